@@ -1,0 +1,172 @@
+"""Rendered frames as training samples: shards on disk in, augmented pictures and points out.
+
+A shard is an .npz file with rgb (N, H, W, 3) uint8 and depth (N, H, W) metres, 0 = unknown.
+Sample number i depends on the seed, i and the frames alone, so an interrupted run goes on with
+the samples it would have seen.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from numpy.random import Generator
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.utils.data import Dataset, Sampler
+
+from model_zoo_defs.training.patterns import draw
+from pnpdepth_cli.models.definition import IMAGENET_MEAN, IMAGENET_STD
+
+REFRESH_EVERY = 2000
+
+
+class Sample(NamedTuple):
+    """rgb (3, H, W) normalised; sparse and depth (1, H, W) metres, 0 = unknown."""
+
+    rgb: Tensor
+    sparse: Tensor
+    depth: Tensor
+
+
+class Frames:
+    """All frames of a folder's shards, held in memory; `refresh` picks up shards that came since."""
+
+    def __init__(self, folder: Path):
+        self.folder = folder
+        self.frames: list[tuple[NDArray[np.uint8], NDArray[np.float32]]] = []
+        self._read: set[Path] = set()
+        self.refresh()
+        if not self.frames:
+            raise FileNotFoundError(f"no shard (*.npz) in {folder}")
+
+    def refresh(self) -> None:
+        """Every complete shard of the folder has been read, in the order of their names."""
+        for path in sorted(self.folder.glob("*.npz")):
+            if path not in self._read:
+                with np.load(path) as shard:
+                    rgb, depth = shard["rgb"], shard["depth"].astype(np.float32)
+                self.frames += list(zip(rgb, depth, strict=True))
+                self._read.add(path)
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def __getitem__(self, index: int) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+        return self.frames[index]
+
+
+class Samples(Dataset[Sample]):
+    """Endless augmented samples of one size (height, width)."""
+
+    def __init__(self, folder: Path, size: tuple[int, int], seed: int):
+        self.folder, self.size, self.seed = folder, size, seed
+        self.frames: Frames | None = None
+        self._calls = 0
+
+    def __getitem__(self, index: int) -> Sample:
+        if self.frames is None:
+            self.frames = Frames(self.folder)
+        self._calls += 1
+        if self._calls % REFRESH_EVERY == 0:
+            self.frames.refresh()
+        rng = np.random.default_rng((self.seed, index))
+        while True:
+            rgb, depth = self.frames[int(rng.integers(len(self.frames)))]
+            sample = augmented(rng, rgb, depth, self.size)
+            if bool((sample.depth > 0).any() and (sample.sparse > 0).any()):
+                return sample
+
+
+class Counting(Sampler[int]):
+    """The sample numbers from `start` on, `count` of them."""
+
+    def __init__(self, start: int, count: int):
+        self.numbers = range(start, start + count)
+
+    def __iter__(self) -> Iterator[int]:
+        return iter(self.numbers)
+
+    def __len__(self) -> int:
+        return len(self.numbers)
+
+
+def normalised(rgb: Tensor) -> Tensor:
+    """rgb (3, H, W) in 0..1 as the network takes it."""
+    mean, std = (torch.tensor(x).view(3, 1, 1) for x in (IMAGENET_MEAN, IMAGENET_STD))
+    return (rgb - mean) / std
+
+
+def augmented(
+    rng: Generator, rgb: NDArray[np.uint8], depth: NDArray[np.float32], size: tuple[int, int]
+) -> Sample:
+    """A random part of a frame at a random zoom, mirrored half the time, with random points."""
+    picture, distance = _zoomed_part(rng, rgb, depth, size)
+    if rng.random() < 0.5:
+        picture, distance = picture.flip(-1), distance.flip(-1)
+    distance = distance * float(np.exp(rng.uniform(np.log(0.5), np.log(2.0))))
+    sparse = draw(rng, distance.numpy(), picture.mean(0).numpy())
+    picture = degraded(rng, picture)
+    return Sample(normalised(picture), torch.from_numpy(sparse)[None], distance[None])
+
+
+def _zoomed_part(
+    rng: Generator, rgb: NDArray[np.uint8], depth: NDArray[np.float32], size: tuple[int, int]
+) -> tuple[Tensor, Tensor]:
+    """A window of the frame resized to `size`: picture (3, h, w) 0..1, depth (h, w)."""
+    height, width = depth.shape
+    least = max(size[0] / height, size[1] / width)
+    zoom = least * float(np.exp(rng.uniform(0.0, np.log(2.5))))
+    h, w = min(height, round(size[0] / zoom)), min(width, round(size[1] / zoom))
+    top, left = int(rng.integers(height - h + 1)), int(rng.integers(width - w + 1))
+    part = (slice(top, top + h), slice(left, left + w))
+    picture = torch.from_numpy(np.ascontiguousarray(rgb[part])).permute(2, 0, 1).float() / 255.0
+    picture = F.interpolate(
+        picture[None], size, mode="bilinear", align_corners=False, antialias=True
+    )[0]
+    distance = torch.from_numpy(np.ascontiguousarray(depth[part]))
+    distance = F.interpolate(distance[None, None], size, mode="nearest-exact")[0, 0]
+    return picture.contiguous(), distance.contiguous()
+
+
+def degraded(rng: Generator, rgb: Tensor) -> Tensor:
+    """The picture (3, H, W) 0..1 as a cheaper camera in another light would have taken it."""
+    if rng.random() < 0.8:
+        gain = float(np.exp(rng.normal(0.0, 0.2))) * np.exp(rng.normal(0.0, 0.06, (3, 1, 1)))
+        rgb = rgb * torch.from_numpy(gain).float()
+        grey = rgb.mean(0, keepdim=True)
+        rgb = grey + (rgb - grey) * float(rng.uniform(0.3, 1.5))
+        rgb = 0.5 + (rgb - 0.5) * float(rng.uniform(0.7, 1.3))
+        rgb = rgb.clamp(0.0, 1.0) ** float(np.exp(rng.normal(0.0, 0.25)))
+    if rng.random() < 0.3:
+        rgb = _blurred(rgb, float(rng.uniform(0.3, 1.5)))
+    if rng.random() < 0.4:
+        noise = rng.standard_normal(rgb.shape, dtype=np.float32) * rng.uniform(0.0, 0.05)
+        rgb = rgb + torch.from_numpy(noise.astype(np.float32))
+    if rng.random() < 0.3:
+        rgb = _block_compressed(rgb, float(rng.uniform(0.005, 0.06)))
+    return rgb.clamp(0.0, 1.0)
+
+
+def _blurred(rgb: Tensor, sigma: float) -> Tensor:
+    at = torch.arange(-3.0, 4.0)
+    kernel = torch.exp(-0.5 * (at / sigma) ** 2)
+    kernel = (kernel / kernel.sum()).repeat(3, 1, 1, 1)
+    padded = F.pad(rgb[None], (3, 3, 3, 3), mode="replicate")
+    return F.conv2d(F.conv2d(padded, kernel, groups=3), kernel.transpose(2, 3), groups=3)[0]
+
+
+def _block_compressed(rgb: Tensor, step: float) -> Tensor:
+    """What JPEG does: 8 x 8 cosine transforms rounded, high frequencies more coarsely."""
+    k, n = torch.arange(8.0)[:, None], torch.arange(8.0)[None, :]
+    basis = torch.cos(torch.pi * (2 * n + 1) * k / 16) * 0.5
+    basis[0] = 8**-0.5
+    _, height, width = rgb.shape
+    blocks = rgb.view(3, height // 8, 8, width // 8, 8).transpose(2, 3)
+    table = step * (1.0 + k + n)
+    coefficients = torch.round(basis @ blocks @ basis.t() / table) * table
+    return (basis.t() @ coefficients @ basis).transpose(2, 3).reshape(rgb.shape)

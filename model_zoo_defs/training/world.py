@@ -1,0 +1,181 @@
+"""A finished scene that rays can be cast into, and the cameras that look at it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+from embreex.mesh_construction import TriangleMesh
+from embreex.rtcore_scene import EmbreeScene
+
+from model_zoo_defs.training.materials import MaterialTable
+from model_zoo_defs.training.shapes import FloatArray, IntArray, Mesh, rotation
+
+
+@dataclass(frozen=True, kw_only=True)
+class Light:
+    """Shines from a place (or, a sun, along a direction) and casts a shadow blurred by radius."""
+
+    place: tuple[float, float, float]
+    colour: tuple[float, float, float]
+    radius: float
+    sun: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sky:
+    """Is what rays see that leave the scene, and the light that comes from all sides."""
+
+    zenith: tuple[float, float, float]
+    horizon: tuple[float, float, float]
+    clouds: float
+    ambient_up: tuple[float, float, float]
+    ambient_down: tuple[float, float, float]
+    haze_m: float
+    occlusion_m: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class View:
+    """Is a pinhole camera: pixel (u, v) sees along R [(u - cx) / fx, (v - cy) / fy, 1].
+
+    Pixel centres lie at whole numbers. The columns of R are the camera's right, down and
+    forward axes in the world, whose z points up.
+    """
+
+    place: FloatArray
+    axes: FloatArray
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    height: int
+    width: int
+
+    def rays(self, u: npt.ArrayLike, v: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """Returns origins and directions (n, 3); a direction's length along the axis is 1."""
+        x = (np.asarray(u, np.float32).ravel() - self.cx) / self.fx
+        y = (np.asarray(v, np.float32).ravel() - self.cy) / self.fy
+        local = np.stack([x, y, np.ones_like(x)], axis=1).astype(np.float32)
+        directions = local @ self.axes.T
+        return np.tile(self.place, (len(directions), 1)), directions
+
+    def grid(self) -> tuple[FloatArray, FloatArray]:
+        """Returns the rays through all pixel centres, row by row."""
+        v, u = np.mgrid[: self.height, : self.width]
+        return self.rays(u, v)
+
+
+def looking(
+    place: npt.ArrayLike,
+    yaw: float,
+    pitch: float,
+    roll: float,
+    *,
+    fov_deg: float,
+    height: int,
+    width: int,
+    shift: tuple[float, float] = (0.0, 0.0),
+) -> View:
+    """Returns a view along +y turned by yaw (left), pitch (up) and roll, all in radians."""
+    right_forward_up = rotation(yaw, pitch, roll)
+    axes = np.stack(
+        [right_forward_up[:, 0], -right_forward_up[:, 2], right_forward_up[:, 1]], axis=1
+    )
+    focal_px = width / 2 / np.tan(np.radians(fov_deg) / 2)
+    return View(
+        place=np.asarray(place, np.float32),
+        axes=np.ascontiguousarray(axes),
+        fx=float(focal_px),
+        fy=float(focal_px),
+        cx=(width - 1) / 2 + shift[0] * width,
+        cy=(height - 1) / 2 + shift[1] * height,
+        height=height,
+        width=width,
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Hits:
+    """Says for n rays what they met; `t` counts in lengths of the ray's direction."""
+
+    met: npt.NDArray[np.bool_]
+    t: FloatArray
+    face: IntArray
+    points: FloatArray
+    flat: FloatArray
+    normals: FloatArray
+    uv: FloatArray
+    material: IntArray
+
+
+@dataclass(frozen=True)
+class World:
+    """Holds a scene's triangles, materials and lights."""
+
+    mesh: Mesh
+    face_material: IntArray
+    table: MaterialTable
+    lights: tuple[Light, ...]
+    sky: Sky
+    far_m: float = 120.0
+
+    @cached_property
+    def _embree(self) -> EmbreeScene:
+        scene = EmbreeScene()
+        TriangleMesh(scene, self.mesh.vertices, self.mesh.faces)
+        return scene
+
+    @cached_property
+    def _attributes(self) -> FloatArray:
+        return np.concatenate([self.mesh.normals, self.mesh.uv], axis=1)
+
+    def depths(self, origins: FloatArray, directions: FloatArray) -> FloatArray:
+        """Returns t of the first hit of every ray, 0 where it leaves the scene."""
+        found = self._embree.run(origins, directions, output=1)
+        return np.where(found["primID"] >= 0, found["tfar"], 0).astype(np.float32)
+
+    def cast(self, origins: FloatArray, directions: FloatArray) -> Hits:
+        """Returns what the rays meet first; both normals face the ray's origin."""
+        found = self._embree.run(origins, directions, output=1)
+        met = found["primID"] >= 0
+        face = np.where(met, found["primID"], 0).astype(np.int32)
+        t = np.where(met, found["tfar"], 0).astype(np.float32)
+        corner = self.mesh.faces[face]
+        u, v = found["u"][:, None], found["v"][:, None]
+        mixed = self._attributes[corner[:, 0]] * (1 - u - v)
+        mixed += self._attributes[corner[:, 1]] * u
+        mixed += self._attributes[corner[:, 2]] * v
+        flat = _facing(_unit(found["Ng"]), directions)
+        normals = _unit(mixed[:, :3])
+        # A smooth normal takes the side of the flat one, then may not turn from the viewer.
+        normals = np.where((normals * flat).sum(1, keepdims=True) < 0, -normals, normals)
+        return Hits(
+            met=met,
+            t=t,
+            face=face,
+            points=origins + directions * t[:, None],
+            flat=flat,
+            normals=normals,
+            uv=mixed[:, 3:],
+            material=self.face_material[face],
+        )
+
+    def open_share(
+        self, origins: FloatArray, directions: FloatArray, reach: npt.NDArray[np.float32]
+    ) -> FloatArray:
+        """Returns 1 for every ray that gets `reach` lengths of its direction far, else 0."""
+        found = self._embree.run(origins, directions, dists=reach, query="OCCLUDED")
+        return (found != 0).astype(np.float32)
+
+
+def _unit(vectors: FloatArray) -> FloatArray:
+    length = np.sqrt(np.einsum("ij,ij->i", vectors, vectors))
+    return np.asarray(vectors / (length[:, None] + 1e-12), np.float32)
+
+
+def _facing(normals: FloatArray, directions: FloatArray) -> FloatArray:
+    away = np.einsum("ij,ij->i", normals, directions) > 0
+    return np.where(away[:, None], -normals, normals)

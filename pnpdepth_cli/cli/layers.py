@@ -1,0 +1,83 @@
+"""`pnpdepth layers`."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import click
+
+from pnpdepth_cli.cli import options
+from pnpdepth_cli.errors import UsageError
+
+
+@click.command(short_help="List the layers a network can be cut at.")
+@options.model
+@options.checkpoint
+@click.option("--all", "every", is_flag=True, help="Every submodule, not the definition's choice.")
+@click.option("--size", metavar="HxW", help="Of the frame to measure with.")
+@options.device
+@options.as_json
+def layers(
+    model: str,
+    checkpoint: Path | None,
+    every: bool,
+    size: str | None,
+    device: str,
+    as_json: bool,
+) -> None:
+    """List the layers a network can be cut at.
+
+    Shape of z and its stride, the share of the network's cost behind the cut (what every update
+    repeats), and the influential field of one sparse point: in z, and in the depth map.
+    """
+    from tqdm import tqdm
+
+    from pnpdepth_cli.pipeline.layers import list_layers
+
+    with tqdm(desc="layers", unit="layer", leave=False, delay=1) as bar:
+
+        def show(done: int, of: int) -> None:
+            bar.total = of
+            bar.update(done - bar.n)
+
+        rows = list_layers(
+            model,
+            checkpoint,
+            device,
+            every=every,
+            size=_height_and_width(size) if size else None,
+            on_layer=show,
+        )
+    if as_json:
+        click.echo(json.dumps([asdict(row) for row in rows], indent=2))
+        return
+    from pnpdepth_cli.cli.tables import print_rows
+
+    print_rows(
+        f"layers of {model}",
+        ("layer", "z", "stride", "cost behind", "field in z", "field in depth"),
+        [_cells(asdict(row)) for row in rows],
+    )
+
+
+def _cells(row: dict[str, Any]) -> tuple[str, ...]:
+    if row["problem"]:
+        return (row["name"], "–", "", "", "", row["problem"].partition(": ")[2] or row["problem"])
+    return (
+        row["name"],
+        "×".join(str(n) for n in row["shape"]),
+        f"{row['stride']:g}" if row["stride"] else "–",
+        f"{row['cost_behind']:.0%}" if row["cost_behind"] is not None else "–",
+        "{}×{}".format(*row["field_in_z"]) if row["field_in_z"] else "–",
+        "{}×{}".format(*row["field_in_output"]),
+    )
+
+
+def _height_and_width(text: str) -> tuple[int, int]:
+    height, x, width = text.lower().partition("x")
+    if not (x and height.isdigit() and width.isdigit() and int(height) and int(width)):
+        raise UsageError(f"size {text!r} is not of the form HxW, such as 480x640")
+    return int(height), int(width)

@@ -1,0 +1,92 @@
+"""Results as tables on stderr."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+_SCORES: tuple[tuple[str, str, Callable[[float], str]], ...] = (
+    ("RMSE", "rmse", lambda v: f"{v:.4f} m"),
+    ("MAE", "mae", lambda v: f"{v:.4f} m"),
+    ("MRE", "mre", lambda v: f"{v:.4f}"),
+    ("iRMSE", "irmse", lambda v: f"{v:.2f} 1/km"),
+    ("SILog", "silog", lambda v: f"{v:.2f}"),
+    ("δ1", "delta1", lambda v: f"{v:.2%}"),
+    ("δ2", "delta2", lambda v: f"{v:.2%}"),
+    ("δ3", "delta3", lambda v: f"{v:.2%}"),
+)
+
+
+def print_refinement(record: Mapping[str, Any]) -> None:
+    """The end of `pnpdepth refine`: what was assumed, errors before and after, files, time."""
+    console = Console(stderr=True, highlight=False)
+    for note in record["notes"]:
+        style = "yellow" if note.startswith("warning") else "dim"
+        console.print(escape(note), style=style, soft_wrap=True)
+    settings, points = record["settings"], record["points"]
+    table = Table(title=escape(f"{record['model']['name']} cut at {settings['layer']}"))
+    for column in ("", "before", "after", "change"):
+        table.add_column(column, justify="left" if not column else "right")
+    _point_rows(table, f"error at {points['used']:,} points used", record["sparse_error"])
+    _point_rows(table, f"error at {points['held_out']:,} held-out points", record["held_out_error"])
+    if record["scores"] is not None:
+        before, after = record["scores"]["before"], record["scores"]["after"]
+        table.add_section()
+        for title, key, show in _SCORES:
+            table.add_row(title, show(before[key]), show(after[key]), _change(key, before, after))
+        table.caption = (
+            f"scored on {after['pixels']:,} pixels of ground truth"
+            f" ({after['coverage']:.1%} of those known)"
+        )
+    console.print(table)
+    if record["improved_share"] is not None:
+        where = "pixels with truth" if record["scores"] else "points"
+        console.print(f"improved: {record['improved_share']:.1%} of the {where}")
+    seconds = record["seconds"]
+    console.print(
+        f"{settings['iterations']} updates ({settings['update']}, {settings['loss']}, step"
+        f" {settings['step']:.3g}) · "
+        + ", ".join(f"{stage} {spent:.2f} s" for stage, spent in seconds.items())
+        + f" · peak {record['peak_memory_mb']['process']:,.0f} MB"
+    )
+    written = [path for path in record["outputs"].values() if path]
+    console.print("wrote " + escape("  ".join(written)), soft_wrap=True)
+
+
+def print_rows(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+    """A table of text on stdout."""
+    console = Console(highlight=False)
+    table = Table(title=title, title_justify="left")
+    for number, column in enumerate(columns):
+        table.add_column(column, overflow="fold", justify="left" if number == 0 else "right")
+    for row in rows:
+        table.add_row(*(escape(cell) for cell in row))
+    console.print(table)
+
+
+def _point_rows(table: Table, title: str, error: Mapping[str, Any] | None) -> None:
+    if error is not None:
+        before, after = error["before"], error["after"]
+        for name, key in (("MAE", "mae"), ("RMSE", "rmse")):
+            table.add_row(
+                f"{title}, {name}",
+                f"{before[key]:.4f} m",
+                f"{after[key]:.4f} m",
+                _change(key, before, after),
+            )
+
+
+def _change(key: str, before: Mapping[str, float], after: Mapping[str, float]) -> str:
+    if key.startswith("delta"):
+        points = 100 * (after[key] - before[key])
+        colour = "green" if points > 0 else "red" if points < 0 else "dim"
+        return f"[{colour}]{points:+.2f} pt[/]"
+    if before[key] == 0:
+        return "[dim]–[/]"
+    change = after[key] / before[key] - 1
+    colour = "green" if change < 0 else "red" if change > 0 else "dim"
+    return f"[{colour}]{change:+.1%}[/]"

@@ -1,0 +1,109 @@
+"""Colours for depth and for improvement, and the ticks that say what they mean."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Pixels = NDArray[np.uint8]
+
+UNKNOWN = 70
+"""The grey of a pixel without depth: turbo has no such colour."""
+
+_RED = np.array([214, 26, 30], dtype=np.float32)
+_GREEN = np.array([16, 140, 52], dtype=np.float32)
+# A range wider than this is shown on a logarithmic scale; on a linear one nearly all of a
+# street would have the colour of its far end.
+_LOGARITHMIC_FROM = 8.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class DepthScale:
+    """Which depth has which colour: turbo from `low_m` (warm) to `high_m` (cold)."""
+
+    low_m: float
+    high_m: float
+
+    @property
+    def logarithmic(self) -> bool:
+        """True when the colours follow log depth."""
+        return self.high_m / self.low_m > _LOGARITHMIC_FROM
+
+    def position(self, depth: NDArray[np.floating]) -> NDArray[np.float64]:
+        """0 at the near end, 1 at the far end, clipped there."""
+        bounded = np.clip(np.asarray(depth, dtype=np.float64), self.low_m, self.high_m)
+        if self.logarithmic:
+            return np.log(bounded / self.low_m) / math.log(self.high_m / self.low_m)
+        return (bounded - self.low_m) / (self.high_m - self.low_m)
+
+    def paint(self, depth: NDArray[np.floating]) -> Pixels:
+        """(..., 3) colours of depths of any shape; `UNKNOWN` where there is none."""
+        known = np.isfinite(depth) & (depth > 0)
+        pixels = _turbo(1 - self.position(np.where(known, depth, self.low_m)))
+        pixels[~known] = UNKNOWN
+        return pixels
+
+    def ticks(self) -> list[float]:
+        """Round depths within the range, ascending."""
+        if not self.logarithmic:
+            return round_steps(self.low_m, self.high_m)
+        decades = range(math.floor(math.log10(self.low_m)), math.ceil(math.log10(self.high_m)))
+        digits = {1: (1, 2, 3, 5, 7), 2: (1, 2, 3, 5, 7), 3: (1, 2, 5)}.get(len(decades), (1,))
+        candidates = [digit * 10.0**decade for decade in decades for digit in digits]
+        return [value for value in candidates if self.low_m <= value <= self.high_m]
+
+
+def depth_scale(*depths: NDArray[np.floating]) -> DepthScale:
+    """The scale over the 2nd to 98th percentile of all known depths together."""
+    values = [np.asarray(d, dtype=np.float64).ravel() for d in depths]
+    known = np.concatenate([v[np.isfinite(v) & (v > 0)] for v in values])
+    if known.size == 0:
+        return DepthScale(low_m=1.0, high_m=2.0)
+    low, high = (float(v) for v in np.percentile(known, (2, 98)))
+    if high - low < 0.01 * low:  # one single depth still needs a bar with two ends
+        low, high = 0.95 * low, 1.05 * high
+    return DepthScale(low_m=low, high_m=high)
+
+
+def round_steps(low: float, high: float) -> list[float]:
+    """Multiples of 1, 2 or 5 times a power of ten within the range, at most eleven."""
+    rough = (high - low) / 10
+    power = 10.0 ** math.floor(math.log10(rough))
+    step = next(m * power for m in (1, 2, 5, 10) if m * power >= rough)
+    first, last = math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9)
+    return [index * step for index in range(first, last + 1)]
+
+
+def grey_of(rgb: NDArray[np.floating]) -> NDArray[np.float32]:
+    """(H, W) luma 0..1 of an (H, W, 3) or (H, W) picture in 0..1."""
+    picture = np.clip(np.nan_to_num(np.asarray(rgb, dtype=np.float32)), 0, 1)
+    if picture.ndim == 2:
+        return picture
+    weights = np.array([0.299, 0.587, 0.114], dtype=np.float32)
+    return np.asarray(picture @ weights, dtype=np.float32)
+
+
+def dimmed(grey: NDArray[np.float32]) -> Pixels:
+    """(H, W, 3) dark grey picture, on which coloured points stand out."""
+    levels = np.rint(20 + 115 * grey).astype(np.uint8)
+    return np.repeat(levels[:, :, None], 3, axis=2)
+
+
+def paint_gain(strength: NDArray[np.floating], light: NDArray[np.floating]) -> Pixels:
+    """(..., 3) colours: red at strength 1 (better), green at -1 (worse), `light` grey at 0."""
+    amount = np.clip(np.abs(np.asarray(strength, dtype=np.float32)), 0, 1)[..., None]
+    hue = np.where(np.asarray(strength)[..., None] > 0, _RED, _GREEN)
+    base = 255 * np.asarray(light, dtype=np.float32)[..., None]
+    return np.asarray(np.rint((1 - amount) * base + amount * hue), dtype=np.uint8)
+
+
+def _turbo(position: NDArray[np.float64]) -> Pixels:
+    levels = np.arange(256, dtype=np.uint8)[:, None]
+    table = cv2.applyColorMap(levels, cv2.COLORMAP_TURBO)[:, 0, ::-1]
+    # The last tenths of turbo are so dark at both ends that near and far look alike.
+    index = np.rint(12 + 231 * np.clip(position, 0, 1)).astype(np.intp)
+    return np.array(table[index], dtype=np.uint8)

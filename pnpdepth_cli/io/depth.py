@@ -1,0 +1,19 @@
+"""Depth files: everything the rest of the program needs of them, in one place to import from."""
+
+from __future__ import annotations
+
+from pnpdepth_cli.io.depth_range import describe_range, implausible
+from pnpdepth_cli.io.depth_reading import DepthImage, read_depth
+from pnpdepth_cli.io.depth_writing import DEPTH_SUFFIXES, write_depth
+from pnpdepth_cli.io.sparse_reading import SparseFile, read_sparse
+
+__all__ = [
+    "DEPTH_SUFFIXES",
+    "DepthImage",
+    "SparseFile",
+    "describe_range",
+    "implausible",
+    "read_depth",
+    "read_sparse",
+    "write_depth",
+]

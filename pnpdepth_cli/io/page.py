@@ -1,0 +1,191 @@
+"""A white page with titled panels and a legend: the frame of every picture written here."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from pnpdepth_cli.io.atomic import atomic_path
+from pnpdepth_cli.io.colours import DepthScale, Pixels
+
+if TYPE_CHECKING:
+    import PIL.Image
+    import PIL.ImageDraw
+
+PAGE_WIDTH = 1600
+MARGIN = 24
+GAP = 20
+_TITLE_HEIGHT = 34
+_BAR_WIDTH = 22
+_LEGEND_WIDTH = 112
+_MAX_PANEL_HEIGHT = 1100
+_MIN_PAGE_WIDTH = 760
+_FONT_SIZE = 19
+_SMALL_FONT_SIZE = 17
+_INK = (32, 33, 36)
+_FAINT_INK = (95, 99, 104)
+_LINE = (200, 202, 206)
+
+Ink = tuple[int, int, int]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Panel:
+    """A picture of uint8 RGB with a title above it, and a remark in fainter ink."""
+
+    title: str
+    pixels: Pixels
+    remark: str = ""
+
+
+def magnification(shape: tuple[int, ...], *, columns: int, legend: bool) -> float:
+    """The factor that makes an (H, W) picture fit its column: whole when it enlarges."""
+    height, width = shape[:2]
+    room = PAGE_WIDTH - 2 * MARGIN - (columns - 1) * GAP - (_LEGEND_WIDTH if legend else 0)
+    fit = min(room / columns / width, _MAX_PANEL_HEIGHT / height)
+    return math.floor(fit) if fit >= 1 else fit
+
+
+def resized(pixels: NDArray[Any], factor: float, *, smooth: bool = False) -> NDArray[Any]:
+    """The picture at `factor` times its size; enlarged pixels stay square unless `smooth`."""
+    height, width = pixels.shape[:2]
+    size = (max(1, round(width * factor)), max(1, round(height * factor)))
+    enlarging = cv2.INTER_CUBIC if smooth else cv2.INTER_NEAREST
+    method = cv2.INTER_AREA if factor < 1 else enlarging
+    return np.asarray(cv2.resize(pixels, size, interpolation=method))
+
+
+def draw_discs(
+    pixels: Pixels,
+    xy: NDArray[np.floating],
+    colours: Pixels,
+    factor: float,
+    order: NDArray[np.intp],
+) -> Pixels:
+    """A copy of the enlarged picture with a disc at each point of the original, in `order`."""
+    canvas = np.ascontiguousarray(pixels).copy()
+    if len(xy) == 0:
+        return canvas
+    spacing = math.sqrt(canvas.shape[0] * canvas.shape[1] / len(xy))
+    radius = min(max(0.24 * spacing, 1.4), 6.0)
+    centres = (np.asarray(xy, dtype=np.float64) + 0.5) * factor - 0.5
+    fraction = 4  # OpenCV takes coordinates in sixteenths of a pixel
+    sixteenths = np.rint(centres * (1 << fraction)).astype(int)
+    rim = radius + 1.2 if radius >= 3 else 0.0
+    for index in order:
+        centre = (int(sixteenths[index, 0]), int(sixteenths[index, 1]))
+        red, green, blue = (int(level) for level in colours[index])
+        if rim:
+            _disc(canvas, centre, rim, (15, 15, 15), fraction)
+        _disc(canvas, centre, radius, (red, green, blue), fraction)
+    return canvas
+
+
+def depth_page(panels: list[Panel], columns: int, scale: DepthScale) -> PIL.Image.Image:
+    """The panels, `columns` to a row, with the depth colours in a bar to their right."""
+    page, draw = _lay_out(panels, columns, extra_width=_LEGEND_WIDTH, extra_height=0)
+    left = page.width - MARGIN - _LEGEND_WIDTH + GAP
+    top, bottom = MARGIN + _TITLE_HEIGHT, page.height - MARGIN
+    draw.text((left, MARGIN + 5), "metres", font=_font(_FONT_SIZE), fill=_INK)
+    # Far at the top, as on an axis.
+    depths = np.linspace(1, 0, bottom - top)
+    if scale.logarithmic:
+        metres = scale.low_m * (scale.high_m / scale.low_m) ** depths
+    else:
+        metres = scale.low_m + (scale.high_m - scale.low_m) * depths
+    bar = np.repeat(scale.paint(metres)[:, None], _BAR_WIDTH, axis=1)
+    _paste(page, bar, left, top)
+    draw.rectangle((left - 1, top - 1, left + _BAR_WIDTH, bottom), outline=_LINE)
+    for tick, label in _labels(scale.ticks()):
+        y = bottom - 1 - float(scale.position(np.array(tick))) * (bottom - top - 1)
+        right = left + _BAR_WIDTH
+        draw.line((right, y, right + 6, y), fill=_INK, width=1)
+        draw.text((right + 11, y), label, font=_font(_SMALL_FONT_SIZE), fill=_INK, anchor="lm")
+    return page
+
+
+def gain_page(
+    panel: Panel, bar: Pixels, ends: tuple[str, str], swatch: tuple[Ink, str] | None, footer: str
+) -> PIL.Image.Image:
+    """One panel; under it the colour bar between its two `ends`, a swatch, and the footer."""
+    page, draw = _lay_out([panel], 1, extra_width=0, extra_height=84)
+    font, small = _font(_FONT_SIZE), _font(_SMALL_FONT_SIZE)
+    y = page.height - MARGIN - 56
+    x = float(MARGIN)
+    draw.text((x, y), ends[0], font=small, fill=_INK, anchor="lm")
+    x += draw.textlength(ends[0], font=small) + 12
+    _paste(page, bar, round(x), y - bar.shape[0] // 2)
+    x += bar.shape[1] + 12
+    draw.text((x, y), ends[1], font=small, fill=_INK, anchor="lm")
+    x += draw.textlength(ends[1], font=small) + 2 * GAP
+    if swatch is not None:
+        colour, meaning = swatch
+        draw.rectangle((x, y - 9, x + 18, y + 9), fill=colour)
+        draw.text((x + 28, y), meaning, font=small, fill=_INK, anchor="lm")
+    draw.text((MARGIN, y + 40), footer, font=font, fill=_INK, anchor="lm")
+    return page
+
+
+def save_page(page: PIL.Image.Image, path: Path) -> None:
+    """`path` holds the page as a PNG, whatever its suffix."""
+    with atomic_path(path) as temporary:
+        page.save(temporary, "PNG")
+
+
+def _lay_out(
+    panels: list[Panel], columns: int, *, extra_width: int, extra_height: int
+) -> tuple[PIL.Image.Image, PIL.ImageDraw.ImageDraw]:
+    from PIL import Image, ImageDraw
+
+    height, width = panels[0].pixels.shape[:2]
+    rows = -(-len(panels) // columns)
+    used = columns * width + (columns - 1) * GAP + extra_width
+    page_width = max(used + 2 * MARGIN, _MIN_PAGE_WIDTH)
+    row_height = _TITLE_HEIGHT + height
+    page_height = 2 * MARGIN + rows * row_height + (rows - 1) * (GAP // 2) + extra_height
+    page = Image.new("RGB", (page_width, page_height), "white")
+    draw = ImageDraw.Draw(page)
+    for index, panel in enumerate(panels):
+        row, column = divmod(index, columns)
+        x = MARGIN + column * (width + GAP)
+        y = MARGIN + row * (row_height + GAP // 2)
+        font = _font(_FONT_SIZE)
+        draw.text((x, y + 4), panel.title, font=font, fill=_INK)
+        indent = draw.textlength(panel.title, font=font) + 14
+        draw.text((x + indent, y + 5), panel.remark, font=_font(_SMALL_FONT_SIZE), fill=_FAINT_INK)
+        _paste(page, panel.pixels, x, y + _TITLE_HEIGHT)
+    return page, draw
+
+
+def _labels(ticks: list[float]) -> list[tuple[float, str]]:
+    gaps = [b - a for a, b in pairwise(ticks)]
+    smallest = min([*gaps, *ticks[:1]], default=1.0)
+    decimals = max(0, -math.floor(math.log10(smallest) + 1e-9)) if smallest > 0 else 0
+    return [(tick, f"{tick:,.{decimals}f}") for tick in ticks]
+
+
+def _disc(
+    canvas: Pixels, centre: tuple[int, int], radius: float, colour: Ink, fraction: int
+) -> None:
+    sixteenths = round(radius * (1 << fraction))
+    cv2.circle(canvas, centre, sixteenths, colour, -1, cv2.LINE_AA, fraction)
+
+
+def _paste(page: PIL.Image.Image, pixels: Pixels, x: int, y: int) -> None:
+    from PIL import Image
+
+    page.paste(Image.fromarray(np.ascontiguousarray(pixels)), (x, y))
+
+
+def _font(size: int) -> Any:
+    from PIL import ImageFont
+
+    # Pillow's own font: the same everywhere. It has no en dash, minus or multiplication sign.
+    return ImageFont.load_default(size)

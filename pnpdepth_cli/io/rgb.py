@@ -1,0 +1,180 @@
+"""The image a network sees, from any common picture file."""
+
+from __future__ import annotations
+
+import io
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pnpdepth_cli.errors import FileFormatError
+from pnpdepth_cli.io.opening import (
+    check_pixel_count,
+    damaged,
+    decode_with_opencv,
+    kind_of,
+    one_line,
+    read_bytes,
+)
+from pnpdepth_cli.io.png import read_png_facts
+from pnpdepth_cli.io.tiff import read_tiff_facts
+
+if TYPE_CHECKING:
+    import PIL.Image
+
+_EXIF_ORIENTATION = 0x0112
+
+
+@dataclass(frozen=True, kw_only=True)
+class RgbImage:
+    """An upright picture: `values` is (H, W, 3) float32 in 0..1, sRGB-encoded.
+
+    `note` says what was assumed or changed on the way, if anything was.
+    """
+
+    values: NDArray[np.float32]
+    note: str | None
+
+
+def read_rgb(path: Path) -> RgbImage:
+    """The picture in a PNG, JPEG, TIFF, WebP or EXR file; grey is repeated, alpha dropped.
+
+    EXIF rotation is applied. A file that ends early is refused rather than filled with grey.
+    """
+    data = read_bytes(path)
+    kind = kind_of(data)
+    if kind == "EXR":
+        return _from_linear_light(path, data)
+    if kind not in ("PNG", "JPEG", "TIFF", "WEBP"):
+        raise FileFormatError(f"{path} is not a picture; give a PNG, JPEG, TIFF, WebP or EXR file")
+    if _is_16_bit(path, data, kind):
+        values, orientation = _decode_16_bit(path, data, kind)
+        note = None
+    else:
+        values, orientation, note = _decode_8_bit(path, data, kind)
+    upright = _turn_upright(values, orientation)
+    return RgbImage(values=np.ascontiguousarray(upright), note=note)
+
+
+def _is_16_bit(path: Path, data: bytes, kind: str) -> bool:
+    if kind == "PNG":
+        return read_png_facts(path, data).bit_depth == 16
+    if kind != "TIFF":
+        return False
+    facts = read_tiff_facts(path, data)
+    if facts.number != "uint" or facts.bits > 16:
+        raise FileFormatError(
+            f"{path} is a {facts.bits}-bit {facts.number} TIFF; save the picture with 8 or 16 bits"
+        )
+    return facts.bits == 16
+
+
+def _decode_8_bit(
+    path: Path, data: bytes, kind: str
+) -> tuple[NDArray[np.float32], int, str | None]:
+    from PIL import Image
+
+    try:
+        with _quietly(), Image.open(io.BytesIO(data), formats=[kind]) as picture:
+            check_pixel_count(path, *picture.size)
+            picture.load()
+            frames = getattr(picture, "n_frames", 1)
+            orientation = _orientation(picture)
+            pixels = np.asarray(picture.convert("RGB"), dtype=np.uint8)
+    except FileFormatError:
+        raise
+    except Exception as error:  # Pillow's plugins raise many kinds on damaged files
+        fact = "is cut short" if "truncated" in str(error).lower() else "cannot be decoded"
+        raise damaged(path, kind, f"{fact} ({_reason(error)})") from error
+    # A camera's JPEG may carry a preview as a second frame; that is no choice to report.
+    note = f"first of {frames} pictures" if frames > 1 and kind != "JPEG" else None
+    return pixels.astype(np.float32) / np.float32(255), orientation, note
+
+
+def _decode_16_bit(path: Path, data: bytes, kind: str) -> tuple[NDArray[np.float32], int]:
+    pixels = decode_with_opencv(path, data, kind)
+    values = pixels.astype(np.float32) / np.float32(np.iinfo(pixels.dtype).max)
+    if values.ndim == 2:
+        values = values[:, :, None]
+    if values.shape[2] in (1, 2):
+        values = np.repeat(values[:, :, :1], 3, axis=2)
+    values = values[:, :, 2::-1]  # OpenCV hands out blue first
+    # OpenCV has turned a TIFF upright by now, a PNG not.
+    if kind != "PNG":
+        return values, 1
+    from PIL import Image
+
+    with _quietly(), Image.open(io.BytesIO(data), formats=["PNG"]) as picture:
+        return values, _orientation(picture)
+
+
+def _orientation(picture: PIL.Image.Image) -> int:
+    try:
+        return int(picture.getexif().get(_EXIF_ORIENTATION, 1))
+    except Exception:  # unreadable EXIF in a good picture says nothing of its rotation
+        return 1
+
+
+@contextmanager
+def _quietly() -> Iterator[None]:
+    """Pillow's warnings, of damaged EXIF or a large picture, are not shown inside."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        yield
+
+
+def _turn_upright(values: NDArray[np.float32], orientation: int) -> NDArray[np.float32]:
+    """Undoes EXIF orientation 1..8 (TIFF 6.0, tag 274); other numbers mean nothing."""
+    if orientation in (5, 6, 7, 8):
+        values = values.transpose(1, 0, 2)
+    if orientation in (3, 4, 7, 8):
+        values = values[::-1]
+    if orientation in (2, 3, 6, 7):
+        values = values[:, ::-1]
+    return values
+
+
+def _from_linear_light(path: Path, data: bytes) -> RgbImage:
+    from pnpdepth_cli.io.exr import read_exr_channels
+
+    linear = _colour_of(path, read_exr_channels(path, data)).astype(np.float32)
+    linear = np.nan_to_num(linear, nan=0.0, posinf=1e9, neginf=0.0)
+    outside = float(((linear > 1) | (linear < 0)).any(axis=2).mean())
+    note = "EXR linear light, converted with the sRGB curve"
+    if outside > 0:
+        note += f"; {100 * outside:.2g} % of pixels lay outside 0..1 and were clipped"
+    return RgbImage(values=srgb_from_linear(np.clip(linear, 0, 1)), note=note)
+
+
+def srgb_from_linear(linear: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Linear light in 0..1, sRGB-encoded (IEC 61966-2-1)."""
+    curve = 1.055 * np.power(linear, 1 / 2.4) - 0.055
+    return np.where(linear <= 0.0031308, 12.92 * linear, curve).astype(np.float32)
+
+
+def _colour_of(path: Path, channels: dict[str, NDArray[Any]]) -> NDArray[Any]:
+    prefixes = [name[:-1] for name in channels if name.endswith("R")]
+    full = [p for p in prefixes if all(p + letter in channels for letter in "RGB")]
+    if "" in full:
+        full = [""]
+    if len(full) == 1:
+        return np.stack([channels[full[0] + letter] for letter in "RGB"], axis=2)
+    grey = [name for name in channels if name != "A"]
+    if not full and len(grey) == 1:
+        return np.repeat(channels[grey[0]][:, :, None], 3, axis=2)
+    listing = ", ".join(channels)
+    raise FileFormatError(
+        f"{path} has no one picture in its channels ({listing}); export R, G and B"
+    )
+
+
+def _reason(error: Exception) -> str:
+    text = one_line(error)
+    # Pillow names the in-memory buffer, which means nothing to a reader.
+    return "unknown content" if "BytesIO" in text else text or type(error).__name__

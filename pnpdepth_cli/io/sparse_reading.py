@@ -1,0 +1,123 @@
+"""Sparse depth as points, from a depth image or a list of `x y depth` rows."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pnpdepth_cli.errors import FileFormatError, NoPointsError
+from pnpdepth_cli.io.depth_reading import (
+    check_scale,
+    depth_from_stored,
+    known_metres,
+    load_stored,
+)
+from pnpdepth_cli.io.opening import kind_of, one_line, read_bytes
+
+_TEXT_SUFFIXES = (".csv", ".txt")
+_SEPARATOR = re.compile(r"[\s,;]+")
+
+
+@dataclass(frozen=True, kw_only=True)
+class SparseFile:
+    """N points with known depth.
+
+    `xy` is (N, 2) float32 pixel coordinates, x right, y down, whole numbers at pixel centres.
+    `depth` is (N,) float32 metres, all above 0. `size` is (H, W) of the image the points came
+    from, None for a list. `source`, `scale` and `assumed_scale` are as in DepthImage.
+    """
+
+    xy: NDArray[np.float32]
+    depth: NDArray[np.float32]
+    size: tuple[int, int] | None
+    source: str
+    assumed_scale: bool
+    scale: float | None = None
+
+
+def read_sparse(
+    path: Path, *, scale: float | None = None, channel: str | None = None
+) -> SparseFile:
+    """The points with known depth in a depth image or a point list.
+
+    Images give their points row by row. A list is a float array of shape (N, 3) in NPY or NPZ,
+    or text with one `x y depth` per line (.csv, .txt), in metres; it keeps its own order.
+    Raises NoPointsError when no depth is known.
+    """
+    check_scale(scale)
+    if path.suffix.lower() in _TEXT_SUFFIXES:
+        data = read_bytes(path)
+        if kind_of(data) is None:
+            return _from_rows(path, _parse_text(path, data), "point list")
+    stored = load_stored(path, channel)
+    if not stored.shaped and stored.values.ndim == 2 and stored.values.shape[1] == 3:
+        if stored.values.dtype.kind != "f":
+            raise FileFormatError(
+                f"{path}: a point list of {stored.values.dtype}; save x, y, depth as float metres"
+            )
+        return _from_rows(path, stored.values, f"point list, {stored.what}")
+    image = depth_from_stored(path, stored, scale)
+    rows, columns = np.nonzero(image.valid)
+    if rows.size == 0:
+        raise NoPointsError(f"{path} holds no depth above 0; give a file with sparse depth")
+    height, width = image.values.shape
+    return SparseFile(
+        xy=np.stack([columns, rows], axis=1).astype(np.float32),
+        depth=image.values[rows, columns],
+        size=(height, width),
+        source=image.source,
+        assumed_scale=image.assumed_scale,
+        scale=image.scale,
+    )
+
+
+def _from_rows(path: Path, rows: NDArray[np.floating], source: str) -> SparseFile:
+    depth = known_metres(rows[:, 2])
+    known = depth > 0
+    if not known.any():
+        raise NoPointsError(f"{path} holds no depth above 0; give a file with sparse depth")
+    xy = rows[known, :2].astype(np.float32)
+    if not np.isfinite(xy).all():
+        row = int(np.flatnonzero(known)[~np.isfinite(xy).all(axis=1)][0])
+        raise FileFormatError(
+            f"{path}: point {row + 1} has no finite coordinates; correct or remove it"
+        )
+    return SparseFile(xy=xy, depth=depth[known], size=None, source=source, assumed_scale=False)
+
+
+def _parse_text(path: Path, data: bytes) -> NDArray[np.float64]:
+    try:
+        lines = data.decode("utf-8-sig").splitlines()
+    except UnicodeDecodeError as error:
+        raise FileFormatError(
+            f"{path} is not a text file; give lines of x, y and depth in metres"
+        ) from error
+    rows: list[tuple[float, float, float]] = []
+    for number, line in enumerate(lines, start=1):
+        text = line.split("#", 1)[0].strip()
+        if not text:
+            continue
+        fields = _SEPARATOR.split(text)
+        if not rows and [field.strip('"').lower() for field in fields] == ["x", "y", "depth"]:
+            continue
+        rows.append(_parse_row(path, number, text, fields))
+    return np.array(rows, dtype=np.float64).reshape(-1, 3)
+
+
+def _parse_row(path: Path, number: int, text: str, fields: list[str]) -> tuple[float, float, float]:
+    try:
+        x, y, depth = (float(field) for field in fields)
+    except ValueError as error:
+        raise FileFormatError(
+            f"{path}, line {number}: {one_line(text)[:60]!r} is not x, y and depth; correct it"
+        ) from error
+    if not (math.isfinite(x) and math.isfinite(y)):
+        raise FileFormatError(
+            f"{path}, line {number}: the coordinates are not finite; correct or remove it"
+        )
+    return x, y, depth

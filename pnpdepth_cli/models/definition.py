@@ -1,0 +1,137 @@
+"""The contract between the program and a network: one frozen dataclass says all there is to know.
+
+A user's own network is a Python file with such an object in it, named `definition`:
+
+    from pnpdepth_cli.models.definition import Metric, ModelDefinition, Multiple
+
+    definition = ModelDefinition(
+        name="my-net", input_kind="rgb", size=Multiple(32), build=MyNet, layers=("decoder.up1",)
+    )
+
+Nothing here imports torch, so that listing networks stays cheap.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+if TYPE_CHECKING:
+    from torch import Tensor, nn
+
+InputKind = Literal["rgb", "sparse", "rgb+sparse"]
+OutputKind = Literal["depth", "inverse", "log"]
+Fit = Literal["stretch", "crop"]
+
+IMAGENET_MEAN = (0.485, 0.456, 0.406)
+IMAGENET_STD = (0.229, 0.224, 0.225)
+
+
+@dataclass(frozen=True)
+class Fixed:
+    """The network takes pictures of one size only.
+
+    `stretch` resizes the whole picture to it, `crop` cuts the largest centred part of its aspect
+    ratio first; pixels outside the crop then have no depth.
+    """
+
+    height: int
+    width: int
+    fit: Fit = "stretch"
+
+
+@dataclass(frozen=True)
+class Multiple:
+    """The network takes any picture whose sides are multiples of `of`.
+
+    The picture is padded at the right and the bottom (edge pixels repeated); a longest side above
+    `longest` is shrunk first.
+    """
+
+    of: int
+    longest: int | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Normalisation:
+    """(rgb in 0..1 − mean) / std, per channel; the default hands 0..1 to the network."""
+
+    mean: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    std: tuple[float, float, float] = (1.0, 1.0, 1.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RefineDefaults:
+    """How the network is refined when nobody says otherwise.
+
+    `lr` is a number (absolute, as in the paper) or a text like "3%" (of the standard deviation of
+    z_0). `layer` None is the definition's first layer. The values here are the paper's.
+    """
+
+    layer: str | None = None
+    iterations: int = 5
+    lr: float | str = 0.01
+    loss: str = "l1"
+    update: str = "sign"
+
+
+def _inputs_as_named(
+    input_kind: InputKind, rgb: Tensor | None, sparse: Tensor | None
+) -> tuple[Tensor, ...]:
+    wanted = {"rgb": (rgb,), "sparse": (sparse,), "rgb+sparse": (rgb, sparse)}[input_kind]
+    present = tuple(tensor for tensor in wanted if tensor is not None)
+    if len(present) != len(wanted):
+        raise ValueError(f"a network with input kind {input_kind!r} needs all of its inputs")
+    return present
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModelDefinition:
+    """Everything the program needs to know of a network.
+
+    name, summary, paper, licence: what `pnpdepth models` shows.
+    input_kind: what the network looks at.
+    size: which picture sizes it takes.
+    normalisation: of the rgb input.
+    output_kind: what its numbers are; depth in metres is out, 1/out or exp(out).
+    layers: the layers worth cutting at, from shallow to deep (`pnpdepth layers` lists them).
+    defaults: the settings of refinement.
+    build: makes the network (weights not loaded); called without arguments.
+    checkpoint: the weights that come with the definition, or None where the user brings them.
+    read_checkpoint: renames or reshapes the tensors of a published checkpoint into the state
+        dict of the network.
+    arguments: how to call the network; given rgb (1, 3, H, W) normalised and sparse depth
+        (1, 1, H, W) in metres with 0 = unknown (None where the network does not take it),
+        returns the positional arguments. Default: in the order of `input_kind`.
+    output: picks the prediction, (1, 1, h, w) or (1, h, w), out of what the network returns;
+        default: the tensor itself, the only tensor of a structure.
+    """
+
+    name: str
+    input_kind: InputKind
+    size: Fixed | Multiple
+    build: Callable[[], nn.Module]
+    summary: str = ""
+    paper: str = ""
+    licence: str = ""
+    normalisation: Normalisation = Normalisation()
+    output_kind: OutputKind = "depth"
+    layers: tuple[str, ...] = ()
+    defaults: RefineDefaults = RefineDefaults()
+    checkpoint: Path | None = None
+    read_checkpoint: Callable[[Mapping[str, Tensor]], Mapping[str, Tensor]] | None = None
+    arguments: Callable[[Tensor | None, Tensor | None], tuple[Tensor, ...]] | None = None
+    output: Callable[[Any], Tensor] | None = None
+
+    @property
+    def default_layer(self) -> str | None:
+        """The layer to cut at when nobody says otherwise."""
+        return self.defaults.layer or (self.layers[0] if self.layers else None)
+
+    def call_arguments(self, rgb: Tensor | None, sparse: Tensor | None) -> tuple[Tensor, ...]:
+        """The positional arguments of the network for one frame."""
+        if self.arguments is not None:
+            return self.arguments(rgb, sparse)
+        return _inputs_as_named(self.input_kind, rgb, sparse)

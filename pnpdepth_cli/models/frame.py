@@ -1,0 +1,86 @@
+"""Between the image frame and the network's frame. Depth values of points are never touched."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from pnpdepth_cli.core.points import SparsePoints
+from pnpdepth_cli.models.definition import Fixed, Multiple
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrameMap:
+    """How a picture gets into a network: crop a box, resize it, pad right and bottom.
+
+    image: (H, W). crop: (top, left, height, width) in the image. resized: what the crop becomes.
+    network: (h, w), the resized crop with padding.
+    """
+
+    image: tuple[int, int]
+    crop: tuple[int, int, int, int]
+    resized: tuple[int, int]
+    network: tuple[int, int]
+
+    @classmethod
+    def fit(cls, size: Fixed | Multiple, height: int, width: int) -> FrameMap:
+        """The map for an image of this size under a network's size policy."""
+        if isinstance(size, Multiple):
+            shrink = min(1.0, (size.longest or max(height, width)) / max(height, width))
+            resized = (max(1, round(height * shrink)), max(1, round(width * shrink)))
+            network = (-(-resized[0] // size.of) * size.of, -(-resized[1] // size.of) * size.of)
+            return cls(
+                image=(height, width), crop=(0, 0, height, width), resized=resized, network=network
+            )
+        network = (size.height, size.width)
+        crop = (0, 0, height, width)
+        if size.fit == "crop":
+            scale = min(height / size.height, width / size.width)
+            h, w = round(size.height * scale), round(size.width * scale)
+            crop = ((height - h) // 2, (width - w) // 2, h, w)
+        return cls(image=(height, width), crop=crop, resized=network, network=network)
+
+    def rgb_to_network(self, rgb: Tensor) -> Tensor:
+        """(1, 3, H, W) → (1, 3, h, w); antialiased when shrinking, edge pixels in the padding."""
+        top, left, height, width = self.crop
+        picture = rgb[..., top : top + height, left : left + width]
+        if (height, width) != self.resized:
+            picture = F.interpolate(
+                picture, self.resized, mode="bilinear", align_corners=False, antialias=True
+            )
+        bottom, right = (self.network[0] - self.resized[0], self.network[1] - self.resized[1])
+        return (
+            F.pad(picture, (0, right, 0, bottom), mode="replicate") if bottom or right else picture
+        )
+
+    def points_to_network(self, points: SparsePoints) -> SparsePoints:
+        """The points inside the crop, at their places in the network's frame."""
+        top, left, height, width = self.crop
+        x, y = points.xy[:, 0] - left, points.xy[:, 1] - top
+        inside = (x >= -0.5) & (x < width - 0.5) & (y >= -0.5) & (y < height - 0.5)
+        cropped = SparsePoints(
+            xy=torch.stack([x, y], dim=1)[inside],
+            depth=points.depth[inside],
+            size=(height, width),
+        )
+        resized = cropped.in_frame(*self.resized)
+        return SparsePoints(xy=resized.xy, depth=resized.depth, size=self.network)
+
+    def depth_to_image(self, depth: Tensor) -> Tensor:
+        """Depth (1, 1, h', w') over the network's frame → (H, W); 0 outside the crop."""
+        if self.network != self.resized:
+            depth = _resize(depth, self.network)[..., : self.resized[0], : self.resized[1]]
+        top, left, height, width = self.crop
+        depth = _resize(depth, (height, width))
+        image = depth.new_zeros(self.image)
+        image[top : top + height, left : left + width] = depth[0, 0]
+        return image
+
+
+def _resize(depth: Tensor, size: tuple[int, int]) -> Tensor:
+    if tuple(depth.shape[-2:]) == size:
+        return depth
+    return F.interpolate(depth, size, mode="bilinear", align_corners=False)

@@ -1,0 +1,135 @@
+"""A network ready to run: built, with its weights, on its device."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from pnpdepth_cli.core.foreign import blaming, is_out_of_memory
+from pnpdepth_cli.core.points import SparsePoints
+from pnpdepth_cli.core.structure import tensors_in
+from pnpdepth_cli.errors import CheckpointError, DeviceError, ModelError, UsageError
+from pnpdepth_cli.models.checkpoint import load_checkpoint
+from pnpdepth_cli.models.definition import ModelDefinition
+from pnpdepth_cli.models.frame import FrameMap
+from pnpdepth_cli.models.registry import find_definition
+
+FARTHEST_DEPTH = 1e4
+"""Metres; inverse depth below 1/FARTHEST_DEPTH reads as this depth."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Network:
+    """A definition and its module in eval mode; `checkpoint` is the file the weights came from."""
+
+    definition: ModelDefinition
+    module: nn.Module
+    device: torch.device
+    checkpoint: Path | None
+    notes: tuple[str, ...] = ()
+
+    def arguments(
+        self, frame: FrameMap, rgb: Tensor | None, points: SparsePoints
+    ) -> tuple[Tensor, ...]:
+        """The network's arguments for an image (1, 3, H, W) in 0..1 and points in its own frame."""
+        kind = self.definition.input_kind
+        picture = sparse = None
+        if "rgb" in kind:
+            if rgb is None:
+                raise UsageError(
+                    f"network {self.definition.name!r} looks at a picture; name one before --sparse"
+                )
+            normalise = self.definition.normalisation
+            mean = rgb.new_tensor(normalise.mean).reshape(1, 3, 1, 1)
+            std = rgb.new_tensor(normalise.std).reshape(1, 3, 1, 1)
+            picture = ((frame.rgb_to_network(rgb) - mean) / std).to(self.device)
+        if "sparse" in kind:
+            sparse = points.scatter().to(self.device)
+        with blaming(f"arguments of network {self.definition.name!r}"):
+            return self.definition.call_arguments(picture, sparse)
+
+    def depth_of(self, output: Any) -> Tensor:
+        """Depth (1, 1, h, w) in float32 metres of what the module returns. ModelError if none."""
+        tensor = self._tensor_of(output).float()
+        if tensor.ndim == 3:
+            tensor = tensor[:, None]
+        if tensor.ndim == 2:
+            tensor = tensor[None, None]
+        if tensor.ndim != 4 or tuple(tensor.shape[:2]) != (1, 1):
+            raise ModelError(
+                f"network {self.definition.name!r} gives a tensor of shape {tuple(tensor.shape)},"
+                " where one depth map (1, 1, h, w) is expected; pick it by the definition's output"
+            )
+        if self.definition.output_kind == "inverse":
+            return tensor.clamp_min(1 / FARTHEST_DEPTH).reciprocal()
+        return tensor.exp() if self.definition.output_kind == "log" else tensor
+
+    def _tensor_of(self, output: Any) -> Tensor:
+        if self.definition.output is not None:
+            with blaming(f"output of network {self.definition.name!r}"):
+                return self.definition.output(output)
+        found: list[tuple[tuple[str, ...], Tensor]] = list(tensors_in(output))
+        if len(found) != 1:
+            names = ", ".join(".".join(path) for path, _ in found) or "none"
+            raise ModelError(
+                f"network {self.definition.name!r} returns {len(found)} tensors ({names}); its"
+                " definition must pick the depth with `output`"
+            )
+        return found[0][1]
+
+
+def load_network(spec: str, checkpoint: Path | None, device: str = "cpu") -> Network:
+    """The network named by `spec`, with the weights of `checkpoint` or the definition's own.
+
+    Raises ModelError, CheckpointError or DeviceError; never falls back to random weights.
+    """
+    on = find_device(device)
+    definition = find_definition(spec)
+    path = checkpoint or definition.checkpoint
+    with blaming(f"build of network {definition.name!r}"):
+        module = definition.build()
+    if not isinstance(module, nn.Module):
+        raise ModelError(f"build of {definition.name!r} gives no torch module")
+    notes: list[str] = []
+    if path is not None:
+        notes = load_checkpoint(module, definition, path)
+    elif module.state_dict():
+        raise CheckpointError(
+            f"network {definition.name!r} comes without weights; name them with --checkpoint"
+        )
+    module.eval().requires_grad_(False)
+    with out_of_memory_is_a_device_error(on):
+        module.to(on)
+    return Network(
+        definition=definition, module=module, device=on, checkpoint=path, notes=tuple(notes)
+    )
+
+
+def find_device(name: str) -> torch.device:
+    """The torch device of that name. DeviceError if it is not there."""
+    try:
+        device = torch.device(name)
+        torch.empty(1, device=device)
+    except (RuntimeError, AssertionError, NotImplementedError) as error:
+        reason = (str(error).splitlines() or [""])[0][:120]
+        raise DeviceError(f"device {name!r} cannot be used: {reason}; try --device cpu") from None
+    return device
+
+
+@contextmanager
+def out_of_memory_is_a_device_error(device: torch.device) -> Iterator[None]:
+    """Running out of memory becomes a DeviceError."""
+    try:
+        yield
+    except Exception as error:
+        if not is_out_of_memory(error):
+            raise
+        raise DeviceError(
+            f"device {str(device)!r} is out of memory; use a smaller image or another device"
+        ) from None

@@ -1,0 +1,114 @@
+"""`pnpdepth layers`: where a network can be cut, and what each cut costs and reaches."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.utils.flop_counter import FlopCounterMode
+
+from pnpdepth_cli.core.influence import influential_field
+from pnpdepth_cli.core.points import SparsePoints
+from pnpdepth_cli.core.split import Split
+from pnpdepth_cli.errors import LayerError, UsageError
+from pnpdepth_cli.models.definition import Fixed
+from pnpdepth_cli.models.frame import FrameMap
+from pnpdepth_cli.models.network import Network, load_network, out_of_memory_is_a_device_error
+
+DEFAULT_SIZE = (240, 320)
+
+
+@dataclass(frozen=True, kw_only=True)
+class LayerRow:
+    """A layer one can cut at.
+
+    shape: of z. stride: network pixels per element of z, None where z has no two spatial axes.
+    cost_behind: share of the network's floating-point operations that every update repeats.
+    field_in_z, field_in_output: the influential field of one point, see `InfluentialField`.
+    problem: why it cannot be cut at, then all else but the name is None.
+    """
+
+    name: str
+    shape: tuple[int, ...] | None = None
+    stride: float | None = None
+    cost_behind: float | None = None
+    field_in_z: tuple[int, int] | None = None
+    field_in_output: tuple[int, int] | None = None
+    problem: str | None = None
+
+
+def list_layers(
+    model: str,
+    checkpoint: Path | None,
+    device: str,
+    *,
+    every: bool,
+    size: tuple[int, int] | None = None,
+    on_layer: Callable[[int, int], None] = lambda done, of: None,
+) -> list[LayerRow]:
+    """The definition's layers, or every submodule, in order, measured on a made-up frame.
+
+    size: (H, W) of the frame; default the network's own, or 240×320.
+    """
+    network = load_network(model, checkpoint, device)
+    names = list(network.definition.layers)
+    if every:
+        names = [name for name, _ in network.module.named_modules() if name]
+    if not names:
+        raise UsageError(
+            f"the definition of {network.definition.name!r} lists no layers; --all lists every one"
+        )
+    policy = network.definition.size
+    own = (policy.height, policy.width) if isinstance(policy, Fixed) else DEFAULT_SIZE
+    frame = FrameMap.fit(policy, *(size or own))
+    rows = []
+    with out_of_memory_is_a_device_error(network.device):
+        arguments = _made_up_arguments(network, frame)
+        with torch.no_grad(), FlopCounterMode(display=False) as whole:
+            network.depth_of(network.module(*arguments))
+        for done, name in enumerate(names, start=1):
+            rows.append(_measure(network, name, arguments, frame, whole.get_total_flops()))
+            on_layer(done, len(names))
+    return rows
+
+
+def _made_up_arguments(network: Network, frame: FrameMap) -> tuple[Tensor, ...]:
+    """A picture of smooth noise and 500 points on a slanted plane; the seed is fixed."""
+    height, width = frame.image
+    generator = torch.Generator().manual_seed(0)
+    coarse = torch.rand(1, 3, max(2, height // 8), max(2, width // 8), generator=generator)
+    rgb = torch.nn.functional.interpolate(coarse, frame.image, mode="bilinear")
+    places = np.random.default_rng(0).permutation(height * width)[:500]
+    y, x = torch.from_numpy(places // width), torch.from_numpy(places % width)
+    points = SparsePoints(
+        xy=torch.stack([x, y], dim=1).float(),
+        depth=2 + 3 * y.float() / height + torch.rand(len(places), generator=generator),
+        size=frame.image,
+    )
+    return network.arguments(frame, rgb, frame.points_to_network(points))
+
+
+def _measure(
+    network: Network, name: str, arguments: tuple[Tensor, ...], frame: FrameMap, whole: int
+) -> LayerRow:
+    try:
+        with Split(network.module, name) as split, torch.no_grad():
+            z = split.front(*arguments)
+            split.rear(z)
+            with FlopCounterMode(display=False) as behind:
+                split.rear(z)
+            field = influential_field(split, z, network.depth_of)
+    except LayerError as error:
+        return LayerRow(name=name, problem=str(error))
+    return LayerRow(
+        name=name,
+        shape=tuple(z.shape),
+        stride=frame.network[0] / z.shape[-2] if z.ndim == 4 else None,
+        cost_behind=behind.get_total_flops() / whole if whole else None,
+        field_in_z=field.in_z,
+        field_in_output=field.in_output,
+    )

@@ -1,0 +1,66 @@
+"""`pnpdepth models`: the networks that can be named."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+
+from pnpdepth_cli.models.definition import Fixed, Multiple
+from pnpdepth_cli.models.registry import find_definition, names
+
+
+@dataclass(frozen=True, kw_only=True)
+class ListedModel:
+    """One row of the list; the last fields are the defaults of refinement."""
+
+    name: str
+    summary: str
+    paper: str
+    licence: str
+    input_kind: str
+    size: str
+    output_kind: str
+    parameters: int
+    checkpoint: str | None
+    layers: tuple[str, ...]
+    layer: str | None
+    iterations: int
+    lr: float | str
+    loss: str
+    update: str
+
+
+def list_models() -> list[ListedModel]:
+    """Every network that can be named, in the registry's order."""
+    return [_listed(name) for name in names()]
+
+
+def _listed(name: str) -> ListedModel:
+    definition = find_definition(name)
+    with torch.device("meta"):  # shapes only: counting needs no memory
+        module = definition.build()
+    defaults = definition.defaults
+    return ListedModel(
+        name=definition.name,
+        summary=definition.summary,
+        paper=definition.paper,
+        licence=definition.licence,
+        input_kind=definition.input_kind,
+        size=_size(definition.size),
+        output_kind=definition.output_kind,
+        parameters=sum(parameter.numel() for parameter in module.parameters()),
+        checkpoint=str(definition.checkpoint) if definition.checkpoint else None,
+        layers=definition.layers,
+        layer=definition.default_layer,
+        iterations=defaults.iterations,
+        lr=defaults.lr,
+        loss=defaults.loss,
+        update=defaults.update,
+    )
+
+
+def _size(size: Fixed | Multiple) -> str:
+    if isinstance(size, Fixed):
+        return f"{size.height}×{size.width} ({size.fit})"
+    return "any" if size.longest is None else f"any, shrunk to {size.longest}"

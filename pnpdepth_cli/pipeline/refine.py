@@ -1,0 +1,129 @@
+"""`pnpdepth refine`: one image, its sparse depth, and a network; refined depth and its record."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from pnpdepth_cli.core.metrics import Scores, score
+from pnpdepth_cli.core.refine import RefineSettings
+from pnpdepth_cli.errors import DivergedError
+from pnpdepth_cli.io.record import sha256_of
+from pnpdepth_cli.models.network import Network, load_network
+from pnpdepth_cli.pipeline.frame import (
+    PointError,
+    RefinedFrame,
+    point_error,
+    refine_frame,
+    split_points,
+)
+from pnpdepth_cli.pipeline.inputs import Inputs, read_inputs
+from pnpdepth_cli.pipeline.outputs import plan_outputs, write_outputs
+from pnpdepth_cli.pipeline.request import RefineRequest, effective_settings, layer_name
+from pnpdepth_cli.pipeline.stopwatch import Stopwatch, peak_memory_mb, versions
+
+
+@dataclass(frozen=True, kw_only=True)
+class RefineOutcome:
+    """A refined frame: `record` is what <stem>.json holds; `diverged` says why it stopped early."""
+
+    record: dict[str, Any]
+    diverged: DivergedError | None
+
+
+def refine_image(
+    request: RefineRequest,
+    *,
+    on_iteration: Callable[[int, int, float], None] = lambda done, of, loss: None,
+) -> RefineOutcome:
+    """The refined depth and its companions are on disk; what was done is returned.
+
+    on_iteration(done, of, loss) is called after each update of z. Raises the errors of
+    `pnpdepth_cli.errors`; then nothing is written.
+    """
+    watch = Stopwatch()
+    outputs = plan_outputs(request)
+    with watch("read"):
+        inputs = read_inputs(request)
+    with watch("load network"):
+        network = load_network(request.model, request.checkpoint, request.device)
+    layer = layer_name(network.definition, request.layer)
+    settings = effective_settings(network.definition.defaults, request)
+    with watch("refine"):
+        torch.manual_seed(request.seed)
+        used, held_out = split_points(inputs.points, request.holdout, request.seed)
+        frame = refine_frame(
+            network,
+            layer,
+            settings,
+            inputs,
+            used,
+            held_out,
+            on_iteration=lambda done, loss: on_iteration(done, settings.iterations, loss),
+        )
+    record = _record(request, inputs, network, layer, settings, frame)
+    with watch("write"):
+        record |= write_outputs(outputs, inputs, frame)
+    record["seconds"] = watch.seconds
+    record["peak_memory_mb"] = peak_memory_mb(network.device)
+    outputs.write_record(record)
+    return RefineOutcome(record=record, diverged=frame.diverged)
+
+
+def _record(
+    request: RefineRequest,
+    inputs: Inputs,
+    network: Network,
+    layer: str,
+    settings: RefineSettings,
+    frame: RefinedFrame,
+) -> dict[str, Any]:
+    definition, checkpoint = network.definition, network.checkpoint
+    return {
+        "versions": versions(),
+        "inputs": inputs.record,
+        "model": {
+            "name": definition.name,
+            "spec": request.model,
+            "checkpoint": str(checkpoint) if checkpoint else None,
+            "checkpoint_sha256": sha256_of(checkpoint) if checkpoint else None,
+        },
+        "settings": {
+            "layer": layer,
+            **asdict(settings),
+            "step": frame.refinement.step,
+            "holdout": request.holdout,
+            "seed": request.seed,
+            "device": str(network.device),
+        },
+        "points": {
+            "used": len(frame.used),
+            "held_out": len(frame.held_out),
+            "nearest": float(inputs.points.depth.min()),
+            "farthest": float(inputs.points.depth.max()),
+        },
+        "loss": list(frame.refinement.losses),
+        "sparse_error": _before_after(frame, lambda d: point_error(d, frame.used)),
+        "held_out_error": _before_after(frame, lambda d: point_error(d, frame.held_out)),
+        "scores": _before_after(frame, lambda d: _score(d, inputs.gt)),
+        "diverged": str(frame.diverged) if frame.diverged else None,
+        "notes": [*inputs.notes, *network.notes],
+    }
+
+
+def _score(depth: NDArray[np.float32], gt: NDArray[np.float32] | None) -> Scores | None:
+    return None if gt is None else score(torch.from_numpy(depth), torch.from_numpy(gt))
+
+
+def _before_after(
+    frame: RefinedFrame, measure: Callable[[NDArray[np.float32]], PointError | Scores | None]
+) -> dict[str, Any] | None:
+    before, after = measure(frame.before), measure(frame.after)
+    if before is None or after is None:
+        return None
+    return {"before": asdict(before), "after": asdict(after)}

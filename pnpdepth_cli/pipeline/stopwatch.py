@@ -1,0 +1,51 @@
+"""What a run took: seconds per stage, peak memory, and the versions it ran with."""
+
+from __future__ import annotations
+
+import platform
+import resource
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib import metadata
+
+import torch
+
+from pnpdepth_cli import __version__
+
+
+class Stopwatch:
+    """`with watch("read"):` adds the seconds of the block to `seconds["read"]`."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+
+    @contextmanager
+    def __call__(self, stage: str) -> Iterator[None]:
+        start = time.perf_counter()
+        try:
+            yield
+        finally:
+            spent = time.perf_counter() - start
+            self.seconds[stage] = round(self.seconds.get(stage, 0.0) + spent, 4)
+
+
+def peak_memory_mb(device: torch.device) -> dict[str, float]:
+    """The process's peak resident memory, and the GPU's where one is used, in 10^6 bytes."""
+    unit = 1 if sys.platform == "darwin" else 1024
+    peak = {"process": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e6, 1)}
+    if device.type == "cuda":
+        peak["gpu"] = round(torch.cuda.max_memory_allocated(device) / 1e6, 1)
+    return peak
+
+
+def versions() -> dict[str, str]:
+    """Of the program, Python and the libraries that make the numbers."""
+    libraries = ("numpy", "opencv-python-headless", "OpenEXR")
+    return {
+        "pnpdepth": __version__,
+        "python": platform.python_version(),
+        "torch": torch.__version__,
+        **{name: metadata.version(name) for name in libraries},
+    }
