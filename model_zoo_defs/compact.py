@@ -41,7 +41,7 @@ STAGES = {
     "s32": ((112, 192, 5, 2, 6, 4),),
 }
 ENCODER_CHANNELS = {"s2": 16, "s4": 24, "s8": 40, "s16": 112, "s32": 192}
-DECODER_CHANNELS = {"s2": 24, "s4": 32, "s8": 64, "s16": 96, "s32": 96}
+DECODER_CHANNELS = {"s2": 16, "s4": 32, "s8": 64, "s16": 96, "s32": 96}
 STRIDES = {"s16": 16, "s8": 8, "s4": 4, "s2": 2}
 FIT_HEADS = 4
 FIT_KEY = 16
@@ -118,18 +118,22 @@ class Points:
         medians = [row.median() if row.numel() else row.new_zeros(()) for row in known]
         self.median = torch.stack(medians).view(-1, 1, 1, 1)
         self.value = (log_depth - self.median) * self.mask
+        # sums over 2 x 2 pixels are all the residuals need; finer positions change them by less
+        # than half a pixel's slope
+        moments = torch.cat([self.mask, self.value, self.value.square()], dim=1)
+        self.moments = F.avg_pool2d(moments, 2)
 
     def residual(self, depth: Tensor, stride: int) -> tuple[Tensor, Tensor, Tensor]:
         """(mean, spread, share of known pixels) of points minus `depth`, per cell of `stride`."""
-        size = self.value.shape[-2:]
-        dense = F.interpolate(depth, size=size, mode="bilinear", align_corners=False)
-        difference = (self.value - dense) * self.mask
-        share, mean, square = (
-            F.avg_pool2d(x, stride) for x in (self.mask, difference, difference * difference)
-        )
+        share, value, square = self.moments.split(1, dim=1)
+        dense = _resize(depth, share.shape[-2:]) if stride > 2 else depth
+        difference = value - dense * share
+        squared = square - dense * (2.0 * value - dense * share)
+        sums = torch.cat([share, difference, squared], dim=1)
+        share, difference, squared = F.avg_pool2d(sums, stride // 2).split(1, dim=1)
         known = share.clamp(min=1e-6)
-        mean = mean / known
-        spread = (square / known - mean * mean).clamp(min=0.0)
+        mean = difference / known
+        spread = (squared / known - mean * mean).clamp(min=0.0)
         return mean, torch.sqrt(spread + 1e-6), share
 
 
@@ -256,8 +260,8 @@ class Head(nn.Module):
     def __init__(self, channels: int, candidates: int):
         super().__init__()
         self.candidates = candidates
-        self.weigh = nn.Conv2d(channels, candidates + 1 + 10 + 1, 3, padding=1)
-        nn.init.normal_(self.weigh.weight, std=1e-3)
+        self.weigh = nn.Conv2d(channels, candidates + 1 + 10 + 1, 1)
+        nn.init.normal_(self.weigh.weight, std=1e-2)
         nn.init.zeros_(self.weigh.bias)  # type: ignore[arg-type]
 
     def forward(
@@ -296,17 +300,18 @@ class Compact(nn.Module):
                 "s16": Block(width["s32"] + deep["s16"] + hints + FIT_HEADS + 1, width["s16"]),
                 "s8": Block(width["s16"] + deep["s8"] + hints + 1, width["s8"]),
                 "s4": Block(width["s8"] + deep["s4"] + hints, width["s4"]),
-                "s2": Block(width["s4"] + deep["s2"] + hints + 12, width["s2"]),
+                "s2": Block(width["s2"] + deep["s2"] + hints + 12, width["s2"]),
             }
         )
+        self.narrow = nn.Conv2d(width["s4"], width["s2"], 1)
         self.heads = nn.ModuleDict(
             {
                 level: Head(width[level], FIT_HEADS if level == "s16" else 9)
                 for level in ("s16", "s8", "s4", "s2")
             }
         )
-        self.enlarge = nn.Conv2d(width["s2"], 36, 3, padding=1)
-        nn.init.normal_(self.enlarge.weight, std=1e-3)
+        self.enlarge = nn.Conv2d(width["s2"], 36, 1)
+        nn.init.normal_(self.enlarge.weight, std=1e-2)
 
     def forward(self, rgb: Tensor, sparse: Tensor) -> Tensor:
         return self.pyramid(rgb, sparse)[-1]
@@ -333,16 +338,19 @@ class Compact(nn.Module):
             features = self.decoder[level](torch.cat([x.to(features.dtype) for x in parts], 1))
             depth = self.heads[level](features, before, candidates, residual, share)
             depths.append(depth)
+            if self.training:  # every level answers for its own step only
+                depth = depth.detach()
             extra = [_resize(distance, (size[0] * 2, size[1] * 2))] if level == "s16" else []
             if level == "s4":
-                extra = [F.pixel_unshuffle(rgb, 2)]
+                extra, features = [F.pixel_unshuffle(rgb, 2)], self.narrow(features)
         depths.append(self._enlarge(features, depth))
         return [torch.exp(depth + points.median) for depth in depths]
 
     def _enlarge(self, features: Tensor, depth: Tensor) -> Tensor:
-        weights = F.pixel_shuffle(self.enlarge(features).float(), 2).softmax(1)
-        neighbours = F.interpolate(_neighbours(depth), scale_factor=2.0, mode="nearest")
-        return (weights * neighbours).sum(1, keepdim=True)
+        """Full size: every pixel a mixture of the 3 x 3 depths at 1/2 around it."""
+        weights = self.enlarge(features).float().unflatten(1, (9, 4)).softmax(1)
+        mixed = (weights * _neighbours(depth).unsqueeze(2)).sum(1)
+        return F.pixel_shuffle(mixed, 2)
 
 
 definition = ModelDefinition(

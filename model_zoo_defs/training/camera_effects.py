@@ -37,7 +37,9 @@ def photographed(
     if rng.random() < 0.6:
         picture = _blurred(picture, float(rng.uniform(0.1, 0.9)))
     if rng.random() < 0.8:
-        sigma = float(rng.choice([0.004, 0.01, 0.02, 0.035])) * (0.4 + np.sqrt(np.clip(grey, 0, 1)))
+        sigma = float(rng.choice([0.003, 0.006, 0.01, 0.015, 0.03])) * (
+            0.4 + np.sqrt(np.clip(grey, 0, 1))
+        )
         picture = picture + sigma * rng.standard_normal(picture.shape, dtype=np.float32)
     stored = _bytes(picture)
     if rng.random() < 0.6:

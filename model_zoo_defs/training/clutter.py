@@ -9,7 +9,17 @@ import numpy as np
 
 from model_zoo_defs.training.materials import Palette
 from model_zoo_defs.training.shapes import (
-    Group, box, cylinder, lathe, prism, quads, rod, superquadric, surface, torus, tube,
+    Group,
+    box,
+    cylinder,
+    lathe,
+    prism,
+    quads,
+    rod,
+    superquadric,
+    surface,
+    torus,
+    tube,
 )  # fmt: skip
 
 

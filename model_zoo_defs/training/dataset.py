@@ -34,19 +34,19 @@ class Sample(NamedTuple):
 
 
 class Frames:
-    """All frames of a folder's shards, held in memory; `refresh` picks up shards that came since."""
+    """All frames of some folders' shards, held in memory; `refresh` adds shards that came since."""
 
-    def __init__(self, folder: Path):
-        self.folder = folder
+    def __init__(self, *folders: Path):
+        self.folders = folders
         self.frames: list[tuple[NDArray[np.uint8], NDArray[np.float32]]] = []
         self._read: set[Path] = set()
         self.refresh()
         if not self.frames:
-            raise FileNotFoundError(f"no shard (*.npz) in {folder}")
+            raise FileNotFoundError(f"no shard (*.npz) in {', '.join(map(str, folders))}")
 
     def refresh(self) -> None:
-        """Every complete shard of the folder has been read, in the order of their names."""
-        for path in sorted(self.folder.glob("*.npz")):
+        """Every shard has been read, folder by folder, in the order of their names."""
+        for path in (path for folder in self.folders for path in sorted(folder.glob("*.npz"))):
             if path not in self._read:
                 with np.load(path) as shard:
                     rgb, depth = shard["rgb"], shard["depth"].astype(np.float32)
@@ -63,14 +63,14 @@ class Frames:
 class Samples(Dataset[Sample]):
     """Endless augmented samples of one size (height, width)."""
 
-    def __init__(self, folder: Path, size: tuple[int, int], seed: int):
-        self.folder, self.size, self.seed = folder, size, seed
+    def __init__(self, folders: tuple[Path, ...], size: tuple[int, int], seed: int):
+        self.folders, self.size, self.seed = folders, size, seed
         self.frames: Frames | None = None
         self._calls = 0
 
     def __getitem__(self, index: int) -> Sample:
         if self.frames is None:
-            self.frames = Frames(self.folder)
+            self.frames = Frames(*self.folders)
         self._calls += 1
         if self._calls % REFRESH_EVERY == 0:
             self.frames.refresh()

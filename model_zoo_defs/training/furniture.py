@@ -7,11 +7,33 @@ from collections.abc import Callable
 import numpy as np
 
 from model_zoo_defs.training.clutter import (
-    Kit, books, bottle, bowl, carton, frame, gadget, lamp, laptop, monitor, mug, papers, plant,
-    pot, scatter, vase,
+    Kit,
+    books,
+    bottle,
+    bowl,
+    carton,
+    frame,
+    gadget,
+    lamp,
+    laptop,
+    monitor,
+    mug,
+    papers,
+    plant,
+    pot,
+    scatter,
+    vase,
 )  # fmt: skip
 from model_zoo_defs.training.shapes import (
-    Group, box, cylinder, lathe, rod, superquadric, surface, torus, tube,
+    Group,
+    box,
+    cylinder,
+    lathe,
+    rod,
+    superquadric,
+    surface,
+    torus,
+    tube,
 )  # fmt: skip
 
 _SHELF_THINGS = (books, carton, vase, gadget, frame, mug, bottle, plant, bowl)

@@ -39,6 +39,11 @@ class Palette:
         self._known: dict[str, list[int]] = {}
         self._pictures: list[npt.NDArray[np.uint32]] = []
         self.materials: list[Material] = []
+        # Many places keep to a few colours, so that bodies and background look alike.
+        narrow = rng.random() < 0.5
+        self._theme = [
+            colour(rng, vivid=0.15) for _ in range(int(rng.integers(2, 5)) if narrow else 0)
+        ]
 
     def new(
         self,
@@ -54,7 +59,12 @@ class Palette:
     ) -> int:
         """Returns the number of a new material; whole: a tile starts at texture coordinate 0."""
         rng = self._rng
-        chosen = colour(rng, vivid=vivid) if base is None else np.asarray(base, np.float32)
+        if base is not None:
+            chosen = np.asarray(base, np.float32)
+        elif self._theme and rng.random() < 0.7:
+            chosen = near(rng, self._theme[int(rng.integers(len(self._theme)))], 0.12)
+        else:
+            chosen = colour(rng, vivid=vivid)
         known = self._known.setdefault(kind, [])
         if kind == "poster":
             tint = near(rng, (0.92, 0.92, 0.92), 0.05)

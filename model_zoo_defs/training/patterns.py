@@ -117,6 +117,9 @@ def leak(rng: Generator, depth: Depth) -> Depth:
     A pixel looks past an edge k pixels away when the parallax between the two depths,
     focal x baseline x (1/near − 1/far), is more than k pixels.
     """
+    known = depth[depth > 0]
+    if not known.size:
+        return depth
     height, width = depth.shape
     reach = rng.integers(1, 9, depth.shape)
     turn = rng.choice((-1.0, 1.0)) * rng.uniform(0.0, 0.5) + rng.choice(
@@ -126,11 +129,8 @@ def leak(rng: Generator, depth: Depth) -> Depth:
     rows = np.clip(rows + np.rint(reach * np.sin(turn)).astype(int), 0, height - 1)
     columns = np.clip(columns + np.rint(reach * np.cos(turn)).astype(int), 0, width - 1)
     behind = depth[rows, columns]
-    known = depth[depth > 0]
-    if not known.size:
-        return depth
     focal_baseline = rng.uniform(2.0, 12.0) * float(np.percentile(known, 20))
-    with np.errstate(divide="ignore"):
+    with np.errstate(divide="ignore", invalid="ignore"):
         parallax_px = focal_baseline * (1.0 / depth - 1.0 / behind)
     seen = (depth > 0) & (behind > 0) & (parallax_px > reach) & (rng.random(depth.shape) < 0.6)
     return np.where(seen, behind, depth)
@@ -157,14 +157,11 @@ def faults(rng: Generator, sparse: Depth) -> Depth:
 
 
 def _shifted(x: Depth, down: int, right: int) -> Depth:
-    out = np.roll(x, (down, right), (0, 1))
-    if down:
-        out[:down] = 0.0 if down > 0 else out[:down]
-        out[down:] = 0.0 if down < 0 else out[down:]
-    if right:
-        out[:, :right] = 0.0 if right > 0 else out[:, :right]
-        out[:, right:] = 0.0 if right < 0 else out[:, right:]
-    return out
+    height, width = x.shape
+    reach = abs(down) + abs(right)
+    padded = np.pad(x, reach)
+    top, left = reach - down, reach - right
+    return padded[top : top + height, left : left + width].copy()
 
 
 def _mask_at(

@@ -66,6 +66,7 @@ def _opening(kit: Kit, side: Group, hole: Hole, paint: int) -> None:
     ):  # fmt: skip
         side.add(box(*size), trim, at)
     if v0 < 0.05:
+        _hallway(kit, side, (u0 + u1) / 2, deep, paint)
         if kit.chance(0.75):
             door = kit.wood() if kit.chance(0.5) else kit.surface("plain", vivid=0.2)
             angle = kit.size(-1.7, -0.2) if kit.chance(0.4) else 0.0
@@ -98,6 +99,24 @@ def _opening(kit: Kit, side: Group, hole: Hole, paint: int) -> None:
             count=3,
             tallest=0.4,
         )
+
+
+def _hallway(kit: Kit, side: Group, x: float, deep: float, paint: int) -> None:
+    """Adds the walls and the floor that an open door shows."""
+    left, right, far, top = x - kit.size(0.6, 2), x + kit.size(0.6, 2), deep + kit.size(0.9, 3), 2.6
+    low = deep + 0.03
+    faces = [
+        [(left, far, 0), (right, far, 0), (right, far, top), (left, far, top)],
+        [(left, low, 0), (left, far, 0), (left, far, top), (left, low, top)],
+        [(right, low, 0), (right, far, 0), (right, far, top), (right, low, top)],
+        [(left, low, top), (right, low, top), (right, far, top), (left, far, top)],
+    ]
+    side.add(quads(faces), paint if kit.chance(0.5) else kit.surface("plaster", "plain", "stripes"))
+    ground = [(left, low, 0.001), (right, low, 0.001), (right, far, 0.001), (left, far, 0.001)]
+    side.add(quads([ground]), kit.surface("planks", "carpet", "tiles", vivid=0.1))
+    if kit.chance(0.5):
+        item = furniture.drawers(kit) if kit.chance(0.5) else furniture.chair(kit)
+        side.place(item, (kit.size(left, right), far, 0))
 
 
 def _curtain(kit: Kit, side: Group, u0: float, u1: float, top: float) -> None:
@@ -165,7 +184,7 @@ def room(kit: Kit) -> Plan:
         "mottled",
         "spots",
         tile_m=kit.size(1, 3),
-        vivid=0.25,
+        vivid=0.15,
     )
     floor = kit.surface(
         "planks",
@@ -233,9 +252,9 @@ def _holes(kit: Kit, length: float, height: float) -> list[Hole]:
     while u < length - 1.0:
         chance = kit.rng.random()
         w = kit.size(0.7, min(2.0, length - u - 0.2))
-        if chance < 0.3:
+        if chance < 0.22:
             holes.append((u, kit.size(0.5, 1.0), u + w, min(height - 0.15, kit.size(1.7, 2.4))))
-        elif chance < 0.45:
+        elif chance < 0.4:
             w = min(w, kit.size(0.75, 1.0))
             holes.append((u, 0.0, u + w, min(height - 0.1, kit.size(1.95, 2.15))))
         u += w + kit.size(0.3, 1.5)

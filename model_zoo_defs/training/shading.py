@@ -9,36 +9,41 @@ from model_zoo_defs.training import textures
 from model_zoo_defs.training.shapes import FloatArray
 from model_zoo_defs.training.world import Hits, View, World
 
-_AMBIENT_RAYS = 3
 
+def seen(
+    world: World, view: View, rng: np.random.Generator, *, ambient_rays: int = 3
+) -> tuple[FloatArray, FloatArray]:
+    """Returns linear colour (H, W, 3) and exact depth along the axis (H, W), 0 unknown.
 
-def seen(world: World, view: View, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
-    """Returns linear colour (H, W, 3) and exact depth along the axis (H, W), 0 unknown."""
+    More ambient_rays per pixel make the shade in corners smoother.
+    """
     shape = (view.height, view.width)
     origins, directions = view.grid()
     hits = world.cast(origins, directions)
-    visible = _visibility(world, hits, rng)
+    visible = _visibility(world, hits, rng, ambient_rays=ambient_rays)
     visible = _smoothed(visible, hits, shape)
     colour = _radiance(world, view, hits, directions, visible, reflect=True)
     colour = colour.reshape(*shape, 3)
-    _smooth_edges(world, view, hits, colour, rng)
+    _smooth_edges(world, view, hits, colour, rng, max(1, ambient_rays // 3))
     depth = np.where(hits.met & (hits.t <= world.far_m), hits.t, 0).reshape(shape)
     return colour, depth.astype(np.float32)
 
 
-def _visibility(world: World, hits: Hits, rng: np.random.Generator) -> FloatArray:
+def _visibility(
+    world: World, hits: Hits, rng: np.random.Generator, *, ambient_rays: int
+) -> FloatArray:
     """Returns (n, 1 + lights): the open share of the surroundings, then of each light."""
     count = len(hits.t)
     start = hits.points + hits.flat * (1e-3 + 3e-4 * hits.t)[:, None]
     result = np.ones((count, 1 + len(world.lights)), np.float32)
     reach = np.full(count, world.sky.occlusion_m, np.float32)
     ambient = np.zeros(count, np.float32)
-    for _ in range(_AMBIENT_RAYS):
+    for _ in range(ambient_rays):
         toward = rng.standard_normal((count, 3), dtype=np.float32)
         toward /= np.sqrt(np.einsum("ij,ij->i", toward, toward))[:, None] + 1e-6
         toward += hits.flat * np.float32(1.02)
         ambient += world.open_share(start, toward, reach)
-    result[:, 0] = ambient / _AMBIENT_RAYS
+    result[:, 0] = ambient / ambient_rays
     for index, light in enumerate(world.lights):
         jitter = rng.standard_normal((count, 3), dtype=np.float32) * np.float32(light.radius / 2)
         place = np.asarray(light.place, np.float32)
@@ -93,12 +98,13 @@ def _radiance(
     colour += _highlights(world, hits, back, visible)
     if reflect:
         _reflect(world, view, hits, back, facing.astype(np.float32), colour)
-    sky = _sky(world, directions / length[:, None])
     if world.sky.haze_m > 0:
         clear = np.exp(-hits.t / world.sky.haze_m)[:, None]
         haze = np.asarray(world.sky.horizon, np.float32)
         colour = colour * clear + haze * (1 - clear)
-    return np.where(hits.met[:, None], colour, sky).astype(np.float32)
+    missed = np.flatnonzero(~hits.met)
+    colour[missed] = _sky(world, -back[missed])
+    return np.asarray(colour, np.float32)
 
 
 def _toward(
@@ -182,7 +188,12 @@ _EDGE_SAMPLES: npt.NDArray[np.float32] = np.array(
 
 
 def _smooth_edges(
-    world: World, view: View, hits: Hits, colour: FloatArray, rng: np.random.Generator
+    world: World,
+    view: View,
+    hits: Hits,
+    colour: FloatArray,
+    rng: np.random.Generator,
+    ambient_rays: int,
 ) -> None:
     """Replaces, in `colour`, pixels along edges of bodies by the mean of four samples each."""
     shape = (view.height, view.width)
@@ -202,11 +213,11 @@ def _smooth_edges(
     v, u = np.nonzero(edge)
     if not len(v):
         return
-    total = np.zeros((len(v), 3), np.float32)
-    for du, dv in _EDGE_SAMPLES:
-        origins, directions = view.rays(u + du, v + dv)
-        found = world.cast(origins, directions)
-        visible = _visibility(world, found, rng)
-        sample = _radiance(world, view, found, directions, visible, reflect=True)
-        total += np.minimum(sample, 6.0)
-    colour[v, u] = total / len(_EDGE_SAMPLES)
+    du, dv = _EDGE_SAMPLES[:, :1], _EDGE_SAMPLES[:, 1:]
+    origins, directions = view.rays(u + du, v + dv)
+    found = world.cast(origins, directions)
+    visible = _visibility(world, found, rng, ambient_rays=ambient_rays)
+    sample = _radiance(world, view, found, directions, visible, reflect=True)
+    # A lamp in the mirror must not outshine the other samples of its pixel.
+    four = np.minimum(sample, 6.0).reshape(len(_EDGE_SAMPLES), len(v), 3)
+    colour[v, u] = four.mean(axis=0)

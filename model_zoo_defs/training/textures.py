@@ -52,7 +52,7 @@ _MUTED = (
 def colour(rng: np.random.Generator, *, vivid: float = 0.3) -> FloatArray:
     """Returns a random display colour in [0, 1], saturated with probability `vivid`."""
     if rng.random() < vivid:
-        value = colorsys.hsv_to_rgb(rng.random(), rng.uniform(0.4, 1.0), rng.uniform(0.25, 0.95))
+        value = colorsys.hsv_to_rgb(rng.random(), rng.uniform(0.25, 0.9), rng.uniform(0.25, 0.95))
         return np.array(value, np.float32)
     base = np.array(_MUTED[int(rng.integers(len(_MUTED)))])
     spread = base * rng.uniform(0.75, 1.15) + rng.normal(0, 0.03, 3)

@@ -56,10 +56,10 @@ class View:
 
     def rays(self, u: npt.ArrayLike, v: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
         """Returns origins and directions (n, 3); a direction's length along the axis is 1."""
-        x = (np.asarray(u, np.float32).ravel() - self.cx) / self.fx
-        y = (np.asarray(v, np.float32).ravel() - self.cy) / self.fy
-        local = np.stack([x, y, np.ones_like(x)], axis=1).astype(np.float32)
-        directions = local @ self.axes.T
+        x = (np.asarray(u, np.float32).ravel() - np.float32(self.cx)) / np.float32(self.fx)
+        y = (np.asarray(v, np.float32).ravel() - np.float32(self.cy)) / np.float32(self.fy)
+        axes = self.axes
+        directions = x[:, None] * axes[:, 0] + y[:, None] * axes[:, 1] + axes[:, 2]
         return np.tile(self.place, (len(directions), 1)), directions
 
     def grid(self) -> tuple[FloatArray, FloatArray]:

@@ -6,17 +6,19 @@ The rear runs the network's own forward again, but those submodules hand back wh
 the cut layer hands back z. Skip connections and plain Python between the layers come out right by
 construction.
 
-The first rear pass is watched operation by operation (`Watch`). It learns which submodules behind
-the cut do not depend on z either, so that they are remembered as well, and it saves remembered
-tensors from in-place operations.
+Both are watched operation by operation (`Watch`), the rear in its first pass. A submodule that does
+more than give an output (it works in place on its input, or hooks listen to its parts) is not
+remembered itself, its parts are; remembered tensors are saved from in-place operations; and
+submodules behind the cut that do not depend on z either are remembered as well.
 """
 
 from __future__ import annotations
 
 import difflib
+import functools
 import re
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from types import TracebackType
@@ -27,7 +29,7 @@ from torch import Tensor, nn
 
 from pnpdepth_cli.core.foreign import blaming
 from pnpdepth_cli.core.structure import map_tensors, tensors_in
-from pnpdepth_cli.core.watch import Call, Watch
+from pnpdepth_cli.core.watch import Call, Remembered, Watch
 from pnpdepth_cli.errors import LayerError
 
 
@@ -77,32 +79,31 @@ class Split:
     _cut_call: Call | None
     _path: tuple[str, ...]
     _learned: bool
-    _sealed: bool
+    _passing: bool
 
     def __init__(self, network: nn.Module, layer: str) -> None:
         self.layer = layer
         self._network = network
         self._name = LayerName.parse(layer)
-        self._modules = dict(network.named_modules())
+        self._modules = dict(network.named_modules(remove_duplicate=False))
         if self._name.module not in self._modules or not self._name.module:
             raise LayerError(_unknown(self._name.module, [name for name in self._modules if name]))
         self._cut = self._modules[self._name.module]
-        self._around_cut = _ancestors(network, self._cut)
+        self._around_hooks = _around_hooks(self._modules)
         self._forget()
 
     def __enter__(self) -> Split:
-        self._modes = [(module, module.training) for module in self._network.modules()]
-        self._frozen = [p for p in self._network.parameters() if p.requires_grad]
-        self._forwards = [
-            (module, module.__dict__.get("forward"))
-            for module in self._network.modules()
-            if not isinstance(module, torch.jit.ScriptModule)
-        ]
-        self._network.eval()
-        for parameter in self._frozen:
-            parameter.requires_grad_(False)
-        for module, _ in self._forwards:
-            module.__dict__["forward"] = self._stand_in(module, module.forward)
+        modules = list(self._network.modules())
+        self._state = _State(self._network)
+        self._forwards = [(module, module.__dict__.get("forward")) for module in modules]
+        try:
+            self._network.eval()
+            self._state.freeze()
+            for module in modules:
+                module.__dict__["forward"] = self._stand_in(module, module.forward)
+        except BaseException:
+            self.__exit__(None, None, None)
+            raise
         return self
 
     def __exit__(
@@ -116,10 +117,7 @@ class Split:
                 module.__dict__.pop("forward", None)
             else:
                 module.__dict__["forward"] = own_forward
-        for parameter in self._frozen:
-            parameter.requires_grad_(True)
-        for module, training in self._modes:
-            module.training = training
+        self._state.close()
         self._forget()
 
     def front(self, *arguments: Any) -> Tensor:
@@ -132,35 +130,36 @@ class Split:
         except _CutReached:
             self._index()
             assert self._z0 is not None
-            return self._z0
+            return self._z0.clone()  # the network may go on to change the memory it lies in
         raise LayerError(self._never_ran())
 
     def rear(self, z: Tensor) -> Any:
         """What the network returns when the cut layer gives z."""
-        if not self._calls:
+        if self._cut_call is None:
             raise RuntimeError("rear() needs front() first")
         self._z = z
-        self._counts.clear()
         if self._learned:
             return self._run()
         known = len(self._calls)
         try:
-            with self._watching() as watch:
+            with self._watching() as watch, watch.seeing_escapes():
                 output = self._run()
+            if self._name.call is None and self._counts[self._cut] > 1:
+                raise LayerError(_several_calls(self.layer, self._counts[self._cut]))
         except BaseException:
             del self._calls[known:]
             raise
-        if self._name.call is None and self._counts[self._cut] > 1:
-            raise LayerError(_several_calls(self.layer, self._counts[self._cut]))
         if watch.data_dependent:  # another z may take another path behind the cut
             del self._calls[known:]
+            for call in self._calls:
+                call.copied = True
         self._index()
         self._learned = True
         return output
 
     @contextmanager
     def _watching(self) -> Iterator[Watch]:
-        watch = Watch(call for call in self._calls if call.output is not None)
+        watch = Watch((*self._calls, *self._state.tensors))
         self._watch = watch
         try:
             with watch:
@@ -169,15 +168,23 @@ class Split:
             self._watch = None
 
     def _run(self) -> Any:
-        with blaming("the network's forward"):
-            return self._network(*self._arguments)
+        # The network may change its arguments in place.
+        arguments = map_tensors(self._arguments, lambda _, tensor: tensor.detach().clone())
+        self._state.restore()
+        self._counts.clear()
+        self._passing = True
+        try:
+            with blaming("the network's forward"):
+                return self._network(*arguments)
+        finally:
+            self._passing = False
 
     def _forget(self) -> None:
         self._arguments, self._z0, self._z = (), None, None
         self._calls, self._slots, self._ran = [], {}, set()
         self._counts = Counter()
         self._watch = self._cut_call = None
-        self._learned = self._sealed = False
+        self._learned = self._passing = False
 
     def _index(self) -> None:
         self._slots = {}
@@ -185,51 +192,54 @@ class Split:
             self._slots.setdefault(call.module, []).append(call)
 
     def _stand_in(self, module: nn.Module, original: Callable[..., Any]) -> Callable[..., Any]:
+        @functools.wraps(original)
         def forward(*args: Any, **kwargs: Any) -> Any:
+            def run() -> Any:
+                return original(*args, **kwargs)
+
+            if not self._passing:
+                return self._inject(run) if self._is_recomputed_cut(module) else run()
             count = self._counts[module]
             self._counts[module] += 1
             slots = self._slots.get(module, ())
             if count < len(slots):
                 call = slots[count]
                 if call is self._cut_call:
-                    return self._inject(call)
-                return call.hand_back() if call.kept else original(*args, **kwargs)
-            if self._watch is None or (self._sealed and module is not self._cut):
-                return original(*args, **kwargs)
-            return self._record(module, self._watch, lambda: original(*args, **kwargs))
+                    return self._inject(run)
+                return call.hand_back() if call.kept else run()
+            if self._watch is None:
+                return run()
+            return self._record(module, self._watch, (args, kwargs), run)
 
         return forward
 
-    def _record(self, module: nn.Module, watch: Watch, run: Callable[[], Any]) -> Any:
-        """Run a call and note it: kept with its output where nothing in it depended on z."""
+    def _is_recomputed_cut(self, module: nn.Module) -> bool:
+        """True if torch.utils.checkpoint runs the cut layer again within a backward pass."""
+        backward = torch._C._current_graph_task_id() != -1
+        return backward and module is self._cut and self._counts[module] == 1
+
+    def _record(self, module: nn.Module, watch: Watch, given: Any, run: Callable[[], Any]) -> Any:
+        """Run a call and note it: kept where its output can stand for all that it does."""
         self._ran.add(module)
-        call, place, touched = Call(module), len(self._calls), watch.touched
+        call, place, since = Call(module=module), len(self._calls), watch.now()
         self._calls.append(call)
-        # Inside a submodule that will be remembered as a whole, nothing needs noting.
-        sealed, self._sealed = (
-            self._sealed,
-            self._cut_call is None and module not in self._around_cut,
-        )
-        try:
-            output = run()
-        finally:
-            self._sealed = sealed
+        before = list(tensors_in(given))
+        output = run()
         here = module is self._cut and self._name.call in (None, self._counts[module])
-        if here and self._cut_call is None:
-            self._drop_calls_after(place)
-            self._cut_call, call.output = call, output
+        is_cut = here and self._cut_call is None
+        if (
+            watch.can_stand_for(since, given, output)
+            and module not in self._around_hooks
+            and _same_tensors(before, tensors_in(given))
+        ):
+            del self._calls[place + 1 :]
+            call.kept, call.output = True, map_tensors(output, lambda _, tensor: tensor)
+            watch.protect(call)
+        if is_cut:
+            self._cut_call = call
             self._z0 = self._choose(output)
             raise _CutReached
-        if watch.touched == touched and not watch.is_touched(output):
-            self._drop_calls_after(place)
-            call.kept, call.output = True, output
-            watch.protect(call)
         return output
-
-    def _drop_calls_after(self, place: int) -> None:
-        for call in self._calls[place + 1 :]:
-            call.output = None
-        del self._calls[place + 1 :]
 
     def _choose(self, output: Any) -> Tensor:
         found = [
@@ -249,13 +259,16 @@ class Split:
             z = match[0]
         return z.detach()
 
-    def _inject(self, call: Call) -> Any:
+    def _inject(self, run: Callable[[], Any]) -> Any:
         # A clone, because the network may go on in place and z may be a leaf.
         assert self._z is not None
+        assert self._cut_call is not None
         z = self._z.clone()
         if self._watch is not None:
             self._watch.touch(z)
-        return map_tensors(call.output, lambda path, t: z if path == self._path else t)
+        # What the layer does besides, such as changing its input in place, is done again.
+        output = self._cut_call.hand_back() if self._cut_call.kept else run()
+        return map_tensors(output, lambda path, t: z if path == self._path else t)
 
     def _never_ran(self) -> str:
         if self._cut in self._ran:
@@ -270,13 +283,54 @@ class Split:
         return f"layer {self.layer!r} never runs in this network's forward; {hint}"
 
 
-def _ancestors(network: nn.Module, cut: nn.Module) -> set[nn.Module]:
-    """The submodules that contain the cut one, itself included."""
-    modules = dict(network.named_modules(remove_duplicate=False))
-    names = [name for name, module in modules.items() if module is cut]
-    return {m for part, m in modules.items() for n in names if f"{n}.".startswith(f"{part}.")} | {
-        network
-    }
+class _State:
+    """What a network is beside its code, to be put back."""
+
+    def __init__(self, network: nn.Module) -> None:
+        self.tensors = [Remembered(t) for t in (*network.parameters(), *network.buffers())]
+        self._originals = [remembered.output for remembered in self.tensors]
+        self._learning = [(p, p.requires_grad) for p in network.parameters()]
+        # Frozen torch scripts have neither a mode nor buffers that can be set.
+        modules = [m for m in network.modules() if not isinstance(m, torch.jit.ScriptModule)]
+        self._buffers = [(m, dict(m._buffers)) for m in modules]
+        self._modes = [(m, m.training) for m in network.modules() if hasattr(m, "training")]
+
+    def freeze(self) -> None:
+        """No parameter asks for a gradient."""
+        for parameter, _ in self._learning:
+            parameter.requires_grad_(False)
+
+    def restore(self) -> None:
+        """Parameters and buffers that the network changed have their old values."""
+        for module, buffers in self._buffers:
+            module._buffers.update(buffers)
+        with torch.no_grad():
+            for original, saved in zip(self._originals, self.tensors, strict=True):
+                if saved.copied:
+                    original.copy_(saved.output)
+
+    def close(self) -> None:
+        """All of it is as before."""
+        self.restore()
+        for parameter, requires_grad in self._learning:
+            parameter.requires_grad_(requires_grad)
+        for module, training in self._modes:
+            module.training = training
+
+
+def _around_hooks(modules: dict[str, nn.Module]) -> set[nn.Module]:
+    """The submodules with a hooked part; were they remembered whole, its hook would not run."""
+    hooked = [name for name, m in modules.items() if m._forward_hooks or m._forward_pre_hooks]
+    return {m for part, m in modules.items() for name in hooked if _is_within(name, part)}
+
+
+def _is_within(name: str, part: str) -> bool:
+    return name != part and (not part or name.startswith(f"{part}."))
+
+
+def _same_tensors(one: Iterable[tuple[Any, Tensor]], other: Iterable[tuple[Any, Tensor]]) -> bool:
+    """False where a call has changed the lists or dicts it was given."""
+    return [(path, id(tensor)) for path, tensor in one] == [(p, id(t)) for p, t in other]
 
 
 def _output_name(module: str, path: tuple[str, ...]) -> str:

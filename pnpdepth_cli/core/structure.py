@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, MutableMapping
 from typing import Any
 
 from torch import Tensor
@@ -26,42 +26,43 @@ def map_tensors(
     """The structure with every tensor t at path p replaced by change(p, t); containers are new."""
     if isinstance(structure, Tensor):
         return change(path, structure)
-    children = {
-        key: map_tensors(child, change, (*path, key)) for key, child in _children(structure)
-    }
-    if isinstance(structure, Mapping) and children:
-        made: Any = copy.copy(structure)
-        for key in structure:
-            made[key] = children[str(key)]
-        return made
-    if isinstance(structure, tuple) and hasattr(structure, "_fields"):
-        return type(structure)(*children.values())
-    if isinstance(structure, list | tuple):
-        return type(structure)(children.values())
-    if children:
-        return dataclasses.replace(structure, **children)
-    return structure
+    children = [map_tensors(child, change, (*path, key)) for key, child in _children(structure)]
+    if isinstance(structure, tuple):
+        named = hasattr(structure, "_fields")
+        return type(structure)(*children) if named else type(structure)(children)
+    if not _is_container(structure):
+        return structure
+    made: Any = copy.copy(structure)
+    if isinstance(structure, list):
+        made[:] = children
+    elif isinstance(structure, MutableMapping):
+        for key, child in zip(structure, children, strict=True):
+            made[key] = child
+    else:
+        for field, child in zip(dataclasses.fields(structure), children, strict=True):
+            object.__setattr__(made, field.name, child)  # the dataclass may be frozen
+    return made
 
 
 def is_transparent(structure: Any) -> bool:
     """True if nothing in the structure could hide a tensor from `tensors_in`."""
     if structure is None or isinstance(structure, Tensor | int | float | str | bool):
         return True
-    if isinstance(structure, Mapping | list | tuple) or _is_dataclass_value(structure):
-        return all(is_transparent(child) for _, child in _children(structure))
-    return False
+    return _is_container(structure) and all(
+        is_transparent(child) for _, child in _children(structure)
+    )
 
 
 def _children(structure: Any) -> Iterator[tuple[str, Any]]:
-    if isinstance(structure, Mapping):
+    if isinstance(structure, MutableMapping):
         yield from ((str(key), child) for key, child in structure.items())
     elif isinstance(structure, list | tuple):
         yield from ((str(index), child) for index, child in enumerate(structure))
-    elif _is_dataclass_value(structure):
-        for each in dataclasses.fields(structure):
-            if each.init:
-                yield each.name, getattr(structure, each.name)
+    elif _is_container(structure):
+        yield from ((f.name, getattr(structure, f.name)) for f in dataclasses.fields(structure))
 
 
-def _is_dataclass_value(structure: Any) -> bool:
-    return dataclasses.is_dataclass(structure) and not isinstance(structure, type)
+def _is_container(structure: Any) -> bool:
+    return isinstance(structure, MutableMapping | list | tuple) or (
+        dataclasses.is_dataclass(structure) and not isinstance(structure, type)
+    )

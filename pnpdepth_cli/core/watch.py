@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,93 +15,167 @@ from pnpdepth_cli.core.structure import is_transparent, map_tensors, tensors_in
 
 
 @dataclass(eq=False)
-class Call:
-    """One call of a submodule that every later pass makes too.
+class Remembered:
+    """Tensors as they were at one time; `copied` where the network changes them in place."""
 
-    `kept` is true where the pass hands back `output` instead of running the submodule; `copied`
-    where the network changes that output in place, so that each pass needs a copy of its own.
-    """
-
-    module: nn.Module
-    kept: bool = False
     output: Any = None
     copied: bool = False
 
     def hand_back(self) -> Any:
-        return map_tensors(self.output, lambda _, t: t.clone() if self.copied else t)
+        """What is remembered, in containers of its own, and safe from what is done to it."""
+        return map_tensors(
+            self.output, lambda _, t: t.clone() if self.copied or t.is_inference() else t
+        )
+
+
+@dataclass(eq=False, kw_only=True)
+class Call(Remembered):
+    """One call of a submodule that every later pass makes too.
+
+    `kept` is true where the pass hands back `output` instead of running the submodule.
+    """
+
+    module: nn.Module
+    kept: bool = False
+
+
+@dataclass(frozen=True)
+class Moment:
+    """A time in a watched pass, by how much had happened before it."""
+
+    operations: int
+    touches: int
+    writes: int
 
 
 class Watch(TorchDispatchMode):
     """Sees every tensor operation of a pass.
 
-    It marks what depends on z by its storage, counts the operations that touch such a storage,
-    notes where a value (not a shape) that depends on z steers Python, and gives a remembered
-    output its own copy just before an operation would change it in place.
+    It marks what depends on z by its storage, notes which operation made which storage and which
+    storages are changed in place, notes where a value (not a shape) that depends on z gets out to
+    Python, and gives a remembered tensor its own copy just before it would be changed in place.
     """
 
-    def __init__(self, remembered: Iterable[Call]) -> None:
+    def __init__(self, remembered: Iterable[Remembered]) -> None:
         super().__init__()  # type: ignore[no-untyped-call]
-        self.touched = 0
         self.data_dependent = False
+        self._operations = 0
+        self._touches = 0
+        self._writes: list[int] = []  # which operation had made what was changed; 0: none seen here
+        self._made: dict[int, int] = {}
         self._marked: set[int] = set()
-        self._protected: dict[int, list[Call]] = {}
-        for call in remembered:
-            self.protect(call)
+        self._protected: dict[int, list[Remembered]] = {}
+        for each in remembered:
+            self.protect(each)
 
     def touch(self, tensor: Tensor) -> None:
         """Mark a tensor as depending on z."""
-        self.touched += 1
+        self._touches += 1
         self._marked.add(_storage(tensor))
 
-    def is_touched(self, output: Any) -> bool:
-        """True if something in a module's output depends on z, or may."""
-        return bool(self._marked) and not (
+    def protect(self, remembered: Remembered) -> None:
+        """Save these tensors from in-place operations."""
+        for _, tensor in tensors_in(remembered.output):
+            self._protected.setdefault(_storage(tensor), []).append(remembered)
+
+    def now(self) -> Moment:
+        """This moment, for `can_stand_for`."""
+        return Moment(self._operations, self._touches, len(self._writes))
+
+    def can_stand_for(self, since: Moment, given: Any, output: Any) -> bool:
+        """True if handing back `output` does all that the call did which began at `since`.
+
+        So it read nothing of z, changed nothing older than itself in place, and its output is
+        nothing but tensors that it made, no two of them in one memory.
+        """
+        if self._marked and not (is_transparent(given) and not self._any_marked(given)):
+            self._touches += 1  # a native extension may read its arguments unseen
+        made_inside = [_storage(tensor) for _, tensor in tensors_in(output)]
+        made_inside = [s for s in made_inside if self._made.get(s, 0) > since.operations]
+        if self._touches > since.touches:
+            self._marked.update(made_inside)
+            return False
+        return (
             is_transparent(output)
-            and all(_storage(tensor) not in self._marked for _, tensor in tensors_in(output))
+            and len(set(made_inside)) == sum(1 for _ in tensors_in(output))
+            and all(made > since.operations for made in self._writes[since.writes :])
         )
 
-    def protect(self, call: Call) -> None:
-        """Save this call's output from in-place operations."""
-        for _, tensor in tensors_in(call.output):
-            self._protected.setdefault(_storage(tensor), []).append(call)
+    @contextmanager
+    def seeing_escapes(self) -> Iterator[None]:
+        """The two ways for values to get out that are no tensor operations are watched too."""
+        names = ("numpy", "tolist")
+        for name in names:
+            setattr(Tensor, name, self._noticing(getattr(Tensor, name)))
+        try:
+            yield
+        finally:
+            for name in names:
+                delattr(Tensor, name)
+
+    def _noticing(self, method: Callable[..., Any]) -> Callable[..., Any]:
+        def wrapped(tensor: Tensor, *args: Any, **kwargs: Any) -> Any:
+            self.data_dependent |= self._any_marked(tensor)
+            return method(tensor, *args, **kwargs)
+
+        return wrapped
 
     def __torch_dispatch__(
         self, func: Any, types: Any, args: Sequence[Any] = (), kwargs: Any = None
     ) -> Any:
         kwargs = kwargs or {}
-        if func._schema.is_mutable:
-            for argument, value in zip(func._schema.arguments, args, strict=False):
-                if argument.alias_info is not None and argument.alias_info.is_write:
-                    for tensor in _tensors(value):
-                        self._before_write(tensor)
-        marked = any(
-            _storage(tensor) in self._marked
-            for value in (*args, *kwargs.values())
-            for tensor in _tensors(value)
-        )
+        self._operations += 1
+        written = list(_written(func._schema, args, kwargs))
+        for tensor in written:
+            self._before_write(tensor)
+        given = [t for value in (*args, *kwargs.values()) for t in _tensors(value)]
+        marked = bool(self._marked) and any(map(self._is_marked, given))
         result = func(*args, **kwargs)
+        results = {_storage(tensor) for tensor in _tensors(result)}
+        made = results - {_storage(tensor) for tensor in given} - {_NO_STORAGE}
+        self._made.update(dict.fromkeys(made, self._operations))
+        # An address seen before may have been freed and given out again.
+        self._marked -= made
         if marked:
-            self.touched += 1
-            self._marked.update(_storage(tensor) for tensor in _tensors(result))
-            if func._schema.is_mutable:
-                written = (_tensors(value) for value in (*args, *kwargs.values()))
-                self._marked.update(_storage(tensor) for group in written for tensor in group)
+            self._touches += 1
+            self._marked |= results | {_storage(tensor) for tensor in written}
             tags = func.tags
             if torch.Tag.data_dependent_output in tags or torch.Tag.dynamic_output_shape in tags:
                 self.data_dependent = True
-        elif self._marked and not func._schema.is_mutable:
-            # A storage seen before may have been freed and its address given out again.
-            self._marked.difference_update(_storage(tensor) for tensor in _tensors(result))
         return result
 
     def _before_write(self, tensor: Tensor) -> None:
-        for call in self._protected.pop(_storage(tensor), []):
-            call.output = map_tensors(call.output, lambda _, t: t.clone())
-            call.copied = True
+        storage = _storage(tensor)
+        self._writes.append(self._made.get(storage, 0))
+        for remembered in self._protected.pop(storage, []):
+            remembered.output = map_tensors(remembered.output, lambda _, t: t.clone())
+            remembered.copied = True
+
+    def _any_marked(self, value: Any) -> bool:
+        return any(self._is_marked(tensor) for _, tensor in tensors_in(value))
+
+    def _is_marked(self, tensor: Tensor) -> bool:
+        # Only z requires gradient, so what does comes from it, by whatever way.
+        return tensor.requires_grad or _storage(tensor) in self._marked
+
+
+_NO_STORAGE = 0
+"""Sparse tensors have none; they all share this mark."""
 
 
 def _storage(tensor: Tensor) -> int:
-    return int(tensor.untyped_storage()._cdata)
+    try:
+        return int(tensor.untyped_storage()._cdata)
+    except NotImplementedError:
+        return _NO_STORAGE
+
+
+def _written(schema: Any, args: Sequence[Any], kwargs: Any) -> Iterator[Tensor]:
+    """The tensors an operation changes in place."""
+    if schema.is_mutable:
+        for place, argument in enumerate(schema.arguments):
+            if argument.alias_info is not None and argument.alias_info.is_write:
+                yield from _tensors(args[place] if place < len(args) else kwargs.get(argument.name))
 
 
 def _tensors(value: Any) -> list[Tensor]:

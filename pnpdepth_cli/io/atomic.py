@@ -42,9 +42,10 @@ def _empty_file_beside(target: Path, *, named: Path) -> Path:
     temporary = target.with_name(f".{secrets.token_hex(6)}{target.suffix}")
     try:
         os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
-    except FileNotFoundError as error:
-        raise OutputError(f"{named}: its folder does not exist; create it first") from error
     except OSError as error:
+        if not target.parent.exists():
+            message = f"{named}: its folder does not exist; create it first"
+            raise OutputError(message) from error
         raise _cannot_write(named, error) from error
     return temporary
 

@@ -173,7 +173,7 @@ def _load_png(path: Path, data: bytes) -> StoredArray:
         )
     codes = decode_with_opencv(path, data, "PNG")
     if codes.dtype != np.uint16 or codes.ndim != 2:
-        raise FileFormatError(f"{path} has transparency; save it as plain 16-bit grey")
+        raise damaged(path, "PNG", "cannot be decoded as 16-bit grey")
     own = _scale_in(path, f"{SCALE_KEY}={facts.text.get(SCALE_KEY, '')}")
     return StoredArray(values=codes, what="16-bit PNG", scale=own)
 

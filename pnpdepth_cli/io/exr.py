@@ -26,9 +26,9 @@ def read_exr_channels(path: Path, data: bytes) -> dict[str, NDArray[Any]]:
 
     try:
         with OpenEXR.File(str(path), header_only=True) as file:
-            headers = [file.header(index) for index in range(len(file.parts))]
-        for header in headers:
-            _check_header(path, header)
+            count = len(file.parts)
+            for index in range(count):
+                _check_header(path, file.header(index))
         with OpenEXR.File(str(path), separate_channels=True) as file:
             parts = [_part_channels(part) for part in file.parts]
             names = [str(part.name()) for part in file.parts]
@@ -36,7 +36,9 @@ def read_exr_channels(path: Path, data: bytes) -> dict[str, NDArray[Any]]:
         raise
     except Exception as error:  # the binding raises many kinds, UnicodeDecodeError among them
         raise damaged(path, "EXR", f"cannot be read ({error})") from error
-    if len(parts) == 1:
+    if len(parts) != count:  # the binding leaves out a part that it cannot decode
+        raise damaged(path, "EXR", "cannot be decoded")
+    if count == 1:
         channels = parts[0]
     else:
         channels = {
@@ -107,27 +109,27 @@ def _check_complete(path: Path, data: bytes) -> None:
         (version,) = struct.unpack_from("<I", data, 4)
         if version & _DEEP:
             raise FileFormatError(f"{path} is a deep EXR; export it flattened")
-        offsets, table_end = _chunk_offsets(data, version)
-        last = max(offsets)
-        multipart = 4 if version & _MULTIPART else 0
-        # A multi-part file may mix tiles and lines; there only the block's start is checked.
-        start = last + multipart + (16 if version & _TILED else 4)
-        (size,) = struct.unpack_from("<i", data, start)
-        complete = min(offsets) >= table_end and last + 8 <= len(data)
-        if not multipart:
-            complete = complete and size >= 0 and start + 4 + size <= len(data)
-    except (struct.error, ValueError) as error:
+        offsets, table_end, tiled = _chunk_table(data, version)
+        needed = _end_of_chunk(data, max(offsets), tiled, bool(version & _MULTIPART))
+        complete = min(offsets) >= table_end and needed <= len(data)
+    except (struct.error, ValueError, IndexError, OverflowError) as error:
         raise damaged(path, "EXR", "is cut short or corrupt") from error
     if not complete:
         raise damaged(path, "EXR", f"is cut short after {len(data):,} bytes")
 
 
-def _chunk_offsets(data: bytes, version: int) -> tuple[list[int], int]:
-    """The table that follows the header: it ends where the first block of pixels begins."""
-    position = _end_of_header(data, 8)
-    while version & _MULTIPART and data[position] != 0:
-        position = _end_of_header(data, position)
-    position += 1 if version & _MULTIPART else 0
+def _chunk_table(data: bytes, version: int) -> tuple[list[int], int, list[bool]]:
+    """The offset of every block of pixels, where that table ends, and which parts are tiled.
+
+    The table follows the headers and ends where the first block begins.
+    """
+    position, is_tiled = _skip_header(data, 8)
+    tiled = [is_tiled or bool(version & _TILED)]
+    if version & _MULTIPART:
+        while data[position] != 0:
+            position, is_tiled = _skip_header(data, position)
+            tiled.append(is_tiled)
+        position += 1
     offsets: list[int] = []
     first = len(data)
     while position < first:
@@ -135,17 +137,29 @@ def _chunk_offsets(data: bytes, version: int) -> tuple[list[int], int]:
         offsets.append(offset)
         first = min(first, offset)
         position += 8
-    return offsets, position
+    return offsets, position, tiled
 
 
-def _end_of_header(data: bytes, position: int) -> int:
-    while position < len(data) and data[position] != 0:
+def _end_of_chunk(data: bytes, start: int, tiled: list[bool], multipart: bool) -> int:
+    part = 0
+    if multipart:
+        (part,) = struct.unpack_from("<I", data, start)
+        start += 4
+    # A block begins with its line, or its tile and level in x and y; then come size and pixels.
+    start += 16 if tiled[part] else 4
+    (size,) = struct.unpack_from("<I", data, start)
+    return start + 4 + int(size)
+
+
+def _skip_header(data: bytes, position: int) -> tuple[int, bool]:
+    """Where the header that begins at `position` ends, and whether its type is tiled."""
+    tiled = False
+    while data[position] != 0:
         name_end = data.index(0, position)
         type_end = data.index(0, name_end + 1)
-        (size,) = struct.unpack_from("<i", data, type_end + 1)
-        if size < 0:
-            raise ValueError("an attribute has a negative size")
-        position = type_end + 5 + size
-    if position >= len(data):
-        raise ValueError("the header has no end")
-    return position + 1
+        (size,) = struct.unpack_from("<I", data, type_end + 1)
+        value = type_end + 5
+        if data[position:name_end] == b"type":
+            tiled = data[value : value + size] == b"tiledimage"
+        position = value + size
+    return position + 1, tiled

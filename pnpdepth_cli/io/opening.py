@@ -18,6 +18,7 @@ _MAGIC = (
     (b"v/1\x01", "EXR"),
     (b"\x93NUMPY", "NPY"),
     (b"PK\x03\x04", "NPZ"),
+    (b"PK\x05\x06", "NPZ"),  # without any array
     (b"Pf", "PFM"),
     (b"PF", "PFM"),
 )

@@ -26,7 +26,7 @@ _TITLE_HEIGHT = 34
 _BAR_WIDTH = 22
 _LEGEND_WIDTH = 112
 _MAX_PANEL_HEIGHT = 1100
-_MIN_PAGE_WIDTH = 760
+_GAIN_LEGEND = (900, 84)  # width its text needs, height
 _FONT_SIZE = 19
 _SMALL_FONT_SIZE = 17
 _INK = (32, 33, 36)
@@ -90,7 +90,7 @@ def draw_discs(
 
 def depth_page(panels: list[Panel], columns: int, scale: DepthScale) -> PIL.Image.Image:
     """The panels, `columns` to a row, with the depth colours in a bar to their right."""
-    page, draw = _lay_out(panels, columns, extra_width=_LEGEND_WIDTH, extra_height=0)
+    page, draw = _lay_out(panels, columns, legend_width=_LEGEND_WIDTH)
     left = page.width - MARGIN - _LEGEND_WIDTH + GAP
     top, bottom = MARGIN + _TITLE_HEIGHT, page.height - MARGIN
     draw.text((left, MARGIN + 5), "metres", font=_font(_FONT_SIZE), fill=_INK)
@@ -115,7 +115,7 @@ def gain_page(
     panel: Panel, bar: Pixels, ends: tuple[str, str], swatch: tuple[Ink, str] | None, footer: str
 ) -> PIL.Image.Image:
     """One panel; under it the colour bar between its two `ends`, a swatch, and the footer."""
-    page, draw = _lay_out([panel], 1, extra_width=0, extra_height=84)
+    page, draw = _lay_out([panel], 1, least_width=_GAIN_LEGEND[0], legend_height=_GAIN_LEGEND[1])
     font, small = _font(_FONT_SIZE), _font(_SMALL_FONT_SIZE)
     y = page.height - MARGIN - 56
     x = float(MARGIN)
@@ -140,16 +140,21 @@ def save_page(page: PIL.Image.Image, path: Path) -> None:
 
 
 def _lay_out(
-    panels: list[Panel], columns: int, *, extra_width: int, extra_height: int
+    panels: list[Panel],
+    columns: int,
+    *,
+    legend_width: int = 0,
+    legend_height: int = 0,
+    least_width: int = 0,
 ) -> tuple[PIL.Image.Image, PIL.ImageDraw.ImageDraw]:
     from PIL import Image, ImageDraw
 
     height, width = panels[0].pixels.shape[:2]
     rows = -(-len(panels) // columns)
-    used = columns * width + (columns - 1) * GAP + extra_width
-    page_width = max(used + 2 * MARGIN, _MIN_PAGE_WIDTH)
+    used = columns * width + (columns - 1) * GAP + legend_width
+    page_width = max(used + 2 * MARGIN, least_width)
     row_height = _TITLE_HEIGHT + height
-    page_height = 2 * MARGIN + rows * row_height + (rows - 1) * (GAP // 2) + extra_height
+    page_height = 2 * MARGIN + rows * row_height + (rows - 1) * (GAP // 2) + legend_height
     page = Image.new("RGB", (page_width, page_height), "white")
     draw = ImageDraw.Draw(page)
     for index, panel in enumerate(panels):

@@ -154,8 +154,9 @@ def _from_linear_light(path: Path, data: bytes) -> RgbImage:
 
 def srgb_from_linear(linear: NDArray[np.float32]) -> NDArray[np.float32]:
     """Linear light in 0..1, sRGB-encoded (IEC 61966-2-1)."""
-    curve = 1.055 * np.power(linear, 1 / 2.4) - 0.055
-    return np.where(linear <= 0.0031308, 12.92 * linear, curve).astype(np.float32)
+    light = linear.astype(np.float64)  # in float32 white would come out just below 1
+    curve = 1.055 * np.power(light, 1 / 2.4) - 0.055
+    return np.where(light <= 0.0031308, 12.92 * light, curve).astype(np.float32)
 
 
 def _colour_of(path: Path, channels: dict[str, NDArray[Any]]) -> NDArray[Any]:

@@ -52,8 +52,10 @@ def _first_page(data: bytes) -> dict[int, tuple[int, ...]]:
     order = "<" if data[:2] == b"II" else ">"
     (start,) = struct.unpack_from(order + "I", data, 4)
     (count,) = struct.unpack_from(order + "H", data, start)
+    end = start + 2 + 12 * count
+    struct.unpack_from(order + "I", data, end)  # where the next page is: the list is complete
     tags: dict[int, tuple[int, ...]] = {}
-    for entry in range(start + 2, start + 2 + 12 * count, 12):
+    for entry in range(start + 2, end, 12):
         tag, kind, number = struct.unpack_from(order + "HHI", data, entry)
         if kind not in _SIZE:
             continue

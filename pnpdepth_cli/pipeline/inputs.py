@@ -69,7 +69,7 @@ def read_inputs(files: RefineRequest) -> Inputs:
     )
     if len(points) < len(sparse.depth):
         notes.append(f"sparse: {len(sparse.depth) - len(points):,} points outside the image")
-    notes += [f"warning: {text}" for text in [implausible(sparse.depth)] if text]
+    notes += [f"warning: {text}" for text in [implausible(sparse.depth, sparse.scale)] if text]
     gt = None
     if files.gt is not None:
         truth = read_depth(

@@ -9,6 +9,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib import metadata
+from pathlib import Path
 
 import torch
 
@@ -33,11 +34,20 @@ class Stopwatch:
 
 def peak_memory_mb(device: torch.device) -> dict[str, float]:
     """The process's peak resident memory, and the GPU's where one is used, in 10^6 bytes."""
-    unit = 1 if sys.platform == "darwin" else 1024
-    peak = {"process": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e6, 1)}
+    peak = {"process": round(_peak_resident_bytes() / 1e6, 1)}
     if device.type == "cuda":
         peak["gpu"] = round(torch.cuda.max_memory_allocated(device) / 1e6, 1)
     return peak
+
+
+def _peak_resident_bytes() -> int:
+    # Linux's ru_maxrss remembers the process that started this one, so /proc goes first.
+    status = Path("/proc/self/status")
+    if status.exists():
+        line = next(row for row in status.read_text().splitlines() if row.startswith("VmHWM"))
+        return int(line.split()[1]) * 1024
+    unit = 1 if sys.platform == "darwin" else 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
 
 
 def versions() -> dict[str, str]:

@@ -1,0 +1,147 @@
+"""Buildings along a street, with recessed windows, balconies, awnings and roofs."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from model_zoo_defs.training.clutter import Kit
+from model_zoo_defs.training.rooms import Hole, wall
+from model_zoo_defs.training.shapes import Group, box, cylinder, prism, quads, rod
+
+
+def building(kit: Kit, width: float) -> Group:
+    """Returns a house whose front lies along x at y = 0 and looks toward -y."""
+    group = Group()
+    floors, storey = int(kit.rng.integers(1, 6)), kit.size(2.6, 3.4)
+    height, deep = floors * storey + kit.size(0.2, 1), kit.size(7, 12)
+    skin = kit.surface(
+        "plaster",
+        "plaster",
+        "brick",
+        "brick",
+        "plain",
+        "speckle",
+        "tiles",
+        tile_m=kit.size(1.2, 2.5),
+        vivid=0.15,
+    )
+    glass = kit.palette.new("plain", (0.08, 0.09, 0.1), gloss=0.6, mirror=kit.size(0.1, 0.3))
+    trim = (
+        kit.palette.new("plain", (0.85, 0.84, 0.8))
+        if kit.chance(0.6)
+        else kit.surface("plain", vivid=0.3)
+    )
+    holes = _windows(kit, width, floors, storey)
+    group.add(wall(width, height, holes), skin, (-width / 2, 0, 0))
+    side = [(0, 0, 0), (0, deep, 0), (0, deep, height), (0, 0, height)]
+    for x in (-width / 2, width / 2):
+        group.add(quads([side]), skin, (x, 0, 0))
+    recess = kit.size(0.06, 0.3)
+    balcony = kit.chance(0.3)
+    for u0, v0, u1, v1 in holes:
+        x, w, h = (u0 + u1) / 2 - width / 2, u1 - u0, v1 - v0
+        curtain = glass if kit.chance(0.6) else kit.surface("plain", "stripes", vivid=0.1)
+        group.add(box(w, 0.02, h), curtain, (x, recess, v0))
+        for at, size in (
+            ((x - w / 2, recess / 2, v0), (0.01, recess, h)), ((x + w / 2, recess / 2, v0), (0.01, recess, h)),
+            ((x, recess / 2, v1), (w, recess, 0.01)), ((x, recess / 2 - 0.05, v0 - 0.05), (w + 0.15, recess + 0.1, 0.05)),
+            ((x, recess - 0.03, v0), (0.06, 0.05, h)), ((x, recess - 0.03, v0 + h * 0.6), (w, 0.05, 0.06)),
+        ):  # fmt: skip
+            group.add(box(*size), trim, at)
+        if balcony and v0 > 2 and kit.chance(0.6):
+            _balcony(kit, group, x, v0 - 0.4, w)
+    _top(kit, group, width, height, deep, skin)
+    if kit.chance(0.3):
+        awning = [
+            (-width * 0.4, -1.2, 2.4),
+            (width * 0.4, -1.2, 2.4),
+            (width * 0.4, 0, 2.9),
+            (-width * 0.4, 0, 2.9),
+        ]
+        group.add(quads([awning]), kit.surface("stripes", "plain", vivid=0.7, tile_m=2))
+    if kit.chance(0.3):
+        shop = kit.palette.new("poster", tile_m=2.0, glow=kit.size(0, 0.5))
+        group.add(box(width * kit.size(0.3, 0.9), 0.12, 0.6), shop, (0, -0.06, storey - 0.3))
+    return group
+
+
+def _windows(kit: Kit, width: float, floors: int, storey: float) -> list[Hole]:
+    holes: list[Hole] = []
+    count = max(1, int(width / kit.size(1.8, 3.2)))
+    w, h, sill = kit.size(0.8, 1.5), kit.size(1.1, 1.8), kit.size(0.7, 1.0)
+    door = int(kit.rng.integers(count))
+    for floor in range(floors):
+        for column in range(count):
+            middle = (column + 0.5) * width / count
+            if floor == 0 and column == door:
+                holes.append((middle - 0.5, 0.02, middle + 0.5, 2.15))
+            elif w < width / count - 0.1:
+                low = floor * storey + sill
+                holes.append(
+                    (middle - w / 2, low, middle + w / 2, min(low + h, (floor + 1) * storey))
+                )
+    return holes
+
+
+def _balcony(kit: Kit, group: Group, x: float, z: float, w: float) -> None:
+    wide = w + 0.8
+    group.add(box(wide, 1.0, 0.12), kit.palette.new("plain", (0.6, 0.6, 0.58)), (x, -0.5, z))
+    steel = kit.metal()
+    group.add(rod((x - wide / 2, -0.97, z + 1), (x + wide / 2, -0.97, z + 1), 0.025), steel)
+    for bar in np.linspace(-wide / 2, wide / 2, int(wide / 0.14)):
+        group.add(box(0.016, 0.016, 0.9), steel, (x + float(bar), -0.97, z + 0.1))
+
+
+def _top(kit: Kit, group: Group, width: float, height: float, deep: float, skin: int) -> None:
+    tiles = kit.palette.new("tiles", np.array([0.5, 0.25, 0.18]) * kit.size(0.4, 1.2), tile_m=1.2)
+    if kit.chance(0.65):
+        rise, eave = kit.size(1.5, 4.5), kit.size(0.2, 0.6)
+        w = width / 2 + 0.1
+        ridge, low = height + rise, height - eave * rise / (deep / 2)
+        front = [(-w, -eave, low), (w, -eave, low), (w, deep / 2, ridge), (-w, deep / 2, ridge)]
+        back = [
+            (-w, deep + eave, low),
+            (w, deep + eave, low),
+            (w, deep / 2, ridge),
+            (-w, deep / 2, ridge),
+        ]
+        group.add(quads([front, back]), tiles)
+        gable = [(0, height), (deep, height), (deep / 2, ridge - 0.05)]
+        group.add(prism(gable, 2 * w - 0.25), skin, (0, 0, 0), yaw=np.pi / 2)
+        group.add(box(0.6, 0.5, 1.6), skin, (kit.size(-0.3, 0.3) * width, deep * 0.4, ridge - 0.9))
+        group.add(rod((-w, -eave, low), (w, -eave, low), 0.06), kit.metal())
+    else:
+        group.add(
+            box(width + 0.2, deep + 0.2, 0.3),
+            kit.surface("plain", vivid=0.0),
+            (0, deep / 2, height),
+        )
+    group.add(cylinder(0.045, height), kit.metal(), (width / 2 - 0.15, -0.06, 0))
+
+
+def row(kit: Kit, group: Group, side: float, x: float) -> None:
+    """Adds a row of houses, garden walls and gaps along one side of the road."""
+    style = kit.rng.random()
+    y = kit.size(-12, 5)
+    gaps = 0.1 if style < 0.6 else 0.6
+    kinds = [building(kit, kit.size(6, 16)) for _ in range(3)]
+    while y < 95:
+        if kit.chance(gaps):
+            length = kit.size(3, 15)
+            if kit.chance(0.6):
+                material = kit.surface("brick", "plaster", "paving", tile_m=1.5, vivid=0.1)
+                group.add(
+                    box(0.25, length, kit.size(0.6, 2.4)), material, (side * x, y + length / 2, 0)
+                )
+            y += length
+            continue
+        house = (
+            building(kit, kit.size(6, 16))
+            if kit.chance(0.3) and y < 40
+            else kinds[int(kit.rng.integers(3))]
+        )
+        lower, upper = house.bounds()
+        width = float(upper[0] - lower[0])
+        at = (side * (x + kit.size(0, 1.2)), y + width / 2, 0)
+        group.place(house, at, yaw=-side * np.pi / 2)
+        y += width + (0.0 if kit.chance(0.6) else kit.size(0.5, 4))

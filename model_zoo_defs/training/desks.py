@@ -1,0 +1,132 @@
+"""Close-ups: a table or floor full of small bodies before some background."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from model_zoo_defs.training import clutter, furniture
+from model_zoo_defs.training.clutter import Kit
+from model_zoo_defs.training.rooms import Plan
+from model_zoo_defs.training.shapes import Group, box, lathe, quads, superquadric, surface, tube
+from model_zoo_defs.training.world import Light, Sky
+
+
+def _wild(kit: Kit) -> Group:
+    """Returns a body that no household has: bent, lumpy or turned."""
+    group, choice = Group(), kit.rng.random()
+    size = kit.size(0.04, 0.3)
+    if choice < 0.35:
+        body = superquadric(
+            kit.rng.uniform(0.3, 1.0, 3) * size,
+            vertical=kit.size(0.1, 2),
+            around=kit.size(0.1, 2),
+            rows=24,
+            columns=36,
+        )
+        points = body.vertices.astype(np.float64)
+        for _ in range(3):
+            wave = kit.rng.normal(0, 4 / size, 3)
+            points = points * (1 + 0.12 * np.sin(points @ wave))[:, None]
+        group.add(
+            surface(points.reshape(24, 37, 3)),
+            kit.any_surface(),
+            (0, 0, size * 0.4),
+            pitch=kit.size(-1, 1),
+            roll=kit.size(-1, 1),
+        )
+    elif choice < 0.65:
+        z = np.linspace(0, size * 1.5, 20)
+        r = size * 0.4 * np.clip(0.6 + np.cumsum(kit.rng.normal(0, 0.14, 20)), 0.1, 1.4)
+        group.add(lathe(np.stack([r, z], axis=1), sides=24), kit.any_surface())
+    else:
+        s = np.linspace(0, 1, 40)[:, None]
+        path = size * sum(
+            np.sin(s * kit.rng.uniform(1, 7, 3) + kit.rng.uniform(0, 6, 3)) for _ in range(2)
+        )
+        path[:, 2] += size * 1.3
+        group.add(tube(path, size * kit.size(0.02, 0.15), sides=10), kit.any_surface())
+    return group
+
+
+def desk_scene(kit: Kit) -> Plan:
+    """Returns a table top seen from near by, full of things."""
+    group = Group()
+    w, d = kit.size(0.8, 2.2), kit.size(0.6, 1.4)
+    top = kit.surface(
+        "wood",
+        "planks",
+        "plain",
+        "fabric",
+        "poster",
+        "tiles",
+        "marble",
+        "checks",
+        "speckle",
+        "carpet",
+        tile_m=kit.size(0.2, 1.0),
+    )
+    z = 0.75
+    group.add(box(w, d, 0.04), top, (0, 0, z - 0.04))
+    for x in (-w * 0.45, w * 0.45):
+        group.add(box(0.05, 0.05, z - 0.04), kit.wood(), (x, 0, 0))
+    floor = kit.surface("planks", "carpet", "tiles", "plain", tile_m=1)
+    group.add(quads([[(-5, -5, 0), (5, -5, 0), (5, 5, 0), (-5, 5, 0)]]), floor)
+    paper = kit.surface(
+        "plaster",
+        "plain",
+        "stripes",
+        "brick",
+        "tiles",
+        "poster",
+        "mottled",
+        tile_m=kit.size(0.5, 2),
+    )
+    far = d / 2 + (kit.size(0.0, 0.3) if kit.chance(0.5) else kit.size(0.3, 3))
+    for yaw in np.arange(4) * np.pi / 2 + kit.size(-0.2, 0.2):
+        side = Group()
+        side.add(quads([[(-5, 0, 0), (5, 0, 0), (5, 0, 2.8), (-5, 0, 2.8)]]), paper)
+        group.place(
+            side,
+            (-np.sin(yaw) * far, np.cos(yaw) * far if yaw < 0.7 else np.cos(yaw) * 3.5, 0),
+            yaw=float(yaw),
+        )
+        far = max(far, 2.5)
+    group.add(
+        quads([[(-5, -5, 2.8), (5, -5, 2.8), (5, 5, 2.8), (-5, 5, 2.8)]]),
+        kit.surface("plain", vivid=0),
+    )
+    half = (w / 2 - 0.05, d / 2 - 0.05)
+    heaps = int(kit.rng.integers(2, 7))
+    targets = []
+    for _ in range(heaps):
+        x, y, spread = kit.size(-half[0], half[0]), kit.size(-half[1], half[1]), kit.size(0.05, 0.4)
+        targets.append((x, y, z + kit.size(0, 0.15)))
+        low = (max(-half[0], x - spread), max(-half[1], y - spread))
+        high = (min(half[0], x + spread), min(half[1], y + spread))
+        clutter.scatter(kit, group, low=low, high=high, z=z, count=int(kit.rng.integers(4, 14)))
+        for _ in range(int(kit.rng.integers(0, 4))):
+            group.place(
+                _wild(kit),
+                (kit.size(low[0], high[0]), kit.size(low[1], high[1]), z),
+                yaw=kit.size(0, 6.3),
+            )
+    for _ in range(int(kit.rng.integers(0, 4))):
+        maker = furniture.AGAINST_WALL[int(kit.rng.integers(len(furniture.AGAINST_WALL)))]
+        group.place(
+            maker(kit), (kit.size(-2, 2), far - kit.size(0, 0.5), 0), yaw=kit.size(-0.5, 0.5)
+        )
+    lights = []
+    for _ in range(int(kit.rng.integers(1, 5))):
+        power = kit.size(0.3, 1.5)
+        place = (kit.size(-2, 2), kit.size(-2, min(1.5, far - 0.2)), kit.size(1.3, 2.7))
+        tone = (power, power * kit.size(0.75, 1.0), power * kit.size(0.5, 1.05))
+        lights.append(Light(place=place, colour=tone, radius=kit.size(0.03, 0.4)))
+    level = kit.size(0.1, 0.4)
+    sky = Sky(
+        zenith=(1, 1, 1), horizon=(1, 1, 1), clouds=0.0, ambient_up=(level, level, level),
+        ambient_down=(level * 0.6, level * 0.58, level * 0.55), haze_m=0.0, occlusion_m=kit.size(0.15, 0.6),
+    )  # fmt: skip
+    return Plan(
+        group=group, lights=tuple(lights), sky=sky, low=(-w * 0.7, -d * 0.5 - 0.9, z + 0.1),
+        high=(w * 0.7, d * 0.2, z + 0.9), targets=tuple(targets),
+    )  # fmt: skip

@@ -1,0 +1,152 @@
+"""Command that renders training frames: python -m model_zoo_defs.training.render --help."""
+
+from __future__ import annotations
+
+import argparse
+import multiprocessing
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+from PIL import Image
+from tqdm import tqdm
+
+from model_zoo_defs.training.scenes import KINDS, VIEWS_PER_SCENE, Frame, scene_frames
+
+
+@dataclass(frozen=True, kw_only=True)
+class Job:
+    """Says what to render and where to put it."""
+
+    out: Path
+    seed: int
+    height: int
+    width: int
+    frames: int
+    shard_frames: int
+    kinds: tuple[str, ...]
+
+
+def shard_path(out: Path, index: int) -> Path:
+    """Returns the file of a shard."""
+    return out / f"shard_{index:05d}.npz"
+
+
+def render_shard(job: Job, index: int) -> int:
+    """Writes one shard, unless it is there, and returns how many frames it holds."""
+    target = shard_path(job.out, index)
+    first = index * job.shard_frames
+    count = min(job.shard_frames, job.frames - first)
+    if target.exists():
+        return count
+    frames: list[Frame] = []
+    for scene in range(first // VIEWS_PER_SCENE, -(-(first + count) // VIEWS_PER_SCENE)):
+        frames += scene_frames(job.seed, scene, height=job.height, width=job.width, kinds=job.kinds)
+    frames = frames[:count]
+    temporary = target.with_suffix(f".{os.getpid()}.tmp")
+    with temporary.open("wb") as stream:
+        np.savez(
+            stream,
+            rgb=np.stack([frame.rgb for frame in frames]),
+            depth=np.stack([frame.depth for frame in frames]),
+            kind=np.array([frame.kind for frame in frames], np.uint8),
+            intrinsics=np.stack([frame.intrinsics for frame in frames]),
+        )
+    os.replace(temporary, target)
+    return count
+
+
+def render_all(job: Job, *, workers: int) -> None:
+    """Writes every shard that is missing; the bytes do not depend on the workers."""
+    job.out.mkdir(parents=True, exist_ok=True)
+    indices = range(-(-job.frames // job.shard_frames))
+    work = partial(render_shard, job)
+    with tqdm(total=job.frames, unit="frame", smoothing=0.05) as progress:
+        if workers == 1:
+            for index in indices:
+                progress.update(work(index))
+            return
+        with multiprocessing.get_context("spawn").Pool(workers) as pool:
+            for count in pool.imap(work, indices):
+                progress.update(count)
+
+
+def coloured(depth: npt.NDArray[np.float32]) -> npt.NDArray[np.uint8]:
+    """Returns a picture of log depth, near warm and far cold, unknown black."""
+    known = depth > 0
+    if not known.any():
+        return np.zeros((*depth.shape, 3), np.uint8)
+    value = np.log(np.where(known, depth, 1.0))
+    low, high = np.percentile(value[known], (1, 99))
+    share = np.clip((value - low) / max(high - low, 1e-6), 0, 1)
+    stops = np.array([[250, 240, 120], [240, 120, 60], [150, 40, 110], [40, 20, 90], [20, 60, 140]])
+    place = share * (len(stops) - 1)
+    left = np.minimum(place.astype(int), len(stops) - 2)
+    part = (place - left)[..., None]
+    colour = stops[left] * (1 - part) + stops[left + 1] * part
+    return np.where(known[..., None], colour, 0).astype(np.uint8)
+
+
+def contact_sheet(job: Job, *, columns: int = 4) -> Image.Image:
+    """Returns one picture of job.frames frames, one per scene, rgb above depth."""
+    pictures = []
+    for scene in range(job.frames):
+        frame = scene_frames(job.seed, scene, height=job.height, width=job.width, kinds=job.kinds)[
+            0
+        ]
+        pictures.append(np.concatenate([frame.rgb, coloured(frame.depth)], axis=0))
+    while len(pictures) % columns:
+        pictures.append(np.zeros_like(pictures[0]))
+    rows = [
+        np.concatenate(pictures[start : start + columns], axis=1)
+        for start in range(0, len(pictures), columns)
+    ]
+    return Image.fromarray(np.concatenate(rows, axis=0))
+
+
+def _parsed(arguments: Sequence[str] | None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description="Render random scenes with exact depth.")
+    parser.add_argument("--out", type=Path, help="folder for the shards")
+    parser.add_argument("--frames", type=int, default=4000)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--workers", type=int, default=1)
+    parser.add_argument("--size", default="256x320", help="height x width in pixels")
+    parser.add_argument("--shard-frames", type=int, default=64, help="a multiple of 4")
+    parser.add_argument("--kinds", default=",".join(KINDS), help="kinds to draw from")
+    parser.add_argument("--contact-sheet", type=Path, help="write one picture of frames instead")
+    chosen = parser.parse_args(arguments)
+    if chosen.out is None and chosen.contact_sheet is None:
+        parser.error("give --out, or --contact-sheet")
+    unknown = set(chosen.kinds.split(",")) - set(KINDS)
+    if unknown:
+        parser.error(f"unknown kinds: {', '.join(sorted(unknown))}; known: {', '.join(KINDS)}")
+    if chosen.shard_frames % VIEWS_PER_SCENE:
+        parser.error(f"--shard-frames must be a multiple of {VIEWS_PER_SCENE}")
+    return chosen
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Renders what the command line asks for."""
+    chosen = _parsed(arguments)
+    height, width = (int(part) for part in chosen.size.split("x"))
+    job = Job(
+        out=chosen.out or Path(),
+        seed=chosen.seed,
+        height=height,
+        width=width,
+        frames=chosen.frames,
+        shard_frames=chosen.shard_frames,
+        kinds=tuple(chosen.kinds.split(",")),
+    )
+    if chosen.contact_sheet is not None:
+        contact_sheet(job).save(chosen.contact_sheet)
+    else:
+        render_all(job, workers=chosen.workers)
+
+
+if __name__ == "__main__":
+    main()

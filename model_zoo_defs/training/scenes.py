@@ -1,0 +1,154 @@
+"""Random scenes and the views taken of them, each decided by a seed and a number alone."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from model_zoo_defs.training.camera_effects import photographed
+from model_zoo_defs.training.clutter import Kit
+from model_zoo_defs.training.desks import desk_scene
+from model_zoo_defs.training.materials import Palette
+from model_zoo_defs.training.rooms import Plan, room
+from model_zoo_defs.training.shading import seen
+from model_zoo_defs.training.shapes import FloatArray
+from model_zoo_defs.training.streets import street
+from model_zoo_defs.training.world import View, World, looking
+
+KINDS = ("room", "street", "desk")
+"""Kinds of scene; a frame stores the index into this."""
+
+SHARES = {"room": 0.5, "street": 0.3, "desk": 0.2}
+"""How often each kind comes, before leaving out kinds that were not asked for."""
+
+VIEWS_PER_SCENE = 4
+
+_MAKERS = {"room": room, "street": street, "desk": desk_scene}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Frame:
+    """Is one rendered picture: rgb (H, W, 3), depth in metres (H, W) with 0 = unknown."""
+
+    rgb: npt.NDArray[np.uint8]
+    depth: FloatArray
+    kind: int
+    intrinsics: FloatArray
+
+
+def generator(seed: int, scene: int, part: int) -> np.random.Generator:
+    """Returns the random numbers of one part of one scene."""
+    return np.random.default_rng([seed, scene, part])
+
+
+def build(kind: str, rng: np.random.Generator) -> tuple[World, Plan]:
+    """Returns a random scene of the kind, ready for rays, and its plan."""
+    palette = Palette(rng)
+    plan = _MAKERS[kind](Kit(rng=rng, palette=palette))
+    mesh, materials = plan.group.merged()
+    world = World(
+        mesh=mesh,
+        face_material=materials,
+        table=palette.frozen(),
+        lights=plan.lights,
+        sky=plan.sky,
+    )
+    return world, plan
+
+
+def pick_kind(rng: np.random.Generator, kinds: tuple[str, ...]) -> str:
+    """Returns one of the kinds, as often as SHARES says."""
+    weights = np.array([SHARES[kind] for kind in kinds])
+    return kinds[int(rng.choice(len(kinds), p=weights / weights.sum()))]
+
+
+def pick_view(
+    world: World, plan: Plan, kind: str, rng: np.random.Generator, *, height: int, width: int
+) -> View:
+    """Returns a view that shows much of the scene; the best of some tries."""
+    best, best_score = None, -1.0
+    for _ in range(24):
+        view = _street_view(plan, rng, height, width) if kind == "street" else _indoor_view(
+            plan, rng, height, width, near=kind == "desk"
+        )  # fmt: skip
+        score = _score(world, view, kind)
+        if best is None or score > best_score:
+            best, best_score = view, score
+        if score > rng.uniform(0.35, 0.75):
+            break
+    assert best is not None
+    return best
+
+
+def _street_view(plan: Plan, rng: np.random.Generator, height: int, width: int) -> View:
+    place = rng.uniform(plan.low, plan.high)
+    yaw = rng.normal(0, 0.06) if rng.random() < 0.7 else rng.uniform(-1.2, 1.2)
+    # A crop of a wide picture may lie off its principal point.
+    shift = (float(rng.uniform(-0.8, 0.8)), 0.0) if rng.random() < 0.3 else (0.0, 0.0)
+    pitch = rng.normal(-0.02, 0.03)
+    fov = rng.uniform(30, 85)
+    return looking(
+        place, yaw, pitch, rng.normal(0, 0.01), fov_deg=fov, height=height, width=width,
+        shift=(shift[0], float(rng.uniform(-0.15, 0.1))),
+    )  # fmt: skip
+
+
+def _indoor_view(
+    plan: Plan, rng: np.random.Generator, height: int, width: int, *, near: bool
+) -> View:
+    place = rng.uniform(plan.low, plan.high)
+    target = np.asarray(plan.targets[int(rng.integers(len(plan.targets)))])
+    if near:
+        place = target + (place - target) * rng.uniform(0.4, 1.2)
+        place[2] = max(place[2], plan.low[2])
+    toward = target - place
+    yaw = float(np.arctan2(-toward[0], toward[1]))
+    pitch = float(np.arctan2(toward[2], np.hypot(toward[0], toward[1]) + 1e-6))
+    pitch = np.clip(pitch, -1.1, 0.5) * rng.uniform(0.4, 1.0) + rng.normal(0, 0.05)
+    return looking(
+        place, yaw + rng.normal(0, 0.15), pitch, rng.normal(0, 0.06 if rng.random() < 0.8 else 0.3),
+        fov_deg=rng.uniform(40, 95), height=height, width=width,
+    )  # fmt: skip
+
+
+def _score(world: World, view: View, kind: str) -> float:
+    """Returns how much a view shows: 0 when one close face fills it, near 1 when rich."""
+    v, u = np.mgrid[0 : view.height - 1 : 18j, 0 : view.width - 1 : 24j]
+    hits = world.cast(*view.rays(u, v))
+    t = np.where(hits.met, hits.t, 100.0).reshape(18, 24)
+    closest = 2.0 if kind == "street" else 0.15 if kind == "desk" else 0.3
+    if np.percentile(t, 2) < closest or np.mean(t < 1.5 * closest) > 0.3:
+        return 0.0
+    known = float(hits.met.mean())
+    if known < 0.35:
+        return 0.0
+    jumps = np.abs(np.diff(np.log(t), axis=1)) > 0.08
+    steps = np.abs(np.diff(np.log(t), axis=0)) > 0.08
+    materials = len(np.unique(hits.material[hits.met]))
+    rich = 1.6 * float(jumps.mean() + steps.mean()) + 0.02 * materials
+    return float(min(1.0, rich) * min(1.0, known + 0.3))
+
+
+def scene_frames(
+    seed: int, scene: int, *, height: int, width: int, kinds: tuple[str, ...] = KINDS
+) -> list[Frame]:
+    """Returns the VIEWS_PER_SCENE frames of a scene; the same bytes on every run."""
+    rng = generator(seed, scene, 0)
+    kind = pick_kind(rng, kinds)
+    world, plan = build(kind, rng)
+    frames = []
+    for number in range(VIEWS_PER_SCENE):
+        own = generator(seed, scene, 1 + number)
+        view = pick_view(world, plan, kind, own, height=height, width=width)
+        colour, depth = seen(world, view, own)
+        frames.append(
+            Frame(
+                rgb=photographed(colour, own),
+                depth=depth,
+                kind=KINDS.index(kind),
+                intrinsics=np.array([view.fx, view.fy, view.cx, view.cy], np.float32),
+            )
+        )
+    return frames

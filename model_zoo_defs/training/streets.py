@@ -1,0 +1,370 @@
+"""Streets: road, what stands along it, what drives on it, and the far background."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from model_zoo_defs.training import buildings, clutter, furniture, vehicles
+from model_zoo_defs.training.clutter import Kit
+from model_zoo_defs.training.rooms import Plan
+from model_zoo_defs.training.shapes import (
+    Group,
+    box,
+    cylinder,
+    quads,
+    rod,
+    superquadric,
+    surface,
+    tube,
+)  # fmt: skip
+from model_zoo_defs.training.world import Light, Sky
+
+_FAR = 110.0
+
+
+def leaves(kit: Kit, centres: np.ndarray, size: float, material: int) -> Group:
+    """Returns one small bent leaf-like quad at every centre (n, 3), turned at random."""
+    count = len(centres)
+    first = kit.rng.normal(size=(count, 3))
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    second = np.cross(first, kit.rng.normal(size=(count, 3)))
+    second /= np.linalg.norm(second, axis=1, keepdims=True) + 1e-9
+    half = size * kit.rng.uniform(0.5, 1.2, (count, 1))
+    a, b = first * half, second * half * kit.size(0.4, 0.9)
+    group = Group()
+    corners = np.stack([centres - a, centres - b, centres + a, centres + b], axis=1)
+    group.add(quads(corners), material)
+    return group
+
+
+def _green(kit: Kit) -> tuple[float, float, float]:
+    if kit.chance(0.15):
+        return kit.size(0.4, 0.7), kit.size(0.3, 0.45), kit.size(0.08, 0.2)
+    return kit.size(0.16, 0.36), kit.size(0.26, 0.46), kit.size(0.06, 0.2)
+
+
+def tree(kit: Kit, *, far: bool = False) -> Group:
+    """Returns a tree of trunk, branches and clumps of leaves; far: with fewer leaves."""
+    group = Group()
+    h, r = kit.size(4, 13), kit.size(0.1, 0.3)
+    stem = h * kit.size(0.2, 0.45)
+    bark = kit.palette.new("speckle", np.array([0.35, 0.28, 0.22]) * kit.size(0.5, 1.2), tile_m=0.6)
+    lean = kit.rng.normal(0, 0.04 * h, 2)
+    group.add(
+        tube([(0, 0, 0), (lean[0] * 0.3, lean[1] * 0.2, stem), (lean[0], lean[1], h * 0.8)], r),
+        bark,
+    )
+    conifer = kit.chance(0.2)
+    clumps = int(kit.rng.integers(9, 22))
+    green = kit.palette.new("foliage", _green(kit), tile_m=0.8, gloss=0.0)
+    shade = kit.palette.new("foliage", np.array(_green(kit)) * 0.45, tile_m=0.8, gloss=0.0)
+    wide = h * kit.size(0.16, 0.34)
+    centres = []
+    for index in range(clumps):
+        angle, share = kit.size(0, 6.3), kit.size(0, 1) if not conifer else index / clumps
+        out = (
+            wide
+            * kit.size(0.1, 0.9)
+            * ((1 - share) if conifer else np.sqrt(max(0.05, 1 - share * share)))
+        )
+        z = stem + (h - stem) * share
+        middle = np.array([lean[0] + out * np.cos(angle), lean[1] + out * np.sin(angle), z])
+        radius = wide * kit.size(0.4, 0.75) * (1.2 - 0.6 * share)
+        count = 40 if far else 200
+        spread = kit.rng.normal(size=(count, 3))
+        spread /= np.linalg.norm(spread, axis=1, keepdims=True)
+        centres.append(
+            middle + spread * radius * kit.rng.uniform(0.6, 1.1, (count, 1)) * [1, 1, 0.8]
+        )
+        if kit.chance(0.8):
+            size = radius * kit.size(1.1, 1.7)
+            group.add(superquadric((size, size, size * 0.8), rows=8, columns=10), shade, middle)
+        group.add(
+            rod(
+                (lean[0] * 0.3, lean[1] * 0.2, stem * kit.size(0.7, 1.0)), middle, r * 0.35, sides=5
+            ),
+            bark,
+        )
+    size = kit.size(0.1, 0.24) * (2.0 if far else 1.0)
+    group.place(leaves(kit, np.concatenate(centres), size, green))
+    return group
+
+
+def hedge(kit: Kit, length: float) -> Group:
+    """Returns a hedge or a row of bushes along y."""
+    group, tall, wide = Group(), kit.size(0.5, 2.2), kit.size(0.4, 1.0)
+    green = kit.palette.new("foliage", _green(kit), tile_m=0.8)
+    dark = kit.palette.new("foliage", np.array(_green(kit)) * 0.5, tile_m=0.8)
+    group.add(box(wide * 0.9, length, tall * 0.95), dark)
+    count = min(4000, int(260 * length * (tall + wide)))
+    points = kit.rng.uniform(-0.5, 0.5, (count, 3)) * [wide, length, tall]
+    out = kit.rng.integers(0, 3, count)
+    points[out == 0, 0] = np.sign(points[out == 0, 0]) * wide / 2
+    points[out == 2, 2] = tall / 2
+    points += kit.rng.normal(0, 0.05, points.shape)
+    group.place(leaves(kit, points + [0, 0, tall / 2], 0.07, green))
+    return group
+
+
+def fence(kit: Kit, length: float) -> Group:
+    """Returns a fence of thin slats, bars or wires along y."""
+    group, material = Group(), kit.wood() if kit.chance(0.5) else kit.metal()
+    tall, step = kit.size(0.8, 1.8), kit.size(0.1, 0.3)
+    wide = step * kit.size(0.15, 0.8)
+    for y in np.arange(-length / 2, length / 2, step):
+        group.add(box(0.02, wide, tall * kit.size(0.97, 1.0)), material, (0, float(y), 0.03))
+    for z in (0.25, 0.8):
+        group.add(box(0.03, length, 0.06), material, (0.02, 0, tall * z))
+    return group
+
+
+def pole(kit: Kit) -> Group:
+    """Returns a lamp post, traffic light, road sign or bare pole."""
+    group, grey = Group(), kit.palette.new("plain", (kit.size(0.2, 0.6),) * 3, gloss=0.3)
+    choice, r = kit.rng.random(), kit.size(0.03, 0.09)
+    if choice < 0.4:
+        h, reach = kit.size(4.5, 9), kit.size(0.5, 2.2)
+        group.add(
+            tube(
+                [(0, 0, 0), (0, 0, h * 0.6), (0, 0, h * 0.93), (reach * 0.3, 0, h), (reach, 0, h)],
+                r,
+            ),
+            grey,
+        )
+        group.add(superquadric((0.7, 0.25, 0.15), vertical=0.5), grey, (reach, 0, h))
+    elif choice < 0.8:
+        h = kit.size(2.0, 3.0)
+        group.add(cylinder(0.032, h + 0.4), grey)
+        sign = kit.palette.new("poster", tile_m=0.7, whole=True, gloss=0.2)
+        w = kit.size(0.45, 0.9)
+        if kit.chance(0.5):
+            group.add(
+                cylinder(w / 2, 0.02, sides=26),
+                kit.surface("plain", "checks", "poster", vivid=0.9),
+                (0, -0.04, h),
+                pitch=np.pi / 2,
+            )
+        else:
+            group.add(box(w, 0.02, kit.size(0.4, 0.9), fit=0.7), sign, (0, -0.04, h - 0.4))
+    else:
+        h = kit.size(2.6, 6)
+        group.add(cylinder(r, h), grey)
+        case = kit.dark()
+        group.add(box(0.28, 0.25, 0.85), case, (0.0, -0.12, min(h, 3.4) - 0.9))
+        for index, lamp in enumerate(((0.6, 0.05, 0.03), (0.6, 0.4, 0.03), (0.05, 0.5, 0.1))):
+            at = (0, -0.25, min(h, 3.4) - 0.2 - 0.28 * index)
+            group.add(
+                superquadric((0.19, 0.05, 0.19)),
+                kit.palette.new("plain", lamp, glow=kit.size(0, 2)),
+                at,
+            )
+    return group
+
+
+def _ground(kit: Kit, group: Group, half: float) -> None:
+    """Adds road, markings, kerbs, pavements and the land beside them."""
+    asphalt = kit.palette.new(
+        "speckle", (kit.size(0.25, 0.5),) * 3, tile_m=kit.size(1, 3), gloss=0.0
+    )
+    if kit.chance(0.15):
+        asphalt = kit.palette.new("paving", (kit.size(0.35, 0.55),) * 3, tile_m=1.2)
+    land = (
+        kit.surface("foliage", "foliage", "speckle", "paving", tile_m=3, vivid=0.0)
+        if kit.chance(0.4)
+        else kit.palette.new("foliage", _green(kit), tile_m=3)
+    )
+    group.add(box(2 * half, 260, 0.2), asphalt, (0, 60, -0.2))
+    group.add(box(400, 400, 0.1), land, (0, 60, -0.14))
+    walk = kit.surface("paving", "speckle", "tiles", tile_m=kit.size(1, 2), vivid=0.0)
+    kerb = kit.palette.new("speckle", (0.6, 0.6, 0.58), tile_m=1)
+    if kit.chance(0.85):
+        for side in (-1, 1):
+            wide = kit.size(1.2, 3.5)
+            group.add(box(wide, 260, 0.14), walk, (side * (half + wide / 2 + 0.15), 60, -0.02))
+            group.add(box(0.15, 260, 0.14), kerb, (side * (half + 0.075), 60, -0.015))
+    white = kit.palette.new("speckle", (0.85, 0.85, 0.82), tile_m=0.6)
+    lines = [0.0] if half < 5 else [-half / 3, half / 3]
+    for x in lines:
+        dash, gap = kit.size(1, 4), kit.size(1, 6) if kit.chance(0.8) else 0.0
+        for y in np.arange(-10, 90, dash + gap):
+            group.add(box(0.13, dash, 0.008), white, (x, float(y), 0))
+    if kit.chance(0.5):
+        for side in (-1, 1):
+            group.add(box(0.12, 160, 0.008), white, (side * (half - kit.size(0.2, 0.5)), 60, 0))
+    if kit.chance(0.25):
+        y = kit.size(5, 25)
+        for x in np.arange(-half + 0.4, half - 0.3, 0.9):
+            group.add(box(0.45, 3, 0.008), white, (float(x), y, 0))
+    for _ in range(int(kit.rng.integers(0, 6))):
+        patch = kit.palette.new("speckle", (kit.size(0.2, 0.5),) * 3, tile_m=1)
+        group.add(
+            box(kit.size(0.5, 3), kit.size(1, 8), 0.004),
+            patch,
+            (kit.size(-half, half), kit.size(0, 40), 0),
+        )
+
+
+def _traffic(kit: Kit, group: Group, half: float) -> list[tuple[float, float, float]]:
+    """Adds parked and moving vehicles; returns places worth looking at."""
+    targets = []
+    fleet = [vehicles.car(kit) for _ in range(4)] + [vehicles.lorry(kit)]
+    for side in (-1, 1):
+        y = kit.size(-8, 12)
+        if kit.chance(0.3):
+            continue
+        density = kit.size(0.1, 0.9)
+        while y < 80:
+            if kit.chance(density):
+                vehicle = (
+                    vehicles.car(kit)
+                    if kit.chance(0.3) and y < 30
+                    else fleet[int(kit.rng.integers(4))]
+                )
+                x = side * (half - kit.size(0.7, 1.1))
+                group.place(
+                    vehicle, (x, y, 0), yaw=(0 if side > 0 else np.pi) + kit.size(-0.05, 0.05)
+                )
+                targets.append((x, y, 0.8))
+            y += kit.size(5.2, 8)
+    for _ in range(int(kit.rng.integers(0, 4))):
+        lane = kit.rng.choice([-1, 1]) * half * 0.4
+        y = kit.size(7, 70)
+        vehicle = fleet[int(kit.rng.integers(5))]
+        group.place(vehicle, (lane, y, 0), yaw=0 if lane > 0 else np.pi)
+    for _ in range(int(kit.rng.integers(0, 3))):
+        group.place(
+            vehicles.cyclist(kit),
+            (kit.size(-half, half), kit.size(5, 35), 0),
+            yaw=kit.rng.choice([0, np.pi]),
+        )
+    return targets
+
+
+def _verge(kit: Kit, group: Group, side: float, x: float) -> None:
+    """Adds poles, trees, people, bins and hedges along one pavement."""
+    trees = [tree(kit) for _ in range(2)]
+    spacing, density = kit.size(5, 14), kit.size(0, 1)
+    for y in np.arange(kit.size(0, 8), 75, spacing):
+        if kit.chance(density):
+            at = (side * (x + kit.size(0.5, 2.0)), float(y) + kit.size(-1, 1), 0.1)
+            group.place(
+                trees[int(kit.rng.integers(2))], at, yaw=kit.size(0, 6.3), scale=kit.size(0.6, 1.1)
+            )
+    post = pole(kit)
+    for y in np.arange(kit.size(2, 12), 90, kit.size(12, 30)):
+        item = post if kit.chance(0.6) else pole(kit)
+        group.place(
+            item, (side * (x + 0.4), float(y), 0.1), yaw=0 if side < 0 else np.pi * kit.chance(0.5)
+        )
+    for _ in range(int(kit.rng.integers(0, 5))):
+        at = (side * (x + kit.size(0.3, 2.5)), kit.size(3, 40), 0.12)
+        group.place(furniture.person(kit), at, yaw=kit.size(0, 6.3))
+    for _ in range(int(kit.rng.integers(0, 4))):
+        item = vehicles.pram(kit) if kit.chance(0.7) else furniture.bicycle(kit)
+        group.place(
+            item, (side * (x + kit.size(0.5, 2.5)), kit.size(3, 40), 0.12), yaw=kit.size(0, 6.3)
+        )
+    if kit.chance(0.5):
+        length = kit.size(5, 18)
+        maker = hedge if kit.chance(0.55) else fence
+        group.place(maker(kit, length), (side * (x + kit.size(2.2, 4)), kit.size(5, 25), 0.0))
+
+
+def _grove(kit: Kit, group: Group, side: float, x: float) -> None:
+    """Adds trees, bushes and a guard rail along a side without houses."""
+    kinds = [tree(kit) for _ in range(3)]
+    for _ in range(int(kit.rng.integers(4, 26))):
+        at = (side * (x + kit.size(0, 14)), kit.size(3, 80), -0.1)
+        item = kinds[int(kit.rng.integers(3))]
+        group.place(item, at, yaw=kit.size(0, 6.3), scale=kit.size(0.6, 1.2))
+    for _ in range(int(kit.rng.integers(0, 4))):
+        group.place(
+            hedge(kit, kit.size(2, 12)), (side * (x + kit.size(0, 5)), kit.size(4, 50), -0.1)
+        )
+    if kit.chance(0.5):
+        steel = kit.metal()
+        for z in (0.5, 0.66):
+            group.add(box(0.05, 90, 0.11), steel, (side * (x - 1.2), 40, z))
+        for y in np.arange(-4, 85, 3.0):
+            group.add(box(0.1, 0.07, 0.6), steel, (side * (x - 1.12), float(y), 0))
+
+
+def _background(kit: Kit, group: Group) -> None:
+    far_trees = [tree(kit, far=True) for _ in range(3)]
+    for _ in range(int(kit.rng.integers(5, 40))):
+        x = kit.size(-60, 60)
+        y = kit.size(70, _FAR) if abs(x) < 14 else kit.size(25, _FAR)
+        if abs(x) > 9:
+            group.place(far_trees[int(kit.rng.integers(3))], (x, y, -0.1), scale=kit.size(0.7, 1.6))
+    if kit.chance(0.5):
+        x, y = np.meshgrid(np.linspace(-150, 150, 40), np.linspace(85, 180, 12))
+        z = (
+            -6
+            + (y - 85) * kit.size(0.05, 0.35)
+            + 4 * np.sin(x / kit.size(10, 40)) * np.sin(y / 20 + x / 31)
+        )
+        group.add(
+            surface(np.stack([x, y, z], axis=2)), kit.palette.new("foliage", _green(kit), tile_m=15)
+        )
+
+
+def street(kit: Kit) -> Plan:
+    """Returns a street along +y with cameras' free box over its lanes."""
+    group, half = Group(), kit.size(2.8, 7.0)
+    _ground(kit, group, half)
+    targets = _traffic(kit, group, half)
+    for side in (-1.0, 1.0):
+        _verge(kit, group, side, half)
+        if kit.chance(0.75):
+            buildings.row(kit, group, side, half + kit.size(2.5, 7))
+        else:
+            _grove(kit, group, side, half + kit.size(3, 7))
+    _background(kit, group)
+    if kit.chance(0.4):
+        for _ in range(int(kit.rng.integers(1, 5))):
+            y, h = kit.size(5, 60), kit.size(5, 8)
+            group.add(
+                rod(
+                    (-half - 4, y, h),
+                    (half + 4, y + kit.size(-4, 4), h + kit.size(-1, 1)),
+                    0.015,
+                    sides=5,
+                ),
+                kit.dark(),
+            )
+    clutter.scatter(
+        kit,
+        group,
+        low=(-half - 2, 4),
+        high=(half + 2, 20),
+        z=0.0,
+        count=int(kit.rng.integers(0, 4)),
+    )
+    targets += [(kit.size(-9, 9), kit.size(10, 60), kit.size(0.3, 4)) for _ in range(12)]
+    light, sky = _daylight(kit)
+    return Plan(
+        group=group, lights=light, sky=sky, low=(-half * 0.7, -4.0, 1.2), high=(half * 0.7, 12.0, 2.0),
+        targets=tuple(targets),
+    )  # fmt: skip
+
+
+def _daylight(kit: Kit) -> tuple[tuple[Light, ...], Sky]:
+    overcast = kit.chance(0.35)
+    angle, power = kit.size(0, 6.3), kit.size(0.1, 0.4) if overcast else kit.size(1.2, 3.0)
+    place = (np.cos(angle), np.sin(angle), kit.size(0.25, 1.8))
+    sun = Light(
+        place=place,
+        colour=(power, power * kit.size(0.85, 1), power * kit.size(0.7, 0.95)),
+        radius=0.02,
+        sun=True,
+    )
+    level = kit.size(0.6, 1.0) if overcast else kit.size(0.25, 0.6)
+    blue = 1.0 if overcast else kit.size(1.1, 1.5)
+    zenith = (0.9, 0.95, 1.0) if overcast else (kit.size(0.2, 0.5), kit.size(0.45, 0.7), 1.1)
+    horizon = kit.size(0.9, 1.6)
+    return (sun,), Sky(
+        zenith=zenith, horizon=(horizon, horizon, horizon * 1.03), clouds=kit.size(0, 1),
+        ambient_up=(level, level * (1 + blue) / 2, level * blue),
+        ambient_down=(level * 0.4, level * 0.38, level * 0.34),
+        haze_m=kit.size(200, 900) if kit.chance(0.3) else 3000.0, occlusion_m=kit.size(1.0, 4.0),
+    )  # fmt: skip

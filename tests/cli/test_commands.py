@@ -1,0 +1,147 @@
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from pnpdepth_cli.cli.main import main
+from tests.pipeline.frames import FrameOnDisk, frame_on_disk
+
+
+@pytest.fixture
+def frame(tmp_path: Path) -> FrameOnDisk:
+    return frame_on_disk(tmp_path)
+
+
+def code_of(arguments: list[str]) -> int:
+    with pytest.raises(SystemExit) as stop:
+        main(arguments)
+    return int(stop.value.code or 0)
+
+
+def refine(frame: FrameOnDisk, *more: str) -> list[str]:
+    return [
+        "refine", str(frame.image), "--sparse", str(frame.sparse), "-o", str(frame.folder / "out"),
+        "--model", str(frame.model), "--checkpoint", str(frame.checkpoint), *more,
+    ]  # fmt: skip
+
+
+def test_refine_talks_on_stderr_and_leaves_stdout_empty(
+    frame: FrameOnDisk, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert code_of(refine(frame, "--gt", str(frame.gt))) == 0
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert "60 points, 1.6–3.0 m" in err
+    for word in ("RMSE", "δ1", "before", "after", "wrote", "peak"):
+        assert word in err
+
+
+def test_json_prints_the_record_and_nothing_else_on_stdout(
+    frame: FrameOnDisk, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert code_of(refine(frame, "--json")) == 0
+    record = json.loads(capsys.readouterr().out)
+    assert record["settings"]["layer"] == "middle"
+    assert record["settings"]["iterations"] == 5
+    assert len(record["model"]["checkpoint_sha256"]) == 64
+
+
+EXITS = [
+    (["--iterations", "-2"], 2, "negative"),
+    (["--loss", "l3"], 2, "l3"),
+    (["--nonsense"], 2, "--nonsense"),
+    (["--gt", "missing.png"], 3, "missing.png"),
+    (["--layer", "encod"], 4, "encode"),
+    (["--checkpoint", "missing.pt"], 4, "does not exist"),
+    (["--model", "compakt"], 4, "compact"),
+    (["--device", "cuda"], 6, "--device cpu"),
+]
+
+
+@pytest.mark.parametrize(("options", "code", "said"), EXITS)
+def test_the_exit_code_says_whose_mistake_it_was(
+    frame: FrameOnDisk,
+    capsys: pytest.CaptureFixture[str],
+    options: list[str],
+    code: int,
+    said: str,
+) -> None:
+    assert code_of(refine(frame, *options)) == code
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert said in err
+    assert "Traceback" not in err
+
+
+def test_a_divergence_ends_with_code_5_after_writing(
+    frame: FrameOnDisk, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bad = frame.folder / "bad.py"
+    source = frame.model.read_text()
+    bad.write_text(source.replace("return 2 + 3 * self.decode(torch.tanh(", "return torch.exp(self.decode("))
+    assert code_of([*refine(frame), "--model", str(bad), "--lr", "1e4"]) == 5
+    assert "not finite after" in capsys.readouterr().err
+    assert (frame.folder / "out" / "img_depth.png").exists()
+
+
+def test_an_output_below_a_file_is_refused_in_one_line(
+    frame: FrameOnDisk, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert code_of([*refine(frame), "-o", str(frame.gt / "out")]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_layers_lists_shape_stride_cost_and_field(
+    frame: FrameOnDisk, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ["layers", "--model", str(frame.model), "--checkpoint", str(frame.checkpoint)]
+    assert code_of([*arguments, "--json", "--size", "40x48"]) == 0
+    rows = {row["name"]: row for row in json.loads(capsys.readouterr().out)}
+    assert list(rows) == ["encode", "middle"]
+    assert rows["encode"]["shape"] == [1, 8, 20, 24]
+    assert rows["encode"]["stride"] == 2
+    assert rows["encode"]["cost_behind"] > rows["middle"]["cost_behind"] > 0
+    # a 4×4 transposed convolution of stride 2 reads 2×2 elements, the 3×3 before it 4×4
+    assert rows["middle"]["field_in_z"] == [2, 2]
+    assert rows["encode"]["field_in_z"] == [4, 4]
+    assert rows["middle"]["field_in_output"] == [6, 6]
+
+
+def test_layers_all_lists_every_submodule_and_why_some_cannot_be_cut(
+    frame: FrameOnDisk, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ["layers", "--model", str(frame.model), "--checkpoint", str(frame.checkpoint)]
+    assert code_of([*arguments, "--json", "--all"]) == 0
+    rows = {row["name"]: row for row in json.loads(capsys.readouterr().out)}
+    assert set(rows) == {"encode", "encode.0", "encode.1", "middle", "unused", "decode"}
+    assert "never runs" in rows["unused"]["problem"]
+
+
+def test_models_lists_compact_with_its_defaults(capsys: pytest.CaptureFixture[str]) -> None:
+    assert code_of(["models", "--json"]) == 0
+    listed = {model["name"]: model for model in json.loads(capsys.readouterr().out)}
+    assert listed["compact"]["input_kind"] == "rgb+sparse"
+    assert listed["compact"]["layer"] in listed["compact"]["layers"]
+    assert code_of(["models"]) == 0
+    assert "compact" in capsys.readouterr().out
+
+
+def test_the_installed_command_runs_and_ends_without_a_traceback(tmp_path: Path) -> None:
+    command = [sys.executable, "-c", "from pnpdepth_cli.cli.main import main; main()"]
+    done = subprocess.run(
+        [*command, "refine", "no.png", "--sparse", "no.png"],
+        capture_output=True,
+        text=True,
+        check=False,
+        cwd=tmp_path,
+        env={**os.environ, "COLUMNS": "80"},
+    )
+    assert done.returncode == 3
+    assert done.stderr.startswith("pnpdepth: ")
+    assert done.stderr.count("\n") == 1
+    assert not list(tmp_path.iterdir())

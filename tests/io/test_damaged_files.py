@@ -1,0 +1,148 @@
+"""Files cut short or altered raise our own errors, whatever library reads them."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import cv2
+import numpy as np
+import OpenEXR
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from PIL import Image
+
+from pnpdepth_cli.errors import FileFormatError, InputError
+from pnpdepth_cli.io.depth import DEPTH_SUFFIXES, read_depth, read_sparse, write_depth
+from pnpdepth_cli.io.rgb import read_rgb
+
+DEPTH = np.random.default_rng(5).uniform(0.5, 80, (40, 53)).astype(np.float32)
+
+
+@pytest.fixture(scope="module")
+def valid(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with one valid file of each kind."""
+    folder = tmp_path_factory.mktemp("valid")
+    for suffix in DEPTH_SUFFIXES:
+        write_depth(folder / f"depth{suffix}", DEPTH)
+    cv2.imwrite(str(folder / "double.tif"), DEPTH.astype(np.float64))
+    codes = Image.fromarray((DEPTH * 256).astype(np.uint16))
+    codes.save(folder / "codes-raw.tif")
+    codes.save(folder / "codes-lzw.tif", compression="tiff_lzw")
+    for name in ("NO", "RLE", "ZIPS", "PIZ", "DWAA"):
+        header = {
+            "compression": getattr(OpenEXR, f"{name}_COMPRESSION"),
+            "type": OpenEXR.scanlineimage,
+        }
+        with OpenEXR.File(header, {"Z": DEPTH}) as file:
+            file.write(str(folder / f"{name}.exr"))
+    tiles = {"type": OpenEXR.tiledimage, "tiles": OpenEXR.TileDescription()}
+    with OpenEXR.File(tiles, {"Z": DEPTH}) as file:
+        file.write(str(folder / "tiles.exr"))
+    parts = [
+        OpenEXR.Part({"type": OpenEXR.scanlineimage}, {name: DEPTH}, f"part {name}")
+        for name in ("Z", "Q")
+    ]
+    with OpenEXR.File(parts) as file:
+        file.write(str(folder / "parts.exr"))
+    with (folder / "big-endian.pfm").open("wb") as file:
+        file.write(b"Pf\n53 40\n1.0\n" + DEPTH[::-1].astype(">f4").tobytes())
+    return folder
+
+
+def assert_only_our_errors(path: Path) -> None:
+    """Each reader returns, or raises one of our errors with a message of one line."""
+    for read in (read_depth, read_sparse, read_rgb):
+        message = ""
+        try:
+            read(path)
+        except InputError as error:
+            message = str(error)
+        assert "\n" not in message
+        assert message == "" or str(path) in message
+
+
+NAMES = [
+    *(f"depth{suffix}" for suffix in DEPTH_SUFFIXES),
+    *("double.tif", "codes-raw.tif", "codes-lzw.tif", "big-endian.pfm"),
+    *("NO.exr", "RLE.exr", "ZIPS.exr", "PIZ.exr", "DWAA.exr", "tiles.exr", "parts.exr"),
+]
+
+
+def test_every_kind_of_file_is_in_the_list(valid: Path) -> None:
+    assert sorted(path.name for path in valid.iterdir()) == sorted(NAMES)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_valid_file_is_read(valid: Path, name: str) -> None:
+    assert read_depth(valid / name).values == pytest.approx(DEPTH, rel=0.01, abs=0.002)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_truncation_is_refused_in_one_line_and_silently(
+    valid: Path, name: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    content = (valid / name).read_bytes()
+    path = tmp_path / name
+    for length in [*range(0, len(content), max(1, len(content) // 60)), len(content) - 1]:
+        path.write_bytes(content[:length])
+        with pytest.raises(FileFormatError) as caught:
+            read_depth(path)
+        assert str(caught.value).startswith(str(path)), length
+        assert "\n" not in str(caught.value)
+    # OpenEXR, libtiff and OpenCV like to complain on their own; standard output is for data.
+    assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize("name", NAMES)
+@settings(max_examples=30, deadline=None)
+@given(data=st.data())
+def test_altered_bytes_never_raise_anything_but_our_errors(
+    name: str,
+    data: st.DataObject,
+    valid: Path,
+    tmp_path_factory: pytest.TempPathFactory,
+) -> None:
+    content = bytearray((valid / name).read_bytes())
+    # Most of a file's meaning is in its first bytes.
+    places = st.one_of(st.integers(0, min(400, len(content)) - 1), st.integers(0, len(content) - 1))
+    for place in data.draw(st.lists(places, min_size=1, max_size=6)):
+        content[place] = data.draw(st.integers(0, 255))
+    path = tmp_path_factory.getbasetemp() / name
+    path.write_bytes(content)
+    assert_only_our_errors(path)
+
+
+@settings(max_examples=150, deadline=None)
+@given(
+    magic=st.sampled_from(
+        [
+            *(b"", b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff\xe0", b"RIFF\x10\0\0\0WEBP"),
+            *(b"II*\0", b"MM\0*", b"v/1\x01\x02\0\0\0", b"\x93NUMPY\x01\0", b"PK\x03\x04", b"Pf\n"),
+        ]
+    ),
+    rest=st.binary(max_size=200),
+    suffix=st.sampled_from([".png", ".csv", ".txt", ".npy"]),
+)
+def test_arbitrary_bytes_never_raise_anything_but_our_errors(
+    magic: bytes, rest: bytes, suffix: str, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    path = tmp_path_factory.getbasetemp() / f"any{suffix}"
+    path.write_bytes(magic + rest)
+    assert_only_our_errors(path)
+
+
+def test_a_header_that_promises_too_much_is_refused_without_setting_memory_aside(
+    tmp_path: Path,
+) -> None:
+    (tmp_path / "a.pfm").write_bytes(b"Pf\n999999999 999999999\n-1\n" + bytes(16))
+    with pytest.raises(FileFormatError, match="pixels, more than"):
+        read_depth(tmp_path / "a.pfm")
+    buffer = io.BytesIO()
+    np.lib.format.write_array_header_1_0(
+        buffer, {"descr": "<f8", "fortran_order": False, "shape": (1 << 30, 1 << 30)}
+    )
+    (tmp_path / "a.npy").write_bytes(buffer.getvalue() + bytes(64))
+    with pytest.raises(FileFormatError, match="NPY cannot be read"):
+        read_depth(tmp_path / "a.npy")

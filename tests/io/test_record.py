@@ -1,0 +1,94 @@
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pnpdepth_cli.errors import FileFormatError, InputError, OutputError
+from pnpdepth_cli.io.record import read_json, sha256_of, write_json
+
+values = st.recursive(
+    st.none()
+    | st.booleans()
+    | st.integers()
+    | st.floats(allow_nan=False, allow_infinity=False)
+    # JSON text is UTF-8, which has no lone surrogates
+    | st.text(st.characters(exclude_categories=["Cs"])),
+    lambda inner: st.lists(inner) | st.dictionaries(st.text("abcäé"), inner),
+    max_leaves=12,
+)
+
+
+@settings(max_examples=60, deadline=None)
+@given(mapping=st.dictionaries(st.text("abcäé-_"), values))
+def test_what_is_written_is_read_back_in_the_same_order(
+    mapping: dict[str, object], tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    path = tmp_path_factory.getbasetemp() / "record.json"
+    write_json(path, mapping)
+    again = read_json(path)
+    assert again == mapping
+    assert list(again) == list(mapping)
+
+
+def test_not_a_number_becomes_null_also_deep_inside(tmp_path: Path) -> None:
+    path = tmp_path / "r.json"
+    write_json(path, {"b": float("nan"), "a": [1.5, float("inf"), {"c": np.float32("nan")}]})
+    assert json.loads(path.read_text()) == {"b": None, "a": [1.5, None, {"c": None}]}
+
+
+def test_numpy_values_and_paths_become_plain(tmp_path: Path) -> None:
+    path = tmp_path / "r.json"
+    content = {"n": np.int64(3), "x": np.array([0.5, np.nan]), "p": Path("a/b"), "t": (1, 2)}
+    write_json(path, content)
+    assert read_json(path) == {"n": 3, "x": [0.5, None], "p": "a/b", "t": [1, 2]}
+
+
+def test_the_text_is_readable_and_the_same_each_time(tmp_path: Path) -> None:
+    write_json(tmp_path / "a.json", {"name": "Tübingen", "δ1": 0.5})
+    write_json(tmp_path / "b.json", {"name": "Tübingen", "δ1": 0.5})
+    assert (tmp_path / "a.json").read_bytes() == (tmp_path / "b.json").read_bytes()
+    assert (tmp_path / "a.json").read_text("utf-8") == (
+        '{\n  "name": "Tübingen",\n  "δ1": 0.5\n}\n'
+    )
+
+
+def test_what_json_cannot_hold_leaves_the_old_file(tmp_path: Path) -> None:
+    path = tmp_path / "r.json"
+    write_json(path, {"a": 1})
+    with pytest.raises(TypeError):
+        write_json(path, {"a": object()})
+    assert read_json(path) == {"a": 1}
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize(
+    "content", [b"{", b"[1]", b'{"a": NaN}', b"\xff\xfe", b"null", b"[" * 100_000, b"{} {}"]
+)
+def test_what_is_no_json_object_is_refused(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "r.json"
+    path.write_bytes(content)
+    with pytest.raises(FileFormatError, match=r"r\.json") as caught:
+        read_json(path)
+    assert "\n" not in str(caught.value)
+
+
+def test_the_digest_is_that_of_the_content(tmp_path: Path) -> None:
+    content = bytes(range(256)) * 9000
+    (tmp_path / "f").write_bytes(content)
+    assert sha256_of(tmp_path / "f") == hashlib.sha256(content).hexdigest()
+
+
+def test_missing_files_and_folders_are_our_errors(tmp_path: Path) -> None:
+    for read in (read_json, sha256_of):
+        with pytest.raises(InputError):
+            read(tmp_path / "none.json")
+        with pytest.raises(InputError):
+            read(tmp_path)
+    with pytest.raises(OutputError, match="its folder does not exist"):
+        write_json(tmp_path / "none" / "r.json", {})

@@ -1,0 +1,132 @@
+"""The network that comes with the program, with random weights: shapes, scale, gradients."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from model_zoo_defs.compact import Compact, definition
+
+
+@pytest.fixture(scope="module")
+def network() -> Compact:
+    torch.manual_seed(0)
+    net = Compact().eval()
+    # heads start near zero; shaken, so that every path of the decoder shows in the output
+    for head in net.heads.values():
+        torch.nn.init.normal_(head.weigh.weight, std=0.05)
+    return net
+
+
+def frame(height: int, width: int, count: int, seed: int = 0) -> tuple[Tensor, Tensor]:
+    generator = torch.Generator().manual_seed(seed)
+    rgb = torch.randn(1, 3, height, width, generator=generator)
+    sparse = torch.zeros(height * width)
+    at = torch.randperm(height * width, generator=generator)[:count]
+    sparse[at] = 1.0 + 4.0 * torch.rand(len(at), generator=generator)
+    return rgb, sparse.view(1, 1, height, width)
+
+
+@pytest.mark.parametrize("count", [0, 1, 2, 5, 500, 20_000])
+def test_depth_is_finite_and_positive_for_any_number_of_points(network: Compact, count: int) -> None:
+    rgb, sparse = frame(128, 160, count)
+    depth = network(rgb, sparse)
+    assert depth.shape == (1, 1, 128, 160)
+    assert bool(torch.isfinite(depth).all()) and bool((depth > 0).all())
+
+
+@pytest.mark.parametrize("pattern", ["row", "column", "corner", "one depth"])
+def test_depth_is_finite_where_the_points_lie_oddly(network: Compact, pattern: str) -> None:
+    rgb, full = frame(96, 128, 96 * 128)
+    sparse = torch.zeros_like(full)
+    if pattern == "row":
+        sparse[..., 40, :] = full[..., 40, :]
+    elif pattern == "column":
+        sparse[..., :, 3] = full[..., :, 3]
+    elif pattern == "corner":
+        sparse[..., :9, :9] = full[..., :9, :9]
+    else:
+        sparse[..., ::7, ::7] = 2.0
+    depth = network(rgb, sparse)
+    assert bool(torch.isfinite(depth).all()) and bool((depth > 0).all())
+
+
+@pytest.mark.parametrize("size", [(32, 32), (32, 256), (224, 64)])
+def test_any_multiple_of_32_is_taken(network: Compact, size: tuple[int, int]) -> None:
+    assert network(*frame(*size, 40)).shape == (1, 1, *size)
+
+
+@pytest.mark.parametrize("factor", [0.1, 10.0])
+def test_points_ten_times_as_far_give_depth_ten_times_as_far(
+    network: Compact, factor: float
+) -> None:
+    rgb, sparse = frame(96, 128, 300)
+    with torch.no_grad():
+        expected = network(rgb, sparse) * factor
+        found = network(rgb, sparse * factor)
+    torch.testing.assert_close(found, expected, rtol=1e-3, atol=0.0)
+
+
+def test_samples_of_a_batch_do_not_see_each_other(network: Compact) -> None:
+    one, other = frame(64, 96, 30, seed=1), frame(64, 96, 700, seed=2)
+    batch = [torch.cat(pair) for pair in zip(one, other, strict=True)]
+    with torch.no_grad():
+        together = network(*batch)
+        apart = torch.cat([network(*one), network(*other)])
+    torch.testing.assert_close(together, apart, rtol=1e-3, atol=1e-4)
+
+
+def test_the_same_input_gives_the_same_bytes(network: Compact) -> None:
+    inputs = frame(96, 128, 200)
+    with torch.no_grad():
+        assert torch.equal(network(*inputs), network(*inputs))
+
+
+def test_a_plane_seen_at_some_points_is_continued_as_a_plane(network: Compact) -> None:
+    """The untrained network is its point fit, and a fit of planes knows planes."""
+    torch.manual_seed(0)
+    untrained = Compact().eval()
+    rows, columns = torch.meshgrid(torch.arange(96.0), torch.arange(128.0), indexing="ij")
+    truth = torch.exp(0.002 * rows - 0.003 * columns).view(1, 1, 96, 128)
+    rgb, points = frame(96, 128, 400)
+    with torch.no_grad():
+        depth = untrained(torch.zeros_like(rgb), truth * (points > 0))
+    error = (torch.log(depth) - torch.log(truth)).abs()
+    assert float(error.mean()) < 0.03
+
+
+@pytest.mark.parametrize("layer", definition.layers)
+def test_the_error_at_the_points_reaches_every_layer(network: Compact, layer: str) -> None:
+    seen: list[Tensor] = []
+
+    def injected(_module: torch.nn.Module, _inputs: object, output: Tensor) -> Tensor:
+        seen.append(output.detach().clone().requires_grad_())
+        return seen[0]
+
+    module = network.get_submodule(layer)
+    handle = module.register_forward_hook(injected)
+    try:
+        rgb, sparse = frame(96, 128, 200)
+        depth = network(rgb, sparse)
+    finally:
+        handle.remove()
+    known = sparse > 0
+    (gradient,) = torch.autograd.grad((depth - sparse)[known].abs().mean(), seen[0])
+    assert len(seen) == 1
+    assert float((gradient != 0).float().mean()) > 0.3
+
+
+@pytest.mark.skipif(
+    definition.checkpoint is None or not definition.checkpoint.exists(), reason="not trained yet"
+)
+def test_the_shipped_weights_fit_and_are_small() -> None:
+    safetensors = pytest.importorskip("safetensors.torch")
+    assert definition.checkpoint is not None
+    weights = safetensors.load_file(definition.checkpoint)
+    network = definition.build()
+    network.load_state_dict(weights)
+    assert definition.checkpoint.stat().st_size < 20_000_000
+    with torch.no_grad():
+        depth = network.eval()(*frame(96, 128, 100))
+    assert bool(torch.isfinite(depth).all())

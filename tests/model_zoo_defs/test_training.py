@@ -1,0 +1,232 @@
+"""The recipe of `compact`: points are drawn as said, and a run learns, stops and goes on."""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from model_zoo_defs.compact import Compact
+from model_zoo_defs.training import patterns
+from model_zoo_defs.training.dataset import Frames, Samples, degraded
+
+pytest.importorskip("safetensors")
+train = pytest.importorskip("model_zoo_defs.training.train")
+validation = pytest.importorskip("model_zoo_defs.training.validation")
+encoder_weights = pytest.importorskip("model_zoo_defs.training.encoder_weights")
+
+SHAPE = (48, 64)
+seeds = st.integers(0, 2**32 - 1)
+
+
+def room(seed: int) -> NDArray[np.float32]:
+    """A slope with a near box in it and a corner of unknown depth."""
+    rng = np.random.default_rng(seed)
+    rows, columns = np.indices(SHAPE)
+    depth = 4.0 + 0.02 * rows - 0.01 * columns
+    top, left = rng.integers(5, 25, 2)
+    depth[top : top + 15, left : left + 20] = rng.uniform(0.5, 3.0)
+    depth[:4, :6] = 0.0
+    return depth.astype(np.float32)
+
+
+@pytest.fixture(scope="module")
+def shards(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("shards")
+    for number in range(2):
+        depth = np.stack([room(10 * number + i) for i in range(3)])
+        # brightness follows depth, so that there is something to learn
+        rgb = np.repeat((depth * 50.0).astype(np.uint8)[..., None], 3, axis=-1)
+        np.savez(folder / f"shard_{number:05d}.npz", rgb=rgb, depth=depth)
+    return folder
+
+
+@given(seed=seeds, count=st.integers(1, 4000))
+def test_uniform_points_are_as_many_as_asked_and_only_where_depth_is_known(
+    seed: int, count: int
+) -> None:
+    depth = room(seed)
+    mask = patterns.uniform(np.random.default_rng(seed), depth, count)
+    assert mask.sum() == min(count, np.count_nonzero(depth))
+    assert bool((depth[mask] > 0).all())
+
+
+@given(seed=seeds, count=st.integers(1, 500))
+def test_corner_points_are_as_many_as_asked_and_lie_where_the_picture_changes(
+    seed: int, count: int
+) -> None:
+    depth = room(seed)
+    grey = depth / depth.max()
+    mask = patterns.corners(np.random.default_rng(seed), depth, grey, count)
+    assert mask.sum() == count
+    assert bool((depth[mask] > 0).all())
+
+
+@given(seed=seeds, count=st.integers(10, 1000))
+def test_a_grid_has_about_as_many_points_as_asked(seed: int, count: int) -> None:
+    mask = patterns.jittered_grid(np.random.default_rng(seed), room(seed), count)
+    assert 0.5 * count - 10 <= mask.sum() <= 2 * count + 10
+
+
+@given(seed=seeds)
+def test_scan_lines_show_the_depth_of_their_pixel_or_what_is_behind_it(seed: int) -> None:
+    depth = room(seed)
+    sparse = patterns.scan_lines(np.random.default_rng(seed), depth)
+    mask = sparse > 0
+    assert bool((sparse[mask] >= depth[mask]).all())
+    assert set(np.unique(sparse[mask])) <= set(np.unique(depth))
+
+
+@given(seed=seeds)
+def test_a_leak_never_brings_a_depth_nearer_and_leaves_a_wall_alone(seed: int) -> None:
+    depth = room(seed)
+    assert bool((patterns.leak(np.random.default_rng(seed), depth) >= depth).all())
+    wall = np.full(SHAPE, 3.0, np.float32)
+    assert np.array_equal(patterns.leak(np.random.default_rng(seed), wall), wall)
+
+
+def test_a_leak_shows_the_background_through_the_edge_of_a_near_box() -> None:
+    depth = np.full(SHAPE, 10.0, np.float32)
+    depth[10:40, 20:40] = 1.0
+    leaked = sum(
+        int((patterns.leak(np.random.default_rng(seed), depth) != depth).sum()) for seed in range(5)
+    )
+    assert leaked > 0
+
+
+@given(seed=seeds)
+def test_the_same_state_draws_the_same_points_without_touching_the_depth(seed: int) -> None:
+    depth = room(seed)
+    before = depth.copy()
+    first = patterns.draw(np.random.default_rng(seed), depth, depth / 5.0)
+    second = patterns.draw(np.random.default_rng(seed), depth, depth / 5.0)
+    assert np.array_equal(first, second)
+    assert np.array_equal(depth, before)
+    assert first.dtype == np.float32 and first.shape == SHAPE
+    assert bool(np.isfinite(first).all()) and bool((first >= 0).all())
+
+
+def test_a_sample_depends_on_its_number_alone(shards: Path) -> None:
+    straight, jumping = Samples((shards,), (32, 64), 3), Samples((shards,), (32, 64), 3)
+    straight[0], straight[1]
+    for one, other in zip(straight[2], jumping[2], strict=True):
+        assert torch.equal(one, other)
+    assert not torch.equal(straight[2].sparse, Samples((shards,), (32, 64), 4)[2].sparse)
+
+
+def test_new_shards_are_picked_up(shards: Path, tmp_path: Path) -> None:
+    first, second = sorted(shards.glob("*.npz"))
+    (tmp_path / first.name).write_bytes(first.read_bytes())
+    frames = Frames(tmp_path)
+    assert len(frames) == 3
+    (tmp_path / second.name).write_bytes(second.read_bytes())
+    frames.refresh()
+    assert len(frames) == 6
+
+
+def test_a_folder_without_shards_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match="no shard"):
+        Frames(tmp_path)
+
+
+@settings(max_examples=25)
+@given(seed=seeds)
+def test_a_degraded_picture_is_still_a_picture(seed: int) -> None:
+    rgb = torch.rand(3, 32, 48, generator=torch.Generator().manual_seed(seed % 1000))
+    found = degraded(np.random.default_rng(seed), rgb)
+    assert found.shape == rgb.shape
+    assert 0.0 <= float(found.min()) and float(found.max()) <= 1.0
+
+
+def test_linear_interpolation_of_a_plane_is_the_plane_inside_the_hull() -> None:
+    rows, columns = np.indices((20, 30))
+    plane = (1.0 + 0.1 * rows + 0.05 * columns).astype(np.float32)
+    sparse = np.zeros_like(plane)
+    sparse[0, 0], sparse[0, -1], sparse[-1, 0], sparse[-1, -1] = plane[[0, 0, -1, -1], [0, -1, 0, -1]]
+    np.testing.assert_allclose(validation.linear_interpolation(sparse), plane, rtol=1e-5)
+
+
+def test_linear_interpolation_of_points_in_a_row_is_the_nearest_point() -> None:
+    sparse = np.zeros((9, 9), np.float32)
+    sparse[4, 2], sparse[4, 7] = 1.0, 3.0
+    dense = validation.linear_interpolation(sparse)
+    assert dense[0, 0] == 1.0 and dense[8, 8] == 3.0
+
+
+def test_the_loss_is_least_for_the_truth_and_blind_to_unknown_depth() -> None:
+    truth = torch.from_numpy(room(1))[None, None]
+    guess = torch.where(truth > 0, truth, 7.0)
+    assert train.depth_loss(guess, truth) < train.depth_loss(guess * 1.01, truth)
+    other = torch.where(truth > 0, guess, 70.0)
+    assert train.depth_loss(guess, truth) == train.depth_loss(other, truth)
+
+
+def published_names(state: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    """A checkpoint with the published names whose normalisation scales by two and adds one."""
+    names = {"stem": ("_conv_stem", "_bn0")}
+    number = 0
+    for level, rows in encoder_weights.STAGES.items():
+        for place in range(sum(row[-1] for row in rows)):
+            for part, (conv, norm) in {
+                "expand": ("_expand_conv", "_bn0"),
+                "depthwise": ("_depthwise_conv", "_bn1"),
+                "project": ("_project_conv", "_bn2"),
+            }.items():
+                key = f"stages.{level}.{place}.{part}"
+                names[key] = (f"_blocks.{number}.{conv}", f"_blocks.{number}.{norm}")
+            number += 1
+    found = {}
+    for ours, (conv, norm) in names.items():
+        if f"{ours}.weight" in state:
+            width = len(state[f"{ours}.bias"])
+            found[f"{conv}.weight"] = state[f"{ours}.weight"]
+            found[f"{norm}.weight"] = torch.full((width,), 2.0)
+            found[f"{norm}.bias"] = torch.ones(width)
+            found[f"{norm}.running_mean"] = torch.zeros(width)
+            found[f"{norm}.running_var"] = torch.full((width,), 1.0 - encoder_weights.EPSILON)
+    return found
+
+
+def test_published_encoder_weights_are_renamed_and_folded_without_rest() -> None:
+    encoder = Compact().encoder
+    state = encoder.state_dict()
+    converted = encoder_weights.converted(published_names(state))
+    assert converted.keys() == state.keys()
+    for name, tensor in converted.items():
+        expected = state[name] * 2.0 if name.endswith("weight") else torch.ones_like(state[name])
+        torch.testing.assert_close(tensor, expected)
+
+
+def test_a_run_learns_and_going_on_gives_the_bytes_of_an_uninterrupted_run(
+    shards: Path, tmp_path: Path
+) -> None:
+    whole = train.Settings(
+        data=(shards,), val=shards, val_frames=1, out=tmp_path / "whole", steps=8, batch=2,
+        size=(32, 64), save_every=4, pretrained=False, workers=0, lr=1e-2,
+    )  # fmt: skip
+    weights = train.train(whole).read_bytes()
+    broken = replace(whole, out=tmp_path / "broken")
+    stop_at(broken, step=4)
+    assert train.train(replace(broken, resume=True)).read_bytes() == weights
+    with (tmp_path / "whole" / "log.csv").open() as file:
+        losses = [float(row["loss"]) for row in csv.DictReader(file)]
+    assert len(losses) == 2 and losses[1] < losses[0]
+    assert (tmp_path / "whole" / "val.csv").exists()
+
+
+def stop_at(settings_: train.Settings, step: int) -> None:
+    """Leaves the run folder as a run killed right after `step` would."""
+    settings_.out.mkdir()
+    run = train.Run(settings_)
+    for sample in train._loader(settings_, 0):
+        run.learn(sample)
+        if run.step == step:
+            run.save()
+            return

@@ -1,0 +1,82 @@
+"""The arrows of the layout, and what a command may not import."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+PACKAGE = ROOT / "pnpdepth_cli"
+MAY_IMPORT = {
+    "errors": set(),
+    "core": {"errors"},
+    "sensors": {"errors"},
+    "io": {"errors"},
+    "models": {"errors", "core"},
+    "pipeline": {"errors", "core", "sensors", "io", "models"},
+    "cli": {"errors", "pipeline"},
+}
+
+
+def imported_modules(file: Path) -> set[str]:
+    found = set()
+    for node in ast.walk(ast.parse(file.read_text())):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            found |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
+    return found
+
+
+def packages_imported(file: Path) -> set[str]:
+    parts = (name.split(".") for name in imported_modules(file))
+    return {p[1] for p in parts if p[0] == "pnpdepth_cli" and len(p) > 1 and p[1] in MAY_IMPORT}
+
+
+@pytest.mark.parametrize("package", [p for p in MAY_IMPORT if (PACKAGE / p).is_dir()])
+def test_a_package_imports_only_what_its_arrow_allows(package: str) -> None:
+    for file in (PACKAGE / package).rglob("*.py"):
+        assert packages_imported(file) <= MAY_IMPORT[package] | {package}, file
+
+
+def test_only_the_terminal_layer_imports_click_rich_and_tqdm() -> None:
+    for file in PACKAGE.rglob("*.py"):
+        tops = {name.split(".")[0] for name in imported_modules(file)}
+        assert not (tops & {"click", "rich", "tqdm"}) or "cli" in file.parts[-2:], file
+
+
+def test_a_network_file_knows_nothing_of_the_program_but_the_definition_contract() -> None:
+    for file in (ROOT / "model_zoo_defs").glob("*.py"):
+        ours = {n for n in imported_modules(file) if n.split(".")[0] == "pnpdepth_cli"}
+        assert all(name.startswith("pnpdepth_cli.models.definition") for name in ours), file
+
+
+def test_core_and_models_read_no_files_through_cv2_and_io_needs_no_torch() -> None:
+    for package, forbidden in (("core", {"cv2", "numpy"}), ("io", {"torch"}), ("models", {"cv2"})):
+        for file in (PACKAGE / package).rglob("*.py"):
+            tops = {name.split(".")[0] for name in imported_modules(file)}
+            assert not tops & forbidden, file
+
+
+@pytest.mark.parametrize("command", [[], ["refine"], ["models"], ["layers"]])
+def test_help_imports_neither_torch_nor_numpy_nor_rich(command: list[str]) -> None:
+    code = (
+        "import sys\n"
+        "from pnpdepth_cli.cli.main import main\n"
+        "try:\n    main(sys.argv[1:])\n"
+        "except SystemExit as stop:\n    assert stop.code in (None, 0), stop.code\n"
+        "heavy = {'torch', 'numpy', 'cv2', 'rich', 'tqdm'} & set(sys.modules)\n"
+        "assert not heavy, heavy\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code, *command, "--help"],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert "Usage: pnpdepth" in done.stdout
