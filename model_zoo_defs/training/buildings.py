@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from model_zoo_defs.training.clutter import Kit
-from model_zoo_defs.training.rooms import Hole, wall
+from model_zoo_defs.training.kit import Kit
 from model_zoo_defs.training.shapes import Group, box, cylinder, prism, quads, rod
+from model_zoo_defs.training.walls import Hole, wall
 
 
 def building(kit: Kit, width: float) -> Group:
@@ -42,10 +42,12 @@ def building(kit: Kit, width: float) -> Group:
         x, w, h = (u0 + u1) / 2 - width / 2, u1 - u0, v1 - v0
         curtain = glass if kit.chance(0.6) else kit.surface("plain", "stripes", vivid=0.1)
         group.add(box(w, 0.02, h), curtain, (x, recess, v0))
+        reveal, sill = (0.01, recess, h), (w + 0.15, recess + 0.1, 0.05)
         for at, size in (
-            ((x - w / 2, recess / 2, v0), (0.01, recess, h)), ((x + w / 2, recess / 2, v0), (0.01, recess, h)),
-            ((x, recess / 2, v1), (w, recess, 0.01)), ((x, recess / 2 - 0.05, v0 - 0.05), (w + 0.15, recess + 0.1, 0.05)),
-            ((x, recess - 0.03, v0), (0.06, 0.05, h)), ((x, recess - 0.03, v0 + h * 0.6), (w, 0.05, 0.06)),
+            ((x - w / 2, recess / 2, v0), reveal), ((x + w / 2, recess / 2, v0), reveal),
+            ((x, recess / 2, v1), (w, recess, 0.01)), ((x, recess / 2 - 0.05, v0 - 0.05), sill),
+            ((x, recess - 0.03, v0), (0.06, 0.05, h)),
+            ((x, recess - 0.03, v0 + h * 0.6), (w, 0.05, 0.06)),
         ):  # fmt: skip
             group.add(box(*size), trim, at)
         if balcony and v0 > 2 and kit.chance(0.6):

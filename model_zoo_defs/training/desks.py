@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from model_zoo_defs.training import clutter, furniture
-from model_zoo_defs.training.clutter import Kit
-from model_zoo_defs.training.rooms import Plan
+from model_zoo_defs.training.kit import Kit
 from model_zoo_defs.training.shapes import Group, box, lathe, quads, superquadric, surface, tube
-from model_zoo_defs.training.world import Light, Sky
+from model_zoo_defs.training.world import Light, Plan, Sky
 
 
 def _wild(kit: Kit) -> Group:
@@ -40,9 +39,8 @@ def _wild(kit: Kit) -> Group:
         group.add(lathe(np.stack([r, z], axis=1), sides=24), kit.any_surface())
     else:
         s = np.linspace(0, 1, 40)[:, None]
-        path = size * sum(
-            np.sin(s * kit.rng.uniform(1, 7, 3) + kit.rng.uniform(0, 6, 3)) for _ in range(2)
-        )
+        waves = [np.sin(s * kit.rng.uniform(1, 7, 3) + kit.rng.uniform(0, 6, 3)) for _ in range(2)]
+        path = size * (waves[0] + waves[1])
         path[:, 2] += size * 1.3
         group.add(tube(path, size * kit.size(0.02, 0.15), sides=10), kit.any_surface())
     return group
@@ -124,7 +122,8 @@ def desk_scene(kit: Kit) -> Plan:
     level = kit.size(0.1, 0.4)
     sky = Sky(
         zenith=(1, 1, 1), horizon=(1, 1, 1), clouds=0.0, ambient_up=(level, level, level),
-        ambient_down=(level * 0.6, level * 0.58, level * 0.55), haze_m=0.0, occlusion_m=kit.size(0.15, 0.6),
+        ambient_down=(level * 0.6, level * 0.58, level * 0.55), haze_m=0.0,
+        occlusion_m=kit.size(0.15, 0.6),
     )  # fmt: skip
     return Plan(
         group=group, lights=tuple(lights), sky=sky, low=(-w * 0.7, -d * 0.5 - 0.9, z + 0.1),

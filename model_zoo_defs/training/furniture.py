@@ -6,14 +6,13 @@ from collections.abc import Callable
 
 import numpy as np
 
-from model_zoo_defs.training.clutter import (
-    Kit,
+from model_zoo_defs.training.clutter import frame, gadget, scatter
+from model_zoo_defs.training.figures import bicycle
+from model_zoo_defs.training.household import (
     books,
     bottle,
     bowl,
     carton,
-    frame,
-    gadget,
     lamp,
     laptop,
     monitor,
@@ -21,9 +20,10 @@ from model_zoo_defs.training.clutter import (
     papers,
     plant,
     pot,
-    scatter,
     vase,
-)  # fmt: skip
+)
+from model_zoo_defs.training.kit import Kit
+from model_zoo_defs.training.seating import bed, chair, sofa
 from model_zoo_defs.training.shapes import (
     Group,
     box,
@@ -31,29 +31,16 @@ from model_zoo_defs.training.shapes import (
     lathe,
     rod,
     superquadric,
-    surface,
-    torus,
     tube,
-)  # fmt: skip
+)
 
 _SHELF_THINGS = (books, carton, vase, gadget, frame, mug, bottle, plant, bowl)
+
+
 _KITCHEN_THINGS = (pot, pot, bottle, mug, bowl, carton, papers, books, vase)
+
+
 _TABLE_THINGS = (mug, books, papers, laptop, bowl, bottle, plant, lamp, gadget, carton, vase)
-
-
-def cushion(
-    kit: Kit,
-    group: Group,
-    size: tuple[float, float, float],
-    at: tuple[float, float, float],
-    material: int,
-    *,
-    pitch: float = 0.0,
-    yaw: float = 0.0,
-) -> None:
-    """Adds a padded block whose middle is at `at`."""
-    body = superquadric(size, vertical=kit.size(0.25, 0.5), around=kit.size(0.2, 0.4))
-    group.add(body, material, at, pitch=pitch, yaw=yaw)
 
 
 def table(kit: Kit, *, width: float = 0.0) -> Group:
@@ -106,83 +93,6 @@ def desk(kit: Kit) -> Group:
             count=int(kit.rng.integers(1, 7)),
             tallest=0.4,
         )
-    return group
-
-
-def chair(kit: Kit) -> Group:
-    """Returns a chair with legs and an open back."""
-    group, wood = Group(), kit.wood() if kit.chance(0.65) else kit.metal()
-    seat = kit.surface("fabric", "plain", tile_m=0.3) if kit.chance(0.6) else wood
-    w, d, h = kit.size(0.38, 0.5), kit.size(0.38, 0.5), kit.size(0.42, 0.48)
-    back, t = kit.size(0.75, 1.1), kit.size(0.02, 0.045)
-    y = -d / 2
-    if kit.chance(0.5):
-        group.add(box(w, d, 0.04), seat, (0, y, h - 0.04))
-    else:
-        cushion(kit, group, (w, d, 0.08), (0, y, h - 0.03), seat)
-    for sx in (-1, 1):
-        x = sx * (w / 2 - t / 2)
-        group.add(box(t, t, h), wood, (x, -d + t / 2, 0))
-        group.add(box(t, t, back), wood, (x, -t / 2, 0))
-    style = int(kit.rng.integers(3))
-    if style == 0:
-        for z in np.linspace(h + 0.1, back - 0.06, int(kit.rng.integers(2, 5))):
-            group.add(box(w - t, t * 0.6, 0.045), wood, (0, -t / 2, float(z)))
-    elif style == 1:
-        for x in np.linspace(-w / 2 + t, w / 2 - t, int(kit.rng.integers(4, 8))):
-            group.add(cylinder(0.008, back - h), wood, (float(x), -t / 2, h))
-        group.add(box(w, t, 0.06), wood, (0, -t / 2, back - 0.06))
-    else:
-        group.add(box(w, 0.03, (back - h) * 0.8), seat, (0, -t / 2, h + (back - h) * 0.2))
-    return group
-
-
-def office_chair(kit: Kit) -> Group:
-    """Returns a swivel or cantilever chair of bent tube."""
-    group, steel, cloth = Group(), kit.metal(), kit.surface("fabric", "plain", tile_m=0.3)
-    cushion(kit, group, (0.48, 0.48, 0.1), (0, -0.3, 0.46), cloth)
-    cushion(kit, group, (0.46, 0.09, 0.55), (0, -0.06, 0.85), cloth, pitch=-0.12)
-    if kit.chance(0.5):
-        group.add(cylinder(0.03, 0.42), steel, (0, -0.3, 0.05))
-        for angle in np.arange(5) * 1.257:
-            tip = (0.3 * np.cos(angle), -0.3 + 0.3 * np.sin(angle), 0.05)
-            group.add(rod((0, -0.3, 0.1), tip, 0.018), kit.dark())
-    else:
-        for side in (-0.23, 0.23):
-            s = np.linspace(0, 1, 16)
-            path = np.stack(
-                [np.full(16, side), -0.05 - 0.5 * np.sin(s * 2.4), 0.02 + 0.72 * s**1.5], axis=1
-            )
-            group.add(tube(path, 0.014), steel)
-            group.add(rod((side, -0.05, 0.02), (side, -0.5, 0.02), 0.014), steel)
-    return group
-
-
-def sofa(kit: Kit) -> Group:
-    """Returns a sofa or armchair with cushions."""
-    group, cloth = Group(), kit.surface("fabric", "plain", "stripes", "mottled", tile_m=0.4)
-    seats = int(kit.rng.integers(1, 4))
-    each, d, h = kit.size(0.55, 0.75), kit.size(0.75, 0.95), kit.size(0.38, 0.46)
-    w, arm = seats * each, kit.size(0.12, 0.25)
-    group.add(box(w + 2 * arm, d, h * 0.6), cloth, (0, -d / 2, 0.06))
-    cushion(kit, group, (w + 2 * arm, 0.25, kit.size(0.7, 0.95)), (0, -0.13, 0.45), cloth)
-    for side in (-1, 1):
-        cushion(kit, group, (arm, d, h * 1.4), (side * (w + arm) / 2, -d / 2, h * 0.75), cloth)
-    for index in range(seats):
-        x = (index - (seats - 1) / 2) * each
-        cushion(kit, group, (each, d * 0.75, 0.18), (x, -d * 0.58, h), cloth)
-        if kit.chance(0.6):
-            pillow = kit.any_surface()
-            s = kit.size(0.35, 0.5)
-            cushion(
-                kit,
-                group,
-                (s, 0.16, s),
-                (x + kit.size(-0.1, 0.1), -0.36, h + s * 0.55),
-                pillow,
-                pitch=-0.35,
-                yaw=kit.size(-0.3, 0.3),
-            )
     return group
 
 
@@ -323,7 +233,7 @@ def kitchen(kit: Kit) -> Group:
     arc = np.stack(
         [np.zeros(12), -0.18 - 0.09 * (1 - np.cos(a)), h + 0.22 + 0.08 * np.sin(a)], axis=1
     )
-    group.add(tube(np.concatenate([[[0, -0.18, h]], arc]) + [x, 0, 0], 0.012), steel)
+    group.add(tube(np.concatenate([[[0, -0.18, h]], arc]) + np.array([x, 0, 0]), 0.012), steel)
     scatter(
         kit,
         group,
@@ -337,28 +247,6 @@ def kitchen(kit: Kit) -> Group:
     if kit.chance(0.6):
         for side in (-0.25, 0.25):
             group.place(cupboard(kit, hang=h + kit.size(0.5, 0.65)), (side * w, 0, 0))
-    return group
-
-
-def bed(kit: Kit) -> Group:
-    """Returns a bed with blanket and pillows."""
-    group, wood = Group(), kit.wood()
-    w, d = kit.size(0.9, 1.9), kit.size(1.9, 2.1)
-    group.add(box(w, d, 0.3), wood, (0, -d / 2, 0))
-    group.add(box(w, 0.06, kit.size(0.6, 1.1)), wood, (0, -0.03, 0))
-    cushion(
-        kit, group, (w, d, 0.3), (0, -d / 2, 0.38), kit.palette.new("fabric", (0.85, 0.85, 0.85))
-    )
-    x, y = np.meshgrid(np.linspace(-w * 0.55, w * 0.55, 30), np.linspace(-d * 1.01, -d * 0.35, 24))
-    z = (
-        0.55
-        + 0.025 * np.sin(x * kit.size(4, 12) + 3 * np.sin(y * 4))
-        + 0.015 * np.sin(y * 13 + x * 5)
-    )
-    z -= np.clip(np.abs(x) - w * 0.48, 0, None) * 4
-    group.add(surface(np.stack([x, y, z], axis=2)), kit.any_surface())
-    for side in (-0.25, 0.25) if w > 1.3 else (0.0,):
-        cushion(kit, group, (0.6, 0.4, 0.18), (side * w, -0.35, 0.58), kit.any_surface(), pitch=0.2)
     return group
 
 
@@ -393,50 +281,6 @@ def drawers(kit: Kit) -> Group:
     return group
 
 
-def person(kit: Kit) -> Group:
-    """Returns a standing or sitting figure of rounded bodies, about the origin."""
-    group, cloth, legs = Group(), kit.any_surface(), kit.surface("plain", "fabric", vivid=0.2)
-    skin = kit.palette.new("plain", np.array([0.85, 0.65, 0.52]) * kit.size(0.45, 1.1), gloss=0.1)
-    h = kit.size(1.5, 1.9)
-    stride = kit.size(0, 0.3)
-    for side in (-1, 1):
-        x, foot = side * 0.09, side * stride
-        group.add(
-            tube(
-                [(x, 0, h * 0.5), (x * 1.1, -0.03 + foot * 0.4, h * 0.27), (x * 1.1, foot, 0.05)],
-                0.07,
-            ),
-            legs,
-        )
-        group.add(
-            superquadric((0.1, 0.27, 0.1), vertical=0.7), kit.dark(), (x * 1.1, foot - 0.06, 0.05)
-        )
-        swing = -side * stride * 0.8
-        group.add(
-            tube(
-                [
-                    (side * 0.2, 0, h * 0.8),
-                    (side * 0.26, swing * 0.4, h * 0.64),
-                    (side * 0.24, swing - 0.08, h * 0.5),
-                ],
-                0.045,
-            ),
-            cloth,
-        )
-        group.add(superquadric((0.08, 0.08, 0.12)), skin, (side * 0.24, swing - 0.1, h * 0.47))
-    group.add(
-        superquadric((0.4, 0.25, h * 0.38), vertical=0.6, around=0.8), cloth, (0, 0, h * 0.66)
-    )
-    group.add(cylinder(0.05, 0.1), skin, (0, 0, h * 0.83))
-    group.add(superquadric((0.17, 0.2, 0.25)), skin, (0, -0.01, h * 0.93))
-    group.add(
-        superquadric((0.19, 0.2, 0.18)),
-        kit.palette.new("foliage", (0.2, 0.13, 0.08)),
-        (0, 0.02, h * 0.955),
-    )
-    return group
-
-
 def railing(kit: Kit) -> Group:
     """Returns a rail with thin bars."""
     group, steel = Group(), kit.metal() if kit.chance(0.6) else kit.wood()
@@ -445,30 +289,6 @@ def railing(kit: Kit) -> Group:
     group.add(rod((-w / 2, -0.05, 0.1), (w / 2, -0.05, 0.1), 0.012), steel)
     for x in np.arange(-w / 2, w / 2 + 0.01, kit.size(0.08, 0.16)):
         group.add(cylinder(0.007, h), steel, (float(x), -0.05, 0))
-    return group
-
-
-def bicycle(kit: Kit) -> Group:
-    """Returns a bicycle along x."""
-    group, paint, tyre = Group(), kit.palette.new("plain", vivid=0.9, gloss=0.6), kit.dark()
-    for x in (-0.52, 0.52):
-        group.add(torus(0.33, 0.018), tyre, (x, -0.2, 0.35), pitch=np.pi / 2)
-        for angle in np.arange(6) * np.pi / 6:
-            c, s = 0.32 * np.cos(angle), 0.32 * np.sin(angle)
-            group.add(rod((x - c, -0.2, 0.35 - s), (x + c, -0.2, 0.35 + s), 0.003, sides=4), tyre)
-    joints = {
-        "a": (-0.52, 0.35),
-        "b": (-0.05, 0.3),
-        "c": (-0.2, 0.82),
-        "d": (0.36, 0.8),
-        "e": (0.52, 0.35),
-    }
-    for ends in ("ab", "ac", "bc", "bd", "cd", "de"):
-        (x0, z0), (x1, z1) = joints[ends[0]], joints[ends[1]]
-        group.add(rod((x0, -0.2, z0), (x1, -0.2, z1), 0.017), paint)
-    group.add(rod((0.34, -0.45, 1.0), (0.34, 0.05, 1.0), 0.013), tyre)
-    group.add(rod((0.36, -0.2, 0.8), (0.34, -0.2, 1.0), 0.013), tyre)
-    group.add(superquadric((0.26, 0.15, 0.07)), tyre, (-0.24, -0.2, 0.92))
     return group
 
 

@@ -7,7 +7,6 @@ KITTI's formats. Their seeds are set aside: no training frame was made with them
 from __future__ import annotations
 
 import argparse
-import os
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from io import BytesIO
@@ -176,7 +175,7 @@ def _write(path: Path, fill: Callable[[BytesIO], object]) -> None:
     fill(memory)
     temporary = path.with_name(path.name + ".tmp")
     temporary.write_bytes(memory.getvalue())
-    os.replace(temporary, path)
+    temporary.replace(path)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -60,7 +60,7 @@ class Palette:
         """Returns the number of a new material; whole: a tile starts at texture coordinate 0."""
         rng = self._rng
         if base is not None:
-            chosen = np.asarray(base, np.float32)
+            chosen: FloatArray = np.asarray(base, np.float32)
         elif self._theme and rng.random() < 0.7:
             chosen = near(rng, self._theme[int(rng.integers(len(self._theme)))], 0.12)
         else:
@@ -93,7 +93,7 @@ class Palette:
         return len(self.materials) - 1
 
     def _store(self, picture: npt.NDArray[np.uint8]) -> int:
-        level = picture.astype(np.float32)
+        level: npt.NDArray[np.floating] = picture.astype(np.float32)
         packed = []
         for _ in range(_LEVELS):
             four = np.zeros((*level.shape[:2], 4), np.uint8)

@@ -56,7 +56,7 @@ def render_shard(job: Job, index: int) -> int:
             kind=np.array([frame.kind for frame in frames], np.uint8),
             intrinsics=np.stack([frame.intrinsics for frame in frames]),
         )
-    os.replace(temporary, target)
+    temporary.replace(target)
     return count
 
 

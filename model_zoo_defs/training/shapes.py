@@ -30,7 +30,7 @@ def rotation(yaw: float = 0.0, pitch: float = 0.0, roll: float = 0.0) -> FloatAr
     about_z = np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]])
     about_x = np.array([[1, 0, 0], [0, cp, -sp], [0, sp, cp]])
     about_y = np.array([[cr, 0, sr], [0, 1, 0], [-sr, 0, cr]])
-    return (about_z @ about_x @ about_y).astype(np.float32)
+    return np.asarray(about_z @ about_x @ about_y, np.float32)
 
 
 class Group:
@@ -119,7 +119,7 @@ def quads(corners: npt.ArrayLike, uv: npt.ArrayLike | None = None) -> Mesh:
     else:
         texture = np.asarray(uv, np.float32)
     first = np.arange(0, 4 * len(points), 4, dtype=np.int32)[:, None]
-    faces = np.concatenate([first + [0, 1, 2], first + [0, 2, 3]], axis=0)
+    faces = np.concatenate([first + np.array(corners) for corners in ((0, 1, 2), (0, 2, 3))])
     return Mesh(
         vertices=points.reshape(-1, 3),
         normals=np.repeat(normal, 4, axis=0).astype(np.float32),
@@ -166,7 +166,8 @@ def surface(points: npt.ArrayLike) -> Mesh:
     steps = np.linalg.norm(np.diff(grid, axis=0), axis=2).mean(axis=1)
     uv[..., 1] = np.concatenate([[0], np.cumsum(steps)])[:, None]
     first = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).reshape(-1, 1)
-    faces = np.concatenate([first + [0, 1, columns + 1], first + [0, columns + 1, columns]], axis=0)
+    triangles = ((0, 1, columns + 1), (0, columns + 1, columns))
+    faces = np.concatenate([first + np.array(corners) for corners in triangles])
     return Mesh(
         vertices=grid.reshape(-1, 3),
         normals=normals.reshape(-1, 3).astype(np.float32),
@@ -218,7 +219,7 @@ def superquadric(
 
 
 def _power(base: npt.NDArray[np.floating], exponent: float) -> npt.NDArray[np.floating]:
-    return np.sign(base) * np.abs(base) ** exponent
+    return np.asarray(np.sign(base) * np.abs(base) ** exponent)
 
 
 def tube(path: npt.ArrayLike, radius: float, *, sides: int = 8) -> Mesh:

@@ -30,7 +30,7 @@ def noise_tiles() -> FloatArray:
             spectrum[0, 0] = 0.0
             tile = np.fft.irfft2(spectrum, s=(SIDE, SIDE))
             tiles.append(0.5 + 0.2 * tile / tile.std())
-    return np.clip(np.stack(tiles), 0.0, 1.0).astype(np.float32)
+    return np.asarray(np.clip(np.stack(tiles), 0.0, 1.0), np.float32)
 
 
 def noise(rng: np.random.Generator, *, smooth: float = 0.6) -> FloatArray:
@@ -96,7 +96,8 @@ def _cells(
 
 def _plain(rng: np.random.Generator, base: FloatArray) -> FloatArray:
     amount = rng.choice([0.0, 0.06, 0.15])
-    return base * (1 + amount * (noise(rng, smooth=rng.random())[..., None] - 0.5))
+    grain = noise(rng, smooth=rng.random())[..., None] - 0.5
+    return np.asarray(base * (1 + amount * grain))
 
 
 def _plaster(rng: np.random.Generator, base: FloatArray) -> FloatArray:
@@ -195,7 +196,7 @@ def _spots(rng: np.random.Generator, base: FloatArray) -> FloatArray:
 
 
 def _marble(rng: np.random.Generator, base: FloatArray) -> FloatArray:
-    vein = np.abs(np.sin((_U + _V) * 2 * np.pi + 9 * noise(rng, smooth=0.95)))
+    vein: FloatArray = np.abs(np.sin((_U + _V) * 2 * np.pi + 9 * noise(rng, smooth=0.95)))
     return mixed(near(rng, base, 0.3), base, vein ** rng.uniform(0.2, 0.8))
 
 
@@ -248,9 +249,9 @@ def _poster(rng: np.random.Generator, base: FloatArray) -> FloatArray:
     for _ in range(int(rng.integers(0, 5))):
         letters = rng.integers(65, 91, int(rng.integers(3, 12)))
         text = "".join(chr(int(c)) for c in letters)
-        place = tuple(int(v) for v in rng.integers(5, 190, 2))
+        x, y = (int(v) for v in rng.integers(5, 190, 2))
         draw.text(
-            place, text, fill=_ink(colour(rng, vivid=0.5)), font_size=int(rng.integers(10, 60))
+            (x, y), text, fill=_ink(colour(rng, vivid=0.5)), font_size=int(rng.integers(10, 60))
         )
     if rng.random() < 0.5:
         x, y = (int(v) for v in rng.integers(10, 120, 2))
@@ -261,7 +262,7 @@ def _poster(rng: np.random.Generator, base: FloatArray) -> FloatArray:
 
 
 def _contrasted(rng: np.random.Generator) -> FloatArray:
-    return np.clip(0.5 + 3 * (noise(rng, smooth=0.95) - 0.5), 0, 1)
+    return np.asarray(np.clip(0.5 + 3 * (noise(rng, smooth=0.95) - 0.5), 0, 1), np.float32)
 
 
 def _ink(value: FloatArray) -> tuple[int, int, int]:

@@ -16,6 +16,7 @@ import time
 from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -51,7 +52,8 @@ class Settings:
     size: tuple[int, int] = (192, 256)
     lr: float = 1e-3
     encoder_lr: float = 1e-4
-    frozen_stages: tuple[str, ...] = ("s2", "s4")
+    tuned_stages: tuple[str, ...] = ("s16", "s32")
+    encoder_from: float = 0.5
     save_every: int = 500
     val_frames: int = 40
     pretrained: bool = True
@@ -69,33 +71,32 @@ class Run:
         self.network = Compact().to(self.device, memory_format=torch.channels_last)
         if settings.pretrained:
             self.network.encoder.load_state_dict(pretrained_encoder())
-        self._freeze()
+        self.network.encoder.requires_grad_(False)
+        self.inside = [
+            p for level in settings.tuned_stages for p in self._stage(level).parameters()
+        ]
+        self.outside = [p for p in self.network.parameters() if p.requires_grad]
         self.average = Compact().to(self.device, memory_format=torch.channels_last)
         self.average.load_state_dict(self.network.state_dict())
-        self.optimiser = torch.optim.AdamW(self._groups(), lr=settings.lr, weight_decay=1e-2)
-        self.learnt = [p for p in self.network.parameters() if p.requires_grad]
+        groups = [
+            {"params": self.outside, "peak": settings.lr},
+            {"params": self.inside, "peak": settings.encoder_lr},
+        ]
+        self.optimiser = torch.optim.AdamW(groups, lr=settings.lr, weight_decay=1e-2)
         # On a CPU two halves of a batch on a thread each beat one batch on two threads: they wait
         # for each other once a step, not at every operation.
         self.lanes = 1 if self.device.type == "cuda" else min(settings.lanes, settings.batch)
         self.pool = ThreadPoolExecutor(self.lanes)
         self.step, self.elapsed_s = 0, 0.0
 
-    def _freeze(self) -> None:
-        encoder = self.network.encoder
-        if self.settings.encoder_lr == 0.0:
-            encoder.requires_grad_(False)
-        elif self.settings.frozen_stages:
-            encoder.stem.requires_grad_(False)
-            for level in self.settings.frozen_stages:
-                encoder.stages[level].requires_grad_(False)
+    @property
+    def learnt(self) -> list[Tensor]:
+        """What the optimiser moves now; the deep encoder stages join late, the rest never does."""
+        late = self.settings.encoder_from <= self.progress
+        return self.outside + (self.inside if late else [])
 
-    def _groups(self) -> list[dict[str, Any]]:
-        encoder = {id(p) for p in self.network.encoder.parameters()}
-        learnt = [p for p in self.network.parameters() if p.requires_grad]
-        inside = [p for p in learnt if id(p) in encoder]
-        outside = [p for p in learnt if id(p) not in encoder]
-        groups = [{"params": outside, "peak": self.settings.lr}]
-        return groups + ([{"params": inside, "peak": self.settings.encoder_lr}] if inside else [])
+    def _stage(self, level: str) -> nn.Module:
+        return self.network.encoder.get_submodule(f"stages.{level}")
 
     @property
     def progress(self) -> float:
@@ -110,12 +111,15 @@ class Run:
         factor *= 0.5 * (1.0 + math.cos(math.pi * self.progress))
         for group in self.optimiser.param_groups:
             group["lr"] = group["peak"] * factor
+        learnt = self.learnt
+        for parameter in learnt:
+            parameter.requires_grad_()
         parts = [Sample(*part) for part in zip(*(x.chunk(self.lanes) for x in sample), strict=True)]
-        results = list(self.pool.map(self._loss_and_gradients, parts))
+        results = list(self.pool.map(partial(self._loss_and_gradients, learnt), parts))
         gradients = zip(*(found for _, found in results), strict=True)
-        for parameter, pieces in zip(self.learnt, gradients, strict=True):
+        for parameter, pieces in zip(learnt, gradients, strict=True):
             parameter.grad = torch.stack(pieces).mean(0) if len(pieces) > 1 else pieces[0]
-        nn.utils.clip_grad_norm_(self.learnt, 1.0)
+        nn.utils.clip_grad_norm_(learnt, 1.0)
         self.optimiser.step()
         self.step += 1
         # young averages follow faster, or the first export would be the initial weights
@@ -126,14 +130,14 @@ class Run:
             )
         return float(sum(loss for loss, _ in results) / len(results))
 
-    def _loss_and_gradients(self, part: Sample) -> tuple[float, tuple[Tensor, ...]]:
+    def _loss_and_gradients(self, learnt: list[Tensor], part: Sample) -> tuple[float, tuple[Tensor, ...]]:
         torch.set_num_threads(1)  # a setting of the thread it is called in
         rgb, sparse, depth = (x.to(self.device) for x in part)
         rgb = rgb.contiguous(memory_format=torch.channels_last)
         with torch.autocast(self.device.type, torch.bfloat16):
             depths = self.network.pyramid(rgb, sparse)
         loss = pyramid_loss(depths, depth)
-        return float(loss.detach()), torch.autograd.grad(loss, self.learnt)
+        return float(loss.detach()), torch.autograd.grad(loss, learnt)
 
     def save(self) -> None:
         """state.pt and compact.safetensors hold this moment, whole or not at all."""
@@ -264,6 +268,8 @@ def main() -> None:
     parser.add_argument("--batch", type=int, default=Settings.batch)
     parser.add_argument("--lr", type=float, default=Settings.lr)
     parser.add_argument("--encoder-lr", type=float, default=Settings.encoder_lr)
+    parser.add_argument("--encoder-from", type=float, default=Settings.encoder_from,
+                        help="share of the run after which the deep encoder stages learn too")  # fmt: skip
     options = parser.parse_args()
     print(train(Settings(**vars(options) | {"data": tuple(options.data)})))
 

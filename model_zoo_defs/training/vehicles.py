@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from model_zoo_defs.training import furniture
-from model_zoo_defs.training.clutter import Kit
+from model_zoo_defs.training import figures
+from model_zoo_defs.training.kit import Kit
 from model_zoo_defs.training.shapes import (
     Group,
     Mesh,
@@ -91,13 +91,15 @@ def car(kit: Kit) -> Group:
     body = [
         (b, half * 0.86, low + 0.12, belt * 0.85), (b + 0.12, half * 0.95, low + 0.03, belt * 0.97),
         (b + 0.8, half, low, belt), (0.2, half, low, belt), (f - 1.2, half * 0.99, low, hood),
-        (f - 0.5, half * 0.96, low + 0.02, hood * 0.92), (f - 0.1, half * 0.9, low + 0.06, hood * 0.8),
+        (f - 0.5, half * 0.96, low + 0.02, hood * 0.92),
+        (f - 0.1, half * 0.9, low + 0.06, hood * 0.8),
         (f, half * 0.8, low + 0.12, hood * 0.62),
     ]  # fmt: skip
     group.add(_loft(body, 0.35), paint)
     tail = b + (0.1 if estate else kit.size(0.45, 0.85))
     cabin = [
-        (tail, half * 0.82, belt - 0.1, belt + 0.02), (tail + (0.3 if estate else 0.7), half * 0.76, belt - 0.1, roof - 0.04),
+        (tail, half * 0.82, belt - 0.1, belt + 0.02),
+        (tail + (0.3 if estate else 0.7), half * 0.76, belt - 0.1, roof - 0.04),
         (0.1, half * 0.77, belt - 0.1, roof), (f - 1.95, half * 0.76, belt - 0.1, roof - 0.05),
         (f - 1.1, half * 0.83, belt - 0.1, hood + 0.03),
     ]  # fmt: skip
@@ -189,7 +191,7 @@ def lorry(kit: Kit) -> Group:
 def cyclist(kit: Kit) -> Group:
     """Returns a bicycle with a rider."""
     group = Group()
-    group.place(furniture.bicycle(kit), (0.2, 0, 0), yaw=np.pi / 2)
+    group.place(figures.bicycle(kit), (0.2, 0, 0), yaw=np.pi / 2)
     cloth, skin = kit.any_surface(), kit.palette.new("plain", (0.75, 0.55, 0.42))
     group.add(rod((0, -0.25, 1.0), (0, 0.1, 1.5), 0.15), cloth)
     group.add(superquadric((0.19, 0.22, 0.27)), skin, (0, 0.17, 1.68))

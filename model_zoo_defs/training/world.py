@@ -11,7 +11,7 @@ from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 
 from model_zoo_defs.training.materials import MaterialTable
-from model_zoo_defs.training.shapes import FloatArray, IntArray, Mesh, rotation
+from model_zoo_defs.training.shapes import FloatArray, Group, IntArray, Mesh, rotation
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -111,6 +111,18 @@ class Hits:
     material: IntArray
 
 
+@dataclass(frozen=True, kw_only=True)
+class Plan:
+    """Says where a scene's things are, for choosing cameras: targets and the free box."""
+
+    group: Group
+    lights: tuple[Light, ...]
+    sky: Sky
+    low: tuple[float, float, float]
+    high: tuple[float, float, float]
+    targets: tuple[tuple[float, float, float], ...]
+
+
 @dataclass(frozen=True)
 class World:
     """Holds a scene's triangles, materials and lights."""
@@ -168,7 +180,7 @@ class World:
     ) -> FloatArray:
         """Returns 1 for every ray that gets `reach` lengths of its direction far, else 0."""
         found = self._embree.run(origins, directions, dists=reach, query="OCCLUDED")
-        return (found != 0).astype(np.float32)
+        return np.asarray(found != 0, np.float32)
 
 
 def _unit(vectors: FloatArray) -> FloatArray:

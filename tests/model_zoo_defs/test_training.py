@@ -24,6 +24,7 @@ encoder_weights = pytest.importorskip("model_zoo_defs.training.encoder_weights")
 
 SHAPE = (48, 64)
 seeds = st.integers(0, 2**32 - 1)
+drawn_often = settings(max_examples=40, deadline=None)
 
 
 def room(seed: int) -> NDArray[np.float32]:
@@ -48,6 +49,7 @@ def shards(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@drawn_often
 @given(seed=seeds, count=st.integers(1, 4000))
 def test_uniform_points_are_as_many_as_asked_and_only_where_depth_is_known(
     seed: int, count: int
@@ -58,6 +60,7 @@ def test_uniform_points_are_as_many_as_asked_and_only_where_depth_is_known(
     assert bool((depth[mask] > 0).all())
 
 
+@drawn_often
 @given(seed=seeds, count=st.integers(1, 500))
 def test_corner_points_are_as_many_as_asked_and_lie_where_the_picture_changes(
     seed: int, count: int
@@ -69,12 +72,14 @@ def test_corner_points_are_as_many_as_asked_and_lie_where_the_picture_changes(
     assert bool((depth[mask] > 0).all())
 
 
+@drawn_often
 @given(seed=seeds, count=st.integers(10, 1000))
 def test_a_grid_has_about_as_many_points_as_asked(seed: int, count: int) -> None:
     mask = patterns.jittered_grid(np.random.default_rng(seed), room(seed), count)
     assert 0.5 * count - 10 <= mask.sum() <= 2 * count + 10
 
 
+@drawn_often
 @given(seed=seeds)
 def test_scan_lines_show_the_depth_of_their_pixel_or_what_is_behind_it(seed: int) -> None:
     depth = room(seed)
@@ -84,6 +89,7 @@ def test_scan_lines_show_the_depth_of_their_pixel_or_what_is_behind_it(seed: int
     assert set(np.unique(sparse[mask])) <= set(np.unique(depth))
 
 
+@drawn_often
 @given(seed=seeds)
 def test_a_leak_never_brings_a_depth_nearer_and_leaves_a_wall_alone(seed: int) -> None:
     depth = room(seed)
@@ -101,6 +107,7 @@ def test_a_leak_shows_the_background_through_the_edge_of_a_near_box() -> None:
     assert leaked > 0
 
 
+@drawn_often
 @given(seed=seeds)
 def test_the_same_state_draws_the_same_points_without_touching_the_depth(seed: int) -> None:
     depth = room(seed)
@@ -136,7 +143,7 @@ def test_a_folder_without_shards_is_refused(tmp_path: Path) -> None:
         Frames(tmp_path)
 
 
-@settings(max_examples=25)
+@drawn_often
 @given(seed=seeds)
 def test_a_degraded_picture_is_still_a_picture(seed: int) -> None:
     rgb = torch.rand(3, 32, 48, generator=torch.Generator().manual_seed(seed % 1000))

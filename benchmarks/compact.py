@@ -1,0 +1,144 @@
+"""The embedded network on real frames: `python -m benchmarks.compact --data PATH [--seeds 1]`.
+
+Per set and number of points: nearest and linear interpolation of the points, the network's plain
+prediction, and refinement with the definition's defaults; the same points and the same pixels
+(all with known truth) for each. Mean over frames of the per-frame MAE and RMSE.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from benchmarks.frames import SETS, EvalFrame, nearest_and_linear, sampled
+from pnpdepth_cli.core.metrics import score
+from pnpdepth_cli.core.points import SparsePoints
+from pnpdepth_cli.models.network import Network, load_network
+from pnpdepth_cli.pipeline.frame import refine_frame
+from pnpdepth_cli.pipeline.inputs import Inputs
+from pnpdepth_cli.pipeline.request import RefineRequest, effective_settings, layer_name
+
+CELLS = (
+    ("7scenes", 500),
+    ("7scenes", 100),
+    ("icl_nuim", 500),
+    ("icl_nuim", 100),
+    ("kitti_dc", None),
+)
+METHODS = ("nearest", "linear", "plain", "refined")
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What `pnpdepth refine` would be given."""
+
+    layer: str | None
+    iterations: int | None
+    lr: str | None
+    update: str | None
+
+
+def measure_frame(
+    network: Network, frame: EvalFrame, count: int | None, seed: int, settings: Settings
+) -> dict[str, tuple[float, float]]:
+    """(MAE, RMSE) of every method on one frame."""
+    if count is None:
+        assert frame.sensor is not None
+        rows, columns = np.nonzero(frame.sensor > 0)
+        depth = frame.sensor[rows, columns]
+    else:
+        rows, columns = sampled(frame.truth, count, seed)
+        depth = frame.truth[rows, columns]
+    near, linear = nearest_and_linear(rows, columns, depth, frame.truth.shape)
+    points = SparsePoints(
+        xy=torch.from_numpy(np.stack([columns, rows], axis=1).astype(np.float32)),
+        depth=torch.from_numpy(depth),
+        size=frame.truth.shape,
+    )
+    inputs = Inputs(
+        rgb=frame.rgb, points=points, gt=frame.truth, sparse_scale=None, record={}, notes=()
+    )
+    request = RefineRequest(
+        image=None, sparse=Path(), iterations=settings.iterations, lr=settings.lr,
+        update=settings.update,
+    )  # fmt: skip
+    result = refine_frame(
+        network,
+        layer_name(network.definition, settings.layer),
+        effective_settings(network.definition.defaults, request),
+        inputs,
+        points,
+        points.select(torch.zeros(len(points), dtype=torch.bool)),
+    )
+    depths = {"nearest": near, "linear": linear, "plain": result.before, "refined": result.after}
+    truth = torch.from_numpy(frame.truth)
+    scores = {name: score(torch.from_numpy(depth), truth) for name, depth in depths.items()}
+    return {name: (s.mae, s.rmse) for name, s in scores.items()}
+
+
+def measure_cell(
+    network: Network,
+    frames: Iterable[EvalFrame],
+    count: int | None,
+    seeds: int,
+    settings: Settings,
+) -> dict[str, float]:
+    """Means over frames and seeds, gains over linear in per cent, and wins."""
+    results = [
+        measure_frame(network, frame, count, seed, settings)
+        for frame in frames
+        for seed in range(seeds if count is not None else 1)
+    ]
+    row: dict[str, float] = {"frames": len(results)}
+    for number, measure in enumerate(("MAE", "RMSE")):
+        table = np.array([[result[method][number] for method in METHODS] for result in results])
+        mean = dict(zip(METHODS, table.mean(axis=0), strict=True))
+        row |= {f"{measure} {method}": float(value) for method, value in mean.items()}
+        row[f"{measure} refined vs linear %"] = 100 * (mean["refined"] / mean["linear"] - 1)
+        row[f"{measure} refined vs plain %"] = 100 * (mean["refined"] / mean["plain"] - 1)
+        row[f"{measure} wins over linear"] = float((table[:, 3] < table[:, 1]).mean())
+    return row
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--data", type=Path, required=True)
+    parser.add_argument("--model", default="compact")
+    parser.add_argument("--checkpoint", type=Path)
+    parser.add_argument("--seeds", type=int, default=1)
+    parser.add_argument("--every", type=int, default=1, help="use every n-th frame")
+    parser.add_argument("--layer")
+    parser.add_argument("--iterations", type=int)
+    parser.add_argument("--lr")
+    parser.add_argument("--update")
+    parser.add_argument("--json", action="store_true")
+    args = parser.parse_args()
+    network = load_network(args.model, args.checkpoint)
+    settings = Settings(args.layer, args.iterations, args.lr, args.update)
+    table = {}
+    for name, count in CELLS:
+        frames = list(SETS[name](args.data))[:: args.every]
+        cell = f"{name}, {count} points" if count else f"{name}, its LiDAR"
+        table[cell] = measure_cell(network, frames, count, args.seeds, settings)
+        if not args.json:
+            print_row(cell, table[cell], header=len(table) == 1)
+    if args.json:
+        print(json.dumps(table, indent=2))
+
+
+def print_row(cell: str, row: dict[str, float], *, header: bool) -> None:
+    """One line of a Markdown table, flushed, so that a long run can be watched."""
+    if header:
+        print("| set | " + " | ".join(row) + " |")
+        print("|" + "---|" * (len(row) + 1))
+    print(f"| {cell} | " + " | ".join(f"{value:.4g}" for value in row.values()) + " |", flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,72 @@
+"""Real frames for measuring: folders in the layout of the data's own README, or rendered ones."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pnpdepth_cli.io.depth import read_depth
+from pnpdepth_cli.io.rgb import read_rgb
+
+Depth = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class EvalFrame:
+    """rgb (H, W, 3) in 0..1, truth (H, W) metres with 0 unknown, sensor depth (H, W) or None."""
+
+    name: str
+    rgb: NDArray[np.float32]
+    truth: Depth
+    sensor: Depth | None = None
+
+
+def seven_scenes(root: Path) -> Iterator[EvalFrame]:
+    """Kinect frames of one kitchen; 0 and 65535 are unknown."""
+    for path in sorted((root / "7scenes").glob("*.color.jpg")):
+        depth = path.with_name(path.name.replace("color.jpg", "depth.png"))
+        yield EvalFrame(path.stem, read_rgb(path).values, read_depth(depth, scale=1000).values)
+
+
+def icl_nuim(root: Path) -> Iterator[EvalFrame]:
+    """Frames of a rendered living room with perfect depth."""
+    for path in sorted((root / "icl_nuim" / "image").glob("*.jpg")):
+        depth = root / "icl_nuim" / "depth" / f"{path.stem}.png"
+        yield EvalFrame(path.stem, read_rgb(path).values, read_depth(depth, scale=1000).values)
+
+
+def kitti_dc(root: Path) -> Iterator[EvalFrame]:
+    """Street frames with one LiDAR scan each and the accumulated truth."""
+    folder = root / "kitti_dc"
+    for path in sorted((folder / "image").glob("*.jpg")):
+        truth, scan = (
+            read_depth(folder / kind / f"{path.stem}.png", scale=256).values
+            for kind in ("groundtruth", "velodyne_raw")
+        )
+        yield EvalFrame(path.stem, read_rgb(path).values, truth, scan)
+
+
+SETS = {"7scenes": seven_scenes, "icl_nuim": icl_nuim, "kitti_dc": kitti_dc}
+
+
+def sampled(truth: Depth, count: int, seed: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Rows and columns of `count` pixels with known truth, drawn uniformly."""
+    rows, columns = np.nonzero(truth > 0)
+    chosen = np.random.default_rng(seed).choice(len(rows), min(count, len(rows)), replace=False)
+    return rows[chosen], columns[chosen]
+
+
+def nearest_and_linear(
+    rows: NDArray[np.int64], columns: NDArray[np.int64], depth: Depth, shape: tuple[int, int]
+) -> tuple[Depth, Depth]:
+    """Nearest-neighbour and Delaunay-linear fill (nearest outside the hull) of the points."""
+    from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
+
+    places, grid = np.stack([rows, columns], axis=1), np.indices(shape).reshape(2, -1).T
+    near = NearestNDInterpolator(places, depth)(grid).reshape(shape)
+    linear = LinearNDInterpolator(places, depth)(grid).reshape(shape)
+    return near.astype(np.float32), np.where(np.isnan(linear), near, linear).astype(np.float32)

@@ -1,0 +1,174 @@
+"""Walls of rooms: their openings, what hangs on them and what open doors show."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+
+import numpy as np
+
+from model_zoo_defs.training import clutter, furniture, seating
+from model_zoo_defs.training.kit import Kit
+from model_zoo_defs.training.shapes import (
+    Group,
+    Mesh,
+    box,
+    quads,
+    rod,
+    surface,
+)
+
+Hole = tuple[float, float, float, float]
+
+
+def wall(length: float, height: float, holes: Sequence[Hole], *, rise: float = 0.0) -> Mesh:
+    """Returns an upright face from x = 0 to length at y = 0, with rectangular holes left out.
+
+    rise lifts the upper edge at x = length against x = 0.
+    """
+    us = sorted({0.0, length, *(u for hole in holes for u in hole[::2])})
+    vs = sorted({0.0, *(v for hole in holes for v in hole[1::2])})
+    corners = []
+    for u0, u1 in pairwise(us):
+        tops = [height + rise * u / length for u in (u0, u1)]
+        for index, v0 in enumerate(vs):
+            last = index == len(vs) - 1
+            v1 = vs[index + 1] if not last else 0.0
+            middle = ((u0 + u1) / 2, v0 + 0.01)
+            if any(h[0] < middle[0] < h[2] and h[1] < middle[1] < h[3] for h in holes):
+                continue
+            left, right = (tops[0], tops[1]) if last else (v1, v1)
+            corners.append([(u0, 0, v0), (u1, 0, v0), (u1, 0, right), (u0, 0, left)])
+    points = np.array(corners, np.float32)
+    return quads(points, points[..., [0, 2]])
+
+
+def opening(kit: Kit, side: Group, hole: Hole, paint: int) -> None:
+    """Adds the reveal, the frame and what closes a window or door."""
+    u0, v0, u1, v1 = hole
+    deep, x, w, h = kit.size(0.08, 0.3), (u0 + u1) / 2, u1 - u0, v1 - v0
+    for at, size in (
+        ((u0, deep / 2, v0), (0.004, deep, h)), ((u1, deep / 2, v0), (0.004, deep, h)),
+        ((x, deep / 2, v0), (w, deep, 0.004)), ((x, deep / 2, v1), (w, deep, 0.004)),
+    ):  # fmt: skip
+        side.add(box(*size), paint, at)
+    trim = kit.wood() if kit.chance(0.4) else kit.palette.new("plain", (0.9, 0.9, 0.88), gloss=0.3)
+    t = kit.size(0.04, 0.09)
+    for at, size in (
+        ((u0 + t / 2, deep, v0), (t, 0.05, h)), ((u1 - t / 2, deep, v0), (t, 0.05, h)),
+        ((x, deep, v1 - t), (w, 0.05, t)), ((x, deep, v0), (w, 0.05, t)),
+    ):  # fmt: skip
+        side.add(box(*size), trim, at)
+    if v0 < 0.05:
+        _hallway(kit, side, (u0 + u1) / 2, deep, paint)
+        if kit.chance(0.75):
+            door = kit.wood() if kit.chance(0.5) else kit.surface("plain", vivid=0.2)
+            angle = kit.size(-1.7, -0.2) if kit.chance(0.4) else 0.0
+            leaf = Group()
+            leaf.add(box(w - 2 * t, 0.04, h - t), door, (w / 2 - t, 0, 0))
+            for z in (0.15, h * 0.55):
+                leaf.add(box((w - 2 * t) * 0.7, 0.055, h * 0.35), door, (w / 2 - t, 0, z))
+            leaf.add(rod((w * 0.8, -0.06, 1.02), (w * 0.92, -0.06, 1.02), 0.01), kit.metal())
+            side.place(leaf, (u0 + t, deep * 0.6, 0), yaw=angle)
+        return
+    for share in np.linspace(0, 1, int(kit.rng.integers(1, 4)) + 1)[1:-1]:
+        side.add(box(0.05, 0.05, h), trim, (u0 + w * float(share), deep, v0))
+    if kit.chance(0.4):
+        side.add(box(w, 0.04, 0.04), trim, (x, deep, v0 + h * kit.size(0.4, 0.7)))
+    side.add(box(w + 0.1, deep + 0.1, 0.03), trim, (x, deep / 2 - 0.1, v0 - 0.03))
+    if kit.chance(0.5):
+        _curtain(kit, side, u0, u1, v1)
+    elif kit.chance(0.4):
+        slat = kit.surface("plain", vivid=0.15)
+        for z in np.arange(v0 + h * kit.size(0, 0.6), v1, 0.06):
+            side.add(box(w - 0.02, 0.04, 0.002), slat, (x, deep * 0.5, float(z)), pitch=0.6)
+    scatter_z = v0
+    if kit.chance(0.4):
+        clutter.scatter(
+            kit,
+            side,
+            low=(u0 + 0.1, -0.02),
+            high=(u1 - 0.1, 0.04),
+            z=scatter_z,
+            count=3,
+            tallest=0.4,
+        )
+
+
+def _hallway(kit: Kit, side: Group, x: float, deep: float, paint: int) -> None:
+    """Adds the walls and the floor that an open door shows."""
+    left, right, far, top = x - kit.size(0.6, 2), x + kit.size(0.6, 2), deep + kit.size(0.9, 3), 2.6
+    low = deep + 0.03
+    faces = [
+        [(left, far, 0), (right, far, 0), (right, far, top), (left, far, top)],
+        [(left, low, 0), (left, far, 0), (left, far, top), (left, low, top)],
+        [(right, low, 0), (right, far, 0), (right, far, top), (right, low, top)],
+        [(left, low, top), (right, low, top), (right, far, top), (left, far, top)],
+    ]
+    side.add(quads(faces), paint if kit.chance(0.5) else kit.surface("plaster", "plain", "stripes"))
+    ground = [(left, low, 0.001), (right, low, 0.001), (right, far, 0.001), (left, far, 0.001)]
+    side.add(quads([ground]), kit.surface("planks", "carpet", "tiles", vivid=0.1))
+    if kit.chance(0.5):
+        item = furniture.drawers(kit) if kit.chance(0.5) else seating.chair(kit)
+        side.place(item, (kit.size(left, right), far, 0))
+
+
+def _curtain(kit: Kit, side: Group, u0: float, u1: float, top: float) -> None:
+    cloth = kit.surface("fabric", "plain", "stripes", tile_m=0.8, vivid=0.3)
+    bottom = 0.03 if kit.chance(0.6) else top * 0.3
+    side.add(rod((u0 - 0.3, -0.08, top + 0.1), (u1 + 0.3, -0.08, top + 0.1), 0.015), kit.metal())
+    for start, end in ((u0 - 0.25, u0 + kit.size(0.1, 0.5)), (u1 - kit.size(0.1, 0.5), u1 + 0.25)):
+        s, z = np.meshgrid(np.linspace(0, 1, 60), np.linspace(bottom, top + 0.1, 6))
+        folds, deep = kit.size(4, 9), kit.size(0.02, 0.05)
+        y = -0.08 + deep * np.sin(2 * np.pi * folds * s + z * 0.4) * (1.2 - 0.2 * z)
+        side.add(surface(np.stack([start + (end - start) * s, y, z], axis=2)), cloth)
+
+
+def decorate(kit: Kit, side: Group, length: float, height: float, holes: Sequence[Hole]) -> None:
+    """Adds pictures, switches, radiators and shelves where the wall is free."""
+    for _ in range(int(kit.rng.integers(0, 6))):
+        u = kit.size(0.3, max(0.4, length - 0.3))
+        if any(hole[0] - 0.5 < u < hole[2] + 0.5 for hole in holes):
+            continue
+        choice = kit.rng.random()
+        z = kit.size(1.1, max(1.2, height - 0.7))
+        w, h = kit.size(0.2, 1.0), kit.size(0.2, 0.8)
+        if choice < 0.6:
+            thick = kit.size(0.002, 0.04)
+            if thick > 0.01:
+                edge = kit.wood() if kit.chance(0.5) else kit.dark()
+                side.add(box(w + 0.06, thick, h + 0.06), edge, (u, -thick / 2, z - 0.03))
+            picture = kit.palette.new("poster", tile_m=h, whole=True, mirror=kit.size(0, 0.05))
+            side.add(box(w, 0.004, h, fit=h), picture, (u, -thick - 0.002, z))
+        elif choice < 0.75:
+            side.add(box(w + 0.3, 0.2, 0.025), kit.wood(), (u, -0.1, z))
+            clutter.scatter(
+                kit,
+                side,
+                low=(u - w / 2, -0.15),
+                high=(u + w / 2, -0.06),
+                z=z + 0.025,
+                count=4,
+                tallest=0.3,
+            )
+        elif choice < 0.9:
+            white = kit.surface("plain", vivid=0.05)
+            for x in np.arange(-0.4, 0.41, 0.05):
+                side.add(box(0.035, 0.08, 0.55), white, (u + float(x), -0.09, 0.12))
+        else:
+            side.add(box(0.08, 0.012, 0.08), kit.palette.new("plain", (0.9,) * 3), (u, -0.006, 1.1))
+
+
+def openings(kit: Kit, length: float, height: float) -> list[Hole]:
+    found: list[Hole] = []
+    u = kit.size(0.2, 0.8)
+    while u < length - 1.0:
+        chance = kit.rng.random()
+        w = kit.size(0.7, min(2.0, length - u - 0.2))
+        if chance < 0.22:
+            found.append((u, kit.size(0.5, 1.0), u + w, min(height - 0.15, kit.size(1.7, 2.4))))
+        elif chance < 0.4:
+            w = min(w, kit.size(0.75, 1.0))
+            found.append((u, 0.0, u + w, min(height - 0.1, kit.size(1.95, 2.15))))
+        u += w + kit.size(0.3, 1.5)
+    return found
