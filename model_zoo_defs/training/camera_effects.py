@@ -21,7 +21,7 @@ def photographed(
     height, width = colour.shape[:2]
     # The mean of log light decides the exposure, so a bright window may burn out.
     level = float(np.exp(np.log(np.maximum(colour.mean(axis=2), 1e-4)).mean()))
-    key = rng.uniform(0.16, 0.24) if clean else rng.uniform(0.10, 0.30)
+    key = rng.uniform(0.09, 0.11) if clean else rng.uniform(0.10, 0.30)
     picture = colour * np.float32(key / level)
     balance = rng.normal(1.0, 0.01 if clean else 0.06, 3).astype(np.float32)
     picture = picture * balance

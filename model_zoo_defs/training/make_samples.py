@@ -26,8 +26,8 @@ from model_zoo_defs.training.world import View, World, looking
 SAMPLE_SEED = 770077
 """Set aside for samples; training uses others."""
 
-INDOOR_SCENE, INDOOR_VIEW = 0, 0
-STREET_SCENE = 0
+INDOOR_SCENE, INDOOR_VIEW = 5, 1
+STREET_SCENE = 13
 
 INDOOR_SCALE, STREET_SCALE = 1000, 256
 SPARSE_POINTS = 500

@@ -126,6 +126,13 @@ def test_the_same_seed_gives_the_same_bytes_and_another_seed_does_not(tmp_path: 
     assert files[0] != files[2]
 
 
+def test_two_workers_write_the_same_bytes_as_one(tmp_path: Path) -> None:
+    render.render_all(job(tmp_path / "one"), workers=1)
+    render.render_all(job(tmp_path / "two"), workers=2)
+    for path in sorted((tmp_path / "one").iterdir()):
+        assert path.read_bytes() == (tmp_path / "two" / path.name).read_bytes()
+
+
 def test_a_shard_on_disk_is_left_alone_and_missing_ones_are_filled_in(tmp_path: Path) -> None:
     render.render_all(job(tmp_path), workers=1)
     whole = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
