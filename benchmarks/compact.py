@@ -16,12 +16,17 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from benchmarks.frames import SETS, EvalFrame, nearest_and_linear, sampled
+from benchmarks.frames import (
+    SETS,
+    EvalFrame,
+    frame_inputs,
+    nearest_and_linear,
+    points_on_grid,
+    sampled,
+)
 from pnpdepth_cli.core.metrics import score
-from pnpdepth_cli.core.points import SparsePoints
 from pnpdepth_cli.models.network import Network, load_network
 from pnpdepth_cli.pipeline.frame import refine_frame
-from pnpdepth_cli.pipeline.inputs import Inputs
 from pnpdepth_cli.pipeline.request import RefineRequest, effective_settings, layer_name
 
 CELLS = (
@@ -56,14 +61,8 @@ def measure_frame(
         rows, columns = sampled(frame.truth, count, seed)
         depth = frame.truth[rows, columns]
     near, linear = nearest_and_linear(rows, columns, depth, frame.truth.shape)
-    points = SparsePoints(
-        xy=torch.from_numpy(np.stack([columns, rows], axis=1).astype(np.float32)),
-        depth=torch.from_numpy(depth),
-        size=frame.truth.shape,
-    )
-    inputs = Inputs(
-        rgb=frame.rgb, points=points, gt=frame.truth, sparse_scale=None, record={}, notes=()
-    )
+    points = points_on_grid(rows, columns, depth, frame.truth.shape)
+    inputs = frame_inputs(frame.rgb, points, frame.truth)
     request = RefineRequest(
         image=None, sparse=Path(), iterations=settings.iterations, lr=settings.lr,
         update=settings.update,

@@ -7,10 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
+from pnpdepth_cli.core.points import SparsePoints
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.io.rgb import read_rgb
+from pnpdepth_cli.pipeline.inputs import Inputs
 
 Depth = NDArray[np.float32]
 
@@ -58,6 +61,21 @@ def sampled(truth: Depth, count: int, seed: int) -> tuple[NDArray[np.int64], NDA
     rows, columns = np.nonzero(truth > 0)
     chosen = np.random.default_rng(seed).choice(len(rows), min(count, len(rows)), replace=False)
     return rows[chosen], columns[chosen]
+
+
+def points_on_grid(
+    rows: NDArray[np.int64], columns: NDArray[np.int64], depth: Depth, shape: tuple[int, int]
+) -> SparsePoints:
+    """The depths at these pixels as points of a frame of this shape."""
+    xy = np.stack([columns, rows], axis=1).astype(np.float32)
+    return SparsePoints(
+        xy=torch.from_numpy(xy), depth=torch.from_numpy(depth.astype(np.float32)), size=shape
+    )
+
+
+def frame_inputs(rgb: NDArray[np.float32], points: SparsePoints, truth: Depth) -> Inputs:
+    """A frame in memory, as the program reads one from files."""
+    return Inputs(rgb=rgb, points=points, gt=truth, sparse_scale=None, record={}, notes=())
 
 
 def nearest_and_linear(

@@ -17,6 +17,7 @@ is what refinement moves.
 from __future__ import annotations
 
 from pathlib import Path
+from typing import cast
 
 import torch
 import torch.nn.functional as F
@@ -47,6 +48,12 @@ FIT_HEADS = 4
 FIT_KEY = 16
 FIT_CHUNK = 1024
 MASKED = -1e4
+# the pretrained features have a standard deviation of about 10
+FEATURE_SCALE = 0.1
+# The initial weights (as logits) make the untrained network a fair interpolator: follow the depth
+# so far, correct it by the residual of the own cell, else of the nearest ones.
+KEEP, STAY = 4.0, -2.0
+NEIGHBOURS = (-0.5, 0.5, -0.5, 0.5, 2.5, 0.5, -0.5, 0.5, -0.5)
 
 
 class SamePaddedConv(nn.Conv2d):
@@ -74,7 +81,7 @@ class InvertedBottleneck(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         y = x if self.expand is None else F.relu6(self.expand(x))
-        y = self.project(F.relu6(self.depthwise(y)))
+        y = cast(Tensor, self.project(F.relu6(self.depthwise(y))))
         return x + y if self.residual else y
 
 
@@ -101,7 +108,7 @@ class Encoder(nn.Module):
         features = {}
         for level, stage in self.stages.items():
             x = stage(x)
-            features[level] = x
+            features[level] = x * FEATURE_SCALE
         return features
 
 
@@ -114,7 +121,8 @@ class Points:
     def __init__(self, sparse: Tensor):
         self.mask = (sparse > 0).to(torch.float32)
         log_depth = torch.log(torch.where(sparse > 0, sparse, 1.0).to(torch.float32))
-        known = (row[seen] for row, seen in zip(log_depth.flatten(1), self.mask.flatten(1) > 0))
+        rows = zip(log_depth.flatten(1), self.mask.flatten(1) > 0, strict=True)
+        known = (row[seen] for row, seen in rows)
         medians = [row.median() if row.numel() else row.new_zeros(()) for row in known]
         self.median = torch.stack(medians).view(-1, 1, 1, 1)
         self.value = (log_depth - self.median) * self.mask
@@ -125,12 +133,12 @@ class Points:
 
     def residual(self, depth: Tensor, stride: int) -> tuple[Tensor, Tensor, Tensor]:
         """(mean, spread, share of known pixels) of points minus `depth`, per cell of `stride`."""
-        share, value, square = self.moments.split(1, dim=1)
+        share, value, square = self.moments.chunk(3, dim=1)
         dense = _resize(depth, share.shape[-2:]) if stride > 2 else depth
         difference = value - dense * share
         squared = square - dense * (2.0 * value - dense * share)
         sums = torch.cat([share, difference, squared], dim=1)
-        share, difference, squared = F.avg_pool2d(sums, stride // 2).split(1, dim=1)
+        share, difference, squared = F.avg_pool2d(sums, stride // 2).chunk(3, dim=1)
         known = share.clamp(min=1e-6)
         mean = difference / known
         spread = (squared / known - mean * mean).clamp(min=0.0)
@@ -157,8 +165,8 @@ class PointFit(nn.Module):
         self.far = nn.Conv2d(ENCODER_CHANNELS["s32"], 64, 1)
         self.query = nn.Conv2d(64, FIT_HEADS * FIT_KEY, 1)
         self.key = nn.Conv2d(64, FIT_HEADS * FIT_KEY, 1)
-        self.power = nn.Parameter(torch.tensor([1.0, 1.5, 2.0, 3.0]).log())
-        self.ridge = nn.Parameter(torch.tensor([0.1, 0.3, 0.1, 3.0]).log())
+        self.power = nn.Parameter(torch.tensor([2.0, 3.0, 4.0, 6.0]).log())
+        self.ridge = nn.Parameter(torch.tensor([0.05, 0.1, 0.3, 1.0]).log())
         self.floor = nn.Parameter(torch.tensor(0.3).log())
 
     def forward(self, near: Tensor, far: Tensor, points: Points) -> tuple[Tensor, Tensor]:
@@ -189,13 +197,13 @@ class PointFit(nn.Module):
     @staticmethod
     def _per_head(x: Tensor) -> Tensor:
         """(B, heads, cells, key) in float32."""
-        return x.float().flatten(2).unflatten(1, (FIT_HEADS, FIT_KEY)).transpose(2, 3)
+        return x.float().reshape(len(x), FIT_HEADS, FIT_KEY, -1).transpose(2, 3)
 
     @staticmethod
     def _cells(points: Points, height: int, width: int) -> tuple[Tensor, Tensor, Tensor]:
         """Mean place (B, 2, cells), mean value (B, cells) of the points of each cell, and if any"""
         mask = points.mask
-        pixel = (_cell_grid(*mask.shape[-2:], mask) / 16.0).unsqueeze(0) * mask
+        pixel = (_cell_grid(mask.shape[-2], mask.shape[-1], mask) / 16.0).unsqueeze(0) * mask
         share, value, at = (F.avg_pool2d(x, 16) for x in (mask, points.value, pixel))
         safe = share.clamp(min=1e-6)
         return (at / safe).flatten(2), (value / safe).flatten(1), (share > 0).flatten(1)
@@ -239,6 +247,13 @@ def _neighbours(x: Tensor) -> Tensor:
     return torch.cat([padded[..., i : i + height, j : j + width] for i, j in shifts], dim=1)
 
 
+def _bilinear_logits() -> Tensor:
+    """Logits (36,) that make a softmax over 3 x 3 neighbours enlarge twofold bilinearly."""
+    ends = torch.tensor([[0.25, 0.75, 0.0], [0.0, 0.75, 0.25]])  # of the two halves of a cell
+    weights = torch.einsum("ai,bj->ijab", ends, ends).reshape(9, 4)
+    return weights.clamp(min=1e-3).log().flatten()
+
+
 class Block(nn.Module):
     """One level's features, (B, out, h, w), from everything known at that level."""
 
@@ -262,7 +277,10 @@ class Head(nn.Module):
         self.candidates = candidates
         self.weigh = nn.Conv2d(channels, candidates + 1 + 10 + 1, 1)
         nn.init.normal_(self.weigh.weight, std=1e-2)
-        nn.init.zeros_(self.weigh.bias)  # type: ignore[arg-type]
+        bias = torch.zeros(candidates + 12)
+        bias[0] = KEEP if candidates == 9 else 0.0
+        bias[candidates + 1 : -1] = torch.tensor((STAY, *NEIGHBOURS))
+        self.weigh.bias = nn.Parameter(bias)
 
     def forward(
         self, features: Tensor, before: Tensor, candidates: Tensor, residual: Tensor, share: Tensor
@@ -272,13 +290,13 @@ class Head(nn.Module):
         candidates (B, n, h, w) are depths; residual and share (B, 1, h, w) are of `Points`.
         """
         weights = self.weigh(features).float()
-        follow, correct, rest = weights.split((self.candidates + 1, 10, 1), dim=1)
+        follow, correct, rest = weights.tensor_split((self.candidates + 1, self.candidates + 11), 1)
         moved = (follow.softmax(1)[:, 1:] * (candidates - before)).sum(1, keepdim=True)
         nothing = torch.zeros_like(share)
         absent = torch.cat([nothing, (_neighbours(share) <= 0) * MASKED], dim=1)
         corrections = torch.cat([nothing, _neighbours(residual)], dim=1)
         corrected = ((correct + absent).softmax(1) * corrections).sum(1, keepdim=True)
-        return before + moved + corrected + rest
+        return cast(Tensor, before + moved + corrected + rest)
 
 
 class Compact(nn.Module):
@@ -312,6 +330,7 @@ class Compact(nn.Module):
         )
         self.enlarge = nn.Conv2d(width["s2"], 36, 1)
         nn.init.normal_(self.enlarge.weight, std=1e-2)
+        self.enlarge.bias = nn.Parameter(_bilinear_logits())
 
     def forward(self, rgb: Tensor, sparse: Tensor) -> Tensor:
         return self.pyramid(rgb, sparse)[-1]
@@ -348,7 +367,8 @@ class Compact(nn.Module):
 
     def _enlarge(self, features: Tensor, depth: Tensor) -> Tensor:
         """Full size: every pixel a mixture of the 3 x 3 depths at 1/2 around it."""
-        weights = self.enlarge(features).float().unflatten(1, (9, 4)).softmax(1)
+        weights = self.enlarge(features).float()
+        weights = weights.reshape(len(depth), 9, 4, *depth.shape[-2:]).softmax(1)
         mixed = (weights * _neighbours(depth).unsqueeze(2)).sum(1)
         return F.pixel_shuffle(mixed, 2)
 

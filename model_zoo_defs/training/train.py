@@ -11,14 +11,12 @@ from __future__ import annotations
 import argparse
 import csv
 import math
-import os
 import time
 from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import torch
 from safetensors.torch import save_file
@@ -68,7 +66,7 @@ class Run:
         torch.manual_seed(settings.seed)
         self.settings = settings
         self.device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-        self.network = Compact().to(self.device, memory_format=torch.channels_last)
+        self.network = Compact().to(self.device)
         if settings.pretrained:
             self.network.encoder.load_state_dict(pretrained_encoder())
         self.network.encoder.requires_grad_(False)
@@ -76,8 +74,10 @@ class Run:
             p for level in settings.tuned_stages for p in self._stage(level).parameters()
         ]
         self.outside = [p for p in self.network.parameters() if p.requires_grad]
-        self.average = Compact().to(self.device, memory_format=torch.channels_last)
+        self.average = Compact().to(self.device)
         self.average.load_state_dict(self.network.state_dict())
+        for network in (self.network, self.average):
+            _channels_last(network)
         groups = [
             {"params": self.outside, "peak": settings.lr},
             {"params": self.inside, "peak": settings.encoder_lr},
@@ -87,10 +87,12 @@ class Run:
         # for each other once a step, not at every operation.
         self.lanes = 1 if self.device.type == "cuda" else min(settings.lanes, settings.batch)
         self.pool = ThreadPoolExecutor(self.lanes)
+        if self.lanes > 1:
+            torch.set_num_threads(1)
         self.step, self.elapsed_s = 0, 0.0
 
     @property
-    def learnt(self) -> list[Tensor]:
+    def learnt(self) -> list[nn.Parameter]:
         """What the optimiser moves now; the deep encoder stages join late, the rest never does."""
         late = self.settings.encoder_from <= self.progress
         return self.outside + (self.inside if late else [])
@@ -130,7 +132,9 @@ class Run:
             )
         return float(sum(loss for loss, _ in results) / len(results))
 
-    def _loss_and_gradients(self, learnt: list[Tensor], part: Sample) -> tuple[float, tuple[Tensor, ...]]:
+    def _loss_and_gradients(
+        self, learnt: list[nn.Parameter], part: Sample
+    ) -> tuple[float, tuple[Tensor, ...]]:
         torch.set_num_threads(1)  # a setting of the thread it is called in
         rgb, sparse, depth = (x.to(self.device) for x in part)
         rgb = rgb.contiguous(memory_format=torch.channels_last)
@@ -150,7 +154,7 @@ class Run:
         }
         out = self.settings.out
         torch.save(state, out / "state.pt.part")
-        os.replace(out / "state.pt.part", out / "state.pt")
+        (out / "state.pt.part").replace(out / "state.pt")
         export(self.average, out / "compact.safetensors")
 
     def restore(self) -> None:
@@ -160,6 +164,12 @@ class Run:
         self.average.load_state_dict(state["average"])
         self.optimiser.load_state_dict(state["optimiser"])
         self.step, self.elapsed_s = state["step"], state["elapsed_s"]
+
+
+def _channels_last(network: nn.Module) -> None:
+    for parameter in network.parameters():
+        if parameter.ndim == 4:
+            parameter.data = parameter.data.contiguous(memory_format=torch.channels_last)
 
 
 def export(network: nn.Module, path: Path) -> None:
@@ -172,7 +182,7 @@ def export(network: nn.Module, path: Path) -> None:
     }
     part = path.with_name(path.name + ".part")
     save_file(half, part)
-    os.replace(part, path)
+    part.replace(path)
 
 
 def pyramid_loss(depths: list[Tensor], truth: Tensor) -> Tensor:
@@ -195,8 +205,10 @@ def depth_loss(depth: Tensor, truth: Tensor) -> Tensor:
     safe = torch.where(known, truth, depth.detach())
     count = known.sum((1, 2, 3)).clamp(min=1)
     log_error = (torch.log(depth) - torch.log(safe)).abs().sum((1, 2, 3)) / count
-    medians = torch.stack([row[seen].median() if bool(seen.any()) else row.new_ones(())
-                           for row, seen in zip(truth.flatten(1), known.flatten(1), strict=True)])  # fmt: skip
+    rows = zip(truth.flatten(1), known.flatten(1), strict=True)
+    medians = torch.stack(
+        [row[seen].median() if bool(seen.any()) else row.new_ones(()) for row, seen in rows]
+    )
     error = ((depth - safe).abs().sum((1, 2, 3)) / count) / medians
     return torch.log(log_error + 0.5 * error + 1e-2).mean()
 
@@ -268,8 +280,12 @@ def main() -> None:
     parser.add_argument("--batch", type=int, default=Settings.batch)
     parser.add_argument("--lr", type=float, default=Settings.lr)
     parser.add_argument("--encoder-lr", type=float, default=Settings.encoder_lr)
-    parser.add_argument("--encoder-from", type=float, default=Settings.encoder_from,
-                        help="share of the run after which the deep encoder stages learn too")  # fmt: skip
+    parser.add_argument(
+        "--encoder-from",
+        type=float,
+        default=Settings.encoder_from,
+        help="share of the run after which the deep encoder stages learn too",
+    )
     options = parser.parse_args()
     print(train(Settings(**vars(options) | {"data": tuple(options.data)})))
 

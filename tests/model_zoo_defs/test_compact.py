@@ -29,11 +29,14 @@ def frame(height: int, width: int, count: int, seed: int = 0) -> tuple[Tensor, T
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 5, 500, 20_000])
-def test_depth_is_finite_and_positive_for_any_number_of_points(network: Compact, count: int) -> None:
+def test_depth_is_finite_and_positive_for_any_number_of_points(
+    network: Compact, count: int
+) -> None:
     rgb, sparse = frame(128, 160, count)
     depth = network(rgb, sparse)
     assert depth.shape == (1, 1, 128, 160)
-    assert bool(torch.isfinite(depth).all()) and bool((depth > 0).all())
+    assert bool(torch.isfinite(depth).all())
+    assert bool((depth > 0).all())
 
 
 @pytest.mark.parametrize("pattern", ["row", "column", "corner", "one depth"])
@@ -49,7 +52,8 @@ def test_depth_is_finite_where_the_points_lie_oddly(network: Compact, pattern: s
     else:
         sparse[..., ::7, ::7] = 2.0
     depth = network(rgb, sparse)
-    assert bool(torch.isfinite(depth).all()) and bool((depth > 0).all())
+    assert bool(torch.isfinite(depth).all())
+    assert bool((depth > 0).all())
 
 
 @pytest.mark.parametrize("size", [(32, 32), (32, 256), (224, 64)])

@@ -116,8 +116,10 @@ def test_the_same_state_draws_the_same_points_without_touching_the_depth(seed: i
     second = patterns.draw(np.random.default_rng(seed), depth, depth / 5.0)
     assert np.array_equal(first, second)
     assert np.array_equal(depth, before)
-    assert first.dtype == np.float32 and first.shape == SHAPE
-    assert bool(np.isfinite(first).all()) and bool((first >= 0).all())
+    assert first.dtype == np.float32
+    assert first.shape == SHAPE
+    assert bool(np.isfinite(first).all())
+    assert bool((first >= 0).all())
 
 
 def test_a_sample_depends_on_its_number_alone(shards: Path) -> None:
@@ -149,14 +151,17 @@ def test_a_degraded_picture_is_still_a_picture(seed: int) -> None:
     rgb = torch.rand(3, 32, 48, generator=torch.Generator().manual_seed(seed % 1000))
     found = degraded(np.random.default_rng(seed), rgb)
     assert found.shape == rgb.shape
-    assert 0.0 <= float(found.min()) and float(found.max()) <= 1.0
+    assert float(found.min()) >= 0.0
+    assert float(found.max()) <= 1.0
 
 
 def test_linear_interpolation_of_a_plane_is_the_plane_inside_the_hull() -> None:
     rows, columns = np.indices((20, 30))
     plane = (1.0 + 0.1 * rows + 0.05 * columns).astype(np.float32)
     sparse = np.zeros_like(plane)
-    sparse[0, 0], sparse[0, -1], sparse[-1, 0], sparse[-1, -1] = plane[[0, 0, -1, -1], [0, -1, 0, -1]]
+    sparse[0, 0], sparse[0, -1], sparse[-1, 0], sparse[-1, -1] = plane[
+        [0, 0, -1, -1], [0, -1, 0, -1]
+    ]
     np.testing.assert_allclose(validation.linear_interpolation(sparse), plane, rtol=1e-5)
 
 
@@ -164,7 +169,8 @@ def test_linear_interpolation_of_points_in_a_row_is_the_nearest_point() -> None:
     sparse = np.zeros((9, 9), np.float32)
     sparse[4, 2], sparse[4, 7] = 1.0, 3.0
     dense = validation.linear_interpolation(sparse)
-    assert dense[0, 0] == 1.0 and dense[8, 8] == 3.0
+    assert dense[0, 0] == 1.0
+    assert dense[8, 8] == 3.0
 
 
 def test_the_loss_is_least_for_the_truth_and_blind_to_unknown_depth() -> None:
@@ -224,7 +230,8 @@ def test_a_run_learns_and_going_on_gives_the_bytes_of_an_uninterrupted_run(
     assert train.train(replace(broken, resume=True)).read_bytes() == weights
     with (tmp_path / "whole" / "log.csv").open() as file:
         losses = [float(row["loss"]) for row in csv.DictReader(file)]
-    assert len(losses) == 2 and losses[1] < losses[0]
+    assert len(losses) == 2
+    assert losses[1] < losses[0]
     assert (tmp_path / "whole" / "val.csv").exists()
 
 
