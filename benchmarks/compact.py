@@ -70,7 +70,7 @@ def measure_frame(
     result = refine_frame(
         network,
         layer_name(network.definition, settings.layer),
-        effective_settings(network.definition.defaults, request),
+        effective_settings(network.definition, request),
         inputs,
         points,
         points.select(torch.zeros(len(points), dtype=torch.bool)),
