@@ -56,13 +56,21 @@ def test_a_network_file_knows_nothing_of_the_program_but_the_definition_contract
 
 
 def test_core_and_models_read_no_files_through_cv2_and_io_needs_no_torch() -> None:
-    for package, forbidden in (("core", {"cv2", "numpy"}), ("io", {"torch"}), ("models", {"cv2"})):
+    for package, forbidden in (
+        ("core", {"cv2", "numpy"}),
+        ("io", {"torch"}),
+        ("models", {"cv2"}),
+        ("sensors", {"torch"}),
+    ):
         for file in (PACKAGE / package).rglob("*.py"):
             tops = {name.split(".")[0] for name in imported_modules(file)}
             assert not tops & forbidden, file
 
 
-@pytest.mark.parametrize("command", [[], ["refine"], ["models"], ["layers"]])
+COMMANDS = ("refine", "models", "layers", "project", "sample", "simulate")
+
+
+@pytest.mark.parametrize("command", [[], *([name] for name in COMMANDS)])
 def test_help_imports_neither_torch_nor_numpy_nor_rich(command: list[str]) -> None:
     code = (
         "import sys\n"

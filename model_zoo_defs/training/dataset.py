@@ -110,8 +110,18 @@ def augmented(
         picture, distance = picture.flip(-1), distance.flip(-1)
     distance = distance * float(np.exp(rng.uniform(np.log(0.5), np.log(2.0))))
     sparse = draw(rng, distance.numpy(), picture.mean(0).numpy())
+    if rng.random() < 0.15:
+        # colour and depth cameras that are not quite registered
+        picture = _shifted(picture, int(rng.integers(-2, 3)), int(rng.integers(-3, 4)))
     picture = degraded(rng, misregistered(rng, picture))
     return Sample(normalised(picture), torch.from_numpy(sparse)[None], distance[None])
+
+
+def _shifted(picture: Tensor, down: int, right: int) -> Tensor:
+    """The picture moved by whole pixels, its border repeated."""
+    height, width = picture.shape[-2:]
+    padded = F.pad(picture[None], (3, 3, 3, 3), mode="replicate")[0]
+    return padded[:, 3 - down : 3 - down + height, 3 - right : 3 - right + width]
 
 
 def _zoomed_part(

@@ -151,7 +151,7 @@ def faults(rng: Generator, sparse: Depth) -> Depth:
         wrong = mask & (rng.random(sparse.shape) < share)
         out[wrong] *= np.exp(rng.normal(0.0, 0.7, int(wrong.sum()))).astype(np.float32)
     out = np.where(mask, np.maximum(out, np.float32(1e-3)), np.float32(0.0))
-    if rng.random() < 0.25:
+    if rng.random() < 0.1:
         out = _shifted(out, int(rng.integers(-2, 3)), int(rng.integers(-2, 3)))
     return out
 

@@ -15,7 +15,6 @@ import time
 from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
 import torch
@@ -49,11 +48,8 @@ class Settings:
     lanes: int = 2
     size: tuple[int, int] = (192, 256)
     lr: float = 1e-3
-    encoder_lr: float = 1e-4
-    tuned_stages: tuple[str, ...] = ("s16", "s32")
-    encoder_from: float = 0.5
     save_every: int = 500
-    val_frames: int = 40
+    val_frames: int = 24
     pretrained: bool = True
     workers: int = 1
     resume: bool = False
@@ -69,20 +65,14 @@ class Run:
         self.network = Compact().to(self.device)
         if settings.pretrained:
             self.network.encoder.load_state_dict(pretrained_encoder())
+        # Photographs are what the encoder knows and rendered frames are not: it stays as it is.
         self.network.encoder.requires_grad_(False)
-        self.inside = [
-            p for level in settings.tuned_stages for p in self._stage(level).parameters()
-        ]
-        self.outside = [p for p in self.network.parameters() if p.requires_grad]
+        self.learnt = [p for p in self.network.parameters() if p.requires_grad]
         self.average = Compact().to(self.device)
         self.average.load_state_dict(self.network.state_dict())
         for network in (self.network, self.average):
             _channels_last(network)
-        groups = [
-            {"params": self.outside, "peak": settings.lr},
-            {"params": self.inside, "peak": settings.encoder_lr},
-        ]
-        self.optimiser = torch.optim.AdamW(groups, lr=settings.lr, weight_decay=1e-2)
+        self.optimiser = torch.optim.AdamW(self.learnt, lr=settings.lr, weight_decay=1e-2)
         # On a CPU two halves of a batch on a thread each beat one batch on two threads: they wait
         # for each other once a step, not at every operation.
         self.lanes = 1 if self.device.type == "cuda" else min(settings.lanes, settings.batch)
@@ -90,15 +80,6 @@ class Run:
         if self.lanes > 1:
             torch.set_num_threads(1)
         self.step, self.elapsed_s = 0, 0.0
-
-    @property
-    def learnt(self) -> list[nn.Parameter]:
-        """What the optimiser moves now; the deep encoder stages join late, the rest never does."""
-        late = self.settings.encoder_from <= self.progress
-        return self.outside + (self.inside if late else [])
-
-    def _stage(self, level: str) -> nn.Module:
-        return self.network.encoder.get_submodule(f"stages.{level}")
 
     @property
     def progress(self) -> float:
@@ -112,16 +93,13 @@ class Run:
         factor = min(1.0, (self.step + 1) / WARM_UP_STEPS)
         factor *= 0.5 * (1.0 + math.cos(math.pi * self.progress))
         for group in self.optimiser.param_groups:
-            group["lr"] = group["peak"] * factor
-        learnt = self.learnt
-        for parameter in learnt:
-            parameter.requires_grad_()
+            group["lr"] = self.settings.lr * factor
         parts = [Sample(*part) for part in zip(*(x.chunk(self.lanes) for x in sample), strict=True)]
-        results = list(self.pool.map(partial(self._loss_and_gradients, learnt), parts))
+        results = list(self.pool.map(self._loss_and_gradients, parts))
         gradients = zip(*(found for _, found in results), strict=True)
-        for parameter, pieces in zip(learnt, gradients, strict=True):
+        for parameter, pieces in zip(self.learnt, gradients, strict=True):
             parameter.grad = torch.stack(pieces).mean(0) if len(pieces) > 1 else pieces[0]
-        nn.utils.clip_grad_norm_(learnt, 1.0)
+        nn.utils.clip_grad_norm_(self.learnt, 1.0)
         self.optimiser.step()
         self.step += 1
         # young averages follow faster, or the first export would be the initial weights
@@ -132,16 +110,14 @@ class Run:
             )
         return float(sum(loss for loss, _ in results) / len(results))
 
-    def _loss_and_gradients(
-        self, learnt: list[nn.Parameter], part: Sample
-    ) -> tuple[float, tuple[Tensor, ...]]:
+    def _loss_and_gradients(self, part: Sample) -> tuple[float, tuple[Tensor, ...]]:
         torch.set_num_threads(1)  # a setting of the thread it is called in
         rgb, sparse, depth = (x.to(self.device) for x in part)
         rgb = rgb.contiguous(memory_format=torch.channels_last)
         with torch.autocast(self.device.type, torch.bfloat16):
             depths = self.network.pyramid(rgb, sparse)
         loss = pyramid_loss(depths, depth)
-        return float(loss.detach()), torch.autograd.grad(loss, learnt)
+        return float(loss.detach()), torch.autograd.grad(loss, self.learnt)
 
     def save(self) -> None:
         """state.pt and compact.safetensors hold this moment, whole or not at all."""
@@ -279,13 +255,6 @@ def main() -> None:
     parser.add_argument("--resume", action="store_true", help="go on from RUN_DIR/state.pt")
     parser.add_argument("--batch", type=int, default=Settings.batch)
     parser.add_argument("--lr", type=float, default=Settings.lr)
-    parser.add_argument("--encoder-lr", type=float, default=Settings.encoder_lr)
-    parser.add_argument(
-        "--encoder-from",
-        type=float,
-        default=Settings.encoder_from,
-        help="share of the run after which the deep encoder stages learn too",
-    )
     options = parser.parse_args()
     print(train(Settings(**vars(options) | {"data": tuple(options.data)})))
 

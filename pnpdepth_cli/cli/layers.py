@@ -10,7 +10,6 @@ from typing import Any
 import click
 
 from pnpdepth_cli.cli import options
-from pnpdepth_cli.errors import UsageError
 
 
 @click.command(short_help="List the layers a network can be cut at.")
@@ -48,7 +47,7 @@ def layers(
             checkpoint,
             device,
             every=every,
-            size=_height_and_width(size) if size else None,
+            size=options.height_and_width(size) if size else None,
             on_layer=show,
         )
     if as_json:
@@ -74,10 +73,3 @@ def _cells(row: dict[str, Any]) -> tuple[str, ...]:
         "{}×{}".format(*row["field_in_z"]) if row["field_in_z"] else "–",
         "{}×{}".format(*row["field_in_output"]),
     )
-
-
-def _height_and_width(text: str) -> tuple[int, int]:
-    height, x, width = text.lower().partition("x")
-    if not (x and height.isdigit() and width.isdigit() and int(height) and int(width)):
-        raise UsageError(f"size {text!r} is not of the form HxW, such as 480x640")
-    return int(height), int(width)

@@ -10,7 +10,10 @@ import click
 from pnpdepth_cli import __version__
 from pnpdepth_cli.cli.layers import layers
 from pnpdepth_cli.cli.models import models
+from pnpdepth_cli.cli.project import project
 from pnpdepth_cli.cli.refine import refine
+from pnpdepth_cli.cli.sample import sample
+from pnpdepth_cli.cli.simulate import simulate
 from pnpdepth_cli.errors import PnpDepthError
 
 _EXIT_CODES = """\b
@@ -27,6 +30,9 @@ def cli() -> None:
 cli.add_command(refine)
 cli.add_command(models)
 cli.add_command(layers)
+cli.add_command(project)
+cli.add_command(sample)
+cli.add_command(simulate)
 
 
 def main(arguments: list[str] | None = None) -> Any:

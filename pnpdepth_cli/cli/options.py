@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import click
+
+from pnpdepth_cli.errors import UsageError
 
 FILE = click.Path(path_type=Path)
 
@@ -12,8 +16,9 @@ model = click.option(
     "--model",
     default="compact",
     show_default=True,
-    metavar="NAME|FILE.py[:ATTR]",
-    help="A network that `pnpdepth models` lists, or a Python file with a definition.",
+    metavar="NAME|FILE|FOLDER",
+    help="A network that `pnpdepth models` lists; FILE.py[:ATTR] with a definition or a torch"
+    " module; FILE.onnx[:OUTPUT]; FILE.pt2; or a Hugging Face folder.",
 )
 checkpoint = click.option(
     "--checkpoint", type=FILE, help="Its weights: .safetensors, or a torch file of tensors only."
@@ -24,5 +29,115 @@ layer = click.option(
     help="Where to cut: a submodule's name (NAME#2 its second call, NAME[KEY] one of several"
     " outputs), or a share of the definition's layers, 0 the shallowest.",
 )
+ALIGNMENTS = ("none", "median", "scale", "affine", "auto")
+OUTPUT_KINDS = ("depth", "inverse", "log")
+NORMALISATIONS = ("unit", "imagenet", "symmetric", "bytes")
+
+_READING_OPTIONS = (
+    click.option(
+        "--align",
+        type=click.Choice(ALIGNMENTS),
+        help="Fit the network's output to the points: a factor, or a factor and a shift."
+        "  [default: the network's own; none where it gives metres]",
+    ),
+    click.option("--align-every", is_flag=True, help="Fit again at every update of z."),
+    click.option(
+        "--output-kind",
+        type=click.Choice(OUTPUT_KINDS),
+        help="What the network's output is, over what is known of it.",
+    ),
+    click.option(
+        "--normalise",
+        type=click.Choice(NORMALISATIONS),
+        help="The rgb that the network wants: 0…1, ImageNet's, −1…1, 0…255.",
+    ),
+)
+
+
+def reading(command: Callable[..., Any]) -> Callable[..., Any]:
+    """The command has the options of how a network's input and output are to be read."""
+    for option in reversed(_READING_OPTIONS):
+        command = option(command)
+    return command
+
+
 device = click.option("--device", default="cpu", show_default=True, help="cpu, cuda, cuda:1, mps …")
 as_json = click.option("--json", "as_json", is_flag=True, help="Print the result as JSON.")
+overwrite = click.option("--overwrite", is_flag=True, help="Replace results that exist.")
+depth_scale = click.option(
+    "--depth-scale",
+    type=float,
+    metavar="S",
+    help="Integer depth files hold metres × S.  [default: what the file says, else 256]",
+)
+channel = click.option(
+    "--channel", metavar="NAME", help="Which EXR channel or NPZ array holds the depth."
+)
+output_scale = click.option(
+    "--output-scale",
+    type=float,
+    default=256.0,
+    show_default=True,
+    metavar="S",
+    help="A PNG holds metres × S.",
+)
+sparse_output = click.option(
+    "-o",
+    "--output",
+    type=FILE,
+    required=True,
+    help="Sparse depth: PNG, EXR, NPY, NPZ, PFM, TIFF; or CSV, points x y depth.",
+)
+camera = click.option(
+    "--camera", type=int, metavar="N", help="Of KITTI's four, 0 to 3.  [default: 2]"
+)
+euclidean = click.option(
+    "--range", "euclidean", is_flag=True, help="Depth is the distance from the camera, not z."
+)
+max_range = click.option(
+    "--max-range", type=float, metavar="M", help="Drop points farther from the scanner, metres."
+)
+
+_SCAN_OPTIONS = (
+    click.option(
+        "--calib",
+        type=FILE,
+        metavar="FILE|FOLDER",
+        help="For a LiDAR scan: KITTI's calibration, its raw folder, or a file with K, R and t.",
+    ),
+    camera,
+    euclidean,
+    click.option(
+        "--keep-occluded",
+        is_flag=True,
+        help="Keep a scan's points that the camera sees something nearer in front of.",
+    ),
+    click.option(
+        "--min-range", type=float, default=0.0, metavar="M", help="Drop nearer points of a scan."
+    ),
+    max_range,
+)
+
+
+def scan(command: Callable[..., Any]) -> Callable[..., Any]:
+    """The command has the options of a LiDAR scan; `scan_given` takes them out of the rest."""
+    for option in reversed(_SCAN_OPTIONS):
+        command = option(command)
+    return command
+
+
+def scan_given(given: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """(the options of a LiDAR scan, the others) of what the user gave."""
+    names = ("calib", "camera", "euclidean", "keep_occluded", "min_range", "max_range")
+    return (
+        {name: given[name] for name in names},
+        {name: value for name, value in given.items() if name not in names},
+    )
+
+
+def height_and_width(text: str) -> tuple[int, int]:
+    """(H, W) of a text such as 480x640. UsageError for any other."""
+    height, x, width = text.lower().partition("x")
+    if not (x and height.isdecimal() and width.isdecimal() and int(height) and int(width)):
+        raise UsageError(f"size {text!r} is not of the form HxW, such as 480x640")
+    return int(height), int(width)

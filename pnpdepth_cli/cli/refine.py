@@ -25,8 +25,10 @@ FORMATS = ("png", "exr", "npy", "npz", "pfm", "tiff")
     "--sparse",
     type=options.FILE,
     required=True,
-    help="Sparse depth: PNG (16 bit), EXR, NPY, NPZ, PFM, TIFF; or points x y depth as NPY, CSV.",
+    help="Sparse depth: PNG (16 bit), EXR, NPY, NPZ, PFM, TIFF; points x y depth as NPY, CSV;"
+    " or with --calib a LiDAR scan: KITTI's BIN, NPY, PCD, PLY.",
 )
+@options.scan
 @click.option("--gt", type=options.FILE, help="Ground truth: scores and an improvement map.")
 @click.option(
     "-o",
@@ -42,7 +44,7 @@ FORMATS = ("png", "exr", "npy", "npz", "pfm", "tiff")
     show_default=True,
     help="Of the depth file in a folder.",
 )
-@click.option("--overwrite", is_flag=True, help="Replace results that exist.")
+@options.overwrite
 @options.model
 @options.checkpoint
 @options.layer
@@ -53,15 +55,11 @@ FORMATS = ("png", "exr", "npy", "npz", "pfm", "tiff")
     "--lr", metavar="NUMBER|P%", help="Step: absolute, or per cent of z's standard deviation."
 )
 @click.option("--loss", type=click.Choice(LOSSES), help="Between prediction and sparse points.")
+@options.reading
 @click.option("--update", type=click.Choice(UPDATES), help="From gradient to step.")
-@click.option(
-    "--depth-scale",
-    type=float,
-    metavar="S",
-    help="Integer depth files hold metres × S.  [default: what the file says, else 256]",
-)
+@options.depth_scale
 @click.option("--gt-scale", type=float, metavar="S", help="The same for --gt.")
-@click.option("--channel", metavar="NAME", help="Which EXR channel or NPZ array holds the depth.")
+@options.channel
 @click.option("--sparse-size-ok", is_flag=True, help="Map points of a sparse map of another size.")
 @click.option(
     "--holdout",
@@ -81,6 +79,7 @@ def refine(as_json: bool, format_: str, **given: Any) -> None:
     pnpdepth refine img.png --sparse s.exr --gt gt.png -o out/
     pnpdepth refine img.png --sparse s.npy --model my_net.py --checkpoint my_net.pt \\
              --layer decoder.up1 --iterations 10 --lr 0.02 --loss l2 --update adam -o depth.exr
+    pnpdepth refine 000001.png --sparse 000001.bin --calib 000001.txt
 
     Writes into the output folder: <name>_depth.png (16 bit; the scale is in the file),
     <name>_preview.png, <name>_improvement.png (red better, green worse) and <name>.json.
@@ -88,9 +87,12 @@ def refine(as_json: bool, format_: str, **given: Any) -> None:
     from pnpdepth_cli.cli.tables import print_refinement
     from pnpdepth_cli.pipeline.refine import refine_image
     from pnpdepth_cli.pipeline.request import RefineRequest
+    from pnpdepth_cli.pipeline.scans import ScanOptions
 
+    scan, others = options.scan_given(given)
+    request = RefineRequest(format=format_, scan=ScanOptions(**scan), **others)
     with _SlowBar() as bar:
-        outcome = refine_image(RefineRequest(format=format_, **given), on_iteration=bar.show)
+        outcome = refine_image(request, on_iteration=bar.show)
     if as_json:
         click.echo(json.dumps(outcome.record, indent=2))
     else:

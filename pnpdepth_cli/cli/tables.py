@@ -24,9 +24,7 @@ _SCORES: tuple[tuple[str, str, Callable[[float], str]], ...] = (
 def print_refinement(record: Mapping[str, Any]) -> None:
     """The end of `pnpdepth refine`: what was assumed, errors before and after, files, time."""
     console = Console(stderr=True, highlight=False)
-    for note in record["notes"]:
-        style = "yellow" if note.startswith("warning") else "dim"
-        console.print(escape(note), style=style, soft_wrap=True)
+    _print_notes(console, record["notes"])
     settings, points = record["settings"], record["points"]
     table = Table(title=escape(f"{record['model']['name']} cut at {settings['layer']}"))
     for column in ("", "before", "after", "change"):
@@ -57,6 +55,19 @@ def print_refinement(record: Mapping[str, Any]) -> None:
     console.print("wrote " + escape("  ".join(written)), soft_wrap=True)
 
 
+def print_sparse(record: Mapping[str, Any]) -> None:
+    """The end of `pnpdepth project`, `sample` and `simulate`: what was read, and what came out."""
+    console = Console(stderr=True, highlight=False)
+    _print_notes(console, record["notes"])
+    points, (width, height) = record["points"], record["size"]
+    written = [path for path in record["outputs"].values() if path]
+    console.print(
+        f"wrote {points['count']:,} points, {points['share_of_pixels']:.2%} of {width}×{height}"
+        f" pixels: {escape('  '.join(written))}",
+        soft_wrap=True,
+    )
+
+
 def print_rows(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
     """A table of text on stdout."""
     console = Console(highlight=False)
@@ -66,6 +77,12 @@ def print_rows(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]
     for row in rows:
         table.add_row(*(escape(cell) for cell in row))
     console.print(table)
+
+
+def _print_notes(console: Console, notes: Sequence[str]) -> None:
+    for note in notes:
+        style = "yellow" if note.startswith("warning") else "dim"
+        console.print(escape(note), style=style, soft_wrap=True)
 
 
 def _point_rows(table: Table, title: str, error: Mapping[str, Any] | None) -> None:

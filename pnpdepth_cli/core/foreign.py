@@ -29,13 +29,14 @@ def describe(error: BaseException, file: Path | None = None) -> str:
     """The exception on one line, with the line of `file` it came through, if it did."""
     text = " ".join(str(error).split())[:300]
     frames = traceback.extract_tb(error.__traceback__)
-    lines = [f.lineno for f in frames if file is not None and Path(f.filename) == file]
+    lines = [f.lineno for f in frames if file and Path(f.filename).resolve() == file.resolve()]
     place = f" (line {lines[-1]})" if lines else ""
     return f"{type(error).__name__}: {text}{place}" if text else f"{type(error).__name__}{place}"
 
 
 def is_out_of_memory(error: BaseException) -> bool:
     """True for the several ways torch and Python say so."""
-    return isinstance(error, torch.OutOfMemoryError | MemoryError) or (
-        isinstance(error, RuntimeError) and "can't allocate memory" in str(error)
+    said = ("out of memory", "can't allocate memory", "ALLOC_FAILED")
+    return isinstance(error, torch.cuda.OutOfMemoryError | MemoryError) or (
+        isinstance(error, RuntimeError) and any(words in str(error) for words in said)
     )

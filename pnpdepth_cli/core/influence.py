@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from pnpdepth_cli.core.split import Split
+from pnpdepth_cli.core.split import Split, gradient_at
 
 _PLACES = ((0.5, 0.5), (0.35, 0.4), (0.65, 0.6))
 """Where points are tried, as shares of height and width; dead units can hide a part at one."""
@@ -51,10 +51,12 @@ def _at(
         depth = depth_of(split.rear(z))
         height, width = depth.shape[-2:]
         point = depth[..., int(height * place[0]), int(width * place[1])].sum()
-    gradient = torch.autograd.grad(point, z)[0] if point.requires_grad else torch.zeros_like(z)
-    with torch.no_grad():
+        gradient = gradient_at(z, point)
+        if gradient is None:
+            gradient = torch.zeros_like(z)
+        # Like for like: without gradients torch may take another kernel, which rounds differently.
         moved = z.detach() + z.detach().std(correction=0) * gradient.sign()
-        changed = depth_of(split.rear(moved)) != depth.detach()
+        changed = depth_of(split.rear(moved.requires_grad_(True))).detach() != depth.detach()
     return InfluentialField(_extent(gradient != 0) if z.ndim == 4 else None, _extent(changed))
 
 

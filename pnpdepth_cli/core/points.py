@@ -61,7 +61,8 @@ class SparsePoints:
         fx, fy = x - left, y - top
         if not bool((fx != 0).any()) and not bool((fy != 0).any()):
             return flat[top * width + left]
-        right, bottom = (left + 1).clamp(max=width - 1), (top + 1).clamp(max=height - 1)
+        # On the grid both neighbours are one: a pixel without weight may be infinite.
+        right, bottom = x.ceil().long(), y.ceil().long()
         upper = flat[top * width + left] * (1 - fx) + flat[top * width + right] * fx
         lower = flat[bottom * width + left] * (1 - fx) + flat[bottom * width + right] * fx
         return upper * (1 - fy) + lower * fy
@@ -69,8 +70,10 @@ class SparsePoints:
     def scatter(self) -> Tensor:
         """(1, 1, H, W) metres, 0 = unknown: each point on its nearest pixel, nearest point wins."""
         height, width = self.size
-        x, y = self.xy[:, 0].round().long(), self.xy[:, 1].round().long()
-        inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
+        x, y = self.xy[:, 0], self.xy[:, 1]
+        inside = (x >= -0.5) & (x <= width - 0.5) & (y >= -0.5) & (y <= height - 0.5)
+        column, row = x.round().clamp(0, width - 1), y.round().clamp(0, height - 1)
         flat = self.depth.new_full((height * width,), torch.inf)
-        flat.scatter_reduce_(0, (y * width + x)[inside], self.depth[inside], "amin")
+        places = row.long() * width + column.long()
+        flat.scatter_reduce_(0, places[inside], self.depth[inside], "amin")
         return torch.where(flat.isinf(), 0.0, flat).reshape(1, 1, height, width)

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from pnpdepth_cli.core.losses import LOSSES
 from pnpdepth_cli.core.points import SparsePoints
-from pnpdepth_cli.core.split import Split
+from pnpdepth_cli.core.split import Split, gradient_at
 from pnpdepth_cli.core.updates import UPDATES
 from pnpdepth_cli.errors import DivergedError, LayerError, UsageError
 
@@ -29,12 +29,16 @@ class RefineSettings:
 
     iterations: the number of updates of z, 0 for the plain prediction.
     lr: α as a number, or a text like "3%": that share of the standard deviation of z_0.
+    align, align_every: how `depth_of` was asked to fit the network's numbers to metres, and
+        whether again for every z; see `pnpdepth_cli.core.alignment`.
     """
 
     iterations: int = 5
     lr: float | str = 0.01
     loss: str = "l1"
     update: str = "sign"
+    align: str = "none"
+    align_every: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,8 +83,7 @@ def refine(
         with torch.enable_grad():
             depth = depth_of(split.rear(z))
             loss = loss_of(points.sample(depth), points.depth)
-        _check_reaches(loss, split)
-        gradient = torch.autograd.grad(loss, z)[0]
+        gradient = _gradient(loss, z, split)
         finite = bool(loss.isfinite())
         if finite:
             depths = [*depths[:1], depth.detach()]
@@ -112,13 +115,15 @@ def step_size(lr: float | str, z0: Tensor) -> float:
     return value / 100 * float(z0.float().std(correction=0)) if text.endswith("%") else value
 
 
-def _check_reaches(loss: Tensor, split: Split) -> None:
-    if not loss.requires_grad:
+def _gradient(loss: Tensor, z: Tensor, split: Split) -> Tensor:
+    gradient = gradient_at(z, loss)
+    if gradient is None:
         raise LayerError(
             f"layer {split.layer!r}: no gradient comes back from the prediction to it; either the"
             " prediction does not depend on it or the network's forward runs under"
             " torch.no_grad, inference_mode or detach (take that out, or cut at a later layer)"
         )
+    return gradient
 
 
 def _diverged(

@@ -16,11 +16,9 @@ from __future__ import annotations
 
 import difflib
 import functools
-import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from types import TracebackType
 from typing import Any
 
@@ -28,29 +26,11 @@ import torch
 from torch import Tensor, nn
 
 from pnpdepth_cli.core.foreign import blaming
+from pnpdepth_cli.core.layer_name import LayerName
+from pnpdepth_cli.core.state import NetworkState
 from pnpdepth_cli.core.structure import map_tensors, tensors_in
-from pnpdepth_cli.core.watch import Call, Remembered, Watch
+from pnpdepth_cli.core.watch import Call, Watch
 from pnpdepth_cli.errors import LayerError
-
-
-@dataclass(frozen=True)
-class LayerName:
-    """A place to cut: `module`, `module#2` for its second call, `module[key]` for one output."""
-
-    module: str
-    call: int | None = None
-    key: tuple[str, ...] | None = None
-
-    @classmethod
-    def parse(cls, text: str) -> LayerName:
-        """The name in its parts. LayerError if it has no such form."""
-        match = re.fullmatch(
-            r"(?P<module>[^#\[\]]*)(?:#(?P<call>\d+))?(?P<keys>(?:\[[^\[\]]+\])*)", text
-        )
-        if match is None or match["call"] == "0":
-            raise LayerError(f"layer {text!r}: the form is NAME, NAME#CALL or NAME[OUTPUT]")
-        keys = tuple(re.findall(r"\[([^\[\]]+)\]", match["keys"]))
-        return cls(match["module"], int(match["call"]) if match["call"] else None, keys or None)
 
 
 class _CutReached(BaseException):
@@ -94,7 +74,7 @@ class Split:
 
     def __enter__(self) -> Split:
         modules = list(self._network.modules())
-        self._state = _State(self._network)
+        self._state = NetworkState(self._network)
         self._forwards = [(module, module.__dict__.get("forward")) for module in modules]
         try:
             self._network.eval()
@@ -146,6 +126,11 @@ class Split:
                 output = self._run()
             if self._name.call is None and self._counts[self._cut] > 1:
                 raise LayerError(_several_calls(self.layer, self._counts[self._cut]))
+            if watch.torn:
+                raise LayerError(
+                    f"layer {self.layer!r}: its output lies in the memory of an earlier tensor, and"
+                    " the network changes one in place and reads the other; cut one layer later"
+                )
         except BaseException:
             del self._calls[known:]
             raise
@@ -243,9 +228,11 @@ class Split:
 
     def _choose(self, output: Any) -> Tensor:
         found = [
-            (path, tensor) for path, tensor in tensors_in(output) if tensor.is_floating_point()
+            (path, tensor)
+            for path, tensor in tensors_in(output)
+            if tensor.is_floating_point() and tensor.layout == torch.strided
         ]
-        names = ", ".join(_output_name(self._name.module, path) for path, _ in found)
+        names = ", ".join(self._name.of_output(path) for path, _ in found)
         if self._name.key is None and len(found) == 1:
             self._path, z = found[0]
         elif self._name.key is None:
@@ -264,10 +251,12 @@ class Split:
         assert self._z is not None
         assert self._cut_call is not None
         z = self._z.clone()
-        if self._watch is not None:
-            self._watch.touch(z)
         # What the layer does besides, such as changing its input in place, is done again.
         output = self._cut_call.hand_back() if self._cut_call.kept else run()
+        if self._watch is not None:
+            self._watch.touch(z)
+            if not self._cut_call.kept:
+                self._watch.replace(dict(tensors_in(output))[self._path], z)
         return map_tensors(output, lambda path, t: z if path == self._path else t)
 
     def _never_ran(self) -> str:
@@ -283,39 +272,15 @@ class Split:
         return f"layer {self.layer!r} never runs in this network's forward; {hint}"
 
 
-class _State:
-    """What a network is beside its code, to be put back."""
+def gradient_at(z: Tensor, value: Tensor) -> Tensor | None:
+    """∂value/∂z for a fresh leaf z; None where no gradient comes back to it.
 
-    def __init__(self, network: nn.Module) -> None:
-        self.tensors = [Remembered(t) for t in (*network.parameters(), *network.buffers())]
-        self._originals = [remembered.output for remembered in self.tensors]
-        self._learning = [(p, p.requires_grad) for p in network.parameters()]
-        # Frozen torch scripts have neither a mode nor buffers that can be set.
-        modules = [m for m in network.modules() if not isinstance(m, torch.jit.ScriptModule)]
-        self._buffers = [(m, dict(m._buffers)) for m in modules]
-        self._modes = [(m, m.training) for m in network.modules() if hasattr(m, "training")]
-
-    def freeze(self) -> None:
-        """No parameter asks for a gradient."""
-        for parameter, _ in self._learning:
-            parameter.requires_grad_(False)
-
-    def restore(self) -> None:
-        """Parameters and buffers that the network changed have their old values."""
-        for module, buffers in self._buffers:
-            module._buffers.update(buffers)
-        with torch.no_grad():
-            for original, saved in zip(self._originals, self.tensors, strict=True):
-                if saved.copied:
-                    original.copy_(saved.output)
-
-    def close(self) -> None:
-        """All of it is as before."""
-        self.restore()
-        for parameter, requires_grad in self._learning:
-            parameter.requires_grad_(requires_grad)
-        for module, training in self._modes:
-            module.training = training
+    ModelError if the network cannot be differentiated.
+    """
+    if value.requires_grad:
+        with blaming("the gradient of the network"):
+            value.backward()  # type: ignore[no-untyped-call]
+    return z.grad
 
 
 def _around_hooks(modules: dict[str, nn.Module]) -> set[nn.Module]:
@@ -331,10 +296,6 @@ def _is_within(name: str, part: str) -> bool:
 def _same_tensors(one: Iterable[tuple[Any, Tensor]], other: Iterable[tuple[Any, Tensor]]) -> bool:
     """False where a call has changed the lists or dicts it was given."""
     return [(path, id(tensor)) for path, tensor in one] == [(p, id(t)) for p, t in other]
-
-
-def _output_name(module: str, path: tuple[str, ...]) -> str:
-    return module + "".join(f"[{key}]" for key in path)
 
 
 def _several_calls(layer: str, calls: int) -> str:

@@ -56,6 +56,12 @@ class Watch(TorchDispatchMode):
     Python, and gives a remembered tensor its own copy just before it would be changed in place.
     """
 
+    @classmethod
+    def _should_skip_dynamo(cls) -> bool:
+        # Torch's own mark for modes that need no guard from torch.compile; the guard would import
+        # the whole compiler, a second in every run of the program.
+        return False
+
     def __init__(self, remembered: Iterable[Remembered]) -> None:
         super().__init__()  # type: ignore[no-untyped-call]
         self.data_dependent = False
@@ -65,6 +71,9 @@ class Watch(TorchDispatchMode):
         self._made: dict[int, int] = {}
         self._marked: set[int] = set()
         self._protected: dict[int, list[Remembered]] = {}
+        self._twins: tuple[Tensor, ...] = ()
+        self._stale: set[int] = set()  # storages of a twin whose other was changed
+        self.torn = False
         for each in remembered:
             self.protect(each)
 
@@ -72,6 +81,10 @@ class Watch(TorchDispatchMode):
         """Mark a tensor as depending on z."""
         self._touches += 1
         self._marked.add(_storage(tensor))
+
+    def replace(self, original: Tensor, z: Tensor) -> None:
+        """z stands for `original`; `torn` turns true if one is read after the other is changed."""
+        self._twins = (original, z)
 
     def protect(self, remembered: Remembered) -> None:
         """Save these tensors from in-place operations."""
@@ -125,10 +138,11 @@ class Watch(TorchDispatchMode):
     ) -> Any:
         kwargs = kwargs or {}
         self._operations += 1
+        given = [t for value in (*args, *kwargs.values()) for t in _tensors(value)]
+        self.torn |= bool(self._stale) and any(_storage(tensor) in self._stale for tensor in given)
         written = list(_written(func._schema, args, kwargs))
         for tensor in written:
             self._before_write(tensor)
-        given = [t for value in (*args, *kwargs.values()) for t in _tensors(value)]
         marked = bool(self._marked) and any(map(self._is_marked, given))
         result = func(*args, **kwargs)
         results = {_storage(tensor) for tensor in _tensors(result)}
@@ -147,6 +161,9 @@ class Watch(TorchDispatchMode):
     def _before_write(self, tensor: Tensor) -> None:
         storage = _storage(tensor)
         self._writes.append(self._made.get(storage, 0))
+        twins = {_storage(twin) for twin in self._twins}
+        if storage in twins:
+            self._stale |= twins - {storage}
         for remembered in self._protected.pop(storage, []):
             remembered.output = map_tensors(remembered.output, lambda _, t: t.clone())
             remembered.copied = True

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -24,11 +25,17 @@ DEPTH_SUFFIXES = (".png", ".exr", ".npy", ".npz", ".pfm", ".tif", ".tiff")
 """What `write_depth` can write; the first holds whole codes, the others float32 metres."""
 
 
-def write_depth(path: Path, depth: NDArray[np.float32], *, scale: float = KITTI_SCALE) -> None:
+def write_depth(
+    path: Path,
+    depth: NDArray[np.float32],
+    *,
+    scale: float = KITTI_SCALE,
+    text: Mapping[str, str] | None = None,
+) -> None:
     """`path` holds the (H, W) metres in the format of its suffix; not finite or <= 0 is 0.
 
-    `scale` is the codes per metre of a PNG, which keeps it in the file. Raises OutputError
-    when a depth is too large for 16 bits or so small that it would become 0, unknown.
+    `scale` is the codes per metre of a PNG, which keeps it and `text` in the file. Raises
+    OutputError when a depth is too large for 16 bits or so small that it would become 0, unknown.
     """
     suffix = path.suffix.lower()
     if suffix not in DEPTH_SUFFIXES:
@@ -45,12 +52,14 @@ def write_depth(path: Path, depth: NDArray[np.float32], *, scale: float = KITTI_
         with atomic_path(path) as temporary:
             write_exr_channel(temporary, "Z", metres)
         return
-    content = _encode(path, suffix, metres, scale)
+    content = _encode(path, suffix, metres, scale, text or {})
     with atomic_path(path) as temporary:
         temporary.write_bytes(content)
 
 
-def _encode(path: Path, suffix: str, metres: NDArray[np.float32], scale: float) -> bytes:
+def _encode(
+    path: Path, suffix: str, metres: NDArray[np.float32], scale: float, text: Mapping[str, str]
+) -> bytes:
     if suffix == ".npy":
         return npy_bytes(metres)
     if suffix == ".npz":
@@ -58,7 +67,8 @@ def _encode(path: Path, suffix: str, metres: NDArray[np.float32], scale: float) 
     if suffix == ".pfm":
         return pfm_bytes(metres)
     if suffix == ".png":
-        return _png_bytes(_codes(path, metres, scale), scale)
+        key_scale = repr(float(scale)).removesuffix(".0")
+        return _png_bytes(_codes(path, metres, scale), {SCALE_KEY: key_scale, **text})
     return _tiff_bytes(metres)
 
 
@@ -80,13 +90,14 @@ def _codes(path: Path, metres: NDArray[np.float32], scale: float) -> NDArray[np.
     return codes.astype(np.uint16)
 
 
-def _png_bytes(codes: NDArray[np.uint16], scale: float) -> bytes:
+def _png_bytes(codes: NDArray[np.uint16], text: Mapping[str, str]) -> bytes:
     from PIL import Image, PngImagePlugin
 
-    text = PngImagePlugin.PngInfo()
-    text.add_text(SCALE_KEY, repr(float(scale)).removesuffix(".0"))
+    chunks = PngImagePlugin.PngInfo()
+    for key, value in text.items():
+        chunks.add_text(key, value)
     buffer = io.BytesIO()
-    Image.fromarray(codes).save(buffer, "PNG", pnginfo=text)
+    Image.fromarray(codes).save(buffer, "PNG", pnginfo=chunks)
     return buffer.getvalue()
 
 

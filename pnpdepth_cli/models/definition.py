@@ -22,7 +22,8 @@ if TYPE_CHECKING:
     from torch import Tensor, nn
 
 InputKind = Literal["rgb", "sparse", "rgb+sparse"]
-OutputKind = Literal["depth", "inverse", "log"]
+OutputKind = Literal["depth", "inverse", "log", "unknown"]
+OutputScale = Literal["metric", "scale", "affine", "unknown"]
 Fit = Literal["stretch", "crop"]
 
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
@@ -55,6 +56,18 @@ class Multiple:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Near:
+    """The picture is resized to sides that are multiples of `of`, about in its own proportions.
+
+    Towards height × width, whichever of the two asks for less change; with neither, its own size.
+    """
+
+    of: int
+    height: int | None = None
+    width: int | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
 class Normalisation:
     """(rgb in 0..1 − mean) / std, per channel; the default hands 0..1 to the network."""
 
@@ -67,7 +80,8 @@ class RefineDefaults:
     """How the network is refined when nobody says otherwise.
 
     `lr` is a number (absolute, as in the paper) or a text like "3%" (of the standard deviation of
-    z_0). `layer` None is the definition's first layer. The values here are the paper's.
+    z_0). `layer` None is the definition's first layer. `align` None is "none" for a metric network
+    and "auto" for any other. The values here are the paper's.
     """
 
     layer: str | None = None
@@ -75,6 +89,11 @@ class RefineDefaults:
     lr: float | str = 0.01
     loss: str = "l1"
     update: str = "sign"
+    align: str | None = None
+
+
+FOREIGN = RefineDefaults(iterations=20, lr="3%", update="adam")
+"""For networks that nobody here has tuned: steps that follow the feature map's own scale."""
 
 
 def _inputs_as_named(
@@ -95,11 +114,14 @@ class ModelDefinition:
     input_kind: what the network looks at.
     size: which picture sizes it takes.
     normalisation: of the rgb input.
-    output_kind: what its numbers are; depth in metres is out, 1/out or exp(out).
+    output_kind: what its numbers are; depth is out, 1/out or exp(out).
+    output_scale: whether that is in metres, or up to a scale, or a scale and a shift, which are
+        then fitted to the sparse points.
     layers: the layers worth cutting at, from shallow to deep (`pnpdepth layers` lists them).
     defaults: the settings of refinement.
     build: makes the network (weights not loaded); called without arguments.
     checkpoint: the weights that come with the definition, or None where the user brings them.
+    complete: `build` gives the network with its weights, `checkpoint` is only where they lie.
     read_checkpoint: renames or reshapes the tensors of a published checkpoint into the state
         dict of the network.
     arguments: how to call the network; given rgb (1, 3, H, W) normalised and sparse depth
@@ -107,28 +129,40 @@ class ModelDefinition:
         returns the positional arguments. Default: in the order of `input_kind`.
     output: picks the prediction, (1, 1, h, w) or (1, h, w), out of what the network returns;
         default: the tensor itself, the only tensor of a structure.
+    verify: called with the network and its arguments for the first frame; returns what to say, or
+        raises ModelError where the network cannot be trusted.
+    normalisation None: which one is decided from the first frame's points.
     """
 
     name: str
     input_kind: InputKind
-    size: Fixed | Multiple
+    size: Fixed | Multiple | Near
     build: Callable[[], nn.Module]
     summary: str = ""
     paper: str = ""
     licence: str = ""
-    normalisation: Normalisation = Normalisation()
+    normalisation: Normalisation | None = Normalisation()
     output_kind: OutputKind = "depth"
+    output_scale: OutputScale = "metric"
     layers: tuple[str, ...] = ()
     defaults: RefineDefaults = RefineDefaults()
     checkpoint: Path | None = None
+    complete: bool = False
     read_checkpoint: Callable[[Mapping[str, Tensor]], Mapping[str, Tensor]] | None = None
     arguments: Callable[[Tensor | None, Tensor | None], tuple[Tensor, ...]] | None = None
     output: Callable[[Any], Tensor] | None = None
+    verify: Callable[[nn.Module, tuple[Tensor, ...]], str] | None = None
 
     @property
     def default_layer(self) -> str | None:
         """The layer to cut at when nobody says otherwise."""
         return self.defaults.layer or (self.layers[0] if self.layers else None)
+
+    @property
+    def default_alignment(self) -> str:
+        """How the output is aligned with the points when nobody says otherwise."""
+        metric = self.output_scale == "metric" and self.output_kind != "unknown"
+        return self.defaults.align or ("none" if metric else "auto")
 
     def call_arguments(self, rgb: Tensor | None, sparse: Tensor | None) -> tuple[Tensor, ...]:
         """The positional arguments of the network for one frame."""

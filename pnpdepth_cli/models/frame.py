@@ -9,7 +9,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from pnpdepth_cli.core.points import SparsePoints
-from pnpdepth_cli.models.definition import Fixed, Multiple
+from pnpdepth_cli.models.definition import Fixed, Multiple, Near
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,7 +26,7 @@ class FrameMap:
     network: tuple[int, int]
 
     @classmethod
-    def fit(cls, size: Fixed | Multiple, height: int, width: int) -> FrameMap:
+    def fit(cls, size: Fixed | Multiple | Near, height: int, width: int) -> FrameMap:
         """The map for an image of this size under a network's size policy."""
         if isinstance(size, Multiple):
             shrink = min(1.0, (size.longest or max(height, width)) / max(height, width))
@@ -35,11 +35,13 @@ class FrameMap:
             return cls(
                 image=(height, width), crop=(0, 0, height, width), resized=resized, network=network
             )
+        if isinstance(size, Near):
+            return _near(size, height, width)
         network = (size.height, size.width)
         crop = (0, 0, height, width)
         if size.fit == "crop":
             scale = min(height / size.height, width / size.width)
-            h, w = round(size.height * scale), round(size.width * scale)
+            h, w = max(1, round(size.height * scale)), max(1, round(size.width * scale))
             crop = ((height - h) // 2, (width - w) // 2, h, w)
         return cls(image=(height, width), crop=crop, resized=network, network=network)
 
@@ -78,6 +80,20 @@ class FrameMap:
         image = depth.new_zeros(self.image)
         image[top : top + height, left : left + width] = depth[0, 0]
         return image
+
+
+def _near(size: Near, height: int, width: int) -> FrameMap:
+    factors = [
+        wanted / own for wanted, own in ((size.height, height), (size.width, width)) if wanted
+    ]
+    factor = min(factors, key=lambda f: abs(1 - f), default=1.0)
+    network = tuple(max(1, round(n * factor / size.of)) * size.of for n in (height, width))
+    return FrameMap(
+        image=(height, width),
+        crop=(0, 0, height, width),
+        resized=(network[0], network[1]),
+        network=(network[0], network[1]),
+    )
 
 
 def _resize(depth: Tensor, size: tuple[int, int]) -> Tensor:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,12 +16,16 @@ from pnpdepth_cli.core.points import SparsePoints
 from pnpdepth_cli.core.structure import tensors_in
 from pnpdepth_cli.errors import CheckpointError, DeviceError, ModelError, UsageError
 from pnpdepth_cli.models.checkpoint import load_checkpoint
-from pnpdepth_cli.models.definition import ModelDefinition
+from pnpdepth_cli.models.definition import Fixed, ModelDefinition, Normalisation
 from pnpdepth_cli.models.frame import FrameMap
+from pnpdepth_cli.models.made_up import made_up_arguments
+from pnpdepth_cli.models.outline import outline
 from pnpdepth_cli.models.registry import find_definition
 
 FARTHEST_DEPTH = 1e4
 """Metres; inverse depth below 1/FARTHEST_DEPTH reads as this depth."""
+
+_OUTLINED = 128  # pixels a side of the frame that layers are looked for with
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,35 +49,53 @@ class Network:
                 raise UsageError(
                     f"network {self.definition.name!r} looks at a picture; name one before --sparse"
                 )
-            normalise = self.definition.normalisation
+            normalise = self.definition.normalisation or Normalisation()
             mean = rgb.new_tensor(normalise.mean).reshape(1, 3, 1, 1)
             std = rgb.new_tensor(normalise.std).reshape(1, 3, 1, 1)
             picture = ((frame.rgb_to_network(rgb) - mean) / std).to(self.device)
         if "sparse" in kind:
             sparse = points.scatter().to(self.device)
         with blaming(f"arguments of network {self.definition.name!r}"):
-            return self.definition.call_arguments(picture, sparse)
+            arguments = self.definition.call_arguments(picture, sparse)
+        if not isinstance(arguments, tuple):
+            raise ModelError(
+                f"arguments of network {self.definition.name!r} gives a"
+                f" {type(arguments).__name__}, where a tuple is expected"
+            )
+        return arguments
 
     def depth_of(self, output: Any) -> Tensor:
-        """Depth (1, 1, h, w) in float32 metres of what the module returns. ModelError if none."""
-        tensor = self._tensor_of(output).float()
+        """Depth (1, 1, h, w) in float32 of what the module returns, taken to be in metres."""
+        tensor = self.raw_of(output)
+        if self.definition.output_kind == "inverse":
+            return tensor.clamp_min(1 / FARTHEST_DEPTH).reciprocal()
+        return tensor.exp() if self.definition.output_kind == "log" else tensor
+
+    def raw_of(self, output: Any) -> Tensor:
+        """The prediction (1, 1, h, w) in float32 as the network gives it. ModelError if none."""
+        given = self._tensor_of(output)
+        tensor = given.float()
         if tensor.ndim == 3:
             tensor = tensor[:, None]
         if tensor.ndim == 2:
             tensor = tensor[None, None]
         if tensor.ndim != 4 or tuple(tensor.shape[:2]) != (1, 1):
             raise ModelError(
-                f"network {self.definition.name!r} gives a tensor of shape {tuple(tensor.shape)},"
+                f"network {self.definition.name!r} gives a tensor of shape {tuple(given.shape)},"
                 " where one depth map (1, 1, h, w) is expected; pick it by the definition's output"
             )
-        if self.definition.output_kind == "inverse":
-            return tensor.clamp_min(1 / FARTHEST_DEPTH).reciprocal()
-        return tensor.exp() if self.definition.output_kind == "log" else tensor
+        return tensor
 
     def _tensor_of(self, output: Any) -> Tensor:
         if self.definition.output is not None:
             with blaming(f"output of network {self.definition.name!r}"):
-                return self.definition.output(output)
+                chosen = self.definition.output(output)
+            if not isinstance(chosen, Tensor):
+                raise ModelError(
+                    f"output of network {self.definition.name!r} gives a"
+                    f" {type(chosen).__name__}, where a tensor is expected"
+                )
+            return chosen
         found: list[tuple[tuple[str, ...], Tensor]] = list(tensors_in(output))
         if len(found) != 1:
             names = ", ".join(".".join(path) for path, _ in found) or "none"
@@ -97,7 +119,13 @@ def load_network(spec: str, checkpoint: Path | None, device: str = "cpu") -> Net
     if not isinstance(module, nn.Module):
         raise ModelError(f"build of {definition.name!r} gives no torch module")
     notes: list[str] = []
-    if path is not None:
+    if definition.complete and checkpoint is not None:
+        raise UsageError(
+            f"network {definition.name!r} comes with its weights; --checkpoint does not go with it"
+        )
+    if definition.complete:
+        notes = []
+    elif path is not None:
         notes = load_checkpoint(module, definition, path)
     elif module.state_dict():
         raise CheckpointError(
@@ -106,8 +134,32 @@ def load_network(spec: str, checkpoint: Path | None, device: str = "cpu") -> Net
     module.eval().requires_grad_(False)
     with out_of_memory_is_a_device_error(on):
         module.to(on)
-    return Network(
+    network = Network(
         definition=definition, module=module, device=on, checkpoint=path, notes=tuple(notes)
+    )
+    return network if definition.layers or definition.defaults.layer else _outlined(network)
+
+
+def _outlined(network: Network) -> Network:
+    """The network with layers to cut at, where its definition lists none."""
+    size = network.definition.size
+    if isinstance(size, Fixed):
+        height, width = size.height, size.width
+    else:
+        height = width = -(-_OUTLINED // size.of) * size.of
+    with out_of_memory_is_a_device_error(network.device):
+        arguments = made_up_arguments(network, FrameMap.fit(size, height, width))
+        layers = outline(network.module, arguments)
+    if not layers:
+        return network
+    return replace(
+        network,
+        definition=replace(network.definition, layers=layers),
+        notes=(
+            *network.notes,
+            f"layers: none are named for {network.definition.name!r}; by their shapes"
+            f" {', '.join(layers)} are worth a cut, the first is the bottleneck",
+        ),
     )
 
 
@@ -115,8 +167,8 @@ def find_device(name: str) -> torch.device:
     """The torch device of that name. DeviceError if it is not there."""
     try:
         device = torch.device(name)
-        torch.empty(1, device=device)
-    except (RuntimeError, AssertionError, NotImplementedError) as error:
+        float(torch.zeros(1, device=device))  # "meta" has no values
+    except Exception as error:  # every backend has its own way to say that it is not there
         reason = (str(error).splitlines() or [""])[0][:120]
         raise DeviceError(f"device {name!r} cannot be used: {reason}; try --device cpu") from None
     return device

@@ -15,7 +15,11 @@ from pnpdepth_cli.models.definition import ModelDefinition
 
 DEFAULT_MODEL = "compact"
 
-_MODULES = {"compact": "model_zoo_defs.compact"}
+_MODULES = {
+    "compact": "model_zoo_defs.compact",
+    "nconv": "model_zoo_defs.nconv",
+    "pncnn": "model_zoo_defs.pncnn",
+}
 
 
 def names() -> list[str]:
@@ -33,6 +37,9 @@ def find_definition(spec: str) -> ModelDefinition:
         definition = importlib.import_module(_MODULES[spec]).definition
         assert isinstance(definition, ModelDefinition)
         return definition
+    foreign = _foreign(spec)
+    if foreign is not None:
+        return foreign
     file, attribute = _file_and_attribute(spec)
     if file.suffix != ".py":
         near = difflib.get_close_matches(spec, _MODULES, n=1)
@@ -46,6 +53,21 @@ def find_definition(spec: str) -> ModelDefinition:
             f"{attribute!r} in model file {file} is a {type(found).__name__}, not a ModelDefinition"
         )
     return found
+
+
+def _foreign(spec: str) -> ModelDefinition | None:
+    """The definition of a network that is no Python file of ours; None if it is none such."""
+    file, colon, output = spec.rpartition(":")
+    if spec.endswith(".onnx") or (colon and file.endswith(".onnx")):
+        from pnpdepth_cli.models.onnx_network import onnx_definition
+
+        named = not spec.endswith(".onnx")
+        return onnx_definition(Path(file), output) if named else onnx_definition(Path(spec))
+    if Path(spec).is_dir():
+        from pnpdepth_cli.models.hf_network import hf_definition
+
+        return hf_definition(Path(spec))
+    return None
 
 
 def _file_and_attribute(spec: str) -> tuple[Path, str]:
@@ -67,7 +89,7 @@ def _run(file: Path) -> ModuleType:
     sys.path.insert(0, str(file.resolve().parent))
     try:
         spec.loader.exec_module(module)
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise ModelError(f"model file {file} raises {describe(error, file)}") from error
     finally:
         sys.path.remove(str(file.resolve().parent))

@@ -9,10 +9,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from pnpdepth_cli.core.alignment import Alignment
 from pnpdepth_cli.core.points import SparsePoints
 from pnpdepth_cli.core.refine import Refinement, RefineSettings, refine
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.errors import DivergedError, NoPointsError, UsageError
+from pnpdepth_cli.models.aligned import AlignedDepth
 from pnpdepth_cli.models.frame import FrameMap
 from pnpdepth_cli.models.network import Network, out_of_memory_is_a_device_error
 from pnpdepth_cli.pipeline.inputs import Inputs
@@ -20,7 +22,10 @@ from pnpdepth_cli.pipeline.inputs import Inputs
 
 @dataclass(frozen=True, kw_only=True)
 class RefinedFrame:
-    """Depth before and after, (H, W) float32 metres in the image frame, 0 = unknown."""
+    """Depth before and after, (H, W) float32 metres in the image frame, 0 = unknown.
+
+    alignment: of the network's output with the points, None where it is taken as it is.
+    """
 
     before: NDArray[np.float32]
     after: NDArray[np.float32]
@@ -28,6 +33,8 @@ class RefinedFrame:
     held_out: SparsePoints
     refinement: Refinement
     diverged: DivergedError | None
+    alignment: Alignment | None = None
+    notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,14 +86,16 @@ def refine_frame(
     diverged: DivergedError | None = None
     with out_of_memory_is_a_device_error(network.device):
         arguments = network.arguments(frame, inputs.rgb_tensor(), points)
+        at = points.to(network.device)
+        depth_of = AlignedDepth(network, at, settings.align, every=settings.align_every)
         with Split(network.module, layer) as split:
             try:
                 result = refine(
                     split,
                     arguments,
-                    points.to(network.device),
+                    at,
                     settings,
-                    depth_of=network.depth_of,
+                    depth_of=depth_of,
                     on_iteration=lambda iteration, loss: on_iteration(iteration + 1, loss),
                 )
             except DivergedError as error:
@@ -100,6 +109,8 @@ def refine_frame(
         held_out=held_out,
         refinement=result,
         diverged=diverged,
+        alignment=depth_of.alignment,
+        notes=depth_of.notes,
     )
 
 

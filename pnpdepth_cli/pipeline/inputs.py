@@ -17,6 +17,7 @@ from pnpdepth_cli.io.depth import DepthImage, describe_range, implausible, read_
 from pnpdepth_cli.io.record import sha256_of
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.pipeline.request import RefineRequest
+from pnpdepth_cli.pipeline.scans import read_scan_points
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,33 +57,24 @@ def read_inputs(files: RefineRequest) -> Inputs:
         rgb = image.values
         record["image"] = _file_record(files.image)
         notes += [f"image: {image.note}"] if image.note else []
-    sparse = read_sparse(files.sparse, scale=files.depth_scale, channel=files.channel)
-    record["sparse"] = _file_record(files.sparse) | {"read_as": sparse.source}
-    size = rgb.shape[:2] if rgb is not None else sparse.size
-    if size is None:
-        raise SizeError(
-            f"{files.sparse} is a list of points, which needs an image to say the frame's size"
-        )
-    points = _points_in_image(files, sparse.xy, sparse.depth, sparse.size, size)
-    notes.append(
-        f"sparse: {describe_range(sparse.depth, sparse.source, assumed_scale=sparse.assumed_scale)}"
-    )
-    if len(points) < len(sparse.depth):
-        notes.append(f"sparse: {len(sparse.depth) - len(points):,} points outside the image")
-    notes += [f"warning: {text}" for text in [implausible(sparse.depth, sparse.scale)] if text]
+    image_size = None if rgb is None else (rgb.shape[0], rgb.shape[1])
+    is_scan = files.scan.describes(files.sparse)
+    sparse = _read_scan(files, image_size) if is_scan else _read_points(files, image_size)
+    record["sparse"] = sparse.record
+    notes += sparse.notes
     gt = None
     if files.gt is not None:
         truth = read_depth(
             files.gt, scale=files.gt_scale or files.depth_scale, channel=files.channel
         )
-        gt = _checked_gt(files.gt, truth, size)
+        gt = _checked_gt(files.gt, truth, sparse.points.size)
         record["gt"] = _file_record(files.gt) | {"read_as": truth.source}
         assumed = truth.assumed_scale
         said = describe_range(truth.values, truth.source, assumed_scale=assumed, noun="pixels")
         notes.append(f"gt: {said}")
     return Inputs(
         rgb=rgb,
-        points=points,
+        points=sparse.points,
         gt=gt,
         sparse_scale=sparse.scale,
         record=record,
@@ -92,6 +84,48 @@ def read_inputs(files: RefineRequest) -> Inputs:
 
 def _file_record(path: Path) -> dict[str, Any]:
     return {"path": str(path), "sha256": sha256_of(path)}
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Sparse:
+    """Points in the image's frame, the scale of their integer file, and what is said of them."""
+
+    points: SparsePoints
+    scale: float | None
+    record: dict[str, Any]
+    notes: tuple[str, ...]
+
+
+def _read_scan(files: RefineRequest, image_size: tuple[int, int] | None) -> _Sparse:
+    scan = read_scan_points(files.sparse, files.scan, image_size, files.image)
+    points = SparsePoints(
+        xy=torch.from_numpy(scan.points.xy),
+        depth=torch.from_numpy(scan.points.depth),
+        size=scan.points.size,
+    )
+    return _Sparse(points=points, scale=None, record=scan.record, notes=scan.notes)
+
+
+def _read_points(files: RefineRequest, image_size: tuple[int, int] | None) -> _Sparse:
+    sparse = read_sparse(files.sparse, scale=files.depth_scale, channel=files.channel)
+    size = image_size or sparse.size
+    if size is None:
+        raise SizeError(
+            f"{files.sparse} is a list of points, which needs an image to say the frame's size"
+        )
+    points = _points_in_image(files, sparse.xy, sparse.depth, sparse.size, size)
+    notes = [
+        f"sparse: {describe_range(sparse.depth, sparse.source, assumed_scale=sparse.assumed_scale)}"
+    ]
+    if len(points) < len(sparse.depth):
+        notes.append(f"sparse: {len(sparse.depth) - len(points):,} points outside the image")
+    notes += [f"warning: {text}" for text in [implausible(sparse.depth, sparse.scale)] if text]
+    return _Sparse(
+        points=points,
+        scale=sparse.scale,
+        record=_file_record(files.sparse) | {"read_as": sparse.source},
+        notes=tuple(notes),
+    )
 
 
 def _points_in_image(

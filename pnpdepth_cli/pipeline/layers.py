@@ -6,17 +6,16 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 import torch
 from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode
 
 from pnpdepth_cli.core.influence import influential_field
-from pnpdepth_cli.core.points import SparsePoints
 from pnpdepth_cli.core.split import Split
-from pnpdepth_cli.errors import LayerError, UsageError
+from pnpdepth_cli.errors import ModelError, UsageError
 from pnpdepth_cli.models.definition import Fixed
 from pnpdepth_cli.models.frame import FrameMap
+from pnpdepth_cli.models.made_up import made_up_arguments
 from pnpdepth_cli.models.network import Network, load_network, out_of_memory_is_a_device_error
 
 DEFAULT_SIZE = (240, 320)
@@ -67,29 +66,13 @@ def list_layers(
     frame = FrameMap.fit(policy, *(size or own))
     rows = []
     with out_of_memory_is_a_device_error(network.device):
-        arguments = _made_up_arguments(network, frame)
+        arguments = made_up_arguments(network, frame)
         with torch.no_grad(), FlopCounterMode(display=False) as whole:
             network.depth_of(network.module(*arguments))
         for done, name in enumerate(names, start=1):
             rows.append(_measure(network, name, arguments, frame, whole.get_total_flops()))
             on_layer(done, len(names))
     return rows
-
-
-def _made_up_arguments(network: Network, frame: FrameMap) -> tuple[Tensor, ...]:
-    """A picture of smooth noise and 500 points on a slanted plane; the seed is fixed."""
-    height, width = frame.image
-    generator = torch.Generator().manual_seed(0)
-    coarse = torch.rand(1, 3, max(2, height // 8), max(2, width // 8), generator=generator)
-    rgb = torch.nn.functional.interpolate(coarse, frame.image, mode="bilinear")
-    places = np.random.default_rng(0).permutation(height * width)[:500]
-    y, x = torch.from_numpy(places // width), torch.from_numpy(places % width)
-    points = SparsePoints(
-        xy=torch.stack([x, y], dim=1).float(),
-        depth=2 + 3 * y.float() / height + torch.rand(len(places), generator=generator),
-        size=frame.image,
-    )
-    return network.arguments(frame, rgb, frame.points_to_network(points))
 
 
 def _measure(
@@ -102,7 +85,7 @@ def _measure(
             with FlopCounterMode(display=False) as behind:
                 split.rear(z)
             field = influential_field(split, z, network.depth_of)
-    except LayerError as error:
+    except ModelError as error:
         return LayerRow(name=name, problem=str(error))
     return LayerRow(
         name=name,

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import torch
 
-from pnpdepth_cli.models.definition import Fixed, Multiple
+from pnpdepth_cli.models.definition import Fixed, Multiple, Near
 from pnpdepth_cli.models.registry import find_definition, names
 
 
@@ -60,7 +60,9 @@ def _listed(name: str) -> ListedModel:
     )
 
 
-def _size(size: Fixed | Multiple) -> str:
+def _size(size: Fixed | Multiple | Near) -> str:
     if isinstance(size, Fixed):
         return f"{size.height}×{size.width} ({size.fit})"
+    if isinstance(size, Near):
+        return f"any, resized to {size.height}×{size.width}" if size.height else "any, resized"
     return "any" if size.longest is None else f"any, shrunk to {size.longest}"

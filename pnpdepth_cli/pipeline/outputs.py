@@ -61,7 +61,8 @@ def plan_outputs(request: RefineRequest) -> Outputs:
             improvement=output / f"{source.stem}_improvement.png",
             record=output / f"{source.stem}.json",
         )
-    inputs = {p.resolve() for p in (request.image, request.sparse, request.gt) if p is not None}
+    given = (request.image, request.sparse, request.gt, request.scan.calib)
+    inputs = {p.resolve() for p in given if p is not None}
     for path in outputs.paths():
         if path.resolve() in inputs:
             raise OutputError(f"{path} is one of the inputs; name another output with -o")

@@ -25,6 +25,7 @@ from pnpdepth_cli.pipeline.frame import (
 from pnpdepth_cli.pipeline.inputs import Inputs, read_inputs
 from pnpdepth_cli.pipeline.outputs import plan_outputs, write_outputs
 from pnpdepth_cli.pipeline.request import RefineRequest, effective_settings, layer_name
+from pnpdepth_cli.pipeline.settle import settled
 from pnpdepth_cli.pipeline.stopwatch import Stopwatch, peak_memory_mb, versions
 
 
@@ -52,8 +53,9 @@ def refine_image(
         inputs = read_inputs(request)
     with watch("load network"):
         network = load_network(request.model, request.checkpoint, request.device)
+        network = settled(network, inputs, request)
     layer = layer_name(network.definition, request.layer)
-    settings = effective_settings(network.definition.defaults, request)
+    settings = effective_settings(network.definition, request)
     with watch("refine"):
         torch.manual_seed(request.seed)
         used, held_out = split_points(inputs.points, request.holdout, request.seed)
@@ -101,6 +103,7 @@ def _record(
             "seed": request.seed,
             "device": str(network.device),
         },
+        "alignment": asdict(frame.alignment) if frame.alignment else None,
         "points": {
             "used": len(frame.used),
             "held_out": len(frame.held_out),
@@ -112,7 +115,7 @@ def _record(
         "held_out_error": _before_after(frame, lambda d: point_error(d, frame.held_out)),
         "scores": _before_after(frame, lambda d: _score(d, inputs.gt)),
         "diverged": str(frame.diverged) if frame.diverged else None,
-        "notes": [*inputs.notes, *network.notes],
+        "notes": [*inputs.notes, *network.notes, *frame.notes],
     }
 
 

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from pnpdepth_cli.core.refine import RefineSettings
 from pnpdepth_cli.errors import UsageError
-from pnpdepth_cli.models.definition import ModelDefinition, RefineDefaults
+from pnpdepth_cli.models.definition import ModelDefinition
+from pnpdepth_cli.pipeline.scans import ScanOptions
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -15,7 +16,9 @@ class RefineRequest:
     """What the user asks for; None means the network's own default.
 
     depth_scale, gt_scale: integer depth files hold metres × scale. holdout: the share of the
-    points kept from the network and the loss, and only scored.
+    points kept from the network and the loss, and only scored. output_kind, normalise: what the
+    network's numbers are and which rgb it wants, over what its definition says. scan: how to
+    project `sparse` where it is a LiDAR scan.
     """
 
     image: Path | None
@@ -31,10 +34,15 @@ class RefineRequest:
     lr: str | None = None
     loss: str | None = None
     update: str | None = None
+    align: str | None = None
+    align_every: bool = False
+    output_kind: str | None = None
+    normalise: str | None = None
     depth_scale: float | None = None
     gt_scale: float | None = None
     channel: str | None = None
     sparse_size_ok: bool = False
+    scan: ScanOptions = field(default_factory=ScanOptions)
     holdout: float = 0.0
     seed: int = 0
     device: str = "cpu"
@@ -57,8 +65,9 @@ def layer_name(definition: ModelDefinition, wanted: str | None) -> str:
     return definition.layers[round(share * (len(definition.layers) - 1))]
 
 
-def effective_settings(defaults: RefineDefaults, request: RefineRequest) -> RefineSettings:
+def effective_settings(definition: ModelDefinition, request: RefineRequest) -> RefineSettings:
     """The request's settings, filled up with the network's defaults. UsageError if one is amiss."""
+    defaults = definition.defaults
     iterations = defaults.iterations if request.iterations is None else request.iterations
     if iterations < 0:
         raise UsageError(f"iterations {iterations} is negative; 0 gives the plain prediction")
@@ -67,4 +76,6 @@ def effective_settings(defaults: RefineDefaults, request: RefineRequest) -> Refi
         lr=defaults.lr if request.lr is None else request.lr,
         loss=request.loss or defaults.loss,
         update=request.update or defaults.update,
+        align=request.align or definition.default_alignment,
+        align_every=request.align_every,
     )

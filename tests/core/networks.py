@@ -89,7 +89,7 @@ class UNet(nn.Module):
         x = self.bottleneck(skips.pop())
         for up in self.ups:
             skip = skips.pop()
-            skip += 0.5
+            skip = skip + 0.5 if skip.requires_grad else skip.add_(0.5)
             x = up(torch.cat([F.interpolate(F.relu(x), scale_factor=2.0), skip], 1))
         return x.abs() + 1
 
@@ -115,7 +115,9 @@ class Block(nn.Module):
         super().__init__()
         self.norm1, self.norm2 = nn.LayerNorm(width), nn.LayerNorm(width)
         self.attention = nn.MultiheadAttention(width, 2, batch_first=True)
-        self.mlp = nn.Sequential(nn.Linear(width, 2 * width), nn.GELU(), nn.Linear(2 * width, width))
+        self.mlp = nn.Sequential(
+            nn.Linear(width, 2 * width), nn.GELU(), nn.Linear(2 * width, width)
+        )
 
     def forward(self, x: Tensor, *, scale: float = 1.0) -> tuple[Tensor, None]:
         y = self.norm1(x)
@@ -126,7 +128,7 @@ class Block(nn.Module):
 class ViT(nn.Module):
     def __init__(self, width: int = 8):
         super().__init__()
-        self.patches = nn.Conv2d(3, width, 8, 8)
+        self.patches = nn.Conv2d(3, width, 4, 4)
         self.position = nn.Parameter(torch.randn(1, 16, width) * 0.1)
         self.drop = nn.Dropout(0.1)
         self.blocks = nn.ModuleList(Block(width) for _ in range(3))
@@ -153,7 +155,7 @@ class ViTDepth(nn.Module):
         encoded = self.encoder(x, output_hidden=True)
         tokens = self.project(torch.cat([encoded.last, encoded["hidden"][1]], -1))
         grid = tokens.transpose(1, 2).unflatten(2, (4, 4))
-        disparity = self.head(F.interpolate(grid, scale_factor=8.0, mode="bilinear"))
+        disparity = self.head(F.interpolate(grid, scale_factor=4.0, mode="bilinear"))
         return {"disparity": disparity.abs() + 0.5}
 
 
@@ -175,12 +177,12 @@ class InPlace(nn.Module):
         first = self.relu(a)  # the same tensor as a
         b = self.b(first)
         F.relu_(b)
-        b += a
-        a.mul_(1.5)
+        b = b + a if b.requires_grad else b.add_(a)
+        a = a * 1.5 if a.requires_grad else a.mul_(1.5)
         flat = self.flat(b)
         flat.add_(0.25)  # changes b too
         c = self.c(b)
-        torch.add(c, 1, out=c) if not c.requires_grad else c.add_(1)
+        c = c + 1 if c.requires_grad else torch.add(c, 1, out=c)
         c += x.mean()
         return self.d(c + a).abs_().add_(1)
 
@@ -237,7 +239,7 @@ class Branching(nn.Module):
         if self.escape(y.detach()):
             y = y + self.side(a)
         else:
-            self.relu(a)
+            a = F.relu(a) if a.requires_grad else self.relu(a)
             y = y - self.side(y) + a
         return self.head(y).abs() + 1
 
@@ -339,8 +341,8 @@ class Detached(nn.Module):
         self.share = conv(4, 4)
 
     def forward(self, z: Tensor) -> Tensor:
-        chosen = F.one_hot(z.detach().argmax(1), 4).movedim(-1, 1).float()
-        return self.share(chosen)
+        chosen = torch.arange(4)[:, None, None] == z.argmax(1, keepdim=True)
+        return self.share(chosen.float())
 
 
 class TwoBranches(nn.Module):
@@ -534,7 +536,12 @@ class Sparse(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        self.enter, self.cut, self.to_sparse, self.head = conv(3, 4), conv(4, 4), ToSparse(), conv(4, 1)
+        self.enter, self.cut, self.to_sparse, self.head = (
+            conv(3, 4),
+            conv(4, 4),
+            ToSparse(),
+            conv(4, 1),
+        )
 
     def forward(self, x: Tensor) -> Tensor:
         x = self.enter(x)
@@ -641,7 +648,7 @@ def build(name: str) -> nn.Module:
     return network.train()
 
 
-def picture(height: int = 32, width: int = 32) -> Tensor:
+def picture(height: int = 16, width: int = 16) -> Tensor:
     return torch.rand(1, 3, height, width, generator=torch.Generator().manual_seed(1))
 
 

@@ -1,0 +1,139 @@
+"""Evidence for the sensors: python -m benchmarks.sensors DATA, DATA the folder of real frames.
+
+Projection against rendered truth (samples/street), the occlusion filter against KITTI's
+accumulated truth, the shares of samples of the paper's LiDARs, and the time of a projection.
+Without DATA, only what the samples can show.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import time
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pnpdepth_cli.io.calibration import read_calibration
+from pnpdepth_cli.io.depth import read_depth
+from pnpdepth_cli.io.scans import read_scan
+from pnpdepth_cli.pipeline.scans import camera_of
+from pnpdepth_cli.sensors import (
+    FORWARD_LEFT_UP,
+    LIDARS,
+    Camera,
+    OcclusionFilter,
+    ProjectionSettings,
+    project_velodyne,
+    simulate_lidar,
+)
+from pnpdepth_cli.sensors.occlusion import hidden_points
+
+STREET = Path(__file__).parent.parent / "samples" / "street"
+KEEP_ALL = ProjectionSettings(occlusion=None)
+
+# Wang et al. 2019, table on LiDAR types: per cent of the pixels of a SYNTHIA frame.
+PAPER_PERCENT = {"vlp-16": 5.3, "vlp-32c": 28.8, "hdl-32e": 10.3, "hdl-64e": 18.7}
+
+# SYNTHIA's sequences are 1280×760 with a focal length of 532.74; here at 0.4 of that size.
+SYNTHIA = Camera(
+    intrinsics=np.array([[213.1, 0, 255.5], [0, 213.1, 151.5], [0, 0, 1]]),
+    rotation=FORWARD_LEFT_UP,
+)
+SYNTHIA_SIZE = (304, 512)
+
+Floats = NDArray[np.floating]
+
+
+def agreement(hidden: NDArray[np.bool_], depth: Floats, truth: Floats) -> str:
+    """What the filter did to the points that agree with truth within 10 %, and to the others."""
+    known = truth > 0
+    agrees = np.abs(depth[known] - truth[known]) <= 0.1 * truth[known]
+    gone = hidden[known]
+    return (
+        f"{agrees.sum():,} points agree with the truth, {np.mean(~gone[agrees]):.1%} of them kept;"
+        f" {(~agrees).sum():,} do not, {np.mean(gone[~agrees]):.1%} of them removed"
+    )
+
+
+def street() -> None:
+    """The rendered scan, whose truth is exact and dense."""
+    camera = camera_of(read_calibration(STREET / "calib.txt"))
+    scan = read_scan(STREET / "000000.bin").points
+    truth = read_depth(STREET / "gt.png").values
+    points = project_velodyne(scan, camera, truth.shape, KEEP_ALL)
+    column, row = np.floor(points.xy + 0.5).astype(int).T
+    there = truth[row, column]
+    error = np.abs(points.depth - there)[there > 0]
+    print(f"samples/street, {len(points.depth):,} points: median error {np.median(error):.3f} m")
+    kept = project_velodyne(scan, camera, truth.shape).index
+    print("  filter:", agreement(~np.isin(points.index, kept), points.depth, there))
+
+
+def kitti(data: Path) -> None:
+    """Single scans, projected by the data set, against truth accumulated over eleven of them."""
+    folder = data / "kitti_dc"
+    calibration = read_calibration(folder)
+    hidden, depth, truth = [], [], []
+    for path in sorted((folder / "velodyne_raw").glob("*.png")):
+        raw = read_depth(path).values
+        row, column = np.nonzero(raw)
+        depth.append(raw[row, column].astype(np.float64))
+        truth.append(read_depth(folder / "groundtruth" / path.name).values[row, column])
+        hidden.append(
+            hidden_points(
+                np.column_stack([column, row]).astype(np.float64),
+                depth[-1],
+                (raw.shape[0], raw.shape[1]),
+                focal_px=float(calibration.intrinsics[0, 0]),
+                scanner=calibration.intrinsics @ calibration.translation,
+                settings=OcclusionFilter(),
+            )
+        )
+    joined = [np.concatenate(x) for x in (hidden, depth, truth)]
+    print(f"kitti_dc, {len(hidden)} frames, {len(joined[0]):,} points")
+    print("  filter:", agreement(*joined), f"; {joined[0].mean():.1%} of all removed")
+
+
+def shares() -> None:
+    """The paper's LiDARs in SYNTHIA's view of a scene without holes."""
+    depth = np.full(SYNTHIA_SIZE, 10.0)
+    print("samples, % of SYNTHIA's pixels: ours (the paper's)")
+    for name, percent in PAPER_PERCENT.items():
+        got = [
+            len(simulate_lidar(depth, SYNTHIA, LIDARS[f"paper-{name}"], seed).depth)
+            for seed in range(3)
+        ]
+        print(f"  paper-{name:8} {100 * statistics.mean(got) / depth.size:5.1f} ({percent})")
+
+
+def speed(data: Path, runs: int) -> None:
+    """One projection of a whole KITTI scan, with and without the filter."""
+    folder = data / "kitti_object"
+    camera = camera_of(read_calibration(folder / "calib" / "000001.txt"))
+    scan = read_scan(folder / "velodyne" / "000001.bin").points
+    for name, settings in (("with filter", None), ("without", KEEP_ALL)):
+        spent = []
+        for _ in range(runs):
+            start = time.perf_counter()
+            project_velodyne(scan, camera, (375, 1242), settings)
+            spent.append(time.perf_counter() - start)
+        milliseconds = 1000 * statistics.median(spent)
+        print(f"projection of {len(scan):,} points, {name}: median {milliseconds:.0f} ms")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("data", type=Path, nargs="?", help="folder with kitti_dc, kitti_object")
+    parser.add_argument("--runs", type=int, default=15)
+    args = parser.parse_args()
+    street()
+    shares()
+    if args.data is not None:
+        kitti(args.data)
+        speed(args.data, args.runs)
+
+
+if __name__ == "__main__":
+    main()

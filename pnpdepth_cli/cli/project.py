@@ -1,0 +1,64 @@
+"""`pnpdepth project`."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import click
+
+from pnpdepth_cli.cli import options
+
+
+@click.command(short_help="Project a LiDAR scan into a camera's picture.")
+@click.argument("scan", type=options.FILE)
+@options.scan
+@click.option("--image", type=options.FILE, help="The picture; says the size, and is drawn on.")
+@click.option("--size", metavar="HxW", help="Of the picture, instead of --image.")
+@options.sparse_output
+@options.output_scale
+@click.option("--overlay", type=options.FILE, help="Also a PNG of the points on the image.")
+@options.overwrite
+@options.as_json
+def project(
+    scan: Path,
+    image: Path | None,
+    size: str | None,
+    output: Path,
+    output_scale: float,
+    overlay: Path | None,
+    overwrite: bool,
+    as_json: bool,
+    **given: Any,
+) -> None:
+    """Make sparse depth of a LiDAR SCAN: BIN (KITTI), NPY, PCD or PLY.
+
+    \b
+    pnpdepth project 000001.bin --calib 000001.txt --image 000001.png -o sparse.png
+    pnpdepth project 0000000005.bin --calib 2011_09_26/ --camera 3 -o sparse.exr
+
+    Points behind the camera, outside the picture, behind another in their pixel, or hidden by
+    foreground are dropped, and counted. Beside the output, a JSON file says how it was made.
+    """
+    from pnpdepth_cli.cli.tables import print_sparse
+    from pnpdepth_cli.pipeline.project import ProjectRequest, project_scan
+    from pnpdepth_cli.pipeline.scans import ScanOptions
+    from pnpdepth_cli.pipeline.sparse_outputs import SparseTarget
+
+    scan_options, _ = options.scan_given(given)
+    record = project_scan(
+        ProjectRequest(
+            scan=scan,
+            options=ScanOptions(**scan_options),
+            target=SparseTarget(
+                output=output, overlay=overlay, depth_scale=output_scale, overwrite=overwrite
+            ),
+            image=image,
+            size=options.height_and_width(size) if size else None,
+        )
+    )
+    if as_json:
+        click.echo(json.dumps(record, indent=2))
+    else:
+        print_sparse(record)

@@ -1,0 +1,125 @@
+"""`pnpdepth sample`."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import click
+
+from pnpdepth_cli.cli import options
+from pnpdepth_cli.errors import UsageError
+
+PATTERNS = ("uniform", "bernoulli", "grid", "lines", "features", "edges", "region")
+
+
+@click.command(short_help="Make sparse depth out of dense depth.")
+@click.argument("depth", type=options.FILE)
+@click.option("--pattern", type=click.Choice(PATTERNS), default="uniform", show_default=True)
+@click.option(
+    "--count", metavar="N|P%", help="Points, or per cent of the known pixels; lines of `lines`."
+)
+@click.option("--region", metavar="X,Y,W,H", help="The rectangle of the pattern `region`, pixels.")
+@click.option("--image", type=options.FILE, help="Of the same view, for `features` and `edges`.")
+@click.option("--seed", type=int, default=0, show_default=True, help="Of everything random.")
+@click.option("--noise", type=float, default=0.0, metavar="M", help="Gaussian, metres.")
+@click.option("--relative-noise", type=float, default=0.0, metavar="F", help="Share of the depth.")
+@click.option(
+    "--outliers", type=float, default=0.0, metavar="F", help="Share of points of random depth."
+)
+@click.option("--jitter", type=float, default=0.0, metavar="PX", help="Of the points' places.")
+@options.depth_scale
+@options.channel
+@options.sparse_output
+@options.output_scale
+@click.option("--overlay", type=options.FILE, help="Also a PNG of the points on --image.")
+@options.overwrite
+@options.as_json
+def sample(
+    depth: Path,
+    pattern: str,
+    count: str | None,
+    region: str | None,
+    image: Path | None,
+    seed: int,
+    noise: float,
+    relative_noise: float,
+    outliers: float,
+    jitter: float,
+    depth_scale: float | None,
+    channel: str | None,
+    output: Path,
+    output_scale: float,
+    overlay: Path | None,
+    overwrite: bool,
+    as_json: bool,
+) -> None:
+    """Make sparse depth out of the dense DEPTH.
+
+    \b
+    pnpdepth sample gt.png --pattern uniform --count 500 --seed 1 -o sparse.png
+    pnpdepth sample gt.png --pattern lines --count 16 -o sparse.exr
+    pnpdepth sample gt.png --pattern features --count 300 --image rgb.png -o sparse.png
+
+    \b
+    uniform    exactly N known pixels, each as likely as any other
+    bernoulli  a coin for each known pixel; N is the expected number
+    grid       a square grid that has N nodes on a full map
+    lines      all known pixels of N evenly spaced rows
+    features   the N strongest ORB corners, as structure from motion gives
+    edges      N random pixels on the image's edges
+    region     all known pixels of a rectangle, or N random ones of them
+
+    The settings, the seed among them, are kept in the file (PNG, CSV) and in a JSON file beside it.
+    """
+    from pnpdepth_cli.cli.tables import print_sparse
+    from pnpdepth_cli.pipeline.sample import SampleRequest, sample_depth
+    from pnpdepth_cli.pipeline.sparse_outputs import SparseTarget
+
+    points, share = _count(count)
+    record = sample_depth(
+        SampleRequest(
+            depth=depth,
+            target=SparseTarget(
+                output=output, overlay=overlay, depth_scale=output_scale, overwrite=overwrite
+            ),
+            pattern=pattern,
+            count=points,
+            share=share,
+            region=_region(region) if region else None,
+            noise={
+                "metres": noise,
+                "relative": relative_noise,
+                "outliers": outliers,
+                "jitter_px": jitter,
+            },
+            seed=seed,
+            image=image,
+            depth_scale=depth_scale,
+            channel=channel,
+        )
+    )
+    if as_json:
+        click.echo(json.dumps(record, indent=2))
+    else:
+        print_sparse(record)
+
+
+def _count(text: str | None) -> tuple[int | None, float | None]:
+    """(points, share) of `500` or `5%`."""
+    if text is None:
+        return None, None
+    try:
+        if text.strip().endswith("%"):
+            return None, float(text.strip()[:-1]) / 100
+        return int(text), None
+    except ValueError:
+        raise UsageError(f"count {text!r} is neither a number such as 500 nor 5%") from None
+
+
+def _region(text: str) -> tuple[int, int, int, int]:
+    try:
+        left, top, width, height = (int(word) for word in text.split(","))
+    except ValueError:
+        raise UsageError(f"region {text!r} is not of the form X,Y,WIDTH,HEIGHT") from None
+    return left, top, width, height

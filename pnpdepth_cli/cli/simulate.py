@@ -1,0 +1,90 @@
+"""`pnpdepth simulate`."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import click
+
+from pnpdepth_cli.cli import options
+
+SENSORS = ("vlp-16", "vlp-32c", "hdl-32e", "hdl-64e")
+
+
+@click.command(short_help="Simulate a LiDAR in a scene with dense depth.")
+@click.argument("depth", type=options.FILE)
+@click.option(
+    "--sensor",
+    required=True,
+    metavar="NAME|FILE.toml",
+    help=f"{', '.join(SENSORS)}, the paper's idealised paper-{SENSORS[0]} and so on, or a file.",
+)
+@click.option(
+    "--calib",
+    type=options.FILE,
+    required=True,
+    metavar="FILE|FOLDER",
+    help="Intrinsics: nine numbers, a file with K, or one of KITTI's.",
+)
+@options.camera
+@click.option(
+    "--offset",
+    type=float,
+    nargs=3,
+    metavar="X Y Z",
+    help="The scanner is so many metres to the right of, below and in front of the camera.",
+)
+@click.option("--at-scanner", is_flag=True, help="It stands where the calibration has it.")
+@click.option("--seed", type=int, default=0, show_default=True, help="Of everything random.")
+@click.option(
+    "--rotation-noise",
+    "rotation_noise_deg",
+    type=float,
+    default=0.0,
+    metavar="DEG",
+    help="The scanner is turned at random about each axis, standard deviation.",
+)
+@click.option(
+    "--angle-noise",
+    "angle_noise_deg",
+    type=float,
+    metavar="DEG",
+    help="Of every single beam.  [default: the sensor's]",
+)
+@click.option("--range-noise", type=float, metavar="M", help="[default: the sensor's]")
+@click.option("--dropout", type=float, default=0.0, metavar="F", help="Share of lost beams.")
+@options.max_range
+@options.euclidean
+@options.depth_scale
+@options.channel
+@options.sparse_output
+@options.output_scale
+@options.overwrite
+@options.as_json
+def simulate(
+    output: Path, output_scale: float, overwrite: bool, as_json: bool, **given: Any
+) -> None:
+    """Make the sparse depth that a LiDAR would give of the scene in the dense DEPTH.
+
+    \b
+    pnpdepth simulate gt.exr --sensor hdl-64e --calib intrinsics.txt --seed 1 -o sparse.png
+    pnpdepth simulate gt.png --sensor my_lidar.toml --calib calib.txt --at-scanner -o sparse.exr
+
+    \b
+    A sensor file:  elevations_deg = [10, 5, 0, -5, -10]
+                    azimuth_step_deg = 0.2
+                    max_range = 80
+                    range_noise = 0.02
+    """
+    from pnpdepth_cli.cli.tables import print_sparse
+    from pnpdepth_cli.pipeline.simulate import SimulateRequest, simulate_scan
+    from pnpdepth_cli.pipeline.sparse_outputs import SparseTarget
+
+    target = SparseTarget(output=output, depth_scale=output_scale, overwrite=overwrite)
+    record = simulate_scan(SimulateRequest(target=target, **given))
+    if as_json:
+        click.echo(json.dumps(record, indent=2))
+    else:
+        print_sparse(record)

@@ -1,0 +1,75 @@
+"""One frame of a data set: where its parts are, and what is needed to read them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+from pnpdepth_cli.errors import InputError
+from pnpdepth_cli.io.layouts.protocols import WHOLE, Protocol
+
+PICTURES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".exr")
+DEPTHS = (".png", ".exr", ".npy", ".npz", ".pfm", ".tif", ".tiff")
+SCANS = (".bin", ".pcd", ".ply")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Hdf5Array:
+    """An array in an HDF5 or MATLAB 7.3 file; index picks one of its first axis, if any.
+
+    axes: the order that makes the rest (H, W) or (H, W, 3).
+    """
+
+    path: Path
+    name: str
+    axes: tuple[int, ...]
+    index: int | None = None
+
+    def __str__(self) -> str:
+        return f"{self.path}[{self.name}{'' if self.index is None else f', {self.index}'}]"
+
+
+Source = Path | Hdf5Array
+
+
+@dataclass(frozen=True, kw_only=True)
+class Frame:
+    """Parts that a frame does not have are None.
+
+    name: unique in its data set, and fit for a file's name. sparse: a depth file, or a scan with
+    calib; None where the protocol samples the truth. *_scale: codes per metre of integer files.
+    calib, camera: as `read_calibration` takes them. protocol: what is cut out before anything else.
+    """
+
+    name: str
+    image: Source | None = None
+    sparse: Path | None = None
+    gt: Source | None = None
+    calib: Path | None = None
+    camera: int | None = None
+    sparse_scale: float | None = None
+    gt_scale: float | None = None
+    protocol: Protocol = WHOLE
+
+
+def by_stem(folder: Path, suffixes: Iterable[str]) -> dict[str, Path]:
+    """The files of a folder with one of these suffixes, by their stem and in its order.
+
+    InputError if two have the same stem.
+    """
+    wanted = set(suffixes)
+    files: dict[str, Path] = {}
+    for path in sorted(folder.iterdir() if folder.is_dir() else ()):
+        if path.suffix.lower() in wanted and path.is_file():
+            if path.stem in files:
+                raise InputError(f"{path} and {files[path.stem].name} are one frame; keep one")
+            files[path.stem] = path
+    return files
+
+
+def partner(files: dict[str, Path], stem: str, of: Path, folder: Path) -> Path:
+    """The file that belongs to `of`; InputError if the folder has none."""
+    if stem not in files:
+        raise InputError(f"{of} has no partner {stem}.* in {folder}; add or remove one")
+    return files[stem]

@@ -1,0 +1,84 @@
+"""A scanner of one's own, described in a small TOML file.
+
+name = "my-lidar"
+elevations_deg = [10, 5, 0, -5, -10]      # or: top_deg, step_deg and beams
+azimuth_step_deg = 0.2
+max_range = 80                            # metres; optional, as the two below
+range_noise = 0.02                        # metres, standard deviation
+angle_noise_deg = 0.05
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pnpdepth_cli.errors import FileFormatError
+from pnpdepth_cli.io.opening import one_line, read_bytes
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+_EVEN = ("top_deg", "step_deg", "beams")
+_OPTIONAL = {"max_range": math.inf, "range_noise": 0.0, "angle_noise_deg": 0.0}
+
+
+@dataclass(frozen=True, kw_only=True)
+class SensorFile:
+    """What the file says of a scanner: degrees and metres, elevations from the first beam on."""
+
+    name: str
+    elevations_deg: tuple[float, ...]
+    azimuth_step_deg: float
+    max_range: float
+    range_noise: float
+    angle_noise_deg: float
+
+
+def read_sensor(path: Path) -> SensorFile:
+    """The scanner that a TOML file describes. Raises FileFormatError for what it cannot mean."""
+    try:
+        table = tomllib.loads(read_bytes(path).decode("utf-8"))
+    except ValueError as error:
+        raise FileFormatError(
+            f"{path} is not valid TOML ({one_line(error)}); correct it"
+        ) from error
+    known = {"name", "elevations_deg", "azimuth_step_deg", *_EVEN, *_OPTIONAL}
+    unknown = sorted(set(table) - known)
+    if unknown:
+        raise FileFormatError(
+            f"{path}: {unknown[0]!r} says nothing of a sensor; use {', '.join(sorted(known))}"
+        )
+    return SensorFile(
+        name=str(table.get("name", path.stem)),
+        elevations_deg=_elevations(path, table),
+        azimuth_step_deg=_number(path, table, "azimuth_step_deg"),
+        **{key: _number(path, {key: default} | table, key) for key, default in _OPTIONAL.items()},
+    )
+
+
+def _elevations(path: Path, table: dict[str, Any]) -> tuple[float, ...]:
+    if "elevations_deg" in table:
+        if any(key in table for key in _EVEN):
+            raise FileFormatError(f"{path}: give elevations_deg, or {', '.join(_EVEN)}, not both")
+        listed = table["elevations_deg"]
+        if not isinstance(listed, list) or not listed:
+            raise FileFormatError(f"{path}: elevations_deg is not a list of degrees")
+        return tuple(_number(path, {"elevations_deg": item}, "elevations_deg") for item in listed)
+    top, step, beams = (_number(path, table, key) for key in _EVEN)
+    if not (1 <= beams <= 4096 and beams == int(beams)):
+        raise FileFormatError(f"{path}: beams is {beams:g}; give a whole number from 1 to 4096")
+    return tuple(top - step * beam for beam in range(int(beams)))
+
+
+def _number(path: Path, table: dict[str, Any], key: str) -> float:
+    value = table.get(key)
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or math.isnan(value):
+        fact = "is missing" if value is None else f"is {one_line(value)[:40]}, not a number"
+        raise FileFormatError(f"{path}: {key} {fact}; write {key} = NUMBER")
+    return float(value)

@@ -1,0 +1,45 @@
+"""Sparse depth to a file: an image in any depth format, or a list of points that loses nothing."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pnpdepth_cli.io.atomic import atomic_path
+from pnpdepth_cli.io.depth_reading import KITTI_SCALE
+from pnpdepth_cli.io.depth_writing import DEPTH_SUFFIXES, write_depth
+
+SPARSE_SUFFIXES = (*DEPTH_SUFFIXES, ".csv")
+"""What `write_sparse` can write; .csv keeps the places within the pixels."""
+
+MADE_KEY = "pnpdepth:made"
+"""Where a PNG keeps how its sparse depth was made."""
+
+
+def write_sparse(
+    path: Path,
+    xy: NDArray[np.float32],
+    depth: NDArray[np.float32],
+    picture: NDArray[np.float32],
+    *,
+    made: Mapping[str, Any],
+    scale: float = KITTI_SCALE,
+) -> None:
+    """`path` holds the N points (xy (N, 2) pixels, depth (N,) metres), as its suffix says.
+
+    picture: the same points as (H, W) metres, for every format but .csv. made: how they came
+    about; a PNG and a CSV keep it. scale: codes per metre of a PNG.
+    """
+    text = json.dumps(made, sort_keys=True)
+    if path.suffix.lower() != ".csv":
+        write_depth(path, picture, scale=scale, text={MADE_KEY: text})
+        return
+    rows = [f"{x:.9g},{y:.9g},{z:.9g}" for (x, y), z in zip(xy, depth, strict=True)]
+    with atomic_path(path) as temporary:
+        content = "\n".join([f"# {MADE_KEY} {text}", "x,y,depth", *rows]) + "\n"
+        temporary.write_text(content, encoding="utf-8", newline="\n")

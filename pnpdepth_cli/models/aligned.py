@@ -1,0 +1,78 @@
+"""What a network returns, read in metres: aligned with the sparse points when first read."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from torch import Tensor
+
+from pnpdepth_cli.core.alignment import SPACES, Alignment, align
+from pnpdepth_cli.core.points import SparsePoints
+from pnpdepth_cli.models.network import Network
+
+_OFF = 1.5
+"""A prediction that is this factor off the points at the median gets a word of warning."""
+
+
+class AlignedDepth:
+    """Called with what the network returns, gives depth (1, 1, h, w) in metres.
+
+    The alignment is fitted at the first call, which is the plain prediction's, and kept; with
+    `every` it is fitted at each call, the fit itself being a constant to the gradient.
+    """
+
+    def __init__(
+        self, network: Network, points: SparsePoints, kind: str, *, every: bool = False
+    ) -> None:
+        self._network, self._points, self._kind, self._every = network, points, kind, every
+        stated = network.definition.output_kind
+        self._spaces = (stated,) if stated in SPACES else ("depth", "inverse")
+        self.alignment: Alignment | None = None
+        self.notes: tuple[str, ...] = ()
+
+    def __call__(self, output: Any) -> Tensor:
+        if self._kind == "none":
+            depth = self._network.depth_of(output)
+            self.notes = self.notes or self._plain_notes(depth)
+            return depth
+        raw = self._network.raw_of(output)
+        if self.alignment is None or self._every:
+            first = self.alignment is None
+            spaces = (self.alignment.space,) if self.alignment else self._spaces
+            kind = self.alignment.kind if self.alignment else self._kind
+            at_points = self._points.sample(raw.detach())
+            self.alignment = align(at_points, self._points, spaces, kind)
+            if first:
+                self.notes = self._notes(self.alignment, raw.detach())
+        return self.alignment.depth(raw)
+
+    def _notes(self, made: Alignment, raw: Tensor) -> tuple[str, ...]:
+        decided = " (decided from the points)" if self._kind == "auto" else ""
+        notes = [
+            f"alignment {made}{decided}; {made.points:,} points, off by {made.error:.1%} of depth"
+            f" over the best 70 %, {made.outliers:.0%} outliers"
+        ]
+        beyond = made.beyond(raw)
+        if beyond > 0:
+            near, far = made.bounds
+            notes.append(
+                f"alignment: {beyond:.2%} of the picture came out nearer than {near:.3g} m or"
+                f" farther than {far:.3g} m, or at no depth at all, and reads as these bounds"
+            )
+        stated = self._network.definition.output_kind in SPACES
+        if stated and made.scale < 0:
+            notes.append(
+                "warning: the network's output falls where its kind says it should rise; is it"
+                f" {made.space!r}? --output-kind says otherwise"
+            )
+        return tuple(notes)
+
+    def _plain_notes(self, depth: Tensor) -> tuple[str, ...]:
+        ratio = float((self._points.sample(depth.detach()) / self._points.depth).median())
+        if ratio > 0 and abs(math.log(ratio)) < math.log(_OFF):
+            return ("",)
+        return (
+            f"warning: the prediction is {ratio:.3g} × the sparse depth at the median; --align auto"
+            " fits its scale (and shift) to the points",
+        )

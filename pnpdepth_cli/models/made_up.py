@@ -1,0 +1,33 @@
+"""A made-up frame, to look at a network without one."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from pnpdepth_cli.core.points import SparsePoints
+from pnpdepth_cli.models.frame import FrameMap
+
+if TYPE_CHECKING:
+    from pnpdepth_cli.models.network import Network
+
+_POINTS = 500
+
+
+def made_up_arguments(network: Network, frame: FrameMap) -> tuple[Tensor, ...]:
+    """A picture of smooth noise and 500 points on a slanted plane; the seed is fixed."""
+    height, width = frame.image
+    generator = torch.Generator().manual_seed(0)
+    coarse = torch.rand(1, 3, max(2, height // 8), max(2, width // 8), generator=generator)
+    rgb = F.interpolate(coarse, frame.image, mode="bilinear")
+    places = torch.randperm(height * width, generator=generator)[:_POINTS]
+    y, x = places // width, places % width
+    points = SparsePoints(
+        xy=torch.stack([x, y], dim=1).float(),
+        depth=2 + 3 * y.float() / height + torch.rand(len(places), generator=generator),
+        size=frame.image,
+    )
+    return network.arguments(frame, rgb, frame.points_to_network(points))

@@ -1,0 +1,150 @@
+"""A LiDAR scan and a calibration, read, checked against the picture, and projected into it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pnpdepth_cli.errors import SizeError, UsageError
+from pnpdepth_cli.io.calibration import Calibration, read_calibration
+from pnpdepth_cli.io.depth import describe_range
+from pnpdepth_cli.io.record import sha256_of
+from pnpdepth_cli.io.scans import SCAN_SUFFIXES, read_scan
+from pnpdepth_cli.sensors import (
+    Camera,
+    OcclusionFilter,
+    ProjectedScan,
+    ProjectionSettings,
+    project_velodyne,
+)
+
+_OFF_CENTRE = 0.15
+"""Share of the picture's side by which a principal point is off without being suspicious."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScanOptions:
+    """How a scan becomes sparse depth of a picture.
+
+    calib: a calibration file, or the folder of KITTI's raw calibration. camera: of KITTI's four.
+    euclidean: distances from the camera instead of z. min_range, max_range: metres from the
+    scanner. keep_occluded: also what the camera sees something nearer in front of.
+    """
+
+    calib: Path | None = None
+    camera: int | None = None
+    euclidean: bool = False
+    keep_occluded: bool = False
+    min_range: float = 0.0
+    max_range: float | None = None
+
+    def describes(self, sparse: Path) -> bool:
+        """True if the sparse depth is a scan: by its suffix, or because of a calibration.
+
+        UsageError if it is none, and an option asks for what only a scan has.
+        """
+        if self.calib is not None or sparse.suffix.lower() in set(SCAN_SUFFIXES) - {".npy"}:
+            return True
+        if self != ScanOptions():
+            raise UsageError(
+                f"{sparse} is no scan, so --camera, --range, --keep-occluded, --min-range and"
+                " --max-range do not apply; a scan needs --calib"
+            )
+        return False
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScanPoints:
+    """A projected scan, what a record says of it, and what a person should be told."""
+
+    points: ProjectedScan
+    record: dict[str, Any]
+    notes: tuple[str, ...]
+
+
+def read_scan_points(
+    path: Path, options: ScanOptions, size: tuple[int, int] | None, picture: Path | None = None
+) -> ScanPoints:
+    """The points of the scan that a picture of `size` (H, W) shows.
+
+    size None: what the calibration says. picture: its name, for messages. Raises the errors of
+    reading, SizeError if calibration and picture do not fit, NoPointsError if none is in view.
+    """
+    if options.calib is None:
+        raise UsageError(
+            f"{path} is a scan, which needs --calib: a calibration file, or KITTI's raw folder"
+        )
+    calibration = read_calibration(options.calib, options.camera)
+    if not calibration.has_pose:
+        raise UsageError(
+            f"{options.calib} does not say where the scanner stands; add R and t (or Tr)"
+        )
+    size = size or calibration.size
+    if size is None:
+        raise SizeError(f"{options.calib} does not say the picture's size; give the image too")
+    doubt = check_size(options.calib, calibration, size, picture)
+    scan = read_scan(path)
+    settings = ProjectionSettings(
+        euclidean=options.euclidean,
+        min_range=options.min_range,
+        max_range=np.inf if options.max_range is None else options.max_range,
+        occlusion=None if options.keep_occluded else OcclusionFilter(),
+    )
+    points = project_velodyne(scan.points, camera_of(calibration), size, settings)
+    source = f"{scan.source} of {len(scan.points):,} points, {calibration.source}"
+    lost = ", ".join(f"{count:,} {why}" for why, count in points.dropped.items() if count)
+    notes = [f"sparse: {describe_range(points.depth, source)}"]
+    notes += [f"sparse: dropped {lost}"] if lost else []
+    return ScanPoints(
+        points=points,
+        record={
+            "path": str(path),
+            "sha256": sha256_of(path),
+            "read_as": source,
+            "calibration": str(options.calib),
+            "depth_is": "range" if options.euclidean else "z",
+            "dropped": points.dropped,
+        },
+        notes=(*notes, *doubt),
+    )
+
+
+def camera_of(calibration: Calibration) -> Camera:
+    """The camera and scanner that a calibration describes."""
+    return Camera(
+        intrinsics=calibration.intrinsics,
+        rotation=calibration.rotation,
+        translation=calibration.translation,
+        distortion=calibration.distortion,
+    )
+
+
+def check_size(
+    path: Path, calibration: Calibration, size: tuple[int, int], picture: Path | None = None
+) -> list[str]:
+    """A warning if picture and calibration look like those of two cameras; SizeError if they are.
+
+    size: (H, W) of the picture.
+    """
+    name = f"{picture} is" if picture else "the picture is"
+    if calibration.size is not None and calibration.size != size:
+        height, width = calibration.size
+        raise SizeError(
+            f"{name} {size[1]}×{size[0]} but {path} is of {width}×{height} pictures; give the"
+            " picture as the calibration knows it"
+        )
+    x, y = calibration.intrinsics[:2, 2]
+    if not (0 <= x < size[1] and 0 <= y < size[0]):
+        raise SizeError(
+            f"{name} {size[1]}×{size[0]}, which does not contain the principal point"
+            f" ({x:.1f}, {y:.1f}) of {path}; one of them is of another camera or size"
+        )
+    if max(abs(x / size[1] - 0.5), abs(y / size[0] - 0.5)) > _OFF_CENTRE:
+        return [
+            f"warning: the principal point ({x:.1f}, {y:.1f}) of {path} is far from the middle of"
+            f" a {size[1]}×{size[0]} picture; is this the picture it was made for?"
+        ]
+    return []

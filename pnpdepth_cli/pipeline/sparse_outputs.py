@@ -1,0 +1,95 @@
+"""Sparse depth that a command made: planned before the work, written whole after it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pnpdepth_cli import __version__
+from pnpdepth_cli.errors import OutputError
+from pnpdepth_cli.io.overlay import overlay
+from pnpdepth_cli.io.record import write_json
+from pnpdepth_cli.io.sparse_writing import SPARSE_SUFFIXES, write_sparse
+from pnpdepth_cli.sensors import SparseDepth, as_picture
+
+
+@dataclass(frozen=True, kw_only=True)
+class SparseTarget:
+    """Where sparse depth is to go. depth_scale: codes per metre of a PNG."""
+
+    output: Path
+    overlay: Path | None = None
+    depth_scale: float = 256.0
+    overwrite: bool = False
+
+    @property
+    def record(self) -> Path:
+        """Beside the output: how it was made."""
+        return self.output.with_suffix(".json")
+
+    def check(self, inputs: Iterable[Path | None]) -> None:
+        """Raises OutputError for a place that cannot be used, before any work is done."""
+        if self.output.suffix.lower() not in SPARSE_SUFFIXES:
+            raise OutputError(
+                f"{self.output}: sparse depth is written as one of {', '.join(SPARSE_SUFFIXES)}"
+            )
+        if self.overlay is not None and self.overlay.suffix.lower() != ".png":
+            raise OutputError(f"{self.overlay}: the overlay is a PNG; name it so")
+        taken = {p.resolve() for p in inputs if p is not None}
+        for path in filter(None, (self.output, self.record, self.overlay)):
+            if path.resolve() in taken:
+                raise OutputError(f"{path} is an input or named twice; give another output")
+            if path.exists() and not self.overwrite:
+                raise OutputError(f"{path} exists; --overwrite replaces it, -o names another place")
+            taken.add(path.resolve())
+
+
+def write_sparse_outputs(
+    target: SparseTarget,
+    points: SparseDepth,
+    *,
+    command: str,
+    settings: dict[str, Any],
+    inputs: dict[str, Any],
+    notes: Iterable[str],
+    rgb: NDArray[np.float32] | None = None,
+) -> dict[str, Any]:
+    """The sparse depth, its record and the overlay on `rgb` are on disk; returns the record.
+
+    settings, with the seed among them, also go into the sparse file itself where it is PNG or CSV.
+    """
+    made = {"command": command, "version": __version__, **settings}
+    target.output.parent.mkdir(parents=True, exist_ok=True)
+    picture = as_picture(points)
+    write_sparse(
+        target.output, points.xy, points.depth, picture, made=made, scale=target.depth_scale
+    )
+    if target.overlay is not None and rgb is not None:
+        target.overlay.parent.mkdir(parents=True, exist_ok=True)
+        overlay(rgb, points.xy, points.depth, target.overlay)
+    height, width = points.size
+    record = {
+        **made,
+        "inputs": inputs,
+        "points": {
+            "count": len(points.depth),
+            "share_of_pixels": len(points.depth) / (height * width),
+            "nearest": float(points.depth.min()),
+            "farthest": float(points.depth.max()),
+            "dropped": points.dropped,
+        },
+        "size": [width, height],
+        "notes": list(notes),
+        "outputs": {
+            "sparse": str(target.output),
+            "overlay": str(target.overlay) if target.overlay else None,
+            "record": str(target.record),
+        },
+    }
+    write_json(target.record, record)
+    return record

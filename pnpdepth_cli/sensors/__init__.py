@@ -1,0 +1,36 @@
+"""Where sparse depth comes from: scans, dense depth, and scanners that were never there.
+
+    from pnpdepth_cli.sensors import LIDARS, Camera, project_velodyne, sample_points, simulate_lidar
+
+All give `SparseDepth`: N depths in metres at pixel coordinates of one picture, x to the right and
+y down, whole numbers at pixel centres. numpy only; nothing here reads a file.
+"""
+
+from __future__ import annotations
+
+from pnpdepth_cli.sensors.camera import Camera
+from pnpdepth_cli.sensors.lidar import FORWARD_LEFT_UP, LIDARS, Lidar
+from pnpdepth_cli.sensors.occlusion import OcclusionFilter
+from pnpdepth_cli.sensors.samplers import PATTERNS, SampleNoise, SamplePattern, sample_points
+from pnpdepth_cli.sensors.simulate import SimulationSettings, simulate_lidar
+from pnpdepth_cli.sensors.sparse import SparseDepth, as_picture
+from pnpdepth_cli.sensors.velodyne import ProjectedScan, ProjectionSettings, project_velodyne
+
+__all__ = [
+    "FORWARD_LEFT_UP",
+    "LIDARS",
+    "PATTERNS",
+    "Camera",
+    "Lidar",
+    "OcclusionFilter",
+    "ProjectedScan",
+    "ProjectionSettings",
+    "SampleNoise",
+    "SamplePattern",
+    "SimulationSettings",
+    "SparseDepth",
+    "as_picture",
+    "project_velodyne",
+    "sample_points",
+    "simulate_lidar",
+]

@@ -1,0 +1,143 @@
+"""Scanners as lists of beams: the paper's four by their data sheets, and as the paper has them.
+
+A turning scanner fires all its beams at every azimuth step. Elevations are degrees above the
+horizontal; frames are the makers': x forward, y left, z up.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pnpdepth_cli.errors import UsageError
+
+Floats = NDArray[np.float64]
+
+FORWARD_LEFT_UP: Floats = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
+"""The rotation from a scanner's frame to that of a camera which looks the same way."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Lidar:
+    """A turning scanner.
+
+    elevations_deg: one per beam. azimuth_step_deg: between firings. max_range: metres.
+    range_noise: standard deviation in metres. angle_noise_deg: standard deviation of every single
+    beam's direction, up and sideways.
+    """
+
+    name: str
+    elevations_deg: tuple[float, ...]
+    azimuth_step_deg: float
+    max_range: float
+    range_noise: float = 0.0
+    angle_noise_deg: float = 0.0
+
+    def __post_init__(self) -> None:
+        angles = np.array(self.elevations_deg, np.float64)
+        if not angles.size or not (np.abs(angles) <= 90).all():
+            raise UsageError(f"sensor {self.name!r}: give elevations between −90° and 90°")
+        if not 0.001 <= self.azimuth_step_deg <= 360:
+            raise UsageError(
+                f"sensor {self.name!r}: azimuth step {self.azimuth_step_deg:g}° is not"
+                " between 0.001° and 360°"
+            )
+        if not self.max_range > 0 or min(self.range_noise, self.angle_noise_deg) < 0:
+            raise UsageError(
+                f"sensor {self.name!r}: give a maximum range above 0 and no negative noise"
+            )
+
+    def directions(self, rng: np.random.Generator) -> Floats:
+        """(M, 3) unit vectors of one turn in the scanner's frame, beam by beam.
+
+        rng draws the beams' own noise, and nothing if there is none.
+        """
+        elevation = np.radians(self.elevations_deg)[:, None]
+        steps = round(360 / self.azimuth_step_deg)
+        azimuth = np.radians(np.arange(steps) * self.azimuth_step_deg)[None, :]
+        elevation, azimuth = np.broadcast_arrays(elevation, azimuth)
+        if self.angle_noise_deg > 0:
+            spread = np.radians(self.angle_noise_deg)
+            elevation = elevation + rng.normal(0, spread, elevation.shape)
+            azimuth = azimuth + rng.normal(0, spread, azimuth.shape)
+        level = np.cos(elevation)
+        return np.stack(
+            [level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)], axis=-1
+        ).reshape(-1, 3)
+
+
+def evenly_spaced(top_deg: float, step_deg: float, beams: int) -> tuple[float, ...]:
+    """Elevations from the top downwards."""
+    return tuple(round(top_deg - step_deg * beam, 6) for beam in range(beams))
+
+
+# Azimuth steps are those at 10 turns a second; firing times and angles from the makers' manuals:
+# Velodyne VLP-16 user manual 63-9243, VLP-32C 63-9325, HDL-32E 63-9113, HDL-64E S2 63-HDL64ES2.
+_VLP_32C_DEG = (
+    15.0, 10.333, 7.0, 4.667, 3.333, 2.333, 1.667, 1.333, 1.0, 0.667, 0.333, 0.0, -0.333, -0.667,
+    -1.0, -1.333, -1.667, -2.0, -2.333, -2.667, -3.0, -3.333, -3.667, -4.0, -4.667, -5.333, -6.148,
+    -7.254, -8.843, -11.31, -15.639, -25.0,
+)  # fmt: skip
+_SHEETS = (
+    Lidar(
+        name="vlp-16",
+        elevations_deg=evenly_spaced(15, 2, 16),
+        azimuth_step_deg=0.2,
+        max_range=100,
+        range_noise=0.03,
+    ),
+    Lidar(
+        name="vlp-32c",
+        elevations_deg=_VLP_32C_DEG,
+        azimuth_step_deg=0.2,
+        max_range=200,
+        range_noise=0.03,
+    ),
+    Lidar(
+        name="hdl-32e",
+        elevations_deg=evenly_spaced(10 + 2 / 3, 4 / 3, 32),
+        azimuth_step_deg=0.166,
+        max_range=100,
+        range_noise=0.02,
+    ),
+    Lidar(
+        name="hdl-64e",
+        elevations_deg=evenly_spaced(2, 1 / 3, 32) + evenly_spaced(-8.83, 0.5, 32),
+        azimuth_step_deg=0.1728,
+        max_range=120,
+        range_noise=0.02,
+    ),
+)
+
+# Wang et al. 2019, table on LiDAR types: field of view and vertical resolution, beams evenly
+# spaced. Where the top beam points is the data sheet's; the table does not say. Nor does it say
+# how fine the azimuth is or how strong the "random noise on rotation": these two are ours, chosen
+# once for all four so that their shares of samples come out about as printed there, in SYNTHIA's
+# view of 100° by 71° at 512×304 pixels.
+_PAPER_FOV = {
+    "vlp-16": (30, 2.0, 15.0),
+    "vlp-32c": (40, 0.3, 15.0),
+    "hdl-32e": (41, 1.3, 10.67),
+    "hdl-64e": (27, 0.4, 2.0),
+}
+_PAPER_AZIMUTH_STEP_DEG = 0.19
+_PAPER_ANGLE_NOISE_DEG = 0.4
+
+
+def _paper(name: str) -> Lidar:
+    fov_deg, step_deg, top_deg = _PAPER_FOV[name]
+    return Lidar(
+        name=f"paper-{name}",
+        elevations_deg=evenly_spaced(top_deg, step_deg, int(fov_deg / step_deg + 1e-9) + 1),
+        azimuth_step_deg=_PAPER_AZIMUTH_STEP_DEG,
+        max_range=np.inf,
+        angle_noise_deg=_PAPER_ANGLE_NOISE_DEG,
+    )
+
+
+LIDARS: dict[str, Lidar] = {
+    sensor.name: sensor for sensor in (*_SHEETS, *(_paper(name) for name in _PAPER_FOV))
+}
+"""The scanners that can be named."""

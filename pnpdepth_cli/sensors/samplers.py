@@ -1,0 +1,277 @@
+"""Sparse depth out of dense depth: which pixels are kept, and what a sensor would add to them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pnpdepth_cli.errors import NoPointsError, SizeError, UsageError
+from pnpdepth_cli.sensors.sparse import SparseDepth, Steps, in_picture
+
+Depth = NDArray[np.float32]
+Picture = NDArray[np.float32]
+Pixels = NDArray[np.intp]
+
+
+@dataclass(frozen=True, kw_only=True)
+class SamplePattern:
+    """Which of the N known pixels are kept.
+
+    kind: one of `PATTERNS`. count, share: how many points, or which share (0…1) of the known
+    pixels; at most one of the two. For `lines`, count is the number of lines. region: x, y,
+    width and height in pixels, for `region` alone.
+    """
+
+    kind: str = "uniform"
+    count: int | None = None
+    share: float | None = None
+    region: tuple[int, int, int, int] | None = None
+
+    def __post_init__(self) -> None:
+        if self.kind not in PATTERNS:
+            raise UsageError(f"pattern {self.kind!r} is not one of {', '.join(PATTERNS)}")
+        if self.count is not None and self.share is not None:
+            raise UsageError("give a number of points or a share of the pixels, not both")
+        too_few = self.count is not None and self.count < 1
+        if too_few or (self.share is not None and not 0 < self.share <= 1):
+            raise UsageError("give at least one point, or a share above 0 and at most 100 %")
+        if self.kind == "lines" and self.count is None:
+            raise UsageError("pattern 'lines' needs the number of lines as its count")
+        if self.kind not in ("lines", "region") and self.count is None and self.share is None:
+            raise UsageError(f"pattern {self.kind!r} needs a count, N or N %")
+        if (self.region is None) == (self.kind == "region"):
+            raise UsageError(
+                "a region X,Y,WIDTH,HEIGHT goes with the pattern 'region', and only it"
+            )
+
+    def wanted(self, known: int) -> int:
+        """The number of points among `known` pixels."""
+        if self.share is not None:
+            return max(1, round(self.share * known))
+        return known if self.count is None else self.count
+
+
+@dataclass(frozen=True, kw_only=True)
+class SampleNoise:
+    """What a sensor adds to true depth; all zero for nothing.
+
+    metres: standard deviation. relative: the same as a share of the depth. outliers: the share of
+    points whose depth is drawn anew between the nearest and the farthest. jitter_px: standard
+    deviation of the place, in x and in y.
+    """
+
+    metres: float = 0.0
+    relative: float = 0.0
+    outliers: float = 0.0
+    jitter_px: float = 0.0
+
+    def __post_init__(self) -> None:
+        if min(self.metres, self.relative, self.jitter_px) < 0 or not 0 <= self.outliers <= 1:
+            raise UsageError("give noise that is not negative, and outliers as a share of 0 to 1")
+
+
+def sample_points(
+    depth: Depth,
+    pattern: SamplePattern,
+    seed: int,
+    *,
+    image: Picture | None = None,
+    noise: SampleNoise | None = None,
+) -> SparseDepth:
+    """Points of a dense depth map; the same seed gives the same points.
+
+    depth: (H, W) metres, 0 = unknown. image: (H, W, 3) in 0..1 of the same view, for `features`
+    and `edges`. Raises NoPointsError if nothing is left, UsageError for more points than known.
+    """
+    if image is not None and image.shape[:2] != depth.shape:
+        raise SizeError(
+            f"the image is {image.shape[1]}×{image.shape[0]} but the depth is"
+            f" {depth.shape[1]}×{depth.shape[0]}"
+        )
+    rng = np.random.default_rng(seed)
+    known = np.flatnonzero(np.isfinite(depth) & (depth > 0))
+    if not known.size:
+        raise NoPointsError("the depth map has no pixel with known depth to sample from")
+    chosen = np.sort(PATTERNS[pattern.kind](depth, known, pattern, image, rng))
+    if not chosen.size:
+        raise NoPointsError(f"pattern {pattern.kind!r} leaves no point; ask for more")
+    row, column = np.divmod(chosen, depth.shape[1])
+    xy = np.stack([column, row], axis=1).astype(np.float64)
+    return _disturbed(xy, depth.ravel()[chosen].astype(np.float64), depth, noise, rng)
+
+
+def _uniform(
+    depth: Depth,
+    known: Pixels,
+    pattern: SamplePattern,
+    image: Picture | None,
+    rng: np.random.Generator,
+) -> Pixels:
+    count = pattern.wanted(known.size)
+    if count > known.size:
+        raise UsageError(f"{count:,} points of {known.size:,} known pixels; ask for fewer")
+    return rng.choice(known, count, replace=False)
+
+
+def _bernoulli(
+    depth: Depth,
+    known: Pixels,
+    pattern: SamplePattern,
+    image: Picture | None,
+    rng: np.random.Generator,
+) -> Pixels:
+    """A coin for each known pixel, so that the wanted number is only the expected one."""
+    return known[rng.random(known.size) < pattern.wanted(known.size) / known.size]
+
+
+def _grid(
+    depth: Depth,
+    known: Pixels,
+    pattern: SamplePattern,
+    image: Picture | None,
+    rng: np.random.Generator,
+) -> Pixels:
+    """Known pixels of a square grid, of a spacing that gives a full map the wanted number."""
+    height, width = depth.shape
+    if pattern.share is not None:
+        spacing = pattern.share**-0.5
+    else:
+        spacing = max(1.0, (height * width / pattern.wanted(known.size)) ** 0.5)
+    rows, columns = (
+        (np.floor((np.arange(max(1, round(side / spacing))) + 0.5) * spacing)).astype(np.intp)
+        for side in (height, width)
+    )
+    nodes = np.minimum(rows, height - 1)[:, None] * width + np.minimum(columns, width - 1)
+    return np.intersect1d(nodes, known)
+
+
+def _lines(
+    depth: Depth,
+    known: Pixels,
+    pattern: SamplePattern,
+    image: Picture | None,
+    rng: np.random.Generator,
+) -> Pixels:
+    """All known pixels of evenly spaced rows."""
+    height, width = depth.shape
+    count = pattern.wanted(height)
+    if count > height:
+        raise UsageError(f"{count:,} lines do not fit {height:,} rows; ask for fewer")
+    rows = np.floor((np.arange(count) + 0.5) * height / count).astype(np.intp)
+    return known[np.isin(known // width, rows)]
+
+
+def _region(
+    depth: Depth,
+    known: Pixels,
+    pattern: SamplePattern,
+    image: Picture | None,
+    rng: np.random.Generator,
+) -> Pixels:
+    """Pixels of a rectangle; all known ones, or as many as wanted at random."""
+    left, top, width, height = pattern.region or (0, 0, 0, 0)
+    row, column = np.divmod(known, depth.shape[1])
+    inside = (column >= left) & (column < left + width) & (row >= top) & (row < top + height)
+    if not inside.any():
+        raise NoPointsError(
+            f"region {left},{top},{width},{height} holds no pixel with known depth of the"
+            f" {depth.shape[1]}×{depth.shape[0]} picture"
+        )
+    return _uniform(depth, known[inside], pattern, image, rng)
+
+
+def _features(
+    depth: Depth,
+    known: Pixels,
+    pattern: SamplePattern,
+    image: Picture | None,
+    rng: np.random.Generator,
+) -> Pixels:
+    """The strongest ORB corners with known depth: where structure from motion has its points."""
+    import cv2
+
+    # Corners in a pyramid crowd the same places; three times as many leave enough after merging.
+    wanted = pattern.wanted(known.size)
+    detector = cv2.ORB_create(nfeatures=3 * wanted + 100, edgeThreshold=4, fastThreshold=5)  # type: ignore[attr-defined]
+    corners = detector.detect(_grey_bytes(pattern, image))
+    corners = sorted(corners, key=lambda corner: -corner.response)
+    places = np.array([corner.pt for corner in corners], np.float64).reshape(-1, 2)
+    column, row = np.rint(places).astype(np.intp).T
+    pixels = row * depth.shape[1] + column
+    _, first = np.unique(pixels, return_index=True)
+    strongest = pixels[np.sort(first)]
+    kept: Pixels = strongest[np.isin(strongest, known)][:wanted]
+    return kept
+
+
+def _edges(
+    depth: Depth,
+    known: Pixels,
+    pattern: SamplePattern,
+    image: Picture | None,
+    rng: np.random.Generator,
+) -> Pixels:
+    """Known pixels on the picture's edges (Canny), as many as wanted at random."""
+    import cv2
+
+    grey = cv2.GaussianBlur(_grey_bytes(pattern, image), (5, 5), 0)
+    on_edge = np.flatnonzero(cv2.Canny(grey, 30, 90))
+    candidates = np.intersect1d(on_edge, known)
+    count = min(pattern.wanted(known.size), candidates.size)
+    return rng.choice(candidates, count, replace=False)
+
+
+def _grey_bytes(pattern: SamplePattern, image: Picture | None) -> NDArray[np.uint8]:
+    if image is None:
+        raise UsageError(f"pattern {pattern.kind!r} needs the image that the depth belongs to")
+    grey = image @ np.array([0.299, 0.587, 0.114], np.float32)
+    return np.rint(255 * np.clip(grey, 0, 1)).astype(np.uint8)
+
+
+Sampler = Callable[[Depth, Pixels, SamplePattern, "Picture | None", np.random.Generator], Pixels]
+PATTERNS: dict[str, Sampler] = {
+    "uniform": _uniform,
+    "bernoulli": _bernoulli,
+    "grid": _grid,
+    "lines": _lines,
+    "features": _features,
+    "edges": _edges,
+    "region": _region,
+}
+"""The patterns that can be named: row-major indices of the pixels each keeps."""
+
+
+def _disturbed(
+    xy: NDArray[np.float64],
+    values: NDArray[np.float64],
+    depth: Depth,
+    noise: SampleNoise | None,
+    rng: np.random.Generator,
+) -> SparseDepth:
+    noise = noise or SampleNoise()
+    height, width = depth.shape
+    low, high = values.min(), values.max()
+    if noise.metres > 0:
+        values = values + rng.normal(0, noise.metres, len(values))
+    if noise.relative > 0:
+        values = values * (1 + rng.normal(0, noise.relative, len(values)))
+    if noise.outliers > 0:
+        wrong = rng.permutation(len(values))[: round(noise.outliers * len(values))]
+        values[wrong] = rng.uniform(low, high, len(wrong))
+    if noise.jitter_px > 0:
+        xy = xy + rng.normal(0, noise.jitter_px, xy.shape)
+    steps = Steps(len(values))
+    positive = steps.keep(values.astype(np.float32) > 0, "noise left no depth")
+    xy, values = xy[positive], values[positive]
+    inside = steps.keep(in_picture(xy, (height, width)), "outside the picture")
+    if not inside.any():
+        raise NoPointsError(f"noise leaves no point ({steps}); make it smaller")
+    return SparseDepth(
+        xy=xy[inside].astype(np.float32),
+        depth=values[inside].astype(np.float32),
+        size=(height, width),
+        dropped={why: count for why, count in steps.dropped.items() if count},
+    )

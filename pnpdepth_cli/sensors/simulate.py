@@ -1,0 +1,180 @@
+"""What a scanner would measure in a scene of which a camera's dense depth is known."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pnpdepth_cli.errors import NoPointsError, UsageError
+from pnpdepth_cli.sensors.camera import Camera
+from pnpdepth_cli.sensors.lidar import Lidar
+from pnpdepth_cli.sensors.sparse import (
+    Floats,
+    SparseDepth,
+    Steps,
+    in_picture,
+    nearest_in_pixel,
+    pixel_index,
+)
+
+_SAME_SURFACE = 1.1
+"""Depths of neighbouring pixels within this ratio are taken for one surface."""
+
+_LONGEST_WALK = 4096
+
+
+@dataclass(frozen=True, kw_only=True)
+class SimulationSettings:
+    """What is between the scanner and ideal measurement; None means the sensor's own value.
+
+    rotation_noise_deg: standard deviation of one turn of the whole scanner about each axis.
+    angle_noise_deg: the same of every single beam. range_noise: metres. dropout: the share of
+    beams that never return. max_range: metres from the scanner. euclidean: as in projection.
+    """
+
+    rotation_noise_deg: float = 0.0
+    angle_noise_deg: float | None = None
+    range_noise: float | None = None
+    dropout: float = 0.0
+    max_range: float | None = None
+    euclidean: bool = False
+
+    def __post_init__(self) -> None:
+        if self.rotation_noise_deg < 0 or not 0 <= self.dropout < 1:
+            raise UsageError("give a rotation noise ≥ 0 and a drop-out of 0 ≤ share < 1")
+
+
+def simulate_lidar(
+    depth: NDArray[np.floating],
+    camera: Camera,
+    sensor: Lidar,
+    seed: int,
+    settings: SimulationSettings | None = None,
+) -> SparseDepth:
+    """Sparse depth of one turn of the scanner, in the picture the depth belongs to.
+
+    depth: (H, W) metres along the camera's axis, 0 = unknown. camera: how it sees, and where the
+    scanner stands to it (`FORWARD_LEFT_UP` and zero: in its place). The same seed gives the same
+    points. Raises NoPointsError when no beam meets anything that the camera sees.
+    """
+    settings = settings or SimulationSettings()
+    sensor = _as_set(sensor, settings)
+    size = (depth.shape[0], depth.shape[1])
+    rng = np.random.default_rng(seed)
+    turned = _turned(camera, settings.rotation_noise_deg, rng)
+    beams = sensor.directions(rng) @ turned.rotation.T
+    steps = Steps(len(beams))
+    z = _depth_at_first_hit(np.asarray(depth, np.float64), turned, beams)
+    met = steps.keep(np.isfinite(z), "meets nothing that the camera sees")
+    distance = (z[met] - camera.translation[2]) / beams[met, 2]
+    kept = steps.keep(distance <= sensor.max_range, "out of range")
+    returned = steps.keep(rng.random(np.count_nonzero(kept)) >= settings.dropout, "dropped out")
+    distance, beams = distance[kept][returned], beams[met][kept][returned]
+    if sensor.range_noise > 0:
+        distance = distance + rng.normal(0, sensor.range_noise, len(distance))
+    points = camera.translation + beams * distance[:, None]
+    ahead = steps.keep((distance > 0) & (points[:, 2] > 0), "noise put it behind the camera")
+    points = points[ahead]
+    xy = camera.pixels_of(points)
+    inside = steps.keep(in_picture(xy, size), "outside the picture")
+    points, xy = points[inside], xy[inside]
+    front = steps.keep(nearest_in_pixel(xy, points[:, 2], size), "behind another in their pixel")
+    points, xy = points[front], xy[front]
+    if not len(xy):
+        raise NoPointsError(
+            f"no beam of {sensor.name} gives a point in the picture ({steps}); check depth,"
+            " intrinsics and where the scanner stands"
+        )
+    values = np.linalg.norm(points, axis=1) if settings.euclidean else points[:, 2]
+    return SparseDepth(
+        xy=xy.astype(np.float32),
+        depth=values.astype(np.float32),
+        size=size,
+        dropped=steps.dropped,
+    )
+
+
+def _as_set(sensor: Lidar, settings: SimulationSettings) -> Lidar:
+    return replace(
+        sensor,
+        angle_noise_deg=_first(settings.angle_noise_deg, sensor.angle_noise_deg),
+        range_noise=_first(settings.range_noise, sensor.range_noise),
+        max_range=_first(settings.max_range, sensor.max_range),
+    )
+
+
+def _first(wanted: float | None, otherwise: float) -> float:
+    return otherwise if wanted is None else wanted
+
+
+def _turned(camera: Camera, spread_deg: float, rng: np.random.Generator) -> Camera:
+    """The scanner turned at random about its own place."""
+    if spread_deg == 0:
+        return camera
+    x, y, z = np.radians(rng.normal(0, spread_deg, 3))
+    about_x = np.array([[1, 0, 0], [0, np.cos(x), -np.sin(x)], [0, np.sin(x), np.cos(x)]])
+    about_y = np.array([[np.cos(y), 0, np.sin(y)], [0, 1, 0], [-np.sin(y), 0, np.cos(y)]])
+    about_z = np.array([[np.cos(z), -np.sin(z), 0], [np.sin(z), np.cos(z), 0], [0, 0, 1]])
+    return replace(camera, rotation=camera.rotation @ about_z @ about_y @ about_x)
+
+
+def _depth_at_first_hit(depth: Floats, camera: Camera, beams: Floats) -> Floats:
+    """(M,) the depth z at which each beam first meets the depth map; NaN where it does not.
+
+    beams: (M, 3) unit vectors in the camera's frame, from the scanner's place. A beam is followed
+    outwards in steps of at most a pixel. One that slips behind an edge is lost: what is there, the
+    camera does not see.
+    """
+    hit = np.full(len(beams), np.nan)
+    known = depth[depth > 0]
+    start = camera.translation
+    if not known.size:
+        return hit
+    near, far = 0.999 * known.min(), 1.001 * known.max()
+    # A beam that turns away from the camera's axis never gets beyond `near`.
+    forward = np.flatnonzero((beams[:, 2] > 1e-9) & (start[2] < near))
+    beams = beams[forward]
+    depths_z = 1 / np.linspace(1 / near, 1 / far, _walk_length(camera, beams, near, far, depth) + 1)
+    before_z, before_map = near, np.full(len(forward), np.inf)
+    walking = np.arange(len(forward))
+    for z in depths_z:
+        reached = start + beams[walking] * ((z - start[2]) / beams[walking, 2])[:, None]
+        ahead = _map_at(depth, camera, reached)
+        met = (ahead > 0) & (z >= ahead)
+        same = before_map[walking] <= _SAME_SURFACE * ahead
+        straight_on = met & (before_z <= ahead)
+        slanted = met & ~straight_on & same
+        hit[forward[walking[straight_on]]] = ahead[straight_on]
+        gap_before = before_map[walking[slanted]] - before_z
+        share = gap_before / (gap_before + z - ahead[slanted])
+        hit[forward[walking[slanted]]] = before_z + share * (z - before_z)
+        before_map[walking] = np.where(ahead > 0, ahead, np.inf)
+        before_z = z
+        walking = walking[~met]
+    return hit
+
+
+def _walk_length(camera: Camera, beams: Floats, near: float, far: float, depth: Floats) -> int:
+    """Steps that no beam in the picture needs more of to move by at most a pixel in each."""
+    ends = []
+    for z in (near, far):
+        reached = camera.translation + beams * ((z - camera.translation[2]) / beams[:, 2])[:, None]
+        ends.append(camera.pixels_of(reached))
+    size = (depth.shape[0], depth.shape[1])
+    seen = in_picture(ends[0], size) | in_picture(ends[1], size)
+    if not seen.any():
+        return 1
+    moved = np.hypot(*(ends[1] - ends[0])[seen].T)
+    return int(min(max(1, np.ceil(np.nanmax(moved, initial=0))), _LONGEST_WALK))
+
+
+def _map_at(depth: Floats, camera: Camera, points: Floats) -> Floats:
+    """(M,) the depth map at the pixels of points; 0 outside the picture."""
+    xy = camera.pixels_of(points)
+    size = (depth.shape[0], depth.shape[1])
+    inside = in_picture(xy, size)
+    values = np.zeros(len(points))
+    values[inside] = depth.ravel()[pixel_index(xy[inside], size)]
+    return values

@@ -1,0 +1,117 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from pnpdepth_cli.cli.sample import PATTERNS
+from pnpdepth_cli.cli.simulate import SENSORS
+from tests.cli.test_commands import code_of
+from tests.pipeline.frames import frame_on_disk
+from tests.pipeline.scan_frames import ScanOnDisk, scan_on_disk
+
+
+@pytest.fixture
+def frame(tmp_path: Path) -> ScanOnDisk:
+    return scan_on_disk(tmp_path)
+
+
+def test_project_says_what_it_dropped_and_wrote(
+    frame: ScanOnDisk, capsys: pytest.CaptureFixture[str]
+) -> None:
+    sparse = frame.folder / "sparse.png"
+    arguments = ["project", str(frame.scan), "--calib", str(frame.calib), "-o", str(sparse)]
+    assert code_of([*arguments, "--image", str(frame.image), "--max-range", "4.8"]) == 0
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert "KITTI scan of 150 points" in err
+    assert "out of range" in err
+    assert "sparse.png" in err
+    assert code_of([*arguments, "--size", "48x64", "--overwrite", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["points"]["count"] == 150
+
+
+@pytest.mark.parametrize(
+    ("options", "code", "said"),
+    [
+        (["--size", "48"], 2, "HxW"),
+        (["--size", "48x64", "--camera", "1"], 2, "leave out --camera"),
+        (["--size", "48x64", "--min-range", "9", "--max-range", "2"], 2, "is empty"),
+        (["--image", "missing.png"], 3, "missing.png"),
+        (["--size", "48x64", "--min-range", "90"], 3, "none of the scan's"),
+    ],
+)
+def test_the_exit_code_of_project_says_whose_mistake_it_was(
+    frame: ScanOnDisk, capsys: pytest.CaptureFixture[str], options: list[str], code: int, said: str
+) -> None:
+    sparse = frame.folder / "sparse.png"
+    arguments = ["project", str(frame.scan), "--calib", str(frame.calib), "-o", str(sparse)]
+    assert code_of([*arguments, *options]) == code
+    err = capsys.readouterr().err
+    assert said in err
+    assert err.count("\n") == 1
+    assert not sparse.exists()
+
+
+def test_sample_takes_a_number_or_a_share(
+    frame: ScanOnDisk, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = [
+        "sample",
+        str(frame.gt),
+        "-o",
+        str(frame.folder / "s.csv"),
+        "--json",
+        "--overwrite",
+    ]
+    for count, points in (("40", 40), ("25%", 768)):
+        assert code_of([*arguments, "--count", count, "--seed", "3"]) == 0
+        record = json.loads(capsys.readouterr().out)
+        assert record["points"]["count"] == points
+        assert record["seed"] == 3
+    assert code_of([*arguments, "--count", "many"]) == 2
+    assert code_of([*arguments, "--pattern", "region", "--region", "1,2,3"]) == 2
+    assert code_of([*arguments, "--pattern", "region", "--region", "1,2,3,4"]) == 0
+
+
+def test_simulate_writes_the_sensors_points(
+    frame: ScanOnDisk, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ["simulate", str(frame.gt), "--calib", str(frame.calib), "--seed", "1"]
+    output = ["-o", str(frame.folder / "s.exr")]
+    assert code_of([*arguments, *output, "--sensor", "hdl-64e", "--offset", "0", "-0.1", "0"]) == 0
+    assert "hdl-64e, seed 1" in capsys.readouterr().err
+    assert (frame.folder / "s.exr").exists()
+    assert code_of([*arguments, *output, "--overwrite", "--sensor", "hdl-65e"]) == 2
+    assert "hdl-64e" in capsys.readouterr().err
+
+
+def test_the_names_in_the_help_are_those_that_work() -> None:
+    from pnpdepth_cli.sensors import LIDARS
+    from pnpdepth_cli.sensors import PATTERNS as KNOWN
+
+    assert tuple(KNOWN) == PATTERNS
+    assert tuple(LIDARS) == (*SENSORS, *(f"paper-{name}" for name in SENSORS))
+
+
+def test_refine_takes_a_scan_with_its_calibration(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    network = frame_on_disk(tmp_path)
+    (tmp_path / "scan").mkdir()
+    scan = scan_on_disk(tmp_path / "scan")
+    arguments = [
+        "refine", str(scan.image), "--sparse", str(scan.scan), "-o", str(tmp_path / "out"),
+        "--model", str(network.model), "--checkpoint", str(network.checkpoint), "--json",
+    ]  # fmt: skip
+    assert code_of([*arguments, "--calib", str(scan.calib), "--gt", str(scan.gt)]) == 0
+    record = json.loads(capsys.readouterr().out)
+    assert record["points"]["used"] == 150
+    assert record["inputs"]["sparse"]["dropped"]["hidden by foreground"] == 0
+    assert record["sparse_error"]["after"]["mae"] < record["sparse_error"]["before"]["mae"]
+    arguments.append("--overwrite")
+    assert code_of(arguments) == 2
+    assert "needs --calib" in capsys.readouterr().err
+    assert code_of([*arguments[:3], str(scan.gt), *arguments[4:], "--keep-occluded"]) == 2
+    assert "is no scan" in capsys.readouterr().err

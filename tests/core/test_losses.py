@@ -1,0 +1,74 @@
+"""Losses against values worked out by hand."""
+
+from __future__ import annotations
+
+from math import inf, log
+
+import pytest
+import torch
+
+from pnpdepth_cli.core.losses import LOSSES, NEAREST_DEPTH, berhu
+
+PREDICTED, TRUE = torch.tensor([1.0, 2.0, 4.0, 10.0]), torch.tensor([1.0, 2.5, 2.0, 5.0])
+# errors 0, ½, 2, 5; c of berhu = 1, so ½ is linear there and 2 and 5 are quadratic
+BY_HAND = {
+    "l1": 7.5 / 4,
+    "l2": (0.25 + 4 + 25) / 4,
+    "huber": (0.5 * 0.25 + 1.5 + 4.5) / 4,
+    "berhu": (0.5 + (4 + 1) / 2 + (25 + 1) / 2) / 4,
+    "inverse": (0.1 + 0.25 + 0.1) / 4,
+    "log": (log(2.5 / 2) + log(2) + log(2)) / 4,
+}
+
+
+@pytest.mark.parametrize("name", LOSSES)
+def test_a_loss_has_the_value_worked_out_by_hand(name: str) -> None:
+    assert float(LOSSES[name](PREDICTED, TRUE)) == pytest.approx(BY_HAND[name], rel=1e-6)
+
+
+def test_every_loss_has_its_value_here() -> None:
+    assert set(BY_HAND) == set(LOSSES)
+
+
+def test_berhu_is_lainas_formula() -> None:
+    generator = torch.Generator().manual_seed(0)
+    predicted, true = torch.rand(2, 200, generator=generator) * 10
+    c = max(abs(p - d) for p, d in zip(predicted.tolist(), true.tolist(), strict=True)) / 5
+    errors = [abs(p - d) for p, d in zip(predicted.tolist(), true.tolist(), strict=True)]
+    expected = sum(e if e <= c else (e * e + c * c) / (2 * c) for e in errors) / 200
+    assert float(berhu(predicted, true)) == pytest.approx(expected, rel=1e-5)
+
+
+@pytest.mark.parametrize("name", LOSSES)
+def test_no_error_is_no_loss_and_no_gradient(name: str) -> None:
+    predicted = TRUE.clone().requires_grad_(True)
+    loss = LOSSES[name](predicted, TRUE)
+    assert float(loss) == 0
+    assert torch.autograd.grad(loss, predicted)[0].tolist() == [0, 0, 0, 0]
+
+
+@pytest.mark.parametrize("name", LOSSES)
+@pytest.mark.parametrize("value", [-5.0, 0.0, NEAREST_DEPTH / 2, 1e30, 1e-30])
+def test_any_finite_prediction_has_a_gradient_without_nan(name: str, value: float) -> None:
+    predicted = torch.tensor([value, 1.0], requires_grad=True)
+    loss = LOSSES[name](predicted, torch.tensor([2.0, 1.5]))
+    gradient = torch.autograd.grad(loss, predicted)[0]
+    assert not bool(gradient.isnan().any())
+    assert not bool(loss.isnan())
+
+
+@pytest.mark.parametrize("name", LOSSES)
+@pytest.mark.parametrize("value", [inf, float("nan")])
+def test_a_prediction_that_is_not_finite_is_seen_in_the_loss_or_the_gradient(
+    name: str, value: float
+) -> None:
+    if name == "inverse" and value == inf:
+        pytest.skip("1/∞ is 0: a prediction without end is a finite error")
+    predicted = torch.tensor([value, 1.0], requires_grad=True)
+    loss = LOSSES[name](predicted, torch.tensor([2.0, 1.5]))
+    assert not bool(loss.isfinite())
+
+
+@pytest.mark.parametrize("name", LOSSES)
+def test_a_single_point_is_enough(name: str) -> None:
+    assert float(LOSSES[name](PREDICTED[:1] + 1, TRUE[:1])) > 0

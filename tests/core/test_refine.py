@@ -1,0 +1,353 @@
+"""Equations 2 and 3, against a refinement that runs the whole network every time."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from pnpdepth_cli.core.points import SparsePoints
+from pnpdepth_cli.core.refine import Refinement, RefineSettings, refine, step_size
+from pnpdepth_cli.core.split import Split
+from pnpdepth_cli.core.updates import UPDATES
+from pnpdepth_cli.errors import DivergedError, LayerError, ModelError, UsageError
+from tests.core.naive import naive_refine, plain
+from tests.core.networks import NETWORKS, TwoBranches, UNet, build, conv, depth_of, picture
+
+POINTS = SparsePoints(
+    xy=torch.tensor([[3.0, 4.0], [10.0, 12.0], [15.0, 15.0], [7.0, 9.0], [0.0, 1.0]]),
+    depth=torch.tensor([2.0, 3.0, 1.5, 4.0, 0.7]),
+    size=(16, 16),
+)
+CUTS = {
+    "resnet": ("layer1.1.relu#1", "layer2", "layer2.0.downsample.1"),
+    "unet": ("encoder.stages.0", "encoder[3]", "bottleneck", "ups.1"),
+    "vit": ("encoder[last]", "encoder[hidden][1]", "encoder.blocks.1[0]", "encoder.norm"),
+    "in place": ("a", "b", "relu", "c"),
+    "midas": ("backbone.2", "backbone.3", "unit1", "unit2.relu#1", "unit1.conv1"),
+    "branching": ("a", "cut"),
+    "repeated": ("norm#1", "same#1", "same#2", "same#3", "enter"),
+    "tuple output": ("cut[0]", "cut.a"),
+    "list output": ("cut[1]",),
+    "dict output": ("cut[deep]", "cut[shallow]"),
+    "namedtuple output": ("cut[0]",),
+    "dataclass output": ("cut[shallow]",),
+    "nested output": ("cut[out][1][x]",),
+    "two branches": ("cut", "guide", "front.inner"),
+    "side effects": ("cut", "one.conv", "enter"),
+    "updating": ("enter", "cut"),
+    "direct": ("methods.a#1", "methods.b", "head", "spectral.parametrizations.weight"),
+    "scripted": ("cut",),
+    "checkpointed": ("cut", "enter#1", "a"),
+    "checkpointed, reentrant": ("cut", "enter#1"),
+    "checkpointed cut": ("enter", "cut"),
+    "sparse": ("cut", "enter"),
+    "native": ("enter", "cut", "native"),
+    "fx": ("0", "2.a"),
+    "wrapped": ("module.0.0", "module.0", "module.1.a"),
+}
+
+
+def refined(network: nn.Module, layer: str, settings: RefineSettings, **more: Any) -> Refinement:
+    points = more.pop("points", POINTS)
+    with Split(network, layer) as split:
+        return refine(split, (picture(),), points, settings, depth_of=depth_of, **more)
+
+
+def test_every_network_is_compared_except_one_that_no_hook_can_follow() -> None:
+    assert set(NETWORKS) - set(CUTS) == {"half inference"}
+
+
+@pytest.mark.parametrize("update", UPDATES)
+@pytest.mark.parametrize(("name", "layer"), [(n, cut) for n, cuts in CUTS.items() for cut in cuts])
+def test_five_updates_are_those_of_running_the_whole_network_every_time(
+    name: str, layer: str, update: str
+) -> None:
+    network = build(name)
+    settings = RefineSettings(iterations=5, lr=0.02, update=update)
+    depth, losses = naive_refine(network, layer, picture(), POINTS, settings, depth_of)
+    result = refined(network, layer, settings)
+    assert torch.equal(result.after, depth)
+    assert list(result.losses) == losses
+    whole = depth_of(plain(network, picture()))
+    if name == "vit":  # torch's attention takes another kernel where no gradient is wanted
+        torch.testing.assert_close(result.before, whole)
+    else:
+        assert torch.equal(result.before, whole)
+    assert not torch.equal(result.after, result.before)
+
+
+@pytest.mark.parametrize("name", CUTS)
+def test_no_iteration_is_the_plain_prediction_bit_for_bit(name: str) -> None:
+    network = build(name)
+    result = refined(network, CUTS[name][0], RefineSettings(iterations=0))
+    assert torch.equal(result.after, depth_of(plain(network, picture())))
+    assert result.before is result.after
+    assert len(result.losses) == 1
+
+
+@pytest.mark.parametrize("loss", ["l1", "l2", "huber", "berhu", "inverse", "log"])
+@pytest.mark.parametrize("update", UPDATES)
+def test_points_that_agree_with_the_prediction_change_nothing(loss: str, update: str) -> None:
+    network = build("unet")
+    predicted = plain(network, picture())
+    points = SparsePoints(xy=POINTS.xy, depth=POINTS.sample(predicted), size=(16, 16))
+    settings = RefineSettings(loss=loss, update=update)
+    result = refined(network, "bottleneck", settings, points=points)
+    assert torch.equal(result.after, predicted)
+    assert result.losses == (0.0,) * 6
+
+
+@pytest.mark.parametrize("update", UPDATES)
+def test_pixels_that_no_point_reaches_keep_their_bits(update: str) -> None:
+    torch.manual_seed(0)
+    network = nn.Sequential(conv(3, 4), conv(4, 4), nn.ReLU(inplace=True), conv(4, 1))
+    one = POINTS.select(torch.tensor([True, False, False, False, False]))  # at (3, 4)
+    result = refined(network, "0", RefineSettings(update=update, lr=0.1), points=one)
+    changed = (result.after != result.before)[0, 0]
+    assert bool(changed[4, 3])
+    rows, columns = changed.any(1).nonzero().flatten(), changed.any(0).nonzero().flatten()
+    assert (int(rows.min()), int(rows.max())) == (0, 8)  # two 3×3 convolutions, there and back
+    assert (int(columns.min()), int(columns.max())) == (0, 7)
+    assert not changed[9:].any()
+    assert not changed[:, 8:].any()
+
+
+def test_the_loss_goes_down_and_iterations_are_updates_of_z() -> None:
+    network = build("unet")
+    seen: list[tuple[int, float]] = []
+    result = refined(
+        network,
+        "bottleneck",
+        RefineSettings(iterations=7, lr=0.05),
+        on_iteration=lambda iteration, loss: seen.append((iteration, loss)),
+    )
+    assert [iteration for iteration, _ in seen] == list(range(7))
+    assert [loss for _, loss in seen] == list(result.losses[:-1])
+    assert len(result.losses) == 8
+    assert result.losses[-1] < result.losses[0]
+
+
+def test_one_update_by_hand() -> None:
+    class Shift(nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.cut = nn.Identity()
+
+        def forward(self, x: Tensor) -> Tensor:
+            return self.cut(x[:, :1]) * 2
+
+    x = torch.full((1, 3, 1, 2), 3.0)
+    points = SparsePoints(
+        xy=torch.tensor([[0.0, 0.0], [1.0, 0.0]]), depth=torch.tensor([5.0, 9.0]), size=(1, 2)
+    )
+    with Split(Shift(), "cut") as split:
+        result = refine(
+            split, (x,), points, RefineSettings(iterations=1, lr=0.25), depth_of=lambda y: y
+        )
+    assert result.before.flatten().tolist() == [6.0, 6.0]
+    assert result.after.flatten().tolist() == [5.5, 6.5]
+    assert result.losses == (2.0, 1.5)
+
+
+@pytest.mark.parametrize("update", UPDATES)
+def test_the_same_seed_gives_the_same_bytes(update: str) -> None:
+    runs = [refined(build("resnet"), "layer2", RefineSettings(update=update)) for _ in range(2)]
+    assert runs[0].after.numpy().tobytes() == runs[1].after.numpy().tobytes()
+    assert runs[0].losses == runs[1].losses
+
+
+def test_the_front_and_independent_branches_run_once_in_a_whole_refinement() -> None:
+    network = TwoBranches()
+    refined(network, "cut", RefineSettings(iterations=5))
+    assert (network.front.calls, network.guide.calls) == (1, 1)
+    assert (network.detached.calls, network.head.calls) == (6, 6)
+
+
+def test_grad_mode_and_random_state_of_the_caller_stay() -> None:
+    network = build("unet")
+    torch.manual_seed(5)
+    before = torch.get_rng_state()
+    for mode in (True, False):
+        with torch.set_grad_enabled(mode):
+            result = refined(network, "bottleneck", RefineSettings())
+            assert torch.is_grad_enabled() is mode
+            assert not result.after.requires_grad
+            assert not result.before.requires_grad
+    assert torch.equal(torch.get_rng_state(), before)
+
+
+# ------------------------------------------------------------------ the step size
+
+
+def test_a_per_cent_step_is_that_share_of_the_standard_deviation_of_z0() -> None:
+    z = torch.tensor([1.0, 3.0, 1.0, 3.0])  # standard deviation 1
+    assert step_size("3%", z) == pytest.approx(0.03)
+    assert step_size(" 3 % ", z * 10) == pytest.approx(0.3)
+    assert step_size(0.01, z) == 0.01
+    assert step_size("0.5", z) == 0.5
+    network = build("unet")
+    with Split(network, "bottleneck") as split, torch.no_grad():
+        std = float(split.front(picture()).std(correction=0))
+    assert refined(network, "bottleneck", RefineSettings(lr="3%")).step == pytest.approx(0.03 * std)
+
+
+@pytest.mark.parametrize(
+    "lr", [0, -1, "0%", "-3%", "x", "", "%", "nan", "inf", float("nan"), "3%%"]
+)
+def test_what_is_no_step_is_refused(lr: float | str) -> None:
+    with pytest.raises(UsageError, match="step size"):
+        step_size(lr, torch.ones(2))
+
+
+# ------------------------------------------------------------------ divergence
+
+
+class Breaking(nn.Module):
+    """Gives `bad` in the n-th pass behind the cut."""
+
+    def __init__(self, n: int, bad: float):
+        super().__init__()
+        self.cut, self.head = conv(3, 4), conv(4, 1)
+        self.n, self.bad, self.passes = n, bad, 0
+
+    def forward(self, x: Tensor) -> Tensor:
+        y = self.head(self.cut(x)).abs()
+        self.passes += 1
+        return y * self.bad if self.passes == self.n else y
+
+
+@pytest.mark.parametrize("bad", [float("nan"), float("inf")])
+@pytest.mark.parametrize("iteration", [0, 2, 5])
+def test_a_loss_that_is_not_finite_stops_with_the_last_good_depth(
+    iteration: int, bad: float
+) -> None:
+    torch.manual_seed(0)
+    network = Breaking(iteration + 1, bad)
+    with pytest.raises(
+        DivergedError, match=f"loss is not finite after {iteration} update"
+    ) as error:
+        refined(network, "cut", RefineSettings())
+    assert error.value.exit_code == 5
+    if iteration == 0:
+        assert error.value.last_good is None
+        return
+    network.n = 0
+    good = refined(network, "cut", RefineSettings(iterations=iteration - 1))
+    assert torch.equal(error.value.last_good.after, good.after)
+    assert torch.equal(error.value.last_good.before, good.before)
+    assert error.value.last_good.losses == good.losses
+
+
+def test_a_gradient_that_is_not_finite_stops_with_the_depth_it_came_from() -> None:
+    class Root(nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.cut = nn.Identity()
+
+        def forward(self, x: Tensor) -> Tensor:
+            return self.cut(x[:, :1] * 0).sqrt() + 1
+
+    with pytest.raises(DivergedError, match="gradient is not finite after 0 updates") as error:
+        refined(Root(), "cut", RefineSettings(loss="l1"))
+    assert torch.equal(error.value.last_good.after, torch.ones(1, 1, 16, 16))
+    assert len(error.value.last_good.losses) == 1
+
+
+def test_a_bad_prediction_without_updates_is_handed_over_as_it_is() -> None:
+    result = refined(Breaking(1, float("nan")), "cut", RefineSettings(iterations=0))
+    assert bool(result.after.isnan().all())
+
+
+def test_a_step_far_too_large_diverges_and_leaves_the_network_as_it_was() -> None:
+    network = build("unet")
+    before = plain(network, picture())
+    with pytest.raises(DivergedError, match="try a smaller --lr"):
+        refined(network, "bottleneck", RefineSettings(lr=1e38, update="sgd", loss="l2"))
+    assert torch.equal(plain(network, picture()), before)
+
+
+# ------------------------------------------------------------------ no way back to z
+
+
+class NoWayBack(nn.Module):
+    def __init__(self, how: str):
+        super().__init__()
+        self.cut, self.side, self.head, self.how = conv(3, 4), conv(3, 4), conv(4, 1), how
+
+    def forward(self, x: Tensor) -> Tensor:
+        z, side = self.cut(x), self.side(x)
+        if self.how == "unused":
+            z = side
+        elif self.how == "detach":
+            z = z.detach() + side
+        elif self.how == "no_grad":
+            with torch.no_grad():
+                return self.head(z)
+        elif self.how == "inference_mode":
+            with torch.inference_mode():
+                return self.head(z)
+        return self.head(z)
+
+
+@pytest.mark.parametrize("how", ["unused", "detach", "no_grad", "inference_mode"])
+def test_a_layer_without_a_gradient_back_to_it_is_refused(how: str) -> None:
+    with pytest.raises(LayerError, match="no gradient comes back") as error:
+        refined(NoWayBack(how), "cut", RefineSettings())
+    assert error.value.exit_code == 4
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("mode", [torch.no_grad, torch.inference_mode])
+def test_a_forward_wholly_without_gradients_is_refused(mode: Any) -> None:
+    network = UNet()
+    network.forward = mode()(network.forward)  # type: ignore[method-assign]
+    with pytest.raises(LayerError, match="no_grad, inference_mode"):
+        refined(network, "bottleneck", RefineSettings())
+    assert "forward" in vars(network)
+
+
+def test_another_tensor_that_requires_gradient_does_not_hide_a_missing_one() -> None:
+    network = NoWayBack("unused")
+    network.scale = torch.ones(1, requires_grad=True)
+    network.head.register_forward_hook(lambda module, given, output: output * network.scale)
+    with pytest.raises(LayerError, match="no gradient comes back"):
+        refined(network, "cut", RefineSettings())
+
+
+def test_an_in_place_operation_that_autograd_cannot_undo_is_the_networks_fault() -> None:
+    class Network(nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.cut, self.head = conv(3, 4), conv(4, 1)
+
+        def forward(self, x: Tensor) -> Tensor:
+            y = self.cut(x).sigmoid()
+            y.add_(1)
+            return self.head(y)
+
+    with pytest.raises(ModelError, match="gradient of the network raises RuntimeError") as error:
+        refined(Network(), "cut", RefineSettings())
+    assert "\n" not in str(error.value)
+
+
+def test_settings_are_the_papers() -> None:
+    assert RefineSettings() == RefineSettings(iterations=5, lr=0.01, loss="l1", update="sign")
+    with pytest.raises(AttributeError):
+        replace(RefineSettings()).iterations = 3  # type: ignore[misc]
+
+
+def test_a_refinement_does_not_import_the_compiler() -> None:
+    code = (
+        "import sys; from tests.core.test_refine import *;"
+        "refined(build('unet'), 'bottleneck', RefineSettings());"
+        "assert 'torch._dynamo' not in sys.modules"
+    )
+    root = Path(__file__).parents[2]
+    assert subprocess.run([sys.executable, "-c", code], cwd=root, check=False).returncode == 0

@@ -1,0 +1,73 @@
+"""U of equation 3, against torch.optim where it has the same rule."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+import torch
+from torch import Tensor
+
+from pnpdepth_cli.core.updates import UPDATES, Update, adam, momentum, sgd, sign
+
+
+def stepped(update: Update, steps: int = 20, lr: float = 0.1) -> Tensor:
+    z = torch.linspace(-2, 3, 7)
+    for _ in range(steps):
+        z = z - lr * update(gradient_of(z))
+    return z
+
+
+def gradient_of(z: Tensor) -> Tensor:
+    """Of Σ (z² − 1)² / 4, which has minima at ±1."""
+    return (z * z - 1) * z
+
+
+def optimised(make: Callable[[list[Tensor]], torch.optim.Optimizer], steps: int = 20) -> Tensor:
+    z = torch.linspace(-2, 3, 7).requires_grad_(True)
+    optimiser = make([z])
+    for _ in range(steps):
+        z.grad = gradient_of(z.detach())
+        optimiser.step()
+    return z.detach()
+
+
+@pytest.mark.parametrize(
+    ("update", "make"),
+    [
+        (sgd, lambda p: torch.optim.SGD(p, lr=0.1)),
+        (momentum, lambda p: torch.optim.SGD(p, lr=0.1, momentum=0.9)),
+        (adam, lambda p: torch.optim.Adam(p, lr=0.1, eps=1e-12)),
+        (lambda: adam(0.5, 0.9, 1e-8), lambda p: torch.optim.Adam(p, 0.1, (0.5, 0.9), 1e-8)),
+    ],
+)
+def test_an_update_is_that_of_torch_optim(
+    update: Callable[[], Update], make: Callable[[list[Tensor]], torch.optim.Optimizer]
+) -> None:
+    torch.testing.assert_close(stepped(update()), optimised(make), rtol=1e-5, atol=1e-6)
+
+
+def test_the_sign_of_nothing_is_nothing() -> None:
+    assert sign()(torch.tensor([-3.0, 0.0, -0.0, 1e-30])).tolist() == [-1, 0, 0, 1]
+
+
+@pytest.mark.parametrize("name", UPDATES)
+def test_where_no_gradient_ever_comes_nothing_moves(name: str) -> None:
+    update = UPDATES[name]()
+    for _ in range(4):
+        assert update(torch.tensor([0.0, 5.0]))[0] == 0
+
+
+@pytest.mark.parametrize("name", UPDATES)
+def test_an_update_changes_neither_its_gradient_nor_a_second_run(name: str) -> None:
+    gradient = torch.tensor([1.0, -2.0])
+    runs = []
+    for _ in range(2):
+        update = UPDATES[name]()
+        runs.append([update(gradient * k) for k in (1, 2, 3)])
+    assert torch.equal(gradient, torch.tensor([1.0, -2.0]))
+    assert all(torch.equal(a, b) for a, b in zip(*runs, strict=True))
+
+
+def test_adam_moves_by_the_step_however_small_the_gradient() -> None:
+    assert adam()(torch.tensor([1e-6, -1e-9])).tolist() == pytest.approx([1, -1], rel=2e-3)

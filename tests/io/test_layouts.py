@@ -1,0 +1,341 @@
+"""Data sets as they lie on disk, made small."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from pnpdepth_cli.errors import FileFormatError, InputError, SizeError, UsageError
+from pnpdepth_cli.io.depth import write_depth
+from pnpdepth_cli.io.layouts import (
+    LAYOUTS,
+    PROTOCOLS,
+    Hdf5Array,
+    find_layout,
+    find_protocol,
+    read_frame_image,
+    read_frame_truth,
+    read_frames,
+)
+
+DEPTH = np.random.default_rng(0).uniform(1, 9, (12, 16)).astype(np.float32)
+
+
+def touch(*paths: Path) -> None:
+    for path in paths:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.touch()
+
+
+def pairs(root: Path) -> None:
+    touch(*(root / f / f"{s}.png" for f in ("rgb", "sparse") for s in "ab"), root / "gt/a.exr")
+    touch(root / "calib/a.json")
+
+
+def kitti_object(root: Path) -> None:
+    part = root / "training"
+    touch(*(part / f / f"00000{i}{s}" for i in (0, 1) for f, s in
+            (("image_2", ".png"), ("velodyne", ".bin"), ("calib", ".txt"))))  # fmt: skip
+
+
+def kitti_odometry(root: Path) -> None:
+    for sequence in ("00", "03"):
+        part = root / "sequences" / sequence
+        touch(part / "image_2/000000.png", part / "velodyne/000000.bin", part / "calib.txt")
+
+
+def kitti_selection(root: Path) -> None:
+    name = "2011_09_26_drive_0002_sync_{}_0000000005_image_02"
+    for folder, suffix in (
+        ("image", ".png"), ("velodyne_raw", ".png"), ("groundtruth_depth", ".png"),
+        ("intrinsics", ".txt"),
+    ):  # fmt: skip
+        kind = "image" if folder == "intrinsics" else folder
+        touch(root / folder / f"{name.format(kind)}{suffix}")
+
+
+def kitti_tree(root: Path) -> None:
+    drive = root / "val" / "2011_09_26_drive_0002_sync"
+    for camera in ("image_02", "image_03"):
+        for kind in ("velodyne_raw", "groundtruth"):
+            touch(drive / "proj_depth" / kind / camera / "0000000005.png")
+        touch(root / "2011_09_26" / drive.name / camera / "data" / "0000000005.png")
+    touch(root / "2011_09_26" / "calib_cam_to_cam.txt")
+
+
+def tum(root: Path) -> None:
+    root.mkdir(exist_ok=True)
+    (root / "rgb.txt").write_text(
+        "# time file\n1.000 rgb/1.000.png\n1.033 rgb/1.033.png\n2 rgb/2.png\n"
+    )
+    (root / "depth.txt").write_text("1.015 depth/1.015.png\n1.030 depth/1.030.png\n")
+
+
+def seven_scenes(root: Path) -> None:
+    touch(
+        *(root / f"seq-0{n}/frame-000000.{kind}.png" for n in (1, 2) for kind in ("color", "depth"))
+    )
+
+
+def nyu_h5(root: Path) -> None:
+    h5py = pytest.importorskip("h5py")
+    (root / "official").mkdir(parents=True)
+    for number in (1, 9):
+        with h5py.File(root / "official" / f"{number:05}.h5", "w") as file:
+            file["rgb"] = np.full((3, 480, 640), number, np.uint8)
+            file["depth"] = np.full((480, 640), float(number), np.float32)
+
+
+def nyu_mat(root: Path) -> None:
+    h5py = pytest.importorskip("h5py")
+    root.mkdir(exist_ok=True)
+    with h5py.File(root / "nyu_depth_v2_labeled.mat", "w") as file:
+        # MATLAB's column order: frames, channels, columns, rows
+        file["images"] = np.arange(4, dtype=np.uint8)[:, None, None, None] * np.ones(
+            (1, 3, 640, 480), np.uint8
+        )
+        file["depths"] = np.tile(np.arange(640, dtype=np.float32)[:, None] + 1, (4, 1, 480))
+
+
+MAKERS = {
+    "pairs": (pairs, ["a", "b"]),
+    "kitti-object": (kitti_object, ["training_000000", "training_000001"]),
+    "kitti-odometry": (kitti_odometry, ["00_000000", "03_000000"]),
+    "kitti-depth": (kitti_selection, ["2011_09_26_drive_0002_sync_0000000005_image_02"]),
+    "tum": (tum, ["1.000", "1.033"]),
+    "7scenes": (seven_scenes, ["seq-01_frame-000000", "seq-02_frame-000000"]),
+    "nyu-h5": (nyu_h5, ["official_00001", "official_00009"]),
+    "nyu-mat": (nyu_mat, ["0001", "0002", "0003", "0004"]),
+}
+
+
+@pytest.mark.parametrize("name", MAKERS)
+def test_a_layout_is_guessed_from_its_folder_and_gives_its_frames(
+    name: str, tmp_path: Path
+) -> None:
+    make, names = MAKERS[name]
+    make(tmp_path / "set")
+    assert find_layout(tmp_path / "set").name == name
+    frames = read_frames(tmp_path / "set")
+    assert [frame.name for frame in frames] == names
+    assert frames == read_frames(tmp_path / "set", name)
+
+
+@pytest.mark.parametrize("name", MAKERS)
+def test_no_other_layout_takes_it_for_its_own(name: str, tmp_path: Path) -> None:
+    MAKERS[name][0](tmp_path / "set")
+    alike = [other for other, layout in LAYOUTS.items() if layout.matches(tmp_path / "set")]
+    assert alike == [name]
+
+
+def test_pairs_may_lack_truth_and_calibration_but_not_sparse_depth(tmp_path: Path) -> None:
+    pairs(tmp_path)
+    a, b = read_frames(tmp_path)
+    assert (a.gt, a.calib) == (tmp_path / "gt/a.exr", tmp_path / "calib/a.json")
+    assert (b.gt, b.calib) == (None, None)
+    touch(tmp_path / "calib.txt")
+    assert read_frames(tmp_path)[1].calib == tmp_path / "calib.txt"
+    (tmp_path / "sparse/b.png").unlink()
+    with pytest.raises(InputError, match=r"rgb/b\.png has no partner b\.\*"):
+        read_frames(tmp_path)
+    touch(tmp_path / "sparse/b.png", tmp_path / "sparse/b.exr")
+    with pytest.raises(InputError, match="are one frame"):
+        read_frames(tmp_path)
+
+
+def test_kittis_selection_pairs_its_long_names(tmp_path: Path) -> None:
+    kitti_selection(tmp_path)
+    (frame,) = read_frames(tmp_path)
+    middle = "2011_09_26_drive_0002_sync_{}_0000000005_image_02"
+    assert frame.sparse == tmp_path / "velodyne_raw" / f"{middle.format('velodyne_raw')}.png"
+    assert frame.gt == tmp_path / "groundtruth_depth" / f"{middle.format('groundtruth_depth')}.png"
+    assert frame.calib == tmp_path / "intrinsics" / f"{middle.format('image')}.txt"
+    assert (frame.sparse_scale, frame.gt_scale) == (256, 256)
+
+
+def test_kittis_tree_finds_its_images_in_the_raw_data(tmp_path: Path) -> None:
+    kitti_tree(tmp_path)
+    left, right = read_frames(tmp_path, "kitti-depth")
+    assert left.name == "2011_09_26_drive_0002_sync_0000000005_image_02"
+    assert (left.camera, right.camera) == (2, 3)
+    assert right.image == (
+        tmp_path / "2011_09_26/2011_09_26_drive_0002_sync/image_03/data/0000000005.png"
+    )
+    assert right.calib == tmp_path / "2011_09_26"
+    shutil.rmtree(tmp_path / "2011_09_26")
+    with pytest.raises(InputError, match="has no image_02/data"):
+        read_frames(tmp_path)
+
+
+def test_tum_pairs_each_image_with_the_nearest_depth_once(tmp_path: Path) -> None:
+    tum(tmp_path)
+    first, second = read_frames(tmp_path)
+    assert first.gt == tmp_path / "depth/1.015.png"
+    assert second.gt == tmp_path / "depth/1.030.png"
+    assert first.gt_scale == 5000
+    (tmp_path / "depth.txt").write_text("soon depth/1.png\n")
+    with pytest.raises(FileFormatError, match=r"depth\.txt, line 1"):
+        read_frames(tmp_path)
+
+
+def test_nyu_frames_come_halved_and_cropped_to_228_by_304(tmp_path: Path) -> None:
+    nyu_h5(tmp_path / "h5")
+    frame = read_frames(tmp_path / "h5")[1]
+    assert read_frame_image(frame).shape == (228, 304, 3)
+    assert read_frame_truth(frame).tolist() == np.full((228, 304), 9.0).tolist()
+    nyu_mat(tmp_path / "mat")
+    frame = read_frames(tmp_path / "mat")[2]
+    np.testing.assert_array_equal(read_frame_image(frame), np.float32(2) / np.float32(255))
+    # columns 8 … 311 of every second pixel, 1 3 5 …: column c holds 2 c + 2 metres
+    want = 2 * np.arange(8, 312) + 2
+    assert (read_frame_truth(frame) == want).all()
+
+
+@pytest.mark.parametrize("kind", ["txt", "mat"])
+def test_the_official_file_is_split_by_the_file_beside_it(tmp_path: Path, kind: str) -> None:
+    nyu_mat(tmp_path)
+    if kind == "txt":
+        (tmp_path / "test.txt").write_text("2\n4\n")
+    else:
+        from scipy.io import savemat
+
+        savemat(tmp_path / "splits.mat", {"testNdxs": np.array([[2], [4]], np.uint16)})
+    frames = read_frames(tmp_path)
+    assert [frame.name for frame in frames] == ["0002", "0004"]
+    assert [frame.image.index for frame in frames] == [1, 3]  # type: ignore[union-attr]
+    (tmp_path / "test.txt").write_text("2\n5\n")
+    with pytest.raises(FileFormatError, match="from 1 to 4"):
+        read_frames(tmp_path)
+
+
+def test_an_hdf5_file_that_is_damaged_or_of_another_kind_is_named(tmp_path: Path) -> None:
+    nyu_h5(tmp_path)
+    path = tmp_path / "official" / "00001.h5"
+    frame = read_frames(tmp_path)[0]
+    path.write_bytes(path.read_bytes()[:500])
+    with pytest.raises(FileFormatError, match="cannot be read as HDF5"):
+        read_frame_truth(frame)
+    other = read_frames(tmp_path)[1]
+    assert isinstance(other.image, Hdf5Array)
+    wrong = Hdf5Array(path=other.image.path, name="infra", axes=(0, 1))
+    from pnpdepth_cli.io.layouts.hdf5 import depth_of
+
+    with pytest.raises(FileFormatError, match="has no array infra"):
+        depth_of(wrong)
+
+
+def test_a_manifest_says_all_that_a_frame_can_have(tmp_path: Path) -> None:
+    touch(tmp_path / "i.png", tmp_path / "s.bin", tmp_path / "c.txt", tmp_path / "deep/g.png")
+    row = {
+        "image": "i.png", "sparse": "s.bin", "gt": "deep/g.png", "calib": "c.txt", "camera": 3,
+        "sparse_scale": "", "gt_scale": 1000, "name": "first", "protocol": "kitti-odometry",
+    }  # fmt: skip
+    (tmp_path / "m.jsonl").write_text(json.dumps(row) + "\n\n")
+    header = ",".join(row)
+    (tmp_path / "m.csv").write_text(f"{header}\n{','.join(str(v) for v in row.values())}\n")
+    from_json, from_csv = (read_frames(tmp_path / name) for name in ("m.jsonl", "m.csv"))
+    assert from_json == from_csv
+    (frame,) = from_csv
+    assert (frame.name, frame.camera, frame.gt_scale, frame.sparse_scale) == (
+        "first",
+        3,
+        1000,
+        None,
+    )
+    assert frame.gt == tmp_path / "deep/g.png"
+    assert frame.protocol == PROTOCOLS["kitti-odometry"]
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("image,sparse\nlost.png,s.png\n", "line 2: "),
+        ("image,depth\ni.png,s.png\n", "'depth' is not one of"),
+        ("image,camera\ni.png,left\n", "line 2"),
+        ("image\ni.png\ni.png\n", "line 3: a second frame 'i'"),
+        ("image,gt\n,i.png\n", "neither image nor sparse"),
+        ("image\ni.png,more\n", "more than the header has"),
+    ],
+)
+def test_a_line_of_a_manifest_that_means_nothing_is_named(
+    tmp_path: Path, text: str, said: str
+) -> None:
+    touch(tmp_path / "i.png")
+    (tmp_path / "m.csv").write_text(text)
+    with pytest.raises(InputError) as error:
+        read_frames(tmp_path / "m.csv")
+    assert said in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_what_is_no_data_set_is_said(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="does not look like any layout"):
+        read_frames(tmp_path)
+    with pytest.raises(InputError, match="does not look like 'tum'"):
+        read_frames(tmp_path, "tum")
+    with pytest.raises(InputError, match="no such folder"):
+        read_frames(tmp_path / "lost")
+    with pytest.raises(UsageError, match="no layout 'nyu'; there are manifest"):
+        read_frames(tmp_path, "nyu")
+    (tmp_path / "rgb").mkdir()
+    (tmp_path / "sparse").mkdir()
+    with pytest.raises(InputError, match="has no frame"):
+        read_frames(tmp_path)
+
+
+def test_protocols_cut_what_the_paper_says() -> None:
+    rows, columns = np.indices((376, 1241))
+    part = PROTOCOLS["kitti-odometry"].apply(np.stack([rows, columns], axis=2))
+    assert part.shape == (228, 912, 2)
+    assert part[0, 0].tolist() == [148, 164]
+    assert part[-1, -1].tolist() == [375, 1075]
+    rows, columns = np.indices((480, 640))
+    part = PROTOCOLS["nyu"].apply(np.stack([rows, columns], axis=2))
+    assert part.shape == (228, 304, 2)
+    assert part[0, 0].tolist() == [13, 17]  # row 6 and column 8 of every second pixel from 1 on
+    with pytest.raises(SizeError, match="912×228"):
+        PROTOCOLS["kitti-odometry"].apply(np.zeros((200, 1000)))
+    with pytest.raises(UsageError, match="there are whole, nyu"):
+        find_protocol("eigen")
+
+
+@pytest.mark.parametrize("name", PROTOCOLS)
+def test_places_move_as_the_picture_is_cut(name: str) -> None:
+    protocol = PROTOCOLS[name]
+    rows, columns = np.indices((480, 1240))
+    part = protocol.apply(np.stack([columns, rows], axis=2))
+    row, column = 100, 200
+    there = protocol.places(part[row, column][None].astype(np.float32), (480, 1240))
+    # the kept pixel is one quarter of a new one away from its centre where pixels are halved
+    np.testing.assert_allclose(there[0], [column, row], atol=0.26)
+
+
+def test_the_shared_frames_are_recognised(shared_data: Path) -> None:
+    objects = read_frames(shared_data / "kitti_object")
+    assert [f.name for f in objects] == [f"00000{i}" for i in range(4)]
+    completion = read_frames(shared_data / "kitti_dc")
+    assert len(completion) == 6
+    assert completion[0].calib == shared_data / "kitti_dc"
+    truth = read_frame_truth(completion[0])
+    assert truth.shape == (375, 1242)
+    assert 0.15 < np.mean(truth > 0) < 0.25
+    scenes = read_frames(shared_data / "7scenes")
+    assert len(scenes) == 50
+    assert read_frame_image(scenes[0]).shape == (480, 640, 3)
+    assert 0.5 < np.median(read_frame_truth(scenes[0])) < 4
+
+
+def test_a_depth_file_is_read_with_the_scale_of_its_frame(tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "frame-000000.color.png"), np.zeros((12, 16, 3), np.uint8))
+    codes = np.rint(1000 * DEPTH).astype(np.uint16)
+    cv2.imwrite(str(tmp_path / "frame-000000.depth.png"), codes)
+    (frame,) = read_frames(tmp_path)
+    np.testing.assert_allclose(read_frame_truth(frame), DEPTH, atol=6e-4)
+    write_depth(tmp_path / "g.exr", DEPTH)
+    (tmp_path / "m.csv").write_text("image,gt\nframe-000000.color.png,g.exr\n")
+    assert np.array_equal(read_frame_truth(read_frames(tmp_path / "m.csv")[0]), DEPTH)

@@ -1,0 +1,207 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from pnpdepth_cli.errors import FileFormatError, InputError, NoPointsError
+from pnpdepth_cli.io.scans import SCAN_SUFFIXES, read_scan
+
+POINTS = np.random.default_rng(3).normal(0, 20, (37, 3)).astype(np.float32)
+
+
+def bin_bytes(points: NDArray[np.float32]) -> bytes:
+    return np.column_stack([points, np.full(len(points), 0.5)]).astype("<f4").tobytes()
+
+
+def pcd_bytes(points: NDArray[np.float32], stored: str = "binary") -> bytes:
+    """x, y, z between an intensity and a pair of normals, as a PCD may have them."""
+    n = len(points)
+    header = (
+        "# .PCD v0.7\nVERSION 0.7\nFIELDS intensity x y z n\nSIZE 1 4 4 4 4\nTYPE U F F F F\n"
+        f"COUNT 1 1 1 1 2\nWIDTH {n}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {n}\n"
+        f"DATA {stored}\n"
+    )
+    if stored == "ascii":
+        return (header + "".join(f"7 {x:.9g} {y:.9g} {z:.9g} 0 1\n" for x, y, z in points)).encode()
+    layout = np.dtype([("i", "u1"), ("p", "<f4", 3), ("n", "<f4", 2)])
+    rows = np.zeros(n, layout)
+    rows["p"] = points
+    return header.encode() + rows.tobytes()
+
+
+def ply_bytes(points: NDArray[np.float32], stored: str = "binary_little_endian") -> bytes:
+    """Vertices of doubles with a colour before them, and a face after them."""
+    header = (
+        f"ply\nformat {stored} 1.0\ncomment made by a test\nelement vertex {len(points)}\n"
+        "property uchar red\nproperty double x\nproperty double y\nproperty double z\n"
+        "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
+    )
+    if stored == "ascii":
+        rows = "".join(f"9 {x:.9g} {y:.9g} {z:.9g}\n" for x, y, z in points)
+        return (header + rows + "3 0 1 2\n").encode()
+    order = "<" if "little" in stored else ">"
+    rows_ = np.zeros(len(points), np.dtype([("r", "u1"), ("p", f"{order}f8", 3)]))
+    rows_["p"] = points
+    return header.encode() + rows_.tobytes() + b"\x03" + bytes(12)
+
+
+def npy_bytes(points: NDArray[np.float32]) -> bytes:
+    import io
+
+    buffer = io.BytesIO()
+    np.save(buffer, np.column_stack([points, points[:, :1]]).astype(np.float64))
+    return buffer.getvalue()
+
+
+FILES = {
+    "kitti.bin": bin_bytes,
+    "scan.npy": npy_bytes,
+    "binary.pcd": pcd_bytes,
+    "ascii.pcd": lambda points: pcd_bytes(points, "ascii"),
+    "little.ply": ply_bytes,
+    "big.ply": lambda points: ply_bytes(points, "binary_big_endian"),
+    "ascii.ply": lambda points: ply_bytes(points, "ascii"),
+}
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_a_scan_gives_its_points_in_file_order(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).write_bytes(FILES[name](POINTS))
+    got = read_scan(tmp_path / name).points
+    assert got.dtype == np.float32
+    assert np.array_equal(got, POINTS)
+
+
+@settings(deadline=None, max_examples=60)
+@given(
+    name=st.sampled_from(sorted(FILES)),
+    seed=st.integers(0, 2**32 - 1),
+    count=st.integers(1, 50),
+    scale=st.sampled_from([1e-3, 1.0, 1e4]),
+)
+def test_points_of_any_scan_survive_every_format(
+    tmp_path_factory: pytest.TempPathFactory, name: str, seed: int, count: int, scale: float
+) -> None:
+    points = np.random.default_rng(seed).uniform(-scale, scale, (count, 3)).astype(np.float32)
+    path = tmp_path_factory.mktemp("scan") / name
+    path.write_bytes(FILES[name](points))
+    assert np.array_equal(read_scan(path).points, points)
+
+
+@settings(deadline=None, max_examples=200)
+@given(data=st.data())
+def test_a_damaged_scan_raises_only_our_errors_of_one_line(
+    data: st.DataObject, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    name = data.draw(st.sampled_from(sorted(FILES)))
+    content = bytearray(FILES[name](POINTS))
+    if data.draw(st.booleans()):
+        content = content[: data.draw(st.integers(0, len(content)))]
+    else:
+        at = data.draw(st.integers(0, min(len(content), 400) - 1))
+        content[at] = data.draw(st.integers(0, 255))
+    path = tmp_path_factory.mktemp("scan") / name
+    path.write_bytes(bytes(content))
+    message = name
+    try:
+        points = read_scan(path).points
+    except InputError as error:
+        message = str(error)
+    else:
+        assert np.isfinite(points).all()
+    assert len(message.splitlines()) == 1
+    assert name in message
+
+
+@pytest.mark.parametrize("lost", range(1, 16))
+def test_a_bin_that_ends_within_a_point_is_refused(tmp_path: Path, lost: int) -> None:
+    path = tmp_path / "cut.bin"
+    path.write_bytes(bin_bytes(POINTS)[:-lost])
+    with pytest.raises(FileFormatError, match="not a multiple of 16"):
+        read_scan(path)
+
+
+@pytest.mark.parametrize("name", sorted(set(FILES) - {"kitti.bin", "scan.npy"}))
+def test_a_scan_with_fewer_points_than_its_header_says_is_refused(
+    tmp_path: Path, name: str
+) -> None:
+    short = FILES[name](POINTS).replace(b" 37\n", b" 9037\n")
+    (tmp_path / name).write_bytes(short)
+    with pytest.raises(FileFormatError, match=r"cut short|lines for"):
+        read_scan(tmp_path / name)
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_points_that_are_no_numbers_are_refused_and_counted(tmp_path: Path, name: str) -> None:
+    bad = POINTS.copy()
+    bad[5, 1], bad[20, 0] = np.nan, np.inf
+    (tmp_path / name).write_bytes(FILES[name](bad))
+    with pytest.raises(FileFormatError, match=r"2 of 37 points .* number 6"):
+        read_scan(tmp_path / name)
+
+
+def test_a_beam_without_return_in_a_pcd_is_left_out_and_said(tmp_path: Path) -> None:
+    organised = POINTS.copy()
+    organised[[4, 9]] = np.nan
+    (tmp_path / "a.pcd").write_bytes(pcd_bytes(organised))
+    got = read_scan(tmp_path / "a.pcd")
+    assert np.array_equal(got.points, np.delete(POINTS, [4, 9], axis=0))
+    assert "2 beams without return" in got.source
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "said"),
+    [
+        ("a.png", b"\x89PNG\r\n\x1a\n" + bytes(24), "not a scan; give a file of .bin"),
+        ("a.bin", b"\x89PNG\r\n\x1a\n" + bytes(24), "is a PNG file"),
+        ("a.bin", np.full((2, 4), 1e9, "<f4").tobytes(), "1e+09 m is none of a scan"),
+        ("a.npy", npy_bytes(POINTS)[:-4], "cannot be read"),
+        ("a.npy", b"text", "not an NPY file"),
+        ("a.pcd", b"VERSION 0.7\nPOINTS 3\n", "no header that ends with DATA"),
+        ("a.pcd", b"FIELDS x y z\nDATA ascii\n", "has no SIZE"),
+        ("a.pcd", pcd_bytes(POINTS).replace(b" y ", b" w "), "without one y"),
+        ("a.pcd", pcd_bytes(POINTS).replace(b"DATA binary", b"DATA binary_compressed"), "convert"),
+        ("a.ply", b"ply\nformat ascii 1.0\nelement face 1\nend_header\n", "not vertex"),
+        ("a.ply", ply_bytes(POINTS).replace(b"uchar red", b"list uchar int red"), "not one number"),
+    ],
+)
+def test_what_is_no_scan_is_said_in_one_line(
+    tmp_path: Path, name: str, content: bytes, said: str
+) -> None:
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(FileFormatError) as error:
+        read_scan(tmp_path / name)
+    assert said in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_a_scan_of_no_points_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "a.ply").write_bytes(ply_bytes(POINTS[:0]))
+    with pytest.raises(NoPointsError):
+        read_scan(tmp_path / "a.ply")
+    (tmp_path / "a.bin").write_bytes(b"")
+    with pytest.raises(FileFormatError, match="empty"):
+        read_scan(tmp_path / "a.bin")
+
+
+def test_a_list_of_points_with_integers_is_not_taken_for_metres(tmp_path: Path) -> None:
+    np.save(tmp_path / "a.npy", np.ones((4, 3), np.int32))
+    with pytest.raises(FileFormatError, match="int32 of shape 4×3"):
+        read_scan(tmp_path / "a.npy")
+
+
+def test_every_suffix_has_a_reader() -> None:
+    assert SCAN_SUFFIXES == (".bin", ".npy", ".pcd", ".ply")
+
+
+def test_kittis_scans_are_read_whole(shared_data: Path) -> None:
+    for path in sorted((shared_data / "kitti_object" / "velodyne").glob("*.bin")):
+        got = read_scan(path).points
+        assert len(got) == path.stat().st_size // 16
+        assert 100_000 < len(got) < 130_000
+        assert np.abs(got).max() < 125

@@ -1,0 +1,54 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from pnpdepth_cli.errors import FileFormatError
+from pnpdepth_cli.io.sensor_file import read_sensor
+
+
+def write(folder: Path, text: str) -> Path:
+    path = folder / "mine.toml"
+    path.write_text(text)
+    return path
+
+
+def test_listed_elevations_are_taken_as_they_stand(tmp_path: Path) -> None:
+    text = 'name = "five"\nelevations_deg = [10, 5, 0.5, -5, -10]\nazimuth_step_deg = 0.2\n'
+    got = read_sensor(write(tmp_path, text + "max_range = 80\nrange_noise = 0.02\n"))
+    assert got.name == "five"
+    assert got.elevations_deg == (10, 5, 0.5, -5, -10)
+    assert (got.azimuth_step_deg, got.max_range) == (0.2, 80)
+    assert (got.range_noise, got.angle_noise_deg) == (0.02, 0)
+
+
+def test_even_elevations_go_down_from_the_top(tmp_path: Path) -> None:
+    text = "top_deg = 3\nstep_deg = 1.5\nbeams = 4\nazimuth_step_deg = 1\n"
+    got = read_sensor(write(tmp_path, text))
+    assert got.elevations_deg == (3, 1.5, 0, -1.5)
+    assert got.name == "mine"
+    assert got.max_range == float("inf")
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("elevations_deg = [1\n", "not valid TOML"),
+        ("elevations_deg = [1]\n", "azimuth_step_deg is missing"),
+        ("azimuth_step_deg = 1\n", "top_deg is missing"),
+        ("elevations_deg = []\nazimuth_step_deg = 1\n", "not a list of degrees"),
+        ('elevations_deg = ["up"]\nazimuth_step_deg = 1\n', "not a number"),
+        ("elevations_deg = [1]\ntop_deg = 1\nazimuth_step_deg = 1\n", "not both"),
+        ("top_deg = 1\nstep_deg = 1\nbeams = 1.5\nazimuth_step_deg = 1\n", "whole number"),
+        ("elevations_deg = [1]\nazimut_step_deg = 1\n", "'azimut_step_deg' says nothing"),
+        ("elevations_deg = [nan]\nazimuth_step_deg = 1\n", "not a number"),
+    ],
+)
+def test_what_is_missing_or_wrong_is_named_in_one_line(
+    tmp_path: Path, text: str, said: str
+) -> None:
+    with pytest.raises(FileFormatError) as error:
+        read_sensor(write(tmp_path, text))
+    assert said in str(error.value)
+    assert "\n" not in str(error.value)

@@ -1,0 +1,67 @@
+"""nconv and pncnn: their published weights give the published errors on real frames."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from benchmarks.frames import kitti_dc
+from model_zoo_defs.nconv import NConv, NormalisedConv, halved
+from model_zoo_defs.pncnn import Pncnn
+from pnpdepth_cli.core.metrics import score
+from pnpdepth_cli.core.points import SparsePoints
+from pnpdepth_cli.models.frame import FrameMap
+from pnpdepth_cli.models.network import load_network
+
+
+def test_a_constant_depth_stays_whatever_pixels_are_known() -> None:
+    layer = NormalisedConv(1, 1, 5)
+    known = torch.rand(1, 1, 12, 14, generator=torch.Generator().manual_seed(0)) < 0.3
+    depth, confidence = layer(7.0 * known, known.float())
+    assert torch.allclose(depth[confidence > 0], torch.tensor(7.0), atol=1e-5)
+
+
+def test_halving_keeps_the_depth_of_the_most_confident_pixel() -> None:
+    depth = torch.arange(16.0).reshape(1, 1, 4, 4)
+    confidence = torch.zeros(1, 1, 4, 4)
+    confidence[0, 0, 1, 1], confidence[0, 0, 2, 3] = 0.8, 0.4
+    picked, share = halved(depth, confidence)
+    assert picked[0, 0, 0, 0] == 5
+    assert picked[0, 0, 1, 1] == 11
+    assert share[0, 0, 0, 0] == pytest.approx(0.2)
+
+
+def test_the_networks_have_as_many_values_as_published() -> None:
+    assert sum(p.numel() for p in NConv().parameters()) == 481
+    counted = Pncnn().state_dict().items()
+    assert sum(t.numel() for _, t in counted) == 335_792
+
+
+@pytest.mark.parametrize(
+    ("name", "weights", "mae", "rmse"),
+    [
+        ("pncnn", "pncnn/kitti_model_best.pth.tar", 0.204, 0.688),
+        ("nconv", "nconv/CNN_ep0003.pth.tar", 0.29, 1.10),
+    ],
+)
+def test_published_weights_give_about_the_published_errors_on_kitti(
+    shared_data: Path, name: str, weights: str, mae: float, rmse: float
+) -> None:
+    network = load_network(name, shared_data / "weights" / weights)
+    frame = next(iter(kitti_dc(shared_data)))
+    assert frame.sensor is not None
+    rows, columns = np.nonzero(frame.sensor)
+    points = SparsePoints(
+        xy=torch.from_numpy(np.stack([columns, rows], 1).astype(np.float32)),
+        depth=torch.from_numpy(frame.sensor[rows, columns]),
+        size=frame.truth.shape,
+    )
+    fit = FrameMap.fit(network.definition.size, *frame.truth.shape)
+    with torch.no_grad():
+        output = network.module(*network.arguments(fit, None, fit.points_to_network(points)))
+    scores = score(fit.depth_to_image(network.depth_of(output)), torch.from_numpy(frame.truth))
+    assert scores.mae == pytest.approx(mae, rel=0.1)
+    assert scores.rmse == pytest.approx(rmse, rel=0.1)

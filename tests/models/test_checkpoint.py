@@ -1,0 +1,316 @@
+"""Weights from files: whole and fitting, or one line; nothing that is in a file is ever run."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import zipfile
+from collections import OrderedDict
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from safetensors.torch import save_file
+from torch import Tensor, nn
+
+from pnpdepth_cli.errors import CheckpointError, ModelError
+from pnpdepth_cli.models.checkpoint import load_checkpoint, read_checkpoint
+from pnpdepth_cli.models.definition import ModelDefinition, Multiple
+
+
+class Net(nn.Module):
+    def __init__(self) -> None:
+        super().__init__()
+        self.conv, self.norm = nn.Conv2d(3, 4, 3), nn.BatchNorm2d(4)
+
+
+def definition(**more: Any) -> ModelDefinition:
+    return ModelDefinition(name="net", input_kind="rgb", size=Multiple(1), build=Net, **more)
+
+
+def weights() -> dict[str, Tensor]:
+    torch.manual_seed(3)
+    return Net().state_dict()
+
+
+def loaded(path: Path, **more: Any) -> tuple[dict[str, Tensor], list[str]]:
+    network = Net()
+    notes = load_checkpoint(network, definition(**more), path)
+    return network.state_dict(), notes
+
+
+def equal(one: Mapping[str, Tensor], other: Mapping[str, Tensor]) -> bool:
+    return one.keys() == other.keys() and all(torch.equal(one[k], other[k]) for k in one)
+
+
+SAVES: dict[str, Callable[[Any, Path], None]] = {
+    "zip": torch.save,
+    "legacy": lambda content, path: torch.save(content, path, _use_new_zipfile_serialization=False),
+}
+
+
+# ------------------------------------------------------------------ good files
+
+
+def test_a_safetensors_file_is_read(tmp_path: Path) -> None:
+    save_file(weights(), tmp_path / "w.safetensors")
+    state, notes = loaded(tmp_path / "w.safetensors")
+    assert equal(state, weights())
+    assert notes == []
+
+
+@pytest.mark.parametrize("save", SAVES)
+@pytest.mark.parametrize("suffix", [".pth", ".pt", ".pth.tar", ".ckpt", ""])
+def test_a_torch_file_is_read_whatever_its_suffix(save: str, suffix: str, tmp_path: Path) -> None:
+    SAVES[save](weights(), tmp_path / f"w{suffix}")
+    assert equal(loaded(tmp_path / f"w{suffix}")[0], weights())
+
+
+@pytest.mark.parametrize("key", ["state_dict", "model_state_dict", "model", "network", "net"])
+def test_the_state_dict_may_lie_beside_other_things(key: str, tmp_path: Path) -> None:
+    optimiser = torch.optim.Adam(Net().parameters()).state_dict()
+    content = {"epoch": 3, "loss": 0.5, "optimizer": optimiser, key: OrderedDict(weights())}
+    torch.save(content, tmp_path / "w.pth")
+    assert equal(loaded(tmp_path / "w.pth")[0], weights())
+
+
+def test_a_prefix_of_every_key_is_stripped_and_said(tmp_path: Path) -> None:
+    torch.save({f"module.{k}": v for k, v in weights().items()}, tmp_path / "w.pth")
+    state, notes = loaded(tmp_path / "w.pth")
+    assert equal(state, weights())
+    assert notes == ["checkpoint w.pth: prefix 'module.' of every key stripped"]
+
+
+def test_a_prefix_of_some_keys_is_not_stripped(tmp_path: Path) -> None:
+    first, *others = weights().items()
+    torch.save(dict([first, *((f"module.{k}", v) for k, v in others)]), tmp_path / "w.pth")
+    with pytest.raises(CheckpointError, match=r"unexpected .*module\."):
+        loaded(tmp_path / "w.pth")
+
+
+def test_a_network_whose_own_names_start_so_keeps_them(tmp_path: Path) -> None:
+    network = nn.DataParallel(Net())
+    torch.save(network.state_dict(), tmp_path / "w.pth")
+    fresh = nn.DataParallel(Net())
+    assert load_checkpoint(fresh, definition(), tmp_path / "w.pth") == []
+    assert equal(fresh.state_dict(), network.state_dict())
+
+
+def test_a_definition_may_rename_what_a_published_file_holds(tmp_path: Path) -> None:
+    torch.save({f"module.net.{k}": v for k, v in weights().items()}, tmp_path / "w.pth")
+    rename = {"read_checkpoint": lambda s: {k.removeprefix("net."): v for k, v in s.items()}}
+    assert equal(loaded(tmp_path / "w.pth", **rename)[0], weights())
+
+
+# ------------------------------------------------------------------ files that do not fit
+
+
+def test_every_kind_of_misfit_is_listed_and_nothing_is_loaded(tmp_path: Path) -> None:
+    state = weights()
+    del state["norm.weight"], state["norm.bias"]
+    state["extra.weight"] = torch.ones(1)
+    state["conv.bias"] = torch.ones(7)
+    torch.save(state, tmp_path / "w.pth")
+    network = Net()
+    before = {k: v.clone() for k, v in network.state_dict().items()}
+    with pytest.raises(CheckpointError) as error:
+        load_checkpoint(network, definition(), tmp_path / "w.pth")
+    said = str(error.value)
+    assert "does not fit network 'net': 2 missing (norm.weight, norm.bias)" in said
+    assert "1 unexpected (extra.weight)" in said
+    assert "1 of another shape (conv.bias (7,) for (4,))" in said
+    assert "\n" not in said
+    assert error.value.exit_code == 4
+    assert equal(network.state_dict(), before)
+
+
+def test_the_checkpoint_of_another_network_is_refused_in_few_words(tmp_path: Path) -> None:
+    other = nn.Sequential(*(nn.Linear(2, 2) for _ in range(50)))
+    torch.save(other.state_dict(), tmp_path / "w.pth")
+    with pytest.raises(
+        CheckpointError, match=r"100 unexpected \(0.weight, .* and 96 more\)"
+    ) as error:
+        loaded(tmp_path / "w.pth")
+    assert len(str(error.value)) < 500
+
+
+def test_a_definition_that_cannot_read_the_layout_is_said(tmp_path: Path) -> None:
+    torch.save(weights(), tmp_path / "w.pth")
+    for fault in (KeyError("x"), TypeError("x"), IndexError("x"), AttributeError("x")):
+
+        def reader(state: Mapping[str, Tensor], fault: Exception = fault) -> Mapping[str, Tensor]:
+            raise fault
+
+        with pytest.raises(CheckpointError, match="not in a layout that 'net' reads"):
+            loaded(tmp_path / "w.pth", read_checkpoint=reader)
+    with pytest.raises(ModelError, match="gives no named tensors"):
+        loaded(tmp_path / "w.pth", read_checkpoint=lambda state: None)
+
+
+def test_a_network_that_refuses_its_state_is_one_line(tmp_path: Path) -> None:
+    class Picky(Net):
+        def get_extra_state(self) -> dict[str, int]:
+            return {"version": 1}
+
+        def set_extra_state(self, state: Any) -> None:
+            raise AssertionError
+
+    torch.save(weights(), tmp_path / "w.pth")
+    with pytest.raises(CheckpointError, match=r"does not fit .*_extra_state") as error:
+        load_checkpoint(Picky(), definition(), tmp_path / "w.pth")
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        ({}, "no state dict; it holds nothing"),
+        ({"epoch": 1, "best": 0.3}, "no state dict; it holds epoch, best"),
+        ({0: torch.ones(1)}, "no state dict; it holds 0"),
+        ([torch.ones(1)], "holds a list"),
+        (torch.ones(1), "holds a Tensor"),
+        ({"state_dict": {"a": 1}}, "no state dict; it holds state_dict"),
+    ],
+)
+def test_a_file_without_named_tensors_is_said(content: Any, said: str, tmp_path: Path) -> None:
+    torch.save(content, tmp_path / "w.pth")
+    with pytest.raises(CheckpointError, match=said):
+        read_checkpoint(tmp_path / "w.pth")
+
+
+# ------------------------------------------------------------------ broken files
+
+
+def test_a_path_that_is_no_file_is_said(tmp_path: Path) -> None:
+    with pytest.raises(CheckpointError, match="does not exist"):
+        read_checkpoint(tmp_path / "absent.pth")
+    with pytest.raises(CheckpointError, match="is a folder"):
+        read_checkpoint(tmp_path)
+
+
+GARBAGE = [b"", b"\0" * 50, b"not a checkpoint\n", b"<html>", b"\x80\x02}q\0.", b"PK\x03\x04"]
+
+
+def one_line_about(path: Path) -> str:
+    with pytest.raises(CheckpointError) as error:
+        read_checkpoint(path)
+    assert "\n" not in str(error.value)
+    assert str(path) in str(error.value)
+    assert len(str(error.value)) < 500 + len(str(path))
+    return str(error.value)
+
+
+@pytest.mark.parametrize("suffix", [".pth", ".safetensors"])
+@pytest.mark.parametrize(
+    "content",
+    GARBAGE,
+)
+def test_garbage_is_refused(content: bytes, suffix: str, tmp_path: Path) -> None:
+    (tmp_path / f"w{suffix}").write_bytes(content)
+    one_line_about(tmp_path / f"w{suffix}")
+
+
+@pytest.mark.parametrize("save", [*SAVES, "safetensors"])
+def test_a_truncated_file_is_refused_wherever_it_ends(save: str, tmp_path: Path) -> None:
+    whole = tmp_path / ("w.safetensors" if save == "safetensors" else "w.pth")
+    if save == "safetensors":
+        save_file(weights(), whole)
+    else:
+        SAVES[save](weights(), whole)
+    content = whole.read_bytes()
+    for share in (0.001, 0.1, 0.3, 0.5, 0.7, 0.9, 0.999):
+        whole.write_bytes(content[: int(len(content) * share)])
+        one_line_about(whole)
+
+
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=60)
+@given(content=st.binary(max_size=200), suffix=st.sampled_from([".pth", ".safetensors"]))
+def test_any_other_bytes_are_refused(content: bytes, suffix: str, tmp_path: Path) -> None:
+    path = tmp_path / f"fuzz{suffix}"
+    path.write_bytes(content)
+    one_line_about(path)
+
+
+def test_a_zip_that_is_no_checkpoint_is_refused(tmp_path: Path) -> None:
+    with zipfile.ZipFile(tmp_path / "w.pth", "w") as archive:
+        archive.writestr("readme.txt", "hello")
+    one_line_about(tmp_path / "w.pth")
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+def test_a_torchscript_archive_says_what_to_save_instead(tmp_path: Path) -> None:
+    torch.jit.save(torch.jit.script(nn.Conv2d(1, 1, 1)), tmp_path / "w.pt")
+    assert "state_dict() of its module" in one_line_about(tmp_path / "w.pt")
+
+
+# ------------------------------------------------------------------ files with code in them
+
+
+class Runs:
+    """Runs a command as soon as it is unpickled."""
+
+    def __init__(self, how: str, marker: Path):
+        self.how, self.marker = how, marker
+
+    def __reduce__(self) -> Any:
+        command = f"touch {self.marker}"
+        code = f"open({str(self.marker)!r}, 'w')"
+        return {
+            "system": (os.system, (command,)),
+            "eval": (eval, (code,)),
+            "exec": (exec, (code,)),
+            "getattr": (getattr, (os, "system")),
+        }[self.how]
+
+
+@pytest.mark.parametrize("how", ["system", "eval", "exec"])
+@pytest.mark.parametrize("save", [*SAVES, "raw pickle"])
+@pytest.mark.parametrize("forced", [True, False])
+def test_nothing_in_a_pickle_is_run(
+    how: str, save: str, forced: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if forced:  # torch's own switch to run pickles all the same must not reach us
+        monkeypatch.setenv("TORCH_FORCE_NO_WEIGHTS_ONLY_LOAD", "1")
+    marker, path = tmp_path / "was_run", tmp_path / "w.pth"
+    content = {**weights(), "x": Runs(how, marker)}
+    if save == "raw pickle":
+        path.write_bytes(pickle.dumps(content))
+    else:
+        SAVES[save](content, path)
+    one_line_about(path)  # beside weights lies something that is no tensor
+    assert not marker.exists()
+    if save == "raw pickle":
+        pickle.loads(path.read_bytes())
+    else:
+        torch.load(path, weights_only=False)
+    assert marker.exists()  # so the file would have done it
+
+
+@pytest.mark.parametrize("save", SAVES)
+def test_the_tensors_of_a_whole_module_are_taken_out_and_that_is_said(
+    save: str, tmp_path: Path
+) -> None:
+    torch.manual_seed(3)
+    SAVES[save](Net(), tmp_path / "w.pth")
+    state, notes = loaded(tmp_path / "w.pth")
+    assert equal(state, weights())
+    assert len(notes) == 1
+    assert "nothing of it was run" in notes[0]
+
+
+def test_published_pickles_with_more_than_tensors_give_their_tensors(shared_data: Path) -> None:
+    folder = shared_data / "weights"
+    for path in (folder / "nconv" / "whole_module.pth", *(folder / "pncnn").glob("*.pth.tar")):
+        state = read_checkpoint(path)
+        assert state
+        assert all(isinstance(tensor, Tensor) for tensor in state.values())
+
+
+def test_a_published_file_of_tensors_is_read(shared_data: Path) -> None:
+    state = read_checkpoint(shared_data / "weights" / "nconv" / "CNN_ep0003.pth.tar")
+    assert len(state) == 14
+    assert all(bool(tensor.isfinite().all()) for tensor in state.values())

@@ -1,0 +1,150 @@
+"""Between image and network: points stay where they are seen, depth comes back to its pixels."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from torch import Tensor
+
+from pnpdepth_cli.core.points import SparsePoints
+from pnpdepth_cli.models.definition import Fixed, Multiple
+from pnpdepth_cli.models.frame import FrameMap
+
+sides = st.integers(1, 70)
+policies = st.one_of(
+    st.builds(Multiple, st.integers(1, 33), st.one_of(st.none(), st.integers(8, 60))),
+    st.builds(Fixed, st.integers(1, 40), st.integers(1, 40), st.sampled_from(["stretch", "crop"])),
+)
+
+
+def ramps(height: int, width: int) -> Tensor:
+    """(1, 3, H, W): column, row, and one, of every pixel."""
+    y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+    return torch.stack([x, y, torch.ones_like(x)]).float()[None]
+
+
+def every_pixel(height: int, width: int) -> SparsePoints:
+    xy = ramps(height, width)[0, :2].flatten(1).t().contiguous()
+    return SparsePoints(xy=xy, depth=torch.arange(1.0, len(xy) + 1), size=(height, width))
+
+
+@given(policies, sides, sides)
+def test_any_image_fits_any_policy_and_depth_comes_back_in_its_size(
+    policy: Fixed | Multiple, height: int, width: int
+) -> None:
+    frame = FrameMap.fit(policy, height, width)
+    picture = frame.rgb_to_network(torch.rand(1, 3, height, width))
+    assert tuple(picture.shape) == (1, 3, *frame.network)
+    if isinstance(policy, Multiple):
+        assert frame.network[0] % policy.of == 0
+        assert frame.network[1] % policy.of == 0
+        assert max(frame.resized) <= (policy.longest or max(height, width))
+    else:
+        assert frame.network == (policy.height, policy.width)
+    for divisor in (1, 2, 3):
+        h, w = (max(1, side // divisor) for side in frame.network)
+        depth = frame.depth_to_image(torch.full((1, 1, h, w), 2.5))
+        assert tuple(depth.shape) == (height, width)
+        top, left, rows, columns = frame.crop
+        inside = torch.zeros(height, width)
+        inside[top : top + rows, left : left + columns] = 2.5
+        torch.testing.assert_close(depth, inside)
+
+
+@given(policies, sides, sides)
+def test_a_point_goes_where_its_pixel_goes(
+    policy: Fixed | Multiple, height: int, width: int
+) -> None:
+    frame = FrameMap.fit(policy, height, width)
+    here = every_pixel(height, width)
+    there = frame.points_to_network(here)
+    top, left, rows, columns = frame.crop
+    assert there.size == frame.network
+    assert len(there) == rows * columns  # those outside the crop are dropped, no other
+    x, y = ramps(rows, columns)[0, :2].flatten(1)
+    kept = here.depth.reshape(height, width)[top : top + rows, left : left + columns]
+    assert torch.equal(there.depth, kept.flatten())
+    scale = frame.resized[1] / columns, frame.resized[0] / rows
+    torch.testing.assert_close(there.xy[:, 0], (x + 0.5) * scale[0] - 0.5, atol=1e-4, rtol=1e-5)
+    torch.testing.assert_close(there.xy[:, 1], (y + 0.5) * scale[1] - 0.5, atol=1e-4, rtol=1e-5)
+
+
+@given(st.integers(1, 40), sides, sides)
+def test_padding_moves_neither_a_point_nor_a_bit_of_picture_or_depth(
+    multiple: int, height: int, width: int
+) -> None:
+    frame = FrameMap.fit(Multiple(multiple), height, width)
+    here = every_pixel(height, width)
+    assert torch.equal(frame.points_to_network(here).xy, here.xy)
+    rgb = torch.rand(1, 3, height, width)
+    picture = frame.rgb_to_network(rgb)
+    assert torch.equal(picture[..., :height, :width], rgb)
+    assert torch.equal(picture[..., -1, :width], rgb[..., -1, :])
+    assert torch.equal(picture[..., :height, -1], rgb[..., -1])
+    depth = torch.rand(1, 1, *frame.network)
+    assert torch.equal(frame.depth_to_image(depth), depth[0, 0, :height, :width])
+
+
+@pytest.mark.parametrize("fit", ["stretch", "crop"])
+@pytest.mark.parametrize("size", [(48, 64), (24, 20), (97, 131)])
+def test_what_a_point_reads_in_the_network_is_what_is_at_its_pixel(
+    fit: str, size: tuple[int, int]
+) -> None:
+    height, width = size
+    frame = FrameMap.fit(Fixed(30, 40, fit), height, width)  # type: ignore[arg-type]
+    network = frame.rgb_to_network(ramps(height, width))
+    here = every_pixel(height, width)
+    there = frame.points_to_network(here)
+    inside = there.in_frame(*frame.network).xy
+    middle = (inside > 2).all(1) & (inside < torch.tensor([37, 27])).all(1)
+    back = there.select(middle)
+    index = (back.depth - 1).long()
+    torch.testing.assert_close(
+        back.sample(network[:, :1]), (index % width).float(), atol=0.1, rtol=0
+    )
+    rows = index.div(width, rounding_mode="floor").float()
+    torch.testing.assert_close(back.sample(network[:, 1:2]), rows, atol=0.1, rtol=0)
+    assert len(back) > 50
+
+
+@pytest.mark.parametrize("fit", ["stretch", "crop"])
+def test_a_ramp_goes_there_and_back(fit: str) -> None:
+    frame = FrameMap.fit(Fixed(30, 40, fit), 60, 100)  # type: ignore[arg-type]
+    ramp = ramps(60, 100)[:, :2] + 1
+    for channel in ramp[0]:
+        seen = frame.rgb_to_network(channel.expand(1, 3, -1, -1))
+        back = frame.depth_to_image(seen[:, :1])
+        top, left, rows, columns = frame.crop
+        middle = slice(top + 4, top + rows - 4), slice(left + 4, left + columns - 4)
+        torch.testing.assert_close(back[middle], channel[middle], atol=0.05, rtol=0)
+
+
+def test_a_crop_is_the_largest_in_the_middle_and_zero_outside() -> None:
+    frame = FrameMap.fit(Fixed(30, 40, "crop"), 60, 100)
+    assert frame.crop == (0, 10, 60, 80)
+    depth = frame.depth_to_image(torch.ones(1, 1, 30, 40))
+    assert not depth[:, :10].any()
+    assert not depth[:, 90:].any()
+    assert bool((depth[:, 10:90] == 1).all())
+    inside = frame.points_to_network(every_pixel(60, 100))
+    assert len(inside) == 60 * 80
+
+
+def test_a_crop_of_a_sliver_still_has_a_pixel() -> None:
+    frame = FrameMap.fit(Fixed(10, 1000, "crop"), 1, 50)
+    assert frame.crop == (0, 0, 1, 50)
+    assert tuple(frame.rgb_to_network(torch.rand(1, 3, 1, 50)).shape) == (1, 3, 10, 1000)
+
+
+def test_a_longest_side_shrinks_and_is_not_enlarged() -> None:
+    assert FrameMap.fit(Multiple(32, longest=640), 1000, 2000).resized == (320, 640)
+    assert FrameMap.fit(Multiple(32, longest=640), 100, 200).resized == (100, 200)
+
+
+def test_depth_of_points_is_never_touched() -> None:
+    here = every_pixel(33, 47)
+    for policy in (Fixed(30, 40), Fixed(30, 40, "crop"), Multiple(32, longest=32)):
+        there = FrameMap.fit(policy, 33, 47).points_to_network(here)
+        assert set(there.depth.tolist()) <= set(here.depth.tolist())

@@ -1,0 +1,233 @@
+"""A network ready to run: its arguments, its depth, its device; never random weights in silence."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from safetensors.torch import save_file
+from torch import Tensor, nn
+
+from pnpdepth_cli.core.points import SparsePoints
+from pnpdepth_cli.errors import CheckpointError, DeviceError, ModelError, UsageError
+from pnpdepth_cli.models import network as module_under_test
+from pnpdepth_cli.models.definition import Fixed, ModelDefinition, Multiple, Normalisation
+from pnpdepth_cli.models.frame import FrameMap
+from pnpdepth_cli.models.network import (
+    FARTHEST_DEPTH,
+    Network,
+    find_device,
+    load_network,
+    out_of_memory_is_a_device_error,
+)
+
+POINTS = SparsePoints(
+    xy=torch.tensor([[0.0, 0.0], [2.0, 1.0]]), depth=torch.tensor([4.0, 2.0]), size=(2, 3)
+)
+
+
+def network(**more: Any) -> Network:
+    settings = {"name": "mine", "input_kind": "rgb", "size": Multiple(1), "build": nn.Identity}
+    return Network(
+        definition=ModelDefinition(**settings | more),
+        module=nn.Identity(),
+        device=torch.device("cpu"),
+        checkpoint=None,
+    )
+
+
+def arguments(of: Network, rgb: Tensor | None) -> tuple[Tensor, ...]:
+    return of.arguments(FrameMap.fit(Multiple(1), 2, 3), rgb, POINTS)
+
+
+def test_a_picture_is_normalised_and_points_are_scattered() -> None:
+    normalisation = Normalisation(mean=(0.5, 0.25, 0.0), std=(0.5, 0.25, 2.0))
+    rgb, sparse = arguments(
+        network(input_kind="rgb+sparse", normalisation=normalisation), torch.full((1, 3, 2, 3), 0.5)
+    )
+    assert rgb[0, :, 0, 0].tolist() == [0.0, 1.0, 0.25]
+    assert sparse.tolist() == [[[[4, 0, 0], [0, 0, 2]]]]
+
+
+def test_a_network_of_points_alone_needs_no_picture_and_one_of_pictures_does() -> None:
+    assert len(arguments(network(input_kind="sparse"), None)) == 1
+    with pytest.raises(UsageError, match="looks at a picture"):
+        arguments(network(), None)
+
+
+def test_arguments_that_raise_or_are_no_tuple_are_the_definitions_fault() -> None:
+    rgb = torch.zeros(1, 3, 2, 3)
+    with pytest.raises(ModelError, match="arguments of network 'mine' raises ZeroDivisionError"):
+        arguments(network(arguments=lambda rgb, sparse: 1 / 0), rgb)
+    with pytest.raises(ModelError, match="gives a Tensor, where a tuple is expected"):
+        arguments(network(arguments=lambda rgb, sparse: rgb), rgb)
+
+
+@pytest.mark.parametrize("shape", [(1, 1, 2, 3), (1, 2, 3), (2, 3)])
+def test_one_depth_map_in_any_shape_is_depth(shape: tuple[int, ...]) -> None:
+    depth = network().depth_of(torch.full(shape, 2.0, dtype=torch.float64))
+    assert depth.dtype == torch.float32
+    assert torch.equal(depth, torch.full((1, 1, 2, 3), 2.0))
+
+
+BAD_SHAPES = [(2, 1, 2, 3), (1, 2, 2, 3), (2, 2, 3), (3,), (), (1, 1, 1, 2, 3)]
+
+
+@pytest.mark.parametrize("shape", BAD_SHAPES)
+def test_anything_else_is_said_with_its_shape(shape: tuple[int, ...]) -> None:
+    with pytest.raises(ModelError, match="shape") as error:
+        network().depth_of(torch.zeros(shape))
+    assert str(shape) in str(error.value)
+
+
+def test_inverse_and_log_depth_become_metres() -> None:
+    values = torch.tensor([[[[0.5, 4.0, 0.0, -1.0]]]])
+    inverse = network(output_kind="inverse").depth_of(values)
+    assert inverse.flatten().tolist() == pytest.approx([2.0, 0.25, FARTHEST_DEPTH, FARTHEST_DEPTH])
+    logarithm = network(output_kind="log").depth_of(torch.tensor([[[[0.0, 1.0]]]]))
+    assert logarithm.flatten().tolist() == pytest.approx([1.0, 2.718281828])
+
+
+def test_the_only_tensor_of_a_structure_is_the_output_and_several_need_a_choice() -> None:
+    depth = torch.ones(1, 1, 2, 2)
+    assert torch.equal(network().depth_of({"depth": [depth], "text": "x"}), depth)
+    with pytest.raises(ModelError, match=r"returns 2 tensors \(a, b.0\); its definition must pick"):
+        network().depth_of({"a": depth, "b": [depth]})
+    with pytest.raises(ModelError, match=r"returns 0 tensors \(none\)"):
+        network().depth_of(None)
+    chosen = network(output=lambda output: output["b"][0] * 2)
+    assert torch.equal(chosen.depth_of({"a": depth, "b": [depth]}), depth * 2)
+
+
+def test_an_output_that_raises_or_is_no_tensor_is_the_definitions_fault() -> None:
+    with pytest.raises(ModelError, match="output of network 'mine' raises KeyError"):
+        network(output=lambda output: output["x"]).depth_of({})
+    with pytest.raises(ModelError, match="gives a dict, where a tensor is expected"):
+        network(output=lambda output: output).depth_of({})
+
+
+# ------------------------------------------------------------------ loading
+
+FILE = """
+from pathlib import Path
+from torch import nn
+from pnpdepth_cli.models.definition import ModelDefinition, Multiple
+OWN = Path(__file__).parent / "own.safetensors"
+def of(build, **more):
+    kind = {"name": "mine", "input_kind": "rgb", "size": Multiple(1), "layers": ("0",)}
+    return ModelDefinition(build=build, **kind, **more)
+definition = of(lambda: nn.Conv2d(1, 1, 1))
+owned = of(lambda: nn.Conv2d(1, 1, 1), checkpoint=OWN)
+empty = of(nn.Identity)
+raising = of(lambda: 1 / 0)
+wrong = of(lambda: "text")
+"""
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    path = tmp_path / "mine.py"
+    path.write_text(FILE)
+    weights = {"weight": torch.full((1, 1, 1, 1), 3.0), "bias": torch.ones(1)}
+    save_file(weights, tmp_path / "own.safetensors")
+    return path
+
+
+def test_weights_come_from_the_file_named_or_the_definitions_own(file: Path) -> None:
+    own = file.parent / "own.safetensors"
+    for spec, checkpoint in ((f"{file}:owned", None), (str(file), own)):
+        loaded = load_network(spec, checkpoint)
+        assert float(loaded.module.weight) == 3  # type: ignore[arg-type]
+        assert not loaded.module.training
+        assert not any(p.requires_grad for p in loaded.module.parameters())
+        assert loaded.checkpoint == own
+
+
+def test_random_weights_are_never_used(file: Path) -> None:
+    with pytest.raises(CheckpointError, match="comes without weights; name them with --checkpoint"):
+        load_network(str(file), None)
+    (file.parent / "own.safetensors").unlink()
+    with pytest.raises(CheckpointError, match="does not exist"):
+        load_network(f"{file}:owned", None)
+
+
+def test_a_network_without_weights_needs_none(file: Path) -> None:
+    assert load_network(f"{file}:empty", None).checkpoint is None
+
+
+def test_a_build_that_raises_or_gives_no_module_is_said(file: Path) -> None:
+    with pytest.raises(ModelError, match="build of network 'mine' raises ZeroDivisionError"):
+        load_network(f"{file}:raising", None)
+    with pytest.raises(ModelError, match="gives no torch module"):
+        load_network(f"{file}:wrong", None)
+
+
+# ------------------------------------------------------------------ the device
+
+
+@pytest.mark.parametrize("name", ["cuda:99", "meta", "xla", "nonsense", "", "privateuseone", "hpu"])
+def test_a_device_that_is_not_there_is_said_with_the_way_out(name: str) -> None:
+    with pytest.raises(DeviceError, match=r"cannot be used: .*; try --device cpu") as error:
+        find_device(name)
+    assert error.value.exit_code == 6
+    assert "\n" not in str(error.value)
+
+
+def test_the_cpu_is_always_there() -> None:
+    assert find_device("cpu") == torch.device("cpu")
+
+
+def raises(error: BaseException) -> Callable[..., Any]:
+    def call(*args: object, **kwargs: object) -> Any:
+        raise error
+
+    return call
+
+
+@pytest.mark.parametrize(
+    "error", [torch.cuda.OutOfMemoryError("CUDA out of memory."), MemoryError()]
+)
+def test_memory_running_out_is_a_device_error(
+    error: Exception, file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(nn.Module, "to", raises(error))
+    with pytest.raises(DeviceError, match="'cpu' is out of memory; use a smaller image") as raised:
+        load_network(f"{file}:owned", None)
+    assert raised.value.exit_code == 6
+
+
+def test_memory_running_out_in_the_networks_forward_is_one_too() -> None:
+    from pnpdepth_cli.core.split import Split
+
+    class Hungry(nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.cut = nn.Identity()
+
+        def forward(self, x: Tensor) -> Tensor:
+            return self.cut(torch.empty(2**60, dtype=torch.uint8))
+
+    with (
+        pytest.raises(DeviceError),
+        out_of_memory_is_a_device_error(torch.device("cpu")),
+        Split(Hungry(), "cut") as split,
+    ):
+        split.front(torch.zeros(1))
+
+
+def test_other_errors_stay_what_they_are() -> None:
+    with pytest.raises(ZeroDivisionError), out_of_memory_is_a_device_error(torch.device("cpu")):
+        raise ZeroDivisionError
+
+
+def test_points_stay_on_the_grid_through_a_padded_frame() -> None:
+    frame = FrameMap.fit(Multiple(32), 2, 3)
+    sparse = network(input_kind="sparse").arguments(frame, None, frame.points_to_network(POINTS))[0]
+    assert tuple(sparse.shape) == (1, 1, 32, 32)
+    assert (float(sparse[0, 0, 0, 0]), float(sparse[0, 0, 1, 2])) == (4, 2)
+    assert int(sparse.count_nonzero()) == 2
+    assert Fixed(1, 1).fit == "stretch"
+    assert module_under_test.FARTHEST_DEPTH == 1e4

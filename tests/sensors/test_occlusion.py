@@ -1,0 +1,153 @@
+"""The occlusion filter, on a scene computed exactly and on frames with truth."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from pnpdepth_cli.errors import UsageError
+from pnpdepth_cli.io.calibration import read_calibration
+from pnpdepth_cli.io.depth import read_depth
+from pnpdepth_cli.io.scans import read_scan
+from pnpdepth_cli.sensors import (
+    FORWARD_LEFT_UP,
+    Camera,
+    OcclusionFilter,
+    ProjectionSettings,
+    project_velodyne,
+)
+from pnpdepth_cli.sensors.occlusion import hidden_points
+
+STREET = Path(__file__).resolve().parents[2] / "samples" / "street"
+K = np.array([[700.0, 0, 320], [0, 700, 240], [0, 0, 1]])
+SIZE = (480, 640)
+
+
+def board_before_wall(left_m: float) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """A scan of a board 5 m away (|y| < 0.5, |z| < 0.5 of the scanner) and a wall at 20 m.
+
+    Also which points the camera, `left_m` to the scanner's right, cannot see.
+    """
+    elevation, azimuth = np.meshgrid(
+        np.radians(np.arange(-15, 15, 0.4)), np.radians(np.arange(-24, 24, 0.17)), indexing="ij"
+    )
+    y, z = np.tan(azimuth).ravel(), (np.tan(elevation) / np.cos(azimuth)).ravel()
+    on_board = (np.abs(5 * y) < 0.5) & (np.abs(5 * z) < 0.5)
+    x = np.where(on_board, 5.0, 20.0)
+    scan = np.column_stack([x, x * y, x * z])
+    # the camera's ray to a wall point passes the board's plane at a quarter of the way
+    at_board = np.array([0, -left_m, 0]) * 0.75 + scan * 0.25
+    hidden = ~on_board & (np.abs(at_board[:, 1]) < 0.5) & (np.abs(at_board[:, 2]) < 0.5)
+    return scan, hidden
+
+
+@pytest.mark.parametrize("left_m", [0.05, 0.09, -0.13])
+def test_wall_seen_past_a_board_is_hidden_and_little_else(left_m: float) -> None:
+    scan, hidden = board_before_wall(left_m)
+    camera = Camera(
+        intrinsics=K, rotation=FORWARD_LEFT_UP, translation=np.array([-left_m, 0.0, 0.0])
+    )
+    everything = project_velodyne(scan, camera, SIZE, ProjectionSettings(occlusion=None)).index
+    kept = project_velodyne(scan, camera, SIZE).index
+    removed = np.setdiff1d(everything, kept)
+    truly_hidden = np.intersect1d(everything, np.flatnonzero(hidden))
+    assert len(truly_hidden) > 50
+    assert len(np.intersect1d(removed, truly_hidden)) >= 0.9 * len(truly_hidden)
+    visible = np.setdiff1d(everything, truly_hidden)
+    assert len(np.intersect1d(kept, visible)) >= 0.98 * len(visible)
+    assert scan[removed, 0].min() == 20  # the foreground itself stays
+
+
+def test_a_scanner_in_the_cameras_place_hides_nothing_far_from_an_edge() -> None:
+    scan, _ = board_before_wall(0.0)
+    camera = Camera(intrinsics=K, rotation=FORWARD_LEFT_UP)
+    got = project_velodyne(scan, camera, SIZE)
+    assert got.dropped["hidden by foreground"] < 0.02 * len(scan)
+
+
+def test_ground_at_a_grazing_angle_hides_no_ground() -> None:
+    elevation, azimuth = np.meshgrid(
+        np.radians(np.arange(-20, -4.5, 0.4)), np.radians(np.arange(-20, 20, 0.2)), indexing="ij"
+    )
+    distance = 1.7 / np.tan(-elevation)
+    scan = np.column_stack(
+        [
+            (distance * np.cos(azimuth)).ravel(),
+            (distance * np.sin(azimuth)).ravel(),
+            np.full(distance.size, -1.7),
+        ]
+    )
+    camera = Camera(
+        intrinsics=K, rotation=FORWARD_LEFT_UP, translation=np.array([0.06, -0.08, -0.27])
+    )
+    assert project_velodyne(scan, camera, SIZE).dropped["hidden by foreground"] == 0
+
+
+def test_the_scanner_in_front_of_the_camera_needs_no_parallax_to_be_defined() -> None:
+    xy = np.array([[100.0, 100.0], [101.0, 100.0], [300.0, 200.0]])
+    depth = np.array([1.0, 5.0, 5.0])
+    hidden = hidden_points(
+        xy, depth, SIZE, focal_px=700.0, scanner=np.array([640.0, 480.0, 2.0]),
+        settings=OcclusionFilter(),
+    )  # fmt: skip
+    assert hidden.tolist() == [False, True, False]
+
+
+def test_settings_that_mean_nothing_are_refused() -> None:
+    with pytest.raises(UsageError):
+        OcclusionFilter(nearer=0)
+    with pytest.raises(UsageError):
+        OcclusionFilter(margin_deg=-1)
+
+
+def kept_and_removed(
+    hidden: NDArray[np.bool_], depth: NDArray[np.floating], truth: NDArray[np.floating]
+) -> tuple[float, float]:
+    """Shares: kept of the points within 10 % of the truth, removed of the others."""
+    known = truth > 0
+    agrees = np.abs(depth[known] - truth[known]) <= 0.1 * truth[known]
+    gone = hidden[known]
+    return float((~gone[agrees]).mean()), float(gone[~agrees].mean())
+
+
+def test_on_the_rendered_street_most_points_that_contradict_the_truth_go() -> None:
+    calibration = read_calibration(STREET / "calib.txt")
+    camera = Camera(
+        intrinsics=calibration.intrinsics,
+        rotation=calibration.rotation,
+        translation=calibration.translation,
+    )
+    truth = read_depth(STREET / "gt.png").values
+    scan = read_scan(STREET / "000000.bin").points
+    points = project_velodyne(scan, camera, truth.shape, ProjectionSettings(occlusion=None))
+    column, row = np.floor(points.xy + 0.5).astype(int).T
+    kept_rows = project_velodyne(scan, camera, truth.shape).index
+    hidden = ~np.isin(points.index, kept_rows)
+    kept, removed = kept_and_removed(hidden, points.depth, truth[row, column])
+    assert kept >= 0.95
+    assert removed >= 0.7
+
+
+def test_on_kitti_most_points_that_contradict_the_truth_go(shared_data: Path) -> None:
+    folder = shared_data / "kitti_dc"
+    calibration = read_calibration(folder)
+    scanner = calibration.intrinsics @ calibration.translation
+    hidden, depth, truth = [], [], []
+    for path in sorted((folder / "velodyne_raw").glob("*.png")):
+        raw = read_depth(path).values
+        row, column = np.nonzero(raw)
+        xy = np.column_stack([column, row]).astype(np.float64)
+        depth.append(raw[row, column].astype(np.float64))
+        truth.append(read_depth(folder / "groundtruth" / path.name).values[row, column])
+        hidden.append(
+            hidden_points(
+                xy, depth[-1], raw.shape, focal_px=float(calibration.intrinsics[0, 0]),
+                scanner=scanner, settings=OcclusionFilter(),
+            )
+        )  # fmt: skip
+    kept, removed = kept_and_removed(*(np.concatenate(x) for x in (hidden, depth, truth)))
+    assert kept >= 0.95
+    assert removed >= 0.65

@@ -1,0 +1,178 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pnpdepth_cli.errors import NoPointsError, SizeError, UsageError
+from pnpdepth_cli.sensors import PATTERNS, SampleNoise, SamplePattern, as_picture, sample_points
+
+DEPTH = np.random.default_rng(7).uniform(1, 9, (60, 80)).astype(np.float32)
+HOLES = np.where(np.random.default_rng(8).random((60, 80)) < 0.3, 0, DEPTH).astype(np.float32)
+
+
+def checkerboard() -> np.ndarray:
+    y, x = np.mgrid[:60, :80]
+    board = (((y // 12) + (x // 12)) % 2).astype(np.float32)
+    return np.repeat(board[:, :, None], 3, axis=2)
+
+
+def pattern(kind: str) -> SamplePattern:
+    region = (10, 20, 30, 25) if kind == "region" else None
+    return SamplePattern(kind=kind, count=9 if kind == "lines" else 40, region=region)
+
+
+@pytest.mark.parametrize("kind", PATTERNS)
+def test_every_pattern_gives_known_pixels_once_with_their_own_depth(kind: str) -> None:
+    got = sample_points(HOLES, pattern(kind), 1, image=checkerboard())
+    column, row = got.xy.astype(int).T
+    assert np.array_equal(got.xy, np.column_stack([column, row]))
+    assert np.array_equal(got.depth, HOLES[row, column])
+    assert (got.depth > 0).all()
+    assert len({*zip(row, column, strict=True)}) == len(row)
+
+
+@pytest.mark.parametrize("kind", PATTERNS)
+def test_the_same_seed_gives_the_same_points(kind: str) -> None:
+    first, again = (sample_points(HOLES, pattern(kind), 5, image=checkerboard()) for _ in "ab")
+    assert np.array_equal(first.xy, again.xy)
+    if kind in ("uniform", "bernoulli", "edges", "region"):
+        other = sample_points(HOLES, pattern(kind), 6, image=checkerboard())
+        assert not np.array_equal(as_picture(first), as_picture(other))
+
+
+@settings(deadline=None, max_examples=30)
+@given(count=st.integers(1, 3000), seed=st.integers(0, 2**32))
+def test_uniform_gives_exactly_the_number_asked_for(count: int, seed: int) -> None:
+    assert len(sample_points(HOLES, SamplePattern(count=count), seed).depth) == count
+
+
+def test_uniform_of_a_share_is_of_the_known_pixels() -> None:
+    known = np.count_nonzero(HOLES)
+    assert len(sample_points(HOLES, SamplePattern(share=0.05), 0).depth) == round(0.05 * known)
+
+
+def test_bernoulli_gives_the_number_on_average_but_not_exactly() -> None:
+    counts = [
+        len(sample_points(HOLES, SamplePattern(kind="bernoulli", count=300), seed).depth)
+        for seed in range(40)
+    ]
+    assert len(set(counts)) > 5
+    assert np.mean(counts) == pytest.approx(300, abs=4 * 300**0.5 / 40**0.5)
+
+
+def test_grid_gives_evenly_spaced_points_of_about_the_number() -> None:
+    got = sample_points(DEPTH, SamplePattern(kind="grid", count=48), 0)
+    assert len(got.depth) == 48  # 6 × 8 at a spacing of 10
+    assert set(np.diff(np.unique(got.xy[:, 0]))) == {10}
+    assert set(np.diff(np.unique(got.xy[:, 1]))) == {10}
+
+
+def test_lines_keeps_whole_rows() -> None:
+    got = sample_points(DEPTH, SamplePattern(kind="lines", count=4), 0)
+    assert np.unique(got.xy[:, 1]).tolist() == [7, 22, 37, 52]
+    assert len(got.depth) == 4 * 80
+
+
+def test_features_lie_at_the_corners_of_the_image() -> None:
+    picture = np.full((160, 200, 3), 0.2, np.float32)
+    picture[40:120, 50:150] = 0.9
+    depth = np.full((160, 200), 3, np.float32)
+    got = sample_points(depth, SamplePattern(kind="features", count=8), 0, image=picture)
+    corners = np.array([[50, 40], [149, 40], [50, 119], [149, 119]])
+    away = np.abs(got.xy[:, None] - corners).max(axis=2)
+    assert away.min(axis=1).max() <= 6
+    assert len(got.depth) == 8
+    assert (away.min(axis=0) <= 6).all()
+
+
+def test_edges_lie_on_the_edges_of_the_image() -> None:
+    got = sample_points(DEPTH, SamplePattern(kind="edges", count=60), 0, image=checkerboard())
+    to_line = np.abs(got.xy - 12 * np.rint(got.xy / 12)).min(axis=1)
+    assert to_line.max() <= 2
+
+
+def test_region_keeps_all_of_it_or_a_number_at_random() -> None:
+    area = (10, 20, 30, 25)
+    everything = sample_points(DEPTH, SamplePattern(kind="region", region=area), 0)
+    assert len(everything.depth) == 30 * 25
+    assert everything.xy.min(axis=0).tolist() == [10, 20]
+    assert everything.xy.max(axis=0).tolist() == [39, 44]
+    some = sample_points(DEPTH, SamplePattern(kind="region", region=area, count=17), 0)
+    assert len(some.depth) == 17
+
+
+def test_noise_has_the_size_asked_for() -> None:
+    every = SamplePattern(count=DEPTH.size)
+    clean = sample_points(DEPTH, every, 3)
+    metres = sample_points(DEPTH, every, 3, noise=SampleNoise(metres=0.05))
+    assert (metres.depth - clean.depth).std() == pytest.approx(0.05, rel=0.1)
+    relative = sample_points(DEPTH, every, 3, noise=SampleNoise(relative=0.02))
+    assert (relative.depth / clean.depth - 1).std() == pytest.approx(0.02, rel=0.1)
+    wrong = sample_points(DEPTH, every, 3, noise=SampleNoise(outliers=0.1))
+    assert np.count_nonzero(wrong.depth != clean.depth) == DEPTH.size // 10
+    assert clean.depth.min() <= wrong.depth.min() <= wrong.depth.max() <= clean.depth.max()
+
+
+def test_jitter_moves_places_and_leaves_depths() -> None:
+    clean = sample_points(DEPTH, SamplePattern(count=500), 3)
+    moved = sample_points(DEPTH, SamplePattern(count=500), 3, noise=SampleNoise(jitter_px=0.7))
+    lost = moved.dropped.get("outside the picture", 0)
+    assert len(moved.depth) == 500 - lost
+    assert np.isin(moved.depth, clean.depth).all()
+    if not lost:
+        assert (moved.xy - clean.xy).std() == pytest.approx(0.7, rel=0.1)
+
+
+@pytest.mark.parametrize(
+    ("given_", "said"),
+    [
+        ({"kind": "spiral", "count": 3}, "spiral"),
+        ({"count": 0}, "at least one"),
+        ({"share": 1.5}, "100 %"),
+        ({"share": 0.0}, "above 0"),
+        ({"count": 3, "share": 0.1}, "not both"),
+        ({}, "needs a count"),
+        ({"kind": "lines"}, "number of lines"),
+        ({"kind": "region", "count": 3}, "region"),
+        ({"count": 3, "region": (0, 0, 1, 1)}, "region"),
+    ],
+)
+def test_a_pattern_that_makes_no_sense_is_refused(given_: dict[str, object], said: str) -> None:
+    with pytest.raises(UsageError, match=said):
+        SamplePattern(**given_)  # type: ignore[arg-type]
+
+
+def test_what_the_depth_map_cannot_give_is_refused() -> None:
+    with pytest.raises(UsageError, match="ask for fewer"):
+        sample_points(HOLES, SamplePattern(count=DEPTH.size), 0)
+    with pytest.raises(NoPointsError):
+        sample_points(np.zeros((5, 5), np.float32), SamplePattern(count=1), 0)
+    with pytest.raises(NoPointsError, match="100,0,5,5"):
+        sample_points(DEPTH, SamplePattern(kind="region", region=(100, 0, 5, 5)), 0)
+    with pytest.raises(UsageError, match="needs the image"):
+        sample_points(DEPTH, SamplePattern(kind="features", count=3), 0)
+    with pytest.raises(SizeError, match="40×30"):
+        sample_points(
+            DEPTH, SamplePattern(kind="edges", count=3), 0, image=np.zeros((30, 40, 3), np.float32)
+        )
+
+
+def test_a_plain_image_has_no_features() -> None:
+    flat = np.full((60, 80, 3), 0.5, np.float32)
+    with pytest.raises(NoPointsError, match="leaves no point"):
+        sample_points(DEPTH, SamplePattern(kind="features", count=3), 0, image=flat)
+
+
+def test_features_of_a_real_frame_spread_over_it(shared_data: Path) -> None:
+    from pnpdepth_cli.io.depth import read_depth
+    from pnpdepth_cli.io.rgb import read_rgb
+
+    rgb = read_rgb(shared_data / "icl_nuim" / "image" / "00000.jpg").values
+    depth = read_depth(shared_data / "icl_nuim" / "depth" / "00000.png", scale=1000).values
+    got = sample_points(depth, SamplePattern(kind="features", count=300), 0, image=rgb)
+    assert len(got.depth) == 300
+    assert (got.xy.max(axis=0) - got.xy.min(axis=0) > np.array([320, 240])).all()

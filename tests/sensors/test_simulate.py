@@ -1,0 +1,163 @@
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pnpdepth_cli.errors import NoPointsError, UsageError
+from pnpdepth_cli.sensors import (
+    FORWARD_LEFT_UP,
+    LIDARS,
+    Camera,
+    Lidar,
+    SimulationSettings,
+    simulate_lidar,
+)
+
+K = np.array([[300.0, 0, 159.5], [0, 300, 119.5], [0, 0, 1]])
+CAMERA = Camera(intrinsics=K, rotation=FORWARD_LEFT_UP)
+IDEAL = Lidar(
+    name="ideal", elevations_deg=tuple(range(-14, 15, 2)), azimuth_step_deg=0.2, max_range=100
+)
+
+
+def rows_of(xy: np.ndarray) -> np.ndarray:
+    return np.floor(xy + 0.5).astype(int)
+
+
+def test_without_noise_every_point_lies_on_the_depth_map() -> None:
+    depth = np.random.default_rng(0).uniform(2, 50, (240, 320)).astype(np.float32)
+    got = simulate_lidar(depth, CAMERA, IDEAL, seed=0)
+    column, row = rows_of(got.xy).T
+    np.testing.assert_allclose(got.depth, depth[row, column], rtol=1e-6)
+    assert len(got.depth) > 1000
+
+
+def test_points_lie_on_the_beams_elevations() -> None:
+    got = simulate_lidar(np.full((240, 320), 8.0), CAMERA, IDEAL, seed=0)
+    points = CAMERA.to_scanner(CAMERA.unproject(got.xy, got.depth))
+    elevation = np.degrees(np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1])))
+    np.testing.assert_allclose(elevation, 2 * np.rint(elevation / 2), atol=1e-4)
+    assert set(np.rint(elevation).astype(int)) == set(range(-14, 15, 2))
+
+
+@pytest.mark.parametrize("place", [(0.3, 0.0, 0.0), (0.0, -0.8, -0.3), (-0.5, 0.4, 0.5)])
+def test_from_another_place_every_point_lies_on_the_wall_it_hits(
+    place: tuple[float, float, float],
+) -> None:
+    # a wall that runs away to the right: n · p = 6 with n = (-0.4, 0, 1)
+    x = (np.arange(320) - K[0, 2]) / K[0, 0]
+    depth = np.broadcast_to(6 / (1 - 0.4 * x), (240, 320))
+    camera = replace(CAMERA, translation=np.array(place))
+    got = simulate_lidar(depth, camera, IDEAL, seed=0)
+    points = camera.unproject(got.xy, got.depth)
+    np.testing.assert_allclose(points @ [-0.4, 0, 1], 6, atol=0.02)
+    seen = camera.to_scanner(points)
+    elevation = np.degrees(np.arctan2(seen[:, 2], np.hypot(seen[:, 0], seen[:, 1])))
+    np.testing.assert_allclose(elevation, 2 * np.rint(elevation / 2), atol=1e-3)
+    assert len(got.depth) > 1000
+
+
+def test_what_is_behind_an_edge_for_the_scanner_is_not_measured() -> None:
+    # a board at 3 m in the middle columns before a wall at 12 m; the scanner 1 m to the right
+    depth = np.full((240, 320), 12.0)
+    depth[:, 130:190] = 3.0
+    camera = replace(CAMERA, translation=np.array([1.0, 0.0, 0.0]))
+    got = simulate_lidar(depth, camera, replace(IDEAL, azimuth_step_deg=0.05), seed=0)
+    wall = got.depth > 6
+    edge_left = camera.unproject(np.array([[129.5, 120.0]]), np.array([3.0]))[0, 0]
+    # the scanner's line of sight past the board's left edge meets the wall at:
+    shadow_end = 1.0 + (edge_left - 1.0) * 12 / 3
+    x = camera.unproject(got.xy[wall], got.depth[wall])[:, 0]
+    left_of_board = x < edge_left * 12 / 3
+    assert left_of_board.any()
+    assert x[left_of_board].max() <= shadow_end + 0.05
+
+
+def test_range_noise_moves_points_along_their_beams() -> None:
+    depth = np.full((240, 320), 10.0)
+    got = simulate_lidar(depth, CAMERA, replace(IDEAL, range_noise=0.05), seed=3)
+    x, y = ((got.xy - K[:2, 2]) / 300).T
+    error = (got.depth - 10) * np.sqrt(1 + x * x + y * y)
+    assert 0.04 < error.std() < 0.06
+    assert abs(error.mean()) < 0.01
+
+
+def test_drop_out_and_maximum_range_take_their_share() -> None:
+    depth = np.full((240, 320), 10.0)
+    full = simulate_lidar(depth, CAMERA, IDEAL, seed=0)
+    thin = simulate_lidar(depth, CAMERA, IDEAL, seed=0, settings=SimulationSettings(dropout=0.3))
+    assert 0.65 < len(thin.depth) / len(full.depth) < 0.75
+    near = simulate_lidar(
+        depth, CAMERA, IDEAL, seed=0, settings=SimulationSettings(max_range=10.2, euclidean=True)
+    )
+    assert near.depth.max() <= 10.2 + 1e-5
+    assert near.dropped["out of range"] > 0
+
+
+def test_rotation_noise_turns_the_whole_scanner() -> None:
+    depth = np.full((240, 320), 10.0)
+    noise = SimulationSettings(rotation_noise_deg=1.0)
+    got = simulate_lidar(depth, CAMERA, IDEAL, seed=4, settings=noise)
+    points = CAMERA.to_scanner(CAMERA.unproject(got.xy, got.depth))
+    elevation = np.degrees(np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1])))
+    off = elevation - 2 * np.rint(elevation / 2)
+    assert np.abs(off).max() > 0.2
+
+
+def test_the_same_seed_gives_the_same_points_and_another_seed_others() -> None:
+    depth = np.full((240, 320), 10.0)
+    noisy = replace(IDEAL, range_noise=0.02, angle_noise_deg=0.1)
+    first, again, other = (simulate_lidar(depth, CAMERA, noisy, seed=s) for s in (1, 1, 2))
+    assert np.array_equal(first.xy, again.xy)
+    assert np.array_equal(first.depth, again.depth)
+    assert not np.array_equal(first.depth[:100], other.depth[:100])
+
+
+def test_unknown_depth_gives_no_points() -> None:
+    with pytest.raises(NoPointsError, match="ideal"):
+        simulate_lidar(np.zeros((240, 320)), CAMERA, IDEAL, seed=0)
+    half = np.full((240, 320), 5.0)
+    half[:, :160] = 0
+    assert simulate_lidar(half, CAMERA, IDEAL, seed=0).xy[:, 0].min() >= 159.5
+
+
+def test_a_share_that_is_none_is_refused() -> None:
+    with pytest.raises(UsageError):
+        SimulationSettings(dropout=1.0)
+
+
+PAPER_PERCENT = {"vlp-16": 5.3, "vlp-32c": 28.8, "hdl-32e": 10.3, "hdl-64e": 18.7}
+
+
+def test_the_papers_sensors_give_about_its_shares_of_samples_in_its_order() -> None:
+    # SYNTHIA's sequences are 1280×760 with a focal length of 532.74; at 0.4 of that size
+    intrinsics = np.array([[213.1, 0, 255.5], [0, 213.1, 151.5], [0, 0, 1]])
+    synthia = Camera(intrinsics=intrinsics, rotation=FORWARD_LEFT_UP)
+    depth = np.full((304, 512), 10.0)
+    shares = {
+        name: 100
+        * len(simulate_lidar(depth, synthia, LIDARS[f"paper-{name}"], 0).depth)
+        / depth.size
+        for name in PAPER_PERCENT
+    }
+    assert sorted(shares, key=shares.__getitem__) == ["vlp-16", "hdl-32e", "hdl-64e", "vlp-32c"]
+    for name, percent in PAPER_PERCENT.items():
+        assert shares[name] == pytest.approx(percent, rel=0.1), name
+
+
+def test_the_real_sensor_seen_on_the_street_has_the_density_of_kitti() -> None:
+    from pnpdepth_cli.io.calibration import read_calibration
+    from pnpdepth_cli.io.depth import read_depth
+
+    street = Path(__file__).resolve().parents[2] / "samples" / "street"
+    calibration = read_calibration(street / "calib.txt")
+    camera = Camera(
+        intrinsics=calibration.intrinsics,
+        rotation=calibration.rotation,
+        translation=calibration.translation,
+    )
+    got = simulate_lidar(read_depth(street / "gt.png").values, camera, LIDARS["hdl-64e"], seed=0)
+    assert 0.035 < len(got.depth) / (375 * 1242) < 0.055
