@@ -17,6 +17,9 @@ from pnpdepth_cli.cli import options
 @options.checkpoint
 @click.option("--all", "every", is_flag=True, help="Every submodule, not the definition's choice.")
 @click.option("--size", metavar="HxW", help="Of the frame to measure with.")
+@click.option(
+    "--sparse", type=options.FILE, help="Rank the layers for sparse depth as dense as this map."
+)
 @options.device
 @options.as_json
 def layers(
@@ -24,6 +27,7 @@ def layers(
     checkpoint: Path | None,
     every: bool,
     size: str | None,
+    sparse: Path | None,
     device: str,
     as_json: bool,
 ) -> None:
@@ -42,34 +46,57 @@ def layers(
             bar.total = of
             bar.update(done - bar.n)
 
-        rows = list_layers(
+        found = list_layers(
             model,
             checkpoint,
             device,
             every=every,
             size=options.height_and_width(size) if size else None,
+            sparse=sparse,
             on_layer=show,
         )
     if as_json:
-        click.echo(json.dumps([asdict(row) for row in rows], indent=2))
+        click.echo(json.dumps([asdict(row) for row in found.rows], indent=2))
         return
     from pnpdepth_cli.cli.tables import print_rows
 
     print_rows(
         f"layers of {model}",
-        ("layer", "z", "stride", "cost behind", "field in z", "field in depth"),
-        [_cells(asdict(row)) for row in rows],
+        (
+            "layer",
+            "z",
+            "stride",
+            "parameters",
+            "cost behind",
+            "time behind",
+            "field in z",
+            "field in depth",
+            "rank",
+        ),
+        [_cells(asdict(row)) for row in found.rows],
     )
 
 
 def _cells(row: dict[str, Any]) -> tuple[str, ...]:
     if row["problem"]:
-        return (row["name"], "–", "", "", "", row["problem"].partition(": ")[2] or row["problem"])
+        return (
+            row["name"],
+            "–",
+            "",
+            "",
+            "",
+            "",
+            "",
+            row["problem"].partition(": ")[2] or row["problem"],
+        )
     return (
         row["name"],
         "×".join(str(n) for n in row["shape"]),
         f"{row['stride']:g}" if row["stride"] else "–",
+        f"{row['parameters']:,}",
         f"{row['cost_behind']:.0%}" if row["cost_behind"] is not None else "–",
+        f"{1000 * row['seconds_behind']:.0f} ms",
         "{}×{}".format(*row["field_in_z"]) if row["field_in_z"] else "–",
         "{}×{}".format(*row["field_in_output"]),
+        str(row["rank"] or ""),
     )

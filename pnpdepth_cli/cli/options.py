@@ -21,7 +21,9 @@ model = click.option(
     " module; FILE.onnx[:OUTPUT]; FILE.pt2; or a Hugging Face folder.",
 )
 checkpoint = click.option(
-    "--checkpoint", type=FILE, help="Its weights: .safetensors, or a torch file of tensors only."
+    "--checkpoint",
+    type=FILE,
+    help="Its weights: .safetensors, or a torch file; nothing in it is run.",
 )
 layer = click.option(
     "--layer",

@@ -32,9 +32,10 @@ BEYOND = 10.0
 
 _PAIRS = 1024
 _SCORED = 1024
-_BIWEIGHT = 4.685  # Tukey's c for 95 % efficiency on normal errors
+_BIWEIGHT = 8.0  # of Tukey's weights; 4.685 suits normal errors, networks' have longer tails
 _NORMAL_MAD = 1.4826  # standard deviation over median absolute deviation, normal errors
 _TRUSTED = 0.7  # share of the points that `error` is measured on: the best ones
+_WRONG = 0.25  # |log| error beyond which a point counts as wrong, not as more wrong
 _NO_BETTER = 1e-3  # relative errors below this do not tell one alignment from another
 
 
@@ -44,8 +45,8 @@ class Alignment:
 
     space, kind, scale, shift: as above. bounds: (nearest, farthest) in metres; what comes out
     beyond them, or at no positive depth at all, reads as the bound. points: how many were
-    fitted. error: mean |log(aligned / true depth)| of the best 70 % of them. outliers: share of
-    points that are far worse than those.
+    fitted. error: mean |log(aligned / true depth)| of the best 70 % of them. misfit: the same of
+    all, none counting more than 0.25. outliers: share of points that are far off.
     """
 
     space: str
@@ -55,6 +56,7 @@ class Alignment:
     bounds: tuple[float, float]
     points: int
     error: float = math.nan
+    misfit: float = math.nan
     outliers: float = 0.0
 
     def depth(self, x: Tensor) -> Tensor:
@@ -128,13 +130,14 @@ def _fitted(x: Tensor, d: Tensor, space: str, kind: str) -> Alignment | None:
     off = (made.depth(x).log() - d.log()).abs()
     error = float(off.sort().values[: max(1, round(_TRUSTED * len(off)))].mean())
     gross = max(3 * _NORMAL_MAD * float(off.median()), 0.05)
-    return replace(made, error=error, outliers=float((off > gross).double().mean()))
+    misfit = float(off.clamp_max(_WRONG).mean())
+    return replace(made, error=error, misfit=misfit, outliers=float((off > gross).double().mean()))
 
 
 def _bic(made: Alignment) -> float:
     parameters = {"none": 0, "affine": 2}.get(made.kind, 1)
-    error = max(made.error, _NO_BETTER)
-    # Trimmed errors fall more readily than errors do, so a parameter costs three times the usual.
+    error = max(made.misfit, _NO_BETTER)
+    # Bounded errors fall more readily than errors do, so a parameter costs three times the usual.
     return 2 * made.points * math.log(error) + 3 * parameters * math.log(max(2, made.points))
 
 

@@ -132,6 +132,7 @@ class ModelDefinition:
     verify: called with the network and its arguments for the first frame; returns what to say, or
         raises ModelError where the network cannot be trusted.
     normalisation None: which one is decided from the first frame's points.
+    assumed: what this definition takes for granted because nobody said; it is printed.
     """
 
     name: str
@@ -152,6 +153,7 @@ class ModelDefinition:
     arguments: Callable[[Tensor | None, Tensor | None], tuple[Tensor, ...]] | None = None
     output: Callable[[Any], Tensor] | None = None
     verify: Callable[[nn.Module, tuple[Tensor, ...]], str] | None = None
+    assumed: str = ""
 
     @property
     def default_layer(self) -> str | None:

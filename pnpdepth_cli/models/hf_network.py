@@ -157,17 +157,17 @@ def _build(folder: Path) -> nn.Module:
     # Read when huggingface_hub is imported; a folder may name a backbone it would look for online.
     os.environ["HF_HUB_OFFLINE"] = "1"
     try:
-        from transformers import AutoModelForDepthEstimation
-        from transformers.utils import logging
+        import transformers
     except ImportError as error:
         raise ModelError(
             f"{folder} is a Hugging Face folder, which needs the package {error.name!r}:"
             " pip install 'pnpdepth[hf]'"
         ) from None
+    logging: Any = transformers.utils.logging
     logging.set_verbosity_error()
     logging.disable_progress_bar()
     try:
-        module, info = AutoModelForDepthEstimation.from_pretrained(
+        module, info = transformers.AutoModelForDepthEstimation.from_pretrained(
             str(folder),
             local_files_only=True,
             use_safetensors=True,

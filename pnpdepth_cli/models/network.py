@@ -134,6 +134,7 @@ def load_network(spec: str, checkpoint: Path | None, device: str = "cpu") -> Net
     module.eval().requires_grad_(False)
     with out_of_memory_is_a_device_error(on):
         module.to(on)
+    notes = [f"model: {definition.assumed}", *notes] if definition.assumed else notes
     network = Network(
         definition=definition, module=module, device=on, checkpoint=path, notes=tuple(notes)
     )

@@ -5,15 +5,22 @@ from __future__ import annotations
 import difflib
 import importlib
 import importlib.util
+import inspect
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 from pnpdepth_cli.core.foreign import describe
 from pnpdepth_cli.errors import ModelError
-from pnpdepth_cli.models.definition import ModelDefinition
+from pnpdepth_cli.models.definition import FOREIGN, ModelDefinition, Multiple
 
 DEFAULT_MODEL = "compact"
+
+_ATTRIBUTE = "definition"
+_MULTIPLE = 32  # what the sides of a picture are padded to where nobody says
+_WEIGHTS_ONLY = (".pt", ".pth", ".ts", ".torchscript", ".ckpt", ".bin", ".safetensors", ".tar")
 
 _MODULES = {
     "compact": "model_zoo_defs.compact",
@@ -45,14 +52,68 @@ def find_definition(spec: str) -> ModelDefinition:
         near = difflib.get_close_matches(spec, _MODULES, n=1)
         hint = f"did you mean {near[0]!r}?" if near else f"known: {', '.join(_MODULES)}"
         raise ModelError(f"model {spec!r} is neither a known name nor a Python file; {hint}")
-    found = getattr(_run(file), attribute, None)
+    module = _run(file)
+    found = getattr(module, attribute, None)
+    if found is None and attribute == _ATTRIBUTE:
+        attribute, found = _only_network(module) or (attribute, None)
     if found is None:
         raise ModelError(f"model file {file} defines no {attribute!r}; name it as {file}:ATTRIBUTE")
+    if callable(found) and not isinstance(found, ModelDefinition):
+        return _assumed(found, attribute, file)
     if not isinstance(found, ModelDefinition):
         raise ModelError(
             f"{attribute!r} in model file {file} is a {type(found).__name__}, not a ModelDefinition"
         )
     return found
+
+
+def _only_network(module: ModuleType) -> tuple[str, Any] | None:
+    """The one torch module class that the file itself defines; None if there is no one such."""
+    from torch import nn
+
+    own = {
+        name: value
+        for name, value in vars(module).items()
+        if isinstance(value, type)
+        and issubclass(value, nn.Module)
+        and value.__module__ == module.__name__
+    }
+    inner = {name for one in own.values() for name in _mentioned(one)}
+    outer = [(name, value) for name, value in own.items() if name not in inner]
+    return outer[0] if len(outer) == 1 else None
+
+
+def _mentioned(network: type) -> set[str]:
+    """The names that a class's constructor uses; a network's blocks are among them."""
+    code = getattr(network.__init__, "__code__", None)  # type: ignore[misc]
+    return set(code.co_names) if code is not None else set()
+
+
+def _assumed(build: Callable[..., Any], attribute: str, file: Path) -> ModelDefinition:
+    """A definition around a class or function that gives a network, and nothing else is known."""
+    needed = [
+        name
+        for name, p in inspect.signature(build).parameters.items()
+        if p.default is p.empty and p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)
+    ]
+    if needed:
+        raise ModelError(
+            f"{attribute!r} in model file {file} needs arguments ({', '.join(needed)}); write a"
+            " function without any that returns the network, and name that"
+        )
+    return ModelDefinition(
+        name=f"{file.stem}.{attribute}",
+        summary=f"{attribute} of {file.name}",
+        input_kind="rgb",
+        size=Multiple(_MULTIPLE),
+        normalisation=None,
+        output_kind="unknown",
+        output_scale="unknown",
+        build=build,
+        defaults=FOREIGN,
+        assumed=f"{attribute!r} of {file.name} is no definition; assumed: one rgb picture in, sides"
+        f" padded to multiples of {_MULTIPLE}; what its numbers mean is decided from the points",
+    )
 
 
 def _foreign(spec: str) -> ModelDefinition | None:
@@ -63,6 +124,16 @@ def _foreign(spec: str) -> ModelDefinition | None:
 
         named = not spec.endswith(".onnx")
         return onnx_definition(Path(file), output) if named else onnx_definition(Path(spec))
+    if spec.endswith(".pt2"):
+        from pnpdepth_cli.models.exported import exported_definition
+
+        return exported_definition(Path(spec))
+    if spec.endswith(_WEIGHTS_ONLY):
+        raise ModelError(
+            f"model {spec} is a file of weights or a TorchScript archive, which cannot be cut; name"
+            " the network's Python file with --model and this file with --checkpoint, or export it"
+            " by torch.export (.pt2) or to ONNX"
+        )
     if Path(spec).is_dir():
         from pnpdepth_cli.models.hf_network import hf_definition
 
@@ -74,7 +145,7 @@ def _file_and_attribute(spec: str) -> tuple[Path, str]:
     file, colon, attribute = spec.rpartition(":")
     if colon and file.endswith(".py"):
         return Path(file), attribute
-    return Path(spec), "definition"
+    return Path(spec), _ATTRIBUTE
 
 
 def _run(file: Path) -> ModuleType:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
+import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
@@ -11,8 +13,10 @@ from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode
 
 from pnpdepth_cli.core.influence import influential_field
+from pnpdepth_cli.core.layer_name import LayerName
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.errors import ModelError, UsageError
+from pnpdepth_cli.io.depth import read_sparse
 from pnpdepth_cli.models.definition import Fixed
 from pnpdepth_cli.models.frame import FrameMap
 from pnpdepth_cli.models.made_up import made_up_arguments
@@ -27,7 +31,9 @@ class LayerRow:
 
     shape: of z. stride: network pixels per element of z, None where z has no two spatial axes.
     cost_behind: share of the network's floating-point operations that every update repeats.
+    seconds_behind: what one pass of the part behind takes here. parameters: of the layer itself.
     field_in_z, field_in_output: the influential field of one point, see `InfluentialField`.
+    rank: 1 is what the paper's rule of thumb picks, where the spacing of points is known.
     problem: why it cannot be cut at, then all else but the name is None.
     """
 
@@ -35,9 +41,21 @@ class LayerRow:
     shape: tuple[int, ...] | None = None
     stride: float | None = None
     cost_behind: float | None = None
+    seconds_behind: float | None = None
+    parameters: int | None = None
     field_in_z: tuple[int, int] | None = None
     field_in_output: tuple[int, int] | None = None
+    rank: int | None = None
     problem: str | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class LayerList:
+    """The layers in order, and how far apart the user's points lie, in the network's pixels."""
+
+    rows: list[LayerRow]
+    spacing: float | None
+    notes: tuple[str, ...]
 
 
 def list_layers(
@@ -47,12 +65,18 @@ def list_layers(
     *,
     every: bool,
     size: tuple[int, int] | None = None,
+    sparse: Path | None = None,
     on_layer: Callable[[int, int], None] = lambda done, of: None,
-) -> list[LayerRow]:
+) -> LayerList:
     """The definition's layers, or every submodule, in order, measured on a made-up frame.
 
-    size: (H, W) of the frame; default the network's own, or 240×320.
+    size: (H, W) of the frame; default that of `sparse`, the network's own, or 240×320. With
+    `sparse`, a sparse depth map, the layers are ranked by the paper's rule of thumb.
     """
+    count = None
+    if sparse is not None:
+        points = read_sparse(sparse)
+        size, count = size or points.size, len(points.depth)
     network = load_network(model, checkpoint, device)
     names = list(network.definition.layers)
     if every:
@@ -72,7 +96,28 @@ def list_layers(
         for done, name in enumerate(names, start=1):
             rows.append(_measure(network, name, arguments, frame, whole.get_total_flops()))
             on_layer(done, len(names))
-    return rows
+    height, width = frame.network
+    spacing = math.sqrt(height * width / count) if count else None
+    return LayerList(
+        rows=ranked(rows, spacing) if spacing else rows, spacing=spacing, notes=network.notes
+    )
+
+
+def ranked(rows: list[LayerRow], spacing: float) -> list[LayerRow]:
+    """The rows with their ranks: fields as wide as the gap between points first, cheapest first.
+
+    Where no field is as wide, the widest go first. Points spread evenly lie √(area / number) apart.
+    """
+
+    def place(row: LayerRow) -> tuple[bool, float]:
+        assert row.field_in_output is not None
+        field = min(row.field_in_output)
+        wide = field >= spacing
+        return (not wide, (row.cost_behind or 0.0) if wide else -float(field))
+
+    order = sorted((row for row in rows if row.problem is None), key=place)
+    ranks = {row.name: number for number, row in enumerate(order, start=1)}
+    return [replace(row, rank=ranks.get(row.name)) for row in rows]
 
 
 def _measure(
@@ -84,6 +129,9 @@ def _measure(
             split.rear(z)
             with FlopCounterMode(display=False) as behind:
                 split.rear(z)
+            start = time.perf_counter()
+            split.rear(z)
+            seconds = time.perf_counter() - start
             field = influential_field(split, z, network.depth_of)
     except ModelError as error:
         return LayerRow(name=name, problem=str(error))
@@ -92,6 +140,13 @@ def _measure(
         shape=tuple(z.shape),
         stride=frame.network[0] / z.shape[-2] if z.ndim == 4 else None,
         cost_behind=behind.get_total_flops() / whole if whole else None,
+        seconds_behind=seconds,
+        parameters=_parameters(network, name),
         field_in_z=field.in_z,
         field_in_output=field.in_output,
     )
+
+
+def _parameters(network: Network, name: str) -> int:
+    module = dict(network.module.named_modules())[LayerName.parse(name).module]
+    return sum(parameter.numel() for parameter in module.parameters())

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli import __version__
-from pnpdepth_cli.errors import OutputError
+from pnpdepth_cli.errors import OutputError, UsageError
 from pnpdepth_cli.io.overlay import overlay
 from pnpdepth_cli.io.record import write_json
 from pnpdepth_cli.io.sparse_writing import SPARSE_SUFFIXES, write_sparse
@@ -38,6 +38,8 @@ class SparseTarget:
             raise OutputError(
                 f"{self.output}: sparse depth is written as one of {', '.join(SPARSE_SUFFIXES)}"
             )
+        if not 0 < self.depth_scale < np.inf:
+            raise UsageError(f"--output-scale must be a number above 0, not {self.depth_scale:g}")
         if self.overlay is not None and self.overlay.suffix.lower() != ".png":
             raise OutputError(f"{self.overlay}: the overlay is a PNG; name it so")
         taken = {p.resolve() for p in inputs if p is not None}
@@ -64,13 +66,13 @@ def write_sparse_outputs(
     settings, with the seed among them, also go into the sparse file itself where it is PNG or CSV.
     """
     made = {"command": command, "version": __version__, **settings}
-    target.output.parent.mkdir(parents=True, exist_ok=True)
+    for path in filter(None, (target.output, target.overlay)):
+        _make_folder_of(path)
     picture = as_picture(points)
     write_sparse(
         target.output, points.xy, points.depth, picture, made=made, scale=target.depth_scale
     )
     if target.overlay is not None and rgb is not None:
-        target.overlay.parent.mkdir(parents=True, exist_ok=True)
         overlay(rgb, points.xy, points.depth, target.overlay)
     height, width = points.size
     record = {
@@ -93,3 +95,10 @@ def write_sparse_outputs(
     }
     write_json(target.record, record)
     return record
+
+
+def _make_folder_of(path: Path) -> None:
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"folder {path.parent} cannot be made: {error.strerror}") from None

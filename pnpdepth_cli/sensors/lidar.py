@@ -44,7 +44,8 @@ class Lidar:
                 f"sensor {self.name!r}: azimuth step {self.azimuth_step_deg:g}° is not"
                 " between 0.001° and 360°"
             )
-        if not self.max_range > 0 or min(self.range_noise, self.angle_noise_deg) < 0:
+        noise = (self.range_noise, self.angle_noise_deg)
+        if not self.max_range > 0 or not all(0 <= size < np.inf for size in noise):
             raise UsageError(
                 f"sensor {self.name!r}: give a maximum range above 0 and no negative noise"
             )

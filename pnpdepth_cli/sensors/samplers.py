@@ -69,7 +69,8 @@ class SampleNoise:
     jitter_px: float = 0.0
 
     def __post_init__(self) -> None:
-        if min(self.metres, self.relative, self.jitter_px) < 0 or not 0 <= self.outliers <= 1:
+        sizes = (self.metres, self.relative, self.jitter_px)
+        if not all(0 <= size < np.inf for size in sizes) or not 0 <= self.outliers <= 1:
             raise UsageError("give noise that is not negative, and outliers as a share of 0 to 1")
 
 

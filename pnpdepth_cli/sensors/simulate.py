@@ -12,6 +12,7 @@ from pnpdepth_cli.sensors.camera import Camera
 from pnpdepth_cli.sensors.lidar import Lidar
 from pnpdepth_cli.sensors.sparse import (
     Floats,
+    Mask,
     SparseDepth,
     Steps,
     in_picture,
@@ -22,7 +23,11 @@ from pnpdepth_cli.sensors.sparse import (
 _SAME_SURFACE = 1.1
 """Depths of neighbouring pixels within this ratio are taken for one surface."""
 
-_LONGEST_WALK = 4096
+_FIRST_M = 0.01
+"""How far ahead of the scanner its beams can first meet something."""
+
+_LONGEST_WALK = 2048
+"""Steps; beams that cross more pixels than this, next to the scanner, take longer ones."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,8 +47,8 @@ class SimulationSettings:
     euclidean: bool = False
 
     def __post_init__(self) -> None:
-        if self.rotation_noise_deg < 0 or not 0 <= self.dropout < 1:
-            raise UsageError("give a rotation noise ≥ 0 and a drop-out of 0 ≤ share < 1")
+        if not 0 <= self.rotation_noise_deg <= 360 or not 0 <= self.dropout < 1:
+            raise UsageError("give a rotation noise of 0° to 360° and a drop-out of 0 ≤ share < 1")
 
 
 def simulate_lidar(
@@ -120,28 +125,31 @@ def _turned(camera: Camera, spread_deg: float, rng: np.random.Generator) -> Came
     return replace(camera, rotation=camera.rotation @ about_z @ about_y @ about_x)
 
 
-def _depth_at_first_hit(depth: Floats, camera: Camera, beams: Floats) -> Floats:
+def _depth_at_first_hit(depth: Floats, camera: Camera, directions: Floats) -> Floats:
     """(M,) the depth z at which each beam first meets the depth map; NaN where it does not.
 
-    beams: (M, 3) unit vectors in the camera's frame, from the scanner's place. A beam is followed
-    outwards in steps of at most a pixel. One that slips behind an edge is lost: what is there, the
-    camera does not see.
+    directions: (M, 3) unit vectors in the camera's frame, from the scanner's place. A beam is
+    followed outwards in steps of about a pixel. One that slips behind an edge is lost: what is
+    there, the camera does not see.
     """
-    hit = np.full(len(beams), np.nan)
+    hit = np.full(len(directions), np.nan)
     known = depth[depth > 0]
     start = camera.translation
     if not known.size:
         return hit
-    near, far = 0.999 * known.min(), 1.001 * known.max()
-    # A beam that turns away from the camera's axis never gets beyond `near`.
-    forward = np.flatnonzero((beams[:, 2] > 1e-9) & (start[2] < near))
-    beams = beams[forward]
+    near, far = max(0.999 * known.min(), start[2] + _FIRST_M), 1.001 * known.max()
+    if far <= near:
+        return hit
+    # The others never get beyond `near`.
+    forward = np.flatnonzero(directions[:, 2] > 1e-9)
+    beams = directions[forward]
     depths_z = 1 / np.linspace(1 / near, 1 / far, _walk_length(camera, beams, near, far, depth) + 1)
     before_z, before_map = near, np.full(len(forward), np.inf)
+    been_inside = np.zeros(len(forward), bool)
     walking = np.arange(len(forward))
     for z in depths_z:
         reached = start + beams[walking] * ((z - start[2]) / beams[walking, 2])[:, None]
-        ahead = _map_at(depth, camera, reached)
+        ahead, inside = _map_at(depth, camera, reached)
         met = (ahead > 0) & (z >= ahead)
         same = before_map[walking] <= _SAME_SURFACE * ahead
         straight_on = met & (before_z <= ahead)
@@ -152,8 +160,22 @@ def _depth_at_first_hit(depth: Floats, camera: Camera, beams: Floats) -> Floats:
         hit[forward[walking[slanted]]] = before_z + share * (z - before_z)
         before_map[walking] = np.where(ahead > 0, ahead, np.inf)
         before_z = z
-        walking = walking[~met]
-    return hit
+        left = been_inside[walking] & ~inside  # a straight line in the picture never comes back
+        been_inside[walking] |= inside
+        walking = walking[~(met | left)]
+    return _on_their_surface(hit, depth, camera, directions)
+
+
+def _on_their_surface(hit: Floats, depth: Floats, camera: Camera, beams: Floats) -> Floats:
+    """The hits whose own pixel shows that surface; one that grazed an edge by a pixel is lost."""
+    found = np.flatnonzero(np.isfinite(hit))
+    z, start = hit[found], camera.translation
+    reached = start + beams[found] * ((z - start[2]) / beams[found, 2])[:, None]
+    there, _ = _map_at(depth, camera, reached)
+    same = (z <= _SAME_SURFACE * there) & (there <= _SAME_SURFACE * z)
+    checked = hit.copy()
+    checked[found[~same]] = np.nan
+    return checked
 
 
 def _walk_length(camera: Camera, beams: Floats, near: float, far: float, depth: Floats) -> int:
@@ -170,11 +192,11 @@ def _walk_length(camera: Camera, beams: Floats, near: float, far: float, depth: 
     return int(min(max(1, np.ceil(np.nanmax(moved, initial=0))), _LONGEST_WALK))
 
 
-def _map_at(depth: Floats, camera: Camera, points: Floats) -> Floats:
-    """(M,) the depth map at the pixels of points; 0 outside the picture."""
+def _map_at(depth: Floats, camera: Camera, points: Floats) -> tuple[Floats, Mask]:
+    """(M,) the depth map at the pixels of points, 0 outside the picture; and (M,) if inside."""
     xy = camera.pixels_of(points)
     size = (depth.shape[0], depth.shape[1])
     inside = in_picture(xy, size)
     values = np.zeros(len(points))
     values[inside] = depth.ravel()[pixel_index(xy[inside], size)]
-    return values
+    return values, inside

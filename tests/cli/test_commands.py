@@ -83,7 +83,9 @@ def test_a_divergence_ends_with_code_5_after_writing(
 ) -> None:
     bad = frame.folder / "bad.py"
     source = frame.model.read_text()
-    bad.write_text(source.replace("return 2 + 3 * self.decode(torch.tanh(", "return torch.exp(self.decode("))
+    bad.write_text(
+        source.replace("return 2 + 3 * self.decode(torch.tanh(", "return torch.exp(self.decode(")
+    )
     assert code_of([*refine(frame), "--model", str(bad), "--lr", "1e4"]) == 5
     assert "not finite after" in capsys.readouterr().err
     assert (frame.folder / "out" / "img_depth.png").exists()

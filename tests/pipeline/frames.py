@@ -13,7 +13,7 @@ from safetensors.torch import save_file
 
 from pnpdepth_cli.io.depth import write_depth
 
-NETWORK = '''
+NETWORK = """
 import torch
 from torch import nn
 from pnpdepth_cli.models.definition import ModelDefinition, Multiple, RefineDefaults
@@ -33,7 +33,7 @@ definition = ModelDefinition(
     name="tiny", input_kind="rgb", size=Multiple(4), build=Net, layers=("encode", "middle"),
     defaults=RefineDefaults(layer="middle"),
 )
-'''
+"""
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,9 @@ def frame_on_disk(folder: Path, height: int = 46, width: int = 62) -> FrameOnDis
     cv2.imwrite(str(image), rgb)
     keep = np.zeros(depth.size, bool)
     keep[rng.permutation(depth.size)[:60]] = True
-    write_depth(sparse, np.where(keep.reshape(depth.shape), depth, 0).astype(np.float32), scale=1000)
+    write_depth(
+        sparse, np.where(keep.reshape(depth.shape), depth, 0).astype(np.float32), scale=1000
+    )
     write_depth(gt, depth, scale=1000)
     model, checkpoint = folder / "my_net.py", folder / "my_net.safetensors"
     model.write_text(NETWORK)

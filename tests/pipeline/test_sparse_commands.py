@@ -19,10 +19,11 @@ from pnpdepth_cli.errors import (
     SizeError,
     UsageError,
 )
+from pnpdepth_cli.io.calibration import read_calibration
 from pnpdepth_cli.io.depth import DEPTH_SUFFIXES, read_depth, read_sparse
 from pnpdepth_cli.pipeline.project import ProjectRequest, project_scan
 from pnpdepth_cli.pipeline.sample import SampleRequest, sample_depth
-from pnpdepth_cli.pipeline.scans import ScanOptions
+from pnpdepth_cli.pipeline.scans import ScanOptions, camera_of, read_scan_points
 from pnpdepth_cli.pipeline.simulate import SimulateRequest, find_sensor, simulate_scan
 from pnpdepth_cli.pipeline.sparse_outputs import SparseTarget
 from tests.pipeline.scan_frames import ScanOnDisk, scan_on_disk
@@ -129,6 +130,10 @@ def test_results_are_replaced_only_when_that_is_said(frame: ScanOnDisk) -> None:
     calib = frame.folder / "calib.json"
     calib.write_text('{"K": [60, 0, 31.5, 0, 60, 23.5, 0, 0, 1]}')
     refused(frame, OutputError, "is an input", target=into, options=ScanOptions(calib=calib))
+    below = SparseTarget(output=frame.gt / "s.png")
+    refused(frame, OutputError, "cannot be made", target=below)
+    scale = SparseTarget(output=frame.folder / "s.png", depth_scale=0)
+    refused(frame, UsageError, "--output-scale", target=scale)
     refused(frame, OutputError, ".jpg", target=SparseTarget(output=frame.folder / "s.jpg"))
 
 
@@ -216,3 +221,51 @@ def test_kittis_frames_project_to_the_density_of_the_data_sets_own(
             )
         )
         assert 0.033 < record["points"]["share_of_pixels"] < 0.045
+
+
+def test_kittis_own_projected_scan_comes_back_from_the_scanners_frame(
+    shared_data: Path, tmp_path: Path
+) -> None:
+    folder = shared_data / "kitti_dc"
+    name = "0000000005.png"
+    theirs = cv2.imread(str(folder / "velodyne_raw" / name), cv2.IMREAD_UNCHANGED)
+    camera = camera_of(read_calibration(folder, 2))
+    row, column = np.nonzero(theirs)
+    xy = np.column_stack([column, row]).astype(np.float64)
+    points = camera.to_scanner(camera.unproject(xy, theirs[row, column] / 256))
+    scan = tmp_path / "scan.bin"
+    np.column_stack([points, np.zeros(len(points))]).astype("<f4").tofile(scan)
+    project_scan(
+        ProjectRequest(
+            scan=scan,
+            options=ScanOptions(calib=folder, camera=2, keep_occluded=True),
+            target=SparseTarget(output=tmp_path / "sparse.png"),
+            image=folder / "image" / "0000000005.jpg",
+        )
+    )
+    ours = cv2.imread(str(tmp_path / "sparse.png"), cv2.IMREAD_UNCHANGED)
+    assert np.array_equal(ours, theirs)
+
+
+@pytest.mark.parametrize("camera", range(4))
+def test_kittis_scans_land_where_the_development_kits_formula_puts_them(
+    shared_data: Path, camera: int
+) -> None:
+    folder = shared_data / "kitti_object"
+    scan = np.fromfile(folder / "velodyne" / "000002.bin", "<f4").reshape(-1, 4)
+    calib = folder / "calib" / "000002.txt"
+    lines = (line.partition(":") for line in calib.read_text().splitlines() if line)
+    rows = {name: np.array(values.split(), float) for name, _, values in lines}
+    rectify, velo_to_cam = np.eye(4), np.eye(4)
+    rectify[:3, :3] = rows["R0_rect"].reshape(3, 3)
+    velo_to_cam[:3] = rows["Tr_velo_to_cam"].reshape(3, 4)
+    projection = rows[f"P{camera}"].reshape(3, 4) @ rectify @ velo_to_cam
+    u, v, depth = projection @ np.column_stack([scan[:, :3], np.ones(len(scan))]).T
+    options = ScanOptions(calib=calib, camera=camera, keep_occluded=True)
+    got = read_scan_points(folder / "velodyne" / "000002.bin", options, (375, 1242)).points
+    want = np.column_stack([u / depth, v / depth])[got.index]
+    np.testing.assert_allclose(got.xy, want, atol=1e-3)
+    np.testing.assert_allclose(got.depth, depth[got.index], rtol=1e-5)
+    x, y = u / depth, v / depth
+    inside = (depth > 0) & (x >= -0.5) & (x < 1241.5) & (y >= -0.5) & (y < 374.5)
+    assert len(got.depth) == inside.sum() - got.dropped["behind another in their pixel"]

@@ -87,13 +87,13 @@ def test_ground_at_a_grazing_angle_hides_no_ground() -> None:
 
 
 def test_the_scanner_in_front_of_the_camera_needs_no_parallax_to_be_defined() -> None:
-    xy = np.array([[100.0, 100.0], [101.0, 100.0], [300.0, 200.0]])
-    depth = np.array([1.0, 5.0, 5.0])
+    xy = np.array([[100.0, 100.0], [101.0, 100.0], [109.0, 100.0], [300.0, 200.0]])
+    depth = np.array([1.0, 5.0, 5.0, 5.0])
     hidden = hidden_points(
         xy, depth, SIZE, focal_px=700.0, scanner=np.array([640.0, 480.0, 2.0]),
         settings=OcclusionFilter(),
     )  # fmt: skip
-    assert hidden.tolist() == [False, True, False]
+    assert hidden.tolist() == [False, True, False, False]
 
 
 def test_settings_that_mean_nothing_are_refused() -> None:

@@ -161,6 +161,13 @@ def test_what_the_depth_map_cannot_give_is_refused() -> None:
         )
 
 
+@pytest.mark.parametrize("wrong", [-1.0, float("nan"), float("inf")])
+@pytest.mark.parametrize("name", ["metres", "relative", "outliers", "jitter_px"])
+def test_noise_that_makes_no_sense_is_refused(name: str, wrong: float) -> None:
+    with pytest.raises(UsageError):
+        SampleNoise(**{name: wrong})
+
+
 def test_a_plain_image_has_no_features() -> None:
     flat = np.full((60, 80, 3), 0.5, np.float32)
     with pytest.raises(NoPointsError, match="leaves no point"):

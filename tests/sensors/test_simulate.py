@@ -66,6 +66,8 @@ def test_what_is_behind_an_edge_for_the_scanner_is_not_measured() -> None:
     depth[:, 130:190] = 3.0
     camera = replace(CAMERA, translation=np.array([1.0, 0.0, 0.0]))
     got = simulate_lidar(depth, camera, replace(IDEAL, azimuth_step_deg=0.05), seed=0)
+    column, row = rows_of(got.xy).T
+    np.testing.assert_allclose(got.depth, depth[row, column], rtol=1e-6)
     wall = got.depth > 6
     edge_left = camera.unproject(np.array([[129.5, 120.0]]), np.array([3.0]))[0, 0]
     # the scanner's line of sight past the board's left edge meets the wall at:
@@ -74,6 +76,16 @@ def test_what_is_behind_an_edge_for_the_scanner_is_not_measured() -> None:
     left_of_board = x < edge_left * 12 / 3
     assert left_of_board.any()
     assert x[left_of_board].max() <= shadow_end + 0.05
+
+
+def test_a_scanner_ahead_of_the_camera_sees_past_what_is_behind_it() -> None:
+    depth = np.full((240, 320), 8.0)
+    depth[:, :40] = 0.5  # beside the camera, behind the scanner
+    camera = replace(CAMERA, translation=np.array([0.0, 0.0, 1.0]))
+    got = simulate_lidar(depth, camera, replace(IDEAL, azimuth_step_deg=1.0), seed=0)
+    np.testing.assert_allclose(got.depth, 8, rtol=1e-6)
+    assert got.xy[:, 0].min() > 39.5
+    assert len(got.depth) > 200
 
 
 def test_range_noise_moves_points_along_their_beams() -> None:
@@ -125,8 +137,9 @@ def test_unknown_depth_gives_no_points() -> None:
 
 
 def test_a_share_that_is_none_is_refused() -> None:
-    with pytest.raises(UsageError):
-        SimulationSettings(dropout=1.0)
+    for wrong in ({"dropout": 1.0}, {"rotation_noise_deg": float("nan")}):
+        with pytest.raises(UsageError):
+            SimulationSettings(**wrong)
 
 
 PAPER_PERCENT = {"vlp-16": 5.3, "vlp-32c": 28.8, "hdl-32e": 10.3, "hdl-64e": 18.7}
