@@ -52,7 +52,8 @@ def test_a_command_of_the_readme_runs(command: str, folder: Path) -> None:
 
 
 def overwrite(command: str) -> list[str]:
-    return ["--overwrite"] if arguments(command)[0] == "refine" else []
+    writes = arguments(command)[0] in ("refine", "project", "sample", "simulate")
+    return ["--overwrite"] if writes else []
 
 
 def test_the_links_of_the_readme_lead_somewhere() -> None:

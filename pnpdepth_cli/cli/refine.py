@@ -55,8 +55,8 @@ FORMATS = ("png", "exr", "npy", "npz", "pfm", "tiff")
     "--lr", metavar="NUMBER|P%", help="Step: absolute, or per cent of z's standard deviation."
 )
 @click.option("--loss", type=click.Choice(LOSSES), help="Between prediction and sparse points.")
-@options.reading
 @click.option("--update", type=click.Choice(UPDATES), help="From gradient to step.")
+@options.reading
 @options.depth_scale
 @click.option("--gt-scale", type=float, metavar="S", help="The same for --gt.")
 @options.channel

@@ -190,3 +190,35 @@ def test_the_definition_can_be_changed_like_any_other(tmp_path: Path) -> None:
     assert (
         replace(definition, output_kind="depth", output_scale="metric").default_alignment == "none"
     )
+
+
+def test_arithmetic_on_shapes_is_no_layer_and_leaves_the_cut_exact(tmp_path: Path) -> None:
+    by = helper.make_tensor("value", 7, [4], [1, 1, 2, 2])
+    nodes = (
+        helper.make_node("Shape", ["depth"], ["shape"], "shape/read"),
+        helper.make_node("Constant", [], ["twice"], "shape/by", value=by),
+        helper.make_node("Mul", ["shape", "twice"], ["size"], "shape/times"),
+        helper.make_node("Resize", ["depth", "", "", "size"], ["big"], "big/up", mode="linear"),
+        helper.make_node("Shape", ["d"], ["coarse"], "shape/coarse"),
+        helper.make_node("Reshape", ["d", "coarse"], ["same"], "side/reshape"),
+        helper.make_node("GlobalAveragePool", ["same"], ["pooled"], "side/pool"),
+        helper.make_node("ReduceMean", ["pooled"], ["mean"], "side/mean", axes=[1]),
+        helper.make_node("Add", ["big", "mean"], ["out"], "big/add"),
+    )
+    shape = (1, 3, None, None)
+    path = write_network(tmp_path / "net.onnx", shape=shape, nodes=nodes, outputs=("out",))
+    network = load_network(str(path), None)
+    names = [name for name, _ in network.module.named_children()]
+    assert not any(name.startswith("shape/") for name in names)
+    for height, width in ((32, 48), (64, 32)):
+        x = picture(1, 3, height, width)
+        with torch.no_grad():
+            whole = network.module(x)
+            assert whole.shape[-2:] == (2 * height, 2 * width)
+            for name in names:
+                with Split(network.module, name) as split:
+                    z = split.front(x)
+                    assert torch.equal(split.rear(z), whole), name
+                    assert torch.equal(split.rear(z), whole), name
+    assert network.definition.verify is not None
+    network.definition.verify(network.module, (picture(1, 3, 32, 48),))
