@@ -35,7 +35,7 @@ _SCORED = 1024
 _BIWEIGHT = 8.0  # of Tukey's weights; 4.685 suits normal errors, networks' have longer tails
 _NORMAL_MAD = 1.4826  # standard deviation over median absolute deviation, normal errors
 _TRUSTED = 0.7  # share of the points that `error` is measured on: the best ones
-_WRONG = 0.25  # |log| error beyond which a point counts as wrong, not as more wrong
+_WRONG = 1.0  # |log| error beyond which a point counts as wrong, not as more wrong
 _NO_BETTER = 1e-3  # relative errors below this do not tell one alignment from another
 
 
@@ -46,7 +46,7 @@ class Alignment:
     space, kind, scale, shift: as above. bounds: (nearest, farthest) in metres; what comes out
     beyond them, or at no positive depth at all, reads as the bound. points: how many were
     fitted. error: mean |log(aligned / true depth)| of the best 70 % of them. misfit: the same of
-    all, none counting more than 0.25. outliers: share of points that are far off.
+    all, none counting more than 1.0. outliers: share of points that are far off.
     """
 
     space: str

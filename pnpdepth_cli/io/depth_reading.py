@@ -21,7 +21,7 @@ from pnpdepth_cli.io.opening import (
     read_bytes,
 )
 from pnpdepth_cli.io.pfm import parse_pfm
-from pnpdepth_cli.io.png import GREY, PALETTE, read_png_facts
+from pnpdepth_cli.io.png import GREY, PALETTE, RGB, read_png_facts
 from pnpdepth_cli.io.tiff import read_tiff_facts
 
 KITTI_SCALE = 256.0
@@ -166,16 +166,34 @@ def _load_png(path: Path, data: bytes) -> StoredArray:
     facts = read_png_facts(path, data)
     if facts.bit_depth != 16 and facts.colour_type != PALETTE:
         raise _eight_bits(path, "PNG")
-    if facts.colour_type != GREY:
-        colours = "a palette" if facts.colour_type == PALETTE else "several channels"
-        raise FileFormatError(
-            f"{path} is a PNG with {colours}; depth is one 16-bit grey channel, save it so"
-        )
+    if facts.colour_type not in (GREY, RGB):
+        raise _not_grey(path, "a palette" if facts.colour_type == PALETTE else "several channels")
     codes = decode_with_opencv(path, data, "PNG")
+    what = "16-bit PNG"
+    if facts.colour_type == RGB:
+        codes = _equal_channel(path, codes)
+        what += " of three equal channels"
     if codes.dtype != np.uint16 or codes.ndim != 2:
         raise damaged(path, "PNG", "cannot be decoded as 16-bit grey")
     own = _scale_in(path, f"{SCALE_KEY}={facts.text.get(SCALE_KEY, '')}")
-    return StoredArray(values=codes, what="16-bit PNG", scale=own)
+    return StoredArray(values=codes, what=what, scale=own)
+
+
+def _equal_channel(path: Path, codes: NDArray[Any]) -> NDArray[Any]:
+    """(H, W) of a picture whose three colours are equal, as SYNTHIA's depth is stored."""
+    if codes.ndim != 3 or codes.shape[2] < 3:
+        raise damaged(path, "PNG", "cannot be decoded as 16-bit colour")
+    first = codes[:, :, 0]
+    # where the file makes one colour transparent, OpenCV adds a fourth channel
+    if not all(np.array_equal(first, codes[:, :, k]) for k in (1, 2)):
+        raise _not_grey(path, "several channels")
+    return np.ascontiguousarray(first)
+
+
+def _not_grey(path: Path, colours: str) -> FileFormatError:
+    return FileFormatError(
+        f"{path} is a PNG with {colours}; depth is one 16-bit grey channel, save it so"
+    )
 
 
 def _load_tiff(path: Path, data: bytes) -> StoredArray:

@@ -132,7 +132,8 @@ def _measure(
             start = time.perf_counter()
             split.rear(z)
             seconds = time.perf_counter() - start
-            field = influential_field(split, z, network.depth_of)
+            # As the network gives it: a depth of inverse zero does not move.
+            field = influential_field(split, z, network.raw_of)
     except ModelError as error:
         return LayerRow(name=name, problem=str(error))
     return LayerRow(

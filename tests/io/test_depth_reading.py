@@ -4,6 +4,7 @@ import math
 import re
 import struct
 import zipfile
+import zlib
 from pathlib import Path
 
 import cv2
@@ -326,10 +327,38 @@ def test_8_bits_are_refused_as_a_picture_of_depth(tmp_path: Path, suffix: str) -
         read_depth(path)
 
 
-def test_colour_and_palette_are_refused(tmp_path: Path) -> None:
-    cv2.imwrite(str(tmp_path / "rgb.png"), np.zeros((3, 4, 3), np.uint16))
-    with pytest.raises(FileFormatError, match="several channels"):
+def test_a_16_bit_png_of_three_equal_channels_is_depth_and_that_is_said(tmp_path: Path) -> None:
+    path = tmp_path / "rgb.png"
+    cv2.imwrite(str(path), np.repeat(np.where(CODES == 0, 65535, CODES)[:, :, None], 3, axis=2))
+    depth = read_depth(path, scale=100)
+    assert np.array_equal(depth.values, (CODES / 100).astype(np.float32))
+    assert depth.source == (
+        "16-bit PNG of three equal channels ÷ 100, 1 pixels of value 65535 taken as unknown"
+    )
+    # one colour made transparent (tRNS, before the pixels) changes no depth
+    content = path.read_bytes()
+    body = b"tRNS" + struct.pack(">3H", 256, 256, 256)
+    chunk = struct.pack(">I", 6) + body + struct.pack(">I", zlib.crc32(body))
+    start = content.index(b"IDAT") - 4
+    path.write_bytes(content[:start] + chunk + content[start:])
+    assert np.array_equal(read_depth(path, scale=100).values, depth.values)
+
+
+@pytest.mark.parametrize("channel", [0, 1, 2])
+def test_a_16_bit_png_with_one_channel_off_by_one_code_is_refused(
+    tmp_path: Path, channel: int
+) -> None:
+    pixels = np.repeat(CODES[:, :, None], 3, axis=2)
+    pixels[1, 2, channel] += 1
+    cv2.imwrite(str(tmp_path / "rgb.png"), pixels)
+    with pytest.raises(FileFormatError, match="several channels; depth is one 16-bit grey"):
         read_depth(tmp_path / "rgb.png")
+
+
+def test_colour_and_palette_are_refused(tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "rgba.png"), np.zeros((3, 4, 4), np.uint16))
+    with pytest.raises(FileFormatError, match="several channels"):
+        read_depth(tmp_path / "rgba.png")
     Image.new("P", (4, 3)).save(tmp_path / "p.png")
     with pytest.raises(FileFormatError, match="a palette"):
         read_depth(tmp_path / "p.png")

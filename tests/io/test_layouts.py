@@ -82,6 +82,12 @@ def seven_scenes(root: Path) -> None:
     )
 
 
+def synthia(root: Path) -> None:
+    for camera in ("Stereo_Left/Omni_F", "Stereo_Right/Omni_B"):
+        touch(*(root / kind / camera / "000000.png" for kind in ("RGB", "Depth")))
+    touch(root / "CameraParams/intrinsics.txt")
+
+
 def nyu_h5(root: Path) -> None:
     h5py = pytest.importorskip("h5py")
     (root / "official").mkdir(parents=True)
@@ -109,6 +115,7 @@ MAKERS = {
     "kitti-depth": (kitti_selection, ["2011_09_26_drive_0002_sync_0000000005_image_02"]),
     "tum": (tum, ["1.000", "1.033"]),
     "7scenes": (seven_scenes, ["seq-01_frame-000000", "seq-02_frame-000000"]),
+    "synthia": (synthia, ["Stereo_Left_Omni_F_000000", "Stereo_Right_Omni_B_000000"]),
     "nyu-h5": (nyu_h5, ["official_00001", "official_00009"]),
     "nyu-mat": (nyu_mat, ["0001", "0002", "0003", "0004"]),
 }
@@ -181,6 +188,88 @@ def test_tum_pairs_each_image_with_the_nearest_depth_once(tmp_path: Path) -> Non
     (tmp_path / "depth.txt").write_text("soon depth/1.png\n")
     with pytest.raises(FileFormatError, match=r"depth\.txt, line 1"):
         read_frames(tmp_path)
+
+
+def test_synthias_sequences_pair_each_camera_with_its_depth(tmp_path: Path) -> None:
+    sequence = tmp_path / "SYNTHIA-SEQS-01-DAWN"
+    synthia(sequence)
+    synthia(tmp_path / "SYNTHIA-SEQS-02-FALL")
+    frames = read_frames(tmp_path)
+    assert len(frames) == 4
+    frame = frames[1]
+    assert frame.name == "SYNTHIA-SEQS-01-DAWN_Stereo_Right_Omni_B_000000"
+    assert frame.image == sequence / "RGB/Stereo_Right/Omni_B/000000.png"
+    assert frame.gt == sequence / "Depth/Stereo_Right/Omni_B/000000.png"
+    assert (frame.sparse, frame.calib, frame.gt_scale) == (None, None, 100)
+    frame.gt.unlink()
+    with pytest.raises(InputError, match=r"000000\.png has no partner 000000\.\*"):
+        read_frames(tmp_path)
+
+
+@pytest.mark.parametrize("folder", ["Depth", "Depth/Depth"])
+@pytest.mark.parametrize("channels", [1, 3])
+def test_synthias_random_set_has_centimetres_in_either_folder(
+    tmp_path: Path, folder: str, channels: int
+) -> None:
+    touch(tmp_path / "RGB/0000000.png")
+    (tmp_path / folder).mkdir(parents=True)
+    codes = np.rint(100 * DEPTH).astype(np.uint16)
+    codes[0, 0] = 65535  # sky
+    cv2.imwrite(str(tmp_path / folder / "0000000.png"), np.stack([codes] * channels, axis=2))
+    assert find_layout(tmp_path).name == "synthia"
+    (frame,) = read_frames(tmp_path)
+    assert (frame.name, frame.gt) == ("0000000", tmp_path / folder / "0000000.png")
+    truth = read_frame_truth(frame)
+    assert truth[0, 0] == 0
+    np.testing.assert_allclose(truth[1:], DEPTH[1:], atol=6e-3)
+
+
+def test_rgb_and_depth_with_other_names_in_them_are_not_synthia(tmp_path: Path) -> None:
+    touch(tmp_path / "RGB/kitchen.png", tmp_path / "Depth/kitchen.png")
+    assert not LAYOUTS["synthia"].matches(tmp_path)
+
+
+def test_the_odometrys_training_sequences_have_poses(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kitti_odometry(tmp_path)
+    part = tmp_path / "sequences/00"
+    touch(part / "image_2/000001.png", part / "velodyne/000001.bin")
+    (tmp_path / "poses").mkdir()
+    rows = ["1 0 0 0.5 0 1 0 0 0 0 1 0", "1e+00 0 0 -1.5e-01 0 0 -1 2 0 1 0 7"]
+    (tmp_path / "poses/00.txt").write_text("\n".join(rows) + "\n")
+    first, second, other = read_frames(tmp_path)
+    assert first.pose == ((1, 0, 0, 0.5), (0, 1, 0, 0), (0, 0, 1, 0))
+    assert second.pose == ((1, 0, 0, -0.15), (0, 0, -1, 2), (0, 1, 0, 7))
+    assert other.pose is None
+    monkeypatch.chdir(part)
+    assert [f.pose for f in read_frames(Path())] == [first.pose, second.pose]
+
+
+_ROW = "1 0 0 0 0 1 0 0 0 0 1 0\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("\n", "0 poses for the 1 images"),
+        (2 * _ROW, "2 poses for the 1 images"),
+        (_ROW[2:], "00.txt, line 1"),
+        (_ROW.replace("\n", " 0"), "00.txt, line 1"),
+        (_ROW + "\n" + _ROW.replace("1", "nan"), "00.txt, line 3"),
+        (_ROW.replace("1", "one"), "00.txt, line 1"),
+    ],
+)
+def test_poses_that_are_not_twelve_numbers_a_frame_are_refused(
+    tmp_path: Path, text: str, said: str
+) -> None:
+    kitti_odometry(tmp_path)
+    (tmp_path / "poses").mkdir()
+    (tmp_path / "poses/00.txt").write_text(text)
+    with pytest.raises(InputError) as error:
+        read_frames(tmp_path)
+    assert said in str(error.value)
+    assert "\n" not in str(error.value)
 
 
 def test_nyu_frames_come_halved_and_cropped_to_228_by_304(tmp_path: Path) -> None:

@@ -19,6 +19,7 @@ from pnpdepth_cli.io.layouts import (
     nyu,
     pairs,
     seven_scenes,
+    synthia,
     tum,
 )
 from pnpdepth_cli.io.layouts.frame import Frame, Hdf5Array
@@ -59,6 +60,7 @@ LAYOUTS = {
         Layout(name="kitti-depth", matches=kitti_depth.matches, frames=kitti_depth.frames),
         Layout(name="tum", matches=tum.matches, frames=tum.frames),
         Layout(name="7scenes", matches=seven_scenes.matches, frames=seven_scenes.frames),
+        Layout(name="synthia", matches=synthia.matches, frames=synthia.frames),
         Layout(name="pairs", matches=pairs.matches, frames=pairs.frames),
         Layout(name="nyu-h5", matches=nyu.h5_matches, frames=nyu.h5_frames),
     )

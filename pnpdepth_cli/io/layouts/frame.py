@@ -32,6 +32,9 @@ class Hdf5Array:
 
 Source = Path | Hdf5Array
 
+Pose = tuple[tuple[float, ...], ...]
+"""(3, 4): the rotation and, in the last column, the translation in metres."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Frame:
@@ -40,6 +43,7 @@ class Frame:
     name: unique in its data set, and fit for a file's name. sparse: a depth file, or a scan with
     calib; None where the protocol samples the truth. *_scale: codes per metre of integer files.
     calib, camera: as `read_calibration` takes them. protocol: what is cut out before anything else.
+    pose: x_world = pose · (x, 1) for points of KITTI's camera 0, whichever camera took the image.
     """
 
     name: str
@@ -51,6 +55,7 @@ class Frame:
     sparse_scale: float | None = None
     gt_scale: float | None = None
     protocol: Protocol = WHOLE
+    pose: Pose | None = None
 
 
 def by_stem(folder: Path, suffixes: Iterable[str]) -> dict[str, Path]:

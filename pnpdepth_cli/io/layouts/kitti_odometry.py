@@ -1,14 +1,19 @@
 """`kitti-odometry`: sequences/NN/ with image_2/, velodyne/ and calib.txt, or one such sequence.
 
-The truth of its experiments is the scan itself.
+The truth of its experiments is the scan itself. The training sequences, 00 to 10, have the poses
+of camera 0 in poses/NN.txt beside sequences/, a row of 12 numbers a frame.
 """
 
 from __future__ import annotations
 
 from pathlib import Path
 
-from pnpdepth_cli.io.layouts.frame import PICTURES, Frame, by_stem, partner
+import numpy as np
+
+from pnpdepth_cli.errors import FileFormatError
+from pnpdepth_cli.io.layouts.frame import PICTURES, Frame, Pose, by_stem, partner
 from pnpdepth_cli.io.layouts.protocols import PROTOCOLS
+from pnpdepth_cli.io.opening import one_line, read_bytes
 
 
 def matches(root: Path) -> bool:
@@ -17,10 +22,14 @@ def matches(root: Path) -> bool:
 
 
 def frames(root: Path) -> list[Frame]:
-    """One frame for each image of the left colour camera, in the order of the sequences."""
+    """One frame for each image of the left colour camera, in the order of the sequences.
+
+    InputError for one without scan, and for poses that are not one a frame.
+    """
     found = []
     for sequence in _sequences(root):
         scans = by_stem(sequence / "velodyne", (".bin",))
+        images = by_stem(sequence / "image_2", PICTURES)
         found += [
             Frame(
                 name=f"{sequence.name}_{stem}",
@@ -29,8 +38,11 @@ def frames(root: Path) -> list[Frame]:
                 calib=sequence / "calib.txt",
                 camera=2,
                 protocol=PROTOCOLS["kitti-odometry"],
+                pose=pose,
             )
-            for stem, image in by_stem(sequence / "image_2", PICTURES).items()
+            for (stem, image), pose in zip(
+                images.items(), _poses(sequence, len(images)), strict=True
+            )
         ]
     return found
 
@@ -43,3 +55,32 @@ def _sequences(root: Path) -> list[Path]:
         for p in candidates
         if (p / "calib.txt").is_file() and (p / "image_2").is_dir() and (p / "velodyne").is_dir()
     )
+
+
+def _poses(sequence: Path, count: int) -> list[Pose] | list[None]:
+    """The pose of each of the sequence's `count` frames, or None for each without a file."""
+    # the folders above "." are only in its absolute path
+    folder = sequence.absolute()
+    path = folder.parents[1] / "poses" / f"{folder.name}.txt"
+    if not path.is_file():
+        return [None] * count
+    lines = read_bytes(path).decode("utf-8", "replace").splitlines()
+    poses = [_pose(path, number, line) for number, line in enumerate(lines, 1) if line.strip()]
+    if len(poses) != count:
+        raise FileFormatError(
+            f"{path} has {len(poses):,} poses for the {count:,} images of {sequence / 'image_2'};"
+            " it must have one a frame"
+        )
+    return poses
+
+
+def _pose(path: Path, number: int, line: str) -> Pose:
+    try:
+        values = [float(word) for word in line.split()]
+    except ValueError:
+        values = []
+    if len(values) != 12 or not np.isfinite(values).all():
+        raise FileFormatError(
+            f"{path}, line {number}: {one_line(line)[:60]!r} is not 12 finite numbers"
+        )
+    return tuple(tuple(values[start : start + 4]) for start in (0, 4, 8))

@@ -1,0 +1,61 @@
+"""`synthia`: SYNTHIA's video sequences and SYNTHIA-RAND-CITYSCAPES, one of them or several.
+
+A video sequence has RGB/ and Depth/ with <Stereo_Left|Stereo_Right>/<Omni_F|Omni_B|Omni_L|Omni_R>/
+NNNNNN.png in both. SYNTHIA-RAND-CITYSCAPES has RGB/NNNNNNN.png and Depth/Depth/NNNNNNN.png, or
+Depth/NNNNNNN.png. Depth is in centimetres, in 16-bit PNGs of one channel or three equal ones; the
+sky's 65535 is unknown.
+
+No file here is a calibration that `read_calibration` takes, so frames have none. All pictures have
+1280×760 pixels and fx = fy = 532.740352, cx = 640, cy = 380, as a plain file says it:
+
+    K: [532.740352, 0, 640,  0, 532.740352, 380,  0, 0, 1]
+    size: [1280, 760]
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+from pnpdepth_cli.io.layouts.frame import Frame, by_stem, partner
+
+_PNG = (".png",)
+_SCALE = 100.0
+_CAMERAS = "Stereo_*/Omni_*"
+_RANDOM_STEM = re.compile(r"\d{7}")
+
+
+def matches(root: Path) -> bool:
+    """True if the folder, or one in it, is a video sequence or the random set."""
+    return any(True for _ in _cameras(root))
+
+
+def frames(root: Path) -> list[Frame]:
+    """One frame for each picture of each camera; InputError for one without depth."""
+    return [
+        Frame(
+            name="_".join([*prefix, stem]),
+            image=image,
+            gt=partner(depths, stem, image, folder),
+            gt_scale=_SCALE,
+        )
+        for prefix, pictures, folder in _cameras(root)
+        for depths in (by_stem(folder, _PNG),)
+        for stem, image in by_stem(pictures, _PNG).items()
+    ]
+
+
+def _cameras(root: Path) -> Iterator[tuple[list[str], Path, Path]]:
+    """What its frames' names begin with, its pictures and its depth, for each camera."""
+    for pictures in sorted(p for start in ("", "*/") for p in root.glob(f"{start}RGB")):
+        part, depth = pictures.parent, pictures.with_name("Depth")
+        if not depth.is_dir():
+            continue
+        prefix = [] if part == root else [part.name]
+        for camera in sorted(p for p in pictures.glob(_CAMERAS) if p.is_dir()):
+            place = camera.relative_to(pictures)
+            yield [*prefix, *place.parts], camera, depth / place
+        # RGB and Depth are common names: only the numbers tell the random set from other data
+        if any(_RANDOM_STEM.fullmatch(p.stem) for p in pictures.glob("*.png")):
+            yield prefix, pictures, depth / "Depth" if (depth / "Depth").is_dir() else depth
