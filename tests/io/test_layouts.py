@@ -246,14 +246,24 @@ def test_the_odometrys_training_sequences_have_poses(
     assert [f.pose for f in read_frames(Path())] == [first.pose, second.pose]
 
 
+def test_a_part_of_an_odometry_sequence_keeps_its_own_poses(tmp_path: Path) -> None:
+    kitti_odometry(tmp_path)
+    part = tmp_path / "sequences/00"
+    for folder, suffix in (("image_2", ".png"), ("velodyne", ".bin")):
+        (part / folder / f"000000{suffix}").rename(part / folder / f"000002{suffix}")
+    (tmp_path / "poses").mkdir()
+    rows = [f"1 0 0 {x} 0 1 0 0 0 0 1 0" for x in range(4)]
+    (tmp_path / "poses/00.txt").write_text("\n".join(rows))
+    assert read_frames(tmp_path)[0].pose == ((1, 0, 0, 2), (0, 1, 0, 0), (0, 0, 1, 0))
+
+
 _ROW = "1 0 0 0 0 1 0 0 0 0 1 0\n"
 
 
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("\n", "0 poses for the 1 images"),
-        (2 * _ROW, "2 poses for the 1 images"),
+        ("\n", "holds 0 poses"),
         (_ROW[2:], "00.txt, line 1"),
         (_ROW.replace("\n", " 0"), "00.txt, line 1"),
         (_ROW + "\n" + _ROW.replace("1", "nan"), "00.txt, line 3"),

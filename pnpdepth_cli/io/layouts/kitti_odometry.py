@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pnpdepth_cli.errors import FileFormatError
+from pnpdepth_cli.errors import FileFormatError, InputError
 from pnpdepth_cli.io.layouts.frame import PICTURES, Frame, Pose, by_stem, partner
 from pnpdepth_cli.io.layouts.protocols import PROTOCOLS
 from pnpdepth_cli.io.opening import one_line, read_bytes
@@ -24,12 +24,14 @@ def matches(root: Path) -> bool:
 def frames(root: Path) -> list[Frame]:
     """One frame for each image of the left colour camera, in the order of the sequences.
 
-    InputError for one without scan, and for poses that are not one a frame.
+    InputError for one without scan, or without a row in a file of poses. Rows belong to frames by
+    their number, so that a part of a sequence keeps its own.
     """
     found = []
     for sequence in _sequences(root):
         scans = by_stem(sequence / "velodyne", (".bin",))
         images = by_stem(sequence / "image_2", PICTURES)
+        poses = _poses(sequence)
         found += [
             Frame(
                 name=f"{sequence.name}_{stem}",
@@ -38,11 +40,9 @@ def frames(root: Path) -> list[Frame]:
                 calib=sequence / "calib.txt",
                 camera=2,
                 protocol=PROTOCOLS["kitti-odometry"],
-                pose=pose,
+                pose=None if poses is None else _pose_of(poses, image),
             )
-            for (stem, image), pose in zip(
-                images.items(), _poses(sequence, len(images)), strict=True
-            )
+            for stem, image in images.items()
         ]
     return found
 
@@ -57,21 +57,23 @@ def _sequences(root: Path) -> list[Path]:
     )
 
 
-def _poses(sequence: Path, count: int) -> list[Pose] | list[None]:
-    """The pose of each of the sequence's `count` frames, or None for each without a file."""
+def _poses(sequence: Path) -> list[Pose] | None:
+    """The poses of the sequence by frame number; None without a file."""
     # the folders above "." are only in its absolute path
     folder = sequence.absolute()
     path = folder.parents[1] / "poses" / f"{folder.name}.txt"
     if not path.is_file():
-        return [None] * count
+        return None
     lines = read_bytes(path).decode("utf-8", "replace").splitlines()
-    poses = [_pose(path, number, line) for number, line in enumerate(lines, 1) if line.strip()]
-    if len(poses) != count:
-        raise FileFormatError(
-            f"{path} has {len(poses):,} poses for the {count:,} images of {sequence / 'image_2'};"
-            " it must have one a frame"
+    return [_pose(path, number, line) for number, line in enumerate(lines, 1) if line.strip()]
+
+
+def _pose_of(poses: list[Pose], image: Path) -> Pose:
+    if not image.stem.isdigit() or int(image.stem) >= len(poses):
+        raise InputError(
+            f"{image} has no pose: its sequence's file holds {len(poses):,} poses, by frame number"
         )
-    return poses
+    return poses[int(image.stem)]
 
 
 def _pose(path: Path, number: int, line: str) -> Pose:
