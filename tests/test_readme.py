@@ -10,6 +10,12 @@ import sys
 from pathlib import Path
 
 import pytest
+from safetensors.torch import save_file
+
+from pnpdepth_cli.models.registry import find_definition
+from pnpdepth_cli.pipeline.refine import refine_image
+from pnpdepth_cli.pipeline.request import RefineRequest
+from tests.pipeline.frames import frame_on_disk
 
 ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text()
@@ -54,6 +60,24 @@ def test_a_command_of_the_readme_runs(command: str, folder: Path) -> None:
 def overwrite(command: str) -> list[str]:
     writes = arguments(command)[0] in ("refine", "project", "sample", "simulate")
     return ["--overwrite"] if writes else []
+
+
+def test_the_network_of_the_readme_is_refined(tmp_path: Path) -> None:
+    (code,) = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)
+    frame = frame_on_disk(tmp_path)
+    (tmp_path / "my_net.py").write_text(code)
+    network = find_definition(str(tmp_path / "my_net.py")).build()
+    save_file(network.state_dict(), tmp_path / "my_net.safetensors")
+    outcome = refine_image(
+        RefineRequest(
+            image=frame.image,
+            sparse=frame.sparse,
+            model=str(tmp_path / "my_net.py"),
+            checkpoint=tmp_path / "my_net.safetensors",
+            output=tmp_path / "depth.npy",
+        )
+    )
+    assert outcome.record["loss"][-1] < outcome.record["loss"][0]
 
 
 def test_the_links_of_the_readme_lead_somewhere() -> None:
