@@ -60,6 +60,8 @@ class Split:
     _path: tuple[str, ...]
     _learned: bool
     _passing: bool
+    _sealed: bool  # inside a submodule that is to be remembered as a whole
+    _open: set[nn.Module]  # submodules that turned out not to be fit for that
 
     def __init__(self, network: nn.Module, layer: str) -> None:
         self.layer = layer
@@ -70,6 +72,8 @@ class Split:
             raise LayerError(_unknown(self._name.module, [name for name in self._modules if name]))
         self._cut = self._modules[self._name.module]
         self._around_hooks = _around_hooks(self._modules)
+        self._around_cut = _around(self._cut, self._modules)
+        self._open = set()
         self._forget()
 
     def __enter__(self) -> Split:
@@ -102,16 +106,20 @@ class Split:
 
     def front(self, *arguments: Any) -> Tensor:
         """z_0, the output of the cut layer for these arguments of the network."""
-        self._forget()
-        self._arguments = arguments
-        try:
-            with self._watching():
-                self._run()
-        except _CutReached:
-            self._index()
-            assert self._z0 is not None
-            return self._z0.clone()  # the network may go on to change the memory it lies in
-        raise LayerError(self._never_ran())
+        while True:
+            self._forget()
+            self._arguments = arguments
+            known_open = len(self._open)
+            try:
+                with self._watching():
+                    self._run()
+            except _CutReached:
+                if len(self._open) > known_open:
+                    continue  # once more, to remember what lies inside those
+                self._index()
+                assert self._z0 is not None
+                return self._z0.clone()  # the network may go on to change the memory it lies in
+            raise LayerError(self._never_ran())
 
     def rear(self, z: Tensor) -> Any:
         """What the network returns when the cut layer gives z."""
@@ -132,10 +140,10 @@ class Split:
                     " the network changes one in place and reads the other; cut one layer later"
                 )
         except BaseException:
-            del self._calls[known:]
+            self._drop_calls_from(known)
             raise
         if watch.data_dependent:  # another z may take another path behind the cut
-            del self._calls[known:]
+            self._drop_calls_from(known)
             for call in self._calls:
                 call.copied = True
         self._index()
@@ -169,7 +177,7 @@ class Split:
         self._calls, self._slots, self._ran = [], {}, set()
         self._counts = Counter()
         self._watch = self._cut_call = None
-        self._learned = self._passing = False
+        self._learned = self._passing = self._sealed = False
 
     def _index(self) -> None:
         self._slots = {}
@@ -192,7 +200,7 @@ class Split:
                 if call is self._cut_call:
                     return self._inject(run)
                 return call.hand_back() if call.kept else run()
-            if self._watch is None:
+            if self._watch is None or (self._sealed and module is not self._cut):
                 return run()
             return self._record(module, self._watch, (args, kwargs), run)
 
@@ -209,7 +217,11 @@ class Split:
         call, place, since = Call(module=module), len(self._calls), watch.now()
         self._calls.append(call)
         before = list(tensors_in(given))
-        output = run()
+        outer, self._sealed = self._sealed, self._can_be_sealed(module)
+        try:
+            output = run()
+        finally:
+            sealed, self._sealed = self._sealed, outer
         here = module is self._cut and self._name.call in (None, self._counts[module])
         is_cut = here and self._cut_call is None
         if (
@@ -217,14 +229,26 @@ class Split:
             and module not in self._around_hooks
             and _same_tensors(before, tensors_in(given))
         ):
-            del self._calls[place + 1 :]
+            self._drop_calls_from(place + 1)
             call.kept, call.output = True, map_tensors(output, lambda _, tensor: tensor)
             watch.protect(call)
+        elif sealed and next(module.children(), None) is not None:
+            self._open.add(module)
         if is_cut:
             self._cut_call = call
             self._z0 = self._choose(output)
             raise _CutReached
         return output
+
+    def _can_be_sealed(self, module: nn.Module) -> bool:
+        """True if it ends before the cut, so that what is inside needs no noting."""
+        apart = module in self._around_cut or module in self._around_hooks or module in self._open
+        return self._cut_call is None and not apart
+
+    def _drop_calls_from(self, place: int) -> None:
+        for call in self._calls[place:]:
+            call.output = None  # the watch knows the call, and would hold its tensors
+        del self._calls[place:]
 
     def _choose(self, output: Any) -> Tensor:
         found = [
@@ -281,6 +305,16 @@ def gradient_at(z: Tensor, value: Tensor) -> Tensor | None:
         with blaming("the gradient of the network"):
             value.backward()  # type: ignore[no-untyped-call]
     return z.grad
+
+
+def _around(inner: nn.Module, modules: dict[str, nn.Module]) -> set[nn.Module]:
+    """The submodules that contain this one, itself included."""
+    names = [f"{name}." for name, module in modules.items() if module is inner]
+    return {
+        module
+        for name, module in modules.items()
+        if not name or any(inside.startswith(f"{name}.") for inside in names)
+    }
 
 
 def _around_hooks(modules: dict[str, nn.Module]) -> set[nn.Module]:

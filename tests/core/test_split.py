@@ -205,8 +205,8 @@ def test_nothing_of_a_picture_stays_in_memory_after_the_split_closes() -> None:
     del z
     hook.remove()
     gc.collect()
-    assert len(seen) == 7
-    assert [reference() for reference in seen] == [None] * 7
+    assert len(seen) == 9  # the front ran twice: this encoder cannot be remembered as a whole
+    assert [reference() for reference in seen] == [None] * 9
     del split
 
 
