@@ -130,8 +130,9 @@ class Split:
             return self._run()
         known = len(self._calls)
         try:
-            with self._watching() as watch, watch.seeing_escapes():
+            with self._watching(reads=True) as watch, watch.seeing_escapes():
                 output = self._run()
+            watch.note_reads(output)
             if self._name.call is None and self._counts[self._cut] > 1:
                 raise LayerError(_several_calls(self.layer, self._counts[self._cut]))
             if watch.torn:
@@ -146,13 +147,15 @@ class Split:
             self._drop_calls_from(known)
             for call in self._calls:
                 call.copied = True
+        else:
+            self._release_unread(watch)
         self._index()
         self._learned = True
         return output
 
     @contextmanager
-    def _watching(self) -> Iterator[Watch]:
-        watch = Watch((*self._calls, *self._state.tensors))
+    def _watching(self, *, reads: bool = False) -> Iterator[Watch]:
+        watch = Watch((*self._calls, *self._state.tensors), reads=reads)
         self._watch = watch
         try:
             with watch:
@@ -188,6 +191,8 @@ class Split:
         @functools.wraps(original)
         def forward(*args: Any, **kwargs: Any) -> Any:
             def run() -> Any:
+                if self._watch is not None:
+                    self._watch.note_reads((args, kwargs))
                 return original(*args, **kwargs)
 
             if not self._passing:
@@ -244,6 +249,15 @@ class Split:
         """True if it ends before the cut, so that what is inside needs no noting."""
         apart = module in self._around_cut or module in self._around_hooks or module in self._open
         return self._cut_call is None and not apart
+
+    def _release_unread(self, watch: Watch) -> None:
+        """Remembered outputs that only go into other remembered submodules lose their memory.
+
+        Something of their shape is handed back in their place; every pass reads the same ones.
+        """
+        for call in self._calls:
+            if not call.copied:  # of those, copies were handed out, and may have been read
+                call.output = map_tensors(call.output, lambda _, t: _emptied(t, watch))
 
     def _drop_calls_from(self, place: int) -> None:
         for call in self._calls[place:]:
@@ -305,6 +319,12 @@ def gradient_at(z: Tensor, value: Tensor) -> Tensor | None:
         with blaming("the gradient of the network"):
             value.backward()  # type: ignore[no-untyped-call]
     return z.grad
+
+
+def _emptied(tensor: Tensor, watch: Watch) -> Tensor:
+    """The tensor, or one number in its shape if nobody read it."""
+    keep = watch.was_read(tensor) or tensor.is_inference() or tensor.layout != torch.strided
+    return tensor if keep else tensor.new_empty(()).expand(tensor.shape)
 
 
 def _around(inner: nn.Module, modules: dict[str, nn.Module]) -> set[nn.Module]:

@@ -16,6 +16,7 @@ def tensors_in(
     """Every tensor of a nested structure with its path, such as ("hidden_states", "0")."""
     if isinstance(structure, Tensor):
         yield path, structure
+        return
     for key, child in _children(structure):
         yield from tensors_in(child, (*path, key))
 
@@ -54,10 +55,10 @@ def is_transparent(structure: Any) -> bool:
 
 
 def _children(structure: Any) -> Iterator[tuple[str, Any]]:
-    if isinstance(structure, MutableMapping):
-        yield from ((str(key), child) for key, child in structure.items())
-    elif isinstance(structure, list | tuple):
+    if isinstance(structure, list | tuple):
         yield from ((str(index), child) for index, child in enumerate(structure))
+    elif isinstance(structure, MutableMapping):
+        yield from ((str(key), child) for key, child in structure.items())
     elif _is_container(structure):
         yield from ((f.name, getattr(structure, f.name)) for f in dataclasses.fields(structure))
 

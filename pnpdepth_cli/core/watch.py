@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -62,8 +63,9 @@ class Watch(TorchDispatchMode):
         # the whole compiler, a second in every run of the program.
         return False
 
-    def __init__(self, remembered: Iterable[Remembered]) -> None:
+    def __init__(self, remembered: Iterable[Remembered], *, reads: bool = False) -> None:
         super().__init__()  # type: ignore[no-untyped-call]
+        self._reads: set[int] | None = set() if reads else None
         self.data_dependent = False
         self._operations = 0
         self._touches = 0
@@ -137,10 +139,14 @@ class Watch(TorchDispatchMode):
         self, func: Any, types: Any, args: Sequence[Any] = (), kwargs: Any = None
     ) -> Any:
         kwargs = kwargs or {}
+        facts = _facts(func)
         self._operations += 1
-        given = [t for value in (*args, *kwargs.values()) for t in _tensors(value)]
+        given: list[Tensor] = []
+        if not facts.fresh or self._reads is not None:
+            given = [t for value in (*args, *kwargs.values()) for t in _tensors(value)]
+            self.note_reads(given)
         self.torn |= bool(self._stale) and any(_storage(tensor) in self._stale for tensor in given)
-        written = list(_written(func._schema, args, kwargs))
+        written = [t for place, name in facts.writes for t in _argument(place, name, args, kwargs)]
         for tensor in written:
             self._before_write(tensor)
         marked = bool(self._marked) and any(map(self._is_marked, given))
@@ -153,10 +159,17 @@ class Watch(TorchDispatchMode):
         if marked:
             self._touches += 1
             self._marked |= results | {_storage(tensor) for tensor in written}
-            tags = func.tags
-            if torch.Tag.data_dependent_output in tags or torch.Tag.dynamic_output_shape in tags:
-                self.data_dependent = True
+            self.data_dependent |= facts.escapes
         return result
+
+    def note_reads(self, structure: Any) -> None:
+        """These tensors are used, as `was_read` will say; only where reads are wanted."""
+        if self._reads is not None:
+            self._reads.update(_storage(tensor) for _, tensor in tensors_in(structure))
+
+    def was_read(self, tensor: Tensor) -> bool:
+        """True if an operation or somebody else may have looked into the tensor's memory."""
+        return self._reads is None or _storage(tensor) in self._reads
 
     def _before_write(self, tensor: Tensor) -> None:
         storage = _storage(tensor)
@@ -187,12 +200,35 @@ def _storage(tensor: Tensor) -> int:
         return _NO_STORAGE
 
 
-def _written(schema: Any, args: Sequence[Any], kwargs: Any) -> Iterator[Tensor]:
-    """The tensors an operation changes in place."""
-    if schema.is_mutable:
-        for place, argument in enumerate(schema.arguments):
-            if argument.alias_info is not None and argument.alias_info.is_write:
-                yield from _tensors(args[place] if place < len(args) else kwargs.get(argument.name))
+@dataclass(frozen=True)
+class _Facts:
+    """Of an operation: which arguments it changes in place, by place and name; whether its results
+
+    are always new memory; whether values can get out of it to Python.
+    """
+
+    writes: tuple[tuple[int, str], ...]
+    fresh: bool
+    escapes: bool
+
+
+@functools.cache
+def _facts(func: Any) -> _Facts:
+    schema = func._schema
+    return _Facts(
+        writes=tuple(
+            (place, argument.name)
+            for place, argument in enumerate(schema.arguments)
+            if argument.alias_info is not None and argument.alias_info.is_write
+        ),
+        fresh=func.namespace == "aten" and all(r.alias_info is None for r in schema.returns),
+        escapes=torch.Tag.data_dependent_output in func.tags
+        or torch.Tag.dynamic_output_shape in func.tags,
+    )
+
+
+def _argument(place: int, name: str, args: Sequence[Any], kwargs: Any) -> list[Tensor]:
+    return _tensors(args[place] if place < len(args) else kwargs.get(name))
 
 
 def _tensors(value: Any) -> list[Tensor]:
