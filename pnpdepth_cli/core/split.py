@@ -29,7 +29,7 @@ from pnpdepth_cli.core.foreign import blaming
 from pnpdepth_cli.core.layer_name import LayerName
 from pnpdepth_cli.core.state import NetworkState
 from pnpdepth_cli.core.structure import map_tensors, tensors_in
-from pnpdepth_cli.core.watch import Call, Watch
+from pnpdepth_cli.core.watch import Call, Remembered, Watch
 from pnpdepth_cli.errors import LayerError
 
 
@@ -48,7 +48,7 @@ class Split:
     layer that does not exist, never runs, or runs or returns several times without a choice.
     """
 
-    _arguments: tuple[Any, ...]
+    _given: Remembered  # the arguments
     _z0: Tensor | None
     _z: Tensor | None
     _calls: list[Call]  # what each pass does, in order; grows behind the cut in the first rear pass
@@ -108,7 +108,8 @@ class Split:
         """z_0, the output of the cut layer for these arguments of the network."""
         while True:
             self._forget()
-            self._arguments = arguments
+            # The network may change them in place, the caller's must not change.
+            self._given = Remembered(map_tensors(arguments, lambda _, t: t.detach().clone()))
             known_open = len(self._open)
             try:
                 with self._watching():
@@ -155,7 +156,7 @@ class Split:
 
     @contextmanager
     def _watching(self, *, reads: bool = False) -> Iterator[Watch]:
-        watch = Watch((*self._calls, *self._state.tensors), reads=reads)
+        watch = Watch((self._given, *self._calls, *self._state.tensors), reads=reads)
         self._watch = watch
         try:
             with watch:
@@ -164,19 +165,17 @@ class Split:
             self._watch = None
 
     def _run(self) -> Any:
-        # The network may change its arguments in place.
-        arguments = map_tensors(self._arguments, lambda _, tensor: tensor.detach().clone())
         self._state.restore()
         self._counts.clear()
         self._passing = True
         try:
             with blaming("the network's forward"):
-                return self._network(*arguments)
+                return self._network(*self._given.hand_back())
         finally:
             self._passing = False
 
     def _forget(self) -> None:
-        self._arguments, self._z0, self._z = (), None, None
+        self._given, self._z0, self._z = Remembered(()), None, None
         self._calls, self._slots, self._ran = [], {}, set()
         self._counts = Counter()
         self._watch = self._cut_call = None
