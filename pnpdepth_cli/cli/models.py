@@ -95,14 +95,14 @@ def _list(as_json: bool) -> None:
 
     print_rows(
         "networks",
-        ("name", "takes", "size", "gives", "parameters", "weights", "defaults"),
+        ("name", "takes", "size", "gives", "params", "weights", "defaults"),
         [
             (
-                f"{model['name']}: {model['summary']}",
+                model["name"],
                 model["input_kind"],
                 model["size"],
                 model["output_kind"],
-                f"{model['parameters']:,}",
+                f"{model['parameters'] / 1e6:.2f} M",
                 "shipped" if model["checkpoint"] else "--checkpoint",
                 f"layer {model['layer']}, K {model['iterations']}, lr {model['lr']},"
                 f" {model['loss']}, {model['update']}",

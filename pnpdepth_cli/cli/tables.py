@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
@@ -49,7 +50,8 @@ def print_refinement(record: Mapping[str, Any]) -> None:
         f"{settings['iterations']} updates ({settings['update']}, {settings['loss']}, step"
         f" {settings['step']:.3g}) · "
         + ", ".join(f"{stage} {spent:.2f} s" for stage, spent in seconds.items())
-        + f" · peak {record['peak_memory_mb']['process']:,.0f} MB"
+        + f" · peak {record['peak_memory_mb']['process']:,.0f} MB",
+        soft_wrap=True,
     )
     written = [path for path in record["outputs"].values() if path]
     console.print("wrote " + escape("  ".join(written)), soft_wrap=True)
@@ -69,13 +71,15 @@ def print_sparse(record: Mapping[str, Any]) -> None:
 
 
 def print_rows(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    """A table of text on stdout."""
+    """A table of text on stdout; as wide as it likes where that is no terminal."""
     console = Console(highlight=False)
-    table = Table(title=title, title_justify="left")
+    table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
     for number, column in enumerate(columns):
         table.add_column(column, overflow="fold", justify="left" if number == 0 else "right")
     for row in rows:
         table.add_row(*(escape(cell) for cell in row))
+    if not console.is_terminal:
+        console.width = max(console.width, console.measure(table).maximum)
     console.print(table)
 
 
