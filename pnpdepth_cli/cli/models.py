@@ -102,8 +102,8 @@ def _list(as_json: bool) -> None:
                 model["input_kind"],
                 model["size"],
                 model["output_kind"],
-                f"{model['parameters'] / 1e6:.2f} M",
-                "shipped" if model["checkpoint"] else "--checkpoint",
+                f"{model['parameters']:,}",
+                "shipped" if model["checkpoint"] else "yours",
                 f"layer {model['layer']}, K {model['iterations']}, lr {model['lr']},"
                 f" {model['loss']}, {model['update']}",
             )

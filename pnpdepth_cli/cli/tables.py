@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from rich.box import SIMPLE_HEAD
-from rich.console import Console
+from rich.console import Console, JustifyMethod
 from rich.markup import escape
 from rich.table import Table
 
@@ -75,11 +75,14 @@ def print_rows(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]
     console = Console(highlight=False)
     table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
     for number, column in enumerate(columns):
-        table.add_column(column, overflow="fold", justify="left" if number == 0 else "right")
+        first = number == 0
+        justify: JustifyMethod = "left" if first else "right"
+        table.add_column(column, overflow="fold", justify=justify, no_wrap=first)
     for row in rows:
         table.add_row(*(escape(cell) for cell in row))
     if not console.is_terminal:
-        console.width = max(console.width, console.measure(table).maximum)
+        wide = console.options.update(max_width=1000)
+        console.width = max(console.width, console.measure(table, options=wide).maximum)
     console.print(table)
 
 
