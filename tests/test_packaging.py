@@ -1,0 +1,31 @@
+"""The wheel holds every package of the source tree."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+
+from pnpdepth_cli.models.registry import find_definition
+
+ROOT = Path(__file__).parent.parent
+
+
+@pytest.mark.skipif(sys.version_info < (3, 11), reason="tomllib came with Python 3.11")
+def test_every_package_is_listed_for_the_wheel() -> None:
+    import tomllib
+
+    listed = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["packages"]
+    folders = (
+        p.parent
+        for r in ("pnpdepth_cli", "model_zoo_defs")
+        for p in (ROOT / r).rglob("__init__.py")
+    )
+    assert sorted(listed) == sorted(".".join(f.relative_to(ROOT).parts) for f in folders)
+
+
+def test_the_shipped_weights_are_there_and_small() -> None:
+    checkpoint = find_definition("compact").checkpoint
+    assert checkpoint is not None
+    assert 1e6 < checkpoint.stat().st_size < 20e6
