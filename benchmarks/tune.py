@@ -70,9 +70,8 @@ def main() -> None:
     network = load_network(args.model, args.checkpoint)
     layers = args.layers.split(",") if args.layers else network.definition.layers
     some = rendered_inputs(args.data, args.frames)
-    print(
-        f"{len(some)} frames with points\n\n| layer | update | lr | K | loss | MAE % | RMSE % | worse % |"
-    )
+    print(f"{len(some)} frames with points\n")
+    print("| layer | update | lr | K | loss | MAE % | RMSE % | worse % |")
     print("|---|---|---|---|---|---|---|---|")
     choices = (args.updates, args.lrs, args.iterations, args.losses)
     for layer, *chosen in product(layers, *(text.split(",") for text in choices)):
