@@ -20,13 +20,13 @@ from benchmarks.frames import (
     SETS,
     EvalFrame,
     frame_inputs,
+    frame_pixels,
     nearest_and_linear,
     points_on_grid,
-    sampled,
+    refined,
 )
 from pnpdepth_cli.core.metrics import score
 from pnpdepth_cli.models.network import Network, load_network
-from pnpdepth_cli.pipeline.frame import refine_frame
 from pnpdepth_cli.pipeline.request import RefineRequest, effective_settings, layer_name
 
 CELLS = (
@@ -53,13 +53,7 @@ def measure_frame(
     network: Network, frame: EvalFrame, count: int | None, seed: int, settings: Settings
 ) -> dict[str, tuple[float, float]]:
     """(MAE, RMSE) of every method on one frame."""
-    if count is None:
-        assert frame.sensor is not None
-        rows, columns = np.nonzero(frame.sensor > 0)
-        depth = frame.sensor[rows, columns]
-    else:
-        rows, columns = sampled(frame.truth, count, seed)
-        depth = frame.truth[rows, columns]
+    rows, columns, depth = frame_pixels(frame, count, seed)
     near, linear = nearest_and_linear(rows, columns, depth, frame.truth.shape)
     points = points_on_grid(rows, columns, depth, frame.truth.shape)
     inputs = frame_inputs(frame.rgb, points, frame.truth)
@@ -67,13 +61,11 @@ def measure_frame(
         image=None, sparse=Path(), iterations=settings.iterations, lr=settings.lr,
         update=settings.update,
     )  # fmt: skip
-    result = refine_frame(
+    result = refined(
         network,
         layer_name(network.definition, settings.layer),
         effective_settings(network.definition, request),
         inputs,
-        points,
-        points.select(torch.zeros(len(points), dtype=torch.bool)),
     )
     depths = {"nearest": near, "linear": linear, "plain": result.before, "refined": result.after}
     truth = torch.from_numpy(frame.truth)

@@ -17,14 +17,19 @@ import cv2
 import numpy as np
 import torch
 
-from benchmarks.frames import EvalFrame, kitti_dc, sampled, seven_scenes
+from benchmarks.frames import (
+    EvalFrame,
+    frame_inputs,
+    frame_pixels,
+    kitti_dc,
+    points_on_grid,
+    refined,
+    seven_scenes,
+)
 from pnpdepth_cli.core.metrics import score
-from pnpdepth_cli.core.points import SparsePoints
 from pnpdepth_cli.core.refine import RefineSettings
 from pnpdepth_cli.models.definition import Normalisation
 from pnpdepth_cli.models.network import Network, load_network
-from pnpdepth_cli.pipeline.frame import refine_frame
-from pnpdepth_cli.pipeline.inputs import Inputs
 
 PLAIN = RefineSettings(iterations=0)
 PAPER = RefineSettings()
@@ -70,21 +75,9 @@ def error(
     network: Network, layer: str, settings: RefineSettings, frame: EvalFrame, count: int | None
 ) -> tuple[float, float, float, float]:
     """MAE and RMSE before and after, on all pixels with known truth."""
-    if count is None:
-        assert frame.sensor is not None
-        rows, columns = np.nonzero(frame.sensor > 0)
-        depth = frame.sensor[rows, columns]
-    else:
-        rows, columns = sampled(frame.truth, count, 0)
-        depth = frame.truth[rows, columns]
-    points = SparsePoints(
-        xy=torch.from_numpy(np.stack([columns, rows], axis=1).astype(np.float32)),
-        depth=torch.from_numpy(depth),
-        size=frame.truth.shape,
-    )
-    inputs = Inputs(rgb=frame.rgb, points=points, gt=None, sparse_scale=None, record={}, notes=())
-    none = points.select(torch.zeros(len(points), dtype=torch.bool))
-    result = refine_frame(network, layer, settings, inputs, points, none)
+    rows, columns, depth = frame_pixels(frame, count, seed=0)
+    points = points_on_grid(rows, columns, depth, frame.truth.shape)
+    result = refined(network, layer, settings, frame_inputs(frame.rgb, points, frame.truth))
     truth = torch.from_numpy(frame.truth)
     before, after = (score(torch.from_numpy(d), truth) for d in (result.before, result.after))
     return before.mae, before.rmse, after.mae, after.rmse

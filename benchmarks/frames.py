@@ -11,8 +11,11 @@ import torch
 from numpy.typing import NDArray
 
 from pnpdepth_cli.core.points import SparsePoints
+from pnpdepth_cli.core.refine import RefineSettings
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.io.rgb import read_rgb
+from pnpdepth_cli.models.network import Network
+from pnpdepth_cli.pipeline.frame import RefinedFrame, refine_frame
 from pnpdepth_cli.pipeline.inputs import Inputs
 
 Depth = NDArray[np.float32]
@@ -63,6 +66,18 @@ def sampled(truth: Depth, count: int, seed: int) -> tuple[NDArray[np.int64], NDA
     return rows[chosen], columns[chosen]
 
 
+def frame_pixels(
+    frame: EvalFrame, count: int | None, seed: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64], Depth]:
+    """Rows, columns and depths of the sensor's points, or of `count` pixels of the truth."""
+    if count is None:
+        assert frame.sensor is not None
+        rows, columns = np.nonzero(frame.sensor > 0)
+        return rows, columns, frame.sensor[rows, columns]
+    rows, columns = sampled(frame.truth, count, seed)
+    return rows, columns, frame.truth[rows, columns]
+
+
 def points_on_grid(
     rows: NDArray[np.int64], columns: NDArray[np.int64], depth: Depth, shape: tuple[int, int]
 ) -> SparsePoints:
@@ -76,6 +91,12 @@ def points_on_grid(
 def frame_inputs(rgb: NDArray[np.float32], points: SparsePoints, truth: Depth) -> Inputs:
     """A frame in memory, as the program reads one from files."""
     return Inputs(rgb=rgb, points=points, gt=truth, sparse_scale=None, record={}, notes=())
+
+
+def refined(network: Network, layer: str, settings: RefineSettings, inputs: Inputs) -> RefinedFrame:
+    """The refinement of a frame with all of its points."""
+    none = inputs.points.select(torch.zeros(len(inputs.points), dtype=torch.bool))
+    return refine_frame(network, layer, settings, inputs, inputs.points, none)
 
 
 def nearest_and_linear(

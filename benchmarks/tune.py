@@ -16,13 +16,12 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from benchmarks.frames import frame_inputs, points_on_grid
+from benchmarks.frames import frame_inputs, points_on_grid, refined
 from model_zoo_defs.training.dataset import Frames
 from model_zoo_defs.training.validation import PATTERNS
 from pnpdepth_cli.core.metrics import score
 from pnpdepth_cli.core.refine import RefineSettings
 from pnpdepth_cli.models.network import Network, load_network
-from pnpdepth_cli.pipeline.frame import refine_frame
 from pnpdepth_cli.pipeline.inputs import Inputs
 
 
@@ -47,8 +46,7 @@ def ratios(
     found = []
     for inputs in some:
         assert inputs.gt is not None
-        none = inputs.points.select(torch.zeros(len(inputs.points), dtype=torch.bool))
-        result = refine_frame(network, layer, settings, inputs, inputs.points, none)
+        result = refined(network, layer, settings, inputs)
         truth = torch.from_numpy(inputs.gt)
         before, after = (score(torch.from_numpy(d), truth) for d in (result.before, result.after))
         found.append((after.mae / before.mae, after.rmse / before.rmse))

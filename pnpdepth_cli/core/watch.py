@@ -202,9 +202,10 @@ def _storage(tensor: Tensor) -> int:
 
 @dataclass(frozen=True)
 class _Facts:
-    """Of an operation: which arguments it changes in place, by place and name; whether its results
+    """What an operation may do.
 
-    are always new memory; whether values can get out of it to Python.
+    writes: the arguments it changes in place, by place and name. fresh: its results are always
+    new memory. escapes: values can get out of it to Python.
     """
 
     writes: tuple[tuple[int, str], ...]
