@@ -15,7 +15,7 @@ import numpy.typing as npt
 from PIL import Image
 from tqdm import tqdm
 
-from model_zoo_defs.training.scenes import KINDS, VIEWS_PER_SCENE, Frame, scene_frames
+from model_zoo_defs.training.scenes import CAMERAS, KINDS, VIEWS_PER_SCENE, Frame, scene_frames
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,6 +29,18 @@ class Job:
     frames: int
     shard_frames: int
     kinds: tuple[str, ...]
+    camera: str = "any"
+
+    def scene(self, number: int) -> list[Frame]:
+        """Returns the frames of one scene."""
+        return scene_frames(
+            self.seed,
+            number,
+            height=self.height,
+            width=self.width,
+            kinds=self.kinds,
+            lens=CAMERAS[self.camera],
+        )
 
 
 def shard_path(out: Path, index: int) -> Path:
@@ -45,7 +57,7 @@ def render_shard(job: Job, index: int) -> int:
         return count
     frames: list[Frame] = []
     for scene in range(first // VIEWS_PER_SCENE, -(-(first + count) // VIEWS_PER_SCENE)):
-        frames += scene_frames(job.seed, scene, height=job.height, width=job.width, kinds=job.kinds)
+        frames += job.scene(scene)
     frames = frames[:count]
     temporary = target.with_suffix(f".{os.getpid()}.tmp")
     with temporary.open("wb") as stream:
@@ -95,9 +107,7 @@ def contact_sheet(job: Job, *, columns: int = 4) -> Image.Image:
     """Returns one picture of job.frames frames, one per scene, rgb above depth."""
     pictures = []
     for scene in range(job.frames):
-        frame = scene_frames(job.seed, scene, height=job.height, width=job.width, kinds=job.kinds)[
-            0
-        ]
+        frame = job.scene(scene)[0]
         pictures.append(np.concatenate([frame.rgb, coloured(frame.depth)], axis=0))
     while len(pictures) % columns:
         pictures.append(np.zeros_like(pictures[0]))
@@ -117,6 +127,7 @@ def _parsed(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--size", default="256x320", help="height x width in pixels")
     parser.add_argument("--shard-frames", type=int, default=64, help="a multiple of 4")
     parser.add_argument("--kinds", default=",".join(KINDS), help="kinds to draw from")
+    parser.add_argument("--camera", choices=tuple(CAMERAS), default="any")
     parser.add_argument("--contact-sheet", type=Path, help="write one picture of frames instead")
     chosen = parser.parse_args(arguments)
     if chosen.out is None and chosen.contact_sheet is None:
@@ -141,6 +152,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         frames=chosen.frames,
         shard_frames=chosen.shard_frames,
         kinds=tuple(chosen.kinds.split(",")),
+        camera=chosen.camera,
     )
     if chosen.contact_sheet is not None:
         contact_sheet(job).save(chosen.contact_sheet)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -26,6 +27,26 @@ SHARES = {"room": 0.5, "street": 0.3, "desk": 0.2}
 VIEWS_PER_SCENE = 4
 
 _MAKERS = {"room": room, "street": street, "desk": desk_scene}
+
+
+class Lens(NamedTuple):
+    """Says what a camera sees: its horizontal field of view, and where its axis lies off the
+
+    middle of the picture, (right, down) in widths and heights.
+    """
+
+    fov_deg: float
+    shift: tuple[float, float] = (0.0, 0.0)
+
+
+CAMERAS: dict[str, Lens | None] = {
+    "any": None,
+    # 304 × 228 px about the middle of half a Kinect picture, focal length 518.86 px
+    "nyu": Lens(60.7),
+    # columns 154 to 1066, rows 136 to 364 of KITTI's left colour camera: 721.5 px, axis at row 173
+    "kitti": Lens(64.6, (0.0, -0.338)),
+}
+"""Cameras of the benchmarks whose metric depth a network can learn from the picture alone."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,13 +86,20 @@ def pick_kind(rng: np.random.Generator, kinds: tuple[str, ...]) -> str:
 
 
 def pick_view(
-    world: World, plan: Plan, kind: str, rng: np.random.Generator, *, height: int, width: int
+    world: World,
+    plan: Plan,
+    kind: str,
+    rng: np.random.Generator,
+    *,
+    height: int,
+    width: int,
+    lens: Lens | None = None,
 ) -> View:
     """Returns a view that shows much of the scene; the best of some tries."""
     best, best_score = None, -1.0
     for _ in range(24):
-        view = _street_view(plan, rng, height, width) if kind == "street" else _indoor_view(
-            plan, rng, height, width, near=kind == "desk"
+        view = _street_view(plan, rng, height, width, lens) if kind == "street" else _indoor_view(
+            plan, rng, height, width, lens, near=kind == "desk"
         )  # fmt: skip
         score = _score(world, view, kind)
         if best is None or score > best_score:
@@ -82,21 +110,23 @@ def pick_view(
     return best
 
 
-def _street_view(plan: Plan, rng: np.random.Generator, height: int, width: int) -> View:
+def _street_view(
+    plan: Plan, rng: np.random.Generator, height: int, width: int, lens: Lens | None
+) -> View:
     place = rng.uniform(plan.low, plan.high)
     yaw = rng.normal(0, 0.06) if rng.random() < 0.7 else rng.uniform(-1.2, 1.2)
     # A crop of a wide picture may lie off its principal point.
     shift = (float(rng.uniform(-0.8, 0.8)), 0.0) if rng.random() < 0.3 else (0.0, 0.0)
     pitch = rng.normal(-0.02, 0.03)
-    fov = rng.uniform(30, 85)
+    fov, roll = rng.uniform(30, 85), rng.normal(0, 0.01)
+    lens = lens or Lens(fov, (shift[0], float(rng.uniform(-0.15, 0.1))))
     return looking(
-        place, yaw, pitch, rng.normal(0, 0.01), fov_deg=fov, height=height, width=width,
-        shift=(shift[0], float(rng.uniform(-0.15, 0.1))),
-    )  # fmt: skip
+        place, yaw, pitch, roll, fov_deg=lens.fov_deg, height=height, width=width, shift=lens.shift
+    )
 
 
 def _indoor_view(
-    plan: Plan, rng: np.random.Generator, height: int, width: int, *, near: bool
+    plan: Plan, rng: np.random.Generator, height: int, width: int, lens: Lens | None, *, near: bool
 ) -> View:
     place = rng.uniform(plan.low, plan.high)
     target = np.asarray(plan.targets[int(rng.integers(len(plan.targets)))])
@@ -107,10 +137,12 @@ def _indoor_view(
     yaw = float(np.arctan2(-toward[0], toward[1]))
     pitch = float(np.arctan2(toward[2], np.hypot(toward[0], toward[1]) + 1e-6))
     pitch = np.clip(pitch, -1.1, 0.5) * rng.uniform(0.4, 1.0) + rng.normal(0, 0.05)
+    yaw += rng.normal(0, 0.15)
+    roll = rng.normal(0, 0.06 if rng.random() < 0.8 else 0.3)
+    lens = lens or Lens(rng.uniform(40, 95))
     return looking(
-        place, yaw + rng.normal(0, 0.15), pitch, rng.normal(0, 0.06 if rng.random() < 0.8 else 0.3),
-        fov_deg=rng.uniform(40, 95), height=height, width=width,
-    )  # fmt: skip
+        place, yaw, pitch, roll, fov_deg=lens.fov_deg, height=height, width=width, shift=lens.shift
+    )
 
 
 def _score(world: World, view: View, kind: str) -> float:
@@ -132,7 +164,13 @@ def _score(world: World, view: View, kind: str) -> float:
 
 
 def scene_frames(
-    seed: int, scene: int, *, height: int, width: int, kinds: tuple[str, ...] = KINDS
+    seed: int,
+    scene: int,
+    *,
+    height: int,
+    width: int,
+    kinds: tuple[str, ...] = KINDS,
+    lens: Lens | None = None,
 ) -> list[Frame]:
     """Returns the VIEWS_PER_SCENE frames of a scene; the same bytes on every run."""
     rng = generator(seed, scene, 0)
@@ -141,7 +179,7 @@ def scene_frames(
     frames = []
     for number in range(VIEWS_PER_SCENE):
         own = generator(seed, scene, 1 + number)
-        view = pick_view(world, plan, kind, own, height=height, width=width)
+        view = pick_view(world, plan, kind, own, height=height, width=width, lens=lens)
         colour, depth = seen(world, view, own)
         frames.append(
             Frame(
