@@ -10,14 +10,18 @@ Both are watched operation by operation (`Watch`), the rear in its first pass. A
 more than give an output (it works in place on its input, or hooks listen to its parts) is not
 remembered itself, its parts are; remembered tensors are saved from in-place operations; and
 submodules behind the cut that do not depend on z either are remembered as well.
+
+What was learned so holds for other arguments of the same shapes, if no value of a tensor got out to
+Python, where it could choose another path: further frames are neither watched nor copied.
 """
 
 from __future__ import annotations
 
+import contextlib
 import difflib
 import functools
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from types import TracebackType
 from typing import Any
@@ -41,7 +45,7 @@ class Split:
     """A network cut at a layer, as a context manager; the network is as before when it closes.
 
     with Split(network, "decoder.up1") as split:
-        z = split.front(rgb)        # once
+        z = split.front(rgb)        # once for each frame
         output = split.rear(z)      # many times; differentiable in z
 
     While open, the network is in eval mode and only z requires gradient. Raises LayerError for a
@@ -59,7 +63,10 @@ class Split:
     _cut_call: Call | None
     _path: tuple[str, ...]
     _learned: bool
+    _repeats: bool  # what was learned holds for all arguments of `_shapes`
+    _shapes: Any
     _passing: bool
+    _filling: bool  # inside a submodule that is remembered as a whole, as was learned
     _sealed: bool  # inside a submodule that is to be remembered as a whole
     _open: set[nn.Module]  # submodules that turned out not to be fit for that
 
@@ -106,25 +113,38 @@ class Split:
 
     def front(self, *arguments: Any) -> Tensor:
         """z_0, the output of the cut layer for these arguments of the network."""
+        if self._learned and self._repeats and self._shapes == _shapes(arguments):
+            return self._front_of_another_frame(arguments)
         while True:
             self._forget()
-            # The network may change them in place, the caller's must not change.
-            self._given = Remembered(map_tensors(arguments, lambda _, t: t.detach().clone()))
+            self._shapes = _shapes(arguments)
+            self._given.output = _own(arguments)
             known_open = len(self._open)
             try:
-                with self._watching():
+                with self._watching() as watch, watch.seeing_escapes():
                     self._run()
             except _CutReached:
                 if len(self._open) > known_open:
                     continue  # once more, to remember what lies inside those
                 self._index()
+                self._repeats = not watch.escaped
                 assert self._z0 is not None
                 return self._z0.clone()  # the network may go on to change the memory it lies in
             raise LayerError(self._never_ran())
 
+    def _front_of_another_frame(self, arguments: Sequence[Any]) -> Tensor:
+        self._given.output, self._z0 = _own(arguments), None
+        for call in self._calls:
+            call.forget()
+        with contextlib.suppress(_CutReached):
+            self._run()
+        if self._z0 is None:
+            raise LayerError(self._never_ran())
+        return self._z0.clone()
+
     def rear(self, z: Tensor) -> Any:
         """What the network returns when the cut layer gives z."""
-        if self._cut_call is None:
+        if self._z0 is None:
             raise RuntimeError("rear() needs front() first")
         self._z = z
         if self._learned:
@@ -152,6 +172,7 @@ class Split:
             self._release_unread(watch)
         self._index()
         self._learned = True
+        self._repeats &= not watch.escaped
         return output
 
     @contextmanager
@@ -179,7 +200,7 @@ class Split:
         self._calls, self._slots, self._ran = [], {}, set()
         self._counts = Counter()
         self._watch = self._cut_call = None
-        self._learned = self._passing = self._sealed = False
+        self._learned = self._repeats = self._passing = self._filling = self._sealed = False
 
     def _index(self) -> None:
         self._slots = {}
@@ -196,19 +217,37 @@ class Split:
 
             if not self._passing:
                 return self._inject(run) if self._is_recomputed_cut(module) else run()
+            if self._filling:
+                return run()
             count = self._counts[module]
             self._counts[module] += 1
             slots = self._slots.get(module, ())
             if count < len(slots):
                 call = slots[count]
-                if call is self._cut_call:
+                if call is self._cut_call and self._z0 is not None:
                     return self._inject(run)
-                return call.hand_back() if call.kept else run()
+                output = call.hand_back() if call.known else self._fill(call, run)
+                if call is self._cut_call:
+                    self._z0 = dict(tensors_in(output))[self._path].detach()
+                    raise _CutReached
+                return output
             if self._watch is None or (self._sealed and module is not self._cut):
                 return run()
             return self._record(module, self._watch, (args, kwargs), run)
 
         return forward
+
+    def _fill(self, call: Call, run: Callable[[], Any]) -> Any:
+        """Run a call that was learned of; its output is remembered if it is one to keep."""
+        if not call.kept:
+            return run()
+        self._filling = True
+        try:
+            output = run()
+        finally:
+            self._filling = False
+        call.remember(output)
+        return output
 
     def _is_recomputed_cut(self, module: nn.Module) -> bool:
         """True if torch.utils.checkpoint runs the cut layer again within a backward pass."""
@@ -234,7 +273,8 @@ class Split:
             and _same_tensors(before, tensors_in(given))
         ):
             self._drop_calls_from(place + 1)
-            call.kept, call.output = True, map_tensors(output, lambda _, tensor: tensor)
+            call.kept = True
+            call.remember(output)
             watch.protect(call)
         elif sealed and next(module.children(), None) is not None:
             self._open.add(module)
@@ -255,12 +295,15 @@ class Split:
         Something of their shape is handed back in their place; every pass reads the same ones.
         """
         for call in self._calls:
-            if not call.copied:  # of those, copies were handed out, and may have been read
-                call.output = map_tensors(call.output, lambda _, t: _emptied(t, watch))
+            if call.kept and not call.copied:  # of those, copies were handed out, and may be read
+                call.unread = frozenset(
+                    path for path, t in tensors_in(call.output) if not _is_read(t, watch)
+                )
+                call.remember(call.output)
 
     def _drop_calls_from(self, place: int) -> None:
         for call in self._calls[place:]:
-            call.output = None  # the watch knows the call, and would hold its tensors
+            call.forget()  # the watch knows the call, and would hold its tensors
         del self._calls[place:]
 
     def _choose(self, output: Any) -> Tensor:
@@ -320,10 +363,20 @@ def gradient_at(z: Tensor, value: Tensor) -> Tensor | None:
     return z.grad
 
 
-def _emptied(tensor: Tensor, watch: Watch) -> Tensor:
-    """The tensor, or one number in its shape if nobody read it."""
-    keep = watch.was_read(tensor) or tensor.is_inference() or tensor.layout != torch.strided
-    return tensor if keep else tensor.new_empty(()).expand(tensor.shape)
+def _is_read(tensor: Tensor, watch: Watch) -> bool:
+    """True unless it is known that nobody looks into the tensor's memory."""
+    return watch.was_read(tensor) or tensor.is_inference() or tensor.layout != torch.strided
+
+
+def _own(arguments: Sequence[Any]) -> Any:
+    """Copies: the network may change them in place, the caller's must not change."""
+    return map_tensors(tuple(arguments), lambda _, t: t.detach().clone())
+
+
+def _shapes(arguments: Sequence[Any]) -> Any:
+    """What two lists of arguments must share for a network without branches to treat them alike."""
+    tensors = [(t.shape, t.dtype, t.device) for _, t in tensors_in(tuple(arguments))]
+    return tensors, repr(map_tensors(tuple(arguments), lambda _, t: t.new_empty(0)))
 
 
 def _around(inner: nn.Module, modules: dict[str, nn.Module]) -> set[nn.Module]:

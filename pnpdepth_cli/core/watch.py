@@ -33,11 +33,28 @@ class Remembered:
 class Call(Remembered):
     """One call of a submodule that every later pass makes too.
 
-    `kept` is true where the pass hands back `output` instead of running the submodule.
+    `kept` is true where the pass hands back `output` instead of running the submodule, `known`
+    where that is the output for the arguments at hand. `unread`: its tensors nobody looks into.
     """
 
     module: nn.Module
     kept: bool = False
+    known: bool = False
+    unread: frozenset[tuple[str, ...]] = frozenset()
+
+    def remember(self, output: Any) -> None:
+        """`output` is what is handed back; of unread tensors only the shape, in one number."""
+
+        def kept(path: tuple[str, ...], tensor: Tensor) -> Tensor:
+            if path in self.unread:
+                return tensor.new_empty(()).expand(tensor.shape)
+            return tensor.clone() if self.copied else tensor
+
+        self.output, self.known = map_tensors(output, kept), True
+
+    def forget(self) -> None:
+        """Nothing is remembered, until the submodule has run for other arguments."""
+        self.output, self.known = None, False
 
 
 @dataclass(frozen=True)
@@ -53,8 +70,9 @@ class Watch(TorchDispatchMode):
     """Sees every tensor operation of a pass.
 
     It marks what depends on z by its storage, notes which operation made which storage and which
-    storages are changed in place, notes where a value (not a shape) that depends on z gets out to
-    Python, and gives a remembered tensor its own copy just before it would be changed in place.
+    storages are changed in place, notes where a value (not a shape) gets out to Python (`escaped`;
+    `data_dependent` where it depends on z), and gives a remembered tensor its own copy just before
+    it would be changed in place.
     """
 
     @classmethod
@@ -66,7 +84,7 @@ class Watch(TorchDispatchMode):
     def __init__(self, remembered: Iterable[Remembered], *, reads: bool = False) -> None:
         super().__init__()  # type: ignore[no-untyped-call]
         self._reads: set[int] | None = set() if reads else None
-        self.data_dependent = False
+        self.data_dependent = self.escaped = False
         self._operations = 0
         self._touches = 0
         self._writes: list[int] = []  # which operation had made what was changed; 0: none seen here
@@ -130,6 +148,7 @@ class Watch(TorchDispatchMode):
 
     def _noticing(self, method: Callable[..., Any]) -> Callable[..., Any]:
         def wrapped(tensor: Tensor, *args: Any, **kwargs: Any) -> Any:
+            self.escaped = True
             self.data_dependent |= self._any_marked(tensor)
             return method(tensor, *args, **kwargs)
 
@@ -160,6 +179,7 @@ class Watch(TorchDispatchMode):
             self._touches += 1
             self._marked |= results | {_storage(tensor) for tensor in written}
             self.data_dependent |= facts.escapes
+        self.escaped |= facts.escapes
         return result
 
     def note_reads(self, structure: Any) -> None:

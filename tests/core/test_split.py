@@ -6,6 +6,7 @@ import gc
 import inspect
 import weakref
 from typing import Any
+from unittest import mock
 
 import pytest
 import torch
@@ -51,16 +52,18 @@ NO_CUT = {
 @pytest.mark.parametrize("name", NETWORKS)
 def test_the_rear_of_the_front_is_the_network_bit_for_bit_at_every_layer(name: str) -> None:
     network, x = build(name), picture()
-    whole = depth_of(plain(network, x))
+    frames = [x, x.flip(3) * 0.7, x]
+    wholes = [depth_of(plain(network, frame)) for frame in frames]
     layers = [layer for layer, _ in network.named_modules(remove_duplicate=False) if layer]
     can, cannot = 0, set()
     while layers:
         layer = layers.pop(0)
         try:
             with Split(network, layer) as split, torch.no_grad():
-                z = split.front(x)
-                for _ in range(3):
-                    assert torch.equal(depth_of(split.rear(z)), whole), layer
+                for frame, whole in zip(frames, wholes, strict=True):
+                    z = split.front(frame)
+                    for _ in range(3):
+                        assert torch.equal(depth_of(split.rear(z)), whole), layer
             can += 1
         except LayerError as error:
             if "say which" in str(error):
@@ -69,7 +72,7 @@ def test_the_rear_of_the_front_is_the_network_bit_for_bit_at_every_layer(name: s
                 cannot.add(layer)
     assert cannot == NO_CUT.get(name, set())
     assert can > 1
-    assert torch.equal(depth_of(plain(network, x)), whole)
+    assert torch.equal(depth_of(plain(network, x)), wholes[0])
 
 
 @pytest.mark.parametrize("layer", ["cut", "head", "enter"])
@@ -131,6 +134,57 @@ def test_a_second_front_starts_over_with_the_new_picture() -> None:
     with Split(network, "bottleneck") as split, torch.no_grad():
         split.rear(split.front(x))
         assert torch.equal(split.rear(split.front(other)), whole)
+
+
+class ChoosesByValue(nn.Module):
+    """In front of the cut, one of two branches; the second changes what the first only reads."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.enter, self.one, self.relu = conv(3, 4), conv(4, 4), nn.ReLU(inplace=True)
+        self.cut, self.head = conv(4, 4), conv(8, 1)
+
+    def forward(self, x: Tensor) -> Tensor:
+        y = self.enter(x)
+        features = self.one(y) if bool(x.mean() > 0.4) else self.relu(y)
+        return self.head(torch.cat([self.cut(features), y], 1))
+
+
+def test_a_network_that_chooses_by_value_is_learned_anew_for_every_frame() -> None:
+    torch.manual_seed(0)
+    network, x = ChoosesByValue(), picture()
+    frames = [x, x * 0.5, x, x * 0.5]
+    wholes = [plain(network, frame) for frame in frames]
+    with Split(network, "cut") as split, torch.no_grad():
+        for frame, whole in zip(frames, wholes, strict=True):
+            z = split.front(frame)
+            for _ in range(2):
+                assert torch.equal(split.rear(z), whole)
+
+
+def test_a_frame_of_another_size_is_learned_anew() -> None:
+    network, frames = build("unet"), [picture(), picture(32, 16), picture() * 0.5]
+    wholes = [plain(network, frame) for frame in frames]
+    with Split(network, "bottleneck") as split, torch.no_grad():
+        for frame, whole in zip(frames, wholes, strict=True):
+            assert torch.equal(split.rear(split.front(frame)), whole)
+
+
+def test_further_frames_are_not_watched_and_hold_no_more_memory() -> None:
+    network, x = build("unet"), picture()
+    whole = plain(network, x)
+    held: list[list[int]] = []
+    with Split(network, "bottleneck") as split, torch.no_grad():
+        for _ in range(2):
+            assert torch.equal(split.rear(split.front(x)), whole)
+            held.append([_bytes(call.output) for call in split._calls])
+            split._watching = mock.Mock(side_effect=AssertionError("watched"))  # type: ignore[method-assign]
+    assert held[0] == held[1]
+    assert sum(held[0]) > 0
+
+
+def _bytes(output: Any) -> int:
+    return sum(tensor.untyped_storage().nbytes() for _, tensor in tensors_in(output))
 
 
 def test_the_network_may_be_called_for_itself_while_it_is_cut() -> None:
