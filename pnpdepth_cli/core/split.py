@@ -21,7 +21,7 @@ import contextlib
 import difflib
 import functools
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from types import TracebackType
 from typing import Any
@@ -86,12 +86,11 @@ class Split:
     def __enter__(self) -> Split:
         modules = list(self._network.modules())
         self._state = NetworkState(self._network)
-        self._forwards = [(module, module.__dict__.get("forward")) for module in modules]
+        self._forwards = {module: module.__dict__.get("forward") for module in modules}
         try:
+            self._stand_ins = {m: self._stand_in(m, m.forward) for m in modules}
             self._network.eval()
             self._state.freeze()
-            for module in modules:
-                module.__dict__["forward"] = self._stand_in(module, module.forward)
         except BaseException:
             self.__exit__(None, None, None)
             raise
@@ -103,18 +102,25 @@ class Split:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        for module, own_forward in self._forwards:
-            if own_forward is None:
+        self._stand_in_for(())
+        self._state.close()
+        self._forget()
+
+    def _stand_in_for(self, modules: Collection[nn.Module]) -> None:
+        """Calls of these submodules come by here, and of no others."""
+        for module, own_forward in self._forwards.items():
+            if module in modules:
+                module.__dict__["forward"] = self._stand_ins[module]
+            elif own_forward is None:
                 module.__dict__.pop("forward", None)
             else:
                 module.__dict__["forward"] = own_forward
-        self._state.close()
-        self._forget()
 
     def front(self, *arguments: Any) -> Tensor:
         """z_0, the output of the cut layer for these arguments of the network."""
         if self._learned and self._repeats and self._shapes == _shapes(arguments):
             return self._front_of_another_frame(arguments)
+        self._stand_in_for(self._forwards)
         while True:
             self._forget()
             self._shapes = _shapes(arguments)
@@ -173,6 +179,7 @@ class Split:
         self._index()
         self._learned = True
         self._repeats &= not watch.escaped
+        self._stand_in_for({call.module for call in self._calls if self._matters(call)})
         return output
 
     @contextmanager
@@ -194,6 +201,9 @@ class Split:
                 return self._network(*self._given.hand_back())
         finally:
             self._passing = False
+
+    def _matters(self, call: Call) -> bool:
+        return call.kept or call is self._cut_call
 
     def _forget(self) -> None:
         self._given, self._z0, self._z = Remembered(()), None, None

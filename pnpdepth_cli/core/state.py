@@ -20,7 +20,7 @@ class NetworkState:
         self._learning = [(p, p.requires_grad) for p in network.parameters()]
         # Frozen torch scripts have neither a mode nor buffers that can be set.
         modules = [m for m in network.modules() if not isinstance(m, torch.jit.ScriptModule)]
-        self._buffers = [(m, dict(m._buffers)) for m in modules]
+        self._buffers = [(m, dict(m._buffers)) for m in modules if m._buffers]
         self._modes = [(m, m.training) for m in network.modules() if hasattr(m, "training")]
 
     def freeze(self) -> None:
