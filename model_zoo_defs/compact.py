@@ -373,16 +373,18 @@ class Compact(nn.Module):
         return F.pixel_shuffle(mixed, 2)
 
 
-definition = ModelDefinition(
-    name="compact",
-    summary="the program's own network, trained on rendered scenes only",
-    licence="Apache-2.0",
-    input_kind="rgb+sparse",
-    size=Multiple(32, longest=1280),
-    normalisation=Normalisation(mean=IMAGENET_MEAN, std=IMAGENET_STD),
-    output_kind="depth",
-    layers=("decoder.s32", "decoder.s16", "decoder.s8", "decoder.s4", "decoder.s2"),
-    defaults=RefineDefaults(layer="decoder.s8", lr="3%"),
-    build=Compact,
-    checkpoint=Path(__file__).parent / "weights" / "compact.safetensors",
-)
+definitions = {
+    "compact": ModelDefinition(
+        name="compact",
+        summary="the program's own network, trained on rendered scenes only",
+        licence="Apache-2.0",
+        input_kind="rgb+sparse",
+        size=Multiple(32, longest=1280),
+        normalisation=Normalisation(mean=IMAGENET_MEAN, std=IMAGENET_STD),
+        output_kind="depth",
+        layers=("decoder.s32", "decoder.s16", "decoder.s8", "decoder.s4", "decoder.s2"),
+        defaults=RefineDefaults(layer="decoder.s8", lr="3%"),
+        build=Compact,
+        checkpoint=Path(__file__).parent / "weights" / "compact.safetensors",
+    ),
+}

@@ -88,14 +88,16 @@ class NConv(NormalisedUNet):
         return super().forward(sparse, (sparse > 0).to(sparse))[0]
 
 
-definition = ModelDefinition(
-    name="nconv",
-    summary="normalised convolutions, 481 parameters, outdoor depth completion",
-    paper="Eldesokey et al., Confidence Propagation through CNNs, PAMI 2019",
-    licence="published weights: GPL-3.0, not shipped",
-    input_kind="sparse",
-    size=Multiple(8),
-    build=NConv,
-    layers=("nconv1[0]", "nconv2#1[0]", "nconv6[0]"),
-    defaults=RefineDefaults(),
-)
+definitions = {
+    "nconv": ModelDefinition(
+        name="nconv",
+        summary="normalised convolutions, 481 parameters, outdoor depth completion",
+        paper="Eldesokey et al., Confidence Propagation through CNNs, PAMI 2019",
+        licence="published weights: GPL-3.0, not shipped",
+        input_kind="sparse",
+        size=Multiple(8),
+        build=NConv,
+        layers=("nconv1[0]", "nconv2#1[0]", "nconv6[0]"),
+        defaults=RefineDefaults(),
+    ),
+}

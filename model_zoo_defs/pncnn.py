@@ -127,14 +127,16 @@ class Pncnn(nn.Module):
         return depth
 
 
-definition = ModelDefinition(
-    name="pncnn",
-    summary="normalised convolutions with learned input confidence, depth completion",
-    paper="Eldesokey et al., Uncertainty-Aware CNNs for Depth Completion, CVPR 2020",
-    licence="published weights: GPL-3.0, not shipped",
-    input_kind="sparse",
-    size=Multiple(8),
-    build=Pncnn,
-    layers=("conf_estimator.down3", "conf_estimator.up4", "conf_estimator"),
-    defaults=RefineDefaults(),
-)
+definitions = {
+    "pncnn": ModelDefinition(
+        name="pncnn",
+        summary="normalised convolutions with learned input confidence, depth completion",
+        paper="Eldesokey et al., Uncertainty-Aware CNNs for Depth Completion, CVPR 2020",
+        licence="published weights: GPL-3.0, not shipped",
+        input_kind="sparse",
+        size=Multiple(8),
+        build=Pncnn,
+        layers=("conf_estimator.down3", "conf_estimator.up4", "conf_estimator"),
+        defaults=RefineDefaults(),
+    ),
+}

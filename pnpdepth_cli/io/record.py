@@ -18,9 +18,10 @@ from pnpdepth_cli.io.opening import one_line, read_bytes
 
 def write_json(path: Path, mapping: Mapping[str, Any]) -> None:
     """`path` holds the mapping as indented JSON in its own order; NaN and infinity are null."""
-    text = json.dumps(_plain(mapping), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+    text = json.dumps(plain(mapping), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
     with atomic_path(path) as temporary:
-        temporary.write_text(text, encoding="utf-8", newline="\n")
+        # A file name that is no UTF-8 has characters that are none; \udcff is how JSON spells them.
+        temporary.write_text(text, encoding="utf-8", errors="backslashreplace", newline="\n")
 
 
 def read_json(path: Path) -> dict[str, Any]:
@@ -38,8 +39,16 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def sha256_of(path: Path) -> str:
-    """The SHA-256 of the file's content, 64 hexadecimal digits."""
+    """The SHA-256 of the file's content, 64 hexadecimal digits.
+
+    Of a folder, that of its files' names and digests, in the order of the names.
+    """
     digest = hashlib.sha256()
+    if path.is_dir():
+        for inside in sorted(path.iterdir()):
+            if inside.is_file():
+                digest.update(f"{inside.name} {sha256_of(inside)}\n".encode())
+        return digest.hexdigest()
     try:
         with path.open("rb") as file:
             while block := file.read(1 << 20):
@@ -50,13 +59,14 @@ def sha256_of(path: Path) -> str:
     return digest.hexdigest()
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
+    """The value in JSON's own types; NaN and infinity are None."""
     if isinstance(value, Mapping):
-        return {str(key): _plain(item) for key, item in value.items()}
+        return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_plain(item) for item in value]
+        return [plain(item) for item in value]
     if isinstance(value, (np.ndarray, np.generic)):
-        return _plain(value.tolist())
+        return plain(value.tolist())
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     if isinstance(value, Path):

@@ -1,12 +1,14 @@
 """Weights from files, without running anything that is in them.
 
-safetensors files hold tensors only. torch files are pickles; they are read with
-`weights_only=True`, which refuses everything but tensors and plain containers. Where more is in
-them (whole modules, optimisers, arguments), `tensor_pickle` takes the tensors out and runs nothing.
+safetensors files hold tensors only, numpy files arrays, TensorFlow checkpoints variables. torch
+files are pickles; they are read with `weights_only=True`, which refuses everything but tensors and
+plain containers. Where more is in them (whole modules, optimisers, arguments), `tensor_pickle`
+takes the tensors out and runs nothing.
 """
 
 from __future__ import annotations
 
+import functools
 import pickle
 from collections.abc import Mapping
 from pathlib import Path
@@ -17,15 +19,20 @@ from torch import Tensor, nn
 
 from pnpdepth_cli.core.foreign import describe
 from pnpdepth_cli.errors import CheckpointError, ModelError
+from pnpdepth_cli.models import registry
 from pnpdepth_cli.models.definition import ModelDefinition
-from pnpdepth_cli.models.tensor_pickle import (
-    Instance,
-    is_module,
-    module_state,
-    read_tensor_file,
-)
+from pnpdepth_cli.models.numpy_file import SUFFIXES as NUMPY_SUFFIXES
+from pnpdepth_cli.models.numpy_file import read_numpy_file
+from pnpdepth_cli.models.pickle_machine import Instance
+from pnpdepth_cli.models.tensor_bundle import SUFFIX as BUNDLE_SUFFIX
+from pnpdepth_cli.models.tensor_bundle import read_tensor_bundle
+from pnpdepth_cli.models.tensor_pickle import is_module, module_state, read_tensor_file
 
 _STATE_KEYS = ("state_dict", "model_state_dict", "model_state", "model", "network", "net", "params")
+_SUFFIXES = (".safetensors", ".pth", ".pt", ".bin", ".ckpt", ".tar", *NUMPY_SUFFIXES)
+_COUNTER = "num_batches_tracked"
+_LFS_POINTER = b"version https://git-lfs"
+_TOLD = ("data", "dataset", "arch", "decoder", "modality", "height", "width")
 _SHOWN = 4
 
 
@@ -33,36 +40,52 @@ def read_checkpoint(path: Path) -> dict[str, Tensor]:
     """The tensors of a checkpoint by name, on the CPU. CheckpointError if that cannot be had.
 
     In a torch file they may lie in an entry such as "state_dict" beside an epoch or an optimiser.
+    Numpy files hold them as arrays, TensorFlow checkpoints (PREFIX.index) as variables. A folder
+    holds several files, such as encoder.pth and decoder.pth; the name of the file, up to its first
+    dot, comes before the names in it.
     """
-    if not path.is_file():
-        raise CheckpointError(
-            f"checkpoint {path} {'is a folder' if path.exists() else 'does not exist'}"
-        )
-    if path.suffix == ".safetensors":
-        return _read_safetensors(path)
-    return _state_in(_read_torch(path)[0], path)
+    return _read(path)[0]
 
 
 def load_checkpoint(network: nn.Module, definition: ModelDefinition, path: Path) -> list[str]:
     """The network has the weights of the file; returns notes on what was done to fit them.
 
-    CheckpointError if a key is missing, left over, or of another shape.
+    CheckpointError if a key is missing, left over, or of another shape; it names the network of the
+    registry that the file does fit. The counters of batch normalisations may be missing, as in
+    files from before PyTorch 0.4.1: they matter in training only.
     """
-    state: Mapping[str, Tensor]
-    notes: list[str] = []
-    if path.is_file() and path.suffix != ".safetensors":
-        content, notes = _read_torch(path)
-        state = _state_in(content, path)
-    else:
-        state = read_checkpoint(path)
+    given, notes = _read(path)
     own = {n: t for n, t in network.state_dict().items() if isinstance(t, Tensor)}
-    if state and _all_in_module(state) and not _all_in_module(own):
-        state = {name.removeprefix("module."): tensor for name, tensor in state.items()}
-        notes.append(f"checkpoint {path.name}: prefix 'module.' of every key stripped")
-    if definition.read_checkpoint is not None:
-        state = _converted(definition, state, path)
+    if given and _all_in_module(given) and not _all_in_module(own):
+        given = {name.removeprefix("module."): tensor for name, tensor in given.items()}
+        notes = [*notes, f"checkpoint {path.name}: prefix 'module.' of every key stripped"]
+    try:
+        state = _fitted(definition, own, given, path)
+    except CheckpointError:
+        fitting = _networks_it_fits(given, path, definition.name)
+        if not fitting:
+            raise
+        raise CheckpointError(
+            f"checkpoint {path} does not fit network {definition.name!r}: this is"
+            f" {_some(fitting, ' or ')}; use --model {fitting[0]}"
+        ) from None
+    try:
+        network.load_state_dict({**own, **state})
+    except RuntimeError as error:
+        raise _misfit(path, definition, describe(error)) from None
+    return notes
+
+
+def _fitted(
+    definition: ModelDefinition,
+    own: Mapping[str, Tensor],
+    given: Mapping[str, Tensor],
+    path: Path,
+) -> Mapping[str, Tensor]:
+    """The state dict for a network whose own it is to replace. CheckpointError if it is not one."""
+    state = given if definition.read_checkpoint is None else _converted(definition, given, path)
     problems = [
-        *_listed("missing", [name for name in own if name not in state]),
+        *_listed("missing", [n for n in own if n not in state and not n.endswith(_COUNTER)]),
         *_listed("unexpected", [name for name in state if name not in own]),
         *_listed(
             "of another shape",
@@ -75,11 +98,32 @@ def load_checkpoint(network: nn.Module, definition: ModelDefinition, path: Path)
     ]
     if problems:
         raise _misfit(path, definition, "; ".join(problems))
+    return state
+
+
+def _networks_it_fits(given: Mapping[str, Tensor], path: Path, asked: str) -> list[str]:
+    """The networks of the registry whose weights these are; those that end as `asked` come first.
+
+    Names and shapes decide, so variants for other picture sizes (`-kitti`) fit too.
+    """
+    fitting = [name for name in registry.names() if _fits(name, given, path)]
+    ending = asked.rpartition("-")[2]
+    return sorted(fitting, key=lambda name: name.rpartition("-")[2] != ending)
+
+
+def _fits(name: str, given: Mapping[str, Tensor], path: Path) -> bool:
     try:
-        network.load_state_dict(dict(state))
-    except RuntimeError as error:
-        raise _misfit(path, definition, describe(error)) from None
-    return notes
+        _fitted(registry.find_definition(name), _shapes_of(name), given, path)
+    except ModelError:
+        return False
+    return True
+
+
+@functools.cache
+def _shapes_of(name: str) -> dict[str, Tensor]:
+    """The state dict of a network of the registry, without its values."""
+    with torch.device("meta"):
+        return registry.find_definition(name).build().state_dict()
 
 
 def _misfit(path: Path, definition: ModelDefinition, why: str) -> CheckpointError:
@@ -91,10 +135,56 @@ def _all_in_module(state: Mapping[str, Any]) -> bool:
 
 
 def _listed(what: str, names: list[str]) -> list[str]:
-    if not names:
-        return []
+    return [f"{len(names)} {what} ({_some(names)})"] if names else []
+
+
+def _some(names: list[str], between: str = ", ") -> str:
+    """The first few of the names, and how many more there are."""
     more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
-    return [f"{len(names)} {what} ({', '.join(names[:_SHOWN])}{more})"]
+    return f"{between.join(names[:_SHOWN])}{more}"
+
+
+def _read(path: Path) -> tuple[dict[str, Tensor], list[str]]:
+    """The named tensors of a file or folder, and what to say of it."""
+    if path.is_dir():
+        return _read_folder(path)
+    if not path.is_file():
+        index = path.with_name(path.name + BUNDLE_SUFFIX)
+        instead = f"; {index.name} does, name that" if index.is_file() else ""
+        raise CheckpointError(f"checkpoint {path} does not exist{instead}")
+    if _is_lfs_pointer(path):
+        raise CheckpointError(
+            f"checkpoint {path} is a Git LFS pointer, not the file it points to; `git lfs pull`"
+            " fetches that"
+        )
+    if path.suffix == ".safetensors":
+        return _read_safetensors(path), []
+    if path.suffix in NUMPY_SUFFIXES:
+        return read_numpy_file(path), []
+    if path.suffix == BUNDLE_SUFFIX:
+        return read_tensor_bundle(path), []
+    content, notes = _read_torch(path)
+    return _state_in(content, path), notes + _trained_with(content, path)
+
+
+def _is_lfs_pointer(path: Path) -> bool:
+    with path.open("rb") as file:
+        return file.read(len(_LFS_POINTER)) == _LFS_POINTER
+
+
+def _read_folder(folder: Path) -> tuple[dict[str, Tensor], list[str]]:
+    files = sorted(file for file in folder.iterdir() if file.suffix in _SUFFIXES)
+    if not files:
+        raise CheckpointError(
+            f"checkpoint {folder} is a folder without weights; it may hold {', '.join(_SUFFIXES)}"
+        )
+    state: dict[str, Tensor] = {}
+    notes = [f"checkpoint {folder.name}: {', '.join(file.name for file in files)}"]
+    for file in files:
+        part, said = _read(file)
+        state |= {f"{file.name.partition('.')[0]}.{name}": tensor for name, tensor in part.items()}
+        notes += said
+    return state, notes
 
 
 def _read_safetensors(path: Path) -> dict[str, Tensor]:
@@ -116,10 +206,9 @@ def _read_torch(path: Path) -> tuple[Any, list[str]]:
     except pickle.UnpicklingError:
         read = read_tensor_file(path)
         foreign = [name for name in read.named if not name.startswith(("torch.", "collections."))]
-        named = ", ".join(foreign[:_SHOWN]) or "classes of torch"
-        more = f" and {len(foreign) - _SHOWN} more" if len(foreign) > _SHOWN else ""
+        named = _some(foreign) or "classes of torch"
         note = (
-            f"checkpoint {path.name}: its pickle names {named}{more}; its tensors were taken out,"
+            f"checkpoint {path.name}: its pickle names {named}; its tensors were taken out,"
             " nothing of it was run"
         )
         return read.content, [note]
@@ -130,6 +219,19 @@ def _read_torch(path: Path) -> tuple[Any, list[str]]:
         raise CheckpointError(
             f"checkpoint {path} cannot be read as a torch file ({reason})"
         ) from None
+
+
+def _trained_with(content: Any, path: Path) -> list[str]:
+    """What the training's arguments say, where they are kept beside the weights.
+
+    Weights for other data or pictures of another size may fit all the same.
+    """
+    given = content.get("args") if isinstance(content, Mapping) else None
+    given = given.state if isinstance(given, Instance) else given
+    if not isinstance(given, Mapping):
+        return []
+    said = [f"{key} {given[key]}" for key in _TOLD if isinstance(given.get(key), str | int)]
+    return [f"checkpoint {path.name}: trained with {', '.join(said)}"] if said else []
 
 
 def _state_in(content: Any, path: Path) -> dict[str, Tensor]:

@@ -80,8 +80,9 @@ class RefineDefaults:
     """How the network is refined when nobody says otherwise.
 
     `lr` is a number (absolute, as in the paper) or a text like "3%" (of the standard deviation of
-    z_0). `layer` None is the definition's first layer. `align` None is "none" for a metric network
-    and "auto" for any other. The values here are the paper's.
+    z_0). `schedule` and `spread` are those of `pnpdepth_cli.core.refine.RefineSettings`. `layer`
+    None is the definition's first layer. `align` None is "none" for a metric network and "auto" for
+    any other. The values here are the paper's.
     """
 
     layer: str | None = None
@@ -89,11 +90,18 @@ class RefineDefaults:
     lr: float | str = 0.01
     loss: str = "l1"
     update: str = "sign"
+    schedule: str = "constant"
+    spread: float = 0.0
     align: str | None = None
 
 
-FOREIGN = RefineDefaults(iterations=20, lr="3%", update="adam")
-"""For networks that nobody here has tuned: steps that follow the feature map's own scale."""
+FOREIGN = RefineDefaults(
+    iterations=20, lr="25%", loss="cauchy", update="normalised", schedule="linear", spread=1.0
+)
+"""For networks that nobody here has tuned: steps that follow the feature map's own scale.
+
+Chosen with FastDepth on rendered rooms; Adam with steps of 3 % left a quarter more of the error.
+"""
 
 
 def _inputs_as_named(

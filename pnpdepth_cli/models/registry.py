@@ -7,7 +7,7 @@ import importlib
 import importlib.util
 import inspect
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -20,37 +20,55 @@ DEFAULT_MODEL = "compact"
 
 _ATTRIBUTE = "definition"
 _MULTIPLE = 32  # what the sides of a picture are padded to where nobody says
-_WEIGHTS_ONLY = (".pt", ".pth", ".ts", ".torchscript", ".ckpt", ".bin", ".safetensors", ".tar")
+_WEIGHTS_ONLY = (
+    *(".pt", ".pth", ".ts", ".torchscript", ".ckpt", ".bin", ".safetensors", ".tar"),
+    *(".npy", ".npz", ".index"),
+)
 
-_MODULES = {
-    "compact": "model_zoo_defs.compact",
-    "nconv": "model_zoo_defs.nconv",
-    "pncnn": "model_zoo_defs.pncnn",
-}
+# Each is a file of model_zoo_defs with `definitions`, by name: the family itself and its variants.
+_FAMILIES = (
+    "compact",
+    "eigen",
+    "fcrn",
+    "sfmlearner",
+    "sparseconv",
+    "adnn",
+    "sparse2dense",
+    "latefusion",
+    "nconv",
+    "pncnn",
+)
 
 
 def names() -> list[str]:
-    """The networks that can be named."""
-    return list(_MODULES)
+    """The networks that can be named: every family with its variants, each by its own name."""
+    every = (_definitions(family).values() for family in _FAMILIES)
+    return list(dict.fromkeys(definition.name for some in every for definition in some))
+
+
+def _definitions(family: str) -> Mapping[str, ModelDefinition]:
+    definitions: Mapping[str, ModelDefinition]
+    definitions = importlib.import_module(f"model_zoo_defs.{family}").definitions
+    return definitions
 
 
 def find_definition(spec: str) -> ModelDefinition:
     """The definition for `NAME` or `file.py[:attribute]` (attribute `definition` by default).
 
-    The Python file is run, as importing it would. ModelError if there is no such name or file, if
-    the file raises, or if what it defines is not a ModelDefinition.
+    A name is that of a family, or of a variant of it as in `fcrn-tiny`. The Python file is run, as
+    importing it would. ModelError if there is no such name or file, if the file raises, or if what
+    it defines is not a ModelDefinition.
     """
-    if spec in _MODULES:
-        definition = importlib.import_module(_MODULES[spec]).definition
-        assert isinstance(definition, ModelDefinition)
-        return definition
+    family = spec.partition("-")[0]
+    if family in _FAMILIES and spec in _definitions(family):
+        return _definitions(family)[spec]
     foreign = _foreign(spec)
     if foreign is not None:
         return foreign
     file, attribute = _file_and_attribute(spec)
     if file.suffix != ".py":
-        near = difflib.get_close_matches(spec, _MODULES, n=1)
-        hint = f"did you mean {near[0]!r}?" if near else f"known: {', '.join(_MODULES)}"
+        near = difflib.get_close_matches(spec, names(), n=1)
+        hint = f"did you mean {near[0]!r}?" if near else f"known: {', '.join(names())}"
         raise ModelError(f"model {spec!r} is neither a known name nor a Python file; {hint}")
     module = _run(file)
     found = getattr(module, attribute, None)

@@ -84,11 +84,22 @@ def test_the_digest_is_that_of_the_content(tmp_path: Path) -> None:
     assert sha256_of(tmp_path / "f") == hashlib.sha256(content).hexdigest()
 
 
+def test_the_digest_of_a_folder_is_that_of_its_files_by_name(tmp_path: Path) -> None:
+    (tmp_path / "one").mkdir()
+    (tmp_path / "other").mkdir()
+    for folder in ("one", "other"):
+        for name in ("fine.pth", "coarse.pth"):
+            (tmp_path / folder / name).write_text(name)
+    assert sha256_of(tmp_path / "one") == sha256_of(tmp_path / "other")
+    (tmp_path / "other" / "fine.pth").rename(tmp_path / "other" / "finer.pth")
+    assert sha256_of(tmp_path / "one") != sha256_of(tmp_path / "other")
+
+
 def test_missing_files_and_folders_are_our_errors(tmp_path: Path) -> None:
     for read in (read_json, sha256_of):
         with pytest.raises(InputError):
             read(tmp_path / "none.json")
-        with pytest.raises(InputError):
-            read(tmp_path)
+    with pytest.raises(InputError):
+        read_json(tmp_path)
     with pytest.raises(OutputError, match="its folder does not exist"):
         write_json(tmp_path / "none" / "r.json", {})

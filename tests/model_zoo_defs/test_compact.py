@@ -6,7 +6,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from model_zoo_defs.compact import Compact, definition
+from model_zoo_defs.compact import Compact, definitions
+
+definition = definitions["compact"]
 
 
 @pytest.fixture(scope="module")

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import argparse
 import os
 import pickle
 import zipfile
 from collections import OrderedDict
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import HealthCheck, given, settings
@@ -20,6 +23,8 @@ from torch import Tensor, nn
 from pnpdepth_cli.errors import CheckpointError, ModelError
 from pnpdepth_cli.models.checkpoint import load_checkpoint, read_checkpoint
 from pnpdepth_cli.models.definition import ModelDefinition, Multiple
+from pnpdepth_cli.models.registry import find_definition
+from tests.models.numpy_files import write_npy
 
 
 class Net(nn.Module):
@@ -98,6 +103,43 @@ def test_a_network_whose_own_names_start_so_keeps_them(tmp_path: Path) -> None:
     fresh = nn.DataParallel(Net())
     assert load_checkpoint(fresh, definition(), tmp_path / "w.pth") == []
     assert equal(fresh.state_dict(), network.state_dict())
+
+
+def test_files_from_before_torch_counted_batches_are_read(tmp_path: Path) -> None:
+    old = {k: v for k, v in weights().items() if not k.endswith("num_batches_tracked")}
+    assert len(old) == len(weights()) - 1
+    torch.save(old, tmp_path / "w.pth")
+    assert equal(loaded(tmp_path / "w.pth")[0], weights())
+
+
+def test_numpy_files_are_read(tmp_path: Path) -> None:
+    np.savez(tmp_path / "w.npz", **{name: t.numpy() for name, t in weights().items()})
+    state, notes = loaded(tmp_path / "w.npz")
+    assert equal(state, weights())
+    assert notes == []
+    layers: dict[str, dict[str, Any]] = {"conv": {}, "norm": {}}
+    for name, tensor in weights().items():
+        layers[name.partition(".")[0]][name.partition(".")[2]] = tensor.numpy()
+    assert equal(loaded(write_npy(tmp_path / "w.npy", layers))[0], weights())
+
+
+def test_the_files_of_a_folder_are_parts_by_their_names(tmp_path: Path) -> None:
+    parts: dict[str, dict[str, Tensor]] = {"conv": {}, "norm": {}}
+    for name, tensor in weights().items():
+        parts[name.partition(".")[0]][name.partition(".")[2]] = tensor
+    torch.save({"state_dict": parts["conv"]}, tmp_path / "conv.pth.tar")
+    save_file(parts["norm"], tmp_path / "norm.safetensors")
+    (tmp_path / "README.md").write_text("weights")
+    state, notes = loaded(tmp_path)
+    assert equal(state, weights())
+    assert notes == [f"checkpoint {tmp_path.name}: conv.pth.tar, norm.safetensors"]
+
+
+def test_what_the_training_was_told_is_said(tmp_path: Path) -> None:
+    args = argparse.Namespace(arch="resnet18", data="kitti", lr=0.1, secret="x", decoder=None)
+    torch.save({"args": args, "state_dict": weights()}, tmp_path / "w.pth")
+    notes = loaded(tmp_path / "w.pth")[1]
+    assert notes[-1] == "checkpoint w.pth: trained with data kitti, arch resnet18"
 
 
 def test_a_definition_may_rename_what_a_published_file_holds(tmp_path: Path) -> None:
@@ -182,14 +224,39 @@ def test_a_file_without_named_tensors_is_said(content: Any, said: str, tmp_path:
         read_checkpoint(tmp_path / "w.pth")
 
 
+def test_weights_of_another_known_network_name_it(tmp_path: Path) -> None:
+    torch.save(find_definition("nconv").build().state_dict(), tmp_path / "w.pth")
+    with pytest.raises(CheckpointError) as error:
+        loaded(tmp_path / "w.pth")
+    assert str(error.value).endswith("does not fit network 'net': this is nconv; use --model nconv")
+
+
+def test_of_several_that_fit_the_one_that_ends_as_asked_comes_first(tmp_path: Path) -> None:
+    state = find_definition("sparse2dense-r18-deconv3").build().state_dict()
+    torch.save(state, tmp_path / "w.pth")
+    with pytest.raises(CheckpointError, match=r"--model sparse2dense-r18-deconv3-kitti$"):
+        load_checkpoint(
+            Net(), replace(definition(), name="sparse2dense-r50-upproj-kitti"), tmp_path / "w.pth"
+        )
+    with pytest.raises(CheckpointError, match=r"--model sparse2dense-r18-deconv3$"):
+        loaded(tmp_path / "w.pth")
+
+
 # ------------------------------------------------------------------ broken files
 
 
 def test_a_path_that_is_no_file_is_said(tmp_path: Path) -> None:
     with pytest.raises(CheckpointError, match="does not exist"):
         read_checkpoint(tmp_path / "absent.pth")
-    with pytest.raises(CheckpointError, match="is a folder"):
+    with pytest.raises(CheckpointError, match="is a folder without weights"):
         read_checkpoint(tmp_path)
+
+
+def test_a_pointer_to_a_file_that_was_not_fetched_is_said(tmp_path: Path) -> None:
+    pointer = "version https://git-lfs.github.com/spec/v1\noid sha256:b497\nsize 126396039\n"
+    (tmp_path / "w.pth.tar").write_text(pointer)
+    with pytest.raises(CheckpointError, match="is a Git LFS pointer"):
+        read_checkpoint(tmp_path / "w.pth.tar")
 
 
 GARBAGE = [b"", b"\0" * 50, b"not a checkpoint\n", b"<html>", b"\x80\x02}q\0.", b"PK\x03\x04"]
@@ -204,7 +271,7 @@ def one_line_about(path: Path) -> str:
     return str(error.value)
 
 
-@pytest.mark.parametrize("suffix", [".pth", ".safetensors"])
+@pytest.mark.parametrize("suffix", [".pth", ".safetensors", ".npy", ".npz"])
 @pytest.mark.parametrize(
     "content",
     GARBAGE,
@@ -228,7 +295,7 @@ def test_a_truncated_file_is_refused_wherever_it_ends(save: str, tmp_path: Path)
 
 
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=60)
-@given(content=st.binary(max_size=200), suffix=st.sampled_from([".pth", ".safetensors"]))
+@given(content=st.binary(max_size=200), suffix=st.sampled_from([".pth", ".safetensors", ".npy"]))
 def test_any_other_bytes_are_refused(content: bytes, suffix: str, tmp_path: Path) -> None:
     path = tmp_path / f"fuzz{suffix}"
     path.write_bytes(content)

@@ -34,6 +34,21 @@ def test_every_known_name_has_a_definition_of_that_name() -> None:
     assert DEFAULT_MODEL in names()
 
 
+PAPER = ("eigen", "fcrn", "sfmlearner", "sparseconv", "adnn", "sparse2dense", "latefusion")
+
+
+@pytest.mark.parametrize("family", PAPER)
+def test_each_network_of_the_paper_can_be_named_and_has_a_tiny_edition(family: str) -> None:
+    assert find_definition(family).name.startswith(family)
+    assert find_definition(f"{family}-tiny").name == f"{family}-tiny"
+    assert find_definition(f"{family}-tiny").checkpoint is not None
+
+
+def test_no_name_is_listed_twice_and_a_family_may_stand_for_a_variant() -> None:
+    assert len(names()) == len(set(names()))
+    assert find_definition("sparse2dense").name in names()
+
+
 def test_a_file_gives_its_definition_and_may_import_what_is_beside_it(tmp_path: Path) -> None:
     written(tmp_path, "WIDTH = 7", "beside.py")
     file = written(tmp_path, GOOD)
@@ -46,6 +61,10 @@ def test_a_file_gives_its_definition_and_may_import_what_is_beside_it(tmp_path: 
 def test_an_unknown_name_suggests_a_near_one() -> None:
     with pytest.raises(ModelError, match="did you mean 'compact'"):
         find_definition("compat")
+    with pytest.raises(ModelError, match="did you mean 'fcrn-tiny'"):
+        find_definition("fcrn-tyni")
+    with pytest.raises(ModelError, match="did you mean 'sparse2dense-r50-upproj'"):
+        find_definition("sparse2dense-r50-upprj")
     with pytest.raises(ModelError, match="known: compact"):
         find_definition("zzz")
 

@@ -23,7 +23,8 @@ from hypothesis import strategies as st
 from torch import nn
 
 from pnpdepth_cli.errors import CheckpointError
-from pnpdepth_cli.models.tensor_pickle import Instance, is_module, module_state, read_tensor_file
+from pnpdepth_cli.models.pickle_machine import Instance
+from pnpdepth_cli.models.tensor_pickle import is_module, module_state, read_tensor_file
 
 LAYOUTS = [True, False]
 

@@ -1,0 +1,210 @@
+"""Deep convolutional compressed sensing (Chodosh, Wang & Lucey, ACCV 2018): a network that solves.
+
+Three layers of convolutional dictionaries (8, 16, 32 filters; 11, 5, 3 pixels; stride 2 each).
+Depth is what the codes of the last layer give when they are sent back through all three; the codes
+are found by ten ADMM iterations against the sparse depth. Sparse depth in metres (0 = unknown)
+goes in, dense depth in metres comes out, at any size; nothing keeps it positive.
+
+The paper's z (Wang et al.) is "the optimal x", the codes of the last layer; here the output of
+`solve`. The authors' TensorFlow code for it does more: it steps codes, copies and multipliers of
+all layers, each time followed by ten further iterations. Cutting inside the solve
+(`solve.step#5[0][2]`) does the like of that: the iterations behind the cut run again each time.
+
+Written from facts of nchodosh/Super-LiDAR, which names no licence; the names of parameters are its
+own. No weights of the authors' were ever published. Who has trained theirs saves its variables by
+name, `numpy.savez("adnn.npz", kernel0=…, …, bias2=…)`; `-tiny` is this project's own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from pnpdepth_cli.models.definition import ModelDefinition, Multiple, RefineDefaults
+
+FILTERS = (8, 16, 32)
+KERNELS = (11, 5, 3)
+STRIDE = 2
+ITERATIONS = 10
+TUNED = RefineDefaults(layer="solve", lr="3%", update="adam")  # of `-tiny`
+BIAS_SCALE = 1e-3  # the stored biases are a thousand times those of the shrinkage
+
+Three = tuple[Tensor, Tensor, Tensor]
+
+
+class State(NamedTuple):
+    """Of each layer: the codes z, their non-negative copies y, and the multipliers λ of z = y."""
+
+    codes: Three
+    copies: Three
+    multipliers: Three
+
+
+def margins(size: int, kernel: int) -> tuple[int, int]:
+    """The zeros before and behind `size` pixels under TensorFlow's SAME padding, stride 2."""
+    total = max((-(-size // STRIDE) - 1) * STRIDE + kernel - size, 0)
+    return total // 2, total - total // 2
+
+
+def analysed(x: Tensor, kernel: Tensor) -> Tensor:
+    """x (B, c, h, w) seen through the filters (n, c, k, k): (B, n, ⌈h/2⌉, ⌈w/2⌉), SAME padding."""
+    top, bottom = margins(x.shape[-2], kernel.shape[-1])
+    left, right = margins(x.shape[-1], kernel.shape[-1])
+    return F.conv2d(F.pad(x, (left, right, top, bottom)), kernel, stride=STRIDE)
+
+
+def synthesised(codes: Tensor, kernel: Tensor, size: tuple[int, int]) -> Tensor:
+    """The codes (B, n, ⌈h/2⌉, ⌈w/2⌉) as a sum of filters (n, c, k, k): (B, c, h, w), the adjoint
+    of `analysed`."""
+    top, left = margins(size[0], kernel.shape[-1])[0], margins(size[1], kernel.shape[-1])[0]
+    x = F.conv_transpose2d(codes, kernel, stride=STRIDE)
+    return x[..., top : top + size[0], left : left + size[1]]
+
+
+def shrunk(x: Tensor, bias: Tensor, multiplier: Tensor) -> Tensor:
+    """What is left of x when the penalty |bias| and the multiplier are paid; never negative."""
+    return F.relu(x - (bias.abs() * BIAS_SCALE - multiplier))
+
+
+class Step(nn.Module):
+    """One ADMM iteration over the three layers, from the shallow one to the deep (ρ = 1)."""
+
+    def forward(
+        self, state: State, sparse: Tensor, known: Three, kernels: Three, biases: Three
+    ) -> State:
+        """`known`, 1 or 0, says which pixels and codes each layer answers for."""
+        codes, copies, multipliers = (list(part) for part in state)
+        for i, kernel in enumerate(kernels):
+            target = known[i] * copies[i - 1] if i else sparse
+            start = copies[i] - multipliers[i]
+            explained = known[i] * synthesised(start, kernel, _size(target))
+            codes[i] = analysed(target - explained, kernel) / 2 + start
+            if i + 1 < len(kernels):
+                above = synthesised(codes[i + 1], kernels[i + 1], _size(codes[i]))
+                copies[i] = shrunk(codes[i] + above, biases[i], multipliers[i]) / 2
+            else:
+                copies[i] = shrunk(codes[i], biases[i], multipliers[i])
+            multipliers[i] = multipliers[i] + codes[i] - copies[i]
+        return State(_three(codes), _three(copies), _three(multipliers))
+
+
+class Solve(nn.Module):
+    """Sparse depth (B, 1, H, W) → codes of the last layer (B, 32, ⌈H/8⌉, ⌈W/8⌉)."""
+
+    def __init__(self, iterations: int) -> None:
+        super().__init__()
+        self.iterations = iterations
+        self.step = Step()
+
+    def forward(self, sparse: Tensor, kernels: Three, biases: Three) -> Tensor:
+        known = covered((sparse > 0).to(sparse), kernels)
+        state = first_state(sparse, known, kernels, biases)
+        for _ in range(self.iterations):
+            state = self.step(state, sparse, known, kernels, biases)
+        return state.codes[-1]
+
+
+class Synthesis(nn.Module):
+    """Codes of one layer → the map they stand for, of the given size."""
+
+    def forward(self, codes: Tensor, kernel: Tensor, size: tuple[int, int]) -> Tensor:
+        return synthesised(codes, kernel, size)
+
+
+class Adnn(nn.Module):
+    """Sparse depth (B, 1, H, W) in metres, 0 = unknown → depth (B, 1, H, W) in metres."""
+
+    def __init__(
+        self, filters: tuple[int, int, int] = FILTERS, iterations: int = ITERATIONS
+    ) -> None:
+        super().__init__()
+        self.solve = Solve(iterations)
+        self.layers = nn.ModuleList(Synthesis() for _ in filters)
+        self.kernels = tuple(f"kernel{i}" for i in range(len(filters)))
+        self.biases = tuple(f"bias{i}" for i in range(len(filters)))
+        for i, (count, kernel) in enumerate(zip(filters, KERNELS, strict=True)):
+            shape = (count, filters[i - 1] if i else 1, kernel, kernel)
+            deviation = (2 / (kernel * kernel * count)) ** 0.5
+            self.register_parameter(f"kernel{i}", nn.Parameter(deviation * torch.randn(shape)))
+            self.register_parameter(f"bias{i}", nn.Parameter(torch.ones(())))
+
+    def forward(self, sparse: Tensor) -> Tensor:
+        kernels = _three([getattr(self, name) for name in self.kernels])
+        biases = _three([getattr(self, name) for name in self.biases])
+        codes = self.solve(sparse, kernels, biases)
+        sizes = [_size(sparse)]
+        for _ in kernels[1:]:
+            sizes.append((-(-sizes[-1][0] // STRIDE), -(-sizes[-1][1] // STRIDE)))
+        for i in reversed(range(len(kernels))):
+            codes = self.layers[i](codes, kernels[i], sizes[i])
+        return codes  # type: ignore[no-any-return]
+
+
+def covered(mask: Tensor, kernels: Three) -> Three:
+    """The mask of known pixels (B, 1, H, W), and which codes of the layers behind see any."""
+    masks = [mask]
+    for kernel in kernels[:-1]:
+        count = analysed(masks[-1], torch.ones_like(kernel[:1, :1]))
+        masks.append((count > 0).to(mask))
+    return _three(masks)
+
+
+def first_state(sparse: Tensor, known: Three, kernels: Three, biases: Three) -> State:
+    """The codes of one pass forward, no multiplier paid yet."""
+    codes: list[Tensor] = []
+    copies: list[Tensor] = []
+    for i, kernel in enumerate(kernels):
+        codes.append(analysed(known[i] * copies[i - 1] if i else sparse, kernel))
+        copies.append(shrunk(codes[i], biases[i], torch.zeros_like(codes[i])))
+    return State(_three(codes), _three(copies), _three([torch.zeros_like(z) for z in codes]))
+
+
+def from_tensorflow(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Kernels (k, k, c, n) of the authors' variables become (n, c, k, k); any other stay."""
+    return {
+        name: tensor.permute(3, 2, 0, 1)
+        if tensor.ndim == 4 and tensor.shape[2] != tensor.shape[3]
+        else tensor
+        for name, tensor in state.items()
+    }
+
+
+def _three(parts: list[Tensor]) -> Three:
+    first, second, third = parts
+    return first, second, third
+
+
+def _size(x: Tensor) -> tuple[int, int]:
+    return x.shape[-2], x.shape[-1]
+
+
+def _definition(name: str, summary: str) -> ModelDefinition:
+    own = name.endswith("-tiny")
+    weights = Path(__file__).parent / "weights" / f"{name}.safetensors"
+    return ModelDefinition(
+        name=name,
+        summary=summary,
+        paper="Chodosh et al., Deep Convolutional Compressed Sensing for LiDAR, ACCV 2018",
+        licence="Apache-2.0" if own else "no weights published",
+        input_kind="sparse",
+        size=Multiple(1),
+        build=Adnn,
+        layers=(f"solve.step#{ITERATIONS // 2}[0][2]", "solve", "layers.2", "layers.1"),
+        defaults=TUNED if own else RefineDefaults(layer="solve"),
+        checkpoint=weights if own else None,
+        read_checkpoint=from_tensorflow,
+    )
+
+
+definitions: dict[str, ModelDefinition] = {
+    one.name: one
+    for one in (
+        _definition("adnn", "codes of convolutional dictionaries, found by ADMM"),
+        _definition("adnn-tiny", "adnn, trained on rendered scenes"),
+    )
+}

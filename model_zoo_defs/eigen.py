@@ -1,0 +1,182 @@
+"""`eigen`, a coarse and a fine network for depth from one picture (Eigen et al., NIPS 2014).
+
+The coarse network sees the whole picture through two fully connected layers and gives log depth
+at about a quarter of its size; the fine one corrects that with local features. Log depth comes
+out, exp of it is metres.
+
+No weights of it are published. imran3180/depth-map-prediction trains it and writes two files of
+tensors, coarse_model_N.pth and fine_model_N.pth: put the two into a folder of their own and name
+that, `--checkpoint FOLDER`. rgb goes in as 0..1, 228 x 304 or, for KITTI, 172 x 576; the output
+covers all of it.
+
+The paper of this method goes back into the coarse network; where, it does not say. Here z is what
+its last convolution gives, before the ReLU. Own code from the papers and the layers' names.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import partial
+from pathlib import Path
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from pnpdepth_cli.models.definition import (
+    IMAGENET_MEAN,
+    IMAGENET_STD,
+    Fixed,
+    ModelDefinition,
+    Normalisation,
+    RefineDefaults,
+)
+
+NYU = (228, 304)
+KITTI = (172, 576)
+
+
+def out_size(length: int) -> int:
+    """Rows or columns of the output for an input of that length: about a quarter."""
+    return (length - 11) // 4 + 1
+
+
+def deep_size(length: int) -> int:
+    """Rows or columns of the coarse network's last feature map: about a 32nd."""
+    return (out_size(length) // 2 // 2 - 3) // 2 + 1
+
+
+class Coarse(nn.Module):
+    """Log depth (B, 1, h, w), a quarter of the size, from rgb (B, 3, H, W)."""
+
+    def __init__(
+        self, size: tuple[int, int], channels: tuple[int, int, int, int, int], hidden: int
+    ) -> None:
+        super().__init__()
+        one, two, three, four, five = channels
+        self.size = (out_size(size[0]), out_size(size[1]))
+        self.conv1 = nn.Conv2d(3, one, 11, stride=4)
+        self.conv2 = nn.Conv2d(one, two, 5, padding=2)
+        self.conv3 = nn.Conv2d(two, three, 3, padding=1)
+        self.conv4 = nn.Conv2d(three, four, 3, padding=1)
+        self.conv5 = nn.Conv2d(four, five, 3, stride=2)
+        self.fc1 = nn.Linear(five * deep_size(size[0]) * deep_size(size[1]), hidden)
+        self.fc2 = nn.Linear(hidden, self.size[0] * self.size[1])
+        self.dropout = nn.Dropout(0.5)
+
+    def forward(self, rgb: Tensor) -> Tensor:
+        x = F.max_pool2d(F.relu(self.conv1(rgb)), 2)
+        x = F.max_pool2d(F.relu(self.conv2(x)), 2)
+        x = F.relu(self.conv4(F.relu(self.conv3(x))))
+        x = F.relu(self.conv5(x)).flatten(1)
+        x = self.fc2(self.dropout(F.relu(self.fc1(x))))
+        y: Tensor = x.reshape(-1, 1, *self.size)
+        return y
+
+
+class Fine(nn.Module):
+    """Log depth (B, 1, h, w) from rgb (B, 3, H, W) and the coarse log depth (B, 1, h, w)."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.conv1 = nn.Conv2d(3, channels - 1, 9, stride=2)
+        self.conv2 = nn.Conv2d(channels, channels, 5, padding=2)
+        self.conv3 = nn.Conv2d(channels, 1, 5, padding=2)
+
+    def forward(self, rgb: Tensor, coarse: Tensor) -> Tensor:
+        x = F.max_pool2d(F.relu(self.conv1(rgb)), 2)
+        x = F.relu(self.conv2(torch.cat([x, coarse], dim=1)))
+        y: Tensor = self.conv3(x)
+        return y
+
+
+class Eigen(nn.Module):
+    """Log depth (B, 1, h, w), a quarter of the size, from rgb (B, 3, H, W) of the one `size`."""
+
+    def __init__(
+        self,
+        size: tuple[int, int] = NYU,
+        *,
+        channels: tuple[int, int, int, int, int] = (96, 256, 384, 384, 256),
+        hidden: int = 4096,
+        fine: int = 64,
+    ) -> None:
+        super().__init__()
+        self.coarse = Coarse(size, channels, hidden)
+        self.fine = Fine(fine)
+
+    def forward(self, rgb: Tensor) -> Tensor:
+        y: Tensor = self.fine(rgb, self.coarse(rgb))
+        return y
+
+
+def read_two_files(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """The tensors of a coarse and a fine file under the names of `Eigen`.
+
+    The file's name comes before each tensor's, as in "coarse_model_12.conv1.weight". ValueError for
+    one file without the other, or for two of a kind.
+    """
+    if "fc1.weight" in state or "conv3.weight" in state:
+        part = "coarse" if "fc1.weight" in state else "fine"
+        raise ValueError(
+            f"this is the {part} network only; name a folder with one file coarse*.pth and one"
+            " fine*.pth in it"
+        )
+    found: dict[str, Tensor] = {}
+    files: dict[str, str] = {}
+    for name, tensor in state.items():
+        file, _, rest = name.partition(".")
+        part = next((p for p in ("coarse", "fine") if file.startswith(p)), file)
+        if files.setdefault(part, file) != file:
+            raise ValueError(f"{files[part]} and {file} are both the {part} network; keep one")
+        found[f"{part}.{rest}"] = tensor
+    return found
+
+
+LAYERS = ("coarse.conv2", "coarse.conv3", "coarse.conv4", "coarse.conv5", "coarse.fc1", "coarse")
+PAPER = "Eigen et al., Depth Map Prediction from a Single Image, NIPS 2014"
+DEFAULTS = RefineDefaults(layer="coarse.conv5")
+TINY = Path(__file__).parent / "weights" / "eigen-tiny.safetensors"
+
+definitions = {
+    "eigen": ModelDefinition(
+        name="eigen",
+        summary="coarse and fine network, log depth, indoors",
+        paper=PAPER,
+        licence="no published weights",
+        input_kind="rgb",
+        size=Fixed(*NYU),
+        output_kind="log",
+        layers=LAYERS,
+        defaults=DEFAULTS,
+        build=Eigen,
+        read_checkpoint=read_two_files,
+    ),
+    "eigen-kitti": ModelDefinition(
+        name="eigen-kitti",
+        summary="the same for the size of KITTI, street scenes",
+        paper=PAPER,
+        licence="no published weights",
+        input_kind="rgb",
+        size=Fixed(*KITTI),
+        output_kind="log",
+        layers=LAYERS,
+        defaults=DEFAULTS,
+        build=partial(Eigen, KITTI),
+        read_checkpoint=read_two_files,
+    ),
+    "eigen-tiny": ModelDefinition(
+        name="eigen-tiny",
+        summary="the same as `eigen`, narrower, trained on rendered rooms only",
+        paper=PAPER,
+        licence="Apache-2.0",
+        input_kind="rgb",
+        size=Fixed(*NYU),
+        normalisation=Normalisation(mean=IMAGENET_MEAN, std=IMAGENET_STD),
+        output_kind="log",
+        layers=LAYERS,
+        defaults=DEFAULTS,
+        build=partial(Eigen, channels=(32, 64, 96, 96, 48), hidden=128, fine=48),
+        checkpoint=TINY,
+    ),
+}

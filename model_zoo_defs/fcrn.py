@@ -1,0 +1,244 @@
+"""`fcrn`, a residual network with up-projections (Laina et al., 3DV 2016), metres.
+
+ResNet-50 down to 1/32, one convolution without a non-linearity (the paper's z), four
+up-projections to about half the size. The graph is that of the authors' own code, in what ports
+get wrong too: strides on the first 1 x 1 convolution of a stage, a bias in `conv1` and `layer1`,
+pooling padded as TensorFlow does, an up-projection as four small convolutions whose outputs
+interleave, and a last ReLU.
+
+rgb goes in as 0..255, 228 x 304, no mean taken off; 128 x 160 metres come out. The authors'
+`NYU_ResNet-UpProj.npy` (iro-cp/FCRN-DepthPrediction, Simplified BSD) loads, and so does their
+TensorFlow checkpoint, which is easier to find today: `--checkpoint NYU_FCRN.ckpt.index`. numpy
+would run the pickle in the former, here nothing is run. Files of PyTorch ports do not load: their
+networks differ.
+Own code from the paper and from what is known of that graph.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from functools import partial
+from pathlib import Path
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from pnpdepth_cli.models.definition import (
+    IMAGENET_MEAN,
+    IMAGENET_STD,
+    Fixed,
+    ModelDefinition,
+    Normalisation,
+    RefineDefaults,
+)
+
+SIZE = (228, 304)
+BLOCKS = {"res2": 3, "res3": 4, "res4": 6, "res5": 3}  # ResNet-50
+UP_PROJECTIONS = ("layer2x", "layer4x", "layer8x", "layer16x")
+
+
+def batch_norm(channels: int) -> nn.BatchNorm2d:
+    """A batch normalisation as the authors have it."""
+    return nn.BatchNorm2d(channels, eps=1e-4)
+
+
+def same_padding(length: int, kernel: int, stride: int) -> tuple[int, int]:
+    """What TensorFlow's SAME puts before and after a side: the odd pixel goes behind."""
+    missing = max((-(-length // stride) - 1) * stride + kernel - length, 0)
+    return missing // 2, missing - missing // 2
+
+
+def max_pool_same(x: Tensor) -> Tensor:
+    """The largest of 3 x 3 at stride 2, padded as SAME."""
+    rows, columns = (same_padding(length, 3, 2) for length in x.shape[-2:])
+    return F.max_pool2d(F.pad(x, (*columns, *rows), value=-torch.inf), 3, 2)
+
+
+class Bottleneck(nn.Module):
+    """1 x 1 (with the stride), 3 x 3, 1 x 1, added to the input or to its 1 x 1 projection."""
+
+    def __init__(self, channels: int, middle: int, stride: int, *, project: bool) -> None:
+        super().__init__()
+        out = 4 * middle
+        self.branch2a = nn.Conv2d(channels, middle, 1, stride=stride, bias=False)
+        self.bn_branch2a = batch_norm(middle)
+        self.branch2b = nn.Conv2d(middle, middle, 3, padding=1, bias=False)
+        self.bn_branch2b = batch_norm(middle)
+        self.branch2c = nn.Conv2d(middle, out, 1, bias=False)
+        self.bn_branch2c = batch_norm(out)
+        self.branch1 = nn.Conv2d(channels, out, 1, stride=stride, bias=False) if project else None
+        self.bn_branch1 = batch_norm(out) if project else None
+
+    def forward(self, x: Tensor) -> Tensor:
+        y = F.relu(self.bn_branch2a(self.branch2a(x)))
+        y = F.relu(self.bn_branch2b(self.branch2b(y)))
+        y = self.bn_branch2c(self.branch2c(y))
+        if self.branch1 is not None and self.bn_branch1 is not None:
+            x = self.bn_branch1(self.branch1(x))
+        return F.relu(x + y)
+
+
+class Unpooling(nn.Module):
+    """Twice the size: four convolutions, each of which gives every other row and column."""
+
+    def __init__(self, channels: int, out: int) -> None:
+        super().__init__()
+        self.ConvA = nn.Conv2d(channels, out, (3, 3))
+        self.ConvB = nn.Conv2d(channels, out, (2, 3))
+        self.ConvC = nn.Conv2d(channels, out, (3, 2))
+        self.ConvD = nn.Conv2d(channels, out, (2, 2))
+        self.BN = batch_norm(out)
+
+    def forward(self, x: Tensor) -> Tensor:
+        around = F.pad(x, (1, 1, 1, 1))
+        a = self.ConvA(around)
+        b = self.ConvB(around[..., :-1, :])
+        c = self.ConvC(around[..., :-1])
+        d = self.ConvD(around[..., :-1, :-1])
+        even, odd = torch.stack([a, b], dim=3), torch.stack([c, d], dim=3)  # rows a, b, a, b, …
+        batch, channels, height, _, width = even.shape
+        y = torch.stack([even, odd], dim=5).reshape(batch, channels, 2 * height, 2 * width)
+        normed: Tensor = self.BN(y)
+        return normed
+
+
+class UpProjection(nn.Module):
+    """Twice the size and half the channels: two unpoolings, one with a convolution behind it."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        out = channels // 2
+        self.br1 = Unpooling(channels, out)
+        self.Conv = nn.Conv2d(out, out, 3, padding=1)
+        self.BN = batch_norm(out)
+        self.br2 = Unpooling(channels, out)
+
+    def forward(self, x: Tensor) -> Tensor:
+        y = self.BN(self.Conv(F.relu(self.br1(x))))
+        return F.relu(y + self.br2(x))
+
+
+class FCRN(nn.Module):
+    """Depth (B, 1, 128, 160) in metres from rgb (B, 3, 228, 304).
+
+    Any other size goes too: the output is 16 times the 32nd of it, rounded up.
+    """
+
+    def __init__(self, width: int = 64) -> None:
+        super().__init__()
+        self.conv1 = nn.Conv2d(3, width, 7, stride=2, padding=3)
+        self.bn_conv1 = batch_norm(width)
+        channels = width
+        self.trunk: list[str] = []
+        for stage, (name, count) in enumerate(BLOCKS.items()):
+            middle = width * 2**stage
+            for letter in "abcdef"[:count]:
+                stride = 2 if letter == "a" and stage > 0 else 1
+                block = Bottleneck(channels, middle, stride, project=letter == "a")
+                self.add_module(f"{name}{letter}", block)
+                self.trunk.append(f"{name}{letter}")
+                channels = 4 * middle
+        self.layer1 = nn.Conv2d(channels, channels // 2, 1)
+        channels //= 2
+        self.layer1_BN = batch_norm(channels)
+        for name in UP_PROJECTIONS:
+            self.add_module(name, UpProjection(channels))
+            channels //= 2
+        self.ConvPred = nn.Conv2d(channels, 1, 3, padding=1)
+        self.ConvPred.bias = nn.Parameter(torch.full((1,), 2.0))  # at 0 m the ReLU may stay shut
+
+    def forward(self, rgb: Tensor) -> Tensor:
+        x = max_pool_same(F.relu(self.bn_conv1(self.conv1(rgb))))
+        for name in self.trunk:
+            x = self.get_submodule(name)(x)
+        x = self.layer1_BN(self.layer1(x))
+        for name in UP_PROJECTIONS:
+            x = self.get_submodule(name)(x)
+        return F.relu(self.ConvPred(x))
+
+
+KINDS = {
+    "weights": "weight",
+    "biases": "bias",
+    "scale": "weight",
+    "offset": "bias",
+    "mean": "running_mean",
+    "variance": "running_var",
+}
+COUNTERS = ("global_step", "beta1_power", "beta2_power")
+PORTS = {
+    "up1.conv1_1.weight": "XPFly1989/FCRN",
+    "upSample.layer1.upper_branch.conv1.weight": "dontLoveBugs/FCRN_pytorch",
+}
+
+
+def read_authors(state: Mapping[str, Tensor]) -> Mapping[str, Tensor]:
+    """The state dict from the authors' arrays or variables, such as "res2a_branch2a.weights".
+
+    Their kernels are (rows, columns, in, out). A state dict of `FCRN` stays as it is. ValueError
+    for a port's file, KeyError for an array that has no place.
+    """
+    for name, port in PORTS.items():
+        if name in state:
+            raise ValueError(
+                f"this is of the port {port}, another network (strides, biases, interleaving);"
+                " take the authors' NYU_ResNet-UpProj.npy"
+            )
+    if "conv1.weights" not in state:
+        return state
+    found = {}
+    for name, tensor in state.items():
+        layer, _, kind = name.rpartition(".")
+        if layer in state or name in COUNTERS:
+            continue  # the optimiser's own, such as conv1.weights.Momentum
+        if kind not in KINDS:
+            raise KeyError(f"{name} is none of {', '.join(KINDS)}")
+        found[f"{module_of(layer)}.{KINDS[kind]}"] = (
+            tensor.permute(3, 2, 0, 1) if kind == "weights" else tensor
+        )
+    return found
+
+
+def module_of(layer: str) -> str:
+    """The module that the authors call so: bn2a_branch2b is res2a.bn_branch2b."""
+    layer = re.sub(r"^bn(\d[a-f])_", r"res\1.bn_", layer)
+    layer = re.sub(r"^(res\d[a-f])_", r"\1.", layer)
+    layer = re.sub(r"^(layer\d+x)_", r"\1.", layer)
+    return re.sub(r"\.(br\d)_", r".\1.", layer)
+
+
+LAYERS = ("res4f", "res5c", "layer1_BN", *UP_PROJECTIONS[:3])
+PAPER = "Laina et al., Deeper Depth Prediction with Fully Convolutional Residual Networks, 3DV 2016"
+DEFAULTS = RefineDefaults(layer="layer1_BN")
+TINY = Path(__file__).parent / "weights" / "fcrn-tiny.safetensors"
+
+definitions = {
+    "fcrn": ModelDefinition(
+        name="fcrn",
+        summary="ResNet-50 with up-projections, metres, indoors",
+        paper=PAPER,
+        licence="published weights: Simplified BSD, not shipped",
+        input_kind="rgb",
+        size=Fixed(*SIZE),
+        normalisation=Normalisation(std=(1 / 255, 1 / 255, 1 / 255)),  # 0..255 goes in
+        layers=LAYERS,
+        defaults=DEFAULTS,
+        build=FCRN,
+        read_checkpoint=read_authors,
+    ),
+    "fcrn-tiny": ModelDefinition(
+        name="fcrn-tiny",
+        summary="the same at an eighth of the width, trained on rendered rooms only",
+        paper=PAPER,
+        licence="Apache-2.0",
+        input_kind="rgb",
+        size=Fixed(*SIZE),
+        normalisation=Normalisation(mean=IMAGENET_MEAN, std=IMAGENET_STD),
+        layers=LAYERS,
+        defaults=RefineDefaults(layer="layer1_BN", lr="10%", iterations=20),
+        build=partial(FCRN, width=8),
+        checkpoint=TINY,
+    ),
+}

@@ -1,0 +1,267 @@
+"""Late fusion of rgb and sparse depth (Jaritz et al., 3DV 2018): two NASNet encoders, one decoder.
+
+Own building from the paper; neither code nor weights of the authors' are public. From the paper:
+an encoder of NASNet cells for each modality, no batch norm behind their first strided convolution
+(zeros of the sparse map would move its statistics), no mask of known pixels, fusion by putting
+both encoders' features side by side before the decoder, skips, and inverse depth as what is learnt.
+Chosen here, as no public source settles them: NASNet-A as its mobile edition (4 cells a stage,
+44 filters), skips from both encoders, a decoder of bilinear enlargement and one 3×3 convolution a
+level up to 1/2, and softplus for inverse depth, which keeps depth between 0 and 200 m.
+
+rgb is (x − 0.5) / 0.5, sparse depth metres (0 = unknown); H and W are multiples of 32. The
+paper's z (Wang et al.) is "the 8× feature map": here the decoder's, which has seen both encoders.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from pnpdepth_cli.models.definition import (
+    ModelDefinition,
+    Multiple,
+    Normalisation,
+    RefineDefaults,
+)
+
+FARTHEST = 200.0  # metres; our choice, so that depth stays finite
+TUNED = RefineDefaults(layer="decoder.s8", lr="10%")  # of `-tiny`, for 500 points
+LEVELS = ("s16", "s8", "s4", "s2")
+
+
+def pointwise(channels: int, out: int) -> nn.Sequential:
+    """ReLU, 1×1 convolution, batch norm: brings features to `out` channels."""
+    return nn.Sequential(nn.ReLU(), nn.Conv2d(channels, out, 1, bias=False), nn.BatchNorm2d(out))
+
+
+def separable(channels: int, out: int, kernel: int, stride: int = 1) -> nn.Sequential:
+    """ReLU, separable convolution, batch norm, twice; the first has the stride."""
+    parts: list[nn.Module] = []
+    for count, step in ((channels, stride), (out, 1)):
+        parts += [
+            nn.ReLU(),
+            nn.Conv2d(count, count, kernel, step, kernel // 2, groups=count, bias=False),
+            nn.Conv2d(count, out, 1, bias=False),
+            nn.BatchNorm2d(out),
+        ]
+    return nn.Sequential(*parts)
+
+
+class Halved(nn.Module):
+    """Features at half the size: every other pixel, and every other one from (1, 1) on."""
+
+    def __init__(self, channels: int, out: int) -> None:
+        super().__init__()
+        self.even = nn.Conv2d(channels, out // 2, 1, bias=False)
+        self.odd = nn.Conv2d(channels, out - out // 2, 1, bias=False)
+        self.norm = nn.BatchNorm2d(out)
+
+    def forward(self, x: Tensor) -> Tensor:
+        x = F.relu(x)
+        even, odd = self.even(x[..., ::2, ::2]), self.odd(x[..., 1::2, 1::2])
+        return self.norm(torch.cat([even, odd], dim=1))  # type: ignore[no-any-return]
+
+
+def fitted(channels: int, width: int, halved: bool) -> nn.Module:
+    """What brings the earlier features to the later ones' size and `width` channels."""
+    return Halved(channels, width) if halved else pointwise(channels, width)
+
+
+def averaged(x: Tensor, stride: int = 1) -> Tensor:
+    """The mean of 3×3 pixels, those outside not counted."""
+    return F.avg_pool2d(x, 3, stride, 1, count_include_pad=False)
+
+
+class NormalCell(nn.Module):
+    """NASNet-A's normal cell on the last two features: 6·width channels, same size.
+
+    halved: the earlier features are twice as large as the later ones.
+    """
+
+    def __init__(self, earlier: int, later: int, width: int, *, halved: bool) -> None:
+        super().__init__()
+        self.earlier = fitted(earlier, width, halved)
+        self.later = pointwise(later, width)
+        self.later5, self.later3 = separable(width, width, 5), separable(width, width, 3)
+        self.earlier5 = separable(width, width, 5)
+        self.earlier3 = separable(width, width, 3)
+        self.earlier3_too = separable(width, width, 3)
+
+    def forward(self, earlier: Tensor, later: Tensor) -> Tensor:
+        p, h = self.earlier(earlier), self.later(later)
+        parts = [
+            p,
+            self.later5(h) + self.earlier3(p),
+            self.earlier5(p) + self.earlier3_too(p),
+            averaged(h) + p,
+            2 * averaged(p),
+            self.later3(h) + h,
+        ]
+        return torch.cat(parts, dim=1)
+
+
+class ReductionCell(nn.Module):
+    """NASNet-A's reduction cell on the last two features: 4·width channels, half the size.
+
+    earlier None: there are none yet; the later ones take their place as they are.
+    """
+
+    def __init__(self, earlier: int | None, later: int, width: int, *, halved: bool) -> None:
+        super().__init__()
+        self.earlier = nn.Identity() if earlier is None else fitted(earlier, width, halved)
+        count = later if earlier is None else width
+        self.later = pointwise(later, width)
+        self.later5 = separable(width, width, 5, 2)
+        self.earlier7 = separable(count, width, 7, 2)
+        self.earlier7_too = separable(count, width, 7, 2)
+        self.earlier5 = separable(count, width, 5, 2)
+        self.first3 = separable(width, width, 3)
+
+    def forward(self, earlier: Tensor, later: Tensor) -> Tensor:
+        p, h = self.earlier(earlier), self.later(later)
+        first = self.later5(h) + self.earlier7(p)
+        largest = F.max_pool2d(h, 3, 2, 1)
+        second = largest + self.earlier7_too(p)
+        third = averaged(h, 2) + self.earlier5(p)
+        parts = [second, third, averaged(first) + second, self.first3(first) + largest]
+        return torch.cat(parts, dim=1)
+
+
+class Stage(nn.Module):
+    """A reduction cell and `count` normal ones; the last two features in, the last two out."""
+
+    def __init__(
+        self,
+        earlier: int | None,
+        later: int,
+        reduced: int,
+        normal: int,
+        count: int,
+        *,
+        halved: bool,
+    ) -> None:
+        super().__init__()
+        self.cells = nn.ModuleList([ReductionCell(earlier, later, reduced, halved=halved)])
+        self.earlier, self.later = later, 4 * reduced  # channels of the last two features
+        for number in range(count):
+            cell = NormalCell(self.earlier, self.later, normal, halved=number == 0)
+            self.cells.append(cell)
+            self.earlier, self.later = self.later, 6 * normal
+
+    def forward(self, earlier: Tensor, later: Tensor) -> tuple[Tensor, Tensor]:
+        for cell in self.cells:
+            earlier, later = later, cell(earlier, later)
+        return earlier, later
+
+
+class Encoder(nn.Module):
+    """(B, channels, H, W) → features at 1/2, 1/4, 1/8, 1/16, 1/32 as NASNet-A goes down."""
+
+    def __init__(self, channels: int, width: int, cells: int) -> None:
+        super().__init__()
+        stem = width * 8 // 11  # NASNet's 32 before its 44
+        self.stem = nn.Conv2d(channels, stem, 3, 2, 1)  # no batch norm behind it, as in the paper
+        earlier, later, halved = None, stem, False
+        self.channels = [stem]
+        self.stages = nn.ModuleList()
+        for reduced, normal, count in (
+            (width // 4, 0, 0),
+            (width // 2, width, cells),
+            (2 * width, 2 * width, cells),
+            (4 * width, 4 * width, cells),
+        ):
+            stage = Stage(earlier, later, reduced, normal, count, halved=halved)
+            earlier, later, halved = stage.earlier, stage.later, count == 0
+            self.stages.append(stage)
+            self.channels.append(later)
+
+    def forward(self, x: Tensor) -> list[Tensor]:
+        later = self.stem(x)
+        earlier, found = later, [later]
+        for stage in self.stages:
+            earlier, later = stage(earlier, later)
+            found.append(later)
+        return found
+
+
+def convolved(channels: int, out: int) -> nn.Sequential:
+    """3×3 convolution, batch norm, ReLU."""
+    return nn.Sequential(
+        nn.Conv2d(channels, out, 3, padding=1, bias=False), nn.BatchNorm2d(out), nn.ReLU()
+    )
+
+
+class Level(nn.Sequential):
+    """Features at twice the size, joined with what both encoders found there."""
+
+    def __init__(self, channels: int, out: int) -> None:
+        super().__init__(*convolved(channels, out))
+
+    def forward(self, x: Tensor, *skips: Tensor) -> Tensor:
+        x = F.interpolate(x, scale_factor=2, mode="bilinear", align_corners=False)
+        return super().forward(torch.cat([x, *skips], dim=1))  # type: ignore[no-any-return, no-untyped-call]
+
+
+class LateFusion(nn.Module):
+    """Depth (B, 1, H, W) in metres from rgb (B, 3, H, W) and sparse (B, 1, H, W) in metres.
+
+    width: filters of the cells at 1/8, doubled at each halving behind; cells: normal cells a stage.
+    """
+
+    def __init__(self, width: int = 44, cells: int = 4) -> None:
+        super().__init__()
+        self.rgb, self.sparse = Encoder(3, width, cells), Encoder(1, width, cells)
+        *skips, deepest = (2 * count for count in self.rgb.channels)
+        before = 4 * width
+        self.fuse = convolved(deepest, before)
+        self.decoder = nn.ModuleDict()
+        for level, skip in zip(LEVELS, reversed(skips), strict=True):
+            out = before if level == "s16" else before // 2
+            self.decoder[level] = Level(before + skip, out)
+            before = out
+        self.inverse = nn.Conv2d(before, 1, 3, padding=1)
+        nn.init.constant_(self.inverse.bias, -1.5)  # type: ignore[arg-type]  # about 5 m
+
+    def forward(self, rgb: Tensor, sparse: Tensor) -> Tensor:
+        picture, points = self.rgb(rgb), self.sparse(sparse)
+        x = self.fuse(torch.cat([picture.pop(), points.pop()], dim=1))
+        for layer in self.decoder.values():
+            x = layer(x, picture.pop(), points.pop())
+        x = F.interpolate(self.inverse(x), rgb.shape[-2:], mode="bilinear", align_corners=False)
+        return 1 / (F.softplus(x) + 1 / FARTHEST)
+
+
+def _definition(name: str, summary: str, width: int, cells: int) -> ModelDefinition:
+    own = name.endswith("-tiny")
+    weights = Path(__file__).parent / "weights" / f"{name}.safetensors"
+    return ModelDefinition(
+        name=name,
+        summary=summary,
+        paper="Jaritz et al., Sparse and Dense Data with CNNs, 3DV 2018",
+        licence="Apache-2.0" if own else "no weights published",
+        input_kind="rgb+sparse",
+        size=Multiple(32),
+        normalisation=Normalisation(mean=(0.5, 0.5, 0.5), std=(0.5, 0.5, 0.5)),
+        build=partial(LateFusion, width, cells),
+        layers=("fuse", "decoder.s16", "decoder.s8", "decoder.s4", "decoder.s2"),
+        defaults=TUNED if own else RefineDefaults(layer="decoder.s8"),
+        checkpoint=weights if own else None,
+    )
+
+
+definitions: dict[str, ModelDefinition] = {
+    one.name: one
+    for one in (
+        _definition("latefusion", "two NASNet-A encoders, fused late, own building", 44, 4),
+        _definition(
+            "latefusion-tiny",
+            "narrower, one normal cell a stage, trained on rendered scenes",
+            16,
+            1,
+        ),
+    )
+}

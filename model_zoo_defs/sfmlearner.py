@@ -1,0 +1,155 @@
+"""`sfmlearner`, the disparity network learnt from video alone (Zhou et al., CVPR 2017): DispNetS.
+
+An encoder of seven strided steps, a decoder of seven steps up with the encoder's features beside
+them, and the coarser disparity beside those of the last three. What comes out is
+10 · sigmoid + 0.01, an inverse depth up to one factor per picture: the points fix it.
+
+Layers, names and sizes are those of ClementPinard/SfmLearner-Pytorch, whose
+`dispnet_model_best.pth.tar` ({"epoch", "state_dict"}) loads. The paper's z is the bottleneck,
+512 x 1 x 4; the features beside the decoder stay as they are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from pnpdepth_cli.models.definition import Fixed, ModelDefinition, Normalisation, RefineDefaults
+
+GAIN, FLOOR = 10.0, 0.01  # disparity is between FLOOR and GAIN + FLOOR
+DOWN = (1, 2, 4, 8, 16, 16, 16)  # channels of conv1 … conv7, in units of `width`
+DOWN_KERNELS = (7, 5, 3, 3, 3, 3, 3)
+UP = (1, 2, 4, 8, 16, 32, 32)  # channels of upconv1 … upconv7, in units of half a `width`
+PREDICTED = (1, 2, 3, 4)  # the levels that predict a disparity; 1 is full size
+
+
+def down(channels: int, out: int, kernel: int) -> nn.Sequential:
+    """Half the size: a strided convolution and another one."""
+    padding = (kernel - 1) // 2
+    return nn.Sequential(
+        nn.Conv2d(channels, out, kernel, stride=2, padding=padding),
+        nn.ReLU(inplace=True),
+        nn.Conv2d(out, out, kernel, padding=padding),
+        nn.ReLU(inplace=True),
+    )
+
+
+def up(channels: int, out: int) -> nn.Sequential:
+    """Twice the size."""
+    return nn.Sequential(
+        nn.ConvTranspose2d(channels, out, 3, stride=2, padding=1, output_padding=1),
+        nn.ReLU(inplace=True),
+    )
+
+
+def joined(channels: int, out: int) -> nn.Sequential:
+    """What lies side by side becomes one feature map."""
+    return nn.Sequential(nn.Conv2d(channels, out, 3, padding=1), nn.ReLU(inplace=True))
+
+
+def disparity(channels: int) -> nn.Sequential:
+    """Disparity of one level, in 0…1."""
+    return nn.Sequential(nn.Conv2d(channels, 1, 3, padding=1), nn.Sigmoid())
+
+
+def cropped(x: Tensor, like: Tensor) -> Tensor:
+    """The upper left part of x that is as large as `like`."""
+    return x[..., : like.shape[-2], : like.shape[-1]]
+
+
+class DispNet(nn.Module):
+    """Disparity (B, 1, H, W) from rgb (B, 3, H, W) in -1…1."""
+
+    def __init__(self, width: int = 32) -> None:
+        super().__init__()
+        encoded = [width * n for n in DOWN]
+        decoded = [width * n // 2 for n in UP]
+        for level in range(1, 8):
+            channels = encoded[level - 2] if level > 1 else 3
+            step = down(channels, encoded[level - 1], DOWN_KERNELS[level - 1])
+            self.add_module(f"conv{level}", step)
+        for level in range(7, 0, -1):
+            below = decoded[level] if level < 7 else encoded[-1]
+            out = decoded[level - 1]
+            beside = encoded[level - 2] if level > 1 else 0
+            hint = 1 if level < max(PREDICTED) else 0
+            self.add_module(f"upconv{level}", up(below, out))
+            self.add_module(f"iconv{level}", joined(out + beside + hint, out))
+            if level in PREDICTED:
+                self.add_module(f"predict_disp{level}", disparity(out))
+        for layer in self.modules():
+            if isinstance(layer, nn.Conv2d | nn.ConvTranspose2d):
+                nn.init.xavier_uniform_(layer.weight)
+                if layer.bias is not None:
+                    nn.init.zeros_(layer.bias)
+
+    def forward(self, rgb: Tensor) -> Tensor:
+        return self.pyramid(rgb)[0]
+
+    def pyramid(self, rgb: Tensor) -> list[Tensor]:
+        """Disparities at full, 1/2, 1/4 and 1/8 size; training looks at all of them."""
+        features = [rgb]
+        for level in range(1, 8):
+            features.append(self.get_submodule(f"conv{level}")(features[-1]))
+        x = features.pop()
+        disparities: list[Tensor] = []
+        for level in range(7, 0, -1):
+            beside = features.pop()
+            x = cropped(self.get_submodule(f"upconv{level}")(x), beside)
+            parts = [x, beside] if level > 1 else [x]
+            if disparities:
+                larger = F.interpolate(disparities[-1], scale_factor=2.0, mode="bilinear")
+                parts.append(cropped(larger, beside))
+            x = self.get_submodule(f"iconv{level}")(torch.cat(parts, dim=1))
+            if level in PREDICTED:
+                disparities.append(GAIN * self.get_submodule(f"predict_disp{level}")(x) + FLOOR)
+        return disparities[::-1]
+
+
+def read_published(state: Mapping[str, Tensor]) -> Mapping[str, Tensor]:
+    """The state dict as it is. ValueError for the pose network, which is published beside it."""
+    if "pose_pred.weight" in state:
+        raise ValueError("this is the pose network; the other file, dispnet_…, gives disparity")
+    return state
+
+
+LAYERS = ("conv7", "iconv7", "iconv6", "iconv5", "iconv4", "iconv3", "iconv2")
+PAPER = "Zhou et al., Unsupervised Learning of Depth and Ego-Motion from Video, CVPR 2017"
+TINY = Path(__file__).parent / "weights" / "sfmlearner-tiny.safetensors"
+
+definitions = {
+    "sfmlearner": ModelDefinition(
+        name="sfmlearner",
+        summary="DispNet of SfMLearner, disparity up to scale, street scenes",
+        paper=PAPER,
+        licence="published weights: MIT, not shipped",
+        input_kind="rgb",
+        size=Fixed(128, 416),
+        normalisation=Normalisation(mean=(0.5, 0.5, 0.5), std=(0.5, 0.5, 0.5)),
+        output_kind="inverse",
+        output_scale="scale",
+        layers=LAYERS,
+        defaults=RefineDefaults(),
+        build=DispNet,
+        read_checkpoint=read_published,
+    ),
+    "sfmlearner-tiny": ModelDefinition(
+        name="sfmlearner-tiny",
+        summary="the same at 6/32 of the width, trained on rendered streets only",
+        paper=PAPER,
+        licence="Apache-2.0",
+        input_kind="rgb",
+        size=Fixed(128, 416),
+        normalisation=Normalisation(mean=(0.5, 0.5, 0.5), std=(0.5, 0.5, 0.5)),
+        output_kind="inverse",
+        output_scale="scale",
+        layers=LAYERS,
+        defaults=RefineDefaults(layer="iconv5", lr="10%", iterations=20),
+        build=lambda: DispNet(width=6),
+        checkpoint=TINY,
+    ),
+}

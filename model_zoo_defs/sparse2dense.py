@@ -1,0 +1,172 @@
+"""Sparse-to-dense (Ma & Karaman, ICRA 2018): a ResNet encoder on rgb and sparse depth, a decoder.
+
+rgb (0..1, neither mean nor deviation taken off) and sparse depth in metres (0 = unknown) are
+stacked to four channels. The encoder goes down to 1/32, a 1×1 convolution with batch norm halves
+its channels (the paper's z: no ReLU follows), four decoder layers go up to 1/2, and a bilinear
+resize (corners aligned) gives depth in metres at the size of the input; nothing keeps it positive.
+
+The authors trained at 228×304 (NYU) and 228×912 (KITTI), with any of four decoders. Written from
+facts of fangchangma/sparse-to-dense.pytorch; names of parameters are its own. The weights are the
+authors'; that repository names no licence, so none come with this one.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from functools import partial
+from pathlib import Path
+from typing import Literal, cast
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from model_zoo_defs import resnet, sparse2dense_selfsup
+from pnpdepth_cli.models.definition import Fixed, InputKind, ModelDefinition, RefineDefaults
+
+Decoder = Literal["deconv2", "deconv3", "upconv", "upproj"]
+DECODERS: tuple[Decoder, ...] = ("deconv2", "deconv3", "upconv", "upproj")
+CHANNELS: dict[InputKind, int] = {"rgb": 3, "sparse": 1, "rgb+sparse": 4}
+
+
+class Unpooled(nn.Conv2d):
+    """A 5×5 convolution of the input with zeros put between its pixels: (B, c, h, w) → 2h × 2w.
+
+    Pixel (i, j) goes to (2i, 2j), the rest is 0. Done as the transposed convolution that it is,
+    which never multiplies those zeros.
+    """
+
+    def __init__(self, channels: int, out: int) -> None:
+        super().__init__(channels, out, 5, padding=2, bias=False)
+
+    def forward(self, x: Tensor) -> Tensor:
+        flipped = self.weight.flip(2, 3).transpose(0, 1)
+        return F.conv_transpose2d(x, flipped, stride=2, padding=2, output_padding=1)
+
+
+class UpProjection(nn.Module):
+    """Two convolutions beside one, both on the unpooled input (Laina et al. 2016)."""
+
+    def __init__(self, channels: int, out: int) -> None:
+        super().__init__()
+        self.upper_branch = nn.Sequential(
+            OrderedDict(
+                conv1=Unpooled(channels, out),
+                batchnorm1=nn.BatchNorm2d(out),
+                relu=nn.ReLU(),
+                conv2=nn.Conv2d(out, out, 3, padding=1, bias=False),
+                batchnorm2=nn.BatchNorm2d(out),
+            )
+        )
+        self.bottom_branch = nn.Sequential(
+            OrderedDict(conv=Unpooled(channels, out), batchnorm=nn.BatchNorm2d(out))
+        )
+
+    def forward(self, x: Tensor) -> Tensor:
+        return F.relu(self.upper_branch(x) + self.bottom_branch(x))
+
+
+def decoder_layer(kind: Decoder, channels: int) -> nn.Module:
+    """One layer of the decoder: (B, channels, h, w) → (B, channels/2, 2h, 2w)."""
+    out = channels // 2
+    if kind == "upproj":
+        return UpProjection(channels, out)
+    if kind == "upconv":
+        name, enlarge = "conv", cast(nn.Module, Unpooled(channels, out))
+    else:
+        kernel, more = (3, 1) if kind == "deconv3" else (2, 0)
+        name, enlarge = kind, nn.ConvTranspose2d(channels, out, kernel, 2, more, more, bias=False)
+    return nn.Sequential(
+        OrderedDict({name: enlarge, "batchnorm": nn.BatchNorm2d(out), "relu": nn.ReLU()})
+    )
+
+
+class SparseToDense(nn.Module):
+    """Depth (B, 1, H, W) in metres from what `input_kind` names: rgb (B, 3, H, W), sparse
+    (B, 1, H, W) metres, or both in this order. `width` is that of the first stage, 64 as published.
+    """
+
+    def __init__(
+        self,
+        depth: int = 50,
+        decoder: Decoder = "upproj",
+        input_kind: InputKind = "rgb+sparse",
+        width: int = resnet.WIDTH,
+    ) -> None:
+        super().__init__()
+        self.conv1 = nn.Conv2d(CHANNELS[input_kind], width, 7, 2, 3, bias=False)
+        self.bn1 = nn.BatchNorm2d(width)
+        self.relu, self.maxpool = nn.ReLU(), nn.MaxPool2d(3, 2, 1)
+        (self.layer1, self.layer2, self.layer3, self.layer4), channels = resnet.stages(depth, width)
+        channels //= 2
+        self.conv2 = nn.Conv2d(2 * channels, channels, 1, bias=False)
+        self.bn2 = nn.BatchNorm2d(channels)
+        self.decoder = nn.Sequential(
+            OrderedDict(
+                (f"layer{place + 1}", decoder_layer(decoder, channels >> place))
+                for place in range(4)
+            )
+        )
+        self.conv3 = nn.Conv2d(channels >> 4, 1, 3, padding=1, bias=False)
+
+    def forward(self, *inputs: Tensor) -> Tensor:
+        x = torch.cat(inputs, dim=1)
+        size = x.shape[-2:]
+        x = self.maxpool(self.relu(self.bn1(self.conv1(x))))
+        x = self.layer4(self.layer3(self.layer2(self.layer1(x))))
+        x = self.conv3(self.decoder(self.bn2(self.conv2(x))))
+        return F.interpolate(x, size, mode="bilinear", align_corners=True)
+
+
+SIZES = {"": Fixed(228, 304), "-kitti": Fixed(228, 912, "crop")}
+TUNED = RefineDefaults(layer="bn2", lr="3%")  # of `-tiny`, for 500 points
+SCENES = {"": "rendered rooms", "-kitti": "rendered streets"}
+MODALITIES: dict[str, InputKind] = {"": "rgb+sparse", "-rgb": "rgb", "-d": "sparse"}
+LAYERS = ("bn2", "decoder.layer1", "decoder.layer2", "decoder.layer3")
+TINY = partial(SparseToDense, 18, "upproj", width=16)
+
+
+def published(depth: int, decoder: Decoder, modality: str, place: str) -> ModelDefinition:
+    """The definition of one published variant."""
+    return ModelDefinition(
+        name=f"sparse2dense-r{depth}-{decoder}{modality}{place}",
+        summary=f"ResNet-{depth} with the {decoder} decoder, {'KITTI' if place else 'NYU'} size",
+        paper="Ma & Karaman, Sparse-to-Dense, ICRA 2018",
+        licence="published weights: no licence named, not shipped",
+        input_kind=MODALITIES[modality],
+        size=SIZES[place],
+        build=partial(SparseToDense, depth, decoder, MODALITIES[modality]),
+        layers=LAYERS,
+        defaults=RefineDefaults(),
+    )
+
+
+def tiny(place: str) -> ModelDefinition:
+    """The small edition that comes with the program, for one picture size."""
+    return ModelDefinition(
+        name=f"sparse2dense-tiny{place}",
+        summary=f"sparse2dense-r18-upproj at a quarter of its width, trained on {SCENES[place]}",
+        paper="Ma & Karaman, Sparse-to-Dense, ICRA 2018",
+        licence="Apache-2.0",
+        input_kind="rgb+sparse",
+        size=SIZES[place],
+        build=TINY,
+        layers=LAYERS,
+        defaults=TUNED,
+        checkpoint=Path(__file__).parent / "weights" / f"sparse2dense-tiny{place}.safetensors",
+    )
+
+
+_PUBLISHED = [
+    published(depth, decoder, modality, place)
+    for depth in (18, 50)
+    for decoder in DECODERS
+    for modality in MODALITIES
+    for place in SIZES
+]
+definitions: dict[str, ModelDefinition] = {
+    one.name: one
+    for one in (*_PUBLISHED, sparse2dense_selfsup.definition, *(tiny(place) for place in SIZES))
+}
+definitions["sparse2dense"] = definitions["sparse2dense-r50-upproj"]
+definitions["sparse2dense-kitti"] = definitions["sparse2dense-r18-upproj-kitti"]

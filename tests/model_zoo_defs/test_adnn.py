@@ -1,0 +1,207 @@
+"""adnn: SAME padding against a table, the solve against one in dense numpy, the authors' npz."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from model_zoo_defs.adnn import Adnn, analysed, definitions, margins, synthesised
+from pnpdepth_cli.core.split import Split
+from pnpdepth_cli.errors import CheckpointError
+from pnpdepth_cli.models.network import load_network
+from tests.model_zoo_defs.cuts import (
+    assert_the_cut_changes_nothing_and_a_step_does,
+    built,
+    frame_for,
+)
+
+Array = NDArray[np.float64]
+SHAPES = {"kernel0": (11, 11, 1, 8), "kernel1": (5, 5, 8, 16), "kernel2": (3, 3, 16, 32)}
+
+
+@pytest.mark.parametrize(
+    ("size", "kernel", "expected"),
+    [
+        (228, 11, (4, 5)),
+        (227, 11, (5, 5)),
+        (228, 5, (1, 2)),
+        (229, 5, (2, 2)),
+        (228, 3, (0, 1)),
+        (229, 3, (1, 1)),
+        (1, 11, (5, 5)),
+        (2, 11, (4, 5)),
+        (1, 3, (1, 1)),
+        (2, 3, (0, 1)),
+        (352, 2, (0, 0)),
+        (353, 1, (0, 0)),
+    ],
+)
+def test_padding_is_that_of_tensorflows_same_at_stride_2(
+    size: int, kernel: int, expected: tuple[int, int]
+) -> None:
+    assert margins(size, kernel) == expected
+
+
+def dense(kernel: Array, size: tuple[int, int]) -> Array:
+    """The matrix of `analysed` for maps (c, h, w) of this size, element by element."""
+    count, channels, k, _ = kernel.shape
+    (height, width), (rows, columns) = size, (-(-size[0] // 2), -(-size[1] // 2))
+    matrix = np.zeros((count, rows, columns, channels, height, width))
+    top, left = max((rows - 1) * 2 + k - height, 0) // 2, max((columns - 1) * 2 + k - width, 0) // 2
+    for i, j, a, b in np.ndindex(rows, columns, k, k):
+        y, x = 2 * i + a - top, 2 * j + b - left
+        if 0 <= y < height and 0 <= x < width:
+            matrix[:, i, j, :, y, x] += kernel[:, :, a, b]
+    return matrix.reshape(count * rows * columns, channels * height * width)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (5, 8), (6, 7), (12, 9)])
+@pytest.mark.parametrize("k", [11, 5, 3])
+def test_both_ways_through_a_dictionary_are_one_matrix_and_its_transpose(
+    k: int, size: tuple[int, int]
+) -> None:
+    torch.manual_seed(0)
+    kernel, x = torch.randn(4, 2, k, k).double(), torch.randn(1, 2, *size).double()
+    matrix = torch.from_numpy(dense(kernel.numpy(), size))
+    codes = analysed(x, kernel)
+    assert codes.shape == (1, 4, -(-size[0] // 2), -(-size[1] // 2))
+    torch.testing.assert_close(codes.flatten(), matrix @ x.flatten())
+    codes = torch.randn_like(codes)
+    torch.testing.assert_close(
+        synthesised(codes, kernel, size).flatten(), matrix.T @ codes.flatten()
+    )
+
+
+def solved(network: Adnn, sparse: Array, iterations: int) -> Array:
+    """ADMM and the way back to depth with dense matrices, from the authors' update rules."""
+    kernels = [getattr(network, f"kernel{i}").detach().numpy() for i in range(3)]
+    penalty = [float(getattr(network, f"bias{i}").detach().abs()) / 1000 for i in range(3)]
+    sizes = [sparse.shape]
+    for _ in range(2):
+        sizes.append((-(-sizes[-1][0] // 2), -(-sizes[-1][1] // 2)))
+    wt = [dense(kernel, size) for kernel, size in zip(kernels, sizes, strict=True)]
+    d = sparse.flatten()
+    mask = [(d > 0).astype(float)]
+    for kernel, size in zip(kernels[:2], sizes[:2], strict=True):
+        seen = dense(np.ones((1, 1, *kernel.shape[2:])), size) @ (mask[-1].reshape(-1)) > 0
+        mask.append(seen.astype(float))
+
+    def masked(level: int, values: Array) -> Array:
+        """Zero where the level's mask, the same for all channels, is."""
+        return (values.reshape(-1, len(mask[level])) * mask[level]).flatten()
+
+    z, y = [wt[0] @ d], []
+    y.append(np.maximum(z[0] - penalty[0], 0))
+    for i in (1, 2):
+        z.append(wt[i] @ masked(i, y[i - 1]))
+        y.append(np.maximum(z[i] - penalty[i], 0))
+    multiplier = [np.zeros_like(one) for one in z]
+    for _ in range(iterations):
+        for i in range(3):
+            target = masked(i, y[i - 1]) if i else d
+            before = y[i] - multiplier[i]
+            z[i] = wt[i] @ (target - masked(i, wt[i].T @ before)) / 2 + before
+            if i < 2:
+                wanted = z[i] + wt[i + 1].T @ z[i + 1]
+                y[i] = np.maximum(wanted - (penalty[i] - multiplier[i]), 0) / 2
+            else:
+                y[i] = np.maximum(z[i] - (penalty[i] - multiplier[i]), 0)
+            multiplier[i] = multiplier[i] + z[i] - y[i]
+    return (wt[0].T @ (wt[1].T @ (wt[2].T @ z[2]))).reshape(sparse.shape)
+
+
+@pytest.mark.parametrize("iterations", [0, 1, 10])
+@pytest.mark.parametrize("size", [(16, 24), (17, 11)])
+def test_depth_is_that_of_the_same_iterations_with_dense_matrices(
+    size: tuple[int, int], iterations: int
+) -> None:
+    torch.manual_seed(0)
+    network = Adnn(filters=(3, 4, 5), iterations=iterations).double()
+    for bias in network.biases:
+        getattr(network, bias).data.fill_(-80.0)  # a penalty of 0.08
+    rng = np.random.default_rng(0)
+    sparse = rng.uniform(1, 9, size) * (rng.random(size) < 0.1)
+    with torch.no_grad():
+        found = network(torch.from_numpy(sparse)[None, None])[0, 0].numpy()
+    expected = solved(network, sparse, iterations)
+    assert np.abs(expected).max() > 1e-3
+    np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (13, 50)])
+def test_depth_is_finite_without_any_point(size: tuple[int, int]) -> None:
+    depth = Adnn()(torch.zeros(1, 1, *size))
+    assert depth.shape == (1, 1, *size)
+    assert not bool(depth.any())
+
+
+# ------------------------------------------------------------------ the authors' variables
+
+
+def variables() -> dict[str, NDArray[np.float32]]:
+    rng = np.random.default_rng(5)
+    found = {name: rng.normal(size=shape, scale=0.05) for name, shape in SHAPES.items()}
+    found |= {f"bias{i}": np.array(0.5 + i) for i in range(3)}
+    return {name: array.astype(np.float32) for name, array in found.items()}
+
+
+def test_the_kernels_have_as_many_values_as_the_authors() -> None:
+    sizes = [p.numel() for p in Adnn().parameters()]
+    assert sum(size for size in sizes if size > 1) == 8776
+    assert len(sizes) == 6
+
+
+def test_the_authors_variables_load_from_npz_each_in_its_place(tmp_path: Path) -> None:
+    arrays = variables()
+    np.savez(tmp_path / "adnn.npz", **arrays)
+    network = load_network("adnn", tmp_path / "adnn.npz").module
+    assert network.state_dict().keys() == arrays.keys()
+    for name in ("bias0", "bias1", "bias2"):
+        assert float(getattr(network, name)) == arrays[name]
+    for name in SHAPES:
+        kernel = getattr(network, name)
+        for i, j, c, n in ((0, 0, 0, 0), (1, 2, 0, 7), (2, 0, 0, 3)):
+            assert float(kernel[n, c, i, j]) == arrays[name][i, j, c, n]
+
+
+def test_a_state_dict_of_its_own_loads_as_it_is(tmp_path: Path) -> None:
+    state = Adnn().state_dict()
+    torch.save(state, tmp_path / "adnn.pth")
+    own = load_network("adnn", tmp_path / "adnn.pth").module.state_dict()
+    assert all(torch.equal(own[name], tensor) for name, tensor in state.items())
+
+
+def test_a_variable_left_over_is_named(tmp_path: Path) -> None:
+    np.savez(tmp_path / "adnn.npz", **variables(), global_step=np.array(3))
+    with pytest.raises(CheckpointError, match=r"1 unexpected \(global_step\)"):
+        load_network("adnn", tmp_path / "adnn.npz")
+
+
+# ------------------------------------------------------------------ the cut
+
+
+def test_z_is_the_codes_of_the_last_layer() -> None:
+    network = built(definitions["adnn"])
+    assert network.definition.default_layer == "solve"
+    assert network.definition.default_alignment == "none"
+    z = assert_the_cut_changes_nothing_and_a_step_does(network, "solve")
+    assert z.shape == (1, 32, 8, 12)
+
+
+def test_behind_the_codes_depth_is_linear_in_them() -> None:
+    network = built(definitions["adnn"])
+    with torch.no_grad(), Split(network.module, "solve") as split:
+        z = split.front(*frame_for(network))
+        depth: Tensor = split.rear(z)
+        torch.testing.assert_close(split.rear(3 * z), 3 * depth)
+
+
+@pytest.mark.parametrize("layer", definitions["adnn"].layers)
+def test_every_layer_can_be_cut_at_and_a_step_there_changes_depth(layer: str) -> None:
+    network = built(definitions["adnn"])
+    assert_the_cut_changes_nothing_and_a_step_does(network, layer)

@@ -1,0 +1,116 @@
+"""latefusion: NASNet's own size, features of the paper's strides, depth that is always depth."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import save_file
+from torch import Tensor
+
+from model_zoo_defs.latefusion import Encoder, Halved, LateFusion, averaged, definitions
+from pnpdepth_cli.core.split import Split
+from pnpdepth_cli.errors import CheckpointError
+from pnpdepth_cli.models.network import load_network
+from tests.model_zoo_defs.cuts import (
+    assert_the_cut_changes_nothing_and_a_step_does,
+    built,
+    frame_for,
+)
+
+TINY = definitions["latefusion-tiny"]
+
+
+def test_an_encoder_has_as_many_values_as_nasnet_mobile() -> None:
+    """Keras counts 4,232,978 without the classifier; the stem has a bias here, no batch norm."""
+    with torch.device("meta"):
+        encoder = Encoder(3, 44, 4)
+    counted = sum(p.numel() for p in encoder.parameters())
+    assert counted == 4_232_978 - 2 * 32 + 32
+    assert encoder.channels[-1] == 1056
+
+
+def test_features_halve_five_times() -> None:
+    encoder = Encoder(1, 8, 2)
+    found = encoder(torch.rand(2, 1, 64, 96))
+    shapes = [(2, channels, 64 >> i, 96 >> i) for i, channels in enumerate(encoder.channels, 1)]
+    assert [tuple(features.shape) for features in found] == shapes
+
+
+def test_nothing_normalises_behind_the_first_strided_convolution() -> None:
+    """Twice the sparse depth gives features twice as large at 1/2, in training too."""
+    encoder = LateFusion(8, 1).sparse.train().requires_grad_(False)
+    encoder.stem.bias.zero_()
+    sparse = 5 * (torch.rand(1, 1, 64, 96) < 0.1).float()
+    assert torch.equal(encoder(2 * sparse)[0], 2 * encoder(sparse)[0])
+
+
+def test_a_mean_counts_pixels_inside_the_picture_only() -> None:
+    assert torch.equal(averaged(torch.full((1, 1, 5, 6), 3.0)), torch.full((1, 1, 5, 6), 3.0))
+
+
+def test_halving_sees_even_and_odd_pixels() -> None:
+    layer = Halved(1, 2).eval().requires_grad_(False)
+    layer.even.weight.fill_(1)
+    layer.odd.weight.fill_(1)
+    found = layer(torch.arange(16.0).reshape(1, 1, 4, 4))
+    expected = torch.tensor([[[0, 2], [8, 10]], [[5, 7], [13, 15]]]).float()
+    torch.testing.assert_close(found[0], expected, rtol=1e-4, atol=0)
+
+
+@pytest.mark.parametrize("size", [(32, 32), (64, 160)])
+@pytest.mark.parametrize("share", [0.0, 0.01, 1.0])
+def test_depth_is_between_0_and_200_m_whatever_the_points(
+    size: tuple[int, int], share: float
+) -> None:
+    network = built(TINY).module
+    for scale in (1.0, 1e3):
+        sparse = scale * 80 * (torch.rand(1, 1, *size) < share)
+        with torch.no_grad():
+            depth = network(scale * torch.randn(1, 3, *size), sparse)
+        assert depth.shape == (1, 1, *size)
+        assert bool((depth >= 0).all())
+        assert bool((depth <= 200.01).all())
+
+
+def test_both_pictures_matter() -> None:
+    network = built(TINY).module
+    rgb, sparse = frame_for(built(TINY))
+    with torch.no_grad():
+        depth = network(rgb, sparse)
+        assert not torch.equal(network(rgb.flip(3), sparse), depth)
+        assert not torch.equal(network(rgb, sparse.flip(3)), depth)
+
+
+def test_weights_load_whole_and_those_of_the_other_size_name_it(tmp_path: Path) -> None:
+    torch.manual_seed(1)
+    state = TINY.build().state_dict()
+    save_file(state, tmp_path / "w.safetensors")
+    own = load_network("latefusion-tiny", tmp_path / "w.safetensors").module.state_dict()
+    assert all(torch.equal(own[name], tensor) for name, tensor in state.items())
+    with pytest.raises(CheckpointError, match="this is latefusion-tiny; use --model"):
+        load_network("latefusion", tmp_path / "w.safetensors")
+
+
+def test_z_is_the_decoders_feature_map_at_an_eighth() -> None:
+    network = built(TINY)
+    assert network.definition.default_layer == "decoder.s8"
+    assert network.definition.default_alignment == "none"
+    z = assert_the_cut_changes_nothing_and_a_step_does(network, "decoder.s8")
+    assert z.shape == (1, 32, 8, 12)
+
+
+@pytest.mark.parametrize("layer", TINY.layers)
+def test_every_layer_can_be_cut_at_and_a_step_there_changes_depth(layer: str) -> None:
+    network = built(TINY)
+    assert_the_cut_changes_nothing_and_a_step_does(network, layer)
+
+
+def test_the_full_network_is_cut_at_the_same_place() -> None:
+    network = definitions["latefusion"].build().eval()
+    rgb, sparse = torch.rand(1, 3, 32, 64), torch.rand(1, 1, 32, 64)
+    with torch.no_grad(), Split(network, "decoder.s8") as split:
+        z: Tensor = split.front(rgb, sparse)
+        assert z.shape == (1, 88, 4, 8)
+        assert torch.equal(split.rear(z), network(rgb, sparse))

@@ -1,0 +1,215 @@
+"""sparseconv: the sparse convolution against a loop, both published layouts against a reference."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from model_zoo_defs.sparseconv import SparseConv, SparseConvNet, definitions
+from pnpdepth_cli.core.split import Split
+from pnpdepth_cli.errors import CheckpointError
+from pnpdepth_cli.models.network import load_network
+from tests.model_zoo_defs.cuts import assert_the_cut_changes_nothing_and_a_step_does, built
+
+KERNELS = (11, 7, 5, 3, 3)
+
+
+def sparse_depth(height: int, width: int, share: float = 0.1) -> Tensor:
+    generator = torch.Generator().manual_seed(1)
+    depth = 1 + 9 * torch.rand(1, 1, height, width, generator=generator)
+    return depth * (torch.rand(depth.shape, generator=generator) < share)
+
+
+def port(outputs: int = 17) -> dict[str, Tensor]:
+    """Every key and shape of the port's checkpoint, with weights of the size of trained ones."""
+    generator = torch.Generator().manual_seed(2)
+    state, channels = {}, 1
+    for place, kernel in enumerate(KERNELS):
+        name, shape = f"sparse_convs.{place}.sparse_conv", (16, channels, kernel, kernel)
+        state[f"{name}.bias"] = 0.1 * torch.randn(16, generator=generator)
+        state[f"{name}.conv.weight"] = 1 + torch.randn(shape, generator=generator)
+        channels = 16
+    state["mask_conv.weight"] = torch.randn(1, outputs, 1, 1, generator=generator)
+    state["mask_conv.bias"] = torch.randn(1, generator=generator)
+    return state
+
+
+def tensorflow() -> dict[str, np.ndarray]:
+    """Every variable of the TensorFlow network, by its name."""
+    rng = np.random.default_rng(3)
+    variables, channels = {}, 1
+    for number, kernel in enumerate(KERNELS, start=1):
+        shape = (kernel, kernel, channels, 16)
+        variables[f"sp_conv{number}/kernel"] = (1 + rng.normal(size=shape)) / channels
+        variables[f"sp_conv{number}/bias"] = rng.normal(size=(1, 1, 1, 16)) * 0.1
+        channels = 16
+    variables["conv/kernel"] = rng.normal(size=(1, 1, 16, 1))
+    return {name: array.astype(np.float32) for name, array in variables.items()}
+
+
+def looped(x: Tensor, mask: Tensor, weight: Tensor, bias: Tensor, per_channel: bool) -> Tensor:
+    """A sparse convolution pixel by pixel: (c, h, w), (h, w) → (n, h, w)."""
+    (out, channels, kernel, _), (height, width) = weight.shape, mask.shape
+    result, reach = torch.zeros(out, height, width), kernel // 2
+    for i in range(height):
+        for j in range(width):
+            total, count = torch.zeros(out), 0
+            for di in range(-reach, reach + 1):
+                for dj in range(-reach, reach + 1):
+                    a, b = i + di, j + dj
+                    if 0 <= a < height and 0 <= b < width and mask[a, b]:
+                        total += weight[:, :, di + reach, dj + reach] @ x[:, a, b]
+                        count += channels if per_channel else 1
+            result[:, i, j] = total / max(count, 1) + bias
+    return result
+
+
+@pytest.mark.parametrize("per_channel", [True, False])
+@pytest.mark.parametrize("kernel", [3, 5])
+def test_a_layer_is_the_sum_over_known_pixels_over_their_number(
+    kernel: int, per_channel: bool
+) -> None:
+    torch.manual_seed(0)
+    layer = SparseConv(3, 4, kernel, per_channel=per_channel).requires_grad_(False)
+    layer.bias.normal_()
+    x, mask = torch.randn(1, 3, 9, 11), (torch.rand(1, 1, 9, 11) < 0.05).float()
+    found, grown = layer(x, mask)
+    expected = looped(x[0], mask[0, 0], layer.conv.weight, layer.bias, per_channel)
+    torch.testing.assert_close(found[0], expected)
+    reach = kernel // 2
+    near = [
+        mask[0, 0, max(i - reach, 0) : i + reach + 1, max(j - reach, 0) : j + reach + 1].max()
+        for i in range(9)
+        for j in range(11)
+    ]
+    assert torch.equal(grown.flatten(), torch.stack(near))
+    assert 0 < float(grown.mean()) < 1
+
+
+@pytest.mark.parametrize("with_mask", [True, False])
+def test_what_lies_at_unknown_pixels_does_not_matter(with_mask: bool) -> None:
+    torch.manual_seed(0)
+    network, sparse = SparseConvNet(with_mask=with_mask), sparse_depth(20, 24)
+    with torch.no_grad():
+        assert torch.equal(network(sparse), network(torch.where(sparse > 0, sparse, -1.0)))
+
+
+@pytest.mark.parametrize("with_mask", [True, False])
+@pytest.mark.parametrize("size", [(1, 1), (7, 30)])
+def test_depth_is_finite_without_any_point(with_mask: bool, size: tuple[int, int]) -> None:
+    depth = SparseConvNet(with_mask=with_mask)(torch.zeros(1, 1, *size))
+    assert depth.shape == (1, 1, *size)
+    assert bool(depth.isfinite().all())
+
+
+def test_untrained_it_averages_the_points() -> None:
+    torch.manual_seed(0)
+    sparse = 4.0 * (sparse_depth(60, 80) > 0)
+    with torch.no_grad():
+        depth = definitions["sparseconv-tiny"].build()(sparse)
+    assert float(depth.median()) == pytest.approx(4.0, rel=0.2)
+
+
+# ------------------------------------------------------------------ published files
+
+
+def reference(state: dict[str, Tensor], sparse: Tensor, per_channel: bool) -> Tensor:
+    """Depth before the last convolution's bias, straight from the named tensors, in float64."""
+    x, mask = sparse.double(), (sparse > 0).double()
+    for place, kernel in enumerate(KERNELS):
+        name = f"sparse_convs.{place}.sparse_conv"
+        channels, box = x.shape[1], torch.ones(1, 1, kernel, kernel).double()
+        pixels = F.conv2d(mask, box, padding=kernel // 2)
+        count = pixels * channels if per_channel else pixels
+        weight, bias = state[f"{name}.conv.weight"].double(), state[f"{name}.bias"].double()
+        x = F.conv2d(x * mask, weight, padding=kernel // 2)
+        x = F.relu(torch.where(count > 0, x / count.clamp_min(1), 0.0) + bias.view(1, -1, 1, 1))
+        mask = (pixels > 0).double()
+    last = state["mask_conv.weight"].double()
+    return F.conv2d(torch.cat([x, mask], 1)[:, : last.shape[1]], last)
+
+
+def close(found: Tensor, expected: Tensor) -> None:
+    torch.testing.assert_close(
+        found.double(), expected, rtol=1e-4, atol=1e-4 * float(expected.abs().max())
+    )
+
+
+def test_the_ports_file_loads_whole_and_gives_what_its_tensors_say(tmp_path: Path) -> None:
+    state = port()
+    optimizer = {"state": {}, "param_groups": [{"lr": 0.001, "params": [0, 1]}]}
+    content = {"epoch": 20, "rmse": 1777.0, "arch": "sparseconv", "optimizer": optimizer}
+    torch.save({**content, "state_dict": state}, tmp_path / "best_model.pth.tar")
+    network = load_network("sparseconv", tmp_path / "best_model.pth.tar")
+    own = network.module.state_dict()
+    assert own.keys() == state.keys()
+    assert all(torch.equal(own[name], tensor) for name, tensor in state.items())
+    sparse = sparse_depth(40, 60, 0.01)
+    with torch.no_grad():
+        found = network.module(sparse)
+    close(found, reference(state, sparse, per_channel=True) + state["mask_conv.bias"])
+
+
+def test_the_tensorflow_variables_load_and_give_what_they_say(tmp_path: Path) -> None:
+    variables = tensorflow()
+    np.savez(tmp_path / "sparse_cnn.npz", **variables)
+    network = load_network("sparseconv-nomask", tmp_path / "sparse_cnn.npz")
+    kernels = {n: torch.from_numpy(a).permute(3, 2, 0, 1) for n, a in variables.items()}
+    state = {"mask_conv.weight": kernels["conv/kernel"]}
+    for place in range(5):
+        name = f"sparse_convs.{place}.sparse_conv"
+        state[f"{name}.conv.weight"] = kernels[f"sp_conv{place + 1}/kernel"]
+        state[f"{name}.bias"] = kernels[f"sp_conv{place + 1}/bias"].flatten()
+    sparse = sparse_depth(40, 60, 0.01)
+    with torch.no_grad():
+        found = network.module(sparse)
+    close(found, reference(state, sparse, per_channel=False))
+
+
+def test_a_state_dict_without_the_mask_channel_loads_as_it_is(tmp_path: Path) -> None:
+    state = port(16)
+    torch.save({"state_dict": state}, tmp_path / "w.pth.tar")
+    own = load_network("sparseconv-nomask", tmp_path / "w.pth.tar").module.state_dict()
+    assert all(torch.equal(own[name], tensor) for name, tensor in state.items())
+
+
+def test_weights_of_the_other_form_name_it(tmp_path: Path) -> None:
+    torch.save({"state_dict": port(16)}, tmp_path / "w.pth.tar")
+    with pytest.raises(CheckpointError, match="this is sparseconv-nomask; use --model sparseconv"):
+        load_network("sparseconv", tmp_path / "w.pth.tar")
+
+
+def test_a_variable_left_over_is_named(tmp_path: Path) -> None:
+    np.savez(tmp_path / "w.npz", **tensorflow(), **{"conv/bias": np.zeros(1, np.float32)})
+    with pytest.raises(CheckpointError, match=r"1 unexpected \(conv/bias\)"):
+        load_network("sparseconv-nomask", tmp_path / "w.npz")
+
+
+# ------------------------------------------------------------------ the cut
+
+
+def test_z_is_the_features_behind_the_first_layer_and_the_mask_stays() -> None:
+    network = built(definitions["sparseconv"])
+    assert network.definition.default_layer == "sparse_convs.0[0]"
+    assert network.definition.default_alignment == "none"
+    sparse = sparse_depth(64, 96, 0.001)
+    with torch.no_grad(), Split(network.module, "sparse_convs.0[0]") as split:
+        z = split.front(sparse)
+        known = F.max_pool2d((sparse > 0).float(), 11, 1, 5)
+        moved = split.rear(z + (1 - known))  # only where the mask says nothing is known
+        assert torch.equal(moved, network.module(sparse))
+        assert not torch.equal(split.rear(z + known), moved)
+    assert z.shape == (1, 16, 64, 96)
+    assert bool((z >= 0).all())
+
+
+@pytest.mark.parametrize("name", ["sparseconv", "sparseconv-nomask"])
+@pytest.mark.parametrize("layer", definitions["sparseconv"].layers)
+def test_every_layer_can_be_cut_at_and_a_step_there_changes_depth(name: str, layer: str) -> None:
+    network = built(definitions[name])
+    assert_the_cut_changes_nothing_and_a_step_does(network, layer)
