@@ -39,7 +39,7 @@ class Job:
             height=self.height,
             width=self.width,
             kinds=self.kinds,
-            lens=CAMERAS[self.camera],
+            rig=CAMERAS[self.camera],
         )
 
 

@@ -29,24 +29,29 @@ VIEWS_PER_SCENE = 4
 _MAKERS = {"room": room, "street": street, "desk": desk_scene}
 
 
-class Lens(NamedTuple):
-    """Says what a camera sees: its horizontal field of view, and where its axis lies off the
+class Rig(NamedTuple):
+    """Says what a camera sees and how it is carried.
 
-    middle of the picture, (right, down) in widths and heights.
+    fov_deg: horizontal. shift: where its axis lies off the middle of the picture, (right, down) in
+    widths and heights. height: above the floor or road, lowest and highest, metres. roll_deg:
+    standard deviation about level, and in a street also about straight ahead.
     """
 
     fov_deg: float
-    shift: tuple[float, float] = (0.0, 0.0)
+    shift: tuple[float, float]
+    height: tuple[float, float]
+    roll_deg: float
 
 
-CAMERAS: dict[str, Lens | None] = {
+CAMERAS: dict[str, Rig | None] = {
     "any": None,
-    # 304 × 228 px about the middle of half a Kinect picture, focal length 518.86 px
-    "nyu": Lens(60.7),
-    # columns 154 to 1066, rows 136 to 364 of KITTI's left colour camera: 721.5 px, axis at row 173
-    "kitti": Lens(64.6, (0.0, -0.338)),
+    # 304 × 228 px about the middle of half a Kinect picture, focal length 518.86 px; held by hand
+    "nyu": Rig(60.7, (0.0, 0.0), (1.2, 1.6), 1.5),
+    # columns 154 to 1066, rows 136 to 364 of KITTI's left colour camera: 721.5 px, axis at row
+    # 173, on a car's roof
+    "kitti": Rig(64.6, (0.0, -0.338), (1.6, 1.7), 0.5),
 }
-"""Cameras of the benchmarks whose metric depth a network can learn from the picture alone."""
+"""Cameras of the benchmarks, whose metric depth a network can learn from the picture alone."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,13 +98,13 @@ def pick_view(
     *,
     height: int,
     width: int,
-    lens: Lens | None = None,
+    rig: Rig | None = None,
 ) -> View:
     """Returns a view that shows much of the scene; the best of some tries."""
     best, best_score = None, -1.0
     for _ in range(24):
-        view = _street_view(plan, rng, height, width, lens) if kind == "street" else _indoor_view(
-            plan, rng, height, width, lens, near=kind == "desk"
+        view = _street_view(plan, rng, height, width, rig) if kind == "street" else _indoor_view(
+            plan, rng, height, width, rig, near=kind == "desk"
         )  # fmt: skip
         score = _score(world, view, kind)
         if best is None or score > best_score:
@@ -111,7 +116,7 @@ def pick_view(
 
 
 def _street_view(
-    plan: Plan, rng: np.random.Generator, height: int, width: int, lens: Lens | None
+    plan: Plan, rng: np.random.Generator, height: int, width: int, rig: Rig | None
 ) -> View:
     place = rng.uniform(plan.low, plan.high)
     yaw = rng.normal(0, 0.06) if rng.random() < 0.7 else rng.uniform(-1.2, 1.2)
@@ -119,30 +124,34 @@ def _street_view(
     shift = (float(rng.uniform(-0.8, 0.8)), 0.0) if rng.random() < 0.3 else (0.0, 0.0)
     pitch = rng.normal(-0.02, 0.03)
     fov, roll = rng.uniform(30, 85), rng.normal(0, 0.01)
-    lens = lens or Lens(fov, (shift[0], float(rng.uniform(-0.15, 0.1))))
-    return looking(
-        place, yaw, pitch, roll, fov_deg=lens.fov_deg, height=height, width=width, shift=lens.shift
-    )
+    shift = (shift[0], float(rng.uniform(-0.15, 0.1)))
+    if rig is not None:
+        place[2] = rng.uniform(*rig.height)
+        yaw, roll = np.radians(rng.normal(0, rig.roll_deg, 2))
+        fov, shift = rig.fov_deg, rig.shift
+    return looking(place, yaw, pitch, roll, fov_deg=fov, height=height, width=width, shift=shift)
 
 
 def _indoor_view(
-    plan: Plan, rng: np.random.Generator, height: int, width: int, lens: Lens | None, *, near: bool
+    plan: Plan, rng: np.random.Generator, height: int, width: int, rig: Rig | None, *, near: bool
 ) -> View:
     place = rng.uniform(plan.low, plan.high)
     target = np.asarray(plan.targets[int(rng.integers(len(plan.targets)))])
     if near:
         place = target + (place - target) * rng.uniform(0.4, 1.2)
         place[2] = max(place[2], plan.low[2])
+    if rig is not None:
+        place[2] = rng.uniform(*rig.height)
     toward = target - place
     yaw = float(np.arctan2(-toward[0], toward[1]))
     pitch = float(np.arctan2(toward[2], np.hypot(toward[0], toward[1]) + 1e-6))
     pitch = np.clip(pitch, -1.1, 0.5) * rng.uniform(0.4, 1.0) + rng.normal(0, 0.05)
     yaw += rng.normal(0, 0.15)
     roll = rng.normal(0, 0.06 if rng.random() < 0.8 else 0.3)
-    lens = lens or Lens(rng.uniform(40, 95))
-    return looking(
-        place, yaw, pitch, roll, fov_deg=lens.fov_deg, height=height, width=width, shift=lens.shift
-    )
+    fov = rng.uniform(40, 95)
+    if rig is not None:
+        roll, fov = np.radians(rng.normal(0, rig.roll_deg)), rig.fov_deg
+    return looking(place, yaw, pitch, roll, fov_deg=fov, height=height, width=width)
 
 
 def _score(world: World, view: View, kind: str) -> float:
@@ -170,7 +179,7 @@ def scene_frames(
     height: int,
     width: int,
     kinds: tuple[str, ...] = KINDS,
-    lens: Lens | None = None,
+    rig: Rig | None = None,
 ) -> list[Frame]:
     """Returns the VIEWS_PER_SCENE frames of a scene; the same bytes on every run."""
     rng = generator(seed, scene, 0)
@@ -179,7 +188,7 @@ def scene_frames(
     frames = []
     for number in range(VIEWS_PER_SCENE):
         own = generator(seed, scene, 1 + number)
-        view = pick_view(world, plan, kind, own, height=height, width=width, lens=lens)
+        view = pick_view(world, plan, kind, own, height=height, width=width, rig=rig)
         colour, depth = seen(world, view, own)
         frames.append(
             Frame(

@@ -9,11 +9,12 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
 from torch import Tensor, nn
 
 from model_zoo_defs.training.dataset import Frames, normalised
 from model_zoo_defs.training.patterns import keep, scan_lines, uniform
+from pnpdepth_cli.core.interpolation import linear
+from pnpdepth_cli.core.points import SparsePoints
 
 Depth = NDArray[np.float32]
 
@@ -35,16 +36,14 @@ class Case(NamedTuple):
 
 
 def linear_interpolation(sparse: Depth) -> Depth:
-    """Delaunay-linear depth between the points, the nearest point's depth outside their hull."""
+    """The program's own linear interpolation of a map's known pixels, (H, W) metres."""
     rows, columns = np.nonzero(sparse)
-    values = sparse[rows, columns]
-    at = np.stack([rows, columns], axis=1).astype(np.float64)
-    grid = tuple(np.indices(sparse.shape))
-    dense = NearestNDInterpolator(at, values)(*grid)
-    if len(values) >= 3 and np.linalg.matrix_rank(at - at[0]) == 2:
-        inside = LinearNDInterpolator(at, values)(*grid)
-        dense = np.where(np.isnan(inside), dense, inside)
-    return np.asarray(dense, dtype=np.float32)
+    points = SparsePoints(
+        xy=torch.from_numpy(np.stack([columns, rows], axis=1).astype(np.float32)),
+        depth=torch.from_numpy(sparse[rows, columns].astype(np.float32)),
+        size=(sparse.shape[0], sparse.shape[1]),
+    )
+    return linear(points).numpy()
 
 
 def cases(folder: Path, count: int) -> list[Case]:

@@ -1,0 +1,120 @@
+"""Batches for networks that learn metric depth: nothing in them changes a picture's geometry.
+
+Windows of frames as the camera took them, mirrored half the time, in other colours, with points
+where a network takes them. Batch number i depends on the seed, i and the frames alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from numpy.random import Generator
+from numpy.typing import NDArray
+from torch import Tensor
+
+from model_zoo_defs.training.dataset import Frames
+from model_zoo_defs.training.patterns import keep, scan_lines, uniform
+
+Depth = NDArray[np.float32]
+Points = Callable[[Generator, Depth], Depth]
+
+REFRESH_EVERY = 200
+
+
+class Batch(NamedTuple):
+    """rgb (B, 3, h, w) in 0..1, sparse (B, 1, H, W) and depth (B, 1, H, W) metres, 0 = unknown."""
+
+    rgb: Tensor
+    sparse: Tensor
+    depth: Tensor
+
+
+class Batches:
+    """Endless batches; every folder of frames counts alike.
+
+    points: draws the sparse depth of a window, None: there is none.
+    """
+
+    def __init__(self, folders: Sequence[Path], seed: int, points: Points | None = None):
+        self.sets = [Frames(folder) for folder in folders]
+        self.seed, self.points = seed, points
+        self._calls = 0
+
+    def batch(
+        self, number: int, size: int, window: tuple[int, int], shown: tuple[int, int] | None = None
+    ) -> Batch:
+        """Batch number `number`: `size` windows (H, W), their pictures resized to `shown`."""
+        self._calls += 1
+        if self._calls % REFRESH_EVERY == 0:
+            for frames in self.sets:
+                frames.refresh()
+        rng = np.random.default_rng((self.seed, number))
+        windows = [self._window(rng, window) for _ in range(size)]
+        depth = np.stack([depth for _, depth in windows])
+        sparse = np.stack([self._sparse(rng, one) for one in depth])
+        rgb = torch.from_numpy(np.stack([rgb for rgb, _ in windows])).permute(0, 3, 1, 2)
+        rgb = rgb.contiguous(memory_format=torch.channels_last).float() / 255.0
+        if shown:
+            rgb = F.interpolate(rgb, shown, mode="bilinear", antialias=True)
+        points, truth = (torch.from_numpy(x)[:, None] for x in (sparse, depth))
+        return Batch(recoloured(rng, rgb), points, truth)
+
+    def _window(self, rng: Generator, window: tuple[int, int]) -> tuple[NDArray[np.uint8], Depth]:
+        frames = self.sets[int(rng.integers(len(self.sets)))]
+        while True:
+            rgb, depth = frames[int(rng.integers(len(frames)))]
+            top, left = (
+                int(rng.integers(length - part + 1))
+                for length, part in zip(depth.shape, window, strict=True)
+            )
+            part = (slice(top, top + window[0]), slice(left, left + window[1]))
+            rgb, depth = rgb[part], depth[part]
+            if rng.random() < 0.5:
+                rgb, depth = rgb[:, ::-1], depth[:, ::-1]
+            if np.count_nonzero(depth) > depth.size // 10:
+                return rgb, depth
+
+    def _sparse(self, rng: Generator, depth: Depth) -> Depth:
+        return np.zeros_like(depth) if self.points is None else self.points(rng, depth)
+
+
+def recoloured(rng: Generator, rgb: Tensor) -> Tensor:
+    """The pictures (B, 3, h, w) 0..1 in other light, each in its own, and often in other hues."""
+
+    def each(values: NDArray[np.float64]) -> Tensor:
+        return torch.from_numpy(values.astype(np.float32)).view(len(rgb), -1, 1, 1)
+
+    count = len(rgb)
+    orders = [rng.permutation(3) if rng.random() < 0.5 else np.arange(3) for _ in range(count)]
+    rgb = torch.stack([one[torch.from_numpy(o)] for one, o in zip(rgb, orders, strict=True)])
+    rgb = rgb * each(np.exp(rng.normal(0.0, 0.2, (count, 1)) + rng.normal(0.0, 0.06, (count, 3))))
+    grey = rgb.mean(1, keepdim=True)
+    rgb = grey + (rgb - grey) * each(rng.uniform(0.3, 1.3, count))
+    rgb = 0.5 + (rgb - 0.5) * each(rng.uniform(0.8, 1.2, count))
+    return rgb.clamp(0.0, 1.0) ** each(np.exp(rng.normal(0.0, 0.2, count)))
+
+
+def some_points(rng: Generator, depth: Depth) -> Depth:
+    """As many as networks with a picture get, or lines of a LiDAR.
+
+    Half of the time as 500 of 228 x 304 pixels; 500 of 228 x 912 are in the range of the others.
+    """
+    kind = rng.random()
+    if kind < 0.2:
+        return scan_lines(rng, depth)
+    share = 0.0072 if kind < 0.6 else np.exp(rng.uniform(np.log(0.0015), np.log(0.03)))
+    return keep(depth, uniform(rng, depth, max(1, round(share * depth.size))))
+
+
+def many_points(rng: Generator, depth: Depth) -> Depth:
+    """As many as networks without a picture get, often 5 per cent, or lines of a LiDAR."""
+    kind = rng.random()
+    if kind < 0.4:
+        return scan_lines(rng, depth)
+    share = 0.05 if kind < 0.8 else np.exp(rng.uniform(np.log(0.005), np.log(0.2)))
+    return keep(depth, uniform(rng, depth, max(1, round(share * depth.size))))

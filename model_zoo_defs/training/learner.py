@@ -1,0 +1,170 @@
+"""A network being trained: one step, the running average, the schedule, stopping and going on."""
+
+from __future__ import annotations
+
+import copy
+import csv
+import math
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from safetensors.torch import save_file
+from torch import Tensor, nn
+
+WARM_UP_STEPS = 200
+
+
+@dataclass(frozen=True, kw_only=True)
+class Schedule:
+    """How long a run is and how fast it learns; the first limit that is reached ends it.
+
+    averaging: how much of the average of the weights stays at each step.
+    Without `minutes` the same seed and frames give the same bytes on the same machine.
+    """
+
+    lr: float
+    steps: int
+    minutes: float | None = None
+    averaging: float = 0.999
+
+    def progress(self, step: int, elapsed_s: float) -> float:
+        """How much of the run is done, 0..1, by steps or by the clock, whichever is further."""
+        by_clock = elapsed_s / (self.minutes * 60) if self.minutes else 0.0
+        return min(1.0, max(step / self.steps, by_clock))
+
+    def rate(self, step: int, elapsed_s: float) -> float:
+        """The learning rate: up in a straight line, then down to 0 on a cosine."""
+        factor = min(1.0, (step + 1) / WARM_UP_STEPS)
+        return self.lr * factor * 0.5 * (1.0 + math.cos(math.pi * self.progress(step, elapsed_s)))
+
+
+class Learner:
+    """The network being trained, its running average, and the optimiser.
+
+    A run says in `loss` what is to become small. `out` gets state.pt (everything `restore` needs)
+    and NAME.safetensors (the averaged weights, in half precision).
+    """
+
+    def __init__(
+        self, network: nn.Module, schedule: Schedule, out: Path, name: str, lanes: int = 1
+    ):
+        self.schedule, self.out, self.name = schedule, out, name
+        self.device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+        self.network = network.to(self.device)
+        self.average = copy.deepcopy(self.network)
+        for one in (self.network, self.average):
+            _channels_last(one)
+        self.learnt = [p for p in self.network.parameters() if p.requires_grad]
+        self.optimiser = torch.optim.AdamW(
+            self.learnt, lr=schedule.lr, weight_decay=1e-2, fused=True
+        )
+        # On a CPU two halves of a batch on a thread each beat one batch on two threads: they wait
+        # for each other once a step, not at every operation.
+        self.lanes = 1 if self.device.type == "cuda" else lanes
+        self.pool = ThreadPoolExecutor(self.lanes)
+        if self.lanes > 1:
+            torch.set_num_threads(1)
+        self.step, self.elapsed_s = 0, 0.0
+
+    def loss(self, part: Sequence[Tensor]) -> Tensor:
+        """What is to become small, for a part of a batch."""
+        raise NotImplementedError
+
+    @property
+    def progress(self) -> float:
+        """How much of the run is done, 0..1."""
+        return self.schedule.progress(self.step, self.elapsed_s)
+
+    def learn(self, batch: Sequence[Tensor]) -> float:
+        """One step of the optimiser has been made; returns the loss."""
+        self.network.train()
+        for group in self.optimiser.param_groups:
+            group["lr"] = self.schedule.rate(self.step, self.elapsed_s)
+        parts = list(zip(*(tensor.chunk(self.lanes) for tensor in batch), strict=True))
+        results = list(self.pool.map(self._loss_and_gradients, parts))
+        gradients = zip(*(found for _, found in results), strict=True)
+        for parameter, pieces in zip(self.learnt, gradients, strict=True):
+            known = [piece for piece in pieces if piece is not None]
+            parameter.grad = torch.stack(known).mean(0) if len(known) > 1 else pieces[0]
+        nn.utils.clip_grad_norm_(self.learnt, 1.0)
+        self.optimiser.step()
+        self.step += 1
+        # young averages follow faster, or the first export would be the initial weights
+        keep = min(self.schedule.averaging, (1 + self.step) / (10 + self.step))
+        with torch.no_grad():
+            torch._foreach_lerp_(_averaged(self.average), _averaged(self.network), 1.0 - keep)
+        return float(sum(loss for loss, _ in results) / len(results))
+
+    def _loss_and_gradients(
+        self, part: Sequence[Tensor]
+    ) -> tuple[float, tuple[Tensor | None, ...]]:
+        torch.set_num_threads(1)  # a setting of the thread it is called in
+        loss = self.loss([tensor.to(self.device) for tensor in part])
+        # a stage that trains a part of the network leaves the rest without gradient
+        return float(loss.detach()), torch.autograd.grad(loss, self.learnt, allow_unused=True)
+
+    def save(self) -> None:
+        """state.pt and the averaged weights hold this moment, whole or not at all."""
+        state = {
+            "network": self.network.state_dict(),
+            "average": self.average.state_dict(),
+            "optimiser": self.optimiser.state_dict(),
+            "step": self.step,
+            "elapsed_s": self.elapsed_s,
+        }
+        torch.save(state, self.out / "state.pt.part")
+        (self.out / "state.pt.part").replace(self.out / "state.pt")
+        export(self.average, self.weights)
+
+    def restore(self) -> None:
+        """The run stands where `save` left it; without a state.pt, at its beginning."""
+        if not (self.out / "state.pt").exists():
+            return
+        state = torch.load(self.out / "state.pt", map_location=self.device)
+        self.network.load_state_dict(state["network"])
+        self.average.load_state_dict(state["average"])
+        self.optimiser.load_state_dict(state["optimiser"])
+        self.step, self.elapsed_s = state["step"], state["elapsed_s"]
+
+    @property
+    def weights(self) -> Path:
+        """The file with the averaged weights."""
+        return self.out / f"{self.name}.safetensors"
+
+
+def _averaged(network: nn.Module) -> list[Tensor]:
+    """Parameters and the running statistics of normalisation, which belong to them."""
+    statistics = [buffer for buffer in network.buffers() if buffer.is_floating_point()]
+    return [*network.parameters(), *statistics]
+
+
+def _channels_last(network: nn.Module) -> None:
+    for parameter in network.parameters():
+        if parameter.ndim == 4:
+            parameter.data = parameter.data.contiguous(memory_format=torch.channels_last)
+
+
+def export(network: nn.Module, path: Path) -> None:
+    """The weights are in a safetensors file, in half precision."""
+    half = {
+        name: tensor.detach()
+        .to("cpu", torch.float16 if tensor.is_floating_point() else tensor.dtype)
+        .contiguous(memory_format=torch.contiguous_format)
+        for name, tensor in network.state_dict().items()
+    }
+    part = path.with_name(path.name + ".part")
+    save_file(half, part)
+    part.replace(path)
+
+
+def append_row(path: Path, row: dict[str, float]) -> None:
+    """The row is in the CSV file, below a header line."""
+    new = not path.exists()
+    with path.open("a", newline="") as file:
+        writer = csv.DictWriter(file, fieldnames=list(row))
+        if new:
+            writer.writeheader()
+        writer.writerow(row)

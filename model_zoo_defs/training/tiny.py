@@ -1,0 +1,416 @@
+"""Trains the tiny edition of one of the paper's networks on rendered frames.
+
+    python -m model_zoo_defs.training.tiny --network fcrn-tiny --data DIR ... --val DIR
+        --out RUN_DIR --minutes 30 --seed 1
+
+RUN_DIR gets state.pt (everything `--resume` needs), log.csv (loss and, with --val, MAE, RMSE and
+δ1 on frames that are not trained on) and NAME.safetensors (the averaged weights, in half
+precision). `--resume` with more minutes or steps goes on.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import math
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+from tqdm import tqdm
+
+from model_zoo_defs.training.batches import Batch, Batches, Points, many_points, some_points
+from model_zoo_defs.training.dataset import Frames
+from model_zoo_defs.training.learner import Learner, Schedule, append_row
+from pnpdepth_cli.models.definition import ModelDefinition, Multiple
+
+NEAREST = 0.1  # metres; below this a logarithm goes on as a straight line
+AVERAGING = (
+    0.99  # the runs are short, and a stage's weights are of no use to the next one's average
+)
+SETTLING, SETTLED_ON = 1_000_000_000, 48  # the number of a batch no step has, its windows
+COARSER = 0.5  # how much less every next coarser output of a network counts
+
+
+def smooth_log(depth: Tensor) -> Tensor:
+    """log(depth), and its tangent below `NEAREST`, where a network's metres may be negative."""
+    above = depth.clamp(min=NEAREST)
+    return torch.log(above) + (depth - above) / NEAREST
+
+
+def log_error(depth: Tensor, truth: Tensor) -> Tensor:
+    """Mean |log depth − log truth| where the truth is known; 0 = unknown."""
+    known = truth > 0
+    return (smooth_log(depth[known]) - torch.log(truth[known])).abs().mean()
+
+
+def log_error_up_to_scale(depth: Tensor, truth: Tensor) -> Tensor:
+    """The same once every picture's mean is taken off, which itself tends to 10 m = 1 slowly."""
+    losses = []
+    for one, other in zip(depth, truth, strict=True):
+        known = other > 0
+        difference = smooth_log(one[known]) - torch.log(other[known] / 10.0)
+        mean = difference.mean()
+        losses.append((difference - mean).abs().mean() + 0.1 * mean.abs())
+    return torch.stack(losses).mean()
+
+
+def share_of_distance(depth: Tensor, truth: Tensor) -> Tensor:
+    """Log of each picture's mean error over its median depth: near and far scenes count alike."""
+    losses = []
+    for one, other in zip(depth, truth, strict=True):
+        known = other > 0
+        error = (one[known] - other[known]).abs().mean() / other[known].median()
+        losses.append(torch.log(error + 1e-2))
+    return torch.stack(losses).mean()
+
+
+def inverse_error(depth: Tensor, truth: Tensor) -> Tensor:
+    """Log of each picture's mean error of inverse depth, times its median depth."""
+    inverse = 1.0 / depth.clamp(min=NEAREST) + (NEAREST - depth).clamp(min=0.0) / NEAREST**2
+    losses = []
+    for one, other in zip(inverse, truth, strict=True):
+        known = other > 0
+        error = (one[known] - 1.0 / other[known]).abs().mean() * other[known].median()
+        losses.append(torch.log(error + 1e-2))
+    return torch.stack(losses).mean()
+
+
+Loss = Callable[[Tensor, Tensor], Tensor]
+Outputs = Callable[[Any, tuple[Tensor, ...]], list[Tensor]]
+
+
+def whole(network: Any, arguments: tuple[Tensor, ...]) -> list[Tensor]:
+    """What the network says."""
+    return [network(*arguments)]
+
+
+def pyramid(network: Any, arguments: tuple[Tensor, ...]) -> list[Tensor]:
+    """What a network says that has outputs at several sizes, the finest first."""
+    found: list[Tensor] = network.pyramid(*arguments)
+    return found
+
+
+def coarse(network: Any, arguments: tuple[Tensor, ...]) -> list[Tensor]:
+    """What the coarse half of `eigen` says."""
+    return [network.coarse(*arguments)]
+
+
+def fine_and_coarse(network: Any, arguments: tuple[Tensor, ...]) -> list[Tensor]:
+    """What both halves of `eigen` say."""
+    first = network.coarse(*arguments)
+    return [network.fine(*arguments, first), first]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Stage:
+    """A part of a run, up to this share of it.
+
+    window: (H, W) cut out of the frames.
+    shown: (h, w) of the network's picture of the window, where it is not the window's own size.
+    outputs: what is compared with the truth.
+    """
+
+    window: tuple[int, int]
+    until: float = 1.0
+    shown: tuple[int, int] | None = None
+    outputs: Outputs = whole
+
+
+@dataclass(frozen=True, kw_only=True)
+class Recipe:
+    """What a network is shown and what is asked of it.
+
+    quiet: endings of the names of normalisations that start at 0, the last ones of residual
+        branches, so that a deep network starts as a shallow one.
+    flat: layers that start as this constant, so that no step is lost on finding the mean.
+    own_start: the network's own initial weights are right; otherwise He's are taken.
+    dropout: the share that dropout drops in training; half, as published, is more than a narrow
+        network has to spare.
+    farthest: depth beyond these metres is unknown.
+    half_precision: whether bfloat16 is exact enough and faster; it is neither for depth that comes
+        in as numbers only and for convolutions channel by channel.
+    """
+
+    loss: Loss
+    stages: tuple[Stage, ...]
+    points: Points | None = None
+    lr: float = 2e-3
+    batch: int = 8
+    quiet: tuple[str, ...] = ()
+    flat: Mapping[str, float] = field(default_factory=dict)
+    dropout: float = 0.1
+    own_start: bool = False
+    farthest: float = math.inf
+    half_precision: bool = True
+
+    def stage(self, progress: float) -> Stage:
+        """The stage at this share of the run."""
+        return next((one for one in self.stages if progress < one.until), self.stages[-1])
+
+
+KINECT = 10.0  # metres; windows of rooms look farther
+ROOM, STREET, QUARTER = (228, 304), (228, 912), (114, 152)
+
+# metres straight from normalised features: rooms and streets together are learnt much more slowly
+WITH_POINTS = Recipe(
+    loss=log_error, points=some_points, quiet=(".bn2",),
+    stages=(Stage(window=QUARTER, until=0.4), Stage(window=ROOM)),
+)  # fmt: skip
+
+RECIPES = {
+    # the coarse half first, as the authors did it; it is a fifth of the work
+    "eigen-tiny": Recipe(
+        loss=log_error, batch=16, farthest=KINECT, flat={"coarse.fc2": 0.75, "fine.conv3": 0.75},
+        stages=(
+            Stage(window=ROOM, until=0.6, outputs=coarse),
+            Stage(window=ROOM, outputs=fine_and_coarse),
+        ),
+    ),
+    # fewer pixels are less work and show most of what there is to learn
+    "fcrn-tiny": Recipe(
+        loss=log_error, batch=16, farthest=KINECT, quiet=("bn_branch2c",),
+        stages=(
+            Stage(window=ROOM, shown=(57, 76), until=0.3),
+            Stage(window=ROOM, shown=QUARTER, until=0.75),
+            Stage(window=ROOM),
+        ),
+    ),
+    "sfmlearner-tiny": Recipe(
+        loss=log_error_up_to_scale, own_start=True, lr=1e-3,
+        stages=(Stage(window=STREET, shown=(128, 416), outputs=pyramid),),
+    ),
+    "sparseconv-tiny": Recipe(
+        loss=share_of_distance, points=many_points, own_start=True, half_precision=False,
+        stages=(Stage(window=(112, 152)),),
+    ),
+    "adnn-tiny": Recipe(
+        loss=share_of_distance, points=many_points, own_start=True, half_precision=False,
+        stages=(Stage(window=(112, 152)),),
+    ),
+    "sparse2dense-tiny": WITH_POINTS,
+    "sparse2dense-tiny-kitti": replace(
+        WITH_POINTS, stages=(Stage(window=ROOM, until=0.6), Stage(window=STREET))
+    ),
+    "latefusion-tiny": Recipe(
+        loss=inverse_error, points=some_points, own_start=True, batch=4, half_precision=False,
+        stages=(Stage(window=(128, 160), until=0.7), Stage(window=(224, 288))),
+    ),
+}  # fmt: skip
+
+
+def with_start(network: nn.Module, recipe: Recipe) -> nn.Module:
+    """The network with the recipe's initial weights in it."""
+    for name, layer in network.named_modules():
+        if isinstance(layer, nn.Conv2d | nn.Linear) and not recipe.own_start:
+            nn.init.kaiming_normal_(layer.weight, nonlinearity="relu")
+        if isinstance(layer, nn.Dropout):
+            layer.p = recipe.dropout
+        if isinstance(layer, nn.BatchNorm2d) and name.endswith(recipe.quiet):
+            nn.init.zeros_(layer.weight)
+    for name, constant in recipe.flat.items():
+        layer = network.get_submodule(name)
+        assert isinstance(layer, nn.Conv2d | nn.Linear)
+        assert layer.bias is not None
+        nn.init.zeros_(layer.weight)
+        nn.init.constant_(layer.bias, constant)
+    return network
+
+
+def tiny_definition(name: str) -> ModelDefinition:
+    """The definition of that name, out of the file of its family."""
+    family = importlib.import_module(f"model_zoo_defs.{name.partition('-tiny')[0]}")
+    definition: ModelDefinition = family.definitions[name]
+    return definition
+
+
+@dataclass(frozen=True, kw_only=True)
+class Settings:
+    """One training run; the schedule follows whichever of `minutes` and `steps` is nearer."""
+
+    network: str
+    data: tuple[Path, ...]
+    out: Path
+    val: tuple[Path, ...] = ()
+    minutes: float | None = None
+    steps: int = 1_000_000
+    seed: int = 1
+    save_every: int = 250
+    val_frames: int = 24
+    resume: bool = False
+
+
+class TinyRun(Learner):
+    """One tiny edition being trained."""
+
+    def __init__(self, definition: ModelDefinition, recipe: Recipe, settings: Settings):
+        torch.manual_seed(settings.seed)
+        self.definition, self.recipe = definition, recipe
+        schedule = Schedule(
+            lr=recipe.lr, steps=settings.steps, minutes=settings.minutes, averaging=AVERAGING
+        )
+        self.batches = Batches(settings.data, settings.seed, recipe.points)
+        network = with_start(definition.build(), recipe)
+        super().__init__(network, schedule, settings.out, definition.name)
+
+    def loss(self, part: Sequence[Tensor]) -> Tensor:
+        """What the recipe asks, of every output of the network, the finest counting most."""
+        batch = Batch(*part)
+        known = self.known(batch)
+        with torch.autocast(self.device.type, torch.bfloat16, enabled=self.recipe.half_precision):
+            outputs = self.stage.outputs(self.network, self.arguments(batch))
+        total = known.new_zeros(())
+        for level, output in enumerate(outputs):
+            depth = as_depth(output.float(), self.definition.output_kind)
+            truth = F.interpolate(known, depth.shape[-2:], mode="nearest-exact")
+            total = total + COARSER**level * self.recipe.loss(depth, truth)
+        return total
+
+    @property
+    def stage(self) -> Stage:
+        """The stage the run is in."""
+        return self.recipe.stage(self.progress)
+
+    def known(self, batch: Batch) -> Tensor:
+        """The batch's depth (B, 1, H, W) as far as the recipe looks."""
+        return torch.where(batch.depth > self.recipe.farthest, 0.0, batch.depth)
+
+    def batch(self, number: int, size: int) -> Batch:
+        """Batch number `number` as this stage wants it."""
+        return self.batches.batch(number, size, self.stage.window, self.stage.shown)
+
+    @torch.no_grad()
+    def save(self) -> None:
+        """The same as any run's, the average's normalisations settled on many windows at once.
+
+        In training every small batch is normalised by itself; with few points in one and the many
+        of a LiDAR in the next, what is kept of that suits neither.
+        """
+        norms = [layer for layer in self.average.modules() if isinstance(layer, nn.BatchNorm2d)]
+        if norms:
+            momenta = [norm.momentum for norm in norms]
+            for norm in norms:
+                norm.momentum = 1.0
+            self.average.train()
+            self.average(*self.arguments(self.batch(SETTLING, SETTLED_ON)))
+            for norm, momentum in zip(norms, momenta, strict=True):
+                norm.momentum = momentum
+        super().save()
+
+    def arguments(self, batch: Batch) -> tuple[Tensor, ...]:
+        """How the network is called for a batch."""
+        normalisation = self.definition.normalisation
+        assert normalisation is not None
+        mean, std = (
+            torch.tensor(x, device=batch.rgb.device).view(3, 1, 1)
+            for x in (normalisation.mean, normalisation.std)
+        )
+        return self.definition.call_arguments((batch.rgb - mean) / std, batch.sparse)
+
+    @torch.no_grad()
+    def depth(self, batch: Batch) -> Tensor:
+        """The averaged network's depth for a batch, (B, 1, h, w), at the size of this stage."""
+        self.average.eval()
+        if shown := self.stage.shown:
+            picture = F.interpolate(batch.rgb, shown, mode="bilinear", antialias=True)
+            batch = batch._replace(rgb=picture)
+        output = self.average(*self.arguments(Batch(*(x.to(self.device) for x in batch))))
+        return as_depth(output.float().cpu(), self.definition.output_kind)
+
+
+def as_depth(output: Tensor, kind: str) -> Tensor:
+    """Depth out of what a network of this output kind says."""
+    if kind == "inverse":
+        return 1.0 / output.clamp(min=1e-3)
+    return output.clamp(-7.0, 7.0).exp() if kind == "log" else output
+
+
+def held_out(settings: Settings, definition: ModelDefinition, recipe: Recipe) -> list[Batch]:
+    """Frames of each validation folder, evenly taken, one by one, with the same points.
+
+    Whole, but for the pixels at the right and the bottom that a network's size leaves over.
+    """
+    found = []
+    step = definition.size.of if isinstance(definition.size, Multiple) else 1
+    for folder in settings.val:
+        frames = Frames(folder)
+        chosen = np.linspace(0, len(frames) - 1, min(settings.val_frames, len(frames)))
+        for index in chosen.astype(int):
+            rgb, depth = frames[int(index)]
+            height, width = (length - length % step for length in depth.shape)
+            rgb, depth = rgb[:height, :width], depth[:height, :width]
+            rng = np.random.default_rng(int(index))
+            sparse = recipe.points(rng, depth) if recipe.points else np.zeros_like(depth)
+            picture = torch.from_numpy(rgb).permute(2, 0, 1)[None].float() / 255.0
+            points, truth = (torch.from_numpy(x)[None, None] for x in (sparse, depth))
+            found.append(Batch(picture, points, truth))
+    return found
+
+
+def scores(run: TinyRun, frames: list[Batch]) -> dict[str, float]:
+    """Means over the frames of MAE and RMSE in metres and δ1 in per cent; a scale is fitted."""
+    rows = []
+    for batch in frames:
+        depth = F.interpolate(run.depth(batch), batch.depth.shape[-2:], mode="bilinear")
+        true = run.known(batch)
+        ours, truth = depth[true > 0], true[true > 0]
+        if run.definition.output_scale != "metric":
+            ours = ours * (truth.median() / ours.median())
+        ours = ours.clamp(min=1e-3)
+        error, ratio = ours - truth, torch.maximum(ours / truth, truth / ours)
+        close = 100.0 * (ratio < 1.25).float().mean()
+        rows.append([error.abs().mean(), error.square().mean().sqrt(), close])
+    means = np.array(rows).mean(0)
+    return dict(zip(("mae", "rmse", "d1"), (round(float(x), 4) for x in means), strict=True))
+
+
+def train(definition: ModelDefinition, recipe: Recipe, settings: Settings) -> Path:
+    """Trains to the end of the schedule; returns the file with the averaged weights."""
+    settings.out.mkdir(parents=True, exist_ok=True)
+    run = TinyRun(definition, recipe, settings)
+    if settings.resume:
+        run.restore()
+    frames = held_out(settings, definition, recipe)
+    began = time.monotonic() - run.elapsed_s
+    smooth = math.nan
+    with tqdm(total=settings.steps, initial=run.step, unit="step", mininterval=10.0) as bar:
+        while run.progress < 1.0:
+            loss = run.learn(run.batch(run.step, recipe.batch))
+            smooth = loss if math.isnan(smooth) else 0.99 * smooth + 0.01 * loss
+            run.elapsed_s = time.monotonic() - began
+            bar.update()
+            if run.step % settings.save_every == 0 or run.progress >= 1.0:
+                run.save()
+                now = {"step": run.step, "seconds": round(run.elapsed_s), "loss": round(smooth, 4)}
+                row = now | (scores(run, frames) if frames else {})
+                append_row(run.out / "log.csv", row)
+                tqdm.write(str(row))
+    return run.weights
+
+
+def main() -> None:
+    """Reads the command line and trains."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
+    parser.add_argument("--network", choices=tuple(RECIPES), required=True)
+    parser.add_argument("--data", type=Path, required=True, nargs="+", help="folders of shards")
+    parser.add_argument("--val", type=Path, nargs="*", default=(), help="folders kept for watching")
+    parser.add_argument("--out", type=Path, required=True, help="folder of the run")
+    parser.add_argument("--minutes", type=float, help="end after this long at the latest")
+    parser.add_argument("--steps", type=int, default=Settings.steps)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--resume", action="store_true", help="go on from RUN_DIR/state.pt")
+    options = vars(parser.parse_args())
+    settings = Settings(**options | {"data": tuple(options["data"]), "val": tuple(options["val"])})
+    print(train(tiny_definition(settings.network), RECIPES[settings.network], settings))
+
+
+if __name__ == "__main__":
+    main()

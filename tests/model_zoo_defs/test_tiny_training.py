@@ -1,0 +1,215 @@
+"""The recipe of the tiny editions: batches keep metres, losses mean what they say, runs go on."""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+from model_zoo_defs.training import batches
+from pnpdepth_cli.models.definition import ModelDefinition, Multiple
+
+pytest.importorskip("safetensors")
+tiny = pytest.importorskip("model_zoo_defs.training.tiny")
+
+SHAPE = (48, 64)
+WEIGHTS = Path(tiny.__file__).parents[1] / "weights"
+
+
+def slope(seed: int) -> np.ndarray:
+    """Depth that grows to the right and down from 1 to 5 m, unknown in one corner."""
+    rows, columns = np.indices(SHAPE)
+    depth = 1.0 + 0.03 * rows + 0.04 * columns + 0.1 * seed
+    depth[:4, :6] = 0.0
+    return depth.astype(np.float32)
+
+
+@pytest.fixture(scope="module")
+def shards(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("shards")
+    depth = np.stack([slope(i) for i in range(4)])
+    rgb = np.repeat((depth * 40.0).astype(np.uint8)[..., None], 3, axis=-1)
+    np.savez(folder / "shard_00000.npz", rgb=rgb, depth=depth)
+    return folder
+
+
+class Toy(nn.Module):
+    """Metres from a picture, by one layer."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.norm = nn.BatchNorm2d(3)
+        self.conv = nn.Conv2d(3, 1, 3, padding=1)
+
+    def forward(self, rgb: torch.Tensor) -> torch.Tensor:
+        return self.conv(self.norm(rgb))  # type: ignore[no-any-return]
+
+
+TOY = ModelDefinition(name="toy-tiny", input_kind="rgb", size=Multiple(1), build=Toy)
+RECIPE = tiny.Recipe(
+    loss=tiny.log_error, batch=2, lr=3e-2, half_precision=False, flat={"conv": 0.5},
+    stages=(tiny.Stage(window=(32, 48), shown=(16, 24), until=0.5), tiny.Stage(window=(32, 48))),
+)  # fmt: skip
+
+
+def test_a_batch_depends_on_its_number_alone(shards: Path) -> None:
+    straight, jumping = (batches.Batches([shards], 3, batches.some_points) for _ in range(2))
+    straight.batch(0, 2, (32, 48)), straight.batch(1, 2, (32, 48))
+    for one, other in zip(
+        straight.batch(2, 2, (32, 48)), jumping.batch(2, 2, (32, 48)), strict=True
+    ):
+        assert torch.equal(one, other)
+    of_another_seed = batches.Batches([shards], 4, batches.some_points).batch(2, 2, (32, 48))
+    assert not torch.equal(straight.batch(2, 2, (32, 48)).depth, of_another_seed.depth)
+
+
+def test_a_batch_changes_colours_but_neither_metres_nor_places(shards: Path) -> None:
+    seen = set(np.load(shards / "shard_00000.npz")["depth"].ravel().tolist())
+    found = batches.Batches([shards], 1).batch(0, 8, (32, 48))
+    assert set(found.depth.ravel().tolist()) <= seen
+    for rgb, depth in zip(found.rgb, found.depth[:, 0], strict=True):
+        # brightness follows depth in these frames, in whatever light, mirrored or not
+        together = torch.corrcoef(torch.stack([rgb.mean(0).ravel(), depth.ravel()]))[0, 1]
+        assert together > 0.9
+
+
+def test_every_folder_counts_alike(shards: Path, tmp_path: Path) -> None:
+    np.savez(
+        tmp_path / "shard_00000.npz",
+        rgb=np.zeros((1, *SHAPE, 3), np.uint8),
+        depth=np.full((1, *SHAPE), 50.0, np.float32),
+    )
+    found = batches.Batches([shards, tmp_path], 1).batch(0, 200, (8, 8))
+    far = (found.depth == 50.0).flatten(1).all(1).float().mean()
+    assert 0.35 < far < 0.65
+
+
+@pytest.mark.parametrize("draw", [batches.some_points, batches.many_points])
+def test_points_are_depths_of_the_window_or_of_what_lies_behind(draw: batches.Points) -> None:
+    depth = slope(0)
+    for seed in range(20):
+        sparse = draw(np.random.default_rng(seed), depth)
+        assert sparse.shape == depth.shape
+        assert sparse.any()
+        assert set(np.unique(sparse)) <= set(np.unique(depth))
+        assert bool((sparse[sparse > 0] >= depth[sparse > 0]).all())
+
+
+def test_the_logarithm_goes_on_below_the_nearest_depth_and_can_climb_back() -> None:
+    depth = torch.tensor([-1.0, 0.0, tiny.NEAREST, 1.0, 20.0], requires_grad=True)
+    found = tiny.smooth_log(depth)
+    assert torch.equal(found[2:], torch.log(depth[2:]))
+    assert bool((found.diff() > 0).all())
+    (gradient,) = torch.autograd.grad(found.sum(), depth)
+    assert bool((gradient > 0).all())
+
+
+LOSSES = (
+    tiny.log_error, tiny.log_error_up_to_scale, tiny.share_of_distance, tiny.inverse_error
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("loss", LOSSES)
+def test_a_loss_is_least_for_the_truth_and_blind_to_unknown_depth(loss: Any) -> None:
+    truth = torch.from_numpy(np.stack([slope(0), slope(5)]))[:, None]
+    best = truth / 10.0 if loss is tiny.log_error_up_to_scale else truth
+    guess = torch.where(truth > 0, best, 7.0)
+    assert loss(guess, truth) == loss(torch.where(truth > 0, best, 70.0), truth)
+    noise = 1.0 + 0.05 * torch.randn(truth.shape, generator=torch.Generator().manual_seed(0))
+    assert loss(guess, truth) < loss(guess * noise, truth)
+
+
+def test_the_loss_up_to_scale_weighs_a_picture_s_scale_a_tenth() -> None:
+    truth = torch.from_numpy(slope(0))[None, None]
+    guess = torch.where(truth > 0, truth, 1.0) / 10.0
+    found = tiny.log_error_up_to_scale(guess * np.e, truth)
+    torch.testing.assert_close(found, torch.tensor(0.1), atol=1e-5, rtol=0)
+
+
+def test_stages_follow_one_another() -> None:
+    first, second = RECIPE.stages
+    assert [RECIPE.stage(at) for at in (0.0, 0.49, 0.5, 1.0)] == [first, first, second, second]
+
+
+def test_a_start_is_what_the_recipe_says() -> None:
+    recipe = replace(RECIPE, quiet=("norm",), dropout=0.25)
+    network = tiny.with_start(nn.ModuleDict({"toy": Toy(), "drop": nn.Dropout(0.5)}), replace(
+        recipe, flat={"toy.conv": 2.0}
+    ))  # fmt: skip
+    assert network["drop"].p == 0.25
+    assert not network["toy"].norm.weight.any()
+    assert bool((network["toy"](torch.rand(1, 3, 8, 8)) == 2.0).all())
+
+
+def settings(shards: Path, out: Path, steps: int = 8) -> Any:
+    return tiny.Settings(
+        network="toy-tiny", data=(shards,), val=(shards,), out=out, steps=steps, save_every=4
+    )
+
+
+def test_a_run_learns_and_going_on_gives_the_bytes_of_an_uninterrupted_run(
+    shards: Path, tmp_path: Path
+) -> None:
+    weights = tiny.train(TOY, RECIPE, settings(shards, tmp_path / "whole")).read_bytes()
+    broken = settings(shards, tmp_path / "broken")
+    broken.out.mkdir()
+    run = tiny.TinyRun(TOY, RECIPE, broken)
+    for number in range(4):
+        run.learn(run.batch(number, RECIPE.batch))
+    run.save()
+    assert tiny.train(TOY, RECIPE, replace(broken, resume=True)).read_bytes() == weights
+    with (tmp_path / "whole" / "log.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [row["step"] for row in rows] == ["4", "8"]
+    assert float(rows[1]["loss"]) < float(rows[0]["loss"])
+    assert {"mae", "rmse", "d1"} <= rows[1].keys()
+
+
+# the fully connected layers of eigen take one size only
+WINDOWS = {"eigen-tiny": (228, 304)}
+
+
+@pytest.mark.parametrize("name", tiny.RECIPES)
+def test_every_tiny_edition_can_be_trained(name: str, shards: Path, tmp_path: Path) -> None:
+    definition = tiny.tiny_definition(name)
+    assert definition.name == name
+    window = WINDOWS.get(name, (64, 96))
+    folder = tmp_path / "frames"
+    folder.mkdir()
+    depth = np.tile(slope(0), (5, 5))[None, : max(window[0], 70), : max(window[1], 100)]
+    rgb = np.repeat((depth * 40.0).astype(np.uint8)[..., None], 3, axis=-1)
+    np.savez(folder / "shard_00000.npz", rgb=rgb, depth=depth)
+    recipe = tiny.RECIPES[name]
+    stages = tuple(replace(stage, window=window, shown=None) for stage in recipe.stages)
+    recipe = replace(recipe, stages=stages, batch=2)
+    run = tiny.TinyRun(definition, recipe, settings(folder, tmp_path))
+    batch = run.batch(0, 2)
+    before = [parameter.clone() for parameter in run.learnt]
+    for stage in range(len(stages)):
+        run.step = 8 * stage // len(stages)
+        # a layer that starts flat lets nothing through to those in front of it at first
+        assert all(np.isfinite(run.learn(batch)) for _ in range(2))
+    moved = [not torch.equal(a, b) for a, b in zip(before, run.learnt, strict=True)]
+    assert np.mean(moved) > 0.9
+    known = run.depth(batch)
+    assert known.shape[:2] == (2, 1)
+    assert bool(torch.isfinite(known).all())
+
+
+def test_the_shipped_weights_are_small_and_fit_their_definitions() -> None:
+    from safetensors.torch import load_file
+
+    total = 0
+    for name in tiny.RECIPES:
+        path = WEIGHTS / f"{name}.safetensors"
+        total += path.stat().st_size
+        assert path.stat().st_size <= 3_000_000
+        network = tiny.tiny_definition(name).build()
+        network.load_state_dict(load_file(path))
+    assert total <= 15_000_000
