@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from math import isnan, log, sqrt
 
 import numpy as np
@@ -11,7 +11,14 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pnpdepth_cli.core.metrics import score
+from pnpdepth_cli.core.metrics import (
+    MEASURES,
+    SUMS,
+    Scores,
+    error_sums,
+    measures_of,
+    score,
+)
 
 
 def test_two_pixels_by_hand() -> None:
@@ -23,6 +30,10 @@ def test_two_pixels_by_hand() -> None:
     assert scores.irmse == pytest.approx(1000 * sqrt((0.5**2 + (1 / 12) ** 2) / 2))
     a, b = log(2), log(0.75)
     assert scores.silog == pytest.approx(100 * abs(a - b) / 2)
+    assert scores.sq_rel == (1 + 0.25) / 2
+    assert scores.log10 == pytest.approx((a - b) / 2 / log(10))
+    assert scores.rmse_log == pytest.approx(sqrt((a * a + b * b) / 2))
+    assert scores.imae == pytest.approx(1000 * (0.5 + 1 / 12) / 2)
     assert (scores.pixels, scores.coverage) == (2, 1)
 
 
@@ -43,6 +54,10 @@ def brute(predicted: np.ndarray, truth: np.ndarray) -> dict[str, float]:
         **{f"delta{k}": sum(r < 1.25**k for r in ratios) / n for k in (1, 2, 3)},
         "irmse": 1000 * sqrt(sum((1 / p - 1 / g) ** 2 for p, g in pairs) / n),
         "silog": 100 * float(np.std(logs)),
+        "sq_rel": sum((p - g) ** 2 / g for p, g in pairs) / n,
+        "log10": sum(abs(np.log10(p) - np.log10(g)) for p, g in pairs) / n,
+        "rmse_log": sqrt(sum(e**2 for e in logs) / n),
+        "imae": 1000 * sum(abs(1 / p - 1 / g) for p, g in pairs) / n,
         "pixels": n,
         "coverage": n / known,
     }
@@ -91,3 +106,95 @@ def test_nothing_to_score_is_not_a_number() -> None:
 def test_a_ratio_on_the_threshold_is_not_below_it() -> None:
     assert score(torch.tensor([1.25]), torch.tensor([1.0])).delta1 == 0
     assert score(torch.tensor([0.8 + 1e-6]), torch.tensor([1.0])).delta1 == 1
+
+
+def test_every_measure_is_a_score_and_says_its_unit() -> None:
+    keys = [measure.key for measure in MEASURES]
+    assert sorted([*keys, "pixels", "coverage"]) == sorted(f.name for f in fields(Scores))
+    units = {measure.key: measure.unit for measure in MEASURES}
+    assert {key for key, unit in units.items() if unit == "m"} == {"rmse", "mae", "sq_rel"}
+    assert {key for key, unit in units.items() if unit == "1/km"} == {"irmse", "imae"}
+    assert [m.key for m in MEASURES if m.higher_is_better] == ["delta1", "delta2", "delta3"]
+
+
+def test_the_thresholds_of_delta_can_be_the_papers_kitti_ones() -> None:
+    predicted, truth = torch.tensor([1.009, 1.015, 1.025, 1.04]), torch.ones(4)
+    scores = score(predicted, truth, (1.01, 1.01**2, 1.01**3))
+    assert (scores.delta1, scores.delta2, scores.delta3) == (0.25, 0.5, 0.75)
+
+
+def test_shapes_that_differ_are_refused() -> None:
+    with pytest.raises(ValueError, match="truth of"):
+        score(torch.ones(2, 3), torch.ones(3, 2))
+
+
+positive = st.lists(st.tuples(st.floats(0.5, 90), st.floats(0.5, 90)), min_size=2, max_size=30)
+
+
+@given(positive, st.floats(0.25, 4))
+def test_another_unit_of_length_changes_each_measure_as_its_unit_says(
+    pairs: list[tuple[float, float]], factor: float
+) -> None:
+    predicted, truth = torch.tensor(pairs, dtype=torch.float64).T
+    before = asdict(score(predicted, truth, (1.3, 1.7, 2.1)))
+    after = asdict(score(predicted * factor, truth * factor, (1.3, 1.7, 2.1)))
+    power = {"m": 1, "1/km": -1}
+    for measure in MEASURES:
+        if not measure.higher_is_better:  # a ratio may sit on a threshold
+            expected = before[measure.key] * factor ** power.get(measure.unit, 0)
+            assert after[measure.key] == pytest.approx(expected, rel=1e-9, abs=1e-5), measure.key
+
+
+@given(positive)
+def test_prediction_and_truth_can_change_places_in_the_symmetric_measures(
+    pairs: list[tuple[float, float]],
+) -> None:
+    predicted, truth = torch.tensor(pairs, dtype=torch.float64).T
+    one, other = asdict(score(predicted, truth)), asdict(score(truth, predicted))
+    for key in ("rmse", "mae", "log10", "rmse_log", "irmse", "imae", "silog", "delta1"):
+        assert one[key] == pytest.approx(other[key], rel=1e-9, abs=1e-5), key
+
+
+@given(positive)
+def test_no_mean_absolute_error_is_above_its_root_mean_square(
+    pairs: list[tuple[float, float]],
+) -> None:
+    predicted, truth = torch.tensor(pairs, dtype=torch.float64).T
+    scores = score(predicted, truth)
+    slack = 1 + 1e-12
+    assert scores.mae <= scores.rmse * slack
+    assert scores.imae <= scores.irmse * slack
+    assert scores.log10 * log(10) <= scores.rmse_log * slack
+    assert scores.silog / 100 <= scores.rmse_log * slack + 1e-7
+    assert scores.delta1 <= scores.delta2 <= scores.delta3
+
+
+@given(st.lists(st.tuples(depths, depths, st.integers(0, 2)), min_size=1, max_size=40))
+def test_the_sums_of_the_parts_are_the_sums_of_the_picture(
+    rows: list[tuple[float, float, int]],
+) -> None:
+    predicted = torch.tensor([row[0] for row in rows])
+    truth = torch.tensor([row[1] for row in rows])
+    part = torch.tensor([row[2] for row in rows])
+    parts = error_sums(predicted, truth, part=part, parts=3)
+    torch.testing.assert_close(parts.sum(0), error_sums(predicted, truth)[0])
+    for number in range(3):
+        inside = part == number
+        torch.testing.assert_close(parts[number], error_sums(predicted[inside], truth[inside])[0])
+
+
+def test_the_sums_of_two_pictures_are_those_of_both_together() -> None:
+    generator = torch.Generator().manual_seed(0)
+    predicted, truth = (torch.rand(2, 50, generator=generator) * 9 + 1 for _ in range(2))
+    pooled = error_sums(predicted[0], truth[0])[0] + error_sums(predicted[1], truth[1])[0]
+    torch.testing.assert_close(measures_of(pooled), measures_of(error_sums(predicted, truth)[0]))
+    assert int(pooled[SUMS.index("pixels")]) == 100
+
+
+def test_a_picture_of_many_chunks_is_scored_as_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    predicted, truth = torch.rand(7, 9) + 1, torch.rand(7, 9) + 1
+    part = (truth * 2).long() - 2
+    whole = error_sums(predicted, truth, part=part, parts=2)
+    monkeypatch.setattr("pnpdepth_cli.core.metrics._CHUNK", 10)
+    torch.testing.assert_close(error_sums(predicted, truth, part=part, parts=2), whole)
+    torch.testing.assert_close(error_sums(predicted, truth)[0], whole.sum(0))

@@ -1,0 +1,204 @@
+"""Evaluations and comparisons as tables on stdout; what was assumed and what is odd on stderr."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from pnpdepth_cli.cli.printable import printable
+from pnpdepth_cli.errors import UsageError
+from pnpdepth_cli.pipeline.score_files import shown, unit_of, write_bytes
+
+if TYPE_CHECKING:
+    from pnpdepth_cli.pipeline.compare import Comparison
+    from pnpdepth_cli.pipeline.evaluation import Evaluation, Part
+    from pnpdepth_cli.pipeline.frame_scoring import FrameScores
+
+_ALL_FRAMES_SHOWN = 12
+_WORST_SHOWN = 5
+_FRAME_COLUMNS = 6
+
+
+def print_notes(notes: Sequence[str]) -> None:
+    """A line for each on stderr, warnings in a colour."""
+    console = Console(stderr=True, highlight=False)
+    for note in notes:
+        style = "yellow" if note.startswith("warning") else "dim"
+        console.print(escape(printable(note)), style=style, soft_wrap=True)
+
+
+def check_stdout(targets: Sequence[Path | None], as_json: bool) -> None:
+    """Raises UsageError if more than one output is to go to stdout."""
+    if sum(str(path) == "-" for path in targets) + as_json > 1:
+        raise UsageError("only one of --json, --csv -, --markdown - and --latex - can go to stdout")
+
+
+def write_texts(texts: Sequence[tuple[Path | None, str]]) -> bool:
+    """The texts are in their files, if any; True if one went to stdout, as `-` says."""
+    for path, text in texts:
+        # a file name that is no UTF-8 has characters that are none
+        data = text.encode("utf-8", "backslashreplace")
+        if str(path) == "-":
+            click.echo(data, nl=False)
+        elif path is not None:
+            write_bytes(path, data)
+    return any(str(path) == "-" for path, _ in texts)
+
+
+def print_evaluation(evaluation: Evaluation) -> None:
+    """The means, the frames or the worst of them, and the parts by distance and by depth."""
+    console = _stdout()
+    _print(console, _means(evaluation))
+    if evaluation.interval is not None:
+        caption = "±: half of the 95 % interval, bootstrap over the frames"
+        console.print(caption, style="dim", soft_wrap=True)
+    if len(evaluation.frames) > 1:
+        _print(console, _frames(evaluation))
+    for title, column, parts in (
+        ("by distance to the nearest sparse point", "pixels away", evaluation.by_distance),
+        ("by depth of the truth", "metres", evaluation.by_depth),
+    ):
+        if parts:
+            _print(console, _parts(title, column, parts))
+
+
+def print_comparison(comparison: Comparison) -> None:
+    """Each measure of the first run, and of the others with their gain on it."""
+    console = _stdout()
+    base, *others = comparison.runs
+    frames = len(comparison.names)
+    table = _table(f"the {f'{frames:,} frames' if frames > 1 else 'frame'} that all runs have")
+    table.add_column("")
+    table.add_column(_one_line(base.label), justify="right")
+    for run in others:
+        table.add_column(_one_line(run.label), justify="right")
+        for title in ("gain", "95 % of the gain", "p"):
+            table.add_column(title, justify="right")
+    for measure in comparison.measures:
+        unit = f" [dim]{unit_of(measure)}[/]" if unit_of(measure) else ""
+        cells = [f"{measure.title}{unit}", shown(measure, base.mean[measure.key])]
+        for run, gains in zip(others, comparison.gains, strict=True):
+            gain = gains[measure.key]
+            cells += [
+                shown(measure, run.mean[measure.key]),
+                _coloured(gain.percent, significant=gain.p_value < 0.05),
+                _range(gain.low_percent, gain.high_percent),
+                _p_value(gain.p_value),
+            ]
+        table.add_row(*cells)
+    how = "all swaps" if comparison.exact else f"{comparison.resamples:,} random swaps"
+    _print(console, table)
+    caption = (
+        f"gain: in per cent of {base.label}, positive is better; p: of no difference, from {how}"
+    )
+    console.print(_one_line(caption), style="dim", soft_wrap=True)
+
+
+def _means(evaluation: Evaluation) -> Table:
+    measures, interval = evaluation.protocol.measures, evaluation.interval
+    scored = len(evaluation.scored)
+    one = scored == 1 and len(evaluation.frames) == 1
+    table = _table(_one_line(evaluation.frames[0].name) if one else f"{scored:,} frames")
+    table.show_header = not one
+    table.add_column("")
+    table.add_column("mean", justify="right")
+    if interval is not None:
+        table.add_column("±", justify="right")
+    table.add_column("")
+    for measure in measures:
+        cells = [measure.title, shown(measure, evaluation.mean[measure.key])]
+        if interval is not None:
+            cells.append(shown(measure, interval.half_width(measure.key)))
+        better = "higher is better" if measure.higher_is_better else ""
+        table.add_row(*cells, f"[dim]{unit_of(measure) or better}[/]")
+    pixels = sum(frame.pixels for frame in evaluation.frames)
+    table.add_section()
+    cells = ["coverage", f"{evaluation.coverage:.2%}"] + [""] * (interval is not None)
+    table.add_row(*cells, f"[dim]{pixels:,} pixels[/]")
+    return table
+
+
+def _frames(evaluation: Evaluation) -> Table:
+    measures = evaluation.protocol.measures[:_FRAME_COLUMNS]
+    by = next(measure for measure in measures if measure.key == "rmse")
+    everything = len(evaluation.frames) <= _ALL_FRAMES_SHOWN
+    frames = evaluation.frames if everything else evaluation.worst(by.key)[:_WORST_SHOWN]
+    title = "frames" if everything else f"the {len(frames)} worst by {by.title}; --csv has all"
+    table = _table(title)
+    table.add_column("frame", overflow="fold")
+    for measure in measures:
+        unit = f" [dim]{unit_of(measure)}[/]" if unit_of(measure) else ""
+        table.add_column(f"{measure.title}{unit}", justify="right")
+    table.add_column("coverage", justify="right")
+    for frame in frames:
+        cells = [shown(measure, frame.values.get(measure.key)) for measure in measures]
+        table.add_row(_one_line(frame.name), *cells, _coverage(frame))
+    return table
+
+
+def _one_line(name: str) -> str:
+    return escape(printable(name))
+
+
+def _coverage(frame: FrameScores) -> str:
+    if frame.missing:
+        return "[red]missing[/]"
+    return f"{frame.coverage:.2%}" if frame.scored else "[red]not scored[/]"
+
+
+def _parts(title: str, column: str, parts: Sequence[Part]) -> Table:
+    table = _table(f"{title}, all pixels together")
+    total = sum(part.known for part in parts)
+    table.add_column(column)
+    for name in ("of the truth", "RMSE [dim]m[/]", "MAE [dim]m[/]", "MRE", "coverage"):
+        table.add_column(name, justify="right")
+    for part in parts:
+        low, high = f"{part.low:g}", f"{part.high:g}"
+        table.add_row(
+            f"{low} or more" if math.isinf(part.high) else f"{low} to {high}",
+            f"{part.known / total:.1%}",
+            *("–" if math.isnan(v) else f"{v:.4f}" for v in (part.rmse, part.mae, part.mre)),
+            f"{part.pixels / part.known:.2%}",
+        )
+    return table
+
+
+def _coloured(percent: float, *, significant: bool) -> str:
+    if math.isnan(percent):
+        return "–"
+    colour = "dim" if not significant else "green" if percent > 0 else "red"
+    return f"[{colour}]{percent:+.2f} %[/]"
+
+
+def _range(low: float, high: float) -> str:
+    return "–" if math.isnan(low) else f"{low:+.2f} … {high:+.2f}"
+
+
+def _p_value(p_value: float) -> str:
+    if math.isnan(p_value):
+        return "–"
+    return "< 0.001" if p_value < 0.001 else f"{p_value:.3f}"
+
+
+def _table(title: str) -> Table:
+    return Table(title=title, title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
+
+
+def _stdout() -> Console:
+    return Console(highlight=False)
+
+
+def _print(console: Console, table: Table) -> None:
+    """The table on the terminal; as wide as it likes where that is none."""
+    if not console.is_terminal:
+        wide = console.options.update(max_width=1000)
+        console.width = max(console.width, console.measure(table, options=wide).maximum)
+    console.print(table)

@@ -1,0 +1,106 @@
+"""The figures that KITTI's depth development kit prints, digit for digit.
+
+Definitions: the kit's readme and its `evaluate_depth` (Uhrig et al., Sparsity Invariant CNNs, 3DV
+2017; devkit of cvlibs.net/datasets/kitti/eval_depth.php). A missing prediction is filled from its
+row, then from its column; all truth is scored. The kit computes in single precision and adds up
+pixel by pixel, column by column, which shows in the fifth digit: so does this.
+
+Units are the kit's own: metres, 1/m, and no factor on the logarithmic and relative errors. KITTI's
+web pages multiply: RMSE and MAE by 1000 (mm), the inverse errors by 1000 (1/km), SILog and the
+relative errors by 100.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pnpdepth_cli.core.metrics import Measure
+
+DEVKIT_MEASURES = (
+    Measure(key="mae", title="MAE", unit="m", decimals=6),
+    Measure(key="rmse", title="RMSE", unit="m", decimals=6),
+    Measure(key="inverse_mae", title="inverse MAE", unit="1/m", decimals=6),
+    Measure(key="inverse_rmse", title="inverse RMSE", unit="1/m", decimals=6),
+    Measure(key="log_mae", title="log MAE", decimals=6),
+    Measure(key="log_rmse", title="log RMSE", decimals=6),
+    Measure(key="scale_invariant_log", title="scale invariant log", decimals=6),
+    Measure(key="abs_relative", title="abs relative", decimals=6),
+    Measure(key="squared_relative", title="squared relative", decimals=6),
+)
+"""In the kit's order and with its six decimals. Its squared relative is (p − g)²/g²."""
+
+Floats = NDArray[np.float32]
+_MISSING = np.float32(-1)
+
+
+def fill_background(depth: Floats) -> Floats:
+    """(H, W) metres in which each unknown depth (0) took one from its row, or its row from others.
+
+    In a row: between two known depths the nearer of both, outside the outermost known depth that
+    one. Rows without any take the first such row below them, else the last above; one between
+    filled rows stays −1, which the kit then scores as if it were a depth.
+    """
+    known = depth > 0
+    column = np.arange(depth.shape[1])
+    left = np.maximum.accumulate(np.where(known, column, -1), axis=1)
+    right = np.where(known, column, len(column))[:, ::-1]
+    right = np.minimum.accumulate(right, axis=1)[:, ::-1]
+    far = np.float32(np.inf)
+    padded = np.pad(depth, ((0, 0), (1, 1)), constant_values=far)
+    filled = np.minimum(
+        np.take_along_axis(padded, left + 1, axis=1), np.take_along_axis(padded, right + 1, axis=1)
+    )
+    filled = np.where(np.isinf(filled), _MISSING, filled)
+    rows = np.flatnonzero(known.any(axis=1))
+    if len(rows):
+        filled[: rows[0]] = filled[rows[0]]
+        filled[rows[-1] + 1 :] = filled[rows[-1]]
+    return filled
+
+
+def devkit_errors(predicted: Floats, truth: Floats) -> dict[str, float]:
+    """The measures of one frame, (H, W) metres each, 0 where unknown.
+
+    Not a number for the logarithmic ones where a depth stayed −1. There must be truth.
+    """
+    filled = fill_background(predicted)
+    known = truth.T > 0  # the kit walks down each column
+    p, g = filled.T[known], truth.T[known]
+    with np.errstate(invalid="ignore"):
+        error, log_error = np.abs(g - p), _log(g) - _log(p)
+        inverse_error = np.abs(1.0 / g.astype(np.float64) - 1.0 / p.astype(np.float64))
+        inverse_error = inverse_error.astype(np.float32)
+        count = np.float32(len(g))
+        log_mean_squared = _sum(log_error * log_error) / count
+        log_sum = _sum(log_error)
+        measures = {
+            "mae": _sum(error) / count,
+            "rmse": np.sqrt(_sum(error * error) / count),
+            "inverse_mae": _sum(inverse_error) / count,
+            "inverse_rmse": np.sqrt(_sum(inverse_error * inverse_error) / count),
+            "log_mae": _sum(np.abs(log_error)) / count,
+            "log_rmse": np.sqrt(log_mean_squared),
+            "scale_invariant_log": np.sqrt(log_mean_squared - log_sum * log_sum / (count * count)),
+            "abs_relative": _sum(error / g) / count,
+            "squared_relative": _sum(error * error / (g * g)) / count,
+        }
+    return {name: float(value) for name, value in measures.items()}
+
+
+def devkit_mean(values: NDArray[Any]) -> NDArray[np.float64]:
+    """(M,) the mean of (N, M) values of N frames, added up in their order in single precision."""
+    total = np.cumsum(values, axis=0, dtype=np.float32)[-1] / np.float32(len(values))
+    return np.asarray(total, np.float64)
+
+
+def _sum(values: Floats) -> np.float32:
+    # cumsum adds one after the other; sum would add in pairs
+    return np.float32(np.cumsum(values, dtype=np.float32)[-1])
+
+
+def _log(values: Floats) -> Floats:
+    """The natural logarithm rounded once to single precision, as C's logf nearly always does."""
+    return np.log(values, dtype=np.float64).astype(np.float32)

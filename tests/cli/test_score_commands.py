@@ -1,0 +1,246 @@
+"""`pnpdepth eval` and `pnpdepth compare` as a user has them."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pnpdepth_cli.cli.main import main
+from pnpdepth_cli.io.depth import write_depth
+from pnpdepth_cli.pipeline.protocols import PROTOCOLS
+from tests.pipeline.frames import frame_on_disk
+
+
+def code_of(*arguments: str | Path) -> int:
+    with pytest.raises(SystemExit) as stop:
+        main([str(argument) for argument in arguments])
+    return int(stop.value.code or 0)
+
+
+@pytest.fixture
+def frames(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """out/ and gt/ of three frames, one with a strange name; the work goes on beside them."""
+    monkeypatch.chdir(tmp_path)
+    rng = np.random.default_rng(0)
+    for name in ("a", "b ü_1", "c\nd"):
+        truth = rng.uniform(1, 9, (6, 8)).astype(np.float32)
+        for folder, depth in (("out", truth * 1.1), ("better", truth * 1.05), ("gt", truth)):
+            Path(folder).mkdir(exist_ok=True)
+            write_depth(Path(folder) / f"{name}.npy", depth.astype(np.float32))
+    return tmp_path
+
+
+def test_the_table_is_data_and_what_was_assumed_is_talk(
+    frames: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert code_of("eval", "out", "gt") == 0
+    out, err = capsys.readouterr()
+    for word in ("3 frames", "RMSE", "SILog", "δ3", "±", "coverage", "100.00%", "b ü_1", "c\\nd"):
+        assert word in out, word
+    assert err.startswith("protocol paper: all known truth, no crop")
+    assert "float32 NPY" in err
+
+
+def test_json_is_the_whole_result_and_nothing_else_on_stdout(
+    frames: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert code_of("eval", "out", "gt", "--json", "--protocol", "garg", "--max-depth", "5") == 0
+    record = json.loads(capsys.readouterr().out)
+    assert [frame["name"] for frame in record["frames"]] == ["a", "b ü_1", "c\nd"]
+    assert record["protocol"]["name"] == "garg"
+    assert record["protocol"]["scoring"]["max_depth"] == 5
+    assert "garg (changed)" in record["protocol"]["described"]
+    assert record["mean"]["mre"] == pytest.approx(np.mean(
+        [frame["values"]["mre"] for frame in record["frames"]]
+    ))  # fmt: skip
+    assert record["interval"]["level"] == 0.95
+    assert record["counts"]["scored"] == 3
+
+
+def test_the_same_command_gives_the_same_bytes(
+    frames: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    texts = []
+    for workers in ("1", "3"):
+        assert code_of("eval", "out", "gt", "--json", "--workers", workers) == 0
+        texts.append(capsys.readouterr().out)
+    assert texts[0] == texts[1]
+
+
+def test_csv_has_a_line_for_each_frame_also_those_without_score(
+    frames: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    Path("out/a.npy").unlink()
+    assert code_of("eval", "out", "gt", "--csv", "scores.csv") == 7
+    text = Path("scores.csv").read_bytes().decode()
+    a, b, c = csv.DictReader(io.StringIO(text, newline=""))
+    assert (a["name"], a["rmse"], a["coverage"], a["error"]) == (
+        "a", "", "0.0", "there is no prediction",
+    )  # fmt: skip
+    assert c["name"] == "c\nd"
+    assert float(b["mre"]) == pytest.approx(0.1, rel=1e-5)
+    err = capsys.readouterr().err
+    assert err.splitlines()[-1] == (
+        "pnpdepth: 1 of 3 frames were not scored (1 without prediction, 0 with a faulty file); the"
+        " means are over the other 2"
+    )
+
+
+def test_markdown_and_latex_hold_the_means(
+    frames: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert code_of("eval", "out", "gt", "--latex", "t.tex", "--markdown", "-") == 0
+    out = capsys.readouterr().out
+    header, rule, row, *_ = out.splitlines()
+    assert header.startswith("|  | RMSE [m] ↓ | MAE [m] ↓ | MRE ↓ |")
+    assert header.count("|") == rule.count("|") == row.count("|")
+    assert "| 0.1000 ± 0.0000 |" in row
+    latex = Path("t.tex").read_text()
+    assert latex.count("&") == 2 * 14
+    assert r"$\delta$1 $\uparrow$" in latex
+    assert latex.isascii() or "δ below" in latex.splitlines()[0]
+
+
+def test_only_one_thing_goes_to_stdout(frames: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert code_of("eval", "out", "gt", "--json", "--csv", "-") == 2
+    assert capsys.readouterr().err.count("\n") == 1
+    assert code_of("eval", "out", "gt", "--csv", "-") == 0
+    assert capsys.readouterr().out.startswith("name,prediction,truth,")
+
+
+def test_files_are_not_overwritten_unasked_and_inputs_never(
+    frames: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    Path("s.csv").write_text("mine")
+    assert code_of("eval", "out", "gt", "--csv", "s.csv") == 2
+    assert "--overwrite replaces it" in capsys.readouterr().err
+    assert Path("s.csv").read_text() == "mine"
+    assert code_of("eval", "out", "gt", "--csv", "s.csv", "--overwrite") == 0
+    before = Path("gt/a.npy").read_bytes()
+    assert code_of("eval", "out/a.npy", "gt/a.npy", "--csv", "gt/a.npy", "--overwrite") == 2
+    assert Path("gt/a.npy").read_bytes() == before
+    assert code_of("eval", "out", "gt", "--csv", "nowhere/s.csv") == 2
+
+
+EXITS = [
+    (["eval", "out", "gt", "--protocol", "kiti"], 2, "kitti"),
+    (["eval", "out", "gt", "--delta", "1,2"], 2, "--delta"),
+    (["eval", "out", "gt", "--delta", "fast"], 2, "--delta"),
+    (["eval", "out", "gt/a.npy"], 2, "two files or two folders"),
+    (["eval", "out", "nowhere"], 3, "nowhere"),
+    (["eval", "out", "gt", "--protocol", "nyu"], 3, "640×480"),
+    (["eval", "out", "gt", "--sparse", "nowhere"], 3, "nowhere"),
+    (["compare", "a.json"], 2, "two runs"),
+    (["compare", "a.json", "b.json"], 3, "a.json"),
+]
+
+
+@pytest.mark.parametrize(("arguments", "code", "said"), EXITS)
+def test_the_exit_code_says_whose_mistake_it_was(
+    frames: Path,
+    capsys: pytest.CaptureFixture[str],
+    arguments: list[str],
+    code: int,
+    said: str,
+) -> None:
+    assert code_of(*arguments) == code
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert said in err
+    assert "Traceback" not in err
+
+
+def test_the_base_of_delta_is_raised_to_powers(
+    frames: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert code_of("eval", "out", "gt", "--delta", "1.06", "--json") == 0
+    record = json.loads(capsys.readouterr().out)
+    assert record["protocol"]["scoring"]["thresholds"] == [1.06, 1.06**2, 1.06**3]
+    assert (record["mean"]["delta1"], record["mean"]["delta2"]) == (0, 1)
+
+
+def test_runs_are_compared_as_a_table_as_json_and_as_files(
+    frames: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in ("out", "better"):
+        assert code_of("eval", name, "gt", "--json") == 0
+        Path(f"{name}.json").write_text(capsys.readouterr().out)
+    assert code_of("compare", "out.json", "better.json", "--csv", "c.csv", "--latex", "c.tex") == 0
+    out, err = capsys.readouterr()
+    assert err == ""
+    for word in ("the 3 frames that all runs have", "+50.00 %", "0.250", "from all swaps"):
+        assert word in out, word
+    (rmse, *_) = csv.DictReader(io.StringIO(Path("c.csv").read_text()))
+    assert rmse["gain [%]"] == "+50.00"
+    assert r"\toprule" in Path("c.tex").read_text()
+    assert code_of("compare", "out.json", "better.json", "--json") == 0
+    record = json.loads(capsys.readouterr().out)
+    assert record["gains"][0]["mre"]["percent"] == pytest.approx(50, rel=1e-4)
+    assert record["exact_p_values"] is True
+
+
+def test_a_refinement_scores_the_same_when_its_files_are_evaluated(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    frame = frame_on_disk(tmp_path)
+    out = tmp_path / "out"
+    assert code_of(
+        "refine", frame.image, "--sparse", frame.sparse, "--gt", frame.gt, "-o", out,
+        "--model", frame.model, "--checkpoint", frame.checkpoint,
+    ) == 0  # fmt: skip
+    capsys.readouterr()
+    (tmp_path / "gt").mkdir()
+    (tmp_path / "gt" / "img.png").write_bytes(frame.gt.read_bytes())
+    assert code_of("eval", out, tmp_path / "gt", "--json") == 0
+    text, err = capsys.readouterr()
+    record, refined = json.loads(text), json.loads((out / "img.json").read_text())
+    code = 1 / 1000  # the depth was written as whole millimetres
+    assert record["mean"]["mae"] == pytest.approx(refined["scores"]["after"]["mae"], abs=code)
+    assert record["frames"][0]["image"] == str(frame.image)
+    assert record["frames"][0]["pixels_given_as_sparse"] == 60
+    assert "60 of the scored pixels (2.10%) hold a value of the sparse input" in err
+    evaluated = tmp_path / "img.json"
+    evaluated.write_text(text)
+    assert code_of("compare", f"{out}/img.json:before", evaluated) == 0
+
+
+@pytest.mark.skipif(sys.platform == "darwin", reason="file names are Unicode there")
+def test_a_name_that_is_no_utf_8_is_scored_and_printed(
+    frames: Path, capfdbinary: pytest.CaptureFixture[bytes]
+) -> None:
+    for folder in ("out", "gt"):
+        Path(folder, "a.npy").rename(Path(folder, os.fsdecode(b"\xff.npy")))
+    for form in ("--json", "--csv", "--markdown"):
+        arguments = ["eval", "out", "gt", form, *(["-"] if form != "--json" else [])]
+        assert code_of(*arguments) == 0
+    assert code_of("eval", "out", "gt") == 0
+    assert b"\\udcff" in capfdbinary.readouterr().out
+
+
+@pytest.mark.parametrize("command", ["eval", "compare"])
+def test_help_imports_neither_torch_nor_numpy_nor_rich(command: str) -> None:
+    code = (
+        "import sys\nfrom pnpdepth_cli.cli.main import main\n"
+        "try:\n    main(sys.argv[1:])\nexcept SystemExit as stop:\n    assert not stop.code\n"
+        "heavy = {'torch', 'numpy', 'cv2', 'rich', 'tqdm'} & set(sys.modules)\n"
+        "assert not heavy, heavy\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code, command, "--help"], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert f"Usage: pnpdepth {command}" in done.stdout
+
+
+def test_the_help_names_every_protocol() -> None:
+    from pnpdepth_cli.cli import evaluate
+
+    assert tuple(PROTOCOLS) == evaluate.PROTOCOLS
