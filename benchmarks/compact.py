@@ -21,10 +21,10 @@ from benchmarks.frames import (
     EvalFrame,
     frame_inputs,
     frame_pixels,
-    nearest_and_linear,
     points_on_grid,
     refined,
 )
+from pnpdepth_cli.core.interpolation import linear, nearest
 from pnpdepth_cli.core.metrics import score
 from pnpdepth_cli.models.network import Network, load_network
 from pnpdepth_cli.pipeline.request import RefineRequest, effective_settings, layer_name
@@ -54,7 +54,6 @@ def measure_frame(
 ) -> dict[str, tuple[float, float]]:
     """(MAE, RMSE) of every method on one frame."""
     rows, columns, depth = frame_pixels(frame, count, seed)
-    near, linear = nearest_and_linear(rows, columns, depth, frame.truth.shape)
     points = points_on_grid(rows, columns, depth, frame.truth.shape)
     inputs = frame_inputs(frame.rgb, points, frame.truth)
     request = RefineRequest(
@@ -67,9 +66,14 @@ def measure_frame(
         effective_settings(network.definition, request),
         inputs,
     )
-    depths = {"nearest": near, "linear": linear, "plain": result.before, "refined": result.after}
+    depths = {
+        "nearest": nearest(points),
+        "linear": linear(points),
+        "plain": torch.from_numpy(result.before),
+        "refined": torch.from_numpy(result.after),
+    }
     truth = torch.from_numpy(frame.truth)
-    scores = {name: score(torch.from_numpy(depth), truth) for name, depth in depths.items()}
+    scores = {name: score(depth, truth) for name, depth in depths.items()}
     return {name: (s.mae, s.rmse) for name, s in scores.items()}
 
 

@@ -97,15 +97,3 @@ def refined(network: Network, layer: str, settings: RefineSettings, inputs: Inpu
     """The refinement of a frame with all of its points."""
     none = inputs.points.select(torch.zeros(len(inputs.points), dtype=torch.bool))
     return refine_frame(network, layer, settings, inputs, inputs.points, none)
-
-
-def nearest_and_linear(
-    rows: NDArray[np.int64], columns: NDArray[np.int64], depth: Depth, shape: tuple[int, int]
-) -> tuple[Depth, Depth]:
-    """Nearest-neighbour and Delaunay-linear fill (nearest outside the hull) of the points."""
-    from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
-
-    places, grid = np.stack([rows, columns], axis=1), np.indices(shape).reshape(2, -1).T
-    near = NearestNDInterpolator(places, depth)(grid).reshape(shape)
-    linear = LinearNDInterpolator(places, depth)(grid).reshape(shape)
-    return near.astype(np.float32), np.where(np.isnan(linear), near, linear).astype(np.float32)

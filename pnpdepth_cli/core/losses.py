@@ -13,6 +13,13 @@ Loss = Callable[[Tensor, Tensor], Tensor]
 NEAREST_DEPTH = 1e-3
 """Metres; `inverse` and `log` read a prediction below this as this."""
 
+NORMAL_MEDIAN = 1.4826
+"""Standard deviation over the median of |e|, for normal e."""
+
+LEAST_GROSS = 0.1
+"""Error of log depth. 0.02 and 0.05 gave larger errors on rendered rooms, 0.2 as small ones, but
+larger ones where a fifth of the points is wrong."""
+
 
 def l1(predicted: Tensor, true: Tensor) -> Tensor:
     """Mean |p − d|, the paper's choice. (N,), (N,) → ()."""
@@ -46,6 +53,17 @@ def log(predicted: Tensor, true: Tensor) -> Tensor:
     return (predicted.clamp_min(NEAREST_DEPTH).log() - true.log()).abs().mean()
 
 
+def cauchy(predicted: Tensor, true: Tensor) -> Tensor:
+    """Mean c·log(1 + (e/c)²) of e = log p − log d (Cauchy's loss), for points that may be wrong.
+
+    c is the standard deviation of e that its median tells: what lies far beyond hardly pulls. It is
+    no less than LEAST_GROSS, for depth that is off by so little is not wrong.
+    """
+    error = predicted.clamp_min(NEAREST_DEPTH).log() - true.log()
+    c = (NORMAL_MEDIAN * error.detach().abs().median()).clamp_min(LEAST_GROSS)
+    return (c * (error / c).square().log1p()).mean()
+
+
 LOSSES: dict[str, Loss] = {
     "l1": l1,
     "l2": l2,
@@ -53,4 +71,5 @@ LOSSES: dict[str, Loss] = {
     "berhu": berhu,
     "inverse": inverse,
     "log": log,
+    "cauchy": cauchy,
 }

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -19,8 +20,12 @@ from torch import Tensor
 from pnpdepth_cli.core.losses import LOSSES
 from pnpdepth_cli.core.points import SparsePoints
 from pnpdepth_cli.core.split import Split, gradient_at
+from pnpdepth_cli.core.steps import SCHEDULES, spread, step_size
+from pnpdepth_cli.core.structure import map_tensors, tensors_in
 from pnpdepth_cli.core.updates import UPDATES
-from pnpdepth_cli.errors import DivergedError, LayerError, UsageError
+from pnpdepth_cli.errors import BatchError, DivergedError, LayerError, PnpDepthError
+
+DepthOf = Callable[[Any], Tensor]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,6 +34,9 @@ class RefineSettings:
 
     iterations: the number of updates of z, 0 for the plain prediction.
     lr: α as a number, or a text like "3%": that share of the standard deviation of z_0.
+    schedule: how α falls over the updates. spread: how far the gradient is blurred, in spacings of
+        the points; see `pnpdepth_cli.core.steps` for both.
+    keep_best: whether the result is the depth of the lowest loss instead of the last.
     align, align_every: how `depth_of` was asked to fit the network's numbers to metres, and
         whether again for every z; see `pnpdepth_cli.core.alignment`.
     """
@@ -37,6 +45,9 @@ class RefineSettings:
     lr: float | str = 0.01
     loss: str = "l1"
     update: str = "sign"
+    schedule: str = "constant"
+    spread: float = 0.0
+    keep_best: bool = False
     align: str = "none"
     align_every: bool = False
 
@@ -45,7 +56,7 @@ class RefineSettings:
 class Refinement:
     """What refinement gives.
 
-    before, after: depth (1, 1, h, w) in metres of z_0 and of z_K.
+    before, after: depth (1, 1, h, w) in metres of z_0 and of z_kept, which is z_K or the best.
     losses: L(z_0) … L(z_K).
     step: α as a number.
     """
@@ -54,6 +65,7 @@ class Refinement:
     after: Tensor
     losses: tuple[float, ...]
     step: float
+    kept: int
 
 
 def refine(
@@ -62,7 +74,7 @@ def refine(
     points: SparsePoints,
     settings: RefineSettings,
     *,
-    depth_of: Callable[[object], Tensor],
+    depth_of: DepthOf,
     on_iteration: Callable[[int, float], None] = lambda iteration, loss: None,
 ) -> Refinement:
     """The network's depth for `arguments`, brought to agree with the points.
@@ -71,48 +83,143 @@ def refine(
     Raises DivergedError at a non-finite loss or gradient (its `last_good` is the Refinement up to
     there, None if the first prediction is already bad), LayerError if z does not reach the depth.
     """
-    loss_of, update = LOSSES[settings.loss], UPDATES[settings.update]()
+    (result,) = refine_batch(
+        split, arguments, (points,), settings, depth_of=(depth_of,), on_iteration=on_iteration
+    )
+    if isinstance(result, PnpDepthError):
+        raise result
+    return result
+
+
+def refine_batch(
+    split: Split,
+    arguments: Sequence[Tensor],
+    points: Sequence[SparsePoints],
+    settings: RefineSettings,
+    *,
+    depth_of: Sequence[DepthOf],
+    on_iteration: Callable[[int, float], None] = lambda iteration, loss: None,
+) -> list[Refinement | PnpDepthError]:
+    """B frames refined at once, each as if alone: its own α, loss and end, an error in its place.
+
+    arguments: of the network for all frames, stacked. points, depth_of: of each; a `depth_of` is
+    given its frame's part of what the network returns. on_iteration gets the mean loss.
+    BatchError where z or the output is not one part per frame; then refine them one at a time.
+    """
     with torch.no_grad():
         z = split.front(*arguments)
-    alpha = step_size(settings.lr, z)
-    depths: list[Tensor] = []
-    losses: list[float] = []
-
+    frames = [
+        _Frame(settings, step_size(settings.lr, z0), at, read)
+        for z0, at, read in zip(_apart(z, len(points)), points, depth_of, strict=True)
+    ]
     for iteration in range(settings.iterations):
         z.requires_grad_(True)
         with torch.enable_grad():
-            depth = depth_of(split.rear(z))
-            loss = loss_of(points.sample(depth), points.depth)
-        gradient = _gradient(loss, z, split)
-        finite = bool(loss.isfinite())
-        if finite:
-            depths = [*depths[:1], depth.detach()]
-            losses.append(float(loss.detach()))
-        if not finite or not bool(gradient.isfinite().all()):
-            raise _diverged("gradient" if finite else "loss", iteration, depths, losses, alpha)
-        on_iteration(iteration, losses[-1])
+            losses = _losses(frames, split.rear(z))
+            if not losses:
+                break
+            gradient = _gradient(torch.stack(losses).sum(), z, split)
         with torch.no_grad():
-            z = z.detach() - alpha * update(gradient)
-
-    with torch.no_grad():
-        after = depth_of(split.rear(z))
-        last = float(loss_of(points.sample(after), points.depth))
-    if settings.iterations and not torch.isfinite(torch.tensor(last)):
-        raise _diverged("loss", settings.iterations, depths, losses, alpha)
-    before = depths[0] if depths else after
-    return Refinement(before=before, after=after, losses=(*losses, last), step=alpha)
+            z = _moved(frames, z.detach(), gradient)
+        if going := [frame.losses[-1] for frame in frames if frame.error is None]:
+            on_iteration(iteration, sum(going) / len(going))
+    else:
+        with torch.no_grad():
+            _losses(frames, split.rear(z))
+    return [frame.refinement() if frame.error is None else frame.error for frame in frames]
 
 
-def step_size(lr: float | str, z0: Tensor) -> float:
-    """α: `lr` itself, or its per cent of the standard deviation of z_0. UsageError if no step."""
-    text = str(lr).strip()
-    try:
-        value = float(text.removesuffix("%"))
-    except ValueError:
-        value = float("nan")
-    if not 0 < value < float("inf"):
-        raise UsageError(f"lr {lr!r} is not a step size; give a positive number, or one like 3%")
-    return value / 100 * float(z0.float().std(correction=0)) if text.endswith("%") else value
+class _Frame:
+    """A frame on its way: the losses and depths so far, and the error that ended it."""
+
+    def __init__(
+        self, settings: RefineSettings, step: float, points: SparsePoints, depth_of: DepthOf
+    ) -> None:
+        self._settings, self._step, self._points, self._depth_of = settings, step, points, depth_of
+        self._loss_of, self._update = LOSSES[settings.loss], UPDATES[settings.update]()
+        self._depths: list[Tensor] = []  # of z_0, and of z_kept
+        self._kept = 0
+        self.losses: list[float] = []
+        self.error: PnpDepthError | None = None
+
+    def loss(self, output: Any) -> Tensor | None:
+        """L of what the network returned for this frame; None where there is none to go by."""
+        try:
+            depth = self._depth_of(output)
+        except PnpDepthError as error:
+            self.error = error
+            return None
+        loss = self._loss_of(self._points.sample(depth), self._points.depth)
+        if self._settings.iterations and not bool(loss.isfinite()):
+            self.error = self._diverged("loss", len(self.losses))
+            return None
+        self.losses.append(float(loss.detach()))
+        if not self._settings.keep_best or self.losses[-1] <= min(self.losses):
+            self._kept = len(self.losses) - 1
+            self._depths = [*self._depths[:1], depth.detach()]
+        return loss
+
+    def moved(self, z: Tensor, gradient: Tensor) -> Tensor:
+        """z_{k+1} of z_k; the same z_k once the frame has ended."""
+        made = len(self.losses) - 1
+        if self.error is None and not bool(gradient.isfinite().all()):
+            self.error = self._diverged("gradient", made)
+        if self.error is not None:
+            return z
+        alpha = self._step * SCHEDULES[self._settings.schedule](made / self._settings.iterations)
+        return z - alpha * self._update(spread(gradient, self._points, self._settings.spread))
+
+    def refinement(self) -> Refinement:
+        """What has come of it so far."""
+        return Refinement(
+            before=self._depths[0],
+            after=self._depths[-1],
+            losses=tuple(self.losses),
+            step=self._step,
+            kept=self._kept,
+        )
+
+    def _diverged(self, what: str, updates: int) -> DivergedError:
+        return DivergedError(
+            f"the {what} is not finite after {updates} update{'s' if updates != 1 else ''} of z"
+            f" (step {self._step:.3g}); try a smaller --lr or fewer --iterations",
+            self.refinement() if self._depths else None,
+        )
+
+
+def _losses(frames: Sequence[_Frame], output: Any) -> list[Tensor]:
+    """L of every frame that has not ended."""
+    parts = zip(frames, _apart(output, len(frames)), strict=True)
+    found = [frame.loss(part) for frame, part in parts if frame.error is None]
+    return [loss for loss in found if loss is not None]
+
+
+def _moved(frames: Sequence[_Frame], z: Tensor, gradient: Tensor) -> Tensor:
+    if len(frames) == 1:
+        return frames[0].moved(z, gradient)
+    parts = zip(
+        frames, z.tensor_split(len(frames)), gradient.tensor_split(len(frames)), strict=True
+    )
+    return torch.cat([frame.moved(*part) for frame, *part in parts])
+
+
+def _apart(structure: Any, frames: int) -> list[Any]:
+    """What z or the network's output is for each frame; for one frame, whatever it may be."""
+    if frames == 1:
+        return [structure]
+    for path, tensor in tensors_in(structure):
+        if tensor.shape[:1] != (frames,):
+            name = ".".join(path) or "the tensor"
+            raise BatchError(
+                f"{name} of shape {tuple(tensor.shape)}, at the cut or in the output, has not one"
+                f" part for each of {frames} frames; refine them one at a time"
+            )
+    parts = {path: tensor.tensor_split(frames) for path, tensor in tensors_in(structure)}
+
+    def of_frame(index: int) -> Any:
+        return map_tensors(structure, lambda path, _: parts[path][index])
+
+    return [of_frame(index) for index in range(frames)]
 
 
 def _gradient(loss: Tensor, z: Tensor, split: Split) -> Tensor:
@@ -124,16 +231,3 @@ def _gradient(loss: Tensor, z: Tensor, split: Split) -> Tensor:
             " torch.no_grad, inference_mode or detach (take that out, or cut at a later layer)"
         )
     return gradient
-
-
-def _diverged(
-    what: str, iteration: int, depths: list[Tensor], losses: list[float], step: float
-) -> DivergedError:
-    last_good = None
-    if depths:
-        last_good = Refinement(before=depths[0], after=depths[-1], losses=tuple(losses), step=step)
-    return DivergedError(
-        f"the {what} is not finite after {iteration} update{'s' if iteration != 1 else ''} of z"
-        f" (step {step:.3g}); try a smaller --lr or fewer --iterations",
-        last_good,
-    )

@@ -1,4 +1,7 @@
-"""U of equation 3: from the gradient at z to the direction of its update."""
+"""U of equation 3: from the gradient at z to the direction of its update.
+
+Each rule is made anew for every refinement and sees the gradients of one frame, in order.
+"""
 
 from __future__ import annotations
 
@@ -18,6 +21,22 @@ def sign() -> Update:
 def sgd() -> Update:
     """The gradient itself."""
     return lambda gradient: gradient
+
+
+def normalised() -> Update:
+    """The gradient with a root mean square of 1, all zero where it is all zero.
+
+    Like the sign it makes the step independent of the loss's unit and the number of points, but it
+    keeps what the sign throws away: elements that hardly matter hardly move.
+    """
+
+    def update(gradient: Tensor) -> Tensor:
+        # Of the largest element first: squares of tiny gradients would vanish.
+        largest = gradient.abs().max().clamp_min(torch.finfo(gradient.dtype).tiny)
+        gradient = gradient / largest
+        return gradient / gradient.square().mean().sqrt().clamp_min(torch.finfo().tiny)
+
+    return update
 
 
 def momentum(decay: float = 0.9) -> Update:
@@ -55,6 +74,7 @@ def adam(beta1: float = 0.9, beta2: float = 0.999, eps: float = 1e-12) -> Update
 UPDATES: dict[str, Callable[[], Update]] = {
     "sign": sign,
     "sgd": sgd,
+    "normalised": normalised,
     "momentum": momentum,
     "adam": adam,
 }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -136,7 +137,10 @@ class Watch(TorchDispatchMode):
 
     @contextmanager
     def seeing_escapes(self) -> Iterator[None]:
-        """The two ways for values to get out that are no tensor operations are watched too."""
+        """The two ways for values to get out that are no tensor operations are watched too.
+
+        In this thread alone; others may read and write files meanwhile.
+        """
         names = ("numpy", "tolist")
         for name in names:
             setattr(Tensor, name, self._noticing(getattr(Tensor, name)))
@@ -147,9 +151,12 @@ class Watch(TorchDispatchMode):
                 delattr(Tensor, name)
 
     def _noticing(self, method: Callable[..., Any]) -> Callable[..., Any]:
+        thread = threading.get_ident()
+
         def wrapped(tensor: Tensor, *args: Any, **kwargs: Any) -> Any:
-            self.escaped = True
-            self.data_dependent |= self._any_marked(tensor)
+            if threading.get_ident() == thread:
+                self.escaped = True
+                self.data_dependent |= self._any_marked(tensor)
             return method(tensor, *args, **kwargs)
 
         return wrapped

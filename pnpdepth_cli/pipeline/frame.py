@@ -1,8 +1,8 @@
-"""Refinement of one frame in memory, from the image frame and back to it."""
+"""Refinement of frames in memory, from the image frame and back to it."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from pnpdepth_cli.core.alignment import Alignment
 from pnpdepth_cli.core.points import SparsePoints
-from pnpdepth_cli.core.refine import Refinement, RefineSettings, refine
+from pnpdepth_cli.core.refine import Refinement, RefineSettings, refine_batch
 from pnpdepth_cli.core.split import Split
-from pnpdepth_cli.errors import DivergedError, NoPointsError, UsageError
+from pnpdepth_cli.errors import BatchError, DivergedError, NoPointsError, PnpDepthError, UsageError
 from pnpdepth_cli.models.aligned import AlignedDepth
 from pnpdepth_cli.models.frame import FrameMap
 from pnpdepth_cli.models.network import Network, out_of_memory_is_a_device_error
@@ -65,6 +65,15 @@ def split_points(
     return points.select(~mask), points.select(mask)
 
 
+@dataclass(frozen=True, kw_only=True)
+class FrameToRefine:
+    """A frame, its points that are used, and those that are held out."""
+
+    inputs: Inputs
+    used: SparsePoints
+    held_out: SparsePoints
+
+
 def refine_frame(
     network: Network,
     layer: str,
@@ -76,41 +85,98 @@ def refine_frame(
     on_iteration: Callable[[int, float], None] = lambda done, loss: None,
 ) -> RefinedFrame:
     """Refinement of one frame in memory; a divergence with a last good depth is returned in it."""
-    frame = FrameMap.fit(network.definition.size, *inputs.size)
-    points = frame.points_to_network(used)
+    task = FrameToRefine(inputs=inputs, used=used, held_out=held_out)
+    (frame,) = refine_frames(network, layer, settings, (task,), on_iteration=on_iteration)
+    if isinstance(frame, PnpDepthError):
+        raise frame
+    return frame
+
+
+def refine_frames(
+    network: Network,
+    layer: str,
+    settings: RefineSettings,
+    tasks: Sequence[FrameToRefine],
+    *,
+    on_iteration: Callable[[int, float], None] = lambda done, loss: None,
+) -> list[RefinedFrame | PnpDepthError]:
+    """Frames refined in memory, in one pass of the network; where one has no result, its error.
+
+    BatchError if the network does not take them together, or they differ in size; NoPointsError
+    if the network sees no point of one of them.
+    """
+    with out_of_memory_is_a_device_error(network.device):
+        ready = [_ready(network, settings, task) for task in tasks]
+        with Split(network.module, layer) as split:
+            results = refine_batch(
+                split,
+                _stacked([frame.arguments for frame in ready]),
+                [frame.points for frame in ready],
+                settings,
+                depth_of=[frame.depth_of for frame in ready],
+                on_iteration=lambda iteration, loss: on_iteration(iteration + 1, loss),
+            )
+    return [_finished(frame, result) for frame, result in zip(ready, results, strict=True)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Ready:
+    """A frame as the network takes it; `points` are the used ones, in the network's frame."""
+
+    task: FrameToRefine
+    frame: FrameMap
+    arguments: tuple[torch.Tensor, ...]
+    points: SparsePoints
+    depth_of: AlignedDepth
+
+
+def _ready(network: Network, settings: RefineSettings, task: FrameToRefine) -> _Ready:
+    frame = FrameMap.fit(network.definition.size, *task.inputs.size)
+    points = frame.points_to_network(task.used)
     if not len(points):
         raise NoPointsError(
-            f"none of the {len(used)} sparse points lies inside the part of the image that network"
-            f" {network.definition.name!r} sees (rows and columns {frame.crop})"
+            f"none of the {len(task.used)} sparse points lies inside the part of the image that"
+            f" network {network.definition.name!r} sees (rows and columns {frame.crop})"
         )
-    diverged: DivergedError | None = None
-    with out_of_memory_is_a_device_error(network.device):
-        arguments = network.arguments(frame, inputs.rgb_tensor(), points)
-        at = points.to(network.device)
-        depth_of = AlignedDepth(network, at, settings.align, every=settings.align_every)
-        with Split(network.module, layer) as split:
-            try:
-                result = refine(
-                    split,
-                    arguments,
-                    at,
-                    settings,
-                    depth_of=depth_of,
-                    on_iteration=lambda iteration, loss: on_iteration(iteration + 1, loss),
-                )
-            except DivergedError as error:
-                if error.last_good is None:
-                    raise
-                result, diverged = error.last_good, error
+    at = points.to(network.device)
+    return _Ready(
+        task=task,
+        frame=frame,
+        arguments=network.arguments(frame, task.inputs.rgb_tensor(), points),
+        points=at,
+        depth_of=AlignedDepth(network, at, settings.align, every=settings.align_every),
+    )
+
+
+def _stacked(arguments: Sequence[tuple[torch.Tensor, ...]]) -> tuple[torch.Tensor, ...]:
+    """The arguments of all frames as those of one call."""
+    if len(arguments) == 1:
+        return arguments[0]
+    for each in zip(*arguments, strict=True):
+        shapes = {tuple(argument.shape) for argument in each}
+        if len(shapes) > 1 or shapes.pop()[:1] != (1,):
+            raise BatchError(
+                f"the network's arguments of shapes {[tuple(a.shape) for a in each]} cannot be"
+                " stacked; refine the frames one at a time"
+            )
+    return tuple(torch.cat(each) for each in zip(*arguments, strict=True))
+
+
+def _finished(ready: _Ready, result: Refinement | PnpDepthError) -> RefinedFrame | PnpDepthError:
+    diverged = result if isinstance(result, DivergedError) else None
+    if diverged is not None and diverged.last_good is not None:
+        result = diverged.last_good
+    if isinstance(result, PnpDepthError):
+        return result
     return RefinedFrame(
-        before=_to_image(frame, result.before),
-        after=_to_image(frame, result.after),
-        used=used,
-        held_out=held_out,
+        before=_to_image(ready.frame, result.before),
+        after=_to_image(ready.frame, result.after),
+        used=ready.task.used,
+        held_out=ready.task.held_out,
         refinement=result,
         diverged=diverged,
-        alignment=depth_of.alignment,
-        notes=depth_of.notes,
+        alignment=ready.depth_of.alignment,
+        notes=ready.depth_of.notes,
     )
 
 

@@ -7,10 +7,11 @@ from math import inf, log
 import pytest
 import torch
 
-from pnpdepth_cli.core.losses import LOSSES, NEAREST_DEPTH, berhu
+from pnpdepth_cli.core.losses import LEAST_GROSS, LOSSES, NEAREST_DEPTH, berhu, cauchy
 
 PREDICTED, TRUE = torch.tensor([1.0, 2.0, 4.0, 10.0]), torch.tensor([1.0, 2.5, 2.0, 5.0])
 # errors 0, ½, 2, 5; c of berhu = 1, so ½ is linear there and 2 and 5 are quadratic
+C = 1.4826 * log(2.5 / 2)
 BY_HAND = {
     "l1": 7.5 / 4,
     "l2": (0.25 + 4 + 25) / 4,
@@ -18,6 +19,8 @@ BY_HAND = {
     "berhu": (0.5 + (4 + 1) / 2 + (25 + 1) / 2) / 4,
     "inverse": (0.1 + 0.25 + 0.1) / 4,
     "log": (log(2.5 / 2) + log(2) + log(2)) / 4,
+    # the lower of the two middle errors, log 2.5/2, tells c
+    "cauchy": C * (log(1 + 1 / 1.4826**2) + 2 * log(1 + (log(2) / C) ** 2)) / 4,
 }
 
 
@@ -72,3 +75,26 @@ def test_a_prediction_that_is_not_finite_is_seen_in_the_loss_or_the_gradient(
 @pytest.mark.parametrize("name", LOSSES)
 def test_a_single_point_is_enough(name: str) -> None:
     assert float(LOSSES[name](PREDICTED[:1] + 1, TRUE[:1])) > 0
+
+
+def test_cauchy_feels_a_gross_error_less_than_a_middling_one_and_a_small_one_as_a_square() -> None:
+    true = torch.full((9,), 2.0)
+    factor = torch.tensor([1.0, 1.0, 1.0, 1.0, 1.0, 1.001, 1.002, 1.1, 4.0])
+    predicted = (true * factor).requires_grad_(True)
+    (gradient,) = torch.autograd.grad(cauchy(predicted, true), predicted)
+    pull = (gradient * predicted).abs()  # of log depth
+    assert float(pull[8]) < float(pull[7]) / 5
+    assert float(pull[6] / pull[5]) == pytest.approx(2, rel=1e-3)
+
+
+def test_what_counts_as_gross_grows_with_the_errors_of_most_points() -> None:
+    true = torch.ones(5)
+    small, large = (torch.tensor([1.0, 1.1, 0.9, 1.1, 8.0]) ** power for power in (1, 8))
+    pulls = []
+    for predicted in (small, large):
+        predicted = predicted.requires_grad_(True)
+        (gradient,) = torch.autograd.grad(cauchy(predicted, true), predicted)
+        pulls.append((gradient * predicted).abs())
+    assert float(pulls[0][4]) < float(pulls[0][1])
+    assert 8 * log(1.1) > LEAST_GROSS
+    assert float(pulls[1][1]) > 3 * float(pulls[0][1]) / 4

@@ -12,11 +12,19 @@ import pytest
 import torch
 from torch import Tensor, nn
 
+from pnpdepth_cli.core.losses import LOSSES
 from pnpdepth_cli.core.points import SparsePoints
-from pnpdepth_cli.core.refine import Refinement, RefineSettings, refine, step_size
+from pnpdepth_cli.core.refine import Refinement, RefineSettings, refine, refine_batch
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.core.updates import UPDATES
-from pnpdepth_cli.errors import DivergedError, LayerError, ModelError, UsageError
+from pnpdepth_cli.errors import (
+    BatchError,
+    DivergedError,
+    LayerError,
+    ModelError,
+    NoPointsError,
+    PnpDepthError,
+)
 from tests.core.naive import naive_refine, plain
 from tests.core.networks import NETWORKS, TwoBranches, UNet, build, conv, depth_of, picture
 
@@ -92,7 +100,7 @@ def test_no_iteration_is_the_plain_prediction_bit_for_bit(name: str) -> None:
     assert len(result.losses) == 1
 
 
-@pytest.mark.parametrize("loss", ["l1", "l2", "huber", "berhu", "inverse", "log"])
+@pytest.mark.parametrize("loss", LOSSES)
 @pytest.mark.parametrize("update", UPDATES)
 def test_points_that_agree_with_the_prediction_change_nothing(loss: str, update: str) -> None:
     network = build("unet")
@@ -135,19 +143,11 @@ def test_the_loss_goes_down_and_iterations_are_updates_of_z() -> None:
 
 
 def test_one_update_by_hand() -> None:
-    class Shift(nn.Module):
-        def __init__(self) -> None:
-            super().__init__()
-            self.cut = nn.Identity()
-
-        def forward(self, x: Tensor) -> Tensor:
-            return self.cut(x[:, :1]) * 2
-
     x = torch.full((1, 3, 1, 2), 3.0)
     points = SparsePoints(
         xy=torch.tensor([[0.0, 0.0], [1.0, 0.0]]), depth=torch.tensor([5.0, 9.0]), size=(1, 2)
     )
-    with Split(Shift(), "cut") as split:
+    with Split(Doubling(), "cut") as split:
         result = refine(
             split, (x,), points, RefineSettings(iterations=1, lr=0.25), depth_of=lambda y: y
         )
@@ -187,23 +187,60 @@ def test_grad_mode_and_random_state_of_the_caller_stay() -> None:
 
 
 def test_a_per_cent_step_is_that_share_of_the_standard_deviation_of_z0() -> None:
-    z = torch.tensor([1.0, 3.0, 1.0, 3.0])  # standard deviation 1
-    assert step_size("3%", z) == pytest.approx(0.03)
-    assert step_size(" 3 % ", z * 10) == pytest.approx(0.3)
-    assert step_size(0.01, z) == 0.01
-    assert step_size("0.5", z) == 0.5
     network = build("unet")
     with Split(network, "bottleneck") as split, torch.no_grad():
         std = float(split.front(picture()).std(correction=0))
     assert refined(network, "bottleneck", RefineSettings(lr="3%")).step == pytest.approx(0.03 * std)
 
 
-@pytest.mark.parametrize(
-    "lr", [0, -1, "0%", "-3%", "x", "", "%", "nan", "inf", float("nan"), "3%%"]
-)
-def test_what_is_no_step_is_refused(lr: float | str) -> None:
-    with pytest.raises(UsageError, match="step size"):
-        step_size(lr, torch.ones(2))
+def test_a_linear_schedule_is_k_single_updates_with_falling_steps() -> None:
+    x, points = torch.full((1, 3, 1, 2), 3.0), SparsePoints(
+        xy=torch.tensor([[0.0, 0.0], [1.0, 0.0]]), depth=torch.tensor([50.0, 90.0]), size=(1, 2)
+    )  # fmt: skip
+    settings = RefineSettings(iterations=4, lr=0.25, schedule="linear")
+    with Split(Doubling(), "cut") as split:
+        result = refine(split, (x,), points, settings, depth_of=lambda y: y)
+    moved = 2 * 0.25 * (1 + 0.75 + 0.5 + 0.25)
+    assert result.after.flatten().tolist() == [6 + moved, 6 + moved]
+
+
+def test_a_spread_gradient_moves_what_no_point_reaches() -> None:
+    torch.manual_seed(0)
+    network = nn.Sequential(conv(3, 4), conv(4, 4), nn.ReLU(inplace=True), conv(4, 1))
+    one = POINTS.select(torch.tensor([True, False, False, False, False]))
+    settings = RefineSettings(update="normalised", lr=0.1, spread=0.5)
+    result = refined(network, "0", settings, points=one)
+    assert bool((result.after != result.before).all())
+    assert result.losses[-1] < result.losses[0]
+
+
+# ------------------------------------------------------------------ the best iterate
+
+
+class Doubling(nn.Module):
+    """depth = 2·z, z the first channel of the picture."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.cut = nn.Identity()
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.cut(x[:, :1]) * 2
+
+
+@pytest.mark.parametrize("name", ["resnet", "unet", "midas"])
+@pytest.mark.parametrize("lr", [0.02, 1.0])
+def test_the_kept_iterate_has_the_lowest_loss_and_is_one_of_the_way(name: str, lr: float) -> None:
+    settings = RefineSettings(iterations=6, lr=lr, update="sign")
+    last, best = (
+        refined(build(name), CUTS[name][0], replace(settings, keep_best=keep))
+        for keep in (False, True)
+    )
+    assert best.losses == last.losses
+    assert (last.kept, best.kept) == (6, best.losses.index(min(best.losses)))
+    at_best = refined(build(name), CUTS[name][0], replace(settings, iterations=best.kept))
+    assert torch.equal(best.after, at_best.after)
+    assert torch.equal(best.before, last.before)
 
 
 # ------------------------------------------------------------------ divergence
@@ -335,6 +372,176 @@ def test_an_in_place_operation_that_autograd_cannot_undo_is_the_networks_fault()
     with pytest.raises(ModelError, match="gradient of the network raises RuntimeError") as error:
         refined(Network(), "cut", RefineSettings())
     assert "\n" not in str(error.value)
+
+
+# ------------------------------------------------------------------ several frames at once
+
+
+OTHERS = (
+    POINTS,
+    SparsePoints(xy=torch.tensor([[2.5, 7.0]]), depth=torch.tensor([9.0]), size=(16, 16)),
+    SparsePoints(xy=POINTS.xy.flip(1), depth=POINTS.depth * 3, size=(16, 16)),
+)
+PICTURES = torch.cat([picture(), picture().flip(-1) * 2, picture() - 1])
+
+
+def refined_at_once(
+    network: nn.Module, layer: str, settings: RefineSettings, *, read: Any = depth_of, **more: Any
+) -> list[Refinement | PnpDepthError]:
+    reads = read if isinstance(read, list) else [read] * 3
+    with Split(network, layer) as split:
+        return refine_batch(split, (PICTURES,), OTHERS, settings, depth_of=reads, **more)
+
+
+def refined_alone(
+    network: nn.Module, layer: str, settings: RefineSettings, index: int
+) -> Refinement:
+    with Split(network, layer) as split:
+        x = (PICTURES[index : index + 1],)
+        return refine(split, x, OTHERS[index], settings, depth_of=depth_of)
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        RefineSettings(iterations=0),
+        RefineSettings(lr="3%", update="adam", loss="log"),
+        RefineSettings(
+            lr="20%",
+            update="normalised",
+            loss="cauchy",
+            schedule="linear",
+            spread=1,
+            keep_best=True,
+        ),
+    ],
+)
+@pytest.mark.parametrize(
+    ("name", "layer"),
+    [("resnet", "layer2"), ("unet", "bottleneck"), ("vit", "encoder[last]"), ("midas", "unit1")],
+)
+def test_frames_refined_at_once_are_those_refined_alone(
+    name: str, layer: str, settings: RefineSettings
+) -> None:
+    torch.manual_seed(0)
+    network = build(name)
+    for index, together in enumerate(refined_at_once(network, layer, settings)):
+        assert isinstance(together, Refinement)
+        alone = refined_alone(network, layer, settings, index)
+        # torch's kernels may add up in another order in a larger batch
+        torch.testing.assert_close(together.after, alone.after, rtol=1e-4, atol=1e-4)
+        torch.testing.assert_close(together.before, alone.before, rtol=1e-5, atol=1e-5)
+        assert together.losses == pytest.approx(alone.losses, rel=1e-3)
+        assert together.step == pytest.approx(alone.step, rel=1e-5)
+        assert together.kept == alone.kept
+
+
+class PerPixel(nn.Module):
+    """Nothing is summed up, so a batch cannot change a bit."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.cut, self.after = nn.Tanh(), nn.Softplus()
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.after(self.cut(x)[:, :1] * 3)
+
+
+@pytest.mark.parametrize("update", UPDATES)
+@pytest.mark.parametrize("spread", [0.0, 0.7])
+def test_at_once_is_alone_bit_for_bit_where_the_network_is(update: str, spread: float) -> None:
+    settings = RefineSettings(lr="5%", update=update, schedule="linear", spread=spread)
+    network = PerPixel()
+    for index, together in enumerate(refined_at_once(network, "cut", settings)):
+        assert isinstance(together, Refinement)
+        alone = refined_alone(network, "cut", settings, index)
+        assert torch.equal(together.before, alone.before)
+        assert torch.equal(together.after, alone.after)
+        assert (together.losses, together.step) == (alone.losses, alone.step)
+
+
+def test_a_frame_that_diverges_does_not_touch_the_others() -> None:
+    def bad(output: Tensor) -> Tensor:
+        calls.append(1)
+        return output * float("nan") if len(calls) == 3 else output
+
+    calls: list[int] = []
+    seen: list[float] = []
+    settings, network = RefineSettings(lr="5%"), PerPixel()
+    good = refined_at_once(network, "cut", settings)
+    mixed = refined_at_once(
+        network, "cut", settings, read=[depth_of, bad, depth_of],
+        on_iteration=lambda _, loss: seen.append(loss),
+    )  # fmt: skip
+    assert isinstance(mixed[1], DivergedError)
+    assert "after 2 updates" in str(mixed[1])
+    assert len(mixed[1].last_good.losses) == 2
+    assert len(calls) == 3
+    for index in (0, 2):
+        together, alone = mixed[index], good[index]
+        assert isinstance(together, Refinement)
+        assert isinstance(alone, Refinement)
+        assert torch.equal(together.after, alone.after)
+        assert together.losses == alone.losses
+    assert len(seen) == 5
+    assert seen[2] == pytest.approx((mixed[0].losses[2] + mixed[2].losses[2]) / 2)
+
+
+def test_an_error_of_one_frames_reading_stays_its_own() -> None:
+    def none(output: Tensor) -> Tensor:
+        raise NoPointsError("too few to align")
+
+    results = refined_at_once(PerPixel(), "cut", RefineSettings(), read=[none, depth_of, depth_of])
+    assert isinstance(results[0], NoPointsError)
+    assert all(isinstance(result, Refinement) for result in results[1:])
+    nobody = refined_at_once(PerPixel(), "cut", RefineSettings(), read=none)
+    assert [type(result) for result in nobody] == [NoPointsError] * 3
+
+
+class Sequence(nn.Module):
+    """Its z has the batch second, as in nn.Transformer; its output drops it, if asked."""
+
+    def __init__(self, *, dropping: bool) -> None:
+        super().__init__()
+        self.tokens, self.later, self.dropping = nn.Identity(), nn.Identity(), dropping
+
+    def forward(self, x: Tensor) -> Tensor:
+        tokens = self.tokens(x[:, :1].flatten(2).permute(2, 0, 1))
+        depth = self.later(tokens.permute(1, 2, 0).reshape(len(x), 1, *x.shape[-2:]))
+        return depth.flatten(0, 1).mean(0) if self.dropping else depth
+
+
+@pytest.mark.parametrize(("layer", "dropping"), [("tokens", False), ("later", True)])
+def test_a_network_without_one_part_per_frame_is_refused_and_works_one_at_a_time(
+    layer: str, dropping: bool
+) -> None:
+    network = Sequence(dropping=dropping)
+    with pytest.raises(BatchError, match="not one part for each of 3 frames") as error:
+        refined_at_once(network, layer, RefineSettings(), read=lambda y: y)
+    assert error.value.exit_code == 4
+    with Split(network, layer) as split:
+        alone = refine(split, (picture(),), POINTS, RefineSettings(), depth_of=lambda y: y)
+    assert alone.losses[-1] < alone.losses[0]
+
+
+def test_structures_are_taken_apart_for_each_frame() -> None:
+    class Pair(nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.cut = nn.Identity()
+
+        def forward(self, x: Tensor) -> dict[str, Any]:
+            z = self.cut(x)
+            return {"depth": z[:, :1] + 1, "more": (z, None)}
+
+    network = Pair()
+    results = refined_at_once(network, "cut", RefineSettings(), read=lambda y: y["depth"])
+    for index, together in enumerate(results):
+        assert isinstance(together, Refinement)
+        x = (PICTURES[index : index + 1],)
+        with Split(network, "cut") as split:
+            alone = refine(split, x, OTHERS[index], RefineSettings(), depth_of=lambda y: y["depth"])
+        assert torch.equal(together.after, alone.after)
 
 
 def test_settings_are_the_papers() -> None:

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from pnpdepth_cli.core.updates import UPDATES, Update, adam, momentum, sgd, sign
+from pnpdepth_cli.core.updates import UPDATES, Update, adam, momentum, normalised, sgd, sign
 
 
 def stepped(update: Update, steps: int = 20, lr: float = 0.1) -> Tensor:
@@ -71,3 +71,12 @@ def test_an_update_changes_neither_its_gradient_nor_a_second_run(name: str) -> N
 
 def test_adam_moves_by_the_step_however_small_the_gradient() -> None:
     assert adam()(torch.tensor([1e-6, -1e-9])).tolist() == pytest.approx([1, -1], rel=2e-3)
+
+
+@pytest.mark.parametrize("scale", [1.0, 1e-30, 1e30])
+def test_a_normalised_gradient_keeps_its_direction_and_has_a_root_mean_square_of_one(
+    scale: float,
+) -> None:
+    update = normalised()(torch.tensor([[1.0, -7.0], [0.0, 5.0]]) * scale)
+    assert update.flatten().tolist() == pytest.approx([x / 75**0.5 * 2 for x in (1, -7, 0, 5)])
+    assert normalised()(torch.zeros(3)).tolist() == [0, 0, 0]

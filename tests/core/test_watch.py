@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable
 
 import pytest
@@ -230,3 +231,47 @@ def test_watching_costs_little_and_grows_with_the_number_of_layers_only() -> Non
 
     small, large = calls(10), calls(100)
     assert large < 12 * small
+
+
+def test_what_other_threads_do_with_tensors_meanwhile_is_their_own_matter() -> None:
+    watch, z = Watch(()), torch.ones(3)
+    watch.touch(z)
+
+    def in_a_thread(read: Callable[[], object]) -> None:
+        thread = threading.Thread(target=read)
+        thread.start()
+        thread.join()
+
+    with watch, watch.seeing_escapes():
+        in_a_thread(lambda: (z.numpy(), z.tolist(), torch.zeros(2).numpy()))
+        assert not watch.data_dependent
+        z.numpy()
+        assert watch.data_dependent
+
+
+def test_a_pass_is_the_same_while_other_threads_read_tensors() -> None:
+    network, x = Behind(DEPENDENT["a value"]), picture()
+    with Split(network, "cut") as split, torch.no_grad():
+        z = split.front(x)
+        alone = [split.rear(z), split.rear(-z)]
+    stop = threading.Event()
+
+    def read() -> None:
+        tensor = torch.arange(10.0)
+        while not stop.is_set():
+            assert tensor.numpy()[3] == tensor.tolist()[3] == 3
+
+    threads = [threading.Thread(target=read) for _ in range(3)]
+    for thread in threads:
+        thread.start()
+    try:
+        for _ in range(20):
+            with Split(network, "cut") as split, torch.no_grad():
+                split.front(x)
+                assert torch.equal(split.rear(z), alone[0])
+                assert torch.equal(split.rear(-z), alone[1])
+    finally:
+        stop.set()
+        for thread in threads:
+            thread.join()
+    assert "numpy" not in vars(Tensor)

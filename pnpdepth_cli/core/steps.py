@@ -1,0 +1,53 @@
+"""How far z moves in one update: α, how it falls, and how far a point's gradient reaches."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from pnpdepth_cli.core.points import SparsePoints
+from pnpdepth_cli.errors import UsageError
+
+SCHEDULES: dict[str, Callable[[float], float]] = {
+    "constant": lambda done: 1.0,
+    "linear": lambda done: 1.0 - done,
+}
+"""The share of α that an update moves by, from the share 0 ≤ done < 1 of all updates made."""
+
+
+def step_size(lr: float | str, z0: Tensor) -> float:
+    """α: `lr` itself, or its per cent of the standard deviation of z_0. UsageError if no step."""
+    text = str(lr).strip()
+    try:
+        value = float(text.removesuffix("%"))
+    except ValueError:
+        value = float("nan")
+    if not 0 < value < float("inf"):
+        raise UsageError(f"lr {lr!r} is not a step size; give a positive number, or one like 3%")
+    return value / 100 * float(z0.float().std(correction=0)) if text.endswith("%") else value
+
+
+def spread(gradient: Tensor, points: SparsePoints, spacings: float) -> Tensor:
+    """The gradient at a map z (1, C, h, w), blurred so that cells between the points follow them.
+
+    The blur is a Gaussian whose standard deviation is so many spacings of the points, √(HW/N):
+    few points reach far, many hardly beyond their own cells. A z that is no map stays as it is.
+    """
+    if not spacings or gradient.ndim != 4:
+        return gradient
+    height, width = points.size
+    sigma = spacings * (height * width / len(points)) ** 0.5
+    down, across = (
+        _gaussian(cells, sigma * cells / pixels, gradient)
+        for cells, pixels in zip(gradient.shape[-2:], (height, width), strict=True)
+    )
+    return down @ gradient @ across.T
+
+
+def _gaussian(cells: int, sigma: float, like: Tensor) -> Tensor:
+    """(cells, cells): row i weighs the cells around i, with a sum of 1 also at the border."""
+    at = torch.arange(cells, device=like.device, dtype=like.dtype)
+    weights = torch.exp(-0.5 * ((at[:, None] - at) / sigma).square())
+    return weights / weights.sum(dim=1, keepdim=True)
