@@ -1,164 +1,238 @@
-"""How close a refinement comes to one cut by hand: `python -m benchmarks.engine [--runs 15]`.
+"""How close a refinement comes to one cut by hand, and how far ahead of the paper's code it is.
 
-In one process, in turn: a plain forward pass, its front and rear, refinement with a hand-written
-front and rear, ours, and a hook that replaces the layer's output and re-runs the whole network.
-K = 5, fp32. The limit is (front + 11·rear)/(front + rear). Peak memory of each is measured in a
-process of its own, above that of a plain forward pass.
+    python -m benchmarks.engine [--runs 15] [--only NAME …] [--json]
+
+For the paper's seven networks at full size and two more, random weights, K = 5, in one process, in
+turn: a plain forward pass, its front and rear, refinement with a hand-written front and rear, ours
+(a network that stays open from frame to frame, as in a batch), ours opened anew for one frame, a
+hook that replaces the layer's output and re-runs the whole network, and a loop written after the
+description of the paper's PyTorch code: the front with gradients on, `create_graph=True`. The
+limit is (front + 11·rear)/(front + rear). Peak memory of each is measured in a process of its
+own, above that of a plain forward pass.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import platform
 import statistics
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 
 import torch
 from torch import Tensor, nn
 
+from benchmarks.hand_cuts import ZOO
 from benchmarks.networks import CASES, Case
 from pnpdepth_cli.core.points import SparsePoints
 from pnpdepth_cli.core.refine import RefineSettings, refine
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.pipeline.stopwatch import peak_memory_mb
 
-ITERATIONS, STEP = 5, 0.01
+ITERATIONS, STEP, POINTS = 5, 0.01, 500
+SETTINGS = RefineSettings(iterations=ITERATIONS, lr=STEP)
+COMPARED = ("by hand", "ours", "ours, one frame", "by hook", "paper's code")
+
+Inputs = tuple[Tensor, ...]
 
 
-def setup(case: Case) -> tuple[nn.Module, Tensor, SparsePoints]:
-    """The network in eval mode, an input, and 500 points."""
+def setup(case: Case) -> tuple[nn.Module, Inputs, SparsePoints]:
+    """The network in eval mode, its inputs, and points of them."""
     torch.manual_seed(0)
-    network = case.build().eval().requires_grad_(False)
-    height, width = case.shape[2:]
-    pixels = torch.randperm(height * width)[:500]
+    network = case.network()
+    height, width = case.size
+    pixels = torch.randperm(height * width)[:POINTS]
     points = SparsePoints(
         xy=torch.stack([pixels % width, pixels // width], dim=1).float(),
-        depth=1 + 4 * torch.rand(500),
-        size=(height, width),
+        depth=1 + 4 * torch.rand(POINTS),
+        size=case.size,
     )
-    return network, torch.rand(case.shape), points
+    inputs = tuple(
+        points.scatter() if channels == 1 else torch.rand(1, channels, *case.size)
+        for channels in case.channels
+    )
+    return network, inputs, points
 
 
-def loop(z: Tensor, rear: Callable[[Tensor], Tensor], points: SparsePoints) -> Tensor:
+def output_points(case: Case, points: SparsePoints) -> Callable[[Tensor], Tensor]:
+    """The loss of equation 3 for an output of whatever size."""
+    return lambda output: (points.sample(output) - points.depth).abs().mean()
+
+
+def loop(
+    z: Tensor, rear: Callable[[Tensor], Tensor], loss_of: Callable[[Tensor], Tensor]
+) -> Tensor:
     """Equation 3 with sign steps, written out."""
     for _ in range(ITERATIONS):
         z = z.detach().requires_grad_(True)
-        loss = (points.sample(rear(z)) - points.depth).abs().mean()
-        z = z.detach() - STEP * torch.autograd.grad(loss, z)[0].sign()
+        z = z.detach() - STEP * torch.autograd.grad(loss_of(rear(z)), z)[0].sign()
     with torch.no_grad():
         return rear(z)
 
 
-def by_hand(network: nn.Module, x: Tensor, points: SparsePoints) -> Tensor:
-    """Refinement with the network's own `front` and `rear`."""
+def by_hand(case: Case, network: nn.Module, inputs: Inputs, points: SparsePoints) -> Tensor:
+    """Refinement with a front and a rear written for this network."""
     with torch.no_grad():
-        z, kept = network.front(x)
-    return loop(z, lambda z: network.rear(z, kept), points)
+        z, kept = case.front(network, *inputs)
+    return loop(z, lambda z: case.rear(network, z, kept), output_points(case, points))
 
 
-def ours(case: Case, network: nn.Module, x: Tensor, points: SparsePoints) -> Tensor:
-    """Refinement by `Split`."""
-    settings = RefineSettings(iterations=ITERATIONS, lr=STEP)
+def by_split(split: Split, inputs: Inputs, points: SparsePoints) -> Tensor:
+    """Refinement of a further frame of an open network."""
+    return refine(split, inputs, points, SETTINGS, depth_of=lambda output: output).after
+
+
+def by_new_split(case: Case, network: nn.Module, inputs: Inputs, points: SparsePoints) -> Tensor:
+    """Refinement of one frame, the network opened for it."""
     with Split(network, case.layer) as split:
-        return refine(split, (x,), points, settings, depth_of=lambda output: output).after
+        return by_split(split, inputs, points)
 
 
-def by_hook(case: Case, network: nn.Module, x: Tensor, points: SparsePoints) -> Tensor:
+def by_hook(case: Case, network: nn.Module, inputs: Inputs, points: SparsePoints) -> Tensor:
     """Refinement by a hook that replaces the layer's output, re-running the whole network."""
-    layer, seen = network.get_submodule(case.layer), []
+    layer = network.get_submodule(case.layer.removesuffix("[0]"))
+    seen: list[object] = []
+
+    def replaced(output: object, z: Tensor) -> object:
+        return (z, *output[1:]) if isinstance(output, tuple) else z
+
     with torch.no_grad():
         handle = layer.register_forward_hook(lambda *call: seen.append(call[2]))
-        network(x)
+        network(*inputs)
         handle.remove()
 
     def rear(z: Tensor) -> Tensor:
-        handle = layer.register_forward_hook(lambda *_: z.clone())
+        handle = layer.register_forward_hook(lambda *call: replaced(call[2], z.clone()))
         try:
-            return network(x)
+            return network(*inputs)
         finally:
             handle.remove()
 
-    return loop(seen[0], rear, points)
+    first = seen[0][0] if isinstance(seen[0], tuple) else seen[0]
+    assert isinstance(first, Tensor)
+    return loop(first, rear, output_points(case, points))
 
 
-def ways(case: Case) -> dict[str, Callable[[], object]]:
+def by_papers_code(case: Case, network: nn.Module, inputs: Inputs, points: SparsePoints) -> Tensor:
+    """The same updates as the authors' PyTorch code makes them, one more than it does by mistake.
+
+    The network's parameters ask for gradients, the front's graph is built, and each gradient is
+    taken with `create_graph`.
+    """
+    loss_of = output_points(case, points)
+    network.requires_grad_(True)
+    try:
+        z, kept = case.front(network, *inputs)
+        for _ in range(ITERATIONS):
+            z = z.detach().requires_grad_(True)
+            output = case.rear(network, z, kept)
+            gradient = torch.autograd.grad([loss_of(output)], [z], create_graph=True)[0]
+            z = z - STEP * gradient.sign()
+        return case.rear(network, z.detach().requires_grad_(True), kept).detach()
+    finally:
+        network.requires_grad_(False)
+
+
+@contextlib.contextmanager
+def ways(case: Case) -> Iterator[dict[str, Callable[[], object]]]:
     """What is timed, by name."""
-    network, x, points = setup(case)
-    with torch.no_grad():
-        z, kept = network.front(x)
+    network, inputs, points = setup(case)
     no_grad = torch.no_grad()
-    return {
-        "forward": no_grad(lambda: network(x)),
-        "front": no_grad(lambda: network.front(x)),
-        "rear": no_grad(lambda: network.rear(z, kept)),
-        "by hand": lambda: by_hand(network, x, points),
-        "ours": lambda: ours(case, network, x, points),
-        "by hook": lambda: by_hook(case, network, x, points),
-    }
+    with ExitStack() as stack:
+        with torch.no_grad():
+            z, kept = case.front(network, *inputs)
+        twin = case.network()
+        twin.load_state_dict(network.state_dict())
+        split = stack.enter_context(Split(twin, case.layer))
+        given = (case, network, inputs, points)
+        yield {
+            "forward": no_grad(lambda: network(*inputs)),
+            "front": no_grad(lambda: case.front(network, *inputs)),
+            "rear": no_grad(lambda: case.rear(network, z, kept)),
+            "by hand": lambda: by_hand(*given),
+            "ours": lambda: by_split(split, inputs, points),
+            "ours, one frame": lambda: by_new_split(*given),
+            "by hook": lambda: by_hook(*given),
+            "paper's code": lambda: by_papers_code(*given),
+        }
 
 
 def measure(case: Case, runs: int) -> dict[str, float | str]:
     """Medians in seconds of every way, taken in turn, and the ratios."""
-    todo = ways(case)
-    a, b, c = (todo[name]() for name in ("by hand", "ours", "by hook"))
-    assert torch.equal(a, b)
-    assert torch.equal(a, c)
-    spent: dict[str, list[float]] = {name: [] for name in todo}
-    for _ in range(runs):
-        for name, run in todo.items():
-            start = time.perf_counter()
-            run()
-            spent[name].append(time.perf_counter() - start)
+    with ways(case) as todo:
+        results = [todo[name]() for name in COMPARED]
+        for name, result in zip(COMPARED, results, strict=True):
+            assert torch.equal(results[0], result), f"{case.name}: {name} differs"
+        spent: dict[str, list[float]] = {name: [] for name in todo}
+        for _ in range(runs):
+            for name, run in todo.items():
+                start = time.perf_counter()
+                run()
+                spent[name].append(time.perf_counter() - start)
     median = {name: statistics.median(times) for name, times in spent.items()}
     limit = (median["front"] + (2 * ITERATIONS + 1) * median["rear"]) / (
         median["front"] + median["rear"]
     )
-    ratio = {name: median[name] / median["forward"] for name in ("by hand", "ours", "by hook")}
-    paired = [o / h for o, h in zip(spent["ours"], spent["by hand"], strict=True)]
+    ratio = {name: median[name] / median["forward"] for name in COMPARED}
+    paired = {
+        name: statistics.median(o / h for o, h in zip(spent["ours"], spent[name], strict=True))
+        for name in ("by hand", "paper's code")
+    }
     forward = peak_mb(case, "forward")
-    extra = {name: peak_mb(case, name) - forward for name in ("by hand", "ours")}
+    extra = {name: peak_mb(case, name) - forward for name in ("by hand", "ours", "paper's code")}
     return {
-        "network": case.name,
-        "forward_s": median["forward"],
+        "network": f"{case.name}, {case.size[0]}×{case.size[1]}",
+        "forward, ms": 1000 * median["forward"],
         "limit": limit,
-        **{f"{name} / forward": value for name, value in ratio.items()},
+        **ratio,
         "ours / limit": ratio["ours"] / limit,
-        "ours / by hand": statistics.median(paired),
-        "extra MB by hand": extra["by hand"],
-        "extra MB ours": extra["ours"],
-        "extra memory ours / by hand": extra["ours"] / extra["by hand"],
+        "ours / by hand": paired["by hand"],
+        "ours / paper's code": paired["paper's code"],
+        **{f"extra MB {name}": value for name, value in extra.items()},
     }
 
 
 def peak_mb(case: Case, way: str) -> float:
-    """Peak resident memory of a new process that does this once after a forward pass."""
+    """Peak resident memory of a new process that does this twice after a forward pass."""
     command = [sys.executable, "-m", "benchmarks.engine", "--peak", case.name, way]
     return float(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
+
+
+def print_peak(name: str, way: str) -> None:
+    with ways(next(case for case in (*ZOO, *CASES) if case.name == name)) as todo:
+        todo["forward"]()
+        for _ in range(2):
+            todo[way]()
+        print(peak_memory_mb(torch.device("cpu"))["process"])
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--runs", type=int, default=15)
+    parser.add_argument("--only", nargs="+", default=[case.name for case in (*ZOO, *CASES)])
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--peak", nargs=2, help=argparse.SUPPRESS)
     args = parser.parse_args()
     if args.peak:
-        todo = ways(next(case for case in CASES if case.name == args.peak[0]))
-        todo["forward"]()
-        todo[args.peak[1]]()
-        print(peak_memory_mb(torch.device("cpu"))["process"])
+        print_peak(*args.peak)
         return
-    results = [measure(case, args.runs) for case in CASES]
+    results = []
+    for case in (*ZOO, *CASES):
+        if case.name in args.only:
+            print(case.name, file=sys.stderr)
+            results.append(measure(case, args.runs))
     if args.json:
         print(json.dumps(results, indent=2))
         return
     print(
         f"{platform.processor() or platform.machine()}, {torch.get_num_threads()} threads,"
-        f" torch {torch.__version__}, fp32, K = {ITERATIONS}, {args.runs} runs, medians\n"
+        f" torch {torch.__version__}, fp32, K = {ITERATIONS}, {args.runs} runs, medians; in units"
+        " of a forward pass unless said\n"
     )
     print("| " + " | ".join(results[0]) + " |")
     print("|" + "---|" * len(results[0]))

@@ -14,6 +14,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from pnpdepth_cli.models.registry import find_definition
+
 
 class ResidualBlock(nn.Module):
     """ResNet's basic block (He et al. 2016)."""
@@ -172,15 +174,28 @@ class ViTDepth(nn.Module):
 
 @dataclass(frozen=True)
 class Case:
-    """A network, the name of the layer its `front` ends with, and its input's shape."""
+    """A network, the layer its `front` ends with, and the channels and size of its inputs.
+
+    build None: the zoo's network of that name. front(network, *inputs) gives z and what `rear`
+    needs beside it, rear(network, z, kept) what the network gives. Inputs are in 0..1; one of one
+    channel is sparse depth.
+    """
 
     name: str
-    build: Callable[[], nn.Module]
     layer: str
-    shape: tuple[int, int, int, int]
+    channels: tuple[int, ...]
+    size: tuple[int, int]
+    front: Callable[..., Any] = lambda network, *inputs: network.front(*inputs)
+    rear: Callable[..., Tensor] = lambda network, z, kept: network.rear(z, kept)
+    build: Callable[[], nn.Module] | None = None
+
+    def network(self) -> nn.Module:
+        """It, with random weights, in eval mode."""
+        build = self.build or find_definition(self.name).build
+        return build().eval().requires_grad_(False)
 
 
 CASES = (
-    Case("ResNet-18 encoder–decoder, 228×304", ResNetEncoderDecoder, "bn2", (1, 4, 228, 304)),
-    Case("ViT-S + DPT head, 392×518", ViTDepth, "fusions.0", (1, 3, 392, 518)),
+    Case("ResNet-18 encoder–decoder", "bn2", (4,), (228, 304), build=ResNetEncoderDecoder),
+    Case("ViT-S + DPT head", "fusions.0", (3,), (392, 518), build=ViTDepth),
 )

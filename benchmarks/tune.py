@@ -3,8 +3,9 @@
     python -m benchmarks.tune --data SHARDS [--model compact] [--frames 24] [--layers A,B] …
 
 For every layer, update and step: the geometric mean over frames and patterns (100 and 500 uniform
-points, LiDAR lines) of MAE and RMSE after refinement over those before, against the perfect depth,
-in per cent, and the share of frames whose MAE got worse. Never run it on frames that are reported.
+points and LiDAR lines, or what --patterns names, as in 500,5%,lidar) of MAE and RMSE after
+refinement over those before, against the perfect depth, in per cent, and the share of frames whose
+MAE got worse. Never run it on frames that are reported.
 """
 
 from __future__ import annotations
@@ -16,26 +17,35 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from benchmarks.frames import frame_inputs, points_on_grid, refined
+from benchmarks.frames import Depth, frame_inputs, points_on_grid, refined
 from model_zoo_defs.training.dataset import Frames
-from model_zoo_defs.training.validation import PATTERNS
+from model_zoo_defs.training.patterns import keep, scan_lines, uniform
 from pnpdepth_cli.core.metrics import score
 from pnpdepth_cli.core.refine import RefineSettings
 from pnpdepth_cli.models.network import Network, load_network
 from pnpdepth_cli.pipeline.inputs import Inputs
 
 
-def rendered_inputs(folder: Path, count: int) -> list[Inputs]:
+def drawn(pattern: str, rng: np.random.Generator, depth: Depth) -> Depth:
+    """Sparse depth: a number of uniform points, a percentage of all pixels, or `lidar` lines."""
+    if pattern == "lidar":
+        return scan_lines(rng, depth)
+    share = pattern.endswith("%")
+    number = float(pattern.rstrip("%")) * (depth.size / 100 if share else 1)
+    return keep(depth, uniform(rng, depth, round(number)))
+
+
+def rendered_inputs(folder: Path, count: int, patterns: list[str]) -> list[Inputs]:
     """`count` frames evenly taken from the folder's shards, each with every pattern."""
     frames, found = Frames(folder), []
     for index in np.linspace(0, len(frames) - 1, count).astype(int):
         rgb, depth = frames[int(index)]
-        for draw in PATTERNS.values():
-            sparse = draw(np.random.default_rng(int(index)), depth)
+        for pattern in patterns:
+            sparse = drawn(pattern, np.random.default_rng(int(index)), depth)
             rows, columns = np.nonzero(sparse)
             if len(rows) >= 3:
                 points = points_on_grid(rows, columns, sparse[rows, columns], depth.shape)
-                found.append(frame_inputs(rgb.astype(np.float32) / 255, points, depth))
+                found.append(frame_inputs((rgb / 255).astype(np.float32), points, depth))
     return found
 
 
@@ -59,6 +69,7 @@ def main() -> None:
     parser.add_argument("--model", default="compact")
     parser.add_argument("--checkpoint", type=Path)
     parser.add_argument("--frames", type=int, default=24)
+    parser.add_argument("--patterns", default="100,500,lidar")
     parser.add_argument("--layers", help="comma-separated; default: the definition's")
     parser.add_argument("--updates", default="sign,adam")
     parser.add_argument("--lrs", default="0.3%,1%,3%,0.01")
@@ -67,7 +78,7 @@ def main() -> None:
     args = parser.parse_args()
     network = load_network(args.model, args.checkpoint)
     layers = args.layers.split(",") if args.layers else network.definition.layers
-    some = rendered_inputs(args.data, args.frames)
+    some = rendered_inputs(args.data, args.frames, args.patterns.split(","))
     print(f"{len(some)} frames with points\n")
     print("| layer | update | lr | K | loss | MAE % | RMSE % | worse % |")
     print("|---|---|---|---|---|---|---|---|")

@@ -3,15 +3,18 @@
     PnpDepthError                1  our own bug, when raised as itself
     ├── UsageError               2  an option or argument makes no sense
     │   └── OutputError          2  the place to write to cannot be used
+    │       └── StorageError     2  nothing more can be written there: it is full, say
     ├── InputError               3  a file with image or depth data is at fault
     │   ├── FileFormatError      3  it cannot be read as what it should be
     │   ├── SizeError            3  image, sparse depth and ground truth do not fit together
     │   └── NoPointsError        3  there is no sparse depth to work with
     ├── ModelError               4  the network or its definition is at fault
     │   ├── LayerError           4  the layer cannot be cut at
+    │   ├── BatchError           4  the network does not take several frames at once
     │   └── CheckpointError      4  the weights cannot be used
     ├── DivergedError            5  refinement produced non-finite numbers
-    └── DeviceError              6  the device is absent or out of memory
+    ├── DeviceError              6  the device is absent or out of memory
+    └── FramesFailedError        7  a batch went through, but not all of its frames
 
 A message names the thing, the fact and the way out, on one line.
 """
@@ -35,6 +38,10 @@ class UsageError(PnpDepthError):
 
 class OutputError(UsageError):
     """The place to write to cannot be used."""
+
+
+class StorageError(OutputError):
+    """Nothing more can be written there, whatever it is: the disk is full or gone, or read-only."""
 
 
 class InputError(PnpDepthError):
@@ -65,6 +72,10 @@ class LayerError(ModelError):
     """The layer cannot be cut at."""
 
 
+class BatchError(ModelError):
+    """The network does not take several frames at once; one at a time it may."""
+
+
 class CheckpointError(ModelError):
     """The weights cannot be used."""
 
@@ -83,3 +94,9 @@ class DeviceError(PnpDepthError):
     """The device is absent or out of memory."""
 
     exit_code = 6
+
+
+class FramesFailedError(PnpDepthError):
+    """A batch went through, but not all of its frames."""
+
+    exit_code = 7

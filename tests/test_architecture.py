@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from pnpdepth_cli.cli.main import COMMANDS
+
 ROOT = Path(__file__).parent.parent
 PACKAGE = ROOT / "pnpdepth_cli"
 MAY_IMPORT = {
@@ -65,9 +67,6 @@ def test_core_and_models_read_no_files_through_cv2_and_io_needs_no_torch() -> No
         for file in (PACKAGE / package).rglob("*.py"):
             tops = {name.split(".")[0] for name in imported_modules(file)}
             assert not tops & forbidden, file
-
-
-COMMANDS = ("refine", "models", "layers", "project", "sample", "simulate")
 
 
 @pytest.mark.parametrize("command", [[], *([name] for name in COMMANDS)])

@@ -2,37 +2,55 @@
 
 from __future__ import annotations
 
+import importlib
 import sys
 from typing import Any
 
 import click
 
 from pnpdepth_cli import __version__
-from pnpdepth_cli.cli.layers import layers
-from pnpdepth_cli.cli.models import models
-from pnpdepth_cli.cli.project import project
-from pnpdepth_cli.cli.refine import refine
-from pnpdepth_cli.cli.sample import sample
-from pnpdepth_cli.cli.simulate import simulate
+from pnpdepth_cli.cli.printable import printable
 from pnpdepth_cli.errors import PnpDepthError
 
 _EXIT_CODES = """\b
 Exit codes: 0 done · 1 a bug of ours · 2 wrong usage · 3 an input file · 4 network, layer or
-checkpoint · 5 refinement diverged · 6 device"""
+checkpoint · 5 refinement diverged · 6 device · 7 some frames of a batch failed · 130 interrupted"""
+
+COMMANDS = {
+    "refine": "refine:refine",
+    "batch": "batch:batch",
+    "models": "models:models",
+    "layers": "layers:layers",
+    "project": "project:project",
+    "sample": "sample:sample",
+    "simulate": "simulate:simulate",
+    "eval": "evaluate:evaluate",
+    "compare": "compare:compare",
+}
+"""The subcommands in the order of the help: where each is below `pnpdepth_cli.cli`."""
 
 
-@click.group(epilog=_EXIT_CODES, context_settings={"help_option_names": ["-h", "--help"]})
+class _Commands(click.Group):
+    """A group that imports a subcommand only when it is needed."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        return list(COMMANDS)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        if cmd_name not in COMMANDS:
+            return None
+        module, name = COMMANDS[cmd_name].split(":")
+        command = getattr(importlib.import_module(f"pnpdepth_cli.cli.{module}"), name)
+        assert isinstance(command, click.Command)
+        return command
+
+
+@click.group(
+    cls=_Commands, epilog=_EXIT_CODES, context_settings={"help_option_names": ["-h", "--help"]}
+)
 @click.version_option(__version__, prog_name="pnpdepth")
 def cli() -> None:
     """Better depth from any depth network and a few true points, without training."""
-
-
-cli.add_command(refine)
-cli.add_command(models)
-cli.add_command(layers)
-cli.add_command(project)
-cli.add_command(sample)
-cli.add_command(simulate)
 
 
 def main(arguments: list[str] | None = None) -> Any:
@@ -40,5 +58,5 @@ def main(arguments: list[str] | None = None) -> Any:
     try:
         return cli.main(arguments, prog_name="pnpdepth")
     except PnpDepthError as error:
-        click.echo(f"pnpdepth: {error}", err=True)
+        click.echo(f"pnpdepth: {printable(error)}", err=True)
         sys.exit(error.exit_code)

@@ -23,7 +23,8 @@ model = click.option(
 checkpoint = click.option(
     "--checkpoint",
     type=FILE,
-    help="Its weights: .safetensors, or a torch file; nothing in it is run.",
+    help="Its weights: .safetensors, a torch, numpy or TensorFlow (.index) file, or a folder with"
+    " one file per part; nothing in them is run.",
 )
 layer = click.option(
     "--layer",
@@ -137,9 +138,89 @@ def scan_given(given: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
     )
 
 
+LOSSES = ("l1", "l2", "huber", "berhu", "inverse", "log", "cauchy")
+UPDATES = ("sign", "sgd", "normalised", "momentum", "adam")
+SCHEDULES = ("constant", "linear")
+FORMATS = ("png", "exr", "npy", "npz", "pfm", "tiff")
+
+_REFINEMENT_OPTIONS = (
+    click.option(
+        "--format",
+        type=click.Choice(FORMATS),
+        default="png",
+        show_default=True,
+        help="Of the depth file in a folder.",
+    ),
+    overwrite,
+    model,
+    checkpoint,
+    layer,
+    click.option(
+        "--iterations", type=int, metavar="K", help="Updates of z; 0 gives the plain prediction."
+    ),
+    click.option(
+        "--lr", metavar="NUMBER|P%", help="Step: absolute, or per cent of z's standard deviation."
+    ),
+    click.option("--loss", type=click.Choice(LOSSES), help="Between prediction and sparse points."),
+    click.option(
+        "--update",
+        type=click.Choice(UPDATES),
+        help="From gradient to step; one that is not the network's default starts from the paper's"
+        " --lr, --schedule and --spread.",
+    ),
+    click.option(
+        "--schedule", type=click.Choice(SCHEDULES), help="Of the step: it stays, or falls to 0."
+    ),
+    click.option(
+        "--spread",
+        type=float,
+        metavar="S",
+        help="Blur the gradient over S spacings of the points, where z is a map; 0 does not.",
+    ),
+    click.option(
+        "--keep-best", is_flag=True, help="Give the depth of the lowest loss, not the last."
+    ),
+    reading,
+    depth_scale,
+    click.option("--gt-scale", type=float, metavar="S", help="The same for the ground truth."),
+    channel,
+    click.option(
+        "--sparse-size-ok", is_flag=True, help="Map points of a sparse map of another size."
+    ),
+    click.option(
+        "--holdout",
+        type=float,
+        default=0.0,
+        metavar="F",
+        help="Keep this share of the points out, and score them.",
+    ),
+    click.option("--seed", type=int, default=0, show_default=True, help="Of the hold-out choice."),
+    device,
+)
+
+
+def refinement(command: Callable[..., Any]) -> Callable[..., Any]:
+    """The command has the options of how a frame is refined; they are named as in RefineRequest."""
+    for option in reversed(_REFINEMENT_OPTIONS):
+        command = option(command)
+    return command
+
+
 def height_and_width(text: str) -> tuple[int, int]:
     """(H, W) of a text such as 480x640. UsageError for any other."""
     height, x, width = text.lower().partition("x")
     if not (x and height.isdecimal() and width.isdecimal() and int(height) and int(width)):
         raise UsageError(f"size {text!r} is not of the form HxW, such as 480x640")
     return int(height), int(width)
+
+
+def count_or_share(text: str | None) -> tuple[int | None, float | None]:
+    """(points, share) of `500` or `5%`; None for what it is not. UsageError for any other text."""
+    if text is None:
+        return None, None
+    try:
+        if text.strip().endswith("%"):
+            return None, float(text.strip()[:-1]) / 100
+        return int(text), None
+    except ValueError:
+        raise UsageError(f"count {text!r} is neither a number such as 500 nor 5%") from None

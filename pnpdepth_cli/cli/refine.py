@@ -14,10 +14,6 @@ from pnpdepth_cli.cli import options
 if TYPE_CHECKING:
     from tqdm import tqdm
 
-LOSSES = ("l1", "l2", "huber", "berhu", "inverse", "log")
-UPDATES = ("sign", "sgd", "momentum", "adam")
-FORMATS = ("png", "exr", "npy", "npz", "pfm", "tiff")
-
 
 @click.command(short_help="Refine the depth of one image.")
 @click.argument("image", type=options.FILE, required=False)
@@ -36,42 +32,9 @@ FORMATS = ("png", "exr", "npy", "npz", "pfm", "tiff")
     type=options.FILE,
     help="A folder, or one depth file such as depth.exr.  [default: ./IMAGE_refined/]",
 )
-@click.option(
-    "--format",
-    "format_",
-    type=click.Choice(FORMATS),
-    default="png",
-    show_default=True,
-    help="Of the depth file in a folder.",
-)
-@options.overwrite
-@options.model
-@options.checkpoint
-@options.layer
-@click.option(
-    "--iterations", type=int, metavar="K", help="Updates of z; 0 gives the plain prediction."
-)
-@click.option(
-    "--lr", metavar="NUMBER|P%", help="Step: absolute, or per cent of z's standard deviation."
-)
-@click.option("--loss", type=click.Choice(LOSSES), help="Between prediction and sparse points.")
-@click.option("--update", type=click.Choice(UPDATES), help="From gradient to step.")
-@options.reading
-@options.depth_scale
-@click.option("--gt-scale", type=float, metavar="S", help="The same for --gt.")
-@options.channel
-@click.option("--sparse-size-ok", is_flag=True, help="Map points of a sparse map of another size.")
-@click.option(
-    "--holdout",
-    type=float,
-    default=0.0,
-    metavar="F",
-    help="Keep this share of the points out, and score them.",
-)
-@click.option("--seed", type=int, default=0, show_default=True, help="Of the hold-out choice.")
-@options.device
+@options.refinement
 @options.as_json
-def refine(as_json: bool, format_: str, **given: Any) -> None:
+def refine(as_json: bool, **given: Any) -> None:
     """Improve a network's depth of IMAGE with sparse depth.
 
     \b
@@ -90,7 +53,7 @@ def refine(as_json: bool, format_: str, **given: Any) -> None:
     from pnpdepth_cli.pipeline.scans import ScanOptions
 
     scan, others = options.scan_given(given)
-    request = RefineRequest(format=format_, scan=ScanOptions(**scan), **others)
+    request = RefineRequest(scan=ScanOptions(**scan), **others)
     with _SlowBar() as bar:
         outcome = refine_image(request, on_iteration=bar.show)
     if as_json:

@@ -76,7 +76,7 @@ def sample(
     from pnpdepth_cli.pipeline.sample import SampleRequest, sample_depth
     from pnpdepth_cli.pipeline.sparse_outputs import SparseTarget
 
-    points, share = _count(count)
+    points, share = options.count_or_share(count)
     record = sample_depth(
         SampleRequest(
             depth=depth,
@@ -103,18 +103,6 @@ def sample(
         click.echo(json.dumps(record, indent=2))
     else:
         print_sparse(record)
-
-
-def _count(text: str | None) -> tuple[int | None, float | None]:
-    """(points, share) of `500` or `5%`."""
-    if text is None:
-        return None, None
-    try:
-        if text.strip().endswith("%"):
-            return None, float(text.strip()[:-1]) / 100
-        return int(text), None
-    except ValueError:
-        raise UsageError(f"count {text!r} is neither a number such as 500 nor 5%") from None
 
 
 def _region(text: str) -> tuple[int, int, int, int]:

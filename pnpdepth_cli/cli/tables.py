@@ -33,10 +33,8 @@ def print_refinement(record: Mapping[str, Any]) -> None:
     _point_rows(table, f"error at {points['used']:,} points used", record["sparse_error"])
     _point_rows(table, f"error at {points['held_out']:,} held-out points", record["held_out_error"])
     if record["scores"] is not None:
-        before, after = record["scores"]["before"], record["scores"]["after"]
-        table.add_section()
-        for title, key, show in _SCORES:
-            table.add_row(title, show(before[key]), show(after[key]), _change(key, before, after))
+        after = record["scores"]["after"]
+        _score_rows(table, record["scores"])
         table.caption = (
             f"scored on {after['pixels']:,} pixels of ground truth"
             f" ({after['coverage']:.1%} of those known)"
@@ -55,6 +53,30 @@ def print_refinement(record: Mapping[str, Any]) -> None:
     )
     written = [path for path in record["outputs"].values() if path]
     console.print("wrote " + escape("  ".join(written)), soft_wrap=True)
+
+
+def print_batch(summary: Mapping[str, Any]) -> None:
+    """The end of `pnpdepth batch`: errors before and after, means over the frames; the files."""
+    console = Console(stderr=True, highlight=False)
+    mean, counts = summary["mean"], summary["counts"]
+    if any(mean.values()):
+        table = Table(title="means over frames")
+        for column in ("", "before", "after", "change"):
+            table.add_column(column, justify="left" if not column else "right")
+        _point_rows(table, "error at points used", mean["sparse_error"])
+        _point_rows(table, "error at held-out points", mean["held_out_error"])
+        if mean["scores"] is not None:
+            _score_rows(table, mean["scores"])
+            table.caption = f"scored on the ground truth of {mean['scores']['frames']:,} frames"
+        console.print(table)
+    said = [f"{counts['done']:,} of {counts['frames']:,} frames done"]
+    said += [
+        f"{counts[kind]:,} {kind}" for kind in ("diverged", "failed", "pending") if counts[kind]
+    ]
+    said += [f"{counts['with_warnings']:,} with warnings"] if counts["with_warnings"] else []
+    console.print(", ".join(said))
+    output = summary["output"]
+    console.print("wrote " + escape(f"{output}/summary.json  {output}/summary.csv"), soft_wrap=True)
 
 
 def print_sparse(record: Mapping[str, Any]) -> None:
@@ -102,6 +124,13 @@ def _point_rows(table: Table, title: str, error: Mapping[str, Any] | None) -> No
                 f"{after[key]:.4f} m",
                 _change(key, before, after),
             )
+
+
+def _score_rows(table: Table, scores: Mapping[str, Any]) -> None:
+    before, after = scores["before"], scores["after"]
+    table.add_section()
+    for title, key, show in _SCORES:
+        table.add_row(title, show(before[key]), show(after[key]), _change(key, before, after))
 
 
 def _change(key: str, before: Mapping[str, float], after: Mapping[str, float]) -> str:

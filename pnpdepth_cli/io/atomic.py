@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+import errno
 import os
+import re
 import secrets
+import stat
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from pnpdepth_cli.errors import OutputError
+from pnpdepth_cli.errors import OutputError, StorageError
 from pnpdepth_cli.io.opening import one_line
+
+_TEMPORARY = re.compile(r"\.[0-9a-f]{12}(\.[A-Za-z0-9]+)?")
+_FULL = {errno.ENOSPC, errno.EDQUOT}
+_OF_THE_NAME = {errno.ENAMETOOLONG, errno.EILSEQ, errno.EINVAL, errno.EISDIR, errno.ENOTDIR}
 
 
 @contextmanager
@@ -21,10 +28,7 @@ def atomic_path(path: Path) -> Iterator[Path]:
     folder cannot be written to, also when that shows only inside the block.
     """
     target = Path(os.path.realpath(path))
-    if target.is_dir():
-        raise OutputError(f"{path} is a folder; give the name of a file to write")
-    if target.exists() and not target.is_file():
-        raise OutputError(f"{path} is not a regular file; choose another output file")
+    _check_target(target, named=path)
     temporary = _empty_file_beside(target, named=path)
     try:
         yield temporary
@@ -33,8 +37,48 @@ def atomic_path(path: Path) -> Iterator[Path]:
         with suppress(OSError):
             temporary.unlink()
         if isinstance(error, OSError):
-            raise _cannot_write(path, error) from error
+            raise cannot_write(path, error) from error
         raise
+
+
+def make_folder(folder: Path) -> None:
+    """The folder exists, and those above it. OutputError if it cannot be made."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise cannot_write(folder, error) from error
+
+
+def remove_leftovers(folder: Path) -> int:
+    """What writers that were killed left in the folder is gone; returns how many files that were.
+
+    To be called only while nobody writes there.
+    """
+    leftovers = [p for p in folder.iterdir() if _TEMPORARY.fullmatch(p.name) and p.is_file()]
+    for path in leftovers:
+        path.unlink(missing_ok=True)
+    return len(leftovers)
+
+
+def cannot_write(path: Path, error: OSError) -> OutputError:
+    """The error that says why; a StorageError where no other name would help."""
+    reason = one_line(error.strerror or error).lower()
+    kind = OutputError if error.errno in _OF_THE_NAME else StorageError
+    room = "make room, or " if error.errno in _FULL else ""
+    return kind(f"{path} cannot be written ({reason}); {room}choose another output folder")
+
+
+def _check_target(target: Path, *, named: Path) -> None:
+    try:
+        mode = target.stat().st_mode
+    except FileNotFoundError:
+        return
+    except OSError as error:
+        raise cannot_write(named, error) from error
+    if stat.S_ISDIR(mode):
+        raise OutputError(f"{named} is a folder; give the name of a file to write")
+    if not stat.S_ISREG(mode):
+        raise OutputError(f"{named} is not a regular file; choose another output file")
 
 
 def _empty_file_beside(target: Path, *, named: Path) -> Path:
@@ -46,10 +90,5 @@ def _empty_file_beside(target: Path, *, named: Path) -> Path:
         if not target.parent.exists():
             message = f"{named}: its folder does not exist; create it first"
             raise OutputError(message) from error
-        raise _cannot_write(named, error) from error
+        raise cannot_write(named, error) from error
     return temporary
-
-
-def _cannot_write(path: Path, error: OSError) -> OutputError:
-    reason = one_line(error.strerror or error).lower()
-    return OutputError(f"{path} cannot be written ({reason}); choose another output folder")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import FileFormatError, InputError
+from pnpdepth_cli.io.together import Together
 
 _MAGIC = (
     (b"\x89PNG\r\n\x1a\n", "PNG"),
@@ -71,19 +74,31 @@ def check_pixel_count(path: Path, width: int, height: int) -> None:
         )
 
 
+@contextmanager
+def _silent_opencv() -> Iterator[None]:
+    """OpenCV does not print several lines of its own about a damaged file."""
+    import cv2
+
+    loudness = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    try:
+        yield
+    finally:
+        cv2.utils.logging.setLogLevel(loudness)
+
+
+_SILENT_OPENCV = Together(_silent_opencv)
+
+
 def decode_with_opencv(path: Path, data: bytes, kind: str) -> NDArray[Any]:
     """The pixels as stored, (H, W) or (H, W, C) with blue first, in the file's own type."""
     import cv2
 
     buffer = np.frombuffer(data, dtype=np.uint8)
-    # OpenCV would print several lines of its own about a damaged file.
-    loudness = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     try:
-        pixels = cv2.imdecode(buffer, cv2.IMREAD_UNCHANGED)
+        with _SILENT_OPENCV:
+            pixels = cv2.imdecode(buffer, cv2.IMREAD_UNCHANGED)
     except cv2.error as error:
         raise damaged(path, kind, f"cannot be decoded ({error})") from error
-    finally:
-        cv2.utils.logging.setLogLevel(loudness)
     if pixels is None:
         raise damaged(path, kind, "cannot be decoded")
     return pixels

@@ -24,6 +24,7 @@ from pnpdepth_cli.io.opening import (
 )
 from pnpdepth_cli.io.png import read_png_facts
 from pnpdepth_cli.io.tiff import read_tiff_facts
+from pnpdepth_cli.io.together import Together
 
 if TYPE_CHECKING:
     import PIL.Image
@@ -81,7 +82,7 @@ def _decode_8_bit(
     from PIL import Image
 
     try:
-        with _quietly(), Image.open(io.BytesIO(data), formats=[kind]) as picture:
+        with _QUIET_PILLOW, Image.open(io.BytesIO(data), formats=[kind]) as picture:
             check_pixel_count(path, *picture.size)
             picture.load()
             frames = getattr(picture, "n_frames", 1)
@@ -110,7 +111,7 @@ def _decode_16_bit(path: Path, data: bytes, kind: str) -> tuple[NDArray[np.float
         return values, 1
     from PIL import Image
 
-    with _quietly(), Image.open(io.BytesIO(data), formats=["PNG"]) as picture:
+    with _QUIET_PILLOW, Image.open(io.BytesIO(data), formats=["PNG"]) as picture:
         return values, _orientation(picture)
 
 
@@ -122,11 +123,14 @@ def _orientation(picture: PIL.Image.Image) -> int:
 
 
 @contextmanager
-def _quietly() -> Iterator[None]:
+def _quiet_pillow() -> Iterator[None]:
     """Pillow's warnings, of damaged EXIF or a large picture, are not shown inside."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         yield
+
+
+_QUIET_PILLOW = Together(_quiet_pillow)
 
 
 def _turn_upright(values: NDArray[np.float32], orientation: int) -> NDArray[np.float32]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -23,7 +24,8 @@ from pnpdepth_cli.pipeline.frame import (
     split_points,
 )
 from pnpdepth_cli.pipeline.inputs import Inputs, read_inputs
-from pnpdepth_cli.pipeline.outputs import plan_outputs, write_outputs
+from pnpdepth_cli.pipeline.output_files import Outputs, plan_outputs
+from pnpdepth_cli.pipeline.outputs import write_outputs
 from pnpdepth_cli.pipeline.request import RefineRequest, effective_settings, layer_name
 from pnpdepth_cli.pipeline.settle import settled
 from pnpdepth_cli.pipeline.stopwatch import Stopwatch, peak_memory_mb, versions
@@ -52,58 +54,97 @@ def refine_image(
     with watch("read"):
         inputs = read_inputs(request)
     with watch("load network"):
-        network = load_network(request.model, request.checkpoint, request.device)
-        network = settled(network, inputs, request)
-    layer = layer_name(network.definition, request.layer)
-    settings = effective_settings(network.definition, request)
+        refiner = load_refiner(request, inputs)
     with watch("refine"):
-        torch.manual_seed(request.seed)
-        used, held_out = split_points(inputs.points, request.holdout, request.seed)
-        frame = refine_frame(
-            network,
-            layer,
-            settings,
+        of = refiner.settings.iterations
+        frame = refiner.refine(inputs, on_iteration=lambda done, loss: on_iteration(done, of, loss))
+    return write_refined(outputs, refiner, inputs, frame, watch)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Refiner:
+    """A network with nothing left open, the layer to cut it at, and how to refine its frames."""
+
+    request: RefineRequest
+    network: Network
+    layer: str
+    settings: RefineSettings
+
+    def refine(
+        self,
+        inputs: Inputs,
+        *,
+        on_iteration: Callable[[int, float], None] = lambda done, loss: None,
+    ) -> RefinedFrame:
+        """One frame refined in memory, the same whatever was refined before."""
+        torch.manual_seed(self.request.seed)
+        used, held_out = split_points(inputs.points, self.request.holdout, self.request.seed)
+        return refine_frame(
+            self.network,
+            self.layer,
+            self.settings,
             inputs,
             used,
             held_out,
-            on_iteration=lambda done, loss: on_iteration(done, settings.iterations, loss),
+            on_iteration=on_iteration,
         )
-    record = _record(request, inputs, network, layer, settings, frame)
+
+    @functools.cached_property
+    def model_record(self) -> dict[str, Any]:
+        """What a record says of the network."""
+        checkpoint = self.network.checkpoint
+        return {
+            "name": self.network.definition.name,
+            "spec": self.request.model,
+            "checkpoint": str(checkpoint) if checkpoint else None,
+            "checkpoint_sha256": sha256_of(checkpoint) if checkpoint else None,
+        }
+
+
+def load_refiner(request: RefineRequest, first: Inputs) -> Refiner:
+    """The network that is asked for, with what it leaves open settled on this first frame."""
+    network = load_network(request.model, request.checkpoint, request.device)
+    network = settled(network, first, request)
+    return Refiner(
+        request=request,
+        network=network,
+        layer=layer_name(network.definition, request.layer),
+        settings=effective_settings(network.definition, request),
+    )
+
+
+def write_refined(
+    outputs: Outputs, refiner: Refiner, inputs: Inputs, frame: RefinedFrame, watch: Stopwatch
+) -> RefineOutcome:
+    """The refined frame is scored, and it and its record are on disk.
+
+    The record is the same from run to run, but for `seconds` and `peak_memory_mb`.
+    """
+    record = _record(refiner, inputs, frame)
     with watch("write"):
         record |= write_outputs(outputs, inputs, frame)
     record["seconds"] = watch.seconds
-    record["peak_memory_mb"] = peak_memory_mb(network.device)
+    record["peak_memory_mb"] = peak_memory_mb(refiner.network.device)
     outputs.write_record(record)
     return RefineOutcome(record=record, diverged=frame.diverged)
 
 
-def _record(
-    request: RefineRequest,
-    inputs: Inputs,
-    network: Network,
-    layer: str,
-    settings: RefineSettings,
-    frame: RefinedFrame,
-) -> dict[str, Any]:
-    definition, checkpoint = network.definition, network.checkpoint
+def _record(refiner: Refiner, inputs: Inputs, frame: RefinedFrame) -> dict[str, Any]:
+    request, network = refiner.request, refiner.network
     return {
         "versions": versions(),
         "inputs": inputs.record,
-        "model": {
-            "name": definition.name,
-            "spec": request.model,
-            "checkpoint": str(checkpoint) if checkpoint else None,
-            "checkpoint_sha256": sha256_of(checkpoint) if checkpoint else None,
-        },
+        "model": refiner.model_record,
         "settings": {
-            "layer": layer,
-            **asdict(settings),
+            "layer": refiner.layer,
+            **asdict(refiner.settings),
             "step": frame.refinement.step,
             "holdout": request.holdout,
             "seed": request.seed,
             "device": str(network.device),
         },
         "alignment": asdict(frame.alignment) if frame.alignment else None,
+        "size": [inputs.size[1], inputs.size[0]],
         "points": {
             "used": len(frame.used),
             "held_out": len(frame.held_out),

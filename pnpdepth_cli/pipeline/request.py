@@ -2,28 +2,37 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from pnpdepth_cli.core.refine import RefineSettings
 from pnpdepth_cli.errors import UsageError
-from pnpdepth_cli.models.definition import ModelDefinition
+from pnpdepth_cli.io.layouts.frame import Source
+from pnpdepth_cli.io.layouts.protocols import WHOLE, Protocol
+from pnpdepth_cli.models.definition import ModelDefinition, RefineDefaults
 from pnpdepth_cli.pipeline.scans import ScanOptions
+from pnpdepth_cli.sensors import SamplePattern
+
+if TYPE_CHECKING:  # it imports torch, which `pnpdepth batch` can do without when all is done
+    from pnpdepth_cli.core.refine import RefineSettings
 
 
 @dataclass(frozen=True, kw_only=True)
 class RefineRequest:
     """What the user asks for; None means the network's own default.
 
-    depth_scale, gt_scale: integer depth files hold metres × scale. holdout: the share of the
-    points kept from the network and the loss, and only scored. output_kind, normalise: what the
-    network's numbers are and which rgb it wants, over what its definition says. scan: how to
-    project `sparse` where it is a LiDAR scan.
+    sparse: None where `sample` says which pixels of the truth to take instead. depth_scale,
+    sparse_scale, gt_scale: integer depth files hold metres × scale; the first holds for both.
+    holdout: the share of the points kept from the network and the loss, and only scored.
+    output_kind, normalise: what the network's numbers are and which rgb it wants, over what its
+    definition says. scan: how to project `sparse` where it is a LiDAR scan. protocol: what is cut
+    out of a frame first of all.
     """
 
-    image: Path | None
-    sparse: Path
-    gt: Path | None = None
+    image: Source | None
+    sparse: Path | None
+    gt: Source | None = None
     output: Path | None = None
     format: str = "png"
     overwrite: bool = False
@@ -34,18 +43,29 @@ class RefineRequest:
     lr: str | None = None
     loss: str | None = None
     update: str | None = None
+    schedule: str | None = None
+    spread: float | None = None
+    keep_best: bool = False
     align: str | None = None
     align_every: bool = False
     output_kind: str | None = None
     normalise: str | None = None
     depth_scale: float | None = None
+    sparse_scale: float | None = None
     gt_scale: float | None = None
     channel: str | None = None
     sparse_size_ok: bool = False
     scan: ScanOptions = field(default_factory=ScanOptions)
+    sample: SamplePattern | None = None
+    protocol: Protocol = WHOLE
     holdout: float = 0.0
     seed: int = 0
     device: str = "cpu"
+
+
+def sample_pattern(kind: str, count: int | None, share: float | None) -> SamplePattern:
+    """So many points, or this share of the known pixels, by one of the samplers' patterns."""
+    return SamplePattern(kind=kind, count=count, share=share)
 
 
 def layer_name(definition: ModelDefinition, wanted: str | None) -> str:
@@ -67,15 +87,26 @@ def layer_name(definition: ModelDefinition, wanted: str | None) -> str:
 
 def effective_settings(definition: ModelDefinition, request: RefineRequest) -> RefineSettings:
     """The request's settings, filled up with the network's defaults. UsageError if one is amiss."""
+    from pnpdepth_cli.core.refine import RefineSettings
+
     defaults = definition.defaults
     iterations = defaults.iterations if request.iterations is None else request.iterations
     if iterations < 0:
         raise UsageError(f"iterations {iterations} is negative; 0 gives the plain prediction")
+    update = request.update or defaults.update
+    # How far to go depends on how: with another update the rest of a step is the paper's as well.
+    steps = defaults if update == defaults.update else RefineDefaults()
+    spread = steps.spread if request.spread is None else request.spread
+    if not 0 <= spread < math.inf:
+        raise UsageError(f"spread {spread} is no distance; give 0 or more spacings of the points")
     return RefineSettings(
         iterations=iterations,
-        lr=defaults.lr if request.lr is None else request.lr,
+        lr=steps.lr if request.lr is None else request.lr,
         loss=request.loss or defaults.loss,
-        update=request.update or defaults.update,
+        update=update,
+        schedule=request.schedule or steps.schedule,
+        spread=spread,
+        keep_best=request.keep_best,
         align=request.align or definition.default_alignment,
         align_every=request.align_every,
     )

@@ -18,6 +18,7 @@ from pnpdepth_cli.io.layouts import (
     Hdf5Array,
     find_layout,
     find_protocol,
+    list_frames,
     read_frame_image,
     read_frame_truth,
     read_frames,
@@ -353,7 +354,7 @@ def test_a_manifest_says_all_that_a_frame_can_have(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("image,sparse\nlost.png,s.png\n", "line 2: "),
+        ("image,sparse\nlost.png,s.png\n", "lost.png does not exist; correct line 2 of "),
         ("image,depth\ni.png,s.png\n", "'depth' is not one of"),
         ("image,camera\ni.png,left\n", "line 2"),
         ("image\ni.png\ni.png\n", "line 3: a second frame 'i'"),
@@ -438,3 +439,74 @@ def test_a_depth_file_is_read_with_the_scale_of_its_frame(tmp_path: Path) -> Non
     write_depth(tmp_path / "g.exr", DEPTH)
     (tmp_path / "m.csv").write_text("image,gt\nframe-000000.color.png,g.exr\n")
     assert np.array_equal(read_frame_truth(read_frames(tmp_path / "m.csv")[0]), DEPTH)
+
+
+def test_a_listing_tells_what_is_in_no_frame(tmp_path: Path) -> None:
+    pairs(tmp_path)
+    touch(tmp_path / "rgb/c.png", tmp_path / "sparse/d.png", tmp_path / "gt/e.exr")
+    touch(tmp_path / "calib/f.txt", tmp_path / "rgb/.hidden.png", tmp_path / "rgb/notes.txt")
+    layout, listing = list_frames(tmp_path)
+    assert layout.name == "pairs"
+    assert [frame.name for frame in listing.frames] == ["a", "b"]
+    assert [each.path.name for each in listing.broken] == ["c.png"]
+    assert [each.path.name for each in listing.spare] == ["d.png", "e.exr", "f.txt"]
+    assert str(listing.broken[0]).startswith(f"{tmp_path}/rgb/c.png has no partner c.* in ")
+
+
+def test_folders_in_pairs_go_with_folders_of_the_same_name(tmp_path: Path) -> None:
+    for part in ("rgb", "sparse"):
+        touch(*(tmp_path / part / place for place in ("x.png", "one/x.png", "two/deep/x.png")))
+    touch(tmp_path / "gt/one/x.exr")
+    frames = {frame.name: frame for frame in read_frames(tmp_path)}
+    assert list(frames) == ["one/x", "two/deep/x", "x"]
+    assert frames["two/deep/x"].sparse == tmp_path / "sparse/two/deep/x.png"
+    assert [name for name, frame in frames.items() if frame.gt] == ["one/x"]
+
+
+def test_two_files_of_one_frame_are_both_left_out_and_told(tmp_path: Path) -> None:
+    pairs(tmp_path)
+    touch(tmp_path / "rgb/a.jpg")
+    _, listing = list_frames(tmp_path)
+    assert [frame.name for frame in listing.frames] == ["b"]
+    assert "a.png and a.jpg are one frame; keep one" in str(listing.broken[0])
+
+
+def test_links_are_followed_but_not_in_circles(tmp_path: Path) -> None:
+    pairs(tmp_path / "real")
+    root = tmp_path / "linked"
+    root.mkdir()
+    for part in ("rgb", "sparse"):
+        (root / part).symlink_to(tmp_path / "real" / part)
+    (tmp_path / "real/rgb/again").symlink_to(tmp_path / "real/rgb")
+    assert [frame.name for frame in read_frames(root)] == ["a", "b"]
+
+
+def test_a_manifest_names_frames_of_one_stem_by_their_folders(tmp_path: Path) -> None:
+    touch(*(tmp_path / "data" / place for place in ("one/x.png", "two/x.png", "y.png")))
+    (tmp_path / "m.csv").write_text(
+        "image,name\ndata/one/x.png,\ndata/two/x.png,\ndata/y.png,mine\n"
+    )
+    assert [f.name for f in read_frames(tmp_path / "m.csv")] == ["one/x", "two/x", "mine"]
+
+
+def test_a_manifest_may_name_files_with_new_lines(tmp_path: Path) -> None:
+    touch(tmp_path / "a\nb.png", tmp_path / "c\u2028d.png")
+    (tmp_path / "m.csv").write_text('image\n"a\nb.png"\nc\u2028d.png\n', encoding="utf-8")
+    (tmp_path / "m.jsonl").write_text(
+        '{"image": "a\\nb.png"}\n{"image": "c\u2028d.png"}\n', encoding="utf-8"
+    )
+    for name in ("m.csv", "m.jsonl"):
+        assert [f.name for f in read_frames(tmp_path / name)] == ["a\nb", "c\u2028d"]
+
+
+def test_a_folder_that_may_not_be_read_is_an_input_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seven_scenes(tmp_path)
+
+    def locked(path: Path) -> bool:
+        raise PermissionError(13, "Permission denied", str(path))
+
+    monkeypatch.setattr(Path, "is_dir", locked)
+    with pytest.raises(InputError, match=r"cannot be read \(permission denied\)"):
+        list_frames(tmp_path)

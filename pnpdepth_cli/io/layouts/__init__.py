@@ -22,7 +22,7 @@ from pnpdepth_cli.io.layouts import (
     synthia,
     tum,
 )
-from pnpdepth_cli.io.layouts.frame import Frame, Hdf5Array
+from pnpdepth_cli.io.layouts.frame import Frame, Hdf5Array, Listing, Source, Unmatched
 from pnpdepth_cli.io.layouts.protocols import PROTOCOLS, Protocol, find_protocol
 from pnpdepth_cli.io.layouts.reading import read_frame_image, read_frame_truth
 
@@ -32,9 +32,13 @@ __all__ = [
     "Frame",
     "Hdf5Array",
     "Layout",
+    "Listing",
     "Protocol",
+    "Source",
+    "Unmatched",
     "find_layout",
     "find_protocol",
+    "list_frames",
     "read_frame_image",
     "read_frame_truth",
     "read_frames",
@@ -43,26 +47,28 @@ __all__ = [
 
 @dataclass(frozen=True, kw_only=True)
 class Layout:
-    """matches(root): whether a folder or file is of this layout. frames(root): what is in it."""
+    """matches(root): whether a folder or file is of this layout. listing(root): what is in it."""
 
     name: str
     matches: Callable[[Path], bool]
-    frames: Callable[[Path], list[Frame]]
+    listing: Callable[[Path], Listing]
 
 
 LAYOUTS = {
     layout.name: layout
     for layout in (
-        Layout(name="manifest", matches=manifest.matches, frames=manifest.frames),
-        Layout(name="nyu-mat", matches=nyu.mat_matches, frames=nyu.mat_frames),
-        Layout(name="kitti-odometry", matches=kitti_odometry.matches, frames=kitti_odometry.frames),
-        Layout(name="kitti-object", matches=kitti_object.matches, frames=kitti_object.frames),
-        Layout(name="kitti-depth", matches=kitti_depth.matches, frames=kitti_depth.frames),
-        Layout(name="tum", matches=tum.matches, frames=tum.frames),
-        Layout(name="7scenes", matches=seven_scenes.matches, frames=seven_scenes.frames),
-        Layout(name="synthia", matches=synthia.matches, frames=synthia.frames),
-        Layout(name="pairs", matches=pairs.matches, frames=pairs.frames),
-        Layout(name="nyu-h5", matches=nyu.h5_matches, frames=nyu.h5_frames),
+        Layout(name="manifest", matches=manifest.matches, listing=manifest.listing),
+        Layout(name="nyu-mat", matches=nyu.mat_matches, listing=nyu.mat_listing),
+        Layout(
+            name="kitti-odometry", matches=kitti_odometry.matches, listing=kitti_odometry.listing
+        ),
+        Layout(name="kitti-object", matches=kitti_object.matches, listing=kitti_object.listing),
+        Layout(name="kitti-depth", matches=kitti_depth.matches, listing=kitti_depth.listing),
+        Layout(name="tum", matches=tum.matches, listing=tum.listing),
+        Layout(name="7scenes", matches=seven_scenes.matches, listing=seven_scenes.listing),
+        Layout(name="synthia", matches=synthia.matches, listing=synthia.listing),
+        Layout(name="pairs", matches=pairs.matches, listing=pairs.listing),
+        Layout(name="nyu-h5", matches=nyu.h5_matches, listing=nyu.h5_listing),
     )
 }
 """The layouts that can be named, in the order in which they are guessed."""
@@ -84,10 +90,24 @@ def find_layout(root: Path, name: str | None = None) -> Layout:
     raise InputError(f"{root} does not look {looks}; check the folder, or name its layout")
 
 
+def list_frames(root: Path, name: str | None = None) -> tuple[Layout, Listing]:
+    """The layout of a data set, and what is in it, with all that is in no frame.
+
+    InputError if the folder looks like no layout, or cannot be read.
+    """
+    try:
+        layout = find_layout(root, name)
+        return layout, layout.listing(root)
+    except OSError as error:
+        reason = (error.strerror or str(error)).lower()
+        raise InputError(f"{error.filename or root} cannot be read ({reason}); check it") from error
+
+
 def read_frames(root: Path, name: str | None = None) -> list[Frame]:
-    """The frames of a data set, in a fixed order. InputError if there is none."""
-    layout = find_layout(root, name)
-    frames = layout.frames(root)
-    if not frames:
+    """The frames of a data set, in a fixed order. InputError if there is none, or one is broken."""
+    layout, listing = list_frames(root, name)
+    if listing.broken:
+        raise InputError(str(listing.broken[0]))
+    if not listing.frames:
         raise InputError(f"{root} looks like {layout.name!r} but has no frame in it")
-    return frames
+    return listing.frames

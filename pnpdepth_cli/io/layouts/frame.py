@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -40,8 +40,9 @@ Pose = tuple[tuple[float, ...], ...]
 class Frame:
     """Parts that a frame does not have are None.
 
-    name: unique in its data set, and fit for a file's name. sparse: a depth file, or a scan with
-    calib; None where the protocol samples the truth. *_scale: codes per metre of integer files.
+    name: unique in its data set, and fit for the name of a file, in a folder of its own where it
+    contains a slash. sparse: a depth file, or a scan with calib; None where the protocol samples
+    the truth. *_scale: codes per metre of integer files.
     calib, camera: as `read_calibration` takes them. protocol: what is cut out before anything else.
     pose: x_world = pose · (x, 1) for points of KITTI's camera 0, whichever camera took the image.
     """
@@ -56,6 +57,26 @@ class Frame:
     gt_scale: float | None = None
     protocol: Protocol = WHOLE
     pose: Pose | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Unmatched:
+    """A file or folder that is no part of a frame, and why."""
+
+    path: Path
+    why: str
+
+    def __str__(self) -> str:
+        return f"{self.path} {self.why}"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Listing:
+    """frames: in a fixed order. broken: why there are not more. spare: what lies there as well."""
+
+    frames: list[Frame]
+    broken: tuple[Unmatched, ...] = ()
+    spare: tuple[Unmatched, ...] = ()
 
 
 def by_stem(folder: Path, suffixes: Iterable[str]) -> dict[str, Path]:
@@ -73,8 +94,12 @@ def by_stem(folder: Path, suffixes: Iterable[str]) -> dict[str, Path]:
     return files
 
 
-def partner(files: dict[str, Path], stem: str, of: Path, folder: Path) -> Path:
-    """The file that belongs to `of`; InputError if the folder has none."""
-    if stem not in files:
-        raise InputError(f"{of} has no partner {stem}.* in {folder}; add or remove one")
-    return files[stem]
+def without_partner(
+    files: Mapping[str, Path], others: Mapping[str, Path], folder: Path
+) -> tuple[Unmatched, ...]:
+    """The files of whose stem the folder, which holds the others, has none."""
+    return tuple(
+        Unmatched(path=path, why=f"has no partner {stem}.* in {folder}; add or remove one")
+        for stem, path in files.items()
+        if stem not in others
+    )

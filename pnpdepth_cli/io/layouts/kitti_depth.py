@@ -11,8 +11,14 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from pnpdepth_cli.errors import InputError
-from pnpdepth_cli.io.layouts.frame import PICTURES, Frame, by_stem, partner
+from pnpdepth_cli.io.layouts.frame import (
+    PICTURES,
+    Frame,
+    Listing,
+    Unmatched,
+    by_stem,
+    without_partner,
+)
 from pnpdepth_cli.io.layouts.protocols import PROTOCOLS
 
 _PNG = (".png",)
@@ -26,8 +32,8 @@ def matches(root: Path) -> bool:
     return _is_selection(root) or bool(_cameras(root))
 
 
-def frames(root: Path) -> list[Frame]:
-    """One frame for each projected scan; InputError for one without image."""
+def listing(root: Path) -> Listing:
+    """One frame for each projected scan with an image."""
     return _selection(root) if _is_selection(root) else _drives(root)
 
 
@@ -35,27 +41,37 @@ def _is_selection(root: Path) -> bool:
     return (root / "image").is_dir() and (root / "velodyne_raw").is_dir()
 
 
-def _selection(root: Path) -> list[Frame]:
+def _selection(root: Path) -> Listing:
     truth_folder = next(
         (p for p in (root / "groundtruth_depth", root / "groundtruth") if p.is_dir()), root / "none"
     )
+    images = _by_frame(root / "image", PICTURES)
     scans = _by_frame(root / "velodyne_raw", _PNG)
     truth = _by_frame(truth_folder, _PNG)
     intrinsics = _by_frame(root / "intrinsics", (".txt",))
     raw = root if (root / "calib_cam_to_cam.txt").is_file() else None
-    return [
+    frames = [
         Frame(
             name=name,
             image=image,
-            sparse=partner(scans, name, image, root / "velodyne_raw"),
+            sparse=scans[name],
             gt=truth.get(name),
             calib=intrinsics.get(name, raw),
             sparse_scale=_SCALE,
             gt_scale=_SCALE,
             protocol=PROTOCOLS["kitti-depth"],
         )
-        for name, image in _by_frame(root / "image", PICTURES).items()
+        for name, image in images.items()
+        if name in scans
     ]
+    return Listing(
+        frames=frames,
+        broken=without_partner(images, scans, root / "velodyne_raw"),
+        spare=(
+            *without_partner(scans, images, root / "image"),
+            *without_partner(truth, images, root / "image"),
+        ),
+    )
 
 
 def _by_frame(folder: Path, suffixes: tuple[str, ...]) -> dict[str, Path]:
@@ -67,17 +83,22 @@ def _cameras(root: Path) -> list[Path]:
     return sorted(p for start in ("", "*/", "*/*/") for p in root.glob(start + _RAW) if p.is_dir())
 
 
-def _drives(root: Path) -> list[Frame]:
-    found = []
-    for scans in _cameras(root):
-        camera, drive = scans.name, scans.parents[2]
+def _drives(root: Path) -> Listing:
+    frames: list[Frame] = []
+    broken: list[Unmatched] = []
+    spare: list[Unmatched] = []
+    for folder in _cameras(root):
+        camera, drive = folder.name, folder.parents[2]
         images, calib = _images_of(root, drive, camera)
+        if images is None:
+            broken.append(_without_images(root, drive, camera))
+            continue
         truth = by_stem(drive / "proj_depth" / "groundtruth" / camera, _PNG)
-        pictures = by_stem(images, PICTURES)
-        found += [
+        pictures, scans = by_stem(images, PICTURES), by_stem(folder, _PNG)
+        frames += [
             Frame(
                 name=f"{drive.name}_{stem}_{camera}",
-                image=partner(pictures, stem, scan, images),
+                image=pictures[stem],
                 sparse=scan,
                 gt=truth.get(stem),
                 calib=calib,
@@ -86,13 +107,17 @@ def _drives(root: Path) -> list[Frame]:
                 gt_scale=_SCALE,
                 protocol=PROTOCOLS["kitti-depth"],
             )
-            for stem, scan in by_stem(scans, _PNG).items()
+            for stem, scan in scans.items()
+            if stem in pictures
         ]
-    return found
+        broken += without_partner(scans, pictures, images)
+        spare += without_partner(pictures, scans, folder)
+        spare += without_partner(truth, pictures, images)
+    return Listing(frames=frames, broken=tuple(broken), spare=tuple(spare))
 
 
-def _images_of(root: Path, drive: Path, camera: str) -> tuple[Path, Path | None]:
-    """The folder of a drive's images, and that of its calibration if it is there."""
+def _images_of(root: Path, drive: Path, camera: str) -> tuple[Path | None, Path | None]:
+    """The folders of a drive's images and of its calibration, each if it is there."""
     date = drive.name[:10]
     for place in (drive, root / date / drive.name, root / "raw" / date / drive.name):
         images = place / camera / "data"
@@ -101,7 +126,13 @@ def _images_of(root: Path, drive: Path, camera: str) -> tuple[Path, Path | None]
                 (p for p in (place.parent, place) if (p / "calib_cam_to_cam.txt").is_file()), None
             )
             return images, calib
-    raise InputError(
-        f"{drive} has no {camera}/data with images; put KITTI's raw drive {drive.name} there, or"
-        f" into {root / date}"
+    return None, None
+
+
+def _without_images(root: Path, drive: Path, camera: str) -> Unmatched:
+    place = root / drive.name[:10]
+    return Unmatched(
+        path=drive,
+        why=f"has no {camera}/data with images; put KITTI's raw drive {drive.name} there, or into"
+        f" {place}",
     )

@@ -4,7 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from pnpdepth_cli.io.layouts.frame import PICTURES, Frame, by_stem, partner
+from pnpdepth_cli.io.layouts.frame import (
+    PICTURES,
+    Frame,
+    Listing,
+    Unmatched,
+    by_stem,
+    without_partner,
+)
 
 
 def matches(root: Path) -> bool:
@@ -12,24 +19,31 @@ def matches(root: Path) -> bool:
     return bool(_parts(root))
 
 
-def frames(root: Path) -> list[Frame]:
-    """One frame for each image of the left colour camera; InputError for one without scan."""
-    found = []
+def listing(root: Path) -> Listing:
+    """One frame for each image of the left colour camera with a scan and a calibration."""
+    frames: list[Frame] = []
+    broken: list[Unmatched] = []
+    spare: list[Unmatched] = []
     for part in _parts(root):
+        images = by_stem(part / "image_2", PICTURES)
         scans = by_stem(part / "velodyne", (".bin",))
         calibrations = by_stem(part / "calib", (".txt",))
         prefix = "" if part == root else f"{part.name}_"
-        found += [
+        frames += [
             Frame(
                 name=f"{prefix}{stem}",
                 image=image,
-                sparse=partner(scans, stem, image, part / "velodyne"),
-                calib=partner(calibrations, stem, image, part / "calib"),
+                sparse=scans[stem],
+                calib=calibrations[stem],
                 camera=2,
             )
-            for stem, image in by_stem(part / "image_2", PICTURES).items()
+            for stem, image in images.items()
+            if stem in scans and stem in calibrations
         ]
-    return found
+        broken += without_partner(images, scans, part / "velodyne")
+        broken += without_partner(images, calibrations, part / "calib")
+        spare += without_partner(scans, images, part / "image_2")
+    return Listing(frames=frames, broken=tuple(broken), spare=tuple(spare))
 
 
 def _parts(root: Path) -> list[Path]:

@@ -11,7 +11,15 @@ from pathlib import Path
 import numpy as np
 
 from pnpdepth_cli.errors import FileFormatError, InputError
-from pnpdepth_cli.io.layouts.frame import PICTURES, Frame, Pose, by_stem, partner
+from pnpdepth_cli.io.layouts.frame import (
+    PICTURES,
+    Frame,
+    Listing,
+    Pose,
+    Unmatched,
+    by_stem,
+    without_partner,
+)
 from pnpdepth_cli.io.layouts.protocols import PROTOCOLS
 from pnpdepth_cli.io.opening import one_line, read_bytes
 
@@ -21,30 +29,35 @@ def matches(root: Path) -> bool:
     return bool(_sequences(root))
 
 
-def frames(root: Path) -> list[Frame]:
-    """One frame for each image of the left colour camera, in the order of the sequences.
+def listing(root: Path) -> Listing:
+    """One frame for each image of the left colour camera with a scan, sequence by sequence.
 
-    InputError for one without scan, or without a row in a file of poses. Rows belong to frames by
-    their number, so that a part of a sequence keeps its own.
+    InputError for one without a row in a file of poses. Rows belong to frames by their number, so
+    that a part of a sequence keeps its own.
     """
-    found = []
+    frames: list[Frame] = []
+    broken: list[Unmatched] = []
+    spare: list[Unmatched] = []
     for sequence in _sequences(root):
         scans = by_stem(sequence / "velodyne", (".bin",))
         images = by_stem(sequence / "image_2", PICTURES)
         poses = _poses(sequence)
-        found += [
+        frames += [
             Frame(
                 name=f"{sequence.name}_{stem}",
                 image=image,
-                sparse=partner(scans, stem, image, sequence / "velodyne"),
+                sparse=scans[stem],
                 calib=sequence / "calib.txt",
                 camera=2,
                 protocol=PROTOCOLS["kitti-odometry"],
                 pose=None if poses is None else _pose_of(poses, image),
             )
             for stem, image in images.items()
+            if stem in scans
         ]
-    return found
+        broken += without_partner(images, scans, sequence / "velodyne")
+        spare += without_partner(scans, images, sequence / "image_2")
+    return Listing(frames=frames, broken=tuple(broken), spare=tuple(spare))
 
 
 def _sequences(root: Path) -> list[Path]:

@@ -1,19 +1,23 @@
 """`manifest`: a CSV with a header line, or JSON lines, of frames whose files lie anywhere.
 
 Columns or keys: image, sparse, gt, calib, camera, sparse_scale, gt_scale, name, protocol; all may
-be left out or empty but one of image and sparse. Paths are relative to the manifest.
+be left out or empty but one of image and sparse. Paths are relative to the manifest. A frame
+without a name is called by its image's stem; if stems come twice, by its place below the folder
+that all of the images are in.
 """
 
 from __future__ import annotations
 
 import csv
+import io
 import json
-from collections.abc import Iterator
+import os
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from pnpdepth_cli.errors import FileFormatError, InputError
-from pnpdepth_cli.io.layouts.frame import Frame
+from pnpdepth_cli.errors import FileFormatError
+from pnpdepth_cli.io.layouts.frame import Frame, Listing, Unmatched
 from pnpdepth_cli.io.layouts.protocols import WHOLE, find_protocol
 from pnpdepth_cli.io.opening import one_line, read_bytes
 
@@ -27,32 +31,53 @@ def matches(root: Path) -> bool:
     return root.is_file() and root.suffix.lower() in (".csv", ".jsonl")
 
 
-def frames(root: Path) -> list[Frame]:
-    """One frame a line. FileFormatError for a line without meaning, InputError for a lost file."""
+def listing(root: Path) -> Listing:
+    """One frame a line, also with files that do not exist. FileFormatError for a senseless line."""
     try:
         text = read_bytes(root).decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise FileFormatError(f"{root} is not a text file; give CSV or JSON lines") from error
     rows = _csv_rows(text) if root.suffix.lower() == ".csv" else _json_rows(root, text)
-    found: list[Frame] = []
+    parts = [(number, _parts(root, number, row)) for number, row in rows]
+    frames: list[Frame] = []
+    broken: list[Unmatched] = []
     taken: set[str] = set()
-    for number, row in rows:
-        frame = _frame(root, number, row)
-        if frame.name in taken:
-            raise FileFormatError(f"{root}, line {number}: a second frame {frame.name!r}; name it")
-        taken.add(frame.name)
-        found.append(frame)
-    return found
+    for (number, given), name in zip(parts, _names([p for _, p in parts]), strict=True):
+        if name in taken:
+            raise FileFormatError(f"{root}, line {number}: a second frame {name!r}; name it")
+        taken.add(name)
+        frames.append(Frame(**given | {"name": name}))
+        lost = [file for file in _files(given) if not file.exists()]
+        why = f"does not exist; correct line {number} of {root}"
+        broken += [Unmatched(path=file, why=why) for file in lost]
+    return Listing(frames=frames, broken=tuple(broken))
+
+
+def _files(given: dict[str, Any]) -> list[Path]:
+    return [given[key] for key in _PATHS if key in given]
+
+
+def _names(parts: Sequence[dict[str, Any]]) -> list[str]:
+    """A name for each frame: the given one, or the stem, or the place if stems come twice."""
+    unnamed = [_files(given)[0] for given in parts if "name" not in given]
+    if len({path.stem for path in unnamed}) == len(unnamed):
+        return [given.get("name") or _files(given)[0].stem for given in parts]
+    folder = os.path.commonpath([path.parent.absolute() for path in unnamed])
+    return [
+        given.get("name")
+        or _files(given)[0].absolute().relative_to(folder).with_suffix("").as_posix()
+        for given in parts
+    ]
 
 
 def _csv_rows(text: str) -> Iterator[tuple[int, dict[str, Any]]]:
-    reader = csv.DictReader(text.splitlines(), restkey="more than the header has")
+    reader = csv.DictReader(io.StringIO(text, newline=""), restkey="more than the header has")
     for row in reader:
         yield reader.line_num, {str(k).strip(): v for k, v in row.items()}
 
 
 def _json_rows(path: Path, text: str) -> Iterator[tuple[int, dict[str, Any]]]:
-    for number, line in enumerate(text.splitlines(), start=1):
+    for number, line in enumerate(text.split("\n"), start=1):
         if not line.strip():
             continue
         try:
@@ -64,16 +89,14 @@ def _json_rows(path: Path, text: str) -> Iterator[tuple[int, dict[str, Any]]]:
         yield number, row
 
 
-def _frame(path: Path, number: int, row: dict[str, Any]) -> Frame:
+def _parts(path: Path, number: int, row: dict[str, Any]) -> dict[str, Any]:
+    """What a row says of its frame, by the frame's own names."""
     where = f"{path}, line {number}"
     given = {k: str(v).strip() for k, v in row.items() if v is not None and str(v).strip()}
     unknown = sorted(set(given) - set(_KEYS))
     if unknown:
         raise FileFormatError(f"{where}: {unknown[0]!r} is not one of {', '.join(_KEYS)}")
     files: dict[str, Any] = {k: path.parent / given[k] for k in _PATHS if k in given}
-    for file in files.values():
-        if not file.exists():
-            raise InputError(f"{where}: {file}: no such file; correct the path")
     if "image" not in files and "sparse" not in files:
         raise FileFormatError(f"{where}: has neither image nor sparse; give one")
     try:
@@ -81,5 +104,5 @@ def _frame(path: Path, number: int, row: dict[str, Any]) -> Frame:
     except ValueError as error:
         raise FileFormatError(f"{where}: {one_line(error)}") from error
     protocol = find_protocol(given["protocol"]) if "protocol" in given else WHOLE
-    name = given.get("name") or (files.get("image") or files["sparse"]).stem
-    return Frame(name=name, protocol=protocol, **files, **numbers)
+    named = {"name": given["name"]} if "name" in given else {}
+    return {"protocol": protocol, **named, **files, **numbers}

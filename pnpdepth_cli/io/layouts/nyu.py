@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from pnpdepth_cli.errors import FileFormatError, UsageError
-from pnpdepth_cli.io.layouts.frame import Frame, Hdf5Array
+from pnpdepth_cli.io.layouts.frame import Frame, Hdf5Array, Listing
 from pnpdepth_cli.io.layouts.protocols import PROTOCOLS
 from pnpdepth_cli.io.opening import one_line, read_bytes
 
@@ -22,9 +22,9 @@ def h5_matches(root: Path) -> bool:
     return bool(_h5_files(root))
 
 
-def h5_frames(root: Path) -> list[Frame]:
+def h5_listing(root: Path) -> Listing:
     """One frame a file, with rgb (3, H, W) and depth (H, W) in it."""
-    return [
+    frames = [
         Frame(
             name="_".join(path.relative_to(root).with_suffix("").parts),
             image=Hdf5Array(path=path, name="rgb", axes=(1, 2, 0)),
@@ -33,6 +33,7 @@ def h5_frames(root: Path) -> list[Frame]:
         )
         for path in _h5_files(root)
     ]
+    return Listing(frames=frames)
 
 
 def mat_matches(root: Path) -> bool:
@@ -40,11 +41,11 @@ def mat_matches(root: Path) -> bool:
     return _labeled(root).is_file()
 
 
-def mat_frames(root: Path) -> list[Frame]:
+def mat_listing(root: Path) -> Listing:
     """The frames of the split beside the file, or all of them; numbered from 1 as there."""
     path = _labeled(root)
     count = _frames_in(path)
-    return [
+    frames = [
         Frame(
             name=f"{number:04}",
             image=Hdf5Array(path=path, name="images", axes=(2, 1, 0), index=number - 1),
@@ -53,6 +54,7 @@ def mat_frames(root: Path) -> list[Frame]:
         )
         for number in _split(path.parent, count) or range(1, count + 1)
     ]
+    return Listing(frames=frames)
 
 
 def _h5_files(root: Path) -> list[Path]:

@@ -1,5 +1,6 @@
 """`pairs`: rgb/ and sparse/, and perhaps gt/ and calib/, with the same stems.
 
+Folders in them are looked into as well: rgb/drive_1/000.png goes with sparse/drive_1/000.png.
 calib/ has one file a frame; a calib.txt beside the folders holds for all.
 """
 
@@ -7,7 +8,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from pnpdepth_cli.io.layouts.frame import DEPTHS, PICTURES, SCANS, Frame, by_stem, partner
+from pnpdepth_cli.io.layouts.below import files_below
+from pnpdepth_cli.io.layouts.frame import DEPTHS, PICTURES, SCANS, Frame, Listing, without_partner
 
 _CALIBRATIONS = (".txt", ".json", ".yaml", ".yml")
 
@@ -17,18 +19,36 @@ def matches(root: Path) -> bool:
     return (root / "rgb").is_dir() and (root / "sparse").is_dir()
 
 
-def frames(root: Path) -> list[Frame]:
-    """One frame for each image; InputError for one without sparse depth."""
-    sparse = by_stem(root / "sparse", (*DEPTHS, *SCANS, ".csv"))
-    gt, calib = by_stem(root / "gt", DEPTHS), by_stem(root / "calib", _CALIBRATIONS)
+def listing(root: Path) -> Listing:
+    """One frame for each image with sparse depth."""
+    images, lost_images = files_below(root / "rgb", PICTURES)
+    sparse, lost_sparse = files_below(root / "sparse", (*DEPTHS, *SCANS, ".csv"))
+    gt, lost_gt = files_below(root / "gt", DEPTHS)
+    calib, lost_calib = files_below(root / "calib", _CALIBRATIONS)
     shared = root / "calib.txt"
-    return [
+    frames = [
         Frame(
-            name=stem,
+            name=name,
             image=image,
-            sparse=partner(sparse, stem, image, root / "sparse"),
-            gt=gt.get(stem),
-            calib=calib.get(stem, shared if shared.is_file() else None),
+            sparse=sparse[name],
+            gt=gt.get(name),
+            calib=calib.get(name, shared if shared.is_file() else None),
         )
-        for stem, image in by_stem(root / "rgb", PICTURES).items()
+        for name, image in images.items()
+        if name in sparse
     ]
+    return Listing(
+        frames=frames,
+        broken=(
+            *lost_images,
+            *lost_sparse,
+            *lost_gt,
+            *lost_calib,
+            *without_partner(images, sparse, root / "sparse"),
+        ),
+        spare=tuple(
+            each
+            for others in (sparse, gt, calib)
+            for each in without_partner(others, images, root / "rgb")
+        ),
+    )

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from pnpdepth_cli.errors import InputError
-from pnpdepth_cli.io.layouts.frame import PICTURES, Frame
+from pnpdepth_cli.io.layouts.frame import PICTURES, Frame, Listing, Unmatched
 
 _SCALE = 1000.0
 
@@ -15,16 +14,18 @@ def matches(root: Path) -> bool:
     return bool(_images(root))
 
 
-def frames(root: Path) -> list[Frame]:
-    """One frame for each colour picture; InputError for one without depth."""
+def listing(root: Path) -> Listing:
+    """One frame for each colour picture with depth."""
     shared = root / "camera-intrinsics.txt"
-    found = []
+    frames, broken = [], []
     for image in _images(root):
         number = image.name.split(".")[0]
         depth = image.with_name(f"{number}.depth.png")
         if not depth.is_file():
-            raise InputError(f"{image} has no {depth.name} beside it; add or remove one")
-        found.append(
+            why = f"has no {depth.name} beside it; add or remove one"
+            broken.append(Unmatched(path=image, why=why))
+            continue
+        frames.append(
             Frame(
                 name=number if image.parent == root else f"{image.parent.name}_{number}",
                 image=image,
@@ -33,7 +34,7 @@ def frames(root: Path) -> list[Frame]:
                 calib=shared if shared.is_file() else None,
             )
         )
-    return found
+    return Listing(frames=frames, broken=tuple(broken))
 
 
 def _images(root: Path) -> list[Path]:

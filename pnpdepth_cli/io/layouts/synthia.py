@@ -18,7 +18,7 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
-from pnpdepth_cli.io.layouts.frame import Frame, by_stem, partner
+from pnpdepth_cli.io.layouts.frame import Frame, Listing, Unmatched, by_stem, without_partner
 
 _PNG = (".png",)
 _SCALE = 100.0
@@ -31,19 +31,21 @@ def matches(root: Path) -> bool:
     return any(True for _ in _cameras(root))
 
 
-def frames(root: Path) -> list[Frame]:
-    """One frame for each picture of each camera; InputError for one without depth."""
-    return [
-        Frame(
-            name="_".join([*prefix, stem]),
-            image=image,
-            gt=partner(depths, stem, image, folder),
-            gt_scale=_SCALE,
-        )
-        for prefix, pictures, folder in _cameras(root)
-        for depths in (by_stem(folder, _PNG),)
-        for stem, image in by_stem(pictures, _PNG).items()
-    ]
+def listing(root: Path) -> Listing:
+    """One frame for each picture of each camera with depth."""
+    frames: list[Frame] = []
+    broken: list[Unmatched] = []
+    spare: list[Unmatched] = []
+    for prefix, pictures, folder in _cameras(root):
+        images, depths = by_stem(pictures, _PNG), by_stem(folder, _PNG)
+        frames += [
+            Frame(name="_".join([*prefix, stem]), image=image, gt=depths[stem], gt_scale=_SCALE)
+            for stem, image in images.items()
+            if stem in depths
+        ]
+        broken += without_partner(images, depths, folder)
+        spare += without_partner(depths, images, pictures)
+    return Listing(frames=frames, broken=tuple(broken), spare=tuple(spare))
 
 
 def _cameras(root: Path) -> Iterator[tuple[list[str], Path, Path]]:

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from pnpdepth_cli.errors import FileFormatError
-from pnpdepth_cli.io.layouts.frame import Frame
+from pnpdepth_cli.io.layouts.frame import Frame, Listing, Unmatched
 from pnpdepth_cli.io.opening import one_line, read_bytes
 
 _SCALE = 5000.0
@@ -20,7 +20,7 @@ def matches(root: Path) -> bool:
     return (root / "rgb.txt").is_file() and (root / "depth.txt").is_file()
 
 
-def frames(root: Path) -> list[Frame]:
+def listing(root: Path) -> Listing:
     """One frame for each image with a depth image at most 0.02 s away; each is used once."""
     images, depths = _listed(root / "rgb.txt"), _listed(root / "depth.txt")
     gap = np.abs(np.subtract.outer([t for t, _ in images], [t for t, _ in depths]))
@@ -31,7 +31,7 @@ def frames(root: Path) -> list[Frame]:
         if image not in partner_of and depth not in taken:
             partner_of[image] = depth
             taken.add(depth)
-    return [
+    frames = [
         Frame(
             name=images[i][1].stem,
             image=images[i][1],
@@ -40,6 +40,20 @@ def frames(root: Path) -> list[Frame]:
         )
         for i in sorted(partner_of)
     ]
+    why = f"has no {{}} within {_LONGEST_GAP_S} s that is not another's"
+    spare = [
+        *(
+            Unmatched(path=p, why=why.format("depth"))
+            for i, (_, p) in enumerate(images)
+            if i not in partner_of
+        ),
+        *(
+            Unmatched(path=p, why=why.format("image"))
+            for i, (_, p) in enumerate(depths)
+            if i not in taken
+        ),
+    ]
+    return Listing(frames=frames, spare=tuple(spare))
 
 
 def _listed(path: Path) -> list[tuple[float, Path]]:

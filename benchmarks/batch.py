@@ -1,0 +1,130 @@
+"""Memory and time of a batch: `python -m benchmarks.batch [--frames 2000] [--size 48x64]`.
+
+Makes that many small frames, refines them with the embedded network, and prints the memory that the
+process holds as frames go by, its peak, what a frame costs in reading, network and writing, how
+long the network waited, and what a second run costs that has nothing to do.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+
+from pnpdepth_cli.io.depth import write_depth
+from pnpdepth_cli.pipeline.batch import run_batch
+from pnpdepth_cli.pipeline.batch_frames import BatchRequest
+from pnpdepth_cli.pipeline.request import RefineRequest
+from pnpdepth_cli.pipeline.stopwatch import peak_memory_mb
+
+PAGE = 4096
+POINTS = 200
+
+
+class Watcher:
+    """Notes the memory in use after 100, 200, 400, … frames, and when each was done."""
+
+    def __init__(self) -> None:
+        self.memory_mb: dict[int, float] = {}
+        self.began = self.done = 0
+
+    def say(self, text: str) -> None:
+        """What a batch tells is not shown."""
+
+    def begin(self, to_do: int) -> None:
+        """The network is loaded."""
+        self.to_do, self.start = to_do, time.perf_counter()
+
+    def frame(self, row: dict[str, Any]) -> None:
+        """One more."""
+        self.done += 1
+        hundreds, rest = divmod(self.done, 100)
+        if self.done == self.to_do or (not rest and hundreds.bit_count() == 1):
+            resident = int(Path("/proc/self/statm").read_text().split()[1]) * PAGE
+            self.memory_mb[self.done] = resident / 1e6
+
+
+def make_frames(root: Path, count: int, height: int, width: int) -> None:
+    """rgb/ sparse/ gt/ with smooth pictures and slanted depth, no two alike."""
+    rng = np.random.default_rng(0)
+    y, x = np.mgrid[:height, :width] / max(height, width)
+    for part in ("rgb", "sparse", "gt"):
+        (root / part).mkdir(parents=True)
+    for number in range(count):
+        a, b, c = rng.uniform(0.5, 2, 3)
+        depth = (1 + a * x + b * y).astype(np.float32)
+        picture = 127 + 120 * np.sin(6 * np.stack([a * x, b * y, c * (x + y)], axis=-1))
+        cv2.imwrite(str(root / "rgb" / f"{number:06}.png"), picture.astype(np.uint8))
+        points = np.zeros(depth.size, np.float32)
+        chosen = rng.choice(depth.size, POINTS, replace=False)
+        points[chosen] = depth.reshape(-1)[chosen]
+        write_depth(root / "sparse" / f"{number:06}.png", points.reshape(depth.shape), scale=1000)
+        write_depth(root / "gt" / f"{number:06}.png", depth, scale=1000)
+
+
+def measure(root: Path, workers: int) -> dict[str, Any]:
+    """The figures of one batch over the folder, and of a second run."""
+    request = BatchRequest(
+        source=root,
+        output=root / "out",
+        refine=RefineRequest(image=None, sparse=None),
+        workers=workers,
+    )
+    watcher = Watcher()
+    run_batch(request, watcher)
+    spent = time.perf_counter() - watcher.start
+    peak = peak_memory_mb(torch.device("cpu"))["process"]
+    start = time.perf_counter()
+    run_batch(request, Watcher())
+    again = time.perf_counter() - start
+    rows = json.loads((root / "out" / "summary.json").read_text())["frames"]
+    stages = {
+        stage: [row["seconds"][stage] for row in rows] for stage in ("read", "refine", "write")
+    }
+    return {
+        "frames": watcher.done,
+        "memory_mb": watcher.memory_mb,
+        "peak_mb": peak,
+        "seconds": spent,
+        "seconds_of_nothing_to_do": again,
+        "median_ms": {s: 1000 * statistics.median(values) for s, values in stages.items()},
+        "network_busy": sum(stages["refine"]) / spent,
+    }
+
+
+def main() -> None:
+    """Make the frames, measure, print."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--frames", type=int, default=2000)
+    parser.add_argument("--size", default="48x64", help="HxW")
+    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--json", action="store_true")
+    given = parser.parse_args()
+    height, width = (int(side) for side in given.size.split("x"))
+    with tempfile.TemporaryDirectory() as folder:
+        make_frames(Path(folder) / "frames", given.frames, height, width)
+        found = measure(Path(folder) / "frames", given.workers)
+    if given.json:
+        print(json.dumps(found, indent=2))
+        return
+    print(f"{found['frames']:,} frames of {width}×{height}, {given.workers} workers")
+    for count, memory in found["memory_mb"].items():
+        print(f"  after {count:6,} frames: {memory:6.1f} MB in use")
+    print(f"  peak: {found['peak_mb']:.1f} MB")
+    for stage, median in found["median_ms"].items():
+        print(f"  {stage}: {median:.1f} ms a frame (median)")
+    per_frame = 1000 * found["seconds"] / found["frames"]
+    print(f"  altogether: {per_frame:.1f} ms a frame; network busy {found['network_busy']:.0%}")
+    print(f"  a second run, with nothing to do: {found['seconds_of_nothing_to_do']:.1f} s")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,149 @@
+"""The paper's seven networks, full size, each cut by hand at the paper's z.
+
+`front` and `rear` are what an author would write for this one layer of this one network: the
+limit for a cut that works on any network at any layer.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from benchmarks.networks import Case
+from model_zoo_defs import adnn, fcrn, sfmlearner
+from model_zoo_defs.adnn import Adnn
+from model_zoo_defs.eigen import Eigen
+from model_zoo_defs.fcrn import FCRN
+from model_zoo_defs.latefusion import FARTHEST, LEVELS, LateFusion
+from model_zoo_defs.sfmlearner import DispNet
+from model_zoo_defs.sparse2dense import SparseToDense
+from model_zoo_defs.sparseconv import SparseConvNet
+
+
+def eigen_front(network: Eigen, rgb: Tensor) -> Any:
+    """`coarse.conv5`; the fine network's first features stay."""
+    coarse, fine = network.coarse, network.fine
+    x = F.max_pool2d(F.relu(coarse.conv1(rgb)), 2)
+    x = F.max_pool2d(F.relu(coarse.conv2(x)), 2)
+    x = F.relu(coarse.conv4(F.relu(coarse.conv3(x))))
+    return coarse.conv5(x), F.max_pool2d(F.relu(fine.conv1(rgb)), 2)
+
+
+def eigen_rear(network: Eigen, z: Tensor, features: Tensor) -> Tensor:
+    coarse, fine = network.coarse, network.fine
+    x = coarse.fc2(coarse.dropout(F.relu(coarse.fc1(F.relu(z).flatten(1)))))
+    x = torch.cat([features, x.reshape(-1, 1, *coarse.size)], dim=1)
+    return fine.conv3(F.relu(fine.conv2(x)))
+
+
+def fcrn_front(network: FCRN, rgb: Tensor) -> Any:
+    """`layer1_BN`; nothing stays."""
+    x = fcrn.max_pool_same(F.relu(network.bn_conv1(network.conv1(rgb))))
+    for name in network.trunk:
+        x = network.get_submodule(name)(x)
+    return network.layer1_BN(network.layer1(x)), ()
+
+
+def fcrn_rear(network: FCRN, z: Tensor, kept: Any) -> Tensor:
+    for name in fcrn.UP_PROJECTIONS:
+        z = network.get_submodule(name)(z)
+    return F.relu(network.ConvPred(z))
+
+
+def sfmlearner_front(network: DispNet, rgb: Tensor) -> Any:
+    """`conv7`; the features beside the decoder stay."""
+    features = [rgb]
+    for level in range(1, 8):
+        features.append(network.get_submodule(f"conv{level}")(features[-1]))
+    return features.pop(), tuple(features)
+
+
+def sfmlearner_rear(network: DispNet, z: Tensor, features: tuple[Tensor, ...]) -> Tensor:
+    x, disparity = z, None
+    for level in range(7, 0, -1):
+        beside = features[level - 1]
+        x = sfmlearner.cropped(network.get_submodule(f"upconv{level}")(x), beside)
+        parts = [x, beside] if level > 1 else [x]
+        if disparity is not None:
+            larger = F.interpolate(disparity, scale_factor=2.0, mode="bilinear")
+            parts.append(sfmlearner.cropped(larger, beside))
+        x = network.get_submodule(f"iconv{level}")(torch.cat(parts, dim=1))
+        if level in sfmlearner.PREDICTED:
+            predicted = network.get_submodule(f"predict_disp{level}")(x)
+            disparity = sfmlearner.GAIN * predicted + sfmlearner.FLOOR
+    assert disparity is not None
+    return disparity
+
+
+def sparseconv_front(network: SparseConvNet, sparse: Tensor) -> Any:
+    """`sparse_convs.0[0]`; the mask stays."""
+    return network.sparse_convs[0]((sparse, (sparse > 0).to(sparse)))
+
+
+def sparseconv_rear(network: SparseConvNet, z: Tensor, mask: Tensor) -> Tensor:
+    pair = (z, mask)
+    for block in network.sparse_convs[1:]:
+        pair = block(pair)
+    return network.mask_conv(torch.cat(pair, dim=1))
+
+
+def adnn_front(network: Adnn, sparse: Tensor) -> Any:
+    """`solve`; the sizes of the layers stay."""
+    kernels = tuple(getattr(network, name) for name in network.kernels)
+    biases = tuple(getattr(network, name) for name in network.biases)
+    sizes = [tuple(sparse.shape[-2:])]
+    for _ in kernels[1:]:
+        sizes.append(tuple(-(-side // adnn.STRIDE) for side in sizes[-1]))
+    return network.solve(sparse, kernels, biases), (kernels, sizes)
+
+
+def adnn_rear(network: Adnn, z: Tensor, kept: Any) -> Tensor:
+    for kernel, size in zip(*(reversed(part) for part in kept), strict=True):
+        z = adnn.synthesised(z, kernel, size)
+    return z
+
+
+def sparse2dense_front(network: SparseToDense, rgb: Tensor, sparse: Tensor) -> Any:
+    """`bn2`; the size stays."""
+    x = torch.cat([rgb, sparse], dim=1)
+    x = network.maxpool(network.relu(network.bn1(network.conv1(x))))
+    x = network.layer4(network.layer3(network.layer2(network.layer1(x))))
+    return network.bn2(network.conv2(x)), rgb.shape[-2:]
+
+
+def sparse2dense_rear(network: SparseToDense, z: Tensor, size: Any) -> Tensor:
+    x = network.conv3(network.decoder(z))
+    return F.interpolate(x, size, mode="bilinear", align_corners=True)
+
+
+def latefusion_front(network: LateFusion, rgb: Tensor, sparse: Tensor) -> Any:
+    """`decoder.s8`; the encoders' features at 1/4 and 1/2 and the size stay."""
+    picture, points = network.rgb(rgb), network.sparse(sparse)
+    x = network.fuse(torch.cat([picture.pop(), points.pop()], dim=1))
+    for level in LEVELS[:2]:
+        x = network.decoder[level](x, picture.pop(), points.pop())
+    return x, (picture, points, rgb.shape[-2:])
+
+
+def latefusion_rear(network: LateFusion, z: Tensor, kept: Any) -> Tensor:
+    picture, points, size = kept
+    for place, level in enumerate(LEVELS[2:], start=1):
+        z = network.decoder[level](z, picture[-place], points[-place])
+    x = F.interpolate(network.inverse(z), size, mode="bilinear", align_corners=False)
+    return 1 / (F.softplus(x) + 1 / FARTHEST)
+
+
+NYU, KITTI = (228, 304), (352, 1216)
+
+ZOO = (
+    Case("eigen", "coarse.conv5", (3,), NYU, eigen_front, eigen_rear),
+    Case("fcrn", "layer1_BN", (3,), NYU, fcrn_front, fcrn_rear),
+    Case("sfmlearner", "conv7", (3,), (128, 416), sfmlearner_front, sfmlearner_rear),
+    Case("sparseconv", "sparse_convs.0[0]", (1,), KITTI, sparseconv_front, sparseconv_rear),
+    Case("adnn", "solve", (1,), KITTI, adnn_front, adnn_rear),
+    Case("sparse2dense-r18-deconv3", "bn2", (3, 1), NYU, sparse2dense_front, sparse2dense_rear),
+    Case("latefusion", "decoder.s8", (3, 1), (224, 320), latefusion_front, latefusion_rear),
+)

@@ -1,0 +1,240 @@
+"""The tables of `benchmarks.paper_tables` as Markdown and as a picture."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from benchmarks.paper_figures import MEASURES, ROWS, SETTING, PaperRow
+from pnpdepth_cli.errors import UsageError
+from pnpdepth_cli.io.atomic import atomic_path
+
+Table = dict[str, Any]
+Result = dict[str, Any]
+
+ERRORS = MEASURES[:3]
+TITLES = ("RMSE", "MAE", "MRE", "δ1", "δ2", "δ3")
+STATES = {"paper": "the paper's setting", "tuned": "our setting"}
+PUBLISHED = "published"
+COLOURS = {PUBLISHED: "0.7", STATES["paper"]: "tab:orange", STATES["tuned"]: "tab:blue"}
+SMALL_MOVE = 0.02  # of z's spread, by all steps together: no more than a rounding of the features
+LARGE_STEP = 0.1  # of z's spread, by one step
+
+
+def markdown(table: Table) -> str:
+    """A set's table with the paper's figures beside ours, the δ at 1.01^k, and the steps."""
+    rows, beside = table["rows"], table["beside_paper"]
+    parts = [f"## {heading(table)}\n", _measures(rows, table["street"], beside=beside)]
+    if any(row["fine"] for row in rows):
+        parts.append(_fine(rows, beside=beside))
+    notes = [*table["notes"], *remarks(rows)]
+    parts += [_steps(rows), "\n" + "\n".join(f"- {note}" for note in notes)]
+    return "\n".join(part for part in parts if part) + "\n"
+
+
+def heading(table: Table) -> str:
+    """Which of the paper's tables a set's is, on what."""
+    name = f"Table {'II' if table['street'] else 'I'}"
+    return f"{name} on {table['set']}"
+
+
+def paper_row(row: Result, street: bool) -> PaperRow:
+    """The paper's lines for a result."""
+    return next(p for p in ROWS if p.name == row["paper_row"] and p.street == street)
+
+
+def _measures(rows: Sequence[Result], street: bool, *, beside: bool) -> str:
+    lines = [
+        "| network | input | points | frames | | " + " | ".join(TITLES) + " |",
+        "|" + "---|" * (5 + len(TITLES)),
+    ]
+    for row in rows:
+        published = paper_row(row, street)
+        if beside:
+            before = dict(zip(MEASURES, published.before, strict=True))
+            after = dict(zip(MEASURES, published.after, strict=True))
+            points = published.points or "LiDAR"
+            start = f"| *{published.name}, published* | {published.kind} |"
+            lines.append(f"{start} | | before | {_cells(before, fine=published.fine)} |")
+            after_cells = _cells(after, before, fine=published.fine)
+            lines.append(f"| | | {points} | | after | {after_cells} |")
+        points = f"{row['points']:.0f}"
+        start = f"| `{row['network']}` | {row['kind']} | | {row['frames']} | before |"
+        scores, settings = row["scores"], row["settings"]
+        lines.append(f"{start} {_cells(scores['before'])} |")
+        for state, title in STATES.items():
+            how = f"{title}: {described(settings)}" if state == "tuned" else title
+            lines.append(f"| | | {points} | | {how} | {_cells(scores[state], scores['before'])} |")
+    if any(row["fine"] for row in rows) and beside:
+        lines.append("\n† δ at 1.01^k, in the next table")
+    return "\n".join(lines)
+
+
+def described(settings: dict[str, dict[str, Any]]) -> str:
+    """Our setting in a few words."""
+    setting, paper = settings["tuned"], settings["paper"]
+    if all(
+        setting[part] == paper[part] for part in ("layer", "lr", "update", "iterations", "loss")
+    ):
+        return "the same"
+    lr = str(setting["lr"]).replace("%", " %")
+    loss = "" if setting["loss"] == "l1" else f", {setting['loss']}"
+    return f"`{setting['layer']}`, {setting['update']} {lr}, K {setting['iterations']}{loss}"
+
+
+def _cells(
+    values: dict[str, float], before: dict[str, float] | None = None, *, fine: bool = False
+) -> str:
+    """Six cells; with the errors' gains over `before` in per cent."""
+    cells = []
+    for name in MEASURES:
+        if name in ERRORS:
+            gain = f" ({_gain(values[name], before[name])})" if before else ""
+            cells.append(f"{values[name]:.4f}{gain}")
+        else:
+            cells.append("†" if fine else f"{values[name]:.1f}")
+    return " | ".join(cells)
+
+
+def _gain(after: float, before: float) -> str:
+    return f"{100 * (1 - after / before):+.1f} %".replace("-", "−")
+
+
+def _fine(rows: Sequence[Result], *, beside: bool) -> str:
+    """The δ at 1.01^k of the depth completion rows, before and after."""
+    lines = [
+        "\nδ at 1.01, 1.01², 1.01³, as in the paper's depth completion rows, before → after\n",
+        "| network | | δ1 | δ2 | δ3 |",
+        "|---|---|---|---|---|",
+    ]
+    for row in (row for row in rows if row["fine"]):
+        if beside:
+            published = paper_row(row, street=True)
+            pairs = zip(published.before[3:], published.after[3:], strict=True)
+            cells = " | ".join(f"{before:.1f} → {after:.1f}" for before, after in pairs)
+            lines.append(f"| *{published.name}, published* | | {cells} |")
+        for state, title in STATES.items():
+            before, after = row["scores"]["before"], row["scores"][state]
+            cells = " | ".join(
+                f"{before[name]:.1f} → {after[name]:.1f}" for name in ("fine1", "fine2", "fine3")
+            )
+            lines.append(f"| `{row['network']}` | {title} | {cells} |")
+    return "\n".join(lines)
+
+
+def _steps(rows: Sequence[Result]) -> str:
+    """How far the paper's step moves z, and what both settings do at the points themselves."""
+    lines = [
+        "\nThe step against the feature map: standard deviation of the paper's z, α as its share,"
+        " and the mean L1 in metres at the points before → after\n",
+        "| network | z | std(z) | α | L1, the paper's setting | loss, our setting | MAE fell in |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for row in rows:
+        paper, tuned = (row["settings"][state] for state in STATES)
+        share = 100 * paper["lr"] / row["std_z"]
+        cells = (
+            f"`{row['network']}`",
+            f"`{paper['layer']}`",
+            f"{row['std_z']:.3g}",
+            f"{share:.2g} %" if share < 10 else f"{share:.0f} %",
+            *(f"{how['loss_before']:.3f} → {how['loss_after']:.3f}" for how in (paper, tuned)),
+            " / ".join(f"{how['frames_with_lower_mae']:.0%}" for how in (paper, tuned)),
+        )
+        lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def remarks(rows: Sequence[Result]) -> list[str]:
+    """Where MAE falls; where not, and why; alignments, pixels not scored, what diverged."""
+    found = [f"MAE is lower for {fallen(rows, state)} at {STATES[state]}" for state in STATES]
+    for row in rows:
+        if row["aligned"]:
+            kinds = ", ".join(f"{kind} in {count}" for kind, count in row["aligned"].items())
+            found.append(
+                f"`{row['network']}` does not give metres: its output is aligned with the same"
+                f" points, once for before and after alike ({kinds} frames)"
+            )
+        for state, title in STATES.items():
+            gain = row["settings"][state]["gains"]["mae"]
+            if gain <= 0:
+                found.append(
+                    f"`{row['network']}`: {title} does not improve MAE ({gain:+.2f} %): "
+                    + reason(row, state)
+                )
+        if row["coverage"] < 0.9995:
+            found.append(
+                f"`{row['network']}`: {100 * (1 - row['coverage']):.2f} % of the pixels with known"
+                " truth have no positive depth before or after, and are not scored"
+            )
+        if row["diverged"]:
+            found.append(f"`{row['network']}`: {row['diverged']} refinements diverged")
+    return found
+
+
+def fallen(rows: Sequence[Result], state: str) -> str:
+    """How many of the networks a setting improves."""
+    better = sum(row["settings"][state]["gains"]["mae"] > 0 for row in rows)
+    return f"{better} of {len(rows)} networks"
+
+
+def reason(row: Result, state: str) -> str:
+    """Why a setting does not help: what the loss at the points, and the step, say."""
+    how = row["settings"][state]
+    before, after = how["loss_before"], how["loss_after"]
+    losses = f"the loss at the points goes from {before:.3f} to {after:.3f}"
+    if state == "paper":
+        share = SETTING.lr / row["std_z"] if isinstance(SETTING.lr, float) else 0.0
+        if share >= LARGE_STEP:
+            return f"a step is {share:.0%} of std(z) = {row['std_z']:.2g}, too long; {losses}"
+        if share * SETTING.iterations <= SMALL_MOVE:
+            return (
+                f"all {SETTING.iterations} steps together are {SETTING.iterations * share:.2%} of"
+                f" std(z) = {row['std_z']:.3g}, too short to move anything; {losses}"
+            )
+    if after < before:
+        return f"{losses}, so the points are met, at the cost of what lies between them"
+    return f"{losses}, so the steps go too far"
+
+
+def plot(tables: Sequence[Table], path: Path) -> None:
+    """A picture of the gains in MAE: published, at the paper's setting, and with our defaults.
+
+    UsageError without matplotlib.
+    """
+    try:
+        from matplotlib.figure import Figure
+    except ImportError:
+        raise UsageError("--plot needs matplotlib: pip install matplotlib") from None
+    shown = [table for table in tables if table["rows"]]
+    if not shown:
+        raise UsageError("--plot: there is no table to draw")
+    figure = Figure(figsize=(9, 2.4 * len(shown) + 0.4), layout="constrained")
+    drawn: dict[str, Any] = {}
+    for table, axes in zip(shown, figure.subplots(len(shown), squeeze=False)[:, 0], strict=True):
+        bars = bars_of(table)
+        width = 0.8 / len(bars)
+        for number, (title, heights) in enumerate(bars.items()):
+            offset = (number - (len(bars) - 1) / 2) * width
+            places = [place + offset for place in range(len(heights))]
+            drawn[title] = axes.bar(places, heights, width, color=COLOURS[title], label=title)
+        labels = [f"{row['network']}\n{row['points']:.0f} points" for row in table["rows"]]
+        axes.set_xticks(range(len(labels)), labels, fontsize=8)
+        axes.axhline(0, color="black", linewidth=0.8)
+        axes.set_ylabel("MAE lower by, %")
+        axes.set_title(heading(table), fontsize=10)
+    figure.legend(handles=list(drawn.values()), loc="outside upper center", ncols=len(drawn))
+    with atomic_path(path) as temporary:
+        figure.savefig(temporary, dpi=120)
+
+
+def bars_of(table: Table) -> dict[str, list[float]]:
+    """Gains in MAE in per cent, of each row, by what they are gains of."""
+    bars: dict[str, list[float]] = {}
+    if table["beside_paper"]:
+        published = [paper_row(row, table["street"]) for row in table["rows"]]
+        bars[PUBLISHED] = [100 * (1 - row.after[1] / row.before[1]) for row in published]
+    for state, title in STATES.items():
+        bars[title] = [row["settings"][state]["gains"]["mae"] for row in table["rows"]]
+    return bars

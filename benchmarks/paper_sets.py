@@ -1,0 +1,236 @@
+"""The frames of `benchmarks.paper_tables`: rendered for it, the real ones at hand, or data sets."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.frames import SETS, Depth, EvalFrame, points_on_grid, sampled
+from pnpdepth_cli.core.points import SparsePoints
+from pnpdepth_cli.errors import NoPointsError, UsageError
+from pnpdepth_cli.io.layouts import Frame, read_frame_image, read_frame_truth, read_frames
+from pnpdepth_cli.io.layouts.protocols import PROTOCOLS, Protocol
+from pnpdepth_cli.pipeline.batch_frames import BatchRequest, task_of
+from pnpdepth_cli.pipeline.inputs import read_inputs
+from pnpdepth_cli.pipeline.request import RefineRequest
+from pnpdepth_cli.sensors import FORWARD_LEFT_UP, LIDARS, Camera, as_picture, simulate_lidar
+
+T = TypeVar("T")
+
+ROOM_LIMIT, STREET_LIMIT = 10.0, 80.0
+"""Metres beyond which rendered truth counts as unknown: a Kinect's range, and KITTI's."""
+
+SCANNER = LIDARS["hdl-64e"]
+SCANNER_IN_CAMERA = np.array([0.0, -0.08, -0.27])  # metres; as KITTI's stands to its left cameras
+VIEWS = 4  # of one scene; frames are rendered a scene at a time
+
+
+@dataclass(frozen=True, kw_only=True)
+class TableFrame:
+    """rgb (H, W, 3) in 0..1; depths (H, W) in metres, 0 = unknown.
+
+    pool: the pixels that uniform points are drawn from. scan: a LiDAR's points on their pixels,
+    None where there is none besides the truth.
+    """
+
+    rgb: NDArray[np.float32]
+    truth: Depth
+    pool: Depth
+    scan: Depth | None = None
+
+    def cut_by(self, protocol: Protocol) -> TableFrame:
+        """What the protocol leaves of the frame."""
+        return TableFrame(
+            rgb=np.ascontiguousarray(protocol.apply(self.rgb)),
+            truth=np.ascontiguousarray(protocol.apply(self.truth)),
+            pool=protocol.apply(self.pool),
+            scan=None if self.scan is None else protocol.apply(self.scan),
+        )
+
+    def points(self, count: int | None, seed: int) -> SparsePoints:
+        """`count` pixels of the pool, or all of the scan; the same seed gives the same."""
+        if count is None:
+            assert self.scan is not None
+            rows, columns = np.nonzero(self.scan)
+            return points_on_grid(rows, columns, self.scan[rows, columns], self.scan.shape)
+        rows, columns = sampled(self.pool, count, seed)
+        if not len(rows):
+            raise NoPointsError(f"frame {seed} has no pixel with known depth to draw points from")
+        return points_on_grid(rows, columns, self.pool[rows, columns], self.pool.shape)
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrameSet:
+    """frames(): in a fixed order, `count` of them. street: for table II; paper: for its figures."""
+
+    name: str
+    street: bool
+    count: int
+    frames: Callable[[], Iterator[TableFrame]]
+    beside_paper: bool = True
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scenes:
+    """A kind of scene to render, and a seed that is used for these tables alone."""
+
+    name: str
+    camera: str
+    kind: str
+    size: tuple[int, int]
+    seed: int
+    limit: float
+
+    def folder(self, cache: Path) -> Path:
+        """Where the frames lie."""
+        return cache / f"{self.kind}-{self.size[0]}x{self.size[1]}-seed{self.seed}"
+
+
+ROOMS = Scenes(
+    name="rendered rooms", camera="nyu", kind="room", size=(228, 304), seed=900021, limit=ROOM_LIMIT
+)
+STREETS = Scenes(
+    name="rendered streets", camera="kitti", kind="street", size=(228, 912), seed=900022,
+    limit=STREET_LIMIT,
+)  # fmt: skip
+
+
+def rendered(scenes: Scenes, cache: Path, count: int, workers: int) -> FrameSet:
+    """`count` frames of these scenes; what of them is not in the cache is rendered first."""
+    folder, files = scenes.folder(cache), -(-count // VIEWS)
+    shards = [folder / f"shard_{number:05d}.npz" for number in range(files)]
+    if not all(shard.exists() for shard in shards):
+        _render(scenes, folder, files * VIEWS, workers)
+    return FrameSet(
+        name=scenes.name,
+        street=scenes.kind == "street",
+        count=count,
+        frames=partial(_rendered_frames, scenes, shards, count),
+    )
+
+
+def _render(scenes: Scenes, folder: Path, count: int, workers: int) -> None:
+    try:
+        from model_zoo_defs.training.render import Job, render_all
+    except ImportError as error:
+        raise UsageError(f"rendering needs {error.name}: pip install 'pnpdepth[train]'") from error
+    job = Job(
+        out=folder,
+        seed=scenes.seed,
+        height=scenes.size[0],
+        width=scenes.size[1],
+        frames=count,
+        shard_frames=VIEWS,
+        kinds=(scenes.kind,),
+        camera=scenes.camera,
+    )
+    render_all(job, workers=workers)
+
+
+def _rendered_frames(scenes: Scenes, shards: list[Path], count: int) -> Iterator[TableFrame]:
+    for first, path in zip(range(0, count, VIEWS), shards, strict=True):
+        with np.load(path) as shard:
+            views = list(zip(shard["rgb"], shard["depth"], shard["intrinsics"], strict=True))
+        for number, (rgb, depth, lens) in enumerate(views[: count - first], start=first):
+            truth = within(depth, scenes.limit)
+            yield TableFrame(
+                rgb=rgb.astype(np.float32) / 255,
+                truth=truth,
+                pool=truth,
+                scan=scan_of(truth, lens, number) if scenes.kind == "street" else None,
+            )
+
+
+def within(depth: Depth, limit: float) -> Depth:
+    """The depth map with what is beyond `limit` unknown."""
+    return np.where(depth <= limit, depth, np.float32(0))
+
+
+def scan_of(truth: Depth, lens: NDArray[np.float32], seed: int) -> Depth:
+    """(H, W) one turn of the 64-line scanner on KITTI's roof; lens: fx, fy, cx, cy in pixels."""
+    fx, fy, cx, cy = (float(value) for value in lens)
+    camera = Camera(
+        intrinsics=np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]),
+        rotation=FORWARD_LEFT_UP,
+        translation=SCANNER_IN_CAMERA,
+    )
+    return as_picture(simulate_lidar(truth, camera, SCANNER, seed))
+
+
+def shared(root: Path, most: int) -> list[FrameSet]:
+    """The real frames at hand, at most so many of each, evenly taken."""
+    found = []
+    for name, read in SETS.items():
+        every = [_shared_frame(frame) for frame in read(root)]
+        if every:
+            chosen = _evenly(every, most)
+            found.append(
+                FrameSet(
+                    name=name,
+                    street=every[0].scan is not None,
+                    count=len(chosen),
+                    frames=partial(iter, chosen),
+                    beside_paper=False,
+                )
+            )
+    if not found:
+        raise UsageError(f"{root} holds none of {', '.join(SETS)}; check --shared")
+    return found
+
+
+def _evenly(every: Sequence[T], most: int | None) -> list[T]:
+    count = min(most or len(every), len(every))
+    return [every[index] for index in np.linspace(0, len(every) - 1, count).astype(int)]
+
+
+def _shared_frame(frame: EvalFrame) -> TableFrame:
+    if frame.sensor is None:
+        truth = within(frame.truth, ROOM_LIMIT)
+        return TableFrame(rgb=frame.rgb, truth=truth, pool=truth).cut_by(PROTOCOLS["nyu"])
+    truth, scan = (within(depth, STREET_LIMIT) for depth in (frame.truth, frame.sensor))
+    return TableFrame(rgb=frame.rgb, truth=truth, pool=scan, scan=scan)
+
+
+def data_set(what: str, most: int | None) -> FrameSet:
+    """The frames of a data set on disk, `nyu=PATH` or `kitti=PATH`, as its layout reads them.
+
+    The layouts cut frames as the paper's protocols say, but for depth completion, where the row
+    decides. UsageError for another kind of set, or one that the path does not look like.
+    """
+    kind, _, path = what.partition("=")
+    if kind not in ("nyu", "kitti") or not path:
+        raise UsageError(f"--data {what}: give nyu=PATH or kitti=PATH")
+    root = Path(path)
+    every = read_frames(root)
+    if (every[0].protocol.name == "nyu") != (kind == "nyu"):
+        raise UsageError(f"--data {what}: {root} is read as {every[0].protocol.name!r} frames")
+    chosen = _evenly(every, most)
+    return FrameSet(
+        name=f"{kind} ({root.name})",
+        street=kind == "kitti",
+        count=len(chosen),
+        frames=lambda: (_data_frame(root, frame) for frame in chosen),
+    )
+
+
+def _data_frame(root: Path, frame: Frame) -> TableFrame:
+    """A frame in memory; without another truth, the scan is the truth, as in KITTI odometry."""
+    if frame.sparse is None:
+        truth = read_frame_truth(frame)
+        return TableFrame(rgb=read_frame_image(frame), truth=truth, pool=truth)
+    # No output is written; the batch's own reading of scans and scales is wanted.
+    batch = BatchRequest(
+        source=root, output=root / "out", refine=RefineRequest(image=None, sparse=None)
+    )
+    inputs = read_inputs(replace(task_of(batch, frame).request, output=None))
+    assert inputs.rgb is not None
+    scan = inputs.points.scatter()[0, 0].numpy()
+    if inputs.gt is None:
+        return TableFrame(rgb=inputs.rgb, truth=scan, pool=scan)
+    return TableFrame(rgb=inputs.rgb, truth=inputs.gt, pool=scan, scan=scan)

@@ -1,0 +1,302 @@
+"""The paper's tables I and II for the seven networks: `python -m benchmarks.paper_tables`.
+
+    python -m benchmarks.paper_tables --shared ../shared/data --json t.json --plot t.png
+    python -m benchmarks.paper_tables --data nyu=PATH kitti=PATH --checkpoints DIR
+
+By itself: the tiny editions that come with the program, on rooms and streets rendered from seeds
+that nothing else uses (into --cache, once; needs pnpdepth[train]). --data names real data sets
+instead: NYU Depth v2 as .h5 or the official .mat; KITTI odometry or depth completion, each with a
+`kitti=` of its own. --checkpoints names a folder with published weights, each called after its
+network (`pnpdepth models`): fcrn.npy, sfmlearner.pth.tar, sparse2dense-r18-upproj-kitti.pth.tar,
+eigen/ with its two files.
+
+Each network: as it is, refined at the paper's setting (sign, α = 0.01, K = 5, L1, the paper's z),
+and with its definition's defaults. Points are drawn per frame by its number: all networks with as
+many points get the same. Each measure is taken per frame and averaged, over those pixels with
+known truth where all three depths are positive; `coverage` says which share that is. A network
+that knows depth up to scale is scaled by the points, once, for before and after alike.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+import time
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from tqdm import tqdm
+
+from benchmarks.frames import Depth, frame_inputs, refined
+from benchmarks.paper_figures import FINE_THRESHOLDS, MEASURES, ROWS, SETTING, PaperRow, networks_of
+from benchmarks.paper_report import markdown, plot
+from benchmarks.paper_sets import (
+    ROOMS,
+    STREETS,
+    FrameSet,
+    TableFrame,
+    data_set,
+    rendered,
+    shared,
+)
+from pnpdepth_cli.core.metrics import score
+from pnpdepth_cli.core.refine import RefineSettings
+from pnpdepth_cli.errors import CheckpointError, PnpDepthError, UsageError
+from pnpdepth_cli.io.atomic import atomic_path
+from pnpdepth_cli.models.network import Network, load_network
+from pnpdepth_cli.models.registry import names
+from pnpdepth_cli.pipeline.request import RefineRequest, effective_settings, layer_name
+
+ROOM_FRAMES = 48  # of streets, which are three times as wide, half as many
+SHARED_FRAMES = 24  # of each set: neighbours in a video tell little more
+
+
+@dataclass(frozen=True, kw_only=True)
+class Entry:
+    """A network in a row of the tables; settings: (layer, how) of "paper" and of "tuned"."""
+
+    row: PaperRow
+    network: Network
+    settings: dict[str, tuple[str, RefineSettings]]
+
+    @property
+    def name(self) -> str:
+        """The network's."""
+        return self.network.definition.name
+
+
+def entry_of(row: PaperRow, network: Network) -> Entry:
+    """The network at the paper's setting and with its own defaults."""
+    definition = network.definition
+    tuned = effective_settings(definition, RefineRequest(image=None, sparse=None))
+    paper = replace(SETTING, align=definition.default_alignment)
+    settings = {"paper": (row.layer, paper), "tuned": (layer_name(definition, None), tuned)}
+    return Entry(row=row, network=network, settings=settings)
+
+
+def scores_of(depths: dict[str, Depth], truth: Depth) -> tuple[dict[str, dict[str, float]], float]:
+    """The measures of each depth over the pixels where the truth and all depths are known.
+
+    δ in per cent, `fine…` those at 1.01^k; and the share of the known truth that these pixels are.
+    """
+    known = truth > 0
+    scored = known & np.logical_and.reduce([np.isfinite(d) & (d > 0) for d in depths.values()])
+    kept = torch.from_numpy(np.where(scored, truth, np.float32(0)))
+    found = {}
+    for state, depth in depths.items():
+        usual, fine = (
+            score(torch.from_numpy(depth), kept, *limits) for limits in ((), (FINE_THRESHOLDS,))
+        )
+        found[state] = {name: getattr(usual, name) for name in MEASURES[:3]}
+        found[state] |= {f"delta{k}": 100 * getattr(usual, f"delta{k}") for k in (1, 2, 3)}
+        found[state] |= {f"fine{k}": 100 * getattr(fine, f"delta{k}") for k in (1, 2, 3)}
+    return found, float(scored.sum() / known.sum())
+
+
+def frame_figures(entry: Entry, frame: TableFrame, number: int) -> dict[str, Any]:
+    """What one frame shows of a network: its scores, the loss at the points, the spread of z."""
+    frame = frame.cut_by(entry.row.cut)
+    points = frame.points(entry.row.points, number)
+    inputs = frame_inputs(frame.rgb, points, frame.truth)
+    layer, paper = entry.settings["paper"]
+    results = {"paper": refined(entry.network, layer, paper, inputs)}
+    same = entry.settings["tuned"] == entry.settings["paper"]
+    results["tuned"] = (
+        results["paper"] if same else refined(entry.network, *entry.settings["tuned"], inputs)
+    )
+    # A step of 100 % is what the engine takes for the standard deviation of z_0.
+    spread = refined(entry.network, layer, replace(paper, iterations=0, lr="100%"), inputs)
+    depths = {"before": results["paper"].before} | {n: r.after for n, r in results.items()}
+    scores, coverage = scores_of(depths, frame.truth)
+    return {
+        "points": len(points),
+        "coverage": coverage,
+        "std_z": spread.refinement.step,
+        "diverged": sum(result.diverged is not None for result in results.values()),
+        "aligned": None if (fit := results["paper"].alignment) is None else fit.kind,
+        "scores": scores,
+        "loss": {n: [r.refinement.losses[i] for i in (0, -1)] for n, r in results.items()},
+    }
+
+
+def gains(before: dict[str, float], after: dict[str, float]) -> dict[str, float]:
+    """Per cent by which the errors fell, and points by which the shares rose."""
+    errors = MEASURES[:3]
+    return {
+        name: 100 * (1 - after[name] / before[name]) if name in errors else value - before[name]
+        for name, value in after.items()
+    }
+
+
+def result_of(entry: Entry, frames: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """A network's line in the tables: means over the frames."""
+
+    def mean(*path: str | int) -> float:
+        values: list[Any] = list(frames)
+        for key in path:
+            values = [value[key] for value in values]
+        return float(np.mean(values))
+
+    states = {
+        state: {name: mean("scores", state, name) for name in found}
+        for state, found in frames[0]["scores"].items()
+    }
+    settings = {}
+    for state, (layer, how) in entry.settings.items():
+        settings[state] = {"layer": layer, **asdict(how)}
+        settings[state] |= {"loss_before": mean("loss", state, 0)}
+        settings[state] |= {"loss_after": mean("loss", state, 1)}
+        settings[state] |= {"gains": gains(states["before"], states[state])}
+        won = [f["scores"][state]["mae"] < f["scores"]["before"]["mae"] for f in frames]
+        settings[state] |= {"frames_with_lower_mae": float(np.mean(won))}
+    checkpoint = entry.network.checkpoint
+    return {
+        "network": entry.name,
+        "checkpoint": None if checkpoint is None else checkpoint.name,
+        "paper_row": entry.row.name,
+        "kind": entry.row.kind,
+        "fine": entry.row.fine,
+        "frames": len(frames),
+        "points": mean("points"),
+        "coverage": mean("coverage"),
+        "std_z": mean("std_z"),
+        "diverged": sum(frame["diverged"] for frame in frames),
+        "aligned": dict(Counter(frame["aligned"] for frame in frames if frame["aligned"])),
+        "scores": states,
+        "settings": settings,
+    }
+
+
+def table_of(frame_set: FrameSet, entries: Sequence[Entry]) -> dict[str, Any]:
+    """A set's table, frame by frame, so that all networks get what they get of the same frame."""
+    notes = []
+    entries = [entry for entry in entries if entry.row.street == frame_set.street]
+    figures: list[list[dict[str, Any]]] = [[] for _ in entries]
+    bar = tqdm(frame_set.frames(), frame_set.name, frame_set.count, unit="frame", disable=None)
+    for number, frame in enumerate(bar):
+        for entry, found in zip(entries, figures, strict=True):
+            if entry.row.points is not None or frame.scan is not None:
+                found.append(frame_figures(entry, frame, number))
+    rows = []
+    for entry, found in zip(entries, figures, strict=True):
+        if found:
+            rows.append(result_of(entry, found))
+        else:
+            notes.append(f"`{entry.name}` needs a LiDAR and a truth besides it; there is none here")
+    return {
+        "set": frame_set.name,
+        "street": frame_set.street,
+        "beside_paper": frame_set.beside_paper,
+        "rows": rows,
+        "notes": notes,
+    }
+
+
+def checkpoints_in(folder: Path | None) -> dict[str, Path | None]:
+    """Networks by name and their weights: the tiny editions, or what a folder's names say."""
+    known = names()
+    if folder is None:
+        return {name: None for name in known if "-tiny" in name}
+    if not folder.is_dir():
+        raise UsageError(f"--checkpoints {folder} is no folder; put the files of weights into one")
+    known += ["sparse2dense", "sparse2dense-kitti"]
+    found: dict[str, Path | None] = {
+        path.name.split(".")[0]: path for path in sorted(folder.iterdir())
+    }
+    found = {name: path for name, path in found.items() if name in known}
+    if not found:
+        raise UsageError(f"no file in {folder} is called after a network, such as fcrn.npy")
+    return found
+
+
+def entries_of(
+    weights: dict[str, Path | None], only: Sequence[str]
+) -> tuple[list[Entry], list[str]]:
+    """The networks with weights, row by row, and notes on what there is none of."""
+    unknown = set(only) - set(weights)
+    if unknown:
+        raise UsageError(f"--only: no {', '.join(sorted(unknown))}; there are {', '.join(weights)}")
+    entries, notes = [], []
+    loaded: dict[str, Network] = {}
+    for row in ROWS:
+        wanted = networks_of(row, [name for name in weights if not only or name in only])
+        if not wanted and not only:
+            notes.append(row.missing or f"no weights for the row of {row.name} ({row.family})")
+        for name in wanted:
+            try:
+                loaded[name] = loaded.get(name) or load_network(name, weights[name])
+            except CheckpointError as error:
+                if weights[name] is not None:
+                    raise
+                notes.append(f"`{name}` has no row: {error}")
+            else:
+                entries.append(entry_of(row, loaded[name]))
+    return entries, list(dict.fromkeys(notes))
+
+
+def sets_of(args: argparse.Namespace, entries: Sequence[Entry]) -> Iterable[FrameSet]:
+    """The sets that the command line asks for, each rendered when its turn comes, if needed."""
+    if args.data:
+        yield from [data_set(what, args.frames) for what in args.data]
+    else:
+        rooms = args.frames or ROOM_FRAMES
+        for scenes, count in ((ROOMS, rooms), (STREETS, -(-rooms // 2))):
+            if any(entry.row.street == (scenes is STREETS) for entry in entries):
+                yield rendered(scenes, args.cache, count, args.workers)
+    if args.shared:
+        yield from shared(args.shared, args.frames or SHARED_FRAMES)
+
+
+def parsed(arguments: Sequence[str] | None) -> argparse.Namespace:
+    """What the command line says."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument(
+        "--frames", type=int, help="of rooms and each real set; half as many streets"
+    )
+    parser.add_argument("--only", nargs="+", default=[], metavar="NAME", help="these networks")
+    parser.add_argument("--cache", type=Path, default=Path("out/paper_tables"))
+    parser.add_argument("--shared", type=Path, help="also these real frames (../shared/data)")
+    parser.add_argument("--data", nargs="+", metavar="KIND=PATH", help="nyu=PATH, kitti=PATH")
+    parser.add_argument("--checkpoints", type=Path, help="folder with published weights")
+    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1, help="that render")
+    parser.add_argument("--json", type=Path, help="write everything into this file")
+    parser.add_argument("--plot", type=Path, help="draw the gains into this picture")
+    chosen = parser.parse_args(arguments)
+    if chosen.frames is not None and chosen.frames < 1:
+        parser.error("--frames: give 1 or more")
+    return chosen
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """The tables on stdout; returns the exit code."""
+    args, began = parsed(arguments), time.monotonic()
+    try:
+        entries, notes = entries_of(checkpoints_in(args.checkpoints), args.only)
+        tables = []
+        for frame_set in sets_of(args, entries):
+            if any(entry.row.street == frame_set.street for entry in entries):
+                tables.append(table_of(frame_set, entries))
+                print(markdown(tables[-1]), flush=True)
+        for note in notes:
+            print(f"- {note}")
+        if args.json:
+            with atomic_path(args.json) as temporary:
+                temporary.write_text(json.dumps({"tables": tables, "notes": notes}, indent=1))
+        if args.plot:
+            plot(tables, args.plot)
+    except PnpDepthError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return error.exit_code
+    print(f"{time.monotonic() - began:.0f} s", file=sys.stderr)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,107 @@
+"""A file that only grows: a JSON object a line, of which the newest of each key counts.
+
+A process that is killed while it writes leaves a torn last line. It is cut off before the next
+line is written, and lines that mean nothing are passed over, so all the others stay good.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import threading
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from pnpdepth_cli.errors import InputError
+from pnpdepth_cli.io.atomic import cannot_write
+from pnpdepth_cli.io.record import plain
+
+
+class Journal:
+    """The lines of a file by their `key`; only their places in the file are kept in memory.
+
+    `lost` says how many lines mean nothing. Appending may be done by several threads; several
+    processes must not.
+    """
+
+    def __init__(self, path: Path, key: str) -> None:
+        self.path = path
+        self.lost = 0
+        self._key = key
+        self._places: dict[str, int] = {}
+        self._writing = threading.Lock()
+        self._end = self._index()
+
+    def keys(self) -> list[str]:
+        """In the order in which they first appeared."""
+        return list(self._places)
+
+    def newest(self, key: str) -> dict[str, Any] | None:
+        """The newest line with this key; None if there is none."""
+        if key not in self._places:
+            return None
+        try:
+            with self.path.open("rb") as file:
+                file.seek(self._places[key])
+                return _object(file.readline())
+        except OSError as error:
+            raise _cannot_read(self.path, error) from error
+
+    def append(self, line: Mapping[str, Any]) -> None:
+        """The line is in the file. Else StorageError, and at most a torn end is there."""
+        data = (json.dumps(plain(line), allow_nan=False) + "\n").encode("ascii")
+        with self._writing:
+            try:
+                self._write(data)
+            except OSError as error:
+                raise cannot_write(self.path, error) from error
+            if isinstance(line.get(self._key), str):
+                self._places[line[self._key]] = self._end
+            self._end += len(data)
+
+    def _write(self, data: bytes) -> None:
+        descriptor = os.open(self.path, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC, 0o666)
+        try:
+            if os.fstat(descriptor).st_size != self._end:
+                os.ftruncate(descriptor, self._end)
+            written = os.pwrite(descriptor, data, self._end)
+            while written < len(data):  # a disk that is nearly full takes a part
+                written += os.pwrite(descriptor, data[written:], self._end + written)
+        finally:
+            os.close(descriptor)
+
+    def _index(self) -> int:
+        """Note where the lines are; returns the place behind the last whole one."""
+        place = 0
+        try:
+            with self.path.open("rb") as file:
+                for data in file:
+                    if not data.endswith(b"\n"):
+                        break
+                    found = _object(data)
+                    if found is None:
+                        self.lost += 1
+                    elif isinstance(found.get(self._key), str):
+                        self._places[found[self._key]] = place
+                    place += len(data)
+        except FileNotFoundError:
+            return 0
+        except OSError as error:
+            raise _cannot_read(self.path, error) from error
+        return place
+
+
+def _object(data: bytes) -> dict[str, Any] | None:
+    try:
+        found = json.loads(data)
+    except (ValueError, RecursionError):
+        return None
+    return found if isinstance(found, dict) else None
+
+
+def _cannot_read(path: Path, error: OSError) -> InputError:
+    reason = (error.strerror or str(error)).lower()
+    return InputError(
+        f"{path} cannot be read ({reason}); check it, or choose another output folder"
+    )

@@ -1,0 +1,222 @@
+"""`pnpdepth batch`: all frames of a folder or a list, refined; what is done already stays."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Generator, Iterator
+from contextlib import closing
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from pnpdepth_cli.io.atomic import make_folder
+from pnpdepth_cli.io.layouts.frame import Frame
+from pnpdepth_cli.io.lock import in_turn, locked_folder
+from pnpdepth_cli.pipeline.batch_frames import BatchFrames, BatchRequest, find_frames, task_of
+from pnpdepth_cli.pipeline.batch_settings import model_identity, settings_of
+from pnpdepth_cli.pipeline.batch_state import NEW, BatchState, remove_all_leftovers
+from pnpdepth_cli.pipeline.batch_summary import Tally, write_summary, write_table
+
+_NAMED = 5
+"""So many of a list of files are named, the rest is counted; summary.json has all."""
+
+
+class Listener(Protocol):
+    """Who is told how a batch goes on."""
+
+    def say(self, text: str) -> None:
+        """Something a person should know."""
+
+    def begin(self, to_do: int) -> None:
+        """So many frames are to be done; the network is loaded."""
+
+    def frame(self, row: dict[str, Any]) -> None:
+        """One of them is done, or has failed: its row of the summary."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class BatchOutcome:
+    """summary: what summary.json holds but the frames. stopped: before all frames were done."""
+
+    summary: dict[str, Any]
+    stopped: bool
+
+
+@dataclass(frozen=True, kw_only=True)
+class Planned:
+    """A frame that is to be done, and why."""
+
+    name: str
+    why: str
+
+
+def run_batch(
+    request: BatchRequest, listener: Listener, stopped: Callable[[], bool] = lambda: False
+) -> BatchOutcome:
+    """Every frame that is to be done is on disk, or has a row that says why not.
+
+    stopped() is asked before each frame. Raises the errors of `pnpdepth_cli.errors`: not what is
+    wrong with one frame, but with all, such as a network that cannot be loaded, or a full disk.
+    """
+    found = find_frames(request)
+    for text in _said_of(request, found):
+        listener.say(text)
+    make_folder(request.output)
+
+    def clean() -> None:
+        leftovers = remove_all_leftovers(request.output)
+        if leftovers:
+            listener.say(f"removed {leftovers:,} half-written files of a run that was killed")
+
+    with locked_folder(request.output, request.shard, clean):
+        state = BatchState(request.output, request.shard, model_identity(request.refine))
+        for note in state.notes():
+            listener.say(note)
+        to_do, reasons = _to_do(request, found, state)
+        done = len(found.chosen) - len(to_do)
+        listener.say(_plan_text(len(found.chosen), done, reasons))
+        began = 0
+        if to_do:
+            with closing(_rows(request, found, to_do, state, listener, stopped)) as rows:
+                listener.begin(len(to_do))
+                for row in rows:
+                    began += 1
+                    listener.frame(row)
+        with in_turn(request.output):  # so the shard that ends last has the last word
+            state.read_others()
+            summary = _summarise(request, found, state)
+    return BatchOutcome(summary=summary, stopped=began < len(to_do))
+
+
+def plan_batch(request: BatchRequest, say: Callable[[str], None]) -> list[Planned]:
+    """The frames that `run_batch` would do, and why; nothing is written."""
+    found = find_frames(request)
+    for text in _said_of(request, found):
+        say(text)
+    state = BatchState(request.output, request.shard, model_identity(request.refine))
+    planned = []
+    for frame in found.chosen:
+        why = state.why_to_do(task_of(request, frame))
+        if why is not None:
+            planned.append(Planned(name=frame.name, why=why))
+    reasons = Counter(each.why for each in planned)
+    say(_plan_text(len(found.chosen), len(found.chosen) - len(planned), reasons))
+    return planned
+
+
+def _to_do(
+    request: BatchRequest, found: BatchFrames, state: BatchState
+) -> tuple[list[Frame], Counter[str]]:
+    """The frames that are to be done, and how often for which reason.
+
+    OutputError if one would replace a file that is not a batch's, unless that is allowed.
+    """
+    frames, reasons = [], Counter[str]()
+    for frame in found.chosen:
+        task = task_of(request, frame)
+        why = state.why_to_do(task)
+        if why is None:
+            continue
+        if why == NEW and not request.refine.overwrite:
+            state.check_foreign(task)
+        frames.append(frame)
+        reasons[why] += 1
+    return frames, reasons
+
+
+def _rows(
+    request: BatchRequest,
+    found: BatchFrames,
+    to_do: list[Frame],
+    state: BatchState,
+    listener: Listener,
+    stopped: Callable[[], bool],
+) -> Generator[dict[str, Any], None, None]:
+    """A row for each frame as it is done; the network is loaded before the first is asked for."""
+    # They import torch, which a run with nothing to do can do without.
+    from pnpdepth_cli.pipeline.batch_running import run_tasks, settle_refiner
+
+    refiner = settle_refiner((task_of(request, frame) for frame in found.frames), listener.say)
+    return run_tasks(
+        (task_of(request, frame) for frame in to_do),
+        refiner,
+        state,
+        workers=request.workers,
+        proven=len(to_do) < len(found.chosen),
+        stopped=stopped,
+    )
+
+
+def _summarise(request: BatchRequest, found: BatchFrames, state: BatchState) -> dict[str, Any]:
+    """summary.csv and summary.json are on disk; returns what the second holds but the frames."""
+
+    def rows() -> Iterator[dict[str, Any]]:
+        for frame in found.frames:
+            line = state.result_of(task_of(request, frame))
+            if line is not None:
+                yield line["row"]
+
+    tally = Tally()
+
+    def counted() -> Iterator[dict[str, Any]]:
+        for row in rows():
+            tally.add(row)
+            yield row
+
+    write_table(request.output / "summary.csv", counted())
+    known = sum(tally.counts.values())
+    summary = {
+        "command": "batch",
+        "source": str(request.source),
+        "output": str(request.output),
+        "layout": found.layout,
+        "settings": settings_of(request.refine, state.model),
+        "counts": {
+            "frames": len(found.frames),
+            **tally.counts,
+            "pending": len(found.frames) - known,
+            "with_warnings": tally.warned,
+        },
+        "mean": tally.mean(),
+        "unmatched": [str(each) for each in found.unmatched],
+    }
+    write_summary(request.output / "summary.json", summary, rows())
+    return summary
+
+
+def _said_of(request: BatchRequest, found: BatchFrames) -> Iterator[str]:
+    """What was assumed, and which files are in no frame."""
+    truths = sum(frame.gt is not None for frame in found.frames)
+    guessed = " (guessed; --layout names another)" if request.layout is None else ""
+    yield (
+        f"layout: {found.layout}{guessed}: {_count(len(found.frames), 'frame')},"
+        f" {truths:,} with ground truth"
+    )
+    cut = sorted({f.protocol.name for f in found.frames if f.protocol.halved or f.protocol.crop})
+    if cut and request.protocol is None:
+        yield f"protocol: {', '.join(cut)} cuts the frames; --protocol whole keeps all of them"
+    if request.limit is not None:
+        yield f"limit: the first {request.limit:,} of them"
+    if request.shard is not None:
+        number, of = request.shard
+        yield f"shard {number}/{of}: {_count(len(found.chosen), 'frame')} of them"
+    for each in found.unmatched[:_NAMED]:
+        yield f"warning: {each}"
+    if len(found.unmatched) > _NAMED:
+        yield (
+            f"warning: {len(found.unmatched) - _NAMED:,} more files are in no frame; summary.json"
+            " lists them"
+        )
+
+
+def _plan_text(frames: int, done: int, reasons: Counter[str]) -> str:
+    kinds = Counter[str]()
+    for why, count in reasons.items():
+        kinds[why.split(":")[0]] += count
+    because = ", ".join(f"{count:,} {kind}" for kind, count in kinds.items())
+    if not kinds:
+        return f"{_count(frames, 'frame')}, all of them done already"
+    return f"{_count(frames, 'frame')}: {done:,} done already, {frames - done:,} to do ({because})"
+
+
+def _count(number: int, noun: str) -> str:
+    return f"{number:,} {noun}{'' if number == 1 else 's'}"

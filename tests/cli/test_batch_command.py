@@ -1,0 +1,252 @@
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pnpdepth_cli.cli import batch as command
+from pnpdepth_cli.cli import progress
+from pnpdepth_cli.cli.main import main
+from pnpdepth_cli.cli.progress import BatchProgress
+from pnpdepth_cli.io.layouts import LAYOUTS, PROTOCOLS
+from tests.pipeline.batches import pairs_on_disk, results
+
+PROGRAM = [sys.executable, "-c", "from pnpdepth_cli.cli.main import main; main()"]
+
+
+@pytest.fixture
+def root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    return pairs_on_disk(tmp_path / "drive")
+
+
+def arguments(*more: str, source: str = "drive") -> list[str]:
+    return [
+        "batch", source, "-o", "out", "--model", "drive/net/my_net.py",
+        "--checkpoint", "drive/net/my_net.safetensors", *more,
+    ]  # fmt: skip
+
+
+def code_of(given: list[str]) -> int:
+    with pytest.raises(SystemExit) as stop:
+        main(given)
+    return int(stop.value.code or 0)
+
+
+def test_it_says_what_it_took_for_granted_and_what_came_out(
+    root: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert code_of(arguments()) == 0
+    out, err = capsys.readouterr()
+    assert out == ""
+    for said in (
+        "layout: pairs (guessed; --layout names another): 4 frames, 4 with ground truth",
+        "4 frames: 0 done already, 4 to do (4 new)",
+        "means over frames",
+        "4 of 4 frames done",
+        "wrote out/summary.json  out/summary.csv",
+    ):
+        assert said in err
+
+
+def test_json_prints_the_summary_without_frames_and_nothing_else(
+    root: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert code_of(arguments("--json")) == 0
+    printed = json.loads(capsys.readouterr().out)
+    stored = json.loads(Path("out/summary.json").read_text())
+    assert len(stored.pop("frames")) == 4
+    assert printed == stored
+
+
+def test_a_bad_frame_is_one_line_and_exit_code_7(
+    root: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (root / "rgb/b.png").write_bytes(b"")
+    assert code_of(arguments()) == 7
+    err = capsys.readouterr().err
+    (line,) = [line for line in err.splitlines() if line.startswith("failed")]
+    assert line.startswith("failed: b: drive/rgb/b.png is empty")
+    assert err.splitlines()[-1].startswith("pnpdepth: 1 failed of 4 frames; out/summary.csv says")
+    assert "Traceback" not in err
+
+
+EXITS: list[tuple[list[str], int, str]] = [
+    (["--shard", "2"], 2, "I/N"),
+    (["--shard", "0/2"], 2, "1/4"),
+    (["--limit", "0"], 2, "1 or more"),
+    (["--sample", "some:5"], 2, "uniform"),
+    (["--sample", "many"], 2, "500"),
+    (["--layout", "tum"], 3, "does not look like 'tum'"),
+    (["--layer", "encod"], 4, "encode"),
+    (["--model", "compakt"], 4, "compact"),
+    (["--device", "cuda:9"], 6, "--device cpu"),
+]
+
+
+@pytest.mark.parametrize(("more", "code", "said"), EXITS)
+def test_the_exit_code_says_whose_mistake_it_was(
+    root: Path, capsys: pytest.CaptureFixture[str], more: list[str], code: int, said: str
+) -> None:
+    assert code_of(arguments(*more)) == code
+    err = capsys.readouterr().err
+    assert said in err.splitlines()[-1]
+    assert "Traceback" not in err
+
+
+def test_an_empty_folder_is_an_input_error_that_names_the_layouts(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert code_of(["batch", str(tmp_path), "-o", str(tmp_path / "out")]) == 3
+    err = capsys.readouterr().err
+    assert all(name in err for name in LAYOUTS)
+
+
+def test_names_with_new_lines_stay_on_their_line(
+    root: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (root / "rgb/b.png").rename(root / "rgb/b\nb\x1b.png")
+    (root / "sparse/b.png").rename(root / "sparse/b\nb\x1b.png")
+    (root / "rgb/b\nb\x1b.png").write_bytes(b"bad")
+    assert code_of(arguments()) == 7
+    err = capsys.readouterr().err
+    assert "failed: b\\nb\\x1b: drive/rgb/b\\nb\\x1b.png" in err
+    assert "\x1b.png" not in err
+
+
+def test_a_dry_run_lists_what_would_be_done_and_does_nothing(
+    root: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert code_of(arguments("--dry-run", "--limit", "2")) == 0
+    assert capsys.readouterr().out == "a  (new)\nb  (new)\n"
+    assert not Path("out").exists()
+    assert code_of(arguments()) == 0
+    capsys.readouterr()
+    assert code_of(arguments("--dry-run", "--json")) == 0
+    assert json.loads(capsys.readouterr().out) == []
+    assert code_of(arguments("--dry-run", "--json", "--seed", "1")) == 0
+    planned = json.loads(capsys.readouterr().out)
+    assert planned[0] == {"name": "a", "why": "other settings"}
+
+
+def test_neither_a_dry_run_nor_one_with_nothing_to_do_needs_torch(root: Path) -> None:
+    assert code_of(arguments()) == 0
+    code = (
+        "import sys\n"
+        "from pnpdepth_cli.cli.main import main\n"
+        "try:\n    main(sys.argv[1:])\n"
+        "except SystemExit as stop:\n    assert not stop.code, stop.code\n"
+        "assert 'torch' not in sys.modules\n"
+    )
+    for more in ([], ["--dry-run"]):
+        done = subprocess.run(
+            [sys.executable, "-c", code, *arguments(*more)],
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert done.returncode == 0, done.stderr
+        assert "all of them done already" in done.stderr
+
+
+def test_ctrl_c_finishes_the_frame_says_how_to_go_on_and_exits_130(
+    root: Path, tmp_path: Path
+) -> None:
+    slow = root / "net/my_net.py"
+    text = slow.read_text().replace(
+        "        return 2", "        time.sleep(0.02)\n        return 2"
+    )
+    slow.write_text("import time\n" + text)
+    with subprocess.Popen([*PROGRAM, *arguments()], stderr=subprocess.PIPE, text=True) as running:
+        manifest = Path("out/batch.jsonl")
+        until = time.monotonic() + 60
+        while not (manifest.exists() and "begun" in manifest.read_text()):
+            assert time.monotonic() < until
+            time.sleep(0.01)
+        running.send_signal(signal.SIGINT)
+        _, err = running.communicate(timeout=60)
+    assert running.returncode == 130
+    assert "finishing the frame in work" in err
+    assert "of 4 frames; the same command goes on from there" in err.splitlines()[-1]
+    assert "Traceback" not in err
+    states = [json.loads(line)["state"] for line in manifest.read_text().splitlines()]
+    assert states.count("begun") == states.count("done") > 0
+    assert not [p for p in Path("out").iterdir() if p.name[0] == "." and p.suffix != ".lock"]
+    assert code_of(arguments()) == 0
+    resumed = results(Path("out"))
+    Path("out").rename("before")
+    assert code_of(arguments()) == 0
+    assert results(Path("out")) == resumed
+
+
+def test_the_second_ctrl_c_interrupts_and_the_old_handling_comes_back() -> None:
+    before = signal.getsignal(signal.SIGINT)
+    with command._finishing_on_interrupt() as stopped:
+        assert not stopped()
+        os.kill(os.getpid(), signal.SIGINT)
+        assert stopped()
+        with pytest.raises(KeyboardInterrupt):
+            os.kill(os.getpid(), signal.SIGINT)
+    assert signal.getsignal(signal.SIGINT) == before
+
+
+def test_without_a_terminal_there_is_a_line_a_minute(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    now = 0.0
+    monkeypatch.setattr(progress.time, "monotonic", lambda: now)
+    with BatchProgress() as told:
+        told.begin(600)
+        for number in range(300):
+            now += 1.0
+            status = "failed" if number == 10 else "done"
+            told.frame({"name": "x", "status": status, "message": "bad"})
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[0] == "failed: x: bad"
+    assert lines[1] == "60 of 600 frames, 1.0 frames a second, 9 min left, 1 failed"
+    assert len(lines) == 1 + 5
+
+
+def test_on_a_terminal_there_is_a_bar(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
+    with BatchProgress() as told:
+        told.begin(2)
+        told.frame({"name": "x", "status": "failed", "message": "bad"})
+        told.frame({"name": "y", "status": "done", "message": None})
+    err = capsys.readouterr().err
+    assert "failed: x: bad\n" in err
+    assert "2/2" in err
+
+
+@pytest.mark.parametrize(
+    ("seconds", "said"),
+    [(0.4, "0 s"), (29, "29 s"), (90, "2 min"), (3599, "1 h 0 min"), (9000, "2 h 30 min")],
+)
+def test_durations_are_said_shortly(seconds: float, said: str) -> None:
+    assert progress._duration(seconds) == said
+
+
+def test_the_choices_are_those_that_there_are() -> None:
+    assert list(command.LAYOUTS) == list(LAYOUTS)
+    assert list(command.PROTOCOLS) == list(PROTOCOLS)
+
+
+def test_real_frames_of_a_drive_are_told_as_what_they_are(
+    shared_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    given: dict[str, Any] = {"source": str(shared_data / "kitti_dc"), "out": str(tmp_path / "out")}
+    assert code_of(["batch", given["source"], "-o", given["out"], "--limit", "1"]) == 0
+    err = capsys.readouterr().err
+    assert "layout: kitti-depth (guessed; --layout names another): 6 frames, 6 with" in err
+    assert "1 of 6 frames done, 5 pending" in err
+    row = json.loads((tmp_path / "out/summary.json").read_text())["frames"][0]
+    assert row["scores"]["after"]["mae"] < row["scores"]["before"]["mae"]

@@ -1,0 +1,63 @@
+"""The choices of `pnpdepth refine` are those of the method, though it does not import it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from pnpdepth_cli.cli import options
+from pnpdepth_cli.core.losses import LOSSES
+from pnpdepth_cli.core.refine import RefineSettings
+from pnpdepth_cli.core.steps import SCHEDULES
+from pnpdepth_cli.core.updates import UPDATES
+from pnpdepth_cli.errors import UsageError
+from pnpdepth_cli.models.definition import FOREIGN, ModelDefinition, Multiple
+from pnpdepth_cli.pipeline.request import RefineRequest, effective_settings
+from tests.core.networks import UNet
+
+REQUEST = RefineRequest(image=None, sparse=Path("points.npy"))
+STRANGER = ModelDefinition(
+    name="stranger", input_kind="rgb", size=Multiple(8), build=UNet, defaults=FOREIGN
+)
+
+
+def test_the_choices_are_those_of_the_method() -> None:
+    assert tuple(LOSSES) == options.LOSSES
+    assert tuple(UPDATES) == options.UPDATES
+    assert tuple(SCHEDULES) == options.SCHEDULES
+
+
+def test_without_a_word_the_settings_are_the_networks() -> None:
+    settings = effective_settings(STRANGER, REQUEST)
+    for name in ("iterations", "lr", "loss", "update", "schedule", "spread"):
+        assert getattr(settings, name) == getattr(FOREIGN, name)
+    plain = ModelDefinition(name="plain", input_kind="rgb", size=Multiple(8), build=UNet)
+    assert effective_settings(plain, REQUEST) == RefineSettings()
+
+
+def test_another_update_starts_from_the_papers_step() -> None:
+    settings = effective_settings(STRANGER, replace(REQUEST, update="sign"))
+    paper = RefineSettings()
+    assert (settings.lr, settings.schedule, settings.spread) == (0.01, "constant", 0)
+    assert (settings.lr, settings.schedule, settings.spread) == (
+        paper.lr, paper.schedule, paper.spread,
+    )  # fmt: skip
+    assert (settings.iterations, settings.loss) == (FOREIGN.iterations, FOREIGN.loss)
+
+
+def test_what_the_user_says_holds() -> None:
+    asked = replace(
+        REQUEST, update="adam", lr="2%", schedule="linear", spread=0.5, keep_best=True, iterations=3
+    )
+    settings = effective_settings(STRANGER, asked)
+    for name in ("update", "lr", "schedule", "spread", "keep_best", "iterations"):
+        assert getattr(settings, name) == getattr(asked, name)
+    assert effective_settings(STRANGER, replace(REQUEST, spread=0)).spread == 0
+
+
+@pytest.mark.parametrize("spread", [-0.1, float("nan"), float("inf")])
+def test_a_spread_that_is_no_distance_is_refused(spread: float) -> None:
+    with pytest.raises(UsageError, match="no distance"):
+        effective_settings(STRANGER, replace(REQUEST, spread=spread))

@@ -1,0 +1,39 @@
+from __future__ import annotations
+
+import hashlib
+import os
+from pathlib import Path
+
+import pytest
+
+from pnpdepth_cli.errors import InputError
+from pnpdepth_cli.io.fingerprint import fingerprint, is_unchanged
+
+
+def test_a_file_is_known_by_size_time_and_digest(tmp_path: Path) -> None:
+    path = tmp_path / "f"
+    path.write_bytes(b"abc")
+    os.utime(path, ns=(5, 7))
+    known = fingerprint(path)
+    assert (known.size, known.mtime_ns) == (3, 7)
+    assert known.sha256 == hashlib.sha256(b"abc").hexdigest()
+    assert is_unchanged(path, known)
+
+
+def test_a_new_time_alone_is_no_change_new_content_is(tmp_path: Path) -> None:
+    path = tmp_path / "f"
+    path.write_bytes(b"abc")
+    known = fingerprint(path)
+    os.utime(path, ns=(5, 7))
+    assert is_unchanged(path, known)
+    path.write_bytes(b"abd")
+    assert not is_unchanged(path, known)
+    path.write_bytes(b"abcd")
+    assert not is_unchanged(path, known)
+    path.unlink()
+    assert not is_unchanged(path, known)
+
+
+def test_a_file_that_is_not_there_is_said(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="cannot be read"):
+        fingerprint(tmp_path / "no")

@@ -1,0 +1,103 @@
+from __future__ import annotations
+
+import json
+import threading
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pnpdepth_cli.errors import InputError, StorageError
+from pnpdepth_cli.io.journal import Journal
+from tests.io.test_atomic import no_room_on_disk
+
+
+def test_the_newest_line_of_each_key_counts(tmp_path: Path) -> None:
+    journal = Journal(tmp_path / "j.jsonl", "frame")
+    journal.append({"frame": "a", "n": 1})
+    journal.append({"frame": "b", "n": 2})
+    journal.append({"frame": "a", "n": float("nan")})
+    journal.append({"n": 4})
+    for seen in (journal, Journal(tmp_path / "j.jsonl", "frame")):
+        assert seen.keys() == ["a", "b"]
+        assert seen.newest("a") == {"frame": "a", "n": None}
+        assert seen.newest("b") == {"frame": "b", "n": 2}
+        assert seen.newest("c") is None
+        assert seen.lost == 0
+    assert len((tmp_path / "j.jsonl").read_text().splitlines()) == 4
+
+
+def test_a_file_that_is_not_there_is_empty(tmp_path: Path) -> None:
+    assert Journal(tmp_path / "j.jsonl", "frame").keys() == []
+    assert not (tmp_path / "j.jsonl").exists()
+
+
+@given(cut=st.integers(min_value=0, max_value=200))
+def test_cut_anywhere_it_keeps_the_whole_lines_and_goes_on(
+    tmp_path_factory: pytest.TempPathFactory, cut: int
+) -> None:
+    path = tmp_path_factory.mktemp("journal") / "j.jsonl"
+    journal = Journal(path, "frame")
+    for number in range(5):
+        journal.append({"frame": f"f{number}", "text": "x" * number})
+    data = path.read_bytes()[:cut]
+    path.write_bytes(data)
+    torn = Journal(path, "frame")
+    assert torn.keys() == [f"f{n}" for n in range(data.count(b"\n"))]
+    torn.append({"frame": "new"})
+    assert Journal(path, "frame").keys() == [*torn.keys()]
+    assert all(json.loads(line) for line in path.read_text().splitlines())
+
+
+@given(noise=st.binary(max_size=60))
+def test_lines_without_meaning_are_counted_and_passed_over(
+    tmp_path_factory: pytest.TempPathFactory, noise: bytes
+) -> None:
+    path = tmp_path_factory.mktemp("journal") / "j.jsonl"
+    path.write_bytes(b'{"frame": "a"}\n' + noise.replace(b"\n", b"") + b'|\n{"frame": "b"}\n')
+    journal = Journal(path, "frame")
+    assert journal.keys() == ["a", "b"]
+    assert journal.lost == 1
+    assert journal.newest("b") == {"frame": "b"}
+
+
+def test_names_that_are_no_utf_8_come_back(tmp_path: Path) -> None:
+    journal = Journal(tmp_path / "j.jsonl", "frame")
+    journal.append({"frame": "caf\udce9\n"})
+    assert Journal(tmp_path / "j.jsonl", "frame").keys() == ["caf\udce9\n"]
+
+
+def test_a_full_disk_is_said_and_what_was_there_stays(tmp_path: Path) -> None:
+    path = tmp_path / "j.jsonl"
+    journal = Journal(path, "frame")
+    journal.append({"frame": "a"})
+    with no_room_on_disk(), pytest.raises(StorageError, match="cannot be written"):
+        journal.append({"frame": "b", "text": "x" * 100})
+    assert Journal(path, "frame").keys() == ["a"]
+    journal.append({"frame": "c"})
+    assert Journal(path, "frame").keys() == ["a", "c"]
+    assert path.read_text() == '{"frame": "a"}\n{"frame": "c"}\n'
+
+
+def test_threads_may_append_at_once(tmp_path: Path) -> None:
+    journal = Journal(tmp_path / "j.jsonl", "frame")
+
+    def work(name: str) -> None:
+        for number in range(50):
+            journal.append({"frame": f"{name}{number}", "text": name * number})
+
+    threads = [threading.Thread(target=work, args=(name,)) for name in "abcd"]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    again = Journal(tmp_path / "j.jsonl", "frame")
+    assert len(again.keys()) == 200
+    assert again.lost == 0
+    assert all(again.newest(key) == journal.newest(key) for key in again.keys())  # noqa: SIM118
+
+
+def test_a_folder_in_its_place_is_said(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="cannot be read"):
+        Journal(tmp_path, "frame")

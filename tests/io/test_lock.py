@@ -1,0 +1,117 @@
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+from pnpdepth_cli.errors import OutputError, StorageError
+from pnpdepth_cli.io import lock
+from pnpdepth_cli.io.lock import in_turn, locked_folder
+
+HOLDER = """
+import sys, time
+from pathlib import Path
+from pnpdepth_cli.io.lock import locked_folder
+with locked_folder(Path(sys.argv[1]), None, lambda: None):
+    print("held", flush=True)
+    time.sleep(600)
+"""
+
+
+@pytest.fixture(autouse=True)
+def no_long_wait(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(lock, "_CLEANING_S", 0.1)
+
+
+class Alone:
+    """Whether a run was told that nobody else is there."""
+
+    def __init__(self) -> None:
+        self.told = 0
+
+    def __call__(self) -> None:
+        self.told += 1
+
+
+def test_one_run_at_a_time_and_after_it_another(tmp_path: Path) -> None:
+    for _ in range(2):
+        alone = Alone()
+        with locked_folder(tmp_path, None, alone):
+            assert alone.told == 1
+            with (
+                pytest.raises(OutputError, match="another batch writes there; wait for it"),
+                locked_folder(tmp_path, None, Alone()),
+            ):
+                pass
+
+
+def test_shards_of_one_division_run_together_and_only_the_first_is_alone(tmp_path: Path) -> None:
+    first, second = Alone(), Alone()
+    with locked_folder(tmp_path, (1, 3), first), locked_folder(tmp_path, (3, 3), second):
+        assert (first.told, second.told) == (1, 0)
+        for shard in ((1, 3), (3, 3), (1, 2), None):
+            with pytest.raises(OutputError), locked_folder(tmp_path, shard, Alone()):
+                pass
+        with locked_folder(tmp_path, (2, 3), Alone()):
+            pass
+    with locked_folder(tmp_path, (1, 2), Alone()):
+        pass
+
+
+def test_a_shard_waits_for_nobody_who_runs_everything(tmp_path: Path) -> None:
+    with (
+        locked_folder(tmp_path, None, Alone()),
+        pytest.raises(OutputError, match="one without --shard"),
+        locked_folder(tmp_path, (1, 2), Alone()),
+    ):
+        pass
+
+
+def test_the_lock_ends_with_its_process_however_it_ends(tmp_path: Path) -> None:
+    with subprocess.Popen(
+        [sys.executable, "-c", HOLDER, str(tmp_path)], stdout=subprocess.PIPE, text=True
+    ) as holder:
+        assert holder.stdout is not None
+        assert holder.stdout.readline() == "held\n"
+        with pytest.raises(OutputError), locked_folder(tmp_path, None, Alone()):
+            pass
+        os.kill(holder.pid, signal.SIGKILL)
+    with locked_folder(tmp_path, None, Alone()):
+        pass
+
+
+def test_an_error_inside_gives_the_lock_back(tmp_path: Path) -> None:
+    with pytest.raises(ZeroDivisionError), locked_folder(tmp_path, (1, 1), Alone()):
+        raise ZeroDivisionError
+    with locked_folder(tmp_path, None, Alone()):
+        pass
+
+
+def test_a_folder_that_is_not_there_cannot_be_locked(tmp_path: Path) -> None:
+    with pytest.raises(StorageError), locked_folder(tmp_path / "no", None, Alone()):
+        pass
+
+
+def test_in_turn_one_waits_for_the_other(tmp_path: Path) -> None:
+    order: list[str] = []
+    inside = threading.Event()
+
+    def first() -> None:
+        with in_turn(tmp_path):
+            inside.set()
+            time.sleep(0.05)
+            order.append("first")
+
+    thread = threading.Thread(target=first)
+    thread.start()
+    inside.wait()
+    with in_turn(tmp_path):
+        order.append("second")
+    thread.join()
+    assert order == ["first", "second"]
