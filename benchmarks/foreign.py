@@ -1,8 +1,9 @@
 """Public networks on real frames: `python -m benchmarks.foreign --data PATH [--every 4]`.
 
-FastDepth (ONNX) on 7-Scenes with 100 and 500 random points: as it is, aligned in each way, refined
-with the paper's setting at three layers, and with the program's own for foreign networks. Frames
-are a 250/480 resize, its centre 228×304, scaled to the network's 224×224, scored at that size.
+FastDepth (ONNX) on 7-Scenes and two NYU frames with 100 and 500 random points: as it is, aligned in
+each way, refined with the paper's setting at three layers, and with the program's own for foreign
+networks. Frames are a 250/480 resize, its centre 228×304, scaled to the network's 224×224, scored
+at that size; one NYU frame is published in that form.
 nconv and pncnn on KITTI with its own LiDAR, before and after refinement.
 """
 
@@ -28,6 +29,8 @@ from benchmarks.frames import (
 )
 from pnpdepth_cli.core.metrics import score
 from pnpdepth_cli.core.refine import RefineSettings
+from pnpdepth_cli.io.depth import read_depth
+from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.models.definition import Normalisation
 from pnpdepth_cli.models.network import Network, load_network
 
@@ -55,6 +58,19 @@ def as_fastdepth_sees_it(frame: EvalFrame) -> EvalFrame:
     return EvalFrame(
         frame.name, cut(frame.rgb, cv2.INTER_AREA), cut(frame.truth, cv2.INTER_NEAREST)
     )
+
+
+def nyu(data: Path) -> list[EvalFrame]:
+    """The two NYU frames, as FastDepth sees them."""
+    folder = data / "nyu"
+    ready = (np.load(folder / f"{name}.npy").squeeze() for name in ("rgb", "depth"))
+    rgb, truth = (values.astype(np.float32) for values in ready)
+    found = [EvalFrame("nyu", np.ascontiguousarray(rgb), np.ascontiguousarray(truth))]
+    for path in sorted((folder / "metric3d").glob("rgb_*.jpg")):
+        depth = path.with_name(path.name.replace("rgb", "sync_depth")).with_suffix(".png")
+        frame = EvalFrame(path.stem, read_rgb(path).values, read_depth(depth, scale=1000).values)
+        found.append(as_fastdepth_sees_it(frame))
+    return found
 
 
 def ways(network: Network) -> Iterator[tuple[str, str, RefineSettings]]:
@@ -88,8 +104,17 @@ def fastdepth_table(data: Path, every: int, points: list[int]) -> None:
     network = replace(
         network, definition=replace(network.definition, normalisation=Normalisation())
     )
-    frames = [as_fastdepth_sees_it(frame) for frame in list(seven_scenes(data))[::every]]
-    print(f"FastDepth, 7-Scenes, {len(frames)} frames: MAE / RMSE, m\n")
+    sets = {
+        "7-Scenes": [as_fastdepth_sees_it(frame) for frame in list(seven_scenes(data))[::every]],
+        "NYU": nyu(data),
+    }
+    for name, frames in sets.items():
+        print(f"FastDepth, {name}, {len(frames)} frames: MAE / RMSE, m\n")
+        print_rows(network, frames, points)
+        print()
+
+
+def print_rows(network: Network, frames: list[EvalFrame], points: list[int]) -> None:
     print("| | " + " | ".join(f"{count} points" for count in points) + " |")
     print("|---|" + "---|" * len(points))
     for title, layer, settings in ways(network):
@@ -102,7 +127,7 @@ def fastdepth_table(data: Path, every: int, points: list[int]) -> None:
 
 def completion_table(data: Path, every: int) -> None:
     frames = list(kitti_dc(data))[::every]
-    print(f"\nKITTI, {len(frames)} frames, its LiDAR: MAE / RMSE, m\n")
+    print(f"KITTI, {len(frames)} frames, its LiDAR: MAE / RMSE, m\n")
     print("| network, layer | published weights | after the paper's setting |")
     print("|---|---|---|")
     for name, weights in COMPLETION:

@@ -60,8 +60,9 @@ def layers(
         return
     from pnpdepth_cli.cli.tables import print_rows
 
+    apart = "" if found.spacing is None else f", points {found.spacing:.3g} pixels apart"
     print_rows(
-        f"layers of {model}",
+        f"layers of {model}{apart}",
         (
             "layer",
             "z",

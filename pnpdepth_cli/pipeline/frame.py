@@ -102,21 +102,14 @@ def refine_frames(
 ) -> list[RefinedFrame | PnpDepthError]:
     """Frames refined in memory, in one pass of the network; where one has no result, its error.
 
-    BatchError if the network does not take them together, or they differ in size; NoPointsError
-    if the network sees no point of one of them.
+    BatchError if the network does not take them together, or they differ in size.
     """
     with out_of_memory_is_a_device_error(network.device):
         ready = [_ready(network, settings, task) for task in tasks]
+        going = [frame for frame in ready if isinstance(frame, _Ready)]
         with Split(network.module, layer) as split:
-            results = refine_batch(
-                split,
-                _stacked([frame.arguments for frame in ready]),
-                [frame.points for frame in ready],
-                settings,
-                depth_of=[frame.depth_of for frame in ready],
-                on_iteration=lambda iteration, loss: on_iteration(iteration + 1, loss),
-            )
-    return [_finished(frame, result) for frame, result in zip(ready, results, strict=True)]
+            results = iter(_refined(split, settings, going, on_iteration) if going else ())
+    return [_finished(f, next(results)) if isinstance(f, _Ready) else f for f in ready]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -130,11 +123,13 @@ class _Ready:
     depth_of: AlignedDepth
 
 
-def _ready(network: Network, settings: RefineSettings, task: FrameToRefine) -> _Ready:
+def _ready(
+    network: Network, settings: RefineSettings, task: FrameToRefine
+) -> _Ready | NoPointsError:
     frame = FrameMap.fit(network.definition.size, *task.inputs.size)
     points = frame.points_to_network(task.used)
     if not len(points):
-        raise NoPointsError(
+        return NoPointsError(
             f"none of the {len(task.used)} sparse points lies inside the part of the image that"
             f" network {network.definition.name!r} sees (rows and columns {frame.crop})"
         )
@@ -145,6 +140,22 @@ def _ready(network: Network, settings: RefineSettings, task: FrameToRefine) -> _
         arguments=network.arguments(frame, task.inputs.rgb_tensor(), points),
         points=at,
         depth_of=AlignedDepth(network, at, settings.align, every=settings.align_every),
+    )
+
+
+def _refined(
+    split: Split,
+    settings: RefineSettings,
+    frames: Sequence[_Ready],
+    on_iteration: Callable[[int, float], None],
+) -> list[Refinement | PnpDepthError]:
+    return refine_batch(
+        split,
+        _stacked([frame.arguments for frame in frames]),
+        [frame.points for frame in frames],
+        settings,
+        depth_of=[frame.depth_of for frame in frames],
+        on_iteration=lambda iteration, loss: on_iteration(iteration + 1, loss),
     )
 
 

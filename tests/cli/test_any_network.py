@@ -72,6 +72,8 @@ def test_an_onnx_file_is_refined_layers_listed_and_checked(
     rows = json.loads(capsys.readouterr().out)
     assert sorted(row["rank"] for row in rows) == list(range(1, len(rows) + 1))
     assert all(row["seconds_behind"] > 0 for row in rows)
+    assert code_of(["layers", "--model", net, "--sparse", str(frame.sparse)]) == 0
+    assert "pixels apart" in capsys.readouterr().out
     assert code_of(["models", "--check", net, "--image", str(frame.image), "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert set(found["layers"].values()) == {"ok"}
