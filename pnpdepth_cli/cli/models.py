@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
@@ -27,6 +28,7 @@ from pnpdepth_cli.errors import UsageError
 @click.option("--fetch", metavar="ORG/NAME", help="Download a network from Hugging Face.")
 @click.option("--revision", metavar="REV", help="For --fetch: a branch, tag or commit.")
 @click.option("-o", "--output", type=options.FILE, help="For --fetch: the folder.")
+@click.option("--all", "every", is_flag=True, help="List every variant of a network.")
 @options.overwrite
 @options.device
 @options.as_json
@@ -34,6 +36,7 @@ def models(
     check: str | None,
     convert: tuple[Path, Path] | None,
     fetch: str | None,
+    every: bool,
     as_json: bool,
     **given: Any,
 ) -> None:
@@ -63,7 +66,7 @@ def models(
 
         _show(fetch_model(fetch, given["revision"], given["output"]), as_json)
     else:
-        _list(as_json)
+        _list(every, as_json)
 
 
 def _show(found: Mapping[str, Any], as_json: bool) -> None:
@@ -84,10 +87,11 @@ def _show(found: Mapping[str, Any], as_json: bool) -> None:
             click.echo(f"{key}: {value}")
 
 
-def _list(as_json: bool) -> None:
+def _list(every: bool, as_json: bool) -> None:
     from pnpdepth_cli.pipeline.models import list_models
 
     listed = [asdict(model) for model in list_models()]
+    left_out = Counter(model["family"] for model in listed if model["variant"] and not every)
     if as_json:
         click.echo(json.dumps(listed, indent=2))
         return
@@ -108,5 +112,8 @@ def _list(as_json: bool) -> None:
                 f" {model['loss']}, {model['update']}",
             )
             for model in listed
+            if every or not model["variant"]
         ],
     )
+    for family, count in left_out.items():
+        click.echo(f"{family}: {count} more; --all lists them", err=True)

@@ -12,9 +12,14 @@ from pnpdepth_cli.models.registry import find_definition, names
 
 @dataclass(frozen=True, kw_only=True)
 class ListedModel:
-    """One row of the list; the last fields are the defaults of refinement."""
+    """One row of the list; the last fields are the defaults of refinement.
+
+    variant: its family's name alone means another, and no weights of it are shipped.
+    """
 
     name: str
+    family: str
+    variant: bool
     summary: str
     paper: str
     licence: str
@@ -40,9 +45,11 @@ def _listed(name: str) -> ListedModel:
     definition = find_definition(name)
     with torch.device("meta"):  # shapes only: counting needs no memory
         module = definition.build()
-    defaults = definition.defaults
+    defaults, family = definition.defaults, name.partition("-")[0]
     return ListedModel(
         name=definition.name,
+        family=family,
+        variant=definition.checkpoint is None and find_definition(family).name != name,
         summary=definition.summary,
         paper=definition.paper,
         licence=definition.licence,

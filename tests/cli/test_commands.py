@@ -124,6 +124,20 @@ def test_layers_all_lists_every_submodule_and_why_some_cannot_be_cut(
     assert "never runs" in rows["unused"]["problem"]
 
 
+def test_models_lists_the_variants_of_a_network_only_if_asked(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert code_of(["models"]) == 0
+    short = capsys.readouterr()
+    assert "sparse2dense-tiny" in short.out
+    assert "sparse2dense-r18-deconv2" not in short.out
+    assert "sparse2dense: 48 more" in short.err
+    assert code_of(["models", "--all"]) == 0
+    every = capsys.readouterr()
+    assert "sparse2dense-r18-deconv2-d-kitti" in every.out
+    assert "more" not in every.err
+
+
 def test_models_lists_compact_with_its_defaults(capsys: pytest.CaptureFixture[str]) -> None:
     assert code_of(["models", "--json"]) == 0
     listed = {model["name"]: model for model in json.loads(capsys.readouterr().out)}
