@@ -30,9 +30,7 @@ from model_zoo_defs.training.learner import Learner, Schedule, append_row
 from model_zoo_defs.training.recipes import RECIPES, Recipe, Stage, with_start
 from pnpdepth_cli.models.definition import ModelDefinition, Multiple
 
-AVERAGING = (
-    0.99  # the runs are short, and a stage's weights are of no use to the next one's average
-)
+AVERAGING = 0.99  # runs are short, and a stage's weights are of no use to the next one's average
 SETTLING, SETTLED_ON = 1_000_000_000, 48  # the number of a batch no step has, its windows
 COARSER = 0.5  # how much less every next coarser output of a network counts
 

@@ -12,7 +12,7 @@ import pytest
 import torch
 from torch import nn
 
-from model_zoo_defs.training import batches
+from model_zoo_defs.training import batches, recipes
 from pnpdepth_cli.models.definition import ModelDefinition, Multiple
 
 pytest.importorskip("safetensors")
@@ -52,9 +52,12 @@ class Toy(nn.Module):
 
 
 TOY = ModelDefinition(name="toy-tiny", input_kind="rgb", size=Multiple(1), build=Toy)
-RECIPE = tiny.Recipe(
-    loss=tiny.log_error, batch=2, lr=3e-2, half_precision=False, flat={"conv": 0.5},
-    stages=(tiny.Stage(window=(32, 48), shown=(16, 24), until=0.5), tiny.Stage(window=(32, 48))),
+RECIPE = recipes.Recipe(
+    loss=recipes.log_error, batch=2, lr=3e-2, half_precision=False, flat={"conv": 0.5},
+    stages=(
+        recipes.Stage(window=(32, 48), shown=(16, 24), until=0.5),
+        recipes.Stage(window=(32, 48)),
+    ),
 )  # fmt: skip
 
 
@@ -102,8 +105,8 @@ def test_points_are_depths_of_the_window_or_of_what_lies_behind(draw: batches.Po
 
 
 def test_the_logarithm_goes_on_below_the_nearest_depth_and_can_climb_back() -> None:
-    depth = torch.tensor([-1.0, 0.0, tiny.NEAREST, 1.0, 20.0], requires_grad=True)
-    found = tiny.smooth_log(depth)
+    depth = torch.tensor([-1.0, 0.0, recipes.NEAREST, 1.0, 20.0], requires_grad=True)
+    found = recipes.smooth_log(depth)
     assert torch.equal(found[2:], torch.log(depth[2:]))
     assert bool((found.diff() > 0).all())
     (gradient,) = torch.autograd.grad(found.sum(), depth)
@@ -111,14 +114,15 @@ def test_the_logarithm_goes_on_below_the_nearest_depth_and_can_climb_back() -> N
 
 
 LOSSES = (
-    tiny.log_error, tiny.log_error_up_to_scale, tiny.share_of_distance, tiny.inverse_error
+    recipes.log_error, recipes.log_error_up_to_scale,
+    recipes.share_of_distance, recipes.inverse_error,
 )  # fmt: skip
 
 
 @pytest.mark.parametrize("loss", LOSSES)
 def test_a_loss_is_least_for_the_truth_and_blind_to_unknown_depth(loss: Any) -> None:
     truth = torch.from_numpy(np.stack([slope(0), slope(5)]))[:, None]
-    best = truth / 10.0 if loss is tiny.log_error_up_to_scale else truth
+    best = truth / 10.0 if loss is recipes.log_error_up_to_scale else truth
     guess = torch.where(truth > 0, best, 7.0)
     assert loss(guess, truth) == loss(torch.where(truth > 0, best, 70.0), truth)
     noise = 1.0 + 0.05 * torch.randn(truth.shape, generator=torch.Generator().manual_seed(0))
@@ -128,7 +132,7 @@ def test_a_loss_is_least_for_the_truth_and_blind_to_unknown_depth(loss: Any) -> 
 def test_the_loss_up_to_scale_weighs_a_picture_s_scale_a_tenth() -> None:
     truth = torch.from_numpy(slope(0))[None, None]
     guess = torch.where(truth > 0, truth, 1.0) / 10.0
-    found = tiny.log_error_up_to_scale(guess * np.e, truth)
+    found = recipes.log_error_up_to_scale(guess * np.e, truth)
     torch.testing.assert_close(found, torch.tensor(0.1), atol=1e-5, rtol=0)
 
 
@@ -138,13 +142,12 @@ def test_stages_follow_one_another() -> None:
 
 
 def test_a_start_is_what_the_recipe_says() -> None:
-    recipe = replace(RECIPE, quiet=("norm",), dropout=0.25)
-    network = tiny.with_start(nn.ModuleDict({"toy": Toy(), "drop": nn.Dropout(0.5)}), replace(
-        recipe, flat={"toy.conv": 2.0}
-    ))  # fmt: skip
-    assert network["drop"].p == 0.25
-    assert not network["toy"].norm.weight.any()
-    assert bool((network["toy"](torch.rand(1, 3, 8, 8)) == 2.0).all())
+    toy, drop = Toy(), nn.Dropout(0.5)
+    recipe = replace(RECIPE, quiet=("norm",), dropout=0.25, flat={"toy.conv": 2.0})
+    recipes.with_start(nn.ModuleDict({"toy": toy, "drop": drop}), recipe)
+    assert drop.p == 0.25
+    assert not toy.norm.weight.any()
+    assert bool((toy(torch.rand(1, 3, 8, 8)) == 2.0).all())
 
 
 def settings(shards: Path, out: Path, steps: int = 8) -> Any:
