@@ -14,9 +14,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import torch
 from torch import Tensor, nn
 
 from pnpdepth_cli.core.foreign import describe
+from pnpdepth_cli.core.interpolation import linear
+from pnpdepth_cli.core.points import SparsePoints
 from pnpdepth_cli.errors import CheckpointError, ModelError
 from pnpdepth_cli.models.definition import (
     FOREIGN,
@@ -39,6 +42,10 @@ class _Family:
     kind: OutputKind
     scale: OutputScale
     of: int = 1
+
+
+PROMPT_SIZE = (192, 256)
+"""Rows and columns of the depth that Prompt Depth Anything was trained with, a phone's LiDAR."""
 
 
 _FAMILIES = {
@@ -65,11 +72,11 @@ def hf_definition(folder: Path) -> ModelDefinition:
     if config.get("depth_estimation_type") == "metric":
         family = _Family("depth", "metric", family.of)
     processing = _json(folder / "preprocessor_config.json", "it says how the picture is prepared")
-    weights = _weights(folder)
+    weights, prompted = _weights(folder), kind == "prompt_depth_anything"
     return ModelDefinition(
         name=folder.resolve().name,
         summary=f"Hugging Face {kind}",
-        input_kind="rgb",
+        input_kind="rgb+sparse" if prompted else "rgb",
         size=_size(processing, family.of, folder),
         normalisation=_normalisation(processing, folder),
         output_kind=family.kind,
@@ -77,9 +84,23 @@ def hf_definition(folder: Path) -> ModelDefinition:
         build=lambda: _build(folder),
         complete=True,
         checkpoint=weights,
+        arguments=_with_prompt if prompted else None,
         output=_predicted_depth,
         defaults=FOREIGN,
     )
+
+
+def _with_prompt(rgb: Tensor | None, sparse: Tensor | None) -> tuple[Tensor, ...]:
+    """The picture and coarse dense depth (1, 1, 192, 256): the points, joined linearly."""
+    assert rgb is not None
+    assert sparse is not None
+    rows, columns = torch.nonzero(sparse[0, 0], as_tuple=True)
+    points = SparsePoints(
+        xy=torch.stack([columns, rows], dim=1).float(),
+        depth=sparse[0, 0, rows, columns],
+        size=(sparse.shape[-2], sparse.shape[-1]),
+    )
+    return rgb, linear(points.in_frame(*PROMPT_SIZE))[None, None].to(sparse)
 
 
 def _predicted_depth(output: Any) -> Tensor:

@@ -38,6 +38,23 @@ def depth_anything(kind: str = "relative") -> Any:
     return transformers.DepthAnythingForDepthEstimation(config)
 
 
+def prompt_depth_anything() -> Any:
+    config = transformers.PromptDepthAnythingConfig(
+        backbone_config=transformers.Dinov2Config(**DINO), reassemble_hidden_size=24,
+        head_hidden_size=8, depth_estimation_type="metric", max_depth=20, patch_size=14, **NECK,
+    )  # fmt: skip
+    return lively(transformers.PromptDepthAnythingForDepthEstimation(config), 0.1)
+
+
+def lively(made: Any, deviation: float = 0.3) -> Any:
+    """As initialised, the output does not depend on the picture."""
+    with torch.no_grad():
+        for parameter in made.parameters():
+            if parameter.ndim > 1:
+                parameter.normal_(std=deviation)
+    return made
+
+
 def dpt() -> Any:
     config = transformers.DPTConfig(
         hidden_size=24, num_hidden_layers=4, num_attention_heads=2, intermediate_size=32,
@@ -58,12 +75,7 @@ def zoedepth() -> Any:
         bin_configurations=[{"n_bins": 8, "min_depth": 0.001, "max_depth": 10, "name": "nyu"}],
         **NECK,
     )  # fmt: skip
-    made = transformers.ZoeDepthForDepthEstimation(config)
-    with torch.no_grad():  # as initialised, its bins do not depend on the picture
-        for parameter in made.parameters():
-            if parameter.ndim > 1:
-                parameter.normal_(std=0.3)
-    return made
+    return lively(transformers.ZoeDepthForDepthEstimation(config))
 
 
 def glpn() -> Any:
@@ -97,6 +109,11 @@ NETWORKS: dict[str, tuple[Any, dict[str, Any], tuple[str, str]]] = {
         depth_anything,
         {**IMAGENET, **ASPECT, "size": {"height": 56, "width": 56}, "ensure_multiple_of": 14},
         ("inverse", "affine"),
+    ),
+    "prompt_depth_anything": (
+        prompt_depth_anything,
+        {**IMAGENET, **ASPECT, "size": {"height": 56, "width": 56}, "ensure_multiple_of": 14},
+        ("depth", "metric"),
     ),
     "dpt": (dpt, {**HALF, "size": {"height": 64, "width": 64}}, ("unknown", "affine")),
     "zoedepth": (
@@ -156,6 +173,18 @@ def test_a_folder_loads_lists_layers_and_refines_without_network_access(
     assert not torch.equal(result.before, result.after)
     assert min(result.losses[1:]) < result.losses[0]
     assert bool((result.after > 0).all())
+
+
+def test_prompt_depth_anything_is_given_the_points_as_coarse_dense_depth(tmp_path: Path) -> None:
+    definition = hf_definition(saved(tmp_path / "p", "prompt_depth_anything"))
+    assert definition.input_kind == "rgb+sparse"
+    sparse = torch.zeros(1, 1, 384, 512)  # twice the prompt's size: a plane that rises to the right
+    for row, column in ((0, 0), (0, 511), (383, 0), (383, 511), (100, 300)):
+        sparse[0, 0, row, column] = 1 + column / 511
+    _, prompt = definition.call_arguments(torch.rand(1, 3, 384, 512), sparse)
+    assert prompt.shape == (1, 1, 192, 256)
+    rising = 1 + (2 * torch.arange(256) + 0.5) / 511
+    assert torch.allclose(prompt[0, 0, 1:-1, 1:-1], rising[1:-1].expand(190, -1), atol=1e-3)
 
 
 def test_a_metric_depth_anything_gives_depth_in_metres(tmp_path: Path) -> None:
