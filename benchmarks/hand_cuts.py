@@ -41,7 +41,7 @@ def eigen_rear(network: Eigen, z: Tensor, features: Tensor) -> Tensor:
 
 def fcrn_front(network: FCRN, rgb: Tensor) -> Any:
     """`layer1_BN`; nothing stays."""
-    x = fcrn.max_pool_same(F.relu(network.bn_conv1(network.conv1(rgb))))
+    x = network.pool(network.relu(network.bn_conv1(network.conv1(rgb))))
     for name in network.trunk:
         x = network.get_submodule(name)(x)
     return network.layer1_BN(network.layer1(x)), ()

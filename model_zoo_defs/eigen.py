@@ -20,7 +20,6 @@ from functools import partial
 from pathlib import Path
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 
 from pnpdepth_cli.models.definition import (
@@ -62,14 +61,15 @@ class Coarse(nn.Module):
         self.conv5 = nn.Conv2d(four, five, 3, stride=2)
         self.fc1 = nn.Linear(five * deep_size(size[0]) * deep_size(size[1]), hidden)
         self.fc2 = nn.Linear(hidden, self.size[0] * self.size[1])
+        self.relu, self.pool = nn.ReLU(), nn.MaxPool2d(2)
         self.dropout = nn.Dropout(0.5)
 
     def forward(self, rgb: Tensor) -> Tensor:
-        x = F.max_pool2d(F.relu(self.conv1(rgb)), 2)
-        x = F.max_pool2d(F.relu(self.conv2(x)), 2)
-        x = F.relu(self.conv4(F.relu(self.conv3(x))))
-        x = F.relu(self.conv5(x)).flatten(1)
-        x = self.fc2(self.dropout(F.relu(self.fc1(x))))
+        x = self.pool(self.relu(self.conv1(rgb)))
+        x = self.pool(self.relu(self.conv2(x)))
+        x = self.relu(self.conv4(self.relu(self.conv3(x))))
+        x = self.relu(self.conv5(x)).flatten(1)
+        x = self.fc2(self.dropout(self.relu(self.fc1(x))))
         y: Tensor = x.reshape(-1, 1, *self.size)
         return y
 
@@ -82,10 +82,11 @@ class Fine(nn.Module):
         self.conv1 = nn.Conv2d(3, channels - 1, 9, stride=2)
         self.conv2 = nn.Conv2d(channels, channels, 5, padding=2)
         self.conv3 = nn.Conv2d(channels, 1, 5, padding=2)
+        self.relu, self.pool = nn.ReLU(), nn.MaxPool2d(2)
 
     def forward(self, rgb: Tensor, coarse: Tensor) -> Tensor:
-        x = F.max_pool2d(F.relu(self.conv1(rgb)), 2)
-        x = F.relu(self.conv2(torch.cat([x, coarse], dim=1)))
+        x = self.pool(self.relu(self.conv1(rgb)))
+        x = self.relu(self.conv2(torch.cat([x, coarse], dim=1)))
         y: Tensor = self.conv3(x)
         return y
 

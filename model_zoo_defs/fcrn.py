@@ -50,10 +50,12 @@ def same_padding(length: int, kernel: int, stride: int) -> tuple[int, int]:
     return missing // 2, missing - missing // 2
 
 
-def max_pool_same(x: Tensor) -> Tensor:
+class MaxPoolSame(nn.Module):
     """The largest of 3 x 3 at stride 2, padded as SAME."""
-    rows, columns = (same_padding(length, 3, 2) for length in x.shape[-2:])
-    return F.max_pool2d(F.pad(x, (*columns, *rows), value=-torch.inf), 3, 2)
+
+    def forward(self, x: Tensor) -> Tensor:
+        rows, columns = (same_padding(length, 3, 2) for length in x.shape[-2:])
+        return F.max_pool2d(F.pad(x, (*columns, *rows), value=-torch.inf), 3, 2)
 
 
 class Bottleneck(nn.Module):
@@ -130,6 +132,7 @@ class FCRN(nn.Module):
         super().__init__()
         self.conv1 = nn.Conv2d(3, width, 7, stride=2, padding=3)
         self.bn_conv1 = batch_norm(width)
+        self.relu, self.pool = nn.ReLU(), MaxPoolSame()
         channels = width
         self.trunk: list[str] = []
         for stage, (name, count) in enumerate(BLOCKS.items()):
@@ -150,7 +153,7 @@ class FCRN(nn.Module):
         self.ConvPred.bias = nn.Parameter(torch.full((1,), 2.0))  # at 0 m the ReLU may stay shut
 
     def forward(self, rgb: Tensor) -> Tensor:
-        x = max_pool_same(F.relu(self.bn_conv1(self.conv1(rgb))))
+        x = self.pool(self.relu(self.bn_conv1(self.conv1(rgb))))
         for name in self.trunk:
             x = self.get_submodule(name)(x)
         x = self.layer1_BN(self.layer1(x))

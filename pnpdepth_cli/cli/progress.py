@@ -72,7 +72,7 @@ class BatchProgress:
         rate = self.done / spent_s
         left = _duration((self.to_do - self.done) / rate)
         failed = f", {self._failed:,} failed" if self._failed else ""
-        pace = f"{1 / rate:.2g} s a frame" if rate < 1 else f"{rate:.1f} frames a second"
+        pace = f"{1 / rate:.1f} s a frame" if rate < 1 else f"{rate:.1f} frames a second"
         return f"{self.done:,} of {self.to_do:,} frames, {pace}, {left} left{failed}"
 
 

@@ -18,9 +18,9 @@ from torch import Tensor
 from model_zoo_defs.fcrn import (
     FCRN,
     Bottleneck,
+    MaxPoolSame,
     Unpooling,
     definitions,
-    max_pool_same,
     read_authors,
     same_padding,
 )
@@ -303,12 +303,12 @@ def test_same_padding_is_tensorflows(
 @pytest.mark.parametrize("size", [(6, 8), (7, 9), (6, 9), (2, 2), (1, 5)])
 def test_the_pooling_is_that_of_a_loop_over_windows(size: tuple[int, int]) -> None:
     x = torch.randn(1, 2, *size, generator=torch.Generator().manual_seed(0))
-    assert torch.equal(max_pool_same(x), pooled_by_loop(x))
+    assert torch.equal(MaxPoolSame()(x), pooled_by_loop(x))
 
 
 def test_at_even_sizes_that_is_not_torchs_pooling() -> None:
     x = torch.arange(36.0).reshape(1, 1, 6, 6)
-    assert not torch.equal(max_pool_same(x), F.max_pool2d(x, 3, 2, 1))
+    assert not torch.equal(MaxPoolSame()(x), F.max_pool2d(x, 3, 2, 1))
 
 
 def test_an_unpooling_is_zero_insertion_and_a_5x5_convolution_but_for_swapped_neighbours() -> None:
