@@ -10,11 +10,12 @@ instead: NYU Depth v2 as .h5 or the official .mat; KITTI odometry or depth compl
 network (`pnpdepth models`): fcrn.npy, sfmlearner.pth.tar, sparse2dense-r18-upproj-kitti.pth.tar,
 eigen/ with its two files.
 
-Each network: as it is, refined at the paper's setting (sign, α = 0.01, K = 5, L1, the paper's z),
-and with its definition's defaults. Points are drawn per frame by its number: all networks with as
-many points get the same. Each measure is taken per frame and averaged, over those pixels with
-known truth where all three depths are positive; `coverage` says which share that is. A network
-that knows depth up to scale is scaled by the points, once, for before and after alike.
+Each network: as it is, refined at the paper's setting (sign, α = 0.01, K = 5, L1, the paper's z)
+and with its definition's defaults; beside it, the points interpolated linearly without any network.
+Points are drawn per frame by its number: all networks with as many points get the same. Measures
+are averaged over frames, each over the pixels with known truth where all depths are positive;
+`coverage` says which share that is. A network that knows depth up to scale is given the factor that
+fits the points, once for before and after alike.
 """
 
 from __future__ import annotations
@@ -37,15 +38,8 @@ from tqdm import tqdm
 from benchmarks.frames import Depth, frame_inputs, refined
 from benchmarks.paper_figures import FINE_THRESHOLDS, MEASURES, ROWS, SETTING, PaperRow, networks_of
 from benchmarks.paper_report import markdown, plot
-from benchmarks.paper_sets import (
-    ROOMS,
-    STREETS,
-    FrameSet,
-    TableFrame,
-    data_set,
-    rendered,
-    shared,
-)
+from benchmarks.paper_sets import ROOMS, STREETS, FrameSet, TableFrame, data_set, rendered, shared
+from pnpdepth_cli.core.interpolation import linear
 from pnpdepth_cli.core.metrics import score
 from pnpdepth_cli.core.refine import RefineSettings
 from pnpdepth_cli.errors import CheckpointError, PnpDepthError, UsageError
@@ -73,10 +67,12 @@ class Entry:
 
 
 def entry_of(row: PaperRow, network: Network) -> Entry:
-    """The network at the paper's setting and with its own defaults."""
+    """The network at the paper's setting and with its own defaults, aligned alike in both."""
     definition = network.definition
-    tuned = effective_settings(definition, RefineRequest(image=None, sparse=None))
-    paper = replace(SETTING, align=definition.default_alignment)
+    # One factor, as in the evaluation of networks that know depth up to one; "auto" might take two.
+    align = "scale" if definition.output_scale == "scale" else definition.default_alignment
+    request = RefineRequest(image=None, sparse=None, align=align)
+    tuned, paper = effective_settings(definition, request), replace(SETTING, align=align)
     settings = {"paper": (row.layer, paper), "tuned": (layer_name(definition, None), tuned)}
     return Entry(row=row, network=network, settings=settings)
 
@@ -113,7 +109,8 @@ def frame_figures(entry: Entry, frame: TableFrame, number: int) -> dict[str, Any
     )
     # A step of 100 % is what the engine takes for the standard deviation of z_0.
     spread = refined(entry.network, layer, replace(paper, iterations=0, lr="100%"), inputs)
-    depths = {"before": results["paper"].before} | {n: r.after for n, r in results.items()}
+    depths = {"linear": linear(points).numpy(), "before": results["paper"].before}
+    depths |= {state: result.after for state, result in results.items()}
     scores, coverage = scores_of(depths, frame.truth)
     return {
         "points": len(points),
