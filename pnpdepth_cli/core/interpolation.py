@@ -1,8 +1,9 @@
 """Dense depth from sparse points alone: what a network has to beat.
 
-All take points at any coordinates and give depth (H, W) float32 of their frame, positive
-everywhere; of points at one place the nearest counts, and the order of the points does not. Any
-number of points has an answer, down to one, whose depth is everywhere. NoPointsError without any.
+All take points at any coordinates and give depth (H, W) float32 of their frame, or with `places`
+(M, 2) depth (M,) at those pixel coordinates, positive everywhere; of points at one place the
+nearest counts, and the order of the points does not. Any number of points has an answer, down to
+one, whose depth is everywhere. NoPointsError without any.
 """
 
 from __future__ import annotations
@@ -27,14 +28,14 @@ _AT_A_POINT = 0.25  # pixels; closer than this, a point is as close as can be
 _BLUR_SIGMA = 1.1  # pixels; what OpenCV makes of the 5 × 5 Gaussian kernel of the paper's code
 
 
-def nearest(points: SparsePoints) -> Tensor:
+def nearest(points: SparsePoints, places: Tensor | None = None) -> Tensor:
     """Each pixel has the depth of the point nearest in the picture."""
     points = distinct(points)
-    _, number = nearest_points(points, _pixels(points.size), 1)
-    return points.depth[number[:, 0].to(points.depth.device)].reshape(points.size)
+    _, number = nearest_points(points, _places(points, places), 1)
+    return _shaped(points.depth.cpu()[number[:, 0]], points, places)
 
 
-def linear(points: SparsePoints, *, space: str = "depth") -> Tensor:
+def linear(points: SparsePoints, places: Tensor | None = None, *, space: str = "depth") -> Tensor:
     """Each pixel is interpolated linearly in its Delaunay triangle of points.
 
     The nearest point's depth outside the points' hull, and everywhere if all are on one line.
@@ -44,7 +45,7 @@ def linear(points: SparsePoints, *, space: str = "depth") -> Tensor:
     from scipy.spatial import QhullError
 
     points = distinct(points)
-    pixels = _pixels(points.size)
+    pixels = _places(points, places)
     dense = torch.full((len(pixels),), torch.nan, dtype=torch.float64)
     if len(points) >= 3:
         value = to_space(points.depth.double().cpu(), space)
@@ -56,11 +57,12 @@ def linear(points: SparsePoints, *, space: str = "depth") -> Tensor:
     outside = dense.isnan()
     _, number = nearest_points(points, pixels[outside], 1)
     dense[outside] = points.depth.double().cpu()[number[:, 0]]
-    return dense.float().reshape(points.size).to(points.depth.device)
+    return _shaped(dense, points, places)
 
 
 def inverse_distance(
     points: SparsePoints,
+    places: Tensor | None = None,
     *,
     neighbours: int = IDW_NEIGHBOURS,
     power: float = IDW_POWER,
@@ -73,14 +75,12 @@ def inverse_distance(
     """
     points = distinct(points)
     value = to_space(points.depth.double().cpu(), space)
-    pixels, means = _pixels(points.size), []
-    for first in range(0, len(pixels), _IDW_PIXELS):
-        places = pixels[first : first + _IDW_PIXELS]
-        distance, number = nearest_points(points, places, min(neighbours, len(points)))
+    pixels, means = _places(points, places), []
+    for some in torch.split(pixels, _IDW_PIXELS):
+        distance, number = nearest_points(points, some, min(neighbours, len(points)))
         weight = distance.clamp_min(_AT_A_POINT).pow(-power)
         means.append((weight * value[number]).sum(dim=1) / weight.sum(dim=1))
-    dense = from_space(torch.cat(means), space)
-    return dense.float().reshape(points.size).to(points.depth.device)
+    return _shaped(from_space(torch.cat(means), space), points, places)
 
 
 def morphological(points: SparsePoints) -> Tensor:
@@ -127,10 +127,18 @@ def distinct(points: SparsePoints) -> SparsePoints:
     )
 
 
-def _pixels(size: tuple[int, int]) -> Tensor:
-    """(H·W, 2) float64: x and y of every pixel, row after row."""
-    rows, columns = (torch.arange(n, dtype=torch.float64) for n in size)
+def _places(points: SparsePoints, places: Tensor | None) -> Tensor:
+    """(M, 2) float64: x and y of the places, or of every pixel of the frame, row after row."""
+    if places is not None:
+        return places.double().cpu()
+    rows, columns = (torch.arange(n, dtype=torch.float64) for n in points.size)
     return torch.cartesian_prod(rows, columns).flip(1)
+
+
+def _shaped(values: Tensor, points: SparsePoints, places: Tensor | None) -> Tensor:
+    """The values (M,) as the depth that was asked for, where the points are."""
+    shape = points.size if places is None else (len(places),)
+    return values.float().reshape(shape).to(points.depth.device)
 
 
 def nearest_points(points: SparsePoints, places: Tensor, count: int) -> tuple[Tensor, Tensor]:

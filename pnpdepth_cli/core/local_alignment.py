@@ -42,12 +42,15 @@ _DOUBT = 1e-6  # what a point that is not believed counts where no other is near
 _NORMAL_MEDIAN = 1.4826  # standard deviation over median of |x|, normal errors
 
 
-def locally_aligned(prediction: Tensor, points: SparsePoints, *, space: str = "depth") -> Tensor:
+def locally_aligned(
+    prediction: Tensor, points: SparsePoints, places: Tensor | None = None, *, space: str = "depth"
+) -> Tensor:
     """Depth (H, W) float32: the prediction, near points as they say, else as the network has it.
 
     prediction: (H, W) depth, metric or not; what is not positive and finite is unknown, and so is
-    the result there (0). space: in which of `alignment.SPACES` the lines are fitted. Never nearer
-    or farther than a global alignment's bounds. NoPointsError if no point has a prediction.
+    the result there (0). places: (M, 2) pixel coordinates where the depth (M,) is wanted, in place
+    of all pixels. space: in which of `alignment.SPACES` the lines are fitted. Never nearer or
+    farther than a global alignment's bounds. NoPointsError if no point has a prediction.
     """
     device, prediction, points = prediction.device, prediction.detach().cpu(), points.to("cpu")
     known, points = where_predicted(prediction, points)
@@ -60,7 +63,11 @@ def locally_aligned(prediction: Tensor, points: SparsePoints, *, space: str = "d
     z, z_at_points = ((y - at_points.mean()) / spread for y in (start, at_points))
     missing = to_space(points.depth.double(), space) - at_points
     trusted = trust(points, points.depth.double().log() - reading.depth(at_points).log())
-    shift, slope = _lines(points, missing, z_at_points, trusted)
+    if places is not None:
+        there = SparsePoints(xy=places.cpu(), depth=torch.ones(len(places)), size=points.size)
+        known = there.sample(torch.where(known, 1.0, torch.nan)).isfinite()
+        start, z = there.sample(start), there.sample(z)
+    shift, slope = _lines(points, places, missing, z_at_points, trusted)
     depth = reading.depth(start + shift + slope * z)
     return torch.where(known, depth, 0.0).float().to(device)
 
@@ -81,9 +88,11 @@ def trust(points: SparsePoints, missing: Tensor) -> Tensor:
 
 
 def _lines(
-    points: SparsePoints, missing: Tensor, z: Tensor, trusted: Tensor
+    points: SparsePoints, places: Tensor | None, missing: Tensor, z: Tensor, trusted: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Shift and slope (H, W) of the line through missing (N,) over z (N,) around every pixel."""
+    """Shift and slope of the line through missing (N,) over z (N,) around every place or pixel."""
+    if places is not None:
+        return _lines_at(places.double().cpu(), points, missing, z, trusted)
     height, width = points.size
     step = math.ceil(math.sqrt(height * width / _NODES))
     rows, columns = (
@@ -91,6 +100,17 @@ def _lines(
         for n in points.size
     )
     nodes = torch.cartesian_prod(rows, columns).flip(1)
+    lines = torch.stack(_lines_at(nodes, points, missing, z, trusted))
+    lines = lines.reshape(1, 2, len(rows), len(columns))
+    if step > 1:
+        lines = F.interpolate(lines, points.size, mode="bilinear", align_corners=True)
+    return lines[0, 0], lines[0, 1]
+
+
+def _lines_at(
+    nodes: Tensor, points: SparsePoints, missing: Tensor, z: Tensor, trusted: Tensor
+) -> tuple[Tensor, Tensor]:
+    """The same, (M,), around nodes (M, 2)."""
     distance, near = nearest_points(points, nodes, min(NEIGHBOURS, len(points)))
     weight = distance.clamp_min(_AT_A_POINT).pow(-POWER)
     weight = weight / weight.sum(dim=1, keepdim=True) * (trusted[near] + _DOUBT)
@@ -100,8 +120,4 @@ def _lines(
     slope = (weight * (z - mean_z) * (missing - mean)).sum(dim=1, keepdim=True) / (
         (weight * (z - mean_z).square()).sum(dim=1, keepdim=True) + RIDGE
     )
-    lines = torch.cat([mean - slope * mean_z, slope], dim=1).t()
-    lines = lines.reshape(1, 2, len(rows), len(columns))
-    if step > 1:
-        lines = F.interpolate(lines, points.size, mode="bilinear", align_corners=True)
-    return lines[0, 0], lines[0, 1]
+    return (mean - slope * mean_z)[:, 0], slope[:, 0]

@@ -72,3 +72,14 @@ def test_each_alignment_restores_the_prediction_it_is_made_for(name, prediction)
     depth = truth()
     dense = BASELINES[name].depth(seen(depth), prediction(depth))
     assert torch.allclose(dense, depth, rtol=1e-3)
+
+
+@pytest.mark.parametrize("name", BASELINES)
+def test_depth_at_places_is_the_dense_depth_there(name: str) -> None:
+    points, prediction = seen(truth()), truth() / 3
+    prediction[:4, :4] = 0
+    rows, columns = torch.meshgrid(torch.arange(0, 30, 3), torch.arange(0, 40, 3), indexing="ij")
+    places = torch.stack([columns.flatten(), rows.flatten()], dim=1).float()
+    dense = BASELINES[name].depth(points, prediction)
+    there = BASELINES[name].at(places, points, prediction)
+    assert torch.equal(there, dense[rows.flatten(), columns.flatten()])
