@@ -26,6 +26,8 @@ COMMANDS = {
     "simulate": "simulate:simulate",
     "eval": "evaluate:evaluate",
     "compare": "compare:compare",
+    "sweep": "sweep:sweep",
+    "bench": "bench:bench",
 }
 """The subcommands in the order of the help: where each is below `pnpdepth_cli.cli`."""
 

@@ -19,10 +19,11 @@ _LINE_EVERY_S = 60.0
 
 
 class BatchProgress:
-    """Tells on stderr what happens; done, to_do: how many frames."""
+    """Tells on stderr what happens; done, failed, to_do: how many frames, or what `unit` says."""
 
-    def __init__(self) -> None:
-        self.done = self.to_do = self._failed = 0
+    def __init__(self, name: str = "batch", unit: str = "frame") -> None:
+        self._name, self._unit = name, unit
+        self.done = self.to_do = self.failed = 0
         self._bar: tqdm[Any] | None = None
 
     def __enter__(self) -> BatchProgress:
@@ -52,18 +53,22 @@ class BatchProgress:
         if sys.stderr.isatty():
             from tqdm import tqdm
 
-            self._bar = tqdm(total=to_do, desc="batch", unit="frame", dynamic_ncols=True)
+            self._bar = tqdm(total=to_do, desc=self._name, unit=self._unit, dynamic_ncols=True)
 
     def frame(self, row: Mapping[str, Any]) -> None:
         """One of them is done, or has failed."""
-        self.done += 1
         if row["status"] != "done":
-            self._failed += row["status"] == "failed"
             self.say(f"{row['status']}: {row['name']}: {row['message']}")
+        self.advance(failed=row["status"] == "failed")
+
+    def advance(self, *, failed: bool) -> None:
+        """One more is done."""
+        self.done += 1
+        self.failed += failed
         if self._bar is not None:
             self._bar.update()
-            if self._failed:
-                self._bar.set_postfix_str(f"{self._failed:,} failed")
+            if self.failed:
+                self._bar.set_postfix_str(f"{self.failed:,} failed")
         elif time.monotonic() - self._told >= _LINE_EVERY_S:
             self._told = time.monotonic()
             self.say(self._line(self._told - self._began))
@@ -71,9 +76,10 @@ class BatchProgress:
     def _line(self, spent_s: float) -> str:
         rate = self.done / spent_s
         left = _duration((self.to_do - self.done) / rate)
-        failed = f", {self._failed:,} failed" if self._failed else ""
-        pace = f"{1 / rate:.1f} s a frame" if rate < 1 else f"{rate:.1f} frames a second"
-        return f"{self.done:,} of {self.to_do:,} frames, {pace}, {left} left{failed}"
+        failed = f", {self.failed:,} failed" if self.failed else ""
+        unit = self._unit
+        pace = f"{1 / rate:.1f} s a {unit}" if rate < 1 else f"{rate:.1f} {unit}s a second"
+        return f"{self.done:,} of {self.to_do:,} {unit}s, {pace}, {left} left{failed}"
 
 
 def _duration(seconds: float) -> str:

@@ -11,7 +11,13 @@ from __future__ import annotations
 from pnpdepth_cli.sensors.camera import Camera
 from pnpdepth_cli.sensors.lidar import FORWARD_LEFT_UP, LIDARS, Lidar
 from pnpdepth_cli.sensors.occlusion import OcclusionFilter
-from pnpdepth_cli.sensors.samplers import PATTERNS, SampleNoise, SamplePattern, sample_points
+from pnpdepth_cli.sensors.samplers import (
+    PATTERNS,
+    SampleNoise,
+    SamplePattern,
+    disturbed,
+    sample_points,
+)
 from pnpdepth_cli.sensors.simulate import SimulationSettings, simulate_lidar
 from pnpdepth_cli.sensors.sparse import SparseDepth, as_picture
 from pnpdepth_cli.sensors.velodyne import ProjectedScan, ProjectionSettings, project_velodyne
@@ -30,6 +36,7 @@ __all__ = [
     "SimulationSettings",
     "SparseDepth",
     "as_picture",
+    "disturbed",
     "project_velodyne",
     "sample_points",
     "simulate_lidar",

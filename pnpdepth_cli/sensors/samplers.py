@@ -100,8 +100,12 @@ def sample_points(
     if not chosen.size:
         raise NoPointsError(f"pattern {pattern.kind!r} leaves no point; ask for more")
     row, column = np.divmod(chosen, depth.shape[1])
-    xy = np.stack([column, row], axis=1).astype(np.float64)
-    return _disturbed(xy, depth.ravel()[chosen].astype(np.float64), depth, noise, rng)
+    points = SparseDepth(
+        xy=np.stack([column, row], axis=1).astype(np.float32),
+        depth=depth.ravel()[chosen].astype(np.float32),
+        size=(depth.shape[0], depth.shape[1]),
+    )
+    return disturbed(points, noise or SampleNoise(), rng)
 
 
 def _uniform(
@@ -245,15 +249,13 @@ PATTERNS: dict[str, Sampler] = {
 """The patterns that can be named: row-major indices of the pixels each keeps."""
 
 
-def _disturbed(
-    xy: NDArray[np.float64],
-    values: NDArray[np.float64],
-    depth: Depth,
-    noise: SampleNoise | None,
-    rng: np.random.Generator,
-) -> SparseDepth:
-    noise = noise or SampleNoise()
-    height, width = depth.shape
+def disturbed(points: SparseDepth, noise: SampleNoise, rng: np.random.Generator) -> SparseDepth:
+    """The points with noise; those that it makes impossible or moves out of the picture are gone.
+
+    NoPointsError if that is all of them.
+    """
+    xy, values = points.xy.astype(np.float64), points.depth.astype(np.float64)
+    height, width = points.size
     low, high = values.min(), values.max()
     if noise.metres > 0:
         values = values + rng.normal(0, noise.metres, len(values))

@@ -1,0 +1,174 @@
+from __future__ import annotations
+
+import csv
+import json
+import re
+from pathlib import Path
+
+import click
+import pytest
+
+from pnpdepth_cli.cli import options
+from pnpdepth_cli.cli.main import main
+from pnpdepth_cli.cli.sweep import sweep
+from pnpdepth_cli.pipeline.sweep_axes import PARAMETERS
+from tests.pipeline.batches import pairs_on_disk
+
+
+@pytest.fixture
+def root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    return pairs_on_disk(tmp_path / "drive", ("a", "b"))
+
+
+def arguments(*more: str, source: str = "drive") -> list[str]:
+    return [
+        "sweep", source, "-o", "out", "--model", "drive/net/my_net.py",
+        "--checkpoint", "drive/net/my_net.safetensors", *more,
+    ]  # fmt: skip
+
+
+def code_of(given: list[str]) -> int:
+    with pytest.raises(SystemExit) as stop:
+        main(given)
+    return int(stop.value.code or 0)
+
+
+def test_a_sweep_prints_a_table_a_study_and_says_what_it_wrote(
+    root: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    vary = ("--one-by-one", "--vary", "points=20,60", "--vary", "loss=l1,l2", "--seeds", "2")
+    assert code_of(arguments(*vary)) == 0
+    out, err = capsys.readouterr()
+    titles = [line for line in out.splitlines() if "means over frames" in line]
+    assert [title.split(":")[0] for title in titles] == ["points", "loss"]
+    assert re.search(r"^ 20 +20 +2 +0\.\d{4}", out, re.MULTILINE)
+    assert "points: the frames' own; --sample says otherwise" in err
+    assert "2 frames, 22 runs: 0 done already, 22 to do" in err
+    last = err.splitlines()[-1]
+    assert last.startswith("wrote out/sweep.csv")
+    for written in last.removeprefix("wrote ").split():
+        assert Path(written).stat().st_size > 0
+    assert code_of(arguments(*vary)) == 0
+    again, err = capsys.readouterr()
+    assert again == out
+    assert "22 done already, 0 to do" in err
+
+
+def test_json_prints_what_is_in_the_file_and_the_csv_has_the_same_cells(
+    root: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    vary = ("--vary", "iterations=0,2", "--vary", "update=sign,adam", "--no-plots", "--json")
+    assert code_of(arguments(*vary)) == 0
+    printed = json.loads(capsys.readouterr().out)
+    assert printed == json.loads(Path("out/sweep.json").read_text())
+    with Path("out/sweep.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    cells = printed["studies"][0]["cells"]
+    assert [[row["iterations"], row["update"]] for row in rows] == [
+        list(cell["parameters"].values()) for cell in cells
+    ]
+    assert [float(row["rmse_gain"]) for row in rows] == [
+        cell["measures"]["rmse"]["gain"] for cell in cells
+    ]
+    assert not list(Path("out").glob("*.png"))
+
+
+EXITS: list[tuple[list[str], int, str]] = [
+    (["--vary", "point=20"], 2, "no parameter 'point' to vary; there are points, sensor"),
+    (["--vary", "points=a"], 2, "neither a number"),
+    (["--vary", "points=500"], 7, "runs failed"),
+    (["--vary", "lr=1", "--vary", "loss=l1", "--vary", "points=9"], 2, "--one-by-one"),
+    (["--vary", "lr=1", "--sample", "many"], 2, "no sensor 'many'"),
+    (["--vary", "lr=1", "--seeds", "0"], 2, "once at least"),
+    (["--vary", "lr=1", "--limit", "0"], 2, "1 or more"),
+    (["--vary", "lr=1", "--layout", "tum"], 3, "does not look like 'tum'"),
+    (["--vary", "layer=encod,middle"], 4, "encode"),
+    (["--vary", "lr=1", "--model", "compakt"], 4, "compact"),
+    (["--vary", "sensor=vlp-16"], 7, "runs failed"),
+]
+
+
+@pytest.mark.parametrize(("more", "code", "said"), EXITS)
+def test_the_exit_code_says_whose_mistake_it_was(
+    root: Path, capsys: pytest.CaptureFixture[str], more: list[str], code: int, said: str
+) -> None:
+    assert code_of(arguments(*more, "--no-plots")) == code
+    err = capsys.readouterr().err
+    assert said in err.splitlines()[-1]
+    assert "Traceback" not in err
+
+
+def test_why_frames_failed_is_said_once_for_each(
+    root: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert code_of(arguments("--vary", "points=500", "--vary", "lr=1,2", "--no-plots")) == 7
+    failed = [e for e in capsys.readouterr().err.splitlines() if e.startswith("failed")]
+    assert failed == [
+        f"failed: {name}: 500 points of 60; ask for fewer, or take them of the truth with --sample"
+        " 500"
+        for name in ("a", "b")
+    ]
+
+
+def test_an_empty_folder_and_frames_without_truth_are_input_errors(
+    root: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    Path("empty").mkdir()
+    assert code_of(arguments("--vary", "lr=1", source="empty")) == 3
+    assert "layout" in capsys.readouterr().err
+    for truth in (root / "gt").iterdir():
+        truth.unlink()
+    (root / "gt").rmdir()
+    assert code_of(arguments("--vary", "lr=1")) == 3
+    assert "none of its 2 frames has ground truth" in capsys.readouterr().err
+    assert not Path("out").exists()
+
+
+def test_ctrl_c_says_how_to_go_on_and_exits_130(
+    root: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from pnpdepth_cli.pipeline import sweep_running
+
+    own, calls = sweep_running.refined_curve, []
+
+    def interrupted(*given: object) -> object:
+        calls.append(given)
+        if len(calls) == 2:
+            raise KeyboardInterrupt
+        return own(*given)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(sweep_running, "refined_curve", interrupted)
+    vary = ("--vary", "lr=1%,3%", "--no-plots")
+    assert code_of(arguments(*vary)) == 130
+    assert "stopped; the same command goes on from there" in capsys.readouterr().err
+    assert code_of(arguments(*vary)) == 0
+    assert "6 runs: 2 done already, 4 to do" in capsys.readouterr().err
+
+
+def test_the_help_names_all_that_can_be_varied() -> None:
+    text = sweep.get_help(click.Context(sweep))
+    paragraph = text[text.index("points      N") : text.index("One --vary")]
+    assert set(PARAMETERS) <= set(re.findall(r"[a-z]+(?:-[a-z]+)?", paragraph))
+
+
+def test_options_that_a_sweep_would_not_heed_are_not_there() -> None:
+    names = {option.name for option in sweep.params}
+    assert not names & {"format", "overwrite", "holdout"}
+    assert {"layer", "lr", "keep_best", "calib", "device"} <= names
+    given = click.command()(options.refinement(lambda: None)).params
+    assert {"format", "overwrite", "holdout"} <= {option.name for option in given}
+
+
+def test_the_sample_frames_give_a_table_and_a_picture(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    samples = Path(__file__).parents[2] / "samples/frames.csv"
+    out = tmp_path / "sweep"
+    given = ["--limit", "1", "--sample", "500", "--vary", "iterations=0,2"]
+    assert code_of(["sweep", str(samples), "-o", str(out), *given, "--json"]) == 0
+    first, second = json.loads(capsys.readouterr().out)["studies"][0]["cells"]
+    assert first["measures"]["mae"]["refined"] == first["measures"]["mae"]["plain"]
+    assert second["measures"]["mae"]["refined"] < second["measures"]["mae"]["plain"]
+    assert second["measures"]["mae"]["plain"] < second["measures"]["mae"]["linear"]
+    assert (out / "sweep_iterations.png").stat().st_size > 10_000
