@@ -185,11 +185,13 @@ class PointFit(nn.Module):
         centres = _cell_grid(height, width, value).flatten(1)
         middle = centres.mean(1, keepdim=True)  # small numbers keep the moments exact
         centres, at = centres - middle, at - middle
-        parts = [
-            self._fit(queries[:, :, i : i + FIT_CHUNK], centres[:, i : i + FIT_CHUNK], keys, at,
-                      value, known)
-            for i in range(0, height * width, FIT_CHUNK)
-        ]  # fmt: skip
+        # The moments are small differences of large sums, which bfloat16 would leave nothing of.
+        with torch.autocast(value.device.type, enabled=False):
+            parts = [
+                self._fit(queries[:, :, i : i + FIT_CHUNK], centres[:, i : i + FIT_CHUNK], keys,
+                          at, value, known)
+                for i in range(0, height * width, FIT_CHUNK)
+            ]  # fmt: skip
         estimates = torch.cat([part[0] for part in parts], dim=-1)
         distance = torch.cat([part[1] for part in parts], dim=-1)
         return estimates.view(batch, -1, height, width), distance.view(batch, 1, height, width)

@@ -34,19 +34,24 @@ class Rig(NamedTuple):
 
     fov_deg: horizontal. shift: where its axis lies off the middle of the picture, (right, down) in
     widths and heights. height: above the floor or road, lowest and highest, metres. roll_deg:
-    standard deviation about level, and in a street also about straight ahead.
+    standard deviation about level, and in a street also about straight ahead. pitch_deg: mean,
+    upward, and standard deviation; None where it looks at things by itself. clearance: what it
+    keeps from whatever it sees, metres.
     """
 
     fov_deg: float
     shift: tuple[float, float]
     height: tuple[float, float]
     roll_deg: float
+    pitch_deg: tuple[float, float] | None = None
+    clearance: float | None = None
 
 
 CAMERAS: dict[str, Rig | None] = {
     "any": None,
-    # 304 × 228 px about the middle of half a Kinect picture, focal length 518.86 px; held by hand
-    "nyu": Rig(60.7, (0.0, 0.0), (1.2, 1.6), 1.5),
+    # 304 × 228 px about the middle of half a Kinect picture, focal length 518.86 px; on a robot's
+    # mast, looking down at the floor ahead of it
+    "nyu": Rig(60.7, (0.0, 0.0), (1.35, 1.45), 0.5, (-17.0, 1.5), 0.8),
     # columns 154 to 1066, rows 136 to 364 of KITTI's left colour camera: 721.5 px, axis at row
     # 173, on a car's roof
     "kitti": Rig(64.6, (0.0, -0.338), (1.6, 1.7), 0.5),
@@ -106,7 +111,8 @@ def pick_view(
         view = _street_view(plan, rng, height, width, rig) if kind == "street" else _indoor_view(
             plan, rng, height, width, rig, near=kind == "desk"
         )  # fmt: skip
-        score = _score(world, view, kind)
+        closest = 2.0 if kind == "street" else 0.15 if kind == "desk" else 0.3
+        score = _score(world, view, (rig and rig.clearance) or closest)
         if best is None or score > best_score:
             best, best_score = view, score
         if score > rng.uniform(0.35, 0.75):
@@ -151,15 +157,16 @@ def _indoor_view(
     fov = rng.uniform(40, 95)
     if rig is not None:
         roll, fov = np.radians(rng.normal(0, rig.roll_deg)), rig.fov_deg
+        if rig.pitch_deg is not None:
+            pitch = np.radians(rng.normal(*rig.pitch_deg))
     return looking(place, yaw, pitch, roll, fov_deg=fov, height=height, width=width)
 
 
-def _score(world: World, view: View, kind: str) -> float:
+def _score(world: World, view: View, closest: float) -> float:
     """Returns how much a view shows: 0 when one close face fills it, near 1 when rich."""
     v, u = np.mgrid[0 : view.height - 1 : 18j, 0 : view.width - 1 : 24j]
     hits = world.cast(*view.rays(u, v))
     t = np.where(hits.met, hits.t, 100.0).reshape(18, 24)
-    closest = 2.0 if kind == "street" else 0.15 if kind == "desk" else 0.3
     if np.percentile(t, 2) < closest or np.mean(t < 1.5 * closest) > 0.3:
         return 0.0
     known = float(hits.met.mean())
