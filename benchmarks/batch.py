@@ -1,15 +1,14 @@
 """Memory and time of a batch: `python -m benchmarks.batch [--frames 2000] [--size 48x64]`.
 
 Makes that many small frames, refines them with the embedded network, and prints the memory that the
-process holds as frames go by, its peak, what a frame costs in reading, network and writing, how
-long the network waited, and what a second run costs that has nothing to do.
+process holds as frames go by, its peak, where the time goes, and what a second run costs that has
+nothing to do.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import statistics
 import tempfile
 import time
 from pathlib import Path
@@ -34,14 +33,17 @@ class Watcher:
 
     def __init__(self) -> None:
         self.memory_mb: dict[int, float] = {}
-        self.began = self.done = 0
+        self.said: list[str] = []
+        self.done = 0
 
     def say(self, text: str) -> None:
-        """What a batch tells is not shown."""
+        """What is said of frames that go together is kept."""
+        if "batch size" in text:
+            self.said.append(text)
 
     def begin(self, to_do: int) -> None:
         """The network is loaded."""
-        self.to_do, self.start = to_do, time.perf_counter()
+        self.to_do = to_do
 
     def frame(self, row: dict[str, Any]) -> None:
         """One more."""
@@ -70,33 +72,29 @@ def make_frames(root: Path, count: int, height: int, width: int) -> None:
         write_depth(root / "gt" / f"{number:06}.png", depth, scale=1000)
 
 
-def measure(root: Path, workers: int) -> dict[str, Any]:
+def measure(root: Path, workers: int, model: str, batch_size: int | None) -> dict[str, Any]:
     """The figures of one batch over the folder, and of a second run."""
     request = BatchRequest(
         source=root,
         output=root / "out",
-        refine=RefineRequest(image=None, sparse=None),
+        refine=RefineRequest(image=None, sparse=None, model=model),
         workers=workers,
+        batch_size=batch_size,
+        profile=True,
     )
     watcher = Watcher()
-    run_batch(request, watcher)
-    spent = time.perf_counter() - watcher.start
+    profile = run_batch(request, watcher).summary["profile"]
     peak = peak_memory_mb(torch.device("cpu"))["process"]
     start = time.perf_counter()
     run_batch(request, Watcher())
     again = time.perf_counter() - start
-    rows = json.loads((root / "out" / "summary.json").read_text())["frames"]
-    stages = {
-        stage: [row["seconds"][stage] for row in rows] for stage in ("read", "refine", "write")
-    }
     return {
         "frames": watcher.done,
         "memory_mb": watcher.memory_mb,
         "peak_mb": peak,
-        "seconds": spent,
+        "said": watcher.said,
+        "profile": profile,
         "seconds_of_nothing_to_do": again,
-        "median_ms": {s: 1000 * statistics.median(values) for s, values in stages.items()},
-        "network_busy": sum(stages["refine"]) / spent,
     }
 
 
@@ -106,12 +104,14 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=2000)
     parser.add_argument("--size", default="48x64", help="HxW")
     parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--model", default="compact")
+    parser.add_argument("--batch-size", type=int, help="auto if not given")
     parser.add_argument("--json", action="store_true")
     given = parser.parse_args()
     height, width = (int(side) for side in given.size.split("x"))
     with tempfile.TemporaryDirectory() as folder:
         make_frames(Path(folder) / "frames", given.frames, height, width)
-        found = measure(Path(folder) / "frames", given.workers)
+        found = measure(Path(folder) / "frames", given.workers, given.model, given.batch_size)
     if given.json:
         print(json.dumps(found, indent=2))
         return
@@ -119,10 +119,15 @@ def main() -> None:
     for count, memory in found["memory_mb"].items():
         print(f"  after {count:6,} frames: {memory:6.1f} MB in use")
     print(f"  peak: {found['peak_mb']:.1f} MB")
-    for stage, median in found["median_ms"].items():
-        print(f"  {stage}: {median:.1f} ms a frame (median)")
-    per_frame = 1000 * found["seconds"] / found["frames"]
-    print(f"  altogether: {per_frame:.1f} ms a frame; network busy {found['network_busy']:.0%}")
+    for text in found["said"]:
+        print(f"  {text}")
+    profile = found["profile"]
+    for stage, seconds in profile["seconds"].items():
+        print(f"  {stage.replace('_', ' ')}: {1000 * seconds / found['frames']:.1f} ms a frame")
+    print(
+        f"  {profile['frames_per_second']:.2f} frames a second;"
+        f" network busy {profile['network_busy']:.1%}"
+    )
     print(f"  a second run, with nothing to do: {found['seconds_of_nothing_to_do']:.1f} s")
 
 

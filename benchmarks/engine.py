@@ -1,14 +1,14 @@
 """How close a refinement comes to one cut by hand, and how far ahead of the paper's code it is.
 
-    python -m benchmarks.engine [--runs 15] [--only NAME …] [--json]
+    python -m benchmarks.engine [--runs 15] [--only NAME …] [--no-memory] [--json]
 
 For the paper's seven networks at full size and two more, random weights, K = 5, in one process, in
 turn: a plain forward pass, its front and rear, refinement with a hand-written front and rear, ours
-(a network that stays open from frame to frame, as in a batch), ours opened anew for one frame, a
-hook that replaces the layer's output and re-runs the whole network, and a loop written after the
-description of the paper's PyTorch code: the front with gradients on, `create_graph=True`. The
-limit is (front + 11·rear)/(front + rear). Peak memory of each is measured in a process of its
-own, above that of a plain forward pass.
+(a network that stays open from frame to frame, as in a batch), ours opened anew for one frame,
+ours in bf16, a hook that replaces the layer's output and re-runs the whole network, and a loop
+written after the description of the paper's PyTorch code: the front with gradients on,
+`create_graph=True`. The limit is (front + 11·rear)/(front + rear). Peak memory of each is measured
+in a process of its own, above that of a plain forward pass.
 """
 
 from __future__ import annotations
@@ -20,7 +20,6 @@ import platform
 import statistics
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 
@@ -32,11 +31,17 @@ from benchmarks.networks import CASES, Case
 from pnpdepth_cli.core.points import SparsePoints
 from pnpdepth_cli.core.refine import RefineSettings, refine
 from pnpdepth_cli.core.split import Split
+from pnpdepth_cli.models.precision import lower
 from pnpdepth_cli.pipeline.stopwatch import peak_memory_mb
+from pnpdepth_cli.pipeline.timing import Timed, in_turn
 
 ITERATIONS, STEP, POINTS = 5, 0.01, 500
 SETTINGS = RefineSettings(iterations=ITERATIONS, lr=STEP)
+CPU = torch.device("cpu")
 COMPARED = ("by hand", "ours", "ours, one frame", "by hook", "paper's code")
+"""What gives the same, bit for bit."""
+
+LOWERED = "ours, bf16"
 
 Inputs = tuple[Tensor, ...]
 
@@ -84,7 +89,7 @@ def by_hand(case: Case, network: nn.Module, inputs: Inputs, points: SparsePoints
 
 def by_split(split: Split, inputs: Inputs, points: SparsePoints) -> Tensor:
     """Refinement of a further frame of an open network."""
-    return refine(split, inputs, points, SETTINGS, depth_of=lambda output: output).after
+    return refine(split, inputs, points, SETTINGS, depth_of=lambda output: output.float()).after
 
 
 def by_new_split(case: Case, network: nn.Module, inputs: Inputs, points: SparsePoints) -> Tensor:
@@ -149,6 +154,10 @@ def ways(case: Case) -> Iterator[dict[str, Callable[[], object]]]:
         twin = case.network()
         twin.load_state_dict(network.state_dict())
         split = stack.enter_context(Split(twin, case.layer))
+        low = case.network()
+        low.load_state_dict(network.state_dict())
+        lower(low, torch.bfloat16, CPU)
+        low_split = stack.enter_context(Split(low, case.layer))
         given = (case, network, inputs, points)
         yield {
             "forward": no_grad(lambda: network(*inputs)),
@@ -157,42 +166,42 @@ def ways(case: Case) -> Iterator[dict[str, Callable[[], object]]]:
             "by hand": lambda: by_hand(*given),
             "ours": lambda: by_split(split, inputs, points),
             "ours, one frame": lambda: by_new_split(*given),
+            LOWERED: lambda: by_split(low_split, inputs, points),
             "by hook": lambda: by_hook(*given),
             "paper's code": lambda: by_papers_code(*given),
         }
 
 
-def measure(case: Case, runs: int) -> dict[str, float | str]:
-    """Medians in seconds of every way, taken in turn, and the ratios."""
+def measure(case: Case, runs: int, *, memory: bool) -> dict[str, float | str]:
+    """Medians of every way, taken in turn, and the ratios."""
     with ways(case) as todo:
         results = [todo[name]() for name in COMPARED]
         for name, result in zip(COMPARED, results, strict=True):
             assert torch.equal(results[0], result), f"{case.name}: {name} differs"
-        spent: dict[str, list[float]] = {name: [] for name in todo}
-        for _ in range(runs):
-            for name, run in todo.items():
-                start = time.perf_counter()
-                run()
-                spent[name].append(time.perf_counter() - start)
+        spent = in_turn({n: Timed(run=lambda _, n=n: todo[n]()) for n in todo}, runs, CPU)
     median = {name: statistics.median(times) for name, times in spent.items()}
     limit = (median["front"] + (2 * ITERATIONS + 1) * median["rear"]) / (
         median["front"] + median["rear"]
     )
-    ratio = {name: median[name] / median["forward"] for name in COMPARED}
-    paired = {
-        name: statistics.median(o / h for o, h in zip(spent["ours"], spent[name], strict=True))
-        for name in ("by hand", "paper's code")
-    }
-    forward = peak_mb(case, "forward")
-    extra = {name: peak_mb(case, name) - forward for name in ("by hand", "ours", "paper's code")}
+    ratio = {name: median[name] / median["forward"] for name in (*COMPARED, LOWERED)}
+
+    def paired(one: str, other: str) -> float:
+        pairs = zip(spent[one], spent[other], strict=True)
+        return statistics.median(a / b for a, b in pairs)
+
+    forward = peak_mb(case, "forward") if memory else 0
+    measured = ("by hand", "ours", "paper's code") if memory else ()
+    extra = {name: peak_mb(case, name) - forward for name in measured}
     return {
         "network": f"{case.name}, {case.size[0]}×{case.size[1]}",
         "forward, ms": 1000 * median["forward"],
         "limit": limit,
         **ratio,
         "ours / limit": ratio["ours"] / limit,
-        "ours / by hand": paired["by hand"],
-        "ours / paper's code": paired["paper's code"],
+        "ours / by hand": paired("ours", "by hand"),
+        "ours / paper's code": paired("ours", "paper's code"),
+        "one frame / paper's code": paired("ours, one frame", "paper's code"),
+        "paper's code / bf16": paired("paper's code", LOWERED),
         **{f"extra MB {name}": value for name, value in extra.items()},
     }
 
@@ -208,13 +217,14 @@ def print_peak(name: str, way: str) -> None:
         todo["forward"]()
         for _ in range(2):
             todo[way]()
-        print(peak_memory_mb(torch.device("cpu"))["process"])
+        print(peak_memory_mb(CPU)["process"])
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--runs", type=int, default=15)
     parser.add_argument("--only", nargs="+", default=[case.name for case in (*ZOO, *CASES)])
+    parser.add_argument("--no-memory", action="store_true")
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--peak", nargs=2, help=argparse.SUPPRESS)
     args = parser.parse_args()
@@ -225,7 +235,7 @@ def main() -> None:
     for case in (*ZOO, *CASES):
         if case.name in args.only:
             print(case.name, file=sys.stderr)
-            results.append(measure(case, args.runs))
+            results.append(measure(case, args.runs, memory=not args.no_memory))
     if args.json:
         print(json.dumps(results, indent=2))
         return

@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 
 from pnpdepth_cli.core.points import SparsePoints
 from pnpdepth_cli.core.refine import RefineSettings
+from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.models.network import Network
-from pnpdepth_cli.pipeline.frame import RefinedFrame, refine_frame
+from pnpdepth_cli.pipeline.frame import FrameToRefine, RefinedFrame, refine_frame
 from pnpdepth_cli.pipeline.inputs import Inputs
 
 Depth = NDArray[np.float32]
@@ -95,5 +96,6 @@ def frame_inputs(rgb: NDArray[np.float32], points: SparsePoints, truth: Depth) -
 
 def refined(network: Network, layer: str, settings: RefineSettings, inputs: Inputs) -> RefinedFrame:
     """The refinement of a frame with all of its points."""
-    none = inputs.points.select(torch.zeros(len(inputs.points), dtype=torch.bool))
-    return refine_frame(network, layer, settings, inputs, inputs.points, none)
+    with Split(network.module, layer) as split:
+        task = FrameToRefine.with_points(inputs, inputs.points)
+        return refine_frame(network, split, settings, task)

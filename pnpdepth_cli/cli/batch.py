@@ -54,6 +54,21 @@ _INTERRUPTED = 128 + signal.SIGINT
     metavar="N",
     help="Threads that read, and as many that write.",
 )
+@click.option(
+    "--html",
+    type=options.FILE,
+    metavar="FOLDER",
+    help="A report to open in a browser: every frame before and after, the worst first.",
+)
+@click.option(
+    "--batch-size",
+    default="auto",
+    show_default=True,
+    metavar="auto|N",
+    help="Frames of one size that the network takes at once. auto: as many as gain time and leave"
+    " every bit of the results as it is.",
+)
+@click.option("--profile", is_flag=True, help="Say at the end where the time went.")
 @click.option("--dry-run", is_flag=True, help="List what would be done, and do nothing.")
 @options.scan
 @options.refinement
@@ -67,6 +82,9 @@ def batch(
     limit: int | None,
     shard: str | None,
     workers: int,
+    batch_size: str,
+    profile: bool,
+    html: Path | None,
     dry_run: bool,
     as_json: bool,
     **given: Any,
@@ -78,6 +96,7 @@ def batch(
     pnpdepth batch frames.csv -o out/ --workers 4 --model net.onnx
     pnpdepth batch kitchen/ -o out/ --sample 500          # no sparse depth, but ground truth
     pnpdepth batch drive_0001/ -o out/ --shard 1/4        # one of four processes
+    pnpdepth batch drive_0001/ -o out/ --html report/     # and report/index.html to look at
 
     \b
     A folder is known by what is in it; the simplest layout has the same stems in
@@ -106,8 +125,11 @@ def batch(
         layout=layout,
         protocol=protocol,
         workers=workers,
+        batch_size=None if batch_size == "auto" else _batch_size(batch_size),
+        profile=profile,
         limit=limit,
         shard=None if shard is None else _shard(shard),
+        html=html,
     )
     if dry_run:
         planned = plan_batch(request, lambda text: click.echo(printable(text), err=True))
@@ -123,7 +145,7 @@ def batch(
 def _run(request: BatchRequest, as_json: bool) -> int:
     """The exit code of a batch that went to its end, or was stopped by the user."""
     from pnpdepth_cli.cli.progress import BatchProgress
-    from pnpdepth_cli.cli.tables import print_batch
+    from pnpdepth_cli.cli.tables import print_batch, print_profile
     from pnpdepth_cli.pipeline.batch import run_batch
 
     with BatchProgress() as progress, _finishing_on_interrupt() as stopped:
@@ -139,6 +161,10 @@ def _run(request: BatchRequest, as_json: bool) -> int:
         click.echo(json.dumps(outcome.summary, indent=2))
     else:
         print_batch(outcome.summary)
+    if request.profile:
+        print_profile(outcome.summary["profile"])
+    if request.html is not None:
+        click.echo(printable(f"wrote {request.html / 'index.html'}"), err=True)
     if outcome.stopped:
         click.echo(
             f"stopped after {progress.done:,} of {progress.to_do:,} frames; the same command goes"
@@ -177,6 +203,12 @@ def _sample(text: str) -> tuple[str, int | None, float | None]:
     """(pattern, points, share) of `500`, `5%` or `lines:16`."""
     kind, colon, count = text.rpartition(":")
     return kind if colon else "uniform", *options.count_or_share(count)
+
+
+def _batch_size(text: str) -> int:
+    if not text.isdecimal():
+        raise UsageError(f"batch size {text!r} is neither auto nor a number of frames such as 8")
+    return int(text)
 
 
 def _shard(text: str) -> tuple[int, int]:

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from pnpdepth_cli.cli import options
+from pnpdepth_cli.cli.printable import printable
 from pnpdepth_cli.errors import FramesFailedError, UsageError
 
 if TYPE_CHECKING:
@@ -64,6 +67,12 @@ PROTOCOLS = ("paper", "nyu", "kitti", "kitti-devkit", "eigen", "garg")
 @click.option("--csv", type=options.FILE, metavar="FILE|-", help="A line for each frame.")
 @click.option("--markdown", type=options.FILE, metavar="FILE|-", help="The means as a table.")
 @click.option("--latex", type=options.FILE, metavar="FILE|-", help="The means as a tabular.")
+@click.option(
+    "--html",
+    type=options.FILE,
+    metavar="FOLDER",
+    help="A report to open in a browser: every frame beside its truth, the worst first.",
+)
 @options.overwrite
 @options.as_json
 def evaluate(
@@ -72,6 +81,7 @@ def evaluate(
     csv: Path | None,
     markdown: Path | None,
     latex: Path | None,
+    html: Path | None,
     overwrite: bool,
     as_json: bool,
     **given: Any,
@@ -80,7 +90,7 @@ def evaluate(
 
     \b
     pnpdepth eval pred.png gt.png
-    pnpdepth eval out/ gt/ --protocol kitti --csv scores.csv
+    pnpdepth eval out/ gt/ --protocol kitti --csv scores.csv --html report/
     pnpdepth eval out/ gt/ --sparse sparse/ --json > runs/a.json
     pnpdepth eval out/ gt/ --protocol eigen --max-depth 50 --average pooled
 
@@ -96,11 +106,14 @@ def evaluate(
     eigen, garg   truth in 0.001–80 m, predictions clipped to it, Eigen's or Garg's crop
     """
     from pnpdepth_cli.cli import score_tables
-    from pnpdepth_cli.pipeline import score_files
+    from pnpdepth_cli.pipeline import report_eval, score_files
 
     targets = (csv, markdown, latex)
     score_tables.check_stdout(targets, as_json)
     score_files.check_targets(targets, (prediction, truth), overwrite=overwrite)
+    if html is not None:
+        inputs = [p for p in (prediction, truth, given["sparse"], given["mask"]) if p is not None]
+        report_eval.check_eval_report(html, inputs, overwrite=overwrite)
     evaluation = _evaluate(prediction, truth, **given)
     protocol = evaluation.protocol.describe()
     score_tables.print_notes([f"protocol {protocol}", *evaluation.notes])
@@ -116,6 +129,10 @@ def evaluate(
         click.echo(json.dumps(evaluation.as_record(), indent=2))
     elif not to_stdout:
         score_tables.print_evaluation(evaluation)
+    if html is not None:
+        with _bar("report") as show:
+            report_eval.write_eval_report(html, evaluation, on_frame=show)
+        click.echo(printable(f"wrote {html / 'index.html'}"), err=True)
     unscored = evaluation.unscored()
     if unscored is not None:
         raise FramesFailedError(unscored)
@@ -139,8 +156,6 @@ def _evaluate(
     **changes: Any,
 ) -> Evaluation:
     """The evaluation, with a bar over the frames where it takes longer than a second."""
-    from tqdm import tqdm
-
     from pnpdepth_cli.pipeline.evaluate import evaluate
     from pnpdepth_cli.pipeline.evaluation import EvalRequest
     from pnpdepth_cli.pipeline.frame_reading import Scales
@@ -157,13 +172,22 @@ def _evaluate(
         seed=seed,
         workers=workers,
     )
-    with tqdm(desc="eval", unit="frame", delay=1, leave=False, disable=None) as bar:
+    with _bar("eval") as show:
+        return evaluate(request, on_frame=show)
+
+
+@contextmanager
+def _bar(title: str) -> Iterator[Callable[[int, int], None]]:
+    """Inside, the function that is told (done, of) draws a bar if it takes more than a second."""
+    from tqdm import tqdm
+
+    with tqdm(desc=title, unit="frame", delay=1, leave=False, disable=None) as bar:
 
         def show(done: int, of: int) -> None:
             bar.total = of
             bar.update(done - bar.n)
 
-        return evaluate(request, on_frame=show)
+        yield show
 
 
 def _thresholds(text: str | None) -> tuple[float, float, float] | None:

@@ -65,6 +65,14 @@ def reading(command: Callable[..., Any]) -> Callable[..., Any]:
 
 
 device = click.option("--device", default="cpu", show_default=True, help="cpu, cuda, cuda:1, mps …")
+PRECISIONS = ("fp32", "bf16", "fp16")
+precision = click.option(
+    "--precision",
+    type=click.Choice(PRECISIONS),
+    default="fp32",
+    show_default=True,
+    help="Of the network's convolutions and matrix products; z, loss and updates stay in fp32.",
+)
 as_json = click.option("--json", "as_json", is_flag=True, help="Print the result as JSON.")
 overwrite = click.option("--overwrite", is_flag=True, help="Replace results that exist.")
 depth_scale = click.option(
@@ -141,7 +149,23 @@ def scan_given(given: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
 LOSSES = ("l1", "l2", "huber", "berhu", "inverse", "log", "cauchy")
 UPDATES = ("sign", "sgd", "normalised", "momentum", "adam")
 SCHEDULES = ("constant", "linear")
+PROPAGATIONS = ("none", "gp", "diffusion")
 FORMATS = ("png", "exr", "npy", "npz", "pfm", "tiff")
+
+
+def _seconds(context: click.Context, parameter: click.Parameter, text: str | None) -> float | None:
+    """The seconds of `5`, `5s` or `500ms`. UsageError for any other text."""
+    if text is None:
+        return None
+    number, unit = (text[:-2], 1e-3) if text.endswith("ms") else (text.removesuffix("s"), 1.0)
+    try:
+        seconds = float(number) * unit
+    except ValueError:
+        seconds = -1.0
+    if not 0 < seconds < float("inf"):
+        raise UsageError(f"time budget {text!r} is no time; give seconds, such as 5s")
+    return seconds
+
 
 _REFINEMENT_OPTIONS = (
     click.option(
@@ -180,6 +204,33 @@ _REFINEMENT_OPTIONS = (
     click.option(
         "--keep-best", is_flag=True, help="Give the depth of the lowest loss, not the last."
     ),
+    click.option(
+        "--propagate",
+        type=click.Choice(PROPAGATIONS),
+        help="Spread what is left at the points: by a Gaussian process, or by diffusion that stops"
+        " at edges.  [default: none; with --auto what is best]",
+    ),
+    click.option(
+        "--auto",
+        is_flag=True,
+        help="Choose alignment, updates and propagation, or a baseline, by points held out in"
+        " turns; never worse at those than the network and every baseline.",
+    ),
+    click.option(
+        "--time-budget",
+        "time_budget_s",
+        metavar="SECONDS",
+        callback=_seconds,
+        help="With --auto: try more layers and steps for so long, such as 5s.",
+    ),
+    click.option(
+        "--baselines", is_flag=True, help="Score every simple baseline beside the result."
+    ),
+    click.option(
+        "--uncertainty",
+        is_flag=True,
+        help="Write <name>_sigma.exr, the depth's standard deviation.",
+    ),
     reading,
     depth_scale,
     click.option("--gt-scale", type=float, metavar="S", help="The same for the ground truth."),
@@ -195,6 +246,7 @@ _REFINEMENT_OPTIONS = (
         help="Keep this share of the points out, and score them.",
     ),
     click.option("--seed", type=int, default=0, show_default=True, help="Of the hold-out choice."),
+    precision,
     device,
 )
 
@@ -216,11 +268,6 @@ def height_and_width(text: str) -> tuple[int, int]:
 
 def count_or_share(text: str | None) -> tuple[int | None, float | None]:
     """(points, share) of `500` or `5%`; None for what it is not. UsageError for any other text."""
-    if text is None:
-        return None, None
-    try:
-        if text.strip().endswith("%"):
-            return None, float(text.strip()[:-1]) / 100
-        return int(text), None
-    except ValueError:
-        raise UsageError(f"count {text!r} is neither a number such as 500 nor 5%") from None
+    from pnpdepth_cli.pipeline import request
+
+    return (None, None) if text is None else request.count_or_share(text)

@@ -15,7 +15,7 @@ from rich.table import Table
 
 from pnpdepth_cli.cli.printable import printable
 from pnpdepth_cli.errors import UsageError
-from pnpdepth_cli.pipeline.score_files import shown, unit_of, write_bytes
+from pnpdepth_cli.pipeline.score_files import part_cells, shown, unit_of, write_bytes
 
 if TYPE_CHECKING:
     from pnpdepth_cli.pipeline.compare import Comparison
@@ -156,18 +156,11 @@ def _coverage(frame: FrameScores) -> str:
 
 def _parts(title: str, column: str, parts: Sequence[Part]) -> Table:
     table = _table(f"{title}, all pixels together")
-    total = sum(part.known for part in parts)
     table.add_column(column)
     for name in ("of the truth", "RMSE [dim]m[/]", "MAE [dim]m[/]", "MRE", "coverage"):
         table.add_column(name, justify="right")
-    for part in parts:
-        low, high = f"{part.low:g}", f"{part.high:g}"
-        table.add_row(
-            f"{low} or more" if math.isinf(part.high) else f"{low} to {high}",
-            f"{part.known / total:.1%}",
-            *("–" if math.isnan(v) else f"{v:.4f}" for v in (part.rmse, part.mae, part.mre)),
-            f"{part.pixels / part.known:.2%}",
-        )
+    for cells in part_cells(parts):
+        table.add_row(*cells)
     return table
 
 

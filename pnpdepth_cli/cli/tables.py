@@ -22,6 +22,15 @@ _SCORES: tuple[tuple[str, str, Callable[[float], str]], ...] = (
 )
 
 
+_WAITING = ("waiting_for_reader", "waiting_for_writer")
+_STAGES = {
+    "waiting_for_reader": "waiting for a frame to be read",
+    "waiting_for_writer": "waiting for a frame to be written",
+    "reading": "beside it: reading and decoding",
+    "writing": "beside it: scoring, encoding and writing",
+}
+
+
 def print_refinement(record: Mapping[str, Any]) -> None:
     """The end of `pnpdepth refine`: what was assumed, errors before and after, files, time."""
     console = Console(stderr=True, highlight=False)
@@ -40,6 +49,8 @@ def print_refinement(record: Mapping[str, Any]) -> None:
             f" ({after['coverage']:.1%} of those known)"
         )
     console.print(table)
+    if record["baselines"] is not None:
+        console.print(_baselines(record["baselines"]))
     if record["improved_share"] is not None:
         where = "pixels with truth" if record["scores"] else "points"
         console.print(f"improved: {record['improved_share']:.1%} of the {where}")
@@ -53,6 +64,26 @@ def print_refinement(record: Mapping[str, Any]) -> None:
     )
     written = [path for path in record["outputs"].values() if path]
     console.print("wrote " + escape("  ".join(written)), soft_wrap=True)
+
+
+def _baselines(found: Mapping[str, Any]) -> Table:
+    """The simple baselines, the network and the result, the best at the held-out points first."""
+    with_truth = any(row["scores"] for row in found.values())
+    table = Table(title="against every simple baseline")
+    columns = ["", "MAE, held-out points", *(["MAE, truth", "RMSE, truth"] if with_truth else [])]
+    for column in columns:
+        table.add_column(column, justify="left" if not column else "right")
+    known = {name: row for name, row in found.items() if row["held_out_mae"] is not None}
+    order = sorted(known, key=lambda name: known[name]["held_out_mae"]) or list(found)
+    for name in order:
+        row, cells = found[name], []
+        error = row["held_out_mae"]
+        cells.append("–" if error is None else f"{error:.4f} m")
+        if with_truth:
+            scores = row["scores"]
+            cells += [f"{scores[k]:.4f} m" if scores else "–" for k in ("mae", "rmse")]
+        table.add_row(name, *cells, style="bold" if name == "result" else None)
+    return table
 
 
 def print_batch(summary: Mapping[str, Any]) -> None:
@@ -77,6 +108,34 @@ def print_batch(summary: Mapping[str, Any]) -> None:
     console.print(", ".join(said))
     output = summary["output"]
     console.print("wrote " + escape(f"{output}/summary.json  {output}/summary.csv"), soft_wrap=True)
+
+
+def print_profile(profile: Mapping[str, Any]) -> None:
+    """Where the time of a batch went: in the thread of the network, and in those beside it."""
+    console = Console(stderr=True, highlight=False)
+    seconds, frames = profile["seconds"], profile["frames"]
+    if not frames:
+        console.print("no frame was done; there is no time to share out")
+        return
+    table = Table(title="where the time went")
+    for column in ("", "seconds", "ms a frame", "of the time"):
+        table.add_column(column, justify="left" if not column else "right")
+    wall = seconds["wall"]
+    main = {stage: seconds[stage] for stage in ("network", *_WAITING)}
+    main["other"] = wall - sum(main.values())
+    for stage, spent in [*main.items(), ("wall", wall)]:
+        table.add_row(
+            _STAGES.get(stage, stage),
+            f"{spent:.2f}",
+            f"{1000 * spent / frames:.1f}",
+            f"{spent / wall:.1%}",
+        )
+    table.add_section()
+    for stage in ("reading", "writing"):
+        spent = seconds[stage]
+        table.add_row(_STAGES[stage], f"{spent:.2f}", f"{1000 * spent / frames:.1f}", "")
+    table.caption = f"{frames:,} frames, {profile['frames_per_second']:.2f} a second"
+    console.print(table)
 
 
 def print_sparse(record: Mapping[str, Any]) -> None:

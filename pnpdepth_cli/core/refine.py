@@ -27,6 +27,9 @@ from pnpdepth_cli.errors import BatchError, DivergedError, LayerError, PnpDepthE
 
 DepthOf = Callable[[Any], Tensor]
 
+_HALF_SCALE = 1024.0
+"""Of the loss where float16 is involved: its smallest number is larger than many a gradient."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class RefineSettings:
@@ -108,12 +111,25 @@ def refine_batch(
     """
     with torch.no_grad():
         z = split.front(*arguments)
+    return refine_from(split, z, points, settings, depth_of=depth_of, on_iteration=on_iteration)
+
+
+def refine_from(
+    split: Split,
+    z: Tensor,
+    points: Sequence[SparsePoints],
+    settings: RefineSettings,
+    *,
+    depth_of: Sequence[DepthOf],
+    on_iteration: Callable[[int, float], None] = lambda iteration, loss: None,
+) -> list[Refinement | PnpDepthError]:
+    """The same from z_0 on: the front of these arguments is not run again for other points."""
     frames = [
         _Frame(settings, step_size(settings.lr, z0), at, read)
         for z0, at, read in zip(_apart(z, len(points)), points, depth_of, strict=True)
     ]
     for iteration in range(settings.iterations):
-        z.requires_grad_(True)
+        z = z.detach().requires_grad_(True)
         with torch.enable_grad():
             losses = _losses(frames, split.rear(z))
             if not losses:
@@ -223,11 +239,11 @@ def _apart(structure: Any, frames: int) -> list[Any]:
 
 
 def _gradient(loss: Tensor, z: Tensor, split: Split) -> Tensor:
-    gradient = gradient_at(z, loss)
+    gradient = gradient_at(z, loss * _HALF_SCALE if split.in_half else loss)
     if gradient is None:
         raise LayerError(
             f"layer {split.layer!r}: no gradient comes back from the prediction to it; either the"
             " prediction does not depend on it or the network's forward runs under"
             " torch.no_grad, inference_mode or detach (take that out, or cut at a later layer)"
         )
-    return gradient
+    return gradient / _HALF_SCALE if split.in_half else gradient

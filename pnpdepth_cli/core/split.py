@@ -36,6 +36,9 @@ from pnpdepth_cli.core.structure import map_tensors, tensors_in
 from pnpdepth_cli.core.watch import Call, Remembered, Watch
 from pnpdepth_cli.errors import LayerError
 
+_FEW_BITS = (torch.float16, torch.bfloat16)
+
+
 
 class _CutReached(BaseException):
     """Stops the front's pass at the cut; not an Exception, so that networks do not catch it."""
@@ -84,7 +87,7 @@ class Split:
         self._forget()
 
     def __enter__(self) -> Split:
-        modules = list(self._network.modules())
+        modules = list(dict.fromkeys(self._modules.values()))
         self._state = NetworkState(self._network)
         self._forwards = {module: module.__dict__.get("forward") for module in modules}
         try:
@@ -116,8 +119,19 @@ class Split:
             else:
                 module.__dict__["forward"] = own_forward
 
+    @property
+    def repeats(self) -> bool:
+        """True once it is known that the network treats all arguments of these shapes alike.
+
+        Then no value of a tensor gets out to Python, which could choose another path by it.
+        """
+        return self._learned and self._repeats
+
     def front(self, *arguments: Any) -> Tensor:
-        """z_0, the output of the cut layer for these arguments of the network."""
+        """z_0, the output of the cut layer for these arguments of the network.
+
+        In float32 where the layer gives fewer bits: small steps would get lost in them.
+        """
         if self._learned and self._repeats and self._shapes == _shapes(arguments):
             return self._front_of_another_frame(arguments)
         self._stand_in_for(self._forwards)
@@ -135,7 +149,7 @@ class Split:
                 self._index()
                 self._repeats = not watch.escaped
                 assert self._z0 is not None
-                return self._z0.clone()  # the network may go on to change the memory it lies in
+                return _handed_out(self._z0)
             raise LayerError(self._never_ran())
 
     def _front_of_another_frame(self, arguments: Sequence[Any]) -> Tensor:
@@ -146,7 +160,12 @@ class Split:
             self._run()
         if self._z0 is None:
             raise LayerError(self._never_ran())
-        return self._z0.clone()
+        return _handed_out(self._z0)
+
+    @property
+    def in_half(self) -> bool:
+        """True if the cut layer of the last frame gives float16, in which gradients may vanish."""
+        return self._z0 is not None and self._z0.dtype == torch.float16
 
     def rear(self, z: Tensor) -> Any:
         """What the network returns when the cut layer gives z."""
@@ -340,7 +359,8 @@ class Split:
         # A clone, because the network may go on in place and z may be a leaf.
         assert self._z is not None
         assert self._cut_call is not None
-        z = self._z.clone()
+        assert self._z0 is not None
+        z = self._z.to(self._z0.dtype, copy=True)
         # What the layer does besides, such as changing its input in place, is done again.
         output = self._cut_call.hand_back() if self._cut_call.kept else run()
         if self._watch is not None:
@@ -381,6 +401,11 @@ def _is_read(tensor: Tensor, watch: Watch) -> bool:
 def _own(arguments: Sequence[Any]) -> Any:
     """Copies: the network may change them in place, the caller's must not change."""
     return map_tensors(tuple(arguments), lambda _, t: t.detach().clone())
+
+
+def _handed_out(z0: Tensor) -> Tensor:
+    """A copy, for the network may go on to change the memory that z_0 lies in."""
+    return z0.to(torch.float32 if z0.dtype in _FEW_BITS else z0.dtype, copy=True)
 
 
 def _shapes(arguments: Sequence[Any]) -> Any:

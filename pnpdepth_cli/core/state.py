@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from pnpdepth_cli.core.watch import Remembered
+
+
+def _own(tensors: Mapping[str, Tensor | None]) -> list[Tensor]:
+    return [tensor for tensor in tensors.values() if tensor is not None]
 
 
 class NetworkState:
@@ -15,13 +21,16 @@ class NetworkState:
     """
 
     def __init__(self, network: nn.Module) -> None:
-        self.tensors = [Remembered(t) for t in (*network.parameters(), *network.buffers())]
-        self._originals = [remembered.output for remembered in self.tensors]
-        self._learning = [(p, p.requires_grad) for p in network.parameters()]
+        modules = list(network.modules())  # going through a deep network takes a while: once
         # Frozen torch scripts have neither a mode nor buffers that can be set.
-        modules = [m for m in network.modules() if not isinstance(m, torch.jit.ScriptModule)]
-        self._buffers = [(m, dict(m._buffers)) for m in modules if m._buffers]
-        self._modes = [(m, m.training) for m in network.modules() if hasattr(m, "training")]
+        plain = [m for m in modules if not isinstance(m, torch.jit.ScriptModule)]
+        parameters = list(dict.fromkeys(p for m in modules for p in _own(m._parameters)))
+        buffers = dict.fromkeys(b for m in modules for b in _own(m._buffers))
+        self.tensors = [Remembered(t) for t in (*parameters, *buffers)]
+        self._originals = [remembered.output for remembered in self.tensors]
+        self._learning = [(p, p.requires_grad) for p in parameters]
+        self._buffers = [(m, dict(m._buffers)) for m in plain if m._buffers]
+        self._modes = [(m, m.training) for m in modules if hasattr(m, "training")]
 
     def freeze(self) -> None:
         """No parameter asks for a gradient."""

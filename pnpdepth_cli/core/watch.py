@@ -109,7 +109,10 @@ class Watch(TorchDispatchMode):
 
     def protect(self, remembered: Remembered) -> None:
         """Save these tensors from in-place operations."""
-        for _, tensor in tensors_in(remembered.output):
+        output = remembered.output
+        # Parameters, of which there are many, come as tensors.
+        tensors = [output] if isinstance(output, Tensor) else [t for _, t in tensors_in(output)]
+        for tensor in tensors:
             self._protected.setdefault(_storage(tensor), []).append(remembered)
 
     def now(self) -> Moment:

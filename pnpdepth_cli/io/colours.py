@@ -16,9 +16,11 @@ UNKNOWN = 70
 
 _RED = np.array([214, 26, 30], dtype=np.float32)
 _GREEN = np.array([16, 140, 52], dtype=np.float32)
+_BLUE = np.array([25, 90, 190], dtype=np.float32)
+_ORANGE = np.array([220, 105, 0], dtype=np.float32)
 # A range wider than this is shown on a logarithmic scale; on a linear one nearly all of a
 # street would have the colour of its far end.
-_LOGARITHMIC_FROM = 8.0
+LOGARITHMIC_FROM = 8.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,7 +33,7 @@ class DepthScale:
     @property
     def logarithmic(self) -> bool:
         """True when the colours follow log depth."""
-        return self.high_m / self.low_m > _LOGARITHMIC_FROM
+        return self.high_m / self.low_m > LOGARITHMIC_FROM
 
     def position(self, depth: NDArray[np.floating]) -> NDArray[np.float64]:
         """0 at the near end, 1 at the far end, clipped there."""
@@ -95,8 +97,22 @@ def dimmed(grey: NDArray[np.float32]) -> Pixels:
 
 def paint_gain(strength: NDArray[np.floating], light: NDArray[np.floating]) -> Pixels:
     """(..., 3) colours: red at strength 1 (better), green at -1 (worse), `light` grey at 0."""
+    return _between(strength, light, _RED, _GREEN)
+
+
+def paint_error(strength: NDArray[np.floating], light: NDArray[np.floating]) -> Pixels:
+    """(..., 3) colours: orange at strength 1 (too far), blue at -1 (too near), `light` at 0."""
+    return _between(strength, light, _ORANGE, _BLUE)
+
+
+def _between(
+    strength: NDArray[np.floating],
+    light: NDArray[np.floating],
+    above: NDArray[np.float32],
+    below: NDArray[np.float32],
+) -> Pixels:
     amount = np.clip(np.abs(np.asarray(strength, dtype=np.float32)), 0, 1)[..., None]
-    hue = np.where(np.asarray(strength)[..., None] > 0, _RED, _GREEN)
+    hue = np.where(np.asarray(strength)[..., None] > 0, above, below)
     base = 255 * np.asarray(light, dtype=np.float32)[..., None]
     return np.asarray(np.rint((1 - amount) * base + amount * hue), dtype=np.uint8)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from dataclasses import dataclass
 from itertools import pairwise
@@ -12,8 +13,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from pnpdepth_cli.errors import FileFormatError, InputError
 from pnpdepth_cli.io.atomic import atomic_path
 from pnpdepth_cli.io.colours import DepthScale, Pixels
+from pnpdepth_cli.io.opening import damaged
 
 if TYPE_CHECKING:
     import PIL.Image
@@ -32,6 +35,7 @@ _SMALL_FONT_SIZE = 17
 _INK = (32, 33, 36)
 _FAINT_INK = (95, 99, 104)
 _LINE = (200, 202, 206)
+_SAID = "pnpdepth"  # the PNG text that says what is where on the page
 
 Ink = tuple[int, int, int]
 
@@ -91,6 +95,7 @@ def draw_discs(
 def depth_page(panels: list[Panel], columns: int, scale: DepthScale) -> PIL.Image.Image:
     """The panels, `columns` to a row, with the depth colours in a bar to their right."""
     page, draw = _lay_out(panels, columns, legend_width=_LEGEND_WIDTH)
+    page.info[_SAID] |= {"low_m": scale.low_m, "high_m": scale.high_m}
     left = page.width - MARGIN - _LEGEND_WIDTH + GAP
     top, bottom = MARGIN + _TITLE_HEIGHT, page.height - MARGIN
     draw.text((left, MARGIN + 5), "metres", font=_font(_FONT_SIZE), fill=_INK)
@@ -116,6 +121,8 @@ def gain_page(
 ) -> PIL.Image.Image:
     """One panel; under it the colour bar between its two `ends`, a swatch, and the footer."""
     page, draw = _lay_out([panel], 1, least_width=_GAIN_LEGEND[0], legend_height=_GAIN_LEGEND[1])
+    unknown = swatch[1] if swatch is not None else None
+    page.info[_SAID] |= {"ends": ends, "unknown": unknown, "footer": footer}
     font, small = _font(_FONT_SIZE), _font(_SMALL_FONT_SIZE)
     y = page.height - MARGIN - 56
     x = float(MARGIN)
@@ -134,9 +141,56 @@ def gain_page(
 
 
 def save_page(page: PIL.Image.Image, path: Path) -> None:
-    """`path` holds the page as a PNG, whatever its suffix."""
+    """`path` holds the page as a PNG, whatever its suffix, and `read_panels` can take it apart."""
+    from PIL.PngImagePlugin import PngInfo
+
+    text = PngInfo()
+    text.add_text(_SAID, json.dumps(page.info[_SAID]))
     with atomic_path(path) as temporary:
-        page.save(temporary, "PNG")
+        page.save(temporary, "PNG", pnginfo=text)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SavedPage:
+    """A page on disk. said: low_m and high_m of its depth colours, or ends, unknown and footer."""
+
+    path: Path
+    said: dict[str, Any]
+
+    def panels(self) -> dict[str, Pixels]:
+        """The panels by their titles. InputError if the file cannot be read."""
+        try:
+            with _opened(self.path) as page:
+                pixels = np.asarray(page.convert("RGB"))
+        except (OSError, SyntaxError) as error:
+            raise damaged(self.path, "PNG", str(error)) from error
+        return {
+            each["title"]: pixels[y : y + height, x : x + width]
+            for each in self.said["panels"]
+            for x, y, width, height in [each["box"]]
+        }
+
+
+def open_page(path: Path) -> SavedPage:
+    """What is said in a file of `save_page`; only its first bytes are read.
+
+    InputError if there is none, FileFormatError if it is another picture.
+    """
+    try:
+        with _opened(path) as page:
+            return SavedPage(path=path, said=json.loads(page.info[_SAID]))
+    except (SyntaxError, KeyError, ValueError) as error:
+        raise FileFormatError(f"{path} is no page of this program's; create it again") from error
+
+
+def _opened(path: Path) -> PIL.Image.Image:
+    from PIL import Image
+
+    try:
+        return Image.open(path, formats=["PNG"])
+    except OSError as error:
+        fact = (error.strerror or "is no PNG").lower()
+        raise InputError(f"{path} cannot be read ({fact}); create it again") from error
 
 
 def _lay_out(
@@ -157,6 +211,7 @@ def _lay_out(
     page_height = 2 * MARGIN + rows * row_height + (rows - 1) * (GAP // 2) + legend_height
     page = Image.new("RGB", (page_width, page_height), "white")
     draw = ImageDraw.Draw(page)
+    said = []
     for index, panel in enumerate(panels):
         row, column = divmod(index, columns)
         x = MARGIN + column * (width + GAP)
@@ -166,6 +221,8 @@ def _lay_out(
         indent = draw.textlength(panel.title, font=font) + 14
         draw.text((x + indent, y + 5), panel.remark, font=_font(_SMALL_FONT_SIZE), fill=_FAINT_INK)
         _paste(page, panel.pixels, x, y + _TITLE_HEIGHT)
+        said.append({"title": panel.title, "box": (x, y + _TITLE_HEIGHT, width, height)})
+    page.info[_SAID] = {"panels": said}
     return page, draw
 
 

@@ -18,16 +18,22 @@ _POINTS = 500
 
 
 def made_up_arguments(network: Network, frame: FrameMap) -> tuple[Tensor, ...]:
-    """A picture of smooth noise and 500 points on a slanted plane; the seed is fixed."""
-    height, width = frame.image
+    """The network's arguments for the made-up frame of this size."""
+    rgb, points = made_up_frame(frame.image)
+    return network.arguments(frame, rgb, frame.points_to_network(points))
+
+
+def made_up_frame(size: tuple[int, int], count: int = _POINTS) -> tuple[Tensor, SparsePoints]:
+    """A picture (1, 3, H, W) of smooth noise, and points on a slanted plane; the seed is fixed."""
+    height, width = size
     generator = torch.Generator().manual_seed(0)
     coarse = torch.rand(1, 3, max(2, height // 8), max(2, width // 8), generator=generator)
-    rgb = F.interpolate(coarse, frame.image, mode="bilinear")
-    places = torch.randperm(height * width, generator=generator)[:_POINTS]
+    rgb = F.interpolate(coarse, size, mode="bilinear")
+    places = torch.randperm(height * width, generator=generator)[:count]
     y, x = places // width, places % width
     points = SparsePoints(
         xy=torch.stack([x, y], dim=1).float(),
         depth=2 + 3 * y.float() / height + torch.rand(len(places), generator=generator),
-        size=frame.image,
+        size=size,
     )
-    return network.arguments(frame, rgb, frame.points_to_network(points))
+    return rgb, points

@@ -20,6 +20,7 @@ from pnpdepth_cli.models.definition import Fixed, ModelDefinition, Normalisation
 from pnpdepth_cli.models.frame import FrameMap
 from pnpdepth_cli.models.made_up import made_up_arguments
 from pnpdepth_cli.models.outline import outline
+from pnpdepth_cli.models.precision import dtype_of, lower
 from pnpdepth_cli.models.registry import find_definition
 
 FARTHEST_DEPTH = 1e4
@@ -106,12 +107,22 @@ class Network:
         return found[0][1]
 
 
-def load_network(spec: str, checkpoint: Path | None, device: str = "cpu") -> Network:
+def load_network(
+    spec: str,
+    checkpoint: Path | None,
+    device: str = "cpu",
+    *,
+    precision: str = "fp32",
+    untrained: bool = False,
+) -> Network:
     """The network named by `spec`, with the weights of `checkpoint` or the definition's own.
 
-    Raises ModelError, CheckpointError or DeviceError; never falls back to random weights.
+    untrained: where there are none, random weights, which is noted, will do; without it they never
+    do. precision: see `pnpdepth_cli.models.precision`. Raises ModelError, CheckpointError or
+    DeviceError.
     """
     on = find_device(device)
+    dtype = dtype_of(precision, on)
     definition = find_definition(spec)
     path = checkpoint or definition.checkpoint
     with blaming(f"build of network {definition.name!r}"):
@@ -127,6 +138,8 @@ def load_network(spec: str, checkpoint: Path | None, device: str = "cpu") -> Net
         notes = []
     elif path is not None:
         notes = load_checkpoint(module, definition, path)
+    elif untrained:
+        notes = ["weights: random, for none are given; times are right, depths are not"]
     elif module.state_dict():
         raise CheckpointError(
             f"network {definition.name!r} comes without weights; name them with --checkpoint"
@@ -134,6 +147,8 @@ def load_network(spec: str, checkpoint: Path | None, device: str = "cpu") -> Net
     module.eval().requires_grad_(False)
     with out_of_memory_is_a_device_error(on):
         module.to(on)
+    if dtype is not None:
+        lower(module, dtype, on)
     notes = [f"model: {definition.assumed}", *notes] if definition.assumed else notes
     network = Network(
         definition=definition, module=module, device=on, checkpoint=path, notes=tuple(notes)

@@ -6,15 +6,27 @@ from collections import Counter
 from collections.abc import Callable, Generator, Iterator
 from contextlib import closing
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 from pnpdepth_cli.io.atomic import make_folder
 from pnpdepth_cli.io.layouts.frame import Frame
 from pnpdepth_cli.io.lock import in_turn, locked_folder
-from pnpdepth_cli.pipeline.batch_frames import BatchFrames, BatchRequest, find_frames, task_of
+from pnpdepth_cli.io.report import remove_report_leftovers
+from pnpdepth_cli.pipeline.ahead import in_order
+from pnpdepth_cli.pipeline.batch_frames import (
+    BatchFrames,
+    BatchRequest,
+    find_frames,
+    source_files,
+    task_of,
+)
+from pnpdepth_cli.pipeline.batch_profile import BatchProfile
 from pnpdepth_cli.pipeline.batch_settings import model_identity, settings_of
 from pnpdepth_cli.pipeline.batch_state import NEW, BatchState, remove_all_leftovers
 from pnpdepth_cli.pipeline.batch_summary import Tally, write_summary, write_table
+
+if TYPE_CHECKING:
+    from pnpdepth_cli.pipeline.report_batch import BatchReport
 
 _NAMED = 5
 """So many of a list of files are named, the rest is counted; summary.json has all."""
@@ -58,12 +70,14 @@ def run_batch(
     wrong with one frame, but with all, such as a network that cannot be loaded, or a full disk.
     """
     found = find_frames(request)
+    report = _report_of(request, found)
     for text in _said_of(request, found):
         listener.say(text)
     make_folder(request.output)
 
     def clean() -> None:
         leftovers = remove_all_leftovers(request.output)
+        leftovers += 0 if report is None else remove_report_leftovers(report.folder)
         if leftovers:
             listener.say(f"removed {leftovers:,} half-written files of a run that was killed")
 
@@ -74,22 +88,26 @@ def run_batch(
         to_do, reasons = _to_do(request, found, state)
         done = len(found.chosen) - len(to_do)
         listener.say(_plan_text(len(found.chosen), done, reasons))
-        began = 0
+        began, profile = 0, BatchProfile()
+        if report is not None:
+            report.begin()
         if to_do:
-            with closing(_rows(request, found, to_do, state, listener, stopped)) as rows:
+            made = _rows(request, found, to_do, state, listener, stopped, profile)
+            with closing(made if report is None else _drawn(report, made)) as rows:
                 listener.begin(len(to_do))
                 for row in rows:
                     began += 1
                     listener.frame(row)
         with in_turn(request.output):  # so the shard that ends last has the last word
             state.read_others()
-            summary = _summarise(request, found, state)
+            summary = _summarise(request, found, state, report, profile)
     return BatchOutcome(summary=summary, stopped=began < len(to_do))
 
 
 def plan_batch(request: BatchRequest, say: Callable[[str], None]) -> list[Planned]:
     """The frames that `run_batch` would do, and why; nothing is written."""
     found = find_frames(request)
+    _report_of(request, found)
     for text in _said_of(request, found):
         say(text)
     state = BatchState(request.output, request.shard, model_identity(request.refine))
@@ -130,6 +148,7 @@ def _rows(
     state: BatchState,
     listener: Listener,
     stopped: Callable[[], bool],
+    profile: BatchProfile,
 ) -> Generator[dict[str, Any], None, None]:
     """A row for each frame as it is done; the network is loaded before the first is asked for."""
     # They import torch, which a run with nothing to do can do without.
@@ -141,13 +160,43 @@ def _rows(
         refiner,
         state,
         workers=request.workers,
+        batch_size=request.batch_size,
         proven=len(to_do) < len(found.chosen),
         stopped=stopped,
+        say=listener.say,
+        profile=profile,
     )
 
 
-def _summarise(request: BatchRequest, found: BatchFrames, state: BatchState) -> dict[str, Any]:
-    """summary.csv and summary.json are on disk; returns what the second holds but the frames."""
+def _report_of(request: BatchRequest, found: BatchFrames) -> BatchReport | None:
+    """The report that is asked for. OutputError if it cannot, or may not, be written there."""
+    if request.html is None:
+        return None
+    from pnpdepth_cli.pipeline.report_batch import BatchReport
+
+    report = BatchReport(folder=request.html, output=request.output, workers=request.workers)
+    files = (path for frame in found.frames for path in source_files(frame))
+    inputs = [request.source, *(files if request.html.exists() else ())]
+    report.check(inputs, overwrite=request.refine.overwrite)
+    return report
+
+
+def _drawn(
+    report: BatchReport, rows: Generator[dict[str, Any], None, None]
+) -> Generator[dict[str, Any], None, None]:
+    """The rows, after the report's pictures of their frames are on disk."""
+    with closing(rows):
+        yield from in_order(report.drawn, rows, report.workers)
+
+
+def _summarise(
+    request: BatchRequest,
+    found: BatchFrames,
+    state: BatchState,
+    report: BatchReport | None,
+    profile: BatchProfile,
+) -> dict[str, Any]:
+    """summary.csv, summary.json and the report are on disk; returns the summary's head."""
 
     def rows() -> Iterator[dict[str, Any]]:
         for frame in found.frames:
@@ -179,7 +228,11 @@ def _summarise(request: BatchRequest, found: BatchFrames, state: BatchState) -> 
         "mean": tally.mean(),
         "unmatched": [str(each) for each in found.unmatched],
     }
+    if request.profile:
+        summary["profile"] = profile.summary()
     write_summary(request.output / "summary.json", summary, rows())
+    if report is not None:
+        report.write(summary, rows)
     return summary
 
 

@@ -19,7 +19,10 @@ class BatchRequest:
 
     refine: how; its files, its output and its protocol are set for each frame. layout: its name,
     None to guess it. protocol: its name, None for the layout's own. workers: threads that read,
-    and as many that write. limit: only the first frames. shard: (i, n), every n-th from the i-th.
+    and as many that write. batch_size: frames of one size that go through the network together,
+    None for as many as alter no result. limit: only the first frames. shard: (i, n), every n-th
+    from the i-th. profile: whether the summary says where the time went.
+    html: the folder for a report, None for no report.
     """
 
     source: Path
@@ -28,12 +31,17 @@ class BatchRequest:
     layout: str | None = None
     protocol: str | None = None
     workers: int = 2
+    batch_size: int | None = None
     limit: int | None = None
     shard: tuple[int, int] | None = None
+    profile: bool = False
+    html: Path | None = None
 
     def __post_init__(self) -> None:
         if self.workers < 1:
             raise UsageError(f"workers {self.workers}: at least one thread has to read")
+        if self.batch_size is not None and self.batch_size < 1:
+            raise UsageError(f"batch size {self.batch_size}: give 1 or more frames, or auto")
         if self.limit is not None and self.limit < 1:
             raise UsageError(f"limit {self.limit}: give the number of frames to do, 1 or more")
         if self.shard is not None and not 1 <= self.shard[0] <= self.shard[1]:
@@ -119,8 +127,14 @@ def task_of(request: BatchRequest, frame: Frame) -> Task:
         name=frame.name,
         request=wanted,
         inputs=dict(_input_files(wanted, is_scan=is_scan)),
-        outputs=Outputs.in_folder(request.output, frame.name, asked.format),
+        outputs=Outputs.in_folder(request.output, frame.name, asked),
     )
+
+
+def source_files(frame: Frame) -> list[Path]:
+    """The files that image, sparse depth and truth of the frame are in."""
+    parts = [frame.image, frame.sparse, frame.gt]
+    return [part if isinstance(part, Path) else part.path for part in parts if part is not None]
 
 
 def _input_files(request: RefineRequest, *, is_scan: bool) -> Iterator[tuple[str, Path]]:
@@ -153,9 +167,7 @@ def _outside(output: Path, frames: list[Frame]) -> tuple[list[Frame], list[Unmat
     folder = output.resolve()
     kept, left = [], []
     for frame in frames:
-        parts = [frame.image, frame.sparse, frame.gt]
-        files = [p if isinstance(p, Path) else p.path for p in parts if p is not None]
-        inside = [path for path in files if path.resolve().is_relative_to(folder)]
+        inside = [path for path in source_files(frame) if path.resolve().is_relative_to(folder)]
         if inside:
             why = "lies in the output folder, from which nothing is taken; move it"
             left.append(Unmatched(path=inside[0], why=why))

@@ -1,4 +1,4 @@
-"""Frames read ahead, refined one after the other, and written behind.
+"""Frames read ahead, refined one after the other or a few together, and written behind.
 
 The network runs in the thread that calls, and in no other: it is patched while it is cut. Readers
 and writers are threads of their own, and queues between them are bounded, so memory does not grow
@@ -7,10 +7,12 @@ with the number of frames and the network waits for no file.
 
 from __future__ import annotations
 
+import time
 import traceback
 from collections import deque
-from collections.abc import Callable, Generator, Iterable
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,6 +26,15 @@ from pnpdepth_cli.errors import (
 )
 from pnpdepth_cli.io.fingerprint import Fingerprint
 from pnpdepth_cli.pipeline.batch_frames import Task
+from pnpdepth_cli.pipeline.batch_groups import FrameGroups
+from pnpdepth_cli.pipeline.batch_profile import (
+    NETWORK,
+    READING,
+    WAITING_TO_READ,
+    WAITING_TO_WRITE,
+    WRITING,
+    BatchProfile,
+)
 from pnpdepth_cli.pipeline.batch_state import BatchState, known_inputs
 from pnpdepth_cli.pipeline.batch_summary import failed_row, row_of
 from pnpdepth_cli.pipeline.frame import RefinedFrame
@@ -76,36 +87,55 @@ def run_tasks(
     state: BatchState,
     *,
     workers: int,
+    batch_size: int | None,
     proven: bool,
     stopped: Callable[[], bool],
+    say: Callable[[str], None],
+    profile: BatchProfile,
 ) -> Generator[Row, None, None]:
     """Each task is done and recorded; a row for each, in their order.
 
-    A frame that cannot be done has a row that says why. proven: some frame went through with these
-    settings before. stopped(): no further frame is begun. Raises StorageError when nothing more can
-    be written, and an error of network or settings that shows before any frame went through.
+    A frame that cannot be done has a row that says why. batch_size: see `FrameGroups`. proven: some
+    frame went through with these settings before. stopped(): no further frame is begun. Raises
+    StorageError when nothing more can be written, and an error of network or settings that shows
+    before any frame went through.
     """
     writing: deque[Future[Row]] = deque()
-    with ThreadPoolExecutor(workers) as readers, ThreadPoolExecutor(workers) as writers:
-        reading = _read_ahead(tasks, readers, 2 * workers)
+
+    def written() -> Row:
+        with profile(WAITING_TO_WRITE):
+            return writing.popleft().result()
+
+    with (
+        profile.wall(),
+        refiner.split() if refiner is not None else nullcontext() as split,
+        ThreadPoolExecutor(workers) as readers,
+        ThreadPoolExecutor(workers) as writers,
+    ):
+        groups = None
+        if refiner is not None and split is not None:
+            groups = FrameGroups(refiner, split, batch_size, say)
+        reading = _read_ahead(tasks, readers, workers, groups, profile)
         try:
-            for task, read in reading:
+            for group in _gathered(reading, groups, profile):
                 if stopped():
                     break
-                try:
-                    done = _read_and_refined(refiner, read)
-                except Exception as error:
-                    if not proven and isinstance(error, ModelError | UsageError):
-                        raise
-                    writing.append(writers.submit(_failed, state, task, error))
-                else:
-                    proven = True
-                    writing.append(writers.submit(_write, state, task, *done))
+                for task, read, made in _refined(groups, group, profile):
+                    if isinstance(made, Exception):
+                        if not proven and isinstance(made, ModelError | UsageError):
+                            raise made
+                        writing.append(writers.submit(_failed, state, task, made))
+                    else:
+                        proven = True
+                        assert read is not None
+                        assert refiner is not None
+                        given = (state, task, read, refiner, made, profile)
+                        writing.append(writers.submit(_write, *given))
                 # What is refined but not written is lost if the process is killed; so it is little.
-                while writing and (writing[0].done() or len(writing) > workers):
-                    yield writing.popleft().result()
+                while writing and (writing[0].done() or len(writing) >= workers + len(group)):
+                    yield written()
             while writing:
-                yield writing.popleft().result()
+                yield written()
         finally:
             reading.close()
             for future in writing:  # after a full disk they would only fail as well
@@ -113,13 +143,17 @@ def run_tasks(
 
 
 def _read_ahead(
-    tasks: Iterable[Task], readers: ThreadPoolExecutor, ahead: int
+    tasks: Iterable[Task],
+    readers: ThreadPoolExecutor,
+    workers: int,
+    groups: FrameGroups | None,
+    profile: BatchProfile,
 ) -> Generator[tuple[Task, Future[ReadFrame]], None, None]:
     waiting: deque[tuple[Task, Future[ReadFrame]]] = deque()
     try:
         for task in tasks:
-            waiting.append((task, readers.submit(_read, task)))
-            if len(waiting) > ahead:
+            waiting.append((task, readers.submit(_read, task, profile)))
+            if len(waiting) > 2 * workers + (groups.largest - 1 if groups else 0):
                 yield waiting.popleft()
         while waiting:
             yield waiting.popleft()
@@ -128,40 +162,98 @@ def _read_ahead(
             future.cancel()
 
 
-def _read(task: Task) -> ReadFrame:
+def _gathered(
+    reading: Iterable[tuple[Task, Future[ReadFrame]]],
+    groups: FrameGroups | None,
+    profile: BatchProfile,
+) -> Generator[list[tuple[Task, ReadFrame | Exception]], None, None]:
+    """The frames in their order, so many of one size at once as go together.
+
+    One that could not be read is passed on in its place, and counts for nothing.
+    """
+    group: list[tuple[Task, ReadFrame | Exception]] = []
+    size: tuple[int, int] | None = None
+    for task, future in reading:
+        with profile(WAITING_TO_READ):
+            read = _outcome(future)
+        if isinstance(read, ReadFrame):
+            if size not in (None, read.inputs.size):
+                yield group
+                group = []
+            size = read.inputs.size
+        group.append((task, read))
+        wanted = 1 if size is None or groups is None else groups.of_size(size)
+        if sum(isinstance(read, ReadFrame) for _, read in group) >= wanted or size is None:
+            yield group
+            group, size = [], None
+    if group:
+        yield group
+
+
+def _outcome(future: Future[ReadFrame]) -> ReadFrame | Exception:
+    try:
+        return future.result()
+    except Exception as error:  # this frame's own matter
+        return error
+
+
+def _refined(
+    groups: FrameGroups | None,
+    group: Sequence[tuple[Task, ReadFrame | Exception]],
+    profile: BatchProfile,
+) -> Iterator[tuple[Task, ReadFrame | None, RefinedFrame | Exception]]:
+    """Each frame with what was read and what was made of it; or None, and why it was not read."""
+    frames = [read for _, read in group if isinstance(read, ReadFrame)]
+    results: list[RefinedFrame | Exception] = []
+    if groups is None:
+        missing = InputError("no frame could be read when the batch began; run it again")
+        results = [missing for _ in frames]
+    elif frames:
+        with profile(NETWORK):
+            start = time.perf_counter()
+            results = groups.refine([frame.inputs for frame in frames])
+            for frame in frames:
+                frame.watch.add("refine", (time.perf_counter() - start) / len(frames))
+            groups.try_out()
+    made = iter(results)
+    for task, read in group:
+        if isinstance(read, ReadFrame):
+            yield task, read, next(made)
+        else:
+            yield task, None, read
+
+
+def _read(task: Task, profile: BatchProfile) -> ReadFrame:
     watch = Stopwatch()
-    with watch("read"):
+    with watch("read"), profile(READING):
         known = known_inputs(task)
         inputs = read_inputs(task.request)
     return ReadFrame(inputs=inputs, known=known, watch=watch)
 
 
-def _read_and_refined(
-    refiner: Refiner | None, read: Future[ReadFrame]
-) -> tuple[ReadFrame, Refiner, RefinedFrame]:
-    frame = read.result()
-    if refiner is None:
-        raise InputError("no frame could be read when the batch began; run it again")
-    with frame.watch("refine"):
-        return frame, refiner, refiner.refine(frame.inputs)
-
-
 def _write(
-    state: BatchState, task: Task, frame: ReadFrame, refiner: Refiner, refined: RefinedFrame
+    state: BatchState,
+    task: Task,
+    read: ReadFrame,
+    refiner: Refiner,
+    frame: RefinedFrame,
+    profile: BatchProfile,
 ) -> Row:
     try:
-        state.begin(task)
-        outcome = write_refined(task.outputs, refiner, frame.inputs, refined, frame.watch)
-        written = {
-            kind: path.relative_to(state.output).as_posix()
-            for kind, path in task.outputs.by_kind().items()
-        }
-        row = row_of(task.name, _paths(task), outcome.record, written)
-        state.finish(task, "diverged" if outcome.diverged else "done", row, frame.known)
+        with profile(WRITING):
+            state.begin(task)
+            outcome = write_refined(task.outputs, refiner, read.inputs, frame, read.watch)
+            written = {
+                kind: path.relative_to(state.output).as_posix()
+                for kind, path in task.outputs.by_kind().items()
+            }
+            row = row_of(task.name, _paths(task), outcome.record, written)
+            state.finish(task, "diverged" if outcome.diverged else "done", row, read.known)
     except StorageError:
         raise
     except Exception as error:
         return _failed(state, task, error)
+    profile.count()
     return row
 
 

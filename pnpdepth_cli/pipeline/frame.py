@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 
 from pnpdepth_cli.core.alignment import Alignment
 from pnpdepth_cli.core.points import SparsePoints
+from pnpdepth_cli.core.propagation import propagate
 from pnpdepth_cli.core.refine import Refinement, RefineSettings, refine_batch
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.errors import BatchError, DivergedError, NoPointsError, PnpDepthError, UsageError
@@ -25,6 +27,8 @@ class RefinedFrame:
     """Depth before and after, (H, W) float32 metres in the image frame, 0 = unknown.
 
     alignment: of the network's output with the points, None where it is taken as it is.
+    sigma: (H, W) float32 metres, standard deviation of `after`, if it was asked for. choice,
+    baselines: what --auto chose and by what, and the scores of the simple baselines, for a record.
     """
 
     before: NDArray[np.float32]
@@ -35,6 +39,9 @@ class RefinedFrame:
     diverged: DivergedError | None
     alignment: Alignment | None = None
     notes: tuple[str, ...] = ()
+    sigma: NDArray[np.float32] | None = None
+    choice: dict[str, Any] | None = None
+    baselines: dict[str, dict[str, Any]] | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,26 +74,36 @@ def split_points(
 
 @dataclass(frozen=True, kw_only=True)
 class FrameToRefine:
-    """A frame, its points that are used, and those that are held out."""
+    """A frame, its points that are used, those that are held out, and what follows refinement.
+
+    propagate: how what is left at the points is spread, one of `core.propagation.PROPAGATIONS`.
+    """
 
     inputs: Inputs
     used: SparsePoints
     held_out: SparsePoints
+    propagate: str = "none"
+
+    @classmethod
+    def with_points(cls, inputs: Inputs, used: SparsePoints) -> FrameToRefine:
+        """The frame with these points used and none held out."""
+        none = used.select(torch.zeros(len(used), dtype=torch.bool))
+        return cls(inputs=inputs, used=used, held_out=none)
 
 
 def refine_frame(
     network: Network,
-    layer: str,
+    split: Split,
     settings: RefineSettings,
-    inputs: Inputs,
-    used: SparsePoints,
-    held_out: SparsePoints,
+    task: FrameToRefine,
     *,
     on_iteration: Callable[[int, float], None] = lambda done, loss: None,
 ) -> RefinedFrame:
-    """Refinement of one frame in memory; a divergence with a last good depth is returned in it."""
-    task = FrameToRefine(inputs=inputs, used=used, held_out=held_out)
-    (frame,) = refine_frames(network, layer, settings, (task,), on_iteration=on_iteration)
+    """Refinement of one frame in memory; a divergence with a last good depth is returned in it.
+
+    split: the network's module, open; for frames of one size it learns the network once.
+    """
+    (frame,) = refine_frames(network, split, settings, (task,), on_iteration=on_iteration)
     if isinstance(frame, PnpDepthError):
         raise frame
     return frame
@@ -94,7 +111,7 @@ def refine_frame(
 
 def refine_frames(
     network: Network,
-    layer: str,
+    split: Split,
     settings: RefineSettings,
     tasks: Sequence[FrameToRefine],
     *,
@@ -105,15 +122,14 @@ def refine_frames(
     BatchError if the network does not take them together, or they differ in size.
     """
     with out_of_memory_is_a_device_error(network.device):
-        ready = [_ready(network, settings, task) for task in tasks]
-        going = [frame for frame in ready if isinstance(frame, _Ready)]
-        with Split(network.module, layer) as split:
-            results = iter(_refined(split, settings, going, on_iteration) if going else ())
-    return [_finished(f, next(results)) if isinstance(f, _Ready) else f for f in ready]
+        ready = [ready_frame(network, settings, task) for task in tasks]
+        going = [frame for frame in ready if isinstance(frame, ReadyFrame)]
+        results = iter(_refined(split, settings, going, on_iteration) if going else ())
+    return [finished_frame(f, next(results)) if isinstance(f, ReadyFrame) else f for f in ready]
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Ready:
+class ReadyFrame:
     """A frame as the network takes it; `points` are the used ones, in the network's frame."""
 
     task: FrameToRefine
@@ -123,9 +139,10 @@ class _Ready:
     depth_of: AlignedDepth
 
 
-def _ready(
+def ready_frame(
     network: Network, settings: RefineSettings, task: FrameToRefine
-) -> _Ready | NoPointsError:
+) -> ReadyFrame | NoPointsError:
+    """The frame as the network takes it; an error where no used point lies where it looks."""
     frame = FrameMap.fit(network.definition.size, *task.inputs.size)
     points = frame.points_to_network(task.used)
     if not len(points):
@@ -134,7 +151,7 @@ def _ready(
             f" network {network.definition.name!r} sees (rows and columns {frame.crop})"
         )
     at = points.to(network.device)
-    return _Ready(
+    return ReadyFrame(
         task=task,
         frame=frame,
         arguments=network.arguments(frame, task.inputs.rgb_tensor(), points),
@@ -146,7 +163,7 @@ def _ready(
 def _refined(
     split: Split,
     settings: RefineSettings,
-    frames: Sequence[_Ready],
+    frames: Sequence[ReadyFrame],
     on_iteration: Callable[[int, float], None],
 ) -> list[Refinement | PnpDepthError]:
     return refine_batch(
@@ -173,15 +190,17 @@ def _stacked(arguments: Sequence[tuple[torch.Tensor, ...]]) -> tuple[torch.Tenso
     return tuple(torch.cat(each) for each in zip(*arguments, strict=True))
 
 
-def _finished(ready: _Ready, result: Refinement | PnpDepthError) -> RefinedFrame | PnpDepthError:
+def finished_frame(
+    ready: ReadyFrame, result: Refinement | PnpDepthError
+) -> RefinedFrame | PnpDepthError:
     diverged = result if isinstance(result, DivergedError) else None
     if diverged is not None and diverged.last_good is not None:
         result = diverged.last_good
     if isinstance(result, PnpDepthError):
         return result
     return RefinedFrame(
-        before=_to_image(ready.frame, result.before),
-        after=_to_image(ready.frame, result.after),
+        before=to_image(ready.frame, result.before),
+        after=_propagated(ready.task, to_image(ready.frame, result.after)),
         used=ready.task.used,
         held_out=ready.task.held_out,
         refinement=result,
@@ -191,7 +210,18 @@ def _finished(ready: _Ready, result: Refinement | PnpDepthError) -> RefinedFrame
     )
 
 
-def _to_image(frame: FrameMap, depth: torch.Tensor) -> NDArray[np.float32]:
+def _propagated(task: FrameToRefine, depth: NDArray[np.float32]) -> NDArray[np.float32]:
+    if task.propagate == "none":
+        return depth
+    rgb = task.inputs.rgb_tensor()
+    spread = propagate(
+        torch.from_numpy(depth), task.used, None if rgb is None else rgb[0], kind=task.propagate
+    )
+    return spread.depth.numpy()
+
+
+def to_image(frame: FrameMap, depth: torch.Tensor) -> NDArray[np.float32]:
+    """Depth (1, 1, h, w) of the network's frame as (H, W) of the image's, 0 = unknown."""
     image = frame.depth_to_image(depth).cpu().numpy()
     known = np.isfinite(image) & (image > 0)
     return np.where(known, image, 0).astype(np.float32)

@@ -17,15 +17,17 @@ class Outputs:
     """Where a frame's results go; all but the depth are None when only a depth file is wanted."""
 
     depth: Path
+    sigma: Path | None = None
     preview: Path | None = None
     improvement: Path | None = None
     record: Path | None = None
 
     @classmethod
-    def in_folder(cls, folder: Path, name: str, format: str) -> Outputs:
-        """All of them, in a folder; a name with slashes is a place in folders below it."""
+    def in_folder(cls, folder: Path, name: str, request: RefineRequest) -> Outputs:
+        """All that are asked for, in a folder; a name with slashes is a place in folders below."""
         return cls(
-            depth=folder / f"{name}_depth.{format}",
+            depth=folder / f"{name}_depth.{request.format}",
+            sigma=folder / f"{name}_sigma.exr" if request.uncertainty else None,
             preview=folder / f"{name}_preview.png",
             improvement=folder / f"{name}_improvement.png",
             record=folder / f"{name}.json",
@@ -35,6 +37,7 @@ class Outputs:
         """Every file that will be written."""
         kinds = {
             "depth": self.depth,
+            "sigma": self.sigma,
             "preview": self.preview,
             "improvement": self.improvement,
             "record": self.record,
@@ -62,6 +65,10 @@ def plan_outputs(request: RefineRequest) -> Outputs:
     output = request.output or Path(f"{stem}_refined")
     if f".{request.format}" not in DEPTH_SUFFIXES:
         raise UsageError(f"format {request.format!r} is not one of {' '.join(DEPTH_SUFFIXES)}")
+    if output.suffix.lower() in DEPTH_SUFFIXES and request.uncertainty:
+        raise UsageError(
+            f"--uncertainty writes a second file; name a folder, not {output}, with -o"
+        )
     if output.suffix.lower() in DEPTH_SUFFIXES:
         outputs = Outputs(depth=output)
     elif output.is_file():
@@ -69,7 +76,7 @@ def plan_outputs(request: RefineRequest) -> Outputs:
             f"{output} is a file; name a folder, or a depth file ({' '.join(DEPTH_SUFFIXES)})"
         )
     else:
-        outputs = Outputs.in_folder(output, stem, request.format)
+        outputs = Outputs.in_folder(output, stem, request)
     resolved = {path.resolve() for path in inputs}
     for path in outputs.paths():
         if path.resolve() in resolved:

@@ -22,6 +22,8 @@ def write_outputs(outputs: Outputs, inputs: Inputs, frame: RefinedFrame) -> dict
     """The depth and its pictures are on disk; returns what the record says of them."""
     make_folder(outputs.depth.parent)
     write_depth(outputs.depth, frame.after, scale=inputs.sparse_scale or INTEGER_SCALE)
+    if outputs.sigma is not None and frame.sigma is not None:
+        write_depth(outputs.sigma, frame.sigma, scale=INTEGER_SCALE)
     record: dict[str, Any] = {"improved_share": None}
     if outputs.preview is not None:
         preview(
@@ -35,9 +37,13 @@ def write_outputs(outputs: Outputs, inputs: Inputs, frame: RefinedFrame) -> dict
     if outputs.improvement is not None:
         record["improved_share"] = _write_improvement(outputs.improvement, inputs, frame)
     record["outputs"] = {
-        "depth": str(outputs.depth),
-        "preview": str(outputs.preview) if outputs.preview else None,
-        "improvement": str(outputs.improvement) if outputs.improvement else None,
+        kind: None if path is None else str(path)
+        for kind, path in (
+            ("depth", outputs.depth),
+            ("sigma", outputs.sigma),
+            ("preview", outputs.preview),
+            ("improvement", outputs.improvement),
+        )
     }
     return record
 

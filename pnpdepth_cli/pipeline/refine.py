@@ -13,16 +13,19 @@ from numpy.typing import NDArray
 
 from pnpdepth_cli.core.metrics import Scores, score
 from pnpdepth_cli.core.refine import RefineSettings
+from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.errors import DivergedError
 from pnpdepth_cli.io.record import sha256_of
 from pnpdepth_cli.models.network import Network, load_network
 from pnpdepth_cli.pipeline.frame import (
+    FrameToRefine,
     PointError,
     RefinedFrame,
     point_error,
     refine_frame,
     split_points,
 )
+from pnpdepth_cli.pipeline.held_out import refine_with_folds
 from pnpdepth_cli.pipeline.inputs import Inputs, read_inputs
 from pnpdepth_cli.pipeline.output_files import Outputs, plan_outputs
 from pnpdepth_cli.pipeline.outputs import write_outputs
@@ -57,7 +60,10 @@ def refine_image(
         refiner = load_refiner(request, inputs)
     with watch("refine"):
         of = refiner.settings.iterations
-        frame = refiner.refine(inputs, on_iteration=lambda done, loss: on_iteration(done, of, loss))
+        with refiner.split() as split:
+            frame = refiner.refine(
+                split, inputs, on_iteration=lambda done, loss: on_iteration(done, of, loss)
+            )
     return write_refined(outputs, refiner, inputs, frame, watch)
 
 
@@ -70,23 +76,32 @@ class Refiner:
     layer: str
     settings: RefineSettings
 
+    def split(self) -> Split:
+        """The network cut at the layer, to be opened for as many frames as there are."""
+        return Split(self.network.module, self.layer)
+
     def refine(
         self,
+        split: Split,
         inputs: Inputs,
         *,
         on_iteration: Callable[[int, float], None] = lambda done, loss: None,
     ) -> RefinedFrame:
         """One frame refined in memory, the same whatever was refined before."""
         torch.manual_seed(self.request.seed)
+        task = self.task(inputs)
+        if self.request.needs_folds:
+            return refine_with_folds(self.network, self.layer, self.settings, self.request, task)
+        return refine_frame(self.network, split, self.settings, task, on_iteration=on_iteration)
+
+    def task(self, inputs: Inputs) -> FrameToRefine:
+        """The frame with its points as the request shares them out."""
         used, held_out = split_points(inputs.points, self.request.holdout, self.request.seed)
-        return refine_frame(
-            self.network,
-            self.layer,
-            self.settings,
-            inputs,
-            used,
-            held_out,
-            on_iteration=on_iteration,
+        return FrameToRefine(
+            inputs=inputs,
+            used=used,
+            held_out=held_out,
+            propagate=self.request.propagate or "none",
         )
 
     @functools.cached_property
@@ -103,7 +118,9 @@ class Refiner:
 
 def load_refiner(request: RefineRequest, first: Inputs) -> Refiner:
     """The network that is asked for, with what it leaves open settled on this first frame."""
-    network = load_network(request.model, request.checkpoint, request.device)
+    network = load_network(
+        request.model, request.checkpoint, request.device, precision=request.precision
+    )
     network = settled(network, first, request)
     return Refiner(
         request=request,
@@ -141,6 +158,7 @@ def _record(refiner: Refiner, inputs: Inputs, frame: RefinedFrame) -> dict[str, 
             "step": frame.refinement.step,
             "holdout": request.holdout,
             "seed": request.seed,
+            "precision": request.precision,
             "device": str(network.device),
         },
         "alignment": asdict(frame.alignment) if frame.alignment else None,
@@ -155,8 +173,10 @@ def _record(refiner: Refiner, inputs: Inputs, frame: RefinedFrame) -> dict[str, 
         "sparse_error": _before_after(frame, lambda d: point_error(d, frame.used)),
         "held_out_error": _before_after(frame, lambda d: point_error(d, frame.held_out)),
         "scores": _before_after(frame, lambda d: _score(d, inputs.gt)),
+        "auto": frame.choice,
+        "baselines": frame.baselines,
         "diverged": str(frame.diverged) if frame.diverged else None,
-        "notes": [*inputs.notes, *network.notes, *frame.notes],
+        "notes": [note for note in (*inputs.notes, *network.notes, *frame.notes) if note],
     }
 
 

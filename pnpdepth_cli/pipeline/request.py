@@ -26,8 +26,10 @@ class RefineRequest:
     sparse_scale, gt_scale: integer depth files hold metres × scale; the first holds for both.
     holdout: the share of the points kept from the network and the loss, and only scored.
     output_kind, normalise: what the network's numbers are and which rgb it wants, over what its
-    definition says. scan: how to project `sparse` where it is a LiDAR scan. protocol: what is cut
-    out of a frame first of all.
+    definition says. propagate: how what is left at the points is spread, one of
+    `core.propagation.PROPAGATIONS`. auto, time_budget_s, baselines, uncertainty: see
+    `pnpdepth_cli.pipeline.held_out`. scan: how to project `sparse` where it is a LiDAR scan.
+    protocol: what is cut out of a frame first of all.
     """
 
     image: Source | None
@@ -58,14 +60,35 @@ class RefineRequest:
     scan: ScanOptions = field(default_factory=ScanOptions)
     sample: SamplePattern | None = None
     protocol: Protocol = WHOLE
+    propagate: str | None = None
+    auto: bool = False
+    time_budget_s: float | None = None
+    baselines: bool = False
+    uncertainty: bool = False
     holdout: float = 0.0
     seed: int = 0
+    precision: str = "fp32"
     device: str = "cpu"
+
+    @property
+    def needs_folds(self) -> bool:
+        """Whether points are to be held out in turns, to choose, to compare or to calibrate."""
+        return self.auto or self.baselines or self.uncertainty
 
 
 def sample_pattern(kind: str, count: int | None, share: float | None) -> SamplePattern:
     """So many points, or this share of the known pixels, by one of the samplers' patterns."""
     return SamplePattern(kind=kind, count=count, share=share)
+
+
+def count_or_share(text: str) -> tuple[int | None, float | None]:
+    """(points, share) of `500` or `5%`; None for what it is not. UsageError for any other text."""
+    try:
+        if text.strip().endswith("%"):
+            return None, float(text.strip()[:-1]) / 100
+        return int(text), None
+    except ValueError:
+        raise UsageError(f"count {text!r} is neither a number such as 500 nor 5%") from None
 
 
 def layer_name(definition: ModelDefinition, wanted: str | None) -> str:

@@ -12,7 +12,7 @@ from pnpdepth_cli.core.metrics import Measure
 from pnpdepth_cli.errors import OutputError
 from pnpdepth_cli.io.atomic import atomic_path
 from pnpdepth_cli.pipeline.compare import Comparison
-from pnpdepth_cli.pipeline.evaluation import Evaluation, frame_record
+from pnpdepth_cli.pipeline.evaluation import Evaluation, Part, frame_record
 
 Rows = Sequence[Sequence[str]]
 
@@ -91,6 +91,21 @@ def means_table(evaluation: Evaluation, name: str) -> tuple[list[str], list[list
     header = ["", *(heading(measure) for measure in measures), "frames", "coverage"]
     frames = f"{len(evaluation.scored):,} of {len(evaluation.frames):,}"
     return header, [[name, *cells, frames, f"{evaluation.coverage:.2%}"]]
+
+
+def part_cells(parts: Sequence[Part]) -> list[list[str]]:
+    """A row for each part: its bounds, its share of the truth, RMSE, MAE, MRE and coverage."""
+    total = sum(part.known for part in parts)
+    rows = []
+    for part in parts:
+        low, high = f"{part.low:g}", f"{part.high:g}"
+        rows.append([
+            f"{low} or more" if math.isinf(part.high) else f"{low} to {high}",
+            f"{part.known / total:.1%}",
+            *("–" if math.isnan(v) else f"{v:.4f}" for v in (part.rmse, part.mae, part.mre)),
+            f"{part.pixels / part.known:.2%}",
+        ])  # fmt: skip
+    return rows
 
 
 def comparison_table(comparison: Comparison) -> tuple[list[str], list[list[str]]]:

@@ -28,8 +28,11 @@ class Stopwatch:
         try:
             yield
         finally:
-            spent = time.perf_counter() - start
-            self.seconds[stage] = round(self.seconds.get(stage, 0.0) + spent, 4)
+            self.add(stage, time.perf_counter() - start)
+
+    def add(self, stage: str, seconds: float) -> None:
+        """So many more seconds of it."""
+        self.seconds[stage] = round(self.seconds.get(stage, 0.0) + seconds, 4)
 
 
 def peak_memory_mb(device: torch.device) -> dict[str, float]:

@@ -82,6 +82,8 @@ EXITS: list[tuple[list[str], int, str]] = [
     (["--shard", "2"], 2, "I/N"),
     (["--shard", "0/2"], 2, "1/4"),
     (["--limit", "0"], 2, "1 or more"),
+    (["--batch-size", "0"], 2, "1 or more"),
+    (["--batch-size", "many"], 2, "neither auto nor a number of frames"),
     (["--sample", "some:5"], 2, "uniform"),
     (["--sample", "many"], 2, "500"),
     (["--layout", "tum"], 3, "does not look like 'tum'"),
@@ -119,6 +121,18 @@ def test_names_with_new_lines_stay_on_their_line(
     err = capsys.readouterr().err
     assert "failed: b\\nb\\x1b: drive/rgb/b\\nb\\x1b.png" in err
     assert "\x1b.png" not in err
+
+
+def test_the_profile_is_a_table_on_stderr_and_part_of_the_summary(
+    root: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert code_of(arguments("--profile", "--json", "--batch-size", "1")) == 0
+    out, err = capsys.readouterr()
+    assert json.loads(out)["profile"]["frames"] == 4
+    for said in ("where the time went", "waiting for a frame to be written", "4 frames, "):
+        assert said in err
+    assert code_of(arguments("--profile", "--batch-size", "auto")) == 0
+    assert "no frame was done; there is no time to share out" in capsys.readouterr().err
 
 
 def test_a_dry_run_lists_what_would_be_done_and_does_nothing(

@@ -468,15 +468,17 @@ def test_an_empty_folder_says_which_layouts_there_are(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "changes", [{"workers": 0}, {"limit": 0}, {"shard": (3, 2)}, {"shard": (0, 2)}]
+    "changes",
+    [{"workers": 0}, {"batch_size": 0}, {"limit": 0}, {"shard": (3, 2)}, {"shard": (0, 2)}],
 )
 def test_numbers_that_make_no_sense_are_refused(root: Path, changes: dict[str, Any]) -> None:
     with pytest.raises(UsageError):
         batch(root, **changes)
 
 
+@pytest.mark.parametrize(("batch_size", "most_allowed"), [(1, 6), (3, 6 + 3 * 3)])
 def test_only_a_few_frames_are_in_memory_at_once(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, batch_size: int, most_allowed: int
 ) -> None:
     root = pairs_on_disk(tmp_path / "drive", tuple(f"{i:02}" for i in range(24)), gt=False)
     alive: weakref.WeakSet[Any] = weakref.WeakSet()
@@ -490,8 +492,8 @@ def test_only_a_few_frames_are_in_memory_at_once(
         return inputs
 
     monkeypatch.setattr(batch_running, "read_inputs", watched)
-    batch(root, workers=1)
-    assert most <= 6
+    batch(root, workers=1, batch_size=batch_size)
+    assert most <= most_allowed
 
 
 def test_reading_and_writing_go_on_while_the_network_runs(
@@ -508,14 +510,14 @@ def test_reading_and_writing_go_on_while_the_network_runs(
             second_is_read.set()
         return read_inputs(request)
 
-    def refining(self: Refiner, inputs: Any) -> Any:
+    def refining(self: Refiner, split: Any, inputs: Any) -> Any:
         nonlocal refined
         assert threading.current_thread() is threading.main_thread()
         assert second_is_read.wait(60), "the second frame is not read while the first is refined"
         refined += 1
         if refined == 2:
             second_is_refined.set()
-        return refine(self, inputs)
+        return refine(self, split, inputs)
 
     def writing(*given: Any) -> Any:
         assert second_is_refined.wait(60), "the second frame waits until the first is written"

@@ -11,7 +11,8 @@ import torch
 
 from pnpdepth_cli.core.points import SparsePoints
 from pnpdepth_cli.core.refine import RefineSettings
-from pnpdepth_cli.errors import BatchError, DivergedError, NoPointsError
+from pnpdepth_cli.core.split import Split
+from pnpdepth_cli.errors import BatchError, DivergedError, NoPointsError, PnpDepthError
 from pnpdepth_cli.models.definition import Fixed
 from pnpdepth_cli.models.network import Network, load_network
 from pnpdepth_cli.pipeline.frame import FrameToRefine, RefinedFrame, refine_frame, refine_frames
@@ -44,14 +45,22 @@ def task(seed: int, height: int = 46, width: int = 62, depth: float = 2.0) -> Fr
 
 
 def alone(network: Network, settings: RefineSettings, one: FrameToRefine) -> RefinedFrame:
-    return refine_frame(network, "middle", settings, one.inputs, one.used, one.held_out)
+    with Split(network.module, "middle") as split:
+        return refine_frame(network, split, settings, one)
+
+
+def together(
+    network: Network, settings: RefineSettings, tasks: list[FrameToRefine], layer: str = "middle"
+) -> list[RefinedFrame | PnpDepthError]:
+    with Split(network.module, layer) as split:
+        return refine_frames(network, split, settings, tasks)
 
 
 @pytest.mark.parametrize("align", ["none", "scale", "auto"])
 def test_frames_at_once_are_those_of_one_at_a_time(network: Network, align: str) -> None:
     settings = replace(SETTINGS, align=align)
     tasks = [task(seed, depth=seed + 1) for seed in range(3)]
-    for one, frame in zip(tasks, refine_frames(network, "middle", settings, tasks), strict=True):
+    for one, frame in zip(tasks, together(network, settings, tasks), strict=True):
         assert isinstance(frame, RefinedFrame)
         expected = alone(network, settings, one)
         np.testing.assert_allclose(frame.before, expected.before, rtol=1e-5)
@@ -69,12 +78,12 @@ def test_a_frame_that_fails_does_not_lose_the_others(network: Network) -> None:
     wrong = torch.tensor([[1.0, 20.0]])  # left of the square crop
     outside = SparsePoints(xy=wrong, depth=torch.ones(1), size=(46, 62))
     tasks = [task(0), replace(task(1), used=outside), task(2)]
-    first, failed, last = refine_frames(network, "middle", SETTINGS, tasks)
+    first, failed, last = together(network, SETTINGS, tasks)
     assert isinstance(failed, NoPointsError)
     assert isinstance(first, RefinedFrame)
     assert isinstance(last, RefinedFrame)
     np.testing.assert_allclose(last.after, alone(network, SETTINGS, tasks[2]).after, rtol=1e-4)
-    (nothing,) = refine_frames(network, "middle", SETTINGS, tasks[1:2])
+    (nothing,) = together(network, SETTINGS, tasks[1:2])
     assert isinstance(nothing, NoPointsError)
     with pytest.raises(NoPointsError):
         alone(network, SETTINGS, tasks[1])
@@ -82,7 +91,7 @@ def test_a_frame_that_fails_does_not_lose_the_others(network: Network) -> None:
 
 def test_a_divergence_comes_with_its_last_good_depth(network: Network) -> None:
     settings = replace(SETTINGS, lr=1e38, update="sgd", loss="l2")
-    for frame in refine_frames(network, "decode", settings, [task(0), task(1)]):
+    for frame in together(network, settings, [task(0), task(1)], "decode"):
         assert isinstance(frame, RefinedFrame)
         assert isinstance(frame.diverged, DivergedError)
         assert np.isfinite(frame.after).all()
@@ -90,4 +99,4 @@ def test_a_divergence_comes_with_its_last_good_depth(network: Network) -> None:
 
 def test_frames_of_two_sizes_are_not_refined_at_once(network: Network) -> None:
     with pytest.raises(BatchError, match="one at a time"):
-        refine_frames(network, "middle", SETTINGS, [task(0), task(1, height=54)])
+        together(network, SETTINGS, [task(0), task(1, height=54)])

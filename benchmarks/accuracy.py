@@ -1,0 +1,247 @@
+"""`--auto` against everything simple: `python -m benchmarks.accuracy --data PATH [--every 5]`.
+
+For each network, set and number of points, MAE and RMSE in metres, means over frames and seeds of
+each frame's error: the network as it is, aligned with the points, refined at the paper's setting,
+every baseline of `pnpdepth_cli.core.baselines`, and `--auto`. The same network, points and pixels
+for all: those with known truth where the network sees. `wins` counts frames where `--auto` is not
+above the aligned network, and not more than 3 per cent above the best baseline of that frame.
+`--outliers 0.2` puts so many points at wrong depths. `--render FOLDER` takes frames rendered by
+this project instead. Nothing was tuned on the real frames.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from tqdm import tqdm
+
+from benchmarks.foreign import COMPLETION, as_fastdepth_sees_it, nyu
+from benchmarks.frames import (
+    SETS,
+    EvalFrame,
+    frame_inputs,
+    frame_pixels,
+    points_on_grid,
+    refined,
+)
+from model_zoo_defs.training.dataset import Frames
+from pnpdepth_cli.core.baselines import BASELINES
+from pnpdepth_cli.core.metrics import score
+from pnpdepth_cli.core.points import SparsePoints
+from pnpdepth_cli.core.refine import RefineSettings
+from pnpdepth_cli.models.definition import Normalisation
+from pnpdepth_cli.models.network import Network, load_network
+from pnpdepth_cli.pipeline.auto import refine_automatically, usual_trials
+from pnpdepth_cli.pipeline.request import RefineRequest, effective_settings, layer_name
+
+PAPER = RefineSettings()
+COUNTS: tuple[int | None, ...] = (20, 100, 500)
+ROOMS = ("7scenes", "icl_nuim", "nyu")
+RGB = ("compact", "fastdepth", "eigen-tiny", "fcrn-tiny")
+STREETS = ("pncnn", "nconv", "sparse2dense-tiny-kitti", "compact")
+Errors = dict[str, tuple[float, float]]
+
+
+@dataclass(frozen=True)
+class Case:
+    """A network on a set of frames with so many points, None for the set's own."""
+
+    network: str
+    frames: str
+    points: int | None
+
+
+def cases() -> Iterator[Case]:
+    """All that is measured by default."""
+    for network in (*RGB, "sparse2dense-tiny", "latefusion-tiny"):
+        for frames in ROOMS:
+            for points in COUNTS:
+                yield Case(network, frames, points)
+    for network in STREETS:
+        yield Case(network, "kitti_dc", None)
+
+
+def opened(name: str, data: Path) -> Network:
+    """The network with its published or shipped weights."""
+    if name == "fastdepth":
+        network = load_network(str(data / "weights" / "fastdepth_nyu.onnx"), None)
+        definition = replace(network.definition, normalisation=Normalisation())
+        return replace(network, definition=definition)
+    return load_network(name, (data / "weights" / w) if (w := dict(COMPLETION).get(name)) else None)
+
+
+def frames_of(name: str, data: Path, network: str, every: int) -> list[EvalFrame]:
+    """Frames of a set, for FastDepth cut as its own evaluation does."""
+    if name == "nyu":
+        return nyu(data)
+    if name in SETS:
+        frames = list(SETS[name](data))[::every]
+        return [as_fastdepth_sees_it(f) for f in frames] if network == "fastdepth" else frames
+    shards = Frames(Path(name))
+    numbers = range(0, len(shards), every)
+    return [EvalFrame(str(n), shards[n][0].astype(np.float32) / 255, shards[n][1]) for n in numbers]
+
+
+def with_outliers(points: SparsePoints, share: float, seed: int) -> SparsePoints:
+    """So many of the points at random depths, from half the nearest to twice the farthest."""
+    generator = torch.Generator().manual_seed(seed)
+    wrong = torch.rand(len(points), generator=generator) < share
+    low, high = float(points.depth.min()) / 2, float(points.depth.max()) * 2
+    random = low + (high - low) * torch.rand(len(points), generator=generator)
+    depth = torch.where(wrong, random, points.depth)
+    return SparsePoints(xy=points.xy, depth=depth, size=points.size)
+
+
+def measure(
+    network: Network, frame: EvalFrame, count: int | None, seed: int, outliers: float
+) -> dict[str, object]:
+    """Errors of every way on one frame, what --auto chose, and what it cost."""
+    rows, columns, depth = frame_pixels(frame, count, seed)
+    points = points_on_grid(rows, columns, depth, frame.truth.shape)
+    if outliers:
+        points = with_outliers(points, outliers, seed)
+    inputs = frame_inputs(frame.rgb, points, frame.truth)
+    definition = network.definition
+    layer = layer_name(definition, None)
+    settings = effective_settings(definition, RefineRequest(image=None, sparse=None))
+    start = time.perf_counter()
+    raw = refined(network, layer, replace(settings, iterations=0), inputs)
+    plain_s = time.perf_counter() - start
+    align = "auto" if settings.align == "none" else settings.align
+    paper = replace(PAPER, align=settings.align)
+    aligned = refined(network, layer, replace(settings, iterations=0, align=align), inputs)
+    prediction = torch.from_numpy(raw.before)
+    depths = {
+        "raw": prediction,
+        "aligned": torch.from_numpy(aligned.before),
+        "paper": torch.from_numpy(refined(network, layer, paper, inputs).after),
+        "tuned": torch.from_numpy(refined(network, layer, settings, inputs).after),
+    }
+    depths |= {name: made.depth(points, prediction) for name, made in BASELINES.items()}
+    start = time.perf_counter()
+    auto = refine_automatically(
+        network, usual_trials(network.definition, layer, settings), inputs, points
+    )
+    auto_s = time.perf_counter() - start
+    depths["auto"] = torch.from_numpy(auto.frame.after)
+    return {
+        "errors": errors_of(depths, torch.from_numpy(frame.truth)),
+        "choice": str(auto.choice),
+        "plain_s": plain_s,
+        "auto_s": auto_s,
+    }
+
+
+def errors_of(depths: dict[str, torch.Tensor], truth: torch.Tensor) -> Errors:
+    """(MAE, RMSE) over the pixels with truth where all are known."""
+    seen = torch.stack([depth > 0 for depth in depths.values()]).all(dim=0)
+    truth = torch.where(seen, truth, 0.0)
+    scores = {name: score(depth, truth) for name, depth in depths.items()}
+    return {name: (s.mae, s.rmse) for name, s in scores.items()}
+
+
+def summary(rows: list[dict[str, object]]) -> dict[str, object]:
+    """Means over frames of a case, and how often --auto is not worse."""
+    errors: list[Errors] = [row["errors"] for row in rows]  # type: ignore[misc]
+    mean = {
+        name: tuple(float(np.mean([each[name][k] for each in errors])) for k in (0, 1))
+        for name in errors[0]
+    }
+    auto = np.array([each["auto"][0] for each in errors])
+    aligned = np.array([each["aligned"][0] for each in errors])
+    best = np.array([min(each[name][0] for name in BASELINES) for each in errors])
+    return {
+        "frames": len(rows),
+        "mean": mean,
+        "not above aligned": float((auto <= aligned * (1 + 1e-6)).mean()),
+        "within 3 % of the best baseline": float((auto <= 1.03 * best).mean()),
+        "auto_s": float(np.median([row["auto_s"] for row in rows])),
+        "plain_s": float(np.median([row["plain_s"] for row in rows])),
+        "choices": [row["choice"] for row in rows],
+    }
+
+
+def shown(case: Case, found: dict[str, object]) -> str:
+    """A line of the table."""
+    mean: dict[str, tuple[float, float]] = found["mean"]  # type: ignore[assignment]
+    lowest = min(BASELINES, key=lambda name: mean[name][0])
+    columns = ("raw", "aligned", "paper", "tuned", "linear", lowest, "auto")
+    cells = [f"{mean[name][0]:.3f} / {mean[name][1]:.3f}" for name in columns]
+    cells[5] = f"{lowest} {cells[5]}"
+    gains = [
+        f"{100 * (mean['auto'][0] / mean[name][0] - 1):+.0f} %" for name in ("paper", "linear")
+    ]
+    wins = [
+        f"{found[name]:.0%}" for name in ("not above aligned", "within 3 % of the best baseline")
+    ]
+    below = sum(mean["auto"][k] < mean[name][k] for name in (*BASELINES, "aligned") for k in (0, 1))
+    points = case.points or "LiDAR"
+    cost = f"{found['auto_s']:.2f} s ({found['plain_s']:.2f})"
+    head = [case.network, f"{Path(case.frames).name}, {found['frames']}", str(points)]
+    tally = f"{below}/{2 * (len(BASELINES) + 1)}"
+    return "| " + " | ".join([*head, *cells, *gains, tally, *wins, cost]) + " |"
+
+
+HEAD = (
+    "network", "set, frames", "points", "raw", "aligned", "paper's setting", "tuned", "linear",
+    "best baseline", "--auto", "vs paper", "vs linear", "below", "≤ aligned", "≤ best +3 %",
+    "auto (plain)",
+)  # fmt: skip
+
+
+def main() -> None:
+    """Measure, and print a table as it comes."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--data", type=Path, required=True)
+    parser.add_argument("--networks", nargs="+", help="only these")
+    parser.add_argument("--sets", nargs="+", help="only these")
+    parser.add_argument("--render", type=Path, nargs="+", help="folders of rendered frames instead")
+    parser.add_argument("--points", type=int, nargs="+", help="only so many")
+    parser.add_argument("--every", type=int, default=5, help="use every n-th frame")
+    parser.add_argument("--seeds", type=int, default=1)
+    parser.add_argument("--outliers", type=float, default=0.0)
+    parser.add_argument("--json", type=Path, help="everything, to this file")
+    args = parser.parse_args()
+    wanted = list(cases())
+    if args.render:
+        wanted = [
+            Case(network, str(folder), points)
+            for network in args.networks or RGB
+            for folder in args.render
+            for points in COUNTS
+        ]
+    wanted = [
+        case
+        for case in wanted
+        if (not args.networks or case.network in args.networks)
+        and (not args.sets or case.frames in args.sets)
+        and (not args.points or case.points in args.points)
+    ]
+    print("| " + " | ".join(HEAD) + " |\n|" + "---|" * len(HEAD))
+    networks: dict[str, Network] = {}
+    everything = []
+    for case in wanted:
+        network = networks.setdefault(case.network, opened(case.network, args.data))
+        frames = frames_of(case.frames, args.data, case.network, args.every)
+        seeds = range(args.seeds if case.points else 1)
+        runs = [(frame, seed) for seed in seeds for frame in frames]
+        rows = [
+            measure(network, frame, case.points, seed, args.outliers)
+            for frame, seed in tqdm(runs, leave=False, desc=f"{case.network} {case.frames}")
+        ]
+        found = summary(rows)
+        print(shown(case, found), flush=True)
+        everything.append({"case": vars(case), "summary": found, "frames": rows})
+        if args.json:
+            args.json.write_text(json.dumps(everything, indent=1))
+
+
+if __name__ == "__main__":
+    main()

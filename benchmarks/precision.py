@@ -1,0 +1,89 @@
+"""What bf16 changes: `python -m benchmarks.precision [--data PATH --set icl_nuim --frames 4]`.
+
+The MAE in metres of the plain and of the refined prediction in fp32 and in bf16, with the network's
+defaults, over the pixels with known truth: on the program's own samples, or with --data on the
+first frames of a set (500 points of the truth; KITTI's own LiDAR).
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+from itertools import islice
+from pathlib import Path
+
+import torch
+
+from benchmarks.frames import SETS, frame_inputs, frame_pixels, points_on_grid
+from benchmarks.frames import refined as refined_frame
+from pnpdepth_cli.core.metrics import score
+from pnpdepth_cli.models.network import load_network
+from pnpdepth_cli.pipeline.inputs import Inputs, read_inputs
+from pnpdepth_cli.pipeline.request import RefineRequest, effective_settings, layer_name
+
+PRECISIONS, DEPTHS = ("fp32", "bf16"), ("before", "after")
+SAMPLES = Path(__file__).parent.parent / "samples"
+
+
+def samples() -> Iterator[tuple[str, Inputs]]:
+    """The frames that come with the program."""
+    for name in ("indoor", "street"):
+        folder = SAMPLES / name
+        yield (
+            name,
+            read_inputs(
+                RefineRequest(
+                    image=folder / "rgb.png", sparse=folder / "sparse.png", gt=folder / "gt.png"
+                )
+            ),
+        )
+
+
+def real(data: Path, name: str, count: int) -> Iterator[tuple[str, Inputs]]:
+    """The first frames of a set."""
+    number = None if name == "kitti_dc" else 500
+    for frame in islice(SETS[name](data), count):
+        points = points_on_grid(*frame_pixels(frame, number, seed=0), frame.truth.shape)
+        yield frame.name, frame_inputs(frame.rgb, points, frame.truth)
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--data", type=Path)
+    parser.add_argument("--set", choices=SETS, default="icl_nuim")
+    parser.add_argument("--frames", type=int, default=4)
+    parser.add_argument("--model", default="compact")
+    given = parser.parse_args()
+    networks = {name: load_network(given.model, None, precision=name) for name in PRECISIONS}
+    definition = networks["fp32"].definition
+    layer = layer_name(definition, None)
+    settings = effective_settings(definition, RefineRequest(image=None, sparse=None))
+    print("| frame | plain fp32 | plain bf16 | change | refined fp32 | refined bf16 | change |")
+    print("|" + "---|" * 7)
+    frames = real(given.data, given.set, given.frames) if given.data else samples()
+    total = {(p, depths): 0.0 for p in PRECISIONS for depths in DEPTHS}
+    for name, inputs in frames:
+        assert inputs.gt is not None
+        truth = torch.from_numpy(inputs.gt)
+        made = {p: refined_frame(networks[p], layer, settings, inputs) for p in PRECISIONS}
+        cells = []
+        for depths in DEPTHS:
+            maes = [
+                score(torch.from_numpy(getattr(made[p], depths)), truth).mae for p in PRECISIONS
+            ]
+            cells += compared(*maes)
+            for precision, mae in zip(PRECISIONS, maes, strict=True):
+                total[precision, depths] += mae
+        print(f"| {name} | " + " | ".join(cells) + " |", flush=True)
+    cells = [c for depths in DEPTHS for c in compared(*(total[p, depths] for p in PRECISIONS))]
+    print("| sum | " + " | ".join(cells) + " |")
+
+
+def compared(full: float, low: float) -> list[str]:
+    """Both, and how much more the second is."""
+    return [f"{full:.5f}", f"{low:.5f}", f"{100 * (low / full - 1):+.3f} %"]
+
+
+if __name__ == "__main__":
+    main()

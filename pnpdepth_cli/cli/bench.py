@@ -1,0 +1,209 @@
+"""`pnpdepth bench`."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from pnpdepth_cli.cli import options
+from pnpdepth_cli.cli.printable import printable
+from pnpdepth_cli.errors import UsageError
+
+if TYPE_CHECKING:
+    from pnpdepth_cli.pipeline.bench import Bench, BenchPart
+    from pnpdepth_cli.pipeline.bench_table import TableRow
+
+
+@click.command(short_help="Measure how long a refinement takes here.")
+@options.model
+@options.checkpoint
+@options.layer
+@click.option(
+    "--size", metavar="HxW", help="Of the frame.  [default: 480x640, or the network's own]"
+)
+@click.option(
+    "--points", type=int, default=500, show_default=True, metavar="N", help="Of sparse depth."
+)
+@click.option("--iterations", type=int, metavar="K", help="Updates of z.")
+@options.precision
+@options.device
+@click.option(
+    "--repeats", type=int, default=10, show_default=True, metavar="N", help="Runs of each part."
+)
+@click.option(
+    "--table", is_flag=True, help="The paper's seven networks at full size, beside its Table V."
+)
+@options.as_json
+def bench(
+    model: str,
+    checkpoint: Path | None,
+    layer: str | None,
+    size: str | None,
+    points: int,
+    iterations: int | None,
+    precision: str,
+    device: str,
+    repeats: int,
+    table: bool,
+    as_json: bool,
+) -> None:
+    """Measure how long a refinement takes here, part by part, beside one forward pass.
+
+    \b
+    pnpdepth bench
+    pnpdepth bench --model net.onnx --layer Relu_315 --size 480x640
+    pnpdepth bench --precision bf16
+    pnpdepth bench --table --repeats 5
+
+    The frame is made up; a network without weights gets random ones. The parts run in turn; each
+    has the median of its runs, the quartiles, and the median in units of a forward pass. The limit
+    is what K updates cost at least: (front + (2K+1) rear) / (front + rear). Memory is what a part
+    needs at its peak beyond what lay there before.
+    """
+    if repeats < 1:
+        raise UsageError(f"repeats {repeats}: there must be at least one")
+    if table:
+        given = {
+            "--checkpoint": checkpoint,
+            "--layer": layer,
+            "--size": size,
+            "--iterations": iterations,
+        }
+        if clash := [name for name, value in given.items() if value is not None]:
+            raise UsageError(
+                f"--table measures the paper's networks; it does not go with {clash[0]}"
+            )
+        _table(repeats, precision, device, as_json)
+        return
+    from tqdm import tqdm
+
+    from pnpdepth_cli.pipeline.bench import BenchRequest, run_bench
+
+    request = BenchRequest(
+        model=model,
+        checkpoint=checkpoint,
+        layer=layer,
+        size=options.height_and_width(size) if size else None,
+        points=points,
+        iterations=iterations,
+        precision=precision,
+        device=device,
+        repeats=repeats,
+    )
+    with tqdm(desc="bench", unit="round", leave=False, delay=1) as bar:
+
+        def show(done: int, of: int) -> None:
+            bar.total = of
+            bar.update(done - bar.n)
+
+        found = run_bench(request, on_round=show)
+    if as_json:
+        click.echo(json.dumps(found.record(), indent=2))
+        return
+    _print(found)
+
+
+def _print(found: Bench) -> None:
+    from pnpdepth_cli.cli.tables import print_rows
+
+    _print_notes(found)
+    height, width = found.size
+    print_rows(
+        f"{found.model} cut at {found.layer}, {width}×{height}, {found.points:,} points,"
+        f" K = {found.iterations}, {found.precision}",
+        ("", "median", "quartiles", "× forward", "memory"),
+        [_cells(part) for part in found.parts],
+    )
+    limits = [f"{found.limit_measured:.2f} by the times of front and rear"]
+    if found.limit_by_flops is not None:
+        limits.append(f"{found.limit_by_flops:.2f} by counts of operations")
+    refinement = found.part("refinement").forwards
+    click.echo(
+        f"a refinement takes {refinement:.2f} forward passes; the limit is {', '.join(limits)}"
+    )
+    if found.depth_change is not None:
+        click.echo(f"depth differs from fp32 by {found.depth_change:.3%} on average")
+
+
+def _cells(part: BenchPart) -> tuple[str, ...]:
+    seconds = part.seconds
+    return (
+        part.name,
+        _ms(seconds.median),
+        f"{1000 * seconds.lower:,.1f}–{_ms(seconds.upper)}",
+        f"{part.forwards:.2f}",
+        "" if part.peak_mb is None else f"{part.peak_mb:,.0f} MB",
+    )
+
+
+def _table(repeats: int, precision: str, device: str, as_json: bool) -> None:
+    from tqdm import tqdm
+
+    from pnpdepth_cli.pipeline.bench_table import bench_table
+
+    with tqdm(desc="bench", unit="network", leave=False, delay=1) as bar:
+
+        def show(done: int, of: int, name: str) -> None:
+            bar.total = of
+            bar.set_postfix_str(name)
+            bar.update(done - bar.n)
+
+        rows = bench_table(repeats=repeats, precision=precision, device=device, on_network=show)
+    if as_json:
+        click.echo(json.dumps([row.record() for row in rows], indent=2))
+        return
+    from pnpdepth_cli.cli.tables import print_rows
+
+    print_rows(
+        f"Table V: random weights, K = 5, {precision}, {device}, {rows[0].bench.threads} threads,"
+        f" medians of {repeats}; beside it what the paper prints",
+        (
+            "network",
+            "paper's\nname",
+            "size",
+            "forward",
+            "refinement",
+            "×",
+            "limit\n(times)",
+            "limit\n(counts)",
+            "memory",
+            "paper,\nforward",
+            "paper,\nrefinement",
+            "paper,\n×",
+        ),
+        [_row_cells(row) for row in rows],
+    )
+
+
+def _row_cells(row: TableRow) -> tuple[str, ...]:
+    found, paper = row.bench, row.paper
+    refinement, forward = found.part("refinement"), found.part("forward")
+    flops, memory = found.limit_by_flops, refinement.peak_mb
+    printed = (paper.before, paper.after)
+    return (
+        paper.model,
+        f"{paper.name}, {paper.data}",
+        f"{paper.size[1]}×{paper.size[0]}",
+        _ms(forward.seconds.median),
+        _ms(refinement.seconds.median),
+        f"{refinement.forwards:.2f}",
+        f"{found.limit_measured:.2f}",
+        "–" if flops is None else f"{flops:.2f}",
+        "–" if memory is None else f"{memory:,.0f} MB",
+        *("–" if seconds is None else _ms(seconds) for seconds in printed),
+        "–" if paper.forwards is None else f"{paper.forwards:.2f}",
+    )
+
+
+def _print_notes(found: Bench) -> None:
+    threads = f"{found.threads} thread{'' if found.threads == 1 else 's'}"
+    click.echo(f"{found.device}, {threads}, torch {found.versions['torch']}", err=True)
+    for note in found.notes:
+        click.echo(printable(note), err=True)
+
+
+def _ms(seconds: float) -> str:
+    return f"{1000 * seconds:,.1f} ms"

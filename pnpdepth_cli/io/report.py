@@ -1,0 +1,138 @@
+"""A report as a folder: one page that opens from disk, and its pictures beside it."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+from pnpdepth_cli.errors import FileFormatError, InputError, OutputError
+from pnpdepth_cli.io.atomic import atomic_path, cannot_write, make_folder, remove_leftovers
+from pnpdepth_cli.io.record import plain, read_json, write_json
+
+PAGE = "index.html"
+PICTURES = "pictures"
+_MADE_OF = "report.json"
+_PICTURE = re.compile(r"([0-9a-f]{20})_[a-z_]+\.jpg")
+
+
+def check_report_folder(
+    folder: Path, inputs: Sequence[Path], *, made_of: Mapping[str, Any] | None, overwrite: bool
+) -> None:
+    """Raises OutputError for a folder that holds inputs or lies among them, or may not be written.
+
+    It may if it is empty, if `overwrite`, or if it is a report that was begun as made of the same.
+    """
+    if folder.exists() and not folder.is_dir():
+        raise OutputError(f"{folder} is a file; name a folder for the report")
+    place = folder.resolve()
+    for source in inputs:
+        read = source.resolve()
+        if place.is_relative_to(read):
+            raise OutputError(f"{folder} lies in {source}, which is read; name another folder")
+        if read.is_relative_to(place):
+            raise OutputError(f"{folder} holds {source}, which is read; name another folder")
+    try:
+        empty = not folder.exists() or next(folder.iterdir(), None) is None
+    except OSError as error:
+        raise cannot_write(folder, error) from error
+    if not (empty or overwrite or _is_of(folder, made_of)):
+        raise OutputError(
+            f"{folder} is not empty; --overwrite replaces the report in it, or name another folder"
+        )
+
+
+def begin_report(folder: Path, made_of: Mapping[str, Any]) -> Path:
+    """The folder is there, says what it is made of, and has a folder for pictures, the result."""
+    pictures = folder / PICTURES
+    make_folder(pictures)
+    write_json(folder / _MADE_OF, made_of)
+    return pictures
+
+
+def remove_report_leftovers(folder: Path) -> int:
+    """No half-written file is left in the report's folder; returns how many were.
+
+    To be called only while nobody writes there.
+    """
+    folders = [each for each in (folder, folder / PICTURES) if each.is_dir()]
+    try:
+        return sum(remove_leftovers(each) for each in folders)
+    except OSError as error:
+        raise cannot_write(folder, error) from error
+
+
+def picture_key(*parts: str) -> str:
+    """The start of a frame's picture names: fit for a file, and another one for other parts."""
+    text = "\0".join(parts)
+    return hashlib.sha256(text.encode("utf-8", "surrogateescape")).hexdigest()[:20]
+
+
+def write_report(folder: Path, head: Mapping[str, Any], frames: Iterable[Mapping[str, Any]]) -> int:
+    """The page is on disk, and pictures of which it has no frame are not; returns its bytes.
+
+    head: what report_page.js shows of the whole. frames: a mapping each, taken one by one; its
+    `key` is that of its pictures, None where it has none.
+    """
+    keys: set[str] = set()
+    start, end = _page().split("@DATA@")
+    page = folder / PAGE
+    with (
+        atomic_path(page) as temporary,
+        temporary.open("w", encoding="utf-8", newline="\n") as file,
+    ):
+        file.write(start)
+        file.write(_embedded(head).removesuffix("}") + ',"frames":[')
+        for number, frame in enumerate(frames):
+            file.write((",\n" if number else "\n") + _embedded(frame))
+            keys.add(frame["key"])
+        file.write("\n]}")
+        file.write(end)
+    try:
+        for path in (folder / PICTURES).iterdir():
+            name = _PICTURE.fullmatch(path.name)
+            if name is not None and name[1] not in keys:
+                path.unlink(missing_ok=True)
+        return page.stat().st_size
+    except OSError as error:
+        raise cannot_write(folder, error) from error
+
+
+def _is_of(folder: Path, made_of: Mapping[str, Any] | None) -> bool:
+    try:
+        return made_of is not None and read_json(folder / _MADE_OF) == plain(made_of)
+    except (InputError, FileFormatError):
+        return False
+
+
+def _page() -> str:
+    """The page with style and script in it; nothing else can run, and nothing is fetched."""
+    html, style, script = (_template(kind) for kind in ("html", "css", "js"))
+    policy = (
+        f"default-src 'none'; img-src 'self' file: data:; style-src {_digest(style)};"
+        f" script-src {_digest(script)}"
+    )
+    parts = {"@POLICY@": policy, "@STYLE@": style, "@SCRIPT@": script}
+    for mark, text in parts.items():
+        html = html.replace(mark, text)
+    return html
+
+
+def _template(kind: str) -> str:
+    return files(__package__).joinpath(f"report_page.{kind}").read_text(encoding="utf-8")
+
+
+def _digest(text: str) -> str:
+    digest = hashlib.sha256(text.encode()).digest()
+    return f"'sha256-{base64.b64encode(digest).decode('ascii')}'"
+
+
+def _embedded(mapping: Mapping[str, Any]) -> str:
+    """JSON in ASCII that an HTML page can hold: names are somebody else's, and may say anything."""
+    text = json.dumps(plain(mapping), allow_nan=False, separators=(",", ":"))
+    return text.replace("<", "\\u003c")

@@ -1,0 +1,81 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from pnpdepth_cli.pipeline import bench_table
+from tests.cli.test_commands import code_of
+from tests.pipeline.frames import FrameOnDisk, frame_on_disk
+
+
+@pytest.fixture
+def frame(tmp_path: Path) -> FrameOnDisk:
+    return frame_on_disk(tmp_path)
+
+
+def bench(frame: FrameOnDisk, *more: str) -> list[str]:
+    return [
+        "bench", "--model", str(frame.model), "--checkpoint", str(frame.checkpoint),
+        "--size", "24x32", "--points", "50", "--repeats", "1", *more,
+    ]  # fmt: skip
+
+
+def test_the_table_goes_to_stdout_and_what_it_was_measured_with_to_stderr(
+    frame: FrameOnDisk, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert code_of(bench(frame, "--layer", "encode", "--iterations", "2")) == 0
+    out, err = capsys.readouterr()
+    assert "cut at encode, 32×24, 50 points, K = 2, fp32" in out
+    for part in ("forward", "rear backward", "refinement", "alignment", "reading", "writing"):
+        assert part in out
+    assert "the limit is" in out
+    assert "torch" in err
+
+
+def test_json_is_all_that_goes_to_stdout(
+    frame: FrameOnDisk, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert code_of(bench(frame, "--json")) == 0
+    record = json.loads(capsys.readouterr().out)
+    assert {"parts", "limit_by_flops", "limit_measured", "threads"} <= set(record)
+
+
+def test_the_papers_table_shows_its_figures_beside_ours(
+    frame: FrameOnDisk, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    small = bench_table.PaperTime(
+        name="Chodosh", model="adnn", data="KITTI", size=(16, 24), before=0.0320, after=0.0447
+    )
+    monkeypatch.setattr(bench_table, "PAPER_TIMES", (small,))
+    assert code_of(["bench", "--table", "--repeats", "1"]) == 0
+    out, _ = capsys.readouterr()
+    assert "random weights" in out
+    for cell in ("Chodosh, KITTI", "24×16", "44.7 ms", "1.40"):
+        assert cell in out
+
+
+@pytest.mark.parametrize(
+    ("more", "code", "said"),
+    [
+        (["--table", "--layer", "encode"], 2, "--layer"),
+        (["--repeats", "0"], 2, "at least one"),
+        (["--size", "big"], 2, "HxW"),
+        (["--precision", "fp16"], 6, "bf16"),
+        (["--layer", "encod"], 4, "encode"),
+    ],
+)
+def test_the_exit_code_says_whose_mistake_it_was(
+    frame: FrameOnDisk,
+    capsys: pytest.CaptureFixture[str],
+    more: list[str],
+    code: int,
+    said: str,
+) -> None:
+    given = ["bench", *more] if "--table" in more else bench(frame, *more)
+    assert code_of(given) == code
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert said in err
+    assert "Traceback" not in err

@@ -1,0 +1,89 @@
+"""`--html` of batch and eval as a user has it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from pnpdepth_cli.cli.main import main
+from tests.pipeline.batches import pairs_on_disk
+from tests.pipeline.report_pages import frames_of
+
+BATCH = (
+    *("batch", "drive", "-o", "out", "--model", "drive/net/my_net.py"),
+    *("--checkpoint", "drive/net/my_net.safetensors"),
+)
+
+
+def code_of(*arguments: str) -> int:
+    with pytest.raises(SystemExit) as stop:
+        main(list(arguments))
+    return int(stop.value.code or 0)
+
+
+@pytest.fixture
+def root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    return pairs_on_disk(tmp_path / "drive", ("a", "b"))
+
+
+def test_a_batch_and_its_evaluation_each_have_a_report(
+    root: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert code_of(*BATCH, "--html", "report") == 0
+    assert "wrote report/index.html" in capsys.readouterr().err
+    assert code_of(*BATCH, "--html", "report") == 0
+    assert list(frames_of(Path("report"))) == ["a", "b"]
+    capsys.readouterr()
+    assert code_of("eval", "out", "drive", "--html", "scores", "--json") == 0
+    out, err = capsys.readouterr()
+    assert out.startswith("{")
+    assert "wrote scores/index.html" in err
+    frame = frames_of(Path("scores"))["b"]
+    assert frame["views"] == ["first", "second", "map", "image"]  # the record names the image
+
+
+def test_an_evaluation_replaces_a_report_only_if_asked(
+    root: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    given = ("eval", "drive/gt", "drive/gt", "--html")
+    assert code_of(*given, "scores") == 0
+    before = Path("scores/index.html").stat().st_mtime_ns
+    capsys.readouterr()
+    assert code_of(*given, "scores") == 2
+    assert capsys.readouterr().err == (
+        "pnpdepth: scores is not empty; --overwrite replaces the report in it, or name another"
+        " folder\n"
+    )
+    assert Path("scores/index.html").stat().st_mtime_ns == before
+    assert code_of(*given, "scores", "--overwrite") == 0
+    assert Path("scores/index.html").stat().st_mtime_ns > before
+
+
+@pytest.mark.parametrize("place", ["drive/gt", "drive/gt/report", "drive", "."])
+def test_an_evaluation_writes_neither_into_its_inputs_nor_around_them(
+    root: Path, capsys: pytest.CaptureFixture[str], place: str
+) -> None:
+    before = sorted(root.rglob("*"))
+    assert code_of("eval", "drive/gt", "drive/gt", "--html", place, "--overwrite") == 2
+    out, err = capsys.readouterr()
+    assert (out, err.count("\n")) == ("", 1)
+    assert "which is read; name another folder" in err
+    assert sorted(root.rglob("*")) == before
+
+
+def test_frames_that_are_not_scored_are_in_the_report_and_in_the_exit_code(root: Path) -> None:
+    Path("drive/gt/b.png").rename("drive/gt/c.png")
+    assert code_of("eval", "drive/sparse", "drive/gt", "--html", "scores") == 7
+    assert list(frames_of(Path("scores"))) == ["a"]
+
+
+def test_a_folder_that_cannot_be_made_is_one_line(
+    root: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    Path("file").write_text("mine")
+    assert code_of(*BATCH, "--html", "file/report") == 2
+    assert code_of("eval", "drive/gt", "drive/gt", "--html", "file/report") == 2
+    for line in capsys.readouterr().err.splitlines():
+        assert "Traceback" not in line
