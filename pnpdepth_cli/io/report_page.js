@@ -55,7 +55,7 @@ function fillHead() {
   for (const [label, text] of data.facts) {
     byId("facts").append(make("dt", { text: label }), make("dd", { text: visible(text) }));
   }
-  for (const note of data.notes) byId("notes").append(make("li", { text: visible(note) }));
+  byId("notes").append(...data.notes.map(noted));
   byId("foot").textContent = data.foot;
   if (data.without.length) {
     byId("without").hidden = false;
@@ -66,6 +66,9 @@ function fillHead() {
     }
   }
 }
+
+const noted = (note) =>
+  make("li", { class: note.startsWith("warning") ? "warning" : "", text: visible(note) });
 
 function summaryTable(table) {
   const head = make("tr", {}, ...table.header.map((text) => make("th", { scope: "col", text })));
@@ -308,8 +311,7 @@ function openFrame(place) {
   byId("views").replaceChildren(...viewsOf(frame));
   byId("values").replaceChildren(...columns.map((column, i) => make("div", {},
     make("dt", { text: titled(column) }), make("dd", { text: shown(column, frame.values[i]) }))));
-  byId("frame-notes").replaceChildren(
-    ...frame.notes.map((note) => make("li", { text: visible(note) })));
+  byId("frame-notes").replaceChildren(...frame.notes.map(noted));
   const shownRows = Math.min(list.limit, list.order.length);
   byId("previous").disabled = place === 0;
   byId("next").disabled = place === shownRows - 1;

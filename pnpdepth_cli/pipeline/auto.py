@@ -34,6 +34,7 @@ FEWEST = 5
 """With fewer points than this none is held out."""
 ENOUGH = 1500
 """With this many held-out points no further fold is looked at."""
+SPREADING = ("gp", "diffusion")
 UPDATES = (1, 2, 3, 5, 10, 20)
 """Numbers of updates of z that are scored, as far as a trial's own goes, which is as well."""
 
@@ -238,20 +239,29 @@ def _chosen(
                 predicted[way] = torch.cat([fold.at(way) for fold in folds])
         return {way: float(held_out_error(predicted[way], depth, believed)) for way in ways}
 
-    scored([*(Way(baseline=name) for name in BASELINES), Way(trial=trials[0])])
+    usual = Way(trial=trials[0], iterations=trials[0].settings.iterations)
+    simple = [*(Way(baseline=name) for name in BASELINES), Way(trial=trials[0])]
+    scored([*simple, usual])
     if only is not None:
         scored(only)
     else:
         for trial in trials:
             errors = scored([Way(trial=trial, iterations=k) for k in (0, *updates_of(trial))])
             best = min(errors, key=lambda way: errors[way])
-            scored([replace(way, propagate="gp") for way in {Way(trial=trial), best}])
+            starts = dict.fromkeys([Way(trial=trial), best])
+            scored([replace(way, propagate=kind) for way in starts for kind in SPREADING])
     errors = scored(list(predicted))
     ways = list(predicted)
     if fixed is None:
-        blend = best_blend(torch.stack(list(predicted.values())), depth, believed)
+        blend = best_blend(
+            torch.stack(list(predicted.values())),
+            depth,
+            believed,
+            usual=ways.index(usual),
+            simple=[number for number, way in enumerate(ways) if way in simple],
+        )
     else:
-        blend = Blend(members=(ways.index(fixed),), weights=(1.0,), error=errors[fixed])
+        blend = Blend((ways.index(fixed),), (1.0,), errors[fixed])
     return Choice(
         ways=tuple(ways[member] for member in blend.members),
         weights=blend.weights,

@@ -7,6 +7,7 @@ with the number of frames and the network waits for no file.
 
 from __future__ import annotations
 
+import contextlib
 import time
 import traceback
 from collections import deque
@@ -72,6 +73,8 @@ def settle_refiner(tasks: Iterable[Task], say: Callable[[str], None]) -> Refiner
         refiner = load_refiner(task.request, first)
         for note in refiner.network.notes:
             say(note)
+        if task.request.auto:
+            return _with_ways(refiner, list(tasks), first, say)
         s = refiner.settings
         say(
             f"network: {refiner.network.definition.name} cut at {refiner.layer}, {s.iterations}"
@@ -79,6 +82,21 @@ def settle_refiner(tasks: Iterable[Task], say: Callable[[str], None]) -> Refiner
         )
         return refiner
     return None
+
+
+def _with_ways(
+    refiner: Refiner, others: Sequence[Task], first: Inputs, say: Callable[[str], None]
+) -> Refiner:
+    """The refiner with the ways that are best on the first frame and on a few of the others."""
+    frames = [first]
+    for number in sorted({len(others) // 2, len(others) - 1}) if others else ():
+        with contextlib.suppress(PnpDepthError):  # it will be read again, and its error told
+            frames.append(read_inputs(others[number].request))
+    refiner = refiner.with_ways_of(frames)
+    assert refiner.ways is not None
+    found = "; ".join(str(way) for way in refiner.ways)
+    say(f"auto: best on {len(frames)} frames, and to be checked on each: {found}")
+    return refiner
 
 
 def run_tasks(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 from typing import Any
@@ -48,14 +49,20 @@ def refine_with_folds(
     """
     asked = Trial(layer=layer, settings=settings)
     fixed = Way(trial=asked, iterations=settings.iterations, propagate=task.propagate)
+    trials, budget_s = [asked], request.time_budget_s
+    if request.auto and ways is None:
+        trials = usual_trials(network.definition, layer, settings)
+    elif ways is not None:
+        first = usual_trials(network.definition, layer, settings)[0]
+        trials, budget_s = [first, *(way.trial for way in ways if way.trial)], math.inf
     found = refine_automatically(
         network,
-        usual_trials(network.definition, layer, settings) if request.auto else [asked],
+        list(dict.fromkeys(trials)),
         task.inputs,
         task.used,
         ways=ways,
         fixed=None if request.auto else fixed,
-        budget_s=request.time_budget_s,
+        budget_s=budget_s,
         seed=request.seed,
     )
     frame = replace(
@@ -70,6 +77,29 @@ def refine_with_folds(
         sigma, note = uncertainty(found, frame.after)
         frame = replace(frame, sigma=sigma, notes=(*frame.notes, note))
     return frame
+
+
+def ways_of(
+    network: Network,
+    layer: str,
+    settings: RefineSettings,
+    request: RefineRequest,
+    tasks: Sequence[FrameToRefine],
+) -> tuple[Way, ...]:
+    """The ways that are best on these frames, one or a few of each."""
+    trials = usual_trials(network.definition, layer, settings)
+    found: dict[Way, None] = {}
+    for task in tasks:
+        made = refine_automatically(
+            network,
+            trials,
+            task.inputs,
+            task.used,
+            budget_s=request.time_budget_s,
+            seed=request.seed,
+        )
+        found |= dict.fromkeys(made.choice.ways)
+    return tuple(found)
 
 
 def _said(choice: Choice, request: RefineRequest) -> tuple[str, ...]:

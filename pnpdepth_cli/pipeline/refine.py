@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -25,13 +25,14 @@ from pnpdepth_cli.pipeline.frame import (
     refine_frame,
     split_points,
 )
-from pnpdepth_cli.pipeline.held_out import refine_with_folds
+from pnpdepth_cli.pipeline.held_out import refine_with_folds, ways_of
 from pnpdepth_cli.pipeline.inputs import Inputs, read_inputs
 from pnpdepth_cli.pipeline.output_files import Outputs, plan_outputs
 from pnpdepth_cli.pipeline.outputs import write_outputs
 from pnpdepth_cli.pipeline.request import RefineRequest, effective_settings, layer_name
 from pnpdepth_cli.pipeline.settle import settled
 from pnpdepth_cli.pipeline.stopwatch import Stopwatch, peak_memory_mb, versions
+from pnpdepth_cli.pipeline.ways import Way
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,12 +70,16 @@ def refine_image(
 
 @dataclass(frozen=True, kw_only=True)
 class Refiner:
-    """A network with nothing left open, the layer to cut it at, and how to refine its frames."""
+    """A network with nothing left open, the layer to cut it at, and how to refine its frames.
+
+    ways: with --auto, those that were found on other frames; None: each frame finds its own.
+    """
 
     request: RefineRequest
     network: Network
     layer: str
     settings: RefineSettings
+    ways: tuple[Way, ...] | None = None
 
     def split(self) -> Split:
         """The network cut at the layer, to be opened for as many frames as there are."""
@@ -91,8 +96,16 @@ class Refiner:
         torch.manual_seed(self.request.seed)
         task = self.task(inputs)
         if self.request.needs_folds:
-            return refine_with_folds(self.network, self.layer, self.settings, self.request, task)
+            return refine_with_folds(
+                self.network, self.layer, self.settings, self.request, task, self.ways
+            )
         return refine_frame(self.network, split, self.settings, task, on_iteration=on_iteration)
+
+    def with_ways_of(self, frames: Sequence[Inputs]) -> Refiner:
+        """The same, its ways found on these frames."""
+        tasks = [self.task(inputs) for inputs in frames]
+        ways = ways_of(self.network, self.layer, self.settings, self.request, tasks)
+        return replace(self, ways=ways)
 
     def task(self, inputs: Inputs) -> FrameToRefine:
         """The frame with its points as the request shares them out."""

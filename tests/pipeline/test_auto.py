@@ -23,6 +23,7 @@ from pnpdepth_cli.pipeline.inputs import Inputs
 from pnpdepth_cli.pipeline.refine import RefineOutcome, refine_image
 from pnpdepth_cli.pipeline.request import RefineRequest
 from pnpdepth_cli.pipeline.ways import Trial, Way, trajectories
+from tests.pipeline.batches import NAMES, Heard, batch, pairs_on_disk, results, times
 from tests.pipeline.frames import FrameOnDisk, frame_on_disk
 
 SETTINGS = RefineSettings(iterations=3, lr="5%", update="adam")
@@ -183,3 +184,32 @@ def test_propagation_follows_refinement(frame: FrameOnDisk) -> None:
     spread = run(frame, format="npy", output=frame.folder / "gp", propagate="gp")
     errors = [each.record["sparse_error"]["after"]["mae"] for each in (plain, spread)]
     assert errors[1] < errors[0]
+
+
+def test_a_batch_finds_its_ways_on_a_few_frames_and_checks_them_on_each(tmp_path: Path) -> None:
+    root = pairs_on_disk(tmp_path / "drive")
+    heard = Heard()
+    batch(root, heard, refine={"auto": True})
+    (said,) = [text for text in heard.said if text.startswith("auto: ")]
+    found = said.partition(": best on ")[2].partition(": ")[2].split("; ")
+    for name in NAMES:
+        made = json.loads((root / "out" / f"{name}.json").read_text())["auto"]
+        tried = {each["way"] for each in made["tried"]}
+        assert set(found) <= tried
+        assert {*BASELINES, "network"} <= tried
+        assert made["held_out_mae"] <= made["tried"][0]["held_out_mae"] + 1e-6
+    before = times(root / "out")
+    batch(root, refine={"auto": True})
+    assert times(root / "out") == before
+
+
+def test_shards_find_the_same_ways(tmp_path: Path) -> None:
+    root = pairs_on_disk(tmp_path / "drive")
+    batch(root, refine={"auto": True})
+    whole = results(root / "out")
+    for number in (1, 2):
+        batch(root, refine={"auto": True}, output=tmp_path / "parts", shard=(number, 2))
+    parts = results(tmp_path / "parts")
+    assert {n: b for n, b in parts.items() if isinstance(b, bytes)} == {
+        n: b for n, b in whole.items() if isinstance(b, bytes)
+    }

@@ -12,9 +12,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pnpdepth_cli.errors import OutputError
+from pnpdepth_cli.errors import OutputError, StorageError
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.io.page import open_page
+from pnpdepth_cli.pipeline import report_batch
 from pnpdepth_cli.pipeline.batch import plan_batch
 from pnpdepth_cli.pipeline.batch_frames import BatchRequest
 from tests.pipeline.batches import NAMES, Heard, add_frame, batch, pairs_on_disk, refinement
@@ -259,3 +260,29 @@ def test_a_preview_that_went_missing_costs_one_frame_its_pictures(root: Path, re
     assert frames["b"]["key"] is None
     assert all(frames[name]["key"] for name in "acd")
     assert frames["b"]["values"]["rmse_gain"] is not None
+
+
+def test_a_disk_that_is_full_while_drawing_ends_the_run_and_the_next_one_goes_on(
+    root: Path, report: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drawn: list[str] = []
+    save = report_batch.save_pictures
+
+    def full_at_the_second(folder: Path, key: str, *views: Any, **others: Any) -> None:
+        drawn.append(key)
+        if len(drawn) == 2:
+            raise StorageError("the disk is full")
+        save(folder, key, *views, **others)
+
+    monkeypatch.setattr(report_batch, "save_pictures", full_at_the_second)
+    with pytest.raises(StorageError):
+        batch(root, html=report)
+    assert not (report / "index.html").exists()
+    (report / "pictures" / ".0123456789ab.jpg").write_bytes(b"half")
+    heard = Heard()
+    batch(root, heard, html=report)
+    assert heard.said[1].startswith("removed 1 half-written files")
+    resumed = everything(report)
+    shutil.rmtree(report)
+    batch(root, html=report)
+    assert resumed == everything(report)
