@@ -25,6 +25,17 @@ def test_every_package_is_listed_for_the_wheel() -> None:
     assert sorted(listed) == sorted(".".join(f.relative_to(ROOT).parts) for f in folders)
 
 
+@pytest.mark.skipif(sys.version_info < (3, 11), reason="tomllib came with Python 3.11")
+def test_every_file_that_is_no_module_is_listed_for_the_wheel() -> None:
+    import tomllib
+
+    setuptools = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]
+    for package, patterns in setuptools["package-data"].items():
+        listed = {path for pattern in patterns for path in (ROOT / package).glob(pattern)}
+        files = {path for path in (ROOT / package).rglob("*") if path.is_file()}
+        assert {path for path in files - listed if path.suffix not in (".py", ".pyc")} == set()
+
+
 def test_the_shipped_weights_are_there_and_small() -> None:
     checkpoint = find_definition("compact").checkpoint
     assert checkpoint is not None

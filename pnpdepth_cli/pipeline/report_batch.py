@@ -26,7 +26,14 @@ from pnpdepth_cli.io.report import (
 )
 from pnpdepth_cli.io.report_pictures import gain_colours, picture_paths, save_pictures
 from pnpdepth_cli.pipeline.ahead import in_order
-from pnpdepth_cli.pipeline.report_columns import Column, column_of, figures, table, tile
+from pnpdepth_cli.pipeline.report_columns import (
+    Column,
+    column_of,
+    figures,
+    frames_text,
+    table,
+    tile,
+)
 from pnpdepth_cli.pipeline.score_files import heading, shown
 
 Row = dict[str, Any]
@@ -282,7 +289,7 @@ def _facts(summary: Mapping[str, Any], first: Row | None) -> list[list[str]]:
     if asked["holdout"]:
         facts.append(["Held out", f"{asked['holdout']:.0%} of the points, seed {asked['seed']}"])
     if summary["counts"]["with_warnings"]:
-        facts.append(["Warnings", f"in {summary['counts']['with_warnings']:,} frames"])
+        facts.append(["Warnings", f"in {frames_text(summary['counts']['with_warnings'])}"])
     return facts
 
 
@@ -300,7 +307,7 @@ def _means(basis: str, mean: Mapping[str, Any]) -> dict[str, Any]:
         rows.append(
             ["coverage", *(f"{mean[stage]['coverage']:.2%}" for stage in ("before", "after")), ""]
         )
-    return table(f"Means over {mean['frames']:,} frames, {_BASES[basis]}", header, rows)
+    return table(f"Means over {frames_text(mean['frames'])}, {_BASES[basis]}", header, rows)
 
 
 def _gain_text(measure: Measure, before: float | None, after: float | None) -> str:

@@ -49,6 +49,11 @@ def column_of(measure: Measure, *, title: str = "", key: str = "", listed: bool)
     )
 
 
+def frames_text(count: int) -> str:
+    """So many frames, in words."""
+    return f"{count:,} frame{'' if count == 1 else 's'}"
+
+
 def tile(label: str, value: str, remark: str = "") -> dict[str, str]:
     """A figure that is shown large."""
     return {"label": label, "value": value, "remark": remark}

@@ -28,7 +28,14 @@ from pnpdepth_cli.pipeline.frame_reading import Depth, load_frame
 from pnpdepth_cli.pipeline.frame_scoring import FrameScores
 from pnpdepth_cli.pipeline.kitti_devkit import fill_background
 from pnpdepth_cli.pipeline.pairing import FramePair
-from pnpdepth_cli.pipeline.report_columns import Column, column_of, figures, table, tile
+from pnpdepth_cli.pipeline.report_columns import (
+    Column,
+    column_of,
+    figures,
+    frames_text,
+    table,
+    tile,
+)
 from pnpdepth_cli.pipeline.score_files import heading, part_cells, shown
 
 _MADE_OF = {"command": "eval"}
@@ -136,9 +143,10 @@ def _means(evaluation: Evaluation) -> dict[str, Any]:
         rows.append([heading(measure), shown(measure, evaluation.mean[measure.key])])
         if interval is not None:
             rows[-1].append(f"± {shown(measure, interval.half_width(measure.key))}")
-    caption = f"Means over {len(evaluation.scored):,} frames"
+    of = frames_text(len(evaluation.scored))
+    caption = f"Means over {of}"
     if evaluation.protocol.average == "pooled":
-        caption = f"Over all pixels of {len(evaluation.scored):,} frames together"
+        caption = f"Over all pixels of {of} together"
     if interval is not None:
         header.append("95 %")
         caption += "; ±: half of the 95 % interval, bootstrap over the frames"
