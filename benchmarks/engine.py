@@ -32,8 +32,7 @@ from pnpdepth_cli.core.points import SparsePoints
 from pnpdepth_cli.core.refine import RefineSettings, refine
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.models.precision import lower
-from pnpdepth_cli.pipeline.stopwatch import peak_memory_mb
-from pnpdepth_cli.pipeline.timing import Timed, in_turn
+from pnpdepth_cli.pipeline.timing import Timed, in_turn, peak_mb
 
 ITERATIONS, STEP, POINTS = 5, 0.01, 500
 SETTINGS = RefineSettings(iterations=ITERATIONS, lr=STEP)
@@ -189,9 +188,9 @@ def measure(case: Case, runs: int, *, memory: bool) -> dict[str, float | str]:
         pairs = zip(spent[one], spent[other], strict=True)
         return statistics.median(a / b for a, b in pairs)
 
-    forward = peak_mb(case, "forward") if memory else 0
+    forward = peak_of(case, "forward") if memory else 0
     measured = ("by hand", "ours", "paper's code") if memory else ()
-    extra = {name: peak_mb(case, name) - forward for name in measured}
+    extra = {name: peak_of(case, name) - forward for name in measured}
     return {
         "network": f"{case.name}, {case.size[0]}×{case.size[1]}",
         "forward, ms": 1000 * median["forward"],
@@ -206,8 +205,8 @@ def measure(case: Case, runs: int, *, memory: bool) -> dict[str, float | str]:
     }
 
 
-def peak_mb(case: Case, way: str) -> float:
-    """Peak resident memory of a new process that does this twice after a forward pass."""
+def peak_of(case: Case, way: str) -> float:
+    """What this needs at its peak, in a new process that has done it once, after a forward pass."""
     command = [sys.executable, "-m", "benchmarks.engine", "--peak", case.name, way]
     return float(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
 
@@ -215,9 +214,8 @@ def peak_mb(case: Case, way: str) -> float:
 def print_peak(name: str, way: str) -> None:
     with ways(next(case for case in (*ZOO, *CASES) if case.name == name)) as todo:
         todo["forward"]()
-        for _ in range(2):
-            todo[way]()
-        print(peak_memory_mb(CPU)["process"])
+        todo[way]()
+        print(peak_mb(todo[way], CPU))
 
 
 def main() -> None:

@@ -38,11 +38,18 @@ class Batches:
     """Endless batches; every folder of frames counts alike.
 
     points: draws the sparse depth of a window, None: there is none.
+    spliced: the share of windows that are put together of two.
     """
 
-    def __init__(self, folders: Sequence[Path], seed: int, points: Points | None = None):
+    def __init__(
+        self,
+        folders: Sequence[Path],
+        seed: int,
+        points: Points | None = None,
+        spliced: float = 0.0,
+    ):
         self.sets = [Frames(folder) for folder in folders]
-        self.seed, self.points = seed, points
+        self.seed, self.points, self.spliced = seed, points, spliced
         self._calls = 0
 
     def batch(
@@ -54,7 +61,7 @@ class Batches:
             for frames in self.sets:
                 frames.refresh()
         rng = np.random.default_rng((self.seed, number))
-        windows = [self._window(rng, window) for _ in range(size)]
+        windows = [self._one_or_two(rng, window) for _ in range(size)]
         depth = np.stack([depth for _, depth in windows])
         sparse = np.stack([self._sparse(rng, one) for one in depth])
         rgb = torch.from_numpy(np.stack([rgb for rgb, _ in windows])).permute(0, 3, 1, 2)
@@ -63,6 +70,14 @@ class Batches:
             rgb = F.interpolate(rgb, shown, mode="bilinear", antialias=True)
         points, truth = (torch.from_numpy(x)[:, None] for x in (sparse, depth))
         return Batch(recoloured(rng, rgb), points, truth)
+
+    def _one_or_two(
+        self, rng: Generator, window: tuple[int, int]
+    ) -> tuple[NDArray[np.uint8], Depth]:
+        one = self._window(rng, window)
+        if self.spliced and rng.random() < self.spliced:
+            return spliced(rng, one, self._window(rng, window))
+        return one
 
     def _window(self, rng: Generator, window: tuple[int, int]) -> tuple[NDArray[np.uint8], Depth]:
         frames = self.sets[int(rng.integers(len(self.sets)))]
@@ -81,6 +96,22 @@ class Batches:
 
     def _sparse(self, rng: Generator, depth: Depth) -> Depth:
         return np.zeros_like(depth) if self.points is None else self.points(rng, depth)
+
+
+def spliced(
+    rng: Generator, one: tuple[NDArray[np.uint8], Depth], other: tuple[NDArray[np.uint8], Depth]
+) -> tuple[NDArray[np.uint8], Depth]:
+    """Columns of one frame left of columns of the other, rows kept, so that metres stay true.
+
+    A camera of fixed height and pitch sees the floor of a row equally far in every column.
+    """
+    width = one[1].shape[1]
+    seam = int(rng.integers(width // 4, width - width // 4 + 1))
+    first, second = int(rng.integers(width - seam + 1)), int(rng.integers(seam + 1))
+    (left_rgb, left), (right_rgb, right) = one, other
+    rgb = [left_rgb[:, first : first + seam], right_rgb[:, second : second + width - seam]]
+    depth = [left[:, first : first + seam], right[:, second : second + width - seam]]
+    return np.concatenate(rgb, axis=1), np.concatenate(depth, axis=1)
 
 
 def recoloured(rng: Generator, rgb: Tensor) -> Tensor:

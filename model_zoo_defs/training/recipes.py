@@ -88,6 +88,17 @@ def fine_and_coarse(network: Any, arguments: tuple[Tensor, ...]) -> list[Tensor]
     return [network.fine(*arguments, first), first]
 
 
+@torch.no_grad()
+def hand_coarse_depth_on(network: Any) -> None:
+    """The fine half of `eigen` says what the coarse one says: a channel each for log depth ± ."""
+    fine = network.fine
+    for channel, sign in ((0, 1.0), (1, -1.0)):
+        fine.conv2.weight[channel] = 0.0
+        fine.conv2.weight[channel, -1, 2, 2] = sign
+        fine.conv2.bias[channel] = 0.0
+        fine.conv3.weight[0, channel, 2, 2] = sign
+
+
 @dataclass(frozen=True, kw_only=True)
 class Stage:
     """A part of a run, up to this share of it.
@@ -110,6 +121,9 @@ class Recipe:
     quiet: endings of the names of normalisations that start at 0, the last ones of residual
         branches, so that a deep network starts as a shallow one.
     flat: layers that start as this constant, so that no step is lost on finding the mean.
+    start: what else is put in place before the first step.
+    spliced: the share of windows that are put together of two frames, left and right; for networks
+        that would learn rooms by heart.
     own_start: the network's own initial weights are right; otherwise He's are taken.
     dropout: the share that dropout drops in training; half, as published, is more than a narrow
         network has to spare.
@@ -125,6 +139,8 @@ class Recipe:
     batch: int = 8
     quiet: tuple[str, ...] = ()
     flat: Mapping[str, float] = field(default_factory=dict)
+    start: Callable[[Any], None] | None = None
+    spliced: float = 0.0
     dropout: float = 0.1
     own_start: bool = False
     farthest: float = math.inf
@@ -147,15 +163,16 @@ WITH_POINTS = Recipe(
 RECIPES = {
     # the coarse half first, as the authors did it; it is a fifth of the work
     "eigen-tiny": Recipe(
-        loss=log_error, batch=16, farthest=KINECT, flat={"coarse.fc2": 0.75, "fine.conv3": 0.75},
+        loss=log_error, batch=16, farthest=KINECT, spliced=0.7, dropout=0.3,
+        flat={"coarse.fc2": 0.75, "fine.conv3": 0.0}, start=hand_coarse_depth_on,
         stages=(
-            Stage(window=ROOM, until=0.6, outputs=coarse),
+            Stage(window=ROOM, until=0.75, outputs=coarse),
             Stage(window=ROOM, outputs=fine_and_coarse),
         ),
     ),
     # fewer pixels are less work and show most of what there is to learn
     "fcrn-tiny": Recipe(
-        loss=log_error, batch=16, farthest=KINECT, quiet=("bn_branch2c",),
+        loss=log_error, batch=16, farthest=KINECT, quiet=("bn_branch2c",), spliced=0.7,
         stages=(
             Stage(window=ROOM, shown=(57, 76), until=0.3),
             Stage(window=ROOM, shown=QUARTER, until=0.75),
@@ -200,4 +217,6 @@ def with_start(network: nn.Module, recipe: Recipe) -> nn.Module:
         assert layer.bias is not None
         nn.init.zeros_(layer.weight)
         nn.init.constant_(layer.bias, constant)
+    if recipe.start is not None:
+        recipe.start(network)
     return network

@@ -67,7 +67,7 @@ class TinyRun(Learner):
         schedule = Schedule(
             lr=recipe.lr, steps=settings.steps, minutes=settings.minutes, averaging=AVERAGING
         )
-        self.batches = Batches(settings.data, settings.seed, recipe.points)
+        self.batches = Batches(settings.data, settings.seed, recipe.points, recipe.spliced)
         network = with_start(definition.build(), recipe)
         super().__init__(network, schedule, settings.out, definition.name)
 

@@ -39,7 +39,6 @@ from pnpdepth_cli.errors import LayerError
 _FEW_BITS = (torch.float16, torch.bfloat16)
 
 
-
 class _CutReached(BaseException):
     """Stops the front's pass at the cut; not an Exception, so that networks do not catch it."""
 

@@ -73,13 +73,35 @@ def test_a_batch_depends_on_its_number_alone(shards: Path) -> None:
 
 
 def test_a_batch_changes_colours_but_neither_metres_nor_places(shards: Path) -> None:
-    seen = set(np.load(shards / "shard_00000.npz")["depth"].ravel().tolist())
+    seen = set(np.load(shards / "shard_00000.npz")["depth"].astype(np.float16).ravel().tolist())
     found = batches.Batches([shards], 1).batch(0, 8, (32, 48))
     assert set(found.depth.ravel().tolist()) <= seen
     for rgb, depth in zip(found.rgb, found.depth[:, 0], strict=True):
         # brightness follows depth in these frames, in whatever light, mirrored or not
         together = torch.corrcoef(torch.stack([rgb.mean(0).ravel(), depth.ravel()]))[0, 1]
         assert together > 0.9
+
+
+def test_spliced_windows_are_whole_columns_of_frames_in_their_own_rows(shards: Path) -> None:
+    frames = np.load(shards / "shard_00000.npz")["depth"].astype(np.float16).astype(np.float32)
+    columns = {column.tobytes() for frame in frames for column in frame.T}
+    plain, found = (
+        batches.Batches([shards], 1, spliced=share).batch(0, 20, SHAPE).depth[:, 0].numpy()
+        for share in (0.0, 1.0)
+    )
+    assert {column.tobytes() for window in found for column in window.T} <= columns
+    # depth grows by one step a column in a whole window, to the left or to the right
+    steps = [len(np.unique(np.round(np.diff(window[-1]), 1))) for window in (*plain, *found)]
+    assert max(steps[:20]) == 1
+    assert np.mean(np.array(steps[20:]) > 1) > 0.5
+
+
+def test_the_fine_half_of_eigen_starts_as_what_the_coarse_half_says() -> None:
+    definition = tiny.tiny_definition("eigen-tiny")
+    network = recipes.with_start(definition.build(), recipes.RECIPES["eigen-tiny"]).eval()
+    rgb = torch.rand(1, 3, 228, 304, generator=torch.Generator().manual_seed(0))
+    coarse = torch.randn(1, 1, 55, 74, generator=torch.Generator().manual_seed(1))
+    assert torch.equal(network.fine(rgb, coarse), coarse)
 
 
 def test_every_folder_counts_alike(shards: Path, tmp_path: Path) -> None:
