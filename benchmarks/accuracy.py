@@ -38,8 +38,8 @@ from pnpdepth_cli.core.points import SparsePoints
 from pnpdepth_cli.core.refine import RefineSettings
 from pnpdepth_cli.models.definition import Normalisation
 from pnpdepth_cli.models.network import Network, load_network
-from pnpdepth_cli.pipeline.auto import refine_automatically, usual_trials
-from pnpdepth_cli.pipeline.request import RefineRequest, effective_settings, layer_name
+from pnpdepth_cli.pipeline.refinement.auto import refine_automatically, usual_trials
+from pnpdepth_cli.pipeline.refinement.request import RefineRequest, effective_settings, layer_name
 
 PAPER = RefineSettings()
 COUNTS: tuple[int | None, ...] = (20, 100, 500)

@@ -19,9 +19,9 @@ import numpy as np
 import torch
 
 from pnpdepth_cli.io.depth import write_depth
-from pnpdepth_cli.pipeline.batch import run_batch
-from pnpdepth_cli.pipeline.batch_frames import BatchRequest
-from pnpdepth_cli.pipeline.request import RefineRequest
+from pnpdepth_cli.pipeline.batch.batch import run_batch
+from pnpdepth_cli.pipeline.batch.frames import BatchRequest
+from pnpdepth_cli.pipeline.refinement.request import RefineRequest
 from pnpdepth_cli.pipeline.stopwatch import peak_memory_mb
 
 PAGE = 4096

@@ -27,7 +27,7 @@ from benchmarks.frames import (
 from pnpdepth_cli.core.interpolation import linear, nearest
 from pnpdepth_cli.core.metrics import score
 from pnpdepth_cli.models.network import Network, load_network
-from pnpdepth_cli.pipeline.request import RefineRequest, effective_settings, layer_name
+from pnpdepth_cli.pipeline.refinement.request import RefineRequest, effective_settings, layer_name
 
 CELLS = (
     ("7scenes", 500),

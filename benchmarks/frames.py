@@ -16,8 +16,8 @@ from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.models.network import Network
-from pnpdepth_cli.pipeline.frame import FrameToRefine, RefinedFrame, refine_frame
-from pnpdepth_cli.pipeline.inputs import Inputs
+from pnpdepth_cli.pipeline.refinement.frame import FrameToRefine, RefinedFrame, refine_frame
+from pnpdepth_cli.pipeline.refinement.inputs import Inputs
 
 Depth = NDArray[np.float32]
 

@@ -46,7 +46,7 @@ from pnpdepth_cli.errors import CheckpointError, PnpDepthError, UsageError
 from pnpdepth_cli.io.atomic import atomic_path
 from pnpdepth_cli.models.network import Network, load_network
 from pnpdepth_cli.models.registry import names
-from pnpdepth_cli.pipeline.request import RefineRequest, effective_settings, layer_name
+from pnpdepth_cli.pipeline.refinement.request import RefineRequest, effective_settings, layer_name
 
 ROOM_FRAMES = 48  # of streets, which are three times as wide, half as many
 SHARED_FRAMES = 24  # of each set: neighbours in a video tell little more

@@ -18,8 +18,8 @@ from benchmarks.frames import SETS, frame_inputs, frame_pixels, points_on_grid
 from benchmarks.frames import refined as refined_frame
 from pnpdepth_cli.core.metrics import score
 from pnpdepth_cli.models.network import load_network
-from pnpdepth_cli.pipeline.inputs import Inputs, read_inputs
-from pnpdepth_cli.pipeline.request import RefineRequest, effective_settings, layer_name
+from pnpdepth_cli.pipeline.refinement.inputs import Inputs, read_inputs
+from pnpdepth_cli.pipeline.refinement.request import RefineRequest, effective_settings, layer_name
 
 PRECISIONS, DEPTHS = ("fp32", "bf16"), ("before", "after")
 SAMPLES = Path(__file__).parent.parent / "samples"

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from pnpdepth_cli.io.calibration import read_calibration
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.io.scans import read_scan
-from pnpdepth_cli.pipeline.scans import camera_of
+from pnpdepth_cli.pipeline.sparse.scans import camera_of
 from pnpdepth_cli.sensors import (
     FORWARD_LEFT_UP,
     LIDARS,

@@ -23,7 +23,7 @@ from model_zoo_defs.training.patterns import keep, scan_lines, uniform
 from pnpdepth_cli.core.metrics import score
 from pnpdepth_cli.core.refine import RefineSettings
 from pnpdepth_cli.models.network import Network, load_network
-from pnpdepth_cli.pipeline.inputs import Inputs
+from pnpdepth_cli.pipeline.refinement.inputs import Inputs
 
 
 def drawn(pattern: str, rng: np.random.Generator, depth: Depth) -> Depth:

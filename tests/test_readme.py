@@ -13,8 +13,8 @@ import pytest
 from safetensors.torch import save_file
 
 from pnpdepth_cli.models.registry import find_definition
-from pnpdepth_cli.pipeline.refine import refine_image
-from pnpdepth_cli.pipeline.request import RefineRequest
+from pnpdepth_cli.pipeline.refinement.refine import refine_image
+from pnpdepth_cli.pipeline.refinement.request import RefineRequest
 from tests.pipeline.frames import frame_on_disk
 
 ROOT = Path(__file__).parent.parent

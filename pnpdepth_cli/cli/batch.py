@@ -19,7 +19,7 @@ from pnpdepth_cli.cli.printable import printable
 from pnpdepth_cli.errors import FramesFailedError, StorageError, UsageError
 
 if TYPE_CHECKING:
-    from pnpdepth_cli.pipeline.batch_frames import BatchRequest
+    from pnpdepth_cli.pipeline.batch.frames import BatchRequest
 
 LAYOUTS = (
     *("manifest", "nyu-mat", "kitti-odometry", "kitti-object", "kitti-depth", "tum", "7scenes"),
@@ -108,10 +108,10 @@ def batch(
     made with other settings or from other files, and leaves the rest. OUTPUT/summary.json and
     OUTPUT/summary.csv have all frames, OUTPUT/batch.jsonl is the run's memory.
     """
-    from pnpdepth_cli.pipeline.batch import plan_batch
-    from pnpdepth_cli.pipeline.batch_frames import BatchRequest
-    from pnpdepth_cli.pipeline.request import RefineRequest, sample_pattern
-    from pnpdepth_cli.pipeline.scans import ScanOptions
+    from pnpdepth_cli.pipeline.batch.batch import plan_batch
+    from pnpdepth_cli.pipeline.batch.frames import BatchRequest
+    from pnpdepth_cli.pipeline.refinement.request import RefineRequest, sample_pattern
+    from pnpdepth_cli.pipeline.sparse.scans import ScanOptions
 
     scan, others = options.scan_given(given)
     pattern = None if sample is None else sample_pattern(*_sample(sample))
@@ -146,7 +146,7 @@ def _run(request: BatchRequest, as_json: bool) -> int:
     """The exit code of a batch that went to its end, or was stopped by the user."""
     from pnpdepth_cli.cli.progress import BatchProgress
     from pnpdepth_cli.cli.tables import print_batch, print_profile
-    from pnpdepth_cli.pipeline.batch import run_batch
+    from pnpdepth_cli.pipeline.batch.batch import run_batch
 
     with BatchProgress() as progress, _finishing_on_interrupt() as stopped:
         try:

@@ -13,8 +13,8 @@ from pnpdepth_cli.cli.printable import printable
 from pnpdepth_cli.errors import UsageError
 
 if TYPE_CHECKING:
-    from pnpdepth_cli.pipeline.bench import Bench, BenchPart
-    from pnpdepth_cli.pipeline.bench_table import TableRow
+    from pnpdepth_cli.pipeline.bench.bench import Bench, BenchPart
+    from pnpdepth_cli.pipeline.bench.table import TableRow
 
 
 @click.command(short_help="Measure how long a refinement takes here.")
@@ -80,7 +80,7 @@ def bench(
         return
     from tqdm import tqdm
 
-    from pnpdepth_cli.pipeline.bench import BenchRequest, run_bench
+    from pnpdepth_cli.pipeline.bench.bench import BenchRequest, run_bench
 
     request = BenchRequest(
         model=model,
@@ -142,7 +142,7 @@ def _cells(part: BenchPart) -> tuple[str, ...]:
 def _table(repeats: int, precision: str, device: str, as_json: bool) -> None:
     from tqdm import tqdm
 
-    from pnpdepth_cli.pipeline.bench_table import bench_table
+    from pnpdepth_cli.pipeline.bench.table import bench_table
 
     with tqdm(desc="bench", unit="network", leave=False, delay=1) as bar:
 

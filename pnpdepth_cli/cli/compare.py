@@ -50,8 +50,8 @@ def compare(
     all ways where there are few, else in N random ones.
     """
     from pnpdepth_cli.cli import score_tables
-    from pnpdepth_cli.pipeline import score_files
-    from pnpdepth_cli.pipeline.compare import compare as compare_runs
+    from pnpdepth_cli.pipeline.evaluation import score_files
+    from pnpdepth_cli.pipeline.evaluation.compare import compare as compare_runs
 
     targets = (csv, markdown, latex)
     score_tables.check_stdout(targets, as_json)

@@ -15,7 +15,7 @@ from pnpdepth_cli.cli.printable import printable
 from pnpdepth_cli.errors import FramesFailedError, UsageError
 
 if TYPE_CHECKING:
-    from pnpdepth_cli.pipeline.evaluation import Evaluation
+    from pnpdepth_cli.pipeline.evaluation.result import Evaluation
 
 PROTOCOLS = ("paper", "nyu", "kitti", "kitti-devkit", "eigen", "garg")
 
@@ -106,7 +106,8 @@ def evaluate(
     eigen, garg   truth in 0.001–80 m, predictions clipped to it, Eigen's or Garg's crop
     """
     from pnpdepth_cli.cli import score_tables
-    from pnpdepth_cli.pipeline import report_eval, score_files
+    from pnpdepth_cli.pipeline.evaluation import score_files
+    from pnpdepth_cli.pipeline.report import evaluation as report_eval
 
     targets = (csv, markdown, latex)
     score_tables.check_stdout(targets, as_json)
@@ -156,9 +157,9 @@ def _evaluate(
     **changes: Any,
 ) -> Evaluation:
     """The evaluation, with a bar over the frames where it takes longer than a second."""
-    from pnpdepth_cli.pipeline.evaluate import evaluate
-    from pnpdepth_cli.pipeline.evaluation import EvalRequest
-    from pnpdepth_cli.pipeline.frame_reading import Scales
+    from pnpdepth_cli.pipeline.evaluation.evaluate import evaluate
+    from pnpdepth_cli.pipeline.evaluation.frame_reading import Scales
+    from pnpdepth_cli.pipeline.evaluation.result import EvalRequest
 
     changes |= {"thresholds": _thresholds(delta), "exclude_sparse": exclude_sparse or None}
     request = EvalRequest(

@@ -38,7 +38,7 @@ def layers(
     """
     from tqdm import tqdm
 
-    from pnpdepth_cli.pipeline.layers import list_layers
+    from pnpdepth_cli.pipeline.networks.layers import list_layers
 
     with tqdm(desc="layers", unit="layer", leave=False, delay=1) as bar:
 

@@ -53,16 +53,16 @@ def models(
     if sum(task is not None for task in (check, convert, fetch)) > 1:
         raise UsageError("--check, --convert and --fetch are three tasks; give one")
     if check is not None:
-        from pnpdepth_cli.pipeline.check import check_model
+        from pnpdepth_cli.pipeline.networks.check import check_model
 
         found = check_model(check, given["checkpoint"], given["image"], given["device"])
         _show(found, as_json)
     elif convert is not None:
-        from pnpdepth_cli.pipeline.convert import convert_checkpoint
+        from pnpdepth_cli.pipeline.networks.convert import convert_checkpoint
 
         _show(convert_checkpoint(*convert, overwrite=given["overwrite"]), as_json)
     elif fetch is not None:
-        from pnpdepth_cli.pipeline.fetch import fetch_model
+        from pnpdepth_cli.pipeline.networks.fetch import fetch_model
 
         _show(fetch_model(fetch, given["revision"], given["output"]), as_json)
     else:
@@ -88,7 +88,7 @@ def _show(found: Mapping[str, Any], as_json: bool) -> None:
 
 
 def _list(every: bool, as_json: bool) -> None:
-    from pnpdepth_cli.pipeline.models import list_models
+    from pnpdepth_cli.pipeline.networks.models import list_models
 
     listed = [asdict(model) for model in list_models()]
     left_out = Counter(model["family"] for model in listed if model["variant"] and not every)

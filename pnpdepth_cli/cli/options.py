@@ -268,6 +268,6 @@ def height_and_width(text: str) -> tuple[int, int]:
 
 def count_or_share(text: str | None) -> tuple[int | None, float | None]:
     """(points, share) of `500` or `5%`; None for what it is not. UsageError for any other text."""
-    from pnpdepth_cli.pipeline import request
+    from pnpdepth_cli.pipeline.refinement import request
 
     return (None, None) if text is None else request.count_or_share(text)

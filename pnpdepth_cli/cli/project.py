@@ -42,9 +42,9 @@ def project(
     foreground are dropped, and counted. Beside the output, a JSON file says how it was made.
     """
     from pnpdepth_cli.cli.tables import print_sparse
-    from pnpdepth_cli.pipeline.project import ProjectRequest, project_scan
-    from pnpdepth_cli.pipeline.scans import ScanOptions
-    from pnpdepth_cli.pipeline.sparse_outputs import SparseTarget
+    from pnpdepth_cli.pipeline.sparse.outputs import SparseTarget
+    from pnpdepth_cli.pipeline.sparse.project import ProjectRequest, project_scan
+    from pnpdepth_cli.pipeline.sparse.scans import ScanOptions
 
     scan_options, _ = options.scan_given(given)
     record = project_scan(

@@ -48,9 +48,9 @@ def refine(as_json: bool, **given: Any) -> None:
     <name>_preview.png, <name>_improvement.png (red better, green worse) and <name>.json.
     """
     from pnpdepth_cli.cli.tables import print_refinement
-    from pnpdepth_cli.pipeline.refine import refine_image
-    from pnpdepth_cli.pipeline.request import RefineRequest
-    from pnpdepth_cli.pipeline.scans import ScanOptions
+    from pnpdepth_cli.pipeline.refinement.refine import refine_image
+    from pnpdepth_cli.pipeline.refinement.request import RefineRequest
+    from pnpdepth_cli.pipeline.sparse.scans import ScanOptions
 
     scan, others = options.scan_given(given)
     request = RefineRequest(scan=ScanOptions(**scan), **others)

@@ -73,8 +73,8 @@ def sample(
     The settings, the seed among them, are kept in the file (PNG, CSV) and in a JSON file beside it.
     """
     from pnpdepth_cli.cli.tables import print_sparse
-    from pnpdepth_cli.pipeline.sample import SampleRequest, sample_depth
-    from pnpdepth_cli.pipeline.sparse_outputs import SparseTarget
+    from pnpdepth_cli.pipeline.sparse.outputs import SparseTarget
+    from pnpdepth_cli.pipeline.sparse.sample import SampleRequest, sample_depth
 
     points, share = options.count_or_share(count)
     record = sample_depth(

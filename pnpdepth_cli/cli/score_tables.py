@@ -15,12 +15,12 @@ from rich.table import Table
 
 from pnpdepth_cli.cli.printable import printable
 from pnpdepth_cli.errors import UsageError
-from pnpdepth_cli.pipeline.score_files import part_cells, shown, unit_of, write_bytes
+from pnpdepth_cli.pipeline.evaluation.score_files import part_cells, shown, unit_of, write_bytes
 
 if TYPE_CHECKING:
-    from pnpdepth_cli.pipeline.compare import Comparison
-    from pnpdepth_cli.pipeline.evaluation import Evaluation, Part
-    from pnpdepth_cli.pipeline.frame_scoring import FrameScores
+    from pnpdepth_cli.pipeline.evaluation.compare import Comparison
+    from pnpdepth_cli.pipeline.evaluation.frame_scoring import FrameScores
+    from pnpdepth_cli.pipeline.evaluation.result import Evaluation, Part
 
 _ALL_FRAMES_SHOWN = 12
 _WORST_SHOWN = 5

@@ -79,8 +79,8 @@ def simulate(
                     range_noise = 0.02
     """
     from pnpdepth_cli.cli.tables import print_sparse
-    from pnpdepth_cli.pipeline.simulate import SimulateRequest, simulate_scan
-    from pnpdepth_cli.pipeline.sparse_outputs import SparseTarget
+    from pnpdepth_cli.pipeline.sparse.outputs import SparseTarget
+    from pnpdepth_cli.pipeline.sparse.simulate import SimulateRequest, simulate_scan
 
     target = SparseTarget(output=output, depth_scale=output_scale, overwrite=overwrite)
     record = simulate_scan(SimulateRequest(target=target, **given))

@@ -105,11 +105,11 @@ def sweep(
     each picture, and sweep.jsonl, by which the same command, or one with other values, only
     computes what is missing. Plots need the extra pnpdepth[plot].
     """
-    from pnpdepth_cli.pipeline.request import RefineRequest
-    from pnpdepth_cli.pipeline.scans import ScanOptions
-    from pnpdepth_cli.pipeline.sweep import SweepRequest, run_sweep
-    from pnpdepth_cli.pipeline.sweep_axes import read_axis, studies_of
-    from pnpdepth_cli.pipeline.sweep_points import read_sampling
+    from pnpdepth_cli.pipeline.refinement.request import RefineRequest
+    from pnpdepth_cli.pipeline.sparse.scans import ScanOptions
+    from pnpdepth_cli.pipeline.sweep.axes import read_axis, studies_of
+    from pnpdepth_cli.pipeline.sweep.points import read_sampling
+    from pnpdepth_cli.pipeline.sweep.sweep import SweepRequest, run_sweep
 
     scan, others = options.scan_given(given)
     request = SweepRequest(

@@ -12,7 +12,7 @@ import torch
 from safetensors.torch import load_file
 from torch import nn
 
-from pnpdepth_cli.pipeline.layers import LayerRow, ranked
+from pnpdepth_cli.pipeline.networks.layers import LayerRow, ranked
 from tests.cli.test_commands import code_of, frame, refine
 from tests.pipeline.frames import FrameOnDisk
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from pnpdepth_cli.pipeline import bench_table
+from pnpdepth_cli.pipeline.bench import table as bench_table
 from tests.cli.test_commands import code_of
 from tests.pipeline.frames import FrameOnDisk, frame_on_disk
 

@@ -14,7 +14,7 @@ from pnpdepth_cli.core.steps import SCHEDULES
 from pnpdepth_cli.core.updates import UPDATES
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.models.definition import FOREIGN, ModelDefinition, Multiple
-from pnpdepth_cli.pipeline.request import RefineRequest, effective_settings
+from pnpdepth_cli.pipeline.refinement.request import RefineRequest, effective_settings
 from tests.core.networks import UNet
 
 REQUEST = RefineRequest(image=None, sparse=Path("points.npy"))

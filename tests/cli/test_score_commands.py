@@ -15,7 +15,7 @@ import pytest
 
 from pnpdepth_cli.cli.main import main
 from pnpdepth_cli.io.depth import write_depth
-from pnpdepth_cli.pipeline.protocols import PROTOCOLS
+from pnpdepth_cli.pipeline.evaluation.protocols import PROTOCOLS
 from tests.pipeline.frames import frame_on_disk
 
 

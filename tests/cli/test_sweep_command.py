@@ -11,7 +11,7 @@ import pytest
 from pnpdepth_cli.cli import options
 from pnpdepth_cli.cli.main import main
 from pnpdepth_cli.cli.sweep import sweep
-from pnpdepth_cli.pipeline.sweep_axes import PARAMETERS
+from pnpdepth_cli.pipeline.sweep.axes import PARAMETERS
 from tests.pipeline.batches import pairs_on_disk
 
 
@@ -128,7 +128,7 @@ def test_an_empty_folder_and_frames_without_truth_are_input_errors(
 def test_ctrl_c_says_how_to_go_on_and_exits_130(
     root: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from pnpdepth_cli.pipeline import sweep_running
+    from pnpdepth_cli.pipeline.sweep import running as sweep_running
 
     own, calls = sweep_running.refined_curve, []
 

@@ -10,9 +10,9 @@ from typing import Any
 import cv2
 import numpy as np
 
-from pnpdepth_cli.pipeline.batch import BatchOutcome, run_batch
-from pnpdepth_cli.pipeline.batch_frames import BatchRequest
-from pnpdepth_cli.pipeline.request import RefineRequest
+from pnpdepth_cli.pipeline.batch.batch import BatchOutcome, run_batch
+from pnpdepth_cli.pipeline.batch.frames import BatchRequest
+from pnpdepth_cli.pipeline.refinement.request import RefineRequest
 from tests.pipeline.frames import frame_on_disk
 
 NAMES = ("a", "b", "c", "d")

@@ -1,0 +1,202 @@
+"""Which frames a batch has, and what is to be done with each. No torch is needed to know."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path, PurePosixPath
+
+from pnpdepth_cli.errors import InputError, OutputError, UsageError
+from pnpdepth_cli.io.layouts import LAYOUTS, find_protocol, list_frames
+from pnpdepth_cli.io.layouts.frame import SCANS, Frame, Source, Unmatched
+from pnpdepth_cli.pipeline.refinement.output_files import Outputs
+from pnpdepth_cli.pipeline.refinement.request import RefineRequest
+
+
+@dataclass(frozen=True, kw_only=True)
+class BatchRequest:
+    """What to do with all frames of a folder or a list.
+
+    refine: how; its files, its output and its protocol are set for each frame. layout: its name,
+    None to guess it. protocol: its name, None for the layout's own. workers: threads that read,
+    and as many that write. batch_size: frames of one size that go through the network together,
+    None for as many as alter no result. limit: only the first frames. shard: (i, n), every n-th
+    from the i-th. profile: whether the summary says where the time went.
+    html: the folder for a report, None for no report.
+    """
+
+    source: Path
+    output: Path
+    refine: RefineRequest
+    layout: str | None = None
+    protocol: str | None = None
+    workers: int = 2
+    batch_size: int | None = None
+    limit: int | None = None
+    shard: tuple[int, int] | None = None
+    profile: bool = False
+    html: Path | None = None
+
+    def __post_init__(self) -> None:
+        if self.workers < 1:
+            raise UsageError(f"workers {self.workers}: at least one thread has to read")
+        if self.batch_size is not None and self.batch_size < 1:
+            raise UsageError(f"batch size {self.batch_size}: give 1 or more frames, or auto")
+        if self.limit is not None and self.limit < 1:
+            raise UsageError(f"limit {self.limit}: give the number of frames to do, 1 or more")
+        if self.shard is not None and not 1 <= self.shard[0] <= self.shard[1]:
+            number, of = self.shard
+            raise UsageError(f"shard {number}/{of}: give I/N with I from 1 to N, such as 1/4")
+        if self.protocol is not None:
+            find_protocol(self.protocol)
+
+
+@dataclass(frozen=True, kw_only=True)
+class BatchFrames:
+    """frames: all that are there. chosen: those of them to be done in this run."""
+
+    layout: str
+    frames: list[Frame]
+    chosen: list[Frame]
+    unmatched: tuple[Unmatched, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Task:
+    """One frame: what to refine, the files that are read for it, by their part, and written."""
+
+    name: str
+    request: RefineRequest
+    inputs: dict[str, Path]
+    outputs: Outputs
+
+
+def find_frames(request: BatchRequest) -> BatchFrames:
+    """The frames there are. InputError if there is none, UsageError if none has sparse depth."""
+    if request.output.exists() and not request.output.is_dir():
+        raise OutputError(f"{request.output} is a file; name a folder")
+    if request.source.is_dir() and _is_below(request.source, request.output):
+        raise _holds_the_frames(request.output)
+    layout, listing = list_frames(request.source, request.layout)
+    frames, unmatched = _own_names(_outside(request.output, listing.frames))
+    lost = [*listing.broken, *listing.spare]
+    unmatched += [each for each in lost if not _is_below(each.path, request.output)]
+    if not frames:
+        first = f" ({lost[0]})" if lost else ""
+        raise InputError(
+            f"{request.source} looks like {layout.name!r} but has no frame in it{first};"
+            f" layouts are {', '.join(LAYOUTS)}"
+        )
+    if request.refine.sample is None and all(frame.sparse is None for frame in frames):
+        raise UsageError(
+            f"{request.source} looks like {layout.name!r}, which has no sparse depth; --sample 500"
+            " takes so many points of the ground truth"
+        )
+    number, of = request.shard or (1, 1)
+    return BatchFrames(
+        layout=layout.name,
+        frames=frames,
+        chosen=frames[: request.limit][number - 1 :: of],
+        unmatched=tuple(unmatched),
+    )
+
+
+def task_of(request: BatchRequest, frame: Frame) -> Task:
+    """What is to be done with a frame; what the user said goes before what the data set says."""
+    asked = request.refine
+    sparse = frame.sparse if asked.sample is None else None
+    protocol = frame.protocol if request.protocol is None else find_protocol(request.protocol)
+    is_scan = sparse is not None and (
+        asked.scan.calib is not None or sparse.suffix.lower() in SCANS
+    )
+    scan = asked.scan
+    if is_scan:
+        camera = frame.camera if scan.camera is None else scan.camera
+        scan = replace(scan, calib=scan.calib or frame.calib, camera=camera)
+    wanted = replace(
+        asked,
+        image=frame.image,
+        sparse=sparse,
+        gt=frame.gt,
+        sparse_scale=frame.sparse_scale if asked.depth_scale is None else None,
+        gt_scale=asked.gt_scale or asked.depth_scale or frame.gt_scale,
+        scan=scan,
+        protocol=protocol,
+    )
+    return Task(
+        name=frame.name,
+        request=wanted,
+        inputs=dict(_input_files(wanted, is_scan=is_scan)),
+        outputs=Outputs.in_folder(request.output, frame.name, asked),
+    )
+
+
+def source_files(frame: Frame) -> list[Path]:
+    """The files that image, sparse depth and truth of the frame are in."""
+    parts = [frame.image, frame.sparse, frame.gt]
+    return [part if isinstance(part, Path) else part.path for part in parts if part is not None]
+
+
+def _input_files(request: RefineRequest, *, is_scan: bool) -> Iterator[tuple[str, Path]]:
+    parts: dict[str, Source | None] = {
+        "image": request.image,
+        "sparse": request.sparse,
+        "gt": request.gt,
+    }
+    for part, source in parts.items():
+        if source is not None:
+            yield part, source if isinstance(source, Path) else source.path
+    calib = request.scan.calib
+    if is_scan and calib is not None:
+        if calib.is_dir():
+            yield from ((f"calib {p.name}", p) for p in sorted(calib.glob("calib_*.txt")))
+        else:
+            yield "calib", calib
+
+
+def _holds_the_frames(output: Path) -> OutputError:
+    return OutputError(
+        f"{output} holds the frames themselves; name a folder of its own, such as {output / 'out'}"
+    )
+
+
+def _outside(output: Path, frames: list[Frame]) -> tuple[list[Frame], list[Unmatched]]:
+    """The frames without a file in the output folder, and those others."""
+    if not output.exists():
+        return frames, []
+    folder = output.resolve()
+    kept, left = [], []
+    for frame in frames:
+        inside = [path for path in source_files(frame) if path.resolve().is_relative_to(folder)]
+        if inside:
+            why = "lies in the output folder, from which nothing is taken; move it"
+            left.append(Unmatched(path=inside[0], why=why))
+        else:
+            kept.append(frame)
+    if frames and not kept:
+        raise _holds_the_frames(output)
+    return kept, left
+
+
+def _own_names(found: tuple[list[Frame], list[Unmatched]]) -> tuple[list[Frame], list[Unmatched]]:
+    """The frames whose name is theirs alone, and fit for their results; and the others."""
+    frames, left = found
+    kept: dict[str, Frame] = {}
+    for frame in frames:
+        why = f"is a second frame {frame.name!r}; rename it" if frame.name in kept else None
+        if frame.name == "summary":
+            why = "would be recorded in summary.json, which is the batch's own; rename it"
+        place = PurePosixPath(frame.name)
+        if place.is_absolute() or ".." in place.parts:
+            why = f"is named {frame.name!r}, which leads out of the output folder; rename it"
+        if why is None:
+            kept[frame.name] = frame
+        else:
+            source = frame.image or frame.sparse
+            path = source if isinstance(source, Path) else Path(str(source))
+            left.append(Unmatched(path=path, why=why))
+    return list(kept.values()), left
+
+
+def _is_below(path: Path, folder: Path) -> bool:
+    return path.resolve().is_relative_to(folder.resolve())

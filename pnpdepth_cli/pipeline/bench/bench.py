@@ -1,0 +1,334 @@
+"""`pnpdepth bench`: what a refinement and everything around it takes, beside one forward pass."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+from torch.utils.flop_counter import FlopCounterMode
+
+from pnpdepth_cli.core.alignment import SPACES, align
+from pnpdepth_cli.core.losses import LOSSES
+from pnpdepth_cli.core.points import SparsePoints
+from pnpdepth_cli.core.propagation import propagate
+from pnpdepth_cli.core.refine import RefineSettings, refine
+from pnpdepth_cli.core.split import Split, gradient_at
+from pnpdepth_cli.errors import NoPointsError, PnpDepthError, UsageError
+from pnpdepth_cli.io.depth import write_depth
+from pnpdepth_cli.models.aligned import AlignedDepth
+from pnpdepth_cli.models.definition import Fixed
+from pnpdepth_cli.models.frame import FrameMap
+from pnpdepth_cli.models.made_up import made_up_frame
+from pnpdepth_cli.models.network import Network, load_network, out_of_memory_is_a_device_error
+from pnpdepth_cli.pipeline.bench.timing import Spread, Timed, in_turn, peak_mb
+from pnpdepth_cli.pipeline.refinement.frame import FrameToRefine, refine_frame
+from pnpdepth_cli.pipeline.refinement.inputs import read_inputs
+from pnpdepth_cli.pipeline.refinement.output_files import plan_outputs
+from pnpdepth_cli.pipeline.refinement.outputs import write_outputs
+from pnpdepth_cli.pipeline.refinement.request import RefineRequest, effective_settings, layer_name
+from pnpdepth_cli.pipeline.stopwatch import versions
+
+DEFAULT_SIZE = (480, 640)
+FIRST_FRAME, FULL = "refinement, first frame", "refinement, fp32"
+_WITH_PEAK = ("forward", "refinement", FIRST_FRAME, FULL)
+_CODES = 1000.0  # per metre, of the made-up sparse depth
+
+
+@dataclass(frozen=True, kw_only=True)
+class BenchRequest:
+    """What is to be measured; None is the network's own default.
+
+    size: (H, W) of the made-up frame. repeats: runs that count, after one that does not. files:
+    whether reading, writing and the work on a whole frame are measured too.
+    """
+
+    model: str = "compact"
+    checkpoint: Path | None = None
+    layer: str | None = None
+    size: tuple[int, int] | None = None
+    points: int = 500
+    iterations: int | None = None
+    precision: str = "fp32"
+    device: str = "cpu"
+    repeats: int = 10
+    files: bool = True
+
+
+@dataclass(frozen=True, kw_only=True)
+class BenchPart:
+    """A thing that was timed: `forwards` is its median in forward passes.
+
+    peak_mb: memory beyond what lay there before, 10^6 bytes; None where it was not measured.
+    """
+
+    name: str
+    seconds: Spread
+    forwards: float
+    peak_mb: float | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Bench:
+    """What was measured, and with what.
+
+    limit_by_flops, limit_measured: (front + (2K + 1)·rear) / (front + rear), what a refinement by K
+    updates costs at least, in forward passes; from counts of operations (None where none can be
+    counted) and from the times of the parts.
+    depth_change: mean |d − d'| / d' of the depth refined in fp32, d', where another precision is
+    measured.
+    """
+
+    model: str
+    checkpoint: str | None
+    layer: str
+    size: tuple[int, int]
+    network_size: tuple[int, int]
+    points: int
+    iterations: int
+    precision: str
+    device: str
+    threads: int
+    versions: dict[str, str]
+    parts: tuple[BenchPart, ...]
+    limit_by_flops: float | None
+    limit_measured: float
+    depth_change: float | None
+    notes: tuple[str, ...]
+
+    def part(self, name: str) -> BenchPart:
+        """The part of that name."""
+        return next(part for part in self.parts if part.name == name)
+
+    def record(self) -> dict[str, Any]:
+        """All of it in JSON's own types."""
+        return asdict(self)
+
+
+def run_bench(
+    request: BenchRequest, *, on_round: Callable[[int, int], None] = lambda done, of: None
+) -> Bench:
+    """Everything measured on a made-up frame; a network without weights gets random ones.
+
+    on_round(done, of) is called after every round, in which each part is run once.
+    """
+    if request.repeats < 1 or request.points < 1:
+        raise UsageError(
+            f"repeats {request.repeats}, points {request.points}: there must be at least one"
+        )
+    with tempfile.TemporaryDirectory(prefix="pnpdepth-") as folder, ExitStack() as stack:
+        subject = _Subject.load(request, Path(folder))
+        with out_of_memory_is_a_device_error(subject.network.device):
+            return subject.measured(stack, on_round)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Subject:
+    """A network and a made-up frame for it; `asked` names the frame's files."""
+
+    request: BenchRequest
+    asked: RefineRequest
+    network: Network
+    layer: str
+    settings: RefineSettings
+    frame: FrameMap
+    rgb: Tensor
+    points: SparsePoints
+    arguments: tuple[Tensor, ...]
+
+    @classmethod
+    def load(cls, request: BenchRequest, folder: Path) -> _Subject:
+        network = _network(request, request.precision)
+        definition = network.definition
+        policy = definition.size
+        own = (policy.height, policy.width) if isinstance(policy, Fixed) else DEFAULT_SIZE
+        rgb, points = made_up_frame(request.size or own, request.points)
+        asked = RefineRequest(
+            image=folder / "rgb.png",
+            sparse=folder / "sparse.png",
+            output=folder / "out",
+            overwrite=True,
+            model=request.model,
+            layer=request.layer,
+            iterations=request.iterations,
+            # What random weights give has nothing to do with the points.
+            align=None if network.checkpoint or definition.complete else "none",
+        )
+        _write_frame(asked, rgb, points)
+        frame = FrameMap.fit(definition.size, *points.size)
+        at = frame.points_to_network(points).to(network.device)
+        if not len(at):
+            raise NoPointsError(
+                f"none of {len(points)} points lies in the network's view; take more"
+            )
+        return cls(
+            request=request,
+            asked=asked,
+            network=network,
+            layer=layer_name(definition, request.layer),
+            settings=effective_settings(definition, asked),
+            frame=frame,
+            rgb=rgb,
+            points=at,
+            arguments=network.arguments(frame, rgb, at),
+        )
+
+    def measured(self, stack: ExitStack, on_round: Callable[[int, int], None]) -> Bench:
+        """All parts in turn."""
+        device, notes = self.network.device, list(self.network.notes)
+        opened = _network(self.request, self.request.precision)
+        split = stack.enter_context(Split(opened.module, self.layer))
+        with torch.no_grad():
+            z = split.front(*self.arguments)
+            output = split.rear(z)
+            limit = _limit(*self._operations(split, z), self.settings.iterations)
+        todo = self._engine_parts(split, z)
+        change = None
+        if self.request.precision != "fp32":
+            full = _network(self.request, "fp32")
+            full_split = stack.enter_context(Split(full.module, self.layer))
+            todo[FULL] = Timed(run=lambda _: self._refined(full_split, full))
+            change = _change(self._refined(split, self.network), self._refined(full_split, full))
+        if self.request.files:
+            todo |= self._fitting_parts(output, notes) | self._file_parts()
+        spent = in_turn(todo, self.request.repeats, device, on_round=on_round)
+        peaks = {name: peak_mb(_once(todo[name]), device) for name in _WITH_PEAK if name in todo}
+        seconds = {name: Spread.of(each) for name, each in spent.items()}
+        front, rear = seconds["front"].median, seconds["rear"].median
+        measured = _limit(front, rear, self.settings.iterations)
+        assert measured is not None
+        return Bench(
+            model=self.request.model,
+            checkpoint=str(self.network.checkpoint) if self.network.checkpoint else None,
+            layer=self.layer,
+            size=self.frame.image,
+            network_size=self.frame.network,
+            points=len(self.points),
+            iterations=self.settings.iterations,
+            precision=self.request.precision,
+            device=str(device),
+            threads=torch.get_num_threads(),
+            versions=versions(),
+            parts=tuple(
+                BenchPart(
+                    name=name,
+                    seconds=each,
+                    forwards=each.median / seconds["forward"].median,
+                    peak_mb=peaks.get(name),
+                )
+                for name, each in seconds.items()
+            ),
+            limit_by_flops=limit,
+            limit_measured=measured,
+            depth_change=change,
+            notes=tuple(notes),
+        )
+
+    def _engine_parts(self, split: Split, z: Tensor) -> dict[str, Timed]:
+        """The network, the two halves of it, and the refinement; tensors in, tensors out."""
+        no_grad, module = torch.no_grad(), self.network.module
+        loss_of = LOSSES[self.settings.loss]
+
+        def loss() -> tuple[Tensor, Tensor]:
+            leaf = z.clone().requires_grad_(True)
+            with torch.enable_grad():
+                depth = self.network.depth_of(split.rear(leaf))
+                return leaf, loss_of(self.points.sample(depth), self.points.depth)
+
+        def first_frame(_: object) -> None:
+            with Split(module, self.layer) as fresh:
+                self._refined(fresh, self.network)
+
+        return {
+            "forward": Timed(run=no_grad(lambda _: module(*self.arguments))),
+            "front": Timed(run=no_grad(lambda _: split.front(*self.arguments))),
+            "rear": Timed(run=no_grad(lambda _: split.rear(z))),
+            "rear backward": Timed(run=lambda prepared: gradient_at(*prepared), prepare=loss),
+            "refinement": Timed(run=lambda _: self._refined(split, self.network)),
+            FIRST_FRAME: Timed(run=first_frame),
+        }
+
+    def _refined(self, split: Split, network: Network) -> Tensor:
+        read = AlignedDepth(
+            network, self.points, self.settings.align, every=self.settings.align_every
+        )
+        return refine(split, self.arguments, self.points, self.settings, depth_of=read).after
+
+    def _fitting_parts(self, output: Any, notes: list[str]) -> dict[str, Timed]:
+        """What else may be done to a prediction."""
+        stated = self.network.definition.output_kind
+        spaces = (stated,) if stated in SPACES else ("depth", "inverse")
+        at_points = self.points.sample(self.network.raw_of(output))
+        depth = self.network.depth_of(output)
+        points = self.points.in_frame(*depth.shape[-2:])
+        rgb = F.interpolate(self.rgb, points.size, mode="bilinear")[0]
+        todo = {
+            "alignment": Timed(run=lambda _: align(at_points, self.points, spaces, "auto")),
+            "propagation": Timed(run=lambda _: propagate(depth[0, 0], points, rgb, kind="gp")),
+        }
+        for name in list(todo):
+            try:
+                todo[name].run(None)
+            except PnpDepthError as error:  # random weights may give the same everywhere
+                notes.append(f"{name} is not measured: {error}")
+                del todo[name]
+        return todo
+
+    def _file_parts(self) -> dict[str, Timed]:
+        """From files and to files, as `pnpdepth refine` does it."""
+        inputs, outputs = read_inputs(self.asked), plan_outputs(self.asked)
+        with Split(self.network.module, self.layer) as split:
+            task = FrameToRefine.with_points(inputs, inputs.points)
+            frame = refine_frame(self.network, split, self.settings, task)
+        return {
+            "reading": Timed(run=lambda _: read_inputs(self.asked)),
+            "writing": Timed(run=lambda _: write_outputs(outputs, inputs, frame)),
+        }
+
+    def _operations(self, split: Split, z: Tensor) -> tuple[float, float]:
+        """Floating-point operations of the front and of the rear."""
+        with FlopCounterMode(display=False) as whole:
+            self.network.module(*self.arguments)
+        with FlopCounterMode(display=False) as behind:
+            split.rear(z)
+        rear = behind.get_total_flops()
+        return max(0, whole.get_total_flops() - rear), rear
+
+
+def _network(request: BenchRequest, precision: str) -> Network:
+    """The network of the request, the same each time also where its weights are random."""
+    torch.manual_seed(0)
+    return load_network(
+        request.model,
+        request.checkpoint,
+        request.device,
+        precision=precision,
+        untrained=True,
+    )
+
+
+def _write_frame(asked: RefineRequest, rgb: Tensor, points: SparsePoints) -> None:
+    assert isinstance(asked.image, Path)
+    assert asked.sparse is not None
+    cv2.imwrite(str(asked.image), (255 * rgb[0].permute(1, 2, 0)).round().byte().numpy())
+    write_depth(asked.sparse, points.scatter()[0, 0].numpy(), scale=_CODES)
+
+
+def _limit(front: float, rear: float, iterations: int) -> float | None:
+    return (front + (2 * iterations + 1) * rear) / (front + rear) if front + rear else None
+
+
+def _change(depth: Tensor, of: Tensor) -> float:
+    known = of > 0
+    return float(((depth - of).abs()[known] / of[known]).mean())
+
+
+def _once(timed: Timed) -> Callable[[], object]:
+    return lambda: timed.run(timed.prepare())

@@ -1,0 +1,94 @@
+"""The paper's Table V, the time of a refinement with K = 5, measured again for its networks."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from pnpdepth_cli.pipeline.bench.bench import Bench, BenchRequest, run_bench
+
+
+@dataclass(frozen=True, kw_only=True)
+class PaperTime:
+    """A network of the paper, our name for it, and the size (H, W) of its frames.
+
+    before, after: seconds that the paper prints for the network and with refinement, on a GPU that
+    it does not name; None where it prints none.
+    """
+
+    name: str
+    model: str
+    data: str
+    size: tuple[int, int]
+    before: float | None = None
+    after: float | None = None
+
+    @property
+    def forwards(self) -> float | None:
+        """The paper's refinement in forward passes."""
+        return None if self.before is None or self.after is None else self.after / self.before
+
+
+_NYU, _KITTI = (228, 304), (352, 1216)
+
+PAPER_TIMES = (
+    PaperTime(name="Eigen", model="eigen", data="NYU", size=_NYU),
+    PaperTime(name="FCRN", model="fcrn", data="NYU", size=_NYU),
+    PaperTime(name="Zhou", model="sfmlearner", data="KITTI", size=(128, 416)),
+    PaperTime(
+        name="Uhrig", model="sparseconv", data="KITTI", size=_KITTI, before=0.0311, after=0.1614
+    ),
+    PaperTime(name="Chodosh", model="adnn", data="KITTI", size=_KITTI, before=0.0320, after=0.0447),
+    PaperTime(
+        name="Ma",
+        model="sparse2dense-r18-deconv3",
+        data="NYU",
+        size=_NYU,
+        before=0.0046,
+        after=0.0233,
+    ),
+    PaperTime(
+        name="Jaritz", model="latefusion", data="NYU", size=(224, 320), before=0.0484, after=0.1593
+    ),
+)
+"""Wang et al. (ICRA 2019), Table V, and the three networks that it leaves out."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TableRow:
+    """A network of the paper, and what was measured of ours at full size."""
+
+    paper: PaperTime
+    bench: Bench
+
+    def record(self) -> dict[str, Any]:
+        """All of it in JSON's own types."""
+        return {"paper": asdict(self.paper), "bench": self.bench.record()}
+
+
+def bench_table(
+    *,
+    repeats: int,
+    precision: str,
+    device: str,
+    on_network: Callable[[int, int, str], None] = lambda done, of, name: None,
+) -> list[TableRow]:
+    """The paper's networks, full size, with random weights and the paper's settings.
+
+    on_network(done, of, name) is called before each.
+    """
+    rows = []
+    for number, paper in enumerate(PAPER_TIMES):
+        on_network(number, len(PAPER_TIMES), paper.model)
+        request = BenchRequest(
+            model=paper.model,
+            size=paper.size,
+            iterations=5,
+            precision=precision,
+            device=device,
+            repeats=repeats,
+            files=False,
+        )
+        rows.append(TableRow(paper=paper, bench=run_bench(request)))
+    return rows

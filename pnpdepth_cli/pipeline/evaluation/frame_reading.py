@@ -1,0 +1,214 @@
+"""The depths of one frame to score: read, checked against each other, and cut to what counts."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from pnpdepth_cli.errors import FileFormatError, InputError, SizeError
+from pnpdepth_cli.io.depth import DepthImage, read_sparse
+from pnpdepth_cli.io.depth_reading import depth_from_stored, known_metres, load_stored
+from pnpdepth_cli.io.layouts import Hdf5Array, read_frame_truth
+from pnpdepth_cli.io.layouts.frame import PICTURES
+from pnpdepth_cli.io.rgb import read_rgb
+from pnpdepth_cli.pipeline.evaluation.pairing import FramePair
+from pnpdepth_cli.pipeline.evaluation.protocols import EvalProtocol
+from pnpdepth_cli.sensors.sparse import SparseDepth, as_picture, in_picture
+
+Depth = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scales:
+    """Codes per metre of integer files, as the user gave them; channel: of EXR and NPZ files."""
+
+    prediction: float | None = None
+    truth: float | None = None
+    sparse: float | None = None
+    channel: str | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class LoadedFrame:
+    """Depths of one size (H, W) in float32 metres, 0 where unknown.
+
+    prediction: None where there is no file. truth: 0 also where the protocol does not score.
+    sparse: the points on their pixels, None where no file is known. tolerance: how far two depths
+    that were the same before they became codes can be apart.
+    """
+
+    prediction: DepthImage | None
+    truth: DepthImage
+    sparse: Depth | None
+    tolerance: float = 0.0
+
+
+def load_frame(pair: FramePair, protocol: EvalProtocol, scales: Scales) -> LoadedFrame:
+    """The frame's files in memory, as the protocol wants them.
+
+    Raises the errors of reading, and SizeError where sizes differ.
+    """
+    truth = _read_truth(pair, protocol, scales)
+    size = (truth.values.shape[0], truth.values.shape[1])
+    prediction = None
+    if pair.prediction is not None:
+        prediction = _read(
+            pair.prediction, scales.prediction, protocol.scale, scales.channel, protocol
+        )
+        prediction = replace(
+            prediction, values=_to_size(pair, prediction.values, size, protocol.resize)
+        )
+        if protocol.clip:
+            prediction = replace(prediction, values=_clipped(prediction.values, protocol))
+    sparse, sparse_scale = _known_sparse(pair, protocol, scales, size)
+    counts = _counts(pair, truth.values, protocol)
+    if protocol.exclude_sparse:
+        if sparse is None:
+            raise InputError(
+                f"frame {pair.name} has no sparse depth file to exclude; give it with --sparse"
+            )
+        counts &= sparse == 0
+    half_codes = [0.5 / scale for scale in {truth.scale, sparse_scale} if scale is not None]
+    return LoadedFrame(
+        prediction=prediction,
+        truth=replace(truth, values=np.where(counts, truth.values, np.float32(0))),
+        sparse=sparse,
+        tolerance=sum(half_codes),
+    )
+
+
+def _read_truth(pair: FramePair, protocol: EvalProtocol, scales: Scales) -> DepthImage:
+    frame = pair.truth
+    if isinstance(frame.gt, Hdf5Array):
+        return DepthImage(values=read_frame_truth(frame), source=f"{frame.gt.path.suffix} array",
+                          assumed_scale=False)  # fmt: skip
+    if frame.gt is None:
+        raise InputError(f"frame {pair.name} has no ground truth")
+    scale = scales.truth if scales.truth is not None else frame.gt_scale
+    image = _read(frame.gt, scale, protocol.scale, scales.channel, protocol)
+    return replace(image, values=np.ascontiguousarray(frame.protocol.apply(image.values)))
+
+
+def _read(
+    path: Path, given: float | None, usual: float, channel: str | None, protocol: EvalProtocol
+) -> DepthImage:
+    """The depth image; codes are metres × the given scale, else the file's own, else the usual."""
+    stored = load_stored(path, channel)
+    assumed = given is None and stored.scale is None and stored.values.dtype.kind != "f"
+    scale = usual if assumed else given
+    image = depth_from_stored(path, stored, scale)
+    if protocol.is_devkit and image.scale is not None and stored.values.ndim == 2:
+        # the development kit takes every code but 0 for a depth, also the largest
+        image = replace(image, values=known_metres(stored.values / image.scale))
+    return replace(image, assumed_scale=assumed)
+
+
+def _known_sparse(
+    pair: FramePair, protocol: EvalProtocol, scales: Scales, size: tuple[int, int]
+) -> tuple[Depth | None, float | None]:
+    """As `_read_sparse`; nothing where a file that the user did not name cannot be used."""
+    if pair.sparse_asked or protocol.exclude_sparse:
+        return _read_sparse(pair, protocol, scales, size)
+    try:
+        return _read_sparse(pair, protocol, scales, size)
+    except InputError:
+        return None, None
+
+
+def _read_sparse(
+    pair: FramePair, protocol: EvalProtocol, scales: Scales, size: tuple[int, int]
+) -> tuple[Depth | None, float | None]:
+    """(H, W) metres of the points on their pixels, 0 elsewhere; and the file's codes per metre."""
+    if pair.sparse is None:
+        return None, None
+    scale = scales.sparse if scales.sparse is not None else pair.truth.sparse_scale
+    points = read_sparse(pair.sparse, scale=scale)
+    if points.assumed_scale and protocol.scale != points.scale:
+        points = read_sparse(pair.sparse, scale=protocol.scale)
+    xy, source_size = points.xy, points.size or size
+    if source_size != size:
+        xy = pair.truth.protocol.places(xy, source_size)
+        cut = pair.truth.protocol.apply(np.zeros(source_size, bool)).shape
+        if cut != size:
+            raise _different(pair, "sparse depth", pair.sparse, source_size, size, advice="")
+    inside = in_picture(xy, size)
+    depths = SparseDepth(xy=xy[inside], depth=points.depth[inside], size=size)
+    return as_picture(depths), points.scale
+
+
+def _counts(pair: FramePair, truth: Depth, protocol: EvalProtocol) -> Mask:
+    """(H, W) true where the protocol scores the truth, if it is known there."""
+    top, bottom, left, right = protocol.window((truth.shape[0], truth.shape[1]))
+    counts = np.zeros(truth.shape, bool)
+    counts[top:bottom, left:right] = True
+    counts &= truth > protocol.min_depth
+    if protocol.max_depth is not None:
+        counts &= truth < protocol.max_depth
+    if pair.mask is not None:
+        mask = _read_mask(pair.mask)
+        if mask.shape != truth.shape:
+            raise _different(pair, "mask", pair.mask, mask.shape, truth.shape, advice="")
+        counts &= mask
+    elif protocol.mask is not None:
+        raise InputError(f"frame {pair.name} has no mask in {protocol.mask}; add it")
+    return counts
+
+
+def _read_mask(path: Path) -> Mask:
+    """(H, W) true where a picture has any channel above 0, or an array a number above 0."""
+    if path.suffix.lower() in PICTURES:
+        return np.asarray(read_rgb(path).values.max(axis=2) > 0)
+    values = load_stored(path, None).values
+    if values.ndim != 2:
+        raise FileFormatError(f"{path}: a mask is (H, W), not of shape {values.shape}")
+    return np.asarray(values > 0)
+
+
+def _to_size(pair: FramePair, depth: Depth, size: tuple[int, int], method: str | None) -> Depth:
+    """The depth map at the truth's size: as it is, or resized as the protocol allows."""
+    if depth.shape == size:
+        return depth
+    if method is None:
+        raise _different(
+            pair, "prediction", pair.prediction, depth.shape, size,
+            advice="; --resize nearest or bilinear scales predictions if both show the same view",
+        )  # fmt: skip
+    height, width = size
+    if method == "nearest":
+        resized = cv2.resize(depth, (width, height), interpolation=cv2.INTER_NEAREST_EXACT)
+        return np.asarray(resized, np.float32)
+    known = (depth > 0).astype(np.float32)
+    total, weight = (
+        cv2.resize(part, (width, height), interpolation=cv2.INTER_LINEAR) for part in (depth, known)
+    )
+    # a new pixel is known where most of what it is interpolated from is
+    return np.asarray(
+        np.where(weight > 0.5, total / np.maximum(weight, np.float32(0.5)), 0), np.float32
+    )
+
+
+def _clipped(depth: Depth, protocol: EvalProtocol) -> Depth:
+    clipped = np.clip(depth, protocol.min_depth, protocol.max_depth)
+    return np.asarray(np.where(depth > 0, clipped, 0), np.float32)
+
+
+def _different(
+    pair: FramePair,
+    what: str,
+    path: Path | None,
+    shape: Iterable[int],
+    size: Iterable[int],
+    *,
+    advice: str,
+) -> SizeError:
+    (height, width), (rows, columns) = shape, size
+    return SizeError(
+        f"{what} {path} is {width}×{height} but the truth {pair.truth.gt} is"
+        f" {columns}×{rows}{advice}"
+    )

@@ -1,0 +1,201 @@
+"""What of a frame is scored, how it is scored, and how frames are averaged: published protocols."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from pnpdepth_cli.core.metrics import DELTA_THRESHOLDS, MEASURES, Measure
+from pnpdepth_cli.errors import SizeError, UsageError
+from pnpdepth_cli.pipeline.evaluation.kitti_devkit import DEVKIT_MEASURES
+
+KITTI_DEVKIT = "kitti-devkit"
+AVERAGES = ("per-image", "pooled")
+RESIZES = ("nearest", "bilinear")
+
+# (top, bottom, left, right) as shares of the height and the width, cut to whole pixels.
+# Garg et al. 2016 for KITTI; and what Godard et al. (monodepth, utils/evaluate_kitti.py) found by
+# trial to reproduce Eigen et al. 2014. Both are those of practically every later evaluation.
+_SHARES = {
+    "garg": (0.40810811, 0.99189189, 0.03594771, 0.96405229),
+    "eigen": (0.3324324, 0.91351351, 0.0359477, 0.96405229),
+}
+# Eigen et al. 2014 for NYU Depth v2: rows 45 to 470, columns 41 to 600 of 480x640 pixels.
+_NYU_SIZE = (480, 640)
+_NYU_WINDOW = (45, 471, 41, 601)
+CROPS = ("none", "nyu", *_SHARES)
+
+Window = tuple[int, int, int, int]
+"""(top, bottom, left, right) in pixels; bottom and right are just outside."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvalProtocol:
+    """How predictions are scored. Depths in metres.
+
+    scale: codes per metre of integer files that say nothing themselves, where nobody else does.
+    min_depth, max_depth: truth is scored strictly between them (None: no bound); clip moves
+    predictions into them. crop: one of CROPS, or X,Y,WIDTH,HEIGHT in pixels. mask: a picture, or a
+    folder of them, whose pixels above 0 are scored. average: of the frames' measures, or pooled
+    over the pixels of all. thresholds: of δ1…3. exclude_sparse: pixels with a sparse point are
+    not scored. resize: how a prediction of another size than the truth is brought to it, if it may.
+    """
+
+    name: str
+    scale: float = 256.0
+    min_depth: float = 0.0
+    max_depth: float | None = None
+    clip: bool = False
+    crop: str = "none"
+    mask: Path | None = None
+    average: str = "per-image"
+    thresholds: tuple[float, float, float] = DELTA_THRESHOLDS
+    exclude_sparse: bool = False
+    resize: str | None = None
+
+    @property
+    def is_devkit(self) -> bool:
+        """True if the development kit's definitions take the place of the usual ones."""
+        return self.name == KITTI_DEVKIT
+
+    @property
+    def measures(self) -> tuple[Measure, ...]:
+        """What is measured, in order, and how to show it."""
+        if self.is_devkit:
+            return DEVKIT_MEASURES
+        return _IN_MILLIMETRES if self.name == "kitti" else MEASURES
+
+    def window(self, size: tuple[int, int]) -> Window:
+        """The part of a frame of `size` (H, W) that is scored. SizeError if there is no such."""
+        height, width = size
+        if self.crop == "none":
+            return 0, height, 0, width
+        if self.crop in _SHARES:
+            top, bottom, left, right = _SHARES[self.crop]
+            return int(top * height), int(bottom * height), int(left * width), int(right * width)
+        if self.crop == "nyu":
+            if size != _NYU_SIZE:
+                raise SizeError(
+                    f"crop nyu is for frames of 640×480 but this one is {width}×{height};"
+                    " --crop none, or give X,Y,WIDTH,HEIGHT"
+                )
+            return _NYU_WINDOW
+        x, y, w, h = _rectangle(self.crop)
+        if x + w > width or y + h > height:
+            raise SizeError(f"crop {self.crop} does not lie in a frame of {width}×{height}")
+        return y, y + h, x, x + w
+
+    def scoring(self) -> dict[str, Any]:
+        """What decides the figures: equal for two evaluations that can be compared."""
+        rules = asdict(self)
+        for of_reading in ("name", "scale", "resize", "mask"):
+            rules.pop(of_reading)
+        return rules | {
+            "thresholds": list(self.thresholds),
+            "definitions": KITTI_DEVKIT if self.is_devkit else "usual",
+            "mask": None if self.mask is None else str(self.mask),
+        }
+
+    def describe(self) -> str:
+        """One line, such as `eigen: truth in 0.001–80 m, clipped predictions, crop eigen, …`."""
+        published = PROTOCOLS[self.name]
+        own = replace(
+            published, mask=self.mask, exclude_sparse=self.exclude_sparse, resize=self.resize
+        )
+        return ", ".join(
+            (f"{self.name}{'' if self == own else ' (changed)'}: {self._truth()}", *self._rest())
+        )
+
+    def _truth(self) -> str:
+        if self.max_depth is None:
+            bounds = f" above {self.min_depth:g} m" if self.min_depth else ""
+        else:
+            bounds = f" in {self.min_depth:g}–{self.max_depth:g} m"
+        return f"all known truth{bounds}"
+
+    def _rest(self) -> list[str]:
+        parts = [f"crop {self.crop}" if self.crop != "none" else "no crop"]
+        parts += ["predictions clipped to the same range"] if self.clip else []
+        parts += [f"mask {self.mask}"] if self.mask else []
+        parts += ["without the pixels of sparse points"] if self.exclude_sparse else []
+        parts += [f"predictions resized ({self.resize})"] if self.resize else []
+        if self.is_devkit:
+            parts.append("missing predictions filled in, errors as its program prints them")
+        else:
+            limits = ", ".join(f"{limit:.6g}" for limit in self.thresholds)
+            parts.append(f"δ below {limits}")
+        averaged = "the images" if self.average == "per-image" else "all pixels together"
+        return [*parts, f"mean over {averaged}"]
+
+
+_IN_MILLIMETRES = tuple(
+    replace(m, shown_unit="mm", shown_factor=1000.0, decimals=1) if m.key in ("rmse", "mae") else m
+    for m in MEASURES
+)
+
+_EIGEN_RANGE: dict[str, Any] = {"min_depth": 1e-3, "max_depth": 80.0, "clip": True}
+
+PROTOCOLS = {
+    protocol.name: protocol
+    for protocol in (
+        # Ma and Karaman's evaluation, which the paper's follows: no bounds, no crop.
+        EvalProtocol(name="paper"),
+        # Eigen et al. 2014 with the bounds of later tables (BTS, AdaBins): 0.001 to 10 m.
+        EvalProtocol(
+            name="nyu", scale=1000.0, min_depth=1e-3, max_depth=10.0, clip=True, crop="nyu"
+        ),
+        # The completion benchmark's measures in its units, with nothing filled in.
+        EvalProtocol(name="kitti"),
+        EvalProtocol(name=KITTI_DEVKIT),
+        EvalProtocol(name="eigen", crop="eigen", **_EIGEN_RANGE),
+        EvalProtocol(name="garg", crop="garg", **_EIGEN_RANGE),
+    )
+}
+
+
+def choose_protocol(name: str, **changes: Any) -> EvalProtocol:
+    """The protocol of this name with what the user changes; None leaves a field as it is.
+
+    UsageError for a name nobody knows, and for a setting that makes no sense.
+    """
+    if name not in PROTOCOLS:
+        raise UsageError(f"no protocol {name!r}; there are {', '.join(PROTOCOLS)}")
+    given = {field: value for field, value in changes.items() if value is not None}
+    published = PROTOCOLS[name]
+    if published.is_devkit:
+        for field, option in (("average", "--average"), ("thresholds", "--delta")):
+            if given.get(field, getattr(published, field)) != getattr(published, field):
+                raise UsageError(
+                    f"{option} does not apply to {name}: it has no δ and averages over the images"
+                )
+    protocol = replace(published, **given)
+    _check(protocol)
+    return protocol
+
+
+def _check(protocol: EvalProtocol) -> None:
+    low, high = protocol.min_depth, protocol.max_depth
+    if not (math.isfinite(low) and low >= 0):
+        raise UsageError(f"--min-depth {low:g} is no depth; give metres, 0 or more")
+    if high is not None and not (math.isfinite(high) and high > low):
+        raise UsageError(f"--max-depth {high:g} is not above --min-depth {low:g}; give metres")
+    if protocol.average not in AVERAGES:
+        raise UsageError(f"average {protocol.average!r} is not one of {', '.join(AVERAGES)}")
+    if protocol.resize not in (None, *RESIZES):
+        raise UsageError(f"resize {protocol.resize!r} is not one of {', '.join(RESIZES)}")
+    if not all(math.isfinite(limit) and limit > 1 for limit in protocol.thresholds):
+        raise UsageError("--delta must be above 1: δ counts ratios below it")
+    if protocol.crop not in CROPS:
+        _rectangle(protocol.crop)
+
+
+def _rectangle(text: str) -> tuple[int, int, int, int]:
+    try:
+        x, y, width, height = (int(word) for word in text.split(","))
+    except ValueError:
+        x, y, width, height = -1, -1, 0, 0
+    if min(x, y) < 0 or min(width, height) < 1:
+        raise UsageError(f"crop {text!r} is neither X,Y,WIDTH,HEIGHT nor one of {', '.join(CROPS)}")
+    return x, y, width, height

@@ -1,0 +1,124 @@
+"""Saved scores read back: of `pnpdepth eval --json`, of a batch's summary, of a refine record."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pnpdepth_cli.core.metrics import MEASURES, Measure
+from pnpdepth_cli.errors import FileFormatError, UsageError
+from pnpdepth_cli.io.record import read_json
+from pnpdepth_cli.pipeline.evaluation.protocols import PROTOCOLS
+
+_STAGES = ("before", "after")
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunFrame:
+    """A frame's measures by their key, NaN for what was no number.
+
+    pixels: scored. known: of truth, None where the file does not say. sums: of a pooled run.
+    """
+
+    values: dict[str, float]
+    pixels: int
+    known: int | None = None
+    sums: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Run:
+    """The scored frames of a run by their name. scoring: what decides the figures.
+
+    label: the file's name without its folder. path: as the user gave it.
+    """
+
+    label: str
+    path: str
+    measures: tuple[Measure, ...]
+    scoring: dict[str, Any]
+    frames: dict[str, RunFrame]
+
+    @property
+    def pooled(self) -> bool:
+        """True if the mean is over the pixels of all frames."""
+        return self.scoring.get("average") == "pooled"
+
+
+def read_run(text: str) -> Run:
+    """The run in a file; `FILE:before` is what a refinement started from, else its result counts.
+
+    FileFormatError for a file without scores.
+    """
+    path, stage = Path(text), "after"
+    start, colon, end = text.rpartition(":")
+    if colon and end in _STAGES and not path.exists():
+        path, stage = Path(start), end
+    if path.is_dir():
+        path = path / "summary.json"
+    record = read_json(path)
+    try:
+        if record.get("command") == "eval":
+            if stage == "before":
+                raise UsageError(f"{path} is of eval, which knows no before; leave out :before")
+            return _of_eval(text, path.stem, record)
+        frames = _of_refinements(path, record, stage)
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise FileFormatError(
+            f"{path} does not hold scores as pnpdepth writes them ({error!r}); create it again"
+        ) from error
+    if not frames:
+        raise FileFormatError(
+            f"{path} holds no scores; give what eval --json printed, or the summary of a batch or"
+            " the record of a refinement with ground truth"
+        )
+    keys = set.intersection(*(set(frame.values) for frame in frames.values()))
+    return Run(
+        label=f"{path.stem}:before" if stage == "before" else path.stem,
+        path=text,
+        measures=tuple(measure for measure in MEASURES if measure.key in keys),
+        scoring=PROTOCOLS["paper"].scoring(),
+        frames=frames,
+    )
+
+
+def _of_eval(text: str, label: str, record: Mapping[str, Any]) -> Run:
+    return Run(
+        label=label,
+        path=text,
+        measures=tuple(Measure(**measure) for measure in record["measures"]),
+        scoring=dict(record["protocol"]["scoring"]),
+        frames={
+            frame["name"]: RunFrame(
+                values=_numbers(frame["values"]),
+                pixels=frame["pixels"],
+                known=frame["known"],
+                sums=tuple(frame.get("sums", ())),
+            )
+            for frame in record["frames"]
+            if frame["error"] is None
+        },
+    )
+
+
+def _of_refinements(path: Path, record: Mapping[str, Any], stage: str) -> dict[str, RunFrame]:
+    """The frames of a batch's summary, or the one of a record."""
+    if isinstance(record.get("frames"), list):
+        entries = {entry["name"]: entry.get("scores") for entry in record["frames"]}
+    else:
+        entries = {path.stem: record.get("scores")}
+    found = {}
+    for name, scores in entries.items():
+        if scores is not None:
+            values = _numbers(scores[stage])
+            pixels, coverage = round(values["pixels"]), values["coverage"]
+            known = round(pixels / coverage) if coverage else None
+            found[name] = RunFrame(values=values, pixels=pixels, known=known)
+    return found
+
+
+def _numbers(values: Mapping[str, Any]) -> dict[str, float]:
+    return {key: math.nan if value is None else float(value) for key, value in values.items()}

@@ -1,0 +1,282 @@
+"""`--auto`: the best way to dense depth for a frame, by its error at points that are held out.
+
+The points are shared out into folds. Every way is given the points of all folds but one and is
+scored at those of that one, in turn; the best way, or mean of a few, is then given all points. The
+network as it is and every simple baseline are among the ways, so what is returned is never worse
+than they are at the held-out points.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from pnpdepth_cli.core.alignment import align, where_predicted
+from pnpdepth_cli.core.baselines import BASELINES
+from pnpdepth_cli.core.folds import spatial_folds
+from pnpdepth_cli.core.local_alignment import trust
+from pnpdepth_cli.core.points import SparsePoints
+from pnpdepth_cli.core.refine import RefineSettings
+from pnpdepth_cli.core.selection import Blend, best_blend, held_out_error
+from pnpdepth_cli.errors import PnpDepthError
+from pnpdepth_cli.models.definition import ModelDefinition
+from pnpdepth_cli.models.network import Network
+from pnpdepth_cli.pipeline.refinement.frame import RefinedFrame
+from pnpdepth_cli.pipeline.refinement.inputs import Inputs
+from pnpdepth_cli.pipeline.refinement.ways import Depths, Trajectory, Trial, Way, trajectories
+
+FOLDS = 4
+FEWEST = 5
+"""With fewer points than this none is held out."""
+ENOUGH = 1500
+"""With this many held-out points no further fold is looked at."""
+SPREADING = ("gp", "diffusion")
+UPDATES = (1, 2, 3, 5, 10, 20)
+"""Numbers of updates of z that are scored, as far as a trial's own goes, which is as well."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scored:
+    """A way and its mean absolute error at the held-out points, metres."""
+
+    way: Way
+    error: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Choice:
+    """The ways whose weighted mean is taken, and what it was chosen by.
+
+    error: its mean absolute error at the held-out points, metres; None where none was held out.
+    scored: every way that was tried, the best first.
+    """
+
+    ways: tuple[Way, ...]
+    weights: tuple[float, ...]
+    error: float | None = None
+    held_out: int = 0
+    folds: int = 0
+    scored: tuple[Scored, ...] = ()
+
+    def __str__(self) -> str:
+        if len(self.ways) == 1:
+            return str(self.ways[0])
+        parts = zip(self.weights, self.ways, strict=True)
+        return "mean of " + " and ".join(f"{weight:.0%} {way}" for weight, way in parts)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fold:
+    """Some points held out, how much each is believed (M,), and the depths by all others."""
+
+    held_out: SparsePoints
+    believed: Tensor
+    depths: Depths
+
+    def at(self, way: Way) -> Tensor:
+        """The way's depth (M,) at the held-out points."""
+        return self.depths.at(self.held_out.xy, way)
+
+
+@dataclass(frozen=True, kw_only=True)
+class AutoRefined:
+    """A frame refined by the chosen ways, and what they were chosen from.
+
+    depths: by all points.
+    """
+
+    frame: RefinedFrame
+    choice: Choice
+    depths: Depths
+    folds: tuple[Fold, ...]
+    notes: tuple[str, ...]
+
+
+def usual_trials(definition: ModelDefinition, layer: str, settings: RefineSettings) -> list[Trial]:
+    """Ways to update z, the most promising first: as asked, and with what was left unsaid changed.
+
+    Those that differ from the first in their alignment alone are the usual ones; what takes more
+    time comes after them, other layers last.
+    """
+    adam = replace(settings, update="adam", lr="3%", schedule="constant", spread=0.0, iterations=10)
+    steps = [settings, adam]
+    if settings == replace(RefineSettings(), align=settings.align):
+        steps.reverse()  # nobody has tuned the paper's steps to this network
+    kinds = [settings.align] + (["auto"] if settings.align == "none" else [])
+    layers = [layer, *(other for other in definition.layers if other != layer)]
+    trials = [
+        Trial(layer=cut, settings=replace(step, align=kind))
+        for cut in layers
+        for step in steps
+        for kind in kinds
+    ]
+    return list(dict.fromkeys(trials))
+
+
+def refine_automatically(
+    network: Network,
+    trials: Sequence[Trial],
+    inputs: Inputs,
+    used: SparsePoints,
+    *,
+    ways: Sequence[Way] | None = None,
+    fixed: Way | None = None,
+    budget_s: float | None = None,
+    seed: int = 0,
+) -> AutoRefined:
+    """The frame's depth by the way, or the mean of a few, that is best at held-out points.
+
+    trials: ways to update z; the first is tried in any case. ways: only these, the network and the
+    simple baselines compete, such as those that were best on other frames. fixed: this way is
+    taken, and the others are only scored. budget_s: no further trial is begun that would end later,
+    by what those before took; None tries all.
+    """
+    folds = _folds(used, seed)
+    sets = [used, *(kept for kept, _ in folds)]
+    made, notes = _tried(network, trials, inputs, sets, budget_s)
+    plain = next(iter(made.values()))
+    depths = [
+        Depths(inputs, points, plain[i].depths[0], {trial: of[i] for trial, of in made.items()})
+        for i, points in enumerate(sets)
+    ]
+    believed = _believed(used, plain[0].depths[0])
+    scored = tuple(
+        Fold(held_out=used.select(held), believed=believed[held], depths=each)
+        for (_, held), each in zip(folds, depths[1:], strict=True)
+    )
+    choice = _chosen(scored, tuple(made), ways if fixed is None else (fixed,), fixed)
+    after = torch.stack([depths[0].dense(way) for way in choice.ways])
+    after = (torch.tensor(choice.weights).view(-1, 1, 1) * after).sum(dim=0)
+    weighed = sorted(zip(choice.weights, choice.ways, strict=True), key=lambda one: -one[0])
+    trial = next((way.trial for _, way in weighed if way.trial), next(iter(made)))
+    frame = replace(made[trial][0].frame, before=plain[0].frame.before, after=after.numpy())
+    return AutoRefined(frame=frame, choice=choice, depths=depths[0], folds=scored, notes=notes)
+
+
+def _folds(used: SparsePoints, seed: int) -> list[tuple[SparsePoints, Tensor]]:
+    """(the points that are kept, which are held out) of each fold that is looked at."""
+    if len(used) < FEWEST:
+        return []
+    fold = spatial_folds(used, FOLDS, seed=seed)
+    looked_at = min(FOLDS, max(1, round(ENOUGH * FOLDS / len(used))))
+    return [(used.select(fold != number), fold == number) for number in range(looked_at)]
+
+
+def _tried(
+    network: Network,
+    trials: Sequence[Trial],
+    inputs: Inputs,
+    sets: Sequence[SparsePoints],
+    budget_s: float | None,
+) -> tuple[dict[Trial, list[Trajectory]], tuple[str, ...]]:
+    """The trials' trajectories with each set of points, and what was left out for the time."""
+    began = time.monotonic()
+    made: dict[Trial, list[Trajectory]] = {}
+    first_error: PnpDepthError | None = None
+    tried = 0
+    for trial in trials:
+        if made and trial.settings.align == "auto" and _already_metric(next(iter(made.values()))):
+            continue
+        spent = time.monotonic() - began
+        if budget_s is None and not _is_usual(trial, trials[0]):
+            return made, ()
+        if made and budget_s is not None and spent * (tried + 1) > budget_s * tried:
+            return made, (f"auto: {tried} trials made; for more the time budget is too short",)
+        tried += 1
+        found = trajectories(network, trial, inputs, sets, updates_of(trial))
+        good = [each for each in found if isinstance(each, Trajectory)]
+        if len(good) == len(sets):
+            made[trial] = good
+        else:
+            first_error = first_error or next(e for e in found if isinstance(e, PnpDepthError))
+    if not made and first_error is not None:
+        raise first_error
+    return made, ()
+
+
+def _is_usual(trial: Trial, first: Trial) -> bool:
+    return trial == replace(first, settings=replace(first.settings, align=trial.settings.align))
+
+
+def _already_metric(plain: Sequence[Trajectory]) -> bool:
+    """Whether an alignment would leave the prediction as it is."""
+    prediction, used = plain[0].depths[0], plain[0].frame.used
+    if plain[0].frame.alignment is not None:
+        return True
+    known, points = where_predicted(prediction, used)
+    made = align(points.sample(torch.where(known, prediction, 1.0)), points, ("depth",), "auto")
+    return made.kind == "none"
+
+
+def _believed(points: SparsePoints, prediction: Tensor) -> Tensor:
+    """(N,) 0…1: how much each point is believed when it is scored; wrong ones would decide all."""
+    at_points = points.sample(prediction)
+    missing = points.depth.double().log() - at_points.clamp_min(1e-6).double().log()
+    believed = torch.where(at_points > 0, trust(points, missing), 0.0)
+    return believed if bool(believed.any()) else torch.ones_like(believed)
+
+
+def _chosen(
+    folds: Sequence[Fold],
+    trials: Sequence[Trial],
+    only: Sequence[Way] | None,
+    fixed: Way | None,
+) -> Choice:
+    if not folds:
+        usual = Way(trial=trials[0], iterations=trials[0].settings.iterations, propagate="gp")
+        return Choice(ways=(fixed or usual,), weights=(1.0,))
+    depth = torch.cat([fold.held_out.depth for fold in folds])
+    believed = torch.cat([fold.believed for fold in folds]).float()
+    predicted: dict[Way, Tensor] = {}
+
+    def scored(ways: Sequence[Way]) -> dict[Way, float]:
+        for way in ways:
+            if way not in predicted:
+                predicted[way] = torch.cat([fold.at(way) for fold in folds])
+        return {way: float(held_out_error(predicted[way], depth, believed)) for way in ways}
+
+    usual = Way(trial=trials[0], iterations=trials[0].settings.iterations)
+    simple = [*(Way(baseline=name) for name in BASELINES), Way(trial=trials[0])]
+    scored([*simple, usual])
+    if only is not None:
+        scored(only)
+    else:
+        for trial in trials:
+            errors = scored([Way(trial=trial, iterations=k) for k in (0, *updates_of(trial))])
+            best = min(errors, key=lambda way: errors[way])
+            starts = dict.fromkeys([Way(trial=trial), best])
+            scored([replace(way, propagate=kind) for way in starts for kind in SPREADING])
+    errors = scored(list(predicted))
+    ways = list(predicted)
+    if fixed is None:
+        blend = best_blend(
+            torch.stack(list(predicted.values())),
+            depth,
+            believed,
+            usual=ways.index(usual),
+            simple=[number for number, way in enumerate(ways) if way in simple],
+        )
+    else:
+        blend = Blend((ways.index(fixed),), (1.0,), errors[fixed])
+    return Choice(
+        ways=tuple(ways[member] for member in blend.members),
+        weights=blend.weights,
+        error=blend.error,
+        held_out=len(depth),
+        folds=len(folds),
+        scored=tuple(
+            Scored(way=way, error=error)
+            for way, error in sorted(errors.items(), key=lambda one: one[1])
+        ),
+    )
+
+
+def updates_of(trial: Trial) -> tuple[int, ...]:
+    """The numbers of updates of z that are scored, above 0."""
+    return tuple(
+        sorted({*(k for k in UPDATES if k < trial.settings.iterations), trial.settings.iterations})
+    )

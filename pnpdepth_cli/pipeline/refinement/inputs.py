@@ -1,0 +1,242 @@
+"""What a frame is made of on disk, read and checked against each other."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from pnpdepth_cli.core.points import SparsePoints
+from pnpdepth_cli.errors import InputError, NoPointsError, SizeError, UsageError
+from pnpdepth_cli.io.depth import (
+    DepthImage,
+    describe_range,
+    implausible,
+    read_depth,
+    read_sparse,
+)
+from pnpdepth_cli.io.fingerprint import fingerprint
+from pnpdepth_cli.io.layouts.frame import Hdf5Array, Source
+from pnpdepth_cli.io.layouts.hdf5 import depth_of, rgb_of
+from pnpdepth_cli.io.rgb import read_rgb
+from pnpdepth_cli.pipeline.refinement.request import RefineRequest
+from pnpdepth_cli.pipeline.sparse.scans import read_scan_points
+from pnpdepth_cli.sensors import sample_points
+
+Picture = NDArray[np.float32]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Inputs:
+    """One frame in memory.
+
+    rgb: (H, W, 3) float32 in 0..1, or None without an image. points: in the image's frame.
+    gt: (H, W) float32 metres, 0 = unknown, or None. sparse_scale: of an integer sparse file.
+    """
+
+    rgb: Picture | None
+    points: SparsePoints
+    gt: Picture | None
+    sparse_scale: float | None
+    record: dict[str, Any]
+    notes: tuple[str, ...]
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(H, W) of the image frame."""
+        return self.points.size
+
+    def rgb_tensor(self) -> Tensor | None:
+        """(1, 3, H, W) float32 in 0..1."""
+        if self.rgb is None:
+            return None
+        return torch.from_numpy(np.ascontiguousarray(self.rgb.transpose(2, 0, 1)))[None]
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Part:
+    """A picture of the frame and what is said of it. whole: (H, W) before the protocol's cut."""
+
+    values: Picture
+    whole: tuple[int, int]
+    record: dict[str, Any]
+    notes: tuple[str, ...] = ()
+    scale: float | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Sparse:
+    """Points in the image's frame, the scale of their integer file, and what is said of them."""
+
+    points: SparsePoints
+    scale: float | None
+    record: dict[str, Any]
+    notes: tuple[str, ...]
+
+
+def read_inputs(files: RefineRequest) -> Inputs:
+    """The frame of these files. InputError if one cannot be used or they do not fit together."""
+    image = None if files.image is None else _read_image(files, files.image)
+    truth = None if files.gt is None else _read_truth(files, files.gt)
+    whole = None if image is None else image.whole
+    if truth is not None:
+        _check_truth(files, truth, whole)
+    if files.sparse is None:
+        sparse = _sampled(files, image, truth)
+    elif files.scan.describes(files.sparse):
+        sparse = _read_scan(files, files.sparse, whole)
+    else:
+        sparse = _read_points(files, files.sparse, whole)
+    if truth is not None and truth.values.shape != sparse.points.size:
+        raise _of_another_size(files, truth.values.shape, sparse.points.size)
+    parts = {"image": image, "sparse": sparse, "gt": truth}
+    return Inputs(
+        rgb=None if image is None else image.values,
+        points=sparse.points,
+        gt=None if truth is None else truth.values,
+        sparse_scale=sparse.scale,
+        record={name: part.record for name, part in parts.items() if part is not None},
+        notes=tuple(note for part in parts.values() if part is not None for note in part.notes),
+    )
+
+
+def _read_image(files: RefineRequest, source: Source) -> _Part:
+    if isinstance(source, Hdf5Array):
+        rgb, note = rgb_of(source), None
+    else:
+        image = read_rgb(source)
+        rgb, note = image.values, image.note
+    return _Part(
+        values=np.ascontiguousarray(files.protocol.apply(rgb)),
+        whole=(rgb.shape[0], rgb.shape[1]),
+        record=_file_record(source),
+        notes=(f"image: {note}",) if note else (),
+    )
+
+
+def _read_truth(files: RefineRequest, source: Source) -> _Part:
+    if isinstance(source, Hdf5Array):
+        truth = DepthImage(values=depth_of(source), source="HDF5", assumed_scale=False)
+    else:
+        scale = files.gt_scale or files.depth_scale
+        truth = read_depth(source, scale=scale, channel=files.channel)
+    said = describe_range(
+        truth.values, truth.source, assumed_scale=truth.assumed_scale, noun="pixels"
+    )
+    return _Part(
+        values=np.ascontiguousarray(files.protocol.apply(truth.values)),
+        whole=(truth.values.shape[0], truth.values.shape[1]),
+        record=_file_record(source) | {"read_as": truth.source},
+        notes=(f"gt: {said}",),
+        scale=truth.scale,
+    )
+
+
+def _file_record(source: Source) -> dict[str, Any]:
+    path = source.path if isinstance(source, Hdf5Array) else source
+    return {"path": str(source), "sha256": fingerprint(path).sha256}
+
+
+def _sampled(files: RefineRequest, image: _Part | None, truth: _Part | None) -> _Sparse:
+    """Points of the truth instead of sparse depth."""
+    if files.sample is None:
+        raise InputError(f"{files.image} has no sparse depth; add it, or sample the ground truth")
+    if truth is None:
+        raise InputError(f"{files.image} has no ground truth to sample points from; add it")
+    picture = None if image is None else image.values
+    try:
+        found = sample_points(truth.values, files.sample, files.seed, image=picture)
+    except UsageError as error:  # the pattern itself is good, this frame is too poor for it
+        raise InputError(f"{files.gt}: {error}") from error
+    source = f"{files.sample.kind} of the ground truth, seed {files.seed}"
+    return _Sparse(
+        points=SparsePoints(
+            xy=torch.from_numpy(found.xy), depth=torch.from_numpy(found.depth), size=found.size
+        ),
+        scale=truth.scale,
+        record={"sampled_from": str(files.gt), **asdict(files.sample), "seed": files.seed},
+        notes=(f"sparse: {describe_range(found.depth, source)}",),
+    )
+
+
+def _read_scan(files: RefineRequest, path: Path, image_size: tuple[int, int] | None) -> _Sparse:
+    picture = files.image if isinstance(files.image, Path) else None
+    scan = read_scan_points(path, files.scan, image_size, picture)
+    points = SparsePoints(
+        xy=torch.from_numpy(scan.points.xy),
+        depth=torch.from_numpy(scan.points.depth),
+        size=scan.points.size,
+    )
+    points = _in_protocol(files, path, points)
+    return _Sparse(points=points, scale=None, record=scan.record, notes=scan.notes)
+
+
+def _read_points(files: RefineRequest, path: Path, image_size: tuple[int, int] | None) -> _Sparse:
+    scale = files.sparse_scale or files.depth_scale
+    sparse = read_sparse(path, scale=scale, channel=files.channel)
+    size = image_size or sparse.size
+    if size is None:
+        raise SizeError(f"{path} is a list of points, which needs an image to say the frame's size")
+    sparse_size = sparse.size or size
+    if sparse_size != size and not files.sparse_size_ok:
+        raise SizeError(
+            f"{path} is {sparse_size[1]}×{sparse_size[0]} but {files.image} is"
+            f" {size[1]}×{size[0]}; --sparse-size-ok maps the points if both show the same view"
+        )
+    points = SparsePoints(
+        xy=torch.from_numpy(sparse.xy), depth=torch.from_numpy(sparse.depth), size=sparse_size
+    )
+    points = _inside(path, points.in_frame(*size))
+    notes = [
+        f"sparse: {describe_range(sparse.depth, sparse.source, assumed_scale=sparse.assumed_scale)}"
+    ]
+    if len(points) < len(sparse.depth):
+        notes.append(f"sparse: {len(sparse.depth) - len(points):,} points outside the image")
+    notes += [f"warning: {text}" for text in [implausible(sparse.depth, sparse.scale)] if text]
+    return _Sparse(
+        points=_in_protocol(files, path, points),
+        scale=sparse.scale,
+        record=_file_record(path) | {"read_as": sparse.source},
+        notes=tuple(notes),
+    )
+
+
+def _in_protocol(files: RefineRequest, path: Path, points: SparsePoints) -> SparsePoints:
+    """The points, of the whole image, that are in the part of it that the protocol leaves."""
+    # An array of the image's size that takes no memory; the protocol says what is left of it.
+    left = files.protocol.apply(np.broadcast_to(np.False_, points.size))
+    size = (left.shape[0], left.shape[1])
+    if size == points.size:
+        return points
+    xy = files.protocol.places(points.xy.numpy(), points.size)
+    return _inside(path, SparsePoints(xy=torch.from_numpy(xy), depth=points.depth, size=size))
+
+
+def _inside(path: Path, points: SparsePoints) -> SparsePoints:
+    height, width = points.size
+    x, y = points.xy[:, 0], points.xy[:, 1]
+    inside = (x >= -0.5) & (x < width - 0.5) & (y >= -0.5) & (y < height - 0.5)
+    if not bool(inside.any()):
+        raise NoPointsError(f"{path}: none of its {len(points)} points lies in the image")
+    return points.select(inside)
+
+
+def _check_truth(files: RefineRequest, truth: _Part, image_size: tuple[int, int] | None) -> None:
+    if image_size is not None and truth.whole != image_size:
+        raise _of_another_size(files, truth.whole, image_size)
+    if not bool((truth.values > 0).any()):
+        raise InputError(f"ground truth {files.gt} has no pixel with known depth")
+
+
+def _of_another_size(
+    files: RefineRequest, size: tuple[int, ...], image_size: tuple[int, int]
+) -> SizeError:
+    return SizeError(
+        f"ground truth {files.gt} is {size[1]}×{size[0]} but the image is"
+        f" {image_size[1]}×{image_size[0]}"
+    )

@@ -1,0 +1,86 @@
+"""Which files a refined frame becomes, planned before the work."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pnpdepth_cli.errors import OutputError, UsageError
+from pnpdepth_cli.io.depth import DEPTH_SUFFIXES
+from pnpdepth_cli.io.record import write_json
+from pnpdepth_cli.pipeline.refinement.request import RefineRequest
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outputs:
+    """Where a frame's results go; all but the depth are None when only a depth file is wanted."""
+
+    depth: Path
+    sigma: Path | None = None
+    preview: Path | None = None
+    improvement: Path | None = None
+    record: Path | None = None
+
+    @classmethod
+    def in_folder(cls, folder: Path, name: str, request: RefineRequest) -> Outputs:
+        """All that are asked for, in a folder; a name with slashes is a place in folders below."""
+        return cls(
+            depth=folder / f"{name}_depth.{request.format}",
+            sigma=folder / f"{name}_sigma.exr" if request.uncertainty else None,
+            preview=folder / f"{name}_preview.png",
+            improvement=folder / f"{name}_improvement.png",
+            record=folder / f"{name}.json",
+        )
+
+    def by_kind(self) -> dict[str, Path]:
+        """Every file that will be written."""
+        kinds = {
+            "depth": self.depth,
+            "sigma": self.sigma,
+            "preview": self.preview,
+            "improvement": self.improvement,
+            "record": self.record,
+        }
+        return {kind: path for kind, path in kinds.items() if path is not None}
+
+    def paths(self) -> list[Path]:
+        """The same without saying which is which."""
+        return list(self.by_kind().values())
+
+    def write_record(self, record: dict[str, Any]) -> None:
+        """The record is on disk, if it is wanted there."""
+        if self.record is not None:
+            write_json(self.record, record)
+
+
+def plan_outputs(request: RefineRequest) -> Outputs:
+    """Where the results go: `-o FILE.exr` for the depth alone, a folder for all of them.
+
+    OutputError if one exists already and may not be replaced, or is one of the inputs.
+    """
+    given = [request.image, request.sparse, request.gt, request.scan.calib]
+    inputs = [path for path in given if isinstance(path, Path)]
+    stem = inputs[0].stem
+    output = request.output or Path(f"{stem}_refined")
+    if f".{request.format}" not in DEPTH_SUFFIXES:
+        raise UsageError(f"format {request.format!r} is not one of {' '.join(DEPTH_SUFFIXES)}")
+    if output.suffix.lower() in DEPTH_SUFFIXES and request.uncertainty:
+        raise UsageError(
+            f"--uncertainty writes a second file; name a folder, not {output}, with -o"
+        )
+    if output.suffix.lower() in DEPTH_SUFFIXES:
+        outputs = Outputs(depth=output)
+    elif output.is_file():
+        raise OutputError(
+            f"{output} is a file; name a folder, or a depth file ({' '.join(DEPTH_SUFFIXES)})"
+        )
+    else:
+        outputs = Outputs.in_folder(output, stem, request)
+    resolved = {path.resolve() for path in inputs}
+    for path in outputs.paths():
+        if path.resolve() in resolved:
+            raise OutputError(f"{path} is one of the inputs; name another output with -o")
+        if path.exists() and not request.overwrite:
+            raise OutputError(f"{path} exists; --overwrite replaces it, -o names another place")
+    return outputs

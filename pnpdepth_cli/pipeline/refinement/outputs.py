@@ -1,0 +1,63 @@
+"""A refined frame as files, written whole."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from pnpdepth_cli.io.atomic import make_folder
+from pnpdepth_cli.io.depth import write_depth
+from pnpdepth_cli.io.pictures import improvement, improvement_at_points, preview
+from pnpdepth_cli.pipeline.refinement.frame import RefinedFrame
+from pnpdepth_cli.pipeline.refinement.inputs import Inputs
+from pnpdepth_cli.pipeline.refinement.output_files import Outputs
+
+INTEGER_SCALE = 256.0
+"""KITTI's scale, for integer output where the sparse depth brought none of its own."""
+
+
+def write_outputs(outputs: Outputs, inputs: Inputs, frame: RefinedFrame) -> dict[str, Any]:
+    """The depth and its pictures are on disk; returns what the record says of them."""
+    make_folder(outputs.depth.parent)
+    write_depth(outputs.depth, frame.after, scale=inputs.sparse_scale or INTEGER_SCALE)
+    if outputs.sigma is not None and frame.sigma is not None:
+        write_depth(outputs.sigma, frame.sigma, scale=INTEGER_SCALE)
+    record: dict[str, Any] = {"improved_share": None}
+    if outputs.preview is not None:
+        preview(
+            inputs.rgb,
+            inputs.points.xy.numpy(),
+            inputs.points.depth.numpy(),
+            frame.before,
+            frame.after,
+            outputs.preview,
+        )
+    if outputs.improvement is not None:
+        record["improved_share"] = _write_improvement(outputs.improvement, inputs, frame)
+    record["outputs"] = {
+        kind: None if path is None else str(path)
+        for kind, path in (
+            ("depth", outputs.depth),
+            ("sigma", outputs.sigma),
+            ("preview", outputs.preview),
+            ("improvement", outputs.improvement),
+        )
+    }
+    return record
+
+
+def _write_improvement(path: Path, inputs: Inputs, frame: RefinedFrame) -> float:
+    if inputs.gt is not None:
+        return improvement(frame.before, frame.after, inputs.gt, path, rgb=inputs.rgb)
+    points = frame.held_out if len(frame.held_out) else frame.used
+    return improvement_at_points(
+        inputs.rgb if inputs.rgb is not None else frame.before,
+        points.xy.numpy(),
+        points.depth.numpy(),
+        points.sample(torch.from_numpy(frame.before)).numpy(),
+        points.sample(torch.from_numpy(frame.after)).numpy(),
+        held_out=bool(len(frame.held_out)),
+        path=path,
+    )

@@ -1,0 +1,192 @@
+"""The ways from a network and some points to dense depth, and the depth that each of them gives.
+
+A way starts at a baseline or at the network's prediction after so many updates of z, and may spread
+what is left at the points. For one frame and one set of points `Depths` computes many ways with
+nothing done twice: one refinement gives the depth at every number of updates that is asked for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from pnpdepth_cli.core.baselines import BASELINES
+from pnpdepth_cli.core.points import SparsePoints
+from pnpdepth_cli.core.propagation import propagate, propagated_at
+from pnpdepth_cli.core.refine import DepthOf, RefineSettings, refine_from
+from pnpdepth_cli.core.split import Split
+from pnpdepth_cli.errors import PnpDepthError
+from pnpdepth_cli.models.network import Network, out_of_memory_is_a_device_error
+from pnpdepth_cli.pipeline.refinement.frame import (
+    FrameToRefine,
+    ReadyFrame,
+    RefinedFrame,
+    finished_frame,
+    ready_frame,
+    to_image,
+)
+from pnpdepth_cli.pipeline.refinement.inputs import Inputs
+
+
+@dataclass(frozen=True, kw_only=True)
+class Trial:
+    """Where and how z is updated, `settings.iterations` times at most."""
+
+    layer: str
+    settings: RefineSettings
+
+    def __str__(self) -> str:
+        s = self.settings
+        aligned = "" if s.align == "none" else f", aligned ({s.align})"
+        return f"cut at {self.layer}, {s.update}, step {s.lr}{aligned}"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Way:
+    """One way to dense depth: from a baseline by name, or from a trial after so many updates of z.
+
+    propagate: how what is left at the points is spread, one of `core.propagation.PROPAGATIONS`.
+    """
+
+    baseline: str | None = None
+    trial: Trial | None = None
+    iterations: int = 0
+    propagate: str = "none"
+
+    def __str__(self) -> str:
+        if self.baseline is not None:
+            start = self.baseline
+        elif self.iterations:
+            start = f"{self.iterations} updates of z ({self.trial})"
+        else:
+            aligned = "" if self.trial is None else self.trial.settings.align
+            start = "network" if aligned in ("", "none") else f"network aligned ({aligned})"
+        return start if self.propagate == "none" else f"{start} + {self.propagate}"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Trajectory:
+    """A refinement with its depth (H, W), in the image frame, after some numbers of updates."""
+
+    depths: dict[int, Tensor]
+    frame: RefinedFrame
+
+    def after(self, iterations: int) -> Tensor:
+        """The depth after so many updates, or the last before it diverged."""
+        return self.depths[max(made for made in self.depths if made <= iterations)]
+
+
+def trajectories(
+    network: Network,
+    trial: Trial,
+    inputs: Inputs,
+    sets: Sequence[SparsePoints],
+    wanted: Collection[int],
+) -> list[Trajectory | PnpDepthError]:
+    """The trial's refinement with each set of points, or the error that it ended with.
+
+    wanted: the numbers of updates to know the depth of; 0 is always among them.
+    """
+    found: list[Trajectory | PnpDepthError] = []
+    z0: Tensor | None = None
+    with (
+        out_of_memory_is_a_device_error(network.device),
+        Split(network.module, trial.layer) as split,
+    ):
+        for used in sets:
+            task = FrameToRefine.with_points(inputs, used)
+            frame = ready_frame(network, trial.settings, task)
+            if isinstance(frame, PnpDepthError):
+                found.append(frame)
+                continue
+            if z0 is None or network.definition.input_kind != "rgb":
+                with torch.no_grad():
+                    z0 = split.front(*frame.arguments)
+            found.append(_trajectory(split, z0, frame, trial.settings, wanted))
+    return found
+
+
+def _trajectory(
+    split: Split,
+    z0: Tensor,
+    frame: ReadyFrame,
+    settings: RefineSettings,
+    wanted: Collection[int],
+) -> Trajectory | PnpDepthError:
+    depths: dict[int, Tensor] = {}
+    (result,) = refine_from(
+        split, z0, (frame.points,), settings, depth_of=(_noted(frame.depth_of, depths, wanted),)
+    )
+    done = finished_frame(frame, result)
+    if isinstance(done, PnpDepthError):
+        return done
+    kept = {made: torch.from_numpy(to_image(frame.frame, depth)) for made, depth in depths.items()}
+    return Trajectory(depths=kept, frame=done)
+
+
+def _noted(depth_of: DepthOf, depths: dict[int, Tensor], wanted: Collection[int]) -> DepthOf:
+    """The same, its depth kept where the number of updates is wanted and it is finite."""
+    made = -1
+
+    def noted(output: Any) -> Tensor:
+        nonlocal made
+        made += 1
+        depth = depth_of(output)
+        if made == 0 or (made in wanted and bool(depth.isfinite().all())):
+            depths[made] = depth.detach()
+        return depth
+
+    return noted
+
+
+class Depths:
+    """Depth of one frame from one set of points, by many ways.
+
+    trajectories: of every trial that a way may start with. prediction: (H, W) the network's,
+    aligned with the points if its numbers are relative.
+    """
+
+    def __init__(
+        self,
+        inputs: Inputs,
+        used: SparsePoints,
+        prediction: Tensor,
+        trajectories: Mapping[Trial, Trajectory],
+    ) -> None:
+        self._used, self._prediction, self._trajectories = used, prediction, trajectories
+        rgb = inputs.rgb_tensor()
+        self._rgb = None if rgb is None else rgb[0]
+
+    def dense(self, way: Way) -> Tensor:
+        """The way's depth (H, W), 0 = unknown."""
+        depth = self._start(way)
+        if way.propagate == "none":
+            return depth
+        return propagate(depth, self._used, self._rgb, kind=way.propagate).depth
+
+    def at(self, places: Tensor, way: Way) -> Tensor:
+        """The way's depth (M,) at places (M, 2), x and y in pixels."""
+        if way.baseline is not None and way.propagate == "none":
+            return BASELINES[way.baseline].at(places, self._used, self._prediction)
+        if way.propagate == "none":
+            return SparsePoints(
+                xy=places, depth=places.new_ones(len(places)), size=self._used.size
+            ).sample(self._start(way))
+        return propagated_at(self._start(way), self._used, self._rgb, places, kind=way.propagate)
+
+    def relative_sigma(self, way: Way) -> Tensor:
+        """The standard deviation (H, W) of the way's log depth once its residual is spread."""
+        found = propagate(self._start(way), self._used, self._rgb, sigma=True)
+        assert found.sigma is not None
+        return torch.where(found.depth > 0, found.sigma / found.depth, 0.0)
+
+    def _start(self, way: Way) -> Tensor:
+        if way.baseline is not None:
+            return BASELINES[way.baseline].depth(self._used, self._prediction)
+        if way.trial is None:
+            return self._prediction
+        return self._trajectories[way.trial].after(way.iterations)

@@ -1,0 +1,326 @@
+"""`pnpdepth batch --html`: each frame before and after refinement, and where it helped.
+
+Everything comes from the results on disk: figures from the rows of the summary, pictures from the
+panels of the previews and the improvement maps. So a report has the frames of earlier runs too,
+and a picture is named after the files it was made of, so that it is made once.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pnpdepth_cli.core.metrics import MEASURES, Measure
+from pnpdepth_cli.errors import InputError, OutputError
+from pnpdepth_cli.io.fingerprint import fingerprint
+from pnpdepth_cli.io.page import SavedPage, open_page
+from pnpdepth_cli.io.report import (
+    PICTURES,
+    begin_report,
+    check_report_folder,
+    picture_key,
+    write_report,
+)
+from pnpdepth_cli.io.report_pictures import gain_colours, picture_paths, save_pictures
+from pnpdepth_cli.pipeline.ahead import in_order
+from pnpdepth_cli.pipeline.evaluation.score_files import heading, shown
+from pnpdepth_cli.pipeline.report.columns import (
+    Column,
+    column_of,
+    figures,
+    frames_text,
+    table,
+    tile,
+)
+
+Row = dict[str, Any]
+
+_PANELS = {
+    "Depth before": "first",
+    "Depth after": "second",
+    "Change of error": "map",
+    "Image": "image",
+    "Sparse depth": "sparse",
+}
+_TRUTH, _HELD_OUT, _USED = "scores", "held_out_error", "sparse_error"
+_BASES = {
+    _TRUTH: "against the truth",
+    _HELD_OUT: "at held-out points",
+    _USED: "at the points used",
+}
+"""What a frame's errors are of, the best first. At the points used, a gain means nothing."""
+_ERRORS = {measure.key: measure for measure in MEASURES if measure.key in ("rmse", "mae")}
+
+
+@dataclass(frozen=True, kw_only=True)
+class BatchReport:
+    """The report `folder` of the results in `output`; workers: threads that draw."""
+
+    folder: Path
+    output: Path
+    workers: int
+
+    def check(self, inputs: Sequence[Path], *, overwrite: bool) -> None:
+        """Raises OutputError for a folder that the report cannot, or may not, be written to."""
+        folder, output = self.folder.resolve(), self.output.resolve()
+        if output.is_relative_to(folder):
+            raise OutputError(
+                f"{self.folder} holds the results; name a folder of its own for the report, such as"
+                f" {self.output / 'report'}"
+            )
+        apart = [path for path in inputs if not _is_about(path, output, folder)]
+        check_report_folder(self.folder, apart, made_of=self._made_of(), overwrite=overwrite)
+
+    def begin(self) -> None:
+        """The folder is there, and the next run knows it again."""
+        begin_report(self.folder, self._made_of())
+
+    def drawn(self, row: Row) -> Row:
+        """The pictures of the frame are on disk, if it has results; the row as it is."""
+        if row["outputs"]:
+            self._drawn(row)
+        return row
+
+    def write(self, summary: Mapping[str, Any], rows: Callable[[], Iterable[Row]]) -> None:
+        """The page is on disk, with all frames that `rows` gives and pictures of them."""
+        found = _Overview.of(rows())
+        measured = any(summary["mean"][basis] for basis in (_TRUTH, _HELD_OUT))
+        columns = _columns(measured)
+
+        def entry(row: Row) -> dict[str, Any]:
+            return self._entry(row, columns, measured, mixed=len(found.bases) > 1)
+
+        results = (row for row in rows() if row["outputs"])
+        entries = in_order(entry, results, self.workers)
+        write_report(self.folder, _head(summary, found, columns, measured), entries)
+
+    def _made_of(self) -> dict[str, Any]:
+        folder, output = self.folder.resolve(), self.output.resolve()
+        return {"command": "batch", "output": os.path.relpath(output, folder)}
+
+    def _drawn(self, row: Row) -> dict[str, Any]:
+        """As `drawn`; what the page says of the pictures."""
+        paths = [self.output / row["outputs"][kind] for kind in ("preview", "improvement")]
+        try:
+            key = picture_key(*(fingerprint(path).sha256 for path in paths))
+            preview, improvement = (open_page(path) for path in paths)
+            views = _views(preview, improvement)
+            pictures = self.folder / PICTURES
+            if not all(path.exists() for path in picture_paths(pictures, key, views)):
+                panels = preview.panels() | improvement.panels()
+                named = {_PANELS[title]: panels[title] for title in panels if title in _PANELS}
+                thumb = "image" if "image" in views else "second"
+                save_pictures(pictures, key, named, thumb=thumb)
+        except InputError:  # a result that was there has gone or changed; the next run redoes it
+            return {"key": None}
+        return {
+            "key": key,
+            "views": views,
+            "scale_m": [preview.said["low_m"], preview.said["high_m"]],
+            "map": {name: improvement.said[name] for name in ("ends", "unknown", "footer")},
+        }
+
+    def _entry(
+        self, row: Row, columns: list[Column], measured: bool, *, mixed: bool
+    ) -> dict[str, Any]:
+        basis = _basis(row)
+        values = _values(row, basis, measured)
+        tag = _BASES[basis] if mixed and basis else ""
+        return {
+            "name": row["name"],
+            "values": [values.get(column.key) for column in columns],
+            "notes": list(_notes(row, basis)),
+            "tag": "diverged" if row["status"] == "diverged" else tag,
+            **self._drawn(row),
+        }
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Overview:
+    """bases: the kinds of error the frames have. first: one with results. failed: all without."""
+
+    bases: frozenset[str]
+    first: Row | None
+    failed: list[dict[str, str]]
+
+    @classmethod
+    def of(cls, rows: Iterable[Row]) -> _Overview:
+        bases, failed, first = set[str](), [], None
+        for row in rows:
+            if row["outputs"]:
+                first = first or row
+                bases.add(_basis(row) or "")
+            else:
+                failed.append({"name": row["name"], "reason": row["message"]})
+        return cls(bases=frozenset(bases - {""}), first=first, failed=failed)
+
+
+def _is_about(path: Path, output: Path, folder: Path) -> bool:
+    """True for a folder with the results in it, if the report is beside them: both left aside."""
+    return folder.is_relative_to(output) and output.is_relative_to(path.resolve())
+
+
+def _views(preview: SavedPage, improvement: SavedPage) -> list[str]:
+    titles = [panel["title"] for page in (preview, improvement) for panel in page.said["panels"]]
+    return [view for title, view in _PANELS.items() if title in titles]
+
+
+def _basis(row: Row) -> str | None:
+    return next((basis for basis in _BASES if row[basis]), None)
+
+
+def _columns(measured: bool) -> list[Column]:
+    """Of errors before and after; with gains where any frame has truth or held-out points."""
+    columns = []
+    for key, measure in _ERRORS.items():
+        if measured:
+            title = f"{measure.title} gain"
+            columns.append(
+                Column(
+                    key=f"{key}_gain", title=title, decimals=1, percent=True, signed=True,
+                    higher_is_better=True,
+                )
+            )  # fmt: skip
+        for stage in ("before", "after"):
+            title, name = f"{measure.title} {stage}", f"{key}_{stage}"
+            columns.append(column_of(measure, title=title, key=name, listed=True))
+    improved = Column(
+        key="improved", title="Improved", decimals=1, percent=True, higher_is_better=True
+    )
+    return [*columns, improved]
+
+
+def _values(row: Row, basis: str | None, measured: bool) -> dict[str, float | None]:
+    if basis is None or (measured and basis == _USED):
+        return {}
+    values: dict[str, float | None] = {"improved": row["improved_share"]}
+    before, after = row[basis]["before"], row[basis]["after"]
+    for key in _ERRORS:
+        values |= {f"{key}_before": before[key], f"{key}_after": after[key]}
+        values[f"{key}_gain"] = _gain(before[key], after[key])
+    return values
+
+
+def _gain(before: float | None, after: float | None) -> float | None:
+    return 1 - after / before if before and after is not None else None
+
+
+def _notes(row: Row, basis: str | None) -> Iterator[str]:
+    if row["message"]:
+        yield row["message"]
+    if basis is not None:
+        of = row[basis]["after"]
+        count = f"{of['pixels']:,} pixels" if basis == _TRUTH else f"{of['points']:,} points"
+        yield f"Errors are {_BASES[basis]}, {count}."
+    if basis == _USED:
+        yield "Refinement fitted these points, so its gain there proves nothing."
+    yield from row["warnings"]
+
+
+def _head(
+    summary: Mapping[str, Any], found: _Overview, columns: list[Column], measured: bool
+) -> dict[str, Any]:
+    unmatched = len(summary["unmatched"])
+    return {
+        "kind": "Batch refinement",
+        "title": summary["output"],
+        "tiles": _tiles(summary, measured),
+        "facts": _facts(summary, found.first),
+        "notes": [f"warning: {unmatched:,} files are in no frame; summary.json has them"]
+        if unmatched
+        else [],
+        "tables": [
+            each
+            for basis in _BASES
+            if summary["mean"][basis]
+            for each in [_means(basis, summary["mean"][basis])]
+        ],
+        "labels": {
+            "first": "Before",
+            "second": "After",
+            "map": "Change of error",
+            "image": "Image",
+            "sparse": "Sparse depth",
+        },
+        "map_colours": gain_colours(),
+        "without_title": f"Not refined: {len(found.failed):,}",
+        "without": found.failed,
+        **figures(columns, "rmse_gain" if measured else "rmse_after"),
+    }
+
+
+def _tiles(summary: Mapping[str, Any], measured: bool) -> list[dict[str, str]]:
+    counts = summary["counts"]
+    refined = counts["done"] + counts["diverged"]
+    others = [
+        f"{counts[kind]:,} {kind}" for kind in ("diverged", "failed", "pending") if counts[kind]
+    ]
+    tiles = [tile("Frames refined", f"{refined:,} of {counts['frames']:,}", ", ".join(others))]
+    for basis in (_TRUTH, _HELD_OUT) if measured else (_USED,):
+        mean = summary["mean"][basis]
+        for key, measure in _ERRORS.items() if mean else ():
+            before, after = (mean[stage][key] for stage in ("before", "after"))
+            change = f"{shown(measure, before)} → {shown(measure, after)}"
+            gain = _gain(before, after)
+            said = ""
+            if gain is not None and basis != _USED:
+                said = f"gain {_signed(100 * gain, 1, '%')} "
+            tiles.append(tile(f"{measure.title} [m]", change, f"{said}{_BASES[basis]}"))
+    return tiles
+
+
+def _facts(summary: Mapping[str, Any], first: Row | None) -> list[list[str]]:
+    asked = summary["settings"]
+    facts = [
+        ["Frames of", f"{summary['source']} (layout {summary['layout']})"],
+        ["Results in", summary["output"]],
+        ["Network", str(asked["model"])],
+    ]
+    if first is not None:
+        used = first["settings"]
+        refined = f"{used['iterations']} updates of z at {used['layer']}"
+        facts.append(
+            ["Refinement", f"{refined} ({used['update']}, {used['loss']}, step {used['lr']})"]
+        )
+        facts.append(["Alignment", str(used["align"])])
+    if asked["holdout"]:
+        facts.append(["Held out", f"{asked['holdout']:.0%} of the points, seed {asked['seed']}"])
+    if summary["counts"]["with_warnings"]:
+        facts.append(["Warnings", f"in {frames_text(summary['counts']['with_warnings'])}"])
+    return facts
+
+
+def _means(basis: str, mean: Mapping[str, Any]) -> dict[str, Any]:
+    measures: Iterable[Measure] = MEASURES if basis == _TRUTH else _ERRORS.values()
+    header = ["", "before", "after", *([] if basis == _USED else ["gain"])]
+    rows = []
+    for measure in measures:
+        before, after = (mean[stage].get(measure.key) for stage in ("before", "after"))
+        row = [heading(measure), shown(measure, before), shown(measure, after)]
+        if basis != _USED:
+            row.append(_gain_text(measure, before, after))
+        rows.append(row)
+    if basis == _TRUTH:
+        rows.append(
+            ["coverage", *(f"{mean[stage]['coverage']:.2%}" for stage in ("before", "after")), ""]
+        )
+    return table(f"Means over {frames_text(mean['frames'])}, {_BASES[basis]}", header, rows)
+
+
+def _gain_text(measure: Measure, before: float | None, after: float | None) -> str:
+    if before is None or after is None:
+        return "–"
+    if measure.percent:
+        return _signed(100 * (after - before), 2, " pt")
+    gain = _gain(before, after)
+    return "–" if gain is None else _signed(100 * gain, 1, "%")
+
+
+def _signed(value: float, decimals: int, unit: str) -> str:
+    """The value with its sign, and with none where nothing but noughts is shown."""
+    text = f"{abs(value):.{decimals}f}"
+    sign = "" if float(text) == 0 else "+" if value > 0 else "−"
+    return f"{sign}{text}{unit}"

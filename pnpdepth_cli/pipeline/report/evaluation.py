@@ -1,0 +1,229 @@
+"""`pnpdepth eval --html`: each frame's prediction beside its truth, and where it is wrong."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pnpdepth_cli.errors import InputError, PnpDepthError
+from pnpdepth_cli.io.colours import depth_scale, grey_of
+from pnpdepth_cli.io.layouts import Hdf5Array
+from pnpdepth_cli.io.layouts.hdf5 import rgb_of
+from pnpdepth_cli.io.report import (
+    begin_report,
+    check_report_folder,
+    picture_key,
+    remove_report_leftovers,
+    write_report,
+)
+from pnpdepth_cli.io.report_pictures import error_colours, error_map, save_pictures
+from pnpdepth_cli.io.rgb import read_rgb
+from pnpdepth_cli.pipeline.ahead import in_order
+from pnpdepth_cli.pipeline.evaluation.frame_reading import Depth, load_frame
+from pnpdepth_cli.pipeline.evaluation.frame_scoring import FrameScores
+from pnpdepth_cli.pipeline.evaluation.kitti_devkit import fill_background
+from pnpdepth_cli.pipeline.evaluation.pairing import FramePair
+from pnpdepth_cli.pipeline.evaluation.result import Evaluation, Part
+from pnpdepth_cli.pipeline.evaluation.score_files import heading, part_cells, shown
+from pnpdepth_cli.pipeline.report.columns import (
+    Column,
+    column_of,
+    figures,
+    frames_text,
+    table,
+    tile,
+)
+
+_MADE_OF = {"command": "eval"}
+_LISTED = ("rmse", "mae", "mre", "irmse", "delta1")
+
+
+def check_eval_report(folder: Path, inputs: list[Path], *, overwrite: bool) -> None:
+    """Raises OutputError for a folder that the report cannot, or may not, be written to."""
+    check_report_folder(folder, inputs, made_of=None, overwrite=overwrite)
+
+
+def write_eval_report(
+    folder: Path,
+    evaluation: Evaluation,
+    *,
+    on_frame: Callable[[int, int], None] = lambda done, of: None,
+) -> None:
+    """The report is on disk. Its pictures are of the files as they are now, read once more.
+
+    on_frame(done, of) is called after each frame. Raises OutputError if it cannot be written.
+    """
+    pictures = begin_report(folder, _MADE_OF)
+    remove_report_leftovers(folder)
+    columns = _columns(evaluation)
+    scored = evaluation.scored
+
+    def entries() -> Iterator[dict[str, Any]]:
+        drawn = in_order(
+            lambda frame: _entry(frame, evaluation, columns, pictures),
+            scored,
+            evaluation.request.workers,
+        )
+        for done, entry in enumerate(drawn, start=1):
+            yield entry
+            on_frame(done, len(scored))
+
+    write_report(folder, _head(evaluation, columns), entries())
+
+
+def _columns(evaluation: Evaluation) -> list[Column]:
+    measures = evaluation.protocol.measures
+    keys = {measure.key for measure in measures}
+    listed = _LISTED if keys.issuperset(_LISTED) else tuple(keys)
+    return [
+        *(column_of(measure, listed=measure.key in listed) for measure in measures),
+        Column(key="coverage", title="Coverage", percent=True, decimals=2, higher_is_better=True),
+    ]
+
+
+def _head(evaluation: Evaluation, columns: list[Column]) -> dict[str, Any]:
+    request = evaluation.request
+    without = [frame for frame in evaluation.frames if not frame.scored]
+    filled = " (filled in)" if evaluation.protocol.is_devkit else ""
+    return {
+        "kind": "Depth evaluation",
+        "title": str(request.prediction),
+        "tiles": _tiles(evaluation),
+        "facts": [
+            ["Prediction", str(request.prediction)],
+            ["Truth", str(request.truth)],
+            *([["Sparse depth", str(request.sparse)]] if request.sparse else []),
+            ["Protocol", evaluation.protocol.describe()],
+            ["Pixels scored", f"{sum(frame.pixels for frame in evaluation.frames):,}"],
+        ],
+        "notes": list(evaluation.notes),
+        "tables": [
+            _means(evaluation),
+            *_parts("By distance to the nearest sparse point", "px", evaluation.by_distance),
+            *_parts("By depth of the truth", "m", evaluation.by_depth),
+        ],
+        "labels": {
+            "first": f"Prediction{filled}", "second": "Truth", "map": "Error", "image": "Image",
+        },
+        "map_colours": error_colours(),
+        "without_title": f"Not scored: {len(without):,}",
+        "without": [{"name": frame.name, "reason": frame.error} for frame in without],
+        **figures(columns, "rmse"),
+    }  # fmt: skip
+
+
+def _tiles(evaluation: Evaluation) -> list[dict[str, str]]:
+    frames, scored = len(evaluation.frames), len(evaluation.scored)
+    out = [
+        f"{len(some):,} {what}"
+        for some, what in (
+            (evaluation.missing, "without prediction"),
+            (evaluation.failed, "with a faulty file"),
+        )
+        if some
+    ]
+    means = [
+        tile(measure.title, f"{shown(measure, evaluation.mean[measure.key], unit=True)}")
+        for measure in evaluation.protocol.measures
+        if measure.key in ("rmse", "mae", "delta1")
+    ]
+    coverage = tile("Coverage", f"{evaluation.coverage:.2%}", "of the truth has a prediction")
+    of = f"{scored:,} of {frames:,}" if scored != frames else f"{frames:,}"
+    return [tile("Frames scored", of, ", ".join(out)), *means, coverage]
+
+
+def _means(evaluation: Evaluation) -> dict[str, Any]:
+    measures, interval = evaluation.protocol.measures, evaluation.interval
+    header, rows = ["", "mean"], []
+    for measure in measures:
+        rows.append([heading(measure), shown(measure, evaluation.mean[measure.key])])
+        if interval is not None:
+            rows[-1].append(f"± {shown(measure, interval.half_width(measure.key))}")
+    of = frames_text(len(evaluation.scored))
+    caption = f"Means over {of}"
+    if evaluation.protocol.average == "pooled":
+        caption = f"Over all pixels of {of} together"
+    if interval is not None:
+        header.append("95 %")
+        caption += "; ±: half of the 95 % interval, bootstrap over the frames"
+    return table(caption, header, rows)
+
+
+def _parts(caption: str, unit: str, parts: tuple[Part, ...]) -> list[dict[str, Any]]:
+    if not parts:
+        return []
+    header = [f"[{unit}]", "of the truth", "RMSE [m]", "MAE [m]", "MRE", "coverage"]
+    return [table(f"{caption}, all pixels together", header, part_cells(parts))]
+
+
+def _entry(
+    frame: FrameScores, evaluation: Evaluation, columns: list[Column], pictures: Path
+) -> dict[str, Any]:
+    values = frame.values | {"coverage": frame.coverage}
+    notes = [f"Scored: {frame.pixels:,} of {frame.known:,} pixels of the truth."]
+    if frame.given:
+        notes.append(f"{frame.given:,} of them were given to the network as sparse depth.")
+    notes.append(f"Prediction: {frame.pair.prediction}")
+    notes.append(f"Truth: {frame.pair.truth.gt}")
+    try:
+        drawn = _drawn(frame, evaluation, pictures)
+    except InputError as error:  # a file that could be read to be scored, and now cannot
+        notes.append(str(error))
+        drawn = {"key": None}
+    return {
+        "name": frame.name,
+        "values": [values.get(column.key) for column in columns],
+        "notes": notes,
+        "tag": "",
+        **drawn,
+    }
+
+
+def _drawn(frame: FrameScores, evaluation: Evaluation, pictures: Path) -> dict[str, Any]:
+    """The pictures of a frame are on disk; what the page says of them."""
+    protocol = evaluation.protocol
+    loaded = load_frame(frame.pair, protocol, evaluation.request.scales)
+    truth = loaded.truth.values
+    if loaded.prediction is None:
+        return {"key": None}
+    depth = loaded.prediction.values
+    if protocol.is_devkit:
+        depth = np.maximum(fill_background(depth), np.float32(0))
+    image = _image(frame.pair, truth)
+    errors = error_map(depth, truth, None if image is None else grey_of(image))
+    scale = depth_scale(depth, truth)
+    views = {"first": scale.paint(depth), "second": scale.paint(truth), "map": errors.pixels}
+    if image is not None:
+        views["image"] = np.asarray(np.rint(255 * np.clip(image, 0, 1)), np.uint8)
+    key = picture_key(frame.name)
+    save_pictures(pictures, key, views, thumb="first" if image is None else "image")
+    amount = f"by {errors.strongest_m:.3g} m or more"
+    return {
+        "key": key,
+        "views": list(views),
+        "scale_m": [scale.low_m, scale.high_m],
+        "map": {
+            "ends": [f"too near {amount}", f"too far {amount}"],
+            "unknown": None if ((truth > 0) & (depth > 0)).all() else "not scored",
+            "footer": "prediction against truth",
+        },
+    }
+
+
+def _image(pair: FramePair, truth: Depth) -> NDArray[np.float32] | None:
+    """The frame's picture (H, W, 3) in 0…1, if one is known, can be read and fits the truth."""
+    if pair.image is None:
+        return None
+    try:
+        rgb = (
+            rgb_of(pair.image) if isinstance(pair.image, Hdf5Array) else read_rgb(pair.image).values
+        )
+    except PnpDepthError:
+        return None
+    if rgb.shape[:2] != truth.shape:
+        rgb = pair.truth.protocol.apply(rgb)
+    return rgb if rgb.shape[:2] == truth.shape else None

@@ -1,0 +1,55 @@
+"""`pnpdepth project`: a LiDAR scan as the sparse depth of a camera's picture."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from pnpdepth_cli.errors import SizeError, UsageError
+from pnpdepth_cli.io.record import sha256_of
+from pnpdepth_cli.io.rgb import read_rgb
+from pnpdepth_cli.pipeline.sparse.outputs import SparseTarget, write_sparse_outputs
+from pnpdepth_cli.pipeline.sparse.scans import ScanOptions, read_scan_points
+
+
+@dataclass(frozen=True, kw_only=True)
+class ProjectRequest:
+    """What to project. size: (H, W) of the picture, where there is no image to say it."""
+
+    scan: Path
+    options: ScanOptions
+    target: SparseTarget
+    image: Path | None = None
+    size: tuple[int, int] | None = None
+
+
+def project_scan(request: ProjectRequest) -> dict[str, Any]:
+    """The scan's points that the camera sees are on disk; what was done is returned.
+
+    Raises the errors of `pnpdepth_cli.errors`; then nothing is written.
+    """
+    target, image = request.target, request.image
+    target.check((request.scan, image, request.options.calib))
+    if target.overlay is not None and image is None:
+        raise UsageError("an overlay needs the image; give --image")
+    rgb = None
+    size = request.size
+    inputs: dict[str, Any] = {}
+    if image is not None:
+        rgb = read_rgb(image).values
+        if size not in (None, rgb.shape[:2]):
+            raise SizeError(f"{image} is {rgb.shape[1]}×{rgb.shape[0]}, not of the size given")
+        size = (rgb.shape[0], rgb.shape[1])
+        inputs["image"] = {"path": str(image), "sha256": sha256_of(image)}
+    scan = read_scan_points(request.scan, request.options, size, image)
+    settings = asdict(request.options) | {"calib": str(request.options.calib)}
+    return write_sparse_outputs(
+        target,
+        scan.points,
+        command="project",
+        settings=settings,
+        inputs=inputs | {"scan": scan.record},
+        notes=scan.notes,
+        rgb=rgb,
+    )

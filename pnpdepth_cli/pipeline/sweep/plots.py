@@ -1,0 +1,205 @@
+"""A sweep's studies as pictures: the error, and the gain over the plain network, as PNG."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pnpdepth_cli.errors import UsageError
+from pnpdepth_cli.io.atomic import atomic_path
+from pnpdepth_cli.pipeline.sweep.axes import Axis, Study
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+Cells = Sequence[Mapping[str, Any]]
+
+BLUE, VERMILION, GREEN, PURPLE, SKY, ORANGE = (
+    *("#0072B2", "#D55E00", "#009E73"),
+    *("#CC79A7", "#56B4E9", "#E69F00"),
+)
+"""Told apart by the colour-blind (Okabe and Ito 2008)."""
+
+_GREY = "#555555"
+_KINDS = (BLUE, VERMILION, GREEN, PURPLE, SKY, ORANGE)
+_MARKS = "osD^vP"
+_STYLE: dict[Any, Any] = {
+    "font.size": 8,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "grid.color": "#e6e6e6",
+    "grid.linewidth": 0.6,
+    "axes.axisbelow": True,
+    "lines.linewidth": 1.4,
+    "legend.frameon": False,
+}
+_LONG = 30
+"""So many letters of values do not fit below an axis without being turned."""
+
+
+def need_matplotlib() -> None:
+    """UsageError if pictures cannot be drawn."""
+    if find_spec("matplotlib") is None:
+        raise UsageError(
+            "plots need matplotlib: pip install 'pnpdepth[plot]'; --no-plots does without"
+        )
+
+
+def draw_study(study: Study, cells: Cells, path: Path) -> None:
+    """`path` is a PNG of the cells of one axis or two, in the order of the study's."""
+    import matplotlib as mpl
+    from matplotlib.figure import Figure
+
+    with mpl.rc_context(_STYLE):
+        figure = Figure(figsize=(7.2, 2.9), dpi=200, layout="constrained")
+        error, gain = figure.subplots(1, 2)
+        if len(study.axes) == 1:
+            _draw_one(study.axes[0], cells, error, gain)
+        else:
+            _draw_two(study, cells, error, gain)
+            handles, labels = gain.get_legend_handles_labels()
+            figure.legend(
+                handles, labels, title=_across(*study.axes)[1].title(), loc="outside right center"
+            )
+        error.set_ylabel("MAE (m)")
+        gain.axhline(0, color=_GREY, linewidth=0.8, zorder=1)
+        with atomic_path(path) as temporary:
+            # without the program's version and the date, so the same sweep gives the same bytes
+            figure.savefig(temporary, format="png", metadata={"Software": None})
+
+
+def _draw_one(axis: Axis, cells: Cells, error: Axes, gain: Axes) -> None:
+    for method, colour, dashes, label in (
+        ("plain", _GREY, "--", "plain network"),
+        ("linear", ORANGE, ":", "linear interpolation"),
+        ("refined", BLUE, "-", "refined"),
+    ):
+        line = _Line(colour=colour, dashes=dashes, mark="o" if method == "refined" else "")
+        _draw(error, axis, cells, "mae", method, line, label)
+    for key, title, line in (
+        ("mae", "MAE", _Line(colour=BLUE, mark="o", aside=-0.08)),
+        ("rmse", "RMSE", _Line(colour=VERMILION, mark="s", aside=0.08)),
+    ):
+        _draw(gain, axis, cells, key, "gain", line, title)
+    gain.set_ylabel("gain over the plain network (%)")
+    for axes in (error, gain):
+        _scale(axes, axis)
+        axes.legend()
+
+
+def _draw_two(study: Study, cells: Cells, error: Axes, gain: Axes) -> None:
+    across, apart = _across(*study.axes)
+    groups = [
+        [cell for cell in cells if cell["parameters"][apart.name] == value]
+        for value in apart.values
+    ]
+    for value, group, line in zip(apart.values, groups, _lines(apart), strict=True):
+        _draw(error, across, group, "mae", "refined", line, value)
+        _draw(gain, across, group, "mae", "gain", line, value)
+    for method, dashes, label in (
+        ("plain", "--", "plain network"),
+        ("linear", ":", "linear interpolation"),
+    ):
+        if all(_values(g, "mae", method) == _values(groups[0], "mae", method) for g in groups):
+            _draw(error, across, groups[0], "mae", method, _Line(dashes=dashes), label)
+        elif method == "linear":
+            for group, line in zip(groups, _lines(apart), strict=True):
+                same = _Line(colour=line.colour, dashes=dashes, aside=line.aside)
+                _draw(error, across, group, "mae", method, same, None)
+            error.plot([], [], color=_GREY, linestyle=dashes, label=label)
+    handles, labels = error.get_legend_handles_labels()
+    kept = [pair for pair in zip(handles, labels, strict=True) if pair[1] not in apart.values]
+    error.legend([handle for handle, _ in kept], [label for _, label in kept])
+    gain.set_ylabel("MAE gain over the plain network (%)")
+    for axes in (error, gain):
+        _scale(axes, across)
+
+
+class _Line:
+    """How a line looks."""
+
+    def __init__(
+        self, *, colour: Any = _GREY, dashes: str = "-", mark: str = "", aside: float = 0
+    ) -> None:
+        self.colour, self.dashes, self.mark = colour, dashes, mark
+        self.aside = aside  # of values that are no numbers, so that one does not hide another
+
+
+def _lines(apart: Axis) -> list[_Line]:
+    """One for each value: from dark to light where values have an order, else of all kinds."""
+    import matplotlib as mpl
+
+    many = len(apart.values)
+    if apart.numbers() is not None or many > len(_KINDS):
+        shades = mpl.colormaps["viridis"]
+        # the lightest fifth is hard to see on white
+        colours: list[Any] = [shades(0.8 * n / max(1, many - 1)) for n in range(many)]
+    else:
+        colours = list(_KINDS[:many])
+    return [
+        _Line(colour=c, mark=_MARKS[n % len(_MARKS)], aside=0.6 * ((n + 0.5) / many - 0.5))
+        for n, c in enumerate(colours)
+    ]
+
+
+def _across(first: Axis, second: Axis) -> tuple[Axis, Axis]:
+    """(what goes along the picture, what makes lines): numbers along, and the more values."""
+    along = max((second, first), key=lambda a: (a.numbers() is not None, len(a.values)))
+    return along, first if along is second else second
+
+
+def _draw(
+    axes: Axes, axis: Axis, cells: Cells, key: str, name: str, line: _Line, label: str | None
+) -> None:
+    """A line through the cells' values; gains have their intervals."""
+    places = axis.numbers()
+    x = [n + line.aside for n in range(len(axis.values))] if places is None else places
+    order = sorted(range(len(x)), key=lambda n: x[n])
+    values, low, high = (
+        [_values(cells, key, name + end)[n] for n in order] for end in ("", "_low", "_high")
+    )
+    at = [x[n] for n in order]
+    linked = places is not None or name in ("plain", "linear")
+    style = line.dashes if linked else ""
+    if places is None and name in ("plain", "linear") and len(set(values)) > 1:
+        mark = "_" if name == "plain" else "x"
+        style, line = "", _Line(colour=line.colour, mark=mark, aside=line.aside)
+    drawn = {"color": line.colour, "linestyle": style, "marker": line.mark, "label": label}
+    axes.plot(at, values, markersize=12 if line.mark == "_" else 4, **drawn)
+    if name != "gain" or all(bound != bound for bound in low):
+        return  # how frames differ in their error would hide how the values do
+    if places is None:
+        axes.vlines(at, low, high, color=line.colour, linewidth=1)
+    else:
+        axes.fill_between(at, low, high, color=line.colour, alpha=0.15, linewidth=0)
+
+
+def _values(cells: Cells, key: str, name: str) -> list[float]:
+    """The cells' values; not a number where there is none."""
+    found = [((cell["measures"] or {}).get(key) or {}).get(name) for cell in cells]
+    return [float("nan") if value is None else value for value in found]
+
+
+def _scale(axes: Axes, axis: Axis) -> None:
+    from matplotlib.ticker import FixedFormatter, FixedLocator, NullLocator
+
+    places = axis.numbers()
+    axes.set_xlabel(axis.title())
+    if places is None:
+        turned = sum(map(len, axis.values)) > _LONG
+        axes.set_xlim(-0.5, len(axis.values) - 0.5)
+        axes.set_xticks(
+            range(len(axis.values)),
+            axis.values,
+            rotation=30 if turned else 0,
+            ha="right" if turned else "center",
+        )
+        axes.grid(visible=False, axis="x")
+    elif axis.parameter.log and min(places) > 0:
+        axes.set_xscale("log")
+        axes.xaxis.set_major_locator(FixedLocator(places))
+        axes.xaxis.set_major_formatter(FixedFormatter([v.removesuffix("%") for v in axis.values]))
+        axes.xaxis.set_minor_locator(NullLocator())

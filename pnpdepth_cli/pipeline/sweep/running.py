@@ -1,0 +1,176 @@
+"""The runs of a sweep: one refinement gives the scores of every number of updates."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from pnpdepth_cli.core.interpolation import linear
+from pnpdepth_cli.core.metrics import score
+from pnpdepth_cli.core.propagation import propagate
+from pnpdepth_cli.core.refine import DepthOf, Refinement, RefineSettings, refine
+from pnpdepth_cli.core.split import Split
+from pnpdepth_cli.errors import DivergedError, NoPointsError
+from pnpdepth_cli.models.aligned import AlignedDepth
+from pnpdepth_cli.models.frame import FrameMap
+from pnpdepth_cli.models.network import Network, out_of_memory_is_a_device_error
+from pnpdepth_cli.pipeline.refinement.inputs import Inputs
+from pnpdepth_cli.pipeline.sweep.plan import Method, Run
+
+
+@dataclass(frozen=True, kw_only=True)
+class Curve:
+    """A refinement scored after several numbers of updates.
+
+    plain: of the network alone. scores: by the number of updates. step: α as a number. diverged:
+    why there were no more updates than `made`, None if there were; what was asked of more is
+    scored with the last good depth.
+    """
+
+    plain: dict[str, Any]
+    scores: dict[int, dict[str, Any]]
+    step: float
+    made: int
+    diverged: str | None
+
+
+class CutNetwork:
+    """A network that stays cut while the layer stays the same."""
+
+    def __init__(self, network: Network) -> None:
+        self._network, self._held = network, ExitStack()
+        self._split: Split | None = None
+
+    def __enter__(self) -> CutNetwork:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._held.close()
+        self._split = None
+
+    def run(self, run: Run, inputs: Inputs) -> dict[str, Any]:
+        """The result of a run of this frame with these points, as the journal has it."""
+        done = {"state": "done", "points": len(inputs.points)}
+        if run.method is None:
+            return done | {"scores": {"linear": interpolated(self._network, inputs)}}
+        torch.manual_seed(run.seed)
+        try:
+            split = self._at(run.method.layer)
+            curve = refined_curve(self._network, split, run.method, inputs, run.iterations)
+        except BaseException:
+            self.__exit__()
+            raise
+        return done | {
+            "plain": curve.plain,
+            "scores": {
+                str(k): scores | {"updates": min(k, curve.made)}
+                for k, scores in curve.scores.items()
+            },
+            "step": curve.step,
+            "diverged": curve.diverged,
+        }
+
+    def _at(self, layer: str) -> Split:
+        if self._split is None or self._split.layer != layer:
+            self._held.close()
+            self._split = self._held.enter_context(Split(self._network.module, layer))
+        return self._split
+
+
+def refined_curve(
+    network: Network,
+    split: Split,
+    method: Method,
+    inputs: Inputs,
+    wanted: Sequence[int],
+) -> Curve:
+    """One refinement of as many updates as the most that are wanted, scored after each wanted.
+
+    It is the same as a refinement of each number alone, unless the step falls with their share.
+    split: the network at the method's layer, open.
+    """
+    frame = FrameMap.fit(network.definition.size, *inputs.size)
+    points = frame.points_to_network(inputs.points)
+    if not len(points):
+        raise NoPointsError(f"none of the {len(inputs.points)} points is where the network looks")
+    at = points.to(network.device)
+    settings = replace(method.settings, iterations=max(wanted))
+    aligned = AlignedDepth(network, at, settings.align, every=settings.align_every)
+    seen = _Seen(aligned, None if settings.keep_best else {0, *wanted})
+    diverged: DivergedError | None = None
+    with out_of_memory_is_a_device_error(network.device):
+        arguments = network.arguments(frame, inputs.rgb_tensor(), points)
+        try:
+            result = refine(split, arguments, at, settings, depth_of=seen)
+        except DivergedError as error:
+            if not isinstance(error.last_good, Refinement):
+                raise
+            diverged, result = error, error.last_good
+        made = len(result.losses) - 1
+        kept = {k: _kept(result.losses, min(k, made), settings) for k in wanted}
+        truth = seen_truth(network, inputs)
+        depths = {k: frame.depth_to_image(seen.depths[k]).cpu() for k in {0, *kept.values()}}
+        found = {
+            place: asdict(score(_spread(depths[place], inputs, method.propagate), truth))
+            for place in set(kept.values())
+        }
+    return Curve(
+        plain=asdict(score(depths[0], truth)),
+        scores={k: found[place] for k, place in sorted(kept.items())},
+        step=result.step,
+        made=made,
+        diverged=str(diverged) if diverged else None,
+    )
+
+
+def interpolated(network: Network, inputs: Inputs) -> dict[str, Any]:
+    """The scores of linear interpolation of the points, on the pixels that the network sees."""
+    return asdict(score(linear(inputs.points), seen_truth(network, inputs)))
+
+
+def seen_truth(network: Network, inputs: Inputs) -> Tensor:
+    """(H, W) the true depth, unknown where the network does not look."""
+    assert inputs.gt is not None
+    top, left, height, width = FrameMap.fit(network.definition.size, *inputs.size).crop
+    truth = torch.zeros(inputs.size)
+    here = (slice(top, top + height), slice(left, left + width))
+    truth[here] = torch.from_numpy(inputs.gt)[here]
+    return truth
+
+
+class _Seen:
+    """Reads depth as another does, and remembers what it read of z_0, z_1, …: those places that are
+    wanted (None: all), and the last two, of which one is good if the other is not.
+    """
+
+    def __init__(self, depth_of: DepthOf, wanted: Collection[int] | None) -> None:
+        self._depth_of, self._wanted, self._read = depth_of, wanted, 0
+        self.depths: dict[int, Tensor] = {}
+
+    def __call__(self, output: Any) -> Tensor:
+        depth = self._depth_of(output)
+        self.depths[self._read] = depth.detach()
+        if self._wanted is not None and self._read - 2 not in self._wanted:
+            self.depths.pop(self._read - 2, None)
+        self._read += 1
+        return depth
+
+
+def _kept(losses: Sequence[float], updates: int, settings: RefineSettings) -> int:
+    """Which z's depth a refinement of so many updates gives: the last, or that of least loss."""
+    if not settings.keep_best:
+        return updates
+    return min(range(updates + 1), key=lambda k: (losses[k], -k))
+
+
+def _spread(depth: Tensor, inputs: Inputs, kind: str) -> Tensor:
+    """The depth (H, W) with what is left at the points spread over it."""
+    if kind == "none":
+        return depth
+    rgb = inputs.rgb_tensor()
+    return propagate(depth, inputs.points, None if rgb is None else rgb[0], kind=kind).depth

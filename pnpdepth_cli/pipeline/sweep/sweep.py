@@ -1,0 +1,308 @@
+"""`pnpdepth sweep`: errors against truth while one thing or two are varied."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from itertools import groupby
+from pathlib import Path
+from typing import Any, TypeVar
+
+from pnpdepth_cli.core.split import Split
+from pnpdepth_cli.errors import (
+    DeviceError,
+    InputError,
+    PnpDepthError,
+    StorageError,
+    UsageError,
+)
+from pnpdepth_cli.io.atomic import make_folder, remove_leftovers
+from pnpdepth_cli.io.layouts.frame import Frame
+from pnpdepth_cli.io.lock import locked_folder
+from pnpdepth_cli.models.definition import ModelDefinition
+from pnpdepth_cli.pipeline.batch.batch import Listener
+from pnpdepth_cli.pipeline.batch.frames import BatchRequest, Task, find_frames, task_of
+from pnpdepth_cli.pipeline.batch.settings import model_identity
+from pnpdepth_cli.pipeline.refinement.inputs import Inputs, read_inputs
+from pnpdepth_cli.pipeline.refinement.refine import Refiner, load_refiner
+from pnpdepth_cli.pipeline.refinement.request import RefineRequest, effective_settings, layer_name
+from pnpdepth_cli.pipeline.sweep.axes import Study
+from pnpdepth_cli.pipeline.sweep.plan import Place, Plan, Run, RunPlace, sampling_of
+from pnpdepth_cli.pipeline.sweep.plots import draw_study, need_matplotlib
+from pnpdepth_cli.pipeline.sweep.points import OWN, Sampling, frame_points
+from pnpdepth_cli.pipeline.sweep.running import CutNetwork
+from pnpdepth_cli.pipeline.sweep.state import SweepState
+from pnpdepth_cli.pipeline.sweep.summary import FrameFigures, summarise, write_frames, write_sweep
+from pnpdepth_cli.sensors import SamplePattern
+
+T = TypeVar("T")
+Lines = Mapping[RunPlace, "dict[str, Any] | None"]
+_TRUTH_ALONE = SamplePattern(count=1)
+_TO_SETTLE_ON = 500
+"""Points of the truth; as many as the paper takes indoors."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SweepRequest:
+    """What to vary, over which frames.
+
+    refine: all that is not varied. studies: of `studies_of`. sampling: where points come from
+    unless that is varied, None for the frames' own or, where they have none, the truth. seeds: so
+    many draws of the points, from refine.seed on. layout, protocol, limit: as for a batch.
+    """
+
+    source: Path
+    output: Path
+    refine: RefineRequest
+    studies: Sequence[Study]
+    sampling: Sampling | None = None
+    seeds: int = 1
+    layout: str | None = None
+    protocol: str | None = None
+    limit: int | None = None
+    plots: bool = True
+    resamples: int = 2000
+
+    def __post_init__(self) -> None:
+        if self.seeds < 1:
+            raise UsageError(f"seeds {self.seeds}: the points have to be drawn once at least")
+
+
+def run_sweep(request: SweepRequest, listener: Listener) -> dict[str, Any]:
+    """Tables and pictures of the studies are in the folder; what sweep.json holds is returned.
+
+    Runs that were done before, with these settings and files, are not done again. Raises the
+    errors of `pnpdepth_cli.errors`; what is wrong with one frame is told, and counted.
+    """
+    if request.plots:
+        need_matplotlib()
+    sampling, tasks = _frames(request, listener)
+    make_folder(request.output)
+    with locked_folder(request.output, None, lambda: _clean(request.output)):
+        state = SweepState(request.output)
+        refiner = _settled(request, tasks, listener)
+        plan = Plan(
+            request.studies,
+            refiner.network.definition,
+            request.refine,
+            sampling,
+            request.seeds,
+            model_identity(request.refine),
+        )
+        for layer in plan.layers:
+            with Split(refiner.network.module, layer):
+                pass  # a layer that is not there is told before anything is computed
+        runs = [run for task, frame in tasks for run in plan.runs(task, frame)]
+        to_do = [run for run in runs if not state.is_done(run)]
+        listener.say(
+            f"{len(tasks):,} frames, {len(runs):,} runs: {len(runs) - len(to_do):,} done already,"
+            f" {len(to_do):,} to do"
+        )
+        listener.begin(len(to_do))
+        for row in _rows(to_do, refiner, state):
+            listener.frame(row)
+        lines = {run.place: state.result(run.key) for run in runs}
+        return _write(request, sampling, refiner, plan, [task.name for task, _ in tasks], lines)
+
+
+def _clean(output: Path) -> None:
+    remove_leftovers(output)
+
+
+def _frames(request: SweepRequest, listener: Listener) -> tuple[Sampling, list[tuple[Task, Frame]]]:
+    """Where points come from unless that is varied, and the frames with truth.
+
+    InputError if there are none, UsageError if no points can be had.
+    """
+    asked = BatchRequest(
+        source=request.source,
+        output=request.output,
+        refine=replace(request.refine, sample=_TRUTH_ALONE),
+        layout=request.layout,
+        protocol=request.protocol,
+        limit=request.limit,
+    )
+    found = find_frames(asked)
+    frames = [frame for frame in found.chosen if frame.gt is not None]
+    without = len(found.chosen) - len(frames)
+    listener.say(f"layout: {found.layout}: {len(frames):,} frames with ground truth")
+    if not frames:
+        raise InputError(
+            f"{request.source}: none of its {without:,} frames has ground truth, without which"
+            " nothing can be scored; add it as gt"
+        )
+    if without:
+        listener.say(f"warning: {without:,} frames have no ground truth and are left out")
+    sampling = request.sampling
+    if sampling is None:
+        own = any(frame.sparse is not None for frame in frames)
+        sampling = Sampling(sensor=OWN if own else "uniform")
+        said = "the frames' own" if own else "uniform of the ground truth, for they have no others"
+        listener.say(f"points: {said}; --sample says otherwise")
+    samplings = [sampling_of(cell, sampling) for study in request.studies for cell in study.cells()]
+    scan = request.refine.scan
+    if any(each.lidar for each in samplings):  # then it is the camera's, not of a scan
+        frames = [
+            replace(f, calib=scan.calib or f.calib, camera=_given(scan.camera, f.camera))
+            for f in frames
+        ]
+        scan = replace(scan, calib=None, camera=None)
+    own_wanted = any(each.sensor == OWN for each in samplings)
+    reading_own = replace(asked, refine=replace(request.refine, scan=scan, sample=None))
+    return sampling, [
+        (task_of(reading_own if own_wanted and frame.sparse else asked, frame), frame)
+        for frame in frames
+    ]
+
+
+def _given(first: int | None, otherwise: int | None) -> int | None:
+    return otherwise if first is None else first
+
+
+def _settled(
+    request: SweepRequest, tasks: Sequence[tuple[Task, Frame]], listener: Listener
+) -> Refiner:
+    """The network, with what it leaves open settled on the first frame that can be read.
+
+    It is settled on points of the truth, so that it does not depend on what is varied.
+    """
+    errors = []
+    for task, frame in tasks:
+        try:
+            inputs = read_inputs(task.request)
+            known = 0 if inputs.gt is None else int((inputs.gt > 0).sum())
+            some = Sampling(sensor="uniform", points=str(min(_TO_SETTLE_ON, known)))
+            points = frame_points(some, request.refine.seed, inputs, task.request, frame)
+        except InputError as error:
+            errors.append(error)
+            continue
+        refiner = load_refiner(
+            replace(task.request, layer=_some_layer(request)), replace(inputs, points=points)
+        )
+        for note in inputs.notes:
+            if task.request.sample is None or not note.startswith("sparse"):
+                listener.say(f"{task.name}: {note}")
+        for note in refiner.network.notes:
+            listener.say(note)
+        base = _base(refiner.network.definition, request.refine)
+        listener.say(
+            f"network: {refiner.network.definition.name}; where not varied: cut at {base['layer']},"
+            f" {base['iterations']} updates of z ({base['update']}, {base['loss']}, step"
+            f" {base['lr']})"
+        )
+        return refiner
+    raise errors[0]
+
+
+def _some_layer(request: SweepRequest) -> str | None:
+    """The layer that is asked for, or one that is: a network may have none that it is cut at."""
+    axes = [axis for study in request.studies for axis in study.axes if axis.name == "layer"]
+    return axes[0].values[0] if axes else request.refine.layer
+
+
+def _base(definition: ModelDefinition, request: RefineRequest) -> dict[str, Any]:
+    """What holds where it is not varied."""
+    settings = effective_settings(definition, request)
+    layer = request.layer or definition.default_layer
+    return {
+        "layer": None if layer is None else layer_name(definition, layer),
+        **asdict(settings),
+        "propagate": request.propagate or "none",
+    }
+
+
+def _rows(runs: Sequence[Run], refiner: Refiner, state: SweepState) -> Iterator[dict[str, Any]]:
+    """Each run is done and recorded; a row for each. Frames are read once, points drawn once."""
+    with CutNetwork(refiner.network) as cut:
+        for _, of_frame in groupby(runs, key=lambda run: run.frame.name):
+            of_one = list(of_frame)
+            inputs = _tried(read_inputs, of_one[0].task.request)
+            for _, of_points in groupby(of_one, key=lambda run: (run.sampling, run.seed)):
+                alike = list(of_points)
+                failed = isinstance(inputs, PnpDepthError)
+                drawn = inputs if failed else _tried(_drawn, alike[0], inputs)
+                for run in alike:
+                    yield _done(run, drawn, cut, state)
+
+
+def _tried(read: Callable[..., T], *arguments: Any) -> T | PnpDepthError:
+    """What it gives, or the error of a frame that cannot be used."""
+    try:
+        return read(*arguments)
+    except (StorageError, DeviceError):
+        raise
+    except PnpDepthError as error:
+        return error
+
+
+def _drawn(run: Run, inputs: Inputs) -> Inputs:
+    """The frame with the run's points."""
+    points = frame_points(run.sampling, run.seed, inputs, run.task.request, run.frame)
+    return replace(inputs, points=points)
+
+
+def _done(
+    run: Run, inputs: Inputs | PnpDepthError, cut: CutNetwork, state: SweepState
+) -> dict[str, Any]:
+    """The run's result is recorded; its row for a listener."""
+    result = inputs if isinstance(inputs, PnpDepthError) else _tried(cut.run, run, inputs)
+    row = {"name": run.frame.name, "status": "done", "message": None}
+    if isinstance(result, PnpDepthError):
+        state.fail(run, str(result))
+        return row | {"status": "failed", "message": str(result)}
+    state.add(run, result)
+    if result.get("diverged"):
+        return row | {"status": "diverged", "message": result["diverged"]}
+    return row
+
+
+def _write(
+    request: SweepRequest,
+    sampling: Sampling,
+    refiner: Refiner,
+    plan: Plan,
+    names: Sequence[str],
+    lines: Lines,
+) -> dict[str, Any]:
+    """The tables and pictures are on disk; returns what sweep.json holds."""
+    studies: list[dict[str, Any]] = []
+    rows: list[dict[str, Any]] = []
+    for study in request.studies:
+        figures = [_figures(plan.place(cell), plan, names, lines) for cell in study.cells()]
+        cells = []
+        for cell, of_cell in zip(study.cells(), figures, strict=True):
+            cells.append({"parameters": dict(cell), **summarise(of_cell, request.resamples)})
+            rows += [{"study": study.name, "parameters": cell, "figures": f} for f in of_cell]
+        plot = f"sweep_{study.name}.png" if request.plots else None
+        if plot is not None:
+            draw_study(study, cells, request.output / plot)
+        values = {axis.name: list(axis.values) for axis in study.axes}
+        studies.append({"name": study.name, "parameters": values, "plot": plot, "cells": cells})
+    record = {
+        "command": "sweep",
+        "source": str(request.source),
+        "output": str(request.output),
+        "model": refiner.model_record,
+        "frames": list(names),
+        "seeds": request.seeds,
+        "base": _base(refiner.network.definition, request.refine) | asdict(sampling),
+        "studies": studies,
+    }
+    write_sweep(request.output, record)
+    write_frames(request.output / "sweep_frames.csv", rows)
+    return record
+
+
+def _figures(place: Place, plan: Plan, names: Sequence[str], lines: Lines) -> list[FrameFigures]:
+    """A cell's figures of each frame and seed."""
+    return [
+        FrameFigures.of(
+            name,
+            seed,
+            place.iterations,
+            linear=lines[name, seed, place.sampling, None],
+            curve=lines[name, seed, place.sampling, place.method],
+        )
+        for name in names
+        for seed in plan.seeds(place.sampling)
+    ]

@@ -1,0 +1,555 @@
+from __future__ import annotations
+
+import csv
+import json
+import os
+import shutil
+import threading
+import weakref
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from pnpdepth_cli.core.metrics import Scores
+from pnpdepth_cli.errors import InputError, LayerError, ModelError, OutputError, UsageError
+from pnpdepth_cli.io.depth import read_depth
+from pnpdepth_cli.pipeline.batch import running as batch_running
+from pnpdepth_cli.pipeline.batch.batch import plan_batch
+from pnpdepth_cli.pipeline.batch.frames import BatchRequest
+from pnpdepth_cli.pipeline.batch.summary import _SCORES
+from pnpdepth_cli.pipeline.refinement.inputs import read_inputs
+from pnpdepth_cli.pipeline.refinement.refine import Refiner, refine_image
+from pnpdepth_cli.pipeline.sparse.scans import ScanOptions
+from pnpdepth_cli.sensors import SamplePattern
+from tests.pipeline.batches import (
+    NAMES,
+    Heard,
+    add_frame,
+    batch,
+    pairs_on_disk,
+    refinement,
+    results,
+    times,
+)
+from tests.pipeline.scan_frames import scan_on_disk
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    return pairs_on_disk(tmp_path / "drive")
+
+
+def summary(root: Path) -> dict[str, Any]:
+    found: dict[str, Any] = json.loads((root / "out" / "summary.json").read_text())
+    return found
+
+
+def test_a_batch_equals_as_many_single_refinements_byte_for_byte(root: Path) -> None:
+    batch(root, workers=3, refine={"holdout": 0.3, "seed": 5})
+    together = results(root / "out")
+    shutil.rmtree(root / "out")
+    asked = refinement(root, holdout=0.3, seed=5, output=root / "out")
+    for name in NAMES:
+        parts = {p: root / f / f"{name}.png" for p, f in
+                 (("image", "rgb"), ("sparse", "sparse"), ("gt", "gt"))}  # fmt: skip
+        refine_image(replace(asked, **parts))
+    assert len(together) == 4 * len(NAMES)
+    assert together == results(root / "out")
+
+
+def test_so_does_a_batch_of_lidar_scans(tmp_path: Path) -> None:
+    root = pairs_on_disk(tmp_path / "drive", ())
+    made = scan_on_disk(root / "net")
+    parts = (("image", "rgb", made.image), ("sparse", "sparse", made.scan), ("gt", "gt", made.gt))
+    for _, part, file in (*parts, ("", "calib", made.calib)):
+        (root / part).mkdir(exist_ok=True)
+        for name in "ab":
+            shutil.copy(file, root / part / f"{name}{file.suffix}")
+    batch(root, refine={"scan": ScanOptions(max_range=5.6)})
+    together = results(root / "out")
+    shutil.rmtree(root / "out")
+    for name in "ab":
+        scan = ScanOptions(calib=root / f"calib/{name}.txt", max_range=5.6)
+        files = {p: root / f / f"{name}{file.suffix}" for p, f, file in parts}
+        refine_image(refinement(root, output=root / "out", scan=scan, **files))
+    assert len(together) == 8
+    assert together == results(root / "out")
+
+
+def test_a_second_run_does_nothing(root: Path) -> None:
+    batch(root)
+    before = times(root / "out")
+    heard = Heard()
+    batch(root, heard)
+    assert heard.to_do == 0
+    assert heard.said[-1] == "4 frames, all of them done already"
+    assert times(root / "out") == before
+    assert [row["name"] for row in summary(root)["frames"]] == list(NAMES)
+
+
+def remove_a_result(root: Path) -> None:
+    (root / "out/b_preview.png").unlink()
+
+
+def alter_a_result(root: Path) -> None:
+    with (root / "out/b_depth.png").open("ab") as file:
+        file.write(b"more")
+
+
+def alter_an_input(root: Path) -> None:
+    shutil.copy(root / "rgb/c.png", root / "rgb/b.png")
+
+
+def add_the_truth(root: Path) -> None:
+    shutil.copy(root / "gt/a.png", root / "gt/b.png")
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        (remove_a_result, "result missing: b_preview.png"),
+        (alter_a_result, "result changed: b_depth.png"),
+        (alter_an_input, "input changed: image"),
+        (add_the_truth, "other input files"),
+    ],
+)
+def test_only_what_is_missing_or_changed_is_done_again(root: Path, change: Any, why: str) -> None:
+    (root / "gt/b.png").unlink()
+    batch(root)
+    change(root)
+    asked = BatchRequest(source=root, output=root / "out", refine=refinement(root))
+    assert [(p.name, p.why) for p in plan_batch(asked, lambda text: None)] == [("b", why)]
+    heard = Heard()
+    batch(root, heard)
+    assert heard.names == ["b"]
+    redone = results(root / "out")
+    shutil.rmtree(root / "out")
+    batch(root)
+    assert redone == results(root / "out")
+
+
+def test_a_file_that_was_only_touched_or_moved_has_not_changed(root: Path) -> None:
+    batch(root)
+    os.utime(root / "rgb/a.png", (1, 1))
+    os.utime(root / "out/b_depth.png", (1, 1))
+    moved = root.rename(root.with_name("moved"))
+    heard = Heard()
+    batch(moved, heard)
+    assert heard.names == []
+
+
+@pytest.mark.parametrize(
+    "settings", [{"iterations": 2}, {"holdout": 0.2}, {"format": "exr"}, {"align": "scale"}]
+)
+def test_other_settings_do_all_again(root: Path, settings: dict[str, Any]) -> None:
+    batch(root)
+    heard = Heard()
+    batch(root, heard, refine=settings)
+    assert heard.names == list(NAMES)
+    assert "4 to do (4 other settings)" in heard.said[1]
+
+
+def test_another_network_in_the_same_file_does_all_again(root: Path) -> None:
+    batch(root)
+    model = root / "net/my_net.py"
+    model.write_text(model.read_text().replace("2 + 3", "2.5 + 3"))
+    heard = Heard()
+    batch(root, heard)
+    assert heard.names == list(NAMES)
+
+
+def test_a_bad_frame_is_told_counted_and_passed_over(root: Path) -> None:
+    good = (root / "rgb/b.png").read_bytes()
+    (root / "rgb/b.png").write_bytes(good[:200])
+    heard = Heard()
+    counts = batch(root, heard).summary["counts"]
+    assert (counts["done"], counts["failed"], counts["pending"]) == (3, 1, 0)
+    assert [row["status"] for row in heard.rows] == ["done", "failed", "done", "done"]
+    assert "b.png: PNG is cut short" in heard.rows[1]["message"]
+    assert not list((root / "out").glob("b*_*"))
+    (root / "rgb/b.png").write_bytes(good)
+    again = Heard()
+    counts = batch(root, again).summary["counts"]
+    assert again.names == ["b"]
+    assert (counts["done"], counts["failed"]) == (4, 0)
+
+
+def test_the_first_frame_may_be_the_bad_one_and_even_all(root: Path) -> None:
+    (root / "rgb/a.png").write_bytes(b"no picture")
+    assert batch(root).summary["counts"]["done"] == 3
+    for name in "bcd":
+        (root / f"sparse/{name}.png").write_bytes(b"no depth")
+    counts = batch(root, refine={"seed": 1}).summary["counts"]
+    assert (counts["done"], counts["failed"]) == (0, 4)
+
+
+def test_depth_that_does_not_fit_the_format_is_one_frames_own_matter(root: Path) -> None:
+    model = root / "net/my_net.py"
+    far = "(2 + 900 * (rgb[0, 2, 0, 0] < 0.3)) + 3"
+    model.write_text(model.read_text().replace("2 + 3", far))
+    heard = Heard()
+    outcome = batch(root, heard, refine={"iterations": 0})
+    assert outcome.summary["counts"]["failed"] == 1
+    assert all("does not fit a 16-bit PNG" in r["message"] for r in heard.rows if r["message"])
+
+
+def test_a_divergence_keeps_the_last_good_depth_and_is_counted(root: Path) -> None:
+    model = root / "net/my_net.py"
+    text = model.read_text()
+    formula = "2 + 3 * self.decode(torch.tanh(self.middle(self.encode(rgb))))"
+    assert formula in text
+    exponential = "torch.exp(self.decode(self.middle(self.encode(rgb))))"
+    model.write_text(text.replace(formula, exponential))
+    outcome = batch(root, refine={"lr": "1e4"})
+    assert outcome.summary["counts"]["diverged"] == 4
+    assert (read_depth(root / "out/a_depth.png").values > 0).all()
+    heard = Heard()
+    batch(root, heard, refine={"lr": "1e4"})
+    assert heard.names == []
+
+
+def test_a_mistake_that_concerns_all_frames_stops_the_batch_at_once(root: Path) -> None:
+    with pytest.raises(LayerError, match="did you mean middle"):
+        batch(root, refine={"layer": "midle"})
+    with pytest.raises(UsageError, match="not a step size"):
+        batch(root, refine={"lr": "fast"})
+    with pytest.raises(UsageError, match="is no scan"):
+        batch(root, refine={"scan": ScanOptions(max_range=10)})
+    model = root / "net/my_net.py"
+    model.write_text(model.read_text() + "\nraise ValueError('no')\n")
+    with pytest.raises(ModelError):
+        batch(root)
+
+
+def test_a_network_that_fails_on_one_frame_only_fails_there(root: Path) -> None:
+    tall = np.zeros((50, 40, 3), np.uint8)
+    add_frame(root, "e", tall)
+    for part in ("sparse", "gt"):
+        cv2.imwrite(str(root / part / "e.png"), np.full((50, 40), 2000, np.uint16))
+    model = root / "net/my_net.py"
+    check = "        assert rgb.shape[2] < rgb.shape[3]\n        return"
+    model.write_text(model.read_text().replace("        return", check, 1))
+    for _ in range(2):  # the second run has nothing but this frame to do
+        counts = batch(root, refine={"depth_scale": 1000}).summary["counts"]
+        assert (counts["done"], counts["failed"]) == (4, 1)
+
+
+def test_frames_of_several_sizes_go_through(root: Path) -> None:
+    small = np.zeros((20, 33, 3), np.uint8)
+    add_frame(root, "e", small, gt=False)
+    cv2.imwrite(str(root / "sparse/e.png"), np.full((20, 33), 2000, np.uint16))
+    assert batch(root).summary["counts"]["done"] == 5
+    assert read_depth(root / "out/e_depth.png").values.shape == (20, 33)
+
+
+def test_every_file_without_a_partner_is_told(root: Path) -> None:
+    (root / "sparse/b.png").unlink()
+    shutil.copy(root / "gt/a.png", root / "gt/lost.png")
+    shutil.copy(root / "sparse/a.png", root / "sparse/spare.png")
+    heard = Heard()
+    outcome = batch(root, heard)
+    assert outcome.summary["counts"]["frames"] == 3
+    told = "\n".join(heard.said)
+    for name in ("rgb/b.png", "gt/lost.png", "sparse/spare.png"):
+        assert f"warning: {root / name} has no partner" in told
+    assert len(outcome.summary["unmatched"]) == 3
+
+
+def test_frames_of_one_stem_in_several_folders_keep_their_folders(tmp_path: Path) -> None:
+    root = pairs_on_disk(tmp_path / "drive", ("one/a", "two/a", "a"))
+    assert batch(root).summary["counts"]["done"] == 3
+    for name in ("one/a", "two/a", "a"):
+        assert (root / "out" / f"{name}_depth.png").is_file()
+    rows = ["image,sparse"] + [f"rgb/{n}.png,sparse/{n}.png" for n in ("one/a", "two/a")]
+    (root / "list.csv").write_text("\n".join(rows) + "\n")
+    batch(root, source=root / "list.csv", output=root / "listed")
+    assert (root / "listed/one/a_depth.png").is_file()
+
+
+ODD = ("with space", "ümlaut 深度", "new\nline", "-dash", "quote'\"", "perc%ent", "[x]*")
+
+
+def test_any_name_that_a_file_can_have_will_do(tmp_path: Path) -> None:
+    undecodable = os.fsdecode(b"caf\xe9")
+    root = pairs_on_disk(tmp_path / "drive", (*ODD, undecodable))
+    heard = Heard()
+    batch(root, heard)
+    assert {row["status"] for row in heard.rows} == {"done"}
+    names = sorted((*ODD, undecodable))
+    assert sorted(row["name"] for row in summary(root)["frames"]) == names
+    with (root / "out/summary.csv").open(encoding="utf-8", newline="") as file:
+        assert len(list(csv.DictReader(file))) == len(names)
+    again = Heard()
+    batch(root, again)
+    assert again.names == []
+
+
+def test_links_that_go_round_in_circles_end(root: Path) -> None:
+    (root / "rgb/loop").symlink_to(root / "rgb")
+    (root / "rgb/self.png").symlink_to(root / "rgb/self.png")
+    (root / "sparse/up").symlink_to(root)
+    assert batch(root).summary["counts"] == {
+        "frames": 4, "done": 4, "diverged": 0, "failed": 0, "pending": 0, "with_warnings": 0,
+    }  # fmt: skip
+
+
+def test_a_folder_that_cannot_be_read_is_told_and_left_out(
+    root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (root / "rgb/locked").mkdir()
+    scandir = os.scandir
+
+    def scan(path: Any) -> Any:
+        if str(path).endswith("locked"):
+            raise PermissionError(13, "Permission denied", str(path))
+        return scandir(path)
+
+    monkeypatch.setattr(os, "scandir", scan)
+    heard = Heard()
+    assert batch(root, heard).summary["counts"]["done"] == 4
+    assert any("locked cannot be read (permission denied)" in text for text in heard.said)
+
+
+def test_results_inside_the_input_are_never_taken_as_input(root: Path) -> None:
+    for output in (root / "rgb" / "out", root / "gt" / "deep" / "out"):
+        batch(root, output=output, refine={"format": "exr"})
+        heard = Heard()
+        outcome = batch(root, heard, output=output)
+        assert heard.names == list(NAMES)
+        assert outcome.summary["unmatched"] == []
+        shutil.rmtree(output)
+
+
+@pytest.mark.parametrize("output", [".", "rgb", ".."])
+def test_an_output_folder_that_holds_the_frames_is_refused(root: Path, output: str) -> None:
+    with pytest.raises(OutputError, match="holds the frames themselves"):
+        batch(root, output=root / output)
+    assert not list(root.rglob("batch.jsonl"))
+
+
+def test_what_no_batch_made_is_not_replaced_unless_asked_for(root: Path) -> None:
+    (root / "out").mkdir()
+    (root / "out/c.json").write_text("mine")
+    with pytest.raises(OutputError, match=r"c\.json exists, and no batch made it; --overwrite"):
+        batch(root)
+    assert [p.name for p in (root / "out").iterdir() if p.suffix != ".lock"] == ["c.json"]
+    batch(root, refine={"overwrite": True})
+    assert (root / "out/c.json").read_text() != "mine"
+
+
+def test_a_name_that_leads_elsewhere_or_to_the_summary_is_left_out(root: Path) -> None:
+    rows = [f"rgb/{n}.png,sparse/{n}.png,{m}" for n, m in
+            (("a", "../up"), ("b", "summary"), ("c", "/c"), ("d", "fine"))]  # fmt: skip
+    (root / "list.csv").write_text("\n".join(["image,sparse,name", *rows]))
+    outcome = batch(root, source=root / "list.csv")
+    assert outcome.summary["counts"]["frames"] == 1
+    assert len(outcome.summary["unmatched"]) == 3
+    assert not (root / "up_depth.png").exists()
+
+
+def test_a_listed_file_that_is_not_there_is_a_failed_frame(root: Path) -> None:
+    (root / "list.csv").write_text("image,sparse\nrgb/a.png,sparse/a.png\nno.png,sparse/b.png\n")
+    heard = Heard()
+    counts = batch(root, heard, source=root / "list.csv").summary["counts"]
+    assert (counts["done"], counts["failed"]) == (1, 1)
+    assert any("no.png does not exist; correct line 3" in text for text in heard.said)
+
+
+def test_shards_share_a_folder_without_overlap_and_the_limit_comes_first(root: Path) -> None:
+    parts = []
+    for number in (1, 2, 3):
+        heard = Heard()
+        outcome = batch(root, heard, shard=(number, 3))
+        parts.append(heard.names)
+    assert parts == [["a", "d"], ["b"], ["c"]]
+    assert outcome.summary["counts"]["done"] == 4
+    heard = Heard()
+    batch(root, heard)
+    assert heard.names == []
+    heard = Heard()
+    outcome = batch(root, heard, limit=3, shard=(2, 2), output=root / "few")
+    assert heard.names == ["b"]
+    assert outcome.summary["counts"]["pending"] == 3
+
+
+def test_the_summary_has_the_means_of_its_rows_and_all_earlier_frames(root: Path) -> None:
+    batch(root, limit=2, refine={"holdout": 0.2})
+    outcome = batch(root, refine={"holdout": 0.2})
+    found = summary(root)
+    rows = found.pop("frames")
+    assert found == json.loads(json.dumps(outcome.summary))
+    assert [row["name"] for row in rows] == list(NAMES)
+    for kind in ("sparse_error", "held_out_error", "scores"):
+        assert found["mean"][kind]["frames"] == 4
+        for stage in ("before", "after"):
+            for measure, mean in found["mean"][kind][stage].items():
+                values = [row[kind][stage][measure] for row in rows]
+                assert mean == pytest.approx(np.mean(values), rel=1e-12)
+    record = json.loads((root / "out/b.json").read_text())
+    row = rows[1]
+    assert row["scores"] == record["scores"]
+    assert row["seconds"].keys() == {"read", "refine", "write"}
+    assert row["inputs"] == {p: record["inputs"][p]["path"] for p in ("image", "sparse", "gt")}
+    assert all((root / "out" / path).is_file() for path in row["outputs"].values())
+    with (root / "out/summary.csv").open(newline="") as file:
+        table = list(csv.DictReader(file))
+    assert [line["name"] for line in table] == list(NAMES)
+    assert float(table[1]["rmse_after"]) == row["scores"]["after"]["rmse"]
+    assert float(table[1]["held_out_error_mae_before"]) == row["held_out_error"]["before"]["mae"]
+
+
+def test_the_table_has_every_score() -> None:
+    assert set(_SCORES) == set(Scores.__dataclass_fields__) - {"pixels"}
+
+
+def test_a_batch_can_be_stopped_between_frames_and_goes_on(root: Path) -> None:
+    asked = iter([False, False, True])
+    heard = Heard()
+    outcome = batch(root, heard, stopped=lambda: next(asked))
+    assert outcome.stopped
+    assert heard.names == ["a", "b"]
+    assert outcome.summary["counts"]["pending"] == 2
+    again = Heard()
+    assert not batch(root, again).stopped
+    assert again.names == ["c", "d"]
+
+
+def test_frames_without_sparse_depth_need_to_be_sampled(root: Path, tmp_path: Path) -> None:
+    kitchen = tmp_path / "kitchen"
+    kitchen.mkdir()
+    shutil.copytree(root / "net", kitchen / "net")
+    for name in NAMES:
+        shutil.copy(root / f"rgb/{name}.png", kitchen / f"frame-{name}.color.png")
+        shutil.copy(root / f"gt/{name}.png", kitchen / f"frame-{name}.depth.png")
+    with pytest.raises(UsageError, match="'7scenes', which has no sparse depth; --sample 500"):
+        batch(kitchen)
+    outcome = batch(kitchen, refine={"sample": SamplePattern(kind="uniform", count=50)})
+    assert outcome.summary["counts"]["done"] == 4
+    record = json.loads((kitchen / "out/frame-a.json").read_text())
+    assert record["points"]["used"] == 50
+    assert record["inputs"]["sparse"]["count"] == 50
+    outcome = batch(kitchen, refine={"sample": SamplePattern(kind="uniform", count=10**6)})
+    assert outcome.summary["counts"]["failed"] == 4
+
+
+def test_a_protocol_cuts_image_points_and_truth_alike(root: Path) -> None:
+    (root / "list.csv").write_text(
+        "image,sparse,gt,protocol\nrgb/a.png,sparse/a.png,gt/a.png,nyu\n"
+    )
+    size = (2 * 228, 2 * 304)
+    image = np.zeros((*size, 3), np.uint8)
+    depth = np.zeros(size, np.uint16)
+    depth[101:300:7, 50:500:9] = 2000 + np.arange(50)
+    cv2.imwrite(str(root / "rgb/a.png"), image)
+    for part in ("sparse", "gt"):
+        cv2.imwrite(str(root / part / "a.png"), depth)
+    asked = {"iterations": 0, "depth_scale": 1000.0}
+    batch(root, source=root / "list.csv", refine=asked)
+    assert read_depth(root / "out/a_depth.png").values.shape == (228, 304)
+    record = json.loads((root / "out/a.json").read_text())
+    assert record["size"] == [304, 228]
+    assert record["points"]["used"] == np.count_nonzero(depth)
+    batch(root, source=root / "list.csv", refine=asked, protocol="whole")
+    assert read_depth(root / "out/a_depth.png").values.shape == size
+
+
+def test_an_empty_folder_says_which_layouts_there_are(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"layout \(manifest, .*pairs"):
+        batch(tmp_path)
+    for part in ("rgb", "sparse"):
+        (tmp_path / part).mkdir()
+    with pytest.raises(InputError, match=r"has no frame in it; layouts are manifest, .*pairs"):
+        batch(tmp_path)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{"workers": 0}, {"batch_size": 0}, {"limit": 0}, {"shard": (3, 2)}, {"shard": (0, 2)}],
+)
+def test_numbers_that_make_no_sense_are_refused(root: Path, changes: dict[str, Any]) -> None:
+    with pytest.raises(UsageError):
+        batch(root, **changes)
+
+
+@pytest.mark.parametrize(("batch_size", "most_allowed"), [(1, 6), (3, 6 + 3 * 3)])
+def test_only_a_few_frames_are_in_memory_at_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, batch_size: int, most_allowed: int
+) -> None:
+    root = pairs_on_disk(tmp_path / "drive", tuple(f"{i:02}" for i in range(24)), gt=False)
+    alive: weakref.WeakSet[Any] = weakref.WeakSet()
+    most = 0
+
+    def watched(request: Any) -> Any:
+        nonlocal most
+        inputs = read_inputs(request)
+        alive.add(inputs.points.xy)
+        most = max(most, len(alive))
+        return inputs
+
+    monkeypatch.setattr(batch_running, "read_inputs", watched)
+    batch(root, workers=1, batch_size=batch_size)
+    assert most <= most_allowed
+
+
+def test_reading_and_writing_go_on_while_the_network_runs(
+    root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    read: set[str] = set()
+    second_is_read, second_is_refined = threading.Event(), threading.Event()
+    refined = 0
+    refine, write = Refiner.refine, batch_running.write_refined
+
+    def reading(request: Any) -> Any:
+        read.add(str(request.image))
+        if len(read) == 2:
+            second_is_read.set()
+        return read_inputs(request)
+
+    def refining(self: Refiner, split: Any, inputs: Any) -> Any:
+        nonlocal refined
+        assert threading.current_thread() is threading.main_thread()
+        assert second_is_read.wait(60), "the second frame is not read while the first is refined"
+        refined += 1
+        if refined == 2:
+            second_is_refined.set()
+        return refine(self, split, inputs)
+
+    def writing(*given: Any) -> Any:
+        assert second_is_refined.wait(60), "the second frame waits until the first is written"
+        return write(*given)
+
+    monkeypatch.setattr(batch_running, "read_inputs", reading)
+    monkeypatch.setattr(batch_running, "write_refined", writing)
+    monkeypatch.setattr(Refiner, "refine", refining)
+    assert batch(root, workers=1).summary["counts"]["done"] == 4
+
+
+def test_frames_in_hdf5_files_are_cut_sampled_and_known_by_their_file(
+    root: Path, tmp_path: Path
+) -> None:
+    h5py = pytest.importorskip("h5py")
+    rooms = tmp_path / "rooms"
+    (rooms / "official").mkdir(parents=True)
+    shutil.copytree(root / "net", rooms / "net")
+    x = np.linspace(0, 1, 640, dtype=np.float32)
+    for number in (1, 2):
+        with h5py.File(rooms / "official" / f"{number:05}.h5", "w") as file:
+            file["rgb"] = np.full((3, 480, 640), 50 * number, np.uint8)
+            file["depth"] = np.tile(1 + number + x, (480, 1))
+    asked = {"sample": SamplePattern(kind="uniform", count=100), "iterations": 1}
+    heard = Heard()
+    batch(rooms, heard, refine=asked)
+    assert heard.names == ["official_00001", "official_00002"]
+    assert any("protocol: nyu cuts the frames" in text for text in heard.said)
+    record = json.loads((rooms / "out/official_00002.json").read_text())
+    assert record["size"] == [304, 228]
+    assert record["points"]["used"] == 100
+    assert record["scores"]["after"]["pixels"] == 304 * 228
+    again = Heard()
+    batch(rooms, again, refine=asked)
+    assert again.names == []

@@ -1,0 +1,157 @@
+"""What is really done to a batch: kill -9, a full disk, a second run."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pnpdepth_cli.errors import OutputError, StorageError
+from pnpdepth_cli.io import lock
+from tests.io.test_atomic import no_room_on_disk
+from tests.pipeline.batches import NAMES, Heard, batch, pairs_on_disk, results
+
+ROOT = Path(__file__).parents[3]
+
+
+def test_killed_twenty_times_at_random_moments_it_ends_byte_identical(tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "tests.pipeline.killed_batches", str(tmp_path), "20"],
+        capture_output=True,
+        text=True,
+        check=False,
+        cwd=ROOT,
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+    )
+    assert done.returncode == 0, done.stderr
+    report = json.loads(done.stdout)
+    assert report["kills"] == 20
+    assert report["in_flight"] > 0
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    """A file system of 100 kB; `mount -o remount,size=…` makes it larger."""
+    folder = tmp_path / "run" / "out"
+    folder.mkdir(parents=True)
+    mount = ["mount", "-t", "tmpfs", "-o", "size=100k", "tmpfs", str(folder)]
+    try:
+        made = subprocess.run(mount, capture_output=True, text=True, check=False)
+    except FileNotFoundError:
+        pytest.skip("there is no mount program")
+    if made.returncode:
+        pytest.skip(f"a small file system cannot be mounted here: {made.stderr.strip()}")
+    yield folder
+    subprocess.run(["umount", str(folder)], check=True)
+
+
+def in_folder(folder: Path, root: Path, heard: Heard | None = None) -> Any:
+    """A batch into ./out of this folder, so that records name the same paths everywhere."""
+    before = Path.cwd()
+    folder.mkdir(exist_ok=True)
+    os.chdir(folder)
+    try:
+        return batch(root, heard, output=Path("out"))
+    finally:
+        os.chdir(before)
+
+
+def test_a_full_disk_stops_it_cleanly_and_with_room_it_goes_on(
+    tmp_path: Path, small_disk: Path
+) -> None:
+    root = pairs_on_disk(tmp_path / "drive")
+    in_folder(tmp_path / "plain", root)
+    undisturbed = results(tmp_path / "plain" / "out")
+    stops = []
+    for size_kb in range(100, 1000, 60):
+        grow = ["mount", "-o", f"remount,size={size_kb}k", str(small_disk)]
+        subprocess.run(grow, check=True)
+        try:
+            in_folder(small_disk.parent, root)
+            break
+        except StorageError as error:
+            stops.append(str(error))
+        assert results(small_disk).items() <= undisturbed.items()
+    assert all("no space left on device" in text and "\n" not in text for text in stops)
+    assert len(stops) > 3
+    assert results(small_disk) == undisturbed
+
+
+def test_files_that_cannot_grow_stop_it_too(tmp_path: Path) -> None:
+    root = pairs_on_disk(tmp_path / "drive")
+    with no_room_on_disk(), pytest.raises(StorageError, match="file too large"):
+        batch(root)
+    assert results(root / "out") == {}
+    heard = Heard()
+    batch(root, heard)
+    assert heard.names == list(NAMES)
+
+
+def test_a_second_run_on_the_same_folder_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(lock, "_CLEANING_S", 0.1)
+    root = pairs_on_disk(tmp_path / "drive")
+
+    class Twice(Heard):
+        def frame(self, row: dict[str, Any]) -> None:
+            super().frame(row)
+            with pytest.raises(OutputError, match="another batch writes there; wait"):
+                batch(root)
+            with pytest.raises(OutputError, match="without --shard, writes there"):
+                batch(root, shard=(1, 2))
+
+    heard = Twice()
+    batch(root, heard, limit=1)
+    assert heard.names == ["a"]
+    batch(root)
+
+
+def test_shards_run_at_once_but_not_twice_nor_with_others(tmp_path: Path) -> None:
+    root = pairs_on_disk(tmp_path / "drive")
+    inner = Heard()
+
+    class Beside(Heard):
+        def frame(self, row: dict[str, Any]) -> None:
+            super().frame(row)
+            if row["name"] != "a":
+                return
+            with pytest.raises(OutputError, match="shard 1/2 is being done by another"):
+                batch(root, shard=(1, 2))
+            with pytest.raises(OutputError, match="shard 1/2 of another division"):
+                batch(root, shard=(3, 3))
+            with pytest.raises(OutputError, match="another batch writes there"):
+                batch(root)
+            batch(root, inner, shard=(2, 2))
+
+    outer = Beside()
+    counts = batch(root, outer, shard=(1, 2)).summary["counts"]
+    assert (outer.names, inner.names) == (["a", "c"], ["b", "d"])
+    assert counts["done"] == 4
+
+
+def test_a_manifest_with_a_torn_end_and_nonsense_is_read_as_far_as_it_goes(
+    tmp_path: Path,
+) -> None:
+    root = pairs_on_disk(tmp_path / "drive")
+    batch(root)
+    manifest = root / "out/batch.jsonl"
+    lines = manifest.read_text().splitlines(keepends=True)
+    of_d = [number for number, line in enumerate(lines) if '"frame": "d"' in line][-1]
+    of_b = [number for number, line in enumerate(lines) if '"frame": "b"' in line][-1]
+    lines[of_b] = '{"frame": "b", "state": "done", "settings": 3}\n'
+    torn = lines.pop(of_d)
+    manifest.write_text("".join(lines) + "no JSON\n[]\n" + torn[: len(torn) // 2])
+    heard = Heard()
+    batch(root, heard)
+    assert heard.names == ["b", "d"]
+    assert any("2 lines of" in text for text in heard.said)
+    heard = Heard()
+    batch(root, heard)
+    assert heard.names == []

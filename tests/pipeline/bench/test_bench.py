@@ -1,0 +1,132 @@
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+
+import pytest
+import torch
+
+from pnpdepth_cli.errors import LayerError, UsageError
+from pnpdepth_cli.pipeline.bench.bench import FIRST_FRAME, FULL, Bench, BenchRequest, run_bench
+from pnpdepth_cli.pipeline.bench.table import PAPER_TIMES
+from pnpdepth_cli.pipeline.bench.timing import Spread, Timed, in_turn, peak_mb
+from tests.pipeline.frames import FrameOnDisk, frame_on_disk
+
+CPU = torch.device("cpu")
+
+
+@pytest.fixture(scope="module")
+def frame(tmp_path_factory: pytest.TempPathFactory) -> FrameOnDisk:
+    return frame_on_disk(tmp_path_factory.mktemp("frame"))
+
+
+def request(frame: FrameOnDisk, **more: object) -> BenchRequest:
+    given = {"model": str(frame.model), "checkpoint": frame.checkpoint, "size": (40, 60)}
+    given |= {"points": 80, "repeats": 2}
+    return BenchRequest(**given | more)  # type: ignore[arg-type]
+
+
+@pytest.fixture(scope="module")
+def found(frame: FrameOnDisk) -> Bench:
+    return run_bench(request(frame, precision="bf16"))
+
+
+def test_every_part_is_timed_as_often_as_asked_and_compared_with_one_forward_pass(
+    found: Bench,
+) -> None:
+    assert [part.name for part in found.parts] == [
+        *("forward", "front", "rear", "rear backward", "refinement", FIRST_FRAME, FULL),
+        *("alignment", "propagation", "reading", "writing"),
+    ]
+    forward = found.part("forward").seconds.median
+    for part in found.parts:
+        assert 0 < part.seconds.lower <= part.seconds.median <= part.seconds.upper
+        assert part.seconds.runs == 2
+        assert part.forwards == part.seconds.median / forward
+
+
+def test_the_limit_follows_from_the_parts_and_from_counted_operations(found: Bench) -> None:
+    front, rear = (found.part(name).seconds.median for name in ("front", "rear"))
+    assert found.limit_measured == (front + 11 * rear) / (front + rear)
+    # encode 20·30·8 outputs of 3·9 products; middle, which is cut at, 20·30·8 of 8·9; decode, the
+    # one part behind, 20·30·8 inputs into 16 outputs each.
+    ahead, behind = 4800 * (27 + 72), 4800 * 16
+    assert found.limit_by_flops == (ahead + 11 * behind) / (ahead + behind)
+
+
+def test_low_precision_is_compared_with_fp32(found: Bench, frame: FrameOnDisk) -> None:
+    assert found.precision == "bf16"
+    assert found.depth_change is not None
+    assert 0 < found.depth_change < 0.02
+    full = run_bench(request(frame, files=False))
+    assert full.depth_change is None
+    assert FULL not in [part.name for part in full.parts]
+
+
+def test_the_record_is_json_and_says_what_was_measured(found: Bench) -> None:
+    record = json.loads(json.dumps(found.record()))
+    assert record["network_size"] == record["size"] == [40, 60]
+    assert (record["points"], record["iterations"], record["layer"]) == (80, 5, "middle")
+    assert record["threads"] == torch.get_num_threads()
+    assert record["versions"]["torch"] == torch.__version__
+
+
+def test_a_network_without_weights_gets_random_ones_and_says_so(frame: FrameOnDisk) -> None:
+    found = run_bench(request(frame, checkpoint=None, files=False))
+    assert found.checkpoint is None
+    assert any("weights: random" in note for note in found.notes)
+
+
+def test_nothing_is_left_behind(frame: FrameOnDisk, tmp_path: Path, monkeypatch) -> None:  # type: ignore[no-untyped-def]
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    run_bench(request(frame))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_layer_that_is_not_there_and_no_repeats_are_told(frame: FrameOnDisk) -> None:
+    with pytest.raises(LayerError, match="midle"):
+        run_bench(request(frame, layer="midle"))
+    with pytest.raises(UsageError, match="at least one"):
+        run_bench(request(frame, points=0))
+
+
+def test_the_papers_table_has_its_seven_networks_and_its_four_ratios() -> None:
+    assert len({paper.name for paper in PAPER_TIMES}) == 7
+    ratios = {p.name: round(p.forwards, 1) for p in PAPER_TIMES if p.forwards is not None}
+    assert ratios == {"Ma": 5.1, "Jaritz": 3.3, "Uhrig": 5.2, "Chodosh": 1.4}
+
+
+# ------------------------------------------------------------------ measuring
+
+
+def test_parts_run_in_turn_and_the_first_round_does_not_count() -> None:
+    ran: list[str] = []
+    rounds: list[tuple[int, int]] = []
+    todo = {
+        "a": Timed(run=lambda given: ran.append(f"a{given}"), prepare=lambda: len(ran)),
+        "b": Timed(run=lambda given: ran.append("b")),
+    }
+    spent = in_turn(todo, 2, CPU, on_round=lambda done, of: rounds.append((done, of)))
+    assert ran == ["a0", "b", "a2", "b", "a4", "b"]
+    assert {name: len(times) for name, times in spent.items()} == {"a": 2, "b": 2}
+    assert rounds == [(1, 3), (2, 3), (3, 3)]
+
+
+def test_what_is_prepared_is_not_timed() -> None:
+    todo = {"a": Timed(run=lambda _: None, prepare=lambda: time.sleep(0.05))}
+    assert in_turn(todo, 1, CPU)["a"][0] < 0.05
+
+
+def test_a_spread_is_the_median_and_the_quartiles() -> None:
+    assert Spread.of([5.0, 1.0, 2.0, 4.0, 3.0]) == Spread(median=3, lower=2, upper=4, runs=5)
+    assert Spread.of([2.0]) == Spread(median=2, lower=2, upper=2, runs=1)
+
+
+def test_the_peak_is_what_is_needed_at_once_not_what_is_left() -> None:
+    def run() -> None:
+        for _ in range(3):
+            torch.ones(16_000_000)  # 64 MB each, one at a time
+
+    peak = peak_mb(run, CPU)
+    assert peak is None or 60 < peak < 90

@@ -1,0 +1,47 @@
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pnpdepth_cli.io.depth import read_depth
+from pnpdepth_cli.pipeline.batch.settings import settings_digest
+from pnpdepth_cli.pipeline.refinement.refine import refine_image
+from pnpdepth_cli.pipeline.refinement.request import RefineRequest
+from tests.pipeline.frames import frame_on_disk
+
+
+@pytest.fixture
+def asked(tmp_path: Path) -> RefineRequest:
+    frame = frame_on_disk(tmp_path)
+    return RefineRequest(
+        image=frame.image,
+        sparse=frame.sparse,
+        model=str(frame.model),
+        checkpoint=frame.checkpoint,
+        output=tmp_path / "out",
+        format="npy",
+        overwrite=True,
+    )
+
+
+def test_bf16_refines_to_nearly_the_depth_of_fp32_and_the_record_says_so(
+    asked: RefineRequest,
+) -> None:
+    records, depths = {}, {}
+    for precision in ("fp32", "bf16"):
+        record = refine_image(replace(asked, precision=precision)).record
+        records[precision] = json.loads(json.dumps(record))["settings"]["precision"]
+        depths[precision] = read_depth(Path(record["outputs"]["depth"])).values
+        assert record["sparse_error"]["after"]["mae"] < record["sparse_error"]["before"]["mae"]
+    assert records == {"fp32": "fp32", "bf16": "bf16"}
+    apart = np.abs(depths["bf16"] / depths["fp32"] - 1)
+    assert 0 < apart.mean() < 0.02
+
+
+def test_a_batch_in_another_precision_is_done_again(asked: RefineRequest) -> None:
+    other = replace(asked, precision="bf16")
+    assert settings_digest(asked, {}) != settings_digest(other, {})

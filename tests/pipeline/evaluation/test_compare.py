@@ -1,0 +1,209 @@
+"""Runs compared: gains and p-values by hand, and what cannot be compared."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pnpdepth_cli.errors import FileFormatError, InputError, UsageError
+from pnpdepth_cli.io.depth import write_depth
+from pnpdepth_cli.io.record import write_json
+from pnpdepth_cli.pipeline.evaluation.compare import compare
+from pnpdepth_cli.pipeline.evaluation.evaluate import evaluate
+from pnpdepth_cli.pipeline.evaluation.result import EvalRequest
+
+
+def run(root: Path, name: str, errors: dict[str, list[float]], **given: Any) -> str:
+    """A saved evaluation of frames of 4 pixels at 10 m with these errors."""
+    for frame, error in errors.items():
+        for folder, depth in ((name, 10 + np.array([error])), ("gt", np.full((1, len(error)), 10))):
+            (root / folder).mkdir(exist_ok=True)
+            write_depth(root / folder / f"{frame}.npy", depth.astype(np.float32))
+    request = EvalRequest(prediction=root / name, truth=root / "gt", resamples=0, **given)
+    path = root / f"{name}.json"
+    write_json(path, evaluate(request).as_record())
+    return str(path)
+
+
+FIRST = {"a": [2.0, 2.0], "b": [4.0, 4.0], "c": [1.0, 1.0]}
+BETTER = {"a": [1.0, 1.0], "b": [3.0, 3.0], "c": [0.5, 0.5]}
+
+
+def test_a_lower_error_is_a_positive_gain(tmp_path: Path) -> None:
+    found = compare([run(tmp_path, "one", FIRST), run(tmp_path, "two", BETTER)])
+    gain = found.gains[0]["mae"]
+    assert gain.percent == pytest.approx(100 * 2.5 / 7)
+    assert gain.difference == pytest.approx(-2.5 / 3)
+    assert gain.p_value == 2 / 8  # all three got better: two of the eight swaps differ as much
+    assert gain.low_percent <= gain.percent <= gain.high_percent
+    assert found.exact
+    assert [r.label for r in found.runs] == ["one", "two"]
+    assert found.runs[0].mean["mae"] == pytest.approx(7 / 3)
+    assert found.notes == ()
+
+
+def test_a_higher_share_below_the_threshold_is_a_positive_gain(tmp_path: Path) -> None:
+    found = compare([run(tmp_path, "one", FIRST), run(tmp_path, "two", BETTER)])
+    assert found.runs[0].mean["delta1"] == pytest.approx(2 / 3)
+    assert found.gains[0]["delta1"].percent == 0  # 1.3 and 1.4 are above 1.25
+    half = {"a": [3.0, 1.0]}
+    found = compare([run(tmp_path, "half", half), run(tmp_path, "whole", {"a": [1.0, 1.0]})])
+    assert found.gains[0]["delta1"].percent == pytest.approx(100)
+
+
+def test_a_run_is_no_better_than_itself(tmp_path: Path) -> None:
+    path = run(tmp_path, "one", FIRST)
+    found = compare([path, path])
+    for gain in found.gains[0].values():
+        assert (gain.percent, gain.low_percent, gain.high_percent) == (0, 0, 0)
+        assert gain.p_value == 1
+    assert [r.label for r in found.runs] == [path, path]
+
+
+def test_frames_are_paired_by_name_and_the_others_told(tmp_path: Path) -> None:
+    one = run(tmp_path, "one", {"a": [2.0], "b": [4.0], "only one": [9.0]})
+    (tmp_path / "gt" / "only one.npy").unlink()
+    two = run(tmp_path, "two", {"b": [2.0], "a": [1.0]})
+    found = compare([one, two])
+    assert found.names == ("a", "b")
+    assert found.runs[0].mean["mae"] == pytest.approx(3)
+    (note,) = found.notes
+    assert "1 frames of" in note
+    assert note.endswith("left out: only one")
+
+
+def test_one_frame_has_a_gain_but_nothing_to_resample(tmp_path: Path) -> None:
+    found = compare([run(tmp_path, "one", {"a": [2.0]}), run(tmp_path, "two", {"a": [1.0]})])
+    gain = found.gains[0]["mae"]
+    assert gain.percent == pytest.approx(50)
+    assert np.isnan([gain.low_percent, gain.high_percent, gain.p_value]).all()
+    assert found.as_record()["gains"][0]["mae"]["p_value"] is None
+
+
+def test_pooled_runs_are_compared_over_their_pixels(tmp_path: Path) -> None:
+    pooled: dict[str, Any] = {"changes": {"average": "pooled"}}
+    one = run(tmp_path, "one", {"a": [2.0], "b": [4.0, 4.0, 4.0]}, **pooled)
+    two = run(tmp_path, "two", {"a": [1.0], "b": [4.0, 4.0, 4.0]}, **pooled)
+    found = compare([one, two])
+    assert found.runs[0].mean["mae"] == pytest.approx(14 / 4)
+    assert found.gains[0]["mae"].percent == pytest.approx(100 / 14)
+    assert found.gains[0]["mae"].p_value == 1  # only a differs: any swap is as large
+
+
+def test_three_runs_are_each_compared_with_the_first(tmp_path: Path) -> None:
+    paths = [run(tmp_path, name, errors) for name, errors in
+             (("one", FIRST), ("two", BETTER), ("three", FIRST))]  # fmt: skip
+    found = compare(paths)
+    assert [gains["mae"].percent > 0 for gains in found.gains] == [True, False]
+
+
+def test_many_frames_are_tested_with_random_swaps_of_the_seed(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    first = {f"{n:02}": [float(rng.uniform(1, 2))] for n in range(20)}
+    second = {name: [error[0] * float(rng.uniform(0.7, 1.2))] for name, error in first.items()}
+    paths = [run(tmp_path, "one", first), run(tmp_path, "two", second)]
+    found = compare(paths, resamples=500, seed=1)
+    assert not found.exact
+    assert found.as_record() == compare(paths, resamples=500, seed=1).as_record()
+    assert found.gains != compare(paths, resamples=500, seed=2).gains
+
+
+def test_different_rules_are_refused_and_named(tmp_path: Path) -> None:
+    one = run(tmp_path, "one", FIRST)
+    two = run(tmp_path, "two", FIRST, changes={"max_depth": 50.0})
+    with pytest.raises(InputError) as error:
+        compare([one, two])
+    assert str(error.value) == (
+        f"{one} and {two} were scored by different rules (max_depth None and 50.0); score both by"
+        " one protocol"
+    )
+    devkit = run(tmp_path, "three", FIRST, protocol="kitti-devkit")
+    with pytest.raises(InputError, match="definitions usual and kitti-devkit"):
+        compare([one, devkit])
+
+
+def test_rules_of_another_name_that_score_alike_are_compared(tmp_path: Path) -> None:
+    one, two = run(tmp_path, "one", FIRST), run(tmp_path, "two", FIRST, protocol="kitti")
+    assert compare([one, two]).gains[0]["rmse"].percent == 0
+
+
+def test_runs_without_a_common_frame_are_refused(tmp_path: Path) -> None:
+    one = run(tmp_path, "one", {"a": [1.0]})
+    (tmp_path / "gt" / "a.npy").unlink()
+    two = run(tmp_path, "two", {"b": [1.0]})
+    with pytest.raises(InputError, match="no scored frame in common: a; and b"):
+        compare([one, two])
+
+
+def test_other_pixels_and_other_truth_are_warned_of(tmp_path: Path) -> None:
+    one = run(tmp_path, "one", {"a": [1.0, 1.0]})
+    less = run(tmp_path, "less", {"a": [1.0, -10.0]})
+    (note,) = compare([one, less]).notes
+    assert "do not cover the same pixels (2 in" in note
+    other = run(tmp_path, "other", {"a": [1.0, 1.0, 1.0]})
+    (note,) = compare([one, other]).notes
+    assert "another number of pixels with truth" in note
+
+
+SCORES = {
+    "before": {"rmse": 2.0, "mae": 1.5, "delta1": 0.5, "pixels": 90, "coverage": 0.9},
+    "after": {"rmse": 1.0, "mae": 1.2, "delta1": 0.6, "pixels": 90, "coverage": 0.9},
+}
+
+
+def test_a_batch_is_compared_with_what_it_started_from(tmp_path: Path) -> None:
+    frames = [
+        {"name": "drive/1", "status": "done", "scores": SCORES},
+        {"name": "drive/2", "status": "done", "scores": SCORES},
+        {"name": "drive/3", "status": "failed", "scores": None},
+    ]
+    (tmp_path / "summary.json").write_text(json.dumps({"counts": {}, "frames": frames}))
+    for result in (tmp_path, tmp_path / "summary.json"):
+        found = compare([f"{tmp_path}/summary.json:before", str(result)])
+        assert found.names == ("drive/1", "drive/2")
+        assert [m.key for m in found.measures] == ["rmse", "mae", "delta1"]
+        assert found.gains[0]["rmse"].percent == 50
+        assert found.gains[0]["delta1"].percent == pytest.approx(20)
+        assert [r.label for r in found.runs] == ["summary:before", "summary"]
+
+
+def test_a_refinement_can_be_compared_with_an_evaluation(tmp_path: Path) -> None:
+    (tmp_path / "a.json").write_text(json.dumps({"settings": {}, "scores": SCORES}))
+    one = run(tmp_path, "one", {"a": [1.0] * 90})
+    found = compare([one, str(tmp_path / "a.json")])
+    assert found.names == ("a",)
+    assert [m.key for m in found.measures] == ["rmse", "mae", "delta1"]
+
+
+BROKEN = [
+    ("{}", "holds no scores"),
+    ('{"frames": []}', "holds no scores"),
+    ('{"scores": null}', "holds no scores"),
+    ('{"command": "eval"}', "does not hold scores as pnpdepth writes them"),
+    ('{"frames": [{"scores": {}}]}', "does not hold scores as pnpdepth writes them"),
+    ('{"scores": {"after": {"rmse": 1}}}', "does not hold scores as pnpdepth writes them"),
+    ("[1]", "no JSON object"),
+    ("nonsense", "not valid JSON"),
+]
+
+
+@pytest.mark.parametrize(("text", "said"), BROKEN)
+def test_a_file_without_scores_is_refused(tmp_path: Path, text: str, said: str) -> None:
+    one = run(tmp_path, "one", FIRST)
+    (tmp_path / "broken.json").write_text(text)
+    with pytest.raises(FileFormatError, match=said):
+        compare([one, str(tmp_path / "broken.json")])
+
+
+def test_before_is_only_for_what_has_one_and_one_run_is_none_to_compare(tmp_path: Path) -> None:
+    one = run(tmp_path, "one", FIRST)
+    with pytest.raises(UsageError, match="leave out :before"):
+        compare([one, f"{one}:before"])
+    with pytest.raises(UsageError, match="two runs"):
+        compare([one])
+    with pytest.raises(UsageError, match="--bootstrap 0"):
+        compare([one, one], resamples=0)

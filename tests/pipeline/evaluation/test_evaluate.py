@@ -1,0 +1,446 @@
+"""Evaluations of files and folders: values by hand and by plain numpy, and every warning."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from pnpdepth_cli.errors import InputError, SizeError, UsageError
+from pnpdepth_cli.io.depth import write_depth
+from pnpdepth_cli.io.layouts import PROTOCOLS as LAYOUT_PROTOCOLS
+from pnpdepth_cli.pipeline.evaluation.evaluate import evaluate
+from pnpdepth_cli.pipeline.evaluation.frame_reading import Scales
+from pnpdepth_cli.pipeline.evaluation.result import EvalRequest, Evaluation
+
+
+def depth_file(path: Path, rows: Any, scale: float = 1000) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_depth(path, np.array(rows, np.float32), scale=scale)
+    return path
+
+
+def scored(root: Path, **given: Any) -> Evaluation:
+    changes = {
+        name: given.pop(name)
+        for name in list(given)
+        if name not in ("protocol", "sparse", "scales", "resamples", "seed", "workers")
+    }
+    return evaluate(
+        EvalRequest(prediction=root / "out", truth=root / "gt", changes=changes, **given)
+    )
+
+
+@pytest.fixture
+def two(tmp_path: Path) -> Path:
+    """Two frames: errors of 1 and 1 m over two pixels, and of 3 m over one, half predicted."""
+    depth_file(tmp_path / "out" / "a_depth.npy", [[2, 3]])
+    depth_file(tmp_path / "gt" / "a.npy", [[1, 4]])
+    depth_file(tmp_path / "out" / "ü b_depth.npy", [[8, 0]])
+    depth_file(tmp_path / "gt" / "ü b.npy", [[5, 5]])
+    return tmp_path
+
+
+def test_each_image_counts_alike_or_each_pixel(two: Path) -> None:
+    per_image, pooled = scored(two), scored(two, average="pooled")
+    assert per_image.mean["rmse"] == (1 + 3) / 2
+    assert per_image.mean["mre"] == (0.625 + 0.6) / 2
+    assert pooled.mean["rmse"] == pytest.approx(math.sqrt((1 + 1 + 9) / 3))
+    assert pooled.mean["mae"] == pytest.approx(5 / 3)
+    assert per_image.frames[0].values == pooled.frames[0].values
+
+
+def test_coverage_is_of_each_frame_and_of_all(two: Path) -> None:
+    found = scored(two)
+    assert [(f.name, f.pixels, f.known, f.coverage) for f in found.frames] == [
+        ("a", 2, 2, 1.0), ("ü b", 1, 2, 0.5),
+    ]  # fmt: skip
+    assert found.coverage == 0.75
+    assert any("1 pixels (25.00%) of the truth have no prediction" in n for n in found.notes)
+    assert found.unscored() is None
+
+
+def test_a_frame_without_prediction_is_counted_and_lowers_the_coverage(two: Path) -> None:
+    depth_file(two / "gt" / "c.npy", [[1, 1]])
+    found = scored(two)
+    assert [frame.name for frame in found.missing] == ["c"]
+    assert found.mean["rmse"] == 2
+    assert found.coverage == 3 / 6
+    assert found.unscored() == (
+        "1 of 3 frames were not scored (1 without prediction, 0 with a faulty file); the means are"
+        " over the other 2"
+    )
+    assert "warning: 1 of 3 frames have no prediction: c" in found.notes
+
+
+FAULTS = [
+    (lambda p: p.write_bytes(b"no depth"), "is not a depth file"),
+    (lambda p: depth_file(p, [[0, 0]]), "holds no valid depth"),
+    (lambda p: depth_file(p, [[1, 1, 1]]), "is 3×1 but the truth"),
+]
+
+
+@pytest.mark.parametrize(("spoil", "said"), FAULTS)
+def test_a_frame_at_fault_is_told_and_stops_no_other(two: Path, spoil: Any, said: str) -> None:
+    spoil(two / "out" / "a_depth.npy")
+    found = scored(two)
+    assert [frame.name for frame in found.failed] == ["a"]
+    assert found.mean["rmse"] == 3
+    assert said in (found.frames[0].error or "")
+    assert any(note.startswith("warning: frame a was not scored") for note in found.notes)
+    assert "1 with a faulty file" in (found.unscored() or "")
+
+
+def test_where_nothing_can_be_scored_the_first_reason_is_the_error(two: Path) -> None:
+    for name in ("a_depth.npy", "ü b_depth.npy"):
+        depth_file(two / "out" / name, [[0, 0]])
+    with pytest.raises(InputError, match=r"no frame could be scored; the first: .*a_depth\.npy"):
+        scored(two)
+
+
+def test_two_single_files_raise_what_is_wrong_with_them(two: Path) -> None:
+    prediction, truth = two / "out" / "a_depth.npy", two / "gt" / "a.npy"
+    found = evaluate(EvalRequest(prediction=prediction, truth=truth))
+    assert (found.mean["rmse"], found.interval) == (1, None)
+    depth_file(prediction, [[1, 1, 1]])
+    with pytest.raises(
+        SizeError, match=r"a_depth\.npy is 3×1 but the truth .*a\.npy is 2×1; --res"
+    ):
+        evaluate(EvalRequest(prediction=prediction, truth=truth))
+    depth_file(prediction, [[0, 0]])
+    with pytest.raises(InputError, match="holds no valid depth"):
+        evaluate(EvalRequest(prediction=prediction, truth=truth))
+    depth_file(truth, [[0, 0]])
+    with pytest.raises(InputError, match=r"a\.npy has no known depth where protocol paper scores"):
+        evaluate(EvalRequest(prediction=prediction, truth=truth))
+
+
+def brute(p: np.ndarray, g: np.ndarray, counts: np.ndarray) -> dict[str, float]:
+    """Per image, plain numpy in double precision."""
+    both = counts & (g > 0) & (p > 0)
+    p, g = p[both].astype(float), g[both].astype(float)
+    return {
+        "rmse": float(np.sqrt(np.mean((p - g) ** 2))),
+        "mae": float(np.mean(abs(p - g))),
+        "mre": float(np.mean(abs(p - g) / g)),
+        "sq_rel": float(np.mean((p - g) ** 2 / g)),
+        "log10": float(np.mean(abs(np.log10(p / g)))),
+        "rmse_log": float(np.sqrt(np.mean(np.log(p / g) ** 2))),
+        "irmse": float(1000 * np.sqrt(np.mean((1 / p - 1 / g) ** 2))),
+        "imae": float(1000 * np.mean(abs(1 / p - 1 / g))),
+        "silog": float(100 * np.std(np.log(p / g))),
+        **{f"delta{k}": float(np.mean(np.maximum(p / g, g / p) < 1.25**k)) for k in (1, 2, 3)},
+    }
+
+
+@pytest.fixture(scope="module")
+def random_frames(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, np.ndarray, np.ndarray]:
+    """Four frames of 640×480 with truth from 0.2 to 12 m, and predictions with holes."""
+    root, rng = tmp_path_factory.mktemp("random"), np.random.default_rng(0)
+    truth = rng.uniform(0.2, 12, (4, 480, 640)).astype(np.float32)
+    prediction = (truth * np.exp(rng.normal(0, 0.2, truth.shape))).astype(np.float32)
+    truth[rng.random(truth.shape) < 0.3] = 0
+    prediction[rng.random(truth.shape) < 0.1] = 0
+    for number in range(4):
+        depth_file(root / "out" / f"{number}_depth.npy", prediction[number])
+        depth_file(root / "gt" / f"{number}.npy", truth[number])
+    return root, prediction, truth
+
+
+def means(rows: list[dict[str, float]]) -> dict[str, Any]:
+    return {key: pytest.approx(np.mean([row[key] for row in rows]), rel=1e-9) for key in rows[0]}
+
+
+def test_a_published_protocol_is_what_plain_numpy_makes_of_its_definition(
+    random_frames: tuple[Path, np.ndarray, np.ndarray],
+) -> None:
+    root, prediction, truth = random_frames
+    inside = np.zeros(truth.shape[1:], bool)
+    inside[45:471, 41:601] = True
+    clipped = np.where(prediction > 0, np.clip(prediction, np.float32(1e-3), 10), 0)
+    rows = [
+        brute(p, g, inside & (g > 1e-3) & (g < 10)) for p, g in zip(clipped, truth, strict=True)
+    ]
+    assert scored(root, protocol="nyu").mean == means(rows)
+
+
+def test_crop_bounds_and_mask_can_each_be_given_alone(
+    random_frames: tuple[Path, np.ndarray, np.ndarray], tmp_path: Path
+) -> None:
+    root, prediction, truth = random_frames
+    everything = np.ones(truth.shape[1:], bool)
+    crop = np.zeros_like(everything)
+    crop[20:60, 10:110] = True
+    frames = list(zip(prediction, truth, strict=True))
+    assert scored(root, crop="10,20,100,40").mean == means([brute(p, g, crop) for p, g in frames])
+    far = scored(root, min_depth=2.0, max_depth=5.0)
+    assert far.mean == means([brute(p, g, (g > 2) & (g < 5)) for p, g in frames])
+    mask = np.random.default_rng(1).random(everything.shape) < 0.5
+    cv2.imwrite(str(tmp_path / "mask.png"), mask.astype(np.uint8) * 255)
+    np.save(tmp_path / "mask.npy", mask.astype(np.uint8))
+    expected = means([brute(p, g, mask) for p, g in frames])
+    assert scored(root, mask=tmp_path / "mask.png").mean == expected
+    assert scored(root, mask=tmp_path / "mask.npy").mean == expected
+
+
+def test_workers_change_nothing(random_frames: tuple[Path, np.ndarray, np.ndarray]) -> None:
+    root = random_frames[0]
+    one, four = scored(root, workers=1), scored(root, workers=4)
+    assert one.frames == four.frames
+    assert (one.mean, one.interval) == (four.mean, four.interval)
+
+
+def test_the_interval_holds_the_mean_and_is_of_the_seed(
+    random_frames: tuple[Path, np.ndarray, np.ndarray],
+) -> None:
+    root = random_frames[0]
+    found = scored(root, resamples=500, seed=1)
+    assert found.interval is not None
+    for key, mean in found.mean.items():
+        assert found.interval.low[key] <= mean <= found.interval.high[key], key
+    assert found.interval == scored(root, resamples=500, seed=1).interval
+    assert found.interval != scored(root, resamples=500, seed=2).interval
+    assert scored(root, resamples=0).interval is None
+
+
+def test_a_mask_of_another_size_or_missing_for_a_frame_is_a_fault(two: Path) -> None:
+    depth_file(two / "masks" / "a.npy", [[1, 0, 1]])
+    with pytest.raises(InputError, match=r"mask .*a\.npy is 3×1 but the truth"):
+        scored(two, mask=two / "masks")
+    depth_file(two / "masks" / "a.npy", [[1, 0]])
+    found = scored(two, mask=two / "masks")
+    assert found.frames[0].pixels == 1
+    assert "has no mask in" in (found.frames[1].error or "")
+
+
+def test_integer_files_are_read_by_option_then_by_themselves_then_by_protocol(
+    tmp_path: Path,
+) -> None:
+    codes = np.array([[1000, 2000]], np.uint16)
+    for folder in ("out", "gt"):
+        (tmp_path / folder).mkdir()
+        cv2.imwrite(str(tmp_path / folder / "a.png"), codes)
+    assert scored(tmp_path).mean["rmse"] == 0
+    by_option = scored(tmp_path, scales=Scales(prediction=1000.0))
+    assert by_option.frames[0].ratio == pytest.approx(0.256)
+    nyu = scored(tmp_path, protocol="nyu", crop="none")
+    assert any("÷ 1000; --gt-scale to change" in note for note in nyu.notes)
+    depth_file(tmp_path / "out" / "a.png", [[1, 2]], scale=100)
+    own = scored(tmp_path, protocol="nyu", crop="none")
+    assert own.mean["rmse"] == 0
+    assert any("÷ 100 (from the file)" in note for note in own.notes)
+
+
+FACTORS = [(1000.0, "1000"), (256.0, "256"), (0.1, "1/10"), (1000 / 256, "3.906"),
+           (256 / 1000, "1/3.906")]  # fmt: skip
+
+
+@pytest.mark.parametrize(("factor", "said"), FACTORS)
+def test_a_round_factor_between_the_two_sides_is_warned_of(
+    tmp_path: Path, factor: float, said: str
+) -> None:
+    truth = np.random.default_rng(0).uniform(1, 4, (6, 8)).astype(np.float32)
+    depth_file(tmp_path / "gt" / "a.npy", truth)
+    depth_file(tmp_path / "out" / "a.npy", truth * np.float32(factor * 1.03))
+    (warning,) = (n for n in scored(tmp_path).notes if n.startswith("warning"))
+    assert f"about {said}: a scale is probably wrong; float files hold metres" in warning
+
+
+def test_the_scale_that_would_help_is_named_and_helps(tmp_path: Path) -> None:
+    truth = np.random.default_rng(0).uniform(1, 4, (6, 8)).astype(np.float32)
+    depth_file(tmp_path / "out" / "a.png", truth)
+    (tmp_path / "gt").mkdir()
+    cv2.imwrite(str(tmp_path / "gt" / "a.png"), np.rint(truth * 1000).astype(np.uint16))
+    (warning,) = (n for n in scored(tmp_path).notes if n.startswith("warning"))
+    assert warning.endswith("; --gt-scale 1000 (now 256) would take it away")
+    (warning,) = (
+        n
+        for n in scored(tmp_path, scales=Scales(prediction=256_000.0)).notes
+        if n.startswith("warning")
+    )
+    assert "--pred-scale 256 (now 256000) or --gt-scale 256000 (now 256) would" in warning
+    right = scored(tmp_path, scales=Scales(truth=1000.0))
+    assert right.mean["rmse"] == pytest.approx(0, abs=1e-6)
+    assert not [n for n in right.notes if n.startswith("warning")]
+
+
+def test_a_usual_error_is_no_factor(two: Path) -> None:
+    assert not [n for n in scored(two).notes if "scale is probably wrong" in n]
+
+
+def test_sparse_input_in_the_truth_is_warned_of_and_can_be_left_out(tmp_path: Path) -> None:
+    truth = np.random.default_rng(0).uniform(1, 4, (10, 10)).astype(np.float32)
+    points = np.zeros_like(truth)
+    points[0, :4] = truth[0, :4]  # the truth itself
+    points[1, :3] = truth[1, :3] + 0.2  # measured anew
+    prediction = np.where(points > 0, points, truth + 1)
+    depth_file(tmp_path / "gt" / "a.npy", truth)
+    depth_file(tmp_path / "out" / "a.npy", prediction)
+    depth_file(tmp_path / "sparse.npy", points)
+    found = scored(tmp_path, sparse=tmp_path / "sparse.npy")
+    (warning,) = (n for n in found.notes if n.startswith("warning"))
+    assert "4 of the scored pixels (4.00%) hold a value of the sparse input" in warning
+    assert "--exclude-sparse" in warning
+    without = scored(tmp_path, sparse=tmp_path / "sparse.npy", exclude_sparse=True)
+    assert without.frames[0].known == 93
+    assert without.mean["mae"] == pytest.approx(1)
+    assert not [n for n in without.notes if n.startswith("warning")]
+
+
+def test_the_same_depth_in_other_codes_is_still_the_sparse_input(tmp_path: Path) -> None:
+    truth = np.random.default_rng(0).uniform(1, 4, (10, 10)).astype(np.float32)
+    depth_file(tmp_path / "gt" / "a.png", truth, scale=256)
+    depth_file(tmp_path / "out" / "a.png", truth, scale=1000)
+    depth_file(tmp_path / "s.png", np.where(np.eye(10) > 0, truth, 0), scale=1000)
+    assert scored(tmp_path, sparse=tmp_path / "s.png").frames[0].given == 10
+
+
+def test_the_record_beside_a_prediction_is_enough_to_find_the_leak(two: Path) -> None:
+    sparse = depth_file(two / "s.npy", [[1, 0]])
+    record = {"inputs": {"sparse": {"path": str(sparse)}}}
+    (two / "out" / "a.json").write_text(json.dumps(record))
+    found = scored(two)
+    assert [(f.has_sparse, f.given) for f in found.frames] == [(True, 1), (False, 0)]
+    assert (found.by_distance, found.by_depth) == ((), ())
+    sampled = {"inputs": {"sparse": {"sampled_from": "gt"}}, "points": {"used": 2}}
+    (two / "out" / "a.json").write_text(json.dumps(sampled))
+    assert scored(two).frames[0].given == 2
+    with pytest.raises(InputError, match="no sparse depth file to exclude; give it with --sparse"):
+        scored(two, exclude_sparse=True)
+
+
+def test_a_sparse_file_that_the_record_names_but_is_spoilt_does_no_harm(two: Path) -> None:
+    (two / "s.npy").write_bytes(b"spoilt")
+    record = {"inputs": {"sparse": {"path": str(two / "s.npy")}}}
+    (two / "out" / "a.json").write_text(json.dumps(record))
+    assert [f.has_sparse for f in scored(two).scored] == [False, False]
+    assert scored(two, sparse=two / "out").frames[0].given == 0
+
+
+def test_the_parts_by_distance_and_by_depth_are_plain_numpy(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    truth = rng.uniform(0.5, 30, (40, 50)).astype(np.float32)
+    prediction = (truth * rng.uniform(0.8, 1.2, truth.shape)).astype(np.float32)
+    prediction[:3] = 0
+    points = np.zeros_like(truth)
+    places = [(5, 5), (30, 44), (39, 0)]
+    for v, u in places:
+        points[v, u] = 2
+    for folder, depth in (("out", prediction), ("gt", truth)):
+        depth_file(tmp_path / folder / "a.npy", depth)
+        depth_file(tmp_path / folder / "b.npy", depth)
+    found = scored(tmp_path, sparse=depth_file(tmp_path / "s.npy", points))
+    v, u = np.mgrid[:40, :50]
+    distance = np.min([np.hypot(v - y, u - x) for y, x in places], axis=0)
+    for parts, quantity in ((found.by_distance, distance), (found.by_depth, truth)):
+        assert sum(part.known for part in parts) == 2 * truth.size
+        for part in parts:
+            inside = (quantity >= part.low) & (quantity < part.high)
+            assert part.known == 2 * inside.sum()
+            assert part.pixels == 2 * (inside & (prediction > 0)).sum()
+            expected = brute(prediction, truth, inside)
+            for key in ("rmse", "mae", "mre"):
+                assert getattr(part, key) == pytest.approx(expected[key], rel=1e-9), part
+
+
+def test_a_smaller_prediction_is_resized_only_where_asked(tmp_path: Path) -> None:
+    depth_file(tmp_path / "gt" / "a.npy", [[1, 1, 3, 3], [1, 1, 3, 3]])
+    depth_file(tmp_path / "out" / "a.npy", [[1, 3]])
+    with pytest.raises(InputError, match="--resize nearest or bilinear"):
+        scored(tmp_path)
+    assert scored(tmp_path, resize="nearest").mean["mae"] == 0
+    assert scored(tmp_path, resize="bilinear").mean["mae"] == 0.25
+    depth_file(tmp_path / "out" / "a.npy", [[0, 3]])
+    found = scored(tmp_path, resize="bilinear")
+    assert (found.frames[0].pixels, found.mean["mae"]) == (4, 0)
+
+
+def test_the_development_kits_figures_come_with_their_own_names_and_fill(two: Path) -> None:
+    found = scored(two, protocol="kitti-devkit")
+    assert list(found.mean) == [
+        "mae", "rmse", "inverse_mae", "inverse_rmse", "log_mae", "log_rmse",
+        "scale_invariant_log", "abs_relative", "squared_relative",
+    ]  # fmt: skip
+    assert found.frames[1].values["mae"] == 3
+    assert found.frames[1].coverage == 0.5
+    assert any("was filled in from its neighbours" in note for note in found.notes)
+
+
+def test_the_development_kit_takes_the_largest_code_for_a_depth(tmp_path: Path) -> None:
+    for folder, codes in (("out", [[65535, 512]]), ("gt", [[256, 512]])):
+        (tmp_path / folder).mkdir()
+        cv2.imwrite(str(tmp_path / folder / "a.png"), np.array(codes, np.uint16))
+    devkit = scored(tmp_path, protocol="kitti-devkit")
+    assert devkit.mean["mae"] == pytest.approx((65535 / 256 - 1) / 2)
+    assert scored(tmp_path).frames[0].pixels == 1
+
+
+def test_empty_rows_that_the_kit_does_not_fill_are_told(tmp_path: Path) -> None:
+    depth_file(tmp_path / "out" / "a.npy", [[1], [0], [1]])
+    depth_file(tmp_path / "gt" / "a.npy", [[1], [1], [1]])
+    found = scored(tmp_path, protocol="kitti-devkit")
+    assert found.mean["mae"] == pytest.approx(2 / 3)
+    assert math.isnan(found.mean["log_mae"])
+    assert any("empty rows between others" in note for note in found.notes)
+    assert found.as_record()["mean"]["log_mae"] is None
+
+
+def test_the_truth_of_a_data_set_is_cut_as_its_layout_says(tmp_path: Path) -> None:
+    h5py = pytest.importorskip("h5py")
+    truth = np.random.default_rng(0).uniform(1, 4, (480, 640)).astype(np.float32)
+    (tmp_path / "gt").mkdir()
+    with h5py.File(tmp_path / "gt" / "00001.h5", "w") as file:
+        file["rgb"], file["depth"] = np.zeros((3, 480, 640), np.uint8), truth
+    cut = LAYOUT_PROTOCOLS["nyu"].apply(truth)
+    depth_file(tmp_path / "out" / "00001_depth.npy", cut)
+    found = scored(tmp_path)
+    assert (found.mean["rmse"], found.frames[0].pixels) == (0, 228 * 304)
+
+
+REFUSED = [
+    ({"scales": Scales(truth=0.0)}, "--gt-scale"),
+    ({"scales": Scales(prediction=math.nan)}, "--pred-scale"),
+    ({"workers": 0}, "--workers"),
+    ({"resamples": -1}, "--bootstrap"),
+]
+
+
+@pytest.mark.parametrize(("given", "said"), REFUSED)
+def test_an_option_without_sense_is_refused(two: Path, given: dict[str, Any], said: str) -> None:
+    with pytest.raises(UsageError, match=said):
+        scored(two, **given)
+
+
+def test_the_worst_frames_come_first_in_either_direction(two: Path) -> None:
+    found = scored(two)
+    assert [f.name for f in found.worst("rmse")] == ["ü b", "a"]
+    assert [f.name for f in found.worst("delta3")] == ["a", "ü b"]
+
+
+def test_progress_is_told_frame_by_frame(two: Path) -> None:
+    told: list[tuple[int, int]] = []
+    request = EvalRequest(prediction=two / "out", truth=two / "gt")
+    evaluate(request, on_frame=lambda done, of: told.append((done, of)))
+    assert told == [(1, 2), (2, 2)]
+
+
+def test_real_frames_of_kitti_score_as_plain_numpy_does(shared_data: Path) -> None:
+    """The scan itself against the accumulated truth: where it hits, it is good but not perfect."""
+    folder = shared_data / "kitti_dc"
+    request = EvalRequest(
+        prediction=folder / "velodyne_raw", truth=folder / "groundtruth", protocol="kitti"
+    )
+    found = evaluate(request)
+    assert len(found.scored) == 6
+    for frame in found.frames:
+        p, g = (
+            cv2.imread(str(folder / part / f"{frame.name}.png"), cv2.IMREAD_UNCHANGED) / 256
+            for part in ("velodyne_raw", "groundtruth")
+        )
+        expected = brute(p, g, np.ones(g.shape, bool))
+        assert frame.values == pytest.approx(expected, rel=1e-6)

@@ -1,0 +1,152 @@
+"""The development kit's figures: by hand, by plain loops, and as its own program printed them."""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from pnpdepth_cli.io.depth import read_depth
+from pnpdepth_cli.pipeline.evaluation.kitti_devkit import (
+    DEVKIT_MEASURES,
+    devkit_errors,
+    devkit_mean,
+    fill_background,
+)
+
+SAMPLES = Path(__file__).parents[3] / "samples"
+F = np.float32
+
+
+def filled_by_loops(depth: np.ndarray) -> np.ndarray:
+    """What the readme of the kit says of missing predictions, one pixel after the other."""
+    height, width = depth.shape
+    out = np.where(depth > 0, depth, F(-1))
+    for row in out:
+        places = [u for u in range(width) if row[u] >= 0]
+        for a, b in pairwise(places):
+            for u in range(a + 1, b):
+                row[u] = min(row[a], row[b])
+        if places:
+            row[: places[0]] = row[places[0]]
+            row[places[-1] + 1 :] = row[places[-1]]
+    for column in out.T:
+        places = [v for v in range(height) if column[v] >= 0]
+        if places:
+            column[: places[0]] = column[places[0]]
+            column[places[-1] + 1 :] = column[places[-1]]
+    return out
+
+
+def errors_by_loops(predicted: np.ndarray, truth: np.ndarray) -> dict[str, float]:
+    """The nine errors in single precision, added up down each column, column after column."""
+    predicted = filled_by_loops(predicted)
+    sums = {measure.key: F(0) for measure in DEVKIT_MEASURES}
+    log_sum, count = F(0), 0
+    height, width = truth.shape
+    for u in range(width):
+        for v in range(height):
+            g, p = truth[v, u], predicted[v, u]
+            if g <= 0:
+                continue
+            error = abs(g - p)
+            inverse = F(abs(1.0 / float(g) - 1.0 / float(p)))
+            log_p = F(math.log(p)) if p > 0 else F(math.nan)
+            log_error = F(math.log(g)) - log_p
+            sums["mae"] += error
+            sums["rmse"] += error * error
+            sums["inverse_mae"] += inverse
+            sums["inverse_rmse"] += inverse * inverse
+            sums["log_mae"] += abs(log_error)
+            sums["log_rmse"] += log_error * log_error
+            sums["abs_relative"] += error / g
+            sums["squared_relative"] += error * error / (g * g)
+            log_sum += log_error
+            count += 1
+    n = F(count)
+    found = {key: value / n for key, value in sums.items()}
+    with np.errstate(invalid="ignore"):
+        found["scale_invariant_log"] = np.sqrt(found["log_rmse"] - log_sum * log_sum / (n * n))
+    for key in ("rmse", "inverse_rmse", "log_rmse"):
+        found[key] = np.sqrt(found[key])
+    return {key: float(value) for key, value in found.items()}
+
+
+def codes(least: int) -> st.SearchStrategy[np.ndarray]:
+    """Small pictures of KITTI's codes, many of them unknown."""
+    some = st.one_of(st.just(0), st.integers(0, 3), st.integers(least, 20_000))
+    return arrays(np.uint16, (4, 5), elements=some)
+
+
+def metres(picture: np.ndarray) -> np.ndarray:
+    return picture.astype(F) / F(256)
+
+
+@given(codes(1))
+def test_what_is_missing_is_filled_as_by_the_loops_of_the_definition(picture: np.ndarray) -> None:
+    depth = metres(picture)
+    np.testing.assert_array_equal(fill_background(depth), filled_by_loops(depth))
+
+
+@given(codes(1), codes(1))
+def test_the_errors_are_those_of_the_loops_digit_for_digit(
+    predicted: np.ndarray, truth: np.ndarray
+) -> None:
+    truth[0, 0] = 256
+    found = devkit_errors(metres(predicted), metres(truth))
+    assert found == pytest.approx(
+        errors_by_loops(metres(predicted), metres(truth)), rel=0, abs=0, nan_ok=True
+    )
+
+
+def test_the_nearer_of_two_neighbours_fills_a_gap_and_the_outermost_goes_to_the_border() -> None:
+    depth = np.array([[0, 0, 0, 0, 0], [0, 7, 0, 0, 3], [0, 0, 5, 0, 0], [0, 0, 0, 0, 0]], F)
+    expected = [[7, 7, 3, 3, 3], [7, 7, 3, 3, 3], [5, 5, 5, 5, 5], [5, 5, 5, 5, 5]]
+    np.testing.assert_array_equal(fill_background(depth), np.array(expected, F))
+
+
+def test_an_empty_row_between_others_is_left_out_of_the_fill() -> None:
+    depth = np.array([[2, 2], [0, 0], [4, 4]], F)
+    assert fill_background(depth)[1].tolist() == [-1, -1]
+    errors = devkit_errors(depth, np.full((3, 2), 2, F))
+    assert errors["mae"] == pytest.approx((0 + 3 + 2) / 3)
+    assert math.isnan(errors["log_mae"])
+
+
+def test_nothing_at_all_stays_missing() -> None:
+    assert (fill_background(np.zeros((2, 3), F)) == -1).all()
+
+
+def test_two_pixels_by_hand() -> None:
+    errors = devkit_errors(np.array([[2, 3]], F), np.array([[1, 4]], F))
+    a, b = math.log(1 / 2), math.log(4 / 3)
+    expected = {
+        "mae": 1, "rmse": 1, "inverse_mae": (1 / 2 + 1 / 12) / 2,
+        "inverse_rmse": math.sqrt((1 / 4 + 1 / 144) / 2), "log_mae": (b - a) / 2,
+        "log_rmse": math.sqrt((a * a + b * b) / 2), "scale_invariant_log": (b - a) / 2,
+        "abs_relative": (1 + 1 / 4) / 2, "squared_relative": (1 + 1 / 16) / 2,
+    }  # fmt: skip
+    assert errors == pytest.approx(expected, rel=1e-6)
+
+
+def test_the_figures_are_those_of_the_official_program() -> None:
+    """Printed by evaluate_depth of the kit (g++ -O3) for the sample's scan and its truth."""
+    predicted = read_depth(SAMPLES / "street" / "sparse.png").values
+    truth = read_depth(SAMPLES / "street" / "gt.png").values
+    printed = "5.375677 11.679524 0.025707 0.039534 0.325306 0.521867 0.501333 0.289888 0.218769"
+    errors = devkit_errors(predicted, truth)
+    assert " ".join(f"{errors[measure.key]:f}" for measure in DEVKIT_MEASURES) == printed
+
+
+def test_the_mean_over_frames_is_added_up_in_single_precision_too() -> None:
+    values = np.random.default_rng(0).random((1000, 2))
+    total = np.zeros(2, F)
+    for row in values:
+        total = total + row.astype(F)
+    assert devkit_mean(values).tolist() == (total / F(1000)).astype(float).tolist()

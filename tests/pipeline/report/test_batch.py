@@ -1,0 +1,288 @@
+"""Reports of batches: what is on the page, where it comes from, and where it may not go."""
+
+from __future__ import annotations
+
+import io
+import shutil
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from pnpdepth_cli.errors import OutputError, StorageError
+from pnpdepth_cli.io.depth import read_depth
+from pnpdepth_cli.io.page import open_page
+from pnpdepth_cli.pipeline.batch.batch import plan_batch
+from pnpdepth_cli.pipeline.batch.frames import BatchRequest
+from pnpdepth_cli.pipeline.report import batch as report_batch
+from tests.pipeline.batches import NAMES, Heard, add_frame, batch, pairs_on_disk, refinement
+from tests.pipeline.report_pages import frames_of, page_data, pictures_of
+
+_VIEWS = {"first", "second", "map", "image", "sparse", "thumb", "map_thumb"}
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    return pairs_on_disk(tmp_path / "drive")
+
+
+@pytest.fixture
+def report(tmp_path: Path) -> Path:
+    return tmp_path / "report"
+
+
+def everything(folder: Path) -> dict[str, bytes]:
+    return {p.name: p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
+def test_every_frame_is_on_the_page_with_its_pictures(root: Path, report: Path) -> None:
+    batch(root, html=report)
+    frames = frames_of(report)
+    assert tuple(frames) == NAMES
+    pictures = pictures_of(report)
+    for frame in frames.values():
+        assert {n.partition("_")[2][:-4] for n in pictures if n.startswith(frame["key"])} == _VIEWS
+        assert {*frame["views"], "thumb", "map_thumb"} == _VIEWS
+    assert len(pictures) == len(NAMES) * len(_VIEWS)
+    assert all(each[:3] == b"\xff\xd8\xff" for each in pictures.values())
+
+
+def test_gains_are_those_of_depth_against_truth(root: Path, report: Path) -> None:
+    batch(root, html=report)
+    batch(root, output=root / "plain", refine={"iterations": 0})
+    truth = read_depth(root / "gt/b.png").values
+    before, after = (
+        np.abs(read_depth(root / out / "b_depth.png").values - truth).mean()
+        for out in ("plain", "out")
+    )
+    values = frames_of(report)["b"]["values"]
+    assert values["mae_before"] == pytest.approx(before, abs=3e-3)  # the files are 16-bit
+    assert values["mae_after"] == pytest.approx(after, abs=3e-3)
+    assert values["mae_gain"] == 1 - values["mae_after"] / values["mae_before"]
+    assert values["mae_gain"] != 0
+    assert 0 < values["improved"] < 1
+
+
+def test_the_pictures_are_the_panels_of_the_files_on_disk(root: Path, report: Path) -> None:
+    batch(root, html=report)
+    frame, pictures = frames_of(report)["c"], pictures_of(report)
+    preview, improvement = (
+        open_page(root / f"out/c_{kind}.png") for kind in ("preview", "improvement")
+    )
+    for view, panel in (
+        ("first", preview.panels()["Depth before"]),
+        ("second", preview.panels()["Depth after"]),
+        ("image", preview.panels()["Image"]),
+        ("map", improvement.panels()["Change of error"]),
+    ):
+        shown = np.asarray(Image.open(io.BytesIO(pictures[f"{frame['key']}_{view}.jpg"])))
+        scaled = cv2.resize(panel, shown.shape[1::-1], interpolation=cv2.INTER_AREA)
+        assert np.abs(shown.astype(int) - scaled).mean() < 6, view
+    assert frame["scale_m"] == [preview.said["low_m"], preview.said["high_m"]]
+    assert frame["map"]["footer"] == improvement.said["footer"]
+
+
+def test_frames_of_an_earlier_run_without_a_report_are_in_it(root: Path, report: Path) -> None:
+    batch(root, limit=2)
+    heard = Heard()
+    batch(root, heard, html=report)
+    assert heard.names == ["c", "d"]
+    resumed = everything(report)
+    shutil.rmtree(report)
+    shutil.rmtree(root / "out")
+    batch(root, html=report)
+    assert resumed == everything(report)
+
+
+def test_a_second_run_writes_the_same_page_and_draws_nothing(root: Path, report: Path) -> None:
+    batch(root, html=report)
+    before = everything(report)
+    drawn = {p: p.stat().st_mtime_ns for p in (report / "pictures").iterdir()}
+    batch(root, html=report)
+    assert before == everything(report)
+    assert drawn == {p: p.stat().st_mtime_ns for p in (report / "pictures").iterdir()}
+
+
+def test_a_frame_that_is_redone_has_new_pictures_and_the_old_ones_go(
+    root: Path, report: Path
+) -> None:
+    batch(root, html=report)
+    before = frames_of(report)
+    cv2.imwrite(str(root / "rgb/a.png"), cv2.imread(str(root / "rgb/a.png"))[:, ::-1])
+    batch(root, html=report)
+    after = frames_of(report)
+    assert {name for name in NAMES if before[name]["key"] != after[name]["key"]} == {"a"}
+    assert not [name for name in pictures_of(report) if name.startswith(before["a"]["key"])]
+    assert len(pictures_of(report)) == len(NAMES) * len(_VIEWS)
+
+
+def test_a_picture_that_is_missing_is_drawn_again(root: Path, report: Path) -> None:
+    batch(root, html=report)
+    before = everything(report)
+    (report / "pictures" / f"{frames_of(report)['b']['key']}_map.jpg").unlink()
+    batch(root, html=report)
+    assert before == everything(report)
+
+
+def test_a_failed_frame_is_listed_with_its_reason(root: Path, report: Path) -> None:
+    (root / "rgb/b.png").write_bytes(b"no picture")
+    batch(root, html=report)
+    data = page_data(report)
+    assert [frame["name"] for frame in data["frames"]] == ["a", "c", "d"]
+    (failed,) = data["without"]
+    assert failed["name"] == "b"
+    assert "b.png" in failed["reason"]
+    assert data["tiles"][0] == {
+        "label": "Frames refined", "value": "3 of 4", "remark": "1 failed"
+    }  # fmt: skip
+
+
+def test_a_batch_of_nothing_but_failures_has_a_report_too(root: Path, report: Path) -> None:
+    for name in NAMES:
+        (root / f"rgb/{name}.png").write_bytes(b"no picture")
+    batch(root, html=report)
+    assert frames_of(report) == {}
+    assert len(page_data(report)["without"]) == 4
+
+
+def test_a_batch_that_is_stopped_has_a_report_of_what_is_done(root: Path, report: Path) -> None:
+    answers = iter([False, True, True, True])
+    batch(root, html=report, stopped=lambda: next(answers))
+    assert list(frames_of(report)) == ["a"]
+    assert page_data(report)["tiles"][0]["remark"] == "3 pending"
+
+
+def titles(report: Path) -> list[str]:
+    return [column["title"] for column in page_data(report)["columns"]]
+
+
+def test_without_truth_gains_are_those_at_held_out_points(root: Path, report: Path) -> None:
+    shutil.rmtree(root / "gt")
+    batch(root, html=report, refine={"holdout": 0.3})
+    frame = frames_of(report)["a"]
+    assert frame["values"]["rmse_gain"] is not None
+    assert any("at held-out points" in note for note in frame["notes"])
+    tables = [table["caption"] for table in page_data(report)["tables"]]
+    assert tables == [
+        "Means over 4 frames, at held-out points", "Means over 4 frames, at the points used",
+    ]  # fmt: skip
+
+
+def test_with_neither_truth_nor_held_out_points_there_is_no_gain(root: Path, report: Path) -> None:
+    shutil.rmtree(root / "gt")
+    batch(root, html=report)
+    assert not [title for title in titles(report) if "gain" in title]
+    data = page_data(report)
+    assert data["columns"][data["sort_by"]]["key"] == "rmse_after"
+    assert data["tables"][0]["header"] == ["", "before", "after"]
+    assert any("proves nothing" in note for note in frames_of(report)["a"]["notes"])
+
+
+def test_where_only_some_frames_have_truth_the_others_have_no_figures(
+    root: Path, report: Path
+) -> None:
+    for name in "bcd":
+        (root / f"gt/{name}.png").unlink()
+    batch(root, html=report)
+    frames = frames_of(report)
+    assert frames["a"]["values"]["rmse_gain"] is not None
+    assert set(frames["b"]["values"].values()) == {None}
+    assert (frames["a"]["tag"], frames["b"]["tag"]) == ("against the truth", "at the points used")
+
+
+def test_the_shard_that_ends_last_reports_all_frames(root: Path, report: Path) -> None:
+    batch(root, html=report, shard=(1, 2))
+    assert list(frames_of(report)) == ["a", "c"]
+    batch(root, html=report, shard=(2, 2))
+    assert tuple(frames_of(report)) == NAMES
+    assert len(pictures_of(report)) == len(NAMES) * len(_VIEWS)
+
+
+def test_strange_names_of_frames_reach_the_page_as_they_are(root: Path, report: Path) -> None:
+    names = ["<b>&'\"", "two\nlines", "ü \u2028"]
+    for name in names:
+        add_frame(root, name)
+    batch(root, html=report)
+    assert set(names) <= set(frames_of(report))
+
+
+def test_the_report_may_lie_in_the_results_and_the_results_among_the_frames(root: Path) -> None:
+    report = root / "out" / "report"
+    for _ in range(2):
+        batch(root, html=report)
+        assert tuple(frames_of(report)) == NAMES
+
+
+def refused(root: Path, place: Path, **changes: Any) -> str:
+    request = BatchRequest(
+        source=root, output=root / "out", html=place, refine=refinement(root, **changes)
+    )
+    with pytest.raises(OutputError) as first:
+        batch(root, html=place, refine=changes)
+    with pytest.raises(OutputError) as planned:
+        plan_batch(request, lambda text: None)
+    assert str(first.value) == str(planned.value)
+    return str(first.value)
+
+
+def test_places_among_the_inputs_or_around_them_are_refused(root: Path, tmp_path: Path) -> None:
+    assert "which is read" in refused(root, root / "rgb" / "report", overwrite=True)
+    for place in (root, root / "out", tmp_path):
+        assert "holds the results" in refused(root, place, overwrite=True)
+    assert not (root / "out").exists()
+
+
+def test_a_list_has_its_files_elsewhere_which_are_safe_as_well(root: Path, tmp_path: Path) -> None:
+    listed = tmp_path / "frames.csv"
+    listed.write_text("image,sparse\ndrive/rgb/a.png,drive/sparse/a.png\n")
+    with pytest.raises(OutputError, match=r"holds .*rgb/a\.png, which is read"):
+        batch(root, source=listed, output=tmp_path / "out", html=root, refine={"overwrite": True})
+
+
+def test_another_batchs_report_is_replaced_only_if_asked(root: Path, report: Path) -> None:
+    batch(root, html=report)
+    before = everything(report)
+    with pytest.raises(OutputError, match="--overwrite replaces the report"):
+        batch(root, output=root / "other", html=report)
+    assert everything(report) == before
+    batch(root, output=root / "other", html=report, refine={"overwrite": True})
+    assert page_data(report)["title"].endswith("other")
+
+
+def test_a_preview_that_went_missing_costs_one_frame_its_pictures(root: Path, report: Path) -> None:
+    batch(root)
+    (root / "out/b_preview.png").unlink()
+    batch(root, limit=1, html=report)
+    frames = frames_of(report)
+    assert frames["b"]["key"] is None
+    assert all(frames[name]["key"] for name in "acd")
+    assert frames["b"]["values"]["rmse_gain"] is not None
+
+
+def test_a_disk_that_is_full_while_drawing_ends_the_run_and_the_next_one_goes_on(
+    root: Path, report: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drawn: list[str] = []
+    save = report_batch.save_pictures
+
+    def full_at_the_second(folder: Path, key: str, *views: Any, **others: Any) -> None:
+        drawn.append(key)
+        if len(drawn) == 2:
+            raise StorageError("the disk is full")
+        save(folder, key, *views, **others)
+
+    monkeypatch.setattr(report_batch, "save_pictures", full_at_the_second)
+    with pytest.raises(StorageError):
+        batch(root, html=report)
+    assert not (report / "index.html").exists()
+    (report / "pictures" / ".0123456789ab.jpg").write_bytes(b"half")
+    heard = Heard()
+    batch(root, heard, html=report)
+    assert heard.said[1].startswith("removed 1 half-written files")
+    resumed = everything(report)
+    shutil.rmtree(report)
+    batch(root, html=report)
+    assert resumed == everything(report)

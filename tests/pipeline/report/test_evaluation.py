@@ -1,0 +1,159 @@
+"""Reports of evaluations: what is on the page, and what the pictures show."""
+
+from __future__ import annotations
+
+import io
+import json
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from pnpdepth_cli.io.depth import write_depth
+from pnpdepth_cli.pipeline.evaluation.evaluate import evaluate
+from pnpdepth_cli.pipeline.evaluation.result import EvalRequest, Evaluation
+from pnpdepth_cli.pipeline.report.evaluation import write_eval_report
+from tests.pipeline.report_pages import frames_of, page_data, pictures_of
+
+NAMES = ("a", "b <i>", "c\nd")
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    rng = np.random.default_rng(0)
+    for number, name in enumerate(NAMES):
+        truth = rng.uniform(1, 9, (60, 80)).astype(np.float32)
+        for folder, depth in (("out", truth + 0.1 * (number + 1)), ("gt", truth)):
+            (tmp_path / folder).mkdir(exist_ok=True)
+            write_depth(tmp_path / folder / f"{name}.npy", depth.astype(np.float32))
+    return tmp_path
+
+
+def reported(root: Path, **given: Any) -> Evaluation:
+    found = evaluate(EvalRequest(prediction=root / "out", truth=root / "gt", **given))
+    write_eval_report(root / "report", found)
+    return found
+
+
+def picture(root: Path, name: str, view: str) -> np.ndarray:
+    key = frames_of(root / "report")[name]["key"]
+    data = pictures_of(root / "report")[f"{key}_{view}.jpg"]
+    return np.asarray(Image.open(io.BytesIO(data))).astype(int)
+
+
+def test_the_page_has_the_means_the_protocol_and_every_frame(root: Path) -> None:
+    found = reported(root, protocol="kitti")
+    data = page_data(root / "report")
+    assert dict(data["facts"])["Protocol"] == found.protocol.describe()
+    assert data["tables"][0]["rows"][0][:2] == ["RMSE [mm] ↓", "200.0"]
+    assert data["columns"][data["sort_by"]]["key"] == "rmse"
+    frames = frames_of(root / "report")
+    assert tuple(frames) == NAMES
+    for row in found.frames:
+        assert frames[row.name]["values"] == row.values | {"coverage": 1.0}
+    (rmse,) = (column for column in data["columns"] if column["key"] == "rmse")
+    assert (rmse["unit"], rmse["factor"]) == ("mm", 1000)
+
+
+def test_unscored_frames_are_listed_with_their_reason(root: Path) -> None:
+    (root / "out/a.npy").unlink()
+    (root / "out/b <i>.npy").write_bytes(b"broken")
+    reported(root)
+    data = page_data(root / "report")
+    assert [each["name"] for each in data["without"]] == ["a", "b <i>"]
+    assert data["without"][0]["reason"] == "there is no prediction"
+    assert data["tiles"][0]["value"] == "1 of 3"
+    assert data["tiles"][0]["remark"] == "1 without prediction, 1 with a faulty file"
+    assert list(frames_of(root / "report")) == ["c\nd"]
+
+
+def test_the_slider_has_prediction_and_truth_in_the_same_colours(root: Path) -> None:
+    truth = np.full((60, 80), 2, np.float32)
+    truth[:, 40:] = 6
+    write_depth(root / "gt/a.npy", truth)
+    write_depth(root / "out/a.npy", truth[:, ::-1].copy())
+    reported(root)
+    first, second = picture(root, "a", "first"), picture(root, "a", "second")
+    assert np.abs(first - second[:, ::-1]).mean() < 3
+    low, high = frames_of(root / "report")["a"]["scale_m"]
+    assert (low, high) == (2, 6)
+
+
+def test_the_map_is_orange_where_the_prediction_is_too_far_and_dark_where_none_counts(
+    root: Path,
+) -> None:
+    truth = np.full((60, 80), 4, np.float32)
+    truth[:20] = 0
+    prediction = np.full((60, 80), 4, np.float32)
+    prediction[:, 40:] = 5
+    write_depth(root / "gt/a.npy", truth)
+    write_depth(root / "out/a.npy", prediction)
+    reported(root)
+    shown = picture(root, "a", "map")
+    height, width = shown.shape[:2]
+    unknown = shown[: height // 4].mean((0, 1))
+    right = shown[height // 2 :, : width // 3].mean((0, 1))
+    far = shown[height // 2 :, 2 * width // 3 :].mean((0, 1))
+    assert unknown.max() < 80
+    assert right.min() > 180
+    assert far == pytest.approx([220, 105, 0], abs=6)
+    said = frames_of(root / "report")["a"]["map"]
+    assert said["ends"] == ["too near by 1 m or more", "too far by 1 m or more"]
+    assert said["unknown"] == "not scored"
+
+
+def test_the_image_is_shown_where_the_predictions_record_names_one(root: Path) -> None:
+    image = np.full((60, 80, 3), (0, 0, 255), np.uint8)
+    cv2.imwrite(str(root / "img.png"), image)
+    cv2.imwrite(str(root / "other.png"), image[:30])
+    for name, file in (("a", "img.png"), ("b <i>", "other.png"), ("c\nd", "none.png")):
+        record = {"inputs": {"image": {"path": str(root / file)}}}
+        (root / f"out/{name}.json").write_text(json.dumps(record))
+    reported(root)
+    views = [frame["views"] for frame in frames_of(root / "report").values()]
+    assert ["image" in each for each in views] == [True, False, False]
+    assert picture(root, "a", "image").mean((0, 1)) == pytest.approx([255, 0, 0], abs=3)
+
+
+def test_with_sparse_points_the_errors_by_distance_and_depth_are_on_the_page(root: Path) -> None:
+    points = np.zeros((60, 80), np.float32)
+    points[30, 40] = 5
+    write_depth(root / "points.npy", points)
+    reported(root, sparse=root / "points.npy")
+    captions = [table["caption"] for table in page_data(root / "report")["tables"]]
+    assert captions[1:] == [
+        "By distance to the nearest sparse point, all pixels together",
+        "By depth of the truth, all pixels together",
+    ]
+
+
+def test_what_the_development_kit_fills_in_is_shown_filled(root: Path) -> None:
+    depth = np.full((60, 80), 4, np.float32)
+    write_depth(root / "gt/a.npy", depth)
+    depth[:, 20:40] = 0
+    write_depth(root / "out/a.npy", depth)
+    reported(root, protocol="kitti-devkit")
+    assert page_data(root / "report")["labels"]["first"] == "Prediction (filled in)"
+    assert frames_of(root / "report")["a"]["map"]["unknown"] is None
+    shown = picture(root, "a", "first")
+    assert np.abs(shown - shown[0, 0]).max() < 6
+
+
+def test_a_file_that_goes_after_scoring_costs_one_frame_its_pictures(root: Path) -> None:
+    found = evaluate(EvalRequest(prediction=root / "out", truth=root / "gt"))
+    (root / "out/a.npy").unlink()
+    write_eval_report(root / "report", found)
+    frames = frames_of(root / "report")
+    assert frames["a"]["key"] is None
+    assert "a.npy" in frames["a"]["notes"][-1]
+    assert frames["c\nd"]["key"]
+
+
+def test_the_same_evaluation_gives_the_same_bytes(root: Path) -> None:
+    reported(root, workers=1)
+    first = pictures_of(root / "report"), (root / "report/index.html").read_bytes()
+    reported(root, workers=3)
+    assert first == (pictures_of(root / "report"), (root / "report/index.html").read_bytes())

@@ -1,0 +1,271 @@
+"""project, sample and simulate, through files."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from pnpdepth_cli.errors import (
+    FileFormatError,
+    NoPointsError,
+    OutputError,
+    PnpDepthError,
+    SizeError,
+    UsageError,
+)
+from pnpdepth_cli.io.calibration import read_calibration
+from pnpdepth_cli.io.depth import DEPTH_SUFFIXES, read_depth, read_sparse
+from pnpdepth_cli.pipeline.sparse.outputs import SparseTarget
+from pnpdepth_cli.pipeline.sparse.project import ProjectRequest, project_scan
+from pnpdepth_cli.pipeline.sparse.sample import SampleRequest, sample_depth
+from pnpdepth_cli.pipeline.sparse.scans import ScanOptions, camera_of, read_scan_points
+from pnpdepth_cli.pipeline.sparse.simulate import SimulateRequest, find_sensor, simulate_scan
+from tests.pipeline.scan_frames import ScanOnDisk, scan_on_disk
+
+
+@pytest.fixture
+def frame(tmp_path: Path) -> ScanOnDisk:
+    return scan_on_disk(tmp_path)
+
+
+def projecting(frame: ScanOnDisk, output: str = "sparse.csv", **more: object) -> ProjectRequest:
+    scan = ScanOptions(calib=frame.calib)
+    target = SparseTarget(output=frame.folder / output)
+    request = ProjectRequest(scan=frame.scan, options=scan, target=target, image=frame.image)
+    return replace(request, **more)  # type: ignore[arg-type]
+
+
+def test_a_projected_scan_lands_where_it_was_made_to(frame: ScanOnDisk) -> None:
+    record = project_scan(projecting(frame))
+    got = read_sparse(frame.folder / "sparse.csv")
+    np.testing.assert_allclose(got.xy, frame.places, atol=1e-3)
+    np.testing.assert_allclose(got.depth, frame.depth, atol=1e-4)
+    assert record["points"]["count"] == 150
+    assert json.loads((frame.folder / "sparse.json").read_text()) == json.loads(json.dumps(record))
+
+
+@pytest.mark.parametrize("suffix", DEPTH_SUFFIXES)
+def test_every_depth_format_holds_the_same_points(frame: ScanOnDisk, suffix: str) -> None:
+    project_scan(projecting(frame, f"sparse{suffix}"))
+    got = read_depth(frame.folder / f"sparse{suffix}").values
+    column, row = np.floor(frame.places + 0.5).astype(int).T
+    want = np.zeros((48, 64))
+    want[row, column] = frame.depth
+    np.testing.assert_allclose(got, want, atol=0.002 if suffix == ".png" else 1e-4)
+
+
+def test_the_overlay_is_written_beside(frame: ScanOnDisk) -> None:
+    target = SparseTarget(output=frame.folder / "s.png", overlay=frame.folder / "o" / "over.png")
+    project_scan(projecting(frame, target=target))
+    assert cv2.imread(str(frame.folder / "o" / "over.png")).shape[1] > 300
+    again = replace(target, overwrite=True)
+    with pytest.raises(UsageError, match="needs the image"):
+        project_scan(projecting(frame, target=again, image=None, size=(48, 64)))
+
+
+def test_the_size_comes_from_image_option_or_calibration(frame: ScanOnDisk) -> None:
+    with pytest.raises(SizeError, match="does not say the picture's size"):
+        project_scan(projecting(frame, image=None))
+    by_option = project_scan(projecting(frame, image=None, size=(48, 64)))
+    frame.calib.write_text(frame.calib.read_text() + "size: [64, 48]\n")
+    by_file = project_scan(projecting(frame, "other.csv", image=None))
+    assert by_option["points"] == by_file["points"]
+
+
+def refused(frame: ScanOnDisk, error: type[PnpDepthError], said: str, **more: object) -> None:
+    before = sorted(frame.folder.rglob("*"))
+    with pytest.raises(error) as caught:
+        project_scan(projecting(frame, **more))  # type: ignore[arg-type]
+    assert said in str(caught.value)
+    assert "\n" not in str(caught.value)
+    assert sorted(frame.folder.rglob("*")) == before
+
+
+def test_bad_input_is_refused_in_one_line_and_nothing_is_written(frame: ScanOnDisk) -> None:
+    cut = frame.folder / "cut.bin"
+    cut.write_bytes(frame.scan.read_bytes()[:-3])
+    refused(frame, FileFormatError, "multiple of 16", scan=cut)
+    values = np.fromfile(frame.scan, "<f4")
+    values[9] = np.nan
+    values.tofile(cut)
+    refused(frame, FileFormatError, "1 of 150 points", scan=cut)
+    refused(frame, FileFormatError, "not a scan", scan=frame.image)
+    refused(frame, FileFormatError, "is not a picture", image=frame.scan)
+    refused(frame, UsageError, "needs --calib", options=ScanOptions())
+    behind = np.fromfile(frame.scan, "<f4").reshape(-1, 4) * [-1, 1, 1, 1]
+    behind.astype("<f4").tofile(cut)
+    refused(frame, NoPointsError, "150 behind the camera", scan=cut)
+
+
+def test_a_picture_of_another_camera_is_noticed(frame: ScanOnDisk) -> None:
+    small = frame.folder / "small.png"
+    Image.new("RGB", (20, 15)).save(small)
+    refused(frame, SizeError, "small.png is 20×15, which does not contain", image=small)
+    wide = frame.folder / "wide.png"
+    Image.new("RGB", (128, 48)).save(wide)
+    record = project_scan(projecting(frame, image=wide))
+    assert any(note.startswith("warning: the principal point") for note in record["notes"])
+    frame.calib.write_text(frame.calib.read_text() + "size: [64, 48]\n")
+    target = SparseTarget(output=frame.folder / "b.csv")
+    refused(frame, SizeError, "is of 64×48 pictures", image=wide, target=target)
+
+
+def test_a_calibration_without_a_scanner_is_refused(frame: ScanOnDisk) -> None:
+    frame.calib.write_text("60 0 31.5 0 60 23.5 0 0 1")
+    refused(frame, UsageError, "does not say where the scanner stands")
+
+
+def test_results_are_replaced_only_when_that_is_said(frame: ScanOnDisk) -> None:
+    project_scan(projecting(frame))
+    refused(frame, OutputError, "exists; --overwrite")
+    target = SparseTarget(output=frame.folder / "sparse.csv", overwrite=True)
+    project_scan(projecting(frame, target=target))
+    into = SparseTarget(output=frame.folder / "calib.csv", overwrite=True)
+    calib = frame.folder / "calib.json"
+    calib.write_text('{"K": [60, 0, 31.5, 0, 60, 23.5, 0, 0, 1]}')
+    refused(frame, OutputError, "is an input", target=into, options=ScanOptions(calib=calib))
+    below = SparseTarget(output=frame.gt / "s.png")
+    refused(frame, OutputError, "cannot be made", target=below)
+    scale = SparseTarget(output=frame.folder / "s.png", depth_scale=0)
+    refused(frame, UsageError, "--output-scale", target=scale)
+    refused(frame, OutputError, ".jpg", target=SparseTarget(output=frame.folder / "s.jpg"))
+
+
+def test_options_of_a_scan_are_refused_for_anything_else(frame: ScanOnDisk) -> None:
+    assert ScanOptions(calib=frame.calib).describes(frame.scan)
+    assert ScanOptions().describes(frame.scan)
+    assert ScanOptions(calib=frame.calib).describes(Path("scan.npy"))
+    assert not ScanOptions().describes(Path("sparse.npy"))
+    with pytest.raises(UsageError, match="is no scan"):
+        ScanOptions(keep_occluded=True).describes(frame.gt)
+
+
+def sampling(frame: ScanOnDisk, output: str, **more: object) -> SampleRequest:
+    target = SparseTarget(output=frame.folder / output)
+    return replace(SampleRequest(depth=frame.gt, target=target), **more)  # type: ignore[arg-type]
+
+
+def test_the_seed_is_in_the_png_and_in_the_record(frame: ScanOnDisk) -> None:
+    sample_depth(sampling(frame, "u.png", count=100, seed=11))
+    assert np.count_nonzero(read_depth(frame.folder / "u.png").values) == 100
+    made = json.loads(Image.open(frame.folder / "u.png").text["pnpdepth:made"])
+    assert made["seed"] == 11
+    assert made["pattern"]["kind"] == "uniform"
+    assert json.loads((frame.folder / "u.json").read_text())["seed"] == 11
+    assert read_depth(frame.folder / "u.png").scale == 256
+
+
+def test_the_same_seed_gives_the_same_bytes(frame: ScanOnDisk) -> None:
+    for name in ("a", "b"):
+        sample_depth(sampling(frame, f"{name}.png", share=0.1, noise={"metres": 0.1}, seed=2))
+    assert (frame.folder / "a.png").read_bytes() == (frame.folder / "b.png").read_bytes()
+
+
+def test_fewer_edges_than_asked_for_is_said(frame: ScanOnDisk) -> None:
+    request = sampling(frame, "e.png", pattern="edges", count=3000, image=frame.image)
+    picture = np.zeros((48, 64, 3), np.uint8)
+    picture[:, 30:] = 255
+    cv2.imwrite(str(frame.image), picture)
+    record = sample_depth(request)
+    assert record["points"]["count"] < 3000
+    assert any("of the 3,000 points asked for" in note for note in record["notes"])
+
+
+def simulating(frame: ScanOnDisk, output: str, **more: object) -> SimulateRequest:
+    target = SparseTarget(output=frame.folder / output)
+    request = SimulateRequest(depth=frame.gt, calib=frame.calib, target=target)
+    return replace(request, **more)  # type: ignore[arg-type]
+
+
+def test_a_simulated_sensor_of_ones_own_measures_the_truth(frame: ScanOnDisk) -> None:
+    sensor = frame.folder / "mine.toml"
+    sensor.write_text("top_deg = 20\nstep_deg = 2\nbeams = 21\nazimuth_step_deg = 0.5\n")
+    for output, place in (("camera.csv", {}), ("scanner.csv", {"at_scanner": True})):
+        record = simulate_scan(simulating(frame, output, sensor=str(sensor), **place))
+        got = read_sparse(frame.folder / output)
+        np.testing.assert_allclose(got.depth, 4 + 0.02 * got.xy[:, 0], atol=0.02)
+        assert record["sensor"]["name"] == "mine"
+        assert record["sensor"]["max_range"] is None
+        assert len(got.depth) > 500
+
+
+def test_the_scanner_can_stand_beside_the_camera(frame: ScanOnDisk) -> None:
+    record = simulate_scan(simulating(frame, "s.csv", sensor="vlp-16", offset=(0.5, 0.0, -0.1)))
+    assert record["translation"] == [0.5, 0, -0.1]
+    with pytest.raises(UsageError, match="leave out --offset"):
+        simulate_scan(simulating(frame, "t.csv", offset=(0.0, 0.0, 0.0), at_scanner=True))
+
+
+def test_an_unknown_sensor_is_answered_with_the_known_ones() -> None:
+    with pytest.raises(UsageError, match="vlp-16, vlp-32c"):
+        find_sensor("vlp-17")
+
+
+def test_kittis_frames_project_to_the_density_of_the_data_sets_own(
+    shared_data: Path, tmp_path: Path
+) -> None:
+    folder = shared_data / "kitti_object"
+    for image in sorted((folder / "image_2").glob("*.png")):
+        record = project_scan(
+            ProjectRequest(
+                scan=folder / "velodyne" / f"{image.stem}.bin",
+                options=ScanOptions(calib=folder / "calib" / f"{image.stem}.txt"),
+                target=SparseTarget(output=tmp_path / f"{image.stem}.png"),
+                image=image,
+            )
+        )
+        assert 0.033 < record["points"]["share_of_pixels"] < 0.045
+
+
+def test_kittis_own_projected_scan_comes_back_from_the_scanners_frame(
+    shared_data: Path, tmp_path: Path
+) -> None:
+    folder = shared_data / "kitti_dc"
+    name = "0000000005.png"
+    theirs = cv2.imread(str(folder / "velodyne_raw" / name), cv2.IMREAD_UNCHANGED)
+    camera = camera_of(read_calibration(folder, 2))
+    row, column = np.nonzero(theirs)
+    xy = np.column_stack([column, row]).astype(np.float64)
+    points = camera.to_scanner(camera.unproject(xy, theirs[row, column] / 256))
+    scan = tmp_path / "scan.bin"
+    np.column_stack([points, np.zeros(len(points))]).astype("<f4").tofile(scan)
+    project_scan(
+        ProjectRequest(
+            scan=scan,
+            options=ScanOptions(calib=folder, camera=2, keep_occluded=True),
+            target=SparseTarget(output=tmp_path / "sparse.png"),
+            image=folder / "image" / "0000000005.jpg",
+        )
+    )
+    ours = cv2.imread(str(tmp_path / "sparse.png"), cv2.IMREAD_UNCHANGED)
+    assert np.array_equal(ours, theirs)
+
+
+@pytest.mark.parametrize("camera", range(4))
+def test_kittis_scans_land_where_the_development_kits_formula_puts_them(
+    shared_data: Path, camera: int
+) -> None:
+    folder = shared_data / "kitti_object"
+    scan = np.fromfile(folder / "velodyne" / "000002.bin", "<f4").reshape(-1, 4)
+    calib = folder / "calib" / "000002.txt"
+    lines = (line.partition(":") for line in calib.read_text().splitlines() if line)
+    rows = {name: np.array(values.split(), float) for name, _, values in lines}
+    rectify, velo_to_cam = np.eye(4), np.eye(4)
+    rectify[:3, :3] = rows["R0_rect"].reshape(3, 3)
+    velo_to_cam[:3] = rows["Tr_velo_to_cam"].reshape(3, 4)
+    projection = rows[f"P{camera}"].reshape(3, 4) @ rectify @ velo_to_cam
+    u, v, depth = projection @ np.column_stack([scan[:, :3], np.ones(len(scan))]).T
+    options = ScanOptions(calib=calib, camera=camera, keep_occluded=True)
+    got = read_scan_points(folder / "velodyne" / "000002.bin", options, (375, 1242)).points
+    want = np.column_stack([u / depth, v / depth])[got.index]
+    np.testing.assert_allclose(got.xy, want, atol=1e-3)
+    np.testing.assert_allclose(got.depth, depth[got.index], rtol=1e-5)
+    x, y = u / depth, v / depth
+    inside = (depth > 0) & (x >= -0.5) & (x < 1241.5) & (y >= -0.5) & (y < 374.5)
+    assert len(got.depth) == inside.sum() - got.dropped["behind another in their pixel"]
