@@ -166,7 +166,7 @@ RECIPES = {
         loss=log_error, batch=16, farthest=KINECT, spliced=0.7, dropout=0.3,
         flat={"coarse.fc2": 0.75, "fine.conv3": 0.0}, start=hand_coarse_depth_on,
         stages=(
-            Stage(window=ROOM, until=0.75, outputs=coarse),
+            Stage(window=ROOM, until=0.8, outputs=coarse),
             Stage(window=ROOM, outputs=fine_and_coarse),
         ),
     ),
