@@ -246,6 +246,12 @@ _REFINEMENT_OPTIONS = (
         help="Keep this share of the points out, and score them.",
     ),
     click.option("--seed", type=int, default=0, show_default=True, help="Of the hold-out choice."),
+    click.option(
+        "--tile",
+        type=click.IntRange(min=64),
+        metavar="PIXELS",
+        help="Refine a frame larger than that in tiles of this side, where memory is short.",
+    ),
     precision,
     device,
 )

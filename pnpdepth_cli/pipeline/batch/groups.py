@@ -58,6 +58,10 @@ class FrameGroups:
             if wanted not in (None, 1):
                 say("batch size: 1; what goes by held-out points is chosen for each frame alone")
             wanted = 1
+        elif refiner.request.tile is not None:
+            if wanted not in (None, 1):
+                say("batch size: 1; tiles go through the network one by one")
+            wanted = 1
         self._refiner, self._split = refiner, split
         self._wanted, self._say = wanted, say
         self._found: dict[tuple[int, int], int] = {}  # by size, how many go together

@@ -32,7 +32,7 @@ from pnpdepth_cli.pipeline.refinement.ways import Depths, Trajectory, Trial, Way
 FOLDS = 4
 FEWEST = 5
 """With fewer points than this none is held out."""
-ENOUGH = 1500
+ENOUGH = 250
 """With this many held-out points no further fold is looked at."""
 SPREADING = ("gp", "diffusion")
 UPDATES = (1, 2, 3, 5, 10, 20)
@@ -245,11 +245,10 @@ def _chosen(
     if only is not None:
         scored(only)
     else:
-        for trial in trials:
-            errors = scored([Way(trial=trial, iterations=k) for k in (0, *updates_of(trial))])
-            best = min(errors, key=lambda way: errors[way])
-            starts = dict.fromkeys([Way(trial=trial), best])
-            scored([replace(way, propagate=kind) for way in starts for kind in SPREADING])
+        errors = scored([Way(trial=t, iterations=k) for t in trials for k in (0, *updates_of(t))])
+        best = min(errors, key=lambda way: errors[way])
+        starts = dict.fromkeys([Way(trial=best.trial), best])
+        scored([replace(way, propagate=kind) for way in starts for kind in SPREADING])
     errors = scored(list(predicted))
     ways = list(predicted)
     if fixed is None:

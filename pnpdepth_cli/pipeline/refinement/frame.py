@@ -200,7 +200,7 @@ def finished_frame(
         return result
     return RefinedFrame(
         before=to_image(ready.frame, result.before),
-        after=_propagated(ready.task, to_image(ready.frame, result.after)),
+        after=propagated(ready.task, to_image(ready.frame, result.after)),
         used=ready.task.used,
         held_out=ready.task.held_out,
         refinement=result,
@@ -210,7 +210,8 @@ def finished_frame(
     )
 
 
-def _propagated(task: FrameToRefine, depth: NDArray[np.float32]) -> NDArray[np.float32]:
+def propagated(task: FrameToRefine, depth: NDArray[np.float32]) -> NDArray[np.float32]:
+    """The depth (H, W) with what is left at the used points spread, if the task says so."""
     if task.propagate == "none":
         return depth
     rgb = task.inputs.rgb_tensor()

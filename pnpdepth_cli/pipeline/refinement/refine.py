@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pnpdepth_cli.core.metrics import Scores, score
 from pnpdepth_cli.core.refine import RefineSettings
 from pnpdepth_cli.core.split import Split
-from pnpdepth_cli.errors import DivergedError
+from pnpdepth_cli.errors import DivergedError, UsageError
 from pnpdepth_cli.io.record import sha256_of
 from pnpdepth_cli.models.network import Network, load_network
 from pnpdepth_cli.pipeline.refinement.frame import (
@@ -31,6 +31,7 @@ from pnpdepth_cli.pipeline.refinement.output_files import Outputs, plan_outputs
 from pnpdepth_cli.pipeline.refinement.outputs import write_outputs
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest, effective_settings, layer_name
 from pnpdepth_cli.pipeline.refinement.settle import settled
+from pnpdepth_cli.pipeline.refinement.tiles import refine_tiled
 from pnpdepth_cli.pipeline.refinement.ways import Way
 from pnpdepth_cli.pipeline.stopwatch import Stopwatch, peak_memory_mb, versions
 
@@ -99,6 +100,10 @@ class Refiner:
             return refine_with_folds(
                 self.network, self.layer, self.settings, self.request, task, self.ways
             )
+        if side := self.request.tile:
+            return refine_tiled(
+                self.network, split, self.settings, task, side, on_iteration=on_iteration
+            )
         return refine_frame(self.network, split, self.settings, task, on_iteration=on_iteration)
 
     def with_ways_of(self, frames: Sequence[Inputs]) -> Refiner:
@@ -130,7 +135,12 @@ class Refiner:
 
 
 def load_refiner(request: RefineRequest, first: Inputs) -> Refiner:
-    """The network that is asked for, with what it leaves open settled on this first frame."""
+    """The network that is asked for, with what it leaves open settled on this first frame.
+
+    UsageError if the request asks for what does not go together.
+    """
+    if request.tile is not None and request.needs_folds:
+        raise UsageError("--tile goes with none of --auto, --baselines and --uncertainty")
     network = load_network(
         request.model, request.checkpoint, request.device, precision=request.precision
     )
@@ -172,6 +182,7 @@ def _record(refiner: Refiner, inputs: Inputs, frame: RefinedFrame) -> dict[str, 
             "holdout": request.holdout,
             "seed": request.seed,
             "precision": request.precision,
+            "tile": request.tile,
             "device": str(network.device),
         },
         "alignment": asdict(frame.alignment) if frame.alignment else None,

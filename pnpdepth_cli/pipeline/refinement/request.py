@@ -29,7 +29,8 @@ class RefineRequest:
     definition says. propagate: how what is left at the points is spread, one of
     `core.propagation.PROPAGATIONS`. auto, time_budget_s, baselines, uncertainty: see
     `pipeline.refinement.held_out`. scan: how to project `sparse` where it is a LiDAR scan.
-    protocol: what is cut out of a frame first of all.
+    protocol: what is cut out of a frame first of all. tile: the longest side, in pixels, of what
+    goes through the network at once; None: the whole frame.
     """
 
     image: Source | None
@@ -66,6 +67,7 @@ class RefineRequest:
     baselines: bool = False
     uncertainty: bool = False
     holdout: float = 0.0
+    tile: int | None = None
     seed: int = 0
     precision: str = "fp32"
     device: str = "cpu"
