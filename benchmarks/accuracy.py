@@ -5,8 +5,9 @@ each frame's error: the network as it is, aligned with the points, refined at th
 every baseline of `pnpdepth_cli.core.baselines`, and `--auto`. The same network, points and pixels
 for all: those with known truth where the network sees. `wins` counts frames where `--auto` is not
 above the aligned network, and not more than 3 per cent above the best baseline of that frame.
-`--outliers 0.2` puts so many points at wrong depths. `--render FOLDER` takes frames rendered by
-this project instead. Nothing was tuned on the real frames.
+`--outliers 0.2` puts so many points at wrong depths; `--sigma` adds the share of the truth that
+lies within ± one standard deviation of `--uncertainty`, which should be 68 %. `--render FOLDER`
+takes frames rendered by this project instead. Nothing was tuned on the real frames.
 """
 
 from __future__ import annotations
@@ -39,6 +40,7 @@ from pnpdepth_cli.core.refine import RefineSettings
 from pnpdepth_cli.models.definition import Normalisation
 from pnpdepth_cli.models.network import Network, load_network
 from pnpdepth_cli.pipeline.refinement.auto import refine_automatically, usual_trials
+from pnpdepth_cli.pipeline.refinement.held_out import uncertainty
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest, effective_settings, layer_name
 
 PAPER = RefineSettings()
@@ -100,7 +102,12 @@ def with_outliers(points: SparsePoints, share: float, seed: int) -> SparsePoints
 
 
 def measure(
-    network: Network, frame: EvalFrame, count: int | None, seed: int, outliers: float
+    network: Network,
+    frame: EvalFrame,
+    count: int | None,
+    seed: int,
+    outliers: float,
+    with_sigma: bool = False,
 ) -> dict[str, object]:
     """Errors of every way on one frame, what --auto chose, and what it cost."""
     rows, columns, depth = frame_pixels(frame, count, seed)
@@ -131,7 +138,13 @@ def measure(
     )
     auto_s = time.perf_counter() - start
     depths["auto"] = torch.from_numpy(auto.frame.after)
-    return {
+    within = {}
+    if with_sigma:
+        sigma, _ = uncertainty(auto, auto.frame.after)
+        known = (frame.truth > 0) & (auto.frame.after > 0)
+        inside = np.abs(frame.truth - auto.frame.after)[known] <= sigma[known]
+        within = {"within_sigma": float(inside.mean())}
+    return within | {
         "errors": errors_of(depths, torch.from_numpy(frame.truth)),
         "choice": str(auto.choice),
         "plain_s": plain_s,
@@ -164,6 +177,7 @@ def summary(rows: list[dict[str, object]]) -> dict[str, object]:
         "within 3 % of the best baseline": float((auto <= 1.03 * best).mean()),
         "auto_s": float(np.median([row["auto_s"] for row in rows])),
         "plain_s": float(np.median([row["plain_s"] for row in rows])),
+        "within_sigma": float(np.mean([row.get("within_sigma", np.nan) for row in rows])),
         "choices": [row["choice"] for row in rows],
     }
 
@@ -186,13 +200,14 @@ def shown(case: Case, found: dict[str, object]) -> str:
     cost = f"{found['auto_s']:.2f} s ({found['plain_s']:.2f})"
     head = [case.network, f"{Path(case.frames).name}, {found['frames']}", str(points)]
     tally = f"{below}/{2 * (len(BASELINES) + 1)}"
-    return "| " + " | ".join([*head, *cells, *gains, tally, *wins, cost]) + " |"
+    within = f"{found['within_sigma']:.0%}"
+    return "| " + " | ".join([*head, *cells, *gains, tally, *wins, cost, within]) + " |"
 
 
 HEAD = (
     "network", "set, frames", "points", "raw", "aligned", "paper's setting", "tuned", "linear",
     "best baseline", "--auto", "vs paper", "vs linear", "below", "≤ aligned", "≤ best +3 %",
-    "auto (plain)",
+    "auto (plain)", "± 1 σ",
 )  # fmt: skip
 
 
@@ -207,6 +222,7 @@ def main() -> None:
     parser.add_argument("--every", type=int, default=5, help="use every n-th frame")
     parser.add_argument("--seeds", type=int, default=1)
     parser.add_argument("--outliers", type=float, default=0.0)
+    parser.add_argument("--sigma", action="store_true", help="the standard deviation's coverage")
     parser.add_argument("--json", type=Path, help="everything, to this file")
     args = parser.parse_args()
     wanted = list(cases())
@@ -233,7 +249,7 @@ def main() -> None:
         seeds = range(args.seeds if case.points else 1)
         runs = [(frame, seed) for seed in seeds for frame in frames]
         rows = [
-            measure(network, frame, case.points, seed, args.outliers)
+            measure(network, frame, case.points, seed, args.outliers, args.sigma)
             for frame, seed in tqdm(runs, leave=False, desc=f"{case.network} {case.frames}")
         ]
         found = summary(rows)

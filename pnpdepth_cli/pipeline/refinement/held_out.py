@@ -31,7 +31,7 @@ from pnpdepth_cli.pipeline.refinement.ways import Trial, Way
 
 _BELIEVED = 0.05
 """Of 0…1; a held-out point that is believed less says nothing of how sure the depth is."""
-_FACTORS = (0.05, 20.0)
+_FACTORS = (0.01, 1000.0)
 """A standard deviation is stretched by no more than this, whatever a few points say."""
 
 
@@ -168,9 +168,7 @@ def uncertainty(found: AutoRefined, depth: NDArray[np.float32]) -> tuple[NDArray
     The Gaussian process says where the depth is surer and where less, the held-out points by what
     factor: 68 per cent of them are within ± one of it.
     """
-    weighed = sorted(zip(found.choice.weights, found.choice.ways, strict=True), key=lambda w: -w[0])
-    way = weighed[0][1]
-    relative = found.depths.relative_sigma(way)
+    relative = found.depths.relative_sigma()
     if not found.folds:
         note = "uncertainty: too few points to calibrate it with"
         return (relative.numpy() * depth).astype(np.float32), note
@@ -179,7 +177,7 @@ def uncertainty(found: AutoRefined, depth: NDArray[np.float32]) -> tuple[NDArray
         parts = zip(found.choice.weights, found.choice.ways, strict=True)
         predicted = sum(weight * fold.at(each) for weight, each in parts)
         assert isinstance(predicted, Tensor)
-        sigma = fold.held_out.sample(fold.depths.relative_sigma(way))
+        sigma = fold.held_out.sample(fold.depths.relative_sigma())
         good = (fold.believed > _BELIEVED) & (predicted > 0) & (sigma > 0)
         residual = fold.held_out.depth[good].log() - predicted[good].log()
         beyond.append(torch.stack([residual, sigma[good]]))

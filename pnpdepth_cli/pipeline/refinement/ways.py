@@ -178,9 +178,12 @@ class Depths:
             ).sample(self._start(way))
         return propagated_at(self._start(way), self._used, self._rgb, places, kind=way.propagate)
 
-    def relative_sigma(self, way: Way) -> Tensor:
-        """The standard deviation (H, W) of the way's log depth once its residual is spread."""
-        found = propagate(self._start(way), self._used, self._rgb, sigma=True)
+    def relative_sigma(self) -> Tensor:
+        """(H, W) how unsure log depth is, but for a factor: what the points tell of each pixel.
+
+        By what the network alone leaves at the points; a way that goes through them leaves nothing.
+        """
+        found = propagate(self._prediction, self._used, self._rgb, sigma=True)
         assert found.sigma is not None
         return torch.where(found.depth > 0, found.sigma / found.depth, 0.0)
 
