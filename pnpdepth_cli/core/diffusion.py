@@ -54,7 +54,13 @@ def diffused(field: Field) -> Tensor:
     middle = float(field.residual.median())
     system = reads.T @ reads + laplacian(adjacent) + _ANCHOR * eye_array(total)
     right = reads.T @ (field.residual - middle).numpy()
-    found = splu(csc_array(system), permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
+    # positive definite: its own diagonal will do for pivots, and others would fill the factors
+    found = splu(
+        csc_array(system),
+        permc_spec="MMD_AT_PLUS_A",
+        diag_pivot_thresh=0.0,
+        options={"SymmetricMode": True},
+    )
     correction = torch.from_numpy(found.solve(right)).float().reshape(1, 1, rows, columns) + middle
     return F.interpolate(correction, (height, width), mode="bilinear", align_corners=False)[0, 0]
 
