@@ -279,13 +279,18 @@ def _facts(summary: Mapping[str, Any], first: Row | None) -> list[list[str]]:
         ["Results in", summary["output"]],
         ["Network", str(asked["model"])],
     ]
-    if first is not None:
+    if asked["auto"]:
+        found = "each frame by the way that is best at points held out in turns"
+        facts.append(["Refinement", f"{found} (--auto)"])
+    elif first is not None:
         used = first["settings"]
         refined = f"{used['iterations']} updates of z at {used['layer']}"
         facts.append(
             ["Refinement", f"{refined} ({used['update']}, {used['loss']}, step {used['lr']})"]
         )
         facts.append(["Alignment", str(used["align"])])
+    if asked["propagate"]:
+        facts.append(["Propagation", asked["propagate"]])
     if asked["holdout"]:
         facts.append(["Held out", f"{asked['holdout']:.0%} of the points, seed {asked['seed']}"])
     if summary["counts"]["with_warnings"]:

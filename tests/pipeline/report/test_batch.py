@@ -155,6 +155,19 @@ def test_a_batch_that_is_stopped_has_a_report_of_what_is_done(root: Path, report
     assert page_data(report)["tiles"][0]["remark"] == "3 pending"
 
 
+def test_the_page_says_how_frames_were_refined_and_that_each_may_have_its_own_way(
+    root: Path, report: Path, tmp_path: Path
+) -> None:
+    batch(root, html=report, refine={"propagate": "gp"})
+    facts = dict(page_data(report)["facts"])
+    assert facts["Refinement"] == "5 updates of z at middle (sign, l1, step 0.01)"
+    assert (facts["Alignment"], facts["Propagation"]) == ("none", "gp")
+    batch(root, output=root / "auto", html=tmp_path / "auto", refine={"auto": True})
+    facts = dict(page_data(tmp_path / "auto")["facts"])
+    assert facts["Refinement"].endswith("(--auto)")
+    assert "Alignment" not in facts
+
+
 def titles(report: Path) -> list[str]:
     return [column["title"] for column in page_data(report)["columns"]]
 
