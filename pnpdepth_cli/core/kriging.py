@@ -40,7 +40,8 @@ LENGTHS_DEPTH = (1.0, 2.5, 8.0, 25.0)
 LENGTHS_COLOUR = (2.5, 8.0, 25.0)
 NOISES = (1e-4, 1e-3, 1e-2, 1.0)
 """Lengths in standard deviations over the picture (of the place, in longer sides: 1), and variance
-of the noise. Chosen on rendered frames, with predictions of three networks."""
+of the noise. Chosen on rendered frames, with predictions of three networks; the longest lengths
+and the least and most noise are there for frames unlike those."""
 NEIGHBOURS = 48
 
 _EXACT = 128  # points up to which all of them tell every pixel,

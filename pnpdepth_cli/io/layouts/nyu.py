@@ -9,7 +9,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from pnpdepth_cli.errors import FileFormatError, UsageError
+from pnpdepth_cli.errors import FileFormatError
 from pnpdepth_cli.io.layouts.frame import Frame, Hdf5Array, Listing
 from pnpdepth_cli.io.layouts.protocols import PROTOCOLS
 from pnpdepth_cli.io.opening import one_line, read_bytes
@@ -93,10 +93,8 @@ def _split(folder: Path, count: int) -> list[int]:
 
 
 def _test_numbers(path: Path) -> Any:
-    try:
-        from scipy.io import loadmat
-    except ImportError:
-        raise UsageError(f"reading {path} needs scipy: pip install 'pnpdepth[nyu]'") from None
+    from scipy.io import loadmat
+
     try:
         return loadmat(path, variable_names=["testNdxs"])["testNdxs"].ravel().tolist()
     except Exception as error:  # scipy raises many kinds for a damaged file
