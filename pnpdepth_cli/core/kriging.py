@@ -56,7 +56,8 @@ _CROWDED = 0.05  # but for so many of all points
 _WRONG = (4.0, 4.0, 5.0, 6.0, 8.0)  # times the usual error, beyond which a point is wrong, in turn
 _NOTHING = 1e-6  # the weight of a point that tells nothing
 _DOUBTED = 0.05  # weight of 0…1; points with less are left out,
-_FAR_BETTER = 0.33  # if that makes the others' errors at most so much of what they were
+_FAR_BETTER = 0.4  # if that makes the others' errors at most so much of what they were,
+_FAR_BETTER_MANY = 0.55  # or so much where there are many points, whose errors are well known
 _LEAST = 1e-3  # of the usual error over its standard deviation if f had 1; less is none
 _NORMAL_MEDIAN = 1.4826  # standard deviation over median of |x|, normal errors
 _FEW = 5  # points; fewer cannot tell which lengths are best
@@ -99,8 +100,8 @@ class Field:
         return replace(self, points=points, at=at, residual=residual)
 
 
-def believed(field: Field) -> Field:
-    """The field without points that are wrong, if there are any.
+def believed(field: Field) -> Tensor:
+    """(N,) bool: the points that are not wrong; all of them, unless some clearly are.
 
     Each point is weighted by how well its neighbours tell it: loosely by `trust`, then, unless
     there are very many, by the process, told by the others as they are weighted. A point on a small
@@ -116,12 +117,13 @@ def believed(field: Field) -> Field:
             weight = (1 - (beyond / (many * usual)).square()).clamp_min(0).square()
     kept = weight > _DOUBTED
     if bool(kept.all()) or not bool(kept.any()):
-        return field
+        return torch.ones_like(kept)
     with_all, without = (
         float((error.abs() * weight[near[:, : error.shape[1]]]).sum())
         for error, _ in (_left_out(field, near), _left_out(field, near, weight))
     )
-    return field.select(kept) if without < _FAR_BETTER * with_all else field
+    enough = _FAR_BETTER if len(near) == 1 else _FAR_BETTER_MANY
+    return kept if without < enough * with_all else torch.ones_like(kept)
 
 
 def fitted(field: Field) -> Field:

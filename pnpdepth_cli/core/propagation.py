@@ -153,8 +153,29 @@ def _check(kind: str) -> None:
         raise UsageError(f"there is no propagation {kind!r}; take one of {', '.join(PROPAGATIONS)}")
 
 
+def wrong(prediction: Tensor, points: SparsePoints, rgb: Tensor | None) -> Tensor:
+    """(N,) bool: the points that are wrong, if there clearly are any: others tell them otherwise.
+
+    prediction: (H, W) metres. rgb: (3, H, W) in 0..1, or None. NoPointsError as in `propagate`.
+    """
+    field = _all_points(prediction, points, rgb)
+    places = _keys(field.points)[~believed(field)]
+    return torch.isin(_keys(points.to("cpu")), places).to(points.xy.device)
+
+
+def _keys(points: SparsePoints) -> Tensor:
+    """A number (N,) int64 for each place: x and y bit by bit."""
+    return points.xy.float().contiguous().view(torch.int64).flatten()
+
+
 def _field(prediction: Tensor, points: SparsePoints, rgb: Tensor | None) -> Field:
     """What is left at the points that lie in the frame, have a prediction and are believed."""
+    field = _all_points(prediction, points, rgb)
+    return field.select(believed(field))
+
+
+def _all_points(prediction: Tensor, points: SparsePoints, rgb: Tensor | None) -> Field:
+    """The same with those that are not believed, too."""
     prediction, points = prediction.detach().cpu(), points.to("cpu")
     height, width = points.size
     x, y = points.xy.unbind(1)
@@ -165,13 +186,11 @@ def _field(prediction: Tensor, points: SparsePoints, rgb: Tensor | None) -> Fiel
         torch.where(known, prediction, torch.nan).log(), None if rgb is None else rgb.cpu()
     )
     predicted = points.sample(torch.where(known, prediction, 1.0)).double()
-    return believed(
-        Field(
-            features=features,
-            points=points,
-            at=torch.stack([points.sample(one) for one in features.unbind(2)], dim=1),
-            residual=points.depth.double().log() - predicted.log(),
-        )
+    return Field(
+        features=features,
+        points=points,
+        at=torch.stack([points.sample(one) for one in features.unbind(2)], dim=1),
+        residual=points.depth.double().log() - predicted.log(),
     )
 
 

@@ -14,6 +14,7 @@ from pnpdepth_cli.core.propagation import (
     features_of,
     propagate,
     propagated_at,
+    wrong,
 )
 from pnpdepth_cli.errors import NoPointsError, UsageError
 
@@ -172,6 +173,25 @@ def test_sigma_has_two_thirds_of_the_truth_within_it() -> None:
     assert made.sigma is not None
     within = ((made.depth - truth).abs() <= made.sigma).double().mean()
     assert 0.5 < float(within) < 0.9
+
+
+def test_wrong_points_are_named_in_the_order_of_the_points_and_right_ones_are_not() -> None:
+    truth, rgb, prediction = scene()
+    points = seen(truth, 150)
+    assert not bool(wrong(prediction, points, rgb).any())
+    bad = torch.arange(150) % 6 == 0
+    outside = SparsePoints(
+        xy=torch.tensor([[-9.0, 3.0]]), depth=torch.tensor([50.0]), size=points.size
+    )
+    spoiled = SparsePoints(
+        xy=torch.cat([points.xy, outside.xy]),
+        depth=torch.cat([torch.where(bad, 3 * points.depth, points.depth), outside.depth]),
+        size=points.size,
+    )
+    found = wrong(prediction, spoiled, rgb)
+    assert bool(found[:150][bad].all())
+    assert int(found.sum()) < 2 * int(bad.sum())
+    assert not bool(found[150])  # nothing is known there
 
 
 def test_calibration_brings_two_thirds_of_the_residuals_within_sigma() -> None:

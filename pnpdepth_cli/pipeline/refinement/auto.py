@@ -1,6 +1,7 @@
 """`--auto`: the best way to dense depth for a frame, by its error at points that are held out.
 
-The points are shared out into folds. Every way is given the points of all folds but one and is
+Points that their neighbours clearly tell otherwise are left out first, if there are any. The others
+are shared out into folds. Every way is given the points of all folds but one and is
 scored at those of that one, in turn; the best way, or mean of a few, is then given all points. The
 network as it is and every simple baseline are among the ways, so what is returned is never worse
 than they are at the held-out points.
@@ -20,6 +21,7 @@ from pnpdepth_cli.core.baselines import BASELINES
 from pnpdepth_cli.core.folds import spatial_folds
 from pnpdepth_cli.core.local_alignment import trust
 from pnpdepth_cli.core.points import SparsePoints
+from pnpdepth_cli.core.propagation import wrong
 from pnpdepth_cli.core.refine import RefineSettings
 from pnpdepth_cli.core.selection import Blend, best_blend, held_out_error
 from pnpdepth_cli.errors import PnpDepthError
@@ -135,9 +137,12 @@ def refine_automatically(
     taken, and the others are only scored. budget_s: no further trial is begun that would end later,
     by what those before took; None tries all.
     """
+    notes: tuple[str, ...] = ()
+    if fixed is None:
+        used, notes = _without_wrong(network, trials[0], inputs, used)
     folds = _folds(used, seed)
     sets = [used, *(kept for kept, _ in folds)]
-    made, notes = _tried(network, trials, inputs, sets, budget_s)
+    made, said = _tried(network, trials, inputs, sets, budget_s)
     plain = next(iter(made.values()))
     depths = [
         Depths(inputs, points, plain[i].depths[0], {trial: of[i] for trial, of in made.items()})
@@ -154,7 +159,27 @@ def refine_automatically(
     weighed = sorted(zip(choice.weights, choice.ways, strict=True), key=lambda one: -one[0])
     trial = next((way.trial for _, way in weighed if way.trial), next(iter(made)))
     frame = replace(made[trial][0].frame, before=plain[0].frame.before, after=after.numpy())
-    return AutoRefined(frame=frame, choice=choice, depths=depths[0], folds=scored, notes=notes)
+    return AutoRefined(
+        frame=frame, choice=choice, depths=depths[0], folds=scored, notes=(*notes, *said)
+    )
+
+
+def _without_wrong(
+    network: Network, trial: Trial, inputs: Inputs, used: SparsePoints
+) -> tuple[SparsePoints, tuple[str, ...]]:
+    """The points that are not clearly wrong beside the network's depth, and what was left out."""
+    plain = replace(trial, settings=replace(trial.settings, iterations=0))
+    (found,) = trajectories(network, plain, inputs, [used], ())
+    if isinstance(found, PnpDepthError):
+        return used, ()
+    rgb = inputs.rgb_tensor()
+    doubted = wrong(found.depths[0], used, None if rgb is None else rgb[0])
+    count = int(doubted.sum())
+    if not count:
+        return used, ()
+    return used.select(~doubted), (
+        f"auto: {count:,} of {len(used):,} points left out; all around tells them otherwise",
+    )
 
 
 def _folds(used: SparsePoints, seed: int) -> list[tuple[SparsePoints, Tensor]]:

@@ -93,6 +93,24 @@ def test_held_out_points_do_not_tell_the_depth_that_they_score(
     assert torch.equal(again.folds[0].at(way), before)
 
 
+def test_wrong_points_are_left_out_and_said_and_the_depth_is_hardly_worse(
+    frame: FrameOnDisk, network: Network
+) -> None:
+    inputs = inputs_of(frame)
+    bad = torch.arange(len(inputs.points)) % 5 == 0
+    depth = torch.where(bad, 2.5 * inputs.points.depth, inputs.points.depth)
+    spoiled = replace(inputs, points=replace(inputs.points, depth=depth))
+    clean, found = (
+        refine_automatically(network, [TRIAL], one, one.points) for one in (inputs, spoiled)
+    )
+    assert found.notes[0].endswith("points left out; all around tells them otherwise")
+    assert not any("left out" in note for note in clean.notes)
+    left = {tuple(xy) for xy in found.frame.used.xy.tolist()}
+    assert not left & {tuple(xy) for xy in inputs.points.xy[bad].tolist()}
+    mae = [float(np.abs(one.frame.after - frame.depth).mean()) for one in (clean, found)]
+    assert mae[1] < 1.15 * mae[0]
+
+
 def test_one_refinement_gives_the_depth_after_every_number_of_updates(
     frame: FrameOnDisk, network: Network
 ) -> None:
