@@ -176,7 +176,7 @@ definitions = {
         normalisation=Normalisation(mean=IMAGENET_MEAN, std=IMAGENET_STD),
         output_kind="log",
         layers=LAYERS,
-        defaults=RefineDefaults(layer="coarse.conv5", lr="10%", iterations=20),
+        defaults=RefineDefaults(layer="coarse.conv5", update="adam", lr="10%", iterations=20),
         build=partial(Eigen, channels=(32, 64, 96, 96, 48), hidden=128, fine=48),
         checkpoint=TINY,
     ),

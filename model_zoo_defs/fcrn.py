@@ -233,11 +233,11 @@ definitions = {
     ),
     "fcrn-tiny": ModelDefinition(
         name="fcrn-tiny",
-        summary="the same at an eighth of the width, trained on rendered rooms only",
+        summary="the same at an eighth of the width and half the size, trained on rendered rooms",
         paper=PAPER,
         licence="Apache-2.0",
         input_kind="rgb",
-        size=Fixed(*SIZE),
+        size=Fixed(SIZE[0] // 2, SIZE[1] // 2),
         normalisation=Normalisation(mean=IMAGENET_MEAN, std=IMAGENET_STD),
         layers=LAYERS,
         defaults=RefineDefaults(layer="layer1_BN", lr="10%", iterations=20),

@@ -28,6 +28,7 @@ from pnpdepth_cli.errors import UsageError
 PROPAGATIONS = ("none", "gp", "diffusion")
 
 _WITHIN = 0.68  # share of normal errors within ± one standard deviation
+_PASSES = 3  # looks for wrong points: without the worst, others stand out
 _FLAT_DEPTH, _FLAT_COLOUR = 1e-3, 1.0  # added to the spreads: a flat picture has no edges
 _XYZ_OF_RGB = (
     (0.4124564, 0.3575761, 0.1804375),
@@ -159,7 +160,8 @@ def wrong(prediction: Tensor, points: SparsePoints, rgb: Tensor | None) -> Tenso
     prediction: (H, W) metres. rgb: (3, H, W) in 0..1, or None. NoPointsError as in `propagate`.
     """
     field = _all_points(prediction, points, rgb)
-    places = _keys(field.points)[~believed(field)]
+    places = _keys(field.points)
+    places = places[~torch.isin(places, _keys(_without_wrong(field).points))]
     return torch.isin(_keys(points.to("cpu")), places).to(points.xy.device)
 
 
@@ -170,8 +172,16 @@ def _keys(points: SparsePoints) -> Tensor:
 
 def _field(prediction: Tensor, points: SparsePoints, rgb: Tensor | None) -> Field:
     """What is left at the points that lie in the frame, have a prediction and are believed."""
-    field = _all_points(prediction, points, rgb)
-    return field.select(believed(field))
+    return _without_wrong(_all_points(prediction, points, rgb))
+
+
+def _without_wrong(field: Field) -> Field:
+    for _ in range(_PASSES):
+        kept = believed(field)
+        if bool(kept.all()):
+            break
+        field = field.select(kept)
+    return field
 
 
 def _all_points(prediction: Tensor, points: SparsePoints, rgb: Tensor | None) -> Field:
