@@ -1,4 +1,4 @@
-"""Memory and time of a batch: `python -m benchmarks.batch [--frames 2000] [--size 48x64]`.
+"""Memory and time of a batch: `python -m benchmarks.batch [--frames 2000] [--size 48x64] [--html]`.
 
 Makes that many small frames, refines them with the embedded network, and prints the memory that the
 process holds as frames go by, its peak, where the time goes, and what a second run costs that has
@@ -72,7 +72,9 @@ def make_frames(root: Path, count: int, height: int, width: int) -> None:
         write_depth(root / "gt" / f"{number:06}.png", depth, scale=1000)
 
 
-def measure(root: Path, workers: int, model: str, batch_size: int | None) -> dict[str, Any]:
+def measure(
+    root: Path, workers: int, model: str, batch_size: int | None, html: bool
+) -> dict[str, Any]:
     """The figures of one batch over the folder, and of a second run."""
     request = BatchRequest(
         source=root,
@@ -81,6 +83,7 @@ def measure(root: Path, workers: int, model: str, batch_size: int | None) -> dic
         workers=workers,
         batch_size=batch_size,
         profile=True,
+        html=root.parent / "report" if html else None,
     )
     watcher = Watcher()
     profile = run_batch(request, watcher).summary["profile"]
@@ -106,12 +109,14 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--model", default="compact")
     parser.add_argument("--batch-size", type=int, help="auto if not given")
+    parser.add_argument("--html", action="store_true", help="with a report")
     parser.add_argument("--json", action="store_true")
     given = parser.parse_args()
     height, width = (int(side) for side in given.size.split("x"))
     with tempfile.TemporaryDirectory() as folder:
         make_frames(Path(folder) / "frames", given.frames, height, width)
-        found = measure(Path(folder) / "frames", given.workers, given.model, given.batch_size)
+        root = Path(folder) / "frames"
+        found = measure(root, given.workers, given.model, given.batch_size, given.html)
     if given.json:
         print(json.dumps(found, indent=2))
         return
