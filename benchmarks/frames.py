@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from pnpdepth_cli.core.points import SparsePoints
 from pnpdepth_cli.core.refine import RefineSettings
-from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.models.network import Network
@@ -96,6 +95,6 @@ def frame_inputs(rgb: NDArray[np.float32], points: SparsePoints, truth: Depth) -
 
 def refined(network: Network, layer: str, settings: RefineSettings, inputs: Inputs) -> RefinedFrame:
     """The refinement of a frame with all of its points."""
-    with Split(network.module, layer) as split:
+    with network.cut_at(layer) as split:
         task = FrameToRefine.with_points(inputs, inputs.points)
         return refine_frame(network, split, settings, task)

@@ -52,6 +52,8 @@ class Split:
 
     While open, the network is in eval mode and only z requires gradient. Raises LayerError for a
     layer that does not exist, never runs, or runs or returns several times without a choice.
+    same_path: the network runs the same submodules for all arguments of the same shapes, though
+    values of tensors get out to Python; without a promise, each frame is then learnt anew.
     """
 
     _given: Remembered  # the arguments
@@ -72,8 +74,8 @@ class Split:
     _sealed: bool  # inside a submodule that is to be remembered as a whole
     _open: set[nn.Module]  # submodules that turned out not to be fit for that
 
-    def __init__(self, network: nn.Module, layer: str) -> None:
-        self.layer = layer
+    def __init__(self, network: nn.Module, layer: str, *, same_path: bool = False) -> None:
+        self.layer, self._same_path = layer, same_path
         self._network = network
         self._name = LayerName.parse(layer)
         self._modules = dict(network.named_modules(remove_duplicate=False))
@@ -122,7 +124,8 @@ class Split:
     def repeats(self) -> bool:
         """True once it is known that the network treats all arguments of these shapes alike.
 
-        Then no value of a tensor gets out to Python, which could choose another path by it.
+        Then no value of a tensor gets out to Python, which could choose another path by it, or it
+        was promised (`same_path`) that it does not.
         """
         return self._learned and self._repeats
 
@@ -146,7 +149,7 @@ class Split:
                 if len(self._open) > known_open:
                     continue  # once more, to remember what lies inside those
                 self._index()
-                self._repeats = not watch.escaped
+                self._repeats = self._same_path or not watch.escaped
                 assert self._z0 is not None
                 return _handed_out(self._z0)
             raise LayerError(self._never_ran())
@@ -196,7 +199,7 @@ class Split:
             self._release_unread(watch)
         self._index()
         self._learned = True
-        self._repeats &= not watch.escaped
+        self._repeats &= self._same_path or not watch.escaped
         self._stand_in_for({call.module for call in self._calls if self._matters(call)})
         return output
 

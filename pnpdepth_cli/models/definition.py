@@ -129,6 +129,8 @@ class ModelDefinition:
     defaults: the settings of refinement.
     build: makes the network (weights not loaded); called without arguments.
     checkpoint: the weights that come with the definition, or None where the user brings them.
+    same_path: the submodules that it runs, and their order, are the same for all pictures of one
+        size, whatever it does with values in Python; so they need to be learnt only once.
     complete: `build` gives the network with its weights, `checkpoint` is only where they lie.
     read_checkpoint: renames or reshapes the tensors of a published checkpoint into the state
         dict of the network.
@@ -157,6 +159,7 @@ class ModelDefinition:
     defaults: RefineDefaults = RefineDefaults()
     checkpoint: Path | None = None
     complete: bool = False
+    same_path: bool = False
     read_checkpoint: Callable[[Mapping[str, Tensor]], Mapping[str, Tensor]] | None = None
     arguments: Callable[[Tensor | None, Tensor | None], tuple[Tensor, ...]] | None = None
     output: Callable[[Any], Tensor] | None = None

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 
 from pnpdepth_cli.core.foreign import blaming, is_out_of_memory
 from pnpdepth_cli.core.points import SparsePoints
+from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.core.structure import tensors_in
 from pnpdepth_cli.errors import CheckpointError, DeviceError, ModelError, UsageError
 from pnpdepth_cli.models.checkpoint import load_checkpoint
@@ -38,6 +39,10 @@ class Network:
     device: torch.device
     checkpoint: Path | None
     notes: tuple[str, ...] = ()
+
+    def cut_at(self, layer: str) -> Split:
+        """The network cut at the layer, to be opened. LayerError where there is none."""
+        return Split(self.module, layer, same_path=self.definition.same_path)
 
     def arguments(
         self, frame: FrameMap, rgb: Tensor | None, points: SparsePoints

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from model_zoo_defs.compact import Compact, definitions
+from pnpdepth_cli.core.split import Split
 
 definition = definitions["compact"]
 
@@ -136,3 +137,23 @@ def test_the_shipped_weights_fit_and_are_small() -> None:
     with torch.no_grad():
         depth = network.eval()(*frame(96, 128, 100))
     assert bool(torch.isfinite(depth).all())
+
+
+@pytest.mark.parametrize("layer", ["decoder.s32", "decoder.s8", "decoder.s2"])
+def test_the_path_is_the_same_for_every_frame_as_the_definition_promises(
+    network: Compact, layer: str
+) -> None:
+    assert definition.same_path
+    with Split(network, layer, same_path=True) as split:
+        split.rear(split.front(*frame(96, 128, 60)))
+        assert split.repeats
+        # from no point at all to nearly every cell seen
+        found = []
+        for count in (0, 1, 30, 3000):
+            z = split.front(*frame(96, 128, count, seed=count + 1))
+            found.append((count, z.clone(), split.rear(z + 0.1).clone()))
+    for count, z, depth in found:
+        with Split(network, layer) as fresh:
+            assert torch.equal(fresh.front(*frame(96, 128, count, seed=count + 1)), z)
+            assert torch.equal(fresh.rear(z + 0.1), depth)
+            assert not fresh.repeats

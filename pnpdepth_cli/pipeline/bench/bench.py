@@ -184,7 +184,7 @@ class _Subject:
         """All parts in turn."""
         device, notes = self.network.device, list(self.network.notes)
         opened = _network(self.request, self.request.precision)
-        split = stack.enter_context(Split(opened.module, self.layer))
+        split = stack.enter_context(opened.cut_at(self.layer))
         with torch.no_grad():
             z = split.front(*self.arguments)
             output = split.rear(z)
@@ -193,7 +193,7 @@ class _Subject:
         change = None
         if self.request.precision != "fp32":
             full = _network(self.request, "fp32")
-            full_split = stack.enter_context(Split(full.module, self.layer))
+            full_split = stack.enter_context(full.cut_at(self.layer))
             todo[FULL] = Timed(run=lambda _: self._refined(full_split, full))
             change = _change(self._refined(split, self.network), self._refined(full_split, full))
         if self.request.files:
@@ -243,7 +243,7 @@ class _Subject:
                 return leaf, loss_of(self.points.sample(depth), self.points.depth)
 
         def first_frame(_: object) -> None:
-            with Split(module, self.layer) as fresh:
+            with self.network.cut_at(self.layer) as fresh:
                 self._refined(fresh, self.network)
 
         return {
@@ -284,7 +284,7 @@ class _Subject:
     def _file_parts(self) -> dict[str, Timed]:
         """From files and to files, as `pnpdepth refine` does it."""
         inputs, outputs = read_inputs(self.asked), plan_outputs(self.asked)
-        with Split(self.network.module, self.layer) as split:
+        with self.network.cut_at(self.layer) as split:
             task = FrameToRefine.with_points(inputs, inputs.points)
             frame = refine_frame(self.network, split, self.settings, task)
         return {

@@ -84,7 +84,7 @@ class Refiner:
 
     def split(self) -> Split:
         """The network cut at the layer, to be opened for as many frames as there are."""
-        return Split(self.network.module, self.layer)
+        return self.network.cut_at(self.layer)
 
     def refine(
         self,

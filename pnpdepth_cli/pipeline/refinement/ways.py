@@ -95,7 +95,7 @@ def trajectories(
     z0: Tensor | None = None
     with (
         out_of_memory_is_a_device_error(network.device),
-        Split(network.module, trial.layer) as split,
+        network.cut_at(trial.layer) as split,
     ):
         for used in sets:
             task = FrameToRefine.with_points(inputs, used)

@@ -78,7 +78,7 @@ class CutNetwork:
     def _at(self, layer: str) -> Split:
         if self._split is None or self._split.layer != layer:
             self._held.close()
-            self._split = self._held.enter_context(Split(self._network.module, layer))
+            self._split = self._held.enter_context(self._network.cut_at(layer))
         return self._split
 
 

@@ -8,7 +8,6 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any, TypeVar
 
-from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.errors import (
     DeviceError,
     InputError,
@@ -90,7 +89,7 @@ def run_sweep(request: SweepRequest, listener: Listener) -> dict[str, Any]:
             model_identity(request.refine),
         )
         for layer in plan.layers:
-            with Split(refiner.network.module, layer):
+            with refiner.network.cut_at(layer):
                 pass  # a layer that is not there is told before anything is computed
         runs = [run for task, frame in tasks for run in plan.runs(task, frame)]
         to_do = [run for run in runs if not state.is_done(run)]
