@@ -36,6 +36,14 @@ class SparsePoints:
             xy=(self.xy + 0.5) * scale - 0.5, depth=self.depth, size=(height, width)
         )
 
+    def cropped(self, top: int, left: int, height: int, width: int) -> SparsePoints:
+        """The points in these rows and columns of the frame, at their places in that part."""
+        x, y = self.xy[:, 0] - left, self.xy[:, 1] - top
+        inside = (x >= -0.5) & (x < width - 0.5) & (y >= -0.5) & (y < height - 0.5)
+        return SparsePoints(
+            xy=torch.stack([x, y], dim=1)[inside], depth=self.depth[inside], size=(height, width)
+        )
+
     def select(self, mask: Tensor) -> SparsePoints:
         """The points where mask (N,) is true."""
         return SparsePoints(xy=self.xy[mask], depth=self.depth[mask], size=self.size)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import torch
 import torch.nn.functional as F
 from torch import Tensor
 
@@ -60,15 +59,7 @@ class FrameMap:
 
     def points_to_network(self, points: SparsePoints) -> SparsePoints:
         """The points inside the crop, at their places in the network's frame."""
-        top, left, height, width = self.crop
-        x, y = points.xy[:, 0] - left, points.xy[:, 1] - top
-        inside = (x >= -0.5) & (x < width - 0.5) & (y >= -0.5) & (y < height - 0.5)
-        cropped = SparsePoints(
-            xy=torch.stack([x, y], dim=1)[inside],
-            depth=points.depth[inside],
-            size=(height, width),
-        )
-        resized = cropped.in_frame(*self.resized)
+        resized = points.cropped(*self.crop).in_frame(*self.resized)
         return SparsePoints(xy=resized.xy, depth=resized.depth, size=self.network)
 
     def depth_to_image(self, depth: Tensor) -> Tensor:

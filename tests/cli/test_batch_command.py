@@ -13,9 +13,9 @@ import pytest
 
 from pnpdepth_cli.cli import batch as command
 from pnpdepth_cli.cli import progress
-from pnpdepth_cli.cli.main import main
 from pnpdepth_cli.cli.progress import BatchProgress
 from pnpdepth_cli.io.layouts import LAYOUTS, PROTOCOLS
+from tests.cli.test_commands import code_of
 from tests.pipeline.batches import pairs_on_disk, results
 
 PROGRAM = [sys.executable, "-c", "from pnpdepth_cli.cli.main import main; main()"]
@@ -32,12 +32,6 @@ def arguments(*more: str, source: str = "drive") -> list[str]:
         "batch", source, "-o", "out", "--model", "drive/net/my_net.py",
         "--checkpoint", "drive/net/my_net.safetensors", *more,
     ]  # fmt: skip
-
-
-def code_of(given: list[str]) -> int:
-    with pytest.raises(SystemExit) as stop:
-        main(given)
-    return int(stop.value.code or 0)
 
 
 def test_it_says_what_it_took_for_granted_and_what_came_out(

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from pnpdepth_cli.cli.main import main
+from tests.cli.test_score_commands import code_of
 from tests.pipeline.batches import pairs_on_disk
 from tests.pipeline.report_pages import frames_of
 
@@ -14,12 +14,6 @@ BATCH = (
     *("batch", "drive", "-o", "out", "--model", "drive/net/my_net.py"),
     *("--checkpoint", "drive/net/my_net.safetensors"),
 )
-
-
-def code_of(*arguments: str) -> int:
-    with pytest.raises(SystemExit) as stop:
-        main(list(arguments))
-    return int(stop.value.code or 0)
 
 
 @pytest.fixture

@@ -9,9 +9,9 @@ import click
 import pytest
 
 from pnpdepth_cli.cli import options
-from pnpdepth_cli.cli.main import main
 from pnpdepth_cli.cli.sweep import sweep
 from pnpdepth_cli.pipeline.sweep.axes import PARAMETERS
+from tests.cli.test_commands import code_of
 from tests.pipeline.batches import pairs_on_disk
 
 
@@ -26,12 +26,6 @@ def arguments(*more: str, source: str = "drive") -> list[str]:
         "sweep", source, "-o", "out", "--model", "drive/net/my_net.py",
         "--checkpoint", "drive/net/my_net.safetensors", *more,
     ]  # fmt: skip
-
-
-def code_of(given: list[str]) -> int:
-    with pytest.raises(SystemExit) as stop:
-        main(given)
-    return int(stop.value.code or 0)
 
 
 def test_a_sweep_prints_a_table_a_study_and_says_what_it_wrote(

@@ -12,6 +12,7 @@ import numpy as np
 
 from pnpdepth_cli.pipeline.batch.batch import BatchOutcome, run_batch
 from pnpdepth_cli.pipeline.batch.frames import BatchRequest
+from pnpdepth_cli.pipeline.refinement.refine import refine_image
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest
 from tests.pipeline.frames import frame_on_disk
 
@@ -89,6 +90,14 @@ def batch(
         "refine": refinement(root, **(refine or {})),
     }
     return run_batch(BatchRequest(**given | changes), heard or Heard(), stopped)
+
+
+def refine_one_by_one(root: Path, names: tuple[str, ...], **changes: Any) -> None:
+    """Each of these frames refined by itself, into out/."""
+    for name in names:
+        parts = (("image", "rgb"), ("sparse", "sparse"), ("gt", "gt"))
+        files = {part: root / folder / f"{name}.png" for part, folder in parts}
+        refine_image(refinement(root, output=root / "out", **files, **changes))
 
 
 def results(folder: Path) -> dict[str, bytes | dict[str, Any]]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -12,6 +13,8 @@ from numpy.typing import NDArray
 from safetensors.torch import save_file
 
 from pnpdepth_cli.io.depth import write_depth
+from pnpdepth_cli.pipeline.refinement.refine import RefineOutcome, refine_image
+from pnpdepth_cli.pipeline.refinement.request import RefineRequest
 
 NETWORK = """
 import torch
@@ -71,3 +74,15 @@ def frame_on_disk(folder: Path, height: int = 46, width: int = 62) -> FrameOnDis
     state["decode.weight"].abs_()  # so that z can move the depth of a whole neighbourhood
     save_file(state, checkpoint)
     return FrameOnDisk(folder, image, sparse, gt, model, checkpoint, depth)
+
+
+def run(frame: FrameOnDisk, **changes: Any) -> RefineOutcome:
+    """What `pnpdepth refine` gives of the frame, with these changes of the request."""
+    request: dict[str, Any] = {
+        "image": frame.image,
+        "sparse": frame.sparse,
+        "output": frame.folder / "out",
+        "model": str(frame.model),
+        "checkpoint": frame.checkpoint,
+    }
+    return refine_image(RefineRequest(**(request | changes)))

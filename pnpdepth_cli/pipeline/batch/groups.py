@@ -25,6 +25,7 @@ from pnpdepth_cli.errors import DeviceError, NoPointsError, PnpDepthError
 from pnpdepth_cli.pipeline.refinement.frame import FrameToRefine, RefinedFrame, refine_frames
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs
 from pnpdepth_cli.pipeline.refinement.refine import Refiner
+from pnpdepth_cli.pipeline.refinement.request import RefineRequest
 
 _MOST = 16
 _PIXELS = {"cpu": 2**18}
@@ -54,13 +55,10 @@ class FrameGroups:
     def __init__(
         self, refiner: Refiner, split: Split, wanted: int | None, say: Callable[[str], None]
     ) -> None:
-        if refiner.request.needs_folds:
+        why_alone = _why_alone(refiner.request)
+        if why_alone is not None:
             if wanted not in (None, 1):
-                say("batch size: 1; what goes by held-out points is chosen for each frame alone")
-            wanted = 1
-        elif refiner.request.tile is not None:
-            if wanted not in (None, 1):
-                say("batch size: 1; tiles go through the network one by one")
+                say(f"batch size: 1; {why_alone}")
             wanted = 1
         self._refiner, self._split = refiner, split
         self._wanted, self._say = wanted, say
@@ -208,6 +206,15 @@ class FrameGroups:
             f" (--batch-size {count} takes them so all the same)"
         )
         return False
+
+
+def _why_alone(request: RefineRequest) -> str | None:
+    """Why each frame has to be refined by itself, None where it has not."""
+    if request.needs_folds:
+        return "what goes by held-out points is chosen for each frame alone"
+    if request.tile is not None:
+        return "tiles go through the network one by one"
+    return None
 
 
 def _frames(

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
 
 import numpy as np
 import torch
 
 from pnpdepth_cli.core.metrics import MEASURES, SUMS, measures_of
 from pnpdepth_cli.errors import InputError, PnpDepthError, UsageError
+from pnpdepth_cli.pipeline.ahead import in_order
 from pnpdepth_cli.pipeline.evaluation.averages import FrameTable, bootstrap
 from pnpdepth_cli.pipeline.evaluation.findings import FileKinds, findings
 from pnpdepth_cli.pipeline.evaluation.frame_scoring import (
@@ -100,18 +99,7 @@ def _scored(
             raise InputError(frame.row.error)
         return frame
 
-    waiting: deque[Future[ScoredFrame]] = deque()
-    with ThreadPoolExecutor(request.workers) as pool:
-        try:
-            for pair in frames:
-                waiting.append(pool.submit(scored, pair))
-                if len(waiting) > request.workers:
-                    yield waiting.popleft().result()
-            while waiting:
-                yield waiting.popleft().result()
-        finally:
-            for future in waiting:
-                future.cancel()
+    return in_order(scored, frames, request.workers)
 
 
 def _means(

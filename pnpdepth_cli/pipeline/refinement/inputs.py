@@ -218,12 +218,10 @@ def _in_protocol(files: RefineRequest, path: Path, points: SparsePoints) -> Spar
 
 
 def _inside(path: Path, points: SparsePoints) -> SparsePoints:
-    height, width = points.size
-    x, y = points.xy[:, 0], points.xy[:, 1]
-    inside = (x >= -0.5) & (x < width - 0.5) & (y >= -0.5) & (y < height - 0.5)
-    if not bool(inside.any()):
+    inside = points.cropped(0, 0, *points.size)
+    if not len(inside):
         raise NoPointsError(f"{path}: none of its {len(points)} points lies in the image")
-    return points.select(inside)
+    return inside
 
 
 def _check_truth(files: RefineRequest, truth: _Part, image_size: tuple[int, int] | None) -> None:

@@ -51,12 +51,7 @@ class Tile:
 
     def points(self, points: SparsePoints) -> SparsePoints:
         """The frame's points that lie in it, at their places in the tile."""
-        xy = points.xy - points.xy.new_tensor([self.left, self.top])
-        end = xy.new_tensor([self.width, self.height]) - 0.5
-        inside = ((xy >= -0.5) & (xy < end)).all(dim=1)
-        return SparsePoints(
-            xy=xy[inside], depth=points.depth[inside], size=(self.height, self.width)
-        )
+        return points.cropped(self.top, self.left, self.height, self.width)
 
     def weights(self, size: tuple[int, int]) -> NDArray[np.float32]:
         """(height, width) in 0…1: down to 0 along an edge, but for those of the frame itself."""

@@ -6,7 +6,6 @@ import os
 import shutil
 import threading
 import weakref
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +30,7 @@ from tests.pipeline.batches import (
     add_frame,
     batch,
     pairs_on_disk,
+    refine_one_by_one,
     refinement,
     results,
     times,
@@ -52,11 +52,7 @@ def test_a_batch_equals_as_many_single_refinements_byte_for_byte(root: Path) -> 
     batch(root, workers=3, refine={"holdout": 0.3, "seed": 5})
     together = results(root / "out")
     shutil.rmtree(root / "out")
-    asked = refinement(root, holdout=0.3, seed=5, output=root / "out")
-    for name in NAMES:
-        parts = {p: root / f / f"{name}.png" for p, f in
-                 (("image", "rgb"), ("sparse", "sparse"), ("gt", "gt"))}  # fmt: skip
-        refine_image(replace(asked, **parts))
+    refine_one_by_one(root, NAMES, holdout=0.3, seed=5)
     assert len(together) == 4 * len(NAMES)
     assert together == results(root / "out")
 

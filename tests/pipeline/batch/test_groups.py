@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +16,15 @@ import torch
 from pnpdepth_cli.errors import DeviceError, StorageError
 from pnpdepth_cli.pipeline.batch import groups as batch_groups
 from pnpdepth_cli.pipeline.batch import running as batch_running
-from pnpdepth_cli.pipeline.refinement.refine import Refiner, refine_image
-from tests.pipeline.batches import Heard, add_frame, batch, pairs_on_disk, refinement, results
+from pnpdepth_cli.pipeline.refinement.refine import Refiner
+from tests.pipeline.batches import (
+    Heard,
+    add_frame,
+    batch,
+    pairs_on_disk,
+    refine_one_by_one,
+    results,
+)
 from tests.pipeline.frames import NETWORK
 
 NAMES = tuple("abcdefgh")
@@ -93,11 +99,7 @@ def test_groups_equal_as_many_single_refinements_byte_for_byte(
     assert heard.names == list(NAMES)
     together = results(root / "out")
     shutil.rmtree(root / "out")
-    asked = refinement(root, holdout=0.3, seed=5, output=root / "out")
-    for name in NAMES:
-        parts = {p: root / f / f"{name}.png" for p, f in
-                 (("image", "rgb"), ("sparse", "sparse"), ("gt", "gt"))}  # fmt: skip
-        refine_image(replace(asked, **parts))
+    refine_one_by_one(root, NAMES, holdout=0.3, seed=5)
     assert len(together) == 4 * len(NAMES)
     assert together == results(root / "out")
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -20,11 +19,9 @@ from pnpdepth_cli.models.network import Network, load_network
 from pnpdepth_cli.pipeline.refinement import auto
 from pnpdepth_cli.pipeline.refinement.auto import FEWEST, refine_automatically, usual_trials
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs
-from pnpdepth_cli.pipeline.refinement.refine import RefineOutcome, refine_image
-from pnpdepth_cli.pipeline.refinement.request import RefineRequest
 from pnpdepth_cli.pipeline.refinement.ways import Trial, Way, trajectories
 from tests.pipeline.batches import NAMES, Heard, batch, pairs_on_disk, results, times
-from tests.pipeline.frames import FrameOnDisk, frame_on_disk
+from tests.pipeline.frames import FrameOnDisk, frame_on_disk, run
 
 SETTINGS = RefineSettings(iterations=3, lr="5%", update="adam")
 TRIAL = Trial(layer="middle", settings=SETTINGS)
@@ -50,17 +47,6 @@ def inputs_of(frame: FrameOnDisk, count: int = 60) -> Inputs:
     )
     rgb = rng.random((*frame.depth.shape, 3), dtype=np.float32)
     return Inputs(rgb=rgb, points=points, gt=None, sparse_scale=None, record={}, notes=())
-
-
-def run(frame: FrameOnDisk, **changes: Any) -> RefineOutcome:
-    request: dict[str, Any] = {
-        "image": frame.image,
-        "sparse": frame.sparse,
-        "output": frame.folder / "out",
-        "model": str(frame.model),
-        "checkpoint": frame.checkpoint,
-    }
-    return refine_image(RefineRequest(**(request | changes)))
 
 
 def test_what_is_chosen_is_no_worse_at_held_out_points_than_network_and_baselines(

@@ -21,25 +21,12 @@ from pnpdepth_cli.errors import (
 )
 from pnpdepth_cli.io.depth import read_depth, write_depth
 from pnpdepth_cli.models.network import load_network
-from pnpdepth_cli.pipeline.refinement.refine import RefineOutcome, refine_image
-from pnpdepth_cli.pipeline.refinement.request import RefineRequest
-from tests.pipeline.frames import FrameOnDisk, frame_on_disk
+from tests.pipeline.frames import FrameOnDisk, frame_on_disk, run
 
 
 @pytest.fixture
 def frame(tmp_path: Path) -> FrameOnDisk:
     return frame_on_disk(tmp_path)
-
-
-def run(frame: FrameOnDisk, **changes: Any) -> RefineOutcome:
-    request: dict[str, Any] = {
-        "image": frame.image,
-        "sparse": frame.sparse,
-        "output": frame.folder / "out",
-        "model": str(frame.model),
-        "checkpoint": frame.checkpoint,
-    }
-    return refine_image(RefineRequest(**(request | changes)))
 
 
 def files(folder: Path) -> set[str]:
