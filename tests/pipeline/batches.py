@@ -107,7 +107,7 @@ def results(folder: Path) -> dict[str, bytes | dict[str, Any]]:
         name = path.relative_to(folder).as_posix()
         if path.is_dir() or name.startswith(("summary.", "batch.", ".batch.")):
             continue
-        if path.suffix == ".json":
+        if path.suffix == ".json" and not path.name.startswith("."):  # those need not be whole
             record = json.loads(path.read_text())
             del record["seconds"], record["peak_memory_mb"]
             found[name] = record
