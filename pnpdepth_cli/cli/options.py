@@ -147,8 +147,9 @@ def scan_given(given: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
 
 
 LOSSES = ("l1", "l2", "huber", "berhu", "inverse", "log", "cauchy")
-UPDATES = ("sign", "sgd", "normalised", "momentum", "adam")
+UPDATES = ("sign", "sgd", "normalised", "momentum", "adam", "lbfgs")
 SCHEDULES = ("constant", "linear")
+PARAMETERS = ("elements", "channels")
 PROPAGATIONS = ("none", "gp", "diffusion")
 FORMATS = ("png", "exr", "npy", "npz", "pfm", "tiff")
 
@@ -200,6 +201,23 @@ _REFINEMENT_OPTIONS = (
         type=float,
         metavar="S",
         help="Blur the gradient over S spacings of the points, where z is a map; 0 does not.",
+    ),
+    click.option(
+        "--parameters",
+        type=click.Choice(PARAMETERS),
+        default="elements",
+        show_default=True,
+        help="What is updated: every element of z, or a scale and a shift of each channel.",
+    ),
+    click.option(
+        "--anchor",
+        type=float,
+        default=0.0,
+        metavar="W",
+        help="Add to the loss W times the mean squared change of log depth: stay near the network.",
+    ),
+    click.option(
+        "--line-search", is_flag=True, help="Take back updates that raise the loss; go half as far."
     ),
     click.option(
         "--keep-best", is_flag=True, help="Give the depth of the lowest loss, not the last."

@@ -18,7 +18,8 @@ from pnpdepth_cli.errors import FramesFailedError, StorageError
 _INTERRUPTED = 128 + signal.SIGINT
 _OF_THE_REFINEMENT = {
     *("model", "checkpoint", "layer", "iterations", "lr", "loss", "update", "schedule", "spread"),
-    *("keep_best", "align", "align_every", "output_kind", "normalise", "depth_scale", "gt_scale"),
+    *("parameters", "anchor", "line_search", "keep_best", "align", "align_every", "output_kind"),
+    *("normalise", "depth_scale", "gt_scale"),
     *("channel", "sparse_size_ok", "seed", "device", "precision", "propagate"),
 }
 """Of a refinement's options those that decide a depth; a sweep writes none and holds none out."""
@@ -93,7 +94,7 @@ def sweep(
                 of the points, as `pnpdepth sample` has them
     rotation-noise
                 of a LiDAR, degrees
-    iterations, layer, lr, loss, update, schedule, spread, align, propagate
+    iterations, layer, lr, loss, update, schedule, spread, parameters, anchor, align, propagate
                 the options of these names
 
     One --vary makes a table and a picture of itself, two of their grid; with --one-by-one each of

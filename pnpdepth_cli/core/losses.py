@@ -64,6 +64,12 @@ def cauchy(predicted: Tensor, true: Tensor) -> Tensor:
     return (c * (error / c).square().log1p()).mean()
 
 
+def departure(depth: Tensor, first: Tensor) -> Tensor:
+    """Mean (log d − log d_0)² over the picture: how far depth has gone from the network's."""
+    change = depth.clamp_min(NEAREST_DEPTH).log() - first.clamp_min(NEAREST_DEPTH).log()
+    return change.square().mean()
+
+
 LOSSES: dict[str, Loss] = {
     "l1": l1,
     "l2": l2,

@@ -17,10 +17,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from pnpdepth_cli.core.losses import LOSSES
+from pnpdepth_cli.core.losses import LOSSES, departure
 from pnpdepth_cli.core.points import SparsePoints
 from pnpdepth_cli.core.split import Split, gradient_at
-from pnpdepth_cli.core.steps import SCHEDULES, spread, step_size
+from pnpdepth_cli.core.steps import SCHEDULES, Channels, spread, step_size
 from pnpdepth_cli.core.structure import map_tensors, tensors_in
 from pnpdepth_cli.core.updates import UPDATES
 from pnpdepth_cli.errors import BatchError, DivergedError, LayerError, PnpDepthError
@@ -38,8 +38,11 @@ class RefineSettings:
     iterations: the number of updates of z, 0 for the plain prediction.
     lr: α as a number, or a text like "3%": that share of the standard deviation of z_0.
     schedule: how α falls over the updates. spread: how far the gradient is blurred, in spacings of
-        the points; see `pnpdepth_cli.core.steps` for both.
-    keep_best: whether the result is the depth of the lowest loss instead of the last.
+        the points. parameters: what is updated; see `pnpdepth_cli.core.steps` for these three.
+    anchor: the weight of `pnpdepth_cli.core.losses.departure` in L.
+    line_search: whether an update that raises L is taken back and made half as far instead.
+    keep_best: whether the result is the depth of the lowest loss instead of the last; with a line
+        search it always is.
     align, align_every: how `depth_of` was asked to fit the network's numbers to metres, and
         whether again for every z; see `pnpdepth_cli.core.alignment`.
     """
@@ -50,9 +53,17 @@ class RefineSettings:
     update: str = "sign"
     schedule: str = "constant"
     spread: float = 0.0
+    parameters: str = "elements"
+    anchor: float = 0.0
+    line_search: bool = False
     keep_best: bool = False
     align: str = "none"
     align_every: bool = False
+
+    @property
+    def gives_best(self) -> bool:
+        """Whether the result is the depth of the lowest loss."""
+        return self.keep_best or self.line_search
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -125,7 +136,7 @@ def refine_from(
 ) -> list[Refinement | PnpDepthError]:
     """The same from z_0 on: the front of these arguments is not run again for other points."""
     frames = [
-        _Frame(settings, step_size(settings.lr, z0), at, read)
+        _Frame(settings, z0, at, read)
         for z0, at, read in zip(_apart(z, len(points)), points, depth_of, strict=True)
     ]
     for iteration in range(settings.iterations):
@@ -149,10 +160,13 @@ class _Frame:
     """A frame on its way: the losses and depths so far, and the error that ended it."""
 
     def __init__(
-        self, settings: RefineSettings, step: float, points: SparsePoints, depth_of: DepthOf
+        self, settings: RefineSettings, z0: Tensor, points: SparsePoints, depth_of: DepthOf
     ) -> None:
-        self._settings, self._step, self._points, self._depth_of = settings, step, points, depth_of
+        self._settings, self._points, self._depth_of = settings, points, depth_of
+        self._step, self._halvings = step_size(settings.lr, z0), 0
         self._loss_of, self._update = LOSSES[settings.loss], UPDATES[settings.update]()
+        self._channels = Channels(z0) if settings.parameters == "channels" else None
+        self._way: tuple[Tensor, Tensor] | None = None  # the lowest loss's z, and where it points
         self._depths: list[Tensor] = []  # of z_0, and of z_kept
         self._kept = 0
         self.losses: list[float] = []
@@ -166,11 +180,13 @@ class _Frame:
             self.error = error
             return None
         loss = self._loss_of(self._points.sample(depth), self._points.depth)
+        if self._settings.anchor and self._depths:
+            loss = loss + self._settings.anchor * departure(depth, self._depths[0])
         if self._settings.iterations and not bool(loss.isfinite()):
             self.error = self._diverged("loss", len(self.losses))
             return None
         self.losses.append(float(loss.detach()))
-        if not self._settings.keep_best or self.losses[-1] <= min(self.losses):
+        if not self._settings.gives_best or self.losses[-1] <= min(self.losses):
             self._kept = len(self.losses) - 1
             self._depths = [*self._depths[:1], depth.detach()]
         return loss
@@ -182,8 +198,20 @@ class _Frame:
             self.error = self._diverged("gradient", made)
         if self.error is not None:
             return z
+        if self._settings.line_search and self._way is not None and self._kept < made:
+            self._halvings += 1
+            z, direction = self._way
+        else:
+            direction = self._direction(spread(gradient, self._points, self._settings.spread))
+            if self._settings.line_search:
+                self._way = z, direction
         alpha = self._step * SCHEDULES[self._settings.schedule](made / self._settings.iterations)
-        return z - alpha * self._update(spread(gradient, self._points, self._settings.spread))
+        return z - alpha * 0.5**self._halvings * direction
+
+    def _direction(self, gradient: Tensor) -> Tensor:
+        if self._channels is None:
+            return self._update(gradient)
+        return self._channels.spread_out(self._update(self._channels.of(gradient)))
 
     def refinement(self) -> Refinement:
         """What has come of it so far."""

@@ -5,12 +5,15 @@ Each rule is made anew for every refinement and sees the gradients of one frame,
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable
 
 import torch
 from torch import Tensor
 
 Update = Callable[[Tensor], Tensor]
+
+_LONGEST = 10.0  # root mean square of a direction of L-BFGS; its first one has 1
 
 
 def sign() -> Update:
@@ -71,10 +74,51 @@ def adam(beta1: float = 0.9, beta2: float = 0.999, eps: float = 1e-12) -> Update
     return update
 
 
+def lbfgs(memory: int = 10) -> Update:
+    """Limited-memory BFGS, two loops over the last pairs (Nocedal & Wright 2006, algorithm 7.4).
+
+    The first direction is the normalised gradient. From then on z moves by quasi-Newton steps
+    whatever α is: the rule takes its last direction for the way that z went, which is wrong by the
+    factor α, and so is its inverse Hessian the other way round. Where the loss does not curve
+    upwards the pair is skipped, and no direction is longer than `_LONGEST` of the first.
+    """
+    pairs: deque[tuple[Tensor, Tensor]] = deque(maxlen=memory)  # of −direction and the change of g
+    last: tuple[Tensor, Tensor] | None = None  # gradient and direction
+    first = normalised()
+
+    def update(gradient: Tensor) -> Tensor:
+        nonlocal last
+        if last is not None:
+            step, change = -last[1], gradient - last[0]
+            if (step * change).sum() > 0:
+                pairs.append((step, change))
+        direction = gradient
+        back = []
+        for step, change in reversed(pairs):
+            share = (step * direction).sum() / (step * change).sum()
+            back.append(share)
+            direction = direction - share * change
+        if pairs:
+            step, change = pairs[-1]
+            direction = direction * ((step * change).sum() / change.square().sum())
+            for (step, change), share in zip(pairs, reversed(back), strict=True):
+                again = (change * direction).sum() / (step * change).sum()
+                direction = direction + (share - again) * step
+            length = direction.square().mean().sqrt()
+            direction = direction * (_LONGEST / length.clamp_min(_LONGEST))
+        else:
+            direction = first(gradient)
+        last = gradient, direction
+        return direction
+
+    return update
+
+
 UPDATES: dict[str, Callable[[], Update]] = {
     "sign": sign,
     "sgd": sgd,
     "normalised": normalised,
     "momentum": momentum,
     "adam": adam,
+    "lbfgs": lbfgs,
 }

@@ -10,7 +10,7 @@ import pytest
 from pnpdepth_cli.cli import options
 from pnpdepth_cli.core.losses import LOSSES
 from pnpdepth_cli.core.refine import RefineSettings
-from pnpdepth_cli.core.steps import SCHEDULES
+from pnpdepth_cli.core.steps import PARAMETERS, SCHEDULES
 from pnpdepth_cli.core.updates import UPDATES
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.models.definition import FOREIGN, ModelDefinition, Multiple
@@ -27,6 +27,7 @@ def test_the_choices_are_those_of_the_method() -> None:
     assert tuple(LOSSES) == options.LOSSES
     assert tuple(UPDATES) == options.UPDATES
     assert tuple(SCHEDULES) == options.SCHEDULES
+    assert PARAMETERS == options.PARAMETERS
 
 
 def test_without_a_word_the_settings_are_the_networks() -> None:
@@ -49,10 +50,14 @@ def test_another_update_starts_from_the_papers_step() -> None:
 
 def test_what_the_user_says_holds() -> None:
     asked = replace(
-        REQUEST, update="adam", lr="2%", schedule="linear", spread=0.5, keep_best=True, iterations=3
-    )
+        REQUEST, update="adam", lr="2%", schedule="linear", spread=0.5, keep_best=True,
+        iterations=3, parameters="channels", anchor=0.5, line_search=True,
+    )  # fmt: skip
     settings = effective_settings(STRANGER, asked)
-    for name in ("update", "lr", "schedule", "spread", "keep_best", "iterations"):
+    for name in (
+        *("update", "lr", "schedule", "spread", "keep_best", "iterations"),
+        *("parameters", "anchor", "line_search"),
+    ):
         assert getattr(settings, name) == getattr(asked, name)
     assert effective_settings(STRANGER, replace(REQUEST, spread=0)).spread == 0
 
@@ -61,3 +66,9 @@ def test_what_the_user_says_holds() -> None:
 def test_a_spread_that_is_no_distance_is_refused(spread: float) -> None:
     with pytest.raises(UsageError, match="no distance"):
         effective_settings(STRANGER, replace(REQUEST, spread=spread))
+
+
+@pytest.mark.parametrize("anchor", [-0.1, float("nan"), float("inf")])
+def test_what_is_no_weight_is_refused(anchor: float) -> None:
+    with pytest.raises(UsageError, match="is no weight; give 0 or more"):
+        effective_settings(STRANGER, replace(REQUEST, anchor=anchor))

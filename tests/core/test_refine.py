@@ -243,6 +243,68 @@ def test_the_kept_iterate_has_the_lowest_loss_and_is_one_of_the_way(name: str, l
     assert torch.equal(best.before, last.before)
 
 
+# ------------------------------------------------------------------ what is updated, and how far
+
+
+def test_channels_are_scaled_and_shifted_and_nothing_else() -> None:
+    settings = RefineSettings(parameters="channels", update="adam", lr=0.05)
+    seen: list[Tensor] = []
+
+    class Watched(nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.cut, self.head = conv(3, 4), conv(4, 1)
+
+        def forward(self, x: Tensor) -> Tensor:
+            z = self.cut(x)
+            seen.append(z.detach().clone())
+            return self.head(z).abs()
+
+    torch.manual_seed(0)
+    result = refined(Watched(), "cut", settings)
+    assert result.losses[-1] < result.losses[0]
+    for before, after in zip(seen[0][0].double(), seen[-1][0].double(), strict=True):
+        x = torch.stack([before.flatten(), torch.ones(before.numel())], dim=1)
+        fitted = x @ torch.linalg.lstsq(x, after.flatten()).solution
+        torch.testing.assert_close(fitted, after.flatten(), rtol=1e-5, atol=1e-6)
+    assert not torch.equal(seen[0], seen[-1])
+
+
+def test_an_anchor_adds_the_squared_change_of_log_depth_and_holds_it_back() -> None:
+    def change(result: Refinement) -> float:
+        return float((result.after.log() - result.before.log()).square().mean())
+
+    settings = RefineSettings(iterations=8, lr=0.05, update="normalised")
+    free, held = (
+        refined(build("unet"), "bottleneck", replace(settings, anchor=anchor))
+        for anchor in (0.0, 10.0)
+    )
+    assert free.losses[0] == held.losses[0]
+    assert change(held) < change(free)
+    at_points = (POINTS.sample(held.after) - POINTS.depth).abs().mean()
+    assert held.losses[-1] == pytest.approx(float(at_points) + 10 * change(held), rel=1e-5)
+
+
+def test_a_line_search_takes_back_what_raises_the_loss_and_goes_half_as_far() -> None:
+    x = torch.full((1, 3, 1, 1), 3.0)  # depth 6, and 2 more for every 1 that z moves
+    points = SparsePoints(xy=torch.zeros(1, 2), depth=torch.tensor([7.0]), size=(1, 1))
+    settings = RefineSettings(iterations=4, lr=2.0, line_search=True)
+    with Split(Doubling(), "cut") as split:
+        result = refine(split, (x,), points, settings, depth_of=lambda y: y)
+    # 6 → 10, back and half as far: 8, which is no worse than 6; on from there to 6; again 7
+    assert result.losses == (1.0, 3.0, 1.0, 1.0, 1.0)
+    assert result.kept == 4
+
+
+@pytest.mark.parametrize("update", UPDATES)
+def test_the_result_of_a_line_search_is_the_best_of_its_way(update: str) -> None:
+    settings = RefineSettings(iterations=8, lr=0.5, update=update, line_search=True)
+    result = refined(build("unet"), "bottleneck", settings)
+    at_points = (POINTS.sample(result.after) - POINTS.depth).abs().mean()
+    assert min(result.losses) == result.losses[result.kept] == pytest.approx(float(at_points))
+    assert result.losses[result.kept] < result.losses[0]
+
+
 # ------------------------------------------------------------------ divergence
 
 

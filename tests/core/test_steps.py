@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pnpdepth_cli.core.points import SparsePoints
-from pnpdepth_cli.core.steps import SCHEDULES, spread, step_size
-from pnpdepth_cli.errors import UsageError
+from pnpdepth_cli.core.steps import SCHEDULES, Channels, spread, step_size
+from pnpdepth_cli.errors import LayerError, UsageError
 
 
 def points(count: int, size: tuple[int, int]) -> SparsePoints:
@@ -85,3 +85,32 @@ def test_a_gradient_that_is_the_same_everywhere_stays_so_whatever_the_points(
 def test_many_points_keep_a_gradient_in_its_cell() -> None:
     gradient = torch.randn(1, 2, 6, 8, generator=torch.Generator().manual_seed(0))
     torch.testing.assert_close(spread(gradient, points(4800, (60, 80)), 1.0), gradient)
+
+
+@pytest.mark.parametrize(("shape", "inside"), [((1, 3, 4, 5), (2, 3)), ((1, 7, 3), (1,))])
+def test_channels_move_by_a_scale_and_a_shift_each(
+    shape: tuple[int, ...], inside: tuple[int, ...]
+) -> None:
+    torch.manual_seed(0)
+    z0 = torch.randn(shape).double() * 4 + 1
+    channels = Channels(z0)
+    change = torch.randn_like(channels.of(z0))
+    assert change.numel() == 2 * 3
+    scale, shift = change.tensor_split(2)
+    flat = (z0 - z0.mean(inside, keepdim=True)) / z0.std(inside, correction=0, keepdim=True)
+    torch.testing.assert_close(channels.spread_out(change), scale * flat + shift)
+    # what `of` gives is the slope of the loss in these numbers, over the elements of a channel
+    slope, count = torch.randn_like(z0), z0.numel() // 3
+    along = (slope * channels.spread_out(change)).sum()
+    torch.testing.assert_close((channels.of(slope) * change).sum() * count, along)
+
+
+def test_a_channel_that_is_the_same_everywhere_is_shifted_only() -> None:
+    channels = Channels(torch.ones(1, 1, 2, 2))
+    moved = channels.spread_out(torch.tensor([5.0, 2.0]).view(2, 1, 1, 1))
+    assert moved.flatten().tolist() == [2.0] * 4
+
+
+def test_a_z_without_channels_is_refused() -> None:
+    with pytest.raises(LayerError, match="--parameters elements"):
+        Channels(torch.zeros(1, 8))

@@ -48,6 +48,9 @@ class RefineRequest:
     update: str | None = None
     schedule: str | None = None
     spread: float | None = None
+    parameters: str = "elements"
+    anchor: float = 0.0
+    line_search: bool = False
     keep_best: bool = False
     align: str | None = None
     align_every: bool = False
@@ -124,6 +127,8 @@ def effective_settings(definition: ModelDefinition, request: RefineRequest) -> R
     spread = steps.spread if request.spread is None else request.spread
     if not 0 <= spread < math.inf:
         raise UsageError(f"spread {spread} is no distance; give 0 or more spacings of the points")
+    if not 0 <= request.anchor < math.inf:
+        raise UsageError(f"anchor {request.anchor} is no weight; give 0 or more")
     return RefineSettings(
         iterations=iterations,
         lr=steps.lr if request.lr is None else request.lr,
@@ -131,6 +136,9 @@ def effective_settings(definition: ModelDefinition, request: RefineRequest) -> R
         update=update,
         schedule=request.schedule or steps.schedule,
         spread=spread,
+        parameters=request.parameters,
+        anchor=request.anchor,
+        line_search=request.line_search,
         keep_best=request.keep_best,
         align=request.align or definition.default_alignment,
         align_every=request.align_every,

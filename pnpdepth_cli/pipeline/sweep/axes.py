@@ -13,6 +13,7 @@ import torch
 from pnpdepth_cli.core.alignment import ALIGNMENTS
 from pnpdepth_cli.core.losses import LOSSES
 from pnpdepth_cli.core.propagation import PROPAGATIONS
+from pnpdepth_cli.core.steps import PARAMETERS as PARAMETERS_OF_Z
 from pnpdepth_cli.core.steps import SCHEDULES, step_size
 from pnpdepth_cli.core.updates import UPDATES
 from pnpdepth_cli.errors import UsageError
@@ -195,6 +196,8 @@ PARAMETERS: Mapping[str, Parameter] = {
     "update": Parameter(title="update rule", value=_one_of(tuple(UPDATES))),
     "schedule": Parameter(title="schedule of the step", value=_one_of(tuple(SCHEDULES))),
     "spread": Parameter(title="blur of the gradient (spacings of the points)", value=_ANY),
+    "parameters": Parameter(title="what is updated", value=_one_of(PARAMETERS_OF_Z)),
+    "anchor": Parameter(title="weight of staying near the network", value=_ANY),
     "align": Parameter(title="alignment", value=_one_of(ALIGNMENTS)),
     "propagate": Parameter(title="propagation of what is left", value=_one_of(PROPAGATIONS)),
 }

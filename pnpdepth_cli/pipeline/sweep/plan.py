@@ -185,7 +185,8 @@ def run_key(
 
 
 _OF_THE_RUN = (
-    *("layer", "iterations", "lr", "loss", "update", "schedule", "spread", "keep_best", "align"),
-    *("align_every", "propagate", "sample", "seed", "holdout", "format"),
+    *("layer", "iterations", "lr", "loss", "update", "schedule", "spread", "parameters"),
+    *("anchor", "line_search", "keep_best", "align", "align_every", "propagate", "sample", "seed"),
+    *("holdout", "format"),
 )
 """Fields of a request that a run states itself, or that do not matter to it."""

@@ -101,7 +101,7 @@ def refined_curve(
     at = points.to(network.device)
     settings = replace(method.settings, iterations=max(wanted))
     aligned = AlignedDepth(network, at, settings.align, every=settings.align_every)
-    seen = _Seen(aligned, None if settings.keep_best else {0, *wanted})
+    seen = _Seen(aligned, None if settings.gives_best else {0, *wanted})
     diverged: DivergedError | None = None
     with out_of_memory_is_a_device_error(network.device):
         arguments = network.arguments(frame, inputs.rgb_tensor(), points)
@@ -163,7 +163,7 @@ class _Seen:
 
 def _kept(losses: Sequence[float], updates: int, settings: RefineSettings) -> int:
     """Which z's depth a refinement of so many updates gives: the last, or that of least loss."""
-    if not settings.keep_best:
+    if not settings.gives_best:
         return updates
     return min(range(updates + 1), key=lambda k: (losses[k], -k))
 
