@@ -241,8 +241,7 @@ def _believed(points: SparsePoints, prediction: Tensor) -> Tensor:
     """(N,) 0…1: how much each point is believed when it is scored; wrong ones would decide all."""
     at_points = points.sample(prediction)
     missing = points.depth.double().log() - at_points.clamp_min(1e-6).double().log()
-    believed = torch.where(at_points > 0, trust(points, missing), 0.0)
-    return believed if bool(believed.any()) else torch.ones_like(believed)
+    return torch.where(at_points > 0, trust(points, missing), 0.0)
 
 
 def _chosen(
@@ -256,6 +255,8 @@ def _chosen(
         return Choice(ways=(fixed or usual,), weights=(1.0,))
     depth = torch.cat([fold.held_out.depth for fold in folds])
     believed = torch.cat([fold.believed for fold in folds]).float()
+    if not bool(believed.any()):  # the network sees nothing at these points
+        believed = torch.ones_like(believed)
     predicted: dict[Way, Tensor] = {}
 
     def scored(ways: Sequence[Way]) -> dict[Way, float]:

@@ -79,6 +79,16 @@ def test_held_out_points_do_not_tell_the_depth_that_they_score(
     assert torch.equal(again.folds[0].at(way), before)
 
 
+def test_held_out_points_of_which_none_is_believed_count_alike(
+    frame: FrameOnDisk, network: Network, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(auto, "trust", lambda points, missing: torch.zeros_like(missing))
+    inputs = inputs_of(frame)
+    found = refine_automatically(network, [TRIAL], inputs, inputs.points)
+    assert found.choice.error is not None
+    assert found.choice.error <= min(one.error for one in found.choice.scored) + 1e-6
+
+
 def test_wrong_points_are_left_out_and_said_and_the_depth_is_hardly_worse(
     frame: FrameOnDisk, network: Network
 ) -> None:
