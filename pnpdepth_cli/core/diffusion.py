@@ -6,7 +6,8 @@ With r the residual in log depth at the points and c the correction on a grid of
 
 w_ij = 1 / (place² + (u_i − u_j)² + (colour_i − colour_j)²), each over its length: one sparse linear
 system, as in Levin, Lischinski, Weiss, "Colorization using optimization", 2004, with the weights of
-Perona and Malik 1990. Nodes are the pixels of small pictures; of larger ones, a coarser grid.
+Perona and Malik 1990. The grid is the coarser the fewer the points are: between them each node
+counts as one more step, so that on a fine grid what they tell stays close to them.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ STIFFNESS = 1e-4
 EDGE_DEPTH, EDGE_COLOUR = 0.1, 0.5
 """Differences of neighbouring nodes, in standard deviations of the picture, that halve a weight."""
 
-_NODES = 30_000
+_NODES_A_POINT, _FEWEST_NODES, _MOST_NODES = 10, 2_000, 30_000
 _ANCHOR = 1e-9  # ε: where nothing tells a node anything
 
 
@@ -36,7 +37,8 @@ def diffused(field: Field) -> Tensor:
     from scipy.sparse.linalg import splu
 
     height, width = field.points.size
-    shrink = min(1.0, math.sqrt(_NODES / (height * width)))
+    wanted = min(max(_NODES_A_POINT * len(field.points), _FEWEST_NODES), _MOST_NODES)
+    shrink = min(1.0, math.sqrt(wanted / (height * width)))
     rows, columns = max(1, round(height * shrink)), max(1, round(width * shrink))
     nodes = F.interpolate(field.features.permute(2, 0, 1)[None], (rows, columns), mode="area")[0]
     number = torch.arange(rows * columns).reshape(rows, columns)

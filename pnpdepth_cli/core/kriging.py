@@ -56,6 +56,7 @@ _CROWDED = 0.05  # but for so many of all points
 _WRONG = (4.0, 4.0, 5.0, 6.0, 8.0)  # times the usual error, beyond which a point is wrong, in turn
 _NOTHING = 1e-6  # the weight of a point that tells nothing
 _DOUBTED = 0.05  # weight of 0…1; points with less are left out,
+_AROUND, _MOST_DOUBTED, _HALF = 6, 4, 3  # neighbours: of a fifth of wrong points 2 % have 4 such
 _FAR_BETTER = 0.5  # if that makes the others' errors at most so much of what they were,
 _FAR_BETTER_MANY = 0.65  # or so much where there are many points, whose errors are well known
 _LEAST = 1e-3  # of the usual error over its standard deviation if f had 1; less is none
@@ -106,7 +107,8 @@ def believed(field: Field) -> Tensor:
     Each point is weighted by how well its neighbours tell it: loosely by `trust`, then, unless
     there are very many, by the process, told by the others as they are weighted. A point on a small
     thing is as alone as a wrong one; but only where there are wrong ones do the others tell each
-    other far better without all that are alone.
+    other far better without all that are alone. Where those lie together they are not wrong, but
+    what the network has not seen: a corridor behind a door.
     """
     weight, near = trust(field.points, field.residual), _neighbourhoods(field, _EXACT_MOST)
     if len(near) == 1 and near.shape[1] >= _FEW:
@@ -116,6 +118,8 @@ def believed(field: Field) -> Tensor:
             usual = max(_NORMAL_MEDIAN * float(beyond.median()), _LEAST)
             weight = (1 - (beyond / (many * usual)).square()).clamp_min(0).square()
     kept = weight > _DOUBTED
+    kept = kept | _together(field.points, ~kept)
+    weight = torch.where(kept, weight.clamp_min(_DOUBTED), weight)
     if bool(kept.all()) or not bool(kept.any()):
         return torch.ones_like(kept)
     with_all, without = (
@@ -124,6 +128,20 @@ def believed(field: Field) -> Tensor:
     )
     enough = _FAR_BETTER if len(near) == 1 else _FAR_BETTER_MANY
     return kept if without < enough * with_all else torch.ones_like(kept)
+
+
+def _together(points: SparsePoints, doubted: Tensor) -> Tensor:
+    """(N,) bool: the doubted points most of whose neighbours are doubted, and those beside such."""
+    if len(points) <= _AROUND or not bool(doubted.any()):
+        return torch.zeros_like(doubted)
+    _, near = nearest_points(points, points.xy.double(), _AROUND + 1)
+    near = near[:, 1:]
+    found = doubted & (doubted[near].sum(dim=1) >= _MOST_DOUBTED)
+    while True:
+        more = found | (doubted & (found[near].sum(dim=1) >= _HALF))
+        if torch.equal(more, found):
+            return found
+        found = more
 
 
 def fitted(field: Field) -> Field:

@@ -1,8 +1,11 @@
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
+from scipy.sparse.linalg import splu
 from torch import Tensor
 
 from pnpdepth_cli.core import diffusion
@@ -61,6 +64,23 @@ def test_an_edge_of_the_prediction_stops_it() -> None:
 def test_one_point_is_everywhere_also_on_a_coarser_grid(
     nodes: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(diffusion, "_NODES", nodes)
+    monkeypatch.setattr(diffusion, "_FEWEST_NODES", nodes)
+    monkeypatch.setattr(diffusion, "_MOST_NODES", nodes)
     made = diffused(field([(3.4, 2.6)], [0.25], step()))
     assert torch.allclose(made, torch.full(SIZE, 0.25), atol=1e-5)
+
+
+@pytest.mark.parametrize(("count", "nodes"), [(3, 2000), (400, 4000), (5000, 30_000)])
+def test_the_grid_is_finer_where_points_are_many(
+    count: int, nodes: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    solved = []
+
+    def noted(system: Any, **how: Any) -> Any:
+        solved.append(system.shape[0])
+        return splu(system, **how)
+
+    monkeypatch.setattr("scipy.sparse.linalg.splu", noted)
+    places = torch.rand(count, 2, generator=torch.Generator().manual_seed(0)) * 199
+    diffused(field([(x, y) for x, y in places.tolist()], [0.1] * count, step((200, 300))))
+    assert solved[0] == pytest.approx(nodes, rel=0.02)

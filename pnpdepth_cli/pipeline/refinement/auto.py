@@ -167,13 +167,18 @@ def refine_automatically(
 def _without_wrong(
     network: Network, trial: Trial, inputs: Inputs, used: SparsePoints
 ) -> tuple[SparsePoints, tuple[str, ...]]:
-    """The points that are not clearly wrong beside the network's depth, and what was left out."""
-    plain = replace(trial, settings=replace(trial.settings, iterations=0))
-    (found,) = trajectories(network, plain, inputs, [used], ())
-    if isinstance(found, PnpDepthError):
-        return used, ()
+    """The points that are not clearly wrong, and what is said of the others.
+
+    They are wrong beside each other, or beside what the network predicts from the rest: a network
+    that takes the points follows the wrong ones too.
+    """
     rgb = inputs.rgb_tensor()
-    doubted = wrong(found.depths[0], used, None if rgb is None else rgb[0])
+    rgb = None if rgb is None else rgb[0]
+    doubted = wrong(torch.ones(used.size), used, rgb)
+    plain = replace(trial, settings=replace(trial.settings, iterations=0))
+    (found,) = trajectories(network, plain, inputs, [used.select(~doubted)], ())
+    if not isinstance(found, PnpDepthError):
+        doubted = doubted | wrong(found.depths[0], used, rgb)
     count = int(doubted.sum())
     if not count:
         return used, ()
