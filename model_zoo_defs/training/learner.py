@@ -117,7 +117,11 @@ class Learner:
         }
         torch.save(state, self.out / "state.pt.part")
         (self.out / "state.pt.part").replace(self.out / "state.pt")
-        export(self.average, self.weights)
+        export(self.exported(), self.weights)
+
+    def exported(self) -> nn.Module:
+        """The network whose weights go out."""
+        return self.average
 
     def restore(self) -> None:
         """The run stands where `save` left it; without a state.pt, at its beginning."""

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from model_zoo_defs.training.batches import Points, many_points, some_points
+from model_zoo_defs.training.scaffold import scaffolded
 
 NEAREST = 0.1  # metres; below this a logarithm goes on as a straight line
 
@@ -121,6 +122,7 @@ class Recipe:
     quiet: endings of the names of normalisations that start at 0, the last ones of residual
         branches, so that a deep network starts as a shallow one.
     flat: layers that start as this constant, so that no step is lost on finding the mean.
+    scaffold: layers that are normalised while they learn, in a network that has no normalisation.
     start: what else is put in place before the first step.
     spliced: the share of windows that are put together of two frames, left and right; for networks
         that would learn rooms by heart.
@@ -139,6 +141,7 @@ class Recipe:
     batch: int = 8
     quiet: tuple[str, ...] = ()
     flat: Mapping[str, float] = field(default_factory=dict)
+    scaffold: tuple[str, ...] = ()
     start: Callable[[Any], None] | None = None
     spliced: float = 0.0
     dropout: float = 0.1
@@ -163,16 +166,17 @@ WITH_POINTS = Recipe(
 RECIPES = {
     # the coarse half first, as the authors did it; it is a fifth of the work
     "eigen-tiny": Recipe(
-        loss=log_error, batch=16, farthest=KINECT, spliced=0.7, dropout=0.3,
+        loss=log_error, batch=16, farthest=KINECT, spliced=0.5,
         flat={"coarse.fc2": 0.75, "fine.conv3": 0.0}, start=hand_coarse_depth_on,
+        scaffold=(*(f"coarse.conv{i}" for i in range(1, 6)), "coarse.fc1", "fine.conv1"),
         stages=(
-            Stage(window=ROOM, until=0.8, outputs=coarse),
+            Stage(window=ROOM, until=0.85, outputs=coarse),
             Stage(window=ROOM, outputs=fine_and_coarse),
         ),
     ),
     # fewer pixels are less work and show most of what there is to learn; it keeps half the size
     "fcrn-tiny": Recipe(
-        loss=log_error, batch=16, farthest=KINECT, quiet=("bn_branch2c",), spliced=0.7,
+        loss=log_error, batch=16, farthest=KINECT, quiet=("bn_branch2c",), spliced=0.5,
         stages=(
             Stage(window=ROOM, shown=(57, 76), until=0.2),
             Stage(window=ROOM, shown=QUARTER),
@@ -218,4 +222,4 @@ def with_start(network: nn.Module, recipe: Recipe) -> nn.Module:
         nn.init.constant_(layer.bias, constant)
     if recipe.start is not None:
         recipe.start(network)
-    return network
+    return scaffolded(network, recipe.scaffold)

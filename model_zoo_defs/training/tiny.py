@@ -28,6 +28,7 @@ from model_zoo_defs.training.batches import Batch, Batches
 from model_zoo_defs.training.dataset import Frames
 from model_zoo_defs.training.learner import Learner, Schedule, append_row
 from model_zoo_defs.training.recipes import RECIPES, Recipe, Stage, with_start
+from model_zoo_defs.training.scaffold import without_scaffold
 from pnpdepth_cli.models.definition import ModelDefinition, Multiple
 
 AVERAGING = 0.99  # runs are short, and a stage's weights are of no use to the next one's average
@@ -104,7 +105,8 @@ class TinyRun(Learner):
         In training every small batch is normalised by itself; with few points in one and the many
         of a LiDAR in the next, what is kept of that suits neither.
         """
-        norms = [layer for layer in self.average.modules() if isinstance(layer, nn.BatchNorm2d)]
+        kinds = nn.BatchNorm1d | nn.BatchNorm2d
+        norms = [layer for layer in self.average.modules() if isinstance(layer, kinds)]
         if norms:
             momenta = [norm.momentum for norm in norms]
             for norm in norms:
@@ -114,6 +116,10 @@ class TinyRun(Learner):
             for norm, momentum in zip(norms, momenta, strict=True):
                 norm.momentum = momentum
         super().save()
+
+    def exported(self) -> nn.Module:
+        """The average without what only helped it learn."""
+        return without_scaffold(self.average)
 
     def arguments(self, batch: Batch) -> tuple[Tensor, ...]:
         """How the network is called for a batch."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import csv
 import math
 from dataclasses import replace
@@ -14,6 +15,7 @@ import torch
 from torch import nn
 
 from model_zoo_defs.training import batches, recipes
+from model_zoo_defs.training.scaffold import scaffolded, without_scaffold
 from pnpdepth_cli.models.definition import ModelDefinition, Multiple
 
 pytest.importorskip("safetensors")
@@ -171,6 +173,37 @@ def test_a_start_is_what_the_recipe_says() -> None:
     assert drop.p == 0.25
     assert not toy.norm.weight.any()
     assert bool((toy(torch.rand(1, 3, 8, 8)) == 2.0).all())
+
+
+def test_without_its_scaffold_a_network_says_the_same_and_is_the_published_one() -> None:
+    torch.manual_seed(0)
+    plain = nn.Sequential(
+        nn.Conv2d(3, 5, 3),
+        nn.ReLU(),
+        nn.Flatten(),
+        nn.Linear(5 * 6 * 6, 7),
+        nn.ReLU(),
+        nn.Linear(7, 2),
+    )
+    keys = list(plain.state_dict())
+    before = [weight.clone() for weight in plain.state_dict().values()]
+    network = scaffolded(plain, ("0", "3"))
+    network.train()
+    optimiser = torch.optim.SGD(network.parameters(), lr=0.1)
+    for _ in range(5):
+        optimiser.zero_grad()
+        network(torch.randn(8, 3, 8, 8) * 3 + 1).square().mean().backward()
+        optimiser.step()
+    network.eval()
+    copied, found = copy.deepcopy(network), without_scaffold(network)
+    x = torch.randn(4, 3, 8, 8)
+    assert list(found.state_dict()) == keys
+    assert len(network.state_dict()) > len(keys)  # it goes on learning with its scaffold
+    torch.testing.assert_close(found(x), network(x), rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(copied(x), network(x))
+    assert not any(
+        torch.equal(*pair) for pair in zip(before, found.state_dict().values(), strict=True)
+    )
 
 
 def settings(shards: Path, out: Path, steps: int = 8) -> Any:
