@@ -29,7 +29,14 @@ from pnpdepth_cli.models.definition import ModelDefinition
 from pnpdepth_cli.models.network import Network
 from pnpdepth_cli.pipeline.refinement.frame import RefinedFrame
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs
-from pnpdepth_cli.pipeline.refinement.ways import Depths, Trajectory, Trial, Way, trajectories
+from pnpdepth_cli.pipeline.refinement.ways import (
+    Depths,
+    Trajectory,
+    Trial,
+    Way,
+    trajectories,
+    updates_of,
+)
 
 FOLDS = 4
 FEWEST = 5
@@ -37,8 +44,6 @@ FEWEST = 5
 ENOUGH = 250
 """With this many held-out points no further fold is looked at."""
 SPREADING = ("gp", "diffusion")
-UPDATES = (1, 2, 3, 5, 10, 20)
-"""Numbers of updates of z that are scored, as far as a trial's own goes, which is as well."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -176,7 +181,7 @@ def _without_wrong(
     rgb = None if rgb is None else rgb[0]
     doubted = wrong(torch.ones(used.size), used, rgb)
     plain = replace(trial, settings=replace(trial.settings, iterations=0))
-    (found,) = trajectories(network, plain, inputs, [used.select(~doubted)], ())
+    (found,) = trajectories(network, [plain], inputs, [used.select(~doubted)])[plain]
     if not isinstance(found, PnpDepthError):
         doubted = doubted | wrong(found.depths[0], used, rgb)
     count = int(doubted.sum())
@@ -208,35 +213,41 @@ def _tried(
     made: dict[Trial, list[Trajectory]] = {}
     first_error: PnpDepthError | None = None
     tried = 0
-    for trial in trials:
-        if made and trial.settings.align == "auto" and _already_metric(next(iter(made.values()))):
-            continue
+    for number, variants in enumerate(_alike(trials)):
         spent = time.monotonic() - began
-        if budget_s is None and not _is_usual(trial, trials[0]):
+        if budget_s is None and number:
             return made, ()
-        if made and budget_s is not None and spent * (tried + 1) > budget_s * tried:
+        if made and budget_s is not None and spent * (number + 1) > budget_s * number:
             return made, (f"auto: {tried} trials made; for more the time budget is too short",)
-        tried += 1
-        found = trajectories(network, trial, inputs, sets, updates_of(trial))
-        good = [each for each in found if isinstance(each, Trajectory)]
-        if len(good) == len(sets):
-            made[trial] = good
-        else:
-            first_error = first_error or next(e for e in found if isinstance(e, PnpDepthError))
+        found = trajectories(network, variants, inputs, sets, needless=_needless)
+        tried += len(found)
+        for trial, each in found.items():
+            good = [one for one in each if isinstance(one, Trajectory)]
+            if len(good) == len(sets):
+                made[trial] = good
+            else:
+                first_error = first_error or next(e for e in each if isinstance(e, PnpDepthError))
     if not made and first_error is not None:
         raise first_error
     return made, ()
 
 
-def _is_usual(trial: Trial, first: Trial) -> bool:
-    return trial == replace(first, settings=replace(first.settings, align=trial.settings.align))
+def _alike(trials: Sequence[Trial]) -> list[list[Trial]]:
+    """The trials in order, those together that differ in their alignment alone."""
+    groups: dict[Trial, list[Trial]] = {}
+    for trial in trials:
+        same = replace(trial, settings=replace(trial.settings, align="none"))
+        groups.setdefault(same, []).append(trial)
+    return list(groups.values())
 
 
-def _already_metric(plain: Sequence[Trajectory]) -> bool:
-    """Whether an alignment would leave the prediction as it is."""
-    prediction, used = plain[0].depths[0], plain[0].frame.used
-    if plain[0].frame.alignment is not None:
+def _needless(trial: Trial, first: Trajectory) -> bool:
+    """Whether the trial aligns what needs no alignment."""
+    if trial.settings.align != "auto":
+        return False
+    if first.frame.alignment is not None:
         return True
+    prediction, used = first.depths[0], first.frame.used
     known, points = where_predicted(prediction, used)
     made = align(points.sample(torch.where(known, prediction, 1.0)), points, ("depth",), "auto")
     return made.kind == "none"
@@ -302,11 +313,4 @@ def _chosen(
             Scored(way=way, error=error)
             for way, error in sorted(errors.items(), key=lambda one: one[1])
         ),
-    )
-
-
-def updates_of(trial: Trial) -> tuple[int, ...]:
-    """The numbers of updates of z that are scored, above 0."""
-    return tuple(
-        sorted({*(k for k in UPDATES if k < trial.settings.iterations), trial.settings.iterations})
     )

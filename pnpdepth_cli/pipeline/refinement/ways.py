@@ -7,7 +7,7 @@ nothing done twice: one refinement gives the depth at every number of updates th
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -43,6 +43,16 @@ class Trial:
         s = self.settings
         aligned = "" if s.align == "none" else f", aligned ({s.align})"
         return f"cut at {self.layer}, {s.update}, step {s.lr}{aligned}"
+
+
+UPDATES = (1, 2, 3, 5, 10, 20)
+"""Numbers of updates of z that are looked at, as far as a trial's own goes, which is as well."""
+
+
+def updates_of(trial: Trial) -> tuple[int, ...]:
+    """The numbers of updates of z that are looked at, above 0."""
+    most = trial.settings.iterations
+    return tuple(sorted({*(k for k in UPDATES if k < most), most} - {0}))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,31 +92,41 @@ class Trajectory:
 
 def trajectories(
     network: Network,
-    trial: Trial,
+    trials: Sequence[Trial],
     inputs: Inputs,
     sets: Sequence[SparsePoints],
-    wanted: Collection[int],
-) -> list[Trajectory | PnpDepthError]:
-    """The trial's refinement with each set of points, or the error that it ended with.
+    *,
+    needless: Callable[[Trial, Trajectory], bool] = lambda trial, first: False,
+) -> dict[Trial, list[Trajectory | PnpDepthError]]:
+    """The trials' refinements with each set of points, or the errors that they ended with.
 
-    wanted: the numbers of updates to know the depth of; 0 is always among them.
+    trials: all of one layer, in front of which the network runs once for all of them. needless:
+    what need not be made after the first trial with the first set.
     """
-    found: list[Trajectory | PnpDepthError] = []
+    found: dict[Trial, list[Trajectory | PnpDepthError]] = {trial: [] for trial in trials}
     z0: Tensor | None = None
     with (
         out_of_memory_is_a_device_error(network.device),
-        network.cut_at(trial.layer) as split,
+        network.cut_at(trials[0].layer) as split,
     ):
         for used in sets:
             task = FrameToRefine.with_points(inputs, used)
-            frame = ready_frame(network, trial.settings, task)
-            if isinstance(frame, PnpDepthError):
-                found.append(frame)
-                continue
-            if z0 is None or network.definition.input_kind != "rgb":
-                with torch.no_grad():
-                    z0 = split.front(*frame.arguments)
-            found.append(_trajectory(split, z0, frame, trial.settings, wanted))
+            if network.definition.input_kind != "rgb":
+                z0 = None
+            for trial in tuple(found):
+                if trial not in found:
+                    continue
+                frame = ready_frame(network, trial.settings, task)
+                if isinstance(frame, PnpDepthError):
+                    found[trial].append(frame)
+                    continue
+                if z0 is None:
+                    with torch.no_grad():
+                        z0 = split.front(*frame.arguments)
+                made = _trajectory(split, z0, frame, trial.settings, updates_of(trial))
+                found[trial].append(made)
+                if trial is trials[0] and used is sets[0] and isinstance(made, Trajectory):
+                    found = {t: f for t, f in found.items() if t is trial or not needless(t, made)}
     return found
 
 

@@ -13,6 +13,7 @@ import torch
 from pnpdepth_cli.core.baselines import BASELINES
 from pnpdepth_cli.core.points import SparsePoints
 from pnpdepth_cli.core.refine import RefineSettings
+from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.models.network import Network, load_network
@@ -111,10 +112,10 @@ def test_one_refinement_gives_the_depth_after_every_number_of_updates(
     frame: FrameOnDisk, network: Network
 ) -> None:
     inputs = inputs_of(frame)
-    (path,) = trajectories(network, TRIAL, inputs, [inputs.points], (1, 2, 3))
+    (path,) = trajectories(network, [TRIAL], inputs, [inputs.points])[TRIAL]
     for count in (0, 1, 2, 3):
         alone = Trial(layer="middle", settings=replace(SETTINGS, iterations=count))
-        (end,) = trajectories(network, alone, inputs, [inputs.points], (count,))
+        (end,) = trajectories(network, [alone], inputs, [inputs.points])[alone]
         assert torch.equal(path.after(count), torch.from_numpy(end.frame.after))  # type: ignore[union-attr]
 
 
@@ -150,7 +151,33 @@ def test_trials_that_cost_more_are_made_only_with_a_time_budget(
     assert {trial.layer for trial in tried(None)} == {"middle"}
     assert tried(1e9) >= {t for t in trials if t.settings.align == "none"}
     monkeypatch.setattr(auto.time, "monotonic", iter(range(0, 10**9, 10)).__next__)
-    assert len(tried(5.0)) == 1
+    assert len({(one.layer, one.settings.update) for one in tried(5.0)}) == 1
+
+
+def test_trials_of_one_layer_share_what_lies_in_front_of_it(
+    frame: FrameOnDisk, network: Network, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    inputs = inputs_of(frame)
+    other = replace(TRIAL, settings=replace(SETTINGS, update="sign"))
+    sets = [inputs.points, inputs.points.select(torch.arange(60) < 40)]
+    fronts: list[object] = []
+    front = Split.front
+    monkeypatch.setattr(Split, "front", lambda *given: fronts.append(given) or front(*given))
+    both = trajectories(network, [TRIAL, other], inputs, sets)
+    assert len(fronts) == (1 if network.definition.input_kind == "rgb" else 2)
+    for trial in (TRIAL, other):
+        alone = trajectories(network, [trial], inputs, sets)[trial]
+        for one, same in zip(both[trial], alone, strict=True):
+            assert torch.equal(one.after(3), same.after(3))  # type: ignore[union-attr]
+
+
+def test_what_is_needless_after_the_first_is_not_made(frame: FrameOnDisk, network: Network) -> None:
+    inputs = inputs_of(frame)
+    other = replace(TRIAL, settings=replace(SETTINGS, update="sign"))
+    found = trajectories(
+        network, [TRIAL, other], inputs, [inputs.points], needless=lambda trial, _: True
+    )
+    assert list(found) == [TRIAL]
 
 
 def test_the_record_says_what_was_chosen_and_everything_that_was_tried(frame: FrameOnDisk) -> None:
