@@ -198,7 +198,8 @@ def _folds(used: SparsePoints, seed: int) -> list[tuple[SparsePoints, Tensor]]:
         return []
     fold = spatial_folds(used, FOLDS, seed=seed)
     looked_at = min(FOLDS, max(1, round(ENOUGH * FOLDS / len(used))))
-    return [(used.select(fold != number), fold == number) for number in range(looked_at)]
+    held = [fold == number for number in range(looked_at)]
+    return [(used.select(~one), one) for one in held if 0 < int(one.sum()) < len(used)]
 
 
 def _tried(

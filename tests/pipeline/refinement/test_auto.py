@@ -136,6 +136,18 @@ def test_few_points_are_enough(frame: FrameOnDisk, network: Network, count: int)
     assert (found.frame.after > 0).all()
 
 
+@pytest.mark.parametrize("places", [1, 2, 3])
+def test_points_at_very_few_places_are_enough(
+    frame: FrameOnDisk, network: Network, places: int
+) -> None:
+    inputs = inputs_of(frame, 12)
+    close = inputs.points.xy[torch.arange(12) % places] + 0.01 * torch.arange(12)[:, None]
+    inputs = replace(inputs, points=replace(inputs.points, xy=close))
+    found = refine_automatically(network, [TRIAL], inputs, inputs.points)
+    assert np.isfinite(found.frame.after).all()
+    assert (found.frame.after > 0).all()
+
+
 def test_trials_that_cost_more_are_made_only_with_a_time_budget(
     frame: FrameOnDisk, network: Network, monkeypatch: pytest.MonkeyPatch
 ) -> None:
