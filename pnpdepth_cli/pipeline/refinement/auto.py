@@ -43,6 +43,8 @@ FEWEST = 5
 """With fewer points than this none is held out."""
 ENOUGH = 250
 """With this many held-out points no further fold is looked at."""
+MANY = 50
+"""Of so many points those are wrong, too, that only the other points tell otherwise."""
 SPREADING = ("gp", "diffusion")
 
 
@@ -174,8 +176,9 @@ def _without_wrong(
 ) -> tuple[SparsePoints, tuple[str, ...]]:
     """The points that are not clearly wrong, and what is said of the others.
 
-    They are wrong beside each other, or beside what the network predicts from the rest: a network
-    that takes the points follows the wrong ones too.
+    They are wrong beside what the network predicts from those that are not wrong beside each other:
+    one that takes the points follows the wrong ones too. Of many points, what is wrong beside the
+    others is left out as well; of a few, it may be all that is seen of a small thing.
     """
     rgb = inputs.rgb_tensor()
     rgb = None if rgb is None else rgb[0]
@@ -183,7 +186,8 @@ def _without_wrong(
     plain = replace(trial, settings=replace(trial.settings, iterations=0))
     (found,) = trajectories(network, [plain], inputs, [used.select(~doubted)])[plain]
     if not isinstance(found, PnpDepthError):
-        doubted = doubted | wrong(found.depths[0], used, rgb)
+        beside_network = wrong(found.depths[0], used, rgb)
+        doubted = beside_network | doubted if len(used) >= MANY else beside_network
     count = int(doubted.sum())
     if not count:
         return used, ()
