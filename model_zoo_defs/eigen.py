@@ -177,7 +177,7 @@ definitions = {
         output_kind="log",
         layers=LAYERS,
         defaults=RefineDefaults(layer="coarse.conv5", update="adam", lr="10%", iterations=20),
-        build=partial(Eigen, channels=(32, 64, 96, 96, 48), hidden=128, fine=48),
+        build=partial(Eigen, channels=(40, 80, 112, 112, 64), hidden=128, fine=48),
         checkpoint=TINY,
     ),
 }

@@ -233,15 +233,15 @@ definitions = {
     ),
     "fcrn-tiny": ModelDefinition(
         name="fcrn-tiny",
-        summary="the same at an eighth of the width and half the size, trained on rendered rooms",
+        summary="the same at a seventh of the width and half the size, trained on rendered rooms",
         paper=PAPER,
         licence="Apache-2.0",
         input_kind="rgb",
         size=Fixed(SIZE[0] // 2, SIZE[1] // 2),
         normalisation=Normalisation(mean=IMAGENET_MEAN, std=IMAGENET_STD),
         layers=LAYERS,
-        defaults=RefineDefaults(layer="layer1_BN", lr="10%", iterations=20),
-        build=partial(FCRN, width=8),
+        defaults=RefineDefaults(layer="layer1_BN", update="adam", lr="10%", iterations=20),
+        build=partial(FCRN, width=9),
         checkpoint=TINY,
     ),
 }

@@ -124,7 +124,7 @@ def test_z_is_inside_the_coarse_network() -> None:
     assert network.definition.default_alignment == "none"
     assert assert_the_cut_changes_nothing_and_a_step_does(network, "coarse.conv5").shape == (
         1,
-        48,
+        64,
         6,
         8,
     )
