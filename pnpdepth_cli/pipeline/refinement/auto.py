@@ -185,9 +185,10 @@ def _without_wrong(
     doubted = wrong(torch.ones(used.size), used, rgb)
     plain = replace(trial, settings=replace(trial.settings, iterations=0))
     (found,) = trajectories(network, [plain], inputs, [used.select(~doubted)])[plain]
-    if not isinstance(found, PnpDepthError):
-        beside_network = wrong(found.depths[0], used, rgb)
-        doubted = beside_network | doubted if len(used) >= MANY else beside_network
+    if isinstance(found, PnpDepthError):
+        return used, ()
+    beside_network = wrong(found.depths[0], used, rgb)
+    doubted = beside_network | doubted if len(used) >= MANY else beside_network
     count = int(doubted.sum())
     if not count:
         return used, ()
