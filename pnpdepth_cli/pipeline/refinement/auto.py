@@ -142,7 +142,8 @@ def refine_automatically(
     trials: ways to update z; the first is tried in any case. ways: only these, the network and the
     simple baselines compete, such as those that were best on other frames. fixed: this way is
     taken, and the others are only scored. budget_s: no further trial is begun that would end later,
-    by what those before took; None tries all.
+    by what those before took; those that differ in their alignment alone are begun together. None
+    tries those that differ from the first in nothing else.
     """
     notes: tuple[str, ...] = ()
     if fixed is None:

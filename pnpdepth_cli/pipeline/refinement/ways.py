@@ -113,7 +113,7 @@ def trajectories(
             task = FrameToRefine.with_points(inputs, used)
             if network.definition.input_kind != "rgb":
                 z0 = None
-            for trial in tuple(found):
+            for trial in trials:
                 if trial not in found:
                     continue
                 frame = ready_frame(network, trial.settings, task)
