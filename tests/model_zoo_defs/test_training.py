@@ -5,17 +5,19 @@ from __future__ import annotations
 import csv
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
 from numpy.typing import NDArray
 
 from model_zoo_defs.compact import Compact
 from model_zoo_defs.training import patterns
-from model_zoo_defs.training.dataset import Frames, Samples, degraded
+from model_zoo_defs.training.dataset import Frames, Samples, degraded, mapped
 
 pytest.importorskip("safetensors")
 train = pytest.importorskip("model_zoo_defs.training.train")
@@ -138,6 +140,37 @@ def test_new_shards_are_picked_up(shards: Path, tmp_path: Path) -> None:
     (tmp_path / second.name).write_bytes(second.read_bytes())
     frames.refresh()
     assert len(frames) == 6
+
+
+@drawn_often
+@given(
+    arrays=st.dictionaries(
+        st.text("abcdefgh_", min_size=1, max_size=40),
+        hnp.arrays(
+            st.sampled_from([np.uint8, np.float32, np.float64]),
+            hnp.array_shapes(max_dims=4, max_side=5),
+        ),
+        min_size=1,
+        max_size=4,
+    )
+)
+def test_what_is_mapped_is_what_numpy_reads(
+    tmp_path_factory: pytest.TempPathFactory, arrays: dict[str, NDArray[Any]]
+) -> None:
+    path = tmp_path_factory.mktemp("mapped") / "arrays.npz"
+    np.savez(path, **arrays)
+    found = mapped(path)
+    with np.load(path) as read:
+        assert set(found) == set(read.files)
+        for name in read.files:
+            assert found[name].dtype == read[name].dtype
+            np.testing.assert_array_equal(found[name], read[name])
+
+
+def test_a_compressed_shard_cannot_be_mapped(tmp_path: Path) -> None:
+    np.savez_compressed(tmp_path / "shard_0.npz", rgb=np.zeros((1, 2, 2, 3), np.uint8))
+    with pytest.raises(ValueError, match=r"shard_0.npz: compressed; .* numpy\.savez"):
+        Frames(tmp_path)
 
 
 def test_a_folder_without_shards_is_refused(tmp_path: Path) -> None:
