@@ -56,8 +56,7 @@ _CROWDED = 0.05  # but for so many of all points
 _WRONG = (4.0, 4.0, 5.0, 6.0, 8.0)  # times the usual error, beyond which a point is wrong, in turn
 _NOTHING = 1e-6  # the weight of a point that tells nothing
 _DOUBTED = 0.05  # weight of 0…1; points with less are left out,
-_AROUND, _ALIKE_AROUND, _BESIDE = 6, 3, 2  # neighbours: of a fifth of wrong points 1 % have 3
-_ALIKE = 0.5  # such that differ by less than so much of what the point is off by
+_AROUND, _MOST_DOUBTED, _HALF = 6, 4, 3  # neighbours: of a fifth of wrong points 2 % have 4 such
 _FAR_BETTER = 0.5  # if that makes the others' errors at most so much of what they were,
 _FAR_BETTER_MANY = 0.65  # or so much where there are many points, whose errors are well known
 _LEAST = 1e-3  # of the usual error over its standard deviation if f had 1; less is none
@@ -119,7 +118,7 @@ def believed(field: Field) -> Tensor:
             usual = max(_NORMAL_MEDIAN * float(beyond.median()), _LEAST)
             weight = (1 - (beyond / (many * usual)).square()).clamp_min(0).square()
     kept = weight > _DOUBTED
-    kept = kept | _together(field, ~kept)
+    kept = kept | _together(field.points, ~kept)
     weight = torch.where(kept, weight.clamp_min(_DOUBTED), weight)
     if bool(kept.all()) or not bool(kept.any()):
         return torch.ones_like(kept)
@@ -131,24 +130,15 @@ def believed(field: Field) -> Tensor:
     return kept if without < enough * with_all else torch.ones_like(kept)
 
 
-def _together(field: Field, doubted: Tensor) -> Tensor:
-    """(N,) bool: the doubted points among whose neighbours others are doubted and off as much.
-
-    Off from the middle one of the neighbours that are not doubted, by half as much again at most;
-    and those beside such points, down to a pair of them.
-    """
-    count = min(len(field.points), 2 * _AROUND + 1)
-    if count <= _AROUND or not bool(doubted.any()) or bool(doubted.all()):
+def _together(points: SparsePoints, doubted: Tensor) -> Tensor:
+    """(N,) bool: the doubted points most of whose neighbours are doubted, and those beside such."""
+    if len(points) <= _AROUND or not bool(doubted.any()):
         return torch.zeros_like(doubted)
-    near = nearest_points(field.points, field.points.xy.double(), count)[1][:, 1:]
-    others = torch.where(doubted[near], torch.nan, field.residual[near]).nanmedian(dim=1).values
-    others = torch.where(others.isnan(), field.residual[~doubted].median(), others)
-    off, near = field.residual - others, near[:, :_AROUND]
-    apart = (off[near] - off[:, None]).abs()
-    alike = doubted[near] & (apart < _ALIKE * off.abs()[:, None])
-    found = doubted & (alike.sum(dim=1) >= _ALIKE_AROUND)
+    _, near = nearest_points(points, points.xy.double(), _AROUND + 1)
+    near = near[:, 1:]
+    found = doubted & (doubted[near].sum(dim=1) >= _MOST_DOUBTED)
     while True:
-        more = found | (doubted & ((found[near] & alike).sum(dim=1) >= _BESIDE))
+        more = found | (doubted & (found[near].sum(dim=1) >= _HALF))
         if torch.equal(more, found):
             return found
         found = more

@@ -166,18 +166,6 @@ def test_wrong_points_are_left_out_and_right_ones_are_kept(count: int) -> None:
     assert len(kept.points) > 0.9 * int((~wrong).sum())
 
 
-def test_wrong_points_that_lie_together_by_chance_are_still_left_out() -> None:
-    made = field(250, size=(60, 80))
-    x, y = made.points.xy.unbind(1)
-    here = (x < 30) & (y < 30)
-    apart = torch.linspace(-2.5, 2.5, int(here.sum())).double()
-    jump = torch.zeros(250).double()
-    jump[here] = apart[torch.randperm(len(apart), generator=torch.Generator().manual_seed(2))]
-    gross = jump.abs() > 0.6
-    kept = believed(replace(made, residual=made.residual + jump))
-    assert int((kept & gross).sum()) <= int(gross.sum()) // 4
-
-
 @pytest.mark.parametrize("count", [120, 250])
 def test_points_far_from_what_is_predicted_are_not_wrong_where_they_lie_together(
     count: int,
