@@ -16,6 +16,7 @@ from pnpdepth_cli.core.baselines import BASELINES
 from pnpdepth_cli.core.metrics import score
 from pnpdepth_cli.core.propagation import calibration
 from pnpdepth_cli.core.refine import RefineSettings
+from pnpdepth_cli.models.definition import ModelDefinition
 from pnpdepth_cli.models.network import Network
 from pnpdepth_cli.pipeline.refinement.auto import (
     FEWEST,
@@ -69,7 +70,11 @@ def refine_with_folds(
         found.frame,
         held_out=task.held_out,
         choice=_record(found.choice) if request.auto else None,
-        notes=(*found.frame.notes, *found.notes, *_said(found.choice, request)),
+        notes=(
+            *found.frame.notes,
+            *found.notes,
+            *auto_notes(found.choice, request, network.definition),
+        ),
     )
     if request.baselines:
         frame = replace(frame, baselines=baseline_scores(found, task.inputs))
@@ -102,7 +107,10 @@ def ways_of(
     return tuple(found)
 
 
-def _said(choice: Choice, request: RefineRequest) -> tuple[str, ...]:
+def auto_notes(
+    choice: Choice, request: RefineRequest, definition: ModelDefinition
+) -> tuple[str, ...]:
+    """What the user is told of the choice; nothing if none was asked for."""
     if choice.error is None:
         return (
             (f"auto: with fewer than {FEWEST} points none can be held out; taken is {choice}",)
@@ -114,10 +122,17 @@ def _said(choice: Choice, request: RefineRequest) -> tuple[str, ...]:
     by_name = {str(one.way): one.error for one in choice.scored}
     best = min(BASELINES, key=lambda name: by_name[name])
     network = next(o.error for o in choice.scored if o.way.trial and not o.way.iterations)
-    return (
+    said = (
         f"auto: {choice}; {choice.error:.4f} m off at {choice.held_out:,} held-out points in"
         f" {choice.folds} folds (network {network:.4f} m, best baseline {best}"
-        f" {by_name[best]:.4f} m)",
+        f" {by_name[best]:.4f} m)"
+    )
+    if definition.input_kind == "rgb" or network <= by_name[best]:
+        return (said,)
+    return (
+        said,
+        f"auto: {definition.name} takes the points itself, and was scored with gaps where some were"
+        " held out; if it is trained for points like these, see what it gives without --auto",
     )
 
 

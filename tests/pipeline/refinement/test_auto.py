@@ -16,10 +16,18 @@ from pnpdepth_cli.core.refine import RefineSettings
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.io.depth import read_depth
+from pnpdepth_cli.models.definition import InputKind
 from pnpdepth_cli.models.network import Network, load_network
-from pnpdepth_cli.pipeline.refinement import auto
-from pnpdepth_cli.pipeline.refinement.auto import FEWEST, refine_automatically, usual_trials
+from pnpdepth_cli.pipeline.refinement import auto, held_out
+from pnpdepth_cli.pipeline.refinement.auto import (
+    FEWEST,
+    Choice,
+    Scored,
+    refine_automatically,
+    usual_trials,
+)
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs
+from pnpdepth_cli.pipeline.refinement.request import RefineRequest
 from pnpdepth_cli.pipeline.refinement.ways import Trial, Way, trajectories
 from tests.pipeline.batches import NAMES, Heard, batch, pairs_on_disk, results, times
 from tests.pipeline.frames import FrameOnDisk, frame_on_disk, run
@@ -106,6 +114,28 @@ def test_wrong_points_are_left_out_and_said_and_the_depth_is_hardly_worse(
     assert not left & {tuple(xy) for xy in inputs.points.xy[bad].tolist()}
     mae = [float(np.abs(one.frame.after - frame.depth).mean()) for one in (clean, found)]
     assert mae[1] < 1.15 * mae[0]
+
+
+@pytest.mark.parametrize(
+    ("kind", "network_m", "warned"),
+    [
+        ("rgb+sparse", 0.3, True),
+        ("rgb+sparse", 0.1, False),
+        ("sparse", 0.3, True),
+        ("rgb", 0.3, False),
+    ],
+)
+def test_of_a_network_that_takes_the_points_it_is_said_what_holding_some_out_does_to_it(
+    frame: FrameOnDisk, network: Network, kind: InputKind, network_m: float, warned: bool
+) -> None:
+    scored = [Scored(way=Way(baseline=name), error=0.2) for name in BASELINES]
+    scored.append(Scored(way=Way(trial=TRIAL), error=network_m))
+    best = min(scored, key=lambda one: one.error)
+    choice = Choice(ways=(best.way,), weights=(1.0,), error=best.error, scored=tuple(scored))
+    request = RefineRequest(image=frame.image, sparse=frame.sparse, auto=True)
+    notes = held_out.auto_notes(choice, request, replace(network.definition, input_kind=kind))
+    assert notes[0].startswith("auto: ")
+    assert any("takes the points itself" in note for note in notes[1:]) == warned
 
 
 def test_one_refinement_gives_the_depth_after_every_number_of_updates(
