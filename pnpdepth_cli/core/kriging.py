@@ -147,18 +147,25 @@ def _together(points: SparsePoints, doubted: Tensor) -> Tensor:
 def fitted(field: Field) -> Field:
     """The field with the kernel that tells each point best from the others, and its scale.
 
-    Fewer than 5 points cannot choose: the kernel stays, and the scale is a usual one.
+    First the lengths, then the noise: on rendered frames as good as all of them together. Fewer
+    than 5 points cannot choose: the kernel stays, and the scale is a usual one.
     """
     if len(field.points) < _FEW:
         return replace(field, scale=_UNTOLD)
+    near = _neighbourhoods(field, _EXACT)
+
+    def tried(kernel: Kernel) -> tuple[float, float, Kernel]:
+        error, variance = _left_out(replace(field, kernel=kernel), near)
+        scale = (error.abs() / variance.sqrt()).flatten().quantile(_WITHIN)
+        return float(error.abs().mean()), float(scale), kernel
+
     colours = LENGTHS_COLOUR if field.at.shape[1] > 3 else LENGTHS_COLOUR[:1]
-    near, tried = _neighbourhoods(field, _EXACT), []
-    for depth, colour, noise in product(LENGTHS_DEPTH, colours, NOISES):
-        made = replace(field, kernel=Kernel(depth=depth, colour=colour, noise=noise))
-        error, variance = _left_out(made, near)
-        tried.append((float(error.abs().mean()), made, error.abs() / variance.sqrt()))
-    _, best, beyond = min(tried, key=lambda one: one[0])
-    return replace(best, scale=float(beyond.flatten().quantile(_WITHIN)))
+    lengths = product(LENGTHS_DEPTH, colours)
+    best = min((tried(Kernel(depth=d, colour=c)) for d, c in lengths), key=lambda one: one[0])
+    others = [noise for noise in NOISES if noise != best[2].noise]
+    noises = (tried(replace(best[2], noise=noise)) for noise in others)
+    _, scale, kernel = min([best, *noises], key=lambda one: one[0])
+    return replace(field, kernel=kernel, scale=scale)
 
 
 def spread(field: Field, *, sigma: bool = False) -> tuple[Tensor, Tensor | None]:

@@ -31,6 +31,7 @@ from pnpdepth_cli.pipeline.refinement.frame import RefinedFrame
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs
 from pnpdepth_cli.pipeline.refinement.ways import (
     Depths,
+    HeldCut,
     Trajectory,
     Trial,
     Way,
@@ -146,11 +147,12 @@ def refine_automatically(
     tries those that differ from the first in nothing else.
     """
     notes: tuple[str, ...] = ()
-    if fixed is None:
-        used, notes = _without_wrong(network, trials[0], inputs, used)
-    folds = _folds(used, seed)
-    sets = [used, *(kept for kept, _ in folds)]
-    made, said = _tried(network, trials, inputs, sets, budget_s)
+    with HeldCut(network) as cut:
+        if fixed is None:
+            used, notes = _without_wrong(cut, trials[0], inputs, used)
+        folds = _folds(used, seed)
+        sets = [used, *(kept for kept, _ in folds)]
+        made, said = _tried(cut, trials, inputs, sets, budget_s)
     plain = next(iter(made.values()))
     depths = [
         Depths(inputs, points, plain[i].depths[0], {trial: of[i] for trial, of in made.items()})
@@ -173,7 +175,7 @@ def refine_automatically(
 
 
 def _without_wrong(
-    network: Network, trial: Trial, inputs: Inputs, used: SparsePoints
+    cut: HeldCut, trial: Trial, inputs: Inputs, used: SparsePoints
 ) -> tuple[SparsePoints, tuple[str, ...]]:
     """The points that are not clearly wrong, and what is said of the others.
 
@@ -181,11 +183,10 @@ def _without_wrong(
     one that takes the points follows the wrong ones too. Of many points, what is wrong beside the
     others is left out as well; of a few, it may be all that is seen of a small thing.
     """
-    rgb = inputs.rgb_tensor()
-    rgb = None if rgb is None else rgb[0]
+    rgb = inputs.picture()
     doubted = wrong(torch.ones(used.size), used, rgb)
     plain = replace(trial, settings=replace(trial.settings, iterations=0))
-    (found,) = trajectories(network, [plain], inputs, [used.select(~doubted)])[plain]
+    (found,) = trajectories(cut, [plain], inputs, [used.select(~doubted)])[plain]
     if isinstance(found, PnpDepthError):
         return used, ()
     beside_network = wrong(found.depths[0], used, rgb)
@@ -209,7 +210,7 @@ def _folds(used: SparsePoints, seed: int) -> list[tuple[SparsePoints, Tensor]]:
 
 
 def _tried(
-    network: Network,
+    cut: HeldCut,
     trials: Sequence[Trial],
     inputs: Inputs,
     sets: Sequence[SparsePoints],
@@ -226,7 +227,7 @@ def _tried(
             return made, ()
         if made and budget_s is not None and spent * (number + 1) > budget_s * number:
             return made, (f"auto: {tried} trials made; for more the time budget is too short",)
-        found = trajectories(network, variants, inputs, sets, needless=_needless)
+        found = trajectories(cut, variants, inputs, sets, needless=_needless)
         tried += len(found)
         for trial, each in found.items():
             good = [one for one in each if isinstance(one, Trajectory)]

@@ -214,9 +214,8 @@ def propagated(task: FrameToRefine, depth: NDArray[np.float32]) -> NDArray[np.fl
     """The depth (H, W) with what is left at the used points spread, if the task says so."""
     if task.propagate == "none":
         return depth
-    rgb = task.inputs.rgb_tensor()
     spread = propagate(
-        torch.from_numpy(depth), task.used, None if rgb is None else rgb[0], kind=task.propagate
+        torch.from_numpy(depth), task.used, task.inputs.picture(), kind=task.propagate
     )
     return spread.depth.numpy()
 

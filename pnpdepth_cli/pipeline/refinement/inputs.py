@@ -53,9 +53,14 @@ class Inputs:
 
     def rgb_tensor(self) -> Tensor | None:
         """(1, 3, H, W) float32 in 0..1."""
+        picture = self.picture()
+        return None if picture is None else picture[None]
+
+    def picture(self) -> Tensor | None:
+        """(3, H, W) float32 in 0..1."""
         if self.rgb is None:
             return None
-        return torch.from_numpy(np.ascontiguousarray(self.rgb.transpose(2, 0, 1)))[None]
+        return torch.from_numpy(np.ascontiguousarray(self.rgb.transpose(2, 0, 1)))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -8,6 +8,7 @@ nothing done twice: one refinement gives the depth at every number of updates th
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import Any
 
@@ -90,8 +91,34 @@ class Trajectory:
         return self.depths[max(made for made in self.depths if made <= iterations)]
 
 
+class HeldCut:
+    """A network that stays cut while the layer stays the same, so that a path is learnt once."""
+
+    def __init__(self, network: Network) -> None:
+        self.network, self._held = network, ExitStack()
+        self._split: Split | None = None
+
+    def __enter__(self) -> HeldCut:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """The network is whole again, until it is wanted cut."""
+        self._held.close()
+        self._split = None
+
+    def at(self, layer: str) -> Split:
+        """The network cut at the layer, open."""
+        if self._split is None or self._split.layer != layer:
+            self._held.close()
+            self._split = self._held.enter_context(self.network.cut_at(layer))
+        return self._split
+
+
 def trajectories(
-    network: Network,
+    cut: HeldCut,
     trials: Sequence[Trial],
     inputs: Inputs,
     sets: Sequence[SparsePoints],
@@ -104,11 +131,9 @@ def trajectories(
     what need not be made after the first trial with the first set.
     """
     found: dict[Trial, list[Trajectory | PnpDepthError]] = {trial: [] for trial in trials}
-    z0: Tensor | None = None
-    with (
-        out_of_memory_is_a_device_error(network.device),
-        network.cut_at(trials[0].layer) as split,
-    ):
+    network, z0 = cut.network, None
+    with out_of_memory_is_a_device_error(network.device):
+        split = cut.at(trials[0].layer)
         for used in sets:
             task = FrameToRefine.with_points(inputs, used)
             if network.definition.input_kind != "rgb":
@@ -178,8 +203,7 @@ class Depths:
         trajectories: Mapping[Trial, Trajectory],
     ) -> None:
         self._used, self._prediction, self._trajectories = used, prediction, trajectories
-        rgb = inputs.rgb_tensor()
-        self._rgb = None if rgb is None else rgb[0]
+        self._rgb = inputs.picture()
 
     def dense(self, way: Way) -> Tensor:
         """The way's depth (H, W), 0 = unknown."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -20,6 +19,7 @@ from pnpdepth_cli.models.aligned import AlignedDepth
 from pnpdepth_cli.models.frame import FrameMap
 from pnpdepth_cli.models.network import Network, out_of_memory_is_a_device_error
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs
+from pnpdepth_cli.pipeline.refinement.ways import HeldCut
 from pnpdepth_cli.pipeline.sweep.plan import Method, Run
 
 
@@ -39,47 +39,26 @@ class Curve:
     diverged: str | None
 
 
-class CutNetwork:
-    """A network that stays cut while the layer stays the same."""
-
-    def __init__(self, network: Network) -> None:
-        self._network, self._held = network, ExitStack()
-        self._split: Split | None = None
-
-    def __enter__(self) -> CutNetwork:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._held.close()
-        self._split = None
-
-    def run(self, run: Run, inputs: Inputs) -> dict[str, Any]:
-        """The result of a run of this frame with these points, as the journal has it."""
-        done = {"state": "done", "points": len(inputs.points)}
-        if run.method is None:
-            return done | {"scores": {"linear": interpolated(self._network, inputs)}}
-        torch.manual_seed(run.seed)
-        try:
-            split = self._at(run.method.layer)
-            curve = refined_curve(self._network, split, run.method, inputs, run.iterations)
-        except BaseException:
-            self.__exit__()
-            raise
-        return done | {
-            "plain": curve.plain,
-            "scores": {
-                str(k): scores | {"updates": min(k, curve.made)}
-                for k, scores in curve.scores.items()
-            },
-            "step": curve.step,
-            "diverged": curve.diverged,
-        }
-
-    def _at(self, layer: str) -> Split:
-        if self._split is None or self._split.layer != layer:
-            self._held.close()
-            self._split = self._held.enter_context(self._network.cut_at(layer))
-        return self._split
+def result_of(run: Run, inputs: Inputs, cut: HeldCut) -> dict[str, Any]:
+    """The result of a run of this frame with these points, as the journal has it."""
+    done = {"state": "done", "points": len(inputs.points)}
+    if run.method is None:
+        return done | {"scores": {"linear": interpolated(cut.network, inputs)}}
+    torch.manual_seed(run.seed)
+    try:
+        split = cut.at(run.method.layer)
+        curve = refined_curve(cut.network, split, run.method, inputs, run.iterations)
+    except BaseException:
+        cut.close()
+        raise
+    return done | {
+        "plain": curve.plain,
+        "scores": {
+            str(k): scores | {"updates": min(k, curve.made)} for k, scores in curve.scores.items()
+        },
+        "step": curve.step,
+        "diverged": curve.diverged,
+    }
 
 
 def refined_curve(
@@ -172,5 +151,4 @@ def _spread(depth: Tensor, inputs: Inputs, kind: str) -> Tensor:
     """The depth (H, W) with what is left at the points spread over it."""
     if kind == "none":
         return depth
-    rgb = inputs.rgb_tensor()
-    return propagate(depth, inputs.points, None if rgb is None else rgb[0], kind=kind).depth
+    return propagate(depth, inputs.points, inputs.picture(), kind=kind).depth

@@ -25,11 +25,12 @@ from pnpdepth_cli.pipeline.batch.settings import model_identity
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs, read_inputs
 from pnpdepth_cli.pipeline.refinement.refine import Refiner, load_refiner
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest, effective_settings, layer_name
+from pnpdepth_cli.pipeline.refinement.ways import HeldCut
 from pnpdepth_cli.pipeline.sweep.axes import Study
 from pnpdepth_cli.pipeline.sweep.plan import Place, Plan, Run, RunPlace, sampling_of
 from pnpdepth_cli.pipeline.sweep.plots import draw_study, need_matplotlib
 from pnpdepth_cli.pipeline.sweep.points import OWN, Sampling, frame_points
-from pnpdepth_cli.pipeline.sweep.running import CutNetwork
+from pnpdepth_cli.pipeline.sweep.running import result_of
 from pnpdepth_cli.pipeline.sweep.state import SweepState
 from pnpdepth_cli.pipeline.sweep.summary import FrameFigures, summarise, write_frames, write_sweep
 from pnpdepth_cli.sensors import SamplePattern
@@ -212,7 +213,7 @@ def _base(definition: ModelDefinition, request: RefineRequest) -> dict[str, Any]
 
 def _rows(runs: Sequence[Run], refiner: Refiner, state: SweepState) -> Iterator[dict[str, Any]]:
     """Each run is done and recorded; a row for each. Frames are read once, points drawn once."""
-    with CutNetwork(refiner.network) as cut:
+    with HeldCut(refiner.network) as cut:
         for _, of_frame in groupby(runs, key=lambda run: run.frame.name):
             of_one = list(of_frame)
             inputs = _tried(read_inputs, of_one[0].task.request)
@@ -241,10 +242,10 @@ def _drawn(run: Run, inputs: Inputs) -> Inputs:
 
 
 def _done(
-    run: Run, inputs: Inputs | PnpDepthError, cut: CutNetwork, state: SweepState
+    run: Run, inputs: Inputs | PnpDepthError, cut: HeldCut, state: SweepState
 ) -> dict[str, Any]:
     """The run's result is recorded; its row for a listener."""
-    result = inputs if isinstance(inputs, PnpDepthError) else _tried(cut.run, run, inputs)
+    result = inputs if isinstance(inputs, PnpDepthError) else _tried(result_of, run, inputs, cut)
     row = {"name": run.frame.name, "status": "done", "message": None}
     if isinstance(result, PnpDepthError):
         state.fail(run, str(result))

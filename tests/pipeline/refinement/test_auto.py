@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -28,7 +29,7 @@ from pnpdepth_cli.pipeline.refinement.auto import (
 )
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest
-from pnpdepth_cli.pipeline.refinement.ways import Trial, Way, trajectories
+from pnpdepth_cli.pipeline.refinement.ways import HeldCut, Trial, Way, trajectories
 from tests.pipeline.batches import NAMES, Heard, batch, pairs_on_disk, results, times
 from tests.pipeline.frames import FrameOnDisk, frame_on_disk, run
 
@@ -56,6 +57,22 @@ def inputs_of(frame: FrameOnDisk, count: int = 60) -> Inputs:
     )
     rgb = rng.random((*frame.depth.shape, 3), dtype=np.float32)
     return Inputs(rgb=rgb, points=points, gt=None, sparse_scale=None, record={}, notes=())
+
+
+def refined(network: Network, *given: Any, **options: Any) -> dict[Trial, list[Any]]:
+    """The trajectories of a network that is cut for them alone."""
+    with HeldCut(network) as cut:
+        return trajectories(cut, *given, **options)
+
+
+def test_a_held_cut_is_one_as_long_as_the_layer_stays_the_same(network: Network) -> None:
+    with HeldCut(network) as cut:
+        first = cut.at("middle")
+        assert cut.at("middle") is first
+        other = cut.at("encode")
+        assert other is not first
+        assert other.layer == "encode"
+    assert not any("forward" in module.__dict__ for module in network.module.modules())
 
 
 def test_what_is_chosen_is_no_worse_at_held_out_points_than_network_and_baselines(
@@ -142,10 +159,10 @@ def test_one_refinement_gives_the_depth_after_every_number_of_updates(
     frame: FrameOnDisk, network: Network
 ) -> None:
     inputs = inputs_of(frame)
-    (path,) = trajectories(network, [TRIAL], inputs, [inputs.points])[TRIAL]
+    (path,) = refined(network, [TRIAL], inputs, [inputs.points])[TRIAL]
     for count in (0, 1, 2, 3):
         alone = Trial(layer="middle", settings=replace(SETTINGS, iterations=count))
-        (end,) = trajectories(network, [alone], inputs, [inputs.points])[alone]
+        (end,) = refined(network, [alone], inputs, [inputs.points])[alone]
         assert torch.equal(path.after(count), torch.from_numpy(end.frame.after))  # type: ignore[union-attr]
 
 
@@ -205,10 +222,10 @@ def test_trials_of_one_layer_share_what_lies_in_front_of_it(
     fronts: list[object] = []
     front = Split.front
     monkeypatch.setattr(Split, "front", lambda *given: fronts.append(given) or front(*given))
-    both = trajectories(network, [TRIAL, other], inputs, sets)
+    both = refined(network, [TRIAL, other], inputs, sets)
     assert len(fronts) == (1 if network.definition.input_kind == "rgb" else 2)
     for trial in (TRIAL, other):
-        alone = trajectories(network, [trial], inputs, sets)[trial]
+        alone = refined(network, [trial], inputs, sets)[trial]
         for one, same in zip(both[trial], alone, strict=True):
             assert torch.equal(one.after(3), same.after(3))  # type: ignore[union-attr]
 
@@ -216,10 +233,8 @@ def test_trials_of_one_layer_share_what_lies_in_front_of_it(
 def test_what_is_needless_after_the_first_is_not_made(frame: FrameOnDisk, network: Network) -> None:
     inputs = inputs_of(frame)
     other = replace(TRIAL, settings=replace(SETTINGS, update="sign"))
-    found = trajectories(
-        network, [TRIAL, other], inputs, [inputs.points], needless=lambda trial, _: True
-    )
-    assert list(found) == [TRIAL]
+    made = refined(network, [TRIAL, other], inputs, [inputs.points], needless=lambda trial, _: True)
+    assert list(made) == [TRIAL]
 
 
 def test_the_record_says_what_was_chosen_and_everything_that_was_tried(frame: FrameOnDisk) -> None:
