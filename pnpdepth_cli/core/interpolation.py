@@ -25,6 +25,7 @@ FILL_SHARE = 0.03
 
 _IDW_PIXELS = 1 << 18  # pixels looked up at once: what bounds the memory
 _AT_A_POINT = 0.25  # pixels; closer than this, a point is as close as can be
+_WORTH_THREADS = 1 << 15  # neighbours; for fewer, threads cost more than they save
 _BLUR_SIGMA = 1.1  # pixels; what OpenCV makes of the 5 × 5 Gaussian kernel of the paper's code
 
 
@@ -147,7 +148,8 @@ def nearest_points(points: SparsePoints, places: Tensor, count: int) -> tuple[Te
 
     tree = cKDTree(points.xy.double().cpu().numpy())
     among = torch.arange(1, count + 1).numpy()
-    distance, number = tree.query(places.numpy(), among, workers=-1)
+    many = len(places) * count > _WORTH_THREADS
+    distance, number = tree.query(places.numpy(), among, workers=-1 if many else 1)
     return torch.from_numpy(distance), torch.from_numpy(number)
 
 
