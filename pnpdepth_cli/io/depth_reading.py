@@ -145,6 +145,8 @@ def known_metres(values: NDArray[Any]) -> NDArray[np.float32]:
 
 def _as_image(path: Path, values: NDArray[Any]) -> NDArray[Any]:
     shape = values.shape
+    if len(shape) == 4 and shape[0] == 1:  # a batch of one, as networks give it
+        return _as_image(path, values[0])
     if len(shape) == 3 and 1 in (shape[0], shape[2]):
         return values.reshape(shape[1:] if shape[0] == 1 else shape[:2])
     if len(shape) == 2:

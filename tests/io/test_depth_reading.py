@@ -133,13 +133,17 @@ def test_a_float64_too_large_for_float32_is_unknown(tmp_path: Path) -> None:
     assert read_depth(tmp_path / "d.npy").values.tolist() == [[0, 2]]
 
 
-@pytest.mark.parametrize("shape", [(2, 3), (1, 2, 3), (2, 3, 1)])
-def test_npy_may_have_one_channel_before_or_behind(tmp_path: Path, shape: tuple[int, ...]) -> None:
+@pytest.mark.parametrize("shape", [(2, 3), (1, 2, 3), (2, 3, 1), (1, 1, 2, 3), (1, 2, 3, 1)])
+def test_npy_may_have_one_channel_before_or_behind_and_be_a_batch_of_one(
+    tmp_path: Path, shape: tuple[int, ...]
+) -> None:
     np.save(tmp_path / "d.npy", METRES.reshape(shape))
     assert np.array_equal(read_depth(tmp_path / "d.npy").values, KNOWN)
 
 
-@pytest.mark.parametrize("shape", [(), (6,), (2, 2, 3), (3, 2, 1, 1), (0, 4), (4, 0)])
+@pytest.mark.parametrize(
+    "shape", [(), (6,), (2, 2, 3), (3, 2, 1, 1), (1, 2, 2, 3), (1, 1, 1, 2, 3), (0, 4), (4, 0)]
+)
 def test_other_shapes_are_refused(tmp_path: Path, shape: tuple[int, ...]) -> None:
     np.save(tmp_path / "d.npy", np.ones(shape, np.float32))
     with pytest.raises(FileFormatError, match=r"is \(H, W\)|no pixels"):
