@@ -1,12 +1,14 @@
-"""The wheel holds every package of the source tree."""
+"""The wheel holds every package of the source tree, and the package runs as the command."""
 
 from __future__ import annotations
 
+import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
+from pnpdepth_cli import __version__
 from pnpdepth_cli.models.registry import find_definition
 
 ROOT = Path(__file__).parent.parent
@@ -40,3 +42,12 @@ def test_the_shipped_weights_are_there_and_small() -> None:
     checkpoint = find_definition("compact").checkpoint
     assert checkpoint is not None
     assert 1e6 < checkpoint.stat().st_size < 20e6
+
+
+def test_the_package_runs_as_a_module_like_the_command() -> None:
+    command = [sys.executable, "-m", "pnpdepth_cli"]
+    done = subprocess.run([*command, "--version"], capture_output=True, text=True, check=True)
+    assert done.stdout == f"pnpdepth, version {__version__}\n"
+    wrong = subprocess.run([*command, "refin"], capture_output=True, text=True, check=False)
+    assert wrong.returncode == 2
+    assert "Usage: pnpdepth " in wrong.stderr

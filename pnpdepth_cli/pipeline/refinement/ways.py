@@ -112,7 +112,7 @@ class HeldCut:
     def at(self, layer: str) -> Split:
         """The network cut at the layer, open."""
         if self._split is None or self._split.layer != layer:
-            self._held.close()
+            self.close()
             self._split = self._held.enter_context(self.network.cut_at(layer))
         return self._split
 
