@@ -170,7 +170,7 @@ RECIPES = {
         flat={"coarse.fc2": 0.75, "fine.conv3": 0.0}, start=hand_coarse_depth_on,
         scaffold=(*(f"coarse.conv{i}" for i in range(1, 6)), "coarse.fc1", "fine.conv1"),
         stages=(
-            Stage(window=ROOM, until=0.85, outputs=coarse),
+            Stage(window=ROOM, until=0.9, outputs=coarse),
             Stage(window=ROOM, outputs=fine_and_coarse),
         ),
     ),
