@@ -42,13 +42,14 @@ def refined(
     def cast() -> AbstractContextManager[Any]:
         return torch.autocast("cpu", torch.bfloat16) if precision == "bf16" else nullcontext()
 
+    def loss(output: Tensor) -> Tensor:
+        return torch.stack([loss_of(one[None]) for one in output.float()]).sum()
+
     def run() -> Tensor:
         with cast():
             with torch.no_grad():
                 z, kept = front(network, *inputs)
-            return loop(
-                z.float(), lambda z: rear(network, z, kept), lambda output: loss_of(output.float())
-            )
+            return loop(z.float(), lambda z: rear(network, z, kept), loss)
 
     return run
 
