@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import importlib
+import os
 import sys
 from typing import Any
 
@@ -19,6 +20,11 @@ checkpoint · 5 refinement diverged · 6 device · 7 some frames of a batch fail
 
 _GARBAGE = 50_000
 """Objects between two looks for garbage. The usual 700 make them a tenth of what imports take."""
+
+_SPINS = "3000"
+"""Turns that an idle thread of GNU OpenMP, which torch computes with, waits for work before it
+sleeps. With the usual 300,000 a frame takes 13 times as long as soon as another program keeps one
+of two cores busy; with this, twice as long, and no longer than before on an idle machine."""
 
 COMMANDS = {
     "refine": "refine:refine",
@@ -62,6 +68,8 @@ def cli() -> None:
 def main(arguments: list[str] | None = None) -> Any:
     """Run the command line; the process ends with the exit code of what happened."""
     gc.set_threshold(_GARBAGE)
+    if "OMP_WAIT_POLICY" not in os.environ:
+        os.environ.setdefault("GOMP_SPINCOUNT", _SPINS)  # read when torch is imported
     try:
         return cli.main(arguments, prog_name="pnpdepth")
     except PnpDepthError as error:

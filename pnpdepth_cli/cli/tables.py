@@ -36,7 +36,12 @@ def print_refinement(record: Mapping[str, Any]) -> None:
     console = Console(stderr=True, highlight=False)
     _print_notes(console, record["notes"])
     settings, points = record["settings"], record["points"]
-    table = Table(title=escape(f"{record['model']['name']} cut at {settings['layer']}"))
+    name = record["model"]["name"]
+    table = Table(
+        title=escape(f"{name} cut at {settings['layer']}")
+        if record["auto"] is None
+        else f"{escape(name)} and the points, by what was best at held-out points"
+    )
     for column in ("", "before", "after", "change"):
         table.add_column(column, justify="left" if not column else "right")
     _point_rows(table, f"error at {points['used']:,} points used", record["sparse_error"])
@@ -55,9 +60,12 @@ def print_refinement(record: Mapping[str, Any]) -> None:
         where = "pixels with truth" if record["scores"] else "points"
         console.print(f"improved: {record['improved_share']:.1%} of the {where}")
     seconds = record["seconds"]
-    console.print(
+    updates = (
         f"{settings['iterations']} updates ({settings['update']}, {settings['loss']}, step"
         f" {settings['step']:.3g}) · "
+    )
+    console.print(
+        (updates if record["auto"] is None else "")
         + ", ".join(f"{stage} {spent:.2f} s" for stage, spent in seconds.items())
         + f" · peak {record['peak_memory_mb']['process']:,.0f} MB",
         soft_wrap=True,

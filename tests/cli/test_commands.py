@@ -161,3 +161,33 @@ def test_the_installed_command_runs_and_ends_without_a_traceback(tmp_path: Path)
     assert done.stderr.startswith("pnpdepth: ")
     assert done.stderr.count("\n") == 1
     assert not list(tmp_path.iterdir())
+
+
+def test_with_auto_the_table_does_not_claim_updates_that_may_not_be_in_the_result(
+    frame: FrameOnDisk, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert code_of(refine(frame, "--auto")) == 0
+    err = capsys.readouterr().err
+    assert "by what was best at held-out points" in " ".join(err.split())
+    assert "updates (sign" not in err
+    assert code_of(refine(frame, "--overwrite")) == 0
+    assert "5 updates (sign" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("said", "spins"),
+    [({}, "3000"), ({"GOMP_SPINCOUNT": "7"}, "7"), ({"OMP_WAIT_POLICY": "active"}, "None")],
+)
+def test_idle_threads_sleep_soon_unless_the_user_says_how_they_wait(
+    said: dict[str, str], spins: str
+) -> None:
+    code = (
+        "import os\nfrom pnpdepth_cli.cli.main import main\n"
+        "try:\n    main(['--version'])\nexcept SystemExit:\n    pass\n"
+        "print(os.environ.get('GOMP_SPINCOUNT'))\n"
+    )
+    others = {k: v for k, v in os.environ.items() if k not in ("GOMP_SPINCOUNT", "OMP_WAIT_POLICY")}
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=others | said, capture_output=True, text=True, check=True
+    )
+    assert done.stdout.splitlines()[-1] == spins
