@@ -21,7 +21,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from benchmarks.engine import CPU, loop, output_points, setup
+from benchmarks.engine import CPU, loop, output_points, print_rows, setup
 from benchmarks.hand_cuts import ZOO
 from benchmarks.networks import Case
 from pnpdepth_cli.models.precision import lower
@@ -96,11 +96,7 @@ def main() -> None:
             print(case.name, precision, file=sys.stderr)
             rows.append(measure(case, precision, args.batch, args.runs))
             print(rows[-1], file=sys.stderr)
-    print("| " + " | ".join(rows[0]) + " |")
-    print("|" + "---|" * len(rows[0]))
-    for row in rows:
-        cells = (f"{v:.3g}" if isinstance(v, float) else str(v) for v in row.values())
-        print("| " + " | ".join(cells) + " |")
+    print_rows(rows)
 
 
 if __name__ == "__main__":

@@ -20,7 +20,7 @@ import platform
 import statistics
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 
 import torch
@@ -218,6 +218,15 @@ def print_peak(name: str, way: str) -> None:
         print(peak_mb(todo[way], CPU))
 
 
+def print_rows(rows: Sequence[Mapping[str, object]]) -> None:
+    """The rows as a Markdown table, their keys its head."""
+    print("| " + " | ".join(rows[0]) + " |")
+    print("|" + "---|" * len(rows[0]))
+    for row in rows:
+        cells = (f"{v:.3g}" if isinstance(v, float) else str(v) for v in row.values())
+        print("| " + " | ".join(cells) + " |")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--runs", type=int, default=15)
@@ -242,11 +251,7 @@ def main() -> None:
         f" torch {torch.__version__}, fp32, K = {ITERATIONS}, {args.runs} runs, medians; in units"
         " of a forward pass unless said\n"
     )
-    print("| " + " | ".join(results[0]) + " |")
-    print("|" + "---|" * len(results[0]))
-    for row in results:
-        cells = (f"{v:.3g}" if isinstance(v, float) else str(v) for v in row.values())
-        print("| " + " | ".join(cells) + " |")
+    print_rows(results)
 
 
 if __name__ == "__main__":

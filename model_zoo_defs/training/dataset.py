@@ -79,9 +79,9 @@ def mapped(path: Path) -> dict[str, NDArray[Any]]:
             file.seek(member.header_offset + 26)
             file.seek(sum(struct.unpack("<HH", file.read(4))), SEEK_CUR)
             np.lib.format.read_magic(file)
-            shape, _, dtype = np.lib.format.read_array_header_1_0(file)
+            shape, columns_first, dtype = np.lib.format.read_array_header_1_0(file)
             arrays[member.filename.removesuffix(".npy")] = np.asarray(
-                np.memmap(path, dtype, "c", file.tell(), shape)
+                np.memmap(path, dtype, "c", file.tell(), shape, "F" if columns_first else "C")
             )
     return arrays
 

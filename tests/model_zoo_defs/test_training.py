@@ -158,6 +158,7 @@ def test_what_is_mapped_is_what_numpy_reads(
     tmp_path_factory: pytest.TempPathFactory, arrays: dict[str, NDArray[Any]]
 ) -> None:
     path = tmp_path_factory.mktemp("mapped") / "arrays.npz"
+    arrays |= {f"columns_first_{name}": np.asfortranarray(a) for name, a in arrays.items()}
     np.savez(path, **arrays)
     found = mapped(path)
     with np.load(path) as read:
