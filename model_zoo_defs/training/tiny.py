@@ -15,6 +15,7 @@ import importlib
 import math
 import time
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -45,7 +46,10 @@ def tiny_definition(name: str) -> ModelDefinition:
 
 @dataclass(frozen=True, kw_only=True)
 class Settings:
-    """One training run; the schedule follows whichever of `minutes` and `steps` is nearer."""
+    """One training run; the schedule follows whichever of `minutes` and `steps` is nearer.
+
+    lanes: threads on a CPU that learn side by side, each a batch of the recipe's size.
+    """
 
     network: str
     data: tuple[Path, ...]
@@ -56,6 +60,7 @@ class Settings:
     seed: int = 1
     save_every: int = 250
     val_frames: int = 24
+    lanes: int = 1
     resume: bool = False
 
 
@@ -70,7 +75,7 @@ class TinyRun(Learner):
         )
         self.batches = Batches(settings.data, settings.seed, recipe.points, recipe.spliced)
         network = with_start(definition.build(), recipe)
-        super().__init__(network, schedule, settings.out, definition.name)
+        super().__init__(network, schedule, settings.out, definition.name, settings.lanes)
 
     def loss(self, part: Sequence[Tensor]) -> Tensor:
         """What the recipe asks, of every output of the network, the finest counting most."""
@@ -94,9 +99,11 @@ class TinyRun(Learner):
         """The batch's depth (B, 1, H, W) as far as the recipe looks."""
         return torch.where(batch.depth > self.recipe.farthest, 0.0, batch.depth)
 
-    def batch(self, number: int, size: int) -> Batch:
-        """Batch number `number` as this stage wants it."""
-        return self.batches.batch(number, size, self.stage.window, self.stage.shown)
+    def batch(self, number: int) -> Batch:
+        """What step number `number` learns, as the stage it will be in wants it."""
+        stage = self.recipe.stage(self.schedule.progress(number, self.elapsed_s))
+        size = self.recipe.batch * self.lanes
+        return self.batches.batch(number, size, stage.window, stage.shown)
 
     @torch.no_grad()
     def save(self) -> None:
@@ -112,7 +119,9 @@ class TinyRun(Learner):
             for norm in norms:
                 norm.momentum = 1.0
             self.average.train()
-            self.average(*self.arguments(self.batch(SETTLING, SETTLED_ON)))
+            stage = self.stage
+            batch = self.batches.batch(SETTLING, SETTLED_ON, stage.window, stage.shown)
+            self.average(*self.arguments(batch))
             for norm, momentum in zip(norms, momenta, strict=True):
                 norm.momentum = momentum
         super().save()
@@ -197,9 +206,12 @@ def train(definition: ModelDefinition, recipe: Recipe, settings: Settings) -> Pa
     frames = held_out(settings, definition, recipe)
     began = time.monotonic() - run.elapsed_s
     smooth = math.nan
-    with tqdm(total=settings.steps, initial=run.step, unit="step", mininterval=10.0) as bar:
+    bar = tqdm(total=settings.steps, initial=run.step, unit="step", mininterval=10.0)
+    with bar, ThreadPoolExecutor(1) as ahead:
+        coming = ahead.submit(run.batch, run.step)
         while run.progress < 1.0:
-            loss = run.learn(run.batch(run.step, recipe.batch))
+            batch, coming = coming.result(), ahead.submit(run.batch, run.step + 1)
+            loss = run.learn(batch)
             smooth = loss if math.isnan(smooth) else 0.99 * smooth + 0.01 * loss
             run.elapsed_s = time.monotonic() - began
             bar.update()
@@ -224,6 +236,7 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, help="end after this long at the latest")
     parser.add_argument("--steps", type=int, default=Settings.steps)
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--lanes", type=int, default=1, help="batches learnt side by side on a CPU")
     parser.add_argument("--resume", action="store_true", help="go on from RUN_DIR/state.pt")
     options = vars(parser.parse_args())
     settings = Settings(**options | {"data": tuple(options["data"]), "val": tuple(options["val"])})

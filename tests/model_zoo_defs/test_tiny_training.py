@@ -212,15 +212,17 @@ def settings(shards: Path, out: Path, steps: int = 8) -> Any:
     )
 
 
+@pytest.mark.parametrize("lanes", [1, 2])
 def test_a_run_learns_and_going_on_gives_the_bytes_of_an_uninterrupted_run(
-    shards: Path, tmp_path: Path
+    lanes: int, shards: Path, tmp_path: Path
 ) -> None:
-    weights = tiny.train(TOY, RECIPE, settings(shards, tmp_path / "whole")).read_bytes()
-    broken = settings(shards, tmp_path / "broken")
+    whole = replace(settings(shards, tmp_path / "whole"), lanes=lanes)
+    weights = tiny.train(TOY, RECIPE, whole).read_bytes()
+    broken = replace(whole, out=tmp_path / "broken")
     broken.out.mkdir()
     run = tiny.TinyRun(TOY, RECIPE, broken)
     for number in range(4):
-        run.learn(run.batch(number, RECIPE.batch))
+        run.learn(run.batch(number))
     run.save()
     assert tiny.train(TOY, RECIPE, replace(broken, resume=True)).read_bytes() == weights
     with (tmp_path / "whole" / "log.csv").open() as file:
@@ -248,7 +250,7 @@ def test_every_tiny_edition_can_be_trained(name: str, shards: Path, tmp_path: Pa
     stages = tuple(replace(stage, window=window, shown=None) for stage in recipe.stages)
     recipe = replace(recipe, stages=stages, batch=2)
     run = tiny.TinyRun(definition, recipe, settings(folder, tmp_path, steps=20))
-    batch = run.batch(0, 2)
+    batch = run.batch(0)
     before = [parameter.clone() for parameter in run.learnt]
     for stage in range(len(stages)):
         run.step = math.ceil(20 * stages[stage - 1].until) if stage else 0
