@@ -93,7 +93,7 @@ class Scenes:
 
 
 ROOMS = Scenes(
-    name="rendered rooms", camera="nyu", kind="room", size=(228, 304), seed=900021, limit=ROOM_LIMIT
+    name="rendered rooms", camera="nyu", kind="room", size=(228, 304), seed=900041, limit=ROOM_LIMIT
 )
 STREETS = Scenes(
     name="rendered streets", camera="kitti", kind="street", size=(228, 912), seed=900022,

@@ -33,7 +33,8 @@ from model_zoo_defs.training.scaffold import without_scaffold
 from pnpdepth_cli.models.definition import ModelDefinition, Multiple
 
 AVERAGING = 0.99  # runs are short, and a stage's weights are of no use to the next one's average
-SETTLING, SETTLED_ON = 1_000_000_000, 48  # the number of a batch no step has, its windows
+SETTLING = range(1_000_000_000, 1_000_000_016)  # numbers of batches that no step has
+SETTLED_ON = 48  # windows in each of them
 COARSER = 0.5  # how much less every next coarser output of a network counts
 
 
@@ -58,7 +59,7 @@ class Settings:
     minutes: float | None = None
     steps: int = 1_000_000
     seed: int = 1
-    save_every: int = 250
+    save_every: int = 500
     val_frames: int = 24
     lanes: int = 1
     resume: bool = False
@@ -114,16 +115,16 @@ class TinyRun(Learner):
         """
         kinds = nn.BatchNorm1d | nn.BatchNorm2d
         norms = [layer for layer in self.average.modules() if isinstance(layer, kinds)]
-        if norms:
-            momenta = [norm.momentum for norm in norms]
-            for norm in norms:
-                norm.momentum = 1.0
-            self.average.train()
-            stage = self.stage
-            batch = self.batches.batch(SETTLING, SETTLED_ON, stage.window, stage.shown)
+        momenta = [norm.momentum for norm in norms]
+        for norm in norms:
+            norm.reset_running_stats()
+            norm.momentum = None  # the mean over all batches
+        self.average.train()
+        for number in SETTLING if norms else ():
+            batch = self.batches.batch(number, SETTLED_ON, self.stage.window, self.stage.shown)
             self.average(*self.arguments(batch))
-            for norm, momentum in zip(norms, momenta, strict=True):
-                norm.momentum = momentum
+        for norm, momentum in zip(norms, momenta, strict=True):
+            norm.momentum = momentum
         super().save()
 
     def exported(self) -> nn.Module:

@@ -232,6 +232,22 @@ def test_a_run_learns_and_going_on_gives_the_bytes_of_an_uninterrupted_run(
     assert {"mae", "rmse", "d1"} <= rows[1].keys()
 
 
+def test_what_is_saved_normalises_by_the_mean_over_all_settling_batches(
+    shards: Path, tmp_path: Path
+) -> None:
+    run = tiny.TinyRun(TOY, RECIPE, settings(shards, tmp_path))
+    run.average.norm.running_mean += 1.0
+    run.save()
+    stage = RECIPE.stages[0]
+    means = [
+        run.arguments(run.batches.batch(number, tiny.SETTLED_ON, stage.window, stage.shown))[0]
+        .mean((0, 2, 3)) for number in tiny.SETTLING
+    ]  # fmt: skip
+    assert len(means) > 1
+    torch.testing.assert_close(run.average.norm.running_mean, torch.stack(means).mean(0))
+    assert run.average.norm.momentum == nn.BatchNorm2d(3).momentum
+
+
 # the fully connected layers of eigen take one size only
 WINDOWS = {"eigen-tiny": (228, 304)}
 
