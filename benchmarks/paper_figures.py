@@ -46,7 +46,9 @@ class PaperRow:
 
     def takes(self, network: str) -> bool:
         """True if a network of this name belongs in the row."""
-        if network.split("-")[0] != self.family or network == "sparse2dense-selfsup":
+        parts = network.split("-")
+        # editions for a picture or for depth alone have no row in the paper
+        if parts[0] != self.family or {"selfsup", "rgb", "d"} & set(parts):
             return False
         sized = self.family in ("eigen", "sparse2dense")  # these have an edition for each size
         return not sized or network.endswith("-kitti") == self.street

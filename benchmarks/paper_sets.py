@@ -67,13 +67,17 @@ class TableFrame:
 
 @dataclass(frozen=True, kw_only=True)
 class FrameSet:
-    """frames(): in a fixed order, `count` of them. street: for table II; paper: for its figures."""
+    """frames(): in a fixed order, `count` of them. street: for table II.
+
+    beside_paper: its figures stand beside the paper's. notes: what else to know of it.
+    """
 
     name: str
     street: bool
     count: int
     frames: Callable[[], Iterator[TableFrame]]
     beside_paper: bool = True
+    notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -201,13 +205,14 @@ def data_set(what: str, most: int | None) -> FrameSet:
     """The frames of a data set on disk, `nyu=PATH` or `kitti=PATH`, as its layout reads them.
 
     The layouts cut frames as the paper's protocols say, but for depth completion, where the row
-    decides. UsageError for another kind of set, or one that the path does not look like.
+    decides. Frames that networks are trained on are left out (`test_frames`). UsageError for
+    another kind of set, or one that the path does not look like.
     """
     kind, _, path = what.partition("=")
     if kind not in ("nyu", "kitti") or not path:
         raise UsageError(f"--data {what}: give nyu=PATH or kitti=PATH")
     root = Path(path)
-    every = read_frames(root)
+    every, note = test_frames(root, read_frames(root))
     if (every[0].protocol.name == "nyu") != (kind == "nyu"):
         raise UsageError(f"--data {what}: {root} is read as {every[0].protocol.name!r} frames")
     chosen = _evenly(every, most)
@@ -216,7 +221,34 @@ def data_set(what: str, most: int | None) -> FrameSet:
         street=kind == "kitti",
         count=len(chosen),
         frames=lambda: (_data_frame(root, frame) for frame in chosen),
+        notes=(f"{root.name}: {len(chosen)} of {note}",),
     )
+
+
+def test_frames(root: Path, every: Sequence[Frame]) -> tuple[Sequence[Frame], str]:
+    """The frames of the official test or validation split, and what they are.
+
+    All of them if they belong to one split, or if nothing says to which.
+    """
+    if every[0].protocol.name == "kitti-odometry" and every[0].sparse:
+        first, rest = "sequences 00 to 10", "sequences 11 to 21"
+        trained = [frame.name[:2] <= "10" for frame in every]
+    else:
+        first, rest = "train", "val or test"
+        trained = ["train" in _parts(root, frame) for frame in every]
+    if all(trained):
+        return every, f"{len(every)} frames, all of {first}: networks may have been trained on them"
+    kept = [frame for frame, seen in zip(every, trained, strict=True) if not seen]
+    if any(trained):
+        return kept, f"{len(kept)} frames of {rest}; {len(every) - len(kept)} of {first} left out"
+    return kept, f"{len(kept)} frames; nothing in their paths says that any is of {first}"
+
+
+def _parts(root: Path, frame: Frame) -> tuple[str, ...]:
+    """The folders that the frame's truth, or its image, lies in, from the root on."""
+    source = frame.gt or frame.image
+    path = source if isinstance(source, Path) else source.path if source else root
+    return path.absolute().parts[len(root.absolute().parts) - 1 : -1]
 
 
 def _data_frame(root: Path, frame: Frame) -> TableFrame:

@@ -37,18 +37,21 @@ from tqdm import tqdm
 
 from benchmarks.frames import Depth, frame_inputs, refined
 from benchmarks.paper_figures import FINE_THRESHOLDS, MEASURES, ROWS, SETTING, PaperRow, networks_of
-from benchmarks.paper_report import markdown, plot
+from benchmarks.paper_report import heading, markdown, plot
 from benchmarks.paper_sets import ROOMS, STREETS, FrameSet, TableFrame, data_set, rendered, shared
+from pnpdepth_cli.cli.printable import printable
 from pnpdepth_cli.core.interpolation import linear
 from pnpdepth_cli.core.metrics import score
 from pnpdepth_cli.core.refine import RefineSettings
 from pnpdepth_cli.errors import CheckpointError, PnpDepthError, UsageError
 from pnpdepth_cli.io.atomic import atomic_path
+from pnpdepth_cli.models.checkpoint import WEIGHT_SUFFIXES
 from pnpdepth_cli.models.network import Network, load_network
 from pnpdepth_cli.models.registry import names
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest, effective_settings, layer_name
 
-ROOM_FRAMES = 48  # of streets, which are three times as wide, half as many
+KINDS = {"rgb": "rgb", "sparse": "sd", "rgb+sparse": "rgb + sd"}  # as the paper writes them
+ROOM_FRAMES = 96  # of streets, which are three times as wide, a quarter
 SHARED_FRAMES = 24  # of each set: neighbours in a video tell little more
 
 
@@ -158,7 +161,7 @@ def result_of(entry: Entry, frames: Sequence[dict[str, Any]]) -> dict[str, Any]:
         "network": entry.name,
         "checkpoint": None if checkpoint is None else checkpoint.name,
         "paper_row": entry.row.name,
-        "kind": entry.row.kind,
+        "kind": KINDS[entry.network.definition.input_kind],
         "fine": entry.row.fine,
         "frames": len(frames),
         "points": mean("points"),
@@ -192,7 +195,7 @@ def table_of(frame_set: FrameSet, entries: Sequence[Entry]) -> dict[str, Any]:
         "street": frame_set.street,
         "beside_paper": frame_set.beside_paper,
         "rows": rows,
-        "notes": notes,
+        "notes": [*frame_set.notes, *notes],
     }
 
 
@@ -204,10 +207,14 @@ def checkpoints_in(folder: Path | None) -> dict[str, Path | None]:
     if not folder.is_dir():
         raise UsageError(f"--checkpoints {folder} is no folder; put the files of weights into one")
     known += ["sparse2dense", "sparse2dense-kitti"]
-    found: dict[str, Path | None] = {
-        path.name.split(".")[0]: path for path in sorted(folder.iterdir())
-    }
-    found = {name: path for name, path in found.items() if name in known}
+    found: dict[str, Path | None] = {}
+    for path in sorted(folder.iterdir()):
+        name = path.name.split(".")[0]
+        if name not in known or not (path.is_dir() or path.suffix in WEIGHT_SUFFIXES):
+            continue
+        if name in found:
+            raise UsageError(f"{found[name]} and {path} are both for {name}; keep one of them")
+        found[name] = path
     if not found:
         raise UsageError(f"no file in {folder} is called after a network, such as fcrn.npy")
     return found
@@ -225,7 +232,9 @@ def entries_of(
     for row in ROWS:
         wanted = networks_of(row, [name for name in weights if not only or name in only])
         if not wanted and not only:
-            notes.append(row.missing or f"no weights for the row of {row.name} ({row.family})")
+            # why there is no tiny edition matters where tiny editions are what is asked for
+            missing = row.missing if None in weights.values() else ""
+            notes.append(missing or f"no weights for the row of {row.name} ({row.family})")
         for name in wanted:
             try:
                 loaded[name] = loaded.get(name) or load_network(name, weights[name])
@@ -244,7 +253,7 @@ def sets_of(args: argparse.Namespace, entries: Sequence[Entry]) -> Iterable[Fram
         yield from [data_set(what, args.frames) for what in args.data]
     else:
         rooms = args.frames or ROOM_FRAMES
-        for scenes, count in ((ROOMS, rooms), (STREETS, -(-rooms // 2))):
+        for scenes, count in ((ROOMS, rooms), (STREETS, -(-rooms // 4))):
             if any(entry.row.street == (scenes is STREETS) for entry in entries):
                 yield rendered(scenes, args.cache, count, args.workers)
     if args.shared:
@@ -255,7 +264,7 @@ def parsed(arguments: Sequence[str] | None) -> argparse.Namespace:
     """What the command line says."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument(
-        "--frames", type=int, help="of rooms and each real set; half as many streets"
+        "--frames", type=int, help="of rooms and each real set; a quarter as many streets"
     )
     parser.add_argument("--only", nargs="+", default=[], metavar="NAME", help="these networks")
     parser.add_argument("--cache", type=Path, default=Path("out/paper_tables"))
@@ -278,9 +287,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         entries, notes = entries_of(checkpoints_in(args.checkpoints), args.only)
         tables = []
         for frame_set in sets_of(args, entries):
-            if any(entry.row.street == frame_set.street for entry in entries):
-                tables.append(table_of(frame_set, entries))
-                print(markdown(tables[-1]), flush=True)
+            table = table_of(frame_set, entries)
+            if table["rows"]:
+                print(markdown(table), flush=True)
+            else:
+                notes += [f"{heading(table)}: no row"]
+                notes += table["notes"] or ["none of the networks belongs in it"]
+            tables.append(table)
         for note in notes:
             print(f"- {note}")
         if args.json:
@@ -289,7 +302,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if args.plot:
             plot(tables, args.plot)
     except PnpDepthError as error:
-        print(f"error: {error}", file=sys.stderr)
+        print(f"error: {printable(error)}", file=sys.stderr)
         return error.exit_code
     print(f"{time.monotonic() - began:.0f} s", file=sys.stderr)
     return 0

@@ -12,6 +12,7 @@ from typing import Any
 import click
 
 from pnpdepth_cli.cli import options
+from pnpdepth_cli.cli.printable import printable
 from pnpdepth_cli.errors import UsageError
 
 
@@ -76,7 +77,7 @@ def _show(found: Mapping[str, Any], as_json: bool) -> None:
     for key, value in found.items():
         if key == "notes":
             for note in value:
-                click.echo(note, err=True)
+                click.echo(printable(note), err=True)
         elif isinstance(value, dict):
             click.echo(f"{key}:")
             for name, text in value.items():

@@ -10,6 +10,8 @@ from rich.console import Console, JustifyMethod
 from rich.markup import escape
 from rich.table import Table
 
+from pnpdepth_cli.cli.printable import printable
+
 _SCORES: tuple[tuple[str, str, Callable[[float], str]], ...] = (
     ("RMSE", "rmse", lambda v: f"{v:.4f} m"),
     ("MAE", "mae", lambda v: f"{v:.4f} m"),
@@ -178,7 +180,7 @@ def print_rows(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]
 def _print_notes(console: Console, notes: Sequence[str]) -> None:
     for note in notes:
         style = "yellow" if note.startswith("warning") else "dim"
-        console.print(escape(note), style=style, soft_wrap=True)
+        console.print(escape(printable(note)), style=style, soft_wrap=True)
 
 
 def _point_rows(table: Table, title: str, error: Mapping[str, Any] | None) -> None:

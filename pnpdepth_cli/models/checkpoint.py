@@ -9,6 +9,7 @@ takes the tensors out and runs nothing.
 from __future__ import annotations
 
 import functools
+import math
 import pickle
 from collections.abc import Mapping
 from pathlib import Path
@@ -26,14 +27,23 @@ from pnpdepth_cli.models.numpy_file import read_numpy_file
 from pnpdepth_cli.models.pickle_machine import Instance
 from pnpdepth_cli.models.tensor_bundle import SUFFIX as BUNDLE_SUFFIX
 from pnpdepth_cli.models.tensor_bundle import read_tensor_bundle
-from pnpdepth_cli.models.tensor_pickle import is_module, module_state, read_tensor_file
+from pnpdepth_cli.models.tensor_pickle import (
+    is_module,
+    module_state,
+    read_tensor_file,
+    refuse_compressed,
+)
 
 _STATE_KEYS = ("state_dict", "model_state_dict", "model_state", "model", "network", "net", "params")
-_SUFFIXES = (".safetensors", ".pth", ".pt", ".bin", ".ckpt", ".tar", *NUMPY_SUFFIXES)
+WEIGHT_SUFFIXES = (
+    *(".safetensors", ".pth", ".pt", ".bin", ".ckpt", ".tar"), *NUMPY_SUFFIXES, BUNDLE_SUFFIX
+)  # fmt: skip
 _COUNTER = "num_batches_tracked"
 _LFS_POINTER = b"version https://git-lfs"
 _TOLD = ("data", "dataset", "arch", "decoder", "modality", "height", "width")
 _SHOWN = 4
+_MOST_PIXELS = 1 << 20  # along a side
+_LONGEST = 60  # characters of a word out of a file
 
 
 def read_checkpoint(path: Path) -> dict[str, Tensor]:
@@ -41,8 +51,8 @@ def read_checkpoint(path: Path) -> dict[str, Tensor]:
 
     In a torch file they may lie in an entry such as "state_dict" beside an epoch or an optimiser.
     Numpy files hold them as arrays, TensorFlow checkpoints (PREFIX.index) as variables. A folder
-    holds several files, such as encoder.pth and decoder.pth; the name of the file, up to its first
-    dot, comes before the names in it.
+    may hold several files, such as encoder.pth and decoder.pth; then the name of the file, up to
+    its first dot, comes before the names in it.
     """
     return _read(path)[0]
 
@@ -51,14 +61,15 @@ def load_checkpoint(network: nn.Module, definition: ModelDefinition, path: Path)
     """The network has the weights of the file; returns notes on what was done to fit them.
 
     CheckpointError if a key is missing, left over, or of another shape; it names the network of the
-    registry that the file does fit. The counters of batch normalisations may be missing, as in
-    files from before PyTorch 0.4.1: they matter in training only.
+    registry that the file does fit. Or if a weight is not finite. The counters of batch
+    normalisations may be missing, as in files from before PyTorch 0.4.1: they matter in training
+    only.
     """
     given, notes = _read(path)
     own = {n: t for n, t in network.state_dict().items() if isinstance(t, Tensor)}
-    if given and _all_in_module(given) and not _all_in_module(own):
-        given = {name.removeprefix("module."): tensor for name, tensor in given.items()}
-        notes = [*notes, f"checkpoint {path.name}: prefix 'module.' of every key stripped"]
+    while given and _all_in_module(given) and not _all_in_module(own):
+        given, note = _without_module(given, path)
+        notes = [*notes, note]
     try:
         state = _fitted(definition, own, given, path)
     except CheckpointError:
@@ -69,6 +80,13 @@ def load_checkpoint(network: nn.Module, definition: ModelDefinition, path: Path)
             f"checkpoint {path} does not fit network {definition.name!r}: this is"
             f" {_some(fitting, ' or ')}; use --model {fitting[0]}"
         ) from None
+    learnt = dict(network.named_parameters())
+    broken = [n for n, t in state.items() if n in learnt and not _is_finite(t)]
+    if broken:
+        raise CheckpointError(
+            f"checkpoint {path}: {len(broken)} of its weights are NaN or infinite"
+            f" ({_some(broken)}); was its training broken off?"
+        )
     try:
         network.load_state_dict({**own, **state})
     except RuntimeError as error:
@@ -134,6 +152,17 @@ def _all_in_module(state: Mapping[str, Any]) -> bool:
     return all(name.startswith("module.") for name in state)
 
 
+def _without_module(state: Mapping[str, Tensor], path: Path) -> tuple[dict[str, Tensor], str]:
+    """The tensors under the names they have without torch's DataParallel, and a note on that."""
+    stripped = {name.removeprefix("module."): tensor for name, tensor in state.items()}
+    return stripped, f"checkpoint {path.name}: prefix 'module.' of every key stripped"
+
+
+def _is_finite(tensor: Tensor) -> bool:
+    """True if no value is NaN or infinite; a sum shows it without a copy of the tensor."""
+    return not tensor.is_floating_point() or math.isfinite(tensor.sum(dtype=torch.float64).item())
+
+
 def _listed(what: str, names: list[str]) -> list[str]:
     return [f"{len(names)} {what} ({_some(names)})"] if names else []
 
@@ -141,7 +170,11 @@ def _listed(what: str, names: list[str]) -> list[str]:
 def _some(names: list[str], between: str = ", ") -> str:
     """The first few of the names, and how many more there are."""
     more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
-    return f"{between.join(names[:_SHOWN])}{more}"
+    return f"{between.join(map(_short, names[:_SHOWN]))}{more}"
+
+
+def _short(word: str) -> str:
+    return word if len(word) <= _LONGEST else f"{word[:_LONGEST]}…"
 
 
 def _read(path: Path) -> tuple[dict[str, Tensor], list[str]]:
@@ -173,15 +206,22 @@ def _is_lfs_pointer(path: Path) -> bool:
 
 
 def _read_folder(folder: Path) -> tuple[dict[str, Tensor], list[str]]:
-    files = sorted(file for file in folder.iterdir() if file.suffix in _SUFFIXES)
+    files = sorted(file for file in folder.iterdir() if file.suffix in WEIGHT_SUFFIXES)
     if not files:
         raise CheckpointError(
-            f"checkpoint {folder} is a folder without weights; it may hold {', '.join(_SUFFIXES)}"
+            f"checkpoint {folder} is a folder without weights; it may hold"
+            f" {', '.join(WEIGHT_SUFFIXES)}"
         )
-    state: dict[str, Tensor] = {}
     notes = [f"checkpoint {folder.name}: {', '.join(file.name for file in files)}"]
+    if len(files) == 1:
+        state, said = _read(files[0])
+        return state, notes + said
+    state = {}
     for file in files:
         part, said = _read(file)
+        if part and _all_in_module(part):
+            part, note = _without_module(part, file)
+            said = [*said, note]
         state |= {f"{file.name.partition('.')[0]}.{name}": tensor for name, tensor in part.items()}
         notes += said
     return state, notes
@@ -201,6 +241,7 @@ def _read_safetensors(path: Path) -> dict[str, Tensor]:
 
 def _read_torch(path: Path) -> tuple[Any, list[str]]:
     """What a torch file holds, and what to say of it."""
+    refuse_compressed(path)
     try:
         return torch.load(path, map_location="cpu", weights_only=True), []
     except pickle.UnpicklingError:
@@ -230,7 +271,12 @@ def _trained_with(content: Any, path: Path) -> list[str]:
     given = given.state if isinstance(given, Instance) else given
     if not isinstance(given, Mapping):
         return []
-    said = [f"{key} {given[key]}" for key in _TOLD if isinstance(given.get(key), str | int)]
+    told = {key: given.get(key) for key in _TOLD}
+    said = [
+        f"{key} {_short(str(value))}"
+        for key, value in told.items()
+        if isinstance(value, str) or (isinstance(value, int) and abs(value) < _MOST_PIXELS)
+    ]
     return [f"checkpoint {path.name}: trained with {', '.join(said)}"] if said else []
 
 
@@ -247,12 +293,12 @@ def _state_in(content: Any, path: Path) -> dict[str, Tensor]:
             return module_state(inner)
         if isinstance(inner, Mapping) and inner and _only_tensors(inner):
             return dict(inner)
-    names = ", ".join(str(key) for key in list(content)[:8]) or "nothing"
+    names = ", ".join(_short(str(key)) for key in list(content)[:8]) or "nothing"
     raise CheckpointError(f"checkpoint {path} has no state dict; it holds {names}")
 
 
 def _kind(content: Any) -> str:
-    return content.path if isinstance(content, Instance) else type(content).__name__
+    return _short(content.path) if isinstance(content, Instance) else type(content).__name__
 
 
 def _only_tensors(mapping: Mapping[Any, Any]) -> bool:

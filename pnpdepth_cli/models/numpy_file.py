@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from pnpdepth_cli.errors import CheckpointError
-from pnpdepth_cli.models.pickle_machine import Broken, Instance, Machine
+from pnpdepth_cli.models.pickle_machine import NONSENSE, Broken, Instance, Machine, brief
 
 SUFFIXES = (".npy", ".npz")
 
@@ -52,10 +52,9 @@ def read_numpy_file(path: Path) -> dict[str, Tensor]:
         reason: object = error
     except (zipfile.BadZipFile, zlib.error, OSError, EOFError) as error:
         reason = error
-    except (ValueError, TypeError, KeyError, IndexError, AttributeError, RuntimeError) as error:
-        # What numpy's header parser and the machine raise when the file makes no sense.
-        reason = f"{type(error).__name__}: {' '.join(str(error).split())[:120]}"
-    raise CheckpointError(f"checkpoint {path} cannot be read as a numpy file ({reason})")
+    except NONSENSE as error:
+        reason = f"{type(error).__name__}: {error}"
+    raise CheckpointError(f"checkpoint {path} cannot be read as a numpy file ({brief(reason)})")
 
 
 def _read_archive(path: Path) -> dict[str, Tensor]:
@@ -65,7 +64,10 @@ def _read_archive(path: Path) -> dict[str, Tensor]:
         if sum(info.file_size for info in entries) > limit or len(entries) > _MOST_ENTRIES:
             raise Broken("its arrays are far larger than the file")
         return {
-            info.filename.removesuffix(".npy"): _plain_array(archive.read(info), info.filename)
+            # TensorFlow writes the number of an operation's output behind its name
+            info.filename.removesuffix(".npy").removesuffix(":0"): _plain_array(
+                archive.read(info), info.filename
+            )
             for info in entries
         }
 
@@ -84,8 +86,7 @@ def _header(file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
         read = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
         return read[npy.read_magic(file)](file)
     except Exception as error:  # numpy lets out whatever Python's own parser raises at it
-        reason = f"{type(error).__name__}: {' '.join(str(error).split())[:80]}"
-        raise Broken(f"its header makes no sense, {reason}") from None
+        raise Broken(f"its header makes no sense, {type(error).__name__}: {error}") from None
 
 
 def _read_pickled_dict(file: IO[bytes], size: int) -> dict[str, Tensor]:

@@ -47,6 +47,19 @@ class Broken(Exception):
     """A file is not what it should be; the message says how."""
 
 
+NONSENSE = (
+    *(ValueError, TypeError, KeyError, IndexError, AttributeError, RuntimeError),
+    *(OverflowError, MemoryError),
+)
+"""What the machine's own steps, and readers of the numbers beside them, raise at a file that makes
+no sense; MemoryError at a length that no file has."""
+
+
+def brief(reason: object) -> str:
+    """The reason on one line that is not too long, since parts of it may come out of the file."""
+    return " ".join(str(reason).split())[:160]
+
+
 class Machine:
     """Pickle's stack machine, without its calls."""
 
@@ -261,7 +274,7 @@ def _view(storage: Any, offset: Any, shape: Any, stride: Any) -> Tensor:
     bad = offset < 0 or any(n < 0 for n in shape) or any(s < 0 for s in stride)
     if bad or (not empty and (offset + reach >= len(storage) or count > len(storage))):
         raise Broken(f"a tensor of shape {shape} goes beyond its storage of {len(storage)}")
-    return storage.as_strided(shape, stride, offset).clone()
+    return storage.as_strided(shape, stride, offset)
 
 
 _CONSTANTS: dict[str, Callable[[], Any]] = {

@@ -2,7 +2,8 @@
 
 Published checkpoints often hold whole modules, optimisers or command-line arguments; `Machine`
 reads them without a call. Memory stays bounded by the size of the file: compressed archives,
-storages larger than what is stored and tensors larger than their storage are refused. Both layouts
+storages larger than what is stored and tensors larger than their storage are refused, and tensors
+of one storage share it. Both layouts
 of torch.save are read, the zip archive (torch ≥ 1.6) and the older row of pickles.
 """
 
@@ -21,7 +22,7 @@ import torch
 from torch import Tensor
 
 from pnpdepth_cli.errors import CheckpointError
-from pnpdepth_cli.models.pickle_machine import Broken, Instance, Machine, Name
+from pnpdepth_cli.models.pickle_machine import NONSENSE, Broken, Instance, Machine, Name, brief
 
 _MAGIC = 0x1950A86A20F9469CFC6C
 _DEEPEST = 100
@@ -52,6 +53,7 @@ class TensorFile:
 
 def read_tensor_file(path: Path) -> TensorFile:
     """The content of a torch file. CheckpointError if it is broken or not one."""
+    refuse_compressed(path)
     try:
         if zipfile.is_zipfile(path):
             return _read_archive(path)
@@ -61,10 +63,24 @@ def read_tensor_file(path: Path) -> TensorFile:
         reason: object = error
     except (zipfile.BadZipFile, OSError, EOFError, struct.error) as error:
         reason = error
-    except (ValueError, TypeError, KeyError, IndexError, AttributeError, RuntimeError) as error:
-        # What the machine's own steps raise when the program on its stack makes no sense.
+    except NONSENSE as error:
         reason = f"{type(error).__name__}: {error}"
-    raise CheckpointError(f"checkpoint {path} cannot be read as a torch file ({reason})")
+    raise CheckpointError(f"checkpoint {path} cannot be read as a torch file ({brief(reason)})")
+
+
+def refuse_compressed(path: Path) -> None:
+    """CheckpointError for a zip archive with a compressed entry, before anything unpacks it."""
+    if not zipfile.is_zipfile(path):
+        return
+    try:
+        with zipfile.ZipFile(path) as archive:
+            entries = archive.infolist()
+    except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError):
+        return  # torch says what is wrong with it
+    # the source code in a TorchScript archive is compressed; torch says what that is
+    packed = [info.filename for info in entries if info.compress_type != zipfile.ZIP_STORED]
+    if any("/code/" not in name for name in packed):
+        raise CheckpointError(f"checkpoint {path} is compressed, which torch never does")
 
 
 def module_state(module: Instance) -> dict[str, Tensor]:
@@ -104,8 +120,6 @@ def _read_archive(path: Path) -> TensorFile:
         pickles = [name for name in entries if name == "data.pkl" or name.endswith("/data.pkl")]
         if len(pickles) != 1:
             raise Broken(f"the archive has {len(pickles)} entries named data.pkl")
-        if any(info.compress_type != zipfile.ZIP_STORED for info in entries.values()):
-            raise Broken("the archive is compressed, which torch never does")
         whole = path.stat().st_size
         if sum(info.file_size for info in entries.values()) > whole:
             raise Broken("its entries are larger than the file")

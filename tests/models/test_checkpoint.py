@@ -135,6 +135,77 @@ def test_the_files_of_a_folder_are_parts_by_their_names(tmp_path: Path) -> None:
     assert notes == [f"checkpoint {tmp_path.name}: conv.pth.tar, norm.safetensors"]
 
 
+def test_parts_of_a_folder_lose_the_prefix_of_data_parallel(tmp_path: Path) -> None:
+    for part in ("conv", "norm"):
+        names = {n: t for n, t in weights().items() if n.startswith(part)}
+        state = {f"module.{name.partition('.')[2]}": tensor for name, tensor in names.items()}
+        torch.save(state, tmp_path / f"{part}.pth")
+    state, notes = loaded(tmp_path)
+    assert equal(state, weights())
+    assert [note for note in notes if "'module.'" in note] == [
+        f"checkpoint {part}.pth: prefix 'module.' of every key stripped"
+        for part in ("conv", "norm")
+    ]
+
+
+def test_a_folder_with_one_file_of_weights_is_that_file(tmp_path: Path) -> None:
+    torch.save(weights(), tmp_path / "epoch_7.pth")
+    state, notes = loaded(tmp_path)
+    assert equal(state, weights())
+    assert notes == [f"checkpoint {tmp_path.name}: epoch_7.pth"]
+
+
+def test_a_prefix_given_twice_is_stripped_twice(tmp_path: Path) -> None:
+    torch.save({f"module.module.{n}": t for n, t in weights().items()}, tmp_path / "w.pth")
+    assert equal(loaded(tmp_path / "w.pth")[0], weights())
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_weights_that_are_not_finite_are_refused(value: float, tmp_path: Path) -> None:
+    state = weights()
+    state["conv.weight"][0, 0, 0, 0] = value
+    torch.save(state, tmp_path / "w.pth")
+    with pytest.raises(
+        CheckpointError, match=r"1 of its weights are NaN or infinite \(conv.weight"
+    ):
+        loaded(tmp_path / "w.pth")
+
+
+def test_many_large_half_precision_weights_are_finite(tmp_path: Path) -> None:
+    state = {name: tensor.half() for name, tensor in weights().items()}
+    state["conv.weight"][:] = 60000.0
+    torch.save(state, tmp_path / "w.pth")
+    assert loaded(tmp_path / "w.pth")[0]["conv.weight"].max() == 60000.0
+
+
+def test_the_output_numbers_of_tensorflow_s_operations_are_no_part_of_a_name(
+    tmp_path: Path,
+) -> None:
+    np.savez(tmp_path / "w.npz", **{f"{name}:0": t.numpy() for name, t in weights().items()})
+    assert equal(loaded(tmp_path / "w.npz")[0], weights())
+
+
+def test_a_compressed_archive_is_refused_before_torch_unpacks_it(tmp_path: Path) -> None:
+    torch.save({"w": torch.zeros(10**7)}, tmp_path / "stored.pth")
+    with (
+        zipfile.ZipFile(tmp_path / "stored.pth") as stored,
+        zipfile.ZipFile(tmp_path / "w.pth", "w", zipfile.ZIP_DEFLATED) as deflated,
+    ):
+        for name in stored.namelist():
+            deflated.writestr(name, stored.read(name))
+    with pytest.raises(CheckpointError, match="compressed"):
+        read_checkpoint(tmp_path / "w.pth")
+
+
+@pytest.mark.parametrize("told", [10**5000, "a" * 10**5], ids=["number", "text"])
+def test_what_the_training_was_told_is_cut_short_or_left_out(told: Any, tmp_path: Path) -> None:
+    args = argparse.Namespace(arch="resnet18", width=told)
+    torch.save({"args": args, "state_dict": weights()}, tmp_path / "w.pth")
+    _, notes = loaded(tmp_path / "w.pth")
+    assert notes[-1].startswith("checkpoint w.pth: trained with arch resnet18")
+    assert len(notes[-1]) < 200
+
+
 def test_what_the_training_was_told_is_said(tmp_path: Path) -> None:
     args = argparse.Namespace(arch="resnet18", data="kitti", lr=0.1, secret="x", decoder=None)
     torch.save({"args": args, "state_dict": weights()}, tmp_path / "w.pth")

@@ -198,6 +198,7 @@ def tensor_pickle(elements: int, shape: tuple[int, ...], stride: tuple[int, ...]
 BOMBS = {
     "a tensor repeated by strides of 0": (tensor_pickle(1, (10**12,), (0,)), b"\0" * 4),
     "a tensor beyond its storage": (tensor_pickle(1, (10**9,), (1,)), b"\0" * 4),
+    "a side without end": (tensor_pickle(1, (float("inf"),), (1,)), b"\0" * 4),  # type: ignore[arg-type]
     "a storage larger than stored": (tensor_pickle(10**12, (10**12,), (1,)), b"\0" * 4),
     "a negative stride": (tensor_pickle(4, (2,), (-1,)), b"\0" * 16),
     "text longer than the file": (b"\x80\x02X" + struct.pack("<I", 2**32 - 1) + b"a.", b""),
@@ -213,6 +214,22 @@ def test_what_claims_to_be_larger_than_the_file_is_refused(tmp_path: Path, kind:
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     with pytest.raises(CheckpointError, match=r"bomb\.pt cannot be read"):
         read_tensor_file(path)
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 50_000  # kB
+
+
+def test_a_length_that_no_file_has_is_refused_in_the_older_layout_too(tmp_path: Path) -> None:
+    (tmp_path / "x.pt").write_bytes(b"\x80\x05\x8d" + struct.pack("<Q", 2**62) + b"a.")
+    with pytest.raises(CheckpointError, match=r"x\.pt cannot be read"):
+        read_tensor_file(tmp_path / "x.pt")
+
+
+def test_tensors_of_one_storage_share_it(tmp_path: Path) -> None:
+    whole = torch.zeros(10**6)
+    content = {"args": argparse.Namespace(lr=1), **{str(n): whole[n:] for n in range(300)}}
+    torch.save(content, tmp_path / "x.pt")
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    found = read_tensor_file(tmp_path / "x.pt").content
+    assert [len(found[str(n)]) for n in range(300)] == [10**6 - n for n in range(300)]
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 50_000  # kB
 
 
