@@ -25,6 +25,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from model_zoo_defs.same_padding import same_padding
 from pnpdepth_cli.models.definition import ModelDefinition, Multiple, RefineDefaults
 
 FILTERS = (8, 16, 32)
@@ -45,23 +46,16 @@ class State(NamedTuple):
     multipliers: Three
 
 
-def margins(size: int, kernel: int) -> tuple[int, int]:
-    """The zeros before and behind `size` pixels under TensorFlow's SAME padding, stride 2."""
-    total = max((-(-size // STRIDE) - 1) * STRIDE + kernel - size, 0)
-    return total // 2, total - total // 2
-
-
 def analysed(x: Tensor, kernel: Tensor) -> Tensor:
     """x (B, c, h, w) seen through the filters (n, c, k, k): (B, n, ⌈h/2⌉, ⌈w/2⌉), SAME padding."""
-    top, bottom = margins(x.shape[-2], kernel.shape[-1])
-    left, right = margins(x.shape[-1], kernel.shape[-1])
-    return F.conv2d(F.pad(x, (left, right, top, bottom)), kernel, stride=STRIDE)
+    rows, columns = (same_padding(length, kernel.shape[-1], STRIDE) for length in x.shape[-2:])
+    return F.conv2d(F.pad(x, (*columns, *rows)), kernel, stride=STRIDE)
 
 
 def synthesised(codes: Tensor, kernel: Tensor, size: tuple[int, int]) -> Tensor:
     """The codes (B, n, ⌈h/2⌉, ⌈w/2⌉) as a sum of filters (n, c, k, k): (B, c, h, w), the adjoint
     of `analysed`."""
-    top, left = margins(size[0], kernel.shape[-1])[0], margins(size[1], kernel.shape[-1])[0]
+    top, left = (same_padding(length, kernel.shape[-1], STRIDE)[0] for length in size)
     x = F.conv_transpose2d(codes, kernel, stride=STRIDE)
     return x[..., top : top + size[0], left : left + size[1]]
 

@@ -25,6 +25,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from model_zoo_defs.same_padding import same_padding
 from pnpdepth_cli.models.definition import (
     IMAGENET_MEAN,
     IMAGENET_STD,
@@ -42,12 +43,6 @@ UP_PROJECTIONS = ("layer2x", "layer4x", "layer8x", "layer16x")
 def batch_norm(channels: int) -> nn.BatchNorm2d:
     """A batch normalisation as the authors have it."""
     return nn.BatchNorm2d(channels, eps=1e-4)
-
-
-def same_padding(length: int, kernel: int, stride: int) -> tuple[int, int]:
-    """What TensorFlow's SAME puts before and after a side: the odd pixel goes behind."""
-    missing = max((-(-length // stride) - 1) * stride + kernel - length, 0)
-    return missing // 2, missing - missing // 2
 
 
 class MaxPoolSame(nn.Module):

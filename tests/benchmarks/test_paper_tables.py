@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import h5py
@@ -12,7 +13,7 @@ from PIL import Image
 from benchmarks.paper_figures import ROWS, PaperRow, networks_of
 from benchmarks.paper_report import bars_of, reason
 from benchmarks.paper_sets import ROOMS, data_set, rendered, scan_of, shared
-from benchmarks.paper_tables import main, scores_of
+from benchmarks.paper_tables import checkpoints_in, main, scores_of
 from model_zoo_defs.adnn import Adnn
 from model_zoo_defs.sparseconv import SparseConvNet
 from pnpdepth_cli.errors import UsageError
@@ -123,6 +124,43 @@ def test_in_kitti_odometry_the_scan_is_the_truth(tmp_path: Path) -> None:
     assert frame.scan is None
     assert (frame.truth > 0).sum() > 1000
     assert np.array_equal(frame.truth, frame.pool)
+
+
+def test_frames_that_networks_are_trained_on_are_left_out(tmp_path: Path) -> None:
+    one = nyu(tmp_path) / "00001.h5"
+    for folder in ("train/basement", "val/official"):
+        (tmp_path / "ma" / folder).mkdir(parents=True)
+        shutil.copy(one, tmp_path / "ma" / folder)
+    found = data_set(f"nyu={tmp_path / 'ma'}", None)
+    assert found.count == 1
+    assert found.notes == ("ma: 1 of 1 frames of val or test; 1 of train left out",)
+    only = data_set(f"nyu={tmp_path / 'ma' / 'train'}", None)
+    assert only.count == 1
+    assert "all of train: networks may have been trained on them" in only.notes[0]
+
+
+def test_odometry_is_tested_on_the_sequences_without_public_poses(tmp_path: Path) -> None:
+    root = odometry(tmp_path)
+    source = next(path.parent for path in root.rglob("calib.txt"))
+    shutil.copytree(source, source.parent / "17")
+    found = data_set(f"kitti={root}", None)
+    assert found.count == 1
+    assert "1 of sequences 00 to 10 left out" in found.notes[0]
+
+
+@pytest.mark.parametrize("modality", ["-rgb", "-d", "-rgb-kitti", "-d-kitti"])
+def test_editions_that_see_only_picture_or_depth_stand_in_no_row(modality: str) -> None:
+    assert not any(row.takes(f"sparse2dense-r18-deconv2{modality}") for row in ROWS)
+
+
+def test_files_beside_weights_are_no_weights_and_two_are_one_too_many(tmp_path: Path) -> None:
+    for suffix in (".ckpt.index", ".ckpt.meta", ".ckpt.data-00000-of-00001"):
+        (tmp_path / f"fcrn{suffix}").touch()
+    (tmp_path / "adnn.txt").touch()
+    assert checkpoints_in(tmp_path) == {"fcrn": tmp_path / "fcrn.ckpt.index"}
+    (tmp_path / "fcrn.npy").touch()
+    with pytest.raises(UsageError, match="both for fcrn; keep one of them"):
+        checkpoints_in(tmp_path)
 
 
 @pytest.mark.parametrize("what", ["nyu", "kitti=", "sun=there"])

@@ -296,6 +296,17 @@ def test_nyu_frames_come_halved_and_cropped_to_228_by_304(tmp_path: Path) -> Non
     assert (read_frame_truth(frame) == want).all()
 
 
+def test_kitti_in_files_of_the_same_kind_is_cut_as_kitti_is(tmp_path: Path) -> None:
+    h5py = pytest.importorskip("h5py")
+    depth = np.arange(376, dtype=np.float32)[:, None] + np.ones(1241, np.float32)
+    with h5py.File(tmp_path / "00001.h5", "w") as file:
+        file["rgb"], file["depth"] = np.zeros((3, 376, 1241), np.uint8), depth
+    (frame,) = read_frames(tmp_path)
+    assert frame.protocol.name == "kitti-odometry"
+    assert read_frame_image(frame).shape == (228, 912, 3)
+    np.testing.assert_array_equal(read_frame_truth(frame), depth[148:, 164:1076])
+
+
 @pytest.mark.parametrize("kind", ["txt", "mat"])
 def test_the_official_file_is_split_by_the_file_beside_it(tmp_path: Path, kind: str) -> None:
     nyu_mat(tmp_path)

@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from model_zoo_defs.adnn import Adnn, analysed, definitions, margins, synthesised
+from model_zoo_defs.adnn import Adnn, analysed, definitions, synthesised
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.errors import CheckpointError
 from pnpdepth_cli.models.network import load_network
@@ -22,29 +22,6 @@ from tests.model_zoo_defs.cuts import (
 
 Array = NDArray[np.float64]
 SHAPES = {"kernel0": (11, 11, 1, 8), "kernel1": (5, 5, 8, 16), "kernel2": (3, 3, 16, 32)}
-
-
-@pytest.mark.parametrize(
-    ("size", "kernel", "expected"),
-    [
-        (228, 11, (4, 5)),
-        (227, 11, (5, 5)),
-        (228, 5, (1, 2)),
-        (229, 5, (2, 2)),
-        (228, 3, (0, 1)),
-        (229, 3, (1, 1)),
-        (1, 11, (5, 5)),
-        (2, 11, (4, 5)),
-        (1, 3, (1, 1)),
-        (2, 3, (0, 1)),
-        (352, 2, (0, 0)),
-        (353, 1, (0, 0)),
-    ],
-)
-def test_padding_is_that_of_tensorflows_same_at_stride_2(
-    size: int, kernel: int, expected: tuple[int, int]
-) -> None:
-    assert margins(size, kernel) == expected
 
 
 def dense(kernel: Array, size: tuple[int, int]) -> Array:
@@ -131,6 +108,14 @@ def test_depth_is_that_of_the_same_iterations_with_dense_matrices(
     expected = solved(network, sparse, iterations)
     assert np.abs(expected).max() > 1e-3
     np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12)
+
+
+def test_the_published_network_iterates_ten_times() -> None:
+    network = definitions["adnn"].build()
+    steps: list[None] = []
+    network.solve.step.register_forward_hook(lambda *_: steps.append(None))
+    network(torch.ones(1, 1, 16, 16))
+    assert len(steps) == 10
 
 
 @pytest.mark.parametrize("size", [(1, 1), (13, 50)])

@@ -22,7 +22,6 @@ from model_zoo_defs.fcrn import (
     Unpooling,
     definitions,
     read_authors,
-    same_padding,
 )
 from pnpdepth_cli.errors import CheckpointError
 from pnpdepth_cli.models.checkpoint import load_checkpoint
@@ -276,28 +275,6 @@ def test_files_of_ports_say_that_they_are_another_network(
 
 
 # ------------------------------------------------------------------ what ports get wrong
-
-
-@pytest.mark.parametrize(
-    ("length", "kernel", "stride", "padding"),
-    [
-        (114, 3, 2, (0, 1)),
-        (152, 3, 2, (0, 1)),
-        (113, 3, 2, (1, 1)),
-        (5, 3, 1, (1, 1)),
-        (228, 7, 2, (2, 3)),
-        (227, 7, 2, (3, 3)),
-        (10, 2, 2, (0, 0)),
-        (9, 2, 2, (0, 1)),
-        (8, 1, 2, (0, 0)),
-        (1, 3, 2, (1, 1)),
-        (6, 5, 3, (1, 1)),
-    ],
-)
-def test_same_padding_is_tensorflows(
-    length: int, kernel: int, stride: int, padding: tuple[int, int]
-) -> None:
-    assert same_padding(length, kernel, stride) == padding
 
 
 @pytest.mark.parametrize("size", [(6, 8), (7, 9), (6, 9), (2, 2), (1, 5)])

@@ -43,6 +43,15 @@ def published() -> dict[str, tuple[int, ...]]:
     return shapes
 
 
+def test_pictures_go_in_between_minus_one_and_one() -> None:
+    """The published weights were trained so, not with ImageNet's mean and deviation."""
+    for name in ("sfmlearner", "sfmlearner-tiny"):
+        normalisation = definitions[name].normalisation
+        assert normalisation is not None
+        for mean, std in zip(normalisation.mean, normalisation.std, strict=True):
+            assert [(value - mean) / std for value in (0.0, 0.5, 1.0)] == [-1.0, 0.0, 1.0]
+
+
 def weights(shapes: dict[str, tuple[int, ...]]) -> dict[str, Tensor]:
     torch.manual_seed(1)
     return {name: 0.05 * torch.randn(shape) for name, shape in shapes.items()}

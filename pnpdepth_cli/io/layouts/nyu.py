@@ -1,7 +1,9 @@
 """NYU Depth v2: `nyu-h5`, one .h5 a frame as Ma et al. have it, and `nyu-mat`, the official file.
 
-nyu-mat is nyu_depth_v2_labeled.mat; a splits.mat (testNdxs), or a test.txt with the numbers from 1
-of its frames, beside it says which are the test set. Without one, all frames are meant.
+Ma et al. have KITTI odometry in .h5 files too, the scan on its pixels as depth; what is as wide as
+that is cut as the paper cuts KITTI. nyu-mat is nyu_depth_v2_labeled.mat; a splits.mat (testNdxs),
+or a test.txt with the numbers from 1 of its frames, beside it says which are the test set. Without
+one, all frames are meant.
 """
 
 from __future__ import annotations
@@ -11,9 +13,11 @@ from typing import Any
 
 from pnpdepth_cli.errors import FileFormatError
 from pnpdepth_cli.io.layouts.frame import Frame, Hdf5Array, Listing
-from pnpdepth_cli.io.layouts.protocols import PROTOCOLS
+from pnpdepth_cli.io.layouts.hdf5 import shape_of
+from pnpdepth_cli.io.layouts.protocols import PROTOCOLS, Protocol
 from pnpdepth_cli.io.opening import one_line, read_bytes
 
+_WIDEST_KINECT = 1000  # pixels; NYU's frames have 640, KITTI's 1224 or more
 _LABELED = "nyu_depth_v2_labeled.mat"
 
 
@@ -24,14 +28,16 @@ def h5_matches(root: Path) -> bool:
 
 def h5_listing(root: Path) -> Listing:
     """One frame a file, with rgb (3, H, W) and depth (H, W) in it."""
+    files = _h5_files(root)
+    protocol = _protocol_of(files)
     frames = [
         Frame(
             name="_".join(path.relative_to(root).with_suffix("").parts),
             image=Hdf5Array(path=path, name="rgb", axes=(1, 2, 0)),
             gt=Hdf5Array(path=path, name="depth", axes=(0, 1)),
-            protocol=PROTOCOLS["nyu"],
+            protocol=protocol,
         )
-        for path in _h5_files(root)
+        for path in files
     ]
     return Listing(frames=frames)
 
@@ -44,7 +50,7 @@ def mat_matches(root: Path) -> bool:
 def mat_listing(root: Path) -> Listing:
     """The frames of the split beside the file, or all of them; numbered from 1 as there."""
     path = _labeled(root)
-    count = _frames_in(path)
+    count = shape_of(path, "depths")[0]
     frames = [
         Frame(
             name=f"{number:04}",
@@ -61,14 +67,19 @@ def _h5_files(root: Path) -> list[Path]:
     return sorted(p for start in ("", "*/", "*/*/") for p in root.glob(f"{start}*.h5"))
 
 
+def _protocol_of(files: list[Path]) -> Protocol:
+    """What the first file that can be read asks for."""
+    for path in files:
+        try:
+            width = shape_of(path, "depth")[-1]
+        except FileFormatError:
+            continue  # it is named when it is its turn
+        return PROTOCOLS["kitti-odometry" if width > _WIDEST_KINECT else "nyu"]
+    return PROTOCOLS["nyu"]
+
+
 def _labeled(root: Path) -> Path:
     return root if root.name == _LABELED else root / _LABELED
-
-
-def _frames_in(path: Path) -> int:
-    from pnpdepth_cli.io.layouts.hdf5 import shape_of
-
-    return shape_of(path, "depths")[0]
 
 
 def _split(folder: Path, count: int) -> list[int]:
