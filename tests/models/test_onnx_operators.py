@@ -370,6 +370,7 @@ def test_picking_and_putting_back() -> None:
     check("Gather", [X, np.array([0, -1, 2], I64)], axis=2)
     check("Gather", [X, np.array(1, I64)], axis=1)
     check("Gather", [X, np.array([[0, 1], [3, -2]], I64)], axis=3)
+    check("Gather", [np.array([1, 3, 64, 96], I64), np.array(2, I64)], axis=0)  # x.shape[2]
     check("GatherElements", [normal(3, 3), np.array([[0, -1, 2]], I64)], axis=0)
     check("GatherND", [normal(3, 3), np.array([[0, 1], [2, 2]], I64)])
     check("ScatterND", [normal(4, 2), np.array([[1], [3]], I64), normal(2, 2)])

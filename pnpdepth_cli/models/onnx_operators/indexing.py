@@ -48,7 +48,7 @@ def gather(node: Node, given: Given) -> Tensor:
     size = x.shape[axis]
     flat = torch.where(index < 0, index + size, index).reshape(-1).to(x.device)
     picked = x.index_select(axis, flat)
-    return picked.reshape(*x.shape[:axis], *index.shape, *x.shape[axis + 1 :])
+    return picked.reshape((*x.shape[:axis], *index.shape, *x.shape[axis + 1 :]))
 
 
 @operator("GatherElements")
