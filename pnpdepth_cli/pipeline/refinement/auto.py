@@ -24,7 +24,7 @@ from pnpdepth_cli.core.points import SparsePoints
 from pnpdepth_cli.core.propagation import wrong
 from pnpdepth_cli.core.refine import RefineSettings
 from pnpdepth_cli.core.selection import Blend, best_blend, held_out_error
-from pnpdepth_cli.errors import PnpDepthError
+from pnpdepth_cli.errors import ModelError, PnpDepthError
 from pnpdepth_cli.models.definition import ModelDefinition
 from pnpdepth_cli.models.network import Network
 from pnpdepth_cli.pipeline.refinement.frame import RefinedFrame
@@ -62,12 +62,13 @@ class Choice:
     """The ways whose weighted mean is taken, and what it was chosen by.
 
     error: its mean absolute error at the held-out points, metres; None where none was held out.
-    scored: every way that was tried, the best first.
+    network: that of the network as it is. scored: every way that was tried, the best first.
     """
 
     ways: tuple[Way, ...]
     weights: tuple[float, ...]
     error: float | None = None
+    network: float | None = None
     held_out: int = 0
     folds: int = 0
     scored: tuple[Scored, ...] = ()
@@ -135,6 +136,7 @@ def refine_automatically(
     *,
     ways: Sequence[Way] | None = None,
     fixed: Way | None = None,
+    spreading: Sequence[str] = SPREADING,
     budget_s: float | None = None,
     seed: int = 0,
 ) -> AutoRefined:
@@ -142,9 +144,10 @@ def refine_automatically(
 
     trials: ways to update z; the first is tried in any case. ways: only these, the network and the
     simple baselines compete, such as those that were best on other frames. fixed: this way is
-    taken, and the others are only scored. budget_s: no further trial is begun that would end later,
-    by what those before took; those that differ in their alignment alone are begun together. None
-    tries those that differ from the first in nothing else.
+    taken, and the others are only scored. spreading: the ways to spread what is left at the points
+    that compete, of `core.propagation.PROPAGATIONS`. budget_s: no further trial is begun that would
+    end later, by what those before took; those that differ in their alignment alone are begun
+    together. None tries those that differ from the first in nothing else.
     """
     notes: tuple[str, ...] = ()
     with HeldCut(network) as cut:
@@ -163,7 +166,7 @@ def refine_automatically(
         Fold(held_out=used.select(held), believed=believed[held], depths=each)
         for (_, held), each in zip(folds, depths[1:], strict=True)
     )
-    choice = _chosen(scored, tuple(made), ways if fixed is None else (fixed,), fixed)
+    choice = _chosen(scored, tuple(made), ways if fixed is None else (fixed,), fixed, spreading)
     after = torch.stack([depths[0].dense(way) for way in choice.ways])
     after = (torch.tensor(choice.weights).view(-1, 1, 1) * after).sum(dim=0)
     weighed = sorted(zip(choice.weights, choice.ways, strict=True), key=lambda one: -one[0])
@@ -273,9 +276,14 @@ def _chosen(
     trials: Sequence[Trial],
     only: Sequence[Way] | None,
     fixed: Way | None,
+    spreading: Sequence[str],
 ) -> Choice:
     if not folds:
-        usual = Way(trial=trials[0], iterations=trials[0].settings.iterations, propagate="gp")
+        usual = Way(
+            trial=trials[0],
+            iterations=trials[0].settings.iterations,
+            propagate=next(iter(spreading), "none"),
+        )
         return Choice(ways=(fixed or usual,), weights=(1.0,))
     depth = torch.cat([fold.held_out.depth for fold in folds])
     believed = torch.cat([fold.believed for fold in folds]).float()
@@ -285,12 +293,19 @@ def _chosen(
 
     def scored(ways: Sequence[Way]) -> dict[Way, float]:
         for way in ways:
-            if way not in predicted:
+            if way in predicted:
+                continue
+            try:
                 predicted[way] = torch.cat([fold.at(way) for fold in folds])
-        return {way: float(held_out_error(predicted[way], depth, believed)) for way in ways}
+            except ModelError:
+                if way.baseline is None:
+                    raise  # else no line fits points that are all equally far; it does not compete
+        errors = {way: predicted[way] for way in ways if way in predicted}
+        return {way: float(held_out_error(at, depth, believed)) for way, at in errors.items()}
 
     usual = Way(trial=trials[0], iterations=trials[0].settings.iterations)
-    simple = [*(Way(baseline=name) for name in BASELINES), Way(trial=trials[0])]
+    plain = Way(trial=trials[0])
+    simple = [*(Way(baseline=name) for name in BASELINES), plain]
     scored([*simple, usual])
     if only is not None:
         scored(only)
@@ -298,7 +313,7 @@ def _chosen(
         errors = scored([Way(trial=t, iterations=k) for t in trials for k in (0, *updates_of(t))])
         best = min(errors, key=lambda way: errors[way])
         starts = dict.fromkeys([Way(trial=best.trial), best])
-        scored([replace(way, propagate=kind) for way in starts for kind in SPREADING])
+        scored([replace(way, propagate=kind) for way in starts for kind in spreading])
     errors = scored(list(predicted))
     ways = list(predicted)
     if fixed is None:
@@ -315,6 +330,7 @@ def _chosen(
         ways=tuple(ways[member] for member in blend.members),
         weights=blend.weights,
         error=blend.error,
+        network=errors[plain],
         held_out=len(depth),
         folds=len(folds),
         scored=tuple(

@@ -16,10 +16,12 @@ from pnpdepth_cli.core.baselines import BASELINES
 from pnpdepth_cli.core.metrics import score
 from pnpdepth_cli.core.propagation import calibration
 from pnpdepth_cli.core.refine import RefineSettings
+from pnpdepth_cli.errors import PnpDepthError
 from pnpdepth_cli.models.definition import ModelDefinition
 from pnpdepth_cli.models.network import Network
 from pnpdepth_cli.pipeline.refinement.auto import (
     FEWEST,
+    SPREADING,
     AutoRefined,
     Choice,
     refine_automatically,
@@ -63,6 +65,7 @@ def refine_with_folds(
         task.used,
         ways=ways,
         fixed=None if request.auto else fixed,
+        spreading=_spreading(request),
         budget_s=budget_s,
         seed=request.seed,
     )
@@ -91,20 +94,38 @@ def ways_of(
     request: RefineRequest,
     tasks: Sequence[FrameToRefine],
 ) -> tuple[Way, ...]:
-    """The ways that are best on these frames, one or a few of each."""
+    """The ways that are best on these frames, one or a few of each.
+
+    What is wrong with a frame is told when it is its turn; with all of them, it is raised.
+    """
     trials = usual_trials(network.definition, layer, settings)
     found: dict[Way, None] = {}
+    errors: list[PnpDepthError] = []
     for task in tasks:
-        made = refine_automatically(
-            network,
-            trials,
-            task.inputs,
-            task.used,
-            budget_s=request.time_budget_s,
-            seed=request.seed,
-        )
-        found |= dict.fromkeys(made.choice.ways)
+        try:
+            made = refine_automatically(
+                network,
+                trials,
+                task.inputs,
+                task.used,
+                spreading=_spreading(request),
+                budget_s=request.time_budget_s,
+                seed=request.seed,
+            )
+        except PnpDepthError as error:
+            errors.append(error)
+        else:
+            found |= dict.fromkeys(made.choice.ways)
+    if errors and not found:
+        raise errors[0]
     return tuple(found)
+
+
+def _spreading(request: RefineRequest) -> tuple[str, ...]:
+    """How --auto may spread what is left at the points: as asked, or in any way."""
+    if request.propagate is None:
+        return SPREADING
+    return () if request.propagate == "none" else (request.propagate,)
 
 
 def auto_notes(
@@ -120,8 +141,9 @@ def auto_notes(
     if not request.auto:
         return ()
     by_name = {str(one.way): one.error for one in choice.scored}
-    best = min(BASELINES, key=lambda name: by_name[name])
-    network = next(o.error for o in choice.scored if o.way.trial and not o.way.iterations)
+    best = min(by_name.keys() & BASELINES.keys(), key=lambda name: by_name[name])
+    network = choice.network
+    assert network is not None
     said = (
         f"auto: {choice}; {choice.error:.4f} m off at {choice.held_out:,} held-out points in"
         f" {choice.folds} folds (network {network:.4f} m, best baseline {best}"
@@ -162,12 +184,10 @@ def baseline_scores(found: AutoRefined, inputs: Inputs) -> dict[str, dict[str, A
     truth = None if inputs.gt is None else torch.from_numpy(inputs.gt)
     scores: dict[str, dict[str, Any]] = {}
     for name in BASELINES:
-        dense = found.depths.dense(Way(baseline=name)) if truth is not None else None
+        possible = truth is not None and (name in errors or not errors)
+        dense = found.depths.dense(Way(baseline=name)) if possible else None
         scores[name] = _scores(errors.get(name), dense, truth)
-    plain = next(
-        (o.error for o in found.choice.scored if o.way.trial and not o.way.iterations), None
-    )
-    scores["network"] = _scores(plain, torch.from_numpy(found.frame.before), truth)
+    scores["network"] = _scores(found.choice.network, torch.from_numpy(found.frame.before), truth)
     scores["result"] = _scores(found.choice.error, torch.from_numpy(found.frame.after), truth)
     return scores
 

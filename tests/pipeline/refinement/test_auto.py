@@ -15,7 +15,7 @@ from pnpdepth_cli.core.baselines import BASELINES
 from pnpdepth_cli.core.points import SparsePoints
 from pnpdepth_cli.core.refine import RefineSettings
 from pnpdepth_cli.core.split import Split
-from pnpdepth_cli.errors import UsageError
+from pnpdepth_cli.errors import ModelError, UsageError
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.models.definition import InputKind
 from pnpdepth_cli.models.network import Network, load_network
@@ -148,11 +148,55 @@ def test_of_a_network_that_takes_the_points_it_is_said_what_holding_some_out_doe
     scored = [Scored(way=Way(baseline=name), error=0.2) for name in BASELINES]
     scored.append(Scored(way=Way(trial=TRIAL), error=network_m))
     best = min(scored, key=lambda one: one.error)
-    choice = Choice(ways=(best.way,), weights=(1.0,), error=best.error, scored=tuple(scored))
+    choice = Choice(
+        ways=(best.way,), weights=(1.0,), error=best.error, network=network_m, scored=tuple(scored)
+    )
     request = RefineRequest(image=frame.image, sparse=frame.sparse, auto=True)
     notes = held_out.auto_notes(choice, request, replace(network.definition, input_kind=kind))
     assert notes[0].startswith("auto: ")
     assert any("takes the points itself" in note for note in notes[1:]) == warned
+
+
+def test_the_networks_error_is_that_of_the_network_alone(
+    frame: FrameOnDisk, network: Network
+) -> None:
+    inputs = inputs_of(frame)
+    found = refine_automatically(
+        network, usual_trials(network.definition, "middle", SETTINGS), inputs, inputs.points
+    )
+    errors = {str(one.way): one.error for one in found.choice.scored}
+    assert found.choice.network == errors["network"]
+    assert any("network" in name and name != "network" for name in errors)  # none of it alone
+    request = RefineRequest(image=frame.image, sparse=frame.sparse, auto=True)
+    note = held_out.auto_notes(found.choice, request, network.definition)[0]
+    assert f"network {errors['network']:.4f} m" in note
+
+
+def test_what_cannot_be_fitted_to_points_equally_far_does_not_compete(
+    frame: FrameOnDisk, network: Network
+) -> None:
+    inputs = inputs_of(frame)
+    flat = replace(inputs.points, depth=torch.full((len(inputs.points),), 2.0))
+    found = refine_automatically(network, [TRIAL], replace(inputs, points=flat), flat)
+    tried = {str(one.way) for one in found.choice.scored}
+    assert "affine" not in tried
+    assert {"nearest", "scale", "network"} <= tried
+    assert found.choice.error is not None
+    assert found.choice.error < 1e-5
+    scores = held_out.baseline_scores(found, inputs)
+    assert scores["affine"] == {"held_out_mae": None, "scores": None}
+
+
+@pytest.mark.parametrize(
+    ("asked", "tried"), [(None, {"none", "gp", "diffusion"}), ("gp", {"none", "gp"}),
+                         ("none", {"none"})],
+)  # fmt: skip
+def test_with_auto_only_the_propagation_that_is_asked_for_competes(
+    frame: FrameOnDisk, asked: str | None, tried: set[str]
+) -> None:
+    record = run(frame, auto=True, propagate=asked).record
+    assert {each.get("propagate", "none") for each in record["auto"]["tried"]} == tried
+    assert record["settings"]["propagate"] == asked
 
 
 def test_one_refinement_gives_the_depth_after_every_number_of_updates(
@@ -299,6 +343,23 @@ def test_a_batch_finds_its_ways_on_a_few_frames_and_checks_them_on_each(tmp_path
     before = times(root / "out")
     batch(root, refine={"auto": True})
     assert times(root / "out") == before
+
+
+def test_a_frame_that_no_way_can_be_found_on_does_not_stop_a_batch(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    root = pairs_on_disk(tmp_path / "drive")
+    whole, calls = held_out.refine_automatically, []
+
+    def failing_first(*given: Any, **options: Any) -> Any:
+        calls.append(None)
+        if len(calls) == 1:
+            raise ModelError("no way")
+        return whole(*given, **options)
+
+    monkeypatch.setattr(held_out, "refine_automatically", failing_first)
+    batch(root, refine={"auto": True})
+    assert all((root / "out" / f"{name}.json").exists() for name in NAMES)
 
 
 def test_shards_find_the_same_ways(tmp_path: Path) -> None:
