@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from pnpdepth_cli.cli import options
+from pnpdepth_cli.cli.exit_codes import INTERRUPTED
 from pnpdepth_cli.cli.printable import printable
 from pnpdepth_cli.errors import FramesFailedError, StorageError, UsageError
 
@@ -27,7 +28,6 @@ LAYOUTS = (
 )
 PROTOCOLS = ("whole", "nyu", "kitti-odometry", "kitti-depth")
 _STOPPING = b"\nfinishing the frame in work; Ctrl-C again stops at once\n"
-_INTERRUPTED = 128 + signal.SIGINT
 
 
 @click.command(short_help="Refine all frames of a folder or a list.")
@@ -155,7 +155,7 @@ def _run(request: BatchRequest, as_json: bool) -> int:
             raise StorageError(f"{error}; the same command goes on from there") from error
         except KeyboardInterrupt:
             click.echo("stopped; the same command goes on from there", err=True)
-            return _INTERRUPTED
+            return INTERRUPTED
     counts = outcome.summary["counts"]
     if as_json:
         click.echo(json.dumps(outcome.summary, indent=2))
@@ -171,7 +171,7 @@ def _run(request: BatchRequest, as_json: bool) -> int:
             " on from there",
             err=True,
         )
-        return _INTERRUPTED
+        return INTERRUPTED
     bad = [f"{counts[kind]:,} {kind}" for kind in ("failed", "diverged") if counts[kind]]
     if bad:
         raise FramesFailedError(

@@ -21,7 +21,7 @@ from pnpdepth_cli.cli import options
     metavar="N",
     help="Resamples behind the intervals, and swaps behind the p-values.",
 )
-@click.option("--seed", type=int, default=0, show_default=True, help="Of both.")
+@click.option("--seed", type=options.SEED, default=0, show_default=True, help="Of both.")
 @click.option("--csv", type=options.FILE, metavar="FILE|-", help="The table as CSV.")
 @click.option("--markdown", type=options.FILE, metavar="FILE|-", help="The table as Markdown.")
 @click.option("--latex", type=options.FILE, metavar="FILE|-", help="The table as a tabular.")

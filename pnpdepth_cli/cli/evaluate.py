@@ -62,7 +62,7 @@ PROTOCOLS = ("paper", "nyu", "kitti", "kitti-devkit", "eigen", "garg")
     metavar="N",
     help="Resamples behind the ±; 0 leaves it out.",
 )
-@click.option("--seed", type=int, default=0, show_default=True, help="Of the resampling.")
+@click.option("--seed", type=options.SEED, default=0, show_default=True, help="Of the resampling.")
 @click.option("--workers", type=int, default=2, show_default=True, help="Frames read at once.")
 @click.option("--csv", type=options.FILE, metavar="FILE|-", help="A line for each frame.")
 @click.option("--markdown", type=options.FILE, metavar="FILE|-", help="The means as a table.")

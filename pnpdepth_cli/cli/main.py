@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import gc
 import importlib
+import io
 import os
 import sys
 from typing import Any
@@ -11,8 +13,9 @@ from typing import Any
 import click
 
 from pnpdepth_cli import __version__
+from pnpdepth_cli.cli.exit_codes import INTERRUPTED
 from pnpdepth_cli.cli.printable import printable
-from pnpdepth_cli.errors import PnpDepthError
+from pnpdepth_cli.errors import OutputError, PnpDepthError
 
 _EXIT_CODES = """\b
 Exit codes: 0 done · 1 a bug of ours · 2 wrong usage · 3 an input file · 4 network, layer or
@@ -56,6 +59,13 @@ class _Commands(click.Group):
         assert isinstance(command, click.Command)
         return command
 
+    def invoke(self, ctx: click.Context) -> Any:
+        try:
+            return super().invoke(ctx)
+        except KeyboardInterrupt:
+            click.echo("pnpdepth: interrupted", err=True)
+            ctx.exit(INTERRUPTED)
+
 
 @click.group(
     cls=_Commands, epilog=_EXIT_CODES, context_settings={"help_option_names": ["-h", "--help"]}
@@ -70,8 +80,19 @@ def main(arguments: list[str] | None = None) -> Any:
     gc.set_threshold(_GARBAGE)
     if "OMP_WAIT_POLICY" not in os.environ:
         os.environ.setdefault("GOMP_SPINCOUNT", _SPINS)  # read when torch is imported
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="replace")  # who cannot be shown a σ still sees the rest
     try:
-        return cli.main(arguments, prog_name="pnpdepth")
+        try:
+            return cli.main(arguments, prog_name="pnpdepth")
+        finally:
+            sys.stdout.flush()
     except PnpDepthError as error:
         click.echo(f"pnpdepth: {printable(error)}", err=True)
         sys.exit(error.exit_code)
+    except OSError as error:
+        if error.errno != errno.ENOSPC:
+            raise
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what is left goes nowhere
+        click.echo(f"pnpdepth: stdout cannot be written to: {error.strerror}", err=True)
+        sys.exit(OutputError.exit_code)

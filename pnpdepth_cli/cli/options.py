@@ -11,6 +11,7 @@ import click
 from pnpdepth_cli.errors import UsageError
 
 FILE = click.Path(path_type=Path)
+SEED = click.IntRange(0, 2**32 - 1)
 
 model = click.option(
     "--model",
@@ -263,7 +264,7 @@ _REFINEMENT_OPTIONS = (
         metavar="F",
         help="Keep this share of the points out, and score them.",
     ),
-    click.option("--seed", type=int, default=0, show_default=True, help="Of the hold-out choice."),
+    click.option("--seed", type=SEED, default=0, show_default=True, help="Of the hold-out choice."),
     click.option(
         "--tile",
         type=click.IntRange(min=64),

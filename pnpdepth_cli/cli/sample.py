@@ -21,7 +21,9 @@ PATTERNS = ("uniform", "bernoulli", "grid", "lines", "features", "edges", "regio
 )
 @click.option("--region", metavar="X,Y,W,H", help="The rectangle of the pattern `region`, pixels.")
 @click.option("--image", type=options.FILE, help="Of the same view, for `features` and `edges`.")
-@click.option("--seed", type=int, default=0, show_default=True, help="Of everything random.")
+@click.option(
+    "--seed", type=options.SEED, default=0, show_default=True, help="Of everything random."
+)
 @click.option("--noise", type=float, default=0.0, metavar="M", help="Gaussian, metres.")
 @click.option("--relative-noise", type=float, default=0.0, metavar="F", help="Share of the depth.")
 @click.option(

@@ -37,7 +37,9 @@ SENSORS = ("vlp-16", "vlp-32c", "hdl-32e", "hdl-64e")
     help="The scanner is so many metres to the right of, below and in front of the camera.",
 )
 @click.option("--at-scanner", is_flag=True, help="It stands where the calibration has it.")
-@click.option("--seed", type=int, default=0, show_default=True, help="Of everything random.")
+@click.option(
+    "--seed", type=options.SEED, default=0, show_default=True, help="Of everything random."
+)
 @click.option(
     "--rotation-noise",
     "rotation_noise_deg",

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import signal
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -12,10 +11,10 @@ import click
 
 from pnpdepth_cli.cli import options
 from pnpdepth_cli.cli.batch import LAYOUTS, PROTOCOLS
+from pnpdepth_cli.cli.exit_codes import INTERRUPTED
 from pnpdepth_cli.cli.progress import BatchProgress
 from pnpdepth_cli.errors import FramesFailedError, StorageError
 
-_INTERRUPTED = 128 + signal.SIGINT
 _OF_THE_REFINEMENT = {
     *("model", "checkpoint", "layer", "iterations", "lr", "loss", "update", "schedule", "spread"),
     *("parameters", "anchor", "line_search", "keep_best", "align", "align_every", "output_kind"),
@@ -132,7 +131,7 @@ def sweep(
             raise StorageError(f"{error}; the same command goes on from there") from error
         except KeyboardInterrupt:
             progress.say("stopped; the same command goes on from there")
-            raise click.exceptions.Exit(_INTERRUPTED) from None
+            raise click.exceptions.Exit(INTERRUPTED) from None
     if as_json:
         click.echo(json.dumps(record, indent=2))
     else:

@@ -7,7 +7,7 @@ import os
 import re
 import secrets
 import stat
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -38,6 +38,19 @@ def atomic_path(path: Path) -> Iterator[Path]:
             temporary.unlink()
         if isinstance(error, OSError):
             raise cannot_write(path, error) from error
+        raise
+
+
+@contextmanager
+def all_or_none(paths: Iterable[Path]) -> Iterator[None]:
+    """None of the files that were not there before is there if anything inside failed."""
+    new = [path for path in paths if not path.exists()]
+    try:
+        yield
+    except BaseException:
+        for path in new:
+            with suppress(OSError):
+                path.unlink()
         raise
 
 

@@ -14,11 +14,16 @@ _COMMON_SCALES = (1000.0, 256.0, 5000.0, 100.0, 10.0, 1.0)
 
 
 def describe_range(
-    depth: NDArray[Any], source: str, *, assumed_scale: bool = False, noun: str = "points"
+    depth: NDArray[Any],
+    source: str,
+    *,
+    assumed_scale: bool = False,
+    noun: str = "points",
+    option: str = "--depth-scale",
 ) -> str:
     """One line such as `1,842 points, 2.1–63.4 m (16-bit PNG ÷ 256; --depth-scale to change)`."""
     known = _known(depth)
-    hint = "; --depth-scale to change" if assumed_scale else ""
+    hint = f"; {option} to change" if assumed_scale else ""
     if known.size == 0:
         return f"no {noun} with known depth ({source}{hint})"
     count = f"{known.size:,} {noun[:-1] if known.size == 1 else noun}"

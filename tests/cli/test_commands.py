@@ -174,6 +174,65 @@ def test_with_auto_the_table_does_not_claim_updates_that_may_not_be_in_the_resul
     assert "5 updates (sign" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("command", ["sample", "simulate", "compare"])
+@pytest.mark.parametrize("seed", ["-1", "99999999999999999999"])
+def test_a_seed_that_no_generator_takes_is_refused(
+    command: str, seed: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert code_of([command, "a", "b", "--seed", seed]) == 2
+    assert "--seed" in capsys.readouterr().err
+
+
+def test_ctrl_c_ends_with_130_and_one_line(
+    frame: FrameOnDisk, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupted(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("pnpdepth_cli.pipeline.refinement.refine.read_inputs", interrupted)
+    assert code_of(refine(frame)) == 130
+    assert capsys.readouterr().err.splitlines()[-1] == "pnpdepth: interrupted"
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "latin-1"])
+def test_a_stdout_that_cannot_show_every_character_shows_the_others(encoding: str) -> None:
+    for arguments in (["models"], ["refine", "--help"]):
+        done = subprocess.run(
+            [sys.executable, "-m", "pnpdepth_cli", *arguments],
+            env={**os.environ, "PYTHONIOENCODING": encoding}, capture_output=True, check=False,
+        )  # fmt: skip
+        assert done.returncode == 0, done.stderr.decode()
+        assert len(done.stdout) > 500
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no device that is always full")
+def test_a_full_stdout_is_one_line() -> None:
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run(
+            [sys.executable, "-m", "pnpdepth_cli", "--help"],
+            stdout=full, stderr=subprocess.PIPE, text=True, check=False,
+        )  # fmt: skip
+    assert done.returncode == 2
+    assert done.stderr == "pnpdepth: stdout cannot be written to: No space left on device\n"
+
+
+@pytest.mark.parametrize("name", ["depth.jpg", "depth.hdr"])
+def test_a_file_that_depth_is_not_written_as_does_not_become_a_folder(
+    name: str, frame: FrameOnDisk, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert code_of([*refine(frame), "-o", str(frame.folder / name)]) == 2
+    assert "depth is written as .png" in capsys.readouterr().err
+    assert not (frame.folder / name).exists()
+
+
+def test_the_scale_of_the_truth_names_its_own_option(
+    frame: FrameOnDisk, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert code_of(refine(frame, "--gt", str(frame.gt))) == 0
+    (line,) = [text for text in capsys.readouterr().err.splitlines() if text.startswith("gt: ")]
+    assert "--depth-scale" not in line
+
+
 @pytest.mark.parametrize(
     ("said", "spins"),
     [({}, "3000"), ({"GOMP_SPINCOUNT": "7"}, "7"), ({"OMP_WAIT_POLICY": "active"}, "None")],

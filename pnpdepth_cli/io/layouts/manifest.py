@@ -95,7 +95,10 @@ def _parts(path: Path, number: int, row: dict[str, Any]) -> dict[str, Any]:
     given = {k: str(v).strip() for k, v in row.items() if v is not None and str(v).strip()}
     unknown = sorted(set(given) - set(_KEYS))
     if unknown:
-        raise FileFormatError(f"{where}: {unknown[0]!r} is not one of {', '.join(_KEYS)}")
+        commas = "; columns are parted by commas" if ";" in unknown[0] else ""
+        raise FileFormatError(
+            f"{where}: column {unknown[0]!r} is not one of {', '.join(_KEYS)}{commas}"
+        )
     files: dict[str, Any] = {k: path.parent / given[k] for k in _PATHS if k in given}
     if "image" not in files and "sparse" not in files:
         raise FileFormatError(f"{where}: has neither image nor sparse; give one")

@@ -23,7 +23,7 @@ from pnpdepth_cli.pipeline.batch.frames import (
 from pnpdepth_cli.pipeline.batch.profile import BatchProfile
 from pnpdepth_cli.pipeline.batch.settings import model_identity, settings_of
 from pnpdepth_cli.pipeline.batch.state import NEW, BatchState, remove_all_leftovers
-from pnpdepth_cli.pipeline.batch.summary import Tally, write_summary, write_table
+from pnpdepth_cli.pipeline.batch.summary import CSV, JSON, Tally, write_summary, write_table
 
 if TYPE_CHECKING:
     from pnpdepth_cli.pipeline.report.batch import BatchReport
@@ -129,13 +129,15 @@ def _to_do(
     OutputError if one would replace a file that is not a batch's, unless that is allowed.
     """
     frames, reasons = [], Counter[str]()
+    if state.fresh and not request.refine.overwrite:
+        state.check_foreign(request.output / name for name in (CSV, JSON))
     for frame in found.chosen:
         task = task_of(request, frame)
         why = state.why_to_do(task)
         if why is None:
             continue
         if why == NEW and not request.refine.overwrite:
-            state.check_foreign(task)
+            state.check_foreign(task.outputs.paths())
         frames.append(frame)
         reasons[why] += 1
     return frames, reasons
@@ -211,7 +213,7 @@ def _summarise(
             tally.add(row)
             yield row
 
-    write_table(request.output / "summary.csv", counted())
+    write_table(request.output / CSV, counted())
     known = sum(tally.counts.values())
     summary = {
         "command": "batch",
@@ -230,7 +232,7 @@ def _summarise(
     }
     if request.profile:
         summary["profile"] = profile.summary()
-    write_summary(request.output / "summary.json", summary, rows())
+    write_summary(request.output / JSON, summary, rows())
     if report is not None:
         report.write(summary, rows)
     return summary

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import os
 import re
+from collections.abc import Iterable
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Literal
@@ -30,15 +31,18 @@ _MANIFEST = re.compile(r"batch(\.\d+of\d+)?\.jsonl")
 class BatchState:
     """The run manifests of an output folder; this run writes its own, and reads all of them.
 
-    model: the network's identity, as `model_identity` says it.
+    model: the network's identity, as `model_identity` says it. fresh: no batch was there before.
     """
 
     def __init__(self, output: Path, shard: tuple[int, int] | None, model: dict[str, Any]) -> None:
         self.output = output
         self.model = model
         part = "" if shard is None else f".{shard[0]}of{shard[1]}"
-        self._own = Journal(output / f"batch{part}.jsonl", "frame")
+        own = output / f"batch{part}.jsonl"
+        made_before = own.exists()
+        self._own = Journal(own, "frame")
         self.read_others()
+        self.fresh = not made_before and not self._others
 
     def read_others(self) -> None:
         """What the other shards have done up to now is known."""
@@ -77,9 +81,9 @@ class BatchState:
         found.sort(key=lambda line: line["state"] == "failed")
         return found[0] if found else None
 
-    def check_foreign(self, task: Task) -> None:
-        """OutputError if a file that a new frame would become is there, and not from a batch."""
-        for path in task.outputs.paths():
+    def check_foreign(self, paths: Iterable[Path]) -> None:
+        """OutputError if one of the files that a batch would write is there, not from a batch."""
+        for path in paths:
             if path.exists():
                 raise OutputError(
                     f"{path} exists, and no batch made it; --overwrite replaces such files, -o"

@@ -12,6 +12,8 @@ from typing import Any
 from pnpdepth_cli.io.atomic import atomic_path
 from pnpdepth_cli.io.record import plain
 
+CSV, JSON = "summary.csv", "summary.json"
+
 _POINT_ERRORS = ("mae", "rmse")
 _SCORES = (
     *("rmse", "mae", "mre", "sq_rel", "log10", "rmse_log", "irmse", "imae", "silog"),

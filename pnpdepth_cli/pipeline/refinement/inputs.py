@@ -131,7 +131,11 @@ def _read_truth(files: RefineRequest, source: Source) -> _Part:
         scale = files.gt_scale or files.depth_scale
         truth = read_depth(source, scale=scale, channel=files.channel)
     said = describe_range(
-        truth.values, truth.source, assumed_scale=truth.assumed_scale, noun="pixels"
+        truth.values,
+        truth.source,
+        assumed_scale=truth.assumed_scale,
+        noun="pixels",
+        option="--gt-scale",
     )
     return _Part(
         values=np.ascontiguousarray(files.protocol.apply(truth.values)),

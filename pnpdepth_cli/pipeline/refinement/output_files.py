@@ -8,8 +8,12 @@ from typing import Any
 
 from pnpdepth_cli.errors import OutputError, UsageError
 from pnpdepth_cli.io.depth import DEPTH_SUFFIXES
+from pnpdepth_cli.io.layouts.frame import DEPTHS, PICTURES, SCANS
 from pnpdepth_cli.io.record import write_json
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest
+
+_NO_FOLDERS = {*PICTURES, *DEPTHS, *SCANS, ".hdr", ".bmp", ".mat", ".h5", ".csv", ".json"}
+"""A folder's name may have a dot in it, but who writes these means a file."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,6 +75,10 @@ def plan_outputs(request: RefineRequest) -> Outputs:
         )
     if output.suffix.lower() in DEPTH_SUFFIXES:
         outputs = Outputs(depth=output)
+    elif output.suffix.lower() in _NO_FOLDERS and not output.is_dir():
+        raise OutputError(
+            f"{output}: depth is written as {' '.join(DEPTH_SUFFIXES)}, or into a folder"
+        )
     elif output.is_file():
         raise OutputError(
             f"{output} is a file; name a folder, or a depth file ({' '.join(DEPTH_SUFFIXES)})"

@@ -15,6 +15,7 @@ from pnpdepth_cli.core.metrics import Scores, score
 from pnpdepth_cli.core.refine import RefineSettings
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.errors import DivergedError, UsageError
+from pnpdepth_cli.io.atomic import all_or_none
 from pnpdepth_cli.io.record import sha256_of
 from pnpdepth_cli.models.network import Network, load_network
 from pnpdepth_cli.pipeline.refinement.frame import (
@@ -161,11 +162,12 @@ def write_refined(
     The record is the same from run to run, but for `seconds` and `peak_memory_mb`.
     """
     record = _record(refiner, inputs, frame)
-    with watch("write"):
-        record |= write_outputs(outputs, inputs, frame)
-    record["seconds"] = watch.seconds
-    record["peak_memory_mb"] = peak_memory_mb(refiner.network.device)
-    outputs.write_record(record)
+    with all_or_none(outputs.paths()):
+        with watch("write"):
+            record |= write_outputs(outputs, inputs, frame)
+        record["seconds"] = watch.seconds
+        record["peak_memory_mb"] = peak_memory_mb(refiner.network.device)
+        outputs.write_record(record)
     return RefineOutcome(record=record, diverged=frame.diverged)
 
 
@@ -179,6 +181,9 @@ def _record(refiner: Refiner, inputs: Inputs, frame: RefinedFrame) -> dict[str, 
             "layer": refiner.layer,
             **asdict(refiner.settings),
             "step": frame.refinement.step,
+            "propagate": request.propagate if request.auto else request.propagate or "none",
+            "output_kind": network.definition.output_kind,
+            "normalise": request.normalise,
             "holdout": request.holdout,
             "seed": request.seed,
             "precision": request.precision,

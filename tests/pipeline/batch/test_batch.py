@@ -337,6 +337,18 @@ def test_what_no_batch_made_is_not_replaced_unless_asked_for(root: Path) -> None
     assert (root / "out/c.json").read_text() != "mine"
 
 
+@pytest.mark.parametrize("name", ["summary.csv", "summary.json"])
+def test_a_summary_that_no_batch_made_is_not_replaced(name: str, root: Path) -> None:
+    (root / "out").mkdir()
+    (root / "out" / name).write_text("mine")
+    with pytest.raises(OutputError, match="exists, and no batch made it; --overwrite"):
+        batch(root)
+    assert (root / "out" / name).read_text() == "mine"
+    batch(root, refine={"overwrite": True})
+    batch(root)  # it is the batch's own now
+    assert (root / "out" / name).read_text() != "mine"
+
+
 def test_a_name_that_leads_elsewhere_or_to_the_summary_is_left_out(root: Path) -> None:
     rows = [f"rgb/{n}.png,sparse/{n}.png,{m}" for n, m in
             (("a", "../up"), ("b", "summary"), ("c", "/c"), ("d", "fine"))]  # fmt: skip

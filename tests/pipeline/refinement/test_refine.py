@@ -17,6 +17,7 @@ from pnpdepth_cli.errors import (
     OutputError,
     PnpDepthError,
     SizeError,
+    StorageError,
     UsageError,
 )
 from pnpdepth_cli.io.depth import read_depth, write_depth
@@ -116,6 +117,26 @@ def test_existing_results_are_kept_unless_overwriting_is_asked_for(frame: FrameO
     assert (frame.folder / "out" / "img_depth.png").read_bytes() == old
     run(frame, iterations=0, overwrite=True)
     assert (frame.folder / "out" / "img_depth.png").read_bytes() != old
+
+
+def test_of_a_result_that_cannot_be_written_whole_nothing_stays(
+    frame: FrameOnDisk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object) -> None:
+        raise StorageError("the disk is full")
+
+    monkeypatch.setattr("pnpdepth_cli.pipeline.refinement.output_files.write_json", full)
+    with pytest.raises(StorageError):
+        run(frame)
+    assert not list((frame.folder / "out").iterdir())
+
+
+def test_the_record_says_every_setting_that_changes_the_depth(frame: FrameOnDisk) -> None:
+    plain = run(frame).record["settings"]
+    for name, value in (("propagate", "gp"), ("output_kind", "inverse"), ("normalise", "bytes")):
+        other = run(frame, overwrite=True, **{name: value}).record["settings"]
+        assert {key for key in other if other[key] != plain[key]} == {name}
+        assert other[name] == value
 
 
 def test_an_input_is_never_overwritten(frame: FrameOnDisk) -> None:
