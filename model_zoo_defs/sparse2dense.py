@@ -5,7 +5,9 @@ stacked to four channels. The encoder goes down to 1/32, a 1×1 convolution with
 its channels (the paper's z: no ReLU follows), four decoder layers go up to 1/2, and a bilinear
 resize (corners aligned) gives depth in metres at the size of the input; nothing keeps it positive.
 
-The authors trained at 228×304 (NYU) and 228×912 (KITTI), with any of four decoders. Written from
+The authors trained at 228×304 (NYU) and 228×912 (KITTI), with any of four decoders. Their 228×912
+are cut out of a frame at its own scale; so do `batch` and `eval` with folders of KITTI, while
+`refine` shrinks a whole frame until its columns fit, which costs metric scale. Written from
 facts of fangchangma/sparse-to-dense.pytorch; names of parameters are its own. The weights are the
 authors'; that repository names no licence, so none come with this one.
 """
