@@ -23,7 +23,7 @@ from pnpdepth_cli.core.split import Split, gradient_at
 from pnpdepth_cli.core.steps import SCHEDULES, Channels, spread, step_size
 from pnpdepth_cli.core.structure import map_tensors, tensors_in
 from pnpdepth_cli.core.updates import UPDATES
-from pnpdepth_cli.errors import BatchError, DivergedError, LayerError, PnpDepthError
+from pnpdepth_cli.errors import BatchError, DivergedError, LayerError, ModelError, PnpDepthError
 
 DepthOf = Callable[[Any], Tensor]
 
@@ -95,7 +95,8 @@ def refine(
 
     depth_of: turns what the network returns into depth (1, 1, h, w) in metres, differentiably.
     Raises DivergedError at a non-finite loss or gradient (its `last_good` is the Refinement up to
-    there, None if the first prediction is already bad), LayerError if z does not reach the depth.
+    there), ModelError if the first prediction is already bad, LayerError if z does not reach the
+    depth.
     """
     (result,) = refine_batch(
         split, arguments, (points,), settings, depth_of=(depth_of,), on_iteration=on_iteration
@@ -179,11 +180,14 @@ class _Frame:
         except PnpDepthError as error:
             self.error = error
             return None
-        loss = self._loss_of(self._points.sample(depth), self._points.depth)
+        at_points = self._points.sample(depth)
+        loss = self._loss_of(at_points, self._points.depth)
         if self._settings.anchor and self._depths:
             loss = loss + self._settings.anchor * departure(depth, self._depths[0])
         if self._settings.iterations and not bool(loss.isfinite()):
             self.error = self._diverged("loss", len(self.losses))
+            if not self.losses and not bool(at_points.isfinite().all()):
+                self.error = _bad_from_the_start(at_points)
             return None
         self.losses.append(float(loss.detach()))
         if not self._settings.gives_best or self.losses[-1] <= min(self.losses):
@@ -229,6 +233,14 @@ class _Frame:
             f" (step {self._step:.3g}); try a smaller --lr or fewer --iterations",
             self.refinement() if self._depths else None,
         )
+
+
+def _bad_from_the_start(at_points: Tensor) -> ModelError:
+    return ModelError(
+        f"the network's prediction is not finite at {int((~at_points.isfinite()).sum()):,} of"
+        f" {len(at_points):,} sparse points, before any update of z; are its weights, its input"
+        " range (--normalise) and --precision right?"
+    )
 
 
 def _losses(frames: Sequence[_Frame], output: Any) -> list[Tensor]:

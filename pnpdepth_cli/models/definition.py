@@ -8,7 +8,8 @@ A user's own network is a Python file with such an object in it, named `definiti
         name="my-net", input_kind="rgb", size=Multiple(32), build=MyNet, layers=("decoder.up1",)
     )
 
-Nothing here imports torch, so that listing networks stays cheap.
+Nothing here imports torch, so that listing networks stays cheap. A field with a value that makes no
+sense raises ModelError as soon as the object is made.
 """
 
 from __future__ import annotations
@@ -18,6 +19,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from pnpdepth_cli.models import validity
+
 if TYPE_CHECKING:
     from torch import Tensor, nn
 
@@ -25,6 +28,10 @@ InputKind = Literal["rgb", "sparse", "rgb+sparse"]
 OutputKind = Literal["depth", "inverse", "log", "unknown"]
 OutputScale = Literal["metric", "scale", "affine", "unknown"]
 Fit = Literal["stretch", "crop"]
+Loss = Literal["l1", "l2", "huber", "berhu", "inverse", "log", "cauchy"]
+Update = Literal["sign", "sgd", "normalised", "momentum", "adam", "lbfgs"]
+Schedule = Literal["constant", "linear"]
+Align = Literal["none", "median", "scale", "affine", "auto"]
 
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
@@ -42,6 +49,11 @@ class Fixed:
     width: int
     fit: Fit = "stretch"
 
+    def __post_init__(self) -> None:
+        validity.whole(self, "height", least=1)
+        validity.whole(self, "width", least=1)
+        validity.one_of(self, "fit", Fit)
+
 
 @dataclass(frozen=True)
 class Multiple:
@@ -53,6 +65,11 @@ class Multiple:
 
     of: int
     longest: int | None = None
+
+    def __post_init__(self) -> None:
+        validity.whole(self, "of", least=1)
+        if self.longest is not None:
+            validity.whole(self, "longest", least=1)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,6 +83,12 @@ class Near:
     height: int | None = None
     width: int | None = None
 
+    def __post_init__(self) -> None:
+        validity.whole(self, "of", least=1)
+        for side in ("height", "width"):
+            if getattr(self, side) is not None:
+                validity.whole(self, side, least=1)
+
 
 @dataclass(frozen=True, kw_only=True)
 class Normalisation:
@@ -73,6 +96,10 @@ class Normalisation:
 
     mean: tuple[float, float, float] = (0.0, 0.0, 0.0)
     std: tuple[float, float, float] = (1.0, 1.0, 1.0)
+
+    def __post_init__(self) -> None:
+        validity.per_channel(self, "mean")
+        validity.per_channel(self, "std", positive=True)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,11 +115,23 @@ class RefineDefaults:
     layer: str | None = None
     iterations: int = 5
     lr: float | str = 0.01
-    loss: str = "l1"
-    update: str = "sign"
-    schedule: str = "constant"
+    loss: Loss = "l1"
+    update: Update = "sign"
+    schedule: Schedule = "constant"
     spread: float = 0.0
-    align: str | None = None
+    align: Align | None = None
+
+    def __post_init__(self) -> None:
+        if self.layer is not None:
+            validity.instance(self, "layer", str, "the name of a layer")
+        validity.whole(self, "iterations", least=0)
+        validity.step(self, "lr")
+        validity.one_of(self, "loss", Loss)
+        validity.one_of(self, "update", Update)
+        validity.one_of(self, "schedule", Schedule)
+        validity.at_least_zero(self, "spread")
+        if self.align is not None:
+            validity.one_of(self, "align", Align)
 
 
 FOREIGN = RefineDefaults(
@@ -139,8 +178,8 @@ class ModelDefinition:
         returns the positional arguments. Default: in the order of `input_kind`.
     output: picks the prediction, (1, 1, h, w) or (1, h, w), out of what the network returns;
         default: the tensor itself, the only tensor of a structure.
-    verify: called with the network and its arguments for the first frame; returns what to say, or
-        raises ModelError where the network cannot be trusted.
+    verify: called with the network and its arguments for the first frame; returns what to say, if
+        anything, or raises ModelError where the network cannot be trusted.
     normalisation None: which one is decided from the first frame's points.
     assumed: what this definition takes for granted because nobody said; it is printed.
     """
@@ -163,8 +202,26 @@ class ModelDefinition:
     read_checkpoint: Callable[[Mapping[str, Tensor]], Mapping[str, Tensor]] | None = None
     arguments: Callable[[Tensor | None, Tensor | None], tuple[Tensor, ...]] | None = None
     output: Callable[[Any], Tensor] | None = None
-    verify: Callable[[nn.Module, tuple[Tensor, ...]], str] | None = None
+    verify: Callable[[nn.Module, tuple[Tensor, ...]], str | None] | None = None
     assumed: str = ""
+
+    def __post_init__(self) -> None:
+        validity.instance(self, "name", str, "a text")
+        validity.one_of(self, "input_kind", InputKind)
+        size = "Fixed(height, width), Multiple(of) or Near(of=…)"
+        validity.instance(self, "size", (Fixed, Multiple, Near), size)
+        validity.function(self, "build")
+        if self.normalisation is not None:
+            validity.instance(self, "normalisation", Normalisation, "Normalisation(mean=…, std=…)")
+        validity.one_of(self, "output_kind", OutputKind)
+        validity.one_of(self, "output_scale", OutputScale)
+        validity.names(self, "layers")
+        validity.instance(self, "defaults", RefineDefaults, "RefineDefaults(…)")
+        if self.checkpoint is not None:
+            validity.instance(self, "checkpoint", Path, "a pathlib.Path")
+        for hook in ("read_checkpoint", "arguments", "output", "verify"):
+            if getattr(self, hook) is not None:
+                validity.function(self, hook)
 
     @property
     def default_layer(self) -> str | None:

@@ -167,10 +167,10 @@ def _normalisation(processing: Mapping[str, Any], folder: Path) -> Normalisation
         return Normalisation(
             mean=(m0 / unit, m1 / unit, m2 / unit), std=(s0 / unit, s1 / unit, s2 / unit)
         )
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, ModelError):
         raise ModelError(
             f"{folder / 'preprocessor_config.json'}: image_mean {mean!r} and image_std {std!r} are"
-            " not three numbers each"
+            " not three numbers each, the second above 0"
         ) from None
 
 

@@ -22,7 +22,7 @@ from pnpdepth_cli.models.frame import FrameMap
 from pnpdepth_cli.models.made_up import made_up_arguments
 from pnpdepth_cli.models.outline import outline
 from pnpdepth_cli.models.precision import dtype_of, lower
-from pnpdepth_cli.models.registry import find_definition
+from pnpdepth_cli.models.registry import find_definition, importing_beside
 
 FARTHEST_DEPTH = 1e4
 """Metres; inverse depth below 1/FARTHEST_DEPTH reads as this depth."""
@@ -70,6 +70,14 @@ class Network:
             )
         return arguments
 
+    def verified(self, arguments: tuple[Tensor, ...]) -> tuple[str, ...]:
+        """What the definition's `verify` has to say. ModelError if it raises or has no trust."""
+        if self.definition.verify is None:
+            return ()
+        with blaming(f"verify of network {self.definition.name!r}"):
+            said = self.definition.verify(self.module, arguments)
+        return (str(said),) if said else ()
+
     def depth_of(self, output: Any) -> Tensor:
         """Depth (1, 1, h, w) in float32 of what the module returns, taken to be in metres."""
         tensor = self.raw_of(output)
@@ -103,8 +111,13 @@ class Network:
                 )
             return chosen
         found: list[tuple[tuple[str, ...], Tensor]] = list(tensors_in(output))
+        if not found:
+            raise ModelError(
+                f"network {self.definition.name!r} returns a {type(output).__name__} without a"
+                " tensor in it; its forward, or `output` of its definition, must give the depth"
+            )
         if len(found) != 1:
-            names = ", ".join(".".join(path) for path, _ in found) or "none"
+            names = ", ".join(".".join(path) for path, _ in found)
             raise ModelError(
                 f"network {self.definition.name!r} returns {len(found)} tensors ({names}); its"
                 " definition must pick the depth with `output`"
@@ -130,10 +143,7 @@ def load_network(
     dtype = dtype_of(precision, on)
     definition = find_definition(spec)
     path = checkpoint or definition.checkpoint
-    with blaming(f"build of network {definition.name!r}"):
-        module = definition.build()
-    if not isinstance(module, nn.Module):
-        raise ModelError(f"build of {definition.name!r} gives no torch module")
+    module = _built(definition, spec)
     notes: list[str] = []
     if definition.complete and checkpoint is not None:
         raise UsageError(
@@ -147,7 +157,8 @@ def load_network(
         notes = ["weights: random, for none are given; times are right, depths are not"]
     elif module.state_dict():
         raise CheckpointError(
-            f"network {definition.name!r} comes without weights; name them with --checkpoint"
+            f"network {definition.name!r} comes without weights; name them with --checkpoint, or,"
+            " where its build loads them itself, say complete=True in a definition"
         )
     module.eval().requires_grad_(False)
     with out_of_memory_is_a_device_error(on):
@@ -161,6 +172,20 @@ def load_network(
     return network if definition.layers or definition.defaults.layer else _outlined(network)
 
 
+def _built(definition: ModelDefinition, spec: str) -> nn.Module:
+    """What `build` makes; it may import what lies beside the model file."""
+    if isinstance(definition.build, nn.Module):
+        raise ModelError(
+            f"build of network {definition.name!r} is a {type(definition.build).__name__} that is"
+            " made already; a class or a function that makes it is expected, as in lambda: net"
+        )
+    with blaming(f"build of network {definition.name!r}"), importing_beside(spec):
+        module = definition.build()
+    if not isinstance(module, nn.Module):
+        raise ModelError(f"build of {definition.name!r} gives no torch module")
+    return module
+
+
 def _outlined(network: Network) -> Network:
     """The network with layers to cut at, where its definition lists none."""
     size = network.definition.size
@@ -170,7 +195,7 @@ def _outlined(network: Network) -> Network:
         height = width = -(-_OUTLINED // size.of) * size.of
     with out_of_memory_is_a_device_error(network.device):
         arguments = made_up_arguments(network, FrameMap.fit(size, height, width))
-        layers = outline(network.module, arguments)
+        layers = outline(network.module, arguments, network.raw_of)
     if not layers:
         return network
     return replace(

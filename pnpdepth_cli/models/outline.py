@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -9,7 +10,8 @@ import torch
 from torch import Tensor, nn
 
 from pnpdepth_cli.core.foreign import blaming
-from pnpdepth_cli.core.structure import tensors_in
+from pnpdepth_cli.core.structure import map_tensors
+from pnpdepth_cli.errors import ModelError
 
 _SQUARE_ENOUGH = 1.3
 
@@ -21,26 +23,47 @@ class _Seen:
     output: Tensor
 
 
-def outline(module: nn.Module, arguments: tuple[Tensor, ...]) -> tuple[str, ...]:
+@dataclass(frozen=True)
+class _Run:
+    """seen: single maps of submodules, in order. copies: where gradients were let in afresh."""
+
+    seen: list[_Seen]
+    copies: list[Tensor]
+    prediction: Tensor
+
+
+def outline(
+    module: nn.Module, arguments: tuple[Tensor, ...], read: Callable[[Any], Tensor]
+) -> tuple[str, ...]:
     """From the bottleneck on, the last layer of each resolution, coarse to fine; () if none.
 
     The bottleneck is the coarsest feature map; the paper cuts where it has just been made. Only
     layers that give one map (1, c, h, w) of the picture's proportions, that run once, and that the
-    prediction depends on are counted.
+    prediction depends on are counted. read: the prediction of what the network returns. ModelError
+    if no gradient comes back from it, wherever the network were cut.
     """
     picture = next((a for a in arguments if a.ndim == 4), None)
     if picture is None:
         return ()
     sides = picture.shape[1:3] if picture.shape[-1] <= 4 else picture.shape[2:4]
-    seen, output = _observed(module, arguments)
-    useful = [s for s in seen if s.area > 1 and _same_proportions(s.output, sides)]
-    finals = [t for _, t in tensors_in(output) if t.requires_grad]
-    if not useful or not finals:
+    run = _observed(module, arguments, read)
+    if not run.prediction.requires_grad:  # a front without gradients leaves the layers behind it
+        run = _observed(module, arguments, read, afresh=True)
+        if not _reaches_features(run):
+            raise ModelError(
+                "no gradient comes back from the network's prediction to any of its layers; does"
+                " its forward run under torch.no_grad or inference_mode, detach, or go through"
+                " numpy? take that out"
+            )
+    prediction = run.prediction
+    useful = [s for s in run.seen if s.area > 1 and _same_proportions(s.output, sides)]
+    if not useful:
         return ()
     with blaming("the gradient of the network"):
-        whole = torch.stack([t.float().sum() for t in finals]).sum()
-        gradients = torch.autograd.grad(whole, [s.output for s in useful], allow_unused=True)
-    last = max(t.shape[-2] * t.shape[-1] for t in finals)
+        gradients = torch.autograd.grad(
+            prediction.sum(), [s.output for s in useful], allow_unused=True
+        )
+    last = prediction.shape[-2] * prediction.shape[-1]
     reached = [
         s
         for s, gradient in zip(useful, gradients, strict=True)
@@ -58,16 +81,35 @@ def outline(module: nn.Module, arguments: tuple[Tensor, ...]) -> tuple[str, ...]
     return tuple(s.name for s in chosen if s.area < last or len(chosen) == 1)
 
 
-def _observed(module: nn.Module, arguments: tuple[Tensor, ...]) -> tuple[list[_Seen], Any]:
-    """What single maps the submodules gave, in order, and what the network did."""
-    seen: dict[str, _Seen] = {}
-    twice: set[str] = set()
+def _observed(
+    module: nn.Module,
+    arguments: tuple[Tensor, ...],
+    read: Callable[[Any], Tensor],
+    *,
+    afresh: bool = False,
+) -> _Run:
+    """The network's run with these arguments.
 
-    def note(name: str, output: Any) -> None:
-        if name in seen:
-            twice.add(name)
+    afresh: gradients reach what a submodule gave even where they would not, as if cut there.
+    """
+    seen: dict[str, _Seen] = {}
+    ran: set[str] = set()
+    twice: set[str] = set()
+    copies: list[Tensor] = []
+
+    def let_in(path: tuple[str, ...], tensor: Tensor) -> Tensor:
+        if tensor.requires_grad or not tensor.is_floating_point():
+            return tensor
+        with torch.inference_mode(False), torch.enable_grad():
+            copies.append(tensor.clone().detach().requires_grad_(True))
+            return copies[-1].clone()  # in-place operations on the copy itself are forbidden
+
+    def note(name: str, output: Any) -> Any:
+        output = map_tensors(output, let_in) if afresh else output
+        (twice if name in ran else ran).add(name)
         if isinstance(output, Tensor) and output.ndim == 4 and output.requires_grad:
             seen[name] = _Seen(name, output.shape[2] * output.shape[3], output)
+        return output
 
     hooks = [
         part.register_forward_hook(lambda m, given, output, name=name: note(name, output))
@@ -79,11 +121,27 @@ def _observed(module: nn.Module, arguments: tuple[Tensor, ...]) -> tuple[list[_S
             given = tuple(
                 a.detach().requires_grad_(a.is_floating_point()).clone() for a in arguments
             )
-            output = module(*given)
+            prediction = read(module(*given))
     finally:
         for hook in hooks:
             hook.remove()
-    return [s for name, s in seen.items() if name not in twice], output
+    once = [s for name, s in seen.items() if name not in twice]
+    return _Run(once, copies, prediction)
+
+
+def _reaches_features(run: _Run) -> bool:
+    """Whether a gradient comes back to a copy that is more than the depth map itself."""
+    depth = run.prediction.squeeze().shape
+    features = [
+        t for t in run.copies if t.ndim > 2 and t.shape[1] > 1 and t.squeeze().shape != depth
+    ]
+    if not features or not run.prediction.requires_grad:
+        return False
+    with blaming("the gradient of the network"):
+        gradients = torch.autograd.grad(
+            run.prediction.sum(), features, allow_unused=True, retain_graph=True
+        )
+    return any(gradient is not None for gradient in gradients)
 
 
 def _same_proportions(output: Tensor, sides: tuple[int, ...]) -> bool:

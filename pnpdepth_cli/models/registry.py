@@ -7,13 +7,14 @@ import importlib
 import importlib.util
 import inspect
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 from pnpdepth_cli.core.foreign import describe
-from pnpdepth_cli.errors import ModelError
+from pnpdepth_cli.errors import ModelError, PnpDepthError
 from pnpdepth_cli.models.definition import FOREIGN, ModelDefinition, Multiple
 
 DEFAULT_MODEL = "compact"
@@ -85,6 +86,26 @@ def find_definition(spec: str) -> ModelDefinition:
     return found
 
 
+@contextmanager
+def importing_beside(spec: str) -> Iterator[None]:
+    """Inside, what lies beside the model file that `spec` names can be imported, as when it runs.
+
+    A function that makes a network may import more when it is called. Nothing is changed where
+    `spec` names no Python file.
+    """
+    file, _ = _file_and_attribute(spec)
+    if file.suffix != ".py":
+        yield
+        return
+    folder = str(file.resolve().parent)
+    sys.path.insert(0, folder)
+    try:
+        yield
+    finally:
+        with suppress(ValueError):  # the file's own code may have taken it out
+            sys.path.remove(folder)
+
+
 def _only_network(module: ModuleType) -> tuple[str, Any] | None:
     """The one torch module class that the file itself defines; None if there is no one such."""
     from torch import nn
@@ -109,6 +130,13 @@ def _mentioned(network: type) -> set[str]:
 
 def _assumed(build: Callable[..., Any], attribute: str, file: Path) -> ModelDefinition:
     """A definition around a class or function that gives a network, and nothing else is known."""
+    from torch import nn
+
+    if isinstance(build, nn.Module):
+        raise ModelError(
+            f"{attribute!r} in model file {file} is a {type(build).__name__} that is made already;"
+            " name its class, a function that returns it, or a definition"
+        )
     needed = [
         name
         for name, p in inspect.signature(build).parameters.items()
@@ -175,11 +203,12 @@ def _run(file: Path) -> ModuleType:
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module  # dataclasses and pickling inside the file look it up
-    sys.path.insert(0, str(file.resolve().parent))
     try:
-        spec.loader.exec_module(module)
+        with importing_beside(str(file)):
+            spec.loader.exec_module(module)
+    except PnpDepthError as error:
+        said = describe(error, file).removeprefix(f"{type(error).__name__}: ")
+        raise ModelError(f"model file {file}: {said}") from error
     except (Exception, SystemExit) as error:
         raise ModelError(f"model file {file} raises {describe(error, file)}") from error
-    finally:
-        sys.path.remove(str(file.resolve().parent))
     return module

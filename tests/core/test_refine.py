@@ -323,7 +323,7 @@ class Breaking(nn.Module):
 
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf")])
-@pytest.mark.parametrize("iteration", [0, 2, 5])
+@pytest.mark.parametrize("iteration", [1, 2, 5])
 def test_a_loss_that_is_not_finite_stops_with_the_last_good_depth(
     iteration: int, bad: float
 ) -> None:
@@ -334,14 +334,25 @@ def test_a_loss_that_is_not_finite_stops_with_the_last_good_depth(
     ) as error:
         refined(network, "cut", RefineSettings())
     assert error.value.exit_code == 5
-    if iteration == 0:
-        assert error.value.last_good is None
-        return
     network.n = 0
     good = refined(network, "cut", RefineSettings(iterations=iteration - 1))
     assert torch.equal(error.value.last_good.after, good.after)
     assert torch.equal(error.value.last_good.before, good.before)
     assert error.value.last_good.losses == good.losses
+
+
+@pytest.mark.parametrize("bad", [float("nan"), float("inf")])
+def test_a_prediction_that_is_not_finite_to_begin_with_is_the_networks_fault(bad: float) -> None:
+    with pytest.raises(ModelError, match="the network's prediction is not finite at") as error:
+        refined(Breaking(1, bad), "cut", RefineSettings())
+    assert f"at {len(POINTS)} of {len(POINTS)} sparse points" in str(error.value)
+    assert error.value.exit_code == 4
+    assert "\n" not in str(error.value)
+
+
+def test_a_first_loss_that_only_overflows_is_no_fault_of_the_prediction() -> None:
+    with pytest.raises(DivergedError, match="loss is not finite after 0 updates"):
+        refined(Breaking(1, 1e30), "cut", RefineSettings(loss="l2"))
 
 
 def test_a_gradient_that_is_not_finite_stops_with_the_depth_it_came_from() -> None:

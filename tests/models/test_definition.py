@@ -2,14 +2,35 @@
 
 from __future__ import annotations
 
+import math
 import subprocess
 import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, get_args
 
+import numpy as np
 import pytest
 import torch
 from torch import nn
 
-from pnpdepth_cli.models.definition import ModelDefinition, Multiple, RefineDefaults
+from pnpdepth_cli.core.alignment import ALIGNMENTS
+from pnpdepth_cli.core.losses import LOSSES
+from pnpdepth_cli.core.steps import SCHEDULES, step_size
+from pnpdepth_cli.core.updates import UPDATES
+from pnpdepth_cli.errors import ModelError, UsageError
+from pnpdepth_cli.models.definition import (
+    Align,
+    Fixed,
+    Loss,
+    ModelDefinition,
+    Multiple,
+    Near,
+    Normalisation,
+    RefineDefaults,
+    Schedule,
+    Update,
+)
 
 
 def definition(**more: object) -> ModelDefinition:
@@ -48,3 +69,120 @@ def test_the_defaults_are_the_papers() -> None:
 def test_reading_a_definition_needs_no_torch() -> None:
     code = "import sys, pnpdepth_cli.models.definition; assert 'torch' not in sys.modules"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+# ------------------------------------------------------------------ fields that make no sense
+
+NAN, INF = math.nan, math.inf
+NO_SIZES = [0, -4, 1.5, "8", True, None]
+
+
+def refused(make: Callable[..., Any], **wrong: Any) -> str:
+    (field,) = wrong
+    with pytest.raises(ModelError) as error:
+        make(**wrong)
+    said = str(error.value)
+    assert f" {field}=" in said
+    assert "\n" not in said
+    assert error.value.exit_code == 4
+    return said
+
+
+@pytest.mark.parametrize("wrong", NO_SIZES)
+def test_a_side_or_a_multiple_that_is_no_whole_number_above_zero_is_refused(wrong: Any) -> None:
+    assert "Multiple: of=" in refused(Multiple, of=wrong)
+    assert "Near: of=" in refused(Near, of=wrong)
+    for make in (lambda height: Fixed(height, 8), lambda height: Fixed(height=height, width=8)):
+        assert "not a whole number of at least 1" in refused(make, height=wrong)
+    refused(lambda width: Fixed(8, width), width=wrong)
+    if wrong is not None:
+        refused(lambda longest: Multiple(8, longest), longest=wrong)
+        refused(lambda height: Near(of=8, height=height), height=wrong)
+        refused(lambda width: Near(of=8, width=width), width=wrong)
+
+
+def test_an_unknown_fit_is_not_taken_for_stretch() -> None:
+    said = refused(lambda fit: Fixed(64, 96, fit), fit="pad")
+    assert "fit='pad' is none of 'stretch', 'crop'" in said
+
+
+@pytest.mark.parametrize("field", ["mean", "std"])
+@pytest.mark.parametrize(
+    "wrong", [(1, 1), (1, 1, 1, 1), 0.5, "rgb", (1, 1, NAN), (1, INF, 1), ("1", 1, 1)]
+)
+def test_a_normalisation_holds_three_numbers_each(field: str, wrong: Any) -> None:
+    assert "three numbers" in refused(Normalisation, **{field: wrong})
+
+
+def test_a_deviation_is_above_zero_and_a_mean_need_not_be() -> None:
+    assert "three numbers above 0" in refused(Normalisation, std=(1, 0, 1))
+    assert Normalisation(mean=(-1, 0, 1)).mean == (-1, 0, 1)
+
+
+@pytest.mark.parametrize(
+    ("field", "wrong"),
+    [
+        *(("iterations", value) for value in ("5", -1, 2.0, None)),
+        *(("lr", value) for value in ("x%", "", 0, -1, NAN, INF, "inf", None)),
+        *(("spread", value) for value in (-1, NAN, INF, "1", None)),
+        *((field, "foo") for field in ("loss", "update", "schedule", "align")),
+        *((field, None) for field in ("loss", "update", "schedule")),
+        ("align", ["auto"]),
+        ("layer", 3),
+    ],
+)
+def test_a_default_that_refinement_could_not_use_is_refused(field: str, wrong: Any) -> None:
+    assert "RefineDefaults: " in refused(RefineDefaults, **{field: wrong})
+
+
+@pytest.mark.parametrize("lr", ["x%", "", "0%", "3 %", "3%", "0.5", 0.1, 1, True, None])
+def test_a_definition_takes_those_steps_that_refinement_takes(lr: Any) -> None:
+    try:
+        step_size(lr, torch.randn(8))
+    except UsageError:
+        refused(RefineDefaults, lr=lr)
+    else:
+        assert RefineDefaults(lr=lr).lr == lr
+
+
+def test_the_valid_defaults_are_those_of_the_method() -> None:
+    assert get_args(Loss) == tuple(LOSSES)
+    assert get_args(Update) == tuple(UPDATES)
+    assert get_args(Schedule) == tuple(SCHEDULES)
+    assert get_args(Align) == ALIGNMENTS
+
+
+@pytest.mark.parametrize(
+    ("field", "wrong", "said"),
+    [
+        ("name", 5, "a text is expected"),
+        ("input_kind", "depth", "is none of 'rgb', 'sparse', 'rgb+sparse'"),
+        ("size", 32, "where Fixed(height, width), Multiple(of) or Near(of=…) is expected"),
+        ("build", "net", "cannot be called"),
+        ("normalisation", (0, 1), "Normalisation(mean=…, std=…) is expected"),
+        ("output_kind", "metric", "is none of 'depth', 'inverse', 'log', 'unknown'"),
+        ("output_kind", "disparity", "'unknown'; disparity is 'inverse'"),
+        ("output_scale", "relative", "'unknown'; relative depth is 'scale' (up to a factor) or"),
+        ("layers", "encoder", "is not a tuple of texts"),
+        ("layers", ("a", 3), "is not a tuple of texts"),
+        ("defaults", {"lr": 1}, "RefineDefaults(…) is expected"),
+        ("checkpoint", "net.pt", "a pathlib.Path is expected"),
+        *((f, "x", "cannot be called") for f in ("read_checkpoint", "arguments", "output")),
+        ("verify", "x", "cannot be called"),
+    ],
+)
+def test_a_field_of_a_definition_that_makes_no_sense_is_refused_by_its_name(
+    field: str, wrong: Any, said: str
+) -> None:
+    assert said in refused(definition, **{field: wrong})
+
+
+def test_a_long_value_is_shortened() -> None:
+    assert len(refused(definition, size=["x\n" * 100])) < 200
+
+
+def test_numbers_of_numpy_and_lists_are_as_good() -> None:
+    assert Multiple(np.int64(8)).of == 8  # type: ignore[arg-type]
+    assert RefineDefaults(lr=np.float32(0.5), iterations=np.int32(3)).iterations == 3  # type: ignore[arg-type]
+    Normalisation(mean=[0.5, 0.5, 0.5], std=np.ones(3))  # type: ignore[arg-type]
+    assert definition(layers=["a"], checkpoint=Path("x.pt"), normalisation=None).layers == ["a"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -96,8 +97,6 @@ def test_the_only_tensor_of_a_structure_is_the_output_and_several_need_a_choice(
     assert torch.equal(network().depth_of({"depth": [depth], "text": "x"}), depth)
     with pytest.raises(ModelError, match=r"returns 2 tensors \(a, b.0\); its definition must pick"):
         network().depth_of({"a": depth, "b": [depth]})
-    with pytest.raises(ModelError, match=r"returns 0 tensors \(none\)"):
-        network().depth_of(None)
     chosen = network(output=lambda output: output["b"][0] * 2)
     assert torch.equal(chosen.depth_of({"a": depth, "b": [depth]}), depth * 2)
 
@@ -107,6 +106,27 @@ def test_an_output_that_raises_or_is_no_tensor_is_the_definitions_fault() -> Non
         network(output=lambda output: output["x"]).depth_of({})
     with pytest.raises(ModelError, match="gives a dict, where a tensor is expected"):
         network(output=lambda output: output).depth_of({})
+
+
+def test_what_a_network_returns_without_any_tensor_is_said() -> None:
+    with pytest.raises(ModelError, match="'mine' returns a NoneType without a tensor in it"):
+        network().depth_of(None)
+    with pytest.raises(ModelError, match="'mine' returns a dict without a tensor in it"):
+        network().raw_of({"depth": None})
+
+
+def test_what_verify_says_is_passed_on_and_what_it_raises_is_the_definitions_fault() -> None:
+    assert network().verified(()) == ()
+    assert network(verify=lambda module, given: f"{len(given)}").verified(()) == ("0",)
+    assert network(verify=lambda module, given: None).verified(()) == ()
+    with pytest.raises(ModelError, match="verify of network 'mine' raises ZeroDivisionError"):
+        network(verify=lambda module, given: 1 / 0).verified(())
+
+    def distrust(module: nn.Module, given: tuple[Tensor, ...]) -> str:
+        raise ModelError("it gives something else")
+
+    with pytest.raises(ModelError, match=r"^it gives something else$"):
+        network(verify=distrust).verified(())
 
 
 # ------------------------------------------------------------------ loading
@@ -122,6 +142,7 @@ def of(build, **more):
 definition = of(lambda: nn.Conv2d(1, 1, 1))
 owned = of(lambda: nn.Conv2d(1, 1, 1), checkpoint=OWN)
 empty = of(nn.Identity)
+made = of(nn.Conv2d(1, 1, 1))
 raising = of(lambda: 1 / 0)
 wrong = of(lambda: "text")
 """
@@ -149,6 +170,8 @@ def test_weights_come_from_the_file_named_or_the_definitions_own(file: Path) -> 
 def test_random_weights_are_never_used(file: Path) -> None:
     with pytest.raises(CheckpointError, match="comes without weights; name them with --checkpoint"):
         load_network(str(file), None)
+    with pytest.raises(CheckpointError, match="loads them itself, say complete=True"):
+        load_network(str(file), None)
     (file.parent / "own.safetensors").unlink()
     with pytest.raises(CheckpointError, match="does not exist"):
         load_network(f"{file}:owned", None)
@@ -163,6 +186,56 @@ def test_a_build_that_raises_or_gives_no_module_is_said(file: Path) -> None:
         load_network(f"{file}:raising", None)
     with pytest.raises(ModelError, match="gives no torch module"):
         load_network(f"{file}:wrong", None)
+    with pytest.raises(ModelError, match="build of network 'mine' is a Conv2d that is made alr"):
+        load_network(f"{file}:made", None)
+
+
+def test_a_build_may_import_what_lies_beside_the_file_as_late_as_it_likes(tmp_path: Path) -> None:
+    (tmp_path / "late_blocks.py").write_text(
+        "from torch import nn\nPARTS = [nn.AvgPool3d((3, 1, 1))]"
+    )
+    build = "def make():\n    from late_blocks import PARTS\n    return PARTS[0]\n"
+    (tmp_path / "net.py").write_text(build)
+    before = list(sys.path)
+    assert isinstance(load_network(f"{tmp_path / 'net.py'}:make", None).module, nn.AvgPool3d)
+    assert sys.path == before
+
+
+def test_the_search_path_is_as_before_after_a_build_that_raises(file: Path) -> None:
+    before = list(sys.path)
+    with pytest.raises(ModelError):
+        load_network(f"{file}:raising", None)
+    assert sys.path == before
+
+
+FORWARDS = """
+import torch
+from torch import nn
+class Plain(nn.Module):
+    def __init__(self):
+        super().__init__()
+        self.down = nn.AvgPool2d(2)
+    def forward(self, rgb):
+        return self.down(rgb).mean(1, keepdim=True)
+class NoGrad(Plain):
+    forward = torch.no_grad()(Plain.forward)
+class Nothing(Plain):
+    def forward(self, rgb):
+        self.down(rgb)
+"""
+
+
+def test_a_class_whose_forward_lets_no_gradient_back_or_gives_nothing_is_told_so(
+    tmp_path: Path,
+) -> None:
+    file = tmp_path / "nets.py"
+    file.write_text(FORWARDS)
+    assert load_network(f"{file}:Plain", None).definition.layers == ("down",)
+    with pytest.raises(ModelError, match=r"no gradient comes back .* torch.no_grad") as error:
+        load_network(f"{file}:NoGrad", None)
+    assert error.value.exit_code == 4
+    with pytest.raises(ModelError, match=r"'nets.Nothing' returns a NoneType without a tensor"):
+        load_network(f"{file}:Nothing", None)
 
 
 # ------------------------------------------------------------------ the device

@@ -97,6 +97,33 @@ def test_a_model_file_at_fault_is_said_with_its_line(
     assert error.value.exit_code == 4
 
 
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        ("size=32", "ModelDefinition 'mine': size=32 is a int"),
+        ("size=Multiple(0)", "Multiple: of=0"),
+        ("size=Multiple(8), output_kind='disparity'", "'mine': output_kind='disparity' is none of"),
+    ],
+)
+def test_a_wrong_field_of_a_definition_is_said_with_its_file_and_line(
+    wrong: str, said: str, tmp_path: Path
+) -> None:
+    file = written(tmp_path, GOOD.replace("size=Multiple(8)", wrong, 1))
+    written(tmp_path, "WIDTH = 7", "beside.py")
+    with pytest.raises(ModelError) as error:
+        find_definition(str(file))
+    assert str(error.value).startswith(f"model file {file}: ")
+    assert said in str(error.value)
+    assert "(line " in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_a_network_that_is_made_already_is_not_taken_for_a_function(tmp_path: Path) -> None:
+    file = written(tmp_path, "from torch import nn\nnet = nn.Conv2d(3, 1, 1)\n")
+    with pytest.raises(ModelError, match=r"'net' in .* is a Conv2d that is made already; name its"):
+        find_definition(f"{file}:net")
+
+
 def test_a_file_that_is_not_there_or_lacks_the_attribute_is_said(tmp_path: Path) -> None:
     with pytest.raises(ModelError, match="does not exist"):
         find_definition(str(tmp_path / "absent.py"))
@@ -111,7 +138,7 @@ def test_the_search_path_is_as_before(tmp_path: Path) -> None:
     import sys
 
     before = list(sys.path)
-    for text in ("x = 1", "raise ValueError"):
+    for text in ("x = 1", "raise ValueError", "import sys; sys.path.pop(0)"):
         with pytest.raises(ModelError):
             find_definition(str(written(tmp_path, text)))
     assert sys.path == before

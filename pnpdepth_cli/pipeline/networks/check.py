@@ -41,8 +41,7 @@ def check_model(
             frame = FrameMap.fit(definition.size, *rgb.shape[-2:])
             nowhere = SparsePoints(xy=torch.zeros(0, 2), depth=torch.zeros(0), size=frame.network)
             arguments = network.arguments(frame, rgb, nowhere)
-        if definition.verify is not None:
-            notes.append(definition.verify(network.module, arguments))
+        notes += network.verified(arguments)
         with torch.no_grad():
             raw = network.raw_of(network.module(*arguments))
         layers = {

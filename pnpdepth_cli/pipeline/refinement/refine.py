@@ -140,6 +140,8 @@ def load_refiner(request: RefineRequest, first: Inputs) -> Refiner:
 
     UsageError if the request asks for what does not go together.
     """
+    if request.time_budget_s is not None and not request.auto:
+        raise UsageError("--time-budget is for the trials of --auto; give that too")
     if request.tile is not None and request.needs_folds:
         raise UsageError("--tile goes with none of --auto, --baselines and --uncertainty")
     network = load_network(

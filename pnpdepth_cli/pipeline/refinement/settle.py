@@ -49,7 +49,7 @@ def settled(network: Network, inputs: Inputs, request: RefineRequest) -> Network
             frame = FrameMap.fit(definition.size, *inputs.size)
             points = frame.points_to_network(inputs.points)
             arguments = network.arguments(frame, inputs.rgb_tensor(), points)
-            notes.append(definition.verify(network.module, arguments))
+            notes += network.verified(arguments)
     return replace(network, notes=tuple(notes))
 
 

@@ -1,0 +1,99 @@
+"""Whether the fields of a definition hold what they should; each function raises ModelError if not.
+
+Nothing here imports torch, as the definitions themselves do not.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from numbers import Integral, Real
+from typing import Any, NoReturn, get_args
+
+from pnpdepth_cli.errors import ModelError
+
+_LONGEST = 60  # characters of a wrong value that are shown
+_MEANT = {
+    ("output_kind", "disparity"): "; disparity is 'inverse'",
+    (
+        "output_scale",
+        "relative",
+    ): "; relative depth is 'scale' (up to a factor) or 'affine' (a shift as well)",
+}
+"""What the usual words are called here, by field and word."""
+
+
+def one_of(owner: object, field: str, literal: Any) -> None:
+    """The field is one of the values of a `Literal`."""
+    value, valid = getattr(owner, field), get_args(literal)
+    if not isinstance(value, str) or value not in valid:
+        meant = _MEANT.get((field, str(value)), "")
+        refuse(owner, field, f"is none of {', '.join(map(repr, valid))}{meant}")
+
+
+def whole(owner: object, field: str, *, least: int) -> None:
+    """The field is a whole number, and no less than `least`."""
+    value = getattr(owner, field)
+    if not isinstance(value, Integral) or isinstance(value, bool) or int(value) < least:
+        refuse(owner, field, f"is not a whole number of at least {least}")
+
+
+def at_least_zero(owner: object, field: str) -> None:
+    """The field is a finite number, and not negative."""
+    value = getattr(owner, field)
+    if not _is_number(value) or value < 0:
+        refuse(owner, field, "is not a number of at least 0")
+
+
+def step(owner: object, field: str) -> None:
+    """The field is a positive number, or a text with such a number and perhaps a % behind it."""
+    value = getattr(owner, field)
+    try:
+        number = float(str(value).strip().removesuffix("%"))
+    except ValueError:
+        number = math.nan
+    if not 0 < number < math.inf:
+        refuse(owner, field, "is not a step size; give a positive number, or a text like '3%'")
+
+
+def per_channel(owner: object, field: str, *, positive: bool = False) -> None:
+    """The field holds three finite numbers, for red, green and blue."""
+    value = getattr(owner, field)
+    numbers = list(value) if isinstance(value, Iterable) else []
+    good = len(numbers) == 3 and all(map(_is_number, numbers))
+    if not good or (positive and min(numbers) <= 0):
+        above = " above 0" if positive else ""
+        refuse(owner, field, f"is not three numbers{above}, for red, green and blue")
+
+
+def names(owner: object, field: str) -> None:
+    """The field is a tuple or a list of texts."""
+    value = getattr(owner, field)
+    if not isinstance(value, tuple | list) or not all(isinstance(name, str) for name in value):
+        refuse(owner, field, "is not a tuple of texts, as in ('encoder', 'decoder.up1')")
+
+
+def instance(owner: object, field: str, kinds: type | tuple[type, ...], wanted: str) -> None:
+    """The field is of one of these types; `wanted` says so in words."""
+    value = getattr(owner, field)
+    if not isinstance(value, kinds):
+        refuse(owner, field, f"is a {type(value).__name__}, where {wanted} is expected")
+
+
+def function(owner: object, field: str) -> None:
+    """The field can be called."""
+    if not callable(getattr(owner, field)):
+        refuse(owner, field, "cannot be called; give a function or a class")
+
+
+def refuse(owner: object, field: str, why: str) -> NoReturn:
+    """ModelError: the type and name of the owner, the field and its value, and why not."""
+    name = getattr(owner, "name", None)
+    whose = f"{type(owner).__name__} {name!r}" if isinstance(name, str) else type(owner).__name__
+    shown = " ".join(repr(getattr(owner, field)).split())
+    shown = shown if len(shown) <= _LONGEST else shown[: _LONGEST - 1] + "…"
+    raise ModelError(f"{whose}: {field}={shown} {why}")
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
