@@ -1,4 +1,7 @@
-"""A torch.export archive (.pt2) as a definition; the nodes of its graph are the layers."""
+"""A torch.export archive (.pt2) as a definition; the nodes of its graph are the layers.
+
+The archive is checked before torch reads it, and the source code of its guards is never asked for.
+"""
 
 from __future__ import annotations
 
@@ -13,6 +16,7 @@ from torch import Tensor, fx, nn
 from pnpdepth_cli.core.foreign import describe
 from pnpdepth_cli.errors import ModelError
 from pnpdepth_cli.models.definition import FOREIGN, Fixed, ModelDefinition, Multiple
+from pnpdepth_cli.models.export_archive import check_archive
 
 _MULTIPLE = 32
 
@@ -36,8 +40,10 @@ def exported_definition(file: Path) -> ModelDefinition:
     if not file.is_file():
         raise ModelError(f"exported program {file} does not exist")
     try:
-        program = torch.export.load(file)
-        graph = program.module()
+        check_archive(file)
+        graph = torch.export.load(file).module(check_guards=False)
+    except ModelError:
+        raise
     except Exception as error:  # every part of torch.export has its own way to fail
         raise ModelError(
             f"exported program {file} cannot be read: {describe(error)[:160]}; it must be written"
@@ -75,8 +81,6 @@ def _with_operations_as_modules(exported: Any) -> nn.Module:
     kept: dict[fx.Node, Any] = {}
     taken: set[str] = set()
     for node in exported.graph.nodes:
-        if node.op == "call_module" and "guard" in str(node.target):
-            continue  # checks of the input's shape, which runs have passed already
         made = graph.node_copy(node, lambda n: kept[n])
         kept[node] = made
         if node.op == "get_attr":
@@ -86,8 +90,11 @@ def _with_operations_as_modules(exported: Any) -> nn.Module:
             taken.add(name)
             made.target = name
         elif _is_layer(node):
-            root.add_module(node.name, ExportedOperation(node.target))
-            made.op, made.target = "call_module", node.name
+            name = node.name
+            while hasattr(root, name):  # every module has a method `to`, and so may a graph
+                name += "_"
+            root.add_module(name, ExportedOperation(node.target))
+            made.op, made.target = "call_module", name
     return fx.GraphModule(root, graph)
 
 
@@ -96,8 +103,10 @@ def _is_layer(node: fx.Node) -> bool:
     return node.op == "call_function" and gives_tensors and node.target is not operator.getitem
 
 
-def _hold(root: nn.Module, name: str, value: Tensor) -> None:
-    if value.is_floating_point():
+def _hold(root: nn.Module, name: str, value: Tensor | nn.Module) -> None:
+    if isinstance(value, nn.Module):
+        root.add_module(name, value)  # a part that is run as one, such as one without gradients
+    elif value.is_floating_point():
         root.register_parameter(name, nn.Parameter(value.detach(), requires_grad=False))
     else:
         root.register_buffer(name, value)
