@@ -67,9 +67,9 @@ def load_checkpoint(network: nn.Module, definition: ModelDefinition, path: Path)
     """
     given, notes = _read(path)
     own = {n: t for n, t in network.state_dict().items() if isinstance(t, Tensor)}
-    while given and _all_in_module(given) and not _all_in_module(own):
-        given, note = _without_module(given, path)
-        notes = [*notes, note]
+    if not _all_in_module(own):
+        given, said = _without_module(given, path)
+        notes = [*notes, *said]
     try:
         state = _fitted(definition, own, given, path)
     except CheckpointError:
@@ -149,13 +149,16 @@ def _misfit(path: Path, definition: ModelDefinition, why: str) -> CheckpointErro
 
 
 def _all_in_module(state: Mapping[str, Any]) -> bool:
-    return all(name.startswith("module.") for name in state)
+    return bool(state) and all(name.startswith("module.") for name in state)
 
 
-def _without_module(state: Mapping[str, Tensor], path: Path) -> tuple[dict[str, Tensor], str]:
-    """The tensors under the names they have without torch's DataParallel, and a note on that."""
-    stripped = {name.removeprefix("module."): tensor for name, tensor in state.items()}
-    return stripped, f"checkpoint {path.name}: prefix 'module.' of every key stripped"
+def _without_module(state: dict[str, Tensor], path: Path) -> tuple[dict[str, Tensor], list[str]]:
+    """The tensors by their names without torch's DataParallel, once or more, and what to say."""
+    notes = []
+    while _all_in_module(state):
+        state = {name.removeprefix("module."): tensor for name, tensor in state.items()}
+        notes = [f"checkpoint {path.name}: prefix 'module.' of every key stripped"]
+    return state, notes
 
 
 def _is_finite(tensor: Tensor) -> bool:
@@ -219,11 +222,9 @@ def _read_folder(folder: Path) -> tuple[dict[str, Tensor], list[str]]:
     state = {}
     for file in files:
         part, said = _read(file)
-        if part and _all_in_module(part):
-            part, note = _without_module(part, file)
-            said = [*said, note]
+        part, stripped = _without_module(part, file)
         state |= {f"{file.name.partition('.')[0]}.{name}": tensor for name, tensor in part.items()}
-        notes += said
+        notes += [*said, *stripped]
     return state, notes
 
 

@@ -3,8 +3,8 @@
 Published checkpoints often hold whole modules, optimisers or command-line arguments; `Machine`
 reads them without a call. Memory stays bounded by the size of the file: compressed archives,
 storages larger than what is stored and tensors larger than their storage are refused, and tensors
-of one storage share it. Both layouts
-of torch.save are read, the zip archive (torch ≥ 1.6) and the older row of pickles.
+of one storage share it. Both layouts of torch.save are read, the zip archive (torch ≥ 1.6) and the
+older row of pickles.
 """
 
 from __future__ import annotations

@@ -15,10 +15,9 @@ from pnpdepth_cli.errors import ModelError
 _LONGEST = 60  # characters of a wrong value that are shown
 _MEANT = {
     ("output_kind", "disparity"): "; disparity is 'inverse'",
-    (
-        "output_scale",
-        "relative",
-    ): "; relative depth is 'scale' (up to a factor) or 'affine' (a shift as well)",
+    ("output_scale", "relative"): (
+        "; relative depth is 'scale' (up to a factor) or 'affine' (a shift as well)"
+    ),
 }
 """What the usual words are called here, by field and word."""
 

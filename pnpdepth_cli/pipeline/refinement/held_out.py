@@ -141,7 +141,7 @@ def auto_notes(
     if not request.auto:
         return ()
     by_name = {str(one.way): one.error for one in choice.scored}
-    best = min(by_name.keys() & BASELINES.keys(), key=lambda name: by_name[name])
+    best = min((name for name in BASELINES if name in by_name), key=lambda name: by_name[name])
     network = choice.network
     assert network is not None
     said = (
