@@ -24,7 +24,7 @@ from benchmarks.frames import (
     points_on_grid,
     refined,
 )
-from pnpdepth_cli.core.interpolation import linear, nearest
+from pnpdepth_cli.completion.interpolation import linear, nearest
 from pnpdepth_cli.core.metrics import score
 from pnpdepth_cli.models.network import Network, load_network
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest, effective_settings, layer_name

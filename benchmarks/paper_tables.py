@@ -40,14 +40,14 @@ from benchmarks.paper_figures import FINE_THRESHOLDS, MEASURES, ROWS, SETTING, P
 from benchmarks.paper_report import heading, markdown, plot
 from benchmarks.paper_sets import ROOMS, STREETS, FrameSet, TableFrame, data_set, rendered, shared
 from pnpdepth_cli.cli.printable import printable
-from pnpdepth_cli.core.interpolation import linear
+from pnpdepth_cli.completion.interpolation import linear
 from pnpdepth_cli.core.metrics import score
 from pnpdepth_cli.core.refine import RefineSettings
 from pnpdepth_cli.errors import CheckpointError, PnpDepthError, UsageError
 from pnpdepth_cli.io.atomic import atomic_path
-from pnpdepth_cli.models.checkpoint import WEIGHT_SUFFIXES
 from pnpdepth_cli.models.network import Network, load_network
 from pnpdepth_cli.models.registry import names
+from pnpdepth_cli.models.weights.checkpoint import WEIGHT_SUFFIXES
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest, effective_settings, layer_name
 
 KINDS = {"rgb": "rgb", "sparse": "sd", "rgb+sparse": "rgb + sd"}  # as the paper writes them

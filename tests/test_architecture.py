@@ -13,14 +13,19 @@ from pnpdepth_cli.cli.main import COMMANDS
 
 ROOT = Path(__file__).parent.parent
 PACKAGE = ROOT / "pnpdepth_cli"
+GROUND_FLOOR = {"errors", "choices", "points"}
 MAY_IMPORT = {
     "errors": set(),
-    "core": {"errors"},
-    "sensors": {"errors"},
-    "io": {"errors"},
-    "models": {"errors", "core"},
-    "pipeline": {"errors", "core", "sensors", "io", "models"},
-    "cli": {"errors", "pipeline"},
+    "choices": set(),
+    "points": {"errors"},
+    "core": GROUND_FLOOR,
+    "sensors": GROUND_FLOOR,
+    "io": GROUND_FLOOR,
+    "completion": {*GROUND_FLOOR, "core"},
+    "models": {*GROUND_FLOOR, "core", "completion"},
+    "auto": {*GROUND_FLOOR, "core", "completion", "models"},
+    "pipeline": {*GROUND_FLOOR, "core", "completion", "models", "auto", "sensors", "io"},
+    "cli": {*GROUND_FLOOR, "pipeline"},
 }
 
 
@@ -61,6 +66,7 @@ def test_core_and_models_read_no_files_through_cv2_and_io_needs_no_torch() -> No
     for package, forbidden in (
         ("core", {"cv2", "numpy"}),
         ("io", {"torch"}),
+        ("completion", {"cv2"}),
         ("models", {"cv2"}),
         ("sensors", {"torch"}),
     ):

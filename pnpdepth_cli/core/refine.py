@@ -18,12 +18,12 @@ import torch
 from torch import Tensor
 
 from pnpdepth_cli.core.losses import LOSSES, departure
-from pnpdepth_cli.core.points import SparsePoints
 from pnpdepth_cli.core.split import Split, gradient_at
-from pnpdepth_cli.core.steps import SCHEDULES, Channels, spread, step_size
-from pnpdepth_cli.core.structure import map_tensors, tensors_in
-from pnpdepth_cli.core.updates import UPDATES
+from pnpdepth_cli.core.split.structure import map_tensors, tensors_in
+from pnpdepth_cli.core.step_sizes import SCHEDULES, Channels, spread, step_size
+from pnpdepth_cli.core.update_rules import UPDATES
 from pnpdepth_cli.errors import BatchError, DivergedError, LayerError, ModelError, PnpDepthError
+from pnpdepth_cli.points import SparsePoints
 
 DepthOf = Callable[[Any], Tensor]
 
@@ -38,13 +38,13 @@ class RefineSettings:
     iterations: the number of updates of z, 0 for the plain prediction.
     lr: α as a number, or a text like "3%": that share of the standard deviation of z_0.
     schedule: how α falls over the updates. spread: how far the gradient is blurred, in spacings of
-        the points. parameters: what is updated; see `pnpdepth_cli.core.steps` for these three.
+        the points. parameters: what is updated; see `pnpdepth_cli.core.step_sizes` for these three.
     anchor: the weight of `pnpdepth_cli.core.losses.departure` in L.
     line_search: whether an update that raises L is taken back and made half as far instead.
     keep_best: whether the result is the depth of the lowest loss instead of the last; with a line
         search it always is.
     align, align_every: how `depth_of` was asked to fit the network's numbers to metres, and
-        whether again for every z; see `pnpdepth_cli.core.alignment`.
+        whether again for every z; see `pnpdepth_cli.completion.alignment`.
     """
 
     iterations: int = 5

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import FileFormatError, UsageError
-from pnpdepth_cli.io.opening import damaged
+from pnpdepth_cli.io.file_bytes import damaged
 
 # A fixed time in the archive: the same depth gives the same bytes.
 _EPOCH = (1980, 1, 1, 0, 0, 0)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import FileFormatError, UsageError
 from pnpdepth_cli.io.arrays import parse_npy, parse_npz
-from pnpdepth_cli.io.opening import (
+from pnpdepth_cli.io.file_bytes import (
     check_pixel_count,
     damaged,
     decode_with_opencv,

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import FileFormatError
-from pnpdepth_cli.io.opening import check_pixel_count, damaged
+from pnpdepth_cli.io.file_bytes import check_pixel_count, damaged
 
 _TILED, _DEEP, _MULTIPART = 0x200, 0x800, 0x1000  # bits of the version field
 

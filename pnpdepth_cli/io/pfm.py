@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import FileFormatError
-from pnpdepth_cli.io.opening import check_pixel_count, damaged
+from pnpdepth_cli.io.file_bytes import check_pixel_count, damaged
 
 _HEADER = re.compile(rb"(Pf|PF)\s+(\d{1,9})\s+(\d{1,9})\s+([-+0-9.eE]{1,40})[ \t]*\r?\n")
 

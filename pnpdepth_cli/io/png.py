@@ -7,7 +7,7 @@ import zlib
 from dataclasses import dataclass
 from pathlib import Path
 
-from pnpdepth_cli.io.opening import check_pixel_count, damaged
+from pnpdepth_cli.io.file_bytes import check_pixel_count, damaged
 
 GREY = 0
 RGB = 2

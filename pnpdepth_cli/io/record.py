@@ -13,7 +13,7 @@ import numpy as np
 
 from pnpdepth_cli.errors import FileFormatError, InputError
 from pnpdepth_cli.io.atomic import atomic_path
-from pnpdepth_cli.io.opening import one_line, read_bytes
+from pnpdepth_cli.io.file_bytes import one_line, read_bytes
 
 
 def write_json(path: Path, mapping: Mapping[str, Any]) -> None:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import FileFormatError
-from pnpdepth_cli.io.opening import (
+from pnpdepth_cli.io.file_bytes import (
     check_pixel_count,
     damaged,
     decode_with_opencv,
@@ -23,8 +23,8 @@ from pnpdepth_cli.io.opening import (
     read_bytes,
 )
 from pnpdepth_cli.io.png import read_png_facts
+from pnpdepth_cli.io.shared_context import Together
 from pnpdepth_cli.io.tiff import read_tiff_facts
-from pnpdepth_cli.io.together import Together
 
 if TYPE_CHECKING:
     import PIL.Image

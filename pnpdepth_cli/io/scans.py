@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import FileFormatError, NoPointsError
 from pnpdepth_cli.io.arrays import parse_npy
-from pnpdepth_cli.io.opening import kind_of, read_bytes
+from pnpdepth_cli.io.file_bytes import kind_of, read_bytes
 from pnpdepth_cli.io.point_files import parse_pcd, parse_ply
 
 _KITTI_BYTES = 16

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from pnpdepth_cli.errors import FileFormatError
-from pnpdepth_cli.io.opening import one_line, read_bytes
+from pnpdepth_cli.io.file_bytes import one_line, read_bytes
 
 if sys.version_info >= (3, 11):
     import tomllib

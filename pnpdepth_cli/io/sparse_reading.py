@@ -17,7 +17,7 @@ from pnpdepth_cli.io.depth_reading import (
     known_metres,
     load_stored,
 )
-from pnpdepth_cli.io.opening import kind_of, one_line, read_bytes
+from pnpdepth_cli.io.file_bytes import kind_of, one_line, read_bytes
 
 _TEXT_SUFFIXES = (".csv", ".txt")
 _SEPARATOR = re.compile(r"[\s,;]+")

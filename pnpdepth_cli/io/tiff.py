@@ -6,7 +6,7 @@ import struct
 from dataclasses import dataclass
 from pathlib import Path
 
-from pnpdepth_cli.io.opening import check_pixel_count, damaged
+from pnpdepth_cli.io.file_bytes import check_pixel_count, damaged
 
 _WIDTH, _HEIGHT, _BITS, _DESCRIPTION, _SAMPLES, _FORMAT = 256, 257, 258, 270, 277, 339
 _ORIENTATION = 274

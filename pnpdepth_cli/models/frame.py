@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import torch.nn.functional as F
 from torch import Tensor
 
-from pnpdepth_cli.core.points import SparsePoints
 from pnpdepth_cli.models.definition import Fixed, Multiple, Near
+from pnpdepth_cli.points import SparsePoints
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -11,18 +11,18 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from pnpdepth_cli.core.foreign import blaming, is_out_of_memory
-from pnpdepth_cli.core.points import SparsePoints
 from pnpdepth_cli.core.split import Split
-from pnpdepth_cli.core.structure import tensors_in
+from pnpdepth_cli.core.split.structure import tensors_in
+from pnpdepth_cli.core.split.user_code import blaming, is_out_of_memory
 from pnpdepth_cli.errors import CheckpointError, DeviceError, ModelError, UsageError
-from pnpdepth_cli.models.checkpoint import load_checkpoint
 from pnpdepth_cli.models.definition import Fixed, ModelDefinition, Normalisation
 from pnpdepth_cli.models.frame import FrameMap
 from pnpdepth_cli.models.made_up import made_up_arguments
-from pnpdepth_cli.models.outline import outline
 from pnpdepth_cli.models.precision import dtype_of, lower
 from pnpdepth_cli.models.registry import find_definition, importing_beside
+from pnpdepth_cli.models.suggest_layers import outline
+from pnpdepth_cli.models.weights.checkpoint import load_checkpoint
+from pnpdepth_cli.points import SparsePoints
 
 FARTHEST_DEPTH = 1e4
 """Metres; inverse depth below 1/FARTHEST_DEPTH reads as this depth."""

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import nn
 
-from pnpdepth_cli.core.foreign import describe, is_out_of_memory
+from pnpdepth_cli.core.split.user_code import describe, is_out_of_memory
 from pnpdepth_cli.errors import DeviceError, ModelError, UsageError
 
 PRECISIONS = {"fp32": None, "bf16": torch.bfloat16, "fp16": torch.float16}

@@ -13,7 +13,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from pnpdepth_cli.core.foreign import describe
+from pnpdepth_cli.core.split.user_code import describe
 from pnpdepth_cli.errors import ModelError, PnpDepthError
 from pnpdepth_cli.models.definition import FOREIGN, ModelDefinition, Multiple
 
@@ -166,12 +166,12 @@ def _foreign(spec: str) -> ModelDefinition | None:
     """The definition of a network that is no Python file of ours; None if it is none such."""
     file, colon, output = spec.rpartition(":")
     if spec.endswith(".onnx") or (colon and file.endswith(".onnx")):
-        from pnpdepth_cli.models.onnx_network import onnx_definition
+        from pnpdepth_cli.models.formats.onnx.network import onnx_definition
 
         named = not spec.endswith(".onnx")
         return onnx_definition(Path(file), output) if named else onnx_definition(Path(spec))
     if spec.endswith(".pt2"):
-        from pnpdepth_cli.models.exported import exported_definition
+        from pnpdepth_cli.models.formats.torch_export import exported_definition
 
         return exported_definition(Path(spec))
     if spec.endswith(_WEIGHTS_ONLY):
@@ -181,7 +181,7 @@ def _foreign(spec: str) -> ModelDefinition | None:
             " by torch.export (.pt2) or to ONNX"
         )
     if Path(spec).is_dir():
-        from pnpdepth_cli.models.hf_network import hf_definition
+        from pnpdepth_cli.models.formats.hugging_face import hf_definition
 
         return hf_definition(Path(spec))
     return None

@@ -10,8 +10,8 @@ import pytest
 from pnpdepth_cli.cli import options
 from pnpdepth_cli.core.losses import LOSSES
 from pnpdepth_cli.core.refine import RefineSettings
-from pnpdepth_cli.core.steps import PARAMETERS, SCHEDULES
-from pnpdepth_cli.core.updates import UPDATES
+from pnpdepth_cli.core.step_sizes import PARAMETERS, SCHEDULES
+from pnpdepth_cli.core.update_rules import UPDATES
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.models.definition import FOREIGN, ModelDefinition, Multiple
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest, effective_settings

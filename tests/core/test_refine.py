@@ -13,10 +13,9 @@ import torch
 from torch import Tensor, nn
 
 from pnpdepth_cli.core.losses import LOSSES
-from pnpdepth_cli.core.points import SparsePoints
 from pnpdepth_cli.core.refine import Refinement, RefineSettings, refine, refine_batch
 from pnpdepth_cli.core.split import Split
-from pnpdepth_cli.core.updates import UPDATES
+from pnpdepth_cli.core.update_rules import UPDATES
 from pnpdepth_cli.errors import (
     BatchError,
     DivergedError,
@@ -25,7 +24,8 @@ from pnpdepth_cli.errors import (
     NoPointsError,
     PnpDepthError,
 )
-from tests.core.naive import naive_refine, plain
+from pnpdepth_cli.points import SparsePoints
+from tests.completion.naive import naive_refine, plain
 from tests.core.networks import NETWORKS, TwoBranches, UNet, build, conv, depth_of, picture
 
 POINTS = SparsePoints(

@@ -14,10 +14,10 @@ import pytest
 import torch
 from torch import nn
 
-from pnpdepth_cli.core.alignment import ALIGNMENTS
+from pnpdepth_cli.completion.alignment import ALIGNMENTS
 from pnpdepth_cli.core.losses import LOSSES
-from pnpdepth_cli.core.steps import SCHEDULES, step_size
-from pnpdepth_cli.core.updates import UPDATES
+from pnpdepth_cli.core.step_sizes import SCHEDULES, step_size
+from pnpdepth_cli.core.update_rules import UPDATES
 from pnpdepth_cli.errors import ModelError, UsageError
 from pnpdepth_cli.models.definition import (
     Align,

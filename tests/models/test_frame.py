@@ -8,9 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from pnpdepth_cli.core.points import SparsePoints
 from pnpdepth_cli.models.definition import Fixed, Multiple
 from pnpdepth_cli.models.frame import FrameMap
+from pnpdepth_cli.points import SparsePoints
 
 sides = st.integers(1, 70)
 policies = st.one_of(

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import FileFormatError, InputError, PnpDepthError, UsageError
 from pnpdepth_cli.io.depth_reading import known_metres
+from pnpdepth_cli.io.file_bytes import one_line
 from pnpdepth_cli.io.layouts.frame import Hdf5Array
-from pnpdepth_cli.io.opening import one_line
 
 
 def shape_of(path: Path, name: str) -> tuple[int, ...]:

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from pnpdepth_cli.errors import FileFormatError, InputError
+from pnpdepth_cli.io.file_bytes import one_line, read_bytes
 from pnpdepth_cli.io.layouts.frame import (
     PICTURES,
     Frame,
@@ -21,7 +22,6 @@ from pnpdepth_cli.io.layouts.frame import (
     without_partner,
 )
 from pnpdepth_cli.io.layouts.protocols import PROTOCOLS
-from pnpdepth_cli.io.opening import one_line, read_bytes
 
 
 def matches(root: Path) -> bool:

@@ -17,9 +17,9 @@ from pathlib import Path
 from typing import Any
 
 from pnpdepth_cli.errors import FileFormatError
+from pnpdepth_cli.io.file_bytes import one_line, read_bytes
 from pnpdepth_cli.io.layouts.frame import Frame, Listing, Unmatched
 from pnpdepth_cli.io.layouts.protocols import WHOLE, find_protocol
-from pnpdepth_cli.io.opening import one_line, read_bytes
 
 _PATHS = ("image", "sparse", "gt", "calib")
 _NUMBERS = {"camera": int, "sparse_scale": float, "gt_scale": float}

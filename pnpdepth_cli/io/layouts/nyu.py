@@ -12,10 +12,10 @@ from pathlib import Path
 from typing import Any
 
 from pnpdepth_cli.errors import FileFormatError
+from pnpdepth_cli.io.file_bytes import one_line, read_bytes
 from pnpdepth_cli.io.layouts.frame import Frame, Hdf5Array, Listing
 from pnpdepth_cli.io.layouts.hdf5 import shape_of
 from pnpdepth_cli.io.layouts.protocols import PROTOCOLS, Protocol
-from pnpdepth_cli.io.opening import one_line, read_bytes
 
 _WIDEST_KINECT = 1000  # pixels; NYU's frames have 640, KITTI's 1224 or more
 _LABELED = "nyu_depth_v2_labeled.mat"

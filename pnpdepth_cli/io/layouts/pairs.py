@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from pnpdepth_cli.io.layouts.below import files_below
+from pnpdepth_cli.io.layouts.find_files import files_below
 from pnpdepth_cli.io.layouts.frame import DEPTHS, PICTURES, SCANS, Frame, Listing, without_partner
 
 _CALIBRATIONS = (".txt", ".json", ".yaml", ".yml")

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from pnpdepth_cli.errors import FileFormatError
+from pnpdepth_cli.io.file_bytes import one_line, read_bytes
 from pnpdepth_cli.io.layouts.frame import Frame, Listing, Unmatched
-from pnpdepth_cli.io.opening import one_line, read_bytes
 
 _SCALE = 5000.0
 _LONGEST_GAP_S = 0.02

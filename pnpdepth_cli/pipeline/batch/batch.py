@@ -12,7 +12,6 @@ from pnpdepth_cli.io.atomic import make_folder
 from pnpdepth_cli.io.layouts.frame import Frame
 from pnpdepth_cli.io.lock import in_turn, locked_folder
 from pnpdepth_cli.io.report import remove_report_leftovers
-from pnpdepth_cli.pipeline.ahead import in_order
 from pnpdepth_cli.pipeline.batch.frames import (
     BatchFrames,
     BatchRequest,
@@ -24,6 +23,7 @@ from pnpdepth_cli.pipeline.batch.profile import BatchProfile
 from pnpdepth_cli.pipeline.batch.settings import model_identity, settings_of
 from pnpdepth_cli.pipeline.batch.state import NEW, BatchState, remove_all_leftovers
 from pnpdepth_cli.pipeline.batch.summary import CSV, JSON, Tally, write_summary, write_table
+from pnpdepth_cli.pipeline.ordered_pool import in_order
 
 if TYPE_CHECKING:
     from pnpdepth_cli.pipeline.report.batch import BatchReport

@@ -15,10 +15,9 @@ import torch.nn.functional as F
 from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode
 
-from pnpdepth_cli.core.alignment import SPACES, align
+from pnpdepth_cli.completion.alignment import SPACES, align
+from pnpdepth_cli.completion.propagation import propagate
 from pnpdepth_cli.core.losses import LOSSES
-from pnpdepth_cli.core.points import SparsePoints
-from pnpdepth_cli.core.propagation import propagate
 from pnpdepth_cli.core.refine import RefineSettings, refine
 from pnpdepth_cli.core.split import Split, gradient_at
 from pnpdepth_cli.errors import NoPointsError, PnpDepthError, UsageError
@@ -35,6 +34,7 @@ from pnpdepth_cli.pipeline.refinement.output_files import plan_outputs
 from pnpdepth_cli.pipeline.refinement.outputs import write_outputs
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest, effective_settings, layer_name
 from pnpdepth_cli.pipeline.stopwatch import versions
+from pnpdepth_cli.points import SparsePoints
 
 DEFAULT_SIZE = (480, 640)
 FIRST_FRAME, FULL = "refinement, first frame", "refinement, fp32"

@@ -10,7 +10,6 @@ import torch
 
 from pnpdepth_cli.core.metrics import MEASURES, SUMS, measures_of
 from pnpdepth_cli.errors import InputError, PnpDepthError, UsageError
-from pnpdepth_cli.pipeline.ahead import in_order
 from pnpdepth_cli.pipeline.evaluation.averages import FrameTable, bootstrap
 from pnpdepth_cli.pipeline.evaluation.findings import FileKinds, findings
 from pnpdepth_cli.pipeline.evaluation.frame_scoring import (
@@ -25,6 +24,7 @@ from pnpdepth_cli.pipeline.evaluation.kitti_devkit import devkit_mean
 from pnpdepth_cli.pipeline.evaluation.pairing import FramePair, pair_frames
 from pnpdepth_cli.pipeline.evaluation.protocols import EvalProtocol, choose_protocol
 from pnpdepth_cli.pipeline.evaluation.result import EvalRequest, Evaluation, Interval, Part
+from pnpdepth_cli.pipeline.ordered_pool import in_order
 
 
 def evaluate(

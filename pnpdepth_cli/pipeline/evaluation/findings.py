@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pnpdepth_cli.io.opening import one_line
+from pnpdepth_cli.io.file_bytes import one_line
 from pnpdepth_cli.pipeline.evaluation.frame_scoring import FileFacts, FrameScores, ScoredFrame
 from pnpdepth_cli.pipeline.evaluation.pairing import some_names
 from pnpdepth_cli.pipeline.evaluation.protocols import EvalProtocol

@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from pnpdepth_cli.errors import InputError, PnpDepthError, UsageError
+from pnpdepth_cli.io.file_bytes import one_line
 from pnpdepth_cli.io.layouts import Frame, Source, find_layout, list_frames
 from pnpdepth_cli.io.layouts.frame import DEPTHS, PICTURES
-from pnpdepth_cli.io.opening import one_line
 from pnpdepth_cli.io.record import read_json
 
 _POINTS = (*DEPTHS, ".csv", ".txt")

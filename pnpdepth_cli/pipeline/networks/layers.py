@@ -13,8 +13,8 @@ from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode
 
 from pnpdepth_cli.core.influence import influential_field
-from pnpdepth_cli.core.layer_name import LayerName
 from pnpdepth_cli.core.split import Split
+from pnpdepth_cli.core.split.layer_name import LayerName
 from pnpdepth_cli.errors import ModelError, UsageError
 from pnpdepth_cli.io.depth import read_sparse
 from pnpdepth_cli.models.definition import Fixed

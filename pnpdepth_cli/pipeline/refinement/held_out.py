@@ -12,9 +12,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pnpdepth_cli.core.baselines import BASELINES
+from pnpdepth_cli.completion.baselines import BASELINES
+from pnpdepth_cli.completion.propagation import calibration
 from pnpdepth_cli.core.metrics import score
-from pnpdepth_cli.core.propagation import calibration
 from pnpdepth_cli.core.refine import RefineSettings
 from pnpdepth_cli.errors import PnpDepthError
 from pnpdepth_cli.models.definition import ModelDefinition

@@ -11,7 +11,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pnpdepth_cli.core.points import SparsePoints
 from pnpdepth_cli.errors import InputError, NoPointsError, SizeError, UsageError
 from pnpdepth_cli.io.depth import (
     DepthImage,
@@ -26,6 +25,7 @@ from pnpdepth_cli.io.layouts.hdf5 import depth_of, rgb_of
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest
 from pnpdepth_cli.pipeline.sparse.scans import read_scan_points
+from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.sensors import sample_points
 
 Picture = NDArray[np.float32]

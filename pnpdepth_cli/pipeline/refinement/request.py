@@ -27,7 +27,7 @@ class RefineRequest:
     holdout: the share of the points kept from the network and the loss, and only scored.
     output_kind, normalise: what the network's numbers are and which rgb it wants, over what its
     definition says. propagate: how what is left at the points is spread, one of
-    `core.propagation.PROPAGATIONS`. auto, time_budget_s, baselines, uncertainty: see
+    `completion.propagation.PROPAGATIONS`. auto, time_budget_s, baselines, uncertainty: see
     `pipeline.refinement.held_out`. scan: how to project `sparse` where it is a LiDAR scan.
     protocol: what is cut out of a frame first of all. tile: the longest side, in pixels, of what
     goes through the network at once; None: the whole frame.

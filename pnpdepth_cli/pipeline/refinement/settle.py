@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import torch
 
-from pnpdepth_cli.core.alignment import SPACES, align
+from pnpdepth_cli.completion.alignment import SPACES, align
 from pnpdepth_cli.errors import ModelError, NoPointsError, UsageError
 from pnpdepth_cli.models.definition import IMAGENET_MEAN, IMAGENET_STD, Normalisation
 from pnpdepth_cli.models.frame import FrameMap

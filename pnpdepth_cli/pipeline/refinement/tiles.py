@@ -16,7 +16,6 @@ import torch
 import torch.nn.functional as F
 from numpy.typing import NDArray
 
-from pnpdepth_cli.core.points import SparsePoints
 from pnpdepth_cli.core.refine import RefineSettings
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.models.network import Network
@@ -27,6 +26,7 @@ from pnpdepth_cli.pipeline.refinement.frame import (
     refine_frame,
 )
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs
+from pnpdepth_cli.points import SparsePoints
 
 OVERLAP = 0.25
 """Of a tile's side, at least."""

@@ -15,9 +15,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from pnpdepth_cli.core.baselines import BASELINES
-from pnpdepth_cli.core.points import SparsePoints
-from pnpdepth_cli.core.propagation import propagate, propagated_at
+from pnpdepth_cli.completion.baselines import BASELINES
+from pnpdepth_cli.completion.propagation import propagate, propagated_at
 from pnpdepth_cli.core.refine import DepthOf, RefineSettings, refine_from
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.errors import PnpDepthError
@@ -31,6 +30,7 @@ from pnpdepth_cli.pipeline.refinement.frame import (
     to_image,
 )
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs
+from pnpdepth_cli.points import SparsePoints
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,7 +60,7 @@ def updates_of(trial: Trial) -> tuple[int, ...]:
 class Way:
     """One way to dense depth: from a baseline by name, or from a trial after so many updates of z.
 
-    propagate: how what is left at the points is spread, one of `core.propagation.PROPAGATIONS`.
+    propagate: how the residual is propagated, one of `completion.propagation.PROPAGATIONS`.
     """
 
     baseline: str | None = None

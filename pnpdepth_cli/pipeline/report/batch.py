@@ -25,8 +25,8 @@ from pnpdepth_cli.io.report import (
     write_report,
 )
 from pnpdepth_cli.io.report_pictures import gain_colours, picture_paths, save_pictures
-from pnpdepth_cli.pipeline.ahead import in_order
 from pnpdepth_cli.pipeline.evaluation.score_files import heading, shown
+from pnpdepth_cli.pipeline.ordered_pool import in_order
 from pnpdepth_cli.pipeline.report.columns import (
     Column,
     column_of,

@@ -22,13 +22,13 @@ from pnpdepth_cli.io.report import (
 )
 from pnpdepth_cli.io.report_pictures import error_colours, error_map, save_pictures
 from pnpdepth_cli.io.rgb import read_rgb
-from pnpdepth_cli.pipeline.ahead import in_order
 from pnpdepth_cli.pipeline.evaluation.frame_reading import Depth, load_frame
 from pnpdepth_cli.pipeline.evaluation.frame_scoring import FrameScores
 from pnpdepth_cli.pipeline.evaluation.kitti_devkit import fill_background
 from pnpdepth_cli.pipeline.evaluation.pairing import FramePair
 from pnpdepth_cli.pipeline.evaluation.result import Evaluation, Part
 from pnpdepth_cli.pipeline.evaluation.score_files import heading, part_cells, shown
+from pnpdepth_cli.pipeline.ordered_pool import in_order
 from pnpdepth_cli.pipeline.report.columns import (
     Column,
     column_of,

@@ -10,12 +10,12 @@ from typing import Any
 
 import torch
 
-from pnpdepth_cli.core.alignment import ALIGNMENTS
+from pnpdepth_cli.completion.alignment import ALIGNMENTS
+from pnpdepth_cli.completion.propagation import PROPAGATIONS
 from pnpdepth_cli.core.losses import LOSSES
-from pnpdepth_cli.core.propagation import PROPAGATIONS
-from pnpdepth_cli.core.steps import PARAMETERS as PARAMETERS_OF_Z
-from pnpdepth_cli.core.steps import SCHEDULES, step_size
-from pnpdepth_cli.core.updates import UPDATES
+from pnpdepth_cli.core.step_sizes import PARAMETERS as PARAMETERS_OF_Z
+from pnpdepth_cli.core.step_sizes import SCHEDULES, step_size
+from pnpdepth_cli.core.update_rules import UPDATES
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.pipeline.refinement.request import count_or_share
 from pnpdepth_cli.pipeline.sweep.points import known_sensor

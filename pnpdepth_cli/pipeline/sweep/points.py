@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import torch
 
-from pnpdepth_cli.core.points import SparsePoints
 from pnpdepth_cli.errors import InputError, UsageError
 from pnpdepth_cli.io.calibration import read_calibration
 from pnpdepth_cli.io.layouts.frame import Frame
@@ -17,6 +16,7 @@ from pnpdepth_cli.pipeline.refinement.inputs import Inputs
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest, count_or_share
 from pnpdepth_cli.pipeline.sparse.scans import camera_of, check_size
 from pnpdepth_cli.pipeline.sparse.simulate import find_sensor
+from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.sensors import (
     FORWARD_LEFT_UP,
     LIDARS,

@@ -9,9 +9,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from pnpdepth_cli.core.interpolation import linear
+from pnpdepth_cli.completion.interpolation import linear
+from pnpdepth_cli.completion.propagation import propagate
 from pnpdepth_cli.core.metrics import score
-from pnpdepth_cli.core.propagation import propagate
 from pnpdepth_cli.core.refine import DepthOf, Refinement, RefineSettings, refine
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.errors import DivergedError, NoPointsError

@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from pnpdepth_cli.core.baselines import BASELINES
-from pnpdepth_cli.core.points import SparsePoints
+from pnpdepth_cli.completion.baselines import BASELINES
 from pnpdepth_cli.core.refine import RefineSettings
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.errors import ModelError, UsageError
@@ -30,6 +29,7 @@ from pnpdepth_cli.pipeline.refinement.auto import (
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest
 from pnpdepth_cli.pipeline.refinement.ways import HeldCut, Trial, Way, trajectories
+from pnpdepth_cli.points import SparsePoints
 from tests.pipeline.batches import NAMES, Heard, batch, pairs_on_disk, results, times
 from tests.pipeline.frames import FrameOnDisk, frame_on_disk, run
 

@@ -12,7 +12,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import nn
 
-from pnpdepth_cli.core.points import SparsePoints
 from pnpdepth_cli.core.refine import RefineSettings
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.errors import UsageError
@@ -23,6 +22,7 @@ from pnpdepth_cli.pipeline.refinement.inputs import Inputs
 from pnpdepth_cli.pipeline.refinement.refine import load_refiner
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest
 from pnpdepth_cli.pipeline.refinement.tiles import OVERLAP, refine_tiled, tiles_of
+from pnpdepth_cli.points import SparsePoints
 from tests.pipeline.frames import frame_on_disk
 
 CPU = torch.device("cpu")

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import torch
 
-from pnpdepth_cli.core.interpolation import linear
+from pnpdepth_cli.completion.interpolation import linear
 from pnpdepth_cli.core.metrics import score
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.errors import (
