@@ -47,5 +47,5 @@ def test_an_entry_of_another_package_is_loaded_from_its_entry_point(table: Table
 
 
 def test_an_unknown_name_is_an_error_that_names_the_nearest(table: Table) -> None:
-    with pytest.raises(UsageError, match=r"unknown entry 'pfn'; did you mean 'pfm'\?"):
-        table["pfn"]
+    with pytest.raises(UsageError, match=r"unknown entry 'pfmm'; did you mean 'pfm'\?"):
+        table["pfmm"]
