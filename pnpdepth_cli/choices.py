@@ -76,3 +76,13 @@ class Table(Mapping[str, Any]):
     @functools.cached_property
     def _entry_points(self) -> dict[str, EntryPoint]:
         return {point.name: point for point in entry_points(group=f"pnpdepth.{self.group}")}
+
+
+FORMATS = Table(
+    "io/formats",
+    "FORMAT",
+    group="formats",
+    noun="depth format",
+    first=("png", "exr", "npy", "npz", "pfm", "tiff"),
+)
+"""Depth file formats: `pnpdepth_cli.io.formats.DepthFormat`."""

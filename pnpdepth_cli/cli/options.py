@@ -8,6 +8,7 @@ from typing import Any
 
 import click
 
+from pnpdepth_cli.choices import FORMATS
 from pnpdepth_cli.errors import UsageError
 
 FILE = click.Path(path_type=Path)
@@ -152,7 +153,6 @@ UPDATES = ("sign", "sgd", "normalised", "momentum", "adam", "lbfgs")
 SCHEDULES = ("constant", "linear")
 PARAMETERS = ("elements", "channels")
 PROPAGATIONS = ("none", "gp", "diffusion")
-FORMATS = ("png", "exr", "npy", "npz", "pfm", "tiff")
 
 
 def _seconds(context: click.Context, parameter: click.Parameter, text: str | None) -> float | None:
@@ -172,7 +172,7 @@ def _seconds(context: click.Context, parameter: click.Parameter, text: str | Non
 _REFINEMENT_OPTIONS = (
     click.option(
         "--format",
-        type=click.Choice(FORMATS),
+        type=click.Choice(list(FORMATS)),
         default="png",
         show_default=True,
         help="Of the depth file in a folder.",
