@@ -49,3 +49,9 @@ def test_an_entry_of_another_package_is_loaded_from_its_entry_point(table: Table
 def test_an_unknown_name_is_an_error_that_names_the_nearest(table: Table) -> None:
     with pytest.raises(UsageError, match=r"unknown entry 'pfmm'; did you mean 'pfm'\?"):
         table["pfmm"]
+
+
+def test_a_table_of_modules_leaves_out_subpackages() -> None:
+    table = Table("", None, group="test_none", noun="package")
+    assert table["points"].__name__ == "pnpdepth_cli.points"
+    assert "core" not in table
