@@ -17,35 +17,42 @@ from typing import Any, Literal, get_args
 
 from pnpdepth_cli.errors import UsageError
 
-_PACKAGE = Path(__file__).parent
-
 
 class Table(Mapping[str, Any]):
     """The entries of an open list by name; listing the names imports none of them.
 
     An entry is the object `attribute` of the module `folder/<name>.py` ("-" in a name is "_" in the
-    file), or an entry point `<name>` in the group `pnpdepth.<group>`. Modules whose name starts
-    with "_" are no entries. The package's own entries win over entry points of the same name.
+    file), or an entry point `<name>` in the group `pnpdepth.<group>`. Subpackages and modules whose
+    name starts with "_" are no entries. The package's own entries win over entry points of the same
+    name.
 
     Args:
-        folder: Path of the modules relative to `pnpdepth_cli`, such as "core/losses".
-        attribute: Name of the object in each module.
+        folder: Path of the modules relative to `package`, such as "core/losses".
+        attribute: Name of the object in each module; None makes the entry the module itself.
         group: Last part of the entry point group.
         noun: What one entry is called in messages.
         first: Names listed before the others, which follow in alphabetical order.
+        package: The package that the folder belongs to.
     """
 
     def __init__(
-        self, folder: str, attribute: str, *, group: str, noun: str, first: tuple[str, ...] = ()
+        self,
+        folder: str,
+        attribute: str | None,
+        *,
+        group: str,
+        noun: str,
+        first: tuple[str, ...] = (),
+        package: str = "pnpdepth_cli",
     ) -> None:
         self.folder, self.attribute, self.group, self.noun = folder, attribute, group, noun
-        self._first = first
+        self._first, self._package = first, package
 
     def __getitem__(self, name: str) -> Any:
         """Returns the entry. Raises UsageError, with near matches, for an unknown name."""
         if name in self._modules:
             module = importlib.import_module(self._modules[name])
-            return getattr(module, self.attribute)
+            return module if self.attribute is None else getattr(module, self.attribute)
         if name in self._entry_points:
             return self._entry_points[name].load()
         near = difflib.get_close_matches(name, list(self), n=1)
@@ -65,12 +72,13 @@ class Table(Mapping[str, Any]):
 
     @functools.cached_property
     def _modules(self) -> dict[str, str]:
-        package = ".".join(("pnpdepth_cli", *self.folder.split("/")))
-        found = pkgutil.iter_modules([str(_PACKAGE / self.folder)])
+        package = ".".join((self._package, *filter(None, self.folder.split("/"))))
+        roots = importlib.import_module(self._package).__path__
+        modules = pkgutil.iter_modules([str(Path(root, self.folder)) for root in roots])
         return {
             module.name.replace("_", "-"): f"{package}.{module.name}"
-            for module in found
-            if not module.name.startswith("_")
+            for module in modules
+            if not module.name.startswith("_") and not module.ispkg
         }
 
     @functools.cached_property
@@ -134,3 +142,16 @@ FITS: tuple[Fit, ...] = get_args(Fit)
 
 NORMALISATIONS = ("unit", "imagenet", "symmetric", "bytes")
 """The rgb ranges a network may expect: 0…1, ImageNet's mean and deviation, −1…1, 0…255."""
+
+NETWORKS = Table(
+    "",
+    None,
+    group="models",
+    noun="network",
+    first=(
+        *("compact", "eigen", "fcrn", "sfmlearner", "sparseconv", "adnn", "sparse2dense"),
+        *("latefusion", "nconv", "pncnn"),
+    ),
+    package="model_zoo_defs",
+)
+"""The networks' files in `model_zoo_defs`, and what other packages enter as `pnpdepth.models`."""

@@ -67,3 +67,9 @@ def test_every_name_of_a_closed_list_is_implemented() -> None:
     assert tuple(NORMALISATIONS) == choices.NORMALISATIONS
     for precision in choices.PRECISIONS:
         dtype_of(precision, torch.device("cuda"))
+
+
+def test_a_table_of_modules_leaves_out_subpackages() -> None:
+    table = Table("", None, group="test_none", noun="package")
+    assert table["points"].__name__ == "pnpdepth_cli.points"
+    assert "core" not in table
