@@ -8,7 +8,17 @@ from typing import Any
 
 import click
 
-from pnpdepth_cli.choices import FORMATS
+from pnpdepth_cli.choices import (
+    ALIGNMENTS,
+    FORMATS,
+    LOSSES,
+    NORMALISATIONS,
+    PARAMETERS,
+    PRECISIONS,
+    SCHEDULES,
+    SPACES,
+    UPDATES,
+)
 from pnpdepth_cli.errors import UsageError
 
 FILE = click.Path(path_type=Path)
@@ -34,10 +44,6 @@ layer = click.option(
     help="Where to cut: a submodule's name (NAME#2 its second call, NAME[KEY] one of several"
     " outputs), or a share of the definition's layers, 0 the shallowest.",
 )
-ALIGNMENTS = ("none", "median", "scale", "affine", "auto")
-OUTPUT_KINDS = ("depth", "inverse", "log")
-NORMALISATIONS = ("unit", "imagenet", "symmetric", "bytes")
-
 _READING_OPTIONS = (
     click.option(
         "--align",
@@ -48,7 +54,7 @@ _READING_OPTIONS = (
     click.option("--align-every", is_flag=True, help="Fit again at every update of z."),
     click.option(
         "--output-kind",
-        type=click.Choice(OUTPUT_KINDS),
+        type=click.Choice(SPACES),
         help="What the network's output is, over what is known of it.",
     ),
     click.option(
@@ -67,7 +73,6 @@ def reading(command: Callable[..., Any]) -> Callable[..., Any]:
 
 
 device = click.option("--device", default="cpu", show_default=True, help="cpu, cuda, cuda:1, mps …")
-PRECISIONS = ("fp32", "bf16", "fp16")
 precision = click.option(
     "--precision",
     type=click.Choice(PRECISIONS),
@@ -148,10 +153,6 @@ def scan_given(given: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
     )
 
 
-LOSSES = ("l1", "l2", "huber", "berhu", "inverse", "log", "cauchy")
-UPDATES = ("sign", "sgd", "normalised", "momentum", "adam", "lbfgs")
-SCHEDULES = ("constant", "linear")
-PARAMETERS = ("elements", "channels")
 PROPAGATIONS = ("none", "gp", "diffusion")
 
 
@@ -187,10 +188,12 @@ _REFINEMENT_OPTIONS = (
     click.option(
         "--lr", metavar="NUMBER|P%", help="Step: absolute, or per cent of z's standard deviation."
     ),
-    click.option("--loss", type=click.Choice(LOSSES), help="Between prediction and sparse points."),
+    click.option(
+        "--loss", type=click.Choice(tuple(LOSSES)), help="Between prediction and sparse points."
+    ),
     click.option(
         "--update",
-        type=click.Choice(UPDATES),
+        type=click.Choice(tuple(UPDATES)),
         help="From gradient to step; one that is not the network's default starts from the paper's"
         " --lr, --schedule and --spread.",
     ),
