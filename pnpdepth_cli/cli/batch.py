@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from pnpdepth_cli.choices import FRAME_PROTOCOLS, LAYOUTS
 from pnpdepth_cli.cli import options
 from pnpdepth_cli.cli.exit_codes import INTERRUPTED
 from pnpdepth_cli.cli.printable import printable
@@ -22,21 +23,18 @@ from pnpdepth_cli.errors import FramesFailedError, StorageError, UsageError
 if TYPE_CHECKING:
     from pnpdepth_cli.pipeline.batch.frames import BatchRequest
 
-LAYOUTS = (
-    *("manifest", "nyu-mat", "kitti-odometry", "kitti-object", "kitti-depth", "tum", "7scenes"),
-    *("synthia", "pairs", "nyu-h5"),
-)
-PROTOCOLS = ("whole", "nyu", "kitti-odometry", "kitti-depth")
 _STOPPING = b"\nfinishing the frame in work; Ctrl-C again stops at once\n"
 
 
 @click.command(short_help="Refine all frames of a folder or a list.")
 @click.argument("source", type=options.FILE, metavar="FOLDER|LIST")
 @click.option("-o", "--output", type=options.FILE, required=True, help="The folder for results.")
-@click.option("--layout", type=click.Choice(LAYOUTS), help="Of the folder.  [default: guessed]")
+@click.option(
+    "--layout", type=click.Choice(tuple(LAYOUTS)), help="Of the folder.  [default: guessed]"
+)
 @click.option(
     "--protocol",
-    type=click.Choice(PROTOCOLS),
+    type=click.Choice(FRAME_PROTOCOLS),
     help="What is cut out of the frames first.  [default: the layout's own]",
 )
 @click.option(

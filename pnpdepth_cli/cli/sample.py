@@ -7,10 +7,9 @@ from pathlib import Path
 
 import click
 
+from pnpdepth_cli.choices import PATTERNS
 from pnpdepth_cli.cli import options
 from pnpdepth_cli.errors import UsageError
-
-PATTERNS = ("uniform", "bernoulli", "grid", "lines", "features", "edges", "region")
 
 
 @click.command(short_help="Make sparse depth out of dense depth.")

@@ -9,8 +9,8 @@ from typing import Any
 
 import click
 
+from pnpdepth_cli.choices import FRAME_PROTOCOLS, LAYOUTS
 from pnpdepth_cli.cli import options
-from pnpdepth_cli.cli.batch import LAYOUTS, PROTOCOLS
 from pnpdepth_cli.cli.exit_codes import INTERRUPTED
 from pnpdepth_cli.cli.progress import BatchProgress
 from pnpdepth_cli.errors import FramesFailedError, StorageError
@@ -48,10 +48,12 @@ _OF_THE_REFINEMENT = {
     metavar="N",
     help="Draws of the points, the first by --seed.",
 )
-@click.option("--layout", type=click.Choice(LAYOUTS), help="Of the folder.  [default: guessed]")
+@click.option(
+    "--layout", type=click.Choice(tuple(LAYOUTS)), help="Of the folder.  [default: guessed]"
+)
 @click.option(
     "--protocol",
-    type=click.Choice(PROTOCOLS),
+    type=click.Choice(FRAME_PROTOCOLS),
     help="What is cut out of the frames first.  [default: the layout's own]",
 )
 @click.option("--limit", type=int, metavar="N", help="Only the first N frames.")

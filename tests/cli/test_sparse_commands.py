@@ -5,8 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from pnpdepth_cli.cli.sample import PATTERNS
-from pnpdepth_cli.cli.simulate import SENSORS
+from pnpdepth_cli.choices import PATTERNS, SENSORS
 from tests.cli.test_commands import code_of
 from tests.pipeline.frames import frame_on_disk
 from tests.pipeline.scan_frames import ScanOnDisk, scan_on_disk

@@ -17,9 +17,10 @@ from pathlib import Path
 from typing import Any
 
 from pnpdepth_cli.errors import FileFormatError
+from pnpdepth_cli.io.dataset.frame import Frame, Listing, Unmatched
+from pnpdepth_cli.io.dataset.protocols import WHOLE, find_protocol
 from pnpdepth_cli.io.file_bytes import one_line, read_bytes
-from pnpdepth_cli.io.layouts.frame import Frame, Listing, Unmatched
-from pnpdepth_cli.io.layouts.protocols import WHOLE, find_protocol
+from pnpdepth_cli.io.layouts import Layout
 
 _PATHS = ("image", "sparse", "gt", "calib")
 _NUMBERS = {"camera": int, "sparse_scale": float, "gt_scale": float}
@@ -109,3 +110,6 @@ def _parts(path: Path, number: int, row: dict[str, Any]) -> dict[str, Any]:
     protocol = find_protocol(given["protocol"]) if "protocol" in given else WHOLE
     named = {"name": given["name"]} if "name" in given else {}
     return {"protocol": protocol, **named, **files, **numbers}
+
+
+LAYOUT = Layout(matches=matches, listing=listing)

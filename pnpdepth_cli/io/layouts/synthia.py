@@ -18,7 +18,8 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
-from pnpdepth_cli.io.layouts.frame import Frame, Listing, Unmatched, by_stem, without_partner
+from pnpdepth_cli.io.dataset.frame import Frame, Listing, Unmatched, by_stem, without_partner
+from pnpdepth_cli.io.layouts import Layout
 
 _PNG = (".png",)
 _SCALE = 100.0
@@ -61,3 +62,6 @@ def _cameras(root: Path) -> Iterator[tuple[list[str], Path, Path]]:
         # RGB and Depth are common names: only the numbers tell the random set from other data
         if any(_RANDOM_STEM.fullmatch(p.stem) for p in pictures.glob("*.png")):
             yield prefix, pictures, depth / "Depth" if (depth / "Depth").is_dir() else depth
+
+
+LAYOUT = Layout(matches=matches, listing=listing)

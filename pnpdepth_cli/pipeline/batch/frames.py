@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 
 from pnpdepth_cli.errors import InputError, OutputError, UsageError
+from pnpdepth_cli.io.dataset.frame import SCANS, Frame, Source, Unmatched
 from pnpdepth_cli.io.layouts import LAYOUTS, find_protocol, list_frames
-from pnpdepth_cli.io.layouts.frame import SCANS, Frame, Source, Unmatched
 from pnpdepth_cli.pipeline.refinement.output_files import Outputs
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest
 
@@ -84,17 +84,17 @@ def find_frames(request: BatchRequest) -> BatchFrames:
     if not frames:
         first = f" ({lost[0]})" if lost else ""
         raise InputError(
-            f"{request.source} looks like {layout.name!r} but has no frame in it{first};"
+            f"{request.source} looks like {layout!r} but has no frame in it{first};"
             f" layouts are {', '.join(LAYOUTS)}"
         )
     if request.refine.sample is None and all(frame.sparse is None for frame in frames):
         raise UsageError(
-            f"{request.source} looks like {layout.name!r}, which has no sparse depth; --sample 500"
+            f"{request.source} looks like {layout!r}, which has no sparse depth; --sample 500"
             " takes so many points of the ground truth"
         )
     number, of = request.shard or (1, 1)
     return BatchFrames(
-        layout=layout.name,
+        layout=layout,
         frames=frames,
         chosen=frames[: request.limit][number - 1 :: of],
         unmatched=tuple(unmatched),

@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from pnpdepth_cli.errors import InputError, PnpDepthError, UsageError
+from pnpdepth_cli.io.dataset.frame import DEPTHS, PICTURES
 from pnpdepth_cli.io.file_bytes import one_line
 from pnpdepth_cli.io.layouts import Frame, Source, find_layout, list_frames
-from pnpdepth_cli.io.layouts.frame import DEPTHS, PICTURES
 from pnpdepth_cli.io.record import read_json
 
 _POINTS = (*DEPTHS, ".csv", ".txt")
@@ -114,7 +114,7 @@ def some_names(names: Iterable[str]) -> str:
 def _layout_of(truth: Path) -> str | None:
     """The layout that the truth is a data set of; None for files and folders of files."""
     try:
-        return find_layout(truth).name
+        return find_layout(truth)
     except (InputError, OSError):
         return None
 

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pnpdepth_cli.errors import UsageError
-from pnpdepth_cli.io.layouts.frame import Source
-from pnpdepth_cli.io.layouts.protocols import WHOLE, Protocol
+from pnpdepth_cli.io.dataset.frame import Source
+from pnpdepth_cli.io.dataset.protocols import WHOLE, Protocol
 from pnpdepth_cli.models.definition import ModelDefinition, RefineDefaults
 from pnpdepth_cli.pipeline.sparse.scans import ScanOptions
 from pnpdepth_cli.sensors import SamplePattern

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import FileFormatError, InputError, PnpDepthError, UsageError
+from pnpdepth_cli.io.dataset.frame import Hdf5Array
 from pnpdepth_cli.io.depth_reading import known_metres
 from pnpdepth_cli.io.file_bytes import one_line
-from pnpdepth_cli.io.layouts.frame import Hdf5Array
 
 
 def shape_of(path: Path, name: str) -> tuple[int, ...]:
