@@ -10,6 +10,9 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
+FARTHEST_M = 1e9
+"""Metres; what noise moves farther is no measurement, and would overflow float32 in products."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class SparseDepth:

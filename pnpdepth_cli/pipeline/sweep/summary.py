@@ -13,6 +13,7 @@ import numpy as np
 
 from pnpdepth_cli.core.metrics import MEASURES
 from pnpdepth_cli.io.atomic import atomic_path
+from pnpdepth_cli.io.csv_text import text_cell
 from pnpdepth_cli.io.record import plain, write_json
 from pnpdepth_cli.pipeline.evaluation.averages import Floats, bootstrap
 
@@ -172,7 +173,7 @@ def write_frames(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
             yield [
                 row["study"],
                 *(row["parameters"].get(name) for name in names),
-                *(figures.name, figures.seed),
+                *(text_cell(figures.name), figures.seed),
                 *("failed" if figures.values is None else status, figures.points),
                 *values,
             ]
