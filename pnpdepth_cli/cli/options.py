@@ -8,6 +8,16 @@ from typing import Any
 
 import click
 
+from pnpdepth_cli.choices import (
+    ALIGNMENTS,
+    LOSSES,
+    NORMALISATIONS,
+    PARAMETERS,
+    PRECISIONS,
+    SCHEDULES,
+    SPACES,
+    UPDATES,
+)
 from pnpdepth_cli.errors import UsageError
 
 FILE = click.Path(path_type=Path)
@@ -33,10 +43,6 @@ layer = click.option(
     help="Layer to cut at: the name of a submodule (NAME#2: its second call, NAME[KEY]: one of its"
     " outputs), or a fraction of the network's depth, 0 the shallowest layer.",
 )
-ALIGNMENTS = ("none", "median", "scale", "affine", "auto")
-OUTPUT_KINDS = ("depth", "inverse", "log")
-NORMALISATIONS = ("unit", "imagenet", "symmetric", "bytes")
-
 _READING_OPTIONS = (
     click.option(
         "--align",
@@ -47,7 +53,7 @@ _READING_OPTIONS = (
     click.option("--align-every", is_flag=True, help="Repeat the alignment at every update of z."),
     click.option(
         "--output-kind",
-        type=click.Choice(OUTPUT_KINDS),
+        type=click.Choice(SPACES),
         help="Meaning of the network's output, replacing what its definition says.",
     ),
     click.option(
@@ -68,7 +74,6 @@ def reading(command: Callable[..., Any]) -> Callable[..., Any]:
 device = click.option(
     "--device", default="cpu", show_default=True, metavar="NAME", help="cpu, cuda, cuda:1, mps, …"
 )
-PRECISIONS = ("fp32", "bf16", "fp16")
 precision = click.option(
     "--precision",
     type=click.Choice(PRECISIONS),
@@ -159,10 +164,6 @@ def scan_given(given: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
     )
 
 
-LOSSES = ("l1", "l2", "huber", "berhu", "inverse", "log", "cauchy")
-UPDATES = ("sign", "sgd", "normalised", "momentum", "adam", "lbfgs")
-SCHEDULES = ("constant", "linear")
-PARAMETERS = ("elements", "channels")
 PROPAGATIONS = ("none", "gp", "diffusion")
 FORMATS = ("png", "exr", "npy", "npz", "pfm", "tiff")
 
@@ -204,10 +205,10 @@ _REFINEMENT_OPTIONS = (
         metavar="NUMBER|P%",
         help="Step size: absolute, or % of the std of z.",
     ),
-    click.option("--loss", type=click.Choice(LOSSES), help="Loss at the sparse points."),
+    click.option("--loss", type=click.Choice(tuple(LOSSES)), help="Loss at the sparse points."),
     click.option(
         "--update",
-        type=click.Choice(UPDATES),
+        type=click.Choice(tuple(UPDATES)),
         help="Update rule; another than the network's resets --lr, --schedule and --spread.",
     ),
     click.option(

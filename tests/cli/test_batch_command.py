@@ -68,7 +68,9 @@ def test_a_bad_frame_is_one_line_and_exit_code_7(
     err = capsys.readouterr().err
     (line,) = [line for line in err.splitlines() if line.startswith("failed")]
     assert line.startswith("failed: b: drive/rgb/b.png is empty")
-    assert err.splitlines()[-1].startswith("pnpdepth: 1 failed of 4 frames; the reasons are in out/summary.csv")
+    assert err.splitlines()[-1].startswith(
+        "pnpdepth: 1 failed of 4 frames; the reasons are in out/summary.csv"
+    )
     assert "Traceback" not in err
 
 
