@@ -8,6 +8,7 @@ from pathlib import PurePosixPath
 _LONGEST_PART = 255 - len("_improvement.png")
 """Bytes of a part of a name, so that the longest file name of a result has 255."""
 
+_LEADS_OUT = "leads out of the output folder"
 _DRIVE = re.compile(r"[A-Za-z]:")
 _RESERVED = re.compile(r"(con|prn|aux|nul|com[0-9¹²³]|lpt[0-9¹²³])\s*(\..*)?", re.IGNORECASE)
 """Device names that Windows reserves in every folder, with any suffix."""
@@ -24,7 +25,7 @@ def name_problem(name: str) -> str | None:
         return "holds a NUL character"
     place = PurePosixPath(name)
     if place.is_absolute() or ".." in place.parts:
-        return "leads out of the output folder"
+        return _LEADS_OUT
     if not place.parts:
         return "names no file"
     if any(len(part.encode("utf-8", "surrogateescape")) > _LONGEST_PART for part in place.parts):
@@ -41,4 +42,5 @@ def portable_name_problem(name: str) -> str | None:
     for part in PurePosixPath(name).parts:
         if _RESERVED.fullmatch(part):
             return f"holds {part!r}, which Windows reserves"
-    return name_problem(name)
+    problem = name_problem(name)
+    return None if problem == _LEADS_OUT else problem  # only what writes results minds
