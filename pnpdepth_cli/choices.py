@@ -76,3 +76,25 @@ class Table(Mapping[str, Any]):
     @functools.cached_property
     def _entry_points(self) -> dict[str, EntryPoint]:
         return {point.name: point for point in entry_points(group=f"pnpdepth.{self.group}")}
+
+
+ALIGNMENTS = ("none", "median", "scale", "affine", "auto")
+"""How the network's output is fitted to the sparse points."""
+FORMATS = ("png", "exr", "npy", "npz", "pfm", "tiff")
+"""File formats of dense depth."""
+LOSSES = ("l1", "l2", "huber", "berhu", "inverse", "log", "cauchy")
+"""Losses between prediction and sparse points."""
+NORMALISATIONS = ("unit", "imagenet", "symmetric", "bytes")
+"""Ranges of the rgb input of a network."""
+OUTPUT_KINDS = ("depth", "inverse", "log")
+"""What the numbers of a network are."""
+PARAMETERS = ("elements", "channels")
+"""What of z is updated."""
+PRECISIONS = ("fp32", "bf16", "fp16")
+"""Precisions of a network's convolutions and matrix products."""
+PROPAGATIONS = ("none", "gp", "diffusion")
+"""How the residual at the points is propagated."""
+SCHEDULES = ("constant", "linear")
+"""How the step size falls over the updates."""
+UPDATES = ("sign", "sgd", "normalised", "momentum", "adam", "lbfgs")
+"""Update rules of z."""

@@ -49,11 +49,8 @@ def refine(as_json: bool, **given: Any) -> None:
     """
     from pnpdepth_cli.cli.tables import print_refinement
     from pnpdepth_cli.pipeline.refinement.refine import refine_image
-    from pnpdepth_cli.pipeline.refinement.request import RefineRequest
-    from pnpdepth_cli.pipeline.sparse.scans import ScanOptions
 
-    scan, others = options.scan_given(given)
-    request = RefineRequest(scan=ScanOptions(**scan), **others)
+    request = options.request_of(given)
     with _SlowBar() as bar:
         outcome = refine_image(request, on_iteration=bar.show)
     if as_json:

@@ -14,14 +14,7 @@ from pnpdepth_cli.cli.batch import LAYOUTS, PROTOCOLS
 from pnpdepth_cli.cli.exit_codes import INTERRUPTED
 from pnpdepth_cli.cli.progress import BatchProgress
 from pnpdepth_cli.errors import FramesFailedError, StorageError
-
-_OF_THE_REFINEMENT = {
-    *("model", "checkpoint", "layer", "iterations", "lr", "loss", "update", "schedule", "spread"),
-    *("parameters", "anchor", "line_search", "keep_best", "align", "align_every", "output_kind"),
-    *("normalise", "depth_scale", "gt_scale"),
-    *("channel", "sparse_size_ok", "seed", "device", "precision", "propagate"),
-}
-"""Of a refinement's options those that decide a depth; a sweep writes none and holds none out."""
+from pnpdepth_cli.pipeline.refinement.request import FrameFiles, MethodOptions, NetworkChoice
 
 
 @click.command(short_help="Vary the refinement or the points, and plot the errors.")
@@ -57,7 +50,8 @@ _OF_THE_REFINEMENT = {
 @click.option("--limit", type=int, metavar="N", help="Only the first N frames.")
 @click.option("--plots/--no-plots", default=True, help="Pictures, or tables alone.")
 @options.scan
-@options.refinement
+@options.options_of_groups(FrameFiles, NetworkChoice, MethodOptions, without=["tile"])
+@options.seed
 @options.as_json
 def sweep(
     source: Path,
@@ -93,7 +87,7 @@ def sweep(
                 of the points, as `pnpdepth sample` has them
     rotation-noise
                 of a LiDAR, degrees
-    iterations, layer, lr, loss, update, schedule, spread, parameters, anchor, align, propagate
+    iterations, layer, lr, loss, update, schedule, blur, parameters, proximity, align, propagate
                 the options of these names
 
     One --vary makes a table and a picture of itself, two of their grid; with --one-by-one each of
@@ -105,17 +99,14 @@ def sweep(
     each picture, and sweep.jsonl, by which the same command, or one with other values, only
     computes what is missing. Plots need the extra pnpdepth[plot].
     """
-    from pnpdepth_cli.pipeline.refinement.request import RefineRequest
-    from pnpdepth_cli.pipeline.sparse.scans import ScanOptions
     from pnpdepth_cli.pipeline.sweep.axes import read_axis, studies_of
     from pnpdepth_cli.pipeline.sweep.points import read_sampling
     from pnpdepth_cli.pipeline.sweep.sweep import SweepRequest, run_sweep
 
-    scan, others = options.scan_given(given)
     request = SweepRequest(
         source=source,
         output=output,
-        refine=RefineRequest(image=None, sparse=None, scan=ScanOptions(**scan), **others),
+        refine=options.request_of(given),
         studies=studies_of([read_axis(text) for text in vary], one_by_one=one_by_one),
         sampling=None if sample is None else read_sampling(sample),
         seeds=seeds,
@@ -141,16 +132,6 @@ def sweep(
             f"{progress.failed:,} of {progress.to_do:,} runs failed; {output}/sweep.csv counts the"
             " frames that each mean is without, and the same command tries them again"
         )
-
-
-@click.command()
-@options.refinement
-def _refinement() -> None:
-    """All options of a refinement."""
-
-
-_NOT_OF_A_SWEEP = {option.name for option in _refinement.params} - _OF_THE_REFINEMENT
-sweep.params = [option for option in sweep.params if option.name not in _NOT_OF_A_SWEEP]
 
 
 class _Progress(BatchProgress):

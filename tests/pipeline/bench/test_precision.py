@@ -17,7 +17,7 @@ from tests.pipeline.frames import frame_on_disk
 @pytest.fixture
 def asked(tmp_path: Path) -> RefineRequest:
     frame = frame_on_disk(tmp_path)
-    return RefineRequest(
+    return RefineRequest.from_fields(
         image=frame.image,
         sparse=frame.sparse,
         model=str(frame.model),
