@@ -1,4 +1,4 @@
-"""The choices of `pnpdepth refine` are those of the method, though it does not import it."""
+"""The settings of a refinement follow from the request and the network's defaults."""
 
 from __future__ import annotations
 
@@ -8,13 +8,9 @@ from typing import Any
 import pytest
 from click.testing import CliRunner
 
-from pnpdepth_cli import choices
 from pnpdepth_cli.cli.refine import refine
 from pnpdepth_cli.cli.sweep import sweep
-from pnpdepth_cli.core.losses import LOSSES
 from pnpdepth_cli.core.refine import RefineSettings
-from pnpdepth_cli.core.step_sizes import PARAMETERS, SCHEDULES
-from pnpdepth_cli.core.update_rules import UPDATES
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.models.definition import FOREIGN, ModelDefinition, Multiple
 from pnpdepth_cli.pipeline.options import options_of
@@ -26,13 +22,6 @@ METHOD = MethodOptions()
 STRANGER = ModelDefinition(
     name="stranger", input_kind="rgb", size=Multiple(8), build=UNet, defaults=FOREIGN
 )
-
-
-def test_the_choices_are_those_of_the_method() -> None:
-    assert tuple(LOSSES) == tuple(choices.LOSSES)
-    assert tuple(UPDATES) == tuple(choices.UPDATES)
-    assert tuple(SCHEDULES) == choices.SCHEDULES
-    assert PARAMETERS == choices.PARAMETERS
 
 
 def test_without_a_word_the_settings_are_the_networks() -> None:

@@ -17,6 +17,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from pnpdepth_cli.choices import OutputKind, OutputScale
 from pnpdepth_cli.completion.interpolation import linear
 from pnpdepth_cli.core.split.user_code import describe
 from pnpdepth_cli.errors import CheckpointError, ModelError
@@ -26,8 +27,6 @@ from pnpdepth_cli.models.definition import (
     ModelDefinition,
     Near,
     Normalisation,
-    OutputKind,
-    OutputScale,
 )
 from pnpdepth_cli.points import SparsePoints
 

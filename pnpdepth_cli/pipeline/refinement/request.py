@@ -97,7 +97,7 @@ class NetworkChoice:
     output_kind: str | None = option(
         None,
         "What the network's output is, over what is known of it.",
-        choices=choices.OUTPUT_KINDS,
+        choices=choices.SPACES,
     )
     normalise: str | None = option(
         None,

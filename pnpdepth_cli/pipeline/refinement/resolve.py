@@ -7,7 +7,8 @@ from dataclasses import replace
 
 import torch
 
-from pnpdepth_cli.completion.alignment import SPACES, align
+from pnpdepth_cli.choices import SPACES
+from pnpdepth_cli.completion.alignment import align
 from pnpdepth_cli.core.refine import RefineSettings
 from pnpdepth_cli.errors import ModelError, NoPointsError, UsageError
 from pnpdepth_cli.models.definition import (
@@ -45,8 +46,7 @@ def resolve_definition(network: Network, inputs: Inputs, choice: NetworkChoice) 
     if choice.output_kind is not None:
         if choice.output_kind not in SPACES:
             raise UsageError(f"output kind {choice.output_kind!r} is not one of {SPACES}")
-        # The enum of the definition, checked the line before.
-        definition = replace(definition, output_kind=choice.output_kind)  # type: ignore[arg-type]
+        definition = replace(definition, output_kind=choice.output_kind)
     notes = list(network.notes)
     if choice.normalise is not None:
         if choice.normalise not in NORMALISATIONS:
