@@ -115,23 +115,29 @@ output_scale = click.option(
     default=256.0,
     show_default=True,
     metavar="S",
-    help="A PNG holds metres × S.",
+    help="A written PNG holds metres × S.",
 )
 sparse_output = click.option(
     "-o",
     "--output",
     type=FILE,
     required=True,
-    help="Sparse depth: PNG, EXR, NPY, NPZ, PFM, TIFF; or CSV, points x y depth.",
+    help="Sparse depth file: PNG, EXR, NPY, NPZ, PFM or TIFF map, or CSV rows x y depth.",
 )
 camera = click.option(
-    "--camera", type=int, metavar="N", help="Of KITTI's four, 0 to 3.  [default: 2]"
+    "--camera", type=int, metavar="N", help="KITTI camera number, 0 to 3.  [default: 2]"
 )
 euclidean = click.option(
-    "--range", "euclidean", is_flag=True, help="Depth is the distance from the camera, not z."
+    "--range",
+    "euclidean",
+    is_flag=True,
+    help="Depth is the distance from the camera, not z.",
 )
 max_range = click.option(
-    "--max-range", type=float, metavar="M", help="Drop points farther from the scanner, metres."
+    "--max-range",
+    type=float,
+    metavar="M",
+    help="Drop points farther than M metres.",
 )
 
 _SCAN_OPTIONS = (
@@ -139,31 +145,35 @@ _SCAN_OPTIONS = (
         "--calib",
         type=FILE,
         metavar="FILE|FOLDER",
-        help="For a LiDAR scan: KITTI's calibration, its raw folder, or a file with K, R and t.",
+        help="Calibration of a LiDAR scan: a KITTI file or raw folder, or a file with K, R, t.",
     ),
     camera,
     euclidean,
     click.option(
         "--keep-occluded",
         is_flag=True,
-        help="Keep a scan's points that the camera sees something nearer in front of.",
+        help="Keep scan points that are occluded from the camera.",
     ),
     click.option(
-        "--min-range", type=float, default=0.0, metavar="M", help="Drop nearer points of a scan."
+        "--min-range",
+        type=float,
+        default=0.0,
+        metavar="M",
+        help="Drop points nearer than M metres.",
     ),
     max_range,
 )
 
 
 def scan(command: Callable[..., Any]) -> Callable[..., Any]:
-    """The command has the options of a LiDAR scan; `scan_given` takes them out of the rest."""
+    """Adds the options of a LiDAR scan; `scan_given` separates them from the others."""
     for option in reversed(_SCAN_OPTIONS):
         command = option(command)
     return command
 
 
 def scan_given(given: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """(the options of a LiDAR scan, the others) of what the user gave."""
+    """Returns (the options of a LiDAR scan, the others)."""
     names = ("calib", "camera", "euclidean", "keep_occluded", "min_range", "max_range")
     return (
         {name: given[name] for name in names},
@@ -185,7 +195,7 @@ def request_of(given: dict[str, Any], **others: Any) -> RefineRequest:
 
 
 def height_and_width(text: str) -> tuple[int, int]:
-    """(H, W) of a text such as 480x640. UsageError for any other."""
+    """Returns (H, W) from a text such as 480x640. Raises UsageError for any other text."""
     height, x, width = text.lower().partition("x")
     if not (x and height.isdecimal() and width.isdecimal() and int(height) and int(width)):
         raise UsageError(f"size {text!r} is not of the form HxW, such as 480x640")
@@ -193,5 +203,5 @@ def height_and_width(text: str) -> tuple[int, int]:
 
 
 def count_or_share(text: str | None) -> tuple[int | None, float | None]:
-    """(points, share) of `500` or `5%`; None for what it is not. UsageError for any other text."""
+    """Returns (count, None) for `500`, (None, fraction) for `5%`. Raises UsageError otherwise."""
     return (None, None) if text is None else request.count_or_share(text)

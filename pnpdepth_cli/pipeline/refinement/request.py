@@ -44,7 +44,7 @@ def parse_seconds(text: str) -> float:
     except ValueError:
         seconds = -1.0
     if not 0 < seconds < float("inf"):
-        raise UsageError(f"time budget {text!r} is no time; give seconds, such as 5s")
+        raise UsageError(f"time budget {text!r} is not a duration; give seconds, such as 5s")
     return seconds
 
 
@@ -60,16 +60,18 @@ class FrameFiles:
     """Ground truth depth."""
     depth_scale: float | None = option(
         None,
-        "Integer depth files hold metres × S.  [default: what the file says, else 256]",
+        "Integer depth files hold metres × S.  [default: from the file, else 256]",
         metavar="S",
     )
     sparse_scale: float | None = None
     """The same for the sparse depth, over `depth_scale`."""
-    gt_scale: float | None = option(None, "The same for the ground truth.", metavar="S")
+    gt_scale: float | None = option(None, "--depth-scale of the ground truth.", metavar="S")
     channel: str | None = option(
-        None, "Which EXR channel or NPZ array holds the depth.", metavar="NAME"
+        None, "EXR channel or NPZ array that holds the depth.", metavar="NAME"
     )
-    sparse_size_ok: bool = option(False, "Map points of a sparse map of another size.")
+    sparse_size_ok: bool = option(
+        False, "Accept a sparse depth map of another size; its points are moved to the image."
+    )
     scan: ScanOptions = field(default_factory=_default_scan)
     """How `sparse` is projected where it is a LiDAR scan."""
     sample: SamplePattern | None = None
@@ -84,39 +86,39 @@ class NetworkChoice:
 
     model: str = option(
         "compact",
-        "A network that `pnpdepth models` lists; FILE.py[:ATTR] with a definition or a torch"
-        " module; FILE.onnx[:OUTPUT]; FILE.pt2; or a Hugging Face folder.",
-        metavar="NAME|FILE|FOLDER",
+        "A name of `pnpdepth models`, FILE.onnx[:OUTPUT], FILE.pt2, a Hugging Face folder, or"
+        " FILE.py[:ATTR], which is Python code and is run.",
+        metavar="NETWORK",
         show_default=True,
     )
     checkpoint: Path | None = option(
         None,
-        "Its weights: .safetensors, a torch, numpy or TensorFlow (.index) file, or a folder with"
-        " one file per part; nothing in them is run.",
+        "Weights: a safetensors, torch, numpy or TensorFlow (.index) file, or a folder of them. No"
+        " code in them is run.",
     )
     output_kind: str | None = option(
         None,
-        "What the network's output is, over what is known of it.",
+        "Meaning of the network's output, replacing what its definition says.",
         choices=choices.SPACES,
     )
     normalise: str | None = option(
         None,
-        "The rgb that the network wants: 0…1, ImageNet's, −1…1, 0…255.",
+        "RGB range of the network's input: 0…1, ImageNet's mean and std, −1…1, 0…255.",
         choices=choices.NORMALISATIONS,
     )
     tile: int | None = option(
         None,
-        "Refine a frame larger than that in tiles of this side, where memory is short.",
+        "Refine larger frames in overlapping tiles of this side length, to save memory.",
         metavar="PIXELS",
         least=64,
     )
     precision: str = option(
         "fp32",
-        "Of the network's convolutions and matrix products; z, loss and updates stay in fp32.",
+        "Precision of convolutions and matrix products; z, loss and updates stay in fp32.",
         choices=choices.PRECISIONS,
         show_default=True,
     )
-    device: str = option("cpu", "cpu, cuda, cuda:1, mps …", show_default=True)
+    device: str = option("cpu", "cpu, cuda, cuda:1, mps, …", metavar="NAME", show_default=True)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -125,77 +127,76 @@ class MethodOptions:
 
     layer: str | None = option(
         None,
-        "Where to cut: a submodule's name (NAME#2 its second call, NAME[KEY] one of several"
-        " outputs), or a fraction of the definition's layers, 0 the shallowest.",
+        "Layer to cut at: the name of a submodule (NAME#2: its second call, NAME[KEY]: one of its"
+        " outputs), or a fraction of the network's depth, 0 the shallowest layer.",
         metavar="NAME|0..1",
         axis=Axis(title="layer cut at (0 first, 1 last)"),
     )
     iterations: int | None = option(
         None,
-        "Updates of z; 0 gives the plain prediction.",
+        "Number of updates of z; 0 is no refinement.",
         metavar="K",
         axis=Axis(title="updates of z"),
     )
     lr: str | None = option(
         None,
-        "Step: absolute, or per cent of z's standard deviation.",
+        "Step size: absolute, or % of the std of z.",
         metavar="NUMBER|P%",
         axis=Axis(title="step", title_percent="step (% of the deviation of z)", log=True),
     )
     loss: str | None = option(
         None,
-        "Between prediction and sparse points.",
+        "Loss at the sparse points.",
         choices=choices.LOSSES,
         axis=Axis(title="loss"),
     )
     update: str | None = option(
         None,
-        "From gradient to step; one that is not the network's default starts from the paper's"
-        " --lr, --schedule and --blur.",
+        "Update rule; another than the network's resets --lr, --schedule and --blur.",
         choices=choices.UPDATES,
         axis=Axis(title="update rule"),
     )
     schedule: str | None = option(
         None,
-        "Of the step: it stays, or falls to 0.",
+        "Step size over the updates; linear decays to 0.",
         choices=choices.SCHEDULES,
         axis=Axis(title="schedule of the step"),
     )
     blur: float | None = option(
         None,
-        "Blur the gradient over S spacings of the points, where z is a map; 0 does not.",
+        "Blur the gradient over S times the spacing of the points; 0 is off.",
         alias="--spread",
         metavar="S",
         axis=Axis(title="blur of the gradient (spacings of the points)"),
     )
     parameters: str = option(
         "elements",
-        "What is updated: every element of z, or a scale and a shift of each channel.",
+        "Update every element of z, or a scale and a shift of each channel.",
         choices=choices.PARAMETERS,
         show_default=True,
         axis=Axis(title="what is updated"),
     )
     proximity: float = option(
         0.0,
-        "Add to the loss W times the mean squared change of log depth: stay near the network.",
+        "Add W times the mean squared change of log depth to the loss.",
         alias="--anchor",
         metavar="W",
         axis=Axis(title="weight of staying near the network"),
     )
-    line_search: bool = option(False, "Take back updates that raise the loss; go half as far.")
-    keep_best: bool = option(False, "Give the depth of the lowest loss, not the last.")
+    line_search: bool = option(False, "Undo updates that raise the loss and halve the step.")
+    keep_best: bool = option(False, "Return the depth with the lowest loss, not the last.")
     align: str | None = option(
         None,
-        "Fit the network's output to the points: a factor, or a factor and a shift."
-        "  [default: the network's own; none where it gives metres]",
+        "Fit the network's output to the points by scale, or scale and shift."
+        "  [default: the network's own]",
         choices=choices.ALIGNMENTS,
         axis=Axis(title="alignment"),
     )
-    align_every: bool = option(False, "Fit again at every update of z.")
+    align_every: bool = option(False, "Repeat the alignment at every update of z.")
     propagate: str | None = option(
         None,
-        "Propagate the residual at the points: by a Gaussian process, or by diffusion that stops"
-        " at edges.  [default: none; with --auto what is best]",
+        "Propagate the residuals at the points to all pixels: Gaussian process or edge-aware"
+        " diffusion.  [default: none; chosen by --auto]",
         choices=choices.PROPAGATIONS,
         axis=Axis(title="propagation of the residual"),
     )
@@ -207,22 +208,23 @@ class HoldOut:
 
     auto: bool = option(
         False,
-        "Choose alignment, updates and propagation, or a baseline, by points held out in turns;"
-        " never worse at those than the network and every baseline.",
+        "Choose alignment, updates and propagation by cross-validation over the points.",
     )
     time_budget_s: float | None = option(
         None,
-        "With --auto: try more layers and steps for so long, such as 5s.",
+        "With --auto: also try other layers and step sizes for this long, such as 5s.",
         flag="--time-budget",
         metavar="SECONDS",
         parse=parse_seconds,
     )
-    baselines: bool = option(False, "Score every simple baseline beside the result.")
-    uncertainty: bool = option(False, "Write <name>_sigma.exr, the depth's standard deviation.")
-    holdout: float = option(
-        0.0, "Keep this fraction of the points out, and score them.", metavar="F"
+    baselines: bool = option(False, "Also score every baseline, such as linear interpolation.")
+    uncertainty: bool = option(
+        False, "Write <name>_sigma.exr, the standard deviation of the depth."
     )
-    seed: int = option(0, "Of the hold-out choice.", least=0, most=LARGEST_SEED, show_default=True)
+    holdout: float = option(0.0, "Hold out this fraction of the points to score at.", metavar="F")
+    seed: int = option(
+        0, "Random seed.", metavar="N", least=0, most=LARGEST_SEED, show_default=True
+    )
 
     @property
     def needs_folds(self) -> bool:
@@ -237,9 +239,12 @@ class OutputOptions:
     output: Path | None = None
     """A folder, or one depth file. None: a folder named after the image."""
     format: str = option(
-        "png", "Of the depth file in a folder.", choices=choices.FORMATS, show_default=True
+        "png",
+        "Format of the depth file in an output folder.",
+        choices=choices.FORMATS,
+        show_default=True,
     )
-    overwrite: bool = option(False, "Replace results that exist.")
+    overwrite: bool = option(False, "Replace existing results.")
 
 
 _PLACES = {"image", "sparse", "gt", "model", "checkpoint", "output", "overwrite"}
