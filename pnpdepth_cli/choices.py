@@ -156,8 +156,14 @@ NETWORKS = Table(
 )
 """The networks' files in `model_zoo_defs`, and what other packages enter as `pnpdepth.models`."""
 
+FORMATS = Table(
+    "io/formats",
+    "FORMAT",
+    group="formats",
+    noun="depth format",
+    first=("png", "exr", "npy", "npz", "pfm", "tiff"),
+)
+"""Depth file formats: `pnpdepth_cli.io.formats.DepthFormat`."""
+
 PROPAGATIONS = ("none", "gp", "diffusion")
 """How the residual at the points is propagated."""
-
-FORMATS = ("png", "exr", "npy", "npz", "pfm", "tiff")
-"""File formats of dense depth."""

@@ -26,7 +26,7 @@ STRANGER = ModelDefinition(
 
 def test_without_a_word_the_settings_are_the_networks() -> None:
     settings = resolve_settings(STRANGER, METHOD)
-    for name in ("iterations", "lr", "loss", "update", "schedule", "spread"):
+    for name in ("iterations", "lr", "loss", "update", "schedule", "blur"):
         assert getattr(settings, name) == getattr(FOREIGN, name)
     plain = ModelDefinition(name="plain", input_kind="rgb", size=Multiple(8), build=UNet)
     assert resolve_settings(plain, METHOD) == RefineSettings()
@@ -35,9 +35,9 @@ def test_without_a_word_the_settings_are_the_networks() -> None:
 def test_another_update_starts_from_the_papers_step() -> None:
     settings = resolve_settings(STRANGER, replace(METHOD, update="sign"))
     paper = RefineSettings()
-    assert (settings.lr, settings.schedule, settings.spread) == (0.01, "constant", 0)
-    assert (settings.lr, settings.schedule, settings.spread) == (
-        paper.lr, paper.schedule, paper.spread,
+    assert (settings.lr, settings.schedule, settings.blur) == (0.01, "constant", 0)
+    assert (settings.lr, settings.schedule, settings.blur) == (
+        paper.lr, paper.schedule, paper.blur,
     )  # fmt: skip
     assert (settings.iterations, settings.loss) == (FOREIGN.iterations, FOREIGN.loss)
 
@@ -53,8 +53,8 @@ def test_what_the_user_says_holds() -> None:
         *("parameters", "line_search"),
     ):
         assert getattr(settings, name) == getattr(asked, name)
-    assert (settings.spread, settings.anchor) == (asked.blur, asked.proximity)
-    assert resolve_settings(STRANGER, replace(METHOD, blur=0)).spread == 0
+    assert (settings.blur, settings.proximity) == (asked.blur, asked.proximity)
+    assert resolve_settings(STRANGER, replace(METHOD, blur=0)).blur == 0
 
 
 @pytest.mark.parametrize("blur", [-0.1, float("nan"), float("inf")])

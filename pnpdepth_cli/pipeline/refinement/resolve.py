@@ -105,7 +105,7 @@ def resolve_settings(definition: ModelDefinition, method: MethodOptions) -> Refi
         raise UsageError(f"iterations {iterations} is negative; 0 gives the plain prediction")
     update = method.update or defaults.update
     steps = defaults if update == defaults.update else RefineDefaults()
-    blur = steps.spread if method.blur is None else method.blur
+    blur = steps.blur if method.blur is None else method.blur
     if not 0 <= blur < math.inf:
         raise UsageError(f"blur {blur} is no distance; give 0 or more spacings of the points")
     if not 0 <= method.proximity < math.inf:
@@ -116,9 +116,9 @@ def resolve_settings(definition: ModelDefinition, method: MethodOptions) -> Refi
         loss=method.loss or defaults.loss,
         update=update,
         schedule=method.schedule or steps.schedule,
-        spread=blur,
+        blur=blur,
         parameters=method.parameters,
-        anchor=method.proximity,
+        proximity=method.proximity,
         line_search=method.line_search,
         keep_best=method.keep_best,
         align=method.align or definition.default_alignment,
