@@ -22,6 +22,11 @@ from pnpdepth_cli.cli import options
     help="Resamples behind the intervals, and swaps behind the p-values.",
 )
 @click.option("--seed", type=options.SEED, default=0, show_default=True, help="Of both.")
+@click.option(
+    "--no-groups",
+    is_flag=True,
+    help="Treat all frames as independent, also those of one sequence or group.",
+)
 @click.option("--csv", type=options.FILE, metavar="FILE|-", help="The table as CSV.")
 @click.option("--markdown", type=options.FILE, metavar="FILE|-", help="The table as Markdown.")
 @click.option("--latex", type=options.FILE, metavar="FILE|-", help="The table as a tabular.")
@@ -31,6 +36,7 @@ def compare(
     runs: tuple[str, ...],
     resamples: int,
     seed: int,
+    no_groups: bool,
     csv: Path | None,
     markdown: Path | None,
     latex: Path | None,
@@ -45,18 +51,23 @@ def compare(
 
     A RUN is what `pnpdepth eval --json` printed, or a batch's summary or a refinement's record
     with ground truth, of which the result is meant, or with :before what it started from. Gains
-    are in per cent of the first run, and positive where the other is better. p says how likely
-    as large a difference is if the runs are equally good: the two are swapped frame by frame, in
-    all ways where there are few, else in N random ones.
+    are in per cent of the first run, and positive where the other is better. p is the probability
+    of so large a difference if the runs are equally good: the two are swapped in whole sequences
+    or groups of frames, in all ways where there are few, else in N random ones; in a single
+    sequence, in blocks as long as its errors are correlated. p is adjusted for the number of
+    measures.
     """
     from pnpdepth_cli.cli import score_tables
     from pnpdepth_cli.pipeline.evaluation import score_files
+    from pnpdepth_cli.pipeline.evaluation.compare import CompareRequest
     from pnpdepth_cli.pipeline.evaluation.compare import compare as compare_runs
 
     targets = (csv, markdown, latex)
     score_tables.check_stdout(targets, as_json)
     score_files.check_targets(targets, [Path(run) for run in runs], overwrite=overwrite)
-    comparison = compare_runs(runs, resamples=resamples, seed=seed)
+    comparison = compare_runs(
+        CompareRequest(paths=runs, resamples=resamples, seed=seed, grouped=not no_groups)
+    )
     score_tables.print_notes(comparison.notes)
     table = score_files.comparison_table(comparison)
     caption = score_files.comparison_caption(comparison)

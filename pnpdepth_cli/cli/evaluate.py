@@ -60,9 +60,14 @@ PROTOCOLS = ("paper", "nyu", "kitti", "kitti-devkit", "eigen", "garg")
     default=2000,
     show_default=True,
     metavar="N",
-    help="Resamples behind the ±; 0 leaves it out.",
+    help="Resamples behind the 95 % intervals; 0 leaves them out.",
 )
 @click.option("--seed", type=options.SEED, default=0, show_default=True, help="Of the resampling.")
+@click.option(
+    "--no-groups",
+    is_flag=True,
+    help="Treat all frames as independent, also those of one sequence or group.",
+)
 @click.option("--workers", type=int, default=2, show_default=True, help="Frames read at once.")
 @click.option("--csv", type=options.FILE, metavar="FILE|-", help="A line for each frame.")
 @click.option("--markdown", type=options.FILE, metavar="FILE|-", help="The means as a table.")
@@ -154,6 +159,7 @@ def _evaluate(
     workers: int,
     delta: str | None,
     exclude_sparse: bool,
+    no_groups: bool,
     **changes: Any,
 ) -> Evaluation:
     """The evaluation, with a bar over the frames where it takes longer than a second."""
@@ -164,13 +170,16 @@ def _evaluate(
     changes |= {"thresholds": _thresholds(delta), "exclude_sparse": exclude_sparse or None}
     request = EvalRequest(
         prediction=prediction,
-        truth=truth,
+        ground_truth=truth,
         sparse=sparse,
         protocol=protocol,
         changes=changes,
-        scales=Scales(prediction=pred_scale, truth=gt_scale, sparse=sparse_scale, channel=channel),
+        scales=Scales(
+            prediction=pred_scale, ground_truth=gt_scale, sparse=sparse_scale, channel=channel
+        ),
         resamples=resamples,
         seed=seed,
+        grouped=not no_groups,
         workers=workers,
     )
     with _bar("eval") as show:
