@@ -223,10 +223,12 @@ def _gains(
     first_totals, other_totals = (table.cluster_totals(clusters.ids) for table in (first, other))
     columns = first_totals.shape[1]
 
-    def percent(totals: Tensor) -> Tensor:
-        a, b = first.means_of(totals[..., :columns]), other.means_of(totals[..., columns:])
+    def percent(a: Tensor, b: Tensor) -> Tensor:
         change = torch.where(a == b, torch.zeros_like(a), 100 * better * (b - a) / a.abs())
         return torch.where(change.isfinite(), change, torch.full_like(change, math.nan))
+
+    def percent_of(totals: Tensor) -> Tensor:
+        return percent(first.means_of(totals[..., :columns]), other.means_of(totals[..., columns:]))
 
     def swapped_difference(flips: Floats) -> Floats:
         moved = torch.from_numpy(flips @ (other_totals - first_totals))
@@ -238,14 +240,14 @@ def _gains(
     none = np.full(len(measures), math.nan)
     low, high, p_values, exact = none, none, none, True
     if clusters.count >= MIN_CLUSTERS:
-        low, high = studentised_interval(percent, totals, request.resamples, request.seed)
+        low, high = studentised_interval(percent_of, totals, request.resamples, request.seed)
     if clusters.count > 1:
         p_values, exact = sign_flip_p_values(
             swapped_difference, clusters.count, request.resamples, request.seed
         )
-    gains = percent(torch.from_numpy(totals.sum(axis=0))).numpy()
-    differences = other.mean() - first.mean()
-    rows = zip(gains, low, high, differences, p_values, holm(p_values), strict=True)
+    first_mean, other_mean = first.mean(), other.mean()
+    gains = percent(torch.from_numpy(first_mean), torch.from_numpy(other_mean)).numpy()
+    rows = zip(gains, low, high, other_mean - first_mean, p_values, holm(p_values), strict=True)
     names = ("percent", "low_percent", "high_percent", "difference", "p_value", "p_adjusted")
     return {
         measure.key: Gain(**dict(zip(names, map(float, row), strict=True)))

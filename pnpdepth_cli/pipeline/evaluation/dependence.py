@@ -44,14 +44,16 @@ class Clusters:
         return f"{self.count:,} {self.unit}"
 
 
-def group_of(name: str) -> str:
-    """Returns the sequence that a frame's name says: all before its frame number.
+def groups_by_name(names: Sequence[str]) -> list[str]:
+    """Returns the sequence of each frame: its name before the frame number, or else its folder.
 
-    `drive_0002_sync_0000000008_image_02` is of `drive_0002_sync`, `office/0012` of `office`; a name
-    that is only a number, or has none, belongs to its folder.
+    `drive_0002_sync_0000000008_image_02` is of `drive_0002_sync`, and `office/0012` of `office`.
+    Unless all names end in a number, only folders make groups.
     """
-    stem = _FRAME_NUMBER.sub("", name)
-    return stem if stem != name else name.rpartition("/")[0]
+    stems = [_FRAME_NUMBER.sub("", name) for name in names]
+    if all(stem != name for stem, name in zip(stems, names, strict=True)):
+        return stems
+    return [name.rpartition("/")[0] for name in names]
 
 
 def find_clusters(groups: Sequence[str], series: Floats) -> Clusters:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ from pnpdepth_cli.io.file_bytes import one_line
 from pnpdepth_cli.io.layouts import Frame, Source, find_layout, list_frames
 from pnpdepth_cli.io.layouts.frame import DEPTHS, PICTURES
 from pnpdepth_cli.io.record import read_json
-from pnpdepth_cli.pipeline.evaluation.dependence import group_of
+from pnpdepth_cli.pipeline.evaluation.dependence import groups_by_name
 
 _POINTS = (*DEPTHS, ".csv", ".txt")
 _DEPTH_MARKS = ("_depth", ".depth")
@@ -196,9 +196,15 @@ def _pairs(
         )
     points = _by_frame(sparse, _POINTS, names)
     masks = _by_frame(mask, (*DEPTHS, *PICTURES), names)
+    groups = groups_by_name([frame.name for frame in frames])
     return Pairs(
         frames=tuple(
-            _pair(f, predictions.get(f.name), points.get(f.name), masks.get(f.name)) for f in frames
+            replace(
+                _pair(frame, predictions.get(frame.name), points.get(frame.name)),
+                group=group if frame.group is None else frame.group,
+                mask=masks.get(frame.name),
+            )
+            for frame, group in zip(frames, groups, strict=True)
         ),
         notes=tuple(notes),
         single=single,
@@ -212,20 +218,16 @@ def _by_frame(path: Path | None, suffixes: Sequence[str], names: Iterable[str]) 
     return _files(path, suffixes)[0] if path.is_dir() else dict.fromkeys(names, path)
 
 
-def _pair(
-    frame: Frame, prediction: Path | None, sparse: Path | None, mask: Path | None
-) -> FramePair:
+def _pair(frame: Frame, prediction: Path | None, sparse: Path | None) -> FramePair:
     record = _record_of(prediction)
     return FramePair(
         name=frame.name,
         prediction=prediction,
         frame=frame,
-        group=group_of(frame.name) if frame.group is None else frame.group,
         sparse=sparse or _input(record, "sparse") or _depth_file(frame.sparse),
         sparse_named=sparse is not None,
         sampled=_sampled(record),
         image=_input(record, "image") or frame.image,
-        mask=mask,
     )
 
 

@@ -11,7 +11,7 @@ from typing import Any
 from pnpdepth_cli.core.metrics import MEASURES, Measure
 from pnpdepth_cli.errors import FileFormatError, UsageError
 from pnpdepth_cli.io.record import read_json
-from pnpdepth_cli.pipeline.evaluation.dependence import group_of
+from pnpdepth_cli.pipeline.evaluation.dependence import groups_by_name
 from pnpdepth_cli.pipeline.evaluation.protocols import PROTOCOLS
 
 _STAGES = ("before", "after")
@@ -98,6 +98,8 @@ def read_run(text: str) -> Run:
 
 
 def _eval_run(text: str, label: str, record: Mapping[str, Any]) -> Run:
+    scored = [frame for frame in record["frames"] if frame["error"] is None]
+    groups = groups_by_name([frame["name"] for frame in scored])
     return Run(
         label=label,
         path=text,
@@ -107,12 +109,11 @@ def _eval_run(text: str, label: str, record: Mapping[str, Any]) -> Run:
             frame["name"]: RunFrame(
                 values=_numbers(frame["values"]),
                 pixels=frame["pixels"],
-                group=frame.get("group", group_of(frame["name"])),
+                group=frame.get("group", group),
                 known=frame["known"],
                 sums=tuple(frame.get("sums", ())),
             )
-            for frame in record["frames"]
-            if frame["error"] is None
+            for frame, group in zip(scored, groups, strict=True)
         },
     )
 
@@ -120,17 +121,19 @@ def _eval_run(text: str, label: str, record: Mapping[str, Any]) -> Run:
 def _refinement_frames(path: Path, record: Mapping[str, Any], stage: str) -> dict[str, RunFrame]:
     """The frames of a batch's summary, or the one frame of a record."""
     if isinstance(record.get("frames"), list):
-        entries = {entry["name"]: entry.get("scores") for entry in record["frames"]}
+        scores = {entry["name"]: entry.get("scores") for entry in record["frames"]}
     else:
-        entries = {path.stem: record.get("scores")}
-    frames = {}
-    for name, scores in entries.items():
-        if scores is not None:
-            values = _numbers(scores[stage])
-            pixels, coverage = round(values["pixels"]), values["coverage"]
-            known = round(pixels / coverage) if coverage else None
-            frames[name] = RunFrame(values=values, pixels=pixels, group=group_of(name), known=known)
-    return frames
+        scores = {path.stem: record.get("scores")}
+    values = {name: _numbers(each[stage]) for name, each in scores.items() if each is not None}
+    return {
+        name: RunFrame(
+            values=each,
+            pixels=round(each["pixels"]),
+            group=group,
+            known=round(each["pixels"] / each["coverage"]) if each["coverage"] else None,
+        )
+        for (name, each), group in zip(values.items(), groups_by_name(list(values)), strict=True)
+    }
 
 
 def _numbers(values: Mapping[str, Any]) -> dict[str, float]:

@@ -325,7 +325,7 @@ def _gain_text(measure: Measure, before: float | None, after: float | None) -> s
 
 
 def _signed(value: float, decimals: int, unit: str) -> str:
-    """The value with its sign, and with none where nothing but noughts is format_value."""
+    """The value with its sign, and with none where nothing but zeros is shown."""
     text = f"{abs(value):.{decimals}f}"
     sign = "" if float(text) == 0 else "+" if value > 0 else "−"
     return f"{sign}{text}{unit}"

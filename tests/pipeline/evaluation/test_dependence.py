@@ -6,7 +6,11 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from pnpdepth_cli.pipeline.evaluation.dependence import block_length, find_clusters, group_of
+from pnpdepth_cli.pipeline.evaluation.dependence import (
+    block_length,
+    find_clusters,
+    groups_by_name,
+)
 
 NAMES = [
     ("2011_09_26_drive_0002_sync_0000000008_image_02", "2011_09_26_drive_0002_sync"),
@@ -23,7 +27,11 @@ NAMES = [
 
 @pytest.mark.parametrize(("name", "group"), NAMES)
 def test_the_group_of_a_frame_is_its_name_before_the_frame_number(name: str, group: str) -> None:
-    assert group_of(name) == group
+    assert groups_by_name([name, name]) == [group, group]
+
+
+def test_names_of_which_some_have_no_number_are_grouped_by_folder() -> None:
+    assert groups_by_name(["a", "b_1", "office/c_2"]) == ["", "", "office"]
 
 
 def autoregression(correlation: float, frames: int, seed: int) -> np.ndarray:
