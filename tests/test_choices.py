@@ -5,9 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+import torch
 
+from pnpdepth_cli import choices
 from pnpdepth_cli.choices import Table
+from pnpdepth_cli.core.step_sizes import SCHEDULES
 from pnpdepth_cli.errors import UsageError
+from pnpdepth_cli.models.precision import dtype_of
+from pnpdepth_cli.pipeline.refinement.settle import NORMALISATIONS
 
 
 @pytest.fixture
@@ -49,3 +54,22 @@ def test_an_entry_of_another_package_is_loaded_from_its_entry_point(table: Table
 def test_an_unknown_name_is_an_error_that_names_the_nearest(table: Table) -> None:
     with pytest.raises(UsageError, match=r"unknown entry 'pfmm'; did you mean 'pfm'\?"):
         table["pfmm"]
+
+
+def test_losses_and_update_rules_are_the_files_of_their_folders() -> None:
+    assert list(choices.LOSSES) == ["l1", "l2", "huber", "berhu", "inverse", "log", "cauchy"]
+    assert list(choices.UPDATES) == ["sign", "sgd", "normalised", "momentum", "adam", "lbfgs"]
+    assert all(callable(entry) for entry in (*choices.LOSSES.values(), *choices.UPDATES.values()))
+
+
+def test_every_name_of_a_closed_list_is_implemented() -> None:
+    assert tuple(SCHEDULES) == choices.SCHEDULES
+    assert tuple(NORMALISATIONS) == choices.NORMALISATIONS
+    for precision in choices.PRECISIONS:
+        dtype_of(precision, torch.device("cuda"))
+
+
+def test_a_table_of_modules_leaves_out_subpackages() -> None:
+    table = Table("", None, group="test_none", noun="package")
+    assert table["points"].__name__ == "pnpdepth_cli.points"
+    assert "core" not in table

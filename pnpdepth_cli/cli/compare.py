@@ -19,17 +19,19 @@ from pnpdepth_cli.cli import options
     default=10_000,
     show_default=True,
     metavar="N",
-    help="Resamples behind the intervals, and swaps behind the p-values.",
+    help="Number of bootstrap resamples and of random permutations.",
 )
-@click.option("--seed", type=options.SEED, default=0, show_default=True, help="Of both.")
 @click.option(
-    "--no-groups",
-    is_flag=True,
-    help="Treat all frames as independent, also those of one sequence or group.",
+    "--seed", type=options.SEED, default=0, show_default=True, metavar="N", help="Of --bootstrap."
 )
-@click.option("--csv", type=options.FILE, metavar="FILE|-", help="The table as CSV.")
-@click.option("--markdown", type=options.FILE, metavar="FILE|-", help="The table as Markdown.")
-@click.option("--latex", type=options.FILE, metavar="FILE|-", help="The table as a tabular.")
+@click.option(
+    "--no-groups", is_flag=True, help="Treat all frames as independent, also those of a sequence."
+)
+@click.option("--csv", type=options.FILE, metavar="FILE|-", help="Write the table as CSV.")
+@click.option(
+    "--markdown", type=options.FILE, metavar="FILE|-", help="Write the table as Markdown."
+)
+@click.option("--latex", type=options.FILE, metavar="FILE|-", help="Write it as a tabular.")
 @options.overwrite
 @options.as_json
 def compare(
@@ -49,13 +51,12 @@ def compare(
     pnpdepth compare runs/a.json runs/b.json
     pnpdepth compare out/summary.json:before out/summary.json
 
-    A RUN is what `pnpdepth eval --json` printed, or a batch's summary or a refinement's record
-    with ground truth, of which the result is meant, or with :before what it started from. Gains
-    are in per cent of the first run, and positive where the other is better. p is the probability
-    of so large a difference if the runs are equally good: the two are swapped in whole sequences
-    or groups of frames, in all ways where there are few, else in N random ones; in a single
-    sequence, in blocks as long as its errors are correlated. p is adjusted for the number of
-    measures.
+    A RUN is the output of `pnpdepth eval --json`, the summary.json of a batch, or the record of a
+    refinement with ground truth; FILE:before takes the depth before refinement. Gains are in per
+    cent of the first run and positive if the other run is better. p is the p-value of a paired
+    permutation test over groups of frames (manifest column group, sequence or folder), in a single
+    sequence over blocks as long as its errors are correlated, adjusted for the number of measures
+    (Holm); it is exact for few groups, else with N random permutations.
     """
     from pnpdepth_cli.cli import score_tables
     from pnpdepth_cli.pipeline.evaluation import score_files

@@ -55,10 +55,6 @@ def _gaussian(cells: int, sigma: float, like: Tensor) -> Tensor:
     return weights / weights.sum(dim=1, keepdim=True)
 
 
-PARAMETERS = ("elements", "channels")
-"""What is updated: every element of z, or a scale and a shift of each of its channels."""
-
-
 class Channels:
     """A scale and a shift of every channel of z_0, two numbers that a few points can tell.
 

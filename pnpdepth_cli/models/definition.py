@@ -17,21 +17,15 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
+from pnpdepth_cli import choices
+from pnpdepth_cli.choices import Align, Fit, OutputKind, OutputScale, Schedule
+from pnpdepth_cli.choices import InputKind as InputKind  # for definition files
 from pnpdepth_cli.models import validity
 
 if TYPE_CHECKING:
     from torch import Tensor, nn
-
-InputKind = Literal["rgb", "sparse", "rgb+sparse"]
-OutputKind = Literal["depth", "inverse", "log", "unknown"]
-OutputScale = Literal["metric", "scale", "affine", "unknown"]
-Fit = Literal["stretch", "crop"]
-Loss = Literal["l1", "l2", "huber", "berhu", "inverse", "log", "cauchy"]
-Update = Literal["sign", "sgd", "normalised", "momentum", "adam", "lbfgs"]
-Schedule = Literal["constant", "linear"]
-Align = Literal["none", "median", "scale", "affine", "auto"]
 
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
@@ -52,7 +46,7 @@ class Fixed:
     def __post_init__(self) -> None:
         validity.whole(self, "height", least=1)
         validity.whole(self, "width", least=1)
-        validity.one_of(self, "fit", Fit)
+        validity.one_of(self, "fit", choices.FITS)
 
 
 @dataclass(frozen=True)
@@ -115,8 +109,8 @@ class RefineDefaults:
     layer: str | None = None
     iterations: int = 5
     lr: float | str = 0.01
-    loss: Loss = "l1"
-    update: Update = "sign"
+    loss: str = "l1"
+    update: str = "sign"
     schedule: Schedule = "constant"
     spread: float = 0.0
     align: Align | None = None
@@ -126,12 +120,12 @@ class RefineDefaults:
             validity.instance(self, "layer", str, "the name of a layer")
         validity.whole(self, "iterations", least=0)
         validity.step(self, "lr")
-        validity.one_of(self, "loss", Loss)
-        validity.one_of(self, "update", Update)
-        validity.one_of(self, "schedule", Schedule)
+        validity.one_of(self, "loss", choices.LOSSES)
+        validity.one_of(self, "update", choices.UPDATES)
+        validity.one_of(self, "schedule", choices.SCHEDULES)
         validity.at_least_zero(self, "spread")
         if self.align is not None:
-            validity.one_of(self, "align", Align)
+            validity.one_of(self, "align", choices.ALIGNMENTS)
 
 
 FOREIGN = RefineDefaults(
@@ -207,14 +201,14 @@ class ModelDefinition:
 
     def __post_init__(self) -> None:
         validity.instance(self, "name", str, "a text")
-        validity.one_of(self, "input_kind", InputKind)
+        validity.one_of(self, "input_kind", choices.INPUT_KINDS)
         size = "Fixed(height, width), Multiple(of) or Near(of=…)"
         validity.instance(self, "size", (Fixed, Multiple, Near), size)
         validity.function(self, "build")
         if self.normalisation is not None:
             validity.instance(self, "normalisation", Normalisation, "Normalisation(mean=…, std=…)")
-        validity.one_of(self, "output_kind", OutputKind)
-        validity.one_of(self, "output_scale", OutputScale)
+        validity.one_of(self, "output_kind", choices.OUTPUT_KINDS)
+        validity.one_of(self, "output_scale", choices.OUTPUT_SCALES)
         validity.names(self, "layers")
         validity.instance(self, "defaults", RefineDefaults, "RefineDefaults(…)")
         if self.checkpoint is not None:

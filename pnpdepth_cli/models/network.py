@@ -16,10 +16,11 @@ from pnpdepth_cli.core.split.structure import tensors_in
 from pnpdepth_cli.core.split.user_code import blaming, is_out_of_memory
 from pnpdepth_cli.errors import CheckpointError, DeviceError, ModelError, UsageError
 from pnpdepth_cli.models.definition import Fixed, ModelDefinition, Normalisation
+from pnpdepth_cli.models.formats.python_file import importing_beside
 from pnpdepth_cli.models.frame import FrameMap
 from pnpdepth_cli.models.made_up import made_up_arguments
 from pnpdepth_cli.models.precision import dtype_of, lower
-from pnpdepth_cli.models.registry import find_definition, importing_beside
+from pnpdepth_cli.models.registry import find_definition
 from pnpdepth_cli.models.suggest_layers import outline
 from pnpdepth_cli.models.weights.checkpoint import load_checkpoint
 from pnpdepth_cli.points import SparsePoints

@@ -1,4 +1,4 @@
-"""The choices of `pnpdepth refine` are those of the method, though it does not import it."""
+"""The settings of a refinement follow from the request and the network's defaults."""
 
 from __future__ import annotations
 
@@ -7,11 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from pnpdepth_cli.cli import options
-from pnpdepth_cli.core.losses import LOSSES
 from pnpdepth_cli.core.refine import RefineSettings
-from pnpdepth_cli.core.step_sizes import PARAMETERS, SCHEDULES
-from pnpdepth_cli.core.update_rules import UPDATES
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.models.definition import FOREIGN, ModelDefinition, Multiple
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest, effective_settings
@@ -21,13 +17,6 @@ REQUEST = RefineRequest(image=None, sparse=Path("points.npy"))
 STRANGER = ModelDefinition(
     name="stranger", input_kind="rgb", size=Multiple(8), build=UNet, defaults=FOREIGN
 )
-
-
-def test_the_choices_are_those_of_the_method() -> None:
-    assert tuple(LOSSES) == options.LOSSES
-    assert tuple(UPDATES) == options.UPDATES
-    assert tuple(SCHEDULES) == options.SCHEDULES
-    assert PARAMETERS == options.PARAMETERS
 
 
 def test_without_a_word_the_settings_are_the_networks() -> None:

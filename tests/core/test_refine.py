@@ -12,10 +12,9 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from pnpdepth_cli.core.losses import LOSSES
+from pnpdepth_cli.choices import LOSSES, UPDATES
 from pnpdepth_cli.core.refine import Refinement, RefineSettings, refine, refine_batch
 from pnpdepth_cli.core.split import Split
-from pnpdepth_cli.core.update_rules import UPDATES
 from pnpdepth_cli.errors import (
     BatchError,
     DivergedError,

@@ -7,29 +7,22 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from torch import nn
 
-from pnpdepth_cli.completion.alignment import ALIGNMENTS
-from pnpdepth_cli.core.losses import LOSSES
-from pnpdepth_cli.core.step_sizes import SCHEDULES, step_size
-from pnpdepth_cli.core.update_rules import UPDATES
+from pnpdepth_cli.core.step_sizes import step_size
 from pnpdepth_cli.errors import ModelError, UsageError
 from pnpdepth_cli.models.definition import (
-    Align,
     Fixed,
-    Loss,
     ModelDefinition,
     Multiple,
     Near,
     Normalisation,
     RefineDefaults,
-    Schedule,
-    Update,
 )
 
 
@@ -143,13 +136,6 @@ def test_a_definition_takes_those_steps_that_refinement_takes(lr: Any) -> None:
         refused(RefineDefaults, lr=lr)
     else:
         assert RefineDefaults(lr=lr).lr == lr
-
-
-def test_the_valid_defaults_are_those_of_the_method() -> None:
-    assert get_args(Loss) == tuple(LOSSES)
-    assert get_args(Update) == tuple(UPDATES)
-    assert get_args(Schedule) == tuple(SCHEDULES)
-    assert get_args(Align) == ALIGNMENTS
 
 
 @pytest.mark.parametrize(

@@ -15,9 +15,9 @@ import torch.nn.functional as F
 from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode
 
-from pnpdepth_cli.completion.alignment import SPACES, align
+from pnpdepth_cli.choices import LOSSES, SPACES
+from pnpdepth_cli.completion.alignment import align
 from pnpdepth_cli.completion.propagation import propagate
-from pnpdepth_cli.core.losses import LOSSES
 from pnpdepth_cli.core.refine import RefineSettings, refine
 from pnpdepth_cli.core.split import Split, gradient_at
 from pnpdepth_cli.errors import NoPointsError, PnpDepthError, UsageError

@@ -6,7 +6,8 @@ from dataclasses import replace
 
 import torch
 
-from pnpdepth_cli.completion.alignment import SPACES, align
+from pnpdepth_cli.choices import SPACES
+from pnpdepth_cli.completion.alignment import align
 from pnpdepth_cli.errors import ModelError, NoPointsError, UsageError
 from pnpdepth_cli.models.definition import IMAGENET_MEAN, IMAGENET_STD, Normalisation
 from pnpdepth_cli.models.frame import FrameMap
@@ -33,8 +34,7 @@ def settled(network: Network, inputs: Inputs, request: RefineRequest) -> Network
     if request.output_kind is not None:
         if request.output_kind not in SPACES:
             raise UsageError(f"output kind {request.output_kind!r} is not one of {SPACES}")
-        # The enum of the definition, checked the line before.
-        definition = replace(definition, output_kind=request.output_kind)  # type: ignore[arg-type]
+        definition = replace(definition, output_kind=request.output_kind)
     notes = list(network.notes)
     if request.normalise is not None:
         if request.normalise not in NORMALISATIONS:

@@ -10,12 +10,10 @@ from typing import Any
 
 import torch
 
-from pnpdepth_cli.completion.alignment import ALIGNMENTS
+from pnpdepth_cli.choices import ALIGNMENTS, LOSSES, SCHEDULES, UPDATES
+from pnpdepth_cli.choices import PARAMETERS as PARAMETERS_OF_Z
 from pnpdepth_cli.completion.propagation import PROPAGATIONS
-from pnpdepth_cli.core.losses import LOSSES
-from pnpdepth_cli.core.step_sizes import PARAMETERS as PARAMETERS_OF_Z
-from pnpdepth_cli.core.step_sizes import SCHEDULES, step_size
-from pnpdepth_cli.core.update_rules import UPDATES
+from pnpdepth_cli.core.step_sizes import step_size
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.pipeline.refinement.request import count_or_share
 from pnpdepth_cli.pipeline.sweep.points import known_sensor
@@ -194,7 +192,7 @@ PARAMETERS: Mapping[str, Parameter] = {
     ),
     "loss": Parameter(title="loss", value=_one_of(tuple(LOSSES))),
     "update": Parameter(title="update rule", value=_one_of(tuple(UPDATES))),
-    "schedule": Parameter(title="schedule of the step", value=_one_of(tuple(SCHEDULES))),
+    "schedule": Parameter(title="schedule of the step", value=_one_of(SCHEDULES)),
     "spread": Parameter(title="blur of the gradient (spacings of the points)", value=_ANY),
     "parameters": Parameter(title="what is updated", value=_one_of(PARAMETERS_OF_Z)),
     "anchor": Parameter(title="weight of staying near the network", value=_ANY),

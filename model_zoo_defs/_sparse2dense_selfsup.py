@@ -15,7 +15,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from model_zoo_defs import resnet
+from model_zoo_defs._resnet import stages
 from pnpdepth_cli.models.definition import (
     ModelDefinition,
     Multiple,
@@ -47,7 +47,7 @@ class SelfSupervisedSparseToDense(nn.Module):
     def __init__(self, depth: int = 34) -> None:
         super().__init__()
         self.conv1_d, self.conv1_img = down(1, 16), down(3, 48)
-        (self.conv2, self.conv3, self.conv4, self.conv5), channels = resnet.stages(depth)
+        (self.conv2, self.conv3, self.conv4, self.conv5), channels = stages(depth)
         self.conv6 = down(channels, 512, 2)
         self.convt5, self.convt4 = up(512, 256), up(768, 128)
         self.convt3, self.convt2 = up(384, 64), up(192, 64)
