@@ -14,6 +14,7 @@ sense raises ModelError as soon as the object is made.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -101,7 +102,7 @@ class RefineDefaults:
     """How the network is refined when nobody says otherwise.
 
     `lr` is a number (absolute, as in the paper) or a text like "3%" (of the standard deviation of
-    z_0). `schedule` and `spread` are those of `pnpdepth_cli.core.refine.RefineSettings`. `layer`
+    z_0). `schedule` and `blur` are those of `pnpdepth_cli.core.refine.RefineSettings`. `layer`
     None is the definition's first layer. `align` None is "none" for a metric network and "auto" for
     any other. The values here are the paper's.
     """
@@ -112,10 +113,16 @@ class RefineDefaults:
     loss: str = "l1"
     update: str = "sign"
     schedule: Schedule = "constant"
-    spread: float = 0.0
+    blur: float = 0.0
     align: Align | None = None
+    spread: float | None = None
+    """Deprecated name of `blur`."""
 
     def __post_init__(self) -> None:
+        if self.spread is not None:
+            warnings.warn("RefineDefaults.spread is now blur", DeprecationWarning, stacklevel=3)
+            object.__setattr__(self, "blur", self.spread)
+            object.__setattr__(self, "spread", None)
         if self.layer is not None:
             validity.instance(self, "layer", str, "the name of a layer")
         validity.whole(self, "iterations", least=0)
@@ -123,13 +130,13 @@ class RefineDefaults:
         validity.one_of(self, "loss", choices.LOSSES)
         validity.one_of(self, "update", choices.UPDATES)
         validity.one_of(self, "schedule", choices.SCHEDULES)
-        validity.at_least_zero(self, "spread")
+        validity.at_least_zero(self, "blur")
         if self.align is not None:
             validity.one_of(self, "align", choices.ALIGNMENTS)
 
 
 FOREIGN = RefineDefaults(
-    iterations=20, lr="25%", loss="cauchy", update="normalised", schedule="linear", spread=1.0
+    iterations=20, lr="25%", loss="cauchy", update="normalised", schedule="linear", blur=1.0
 )
 """For networks that nobody here has tuned: steps that follow the feature map's own scale.
 
@@ -162,8 +169,9 @@ class ModelDefinition:
     defaults: the settings of refinement.
     build: makes the network (weights not loaded); called without arguments.
     checkpoint: the weights that come with the definition, or None where the user brings them.
-    same_path: the submodules that it runs, and their order, are the same for all pictures of one
-        size, whatever it does with values in Python; so they need to be learnt only once.
+    static_graph: the network runs the same submodules in the same order for all images of one size,
+        even where values of tensors reach Python code. Then the cut is learned only once.
+    same_path: deprecated name of static_graph.
     complete: `build` gives the network with its weights, `checkpoint` is only where they lie.
     read_checkpoint: renames or reshapes the tensors of a published checkpoint into the state
         dict of the network.
@@ -192,6 +200,7 @@ class ModelDefinition:
     defaults: RefineDefaults = RefineDefaults()
     checkpoint: Path | None = None
     complete: bool = False
+    static_graph: bool = False
     same_path: bool = False
     read_checkpoint: Callable[[Mapping[str, Tensor]], Mapping[str, Tensor]] | None = None
     arguments: Callable[[Tensor | None, Tensor | None], tuple[Tensor, ...]] | None = None
@@ -200,6 +209,12 @@ class ModelDefinition:
     assumed: str = ""
 
     def __post_init__(self) -> None:
+        if self.same_path:
+            warnings.warn(
+                "ModelDefinition.same_path is now static_graph", DeprecationWarning, stacklevel=3
+            )
+            object.__setattr__(self, "static_graph", True)
+            object.__setattr__(self, "same_path", False)
         validity.instance(self, "name", str, "a text")
         validity.one_of(self, "input_kind", choices.INPUT_KINDS)
         size = "Fixed(height, width), Multiple(of) or Near(of=…)"

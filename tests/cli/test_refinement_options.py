@@ -21,7 +21,7 @@ STRANGER = ModelDefinition(
 
 def test_without_a_word_the_settings_are_the_networks() -> None:
     settings = effective_settings(STRANGER, REQUEST)
-    for name in ("iterations", "lr", "loss", "update", "schedule", "spread"):
+    for name in ("iterations", "lr", "loss", "update", "schedule", "blur"):
         assert getattr(settings, name) == getattr(FOREIGN, name)
     plain = ModelDefinition(name="plain", input_kind="rgb", size=Multiple(8), build=UNet)
     assert effective_settings(plain, REQUEST) == RefineSettings()
@@ -30,9 +30,9 @@ def test_without_a_word_the_settings_are_the_networks() -> None:
 def test_another_update_starts_from_the_papers_step() -> None:
     settings = effective_settings(STRANGER, replace(REQUEST, update="sign"))
     paper = RefineSettings()
-    assert (settings.lr, settings.schedule, settings.spread) == (0.01, "constant", 0)
-    assert (settings.lr, settings.schedule, settings.spread) == (
-        paper.lr, paper.schedule, paper.spread,
+    assert (settings.lr, settings.schedule, settings.blur) == (0.01, "constant", 0)
+    assert (settings.lr, settings.schedule, settings.blur) == (
+        paper.lr, paper.schedule, paper.blur,
     )  # fmt: skip
     assert (settings.iterations, settings.loss) == (FOREIGN.iterations, FOREIGN.loss)
 
@@ -44,11 +44,12 @@ def test_what_the_user_says_holds() -> None:
     )  # fmt: skip
     settings = effective_settings(STRANGER, asked)
     for name in (
-        *("update", "lr", "schedule", "spread", "keep_best", "iterations"),
-        *("parameters", "anchor", "line_search"),
+        *("update", "lr", "schedule", "keep_best", "iterations"),
+        *("parameters", "line_search"),
     ):
         assert getattr(settings, name) == getattr(asked, name)
-    assert effective_settings(STRANGER, replace(REQUEST, spread=0)).spread == 0
+    assert (settings.blur, settings.proximity) == (asked.spread, asked.anchor)
+    assert effective_settings(STRANGER, replace(REQUEST, spread=0)).blur == 0
 
 
 @pytest.mark.parametrize("spread", [-0.1, float("nan"), float("inf")])

@@ -117,7 +117,7 @@ def test_a_deviation_is_above_zero_and_a_mean_need_not_be() -> None:
     [
         *(("iterations", value) for value in ("5", -1, 2.0, None)),
         *(("lr", value) for value in ("x%", "", 0, -1, NAN, INF, "inf", None)),
-        *(("spread", value) for value in (-1, NAN, INF, "1", None)),
+        *(("blur", value) for value in (-1, NAN, INF, "1", None)),
         *((field, "foo") for field in ("loss", "update", "schedule", "align")),
         *((field, None) for field in ("loss", "update", "schedule")),
         ("align", ["auto"]),
@@ -172,3 +172,10 @@ def test_numbers_of_numpy_and_lists_are_as_good() -> None:
     assert RefineDefaults(lr=np.float32(0.5), iterations=np.int32(3)).iterations == 3  # type: ignore[arg-type]
     Normalisation(mean=[0.5, 0.5, 0.5], std=np.ones(3))  # type: ignore[arg-type]
     assert definition(layers=["a"], checkpoint=Path("x.pt"), normalisation=None).layers == ["a"]
+
+
+def test_former_names_of_fields_are_accepted_for_one_version() -> None:
+    with pytest.warns(DeprecationWarning, match="static_graph"):
+        assert definition(same_path=True) == definition(static_graph=True)
+    with pytest.warns(DeprecationWarning, match="blur"):
+        assert RefineDefaults(spread=0.5) == RefineDefaults(blur=0.5)

@@ -160,7 +160,7 @@ class FrameGroups:
     def _may_go_together(self, size: tuple[int, int], alone: Sequence[_Alone]) -> bool:
         tasks, what = [self._refiner.task(each.inputs) for each in alone], _name(size)
         plain = self._pass(tasks, replace(self._refiner.settings, iterations=0))
-        if not self._split.repeats:
+        if not self._split.static_graph:
             self._say(
                 f"batch size: 1 for {what}; the network goes by values of its pictures, which for"
                 " several at once need not be those of each"

@@ -124,7 +124,7 @@ def effective_settings(definition: ModelDefinition, request: RefineRequest) -> R
     update = request.update or defaults.update
     # How far to go depends on how: with another update the rest of a step is the paper's as well.
     steps = defaults if update == defaults.update else RefineDefaults()
-    spread = steps.spread if request.spread is None else request.spread
+    spread = steps.blur if request.spread is None else request.spread
     if not 0 <= spread < math.inf:
         raise UsageError(f"spread {spread} is no distance; give 0 or more spacings of the points")
     if not 0 <= request.anchor < math.inf:
@@ -135,9 +135,9 @@ def effective_settings(definition: ModelDefinition, request: RefineRequest) -> R
         loss=request.loss or defaults.loss,
         update=update,
         schedule=request.schedule or steps.schedule,
-        spread=spread,
+        blur=spread,
         parameters=request.parameters,
-        anchor=request.anchor,
+        proximity=request.anchor,
         line_search=request.line_search,
         keep_best=request.keep_best,
         align=request.align or definition.default_alignment,
