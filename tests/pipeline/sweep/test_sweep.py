@@ -161,7 +161,7 @@ def test_a_grid_holds_the_scores_of_batch_and_of_linear_interpolation(root: Path
     assert float(line["rmse_plain"]) == wanted["before"]["rmse"]
     assert float(line["delta1_linear"]) == interpolated.delta1
     assert line["status"] == "done"
-    assert int(line["points"]) == 60
+    assert int(line["points_used"]) == 60
     cells = record["studies"][0]["cells"]
     assert [cell["parameters"] for cell in cells] == [
         {"iterations": k, "lr": lr} for k in ("0", "2") for lr in ("1%", "10%")
