@@ -165,6 +165,9 @@ FORMATS = Table(
 )
 """Depth file formats: `pnpdepth_cli.io.formats.DepthFormat`."""
 
+PROPAGATIONS = ("none", "gp", "diffusion")
+"""How the residual at the points is propagated."""
+
 LAYOUTS = Table(
     "io/layouts",
     "LAYOUT",

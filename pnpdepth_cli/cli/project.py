@@ -17,7 +17,6 @@ from pnpdepth_cli.cli import options
 @click.option("--image", type=options.FILE, help="Camera image: gives the size, and is drawn on.")
 @click.option("--size", metavar="HxW", help="Size of the image, instead of --image.")
 @options.sparse_output
-@options.max_pixels
 @options.output_scale
 @click.option("--overlay", type=options.FILE, help="Also write a PNG of the points on the image.")
 @options.overwrite
