@@ -77,7 +77,7 @@ def refined_curve(
     points = frame.points_to_network(inputs.points)
     if not len(points):
         raise NoPointsError(f"none of the {len(inputs.points)} points is where the network looks")
-    at = points.to(network.device)
+    at = points.tensors(network.device)
     settings = replace(method.settings, iterations=max(wanted))
     aligned = AlignedDepth(network, at, settings.align, every=settings.align_every)
     seen = _Seen(aligned, None if settings.gives_best else {0, *wanted})
