@@ -75,7 +75,9 @@ def test_core_and_models_read_no_files_through_cv2_and_io_needs_no_torch() -> No
             assert not tops & forbidden, file
 
 
-@pytest.mark.parametrize("command", [[], *([name] for name in COMMANDS)])
+@pytest.mark.parametrize(
+    "command", [[], *([name] for name in COMMANDS), ["models", "check"], ["models", "fetch"]]
+)
 def test_help_imports_neither_torch_nor_numpy_nor_rich(command: list[str]) -> None:
     code = (
         "import sys\n"

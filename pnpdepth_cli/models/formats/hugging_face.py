@@ -128,7 +128,7 @@ def _weights(folder: Path) -> Path:
             return folder / name
     if any((folder / name).is_file() for name in _PICKLED):
         raise CheckpointError(
-            f"{folder} has its weights as a pickle only; convert it: pnpdepth models --convert"
+            f"{folder} has its weights as a pickle only; convert it: pnpdepth models convert"
             f" {folder / _PICKLED[0]} {folder / _WEIGHTS[0]}"
         )
     raise CheckpointError(f"{folder} has no {_WEIGHTS[0]}")

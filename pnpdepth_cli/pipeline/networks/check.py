@@ -1,4 +1,4 @@
-"""`pnpdepth models --check`: can this network be run, trusted, cut and refined?"""
+"""`pnpdepth models check`: can this network be run, trusted, cut and refined?"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`pnpdepth models --convert`: the tensors of a published checkpoint as a safetensors file."""
+"""`pnpdepth models convert`: the tensors of a published checkpoint as a safetensors file."""
 
 from __future__ import annotations
 
