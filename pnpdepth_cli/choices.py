@@ -155,3 +155,12 @@ NETWORKS = Table(
     package="model_zoo_defs",
 )
 """The networks' files in `model_zoo_defs`, and what other packages enter as `pnpdepth.models`."""
+
+FORMATS = Table(
+    "io/formats",
+    "FORMAT",
+    group="formats",
+    noun="depth format",
+    first=("png", "exr", "npy", "npz", "pfm", "tiff"),
+)
+"""Depth file formats: `pnpdepth_cli.io.formats.DepthFormat`."""

@@ -13,10 +13,11 @@ from pnpdepth_cli.cli.main import COMMANDS
 
 ROOT = Path(__file__).parent.parent
 PACKAGE = ROOT / "pnpdepth_cli"
-GROUND_FLOOR = {"errors", "choices", "points"}
+GROUND_FLOOR = {"errors", "choices", "points", "budget"}
 MAY_IMPORT = {
     "errors": set(),
     "choices": set(),
+    "budget": {"errors"},
     "points": {"errors"},
     "core": GROUND_FLOOR,
     "sensors": GROUND_FLOOR,

@@ -17,7 +17,7 @@ from pnpdepth_cli.pipeline.refinement.settle import NORMALISATIONS
 
 @pytest.fixture
 def table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Table:
-    """A table over the modules of `pnpdepth_cli.io`, and two entry points of another package."""
+    """A table over the modules of `io.formats`, and two entry points of another package."""
     info = tmp_path / "other-1.0.dist-info"
     info.mkdir()
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: other\nVersion: 1.0\n")
@@ -26,11 +26,11 @@ def table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Table:
     )
     (tmp_path / "other_package.py").write_text("entry = 'loaded from elsewhere'\n")
     monkeypatch.syspath_prepend(str(tmp_path))
-    return Table("io", "__name__", group="test_table", noun="entry", first=("png",))
+    return Table("io/formats", "__name__", group="test_table", noun="entry", first=("png",))
 
 
 def test_names_come_from_the_folder_and_from_entry_points(table: Table) -> None:
-    assert {"pfm", "png", "depth-reading", "elsewhere"} <= set(table)
+    assert {"pfm", "png", "elsewhere"} <= set(table)
     assert "--init--" not in table
     assert len(table) == len(list(table))
 
@@ -44,7 +44,7 @@ def test_names_given_first_are_listed_first_and_the_others_in_alphabetical_order
 
 
 def test_an_entry_of_this_package_is_loaded_from_its_module(table: Table) -> None:
-    assert table["pfm"] == "pnpdepth_cli.io.pfm"
+    assert table["pfm"] == "pnpdepth_cli.io.formats.pfm"
 
 
 def test_an_entry_of_another_package_is_loaded_from_its_entry_point(table: Table) -> None:

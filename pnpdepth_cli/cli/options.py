@@ -10,6 +10,7 @@ import click
 
 from pnpdepth_cli.choices import (
     ALIGNMENTS,
+    FORMATS,
     LOSSES,
     NORMALISATIONS,
     PARAMETERS,
@@ -165,7 +166,6 @@ def scan_given(given: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
 
 
 PROPAGATIONS = ("none", "gp", "diffusion")
-FORMATS = ("png", "exr", "npy", "npz", "pfm", "tiff")
 
 
 def _seconds(context: click.Context, parameter: click.Parameter, text: str | None) -> float | None:
@@ -185,7 +185,7 @@ def _seconds(context: click.Context, parameter: click.Parameter, text: str | Non
 _REFINEMENT_OPTIONS = (
     click.option(
         "--format",
-        type=click.Choice(FORMATS),
+        type=click.Choice(list(FORMATS)),
         default="png",
         show_default=True,
         help="Format of the depth file in an output folder.",

@@ -7,10 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pnpdepth_cli.errors import InputError
+from pnpdepth_cli.io.formats import DEPTH_SUFFIXES
 from pnpdepth_cli.io.layouts.protocols import WHOLE, Protocol
 
 PICTURES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".exr")
-DEPTHS = (".png", ".exr", ".npy", ".npz", ".pfm", ".tif", ".tiff")
+DEPTHS = DEPTH_SUFFIXES
 SCANS = (".bin", ".pcd", ".ply")
 
 
