@@ -2,9 +2,9 @@
 
 For each network, set and number of points, MAE and RMSE in metres, means over frames and seeds of
 each frame's error: the network as it is, aligned with the points, refined at the paper's setting,
-every baseline of `pnpdepth_cli.core.baselines`, and `--auto`. The same network, points and pixels
-for all: those with known truth where the network sees. `wins` counts frames where `--auto` is not
-above the aligned network, and not more than 3 per cent above the best baseline of that frame.
+every baseline of `pnpdepth_cli.completion.baselines`, and `--auto`. The same network, points and
+pixels for all: those with known truth where the network sees. `wins` counts frames where `--auto`
+is not above the aligned network, and at most 3 per cent above the best baseline of that frame.
 `--outliers 0.2` puts so many points at wrong depths; the last column is `--auto` given the others
 alone, as if somebody had told which are wrong. `--sigma` adds the share of the truth that lies
 within ± one standard deviation of `--uncertainty`, which should be 68 %. `--render FOLDER` takes
@@ -34,15 +34,16 @@ from benchmarks.frames import (
     refined,
 )
 from model_zoo_defs.training.dataset import Frames
-from pnpdepth_cli.core.baselines import BASELINES
+from pnpdepth_cli.completion.baselines import BASELINES
 from pnpdepth_cli.core.metrics import score
-from pnpdepth_cli.core.points import SparsePoints
 from pnpdepth_cli.core.refine import RefineSettings
 from pnpdepth_cli.models.definition import Normalisation
 from pnpdepth_cli.models.network import Network, load_network
 from pnpdepth_cli.pipeline.refinement.auto import refine_automatically, usual_trials
 from pnpdepth_cli.pipeline.refinement.held_out import uncertainty
-from pnpdepth_cli.pipeline.refinement.request import RefineRequest, effective_settings, layer_name
+from pnpdepth_cli.pipeline.refinement.request import MethodOptions
+from pnpdepth_cli.pipeline.refinement.resolve import resolve_layer, resolve_settings
+from pnpdepth_cli.points import SparsePoints
 
 PAPER = RefineSettings()
 COUNTS: tuple[int | None, ...] = (20, 100, 500)
@@ -122,8 +123,8 @@ def measure(
     points, wrong = with_outliers(points, outliers, seed)
     inputs = frame_inputs(frame.rgb, points, frame.truth)
     definition = network.definition
-    layer = layer_name(definition, None)
-    settings = effective_settings(definition, RefineRequest(image=None, sparse=None))
+    layer = resolve_layer(definition, None)
+    settings = resolve_settings(definition, MethodOptions())
     start = time.perf_counter()
     raw = refined(network, layer, replace(settings, iterations=0), inputs)
     plain_s = time.perf_counter() - start

@@ -10,13 +10,13 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from pnpdepth_cli.core.points import SparsePoints
 from pnpdepth_cli.core.refine import RefineSettings
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.models.network import Network
 from pnpdepth_cli.pipeline.refinement.frame import FrameToRefine, RefinedFrame, refine_frame
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs
+from pnpdepth_cli.points import SparsePoints
 
 Depth = NDArray[np.float32]
 

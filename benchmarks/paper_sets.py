@@ -12,13 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.frames import SETS, Depth, EvalFrame, points_on_grid, sampled
-from pnpdepth_cli.core.points import SparsePoints
 from pnpdepth_cli.errors import NoPointsError, UsageError
+from pnpdepth_cli.io.dataset.protocols import PROTOCOLS, Protocol
 from pnpdepth_cli.io.layouts import Frame, read_frame_image, read_frame_truth, read_frames
-from pnpdepth_cli.io.layouts.protocols import PROTOCOLS, Protocol
 from pnpdepth_cli.pipeline.batch.frames import BatchRequest, task_of
 from pnpdepth_cli.pipeline.refinement.inputs import read_inputs
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest
+from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.sensors import FORWARD_LEFT_UP, LIDARS, Camera, as_picture, simulate_lidar
 
 T = TypeVar("T")
@@ -257,9 +257,7 @@ def _data_frame(root: Path, frame: Frame) -> TableFrame:
         truth = read_frame_truth(frame)
         return TableFrame(rgb=read_frame_image(frame), truth=truth, pool=truth)
     # No output is written; the batch's own reading of scans and scales is wanted.
-    batch = BatchRequest(
-        source=root, output=root / "out", refine=RefineRequest(image=None, sparse=None)
-    )
+    batch = BatchRequest(source=root, output=root / "out", refine=RefineRequest())
     inputs = read_inputs(replace(task_of(batch, frame).request, output=None))
     assert inputs.rgb is not None
     scan = inputs.points.scatter()[0, 0].numpy()

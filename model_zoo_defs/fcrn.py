@@ -25,7 +25,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from model_zoo_defs.same_padding import same_padding
+from model_zoo_defs._same_padding import same_padding
 from pnpdepth_cli.models.definition import (
     IMAGENET_MEAN,
     IMAGENET_STD,

@@ -23,7 +23,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from model_zoo_defs import resnet, sparse2dense_selfsup
+from model_zoo_defs import _sparse2dense_selfsup
+from model_zoo_defs._resnet import WIDTH, stages
 from pnpdepth_cli.models.definition import Fixed, InputKind, ModelDefinition, RefineDefaults
 
 Decoder = Literal["deconv2", "deconv3", "upconv", "upproj"]
@@ -93,13 +94,13 @@ class SparseToDense(nn.Module):
         depth: int = 50,
         decoder: Decoder = "upproj",
         input_kind: InputKind = "rgb+sparse",
-        width: int = resnet.WIDTH,
+        width: int = WIDTH,
     ) -> None:
         super().__init__()
         self.conv1 = nn.Conv2d(CHANNELS[input_kind], width, 7, 2, 3, bias=False)
         self.bn1 = nn.BatchNorm2d(width)
         self.relu, self.maxpool = nn.ReLU(), nn.MaxPool2d(3, 2, 1)
-        (self.layer1, self.layer2, self.layer3, self.layer4), channels = resnet.stages(depth, width)
+        (self.layer1, self.layer2, self.layer3, self.layer4), channels = stages(depth, width)
         channels //= 2
         self.conv2 = nn.Conv2d(2 * channels, channels, 1, bias=False)
         self.bn2 = nn.BatchNorm2d(channels)
@@ -168,7 +169,7 @@ _PUBLISHED = [
 ]
 definitions: dict[str, ModelDefinition] = {
     one.name: one
-    for one in (*_PUBLISHED, sparse2dense_selfsup.definition, *(tiny(place) for place in SIZES))
+    for one in (*_PUBLISHED, _sparse2dense_selfsup.definition, *(tiny(place) for place in SIZES))
 }
 definitions["sparse2dense"] = definitions["sparse2dense-r50-upproj"]
 definitions["sparse2dense-kitti"] = definitions["sparse2dense-r18-upproj-kitti"]

@@ -14,8 +14,8 @@ from torch import Tensor, nn
 from model_zoo_defs.training import priors
 from model_zoo_defs.training.dataset import Frames, normalised
 from model_zoo_defs.training.patterns import keep, outliers, scan_lines, uniform
-from pnpdepth_cli.core.interpolation import linear
-from pnpdepth_cli.core.points import SparsePoints
+from pnpdepth_cli.completion.interpolation import linear
+from pnpdepth_cli.points import SparsePoints
 
 Depth = NDArray[np.float32]
 

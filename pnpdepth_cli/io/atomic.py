@@ -12,7 +12,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from pnpdepth_cli.errors import OutputError, StorageError
-from pnpdepth_cli.io.opening import one_line
+from pnpdepth_cli.io.file_bytes import one_line
 
 _TEMPORARY = re.compile(r"\.[0-9a-f]{12}(\.[A-Za-z0-9]+)?")
 _FULL = {errno.ENOSPC, errno.EDQUOT}

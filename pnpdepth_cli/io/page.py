@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pnpdepth_cli.errors import FileFormatError, InputError
 from pnpdepth_cli.io.atomic import atomic_path
 from pnpdepth_cli.io.colours import DepthScale, Pixels
-from pnpdepth_cli.io.opening import damaged
+from pnpdepth_cli.io.file_bytes import damaged
 
 if TYPE_CHECKING:
     import PIL.Image

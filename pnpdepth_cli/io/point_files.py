@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import FileFormatError
-from pnpdepth_cli.io.opening import damaged, one_line
+from pnpdepth_cli.io.file_bytes import damaged, one_line
 
 Rows = tuple[NDArray[np.float32], str]
 

@@ -7,9 +7,10 @@ from typing import Any
 
 from torch import Tensor
 
-from pnpdepth_cli.core.alignment import SPACES, Alignment, align
-from pnpdepth_cli.core.points import SparsePoints
+from pnpdepth_cli.choices import SPACES
+from pnpdepth_cli.completion.alignment import Alignment, align
 from pnpdepth_cli.models.network import Network
+from pnpdepth_cli.points import SparsePoints
 
 _OFF = 1.5
 """A prediction that is this factor off the points at the median gets a word of warning."""

@@ -8,8 +8,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from pnpdepth_cli.core.points import SparsePoints
 from pnpdepth_cli.models.frame import FrameMap
+from pnpdepth_cli.points import SparsePoints
 
 if TYPE_CHECKING:
     from pnpdepth_cli.models.network import Network

@@ -1,177 +1,144 @@
-"""From a name or a Python file to a model definition."""
+"""From the name of a network, a file or a folder to its model definition.
+
+A network can be named if `choices.NETWORKS` has a family with it: one file of `model_zoo_defs`, or
+an entry point in the group `pnpdepth.models` of another package. A family is a module (or, for an
+entry point, also the object itself) with one of
+
+    definition = ModelDefinition(...)
+    definitions = {"my-net": ModelDefinition(...), "my-net-tiny": ModelDefinition(...)}
+"""
 
 from __future__ import annotations
 
 import difflib
-import importlib
-import importlib.util
-import inspect
-import sys
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Mapping
 from pathlib import Path
 from types import ModuleType
-from typing import Any
 
-from pnpdepth_cli.core.foreign import describe
+from pnpdepth_cli import choices
+from pnpdepth_cli.core.split.user_code import describe
 from pnpdepth_cli.errors import ModelError, PnpDepthError
-from pnpdepth_cli.models.definition import FOREIGN, ModelDefinition, Multiple
+from pnpdepth_cli.models.definition import ModelDefinition
+from pnpdepth_cli.models.formats.python_file import python_definition
 
 DEFAULT_MODEL = "compact"
 
-_ATTRIBUTE = "definition"
-_MULTIPLE = 32  # what the sides of a picture are padded to where nobody says
 _WEIGHTS_ONLY = (
     *(".pt", ".pth", ".ts", ".torchscript", ".ckpt", ".bin", ".safetensors", ".tar"),
     *(".npy", ".npz", ".index"),
 )
 
-# Each is a file of model_zoo_defs with `definitions`, by name: the family itself and its variants.
-_FAMILIES = (
-    "compact",
-    "eigen",
-    "fcrn",
-    "sfmlearner",
-    "sparseconv",
-    "adnn",
-    "sparse2dense",
-    "latefusion",
-    "nconv",
-    "pncnn",
-)
-
 
 def names() -> list[str]:
-    """The networks that can be named: every family with its variants, each by its own name."""
-    every = (_definitions(family).values() for family in _FAMILIES)
-    return list(dict.fromkeys(definition.name for some in every for definition in some))
+    """Returns the names of all networks that can be named, each once, in the order of the families.
+
+    A family of another package that cannot be loaded is left out; `find_definition` says why.
+    """
+    definitions = (one for some in _loadable_families().values() for one in some.values())
+    return list(dict.fromkeys(definition.name for definition in definitions))
 
 
-def _definitions(family: str) -> Mapping[str, ModelDefinition]:
-    definitions: Mapping[str, ModelDefinition]
-    definitions = importlib.import_module(f"model_zoo_defs.{family}").definitions
+def family_of(name: str) -> str:
+    """Returns the family (the file or entry point) that defines the network of this name.
+
+    Raises:
+        ModelError: No family defines it.
+    """
+    for family in _families_by_prefix(name):
+        if name in family_definitions(family):
+            return family
+    for family, definitions in _loadable_families().items():
+        if name in definitions:
+            return family
+    raise ModelError(f"no network is named {name!r}; {_near_names(name)}")
+
+
+def family_definitions(family: str) -> Mapping[str, ModelDefinition]:
+    """Returns the definitions of one family by the names they can be called by.
+
+    Raises:
+        ModelError: Its file or entry point cannot be loaded, or holds no definitions.
+    """
+    try:
+        entry = choices.NETWORKS[family]
+    except PnpDepthError:
+        raise
+    except Exception as error:  # the code of another package
+        raise ModelError(f"network family {family!r} cannot be loaded: {describe(error)}") from None
+    if isinstance(entry, ModuleType):
+        entry = getattr(entry, "definitions", None) or getattr(entry, "definition", None)
+    definitions = {entry.name: entry} if isinstance(entry, ModelDefinition) else entry
+    if not isinstance(definitions, Mapping) or not all(
+        isinstance(definition, ModelDefinition) for definition in definitions.values()
+    ):
+        raise ModelError(
+            f"network family {family!r} gives a {type(entry).__name__}; a module with `definition`"
+            " or `definitions`, a ModelDefinition, or a dict of them by name is expected"
+        )
     return definitions
 
 
 def find_definition(spec: str) -> ModelDefinition:
-    """The definition for `NAME` or `file.py[:attribute]` (attribute `definition` by default).
+    """Returns the definition that `--model` names.
 
-    A name is that of a family, or of a variant of it as in `fcrn-tiny`. The Python file is run, as
-    importing it would. ModelError if there is no such name or file, if the file raises, or if what
-    it defines is not a ModelDefinition.
+    Args:
+        spec: A name such as `fcrn-tiny`, a Python file `FILE.py` or `FILE.py:ATTRIBUTE` (which is
+            run), an ONNX file `FILE.onnx` or `FILE.onnx:OUTPUT`, a torch.export archive `FILE.pt2`,
+            or a Hugging Face folder.
+
+    Raises:
+        ModelError: There is no such name or file, or it does not define a network.
     """
-    family = spec.partition("-")[0]
-    if family in _FAMILIES and spec in _definitions(family):
-        return _definitions(family)[spec]
-    foreign = _foreign(spec)
-    if foreign is not None:
-        return foreign
-    file, attribute = _file_and_attribute(spec)
-    if file.suffix != ".py":
-        near = difflib.get_close_matches(spec, names(), n=1)
-        hint = f"did you mean {near[0]!r}?" if near else f"known: {', '.join(names())}"
-        raise ModelError(f"model {spec!r} is neither a known name nor a Python file; {hint}")
-    module = _run(file)
-    found = getattr(module, attribute, None)
-    if found is None and attribute == _ATTRIBUTE:
-        attribute, found = _only_network(module) or (attribute, None)
-    if found is None:
-        raise ModelError(f"model file {file} defines no {attribute!r}; name it as {file}:ATTRIBUTE")
-    if callable(found) and not isinstance(found, ModelDefinition):
-        return _assumed(found, attribute, file)
-    if not isinstance(found, ModelDefinition):
-        raise ModelError(
-            f"{attribute!r} in model file {file} is a {type(found).__name__}, not a ModelDefinition"
-        )
-    return found
-
-
-@contextmanager
-def importing_beside(spec: str) -> Iterator[None]:
-    """Inside, what lies beside the model file that `spec` names can be imported, as when it runs.
-
-    A function that makes a network may import more when it is called. Nothing is changed where
-    `spec` names no Python file.
-    """
-    file, _ = _file_and_attribute(spec)
-    if file.suffix != ".py":
-        yield
-        return
-    folder = str(file.resolve().parent)
-    sys.path.insert(0, folder)
-    try:
-        yield
-    finally:
-        with suppress(ValueError):  # the file's own code may have taken it out
-            sys.path.remove(folder)
-
-
-def _only_network(module: ModuleType) -> tuple[str, Any] | None:
-    """The one torch module class that the file itself defines; None if there is no one such."""
-    from torch import nn
-
-    own = {
-        name: value
-        for name, value in vars(module).items()
-        if isinstance(value, type)
-        and issubclass(value, nn.Module)
-        and value.__module__ == module.__name__
-    }
-    inner = {name for one in own.values() for name in _mentioned(one)}
-    outer = [(name, value) for name, value in own.items() if name not in inner]
-    return outer[0] if len(outer) == 1 else None
-
-
-def _mentioned(network: type) -> set[str]:
-    """The names that a class's constructor uses; a network's blocks are among them."""
-    code = getattr(network.__init__, "__code__", None)  # type: ignore[misc]
-    return set(code.co_names) if code is not None else set()
-
-
-def _assumed(build: Callable[..., Any], attribute: str, file: Path) -> ModelDefinition:
-    """A definition around a class or function that gives a network, and nothing else is known."""
-    from torch import nn
-
-    if isinstance(build, nn.Module):
-        raise ModelError(
-            f"{attribute!r} in model file {file} is a {type(build).__name__} that is made already;"
-            " name its class, a function that returns it, or a definition"
-        )
-    needed = [
-        name
-        for name, p in inspect.signature(build).parameters.items()
-        if p.default is p.empty and p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)
-    ]
-    if needed:
-        raise ModelError(
-            f"{attribute!r} in model file {file} needs arguments ({', '.join(needed)}); write a"
-            " function without any that returns the network, and name that"
-        )
-    return ModelDefinition(
-        name=f"{file.stem}.{attribute}",
-        summary=f"{attribute} of {file.name}",
-        input_kind="rgb",
-        size=Multiple(_MULTIPLE),
-        normalisation=None,
-        output_kind="unknown",
-        output_scale="unknown",
-        build=build,
-        defaults=FOREIGN,
-        assumed=f"{attribute!r} of {file.name} is no definition; assumed: one rgb picture in, sides"
-        f" padded to multiples of {_MULTIPLE}; what its numbers mean is decided from the points",
+    for family in _families_by_prefix(spec):
+        definitions = family_definitions(family)
+        if spec in definitions:
+            return definitions[spec]
+    from_file = _from_file(spec)
+    if from_file is not None:
+        return from_file
+    for definitions in _loadable_families().values():
+        if spec in definitions:
+            return definitions[spec]
+    raise ModelError(
+        f"model {spec!r} is neither a known name nor a Python file; {_near_names(spec)}"
     )
 
 
-def _foreign(spec: str) -> ModelDefinition | None:
-    """The definition of a network that is no Python file of ours; None if it is none such."""
-    file, colon, output = spec.rpartition(":")
-    if spec.endswith(".onnx") or (colon and file.endswith(".onnx")):
-        from pnpdepth_cli.models.onnx_network import onnx_definition
+def _families_by_prefix(name: str) -> list[str]:
+    """The families whose name the network's name begins with, longest first."""
+    families = [f for f in choices.NETWORKS if name == f or name.startswith(f"{f}-")]
+    return sorted(families, key=len, reverse=True)
 
-        named = not spec.endswith(".onnx")
-        return onnx_definition(Path(file), output) if named else onnx_definition(Path(spec))
+
+def _loadable_families() -> dict[str, Mapping[str, ModelDefinition]]:
+    loadable = {}
+    for family in choices.NETWORKS:
+        try:
+            loadable[family] = family_definitions(family)
+        except ModelError:
+            continue
+    return loadable
+
+
+def _near_names(name: str) -> str:
+    near = difflib.get_close_matches(name, names(), n=1)
+    return f"did you mean {near[0]!r}?" if near else f"known: {', '.join(names())}"
+
+
+def _from_file(spec: str) -> ModelDefinition | None:
+    """The definition of a file or folder; None if `spec` looks like neither."""
+    file, colon, attribute = spec.rpartition(":")
+    if spec.endswith(".py"):
+        return python_definition(Path(spec))
+    if colon and file.endswith(".py"):
+        return python_definition(Path(file), attribute)
+    if spec.endswith(".onnx") or (colon and file.endswith(".onnx")):
+        from pnpdepth_cli.models.formats.onnx.network import onnx_definition
+
+        whole = spec.endswith(".onnx")
+        return onnx_definition(Path(spec)) if whole else onnx_definition(Path(file), attribute)
     if spec.endswith(".pt2"):
-        from pnpdepth_cli.models.exported import exported_definition
+        from pnpdepth_cli.models.formats.torch_export import exported_definition
 
         return exported_definition(Path(spec))
     if spec.endswith(_WEIGHTS_ONLY):
@@ -181,34 +148,7 @@ def _foreign(spec: str) -> ModelDefinition | None:
             " by torch.export (.pt2) or to ONNX"
         )
     if Path(spec).is_dir():
-        from pnpdepth_cli.models.hf_network import hf_definition
+        from pnpdepth_cli.models.formats.hugging_face import hf_definition
 
         return hf_definition(Path(spec))
     return None
-
-
-def _file_and_attribute(spec: str) -> tuple[Path, str]:
-    file, colon, attribute = spec.rpartition(":")
-    if colon and file.endswith(".py"):
-        return Path(file), attribute
-    return Path(spec), _ATTRIBUTE
-
-
-def _run(file: Path) -> ModuleType:
-    if not file.is_file():
-        raise ModelError(f"model file {file} does not exist")
-    name = f"pnpdepth_user_model_{file.stem}"
-    spec = importlib.util.spec_from_file_location(name, file)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[name] = module  # dataclasses and pickling inside the file look it up
-    try:
-        with importing_beside(str(file)):
-            spec.loader.exec_module(module)
-    except PnpDepthError as error:
-        said = describe(error, file).removeprefix(f"{type(error).__name__}: ")
-        raise ModelError(f"model file {file}: {said}") from error
-    except (Exception, SystemExit) as error:
-        raise ModelError(f"model file {file} raises {describe(error, file)}") from error
-    return module

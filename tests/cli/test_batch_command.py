@@ -11,10 +11,11 @@ from typing import Any
 
 import pytest
 
+from pnpdepth_cli.choices import FRAME_PROTOCOLS, LAYOUTS
 from pnpdepth_cli.cli import batch as command
 from pnpdepth_cli.cli import progress
 from pnpdepth_cli.cli.progress import BatchProgress
-from pnpdepth_cli.io.layouts import LAYOUTS, PROTOCOLS
+from pnpdepth_cli.io.layouts import PROTOCOLS
 from tests.cli.test_commands import code_of
 from tests.pipeline.batches import pairs_on_disk, results
 
@@ -68,7 +69,9 @@ def test_a_bad_frame_is_one_line_and_exit_code_7(
     err = capsys.readouterr().err
     (line,) = [line for line in err.splitlines() if line.startswith("failed")]
     assert line.startswith("failed: b: drive/rgb/b.png is empty")
-    assert err.splitlines()[-1].startswith("pnpdepth: 1 failed of 4 frames; out/summary.csv says")
+    assert err.splitlines()[-1].startswith(
+        "pnpdepth: 1 failed of 4 frames; the reasons are in out/summary.csv"
+    )
     assert "Traceback" not in err
 
 
@@ -182,7 +185,7 @@ def test_ctrl_c_finishes_the_frame_says_how_to_go_on_and_exits_130(
         _, err = running.communicate(timeout=60)
     assert running.returncode == 130
     assert "finishing the frame in work" in err
-    assert "of 4 frames; the same command goes on from there" in err.splitlines()[-1]
+    assert "of 4 frames; run the same command to continue" in err.splitlines()[-1]
     assert "Traceback" not in err
     states = [json.loads(line)["state"] for line in manifest.read_text().splitlines()]
     assert states.count("begun") == states.count("done") > 0
@@ -244,8 +247,7 @@ def test_durations_are_said_shortly(seconds: float, said: str) -> None:
 
 
 def test_the_choices_are_those_that_there_are() -> None:
-    assert list(command.LAYOUTS) == list(LAYOUTS)
-    assert list(command.PROTOCOLS) == list(PROTOCOLS)
+    assert list(FRAME_PROTOCOLS) == list(PROTOCOLS)
 
 
 def test_real_frames_of_a_drive_are_told_as_what_they_are(

@@ -6,9 +6,9 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from pnpdepth_cli.core.points import SparsePoints
 from pnpdepth_cli.core.refine import Refinement, RefineSettings, refine
 from pnpdepth_cli.core.split import Split
+from pnpdepth_cli.points import SparsePoints
 
 
 class InHalf(nn.Module):

@@ -12,11 +12,9 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from pnpdepth_cli.core.losses import LOSSES
-from pnpdepth_cli.core.points import SparsePoints
+from pnpdepth_cli.choices import LOSSES, UPDATES
 from pnpdepth_cli.core.refine import Refinement, RefineSettings, refine, refine_batch
 from pnpdepth_cli.core.split import Split
-from pnpdepth_cli.core.updates import UPDATES
 from pnpdepth_cli.errors import (
     BatchError,
     DivergedError,
@@ -25,7 +23,8 @@ from pnpdepth_cli.errors import (
     NoPointsError,
     PnpDepthError,
 )
-from tests.core.naive import naive_refine, plain
+from pnpdepth_cli.points import SparsePoints
+from tests.completion.naive import naive_refine, plain
 from tests.core.networks import NETWORKS, TwoBranches, UNet, build, conv, depth_of, picture
 
 POINTS = SparsePoints(
@@ -183,6 +182,25 @@ def test_grad_mode_and_random_state_of_the_caller_stay() -> None:
     assert torch.equal(torch.get_rng_state(), before)
 
 
+@pytest.mark.parametrize("keep_best", [False, True])
+def test_depths_are_kept_after_the_chosen_numbers_of_updates(keep_best: bool) -> None:
+    settings = RefineSettings(iterations=5, lr=0.05, keep_best=keep_best)
+    result = refined(build("unet"), "bottleneck", settings, keep_depths=(0, 2, 5, 9))
+    assert list(result.depths) == [0, 2, 5]
+    assert result.depths[0] is result.before
+    for updates in (2, 5):
+        shorter = RefineSettings(iterations=updates, lr=0.05)
+        alone = refined(build("unet"), "bottleneck", shorter)
+        assert torch.equal(result.depths[updates], alone.after)
+
+
+def test_depths_of_a_refinement_that_diverges_are_those_before() -> None:
+    torch.manual_seed(0)
+    with pytest.raises(DivergedError) as error:
+        refined(Breaking(3, float("nan")), "cut", RefineSettings(), keep_depths=range(6))
+    assert list(error.value.last_good.depths) == [0, 1]
+
+
 # ------------------------------------------------------------------ the step size
 
 
@@ -204,11 +222,11 @@ def test_a_linear_schedule_is_k_single_updates_with_falling_steps() -> None:
     assert result.after.flatten().tolist() == [6 + moved, 6 + moved]
 
 
-def test_a_spread_gradient_moves_what_no_point_reaches() -> None:
+def test_a_blurred_gradient_moves_what_no_point_reaches() -> None:
     torch.manual_seed(0)
     network = nn.Sequential(conv(3, 4), conv(4, 4), nn.ReLU(inplace=True), conv(4, 1))
     one = POINTS.select(torch.tensor([True, False, False, False, False]))
-    settings = RefineSettings(update="normalised", lr=0.1, spread=0.5)
+    settings = RefineSettings(update="normalised", lr=0.1, blur=0.5)
     result = refined(network, "0", settings, points=one)
     assert bool((result.after != result.before).all())
     assert result.losses[-1] < result.losses[0]
@@ -270,14 +288,14 @@ def test_channels_are_scaled_and_shifted_and_nothing_else() -> None:
     assert not torch.equal(seen[0], seen[-1])
 
 
-def test_an_anchor_adds_the_squared_change_of_log_depth_and_holds_it_back() -> None:
+def test_a_proximity_weight_adds_the_squared_change_of_log_depth_and_holds_it_back() -> None:
     def change(result: Refinement) -> float:
         return float((result.after.log() - result.before.log()).square().mean())
 
     settings = RefineSettings(iterations=8, lr=0.05, update="normalised")
     free, held = (
-        refined(build("unet"), "bottleneck", replace(settings, anchor=anchor))
-        for anchor in (0.0, 10.0)
+        refined(build("unet"), "bottleneck", replace(settings, proximity=proximity))
+        for proximity in (0.0, 10.0)
     )
     assert free.losses[0] == held.losses[0]
     assert change(held) < change(free)
@@ -484,7 +502,7 @@ def refined_alone(
             update="normalised",
             loss="cauchy",
             schedule="linear",
-            spread=1,
+            blur=1,
             keep_best=True,
         ),
     ],
@@ -521,9 +539,9 @@ class PerPixel(nn.Module):
 
 
 @pytest.mark.parametrize("update", UPDATES)
-@pytest.mark.parametrize("spread", [0.0, 0.7])
-def test_at_once_is_alone_bit_for_bit_where_the_network_is(update: str, spread: float) -> None:
-    settings = RefineSettings(lr="5%", update=update, schedule="linear", spread=spread)
+@pytest.mark.parametrize("blur", [0.0, 0.7])
+def test_at_once_is_alone_bit_for_bit_where_the_network_is(update: str, blur: float) -> None:
+    settings = RefineSettings(lr="5%", update=update, schedule="linear", blur=blur)
     network = PerPixel()
     for index, together in enumerate(refined_at_once(network, "cut", settings)):
         assert isinstance(together, Refinement)

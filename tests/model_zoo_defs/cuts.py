@@ -5,13 +5,13 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from pnpdepth_cli.core.points import SparsePoints
 from pnpdepth_cli.core.refine import RefineSettings, refine
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.models.definition import Fixed, ModelDefinition
 from pnpdepth_cli.models.frame import FrameMap
 from pnpdepth_cli.models.made_up import made_up_arguments
 from pnpdepth_cli.models.network import Network
+from pnpdepth_cli.points import SparsePoints
 
 
 def built(definition: ModelDefinition) -> Network:

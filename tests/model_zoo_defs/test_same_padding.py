@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from model_zoo_defs.same_padding import same_padding
+from model_zoo_defs._same_padding import same_padding
 
 
 @pytest.mark.parametrize(

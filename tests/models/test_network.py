@@ -12,7 +12,6 @@ import torch
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
-from pnpdepth_cli.core.points import SparsePoints
 from pnpdepth_cli.errors import CheckpointError, DeviceError, ModelError, UsageError
 from pnpdepth_cli.models import network as module_under_test
 from pnpdepth_cli.models.definition import Fixed, ModelDefinition, Multiple, Normalisation
@@ -24,6 +23,7 @@ from pnpdepth_cli.models.network import (
     load_network,
     out_of_memory_is_a_device_error,
 )
+from pnpdepth_cli.points import SparsePoints
 
 POINTS = SparsePoints(
     xy=torch.tensor([[0.0, 0.0], [2.0, 1.0]]), depth=torch.tensor([4.0, 2.0]), size=(2, 3)

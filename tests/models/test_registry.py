@@ -1,4 +1,4 @@
-"""From a name or a file to a definition, or to one line that says why not."""
+"""From a name to a definition, or to one line that says why not; the list of names is open."""
 
 from __future__ import annotations
 
@@ -6,26 +6,11 @@ from pathlib import Path
 
 import pytest
 
+import model_zoo_defs
+from pnpdepth_cli import choices
 from pnpdepth_cli.errors import ModelError
-from pnpdepth_cli.models.definition import ModelDefinition
-from pnpdepth_cli.models.registry import DEFAULT_MODEL, find_definition, names
-
-GOOD = """
-from torch import nn
-from pnpdepth_cli.models.definition import ModelDefinition, Multiple
-from beside import WIDTH
-
-definition = ModelDefinition(
-    name="mine", input_kind="rgb", size=Multiple(8), build=lambda: nn.Conv2d(3, WIDTH, 1)
-)
-other = ModelDefinition(name="other", input_kind="rgb", size=Multiple(8), build=nn.Identity)
-"""
-
-
-def written(folder: Path, text: str, name: str = "mine.py") -> Path:
-    file = folder / name
-    file.write_text(text)
-    return file
+from pnpdepth_cli.models.registry import DEFAULT_MODEL, family_of, find_definition, names
+from pnpdepth_cli.pipeline.networks.models import list_models
 
 
 def test_every_known_name_has_a_definition_of_that_name() -> None:
@@ -49,15 +34,6 @@ def test_no_name_is_listed_twice_and_a_family_may_stand_for_a_variant() -> None:
     assert find_definition("sparse2dense").name in names()
 
 
-def test_a_file_gives_its_definition_and_may_import_what_is_beside_it(tmp_path: Path) -> None:
-    written(tmp_path, "WIDTH = 7", "beside.py")
-    file = written(tmp_path, GOOD)
-    assert find_definition(str(file)).name == "mine"
-    assert find_definition(f"{file}:other").name == "other"
-    assert isinstance(find_definition(str(file)), ModelDefinition)
-    assert find_definition(str(file)).build().out_channels == 7
-
-
 def test_an_unknown_name_suggests_a_near_one() -> None:
     with pytest.raises(ModelError, match="did you mean 'compact'"):
         find_definition("compat")
@@ -69,76 +45,78 @@ def test_an_unknown_name_suggests_a_near_one() -> None:
         find_definition("zzz")
 
 
+ONE = """
+from torch import nn
+from pnpdepth_cli.models.definition import ModelDefinition, Multiple
+
+definition = ModelDefinition(
+    name="NAME", input_kind="rgb", size=Multiple(8), build=lambda: nn.Conv2d(3, 1, 1)
+)
+"""
+SEVERAL = ONE.replace("definition =", "one =") + "definitions = {one.name: one}\n"
+
+
+@pytest.fixture
+def open_list(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    """A folder whose files count as files of model_zoo_defs, and whose packages are installed."""
+    monkeypatch.setattr(model_zoo_defs, "__path__", [*model_zoo_defs.__path__, str(tmp_path)])
+    monkeypatch.syspath_prepend(str(tmp_path))
+    old = choices.NETWORKS
+    table = choices.Table(
+        "", None, group="models", noun="network", first=tuple(old), package="model_zoo_defs"
+    )
+    monkeypatch.setattr(choices, "NETWORKS", table)
+    return tmp_path
+
+
+def install(folder: Path, entry_points: str) -> None:
+    """A package of somebody else, with these entry points in the group pnpdepth.models."""
+    info = folder / "other-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: other\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text(f"[pnpdepth.models]\n{entry_points}\n")
+
+
+@pytest.mark.parametrize("text", [ONE, SEVERAL])
+def test_one_new_file_in_model_zoo_defs_adds_a_network(text: str, open_list: Path) -> None:
+    stem = f"my_net{len(text)}"
+    (open_list / f"{stem}.py").write_text(text.replace("NAME", stem.replace("_", "-")))
+    name = stem.replace("_", "-")
+    assert names()[-1] == name
+    assert find_definition(name).build().out_channels == 1
+    assert list_models()[-1].name == name
+    assert not list_models()[-1].variant
+
+
+def test_an_entry_point_of_another_package_adds_networks(open_list: Path) -> None:
+    (open_list / "other_nets.py").write_text(
+        ONE.replace("NAME", "theirs-object") + SEVERAL.replace("NAME", "theirs-in-a-module")
+    )
+    install(
+        open_list,
+        "an-object = other_nets:definition\na-module = other_nets\na-dict = other_nets:definitions",
+    )
+    assert {"theirs-object", "theirs-in-a-module"} <= set(names())
+    assert find_definition("theirs-object").name == "theirs-object"
+    assert find_definition("theirs-in-a-module").name == "theirs-in-a-module"
+    assert family_of("theirs-object") == "an-object"
+
+
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("entry_point", "reason"),
     [
-        ("x = 1\n\nraise ValueError('a\\nb')\n", "raises ValueError: a b (line 3)"),
-        ("def f():\n    return 1 / 0\n\nf()\n", "ZeroDivisionError: division by zero (line 2)"),
-        ("import torch\ntorch.zeros(1) @ 5\n", "(line 2)"),
-        ("def (:\n", "mine.py, line 1"),
-        ("import nonexistent_module\n", "No module named 'nonexistent_module' (line 1)"),
-        ("import sys\nsys.exit(0)\n", "raises SystemExit: 0 (line 2)"),
-        ("x = 1\n", "defines no 'definition'"),
-        ("definition = 'text'\n", "is a str, not a ModelDefinition"),
-        ("definition = None\n", "defines no 'definition'"),
+        ("theirs = missing_package:definition", "ModuleNotFoundError"),
+        ("theirs = os.path", "gives a NoneType"),
+        ("theirs = os.path:sep", "gives a str"),
     ],
 )
-@pytest.mark.parametrize("relative", [True, False])
-def test_a_model_file_at_fault_is_said_with_its_line(
-    text: str, said: str, relative: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_a_package_that_cannot_be_loaded_is_reported_only_when_it_is_named(
+    entry_point: str, reason: str, open_list: Path
 ) -> None:
-    file = written(tmp_path, text)
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(ModelError) as error:
-        find_definition("mine.py" if relative else str(file))
-    assert said in str(error.value)
-    assert "mine.py" in str(error.value)
-    assert "\n" not in str(error.value)
-    assert error.value.exit_code == 4
-
-
-@pytest.mark.parametrize(
-    ("wrong", "said"),
-    [
-        ("size=32", "ModelDefinition 'mine': size=32 is a int"),
-        ("size=Multiple(0)", "Multiple: of=0"),
-        ("size=Multiple(8), output_kind='disparity'", "'mine': output_kind='disparity' is none of"),
-    ],
-)
-def test_a_wrong_field_of_a_definition_is_said_with_its_file_and_line(
-    wrong: str, said: str, tmp_path: Path
-) -> None:
-    file = written(tmp_path, GOOD.replace("size=Multiple(8)", wrong, 1))
-    written(tmp_path, "WIDTH = 7", "beside.py")
-    with pytest.raises(ModelError) as error:
-        find_definition(str(file))
-    assert str(error.value).startswith(f"model file {file}: ")
-    assert said in str(error.value)
-    assert "(line " in str(error.value)
-    assert "\n" not in str(error.value)
-
-
-def test_a_network_that_is_made_already_is_not_taken_for_a_function(tmp_path: Path) -> None:
-    file = written(tmp_path, "from torch import nn\nnet = nn.Conv2d(3, 1, 1)\n")
-    with pytest.raises(ModelError, match=r"'net' in .* is a Conv2d that is made already; name its"):
-        find_definition(f"{file}:net")
-
-
-def test_a_file_that_is_not_there_or_lacks_the_attribute_is_said(tmp_path: Path) -> None:
-    with pytest.raises(ModelError, match="does not exist"):
-        find_definition(str(tmp_path / "absent.py"))
-    file = written(tmp_path, "x = 1")
-    with pytest.raises(ModelError, match="defines no 'network'"):
-        find_definition(f"{file}:network")
-    with pytest.raises(ModelError, match=r"'x' in model file .* is a int"):
-        find_definition(f"{file}:x")
-
-
-def test_the_search_path_is_as_before(tmp_path: Path) -> None:
-    import sys
-
-    before = list(sys.path)
-    for text in ("x = 1", "raise ValueError", "import sys; sys.path.pop(0)"):
-        with pytest.raises(ModelError):
-            find_definition(str(written(tmp_path, text)))
-    assert sys.path == before
+    install(open_list, entry_point)
+    assert "compact" in names()
+    assert "theirs" not in names()
+    with pytest.raises(ModelError, match=f"network family 'theirs' .*{reason}"):
+        find_definition("theirs")
+    with pytest.raises(ModelError, match="did you mean 'fcrn-tiny'"):
+        find_definition("fcrn-tyni")

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from pnpdepth_cli.io.layouts.below import files_below
-from pnpdepth_cli.io.layouts.frame import DEPTHS, PICTURES, SCANS, Frame, Listing, without_partner
+from pnpdepth_cli.io.dataset.find_files import find_files
+from pnpdepth_cli.io.dataset.frame import DEPTHS, PICTURES, SCANS, Frame, Listing, without_partner
+from pnpdepth_cli.io.layouts import Layout
 
 _CALIBRATIONS = (".txt", ".json", ".yaml", ".yml")
 
@@ -21,10 +22,10 @@ def matches(root: Path) -> bool:
 
 def listing(root: Path) -> Listing:
     """One frame for each image with sparse depth."""
-    images, lost_images = files_below(root / "rgb", PICTURES)
-    sparse, lost_sparse = files_below(root / "sparse", (*DEPTHS, *SCANS, ".csv"))
-    gt, lost_gt = files_below(root / "gt", DEPTHS)
-    calib, lost_calib = files_below(root / "calib", _CALIBRATIONS)
+    images, lost_images = find_files(root / "rgb", PICTURES)
+    sparse, lost_sparse = find_files(root / "sparse", (*DEPTHS, *SCANS, ".csv"))
+    gt, lost_gt = find_files(root / "gt", DEPTHS)
+    calib, lost_calib = find_files(root / "calib", _CALIBRATIONS)
     shared = root / "calib.txt"
     frames = [
         Frame(
@@ -52,3 +53,6 @@ def listing(root: Path) -> Listing:
             for each in without_partner(others, images, root / "rgb")
         ),
     )
+
+
+LAYOUT = Layout(matches=matches, listing=listing)

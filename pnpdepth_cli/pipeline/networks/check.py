@@ -1,4 +1,4 @@
-"""`pnpdepth models --check`: can this network be run, trusted, cut and refined?"""
+"""`pnpdepth models check`: can this network be run, trusted, cut and refined?"""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from typing import Any
 
 import torch
 
-from pnpdepth_cli.core.points import SparsePoints
 from pnpdepth_cli.core.split import Split, gradient_at
 from pnpdepth_cli.errors import ModelError
 from pnpdepth_cli.io.rgb import read_rgb
@@ -15,6 +14,7 @@ from pnpdepth_cli.models.definition import Fixed
 from pnpdepth_cli.models.frame import FrameMap
 from pnpdepth_cli.models.made_up import made_up_arguments
 from pnpdepth_cli.models.network import load_network, out_of_memory_is_a_device_error
+from pnpdepth_cli.points import SparsePoints
 
 _SIZE = (240, 320)
 

@@ -1,4 +1,4 @@
-"""`pnpdepth models --convert`: the tensors of a published checkpoint as a safetensors file."""
+"""`pnpdepth models convert`: the tensors of a published checkpoint as a safetensors file."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from safetensors.torch import save_file
 
 from pnpdepth_cli.errors import OutputError, UsageError
 from pnpdepth_cli.io.atomic import atomic_path
-from pnpdepth_cli.models.checkpoint import read_checkpoint
+from pnpdepth_cli.models.weights.checkpoint import read_checkpoint
 
 
 def convert_checkpoint(source: Path, target: Path, *, overwrite: bool = False) -> dict[str, Any]:

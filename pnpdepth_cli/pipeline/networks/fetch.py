@@ -1,4 +1,4 @@
-"""`pnpdepth models --fetch`: the only place that opens a network connection."""
+"""`pnpdepth models fetch`: the only place that opens a network connection."""
 
 from __future__ import annotations
 

@@ -7,7 +7,12 @@ from dataclasses import dataclass
 import torch
 
 from pnpdepth_cli.models.definition import Fixed, Multiple, Near
-from pnpdepth_cli.models.registry import find_definition, names
+from pnpdepth_cli.models.registry import (
+    family_definitions,
+    family_of,
+    find_definition,
+    names,
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,11 +50,11 @@ def _listed(name: str) -> ListedModel:
     definition = find_definition(name)
     with torch.device("meta"):  # shapes only: counting needs no memory
         module = definition.build()
-    defaults, family = definition.defaults, name.partition("-")[0]
+    defaults, family = definition.defaults, family_of(name)
     return ListedModel(
         name=definition.name,
         family=family,
-        variant=definition.checkpoint is None and find_definition(family).name != name,
+        variant=definition.checkpoint is None and _other_default(family, name),
         summary=definition.summary,
         paper=definition.paper,
         licence=definition.licence,
@@ -65,6 +70,12 @@ def _listed(name: str) -> ListedModel:
         loss=defaults.loss,
         update=defaults.update,
     )
+
+
+def _other_default(family: str, name: str) -> bool:
+    """True if the family's own name stands for another of its networks."""
+    default = family_definitions(family).get(family)
+    return default is not None and default.name != name
 
 
 def _size(size: Fixed | Multiple | Near) -> str:

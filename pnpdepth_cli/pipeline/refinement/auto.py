@@ -16,14 +16,13 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from pnpdepth_cli.core.alignment import align, where_predicted
-from pnpdepth_cli.core.baselines import BASELINES
-from pnpdepth_cli.core.folds import spatial_folds
-from pnpdepth_cli.core.local_alignment import trust
-from pnpdepth_cli.core.points import SparsePoints
-from pnpdepth_cli.core.propagation import wrong
+from pnpdepth_cli.auto.blending import Blend, best_blend, held_out_error
+from pnpdepth_cli.auto.cross_validation import spatial_folds
+from pnpdepth_cli.completion.alignment import align, where_predicted
+from pnpdepth_cli.completion.baselines import BASELINES
+from pnpdepth_cli.completion.local_alignment import trust
+from pnpdepth_cli.completion.propagation import wrong
 from pnpdepth_cli.core.refine import RefineSettings
-from pnpdepth_cli.core.selection import Blend, best_blend, held_out_error
 from pnpdepth_cli.errors import ModelError, PnpDepthError
 from pnpdepth_cli.models.definition import ModelDefinition
 from pnpdepth_cli.models.network import Network
@@ -38,6 +37,7 @@ from pnpdepth_cli.pipeline.refinement.ways import (
     trajectories,
     updates_of,
 )
+from pnpdepth_cli.points import SparsePoints
 
 FOLDS = 4
 FEWEST = 5
@@ -113,7 +113,7 @@ def usual_trials(definition: ModelDefinition, layer: str, settings: RefineSettin
     Those that differ from the first in their alignment alone are the usual ones; what takes more
     time comes after them, other layers last.
     """
-    adam = replace(settings, update="adam", lr="3%", schedule="constant", spread=0.0, iterations=10)
+    adam = replace(settings, update="adam", lr="3%", schedule="constant", blur=0.0, iterations=10)
     steps = [settings, adam]
     if settings == replace(RefineSettings(), align=settings.align):
         steps.reverse()  # nobody has tuned the paper's steps to this network
@@ -144,10 +144,10 @@ def refine_automatically(
 
     trials: ways to update z; the first is tried in any case. ways: only these, the network and the
     simple baselines compete, such as those that were best on other frames. fixed: this way is
-    taken, and the others are only scored. spreading: the ways to spread what is left at the points
-    that compete, of `core.propagation.PROPAGATIONS`. budget_s: no further trial is begun that would
-    end later, by what those before took; those that differ in their alignment alone are begun
-    together. None tries those that differ from the first in nothing else.
+    taken, and the others are only scored. spreading: the propagations that compete, of
+    `completion.propagation.PROPAGATIONS`. budget_s: no trial is begun that would end after this
+    many seconds, judged by the trials before it; trials that differ in alignment alone count as
+    one. With no time budget, only trials that differ from the first in alignment are tried.
     """
     notes: tuple[str, ...] = ()
     with HeldCut(network) as cut:

@@ -10,9 +10,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from pnpdepth_cli.core.alignment import Alignment
-from pnpdepth_cli.core.points import SparsePoints
-from pnpdepth_cli.core.propagation import propagate
+from pnpdepth_cli.completion.alignment import Alignment
+from pnpdepth_cli.completion.propagation import propagate
 from pnpdepth_cli.core.refine import Refinement, RefineSettings, refine_batch
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.errors import BatchError, DivergedError, NoPointsError, PnpDepthError, UsageError
@@ -20,6 +19,7 @@ from pnpdepth_cli.models.aligned import AlignedDepth
 from pnpdepth_cli.models.frame import FrameMap
 from pnpdepth_cli.models.network import Network, out_of_memory_is_a_device_error
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs
+from pnpdepth_cli.points import SparsePoints
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,7 +76,7 @@ def split_points(
 class FrameToRefine:
     """A frame, its points that are used, those that are held out, and what follows refinement.
 
-    propagate: how what is left at the points is spread, one of `core.propagation.PROPAGATIONS`.
+    propagate: how the residual is propagated, one of `completion.propagation.PROPAGATIONS`.
     """
 
     inputs: Inputs
@@ -150,7 +150,7 @@ def ready_frame(
             f"none of the {len(task.used)} sparse points lies inside the part of the image that"
             f" network {network.definition.name!r} sees (rows and columns {frame.crop})"
         )
-    at = points.to(network.device)
+    at = points.tensors(network.device)
     return ReadyFrame(
         task=task,
         frame=frame,

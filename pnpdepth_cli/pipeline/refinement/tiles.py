@@ -16,7 +16,6 @@ import torch
 import torch.nn.functional as F
 from numpy.typing import NDArray
 
-from pnpdepth_cli.core.points import SparsePoints
 from pnpdepth_cli.core.refine import RefineSettings
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.models.network import Network
@@ -27,6 +26,7 @@ from pnpdepth_cli.pipeline.refinement.frame import (
     refine_frame,
 )
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs
+from pnpdepth_cli.points import SparsePoints
 
 OVERLAP = 0.25
 """Of a tile's side, at least."""
@@ -143,7 +143,7 @@ def _reduced(task: FrameToRefine, longest: int) -> FrameToRefine:
     rgb = task.inputs.rgb_tensor()
     if rgb is not None:
         rgb = F.interpolate(rgb, size, mode="bilinear", antialias=True)[0].permute(1, 2, 0)
-    points = task.used.in_frame(*size)
+    points = task.used.resized(*size)
     inputs = replace(task.inputs, rgb=None if rgb is None else rgb.numpy(), points=points, gt=None)
     return FrameToRefine.with_points(inputs, points)
 

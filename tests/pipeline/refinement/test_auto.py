@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from pnpdepth_cli.core.baselines import BASELINES
-from pnpdepth_cli.core.points import SparsePoints
+from pnpdepth_cli.completion.baselines import BASELINES
 from pnpdepth_cli.core.refine import RefineSettings
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.errors import ModelError, UsageError
@@ -30,6 +29,7 @@ from pnpdepth_cli.pipeline.refinement.auto import (
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest
 from pnpdepth_cli.pipeline.refinement.ways import HeldCut, Trial, Way, trajectories
+from pnpdepth_cli.points import SparsePoints
 from tests.pipeline.batches import NAMES, Heard, batch, pairs_on_disk, results, times
 from tests.pipeline.frames import FrameOnDisk, frame_on_disk, run
 
@@ -151,7 +151,7 @@ def test_of_a_network_that_takes_the_points_it_is_said_what_holding_some_out_doe
     choice = Choice(
         ways=(best.way,), weights=(1.0,), error=best.error, network=network_m, scored=tuple(scored)
     )
-    request = RefineRequest(image=frame.image, sparse=frame.sparse, auto=True)
+    request = RefineRequest.from_fields(image=frame.image, sparse=frame.sparse, auto=True)
     notes = held_out.auto_notes(choice, request, replace(network.definition, input_kind=kind))
     assert notes[0].startswith("auto: ")
     assert any("takes the points itself" in note for note in notes[1:]) == warned
@@ -167,7 +167,7 @@ def test_the_networks_error_is_that_of_the_network_alone(
     errors = {str(one.way): one.error for one in found.choice.scored}
     assert found.choice.network == errors["network"]
     assert any("network" in name and name != "network" for name in errors)  # none of it alone
-    request = RefineRequest(image=frame.image, sparse=frame.sparse, auto=True)
+    request = RefineRequest.from_fields(image=frame.image, sparse=frame.sparse, auto=True)
     note = held_out.auto_notes(found.choice, request, network.definition)[0]
     assert f"network {errors['network']:.4f} m" in note
 

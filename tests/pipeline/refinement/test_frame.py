@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import torch
 
-from pnpdepth_cli.core.points import SparsePoints
 from pnpdepth_cli.core.refine import RefineSettings
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.errors import BatchError, DivergedError, NoPointsError, PnpDepthError
@@ -22,6 +21,7 @@ from pnpdepth_cli.pipeline.refinement.frame import (
     refine_frames,
 )
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs
+from pnpdepth_cli.points import SparsePoints
 from tests.pipeline.frames import frame_on_disk
 
 SETTINGS = RefineSettings(iterations=4, lr="5%", update="adam")

@@ -12,7 +12,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import nn
 
-from pnpdepth_cli.core.points import SparsePoints
 from pnpdepth_cli.core.refine import RefineSettings
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.errors import UsageError
@@ -23,6 +22,7 @@ from pnpdepth_cli.pipeline.refinement.inputs import Inputs
 from pnpdepth_cli.pipeline.refinement.refine import load_refiner
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest
 from pnpdepth_cli.pipeline.refinement.tiles import OVERLAP, refine_tiled, tiles_of
+from pnpdepth_cli.points import SparsePoints
 from tests.pipeline.frames import frame_on_disk
 
 CPU = torch.device("cpu")
@@ -172,7 +172,7 @@ def test_propagation_follows_once_over_all_tiles() -> None:
 
 def test_tiles_and_folds_do_not_go_together(tmp_path_factory: pytest.TempPathFactory) -> None:
     frame = frame_on_disk(tmp_path_factory.mktemp("frame"))
-    request = RefineRequest(image=frame.image, sparse=frame.sparse, tile=64, auto=True)
+    request = RefineRequest.from_fields(image=frame.image, sparse=frame.sparse, tile=64, auto=True)
     with pytest.raises(UsageError, match="--tile goes with none of --auto"):
         load_refiner(request, everywhere((64, 64)).inputs)
 

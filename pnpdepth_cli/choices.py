@@ -1,0 +1,190 @@
+"""Every list of names that a user can choose from. Imports nothing heavy.
+
+Open lists are `Table`s: one file in a folder of this package adds one entry, and an entry point of
+an installed package adds another. Closed lists are tuples.
+"""
+
+from __future__ import annotations
+
+import difflib
+import functools
+import importlib
+import pkgutil
+from collections.abc import Iterator, Mapping
+from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+from pnpdepth_cli.errors import UsageError
+
+
+class Table(Mapping[str, Any]):
+    """The entries of an open list by name; listing the names imports none of them.
+
+    An entry is the object `attribute` of the module `folder/<name>.py` ("-" in a name is "_" in the
+    file), or an entry point `<name>` in the group `pnpdepth.<group>`. Subpackages and modules whose
+    name starts with "_" are no entries. The package's own entries win over entry points of the same
+    name.
+
+    Args:
+        folder: Path of the modules relative to `package`, such as "core/losses".
+        attribute: Name of the object in each module; None makes the entry the module itself.
+        group: Last part of the entry point group.
+        noun: What one entry is called in messages.
+        first: Names listed before the others, which follow in alphabetical order.
+        package: The package that the folder belongs to.
+    """
+
+    def __init__(
+        self,
+        folder: str,
+        attribute: str | None,
+        *,
+        group: str,
+        noun: str,
+        first: tuple[str, ...] = (),
+        package: str = "pnpdepth_cli",
+    ) -> None:
+        self.folder, self.attribute, self.group, self.noun = folder, attribute, group, noun
+        self._first, self._package = first, package
+
+    def __getitem__(self, name: str) -> Any:
+        """Returns the entry. Raises UsageError, with near matches, for an unknown name."""
+        if name in self._modules:
+            module = importlib.import_module(self._modules[name])
+            return module if self.attribute is None else getattr(module, self.attribute)
+        if name in self._entry_points:
+            return self._entry_points[name].load()
+        near = difflib.get_close_matches(name, list(self), n=1)
+        hint = f"did you mean {near[0]!r}?" if near else f"choose from {', '.join(self)}"
+        raise UsageError(f"unknown {self.noun} {name!r}; {hint}")
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._modules or name in self._entry_points
+
+    def __iter__(self) -> Iterator[str]:
+        names = {**self._modules, **self._entry_points}
+        order = {name: place for place, name in enumerate(self._first)}
+        return iter(sorted(names, key=lambda name: (order.get(name, len(order)), name)))
+
+    def __len__(self) -> int:
+        return len({**self._modules, **self._entry_points})
+
+    @functools.cached_property
+    def _modules(self) -> dict[str, str]:
+        package = ".".join((self._package, *filter(None, self.folder.split("/"))))
+        roots = importlib.import_module(self._package).__path__
+        modules = pkgutil.iter_modules([str(Path(root, self.folder)) for root in roots])
+        return {
+            module.name.replace("_", "-"): f"{package}.{module.name}"
+            for module in modules
+            if not module.name.startswith("_") and not module.ispkg
+        }
+
+    @functools.cached_property
+    def _entry_points(self) -> dict[str, EntryPoint]:
+        return {point.name: point for point in entry_points(group=f"pnpdepth.{self.group}")}
+
+
+LOSSES = Table(
+    "core/losses",
+    "loss",
+    group="losses",
+    noun="loss",
+    first=("l1", "l2", "huber", "berhu", "inverse", "log", "cauchy"),
+)
+"""L of equation 3: (N,) predicted and (N,) measured depth to a scalar."""
+
+UPDATES = Table(
+    "core/update_rules",
+    "update_rule",
+    group="updates",
+    noun="update rule",
+    first=("sign", "sgd", "normalised", "momentum", "adam", "lbfgs"),
+)
+"""U of equation 3: each entry makes a rule that turns gradients into directions."""
+
+Schedule = Literal["constant", "linear"]
+SCHEDULES: tuple[Schedule, ...] = get_args(Schedule)
+"""How the step size changes over the updates of z."""
+
+Parameters = Literal["elements", "channels"]
+PARAMETERS: tuple[Parameters, ...] = get_args(Parameters)
+"""What is updated: every element of z, or a scale and a shift of each channel of z."""
+
+Precision = Literal["fp32", "bf16", "fp16"]
+PRECISIONS: tuple[Precision, ...] = get_args(Precision)
+"""The number format of the network's convolutions and matrix products."""
+
+Align = Literal["none", "median", "scale", "affine", "auto"]
+ALIGNMENTS: tuple[Align, ...] = get_args(Align)
+"""How the network's output is fitted to the sparse points."""
+
+Space = Literal["depth", "inverse", "log"]
+SPACES: tuple[Space, ...] = get_args(Space)
+"""The quantities in which depth is predicted, fitted or interpolated."""
+
+OutputKind = Literal[Space, "unknown"]
+OUTPUT_KINDS: tuple[OutputKind, ...] = get_args(OutputKind)
+"""What the numbers of a network's output are."""
+
+OutputScale = Literal["metric", "scale", "affine", "unknown"]
+OUTPUT_SCALES: tuple[OutputScale, ...] = get_args(OutputScale)
+"""Up to what a network's output is known: metres, a factor, or a factor and a shift."""
+
+InputKind = Literal["rgb", "sparse", "rgb+sparse"]
+INPUT_KINDS: tuple[InputKind, ...] = get_args(InputKind)
+"""What a network takes as input."""
+
+Fit = Literal["stretch", "crop"]
+FITS: tuple[Fit, ...] = get_args(Fit)
+"""How an image is brought to a network's fixed input size."""
+
+NORMALISATIONS = ("unit", "imagenet", "symmetric", "bytes")
+"""The rgb ranges a network may expect: 0…1, ImageNet's mean and deviation, −1…1, 0…255."""
+
+NETWORKS = Table(
+    "",
+    None,
+    group="models",
+    noun="network",
+    first=(
+        *("compact", "eigen", "fcrn", "sfmlearner", "sparseconv", "adnn", "sparse2dense"),
+        *("latefusion", "nconv", "pncnn"),
+    ),
+    package="model_zoo_defs",
+)
+"""The networks' files in `model_zoo_defs`, and what other packages enter as `pnpdepth.models`."""
+
+FORMATS = Table(
+    "io/formats",
+    "FORMAT",
+    group="formats",
+    noun="depth format",
+    first=("png", "exr", "npy", "npz", "pfm", "tiff"),
+)
+"""Depth file formats: `pnpdepth_cli.io.formats.DepthFormat`."""
+
+PROPAGATIONS = ("none", "gp", "diffusion")
+"""How the residual at the points is propagated."""
+
+LAYOUTS = Table(
+    "io/layouts",
+    "LAYOUT",
+    group="layouts",
+    noun="layout",
+    first=(
+        *("manifest", "nyu-mat", "kitti-odometry", "kitti-object", "kitti-depth", "tum"),
+        *("7scenes", "synthia", "pairs", "nyu-h5"),
+    ),
+)
+"""Data set layouts, in the order in which they are guessed: `pnpdepth_cli.io.layouts.Layout`."""
+
+FRAME_PROTOCOLS = ("whole", "nyu", "kitti-odometry", "kitti-depth")
+"""What of a frame the paper's experiments use: `pnpdepth_cli.io.dataset.protocols.PROTOCOLS`."""
+
+PATTERNS = ("uniform", "bernoulli", "grid", "lines", "features", "edges", "region")
+"""Which pixels of dense depth become sparse points: `pnpdepth_cli.sensors.samplers`."""
+
+SENSORS = ("vlp-16", "vlp-32c", "hdl-32e", "hdl-64e")
+"""LiDARs by data sheet; `pnpdepth_cli.sensors.LIDARS` has the paper's of each as "paper-<name>"."""

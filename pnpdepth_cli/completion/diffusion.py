@@ -1,0 +1,90 @@
+"""What is left at the points, diffused over the picture up to the edges.
+
+With r the residual in log depth at the points and c the correction on a grid of nodes,
+
+    min over c of  Σ_points (c(p) − r_p)² + λ·Σ_edges w_ij·(c_i − c_j)² + ε·Σ_i (c_i − median r)²,
+
+w_ij = 1 / (place² + (u_i − u_j)² + (colour_i − colour_j)²), each over its length: one sparse linear
+system, as in Levin, Lischinski, Weiss, "Colorization using optimization", 2004, with the weights of
+Perona and Malik 1990. The grid is the coarser the fewer the points are: between them each node
+counts as one more step, so that on a fine grid what they tell stays close to them.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from pnpdepth_cli.completion.gaussian_process import Field
+
+STIFFNESS = 1e-4
+"""λ, with the weights at 1 where neighbours look the same."""
+EDGE_DEPTH, EDGE_COLOUR = 0.1, 0.5
+"""Differences of neighbouring nodes, in standard deviations of the picture, that halve a weight."""
+
+_NODES_A_POINT, _FEWEST_NODES, _MOST_NODES = 10, 2_000, 30_000
+_ANCHOR = 1e-9  # ε: where nothing tells a node anything
+
+
+def diffused(field: Field) -> Tensor:
+    """The residual in every pixel (H, W) float32."""
+    from scipy.sparse import coo_array, csc_array, eye_array
+    from scipy.sparse.csgraph import laplacian
+    from scipy.sparse.linalg import splu
+
+    height, width = field.points.size
+    wanted = min(max(_NODES_A_POINT * len(field.points), _FEWEST_NODES), _MOST_NODES)
+    shrink = min(1.0, math.sqrt(wanted / (height * width)))
+    rows, columns = max(1, round(height * shrink)), max(1, round(width * shrink))
+    nodes = F.interpolate(field.features.permute(2, 0, 1)[None], (rows, columns), mode="area")[0]
+    number = torch.arange(rows * columns).reshape(rows, columns)
+    first = torch.cat([number[:, :-1].flatten(), number[:-1].flatten()])
+    second = torch.cat([number[:, 1:].flatten(), number[1:].flatten()])
+    looks = nodes.flatten(1).t().double()
+    step = looks[first] - looks[second]
+    apart = (step[:, 2] / EDGE_DEPTH).square()
+    apart = apart + (step[:, 3:] / EDGE_COLOUR).square().sum(dim=1)
+    weight = STIFFNESS / (1 + apart)
+    total = rows * columns
+    ends = torch.cat([first, second]).numpy(), torch.cat([second, first]).numpy()
+    adjacent = coo_array((weight.repeat(2).numpy(), ends), shape=(total, total)).tocsr()
+    reads = _readings(field, rows, columns)
+    middle = float(field.residual.median())
+    system = reads.T @ reads + laplacian(adjacent) + _ANCHOR * eye_array(total)
+    right = reads.T @ (field.residual - middle).numpy()
+    # positive definite: its own diagonal will do for pivots, and others would fill the factors
+    found = splu(
+        csc_array(system),
+        permc_spec="MMD_AT_PLUS_A",
+        diag_pivot_thresh=0.0,
+        options={"SymmetricMode": True},
+    )
+    correction = torch.from_numpy(found.solve(right)).float().reshape(1, 1, rows, columns) + middle
+    return F.interpolate(correction, (height, width), mode="bilinear", align_corners=False)[0, 0]
+
+
+def _readings(field: Field, rows: int, columns: int) -> Any:
+    """The sparse matrix (N, nodes) that reads a map of the nodes at the points, bilinearly."""
+    from scipy.sparse import coo_array
+
+    xy = field.points.resized(rows, columns).xy.double()
+    x, y = xy[:, 0].clamp(0, columns - 1), xy[:, 1].clamp(0, rows - 1)
+    left, top = x.floor(), y.floor()
+    fx, fy = x - left, y - top
+    right, bottom = x.ceil(), y.ceil()
+    places = torch.stack(
+        [
+            top * columns + left,
+            top * columns + right,
+            bottom * columns + left,
+            bottom * columns + right,
+        ]
+    )
+    shares = torch.stack([(1 - fx) * (1 - fy), fx * (1 - fy), (1 - fx) * fy, fx * fy])
+    which = torch.arange(len(xy)).repeat(4, 1)
+    values = (shares.flatten().numpy(), (which.flatten().numpy(), places.long().flatten().numpy()))
+    return coo_array(values, shape=(len(xy), rows * columns)).tocsr()

@@ -1,0 +1,77 @@
+"""Arrays out of HDF5 and MATLAB 7.3 files."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pnpdepth_cli.errors import FileFormatError, InputError, PnpDepthError, UsageError
+from pnpdepth_cli.io.dataset.frame import Hdf5Array
+from pnpdepth_cli.io.depth_reading import known_metres
+from pnpdepth_cli.io.file_bytes import check_value_count, one_line, size_of_regular_file
+
+
+def shape_of(path: Path, name: str) -> tuple[int, ...]:
+    """The shape of one array of the file."""
+    return tuple(_with_array(path, name, lambda array: array.shape))
+
+
+def rgb_of(source: Hdf5Array) -> NDArray[np.float32]:
+    """(H, W, 3) float32 in 0..1 of an array of bytes."""
+    pixels = _read(source)
+    if pixels.dtype != np.uint8 or pixels.ndim != 3 or pixels.shape[2] != 3:
+        raise FileFormatError(f"{source} is {pixels.dtype} of shape {pixels.shape}, not an image")
+    return pixels.astype(np.float32) / np.float32(255)
+
+
+def depth_of(source: Hdf5Array) -> NDArray[np.float32]:
+    """(H, W) float32 metres, 0 where unknown, of an array of floats."""
+    metres = _read(source)
+    if metres.dtype.kind != "f" or metres.ndim != 2:
+        raise FileFormatError(f"{source} is {metres.dtype} of shape {metres.shape}, not depth")
+    return known_metres(metres)
+
+
+def _read(source: Hdf5Array) -> NDArray[Any]:
+    def pick(array: Any) -> NDArray[Any]:
+        if array.dtype.kind not in "fiu":
+            raise FileFormatError(f"{source} holds {array.dtype} values, not numbers")
+        one = array.shape if source.index is None else array.shape[1:]
+        check_value_count(source.path, math.prod(one), size_of_regular_file(source.path))
+        if source.index is not None and source.index >= array.shape[0]:
+            raise FileFormatError(f"{source}: there are only {array.shape[0]}")
+        return np.asarray(array[()] if source.index is None else array[source.index])
+
+    values: NDArray[Any] = _with_array(source.path, source.name, pick)
+    if values.ndim != len(source.axes):
+        raise FileFormatError(f"{source} has {values.ndim} axes instead of {len(source.axes)}")
+    return values.transpose(source.axes)
+
+
+def _with_array(path: Path, name: str, use: Callable[[Any], Any]) -> Any:
+    try:
+        import h5py
+    except ImportError:
+        raise UsageError(f"reading {path} needs h5py: pip install 'pnpdepth[nyu]'") from None
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; check the path")
+    try:
+        with h5py.File(path, "r") as file:
+            link = file.get(name, getlink=True)
+            if link is None:
+                raise FileFormatError(f"{path} has no array {name}; it is of another kind")
+            array = file[name] if isinstance(link, h5py.HardLink) else None
+            if array is None or array.external or array.is_virtual:
+                raise FileFormatError(
+                    f"{path}: {name} lies in another file or place; copy its values into this one"
+                )
+            return use(array)
+    except PnpDepthError:
+        raise
+    except Exception as error:  # h5py raises many kinds for a damaged file
+        raise FileFormatError(f"{path} cannot be read as HDF5 ({one_line(error)})") from error

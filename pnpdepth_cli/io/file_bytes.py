@@ -1,0 +1,116 @@
+"""The bytes of an input file, within the budget of `pnpdepth_cli.budget`."""
+
+from __future__ import annotations
+
+import stat
+from pathlib import Path
+
+from pnpdepth_cli.budget import budget
+from pnpdepth_cli.errors import FileFormatError, InputError
+
+
+def read_bytes(path: Path) -> bytes:
+    """Returns the whole content of a regular file.
+
+    Raises:
+        InputError: There is no such file, or it is a folder, a device or a pipe.
+        FileFormatError: It is empty, or larger than the budget.
+    """
+    size = size_of_regular_file(path)
+    limit = budget().max_file_bytes
+    if size > limit:
+        raise FileFormatError(
+            f"{path} has {size:,} bytes, more than {limit:,}; make it smaller, or allow more with"
+            " --max-pixels"
+        )
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise cannot_read(path, error) from error
+    if not data:
+        raise FileFormatError(f"{path} is empty (0 bytes); copy or create it again")
+    return data
+
+
+def size_of_regular_file(path: Path) -> int:
+    """Returns the size of a file in bytes.
+
+    Raises:
+        InputError: There is no such file, or it is a folder, a device or a pipe.
+    """
+    try:
+        status = path.stat()
+    except (OSError, ValueError) as error:
+        raise cannot_read(path, error) from error
+    if stat.S_ISDIR(status.st_mode):
+        raise InputError(f"{path} is a folder; give one file")
+    if not stat.S_ISREG(status.st_mode):
+        raise InputError(f"{path} is a device or a pipe; save its content to a file first")
+    return status.st_size
+
+
+def cannot_read(path: Path, error: OSError | ValueError) -> InputError:
+    """Returns the error that says why a file cannot be read."""
+    if isinstance(error, (FileNotFoundError, NotADirectoryError)):
+        return InputError(f"{path}: no such file; check the path")
+    reason = one_line(getattr(error, "strerror", None) or error).lower()
+    return InputError(f"{one_line(path)} cannot be read ({reason}); check the path")
+
+
+def damaged(path: Path, kind: str, fact: str) -> FileFormatError:
+    """Returns the error for a file that ends early or is corrupt."""
+    return FileFormatError(f"{path}: {kind} {one_line(fact)}; copy or create the file again")
+
+
+def one_line(text: object) -> str:
+    """Returns the text with runs of white space made single spaces, cut to a readable length."""
+    line = " ".join(str(text).split())
+    return line if len(line) <= 160 else line[:159] + "…"
+
+
+def check_pixel_count(
+    path: Path, width: int, height: int, *, channels: int = 1, file_bytes: int | None = None
+) -> None:
+    """Raises FileFormatError for an image without pixels, or with more than the budget.
+
+    Args:
+        path: Named in messages.
+        width: Pixels.
+        height: Pixels.
+        channels: Values of a pixel that are decoded.
+        file_bytes: Size of the file, where the format allows a few bytes to claim any size.
+    """
+    if width < 1 or height < 1:
+        raise FileFormatError(f"{path} has no pixels ({width}x{height}); create it again")
+    limit = budget().max_pixels
+    if width * height > limit:
+        raise FileFormatError(
+            f"{path} is {width}x{height} pixels, more than {limit:,}; make it smaller, or allow"
+            " more with --max-pixels"
+        )
+    if file_bytes is not None and width * height * channels > budget().max_values_from(file_bytes):
+        raise FileFormatError(
+            f"{path} claims {width}x{height} pixels in {file_bytes:,} bytes, which cannot be true;"
+            " create it again"
+        )
+
+
+def check_value_count(path: Path, count: int, file_bytes: int | None = None) -> None:
+    """Raises FileFormatError for an array of more values than the budget.
+
+    Args:
+        path: Named in messages.
+        count: Values of the array.
+        file_bytes: Size of the file, where a few bytes can claim any count.
+    """
+    limit = budget().max_pixels
+    if count > limit:
+        raise FileFormatError(
+            f"{path} holds {count:,} values, more than {limit:,}; make it smaller, or allow more"
+            " with --max-pixels"
+        )
+    if file_bytes is not None and count > budget().max_values_from(file_bytes):
+        raise FileFormatError(
+            f"{path} claims {count:,} values in {file_bytes:,} bytes, which cannot be true;"
+            " create it again"
+        )

@@ -1,0 +1,204 @@
+"""OpenEXR: the flat channels of a file, in the frame of its display window."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pnpdepth_cli.errors import FileFormatError, UsageError
+from pnpdepth_cli.io.file_bytes import check_pixel_count, damaged
+from pnpdepth_cli.io.formats import DepthFormat, StoredArray, WriteOptions
+
+_DEPTH_NAMES = frozenset({"z", "depth"})
+_TILED, _DEEP, _MULTIPART = 0x200, 0x800, 0x1000  # bits of the version field
+
+
+def read_exr_channels(path: Path, data: bytes) -> dict[str, NDArray[Any]]:
+    """Returns the channels by name: (H, W) arrays of float16, float32 or uint32.
+
+    Channels of a file with several parts are called `part.channel`. Pixels of the display
+    window outside the data window are 0.
+
+    Args:
+        path: The file.
+        data: Its content.
+
+    Raises:
+        FileFormatError: The file is damaged, deep or subsampled, or exceeds the budget.
+    """
+    _check_complete(path, data)
+    import OpenEXR
+
+    try:
+        with OpenEXR.File(str(path), header_only=True) as file:
+            count = len(file.parts)
+            for index in range(count):
+                _check_header(path, file.header(index), len(data))
+        with OpenEXR.File(str(path), separate_channels=True) as file:
+            parts = [_part_channels(part) for part in file.parts]
+            names = [str(part.name()) for part in file.parts]
+    except FileFormatError:
+        raise
+    except Exception as error:  # the binding raises many kinds, UnicodeDecodeError among them
+        raise damaged(path, "EXR", f"cannot be read ({error})") from error
+    if len(parts) != count:  # the binding leaves out a part that it cannot decode
+        raise damaged(path, "EXR", "cannot be decoded")
+    if count == 1:
+        channels = parts[0]
+    else:
+        channels = {
+            f"{name}.{channel}": pixels
+            for name, part in zip(names, parts, strict=True)
+            for channel, pixels in part.items()
+        }
+    if not channels:
+        raise FileFormatError(f"{path} holds no channel; export the depth again")
+    return channels
+
+
+def _write(file: Path, metres: NDArray[np.float32], options: WriteOptions) -> None:
+    """One float32 channel Z, ZIP compressed."""
+    import OpenEXR
+
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    channel = OpenEXR.Channel(np.ascontiguousarray(metres, dtype=np.float32))
+    try:
+        with OpenEXR.File(header, {"Z": channel}) as image:
+            image.write(str(file))
+    except RuntimeError as error:  # how the binding reports a full disk, say
+        raise OSError(str(error)) from error
+
+
+def _check_header(path: Path, header: dict[str, Any], file_bytes: int) -> None:
+    for window in ("dataWindow", "displayWindow"):
+        low, high = header[window]
+        width, height = (int(b) - int(a) + 1 for a, b in zip(low, high, strict=True))
+        channels = len(header["channels"])
+        check_pixel_count(path, width, height, channels=channels, file_bytes=file_bytes)
+    for channel in header["channels"]:
+        if (channel.xSampling, channel.ySampling) != (1, 1):
+            raise FileFormatError(
+                f"{path}: channel {channel.name} is subsampled; export it at full resolution"
+            )
+
+
+def _part_channels(part: Any) -> dict[str, NDArray[Any]]:
+    data, display = (np.asarray(part.header[key]) for key in ("dataWindow", "displayWindow"))
+    channels = {name: np.asarray(channel.pixels) for name, channel in part.channels.items()}
+    if np.array_equal(data, display):
+        return channels
+    return {name: _in_display(pixels, data, display) for name, pixels in channels.items()}
+
+
+def _in_display(
+    pixels: NDArray[Any], data: NDArray[np.int64], display: NDArray[np.int64]
+) -> NDArray[Any]:
+    width, height = display[1] - display[0] + 1
+    placed = np.zeros((height, width), dtype=pixels.dtype)
+    left, top = np.maximum(data[0], display[0])
+    right, bottom = np.minimum(data[1], display[1]) + 1
+    if left < right and top < bottom:
+        (x0, y0), (x1, y1) = data[0], display[0]
+        placed[top - y1 : bottom - y1, left - x1 : right - x1] = pixels[
+            top - y0 : bottom - y0, left - x0 : right - x0
+        ]
+    return placed
+
+
+def _check_complete(path: Path, data: bytes) -> None:
+    """Raises FileFormatError unless every block of pixels lies within the file.
+
+    The OpenEXR binding prints its complaints about a file cut short to standard output,
+    which belongs to our own data; so such a file must not reach it.
+    """
+    try:
+        (version,) = struct.unpack_from("<I", data, 4)
+        if version & _DEEP:
+            raise FileFormatError(f"{path} is a deep EXR; export it flattened")
+        offsets, table_end, tiled = _chunk_table(data, version)
+        needed = _end_of_chunk(data, max(offsets), tiled, bool(version & _MULTIPART))
+        complete = min(offsets) >= table_end and needed <= len(data)
+    except (struct.error, ValueError, IndexError, OverflowError) as error:
+        raise damaged(path, "EXR", "is cut short or corrupt") from error
+    if not complete:
+        raise damaged(path, "EXR", f"is cut short after {len(data):,} bytes")
+
+
+def _chunk_table(data: bytes, version: int) -> tuple[list[int], int, list[bool]]:
+    """The offset of every block of pixels, where that table ends, and which parts are tiled.
+
+    The table follows the headers and ends where the first block begins.
+    """
+    position, is_tiled = _skip_header(data, 8)
+    tiled = [is_tiled or bool(version & _TILED)]
+    if version & _MULTIPART:
+        while data[position] != 0:
+            position, is_tiled = _skip_header(data, position)
+            tiled.append(is_tiled)
+        position += 1
+    offsets: list[int] = []
+    first = len(data)
+    while position < first:
+        (offset,) = struct.unpack_from("<Q", data, position)
+        offsets.append(offset)
+        first = min(first, offset)
+        position += 8
+    return offsets, position, tiled
+
+
+def _end_of_chunk(data: bytes, start: int, tiled: list[bool], multipart: bool) -> int:
+    part = 0
+    if multipart:
+        (part,) = struct.unpack_from("<I", data, start)
+        start += 4
+    # A block begins with its line, or its tile and level in x and y; then come size and pixels.
+    start += 16 if tiled[part] else 4
+    (size,) = struct.unpack_from("<I", data, start)
+    return start + 4 + int(size)
+
+
+def _skip_header(data: bytes, position: int) -> tuple[int, bool]:
+    """Where the header that begins at `position` ends, and whether its type is tiled."""
+    tiled = False
+    while data[position] != 0:
+        name_end = data.index(0, position)
+        type_end = data.index(0, name_end + 1)
+        (size,) = struct.unpack_from("<I", data, type_end + 1)
+        value = type_end + 5
+        if data[position:name_end] == b"type":
+            tiled = data[value : value + size] == b"tiledimage"
+        position = value + size
+    return position + 1, tiled
+
+
+def _read(path: Path, data: bytes, channel: str | None) -> StoredArray:
+    channels = read_exr_channels(path, data)
+    name = channel if channel is not None else _depth_channel(path, channels)
+    if name not in channels:
+        listing = ", ".join(channels)
+        raise UsageError(f"{path} has no channel {name!r}; --channel can be one of: {listing}")
+    return StoredArray(values=channels[name], description=f"EXR channel {name}")
+
+
+def _depth_channel(path: Path, channels: dict[str, NDArray[Any]]) -> str:
+    """The only channel, or the only one named for depth, or R of a grey image in R, G, B."""
+    names = [name for name in channels if name != "A"] or list(channels)
+    if len(names) == 1:
+        return names[0]
+    named = [name for name in names if not _DEPTH_NAMES.isdisjoint(name.lower().split("."))]
+    if len(named) == 1:
+        return named[0]
+    if sorted(names) == ["B", "G", "R"]:
+        first = channels["R"]
+        if all(np.array_equal(first, channels[k], equal_nan=True) for k in "GB"):
+            return "R"
+    raise FileFormatError(
+        f"{path} has several channels ({', '.join(channels)}); choose one with --channel"
+    )
+
+
+FORMAT = DepthFormat(name="EXR", suffixes=(".exr",), magic=(b"v/1\x01",), read=_read, write=_write)

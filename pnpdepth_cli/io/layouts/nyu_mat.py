@@ -1,0 +1,77 @@
+"""`nyu-mat`: nyu_depth_v2_labeled.mat, the official file of NYU Depth v2.
+
+A splits.mat (testNdxs), or a test.txt with the numbers of its frames from 1, beside it names the
+test set. Without one, all frames are meant.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from pnpdepth_cli.errors import FileFormatError
+from pnpdepth_cli.io.dataset.frame import Frame, Hdf5Array, Listing
+from pnpdepth_cli.io.dataset.hdf5 import shape_of
+from pnpdepth_cli.io.dataset.protocols import PROTOCOLS
+from pnpdepth_cli.io.file_bytes import one_line, read_bytes
+from pnpdepth_cli.io.layouts import Layout
+
+_LABELED = "nyu_depth_v2_labeled.mat"
+
+
+def matches(root: Path) -> bool:
+    """True for the official file, or a folder with it."""
+    return _labeled(root).is_file()
+
+
+def listing(root: Path) -> Listing:
+    """The frames of the split beside the file, or all of them; numbered from 1 as there."""
+    path = _labeled(root)
+    count = shape_of(path, "depths")[0]
+    frames = [
+        Frame(
+            name=f"{number:04}",
+            image=Hdf5Array(path=path, name="images", axes=(2, 1, 0), index=number - 1),
+            gt=Hdf5Array(path=path, name="depths", axes=(1, 0), index=number - 1),
+            protocol=PROTOCOLS["nyu"],
+        )
+        for number in _split(path.parent, count) or range(1, count + 1)
+    ]
+    return Listing(frames=frames)
+
+
+def _labeled(root: Path) -> Path:
+    return root if root.name == _LABELED else root / _LABELED
+
+
+def _split(folder: Path, count: int) -> list[int]:
+    """The numbers of the test set, sorted; empty if there is no file that says them."""
+    text, matlab = folder / "test.txt", folder / "splits.mat"
+    if text.is_file():
+        source = text
+        words: Any = read_bytes(text).decode("utf-8", "replace").split()
+    elif matlab.is_file():
+        source, words = matlab, _test_numbers(matlab)
+    else:
+        return []
+    try:
+        numbers = sorted({int(word) for word in words})
+    except ValueError as error:
+        raise FileFormatError(
+            f"{source} is not a list of frame numbers: {one_line(error)}"
+        ) from error
+    if not numbers or not 1 <= numbers[0] <= numbers[-1] <= count:
+        raise FileFormatError(f"{source}: frame numbers must be from 1 to {count:,}")
+    return numbers
+
+
+def _test_numbers(path: Path) -> Any:
+    from scipy.io import loadmat
+
+    try:
+        return loadmat(path, variable_names=["testNdxs"])["testNdxs"].ravel().tolist()
+    except Exception as error:  # scipy raises many kinds for a damaged file
+        raise FileFormatError(f"{path} has no testNdxs ({one_line(error)})") from error
+
+
+LAYOUT = Layout(matches=matches, listing=listing)

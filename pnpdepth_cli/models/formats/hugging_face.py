@@ -1,0 +1,206 @@
+"""A local Hugging Face folder as a definition: config.json, preprocessor_config.json, safetensors.
+
+Needs `pip install pnpdepth[hf]`. The network is transformers' own class, with code from that
+package only; nothing is downloaded. The picture is prepared by what preprocessor_config.json
+says, on this program's own frame map, so torchvision is not needed.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from pnpdepth_cli.choices import OutputKind, OutputScale
+from pnpdepth_cli.completion.interpolation import linear
+from pnpdepth_cli.core.split.user_code import describe
+from pnpdepth_cli.errors import CheckpointError, ModelError
+from pnpdepth_cli.models.definition import (
+    FOREIGN,
+    Fixed,
+    ModelDefinition,
+    Near,
+    Normalisation,
+)
+from pnpdepth_cli.points import SparsePoints
+
+_WEIGHTS = ("model.safetensors", "model.safetensors.index.json")
+_PICKLED = ("pytorch_model.bin", "pytorch_model.bin.index.json")
+
+
+@dataclass(frozen=True)
+class _Family:
+    """What the classes of one model type give, and the multiple their picture's sides must be."""
+
+    kind: OutputKind
+    scale: OutputScale
+    of: int = 1
+
+
+PROMPT_SIZE = (192, 256)
+"""Rows and columns of the depth that Prompt Depth Anything was trained with, a phone's LiDAR."""
+
+
+_FAMILIES = {
+    "depth_anything": _Family("inverse", "affine", 14),
+    "prompt_depth_anything": _Family("depth", "metric", 14),
+    # Intel's DPT give inverse depth, Meta's on DINOv2 give depth; their configurations do not say.
+    "dpt": _Family("unknown", "affine", 16),
+    "zoedepth": _Family("depth", "metric", 32),
+    "glpn": _Family("depth", "metric", 32),
+    # Inverse depth for a canonical camera: a factor away from metres.
+    "depth_pro": _Family("inverse", "scale"),
+}
+
+
+def hf_definition(folder: Path) -> ModelDefinition:
+    """The definition of a depth network in a folder. ModelError where it cannot be run."""
+    config = _json(folder / "config.json", "it says which network this is")
+    kind = str(config.get("model_type"))
+    if kind not in _FAMILIES:
+        raise ModelError(
+            f"{folder}: networks of type {kind!r} are not known; known: {', '.join(_FAMILIES)}"
+        )
+    family = _FAMILIES[kind]
+    if config.get("depth_estimation_type") == "metric":
+        family = _Family("depth", "metric", family.of)
+    processing = _json(folder / "preprocessor_config.json", "it says how the picture is prepared")
+    weights, prompted = _weights(folder), kind == "prompt_depth_anything"
+    return ModelDefinition(
+        name=folder.resolve().name,
+        summary=f"Hugging Face {kind}",
+        input_kind="rgb+sparse" if prompted else "rgb",
+        size=_size(processing, family.of, folder),
+        normalisation=_normalisation(processing, folder),
+        output_kind=family.kind,
+        output_scale=family.scale,
+        build=lambda: _build(folder),
+        complete=True,
+        checkpoint=weights,
+        arguments=_with_prompt if prompted else None,
+        output=_predicted_depth,
+        defaults=FOREIGN,
+    )
+
+
+def _with_prompt(rgb: Tensor | None, sparse: Tensor | None) -> tuple[Tensor, ...]:
+    """The picture and coarse dense depth (1, 1, 192, 256): the points, joined linearly."""
+    assert rgb is not None
+    assert sparse is not None
+    rows, columns = torch.nonzero(sparse[0, 0], as_tuple=True)
+    points = SparsePoints(
+        xy=torch.stack([columns, rows], dim=1).float(),
+        depth=sparse[0, 0, rows, columns],
+        size=(sparse.shape[-2], sparse.shape[-1]),
+    )
+    return rgb, linear(points.resized(*PROMPT_SIZE))[None, None].to(sparse)
+
+
+def _predicted_depth(output: Any) -> Tensor:
+    depth: Tensor = output.predicted_depth
+    return depth
+
+
+def _json(file: Path, why: str) -> Mapping[str, Any]:
+    if not file.is_file():
+        raise ModelError(
+            f"{file.parent} is no Hugging Face folder: it has no {file.name}, and {why}; take it"
+            " from the network's page"
+        )
+    try:
+        read = json.loads(file.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise ModelError(f"{file} is not JSON: {error}") from None
+    if not isinstance(read, dict):
+        raise ModelError(f"{file} holds no settings")
+    return read
+
+
+def _weights(folder: Path) -> Path:
+    for name in _WEIGHTS:
+        if (folder / name).is_file():
+            return folder / name
+    if any((folder / name).is_file() for name in _PICKLED):
+        raise CheckpointError(
+            f"{folder} has its weights as a pickle only; convert it: pnpdepth models convert"
+            f" {folder / _PICKLED[0]} {folder / _WEIGHTS[0]}"
+        )
+    raise CheckpointError(f"{folder} has no {_WEIGHTS[0]}")
+
+
+def _size(processing: Mapping[str, Any], of: int, folder: Path) -> Fixed | Near:
+    if not processing.get("do_resize", True) or "size_divisor" in processing:
+        return Near(of=max(of, int(processing.get("size_divisor") or 1)))
+    size = processing.get("size")
+    if isinstance(size, Mapping):
+        height = size.get("height") or size.get("shortest_edge")
+        width = size.get("width") or size.get("shortest_edge")
+    else:
+        height = width = size
+    if not isinstance(height, int) or not isinstance(width, int) or min(height, width) < 1:
+        raise ModelError(
+            f"{folder / 'preprocessor_config.json'}: size {size!r} is no height and width"
+        )
+    if not processing.get("keep_aspect_ratio", False):
+        return Fixed(height, width)
+    return Near(
+        of=max(of, int(processing.get("ensure_multiple_of") or 1)), height=height, width=width
+    )
+
+
+def _normalisation(processing: Mapping[str, Any], folder: Path) -> Normalisation:
+    # A picture in 0…255 where it is not rescaled: 1/255 of the deviation does the same.
+    unit = float(processing.get("rescale_factor", 1 / 255)) * 255
+    unit = unit if processing.get("do_rescale", True) else 255.0
+    if not processing.get("do_normalize", "image_mean" in processing):
+        return Normalisation(std=(1 / unit, 1 / unit, 1 / unit))
+    mean, std = processing.get("image_mean", (0.5,) * 3), processing.get("image_std", (0.5,) * 3)
+    try:
+        (m0, m1, m2), (s0, s1, s2) = mean, std
+        return Normalisation(
+            mean=(m0 / unit, m1 / unit, m2 / unit), std=(s0 / unit, s1 / unit, s2 / unit)
+        )
+    except (TypeError, ValueError, ModelError):
+        raise ModelError(
+            f"{folder / 'preprocessor_config.json'}: image_mean {mean!r} and image_std {std!r} are"
+            " not three numbers each, the second above 0"
+        ) from None
+
+
+def _build(folder: Path) -> nn.Module:
+    # Read when huggingface_hub is imported; a folder may name a backbone it would look for online.
+    os.environ["HF_HUB_OFFLINE"] = "1"
+    try:
+        import transformers
+    except ImportError as error:
+        raise ModelError(
+            f"{folder} is a Hugging Face folder, which needs the package {error.name!r}:"
+            " pip install 'pnpdepth[hf]'"
+        ) from None
+    logging: Any = transformers.utils.logging
+    logging.set_verbosity_error()
+    logging.disable_progress_bar()
+    try:
+        module, info = transformers.AutoModelForDepthEstimation.from_pretrained(
+            str(folder),
+            local_files_only=True,
+            use_safetensors=True,
+            trust_remote_code=False,
+            output_loading_info=True,
+        )
+    except Exception as error:  # transformers raises what its parts raise
+        raise ModelError(f"{folder}: transformers cannot load it: {describe(error)}") from None
+    missing = [*info["missing_keys"], *(str(key) for key in info["mismatched_keys"])]
+    if missing:
+        raise CheckpointError(
+            f"{folder}: its weights leave {len(missing)} of the network's out or of another shape"
+            f" ({', '.join(sorted(missing)[:4])})"
+        )
+    made: nn.Module = module.float()
+    return made

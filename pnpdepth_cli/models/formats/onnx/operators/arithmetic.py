@@ -1,0 +1,274 @@
+"""Numbers from numbers: activations, arithmetic, comparison, matrices, reductions."""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Callable
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from pnpdepth_cli.models.formats.onnx.operators.table import (
+    OPERATORS,
+    Given,
+    Node,
+    Unsupported,
+    at,
+    operator,
+    whole_numbers,
+)
+
+_UNARY: dict[str, Callable[[Tensor], Tensor]] = {
+    "Relu": torch.relu,
+    "Sigmoid": torch.sigmoid,
+    "Tanh": torch.tanh,
+    "Softplus": F.softplus,
+    "Softsign": F.softsign,
+    "HardSwish": F.hardswish,
+    "Mish": F.mish,
+    "Erf": torch.erf,
+    "Exp": torch.exp,
+    "Log": torch.log,
+    "Sqrt": torch.sqrt,
+    "Reciprocal": torch.reciprocal,
+    "Abs": torch.abs,
+    "Neg": torch.neg,
+    "Floor": torch.floor,
+    "Ceil": torch.ceil,
+    "Round": torch.round,
+    "Sign": torch.sign,
+    "Sin": torch.sin,
+    "Cos": torch.cos,
+    "Tan": torch.tan,
+    "Asin": torch.asin,
+    "Acos": torch.acos,
+    "Atan": torch.atan,
+    "Sinh": torch.sinh,
+    "Cosh": torch.cosh,
+    "Not": torch.logical_not,
+    "IsNaN": torch.isnan,
+    "Identity": lambda x: x.clone(),
+}
+
+_BINARY: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
+    "Add": torch.add,
+    "Sub": torch.sub,
+    "Mul": torch.mul,
+    "Equal": torch.eq,
+    "Greater": torch.gt,
+    "Less": torch.lt,
+    "GreaterOrEqual": torch.ge,
+    "LessOrEqual": torch.le,
+    "And": torch.logical_and,
+    "Or": torch.logical_or,
+    "Xor": torch.logical_xor,
+}
+
+_FOLDED: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
+    "Max": torch.maximum,
+    "Min": torch.minimum,
+    "Sum": torch.add,
+}
+
+
+def _unary(function: Callable[[Tensor], Tensor]) -> Callable[[Node, Given], Tensor]:
+    return lambda node, given: function(given[0])
+
+
+def _binary(function: Callable[[Tensor, Tensor], Tensor]) -> Callable[[Node, Given], Tensor]:
+    return lambda node, given: function(given[0], _placed(node, given[0], given[1]))
+
+
+def _folded(function: Callable[[Tensor, Tensor], Tensor]) -> Callable[[Node, Given], Tensor]:
+    return lambda node, given: functools.reduce(function, given)
+
+
+OPERATORS.update({name: _unary(f) for name, f in _UNARY.items()})
+OPERATORS.update({name: _binary(f) for name, f in _BINARY.items()})
+OPERATORS.update({name: _folded(f) for name, f in _FOLDED.items()})
+
+
+def _placed(node: Node, a: Tensor, b: Tensor) -> Tensor:
+    """Before opset 7, `axis` said where the dimensions of b start in a."""
+    axis = node.get("axis")
+    if node.opset >= 7 or axis is None or not node.get("broadcast"):
+        return b
+    axis %= a.ndim
+    return b.reshape(*b.shape, *[1] * (a.ndim - axis - b.ndim))
+
+
+@operator("Div")
+def div(node: Node, given: Given) -> Tensor:
+    a, b = given[0], _placed(node, given[0], given[1])
+    whole = not a.is_floating_point() and not b.is_floating_point()
+    return torch.div(a, b, rounding_mode="trunc") if whole else a / b
+
+
+@operator("Mean")
+def mean(node: Node, given: Given) -> Tensor:
+    total: Tensor = functools.reduce(torch.add, given)
+    return total / len(given)
+
+
+@operator("Mod")
+def mod(node: Node, given: Given) -> Tensor:
+    return (torch.fmod if node.get("fmod", 0) else torch.remainder)(given[0], given[1])
+
+
+@operator("Pow")
+def power(node: Node, given: Given) -> Tensor:
+    base, exponent = given[0], _placed(node, given[0], given[1])
+    return torch.pow(base, exponent).to(base.dtype)
+
+
+@operator("Where")
+def where(node: Node, given: Given) -> Tensor:
+    return torch.where(given[0], given[1], given[2])
+
+
+@operator("IsInf")
+def is_infinite(node: Node, given: Given) -> Tensor:
+    found = torch.zeros_like(given[0], dtype=torch.bool)
+    if node.get("detect_positive", 1):
+        found = found | torch.isposinf(given[0])
+    return found | torch.isneginf(given[0]) if node.get("detect_negative", 1) else found
+
+
+@operator("Clip")
+def clip(node: Node, given: Given) -> Tensor:
+    low = at(given, 1) if node.opset >= 11 else node.get("min")
+    high = at(given, 2) if node.opset >= 11 else node.get("max")
+    x: Tensor = given[0]
+    # Two steps: where low > high the standard gives high, and either may be left out.
+    x = x if low is None else torch.maximum(x, torch.as_tensor(low, dtype=x.dtype, device=x.device))
+    if high is None:
+        return x
+    return torch.minimum(x, torch.as_tensor(high, dtype=x.dtype, device=x.device))
+
+
+@operator("LeakyRelu")
+def leaky_relu(node: Node, given: Given) -> Tensor:
+    return F.leaky_relu(given[0], node.get("alpha", 0.01))
+
+
+@operator("PRelu")
+def prelu(node: Node, given: Given) -> Tensor:
+    x, slope = given
+    if node.opset < 7 and slope.ndim == 1 and len(slope) > 1:
+        slope = slope.reshape(-1, *[1] * (x.ndim - 2))
+    return torch.where(x < 0, x * slope, x)
+
+
+@operator("Elu")
+def elu(node: Node, given: Given) -> Tensor:
+    return F.elu(given[0], node.get("alpha", 1.0))
+
+
+@operator("Celu")
+def celu(node: Node, given: Given) -> Tensor:
+    return F.celu(given[0], node.get("alpha", 1.0))
+
+
+@operator("Selu")
+def selu(node: Node, given: Given) -> Tensor:
+    alpha, gamma = node.get("alpha", 1.6732632423543772), node.get("gamma", 1.0507009873554805)
+    return torch.mul(F.elu(given[0], alpha), gamma)
+
+
+@operator("ThresholdedRelu")
+def thresholded_relu(node: Node, given: Given) -> Tensor:
+    return F.threshold(given[0], node.get("alpha", 1.0), 0.0)
+
+
+@operator("HardSigmoid")
+def hard_sigmoid(node: Node, given: Given) -> Tensor:
+    line = torch.add(torch.mul(given[0], node.get("alpha", 0.2)), node.get("beta", 0.5))
+    return line.clamp(0, 1)
+
+
+@operator("Gelu")
+def gelu(node: Node, given: Given) -> Tensor:
+    return F.gelu(given[0], approximate=node.get("approximate", "none"))
+
+
+@operator("Softmax", "LogSoftmax")
+def softmax(node: Node, given: Given) -> Tensor:
+    x = given[0]
+    function = torch.softmax if node.op == "Softmax" else torch.log_softmax
+    if node.opset >= 13:
+        return function(x, node.get("axis", -1))
+    axis = node.get("axis", 1) % x.ndim
+    rows = math.prod(x.shape[:axis])
+    return function(x.reshape(rows, -1), 1).reshape(x.shape)
+
+
+@operator("MatMul")
+def matmul(node: Node, given: Given) -> Tensor:
+    return torch.matmul(given[0], given[1])
+
+
+@operator("Gemm")
+def gemm(node: Node, given: Given) -> Tensor:
+    a, b, c = given[0], given[1], at(given, 2)
+    a = a.T if node.get("transA", 0) else a
+    b = b.T if node.get("transB", 0) else b
+    product: Tensor = node.get("alpha", 1.0) * (a @ b)
+    return product if c is None else product + node.get("beta", 1.0) * c
+
+
+@operator("Einsum")
+def einsum(node: Node, given: Given) -> Tensor:
+    return torch.einsum(node.get("equation"), *given)
+
+
+@operator("CumSum")
+def cumsum(node: Node, given: Given) -> Tensor:
+    x, axis = given[0], whole_numbers(given[1])[0]
+    x = x.flip(axis) if node.get("reverse", 0) else x
+    total = x.cumsum(axis, dtype=x.dtype)
+    total = total - x if node.get("exclusive", 0) else total
+    return total.flip(axis) if node.get("reverse", 0) else total
+
+
+_REDUCTIONS: dict[str, Callable[[Tensor, list[int], bool], Tensor]] = {
+    "ReduceMean": lambda x, axes, keep: x.mean(axes, keepdim=keep),
+    "ReduceSum": lambda x, axes, keep: x.sum(axes, keepdim=keep, dtype=x.dtype),
+    "ReduceMax": lambda x, axes, keep: x.amax(axes, keepdim=keep),
+    "ReduceMin": lambda x, axes, keep: x.amin(axes, keepdim=keep),
+    "ReduceL1": lambda x, axes, keep: x.abs().sum(axes, keepdim=keep),
+    "ReduceL2": lambda x, axes, keep: x.square().sum(axes, keepdim=keep).sqrt(),
+    "ReduceSumSquare": lambda x, axes, keep: x.square().sum(axes, keepdim=keep),
+    "ReduceLogSum": lambda x, axes, keep: x.sum(axes, keepdim=keep).log(),
+    "ReduceLogSumExp": lambda x, axes, keep: x.logsumexp(axes, keepdim=keep),
+    "ReduceProd": lambda x, axes, keep: _product(x, axes, keep),
+}
+
+
+def _product(x: Tensor, axes: list[int], keep: bool) -> Tensor:
+    for axis in sorted((a % x.ndim for a in axes), reverse=True):
+        x = x.prod(axis, keepdim=keep, dtype=x.dtype)
+    return x
+
+
+@operator(*_REDUCTIONS)
+def reduce(node: Node, given: Given) -> Tensor:
+    axes: Any = node.get("axes")
+    if axes is None and at(given, 1) is not None:
+        axes = whole_numbers(given[1])
+    if not axes:
+        if node.get("noop_with_empty_axes", 0):
+            # Nothing is summed, but what is done to each element still is.
+            return _REDUCTIONS[node.op](given[0][..., None], [-1], False)
+        axes = list(range(given[0].ndim))
+    return _REDUCTIONS[node.op](given[0], list(axes), bool(node.get("keepdims", 1)))
+
+
+@operator("ArgMax", "ArgMin")
+def arg_extreme(node: Node, given: Given) -> Tensor:
+    if node.get("select_last_index", 0):
+        raise Unsupported("select_last_index")
+    function = torch.argmax if node.op == "ArgMax" else torch.argmin
+    return function(given[0], node.get("axis", 0), keepdim=bool(node.get("keepdims", 1)))

@@ -1,0 +1,147 @@
+"""Convolutions and pooling, with the standard's ways to pad."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from pnpdepth_cli.models.formats.onnx.operators.table import Given, Node, Unsupported, at, operator
+
+_CONV = {1: F.conv1d, 2: F.conv2d, 3: F.conv3d}
+_TRANSPOSED = {1: F.conv_transpose1d, 2: F.conv_transpose2d, 3: F.conv_transpose3d}
+_MAX_POOL = {1: F.max_pool1d, 2: F.max_pool2d, 3: F.max_pool3d}
+
+Pads = list[tuple[int, int]]
+
+
+def _sides(pads: Pads) -> list[int]:
+    """As F.pad has them: the last axis first."""
+    return [n for pair in reversed(pads) for n in pair]
+
+
+def _pads(
+    node: Node, size: Sequence[int], kernel: Sequence[int], stride: Sequence[int],
+    dilation: Sequence[int],
+) -> Pads:  # fmt: skip
+    """(begin, end) per spatial axis; the window is kernel × dilation."""
+    rank, auto = len(size), node.get("auto_pad", "NOTSET")
+    if auto == "NOTSET":
+        flat = node.get("pads", [0] * (2 * rank))
+        return list(zip(flat[:rank], flat[rank:], strict=True))
+    if auto == "VALID":
+        return [(0, 0)] * rank
+    pads = []
+    for n, k, s, d in zip(size, kernel, stride, dilation, strict=True):
+        total = max(0, (math.ceil(n / s) - 1) * s + (k - 1) * d + 1 - n)
+        small, large = total // 2, total - total // 2
+        pads.append((small, large) if auto == "SAME_UPPER" else (large, small))
+    return pads
+
+
+@operator("Conv")
+def conv(node: Node, given: Given) -> Tensor:
+    x, weight, bias = given[0], given[1], at(given, 2)
+    rank = x.ndim - 2
+    stride, dilation = node.get("strides", [1] * rank), node.get("dilations", [1] * rank)
+    pads = _pads(node, x.shape[2:], weight.shape[2:], stride, dilation)
+    even = all(begin == end for begin, end in pads)
+    if not even:
+        x = F.pad(x, _sides(pads))
+    padding = [begin for begin, _ in pads] if even else [0] * rank
+    return _CONV[rank](x, weight, bias, stride, padding, dilation, node.get("group", 1))
+
+
+@operator("ConvTranspose")
+def conv_transpose(node: Node, given: Given) -> Tensor:
+    x, weight, bias = given[0], given[1], at(given, 2)
+    rank = x.ndim - 2
+    stride, dilation = node.get("strides", [1] * rank), node.get("dilations", [1] * rank)
+    extra = list(node.get("output_padding", [0] * rank))
+    full = [
+        (n - 1) * s + (k - 1) * d + 1 + e
+        for n, s, k, d, e in zip(
+            x.shape[2:], stride, weight.shape[2:], dilation, extra, strict=True
+        )
+    ]
+    y: Tensor = _TRANSPOSED[rank](x, weight, None, stride, 0, 0, node.get("group", 1), dilation)
+    crops = _transposed_pads(node, x, stride, full)
+    sides = [(-begin, e - end) for (begin, end), e in zip(crops, extra, strict=True)]
+    if any(n for pair in sides for n in pair):
+        y = F.pad(y, _sides(sides))
+    return y if bias is None else y + bias.reshape(-1, *[1] * rank)
+
+
+def _transposed_pads(node: Node, x: Tensor, stride: Sequence[int], full: Sequence[int]) -> Pads:
+    auto, wanted = node.get("auto_pad", "NOTSET"), node.get("output_shape")
+    if wanted is None and not auto.startswith("SAME"):
+        return _pads(node, x.shape[2:], full, stride, stride)
+    if wanted is None:
+        wanted = [n * s for n, s in zip(x.shape[2:], stride, strict=True)]
+    pads = []
+    for size, out in zip(full, wanted[-len(full) :], strict=True):
+        total = size - out
+        half = total // 2 if total > 0 else 0
+        rest = total - half
+        pads.append((half, rest) if auto == "SAME_UPPER" else (rest, half))
+    return pads
+
+
+def _pooled(node: Node, x: Tensor) -> tuple[list[int], list[int], list[int], Pads, Pads]:
+    """Kernel, stride, dilation, pads, and the pads with what ceil_mode adds at the end."""
+    rank = x.ndim - 2
+    kernel = list(node.get("kernel_shape"))
+    stride = list(node.get("strides", [1] * rank))
+    dilation = list(node.get("dilations", [1] * rank))
+    pads = _pads(node, x.shape[2:], kernel, stride, dilation)
+    if not node.get("ceil_mode", 0):
+        return kernel, stride, dilation, pads, pads
+    grown = []
+    for n, k, s, d, (begin, end) in zip(x.shape[2:], kernel, stride, dilation, pads, strict=True):
+        window = (k - 1) * d + 1
+        out = math.ceil((n + begin + end - window) / s) + 1
+        if (out - 1) * s >= n + begin:  # a window may not begin in the padding at the end
+            out -= 1
+        grown.append((begin, max(end, (out - 1) * s + window - n - begin)))
+    return kernel, stride, dilation, pads, grown
+
+
+@operator("MaxPool")
+def max_pool(node: Node, given: Given) -> Tensor:
+    if node.outputs > 1:
+        raise Unsupported("its second output, the indices")
+    x = given[0]
+    kernel, stride, dilation, _, grown = _pooled(node, x)
+    if any(n for pair in grown for n in pair):
+        x = F.pad(x, _sides(grown), value=-math.inf)
+    return _MAX_POOL[x.ndim - 2](x, kernel, stride, 0, dilation)
+
+
+@operator("AveragePool")
+def average_pool(node: Node, given: Given) -> Tensor:
+    x = given[0]
+    kernel, stride, dilation, pads, grown = _pooled(node, x)
+    if x.ndim != 4 or any(d != 1 for d in dilation):
+        raise Unsupported("other than two spatial axes, or dilations")
+    if not any(n for pair in grown for n in pair):
+        return F.avg_pool2d(x, kernel, stride)
+    area = math.prod(kernel)
+    total = F.avg_pool2d(F.pad(x, _sides(grown)), kernel, stride) * area
+    inside = torch.ones_like(x[:1, :1])
+    if node.get("count_include_pad", 0):
+        inside = F.pad(inside, _sides(pads), value=1.0)
+        grown = [(0, g[1] - p[1]) for g, p in zip(grown, pads, strict=True)]
+    return total / (F.avg_pool2d(F.pad(inside, _sides(grown)), kernel, stride) * area)
+
+
+@operator("GlobalAveragePool")
+def global_average_pool(node: Node, given: Given) -> Tensor:
+    return given[0].mean(list(range(2, given[0].ndim)), keepdim=True)
+
+
+@operator("GlobalMaxPool")
+def global_max_pool(node: Node, given: Given) -> Tensor:
+    return given[0].amax(list(range(2, given[0].ndim)), keepdim=True)

@@ -1,0 +1,197 @@
+"""Resize and Upsample in every mode of the standard, as a weighted sum of picked elements.
+
+Along one axis each output element is Σ_k weight[k]·x[index[k]]: one element for nearest, two for
+linear, four for cubic, more where an antialiasing filter is asked for.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from pnpdepth_cli.models.formats.onnx.operators.table import (
+    Given,
+    Node,
+    Unsupported,
+    at,
+    operator,
+    whole_numbers,
+)
+
+
+@operator("Upsample")
+def upsample(node: Node, given: Given) -> Tensor:
+    x = given[0]
+    scales = node.get("scales") if len(given) < 2 else given[1].tolist()
+    if scales is None:  # the first version had two attributes
+        scales = [1.0, 1.0, node.get("height_scale"), node.get("width_scale")]
+    mode = {"bilinear": "linear"}.get(node.get("mode", "nearest"), node.get("mode", "nearest"))
+    return _resized(x, _Plan(mode=mode, coordinates="asymmetric", nearest="simple"), scales, None)
+
+
+@operator("Resize")
+def resize(node: Node, given: Given) -> Tensor:
+    x = given[0]
+    if node.opset < 11:
+        plan = _Plan(node.get("mode", "nearest"), "asymmetric", "simple")
+        return _resized(x, plan, given[1].tolist(), None)
+    plan = _Plan(
+        mode=node.get("mode", "nearest"),
+        coordinates=node.get("coordinate_transformation_mode", "half_pixel"),
+        nearest=node.get("nearest_mode", "round_prefer_floor"),
+        a=node.get("cubic_coeff_a", -0.75),
+        exclude_outside=bool(node.get("exclude_outside", 0)),
+        antialias=bool(node.get("antialias", 0)),
+    )
+    if plan.coordinates == "tf_crop_and_resize":
+        raise Unsupported("coordinate_transformation_mode tf_crop_and_resize")
+    given_scales, given_sizes = at(given, 2), at(given, 3)
+    axes = [a % x.ndim for a in node.get("axes", range(x.ndim))]
+    if given_sizes is not None and given_sizes.numel():
+        sizes = dict(zip(axes, whole_numbers(given_sizes), strict=True))
+        policy, factors = node.get("keep_aspect_ratio_policy", "stretch"), {}
+        if policy != "stretch":
+            ratios = [sizes[a] / x.shape[a] for a in axes]
+            ratio = min(ratios) if policy == "not_larger" else max(ratios)
+            sizes = {a: math.floor(ratio * x.shape[a] + 0.5) for a in axes}
+            factors = dict.fromkeys(axes, ratio)
+        wanted = [sizes.get(a, x.shape[a]) for a in range(x.ndim)]
+        return _resized(
+            x,
+            plan,
+            [factors[a] if a in factors else n / x.shape[a] for a, n in enumerate(wanted)],
+            wanted,
+        )
+    if given_scales is None:
+        raise Unsupported("neither scales nor sizes")
+    factors = dict(zip(axes, given_scales.tolist(), strict=True))
+    return _resized(x, plan, [factors.get(a, 1.0) for a in range(x.ndim)], None)
+
+
+class _Plan:
+    """How coordinates of the output fall on the input, and how values are made there."""
+
+    def __init__(
+        self,
+        mode: str,
+        coordinates: str,
+        nearest: str,
+        a: float = -0.75,
+        exclude_outside: bool = False,
+        antialias: bool = False,
+    ) -> None:
+        self.mode, self.coordinates, self.nearest = mode, coordinates, nearest
+        self.a, self.exclude_outside, self.antialias = a, exclude_outside, antialias
+
+
+def _resized(x: Tensor, plan: _Plan, scales: list[float] | None, sizes: list[int] | None) -> Tensor:
+    if sizes is None:
+        assert scales is not None
+        sizes = [math.floor(n * s) for n, s in zip(x.shape, scales, strict=True)]
+    factors = scales or [out / n for out, n in zip(sizes, x.shape, strict=True)]
+    fast = _by_torch(x, plan, factors, sizes)
+    if fast is not None:
+        return fast
+    for axis, (size, factor) in enumerate(zip(sizes, factors, strict=True)):
+        if size != x.shape[axis] or factor != 1:
+            x = _along(x, axis, *_taps(plan, x.shape[axis], size, factor))
+    return x
+
+
+def _by_torch(x: Tensor, plan: _Plan, factors: list[float], sizes: list[int]) -> Tensor | None:
+    """torch's own resize where it does the same; None elsewhere."""
+    exact = all(n * f == s for n, f, s in zip(x.shape, factors, sizes, strict=True))
+    picture = x.ndim == 4 and tuple(x.shape[:2]) == tuple(sizes[:2]) and exact
+    if not picture or plan.antialias or not x.is_floating_point():
+        return None
+    size = (sizes[2], sizes[3])
+    whole = all(f >= 1 and f == int(f) for f in factors)
+    if plan.mode == "nearest" and whole and plan.nearest in ("simple", "floor"):
+        return F.interpolate(x, size) if plan.coordinates == "asymmetric" else None
+    corners = plan.coordinates == "align_corners"
+    half = plan.coordinates in ("half_pixel", "pytorch_half_pixel") and min(size) > 1
+    if plan.mode == "linear" and (half or corners):
+        return F.interpolate(x, size, mode="bilinear", align_corners=corners)
+    return None
+
+
+def _along(x: Tensor, axis: int, index: Tensor, weight: Tensor) -> Tensor:
+    """Σ_k weight (n, k) · x taken at index (n, k) along the axis."""
+    index, shape = index.to(x.device), [1] * x.ndim
+    shape[axis] = -1
+    taken = [x.index_select(axis, index[:, k]) for k in range(index.shape[1])]
+    if len(taken) == 1:
+        return taken[0]
+    weight = weight.to(x)
+    parts = [t * weight[:, k].reshape(shape) for k, t in enumerate(taken)]
+    return torch.stack(parts).sum(dim=0) if len(parts) > 2 else parts[0] + parts[1]
+
+
+def _taps(plan: _Plan, size: int, out: int, factor: float) -> tuple[Tensor, Tensor]:
+    """Indices and weights (out, k) along one axis."""
+    place = _coordinates(plan.coordinates, size, out, factor)
+    if plan.mode == "nearest":
+        index = _ROUNDING[plan.nearest](place, factor).long().clamp(0, size - 1)
+        return index[:, None], torch.ones(out, 1)
+    if plan.mode not in ("linear", "cubic"):
+        raise Unsupported(f"mode {plan.mode}")
+    linear = plan.mode == "linear"
+    if linear and not plan.antialias:
+        place = place.clamp(0, size - 1)
+    shrink = min(1.0, factor) if plan.antialias else 1.0
+    reach = math.ceil((1 if linear else 2) / shrink)
+    index = place.floor().long()[:, None] + torch.arange(1 - reach, reach + 1)
+    distance = (index - place[:, None]) * shrink
+    weight = (1 - distance.abs()).clamp_min(0) if linear else _cubic(distance, plan.a)
+    outside = (index < 0) | (index > size - 1)
+    if plan.exclude_outside:
+        weight = weight.masked_fill(outside, 0)
+    if plan.exclude_outside or plan.antialias:
+        weight = weight / weight.sum(dim=1, keepdim=True)
+    return index.clamp(0, size - 1), weight
+
+
+def _coordinates(mode: str, size: int, out: int, factor: float) -> Tensor:
+    """Where the output's elements lie on the input; in float32 as runtimes compute it.
+
+    A factor that stands for a ratio of sizes is taken as that, lest a half becomes less than one.
+    """
+    o = torch.arange(out, dtype=torch.float32)
+    scale = torch.tensor(factor, dtype=torch.float32)
+    if factor == out / size and mode == "asymmetric":
+        return o * size / out
+    if mode == "asymmetric":
+        return o / scale
+    if mode == "align_corners":
+        return o * (size - 1) / (out - 1) if out > 1 else torch.zeros(out)
+    if mode == "tf_half_pixel_for_nn":
+        return (o + 0.5) / scale
+    if mode == "pytorch_half_pixel" and out == 1:
+        return torch.zeros(out)
+    half = (o + 0.5) / scale - 0.5
+    if mode == "half_pixel_symmetric":
+        return half + size / 2 * (1 - out / (scale * size))
+    if mode in ("half_pixel", "pytorch_half_pixel"):
+        return half
+    raise Unsupported(f"coordinate_transformation_mode {mode}")
+
+
+_ROUNDING: dict[str, Callable[[Tensor, float], Tensor]] = {
+    "round_prefer_floor": lambda p, _: (p - 0.5).ceil(),
+    "round_prefer_ceil": lambda p, _: (p + 0.5).floor(),
+    "floor": lambda p, _: p.floor(),
+    "ceil": lambda p, _: p.ceil(),
+    "simple": lambda p, factor: p.ceil() if factor < 1 else p.floor(),
+}
+
+
+def _cubic(distance: Tensor, a: float) -> Tensor:
+    """The cubic convolution kernel (Keys 1981)."""
+    t = distance.abs()
+    near = ((a + 2) * t - (a + 3)) * t * t + 1
+    far = ((a * t - 5 * a) * t + 8 * a) * t - 4 * a
+    return torch.where(t <= 1, near, torch.where(t < 2, far, torch.zeros_like(t)))

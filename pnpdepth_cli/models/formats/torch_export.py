@@ -1,0 +1,118 @@
+"""A torch.export archive (.pt2) as a definition; the nodes of its graph are the layers.
+
+The archive is checked before torch reads it, and the source code of its guards is never asked for.
+"""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, fx, nn
+
+from pnpdepth_cli.core.split.user_code import describe
+from pnpdepth_cli.errors import ModelError
+from pnpdepth_cli.models.definition import FOREIGN, Fixed, ModelDefinition, Multiple
+from pnpdepth_cli.models.formats.export_archive import check_archive
+
+_MULTIPLE = 32
+
+
+class ExportedOperation(nn.Module):
+    """One operation of the exported graph."""
+
+    def __init__(self, operation: Any) -> None:
+        super().__init__()
+        self._operation = operation
+
+    def forward(self, *args: Any, **kwargs: Any) -> Any:
+        return self._operation(*args, **kwargs)
+
+    def extra_repr(self) -> str:
+        return str(self._operation)
+
+
+def exported_definition(file: Path) -> ModelDefinition:
+    """The definition of a network saved by torch.export.save. ModelError where it cannot be run."""
+    if not file.is_file():
+        raise ModelError(f"exported program {file} does not exist")
+    try:
+        check_archive(file)
+        graph = torch.export.load(file).module(check_guards=False)
+    except ModelError:
+        raise
+    except Exception as error:  # every part of torch.export has its own way to fail
+        raise ModelError(
+            f"exported program {file} cannot be read: {describe(error)[:160]}; it must be written"
+            f" by torch.export.save of about this version of torch ({torch.__version__})"
+        ) from None
+    shapes = [
+        tuple(node.meta["val"].shape)
+        for node in graph.graph.nodes
+        if node.op == "placeholder" and isinstance(node.meta.get("val"), Tensor)
+    ]
+    if len(shapes) != 1 or len(shapes[0]) != 4 or shapes[0][1] != 3:
+        raise ModelError(
+            f"exported program {file} takes inputs {shapes}; one rgb picture 1×3×H×W is expected"
+        )
+    height, width = shapes[0][2:]
+    fixed = isinstance(height, int) and isinstance(width, int)
+    return ModelDefinition(
+        name=file.stem,
+        summary="torch.export archive",
+        input_kind="rgb",
+        size=Fixed(height, width) if fixed else Multiple(_MULTIPLE),
+        normalisation=None,
+        output_kind="unknown",
+        output_scale="unknown",
+        build=lambda: _with_operations_as_modules(graph),
+        complete=True,
+        checkpoint=file,
+        defaults=FOREIGN,
+    )
+
+
+def _with_operations_as_modules(exported: Any) -> nn.Module:
+    """The same graph, every operation on tensors a submodule under its node's name."""
+    root, graph = nn.Module(), fx.Graph()
+    kept: dict[fx.Node, Any] = {}
+    taken: set[str] = set()
+    for node in exported.graph.nodes:
+        made = graph.node_copy(node, lambda n: kept[n])
+        kept[node] = made
+        if node.op == "get_attr":
+            name = str(node.target).replace(".", "_")
+            if name not in taken:
+                _hold(root, name, _attribute(exported, str(node.target)))
+            taken.add(name)
+            made.target = name
+        elif _is_layer(node):
+            name = node.name
+            while hasattr(root, name):  # every module has a method `to`, and so may a graph
+                name += "_"
+            root.add_module(name, ExportedOperation(node.target))
+            made.op, made.target = "call_module", name
+    return fx.GraphModule(root, graph)
+
+
+def _is_layer(node: fx.Node) -> bool:
+    gives_tensors = isinstance(node.meta.get("val"), Tensor | Sequence)
+    return node.op == "call_function" and gives_tensors and node.target is not operator.getitem
+
+
+def _hold(root: nn.Module, name: str, value: Tensor | nn.Module) -> None:
+    if isinstance(value, nn.Module):
+        root.add_module(name, value)  # a part that is run as one, such as one without gradients
+    elif value.is_floating_point():
+        root.register_parameter(name, nn.Parameter(value.detach(), requires_grad=False))
+    else:
+        root.register_buffer(name, value)
+
+
+def _attribute(module: Any, path: str) -> Any:
+    for part in path.split("."):
+        module = getattr(module, part)
+    return module

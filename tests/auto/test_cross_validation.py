@@ -1,0 +1,57 @@
+from __future__ import annotations
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pnpdepth_cli.auto.cross_validation import spatial_folds
+from pnpdepth_cli.completion.interpolation import nearest_points
+from pnpdepth_cli.points import SparsePoints
+
+
+def points_at(xy: torch.Tensor, size: tuple[int, int]) -> SparsePoints:
+    return SparsePoints(xy=xy.float(), depth=torch.ones(len(xy)), size=size)
+
+
+def strewn(count: int, size: tuple[int, int] = (90, 120), seed: int = 0) -> SparsePoints:
+    generator = torch.Generator().manual_seed(seed)
+    xy = torch.rand(count, 2, generator=generator) * torch.tensor([size[1] - 1, size[0] - 1])
+    return points_at(xy, size)
+
+
+@settings(deadline=None, max_examples=40)
+@given(count=st.integers(1, 300), folds=st.integers(2, 6), seed=st.integers(0, 99))
+def test_every_point_has_a_fold_and_the_folds_are_about_equally_large(
+    count: int, folds: int, seed: int
+) -> None:
+    fold = spatial_folds(strewn(count, seed=seed), folds, seed=seed)
+    assert fold.shape == (count,)
+    assert int(fold.min()) >= 0
+    assert int(fold.max()) < folds
+    sizes = torch.bincount(fold, minlength=folds)
+    assert int(sizes.max()) <= count // folds + max(2, count // 5)
+
+
+def test_the_same_seed_gives_the_same_folds_and_another_gives_others() -> None:
+    points = strewn(200)
+    assert torch.equal(spatial_folds(points, 4, seed=1), spatial_folds(points, 4, seed=1))
+    assert not torch.equal(spatial_folds(points, 4, seed=1), spatial_folds(points, 4, seed=2))
+
+
+@pytest.mark.parametrize("gap", [4, 8])
+def test_points_on_lines_are_held_out_as_far_off_as_pixels_are(gap: int) -> None:
+    y, x = torch.meshgrid(torch.arange(40, 120, gap), torch.arange(300), indexing="ij")
+    points = points_at(torch.stack([x.flatten(), y.flatten()], dim=1), (160, 300))
+    held = spatial_folds(points, 4) == 0
+    kept = points.select(~held)
+    apart = nearest_points(kept, points.xy[held].double(), 1)[0].median()
+    assert float(apart) >= gap / 4  # the median distance of pixels between lines
+    one_by_one = torch.randperm(len(points), generator=torch.Generator().manual_seed(0)) % 4 == 0
+    alone = nearest_points(points.select(~one_by_one), points.xy[one_by_one].double(), 1)[0]
+    assert float(alone.median()) == 1.0  # which is what a neighbour on the line would tell
+
+
+def test_points_at_one_place_are_shared_out_too() -> None:
+    fold = spatial_folds(points_at(torch.zeros(12, 2), (20, 20)), 3)
+    assert torch.equal(torch.bincount(fold), torch.tensor([4, 4, 4]))

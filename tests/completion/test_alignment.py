@@ -1,0 +1,165 @@
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+from pnpdepth_cli.choices import SPACES
+from pnpdepth_cli.completion.alignment import align
+from pnpdepth_cli.errors import ModelError, NoPointsError
+from pnpdepth_cli.points import SparsePoints
+
+
+def points_of(depth: Tensor) -> SparsePoints:
+    xy = torch.stack([torch.arange(len(depth)), torch.zeros(len(depth))], dim=1).float()
+    return SparsePoints(xy=xy, depth=depth.float(), size=(1, len(depth)))
+
+
+def scene(count: int, seed: int = 0) -> Tensor:
+    return 1 + 9 * torch.rand(count, generator=torch.Generator().manual_seed(seed))
+
+
+def spoiled(depth: Tensor, share: float = 0.2) -> Tensor:
+    """The first points replaced by depths far off, on both sides."""
+    wrong = depth.clone()
+    count = round(share * len(depth))
+    wrong[:count] = wrong[:count] * torch.tensor([0.2, 3.0, 6.0]).repeat(count)[:count]
+    return wrong
+
+
+def output_for(depth: Tensor, space: str, scale: float, shift: float) -> Tensor:
+    y = {"depth": depth, "inverse": 1 / depth, "log": depth.log()}[space]
+    return (y - shift) / scale
+
+
+@pytest.mark.parametrize("space", SPACES)
+def test_an_affine_output_is_read_exactly_in_every_space(space: str) -> None:
+    d = scene(50)
+    x = output_for(d, space, 0.3, 0.05)
+    made = align(x, points_of(d), (space,), "affine")
+    assert (made.scale, made.shift) == pytest.approx((0.3, 0.05), rel=1e-4)
+    assert torch.allclose(made.depth(x), d, rtol=1e-4)
+
+
+@pytest.mark.parametrize("kind", ["median", "scale"])
+@pytest.mark.parametrize("space", SPACES)
+def test_a_factor_of_depth_is_undone_in_every_space(space: str, kind: str) -> None:
+    d = scene(40)
+    x = {"depth": d / 7, "inverse": 7 / d, "log": (d / 7).log()}[space]
+    made = align(x, points_of(d), (space,), kind)
+    assert torch.allclose(made.depth(x), d, rtol=1e-5)
+
+
+@pytest.mark.parametrize("space", SPACES)
+@pytest.mark.parametrize("kind", ["median", "scale", "affine"])
+@pytest.mark.parametrize("count", [30, 2000])
+@pytest.mark.parametrize("seed", range(3))
+def test_20_percent_gross_outliers_move_the_fit_by_less_than_2_percent(
+    space: str, kind: str, count: int, seed: int
+) -> None:
+    d = scene(count, seed)
+    noise = torch.randn(count, generator=torch.Generator().manual_seed(seed + 100))
+    x = output_for(d * (1 + 0.01 * noise), space, 1.0 if space == "log" else 0.4, 0.0)
+    clean = align(x, points_of(d), (space,), kind).depth(x)
+    moved = align(x, points_of(spoiled(d)), (space,), kind).depth(x)
+    assert float((moved / clean - 1).abs().max()) < 0.02
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize("seed", range(5))
+def test_auto_recovers_a_disparity_network_from_30_points_of_which_a_fifth_is_wrong(
+    sign: int, seed: int
+) -> None:
+    d = scene(4000, seed)
+    x = sign * (37.5 / d + 4.0)
+    made = align(x[:30], points_of(spoiled(d[:30])), ("depth", "inverse"), "auto")
+    assert (made.space, made.kind) == ("inverse", "affine")
+    assert made.falling == (sign > 0)
+    assert float((made.depth(x) / d - 1).abs().max()) < 0.005
+    assert made.outliers == pytest.approx(0.2, abs=0.04)
+
+
+@pytest.mark.parametrize(
+    ("output", "wanted"),
+    [
+        (lambda d: d, ("depth", "none")),
+        (lambda d: 0.2 * d, ("depth", "scale")),
+        (lambda d: 0.2 * d + 3, ("depth", "affine")),
+        (lambda d: 5 - 0.2 * d, ("depth", "affine")),
+        (lambda d: 1 / d, ("inverse", "none")),
+        (lambda d: 9 / d, ("inverse", "scale")),
+        (lambda d: -9 / d, ("inverse", "scale")),
+    ],
+)
+@pytest.mark.parametrize("seed", range(4))
+def test_auto_takes_the_simplest_reading_that_explains_the_points(
+    output: Callable[[Tensor], Tensor], wanted: tuple[str, str], seed: int
+) -> None:
+    d = scene(100, seed)
+    noise = torch.randn(100, generator=torch.Generator().manual_seed(seed + 50))
+    noisy = output(d * (1 + 0.02 * noise))
+    made = align(noisy, points_of(d), ("depth", "inverse"), "auto")
+    assert (made.space, made.kind) == wanted
+
+
+def test_depth_at_or_behind_infinity_reads_as_ten_times_the_farthest_point() -> None:
+    d = scene(50)
+    x = 1 / d
+    made = align(x, points_of(d), ("inverse",), "affine")
+    sky = torch.tensor([-5.0, 0.0])
+    assert torch.allclose(made.depth(sky), torch.full((2,), 10 * float(d.max())), rtol=1e-5)
+    assert made.beyond(torch.cat([sky, x[:8]])) == pytest.approx(0.2)
+
+
+def test_a_value_held_at_a_bound_still_has_a_gradient() -> None:
+    d = scene(50)
+    made = align(d, points_of(d), ("depth",), "scale")
+    below = torch.tensor([-3.0], requires_grad=True)
+    held = made.depth(below)
+    assert float(held.detach()) == pytest.approx(float(d.min()) / 10)
+    held.sum().backward()
+    assert below.grad is not None
+    assert float(below.grad) == pytest.approx(1.0, rel=1e-4)
+
+
+@given(
+    scale=st.floats(0.01, 100),
+    shift=st.floats(-2, 2),
+    seed=st.integers(0, 2**16),
+    count=st.integers(2, 60),
+)
+@settings(max_examples=30, deadline=None)
+def test_the_same_points_give_the_same_alignment_and_depths_are_finite_and_positive(
+    scale: float, shift: float, seed: int, count: int
+) -> None:
+    d = scene(count, seed)
+    x = scale / d + shift
+    one, other = (align(x, points_of(d), ("depth", "inverse"), "auto") for _ in range(2))
+    assert one == other
+    depth = one.depth(torch.linspace(-1e6, 1e6, 101))
+    assert bool((depth > 0).all())
+    assert bool(depth.isfinite().all())
+
+
+def test_what_cannot_be_aligned_is_said() -> None:
+    d = scene(20)
+    with pytest.raises(ModelError, match="same at all 20"):
+        align(torch.ones(20), points_of(d), ("depth",), "affine")
+    with pytest.raises(NoPointsError, match="at least 2"):
+        align(torch.ones(1), points_of(d[:1]), ("depth",), "affine")
+    with pytest.raises(ModelError, match="not finite"):
+        align(torch.full((20,), math.nan), points_of(d), ("depth",), "scale")
+    with pytest.raises(ModelError, match="zero"):
+        align(torch.zeros(20), points_of(d), ("depth",), "scale")
+
+
+def test_the_decision_reads_as_a_sentence() -> None:
+    d = scene(20)
+    assert str(align(5 / d, points_of(d), ("inverse",), "scale")) == (
+        "scale: 1/depth = 0.2·output, larger is nearer"
+    )

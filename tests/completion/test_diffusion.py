@@ -1,0 +1,86 @@
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from scipy.sparse.linalg import splu
+from torch import Tensor
+
+from pnpdepth_cli.completion import diffusion
+from pnpdepth_cli.completion.diffusion import EDGE_DEPTH, STIFFNESS, diffused
+from pnpdepth_cli.completion.gaussian_process import Field
+from pnpdepth_cli.completion.propagation import features_of
+from pnpdepth_cli.points import SparsePoints
+
+SIZE = (6, 8)
+
+
+def field(xy: list[tuple[float, float]], residual: list[float], log_depth: Tensor) -> Field:
+    points = SparsePoints(
+        xy=torch.tensor(xy),
+        depth=torch.ones(len(xy)),
+        size=(log_depth.shape[0], log_depth.shape[1]),
+    )
+    features = features_of(log_depth, None)
+    at = torch.stack([points.sample(one) for one in features.unbind(2)], dim=1)
+    return Field(features=features, points=points, at=at, residual=torch.tensor(residual).double())
+
+
+def step(size: tuple[int, int] = SIZE) -> Tensor:
+    """Log depth (H, W), the right half farther."""
+    log_depth = torch.zeros(size)
+    log_depth[:, size[1] // 2 :] = 1.0
+    return log_depth
+
+
+def test_it_is_the_least_squares_solution_of_its_equation() -> None:
+    made = field([(1.0, 1.0), (6.0, 4.0), (2.0, 5.0)], [0.3, -0.2, 0.1], step())
+    u = made.features[..., 2].double().numpy()
+    number = np.arange(48).reshape(SIZE)
+    lines, right = [], []
+    for (x, y), r in zip(made.points.xy.int().tolist(), made.residual.tolist(), strict=True):
+        lines.append(np.eye(48)[number[y, x]])
+        right.append(r)
+    for a, b in [
+        *zip(number[:, :-1].flat, number[:, 1:].flat, strict=True),
+        *zip(number[:-1].flat, number[1:].flat, strict=True),
+    ]:
+        weight = STIFFNESS / (1 + ((u.flat[a] - u.flat[b]) / EDGE_DEPTH) ** 2)
+        lines.append(np.sqrt(weight) * (np.eye(48)[a] - np.eye(48)[b]))
+        right.append(0.0)
+    expected = np.linalg.lstsq(np.array(lines), np.array(right), rcond=None)[0]
+    assert np.allclose(diffused(made).numpy(), expected.reshape(SIZE), atol=1e-3)
+
+
+def test_an_edge_of_the_prediction_stops_it() -> None:
+    made = diffused(field([(0.0, 3.0), (7.0, 3.0)], [0.5, -0.5], step()))
+    assert float((made[:, :4] - 0.5).abs().max()) < 0.05
+    assert float((made[:, 4:] + 0.5).abs().max()) < 0.05
+
+
+@pytest.mark.parametrize("nodes", [12, 10**6])
+def test_one_point_is_everywhere_also_on_a_coarser_grid(
+    nodes: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(diffusion, "_FEWEST_NODES", nodes)
+    monkeypatch.setattr(diffusion, "_MOST_NODES", nodes)
+    made = diffused(field([(3.4, 2.6)], [0.25], step()))
+    assert torch.allclose(made, torch.full(SIZE, 0.25), atol=1e-5)
+
+
+@pytest.mark.parametrize(("count", "nodes"), [(3, 2000), (400, 4000), (5000, 30_000)])
+def test_the_grid_is_finer_where_points_are_many(
+    count: int, nodes: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    solved = []
+
+    def noted(system: Any, **how: Any) -> Any:
+        solved.append(system.shape[0])
+        return splu(system, **how)
+
+    monkeypatch.setattr("scipy.sparse.linalg.splu", noted)
+    places = torch.rand(count, 2, generator=torch.Generator().manual_seed(0)) * 199
+    diffused(field([(x, y) for x, y in places.tolist()], [0.1] * count, step((200, 300))))
+    assert solved[0] == pytest.approx(nodes, rel=0.02)

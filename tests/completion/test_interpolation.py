@@ -1,0 +1,201 @@
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from functools import partial
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.interpolate import LinearNDInterpolator
+from torch import Tensor
+
+from pnpdepth_cli.choices import SPACES
+from pnpdepth_cli.completion.alignment import from_space, to_space
+from pnpdepth_cli.completion.interpolation import inverse_distance, linear, morphological, nearest
+from pnpdepth_cli.errors import NoPointsError
+from pnpdepth_cli.points import SparsePoints
+
+FILLS: dict[str, Callable[[SparsePoints], Tensor]] = {
+    "nearest": nearest,
+    "linear": linear,
+    "linear log": partial(linear, space="log"),
+    "idw": inverse_distance,
+    "morphological": morphological,
+}
+
+
+def points_at(
+    places: list[tuple[float, float]], depth: list[float], size: tuple[int, int]
+) -> SparsePoints:
+    return SparsePoints(xy=torch.tensor(places), depth=torch.tensor(depth), size=size)
+
+
+def scattered(
+    count: int, size: tuple[int, int] = (40, 60), seed: int = 0, *, on_grid: bool = False
+) -> SparsePoints:
+    generator = torch.Generator().manual_seed(seed)
+    xy = torch.rand(count, 2, generator=generator) * torch.tensor([size[1] - 1.0, size[0] - 1.0])
+    depth = 1 + 9 * torch.rand(count, generator=generator)
+    return SparsePoints(xy=xy.round() if on_grid else xy, depth=depth, size=size)
+
+
+def pixels(size: tuple[int, int]) -> Tensor:
+    y, x = torch.meshgrid(*(torch.arange(float(n)) for n in size), indexing="ij")
+    return torch.stack([x, y], dim=-1)
+
+
+def distances(points: SparsePoints) -> Tensor:
+    """(H, W, N) of every pixel to every point."""
+    return (pixels(points.size)[:, :, None].double() - points.xy.double()).norm(dim=-1)
+
+
+@pytest.mark.parametrize("name", FILLS)
+@pytest.mark.parametrize("count", [1, 2, 3, 50])
+@pytest.mark.parametrize("on_grid", [True, False])
+def test_every_pixel_gets_a_depth_among_those_of_the_points(
+    name: str, count: int, on_grid: bool
+) -> None:
+    points = scattered(count, on_grid=on_grid)
+    dense = FILLS[name](points)
+    assert dense.shape == points.size
+    assert dense.dtype == torch.float32
+    least, most = float(points.depth.min()), float(points.depth.max())
+    assert least * (1 - 1e-5) <= float(dense.min())
+    assert float(dense.max()) <= most * (1 + 1e-5)
+
+
+@pytest.mark.parametrize("name", FILLS)
+def test_the_order_of_the_points_does_not_matter(name: str) -> None:
+    points = scattered(200, on_grid=True)
+    order = torch.randperm(200, generator=torch.Generator().manual_seed(1))
+    shuffled = SparsePoints(xy=points.xy[order], depth=points.depth[order], size=points.size)
+    assert torch.equal(FILLS[name](points), FILLS[name](shuffled))
+
+
+@pytest.mark.parametrize("name", FILLS)
+def test_of_points_at_one_place_the_nearest_counts(name: str) -> None:
+    points = scattered(30, on_grid=True)
+    behind = SparsePoints(xy=points.xy, depth=points.depth + 5, size=points.size)
+    both = SparsePoints(
+        xy=torch.cat([behind.xy, points.xy]),
+        depth=torch.cat([behind.depth, points.depth]),
+        size=points.size,
+    )
+    assert torch.equal(FILLS[name](both), FILLS[name](points))
+
+
+@pytest.mark.parametrize("name", FILLS)
+def test_without_points_there_is_no_answer(name: str) -> None:
+    with pytest.raises(NoPointsError, match="no sparse point"):
+        FILLS[name](scattered(0))
+
+
+@pytest.mark.parametrize("name", FILLS)
+def test_points_beyond_the_border_count(name: str) -> None:
+    dense = FILLS[name](points_at([(-2.0, 3.0), (12.5, 3.0)], [2.0, 8.0], (6, 10)))
+    assert dense[3, 0] < 3
+    assert dense[3, 9] > 7
+
+
+@pytest.mark.parametrize("on_grid", [True, False])
+def test_nearest_is_the_nearest_of_all_points(on_grid: bool) -> None:
+    points = scattered(100, on_grid=on_grid)
+    distance = distances(points)
+    dense = nearest(points)
+    # with several points as near, any of them will do
+    as_near = distance <= distance.amin(dim=-1, keepdim=True) + 1e-9
+    assert bool(((points.depth == dense[..., None]) & as_near).any(dim=-1).all())
+
+
+def test_linear_is_what_scipy_gives_inside_the_hull_and_nearest_outside() -> None:
+    points = scattered(300)
+    dense = linear(points)
+    theirs = torch.from_numpy(
+        LinearNDInterpolator(points.xy.double().numpy(), points.depth.double().numpy())(
+            pixels(points.size).double().numpy()
+        )
+    )
+    inside = ~theirs.isnan()
+    assert 0.5 < float(inside.double().mean()) < 1
+    assert torch.allclose(dense[inside].double(), theirs[inside], rtol=1e-5)
+    assert torch.equal(dense[~inside], nearest(points)[~inside])
+
+
+@pytest.mark.parametrize("space", SPACES)
+@given(
+    slopes=st.tuples(st.floats(-0.004, 0.004), st.floats(-0.004, 0.004)),
+    seed=st.integers(0, 2**16),
+)
+@settings(max_examples=10)
+def test_what_is_linear_in_a_space_is_restored_in_it_between_the_corners(
+    space: str, slopes: tuple[float, float], seed: int
+) -> None:
+    size = (30, 40)
+    corners = torch.tensor([[0.0, 0.0], [39, 0], [0, 29], [39, 29]])
+    xy = torch.cat([corners, scattered(20, size, seed).xy])
+    plane = 0.5 + (pixels(size).double() * torch.tensor(slopes).double()).sum(-1)
+    at_points = 0.5 + (xy.double() * torch.tensor(slopes).double()).sum(-1)
+    points = SparsePoints(xy=xy, depth=from_space(at_points, space).float(), size=size)
+    assert torch.allclose(linear(points, space=space), from_space(plane, space).float(), rtol=1e-5)
+
+
+@pytest.mark.parametrize("step", [(1.0, 0.0), (0.0, 1.0), (1.0, 1.0), (3.0, 1.0)])
+def test_linear_of_points_in_a_row_is_the_nearest_point(step: tuple[float, float]) -> None:
+    places = [(2.0 + i * step[0], 3.0 + i * step[1]) for i in range(5)]
+    points = points_at(places, [1.0, 2.0, 3.0, 4.0, 5.0], (12, 16))
+    assert torch.equal(linear(points), nearest(points))
+
+
+def test_inverse_distance_is_shepards_mean_of_the_nearest_points() -> None:
+    points = scattered(60)
+    distance, number = distances(points).clamp_min(0.25).sort(dim=-1)
+    weight = distance[..., :5].pow(-2.5)
+    mean = (weight * points.depth[number[..., :5]].double()).sum(-1) / weight.sum(-1)
+    dense = inverse_distance(points, neighbours=5, power=2.5, space="depth")
+    assert torch.allclose(dense, mean.float(), rtol=1e-6)
+
+
+def test_inverse_distance_does_not_depend_on_how_many_pixels_are_looked_up_at_once(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    points = scattered(60)
+    whole = inverse_distance(points)
+    monkeypatch.setattr("pnpdepth_cli.completion.interpolation._IDW_PIXELS", 97)
+    assert torch.equal(inverse_distance(points), whole)
+
+
+@given(depth=st.floats(0.1, 100), count=st.integers(1, 300), seed=st.integers(0, 99))
+@settings(max_examples=20)
+def test_a_wall_is_a_wall_however_it_is_filled(depth: float, count: int, seed: int) -> None:
+    points = scattered(count, seed=seed)
+    wall = SparsePoints(xy=points.xy, depth=torch.full((count,), depth), size=points.size)
+    for name, fill in FILLS.items():
+        assert torch.allclose(fill(wall), torch.tensor(depth), rtol=1e-5), name
+
+
+def test_morphological_lets_what_is_near_grow_over_what_is_far() -> None:
+    size = (40, 60)
+    grid = pixels(size)[1::3, 1::3].reshape(-1, 2)
+    near = (grid[:, 0] - 30).abs() < 6
+    points = SparsePoints(xy=grid, depth=torch.where(near, 2.0, 10.0), size=size)
+    filled = morphological(points)
+    assert float((filled[20] < 6).sum()) > float((linear(points)[20] < 6).sum())
+    assert bool((filled[20, 26:35] < 2.01).all())
+    assert bool((filled[:, :18] > 9.9).all())
+
+
+def test_morphological_of_few_points_is_that_of_a_smaller_picture() -> None:
+    places = [(8.0, 8.0), (24.0, 8.0), (8.0, 24.0), (24.0, 24.0)]
+    depth = [2.0, 4.0, 6.0, 8.0]
+    small = morphological(points_at(places, depth, (32, 32)))
+    tenfold = [(10 * x + 4.5, 10 * y + 4.5) for x, y in places]
+    large = morphological(points_at(tenfold, depth, (320, 320)))
+    assert torch.allclose(large[4::10, 4::10], small, atol=0.2)
+
+
+@pytest.mark.parametrize("space", SPACES)
+def test_a_space_is_left_as_it_was_entered(space: str) -> None:
+    depth = torch.tensor([0.1, 1.0, math.e, 80.0], dtype=torch.float64)
+    assert torch.allclose(from_space(to_space(depth, space), space), depth, rtol=1e-12)

@@ -1,0 +1,644 @@
+"""rear(front(x)) is f(x), at every layer of every kind of network, and leaves no trace."""
+
+from __future__ import annotations
+
+import gc
+import inspect
+import weakref
+from typing import Any
+from unittest import mock
+
+import pytest
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from pnpdepth_cli.core.split import Split
+from pnpdepth_cli.core.split.structure import tensors_in
+from pnpdepth_cli.errors import LayerError, ModelError
+from tests.completion.naive import plain
+from tests.core.networks import (
+    NETWORKS,
+    Counting,
+    InPlace,
+    MiDaSLike,
+    Repeated,
+    Structured,
+    TwoBranches,
+    UNet,
+    UNetTail,
+    build,
+    conv,
+    depth_of,
+    picture,
+)
+
+NO_CUT = {
+    "unet": {"encoder.stages", "ups"},
+    "vit": {"encoder.blocks", *(f"encoder.blocks.{i}.attention.out_proj" for i in range(3))},
+    "in place": {"flat"},
+    "side effects": {"many", "hide"},
+    "direct": {"enter.parametrizations", "spectral.parametrizations"},
+    "scripted": {"enter.0", "enter.1"},
+    "sparse": {"to_sparse"},
+    "fx": {"2"},
+}
+"""Layers that give no tensor or never run, and one whose cut would not be a cut (`torn`)."""
+
+
+# ------------------------------------------------------------------ the invariant
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+def test_the_rear_of_the_front_is_the_network_bit_for_bit_at_every_layer(name: str) -> None:
+    network, x = build(name), picture()
+    frames = [x, x.flip(3) * 0.7, x]
+    wholes = [depth_of(plain(network, frame)) for frame in frames]
+    layers = [layer for layer, _ in network.named_modules(remove_duplicate=False) if layer]
+    can, cannot = 0, set()
+    while layers:
+        layer = layers.pop(0)
+        try:
+            with Split(network, layer) as split, torch.no_grad():
+                for frame, whole in zip(frames, wholes, strict=True):
+                    z = split.front(frame)
+                    for _ in range(3):
+                        assert torch.equal(depth_of(split.rear(z)), whole), layer
+            can += 1
+        except LayerError as error:
+            if "say which" in str(error):
+                layers += str(error).split(": ")[-1].split(", ")
+            else:
+                cannot.add(layer)
+    assert cannot == NO_CUT.get(name, set())
+    assert can > 1
+    assert torch.equal(depth_of(plain(network, x)), wholes[0])
+
+
+@pytest.mark.parametrize("layer", ["cut", "head", "enter"])
+def test_an_encoder_under_inference_mode_can_be_left_and_the_decoder_refined(layer: str) -> None:
+    network, x = build("half inference"), picture()
+    with Split(network, layer) as split:
+        z = split.front(x).requires_grad_(True)
+        output = split.rear(z)
+        assert torch.equal(output, plain(network, x))
+        output.sum().backward()
+        assert z.grad is not None
+
+
+def test_it_holds_at_every_layer_of_compact() -> None:
+    compact = pytest.importorskip("model_zoo_defs.compact")
+    torch.manual_seed(0)
+    network = compact.Compact()
+    for parameter in network.parameters():
+        if parameter.ndim > 1:  # some start at zero, where any cut would do
+            nn.init.normal_(parameter, std=0.1)
+    x, sparse = picture(32, 32), torch.zeros(1, 1, 32, 32)
+    sparse[..., ::5, ::3] = 1 + 4 * torch.rand(sparse[..., ::5, ::3].shape)
+    network.eval()
+    with torch.no_grad():
+        whole = network(x, sparse)
+        cut = 0
+        for layer, module in network.named_modules():
+            if layer and not isinstance(module, nn.ModuleDict) and layer not in ("encoder", "fit"):
+                with Split(network, layer) as split:
+                    z = split.front(x, sparse)
+                    assert torch.equal(split.rear(z), whole), layer
+                    assert torch.equal(split.rear(z), whole), layer
+                cut += 1
+    assert cut > 90
+
+
+def test_torch_transformer_layers_with_their_fast_path_come_out_the_same() -> None:
+    torch.manual_seed(0)
+    layer = nn.TransformerEncoderLayer(8, 2, 16, batch_first=True)
+    network = nn.Sequential(nn.Linear(4, 8), nn.TransformerEncoder(layer, 2), nn.Linear(8, 1))
+    x = torch.rand(1, 6, 4)
+    whole = plain(network, x)
+    for name in ("0", "1", "1.layers.0", "1.layers.1"):
+        with Split(network, name) as split, torch.no_grad():
+            assert torch.equal(split.rear(split.front(x)), whole)
+
+
+def test_a_compiled_network_can_be_cut() -> None:
+    network, x = build("unet"), picture()
+    whole = plain(network, x)
+    compiled = torch.compile(network, backend="eager")
+    with Split(compiled, "_orig_mod.bottleneck") as split, torch.no_grad():
+        assert torch.equal(split.rear(split.front(x)), whole)
+
+
+def test_a_second_front_starts_over_with_the_new_picture() -> None:
+    network, x, other = build("unet"), picture(), picture() * 0.5
+    whole = plain(network, other)
+    with Split(network, "bottleneck") as split, torch.no_grad():
+        split.rear(split.front(x))
+        assert torch.equal(split.rear(split.front(other)), whole)
+
+
+class ChoosesByValue(nn.Module):
+    """In front of the cut, one of two branches; the second changes what the first only reads."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.enter, self.one, self.relu = conv(3, 4), conv(4, 4), nn.ReLU(inplace=True)
+        self.cut, self.head = conv(4, 4), conv(8, 1)
+
+    def forward(self, x: Tensor) -> Tensor:
+        y = self.enter(x)
+        features = self.one(y) if bool(x.mean() > 0.4) else self.relu(y)
+        return self.head(torch.cat([self.cut(features), y], 1))
+
+
+def test_a_network_that_chooses_by_value_is_learned_anew_for_every_frame() -> None:
+    torch.manual_seed(0)
+    network, x = ChoosesByValue(), picture()
+    frames = [x, x * 0.5, x, x * 0.5]
+    wholes = [plain(network, frame) for frame in frames]
+    with Split(network, "cut") as split, torch.no_grad():
+        for frame, whole in zip(frames, wholes, strict=True):
+            z = split.front(frame)
+            for _ in range(2):
+                assert torch.equal(split.rear(z), whole)
+
+
+def test_a_frame_of_another_size_is_learned_anew() -> None:
+    network, frames = build("unet"), [picture(), picture(32, 16), picture() * 0.5]
+    wholes = [plain(network, frame) for frame in frames]
+    with Split(network, "bottleneck") as split, torch.no_grad():
+        for frame, whole in zip(frames, wholes, strict=True):
+            assert torch.equal(split.rear(split.front(frame)), whole)
+
+
+def test_further_frames_are_not_watched_and_hold_no_more_memory() -> None:
+    network, x = build("unet"), picture()
+    whole = plain(network, x)
+    held: list[list[int]] = []
+    with Split(network, "bottleneck") as split, torch.no_grad():
+        for _ in range(2):
+            assert torch.equal(split.rear(split.front(x)), whole)
+            held.append([_bytes(call.output) for call in split._calls])
+            split._watching = mock.Mock(side_effect=AssertionError("watched"))  # type: ignore[method-assign]
+    assert held[0] == held[1]
+    assert sum(held[0]) > 0
+
+
+def _bytes(output: Any) -> int:
+    return sum(tensor.untyped_storage().nbytes() for _, tensor in tensors_in(output))
+
+
+def test_the_network_may_be_called_for_itself_while_it_is_cut() -> None:
+    network, x, other = build("repeated"), picture(), picture() * 0.5
+    whole, other_whole = plain(network, x), plain(network, other)
+    with Split(network, "head") as split, torch.no_grad():
+        z = split.front(x)
+        assert torch.equal(network(other), other_whole)
+        assert torch.equal(split.rear(z), whole)
+        assert torch.equal(network(other), other_whole)
+        assert torch.equal(split.rear(z), whole)
+
+
+# ------------------------------------------------------------------ how often things run
+
+
+def test_the_front_runs_once_and_what_does_not_depend_on_z_twice_at_most() -> None:
+    network, x = TwoBranches(), picture()
+    with Split(network, "cut") as split, torch.no_grad():
+        z = split.front(x)
+        assert (network.front.calls, network.guide.calls) == (1, 0)
+        for k in range(5):
+            split.rear(z + k)
+    assert network.front.calls == 1
+    assert network.guide.calls == 1
+    assert network.detached.calls == 5  # looks at z through argmax only
+    assert network.head.calls == 5
+
+
+def test_a_rear_pass_costs_the_operations_behind_the_cut_only() -> None:
+    from torch.utils.flop_counter import FlopCounterMode
+
+    network, x = build("unet"), picture()
+    with Split(network, "bottleneck") as split, torch.no_grad():
+        z = split.front(x)
+        split.rear(z)
+        with FlopCounterMode(display=False) as behind:
+            split.rear(z)
+    # multiply-adds of the three convolutions behind the cut: output pixels × in × out × 9
+    assert behind.get_total_flops() == 2 * 9 * (16 * 16 * 8 + 64 * 12 * 4 + 256 * 7 * 1)
+
+
+def test_the_outermost_finished_submodule_is_remembered_and_its_parts_are_let_go() -> None:
+    network, x = build("resnet"), picture()
+    inner: list[weakref.ref[Tensor]] = []
+    original = network.layer1[0].conv2.forward
+
+    def spy(value: Tensor) -> Tensor:
+        output = original(value)
+        inner.append(weakref.ref(output))
+        return output
+
+    network.layer1[0].conv2.forward = spy
+    with Split(network, "up1") as split, torch.no_grad():
+        split.front(x)
+        gc.collect()
+        assert [reference() for reference in inner] == [None]
+
+
+def test_nothing_of_a_picture_stays_in_memory_after_the_split_closes() -> None:
+    network, x = build("unet"), picture()
+    seen: list[weakref.ref[Tensor]] = []
+    hook = network.bottleneck.register_forward_hook(
+        lambda module, given, output: seen.extend((weakref.ref(given[0]), weakref.ref(output)))
+    )
+    split = Split(network, "ups.0")
+    with split:
+        z = split.front(x).requires_grad_(True)
+        split.rear(z).sum().backward()
+        split.rear(z.detach())
+        seen.append(weakref.ref(z))
+    del z
+    hook.remove()
+    gc.collect()
+    assert len(seen) == 9  # the front ran twice: this encoder cannot be remembered as a whole
+    assert [reference() for reference in seen] == [None] * 9
+    del split
+
+
+def test_an_exception_holds_nothing_once_it_is_dropped() -> None:
+    network, x = build("unet"), picture()
+    with torch.no_grad(), Split(network, "bottleneck") as split:
+        kept = weakref.ref(split.front(x))
+        with pytest.raises(ModelError):
+            split.rear(torch.zeros(1))
+    del split
+    gc.collect()
+    assert kept() is None
+
+
+# ------------------------------------------------------------------ z
+
+
+def test_only_z_requires_gradient_and_no_parameter_gets_one() -> None:
+    network, x = build("resnet"), picture()
+    with Split(network, "layer2") as split:
+        z = split.front(x)
+        assert not z.requires_grad
+        assert not any(parameter.requires_grad for parameter in network.parameters())
+        z.requires_grad_(True)
+        split.rear(z).sum().backward()
+        assert z.grad is not None
+        assert bool((z.grad != 0).any())
+    assert all(parameter.grad is None for parameter in network.parameters())
+
+
+def test_an_in_place_operation_behind_the_cut_changes_neither_z_nor_the_arguments() -> None:
+    network, x = InPlace(), picture()
+    x_before = x.clone()
+    with Split(network, "b") as split, torch.no_grad():
+        z = split.front(x)
+        z_before = z.clone()
+        split.rear(z)
+        split.rear(z)
+    assert torch.equal(z, z_before)
+    assert torch.equal(x, x_before)
+
+
+def test_z_is_safe_where_the_cut_layer_gives_back_its_own_input() -> None:
+    class Network(nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.enter, self.cut, self.head = conv(3, 4), nn.Identity(), conv(4, 1)
+
+        def forward(self, x: Tensor) -> Tensor:
+            y = self.enter(x)
+            out = self.head(self.cut(y))
+            return out + F.relu_(y).mean()
+
+    network, x = Network(), picture()
+    with Split(network, "cut") as split, torch.no_grad():
+        z = split.front(x)
+        before = z.clone()
+        assert torch.equal(split.rear(z), plain(network, x))
+        assert torch.equal(z, before)
+        assert torch.equal(split.rear(z), plain(network, x))
+
+
+def test_a_cut_whose_output_is_changed_under_another_name_is_refused() -> None:
+    with Split(InPlace(), "flat") as split, torch.no_grad():
+        z = split.front(picture())
+        with pytest.raises(LayerError, match="memory of an earlier tensor"):
+            split.rear(z)
+
+
+# ------------------------------------------------------------------ naming the layer
+
+
+def test_every_call_of_a_layer_can_be_named_and_is_another_cut() -> None:
+    network, x = build("repeated"), picture()
+    shapes = []
+    for call in (1, 2, 3):
+        with Split(network, f"same#{call}") as split, torch.no_grad():
+            shapes.append(split.front(x))
+    assert not torch.equal(shapes[0], shapes[1])
+    assert not torch.equal(shapes[1], shapes[2])
+
+
+def test_a_layer_called_several_times_asks_which_call() -> None:
+    with Split(Repeated(), "same") as split, torch.no_grad():
+        z = split.front(picture())
+        with pytest.raises(LayerError, match="is called 3 times; say which call: same#1, same#2"):
+            split.rear(z)
+
+
+def test_a_call_too_far_says_how_many_there_are() -> None:
+    with Split(Repeated(), "same#4") as split, pytest.raises(LayerError, match="only 3 times"):
+        split.front(picture())
+
+
+def test_a_shared_layer_can_be_cut_under_either_name() -> None:
+    network, x = build("repeated"), picture()
+    outputs = []
+    for name in ("enter", "alias"):
+        with Split(network, name) as split, torch.no_grad():
+            outputs.append(split.front(x))
+    assert torch.equal(*outputs)
+
+
+@pytest.mark.parametrize(
+    ("kind", "names"),
+    [
+        ("tuple", ("cut[0]", "cut[1]")),
+        ("list", ("cut[0]", "cut[1]")),
+        ("dict", ("cut[deep]", "cut[shallow]")),
+        ("namedtuple", ("cut[0]", "cut[1]")),
+        ("dataclass", ("cut[deep]", "cut[shallow]")),
+        ("nested", ("cut[out][0][0]", "cut[out][1][x]")),
+    ],
+)
+def test_a_layer_with_several_outputs_names_them_and_each_can_be_cut(
+    kind: str, names: tuple[str, ...]
+) -> None:
+    network, x = build(f"{kind} output"), picture()
+    with Split(network, "cut") as split, pytest.raises(LayerError) as error:
+        split.front(x)
+    assert str(error.value).endswith(f"say which: {', '.join(names)}")
+    for name in names:
+        with Split(network, name) as split, torch.no_grad():
+            z = split.front(x)
+            changed = split.rear(z + 1)
+            assert torch.equal(split.rear(z), plain(network, x))
+        assert not torch.equal(changed, plain(network, x))
+
+
+def test_an_output_that_is_not_there_is_said_with_those_that_are() -> None:
+    with (
+        Split(Structured("dict"), "cut[wide]") as split,
+        pytest.raises(LayerError, match=r"no such output; it has cut\[deep\], cut\[shallow\]"),
+    ):
+        split.front(picture())
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("botleneck", "did you mean bottleneck"),
+        ("encoder.stage.0.0", "did you mean encoder.stages.0.0"),
+        ("zzzzzzzzz", "pnpdepth layers --all"),
+        ("", "not in this network"),
+        ("ups.3", "did you mean ups."),
+        ("bottleneck#0", "the form is"),
+        ("bottleneck[", "the form is"),
+        ("bottleneck#x", "the form is"),
+    ],
+)
+def test_an_unknown_layer_is_refused_with_what_is_near(name: str, said: str) -> None:
+    with pytest.raises(LayerError) as error:
+        Split(UNet(), name)
+    assert said in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_a_container_that_is_never_called_points_to_its_parts() -> None:
+    with (
+        Split(UNet(), "encoder.stages") as split,
+        pytest.raises(LayerError, match=r"never runs .* cut at a part of it: encoder.stages.0"),
+    ):
+        split.front(picture())
+
+
+def test_a_layer_that_never_runs_is_said_so() -> None:
+    network = nn.Sequential(conv(3, 1))
+    network.unused = conv(1, 1)
+    network.forward = network[0].forward  # type: ignore[method-assign]
+    with Split(network, "unused") as split, pytest.raises(LayerError, match="never runs"):
+        split.front(picture())
+
+
+def test_a_layer_whose_output_is_no_tensor_is_refused() -> None:
+    with (
+        Split(build("side effects"), "hide") as split,
+        pytest.raises(LayerError, match="returns no tensor"),
+    ):
+        split.front(picture())
+
+
+def test_the_rear_needs_a_front() -> None:
+    with Split(UNet(), "bottleneck") as split:
+        with pytest.raises(RuntimeError, match="front"):
+            split.rear(torch.zeros(1))
+        with pytest.raises(ModelError):
+            split.front(torch.zeros(1, 7, 4, 4))
+        with pytest.raises(RuntimeError, match="front"):
+            split.rear(torch.zeros(1))
+
+
+# ------------------------------------------------------------------ leaving no trace
+
+
+def state_of(network: nn.Module) -> dict[str, Any]:
+    """Everything of a network that a split could leave changed."""
+    state: dict[str, Any] = {}
+    for name, module in network.named_modules():
+        state[name] = (
+            module.training,
+            module.__dict__.get("forward"),
+            sorted(module.__dict__),
+            *(list(getattr(module, hooks)) for hooks in vars(nn.Module()) if "hooks" in hooks),
+        )
+    for name, p in network.named_parameters():
+        grad = None if p.grad is None else p.grad.clone()
+        state[f"parameter {name}"] = (id(p), p.detach().clone(), p.requires_grad, grad)
+    for name, b in network.named_buffers():
+        state[f"buffer {name}"] = (id(b), b.clone())
+    return state
+
+
+def same(one: Any, other: Any) -> bool:
+    if isinstance(one, Tensor) and isinstance(other, Tensor):
+        return torch.equal(one, other)
+    if isinstance(one, dict | tuple | list):
+        values = zip(list(one), list(other), strict=True)
+        if isinstance(one, dict):
+            values = zip(one.values(), other.values(), strict=True)
+        return type(one) is type(other) and all(same(a, b) for a, b in values)
+    return bool(one == other)
+
+
+def prepared(name: str) -> nn.Module:
+    """A network with mixed modes and flags, a gradient, a hook, and a forward of its own."""
+    network = build(name)
+    parts = list(network.modules())
+    parts[-1].eval()
+    parameters = list(network.parameters())
+    parameters[0].requires_grad_(False)
+    parameters[-1].grad = torch.ones_like(parameters[-1])
+    parts[1].register_forward_pre_hook(lambda module, given: None)
+    parts[-1].forward = parts[-1].forward  # type: ignore[method-assign]
+    return network
+
+
+LAYERS = {
+    "resnet": "layer2",
+    "unet": "bottleneck",
+    "midas": "unit1.conv1",
+    "updating": "cut",
+    "repeated": "same#2",
+    "branching": "cut",
+}
+
+
+@pytest.mark.parametrize("name", LAYERS)
+def test_the_network_is_as_before_when_the_split_closes(name: str) -> None:
+    network, x = prepared(name), picture()
+    before = state_of(network)
+    with Split(network, LAYERS[name]) as split:
+        z = split.front(x).requires_grad_(True)
+        split.rear(z).sum().backward()
+        split.rear(z.detach() + 1)
+        assert not same(before, state_of(network))
+    assert same(before, state_of(network))
+
+
+def use(network: nn.Module, x: Tensor, kind: type[BaseException]) -> None:
+    with Split(network, "cut") as split:
+        z = split.front(x)
+        split.rear(z)
+        split.rear(z)
+        raise kind("inside")
+
+
+@pytest.mark.parametrize("stage", ["front", "first rear", "second rear", "inside", "entering"])
+@pytest.mark.parametrize("kind", [RuntimeError, KeyboardInterrupt])
+def test_the_network_is_as_before_after_an_exception_at_any_stage(
+    stage: str, kind: type[BaseException]
+) -> None:
+    network, x = prepared("updating"), picture()
+    network.enter = Failing(network.enter, 1 if stage == "front" else 0, kind)
+    network.head = Failing(network.head, {"first rear": 1, "second rear": 2}.get(stage, 0), kind)
+    if stage == "entering":
+        network.cut.train = fail_with(kind)  # type: ignore[method-assign]
+    before = state_of(network)
+    in_network = stage not in ("inside", "entering")
+    with pytest.raises(ModelError if in_network and kind is RuntimeError else kind):
+        use(network, x, kind)
+    assert same(before, state_of(network))
+
+
+def fail_with(kind: type[BaseException]) -> Any:
+    def train(mode: bool = True) -> nn.Module:
+        raise kind("entering")
+
+    return train
+
+
+class Failing(nn.Module):
+    """Raises in its n-th call; 0 for never."""
+
+    def __init__(self, inner: nn.Module, n: int, kind: type[BaseException]):
+        super().__init__()
+        self.inner, self.n, self.kind, self.calls = inner, n, kind, 0
+
+    def forward(self, x: Tensor) -> Tensor:
+        self.calls += 1
+        if self.calls == self.n:
+            raise self.kind("failing")
+        return self.inner(x)
+
+
+def test_a_rear_that_failed_can_be_tried_again() -> None:
+    network, x = build("unet"), picture()
+    with Split(network, "bottleneck") as split, torch.no_grad():
+        z = split.front(x)
+        with pytest.raises(ModelError, match="the network's forward raises RuntimeError"):
+            split.rear(z[:, :3])
+        assert torch.equal(split.rear(z), plain(network, x))
+
+
+def test_two_splits_of_one_network_can_be_open_one_in_the_other() -> None:
+    network, x = build("unet"), picture()
+    whole, before = plain(network, x), state_of(network)
+    with torch.no_grad(), Split(network, "bottleneck") as outer:
+        z = outer.front(x)
+        with Split(network, "ups.0") as inner:
+            assert torch.equal(inner.rear(inner.front(x)), whole)
+        assert torch.equal(outer.rear(z), whole)
+    assert same(before, state_of(network))
+
+
+def test_a_forward_keeps_its_signature_while_cut() -> None:
+    network = build("vit")
+    with Split(network, "head"):
+        names = list(inspect.signature(network.encoder.forward).parameters)
+    assert names == ["x", "output_hidden"]
+
+
+# ------------------------------------------------------------------ hooks and side effects
+
+
+def test_the_networks_own_hooks_run_in_every_pass() -> None:
+    network, x = MiDaSLike().eval(), picture()
+    calls = Counting(nn.Identity())
+    network.backbone[1].register_forward_hook(lambda module, given, output: calls(None))
+    with Split(network, "unit1") as split, torch.no_grad():
+        z = split.front(x)
+        for _ in range(3):
+            assert torch.equal(split.rear(z), plain(network, x))
+    assert calls.calls == 1 + 3 + 3  # front, rear, plain
+
+
+def test_a_hook_that_changes_an_output_is_obeyed() -> None:
+    network, x = UNetTail(), picture(16, 16).mean(1, keepdim=True).expand(1, 4, 16, 16)
+    network.a.register_forward_hook(lambda module, given, output: output * 2)
+    network.b.register_forward_pre_hook(lambda module, given: (given[0] + 1,))
+    for layer in ("a", "b"):
+        with Split(network, layer) as split, torch.no_grad():
+            assert torch.equal(split.rear(split.front(x)), plain(network, x))
+
+
+def test_keyword_arguments_and_more_than_one_argument_reach_the_network() -> None:
+    class Network(nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.image, self.points, self.head = conv(3, 2), conv(1, 2), conv(4, 1)
+
+        def forward(self, rgb: Tensor, sparse: Tensor) -> Tensor:
+            rgb.mul_(2), sparse.add_(1)
+            return self.head(torch.cat([self.image(rgb), self.points(sparse)], 1)) + sparse
+
+    network, x = Network(), picture()
+    with torch.no_grad():
+        whole = network(x.clone(), x[:, :1].clone())
+        with Split(network, "points") as split:
+            z = split.front(x, x[:, :1])
+            assert torch.equal(split.rear(z), whole)
+            assert torch.equal(split.rear(z), whole)
+
+
+def test_what_a_rear_gives_is_not_touched_by_the_next() -> None:
+    network, x = build("vit"), picture()
+    with Split(network, "encoder.blocks.1[0]") as split, torch.no_grad():
+        z = split.front(x)
+        first = split.rear(z)
+        copies = [tensor.clone() for _, tensor in tensors_in(first)]
+        split.rear(z + 1)
+    assert all(torch.equal(a, b) for a, (_, b) in zip(copies, tensors_in(first), strict=True))

@@ -1,0 +1,68 @@
+"""What code that is not ours raises, on one line."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+import torch
+
+from pnpdepth_cli.core.split.user_code import describe, is_out_of_memory, wrap_user_errors
+from pnpdepth_cli.errors import LayerError, ModelError
+
+
+def test_an_exception_inside_is_blamed_on_one_line_and_kept_as_the_cause() -> None:
+    with pytest.raises(ModelError) as error, wrap_user_errors("the network's forward"):
+        raise ValueError("a\n  b\n\n c")
+    assert str(error.value) == "the network's forward raises ValueError: a b c"
+    assert isinstance(error.value.__cause__, ValueError)
+
+
+def test_our_own_errors_and_ends_pass_through() -> None:
+    for kind in (LayerError, KeyboardInterrupt, GeneratorExit):
+        with pytest.raises(kind), wrap_user_errors("x"):
+            raise kind
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        MemoryError(),
+        torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 MiB"),
+        RuntimeError("CUDA error: out of memory"),
+        RuntimeError("MPS backend out of memory (MPS allocated: 1 GB)"),
+        RuntimeError("CUDA error: CUBLAS_STATUS_ALLOC_FAILED when calling `cublasCreate(handle)`"),
+        RuntimeError("[enforce fail] DefaultCPUAllocator: can't allocate memory: you tried to"),
+    ],
+)
+def test_running_out_of_memory_stays_itself(error: Exception) -> None:
+    assert is_out_of_memory(error)
+    with pytest.raises(type(error)), wrap_user_errors("x"):
+        raise error
+
+
+def test_other_errors_are_not_taken_for_it() -> None:
+    assert not is_out_of_memory(RuntimeError("shape mismatch"))
+    assert not is_out_of_memory(ValueError("out of memory"))
+
+
+def test_a_real_allocation_that_fails_on_the_cpu_is_recognised() -> None:
+    with pytest.raises(RuntimeError) as error:
+        torch.empty(2**60, dtype=torch.uint8)
+    assert is_out_of_memory(error.value)
+
+
+def test_the_line_of_a_file_is_said_however_the_file_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = tmp_path / "raises.py"
+    file.write_text("def f():\n    return 1 / 0\n\n\nf()\n")
+    with pytest.raises(ZeroDivisionError) as error:
+        exec(compile(file.read_text(), str(file), "exec"), {})
+    monkeypatch.chdir(tmp_path)
+    for named in (file, Path("raises.py"), Path(os.curdir) / "raises.py"):
+        assert describe(error.value, named) == "ZeroDivisionError: division by zero (line 2)"
+    assert describe(error.value) == "ZeroDivisionError: division by zero"
+    assert describe(ValueError()) == "ValueError"
+    assert len(describe(ValueError("x" * 9999))) < 400

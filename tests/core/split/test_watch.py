@@ -1,0 +1,277 @@
+"""What a watched pass learns: what depends on z, what may be handed back, what to protect."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+
+import pytest
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from pnpdepth_cli.core.split import Split
+from pnpdepth_cli.core.split.watch import Remembered, Watch
+from tests.completion.naive import plain
+from tests.core.networks import Branching, Counting, build, conv, picture
+
+
+class Behind(nn.Module):
+    """A branch behind the cut that is given what `way` makes of z."""
+
+    def __init__(self, way: Callable[[Tensor, Tensor], Tensor]) -> None:
+        super().__init__()
+        self.enter, self.cut, self.head = conv(3, 4), conv(4, 4), conv(4, 1)
+        self.way, self.branch = way, Counting(conv(4, 4))
+
+    def forward(self, x: Tensor) -> Tensor:
+        y = self.enter(x)
+        z = self.cut(y)
+        return self.head(z + self.branch(self.way(z, y)))
+
+
+DEPENDENT: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
+    "z itself": lambda z, y: z,
+    "detach": lambda z, y: z.detach() * 2,
+    "data": lambda z, y: z.data,
+    "argmax": lambda z, y: y + z.argmax(1, keepdim=True),
+    "a comparison": lambda z, y: torch.where(z > 0, y, -y),
+    "a view": lambda z, y: z.detach()[:, [0]].expand(-1, 4, -1, -1),
+    "written into a new tensor": lambda z, y: torch.zeros_like(y).copy_(z.detach()),
+    "written by out=": lambda z, y: torch.add(z.detach(), 1, out=torch.empty_like(y)),
+    "written into a part": lambda z, y: y.clone().add_(z[0, 0].detach()),
+    "a value": lambda z, y: y * float(z.detach().mean()),
+    "numpy": lambda z, y: torch.from_numpy(z.detach().numpy() * 2),
+    "a list": lambda z, y: torch.tensor(z.detach().tolist()),
+    "argmax as a list": lambda z, y: y + z.argmax(1).flatten().tolist()[5],
+    "a mask": lambda z, y: y + y[z > 0].sum(),
+    "foreach": lambda z, y: torch._foreach_add([y], [z.detach()])[0],
+}
+
+INDEPENDENT: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
+    "the features before z": lambda z, y: y,
+    "the shape of z": lambda z, y: y * z.shape[1],
+    "new zeros": lambda z, y: y + torch.zeros(z.shape),
+}
+
+
+@pytest.mark.parametrize("way", DEPENDENT)
+def test_a_branch_that_depends_on_z_in_whatever_way_runs_again(way: str) -> None:
+    torch.manual_seed(0)
+    network, x = Behind(DEPENDENT[way]), picture()
+    with Split(network, "cut") as split, torch.no_grad():
+        z = split.front(x)
+        split.rear(z)
+        memoised = split.rear(-z)
+        assert network.branch.calls == 2
+    with Split(network, "cut") as split, torch.no_grad():
+        split.front(x)
+        assert torch.equal(split.rear(-z), memoised)
+
+
+@pytest.mark.parametrize("way", INDEPENDENT)
+def test_a_branch_that_does_not_depend_on_z_does_not(way: str) -> None:
+    network, x = Behind(INDEPENDENT[way]), picture()
+    with Split(network, "cut") as split, torch.no_grad():
+        z = split.front(x)
+        for k in range(4):
+            split.rear(z + k)
+    assert network.branch.calls == 1
+
+
+@pytest.mark.parametrize(
+    "escape",
+    [
+        lambda y: bool(y.mean() > 0),
+        lambda y: y.mean().item() > 0,
+        lambda y: y.mean((0, 2, 3)).tolist()[0] > 0,
+        lambda y: y.numpy().mean() > 0,
+        lambda y: len(y[y > 0]) > 400,
+        lambda y: int((y > 0).sum()) > 400,
+    ],
+)
+def test_python_may_take_another_way_at_another_z(escape: Callable[[Tensor], bool]) -> None:
+    torch.manual_seed(0)
+    network, x = Branching(escape), picture()
+    for sign in (1, -1):
+        with Split(network, "cut") as split, torch.no_grad():
+            z = split.front(x)
+            z = sign * z.abs()
+            ways = [split.rear(each) for each in (z, -z, z, -z)]
+        for way, each in zip(ways, (z, -z), strict=False):
+            with Split(network, "cut") as fresh, torch.no_grad():
+                fresh.front(x)
+                assert torch.equal(fresh.rear(each), way)
+        assert torch.equal(ways[0], ways[2])
+        assert torch.equal(ways[1], ways[3])
+        assert not torch.equal(ways[0], ways[1])
+
+
+def test_a_native_operator_that_reads_z_unseen_runs_again() -> None:
+    network, x = build("native"), picture()
+    for gradient in (False, True):
+        with Split(network, "cut") as split, torch.set_grad_enabled(gradient):
+            z = split.front(x)
+            first = split.rear(z.requires_grad_(gradient))
+            second = split.rear((z * 3).detach())
+        assert not torch.equal(first, second)
+        with Split(network, "cut") as split, torch.no_grad():
+            split.front(x)
+            assert torch.equal(split.rear(z * 3), second)
+
+
+def test_a_remembered_tensor_gets_its_copy_before_it_is_overwritten() -> None:
+    tensor = torch.ones(3)
+    remembered = Remembered([tensor])
+    with Watch([remembered]):
+        tensor.mul_(5)
+    assert remembered.copied
+    assert torch.equal(remembered.output[0], torch.ones(3))
+    handed = remembered.hand_back()
+    handed[0].mul_(7)
+    assert torch.equal(remembered.output[0], torch.ones(3))
+
+
+@pytest.mark.parametrize(
+    "write",
+    [
+        lambda t: t.add_(1),
+        lambda t: t[1:].zero_(),
+        lambda t: torch.add(t, 1, out=t),
+        lambda t: torch._foreach_mul_([t], 2.0),
+        lambda t: F.relu_(t.view(3, 1)),
+        lambda t: t.detach().exp_(),
+        lambda t: t.__setitem__(0, 9.0),
+        lambda t: nn.ReLU(inplace=True)(t),
+        lambda t: t.clamp_(max=0),
+        lambda t: t.data.fill_(4),
+    ],
+)
+def test_every_form_of_writing_is_seen(write: Callable[[Tensor], object]) -> None:
+    tensor = torch.tensor([-1.0, 2.0, 3.0])
+    remembered = Remembered(tensor)
+    with torch.no_grad(), Watch([remembered]):
+        write(tensor)
+    assert remembered.copied
+    assert torch.equal(remembered.output, torch.tensor([-1.0, 2.0, 3.0]))
+
+
+def test_reading_makes_no_copy() -> None:
+    tensor = torch.ones(3)
+    remembered = Remembered(tensor)
+    with Watch([remembered]):
+        (tensor + 1).mul_(2)
+        tensor.view(3, 1).clone().zero_()
+    assert not remembered.copied
+    assert remembered.hand_back() is tensor
+
+
+def replaceable(call: Callable[[Tensor], object]) -> bool:
+    given = torch.ones(2, 3)
+    watch = Watch(())
+    with watch:
+        since = watch.now()
+        output = call(given)
+        return watch.can_stand_for(since, (given,), output)
+
+
+def test_an_output_stands_for_a_call_that_made_it_and_did_nothing_else() -> None:
+    assert replaceable(lambda t: t + 1)
+    assert replaceable(lambda t: {"a": [t + 1, 5, "text", None]})
+    assert replaceable(lambda t: (t + 1).relu_().view(3, 2))
+
+
+def test_an_output_does_not_stand_for_more() -> None:
+    made = torch.ones(2, 3)
+    assert not replaceable(lambda t: t)
+    assert not replaceable(lambda t: t.view(3, 2))
+    assert not replaceable(lambda t: t.add_(1))
+    assert not replaceable(lambda t: (t.add_(1), t + 1)[1])
+    assert not replaceable(lambda t: (made.add_(1), t + 1)[1])
+    assert not replaceable(lambda t: made)
+    assert not replaceable(lambda t: iter([t + 1]))
+    assert not replaceable(lambda t: {"a": t + 1, "b": object()})
+    assert not replaceable(lambda t: [(t + 1)] * 2)
+    assert not replaceable(lambda t: (t + 1).unbind(0))
+
+
+def test_tensor_methods_are_themselves_again_after_a_watched_pass() -> None:
+    before = (Tensor.numpy, Tensor.tolist)
+    network, x = build("unet"), picture()
+    with Split(network, "bottleneck") as split, torch.no_grad():
+        z = split.front(x)
+        with pytest.raises(Exception):  # noqa: B017
+            split.rear(z[:, :1])
+        split.rear(z)
+    assert (Tensor.numpy, Tensor.tolist) == before
+    assert "numpy" not in vars(Tensor)
+
+
+def test_watching_costs_little_and_grows_with_the_number_of_layers_only() -> None:
+    def calls(layers: int) -> int:
+        network = nn.Sequential(
+            *(nn.Sequential(nn.Linear(2, 2), nn.ReLU(True)) for _ in range(layers))
+        )
+        x = torch.rand(1, 2)
+        seen = 0
+
+        def count(frame: object, event: str, argument: object) -> None:
+            nonlocal seen
+            seen += event == "call"
+
+        import sys
+
+        with Split(network, f"{layers // 2}") as split, torch.no_grad():
+            sys.setprofile(count)
+            z = split.front(x)
+            split.rear(z)
+            sys.setprofile(None)
+            assert torch.equal(split.rear(z), plain(network, x))
+        return seen
+
+    small, large = calls(10), calls(100)
+    assert large < 12 * small
+
+
+def test_what_other_threads_do_with_tensors_meanwhile_is_their_own_matter() -> None:
+    watch, z = Watch(()), torch.ones(3)
+    watch.touch(z)
+
+    def in_a_thread(read: Callable[[], object]) -> None:
+        thread = threading.Thread(target=read)
+        thread.start()
+        thread.join()
+
+    with watch, watch.seeing_escapes():
+        in_a_thread(lambda: (z.numpy(), z.tolist(), torch.zeros(2).numpy()))
+        assert not watch.data_dependent
+        z.numpy()
+        assert watch.data_dependent
+
+
+def test_a_pass_is_the_same_while_other_threads_read_tensors() -> None:
+    network, x = Behind(DEPENDENT["a value"]), picture()
+    with Split(network, "cut") as split, torch.no_grad():
+        z = split.front(x)
+        alone = [split.rear(z), split.rear(-z)]
+    stop = threading.Event()
+
+    def read() -> None:
+        tensor = torch.arange(10.0)
+        while not stop.is_set():
+            assert tensor.numpy()[3] == tensor.tolist()[3] == 3
+
+    threads = [threading.Thread(target=read) for _ in range(3)]
+    for thread in threads:
+        thread.start()
+    try:
+        for _ in range(20):
+            with Split(network, "cut") as split, torch.no_grad():
+                split.front(x)
+                assert torch.equal(split.rear(z), alone[0])
+                assert torch.equal(split.rear(-z), alone[1])
+    finally:
+        stop.set()
+        for thread in threads:
+            thread.join()
+    assert "numpy" not in vars(Tensor)

@@ -1,0 +1,116 @@
+"""The size of a step and its reach, against values worked out by hand."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pnpdepth_cli.core.step_sizes import SCHEDULES, Channels, blurred, step_size
+from pnpdepth_cli.errors import LayerError, UsageError
+from pnpdepth_cli.points import SparsePoints
+
+
+def points(count: int, size: tuple[int, int]) -> SparsePoints:
+    return SparsePoints(xy=torch.zeros(count, 2), depth=torch.ones(count), size=size)
+
+
+def test_a_per_cent_step_is_that_share_of_the_standard_deviation_of_z0() -> None:
+    z = torch.tensor([1.0, 3.0, 1.0, 3.0])  # standard deviation 1
+    assert step_size("3%", z) == pytest.approx(0.03)
+    assert step_size(" 3 % ", z * 10) == pytest.approx(0.3)
+    assert step_size(0.01, z) == 0.01
+    assert step_size("0.5", z) == 0.5
+
+
+@pytest.mark.parametrize(
+    "lr", [0, -1, "0%", "-3%", "x", "", "%", "nan", "inf", float("nan"), "3%%"]
+)
+def test_what_is_no_step_is_refused(lr: float | str) -> None:
+    with pytest.raises(UsageError, match="step size"):
+        step_size(lr, torch.ones(2))
+
+
+@pytest.mark.parametrize("name", SCHEDULES)
+def test_a_schedule_starts_at_the_whole_step_and_never_reaches_nothing(name: str) -> None:
+    shares = [SCHEDULES[name](k / 20) for k in range(20)]
+    assert shares[0] == 1
+    assert shares == sorted(shares, reverse=True)
+    assert shares[-1] > 0
+
+
+def test_a_linear_schedule_falls_by_the_same_amount_every_time() -> None:
+    assert [SCHEDULES["linear"](k / 4) for k in range(4)] == [1, 0.75, 0.5, 0.25]
+
+
+def test_no_blur_and_a_z_that_is_no_map_leave_the_gradient_itself() -> None:
+    gradient = torch.randn(1, 3, 5, 7)
+    assert blurred(gradient, points(4, (50, 70)), 0.0) is gradient
+    tokens = torch.randn(1, 35, 3)
+    assert blurred(tokens, points(4, (50, 70)), 2.0) is tokens
+
+
+def test_the_reach_is_a_gaussian_of_so_many_spacings_of_the_points() -> None:
+    # 4 points on 40 × 80 pixels are √800 pixels apart; a cell is 4 pixels high and 2 wide
+    gradient = torch.zeros(1, 1, 10, 40)
+    gradient[0, 0, 5, 20] = 1
+    result = blurred(gradient, points(4, (40, 80)), 0.25)[0, 0]
+
+    def weight(cell: int, cells: int, of: int, sigma: float) -> float:
+        """What cell `of` weighs in the mean that `cell` becomes."""
+        weights = [math.exp(-0.5 * ((cell - other) / sigma) ** 2) for other in range(cells)]
+        return weights[of] / sum(weights)
+
+    down, across = 0.25 * math.sqrt(800) / 4, 0.25 * math.sqrt(800) / 2
+    for row, column in ((5, 20), (4, 20), (9, 23), (0, 0), (7, 39)):
+        expected = weight(row, 10, 5, down) * weight(column, 40, 20, across)
+        assert float(result[row, column]) == pytest.approx(expected, rel=1e-4)
+
+
+@given(
+    count=st.integers(1, 5000),
+    spacings=st.floats(0.01, 5),
+    shape=st.tuples(st.integers(1, 3), st.integers(1, 12), st.integers(1, 12)),
+)
+def test_a_gradient_that_is_the_same_everywhere_stays_so_whatever_the_points(
+    count: int, spacings: float, shape: tuple[int, int, int]
+) -> None:
+    gradient = torch.full((1, *shape), 0.7)
+    torch.testing.assert_close(blurred(gradient, points(count, (64, 96)), spacings), gradient)
+
+
+def test_many_points_keep_a_gradient_in_its_cell() -> None:
+    gradient = torch.randn(1, 2, 6, 8, generator=torch.Generator().manual_seed(0))
+    torch.testing.assert_close(blurred(gradient, points(4800, (60, 80)), 1.0), gradient)
+
+
+@pytest.mark.parametrize(("shape", "inside"), [((1, 3, 4, 5), (2, 3)), ((1, 7, 3), (1,))])
+def test_channels_move_by_a_scale_and_a_shift_each(
+    shape: tuple[int, ...], inside: tuple[int, ...]
+) -> None:
+    torch.manual_seed(0)
+    z0 = torch.randn(shape).double() * 4 + 1
+    channels = Channels(z0)
+    change = torch.randn_like(channels.gradient(z0))
+    assert change.numel() == 2 * 3
+    scale, shift = change.tensor_split(2)
+    flat = (z0 - z0.mean(inside, keepdim=True)) / z0.std(inside, correction=0, keepdim=True)
+    torch.testing.assert_close(channels.change_of_z(change), scale * flat + shift)
+    # what `of` gives is the slope of the loss in these numbers, over the elements of a channel
+    slope, count = torch.randn_like(z0), z0.numel() // 3
+    along = (slope * channels.change_of_z(change)).sum()
+    torch.testing.assert_close((channels.gradient(slope) * change).sum() * count, along)
+
+
+def test_a_channel_that_is_the_same_everywhere_is_shifted_only() -> None:
+    channels = Channels(torch.ones(1, 1, 2, 2))
+    moved = channels.change_of_z(torch.tensor([5.0, 2.0]).view(2, 1, 1, 1))
+    assert moved.flatten().tolist() == [2.0] * 4
+
+
+def test_a_z_without_channels_is_refused() -> None:
+    with pytest.raises(LayerError, match="--parameters elements"):
+        Channels(torch.zeros(1, 8))

@@ -1,0 +1,396 @@
+"""Every operator against onnxruntime, on random inputs."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+onnx = pytest.importorskip("onnx", reason="needs the extra [onnx]")
+ort = pytest.importorskip("onnxruntime", reason="needs the extra [onnx]")
+
+from pathlib import Path  # noqa: E402
+
+from onnx import TensorProto, helper, numpy_helper  # noqa: E402
+
+from pnpdepth_cli.errors import ModelError  # noqa: E402
+from pnpdepth_cli.models.formats.onnx.graph import OnnxGraph  # noqa: E402
+from pnpdepth_cli.models.formats.onnx.operators import OPERATORS  # noqa: E402
+
+F32, I64 = np.float32, np.int64
+
+
+def normal(*shape: int) -> np.ndarray:
+    return np.random.default_rng(0).normal(size=shape).astype(F32)
+
+
+def model_of(
+    op: str, given: list[np.ndarray | None], opset: int, outputs: int, **attributes: Any
+) -> onnx.ModelProto:
+    """One node whose first input is the graph's and whose others are constants."""
+    names = [f"in{n}" if value is not None else "" for n, value in enumerate(given)]
+    node = helper.make_node(op, names, [f"out{n}" for n in range(outputs)], **attributes)
+    kinds = {np.dtype(F32): TensorProto.FLOAT, np.dtype(I64): TensorProto.INT64,
+             np.dtype(bool): TensorProto.BOOL}  # fmt: skip
+    assert given[0] is not None
+    graph = helper.make_graph(
+        [node],
+        "g",
+        [helper.make_tensor_value_info("in0", kinds[given[0].dtype], given[0].shape)],
+        [onnx.ValueInfoProto(name=f"out{n}") for n in range(outputs)],
+        [numpy_helper.from_array(v, f"in{n}") for n, v in enumerate(given) if n and v is not None],
+    )
+    made = helper.make_model(graph, opset_imports=[helper.make_opsetid("", opset)])
+    made.ir_version = 10
+    return made
+
+
+def both(
+    op: str, given: list[np.ndarray | None], opset: int, outputs: int = 1, **attributes: Any
+) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    model = model_of(op, given, opset, outputs, **attributes)
+    session = ort.InferenceSession(model.SerializeToString(), providers=["CPUExecutionProvider"])
+    true = session.run(None, {"in0": given[0]})
+    ours = OnnxGraph(model, Path("x.onnx"))(torch.from_numpy(given[0]))
+    return [t.numpy() for t in (ours.values() if isinstance(ours, dict) else [ours])], true
+
+
+def check(op: str, given: list[np.ndarray | None], opset: int = 17, **more: Any) -> None:
+    ours, true = both(op, given, opset, **more)
+    for one, other in zip(ours, true, strict=True):
+        assert one.shape == other.shape
+        assert one.dtype == other.dtype
+        np.testing.assert_allclose(one, other, rtol=2e-5, atol=2e-5)
+
+
+X = normal(1, 4, 7, 6)
+POSITIVE = np.abs(X) + 0.1
+
+UNARY = [
+    ("Relu", {}), ("LeakyRelu", {"alpha": 0.2}), ("Elu", {"alpha": 0.7}), ("Celu", {"alpha": 0.7}),
+    ("Selu", {}), ("ThresholdedRelu", {"alpha": 0.3}), ("Sigmoid", {}), ("HardSigmoid", {}),
+    ("HardSigmoid", {"alpha": 1 / 6, "beta": 0.5}), ("HardSwish", {}), ("Tanh", {}),
+    ("Softplus", {}), ("Softsign", {}), ("Mish", {}), ("Erf", {}), ("Exp", {}), ("Abs", {}),
+    ("Neg", {}), ("Floor", {}), ("Ceil", {}), ("Round", {}), ("Sign", {}), ("Sin", {}), ("Cos", {}),
+    ("Tan", {}), ("Atan", {}), ("Sinh", {}), ("Cosh", {}), ("Identity", {}), ("IsNaN", {}),
+    ("IsInf", {}), ("Softmax", {"axis": 1}), ("LogSoftmax", {}), ("Flatten", {"axis": 2}),
+    ("Flatten", {"axis": -1}), ("Transpose", {"perm": [0, 2, 3, 1]}), ("Transpose", {}),
+    ("GlobalAveragePool", {}), ("GlobalMaxPool", {}), ("LRN", {"size": 3, "alpha": 0.01}),
+    ("LpNormalization", {"axis": 1}), ("MeanVarianceNormalization", {}), ("Shape", {"start": 1}),
+    ("Size", {}), ("Cast", {"to": TensorProto.INT64}), ("Cast", {"to": TensorProto.BOOL}),
+    ("ArgMax", {"axis": 1}), ("ArgMin", {"axis": 2, "keepdims": 0}), ("Dropout", {}),
+    ("DepthToSpace", {"blocksize": 2}), ("DepthToSpace", {"blocksize": 2, "mode": "CRD"}),
+    ("Trilu", {"upper": 0}),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("op", "attributes"), UNARY, ids=lambda v: str(v))
+def test_an_operator_of_one_input_is_as_in_onnxruntime(op: str, attributes: dict[str, Any]) -> None:
+    check(op, [X], opset=18, **attributes)
+
+
+@pytest.mark.parametrize("op", ["Log", "Sqrt", "Reciprocal", "Asin", "Acos"])
+def test_an_operator_of_a_bounded_input_is_as_in_onnxruntime(op: str) -> None:
+    check(op, [np.clip(POSITIVE, 0.1, 0.9)])
+
+
+@pytest.mark.parametrize("approximate", ["none", "tanh"])
+def test_gelu(approximate: str) -> None:
+    check("Gelu", [X], opset=20, approximate=approximate)
+
+
+BINARY = ["Add", "Sub", "Mul", "Div", "Equal", "Greater", "Less", "GreaterOrEqual", "LessOrEqual",
+          "Max", "Min", "Sum", "Mean"]  # fmt: skip
+
+
+@pytest.mark.parametrize("op", BINARY)
+def test_an_operator_of_two_inputs_broadcasts(op: str) -> None:
+    check(op, [X, normal(4, 1, 1)])
+
+
+def test_powers_divisions_and_remainders() -> None:
+    check("Pow", [POSITIVE, np.array([0.5], F32)])
+    check("Pow", [X, np.array(2, I64)])
+    check("Div", [np.array([7, -7], I64), np.array([2, 2], I64)])
+    check("Mod", [np.array([7, -7], I64), np.array([3, 3], I64)])
+    check("Mod", [X, np.array([0.7], F32)], fmod=1)
+
+
+def test_logic() -> None:
+    a, b = np.array([True, False, True]), np.array([True, True, False])
+    for op in ("And", "Or", "Xor"):
+        check(op, [a, b])
+    check("Not", [a])
+    check("Where", [a, normal(3), normal(2, 3)])
+
+
+def test_clip_of_old_and_new_opsets() -> None:
+    check("Clip", [X], opset=6, min=0.0, max=6.0)
+    check("Clip", [X], opset=6, max=0.5)
+    check("Clip", [X, np.array(0, F32), np.array(6, F32)])
+    check("Clip", [X, None, np.array(0.5, F32)])
+    check("Clip", [X, np.array(2, F32), np.array(1, F32)])
+
+
+def test_prelu_softmax_and_broadcast_of_old_opsets() -> None:
+    check("PRelu", [X, normal(4, 1, 1)])
+    check("Softmax", [X], opset=9)
+    check("Softmax", [X], opset=11, axis=2)
+
+
+def test_matrices() -> None:
+    check("MatMul", [normal(2, 3, 5), normal(5, 4)])
+    check("Gemm", [normal(3, 5), normal(4, 5), normal(4)], transB=1, alpha=0.5, beta=2.0)
+    check("Gemm", [normal(5, 3), normal(5, 4)], transA=1)
+    check("Einsum", [normal(2, 3, 5), normal(2, 5, 4)], equation="bij,bjk->bik")
+    for more in ({}, {"reverse": 1}, {"exclusive": 1}, {"reverse": 1, "exclusive": 1}):
+        check("CumSum", [X, np.array(2, I64)], **more)
+
+
+REDUCTIONS = sorted(name for name in OPERATORS if name.startswith("Reduce"))
+
+
+@pytest.mark.parametrize("op", REDUCTIONS)
+def test_reductions_of_old_and_new_opsets(op: str) -> None:
+    x = POSITIVE
+    old = 11
+    check(op, [x], opset=old, axes=[2, -1], keepdims=0)
+    check(op, [x], opset=old)
+    check(op, [x, np.array([1], I64)], opset=18)
+    check(op, [x, np.array([], I64)], opset=18, noop_with_empty_axes=1)
+
+
+PADS = [
+    {"pads": [1, 1, 1, 1]}, {"pads": [0, 1, 2, 1]}, {"auto_pad": "SAME_UPPER"},
+    {"auto_pad": "SAME_LOWER"}, {"auto_pad": "VALID"}, {},
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("pads", PADS, ids=str)
+@pytest.mark.parametrize("stride", [1, 2])
+def test_convolutions_with_every_way_to_pad(pads: dict[str, Any], stride: int) -> None:
+    weight, bias = normal(6, 4, 3, 3), normal(6)
+    check("Conv", [X, weight, bias], strides=[stride, stride], **pads)
+    check("Conv", [X, normal(4, 1, 3, 3)], group=4, strides=[stride, stride], **pads)
+    if "auto_pad" not in pads:
+        check("Conv", [X, weight], dilations=[2, 2], strides=[stride, stride], **pads)
+
+
+def test_convolutions_along_one_and_three_axes() -> None:
+    check("Conv", [normal(1, 4, 9), normal(5, 4, 3)], pads=[1, 1])
+    check("Conv", [normal(1, 2, 4, 5, 6), normal(3, 2, 3, 3, 3)])
+
+
+TRANSPOSED = [
+    {}, {"strides": [2, 2]}, {"strides": [2, 2], "pads": [1, 1, 1, 1]},
+    {"strides": [2, 2], "pads": [1, 1, 1, 1], "output_padding": [1, 1]},
+    {"strides": [2, 2], "pads": [0, 0, 1, 1]}, {"strides": [2, 2], "output_shape": [14, 12]},
+    {"strides": [2, 2], "auto_pad": "SAME_UPPER"}, {"strides": [2, 2], "auto_pad": "SAME_LOWER"},
+    {"strides": [2, 2], "output_shape": [13, 12], "auto_pad": "SAME_UPPER"},
+    {"strides": [2, 1], "dilations": [2, 1]}, {"strides": [3, 3], "pads": [1, 0, 0, 1]},
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("attributes", TRANSPOSED, ids=str)
+def test_transposed_convolutions(attributes: dict[str, Any]) -> None:
+    check("ConvTranspose", [X, normal(4, 5, 3, 3), normal(5)], **attributes)
+    check("ConvTranspose", [X, normal(4, 2, 4, 4)], group=2, **attributes)
+
+
+POOLS = [
+    {}, {"strides": [2, 2]}, {"strides": [2, 2], "pads": [1, 1, 1, 1]},
+    {"strides": [2, 2], "pads": [0, 0, 1, 1]}, {"strides": [2, 2], "ceil_mode": 1},
+    {"strides": [2, 2], "ceil_mode": 1, "pads": [1, 1, 1, 1]},
+    {"strides": [2, 2], "auto_pad": "SAME_UPPER"}, {"strides": [2, 2], "auto_pad": "SAME_LOWER"},
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("attributes", POOLS, ids=str)
+def test_pools(attributes: dict[str, Any]) -> None:
+    for kernel in (2, 3):
+        if max(attributes.get("pads", [0])) >= kernel:
+            continue
+        check("MaxPool", [X], kernel_shape=[kernel, kernel], opset=12, **attributes)
+        for counted in (0, 1):
+            more = {"kernel_shape": [kernel, kernel], "count_include_pad": counted}
+            check("AveragePool", [X], opset=19, **more, **attributes)
+
+
+COORDINATES = ["half_pixel", "pytorch_half_pixel", "align_corners", "asymmetric"]
+SIZES = [(14, 12), (10, 11), (4, 5), (7, 1)]
+
+
+@pytest.mark.parametrize("coordinates", [*COORDINATES, "half_pixel_symmetric"])
+@pytest.mark.parametrize("size", SIZES)
+@pytest.mark.parametrize("mode", ["nearest", "linear", "cubic"])
+def test_resize_to_sizes(mode: str, size: tuple[int, int], coordinates: str) -> None:
+    roundings = ["round_prefer_floor", "round_prefer_ceil", "floor", "ceil"]
+    for rounding in roundings if mode == "nearest" else roundings[:1]:
+        check(
+            "Resize", [X, None, None, np.array([1, 4, *size], I64)], opset=19, mode=mode,
+            coordinate_transformation_mode=coordinates, nearest_mode=rounding,
+        )  # fmt: skip
+
+
+@pytest.mark.parametrize("coordinates", COORDINATES)
+@pytest.mark.parametrize("scales", [(2, 2), (1.5, 1.7), (0.6, 0.5), (3, 1)])
+@pytest.mark.parametrize("mode", ["nearest", "linear", "cubic"])
+def test_resize_by_scales(mode: str, scales: tuple[float, float], coordinates: str) -> None:
+    check(
+        "Resize", [X, np.array([], F32), np.array([1, 1, *scales], F32)], opset=13, mode=mode,
+        coordinate_transformation_mode=coordinates, nearest_mode="floor",
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("mode", ["linear", "cubic"])
+@pytest.mark.parametrize("size", [(14, 12), (4, 3)])
+def test_resize_with_antialias_and_without_what_is_outside(
+    mode: str, size: tuple[int, int]
+) -> None:
+    sizes = np.array([1, 4, *size], I64)
+    check("Resize", [X, None, None, sizes], opset=19, mode=mode, antialias=1)
+    if mode == "cubic":
+        more = {"exclude_outside": 1, "cubic_coeff_a": -0.5}
+        check("Resize", [X, None, None, sizes], opset=13, mode=mode, **more)
+
+
+def test_resize_of_chosen_axes_and_kept_aspect() -> None:
+    check("Resize", [X, None, None, np.array([9, 9], I64)], opset=18, mode="linear", axes=[2, 3])
+    for policy in ("not_larger", "not_smaller"):
+        check(
+            "Resize", [X, None, None, np.array([9, 9], I64)], opset=18, mode="linear", axes=[2, 3],
+            keep_aspect_ratio_policy=policy,
+        )  # fmt: skip
+
+
+@pytest.mark.parametrize("mode", ["nearest", "linear"])
+@pytest.mark.parametrize("scales", [(2, 2), (1.5, 1.5), (0.5, 0.7)])
+def test_upsample_and_the_first_resize(mode: str, scales: tuple[float, float]) -> None:
+    factors = np.array([1, 1, *scales], F32)
+    check("Resize", [X, factors], opset=10, mode=mode)
+    if min(scales) >= 1:
+        check("Upsample", [X, factors], opset=9, mode=mode)
+        check("Upsample", [X], opset=7, mode=mode, scales=factors.tolist())
+
+
+def test_normalisations() -> None:
+    four = [normal(4), normal(4), np.abs(normal(4)) + 0.1]
+    check("BatchNormalization", [X, np.abs(normal(4)), *four], opset=15, epsilon=1e-3)
+    check("BatchNormalization", [X, np.abs(normal(4)), *four], opset=7)
+    check("InstanceNormalization", [X, normal(4), normal(4)])
+    check("LayerNormalization", [X, normal(6), normal(6)])
+    check("LayerNormalization", [X, normal(7, 6)], axis=2, epsilon=1e-3)
+    check("GroupNormalization", [X, normal(4), normal(4)], opset=21, num_groups=2)
+    check("GroupNormalization", [X, normal(2), normal(2)], opset=18, num_groups=2)
+
+
+def test_dequantised_weights_are_folded_into_numbers() -> None:
+    quantised = np.random.default_rng(0).integers(-128, 127, (4, 3)).astype(np.int8)
+    scale, zero = np.abs(normal(4)) + 0.01, np.arange(4, dtype=np.int8)
+    nodes = [
+        helper.make_node("DequantizeLinear", ["q", "s", "z"], ["w"], axis=0),
+        helper.make_node("MatMul", ["w", "in0"], ["out0"]),
+    ]
+    graph = helper.make_graph(
+        nodes, "g", [helper.make_tensor_value_info("in0", TensorProto.FLOAT, [3, 2])],
+        [onnx.ValueInfoProto(name="out0")],
+        [numpy_helper.from_array(v, n) for n, v in (("q", quantised), ("s", scale), ("z", zero))],
+    )  # fmt: skip
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 13)])
+    model.ir_version = 10
+    x = normal(3, 2)
+    session = ort.InferenceSession(model.SerializeToString(), providers=["CPUExecutionProvider"])
+    module = OnnxGraph(model, Path("x.onnx"))
+    assert [name for name, _ in module.named_children()] == ["MatMul_out0"]
+    np.testing.assert_allclose(
+        module(torch.from_numpy(x)).numpy(), session.run(None, {"in0": x})[0], rtol=1e-5, atol=1e-5
+    )
+
+
+def test_shapes() -> None:
+    check("Reshape", [X, np.array([0, -1, 6], I64)])
+    check("Squeeze", [normal(1, 3, 1), np.array([0], I64)])
+    check("Squeeze", [normal(1, 3, 1)], opset=11, axes=[2])
+    check("Squeeze", [normal(1, 3, 1)], opset=11)
+    check("Unsqueeze", [normal(3, 2), np.array([0, -1], I64)])
+    check("Unsqueeze", [normal(3, 2)], opset=11, axes=[1, 3])
+    check("Expand", [normal(3, 1), np.array([2, 1, 4], I64)])
+    check("Tile", [normal(3, 2), np.array([2, 3], I64)])
+    check("Concat", [normal(3, 2), normal(4, 2)], axis=0)
+    check("SpaceToDepth", [normal(1, 2, 4, 6)], blocksize=2)
+    check("CastLike", [X, np.array([1], I64)])
+    check(
+        "ConstantOfShape",
+        [np.array([2, 3], I64)],
+        value=numpy_helper.from_array(np.array([7], I64)),
+    )
+    check("Range", [np.array(2, I64), np.array(9, I64), np.array(3, I64)])
+
+
+def test_split_into_one_and_several_parts() -> None:
+    check("Split", [normal(5, 2)], opset=11, outputs=1, axis=0)
+    check("Split", [normal(6, 2)], opset=11, outputs=3, axis=0)
+    check("Split", [normal(6, 2)], opset=11, outputs=2, axis=0, split=[4, 2])
+    check("Split", [normal(6, 2), np.array([1, 5], I64)], opset=13, outputs=2)
+    check("Split", [normal(7, 2)], opset=18, outputs=3, num_outputs=3)
+
+
+@pytest.mark.parametrize("mode", ["constant", "reflect", "edge", "wrap"])
+def test_pads(mode: str) -> None:
+    flat = [0, 0, 2, 1, 0, 0, 1, 3]
+    check("Pad", [X, np.array(flat, I64)], opset=19, mode=mode)
+    check("Pad", [X, np.array([1, 2], I64), None, np.array([-1], I64)], opset=19, mode=mode)
+    if mode == "constant":
+        check("Pad", [X, np.array(flat, I64), np.array(1.5, F32)], opset=13)
+        check("Pad", [X, np.array([0, 0, -1, 0, 0, 0, 0, -2], I64)], opset=13)
+    if mode != "wrap":
+        check("Pad", [X], opset=10, mode=mode, pads=flat)
+
+
+SLICES = [
+    ([1], [5], [2], [2]), ([-1], [-100], [3], [-1]), ([4], [0], [2], [-2]),
+    ([0], [2**62], [1], [1]),
+    ([1, -3], [3, -1], [1, -1], [1, 1]), ([5], [2], [2], [1]), ([-100], [3], [3], [1]),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("parts", SLICES, ids=str)
+def test_slices(parts: tuple[list[int], ...]) -> None:
+    check("Slice", [X, *(np.array(p, I64) for p in parts)])
+
+
+def test_slices_of_old_opsets() -> None:
+    check("Slice", [X], opset=9, starts=[1, 0], ends=[3, -1], axes=[2, 3])
+    check("Slice", [X], opset=9, starts=[0, 1], ends=[1, 3])
+
+
+def test_picking_and_putting_back() -> None:
+    check("Gather", [X, np.array([0, -1, 2], I64)], axis=2)
+    check("Gather", [X, np.array(1, I64)], axis=1)
+    check("Gather", [X, np.array([[0, 1], [3, -2]], I64)], axis=3)
+    check("Gather", [np.array([1, 3, 64, 96], I64), np.array(2, I64)], axis=0)  # x.shape[2]
+    check("GatherElements", [normal(3, 3), np.array([[0, -1, 2]], I64)], axis=0)
+    check("GatherND", [normal(3, 3), np.array([[0, 1], [2, 2]], I64)])
+    check("ScatterND", [normal(4, 2), np.array([[1], [3]], I64), normal(2, 2)])
+    check("ScatterElements", [normal(4, 2), np.array([[1, -1]], I64), normal(1, 2)], axis=0)
+    check("OneHot", [np.array([0, 2, -1], I64), np.array(3, I64), np.array([0, 5], F32)])
+    check("TopK", [normal(4, 6), np.array([3], I64)], outputs=2)
+    grid = np.clip(normal(1, 3, 3, 2), -1, 1)
+    for mode, corners in (("linear", 0), ("linear", 1), ("nearest", 0)):
+        check("GridSample", [X, grid], opset=20, mode=mode, align_corners=corners)
+
+
+def test_every_operator_in_the_table_is_tested_here() -> None:
+    untested = {"RMSNormalization"}  # onnxruntime has no opset-23 kernel to compare with
+    source = Path(__file__).read_text()
+    assert {op for op in OPERATORS if f'"{op}"' not in source} - set(REDUCTIONS) <= untested | {
+        "Constant"
+    }
+
+
+def test_an_operator_that_is_not_covered_is_named() -> None:
+    model = model_of("NonZero", [X], 13, 1)
+    with pytest.raises(ModelError, match=r"not covered: NonZero \(1 ×\)"):
+        OnnxGraph(model, Path("x.onnx"))

@@ -1,0 +1,112 @@
+"""A Python file as a definition, or one line that says why not."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from pnpdepth_cli.errors import ModelError
+from pnpdepth_cli.models.definition import ModelDefinition
+from pnpdepth_cli.models.registry import find_definition
+
+GOOD = """
+from torch import nn
+from pnpdepth_cli.models.definition import ModelDefinition, Multiple
+from beside import WIDTH
+
+definition = ModelDefinition(
+    name="mine", input_kind="rgb", size=Multiple(8), build=lambda: nn.Conv2d(3, WIDTH, 1)
+)
+other = ModelDefinition(name="other", input_kind="rgb", size=Multiple(8), build=nn.Identity)
+"""
+
+
+def written(folder: Path, text: str, name: str = "mine.py") -> Path:
+    file = folder / name
+    file.write_text(text)
+    return file
+
+
+def test_a_file_gives_its_definition_and_may_import_what_is_beside_it(tmp_path: Path) -> None:
+    written(tmp_path, "WIDTH = 7", "beside.py")
+    file = written(tmp_path, GOOD)
+    assert find_definition(str(file)).name == "mine"
+    assert find_definition(f"{file}:other").name == "other"
+    assert isinstance(find_definition(str(file)), ModelDefinition)
+    assert find_definition(str(file)).build().out_channels == 7
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("x = 1\n\nraise ValueError('a\\nb')\n", "raises ValueError: a b (line 3)"),
+        ("def f():\n    return 1 / 0\n\nf()\n", "ZeroDivisionError: division by zero (line 2)"),
+        ("import torch\ntorch.zeros(1) @ 5\n", "(line 2)"),
+        ("def (:\n", "mine.py, line 1"),
+        ("import nonexistent_module\n", "No module named 'nonexistent_module' (line 1)"),
+        ("import sys\nsys.exit(0)\n", "raises SystemExit: 0 (line 2)"),
+        ("x = 1\n", "defines no 'definition'"),
+        ("definition = 'text'\n", "is a str, not a ModelDefinition"),
+        ("definition = None\n", "defines no 'definition'"),
+    ],
+)
+@pytest.mark.parametrize("relative", [True, False])
+def test_a_model_file_at_fault_is_said_with_its_line(
+    text: str, said: str, relative: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = written(tmp_path, text)
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ModelError) as error:
+        find_definition("mine.py" if relative else str(file))
+    assert said in str(error.value)
+    assert "mine.py" in str(error.value)
+    assert "\n" not in str(error.value)
+    assert error.value.exit_code == 4
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        ("size=32", "ModelDefinition 'mine': size=32 is a int"),
+        ("size=Multiple(0)", "Multiple: of=0"),
+        ("size=Multiple(8), output_kind='disparity'", "'mine': output_kind='disparity' is none of"),
+    ],
+)
+def test_a_wrong_field_of_a_definition_is_said_with_its_file_and_line(
+    wrong: str, said: str, tmp_path: Path
+) -> None:
+    file = written(tmp_path, GOOD.replace("size=Multiple(8)", wrong, 1))
+    written(tmp_path, "WIDTH = 7", "beside.py")
+    with pytest.raises(ModelError) as error:
+        find_definition(str(file))
+    assert str(error.value).startswith(f"model file {file}: ")
+    assert said in str(error.value)
+    assert "(line " in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_a_network_that_is_made_already_is_not_taken_for_a_function(tmp_path: Path) -> None:
+    file = written(tmp_path, "from torch import nn\nnet = nn.Conv2d(3, 1, 1)\n")
+    with pytest.raises(ModelError, match=r"'net' in .* is a Conv2d that is made already; name its"):
+        find_definition(f"{file}:net")
+
+
+def test_a_file_that_is_not_there_or_lacks_the_attribute_is_said(tmp_path: Path) -> None:
+    with pytest.raises(ModelError, match="does not exist"):
+        find_definition(str(tmp_path / "absent.py"))
+    file = written(tmp_path, "x = 1")
+    with pytest.raises(ModelError, match="defines no 'network'"):
+        find_definition(f"{file}:network")
+    with pytest.raises(ModelError, match=r"'x' in model file .* is a int"):
+        find_definition(f"{file}:x")
+
+
+def test_the_search_path_is_as_before(tmp_path: Path) -> None:
+    import sys
+
+    before = list(sys.path)
+    for text in ("x = 1", "raise ValueError", "import sys; sys.path.pop(0)"):
+        with pytest.raises(ModelError):
+            find_definition(str(written(tmp_path, text)))
+    assert sys.path == before

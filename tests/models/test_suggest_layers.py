@@ -1,0 +1,107 @@
+"""Layers worth cutting at, found by their shapes and by what comes back to them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from pnpdepth_cli.errors import ModelError
+from pnpdepth_cli.models.suggest_layers import outline
+
+PICTURE = torch.rand(1, 3, 32, 48, generator=torch.Generator().manual_seed(0))
+
+
+class Net(nn.Module):
+    """A front to 1/4 of the picture's size, and two layers back to 1/2; `between` lies amid."""
+
+    def __init__(self, between: Callable[[Any], Any] = lambda run: run()) -> None:
+        super().__init__()
+        torch.manual_seed(0)
+        # 16 channels at 1/4 of the size are as many numbers as the prediction has.
+        self.front = nn.Conv2d(3, 16, 3, stride=4, padding=1)
+        self.middle = nn.Conv2d(16, 4, 3, padding=1)
+        self.relu = nn.ReLU(inplace=True)
+        self.squash = nn.Sigmoid()
+        self.up = nn.ConvTranspose2d(4, 4, 4, stride=2, padding=1)
+        self.head = nn.ConvTranspose2d(4, 1, 4, stride=2, padding=1)
+        self.between = between
+        self.requires_grad_(False)  # as networks are loaded
+
+    def forward(self, rgb: Tensor) -> Tensor:
+        z: Tensor = self.between(lambda: self.front(rgb))
+        return self.head(self.up(self.relu(self.middle(self.squash(z)))))
+
+
+def without(mode: Any) -> Callable[[Any], Any]:
+    def run(part: Callable[[], Any]) -> Any:
+        with mode():
+            return part()
+
+    return run
+
+
+CUTS = {
+    "no_grad": without(torch.no_grad),
+    "inference_mode": without(torch.inference_mode),
+    "detach": lambda run: run().detach(),
+    "numpy": lambda run: torch.from_numpy(run().detach().numpy()),
+}
+
+
+def layers_of(network: nn.Module) -> tuple[str, ...]:
+    return outline(network, (PICTURE,), lambda output: output)
+
+
+def test_the_last_layer_of_each_resolution_from_the_bottleneck_on_is_listed() -> None:
+    assert layers_of(Net()) == ("relu", "up")
+
+
+@pytest.mark.parametrize("how", ["no_grad", "inference_mode"])
+def test_a_front_without_gradients_leaves_itself_and_the_layers_behind_it(how: str) -> None:
+    assert layers_of(Net(CUTS[how])) == layers_of(Net())
+
+
+@pytest.mark.parametrize("how", ["detach", "numpy"])
+def test_a_front_that_is_detached_leaves_the_layers_behind_it(how: str) -> None:
+    assert layers_of(Net(CUTS[how])) == layers_of(Net())
+
+
+@pytest.mark.parametrize("how", CUTS)
+def test_a_forward_wholly_without_gradients_is_said_to_be_one(how: str) -> None:
+    class Whole(nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.net = Net()
+
+        def forward(self, rgb: Tensor) -> Any:
+            return CUTS[how](lambda: self.net(rgb))
+
+    with pytest.raises(ModelError, match="no gradient comes back from the network's prediction"):
+        layers_of(Whole())
+
+
+def test_a_layer_that_runs_twice_is_not_listed() -> None:
+    network = Net(CUTS["detach"])
+    network.relu = network.squash = nn.ReLU(inplace=True)
+    assert layers_of(network) == ("middle", "up")
+
+
+def test_a_forward_without_gradients_that_ends_in_a_layer_is_said_to_be_one() -> None:
+    network = Net()
+    network.forward = torch.no_grad()(network.forward)  # type: ignore[method-assign]
+    with pytest.raises(ModelError, match="no gradient comes back"):
+        layers_of(network)
+
+
+def test_what_gives_no_maps_has_no_layers_and_is_no_fault() -> None:
+    assert layers_of(nn.Identity()) == ()
+
+
+def test_the_network_is_left_without_hooks() -> None:
+    for network in (Net(), Net(CUTS["detach"])):
+        layers_of(network)
+        assert not any(part._forward_hooks for part in network.modules())

@@ -1,0 +1,454 @@
+"""Weights from files: whole and fitting, or one line; nothing that is in a file is ever run."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import pickle
+import zipfile
+from collections import OrderedDict
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from safetensors.torch import save_file
+from torch import Tensor, nn
+
+from pnpdepth_cli.errors import CheckpointError, ModelError
+from pnpdepth_cli.models.definition import ModelDefinition, Multiple
+from pnpdepth_cli.models.registry import find_definition
+from pnpdepth_cli.models.weights.checkpoint import load_checkpoint, read_checkpoint
+from tests.models.weights.numpy_files import write_npy
+
+
+class Net(nn.Module):
+    def __init__(self) -> None:
+        super().__init__()
+        self.conv, self.norm = nn.Conv2d(3, 4, 3), nn.BatchNorm2d(4)
+
+
+def definition(**more: Any) -> ModelDefinition:
+    return ModelDefinition(name="net", input_kind="rgb", size=Multiple(1), build=Net, **more)
+
+
+def weights() -> dict[str, Tensor]:
+    torch.manual_seed(3)
+    return Net().state_dict()
+
+
+def loaded(path: Path, **more: Any) -> tuple[dict[str, Tensor], list[str]]:
+    network = Net()
+    notes = load_checkpoint(network, definition(**more), path)
+    return network.state_dict(), notes
+
+
+def equal(one: Mapping[str, Tensor], other: Mapping[str, Tensor]) -> bool:
+    return one.keys() == other.keys() and all(torch.equal(one[k], other[k]) for k in one)
+
+
+SAVES: dict[str, Callable[[Any, Path], None]] = {
+    "zip": torch.save,
+    "legacy": lambda content, path: torch.save(content, path, _use_new_zipfile_serialization=False),
+}
+
+
+# ------------------------------------------------------------------ good files
+
+
+def test_a_safetensors_file_is_read(tmp_path: Path) -> None:
+    save_file(weights(), tmp_path / "w.safetensors")
+    state, notes = loaded(tmp_path / "w.safetensors")
+    assert equal(state, weights())
+    assert notes == []
+
+
+@pytest.mark.parametrize("save", SAVES)
+@pytest.mark.parametrize("suffix", [".pth", ".pt", ".pth.tar", ".ckpt", ""])
+def test_a_torch_file_is_read_whatever_its_suffix(save: str, suffix: str, tmp_path: Path) -> None:
+    SAVES[save](weights(), tmp_path / f"w{suffix}")
+    assert equal(loaded(tmp_path / f"w{suffix}")[0], weights())
+
+
+@pytest.mark.parametrize("key", ["state_dict", "model_state_dict", "model", "network", "net"])
+def test_the_state_dict_may_lie_beside_other_things(key: str, tmp_path: Path) -> None:
+    optimiser = torch.optim.Adam(Net().parameters()).state_dict()
+    content = {"epoch": 3, "loss": 0.5, "optimizer": optimiser, key: OrderedDict(weights())}
+    torch.save(content, tmp_path / "w.pth")
+    assert equal(loaded(tmp_path / "w.pth")[0], weights())
+
+
+def test_a_prefix_of_every_key_is_stripped_and_said(tmp_path: Path) -> None:
+    torch.save({f"module.{k}": v for k, v in weights().items()}, tmp_path / "w.pth")
+    state, notes = loaded(tmp_path / "w.pth")
+    assert equal(state, weights())
+    assert notes == ["checkpoint w.pth: prefix 'module.' of every key stripped"]
+
+
+def test_a_prefix_of_some_keys_is_not_stripped(tmp_path: Path) -> None:
+    first, *others = weights().items()
+    torch.save(dict([first, *((f"module.{k}", v) for k, v in others)]), tmp_path / "w.pth")
+    with pytest.raises(CheckpointError, match=r"unexpected .*module\."):
+        loaded(tmp_path / "w.pth")
+
+
+def test_a_network_whose_own_names_start_so_keeps_them(tmp_path: Path) -> None:
+    network = nn.DataParallel(Net())
+    torch.save(network.state_dict(), tmp_path / "w.pth")
+    fresh = nn.DataParallel(Net())
+    assert load_checkpoint(fresh, definition(), tmp_path / "w.pth") == []
+    assert equal(fresh.state_dict(), network.state_dict())
+
+
+def test_files_from_before_torch_counted_batches_are_read(tmp_path: Path) -> None:
+    old = {k: v for k, v in weights().items() if not k.endswith("num_batches_tracked")}
+    assert len(old) == len(weights()) - 1
+    torch.save(old, tmp_path / "w.pth")
+    assert equal(loaded(tmp_path / "w.pth")[0], weights())
+
+
+def test_numpy_files_are_read(tmp_path: Path) -> None:
+    np.savez(tmp_path / "w.npz", **{name: t.numpy() for name, t in weights().items()})
+    state, notes = loaded(tmp_path / "w.npz")
+    assert equal(state, weights())
+    assert notes == []
+    layers: dict[str, dict[str, Any]] = {"conv": {}, "norm": {}}
+    for name, tensor in weights().items():
+        layers[name.partition(".")[0]][name.partition(".")[2]] = tensor.numpy()
+    assert equal(loaded(write_npy(tmp_path / "w.npy", layers))[0], weights())
+
+
+def test_the_files_of_a_folder_are_parts_by_their_names(tmp_path: Path) -> None:
+    parts: dict[str, dict[str, Tensor]] = {"conv": {}, "norm": {}}
+    for name, tensor in weights().items():
+        parts[name.partition(".")[0]][name.partition(".")[2]] = tensor
+    torch.save({"state_dict": parts["conv"]}, tmp_path / "conv.pth.tar")
+    save_file(parts["norm"], tmp_path / "norm.safetensors")
+    (tmp_path / "README.md").write_text("weights")
+    state, notes = loaded(tmp_path)
+    assert equal(state, weights())
+    assert notes == [f"checkpoint {tmp_path.name}: conv.pth.tar, norm.safetensors"]
+
+
+def test_parts_of_a_folder_lose_the_prefix_of_data_parallel(tmp_path: Path) -> None:
+    for part in ("conv", "norm"):
+        names = {n: t for n, t in weights().items() if n.startswith(part)}
+        state = {f"module.{name.partition('.')[2]}": tensor for name, tensor in names.items()}
+        torch.save(state, tmp_path / f"{part}.pth")
+    state, notes = loaded(tmp_path)
+    assert equal(state, weights())
+    assert [note for note in notes if "'module.'" in note] == [
+        f"checkpoint {part}.pth: prefix 'module.' of every key stripped"
+        for part in ("conv", "norm")
+    ]
+
+
+def test_a_folder_with_one_file_of_weights_is_that_file(tmp_path: Path) -> None:
+    torch.save(weights(), tmp_path / "epoch_7.pth")
+    state, notes = loaded(tmp_path)
+    assert equal(state, weights())
+    assert notes == [f"checkpoint {tmp_path.name}: epoch_7.pth"]
+
+
+def test_a_prefix_given_twice_is_stripped_twice(tmp_path: Path) -> None:
+    torch.save({f"module.module.{n}": t for n, t in weights().items()}, tmp_path / "w.pth")
+    assert equal(loaded(tmp_path / "w.pth")[0], weights())
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_weights_that_are_not_finite_are_refused(value: float, tmp_path: Path) -> None:
+    state = weights()
+    state["conv.weight"][0, 0, 0, 0] = value
+    torch.save(state, tmp_path / "w.pth")
+    with pytest.raises(
+        CheckpointError, match=r"1 of its weights are NaN or infinite \(conv.weight"
+    ):
+        loaded(tmp_path / "w.pth")
+
+
+def test_many_large_half_precision_weights_are_finite(tmp_path: Path) -> None:
+    state = {name: tensor.half() for name, tensor in weights().items()}
+    state["conv.weight"][:] = 60000.0
+    torch.save(state, tmp_path / "w.pth")
+    assert loaded(tmp_path / "w.pth")[0]["conv.weight"].max() == 60000.0
+
+
+def test_the_output_numbers_of_tensorflow_s_operations_are_no_part_of_a_name(
+    tmp_path: Path,
+) -> None:
+    np.savez(tmp_path / "w.npz", **{f"{name}:0": t.numpy() for name, t in weights().items()})
+    assert equal(loaded(tmp_path / "w.npz")[0], weights())
+
+
+def test_a_compressed_archive_is_refused_before_torch_unpacks_it(tmp_path: Path) -> None:
+    torch.save({"w": torch.zeros(10**7)}, tmp_path / "stored.pth")
+    with (
+        zipfile.ZipFile(tmp_path / "stored.pth") as stored,
+        zipfile.ZipFile(tmp_path / "w.pth", "w", zipfile.ZIP_DEFLATED) as deflated,
+    ):
+        for name in stored.namelist():
+            deflated.writestr(name, stored.read(name))
+    with pytest.raises(CheckpointError, match="compressed"):
+        read_checkpoint(tmp_path / "w.pth")
+
+
+@pytest.mark.parametrize("told", [10**5000, "a" * 10**5], ids=["number", "text"])
+def test_what_the_training_was_told_is_cut_short_or_left_out(told: Any, tmp_path: Path) -> None:
+    args = argparse.Namespace(arch="resnet18", width=told)
+    torch.save({"args": args, "state_dict": weights()}, tmp_path / "w.pth")
+    _, notes = loaded(tmp_path / "w.pth")
+    assert notes[-1].startswith("checkpoint w.pth: trained with arch resnet18")
+    assert len(notes[-1]) < 200
+
+
+def test_what_the_training_was_told_is_said(tmp_path: Path) -> None:
+    args = argparse.Namespace(arch="resnet18", data="kitti", lr=0.1, secret="x", decoder=None)
+    torch.save({"args": args, "state_dict": weights()}, tmp_path / "w.pth")
+    notes = loaded(tmp_path / "w.pth")[1]
+    assert notes[-1] == "checkpoint w.pth: trained with data kitti, arch resnet18"
+
+
+def test_a_definition_may_rename_what_a_published_file_holds(tmp_path: Path) -> None:
+    torch.save({f"module.net.{k}": v for k, v in weights().items()}, tmp_path / "w.pth")
+    rename = {"read_checkpoint": lambda s: {k.removeprefix("net."): v for k, v in s.items()}}
+    assert equal(loaded(tmp_path / "w.pth", **rename)[0], weights())
+
+
+# ------------------------------------------------------------------ files that do not fit
+
+
+def test_every_kind_of_misfit_is_listed_and_nothing_is_loaded(tmp_path: Path) -> None:
+    state = weights()
+    del state["norm.weight"], state["norm.bias"]
+    state["extra.weight"] = torch.ones(1)
+    state["conv.bias"] = torch.ones(7)
+    torch.save(state, tmp_path / "w.pth")
+    network = Net()
+    before = {k: v.clone() for k, v in network.state_dict().items()}
+    with pytest.raises(CheckpointError) as error:
+        load_checkpoint(network, definition(), tmp_path / "w.pth")
+    said = str(error.value)
+    assert "does not fit network 'net': 2 missing (norm.weight, norm.bias)" in said
+    assert "1 unexpected (extra.weight)" in said
+    assert "1 of another shape (conv.bias (7,) for (4,))" in said
+    assert "\n" not in said
+    assert error.value.exit_code == 4
+    assert equal(network.state_dict(), before)
+
+
+def test_the_checkpoint_of_another_network_is_refused_in_few_words(tmp_path: Path) -> None:
+    other = nn.Sequential(*(nn.Linear(2, 2) for _ in range(50)))
+    torch.save(other.state_dict(), tmp_path / "w.pth")
+    with pytest.raises(
+        CheckpointError, match=r"100 unexpected \(0.weight, .* and 96 more\)"
+    ) as error:
+        loaded(tmp_path / "w.pth")
+    assert len(str(error.value)) < 500
+
+
+def test_a_definition_that_cannot_read_the_layout_is_said(tmp_path: Path) -> None:
+    torch.save(weights(), tmp_path / "w.pth")
+    for fault in (KeyError("x"), TypeError("x"), IndexError("x"), AttributeError("x")):
+
+        def reader(state: Mapping[str, Tensor], fault: Exception = fault) -> Mapping[str, Tensor]:
+            raise fault
+
+        with pytest.raises(CheckpointError, match="not in a layout that 'net' reads"):
+            loaded(tmp_path / "w.pth", read_checkpoint=reader)
+    with pytest.raises(ModelError, match="gives no named tensors"):
+        loaded(tmp_path / "w.pth", read_checkpoint=lambda state: None)
+
+
+def test_a_network_that_refuses_its_state_is_one_line(tmp_path: Path) -> None:
+    class Picky(Net):
+        def get_extra_state(self) -> dict[str, int]:
+            return {"version": 1}
+
+        def set_extra_state(self, state: Any) -> None:
+            raise AssertionError
+
+    torch.save(weights(), tmp_path / "w.pth")
+    with pytest.raises(CheckpointError, match=r"does not fit .*_extra_state") as error:
+        load_checkpoint(Picky(), definition(), tmp_path / "w.pth")
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        ({}, "no state dict; it holds nothing"),
+        ({"epoch": 1, "best": 0.3}, "no state dict; it holds epoch, best"),
+        ({0: torch.ones(1)}, "no state dict; it holds 0"),
+        ([torch.ones(1)], "holds a list"),
+        (torch.ones(1), "holds a Tensor"),
+        ({"state_dict": {"a": 1}}, "no state dict; it holds state_dict"),
+    ],
+)
+def test_a_file_without_named_tensors_is_said(content: Any, said: str, tmp_path: Path) -> None:
+    torch.save(content, tmp_path / "w.pth")
+    with pytest.raises(CheckpointError, match=said):
+        read_checkpoint(tmp_path / "w.pth")
+
+
+def test_weights_of_another_known_network_name_it(tmp_path: Path) -> None:
+    torch.save(find_definition("nconv").build().state_dict(), tmp_path / "w.pth")
+    with pytest.raises(CheckpointError) as error:
+        loaded(tmp_path / "w.pth")
+    assert str(error.value).endswith("does not fit network 'net': this is nconv; use --model nconv")
+
+
+def test_of_several_that_fit_the_one_that_ends_as_asked_comes_first(tmp_path: Path) -> None:
+    state = find_definition("sparse2dense-r18-deconv3").build().state_dict()
+    torch.save(state, tmp_path / "w.pth")
+    with pytest.raises(CheckpointError, match=r"--model sparse2dense-r18-deconv3-kitti$"):
+        load_checkpoint(
+            Net(), replace(definition(), name="sparse2dense-r50-upproj-kitti"), tmp_path / "w.pth"
+        )
+    with pytest.raises(CheckpointError, match=r"--model sparse2dense-r18-deconv3$"):
+        loaded(tmp_path / "w.pth")
+
+
+# ------------------------------------------------------------------ broken files
+
+
+def test_a_path_that_is_no_file_is_said(tmp_path: Path) -> None:
+    with pytest.raises(CheckpointError, match="does not exist"):
+        read_checkpoint(tmp_path / "absent.pth")
+    with pytest.raises(CheckpointError, match="is a folder without weights"):
+        read_checkpoint(tmp_path)
+
+
+def test_a_pointer_to_a_file_that_was_not_fetched_is_said(tmp_path: Path) -> None:
+    pointer = "version https://git-lfs.github.com/spec/v1\noid sha256:b497\nsize 126396039\n"
+    (tmp_path / "w.pth.tar").write_text(pointer)
+    with pytest.raises(CheckpointError, match="is a Git LFS pointer"):
+        read_checkpoint(tmp_path / "w.pth.tar")
+
+
+GARBAGE = [b"", b"\0" * 50, b"not a checkpoint\n", b"<html>", b"\x80\x02}q\0.", b"PK\x03\x04"]
+
+
+def one_line_about(path: Path) -> str:
+    with pytest.raises(CheckpointError) as error:
+        read_checkpoint(path)
+    assert "\n" not in str(error.value)
+    assert str(path) in str(error.value)
+    assert len(str(error.value)) < 500 + len(str(path))
+    return str(error.value)
+
+
+@pytest.mark.parametrize("suffix", [".pth", ".safetensors", ".npy", ".npz"])
+@pytest.mark.parametrize(
+    "content",
+    GARBAGE,
+)
+def test_garbage_is_refused(content: bytes, suffix: str, tmp_path: Path) -> None:
+    (tmp_path / f"w{suffix}").write_bytes(content)
+    one_line_about(tmp_path / f"w{suffix}")
+
+
+@pytest.mark.parametrize("save", [*SAVES, "safetensors"])
+def test_a_truncated_file_is_refused_wherever_it_ends(save: str, tmp_path: Path) -> None:
+    whole = tmp_path / ("w.safetensors" if save == "safetensors" else "w.pth")
+    if save == "safetensors":
+        save_file(weights(), whole)
+    else:
+        SAVES[save](weights(), whole)
+    content = whole.read_bytes()
+    for share in (0.001, 0.1, 0.3, 0.5, 0.7, 0.9, 0.999):
+        whole.write_bytes(content[: int(len(content) * share)])
+        one_line_about(whole)
+
+
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=60)
+@given(content=st.binary(max_size=200), suffix=st.sampled_from([".pth", ".safetensors", ".npy"]))
+def test_any_other_bytes_are_refused(content: bytes, suffix: str, tmp_path: Path) -> None:
+    path = tmp_path / f"fuzz{suffix}"
+    path.write_bytes(content)
+    one_line_about(path)
+
+
+def test_a_zip_that_is_no_checkpoint_is_refused(tmp_path: Path) -> None:
+    with zipfile.ZipFile(tmp_path / "w.pth", "w") as archive:
+        archive.writestr("readme.txt", "hello")
+    one_line_about(tmp_path / "w.pth")
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+def test_a_torchscript_archive_says_what_to_save_instead(tmp_path: Path) -> None:
+    torch.jit.save(torch.jit.script(nn.Conv2d(1, 1, 1)), tmp_path / "w.pt")
+    assert "state_dict() of its module" in one_line_about(tmp_path / "w.pt")
+
+
+# ------------------------------------------------------------------ files with code in them
+
+
+class Runs:
+    """Runs a command as soon as it is unpickled."""
+
+    def __init__(self, how: str, marker: Path):
+        self.how, self.marker = how, marker
+
+    def __reduce__(self) -> Any:
+        command = f"touch {self.marker}"
+        code = f"open({str(self.marker)!r}, 'w')"
+        return {
+            "system": (os.system, (command,)),
+            "eval": (eval, (code,)),
+            "exec": (exec, (code,)),
+            "getattr": (getattr, (os, "system")),
+        }[self.how]
+
+
+@pytest.mark.parametrize("how", ["system", "eval", "exec"])
+@pytest.mark.parametrize("save", [*SAVES, "raw pickle"])
+@pytest.mark.parametrize("forced", [True, False])
+def test_nothing_in_a_pickle_is_run(
+    how: str, save: str, forced: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if forced:  # torch's own switch to run pickles all the same must not reach us
+        monkeypatch.setenv("TORCH_FORCE_NO_WEIGHTS_ONLY_LOAD", "1")
+    marker, path = tmp_path / "was_run", tmp_path / "w.pth"
+    content = {**weights(), "x": Runs(how, marker)}
+    if save == "raw pickle":
+        path.write_bytes(pickle.dumps(content))
+    else:
+        SAVES[save](content, path)
+    one_line_about(path)  # beside weights lies something that is no tensor
+    assert not marker.exists()
+    if save == "raw pickle":
+        pickle.loads(path.read_bytes())
+    else:
+        torch.load(path, weights_only=False)
+    assert marker.exists()  # so the file would have done it
+
+
+@pytest.mark.parametrize("save", SAVES)
+def test_the_tensors_of_a_whole_module_are_taken_out_and_that_is_said(
+    save: str, tmp_path: Path
+) -> None:
+    torch.manual_seed(3)
+    SAVES[save](Net(), tmp_path / "w.pth")
+    state, notes = loaded(tmp_path / "w.pth")
+    assert equal(state, weights())
+    assert len(notes) == 1
+    assert "nothing of it was run" in notes[0]
+
+
+def test_published_pickles_with_more_than_tensors_give_their_tensors(shared_data: Path) -> None:
+    folder = shared_data / "weights"
+    for path in (folder / "nconv" / "whole_module.pth", *(folder / "pncnn").glob("*.pth.tar")):
+        state = read_checkpoint(path)
+        assert state
+        assert all(isinstance(tensor, Tensor) for tensor in state.values())
+
+
+def test_a_published_file_of_tensors_is_read(shared_data: Path) -> None:
+    state = read_checkpoint(shared_data / "weights" / "nconv" / "CNN_ep0003.pth.tar")
+    assert len(state) == 14
+    assert all(bool(tensor.isfinite().all()) for tensor in state.values())

@@ -1,0 +1,274 @@
+"""Arrays come out of numpy files to the bit, and nothing that a pickle says is done."""
+
+from __future__ import annotations
+
+import io
+import pickle
+import resource
+import sys
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from pnpdepth_cli.errors import CheckpointError
+from pnpdepth_cli.models.weights.numpy_file import read_numpy_file
+from tests.models.weights.numpy_files import pickled, write_npy
+from tests.models.weights.test_tensor_pickle import Hostile, hostile
+
+WRITERS = ["python 2", "2", "3", "4"]
+HEADER = {"descr": "|O", "fortran_order": False, "shape": ()}
+
+
+def layers() -> dict[str, Any]:
+    rng = np.random.default_rng(0)
+    return {
+        "conv1": {
+            "weights": rng.normal(size=(7, 7, 3, 4)).astype(np.float32),
+            "biases": rng.normal(size=4).astype(np.float32),
+        },
+        "bn_conv1": {"mean": rng.normal(size=300).astype(np.float32)},
+        "alone": np.arange(6, dtype=np.int64),
+    }
+
+
+def with_object(path: Path, content: bytes, **header: Any) -> Path:
+    with path.open("wb") as file:
+        np.lib.format.write_array_header_1_0(file, HEADER | header)
+        file.write(content)
+    return path
+
+
+def refused(path: Path) -> str:
+    with pytest.raises(CheckpointError) as error:
+        read_numpy_file(path)
+    assert str(path) in str(error.value)
+    assert "\n" not in str(error.value)
+    assert len(str(error.value)) < 400 + len(str(path))
+    return str(error.value)
+
+
+@pytest.mark.parametrize("written_by", WRITERS)
+def test_a_pickled_dict_of_dicts_gives_its_arrays_to_the_bit(
+    written_by: str, tmp_path: Path
+) -> None:
+    path = write_npy(tmp_path / "x.npy", layers(), written_by)
+    found = read_numpy_file(path)
+    assert list(found) == ["conv1.weights", "conv1.biases", "bn_conv1.mean", "alone"]
+    numpys = np.load(path, allow_pickle=True, encoding="latin1").item()
+    for name, tensor in found.items():
+        layer, _, key = name.partition(".")
+        own = numpys[layer][key] if key else numpys[layer]
+        assert np.array_equal(tensor.numpy(), own)
+        assert tensor.numpy().dtype == own.dtype
+    assert found["conv1.weights"].is_contiguous()
+
+
+def test_what_numpy_saves_today_is_read(tmp_path: Path) -> None:
+    np.save(tmp_path / "x.npy", layers(), allow_pickle=True)  # type: ignore[arg-type]
+    assert torch.equal(read_numpy_file(tmp_path / "x.npy")["alone"], torch.arange(6))
+
+
+@pytest.mark.parametrize("written_by", WRITERS)
+@pytest.mark.parametrize("code", ["<f2", "<f4", "<f8", ">f4", ">i2", "|i1", "|u1", "<i4", "|b1"])
+def test_every_type_order_and_shape_is_read(code: str, written_by: str, tmp_path: Path) -> None:
+    base = np.arange(24).reshape(2, 3, 4).astype(np.dtype(code))
+    arrays = {"c": base, "fortran": np.asfortranarray(base), "turned": base.T, "part": base[:, 1:]}
+    arrays |= {"number": np.array(base[1, 1, 1]), "empty": base[:0]}
+    found = read_numpy_file(write_npy(tmp_path / "x.npy", arrays, written_by))
+    for name, array in arrays.items():
+        assert found[name].shape == array.shape
+        assert np.array_equal(found[name].numpy(), array)
+
+
+@pytest.mark.parametrize("save", [np.savez, np.savez_compressed])
+def test_an_archive_gives_its_arrays_by_name(save: Any, tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    arrays = {"kernel0": rng.normal(size=(11, 11, 1, 8)), "bias0": np.float32(0.5)}
+    arrays["turned"] = np.asfortranarray(rng.normal(size=(3, 5)).astype(np.float32))
+    save(tmp_path / "x.npz", **arrays)
+    found = read_numpy_file(tmp_path / "x.npz")
+    assert set(found) == set(arrays)
+    assert all(np.array_equal(found[name].numpy(), array) for name, array in arrays.items())
+
+
+def test_an_array_named_twice_is_one_and_no_array_is_made_twice(tmp_path: Path) -> None:
+    array = np.arange(1000.0)
+    found = read_numpy_file(write_npy(tmp_path / "x.npy", {"a": array, "b": array}))
+    assert found["a"].data_ptr() == found["b"].data_ptr()
+
+
+# ------------------------------------------------------------------ what is no such file
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        ([1, 2], "no dict of arrays"),
+        ("text", "no dict of arrays"),
+        ({"a": 1}, "a is no array but a int"),
+        ({"a": {"b": "text"}}, "a.b is no array but a str"),
+        ({"a": np.array(["x", "y"])}, "a is an array of"),
+        ({"a": np.array([1 + 2j])}, "a is an array of <c16, not of numbers"),
+        ({"a": np.array([{}, 1], dtype=object)}, "a holds objects"),
+        ({"a": {"b": {"c": {"d": np.ones(1)}}}}, "deeper, than the layers"),
+        ({"a": torch.nn.Identity()}, "a is no array but a torch.nn"),
+    ],
+)
+def test_other_contents_are_named(content: Any, said: str, tmp_path: Path) -> None:
+    assert said in refused(with_object(tmp_path / "x.npy", pickled(content, "4")))
+
+
+def test_a_plain_array_or_several_objects_are_no_checkpoint(tmp_path: Path) -> None:
+    np.save(tmp_path / "a.npy", np.ones((2, 3)))
+    assert "one array of shape (2, 3)" in refused(tmp_path / "a.npy")
+    np.save(tmp_path / "b.npy", np.array([{}, {}]), allow_pickle=True)
+    assert "one array of shape (2,)" in refused(tmp_path / "b.npy")
+    np.savez(tmp_path / "c.npz", a=np.array([{}], dtype=object), allow_pickle=True)
+    assert "a.npy holds objects" in refused(tmp_path / "c.npz")
+
+
+def test_a_dict_in_itself_is_refused(tmp_path: Path) -> None:
+    ring: dict[str, Any] = {}
+    ring["again"] = ring
+    assert "deeper" in refused(with_object(tmp_path / "x.npy", pickled(ring, "4")))
+
+
+@pytest.mark.parametrize("written_by", WRITERS)
+@pytest.mark.parametrize("kind", hostile(Path("x")))
+def test_nothing_of_a_hostile_pickle_runs(kind: str, written_by: str, tmp_path: Path) -> None:
+    marker = tmp_path / "ran"
+    content = {"w": {"weights": np.ones(2)}, "x": hostile(marker)[kind]}
+    path = with_object(tmp_path / "bad.npy", pickled(content, written_by))
+    before = set(sys.modules)
+    refused(path)
+    assert not marker.exists()
+    assert set(sys.modules) == before
+
+
+class HostileArray:
+    """Reconstructs as an array whose parts are calls."""
+
+    def __init__(self, marker: Path, place: str) -> None:
+        self.call, self.place = Hostile(exec, f"open({str(marker)!r}, 'w').close()"), place
+
+    def __reduce__(self) -> Any:
+        _, arguments, state = np.ones(2, dtype=np.float32).__reduce__()  # type: ignore[misc]
+        version, shape, dtype, fortran, data = state
+        parts = {"version": version, "shape": shape, "dtype": dtype, "fortran": fortran}
+        parts |= {"data": data, self.place: self.call}
+        return np.ones(1).__reduce__()[0], arguments, tuple(parts.values())
+
+
+@pytest.mark.parametrize("place", ["version", "shape", "dtype", "fortran", "data"])
+def test_an_array_made_of_calls_runs_none_of_them(place: str, tmp_path: Path) -> None:
+    marker = tmp_path / "ran"
+    path = with_object(tmp_path / "bad.npy", pickled({"a": HostileArray(marker, place)}, "4"))
+    if place in ("version", "fortran"):  # what it would have been makes no difference
+        assert torch.equal(read_numpy_file(path)["a"], torch.ones(2))
+    else:
+        refused(path)
+    assert not marker.exists()
+
+
+def test_the_hostile_files_do_run_where_numpy_itself_reads_them(tmp_path: Path) -> None:
+    marker = tmp_path / "ran"
+    path = with_object(tmp_path / "bad.npy", pickled({"x": hostile(marker)["exec"]}, "python 2"))
+    np.load(path, allow_pickle=True, encoding="latin1")
+    assert marker.exists()
+
+
+def array_of(shape: tuple[int, ...], data: bytes, code: str = "f4") -> Any:
+    """An array's pickle that claims this shape for these bytes."""
+    reconstruct, arguments, _ = np.ones(1, dtype=np.float32).__reduce__()  # type: ignore[misc]
+
+    class Claims:
+        def __reduce__(self) -> Any:
+            return reconstruct, arguments, (1, shape, np.dtype(code), False, data)
+
+    return Claims()
+
+
+BOMBS = {
+    "a shape beyond the data": {"a": array_of((10**9,), b"\0" * 4)},
+    "a shape that overflows": {"a": array_of((2**40, 2**40), b"\0" * 4)},
+    "a negative shape": {"a": array_of((-1,), b"\0" * 4)},
+    "the same bytes as many arrays": {
+        str(n): array_of((10**6,), data) for data in [b"\0" * 4 * 10**6] for n in range(100)
+    },
+    "very many entries": {
+        str(n): layer for layer in [dict.fromkeys(map(str, range(500)))] for n in range(500)
+    },
+}
+
+
+@pytest.mark.parametrize("kind", BOMBS)
+def test_what_claims_to_be_larger_than_the_file_is_refused(kind: str, tmp_path: Path) -> None:
+    path = with_object(tmp_path / "bomb.npy", pickled(BOMBS[kind], "4"))
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    refused(path)
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 60_000  # kB
+
+
+def test_an_archive_that_inflates_far_beyond_its_size_is_refused(tmp_path: Path) -> None:
+    np.savez_compressed(tmp_path / "x.npz", a=np.zeros(10**7))
+    assert "far larger than the file" in refused(tmp_path / "x.npz")
+
+
+def test_an_archive_whose_header_claims_more_than_is_there_is_refused(tmp_path: Path) -> None:
+    header = io.BytesIO()
+    claim = {"descr": "<f4", "fortran_order": False, "shape": (10**10,)}
+    np.lib.format.write_array_header_1_0(header, claim)
+    with zipfile.ZipFile(tmp_path / "x.npz", "w") as archive:
+        archive.writestr("a.npy", header.getvalue() + b"\0" * 4)
+    assert "does not have its 4 bytes" in refused(tmp_path / "x.npz")
+
+
+@pytest.mark.parametrize("suffix", ["npy", "npz"])
+def test_a_file_cut_anywhere_is_refused(suffix: str, tmp_path: Path) -> None:
+    path = tmp_path / f"x.{suffix}"
+    if suffix == "npy":
+        write_npy(path, layers())
+    else:
+        np.savez(path, **layers()["conv1"])
+    whole = path.read_bytes()
+    for length in range(0, len(whole) - 1, max(1, len(whole) // 60)):
+        path.write_bytes(whole[:length])
+        refused(path)
+
+
+@given(data=st.binary(max_size=200), kind=st.sampled_from(["raw", "header", "pickle", "archive"]))
+@settings(
+    max_examples=200, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+def test_any_other_bytes_are_refused(data: bytes, kind: str, tmp_path: Path) -> None:
+    path = tmp_path / "fuzz.npy"
+    if kind == "pickle":
+        with_object(path, data)
+    elif kind == "archive":
+        with zipfile.ZipFile(path, "w") as archive:
+            archive.writestr("a.npy", b"\x93NUMPY\x01\x00" + data)
+    else:
+        path.write_bytes((b"\x93NUMPY\x01\x00" if kind == "header" else b"") + data)
+    refused(path)
+
+
+@given(text=st.text(alphabet="{}[]()'\":,. \ndescrfotashp|O<4i-L0", max_size=80))
+@settings(
+    max_examples=200, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+def test_any_other_header_is_refused(text: str, tmp_path: Path) -> None:
+    path = tmp_path / "fuzz.npy"
+    header = text.encode()
+    path.write_bytes(b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header)
+    refused(path)
+
+
+def test_a_pickle_alone_is_no_numpy_file(tmp_path: Path) -> None:
+    (tmp_path / "x.npy").write_bytes(pickle.dumps(layers()))
+    assert "cannot be read as a numpy file" in refused(tmp_path / "x.npy")

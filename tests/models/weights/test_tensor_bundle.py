@@ -1,0 +1,175 @@
+"""The variables of a TensorFlow checkpoint are read to the bit; what is broken is one line."""
+
+from __future__ import annotations
+
+import base64
+import struct
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from pnpdepth_cli.errors import CheckpointError
+from pnpdepth_cli.models.weights.checkpoint import read_checkpoint
+from pnpdepth_cli.models.weights.tensor_bundle import read_tensor_bundle
+
+# Written by TensorFlow 2.21's tf.compat.v1.train.Saver.
+INDEX = (
+    "c-muNVB=tvV&Y(A;Nefs&nq+3Ps&UzPA%qO6k-u#;$YU`F|Ahe?O|h=El<r%&nN*&2mmD*ftU%3nH6|63{0;t3%$d@&6}Q"
+    "+pOlyrUtE$}z`-fRpkSlHVe0zX?F$2oXhvdA8i%kD2UI(wf{O-|>Dgo4OBq-MvorHjIJm%eGAXzL#p5@eYXpktCFZ7bu!"
+    "F@J6+ARJO{IN|?HPc85kzD^*8U3T9Qd?w0|O&-KEqx{xLEMg@A8KjInFckGY|yfzZ<$$O5JY*0C~nTga"
+)
+DATA = "c-muNXxPudpy0s3-~hxR&|nWFp!^0PUI4@gfcODO-jRVp0EiWU*ub$skP)KAj*)>SDe(2QlGKV40OZUKfd"
+
+
+def written(folder: Path) -> Path:
+    """TensorFlow's checkpoint of four variables of numbers, and one of text."""
+    for suffix, text in ((".index", INDEX), (".data-00000-of-00001", DATA)):
+        (folder / f"x.ckpt{suffix}").write_bytes(zlib.decompress(base64.b85decode(text)))
+    return folder / "x.ckpt.index"
+
+
+def varint(value: int) -> bytes:
+    digits = []
+    while value > 127:
+        digits.append(value & 127 | 128)
+        value >>= 7
+    return bytes([*digits, value])
+
+
+def entry(dtype: int, shape: tuple[int, ...], offset: int, size: int, shard: int = 0) -> bytes:
+    """A variable's entry: type, shape, shard, offset, size, checksum."""
+    sides = b"".join(
+        b"\x12" + varint(len(side)) + side for side in (b"\x08" + varint(n) for n in shape)
+    )
+    message = b"\x08" + varint(dtype) + b"\x12" + varint(len(sides)) + sides
+    message += b"\x18" + varint(shard) + b"\x20" + varint(offset) + b"\x28" + varint(size)
+    return message + b"\x35" + b"\0\0\0\0"
+
+
+def block(entries: list[tuple[bytes, bytes]]) -> bytes:
+    """A block of a table without shared beginnings, and its trailer."""
+    lines = [varint(0) + varint(len(k)) + varint(len(v)) + k + v for k, v in entries]
+    return b"".join(lines) + struct.pack("<II", 0, 1) + b"\0" + b"\0\0\0\0"
+
+
+def index_of(entries: dict[str, bytes], *, shards: int = 1, blocks: int = 1) -> bytes:
+    """An index whose entries lie in several blocks."""
+    header = b"\x08" + varint(shards) + b"\x1a\x02\x08\x01"
+    rows = [(b"", header), *((k.encode(), v) for k, v in sorted(entries.items()))]
+    data, handles = b"", []
+    for part in np.array_split(np.arange(len(rows)), blocks):
+        made = block([rows[i] for i in part])
+        handles.append((rows[part[-1]][0], varint(len(data)) + varint(len(made) - 5)))
+        data += made
+    places = []
+    for made in (block([]), block(handles)):
+        places.append(varint(len(data)) + varint(len(made) - 5))
+        data += made
+    footer = b"".join(places).ljust(40, b"\0") + struct.pack("<Q", 0xDB4775248B80FB57)
+    return data + footer
+
+
+def bundle(folder: Path, entries: dict[str, bytes], content: bytes) -> Path:
+    (folder / "x.index").write_bytes(index_of(entries))
+    (folder / "x.data-00000-of-00001").write_bytes(content)
+    return folder / "x.index"
+
+
+def refused(index: Path) -> str:
+    with pytest.raises(CheckpointError) as error:
+        read_tensor_bundle(index)
+    assert str(index) in str(error.value)
+    assert "\n" not in str(error.value)
+    return str(error.value)
+
+
+def test_what_tensorflow_wrote_is_read_to_the_bit_and_text_is_left_out(tmp_path: Path) -> None:
+    found = read_checkpoint(written(tmp_path))
+    expected = {
+        "conv1.biases": torch.tensor([-1, 2.5, 3]),
+        "conv1.weights": torch.arange(12.0).reshape(1, 2, 2, 3),
+        "global_step": torch.tensor(70000),
+        "half": torch.tensor([[1.5]], dtype=torch.float16),
+        "kind": torch.tensor([True, False]),
+    }
+    assert found.keys() == expected.keys()
+    for name, tensor in expected.items():
+        assert found[name].dtype == tensor.dtype
+        assert torch.equal(found[name], tensor)
+
+
+@pytest.mark.parametrize("blocks", [1, 2, 7])
+def test_an_index_of_many_blocks_and_two_shards_is_read_whole(blocks: int, tmp_path: Path) -> None:
+    arrays = {f"layer{n}/weights": np.full((n % 3, 2), n, np.float32) for n in range(40)}
+    contents, entries = [b"", b""], {}
+    for n, (name, array) in enumerate(arrays.items()):
+        entries[name] = entry(1, array.shape, len(contents[n % 2]), array.nbytes, n % 2)
+        contents[n % 2] += array.tobytes()
+    (tmp_path / "x.index").write_bytes(index_of(entries, shards=2, blocks=blocks))
+    for n, content in enumerate(contents):
+        (tmp_path / f"x.data-0000{n}-of-00002").write_bytes(content)
+    found = read_tensor_bundle(tmp_path / "x.index")
+    assert len(found) == 40
+    for name, array in arrays.items():
+        assert np.array_equal(found[name.replace("/", ".")].numpy(), array)
+
+
+def test_the_prefix_alone_says_what_to_name(tmp_path: Path) -> None:
+    prefix = written(tmp_path).with_suffix("")
+    with pytest.raises(CheckpointError, match=r"x\.ckpt does not exist; x\.ckpt\.index does"):
+        read_checkpoint(prefix)
+
+
+def test_values_that_are_not_beside_it_are_named(tmp_path: Path) -> None:
+    index = written(tmp_path)
+    index.with_name("x.ckpt.data-00000-of-00001").unlink()
+    assert "x.ckpt.data-00000-of-00001 is not beside it" in refused(index)
+
+
+@pytest.mark.parametrize(
+    ("entries", "said"),
+    [
+        ({"a": entry(1, (2,), 4, 8)}, "goes beyond its 8 bytes"),
+        ({"a": entry(1, (3,), 0, 8)}, "of shape (3,) goes beyond its 8 bytes"),
+        ({"a": entry(1, (2**62, 2**62, 0), 0, 0)}, "cannot be read"),
+        ({"a": entry(1, (2**40, 2**40), 0, 8)}, "goes beyond its 8 bytes"),
+        ({"a": entry(1, (1,), 2**62, 4)}, "goes beyond its 4 bytes"),
+        ({"a": entry(8, (1,), 0, 8)}, "TensorFlow's type 8"),
+        ({"a": entry(1, (2,), 0, 8) + b"\x3a\x00"}, "in slices"),
+        ({"a": entry(1, (2**64 - 1,), 0, 8)}, "a size that is none"),
+        ({str(n): entry(1, (2,), 0, 8) for n in range(9)}, "larger than its files"),
+    ],
+)
+def test_what_claims_more_or_other_than_is_there_is_refused(
+    entries: dict[str, bytes], said: str, tmp_path: Path
+) -> None:
+    assert said in refused(bundle(tmp_path, entries, b"\0" * 8))
+
+
+def test_an_index_cut_anywhere_is_refused(tmp_path: Path) -> None:
+    index = written(tmp_path)
+    whole = index.read_bytes()
+    for length in range(len(whole)):
+        index.write_bytes(whole[:length])
+        refused(index)
+
+
+@settings(max_examples=120, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(at=st.integers(0, 226), byte=st.integers(0, 255))
+def test_a_changed_byte_is_refused_or_gives_tensors_of_what_is_there(
+    at: int, byte: int, tmp_path: Path
+) -> None:
+    index = written(tmp_path)
+    content = bytearray(index.read_bytes())
+    content[at] = byte
+    index.write_bytes(content)
+    try:
+        found = read_tensor_bundle(index)
+    except CheckpointError:
+        return
+    assert sum(t.numel() * t.element_size() for t in found.values()) <= 81

@@ -1,0 +1,159 @@
+"""Points move with their frame; nothing happens to their depth."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+import torch.nn.functional as F
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pnpdepth_cli.points import SparsePoints, in_frame
+
+sides = st.integers(1, 400)
+shares = st.floats(0, 1, exclude_max=True, width=32)
+
+
+def points(xy: list[tuple[float, float]], size: tuple[int, int]) -> SparsePoints:
+    depth = torch.arange(1, len(xy) + 1, dtype=torch.float32)
+    return SparsePoints(xy=torch.tensor(xy, dtype=torch.float32), depth=depth, size=size)
+
+
+@given(sides, sides, sides, sides, st.lists(st.tuples(shares, shares), min_size=1, max_size=9))
+def test_a_frame_there_and_back_is_the_same_frame(
+    height: int, width: int, h: int, w: int, places: list[tuple[float, float]]
+) -> None:
+    here = points([(u * width - 0.5, v * height - 0.5) for u, v in places], (height, width))
+    there = here.resized(h, w)
+    assert there.size == (h, w)
+    assert torch.equal(there.depth, here.depth)
+    assert bool((there.xy >= -0.501).all())
+    assert bool((there.xy <= torch.tensor([w, h]) - 0.499).all())
+    back = there.resized(height, width)
+    torch.testing.assert_close(back.xy, here.xy, rtol=1e-5, atol=1e-4)
+
+
+def test_the_same_frame_moves_no_bit() -> None:
+    here = points([(0.1, 0.2), (7.3, 4.9)], (6, 9))
+    assert here.resized(6, 9) is here
+
+
+def test_pixel_areas_move_not_pixel_centres() -> None:
+    there = points([(0, 0), (3, 1)], (2, 4)).resized(4, 8)
+    assert there.xy.tolist() == [[0.5, 0.5], [6.5, 2.5]]
+
+
+@given(st.integers(1, 12), st.integers(1, 12), st.integers(0, 2**31))
+def test_on_the_grid_a_sample_is_plain_indexing(height: int, width: int, seed: int) -> None:
+    generator = torch.Generator().manual_seed(seed)
+    dense = torch.rand(1, 1, height, width, generator=generator)
+    y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+    here = points(
+        list(zip(x.flatten().tolist(), y.flatten().tolist(), strict=True)), (height, width)
+    )
+    assert torch.equal(here.sample(dense), dense.flatten())
+
+
+@given(
+    sides, sides, st.lists(st.tuples(shares, shares), min_size=1, max_size=9), st.integers(0, 99)
+)
+def test_off_the_grid_a_sample_is_bilinear_with_the_border_held(
+    height: int, width: int, places: list[tuple[float, float]], seed: int
+) -> None:
+    dense = torch.rand(1, 1, height, width, generator=torch.Generator().manual_seed(seed % 99))
+    here = points([(u * width - 0.5, v * height - 0.5) for u, v in places], (height, width))
+    grid = ((here.xy.double() + 0.5) / torch.tensor([width, height]) * 2 - 1)[None, None]
+    expected = F.grid_sample(dense.double(), grid, padding_mode="border", align_corners=False)
+    torch.testing.assert_close(
+        here.sample(dense).double(),
+        expected.flatten(),
+        rtol=0,
+        atol=1e-6 * max(1, width / 4, height / 4),
+    )
+
+
+def test_another_resolution_of_the_map_is_the_same_field_of_view() -> None:
+    dense = torch.tensor([[[[1.0, 3.0]]]])
+    here = points([(0, 0), (1, 0), (1.5, 0), (3, 1)], (2, 4))
+    assert here.sample(dense).tolist() == [1.0, 1.5, 2.0, 3.0]
+
+
+def test_an_infinite_neighbour_without_weight_has_no_part() -> None:
+    dense = torch.tensor([[[[1.0, torch.inf, 5.0, 6.0], [torch.inf] * 4]]])
+    here = points([(0, 0), (2.5, 0)], (2, 4))
+    assert here.sample(dense).tolist() == [1.0, 5.5]
+
+
+def test_a_sample_is_differentiable_in_the_map() -> None:
+    dense = torch.zeros(1, 1, 2, 3, requires_grad=True)
+    points([(0.25, 0), (2, 1)], (2, 3)).sample(dense).sum().backward()
+    assert dense.grad is not None
+    assert dense.grad.flatten().tolist() == [0.75, 0.25, 0, 0, 0, 1]
+
+
+def test_two_maps_at_once_are_refused() -> None:
+    with pytest.raises(ValueError, match="one map"):
+        points([(0, 0)], (2, 2)).sample(torch.zeros(1, 2, 2, 2))
+
+
+@given(
+    st.integers(1, 8),
+    st.integers(1, 8),
+    st.lists(st.tuples(shares, shares, st.floats(0.5, 80, width=32)), max_size=30),
+)
+def test_scattered_points_are_on_their_pixels_and_the_nearest_wins(
+    height: int, width: int, places: list[tuple[float, float, float]]
+) -> None:
+    xy = torch.tensor([(u * width - 0.5, v * height - 0.5) for u, v, _ in places]).reshape(-1, 2)
+    here = SparsePoints(xy=xy, depth=torch.tensor([d for *_, d in places]), size=(height, width))
+    expected = torch.zeros(height, width)
+    for (x, y), depth in zip(here.xy.round().tolist(), here.depth.tolist(), strict=True):
+        row, column = min(max(int(y), 0), height - 1), min(max(int(x), 0), width - 1)
+        now = float(expected[row, column])
+        expected[row, column] = depth if now == 0 else min(now, depth)
+    assert torch.equal(here.scatter(), expected[None, None])
+
+
+def test_a_point_outside_the_frame_is_not_scattered() -> None:
+    outside = points([(-0.6, 0), (0, -3), (2.6, 0), (0, 2.7)], (3, 3))
+    assert not outside.scatter().any()
+    assert points([(-0.5, -0.5), (2.5, 2.5), (2.4999, 0)], (3, 3)).scatter().count_nonzero() == 3
+
+
+def test_selecting_and_moving_keep_points_together() -> None:
+    here = points([(0, 1), (2, 3), (4, 5)], (6, 6))
+    chosen = here.select(torch.tensor([True, False, True])).tensors()
+    assert (chosen.xy.tolist(), chosen.depth.tolist()) == ([[0, 1], [4, 5]], [1, 3])
+    assert (len(here), len(chosen), chosen.size) == (3, 2, (6, 6))
+
+
+def test_arrays_become_tensors_without_copy_and_follow_the_same_rules() -> None:
+    xy = np.array([[0.1, 0.2], [7.3, 4.9], [8.5, 1]], np.float32)
+    arrays = SparsePoints(xy=xy, depth=np.ones(3, np.float32), size=(6, 9), dropped={"far": 2})
+    tensors = arrays.tensors()
+    assert tensors.xy.data_ptr() == xy.ctypes.data
+    assert tensors.dropped == {"far": 2}
+    for change in (
+        lambda points: points.resized(5, 7),
+        lambda points: points.cropped(1, 2, 4, 5),
+        lambda points: points.select([0, 2]),
+    ):
+        assert torch.equal(change(arrays).tensors().xy, change(tensors).xy)
+        assert change(arrays).size == change(tensors).size
+
+
+def test_a_frame_reaches_half_a_pixel_beyond_its_outermost_pixel_centres() -> None:
+    xy = np.array([[-0.5, -0.5], [2.4, 1.4], [2.5, 0], [0, 1.5], [-0.6, 0], [np.nan, 0]])
+    for array in (xy, torch.from_numpy(xy)):
+        assert in_frame(array, (2, 3)).tolist() == [True, True, False, False, False, False]
+        closed = in_frame(array, (2, 3), closed=True)
+        assert closed.tolist() == [True, True, True, True, False, False]
+
+
+def test_points_can_be_read_without_torch() -> None:
+    code = "import sys, pnpdepth_cli.points; assert not {'torch', 'numpy'} & set(sys.modules)"
+    subprocess.run([sys.executable, "-c", code], check=True)
