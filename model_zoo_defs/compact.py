@@ -230,7 +230,8 @@ class InlierWeights(nn.Module):
 
     The image is divided into cells with about one point each. A point is compared with the means
     of the 5 x 5 cells around it; its own cell is counted without it. With a prior, the residuals
-    against the prior are compared in the same way.
+    against the prior are compared in the same way. A second pass compares with means that are
+    weighted by the result of the first.
     """
 
     WIDTHS = (1.0, 2.5)
@@ -240,37 +241,35 @@ class InlierWeights(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        self.enter = nn.Linear(self.STATISTICS, 24)
-        self.enter_prior = nn.Linear(self.STATISTICS + 2, 24, bias=False)
-        self.leave = nn.Linear(24, 1)
-        nn.init.zeros_(self.enter_prior.weight)
-        nn.init.zeros_(self.leave.weight)
-        nn.init.constant_(self.leave.bias, 4.0)  # weights of exactly 1
+        self.first = PointScore(self.STATISTICS)
+        self.second = PointScore(self.STATISTICS)
+        nn.init.constant_(self.first.leave.bias, 4.0)  # weights of exactly 1
 
     def forward(self, points: Points, prior: Prior | None) -> tuple[Tensor, Tensor]:
         """(weights, logits), both (B, 1, H, W), 1 and 0 away from the points."""
-        at = points.mask > 0
+        at, nothing = points.mask > 0, torch.zeros_like(points.mask)
         with torch.autocast(points.mask.device.type, enabled=False):
-            log_odds = self.logits(*self.statistics(points, prior))
+            log_odds = self.first(*self.statistics(points, prior, points.mask))
+            use = nothing.masked_scatter(at, torch.sigmoid(log_odds.detach()))
+            log_odds = log_odds + self.second(*self.statistics(points, prior, use))
         weights = torch.sigmoid(STEEPNESS * log_odds + SHIFT)
-        nothing = torch.zeros_like(points.mask)
         return (nothing + 1.0).masked_scatter(at, weights), nothing.masked_scatter(at, log_odds)
 
-    def logits(self, rows: Tensor, of_prior: Tensor | None) -> Tensor:
-        """Log odds (n,) of being an inlier from the statistics of n points."""
-        hidden = self.enter(rows)
-        if of_prior is not None:
-            hidden = hidden + self.enter_prior(of_prior)
-        return cast(Tensor, self.leave(F.relu(hidden)).squeeze(1))
+    def statistics(
+        self, points: Points, prior: Prior | None, use: Tensor
+    ) -> tuple[Tensor, Tensor | None]:
+        """Statistics (n, STATISTICS) of every point of the batch, and of its prior residual.
 
-    def statistics(self, points: Points, prior: Prior | None) -> tuple[Tensor, Tensor | None]:
-        """Of every point of the batch (n, STATISTICS), and of its residual against the prior."""
+        Args:
+            points: The sparse depth of the batch.
+            prior: Its prior, or None.
+            use: Weights (B, 1, H, W) of the points in the means that they are compared with.
+        """
         known = points.mask.squeeze(1) > 0
-        rows = _each(known, points.value, points.mask, self._statistics)
+        rows = _each(known, points.value, use, self._statistics)
         if prior is None:
             return rows, None
-        valid = points.mask * prior.valid
-        of_prior = _each(known, prior.residual, valid, self._statistics)
+        of_prior = _each(known, prior.residual, use * prior.valid, self._statistics)
         at = known.unsqueeze(1)
         single = torch.stack([prior.valid[at], prior.residual[at].abs().clamp(max=2.0)], 1)
         return rows, torch.cat([of_prior, single], 1) * prior.valid[at].unsqueeze(1)
@@ -315,6 +314,25 @@ class InlierWeights(nn.Module):
             table += [*agreement, torch.log1p(number), spread.clamp(max=2.0), signed]
         each = torch.cat(table, 1)
         return torch.cat([each, each.mean(0, keepdim=True).expand_as(each)], 1)
+
+
+class PointScore(nn.Module):
+    """Log odds (n,) from the statistics of n points and of their residuals against a prior."""
+
+    def __init__(self, statistics: int):
+        super().__init__()
+        self.enter = nn.Linear(statistics, 24)
+        self.enter_prior = nn.Linear(statistics + 2, 24, bias=False)
+        self.leave = nn.Linear(24, 1)
+        for layer in (self.enter_prior, self.leave):
+            nn.init.zeros_(layer.weight)
+        nn.init.constant_(self.leave.bias, 0.0)
+
+    def forward(self, rows: Tensor, of_prior: Tensor | None) -> Tensor:
+        hidden = self.enter(rows)
+        if of_prior is not None:
+            hidden = hidden + self.enter_prior(of_prior)
+        return cast(Tensor, self.leave(F.relu(hidden)).squeeze(1))
 
 
 def _each(

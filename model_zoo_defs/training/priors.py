@@ -21,7 +21,7 @@ from model_zoo_defs.training.patterns import window
 Depth = NDArray[np.float32]
 
 SHARE = 0.55
-NONSENSE_SHARE = 0.2
+NONSENSE_SHARE = 0.3
 
 
 def draw(

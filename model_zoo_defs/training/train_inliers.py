@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 import math
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -20,7 +21,7 @@ from safetensors.torch import load_file
 from torch import Tensor
 from tqdm import tqdm
 
-from model_zoo_defs.compact import Compact, Points, Prior
+from model_zoo_defs.compact import Compact, InlierWeights, Points, PointScore, Prior
 from model_zoo_defs.training import priors
 from model_zoo_defs.training.dataset import Frames
 from model_zoo_defs.training.learner import export
@@ -50,40 +51,58 @@ def sample(rng: Generator, frames: Frames) -> tuple[Tensor, Tensor, Tensor]:
     return tensors[0], tensors[1], tensors[2]
 
 
-def rows(network: Compact, frames: Frames, count: int, seed: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Statistics (n, ...) of points and residuals against the prior, and how far they are inliers.
+class Table(NamedTuple):
+    """Statistics of n points of two passes, the log odds of the first, and targets 0..1 (n,)."""
 
-    At most POINTS_PER_SAMPLE points of each of `count` samples.
+    first: tuple[Tensor, Tensor]
+    second: tuple[Tensor, Tensor]
+    log_odds: Tensor
+    target: Tensor
+
+
+@torch.no_grad()
+def table(layer: InlierWeights, frames: Frames, count: int, seed: int) -> Table:
+    """The table of `count` samples, at most POINTS_PER_SAMPLE points of each.
+
+    The second pass uses the present weights of the first.
     """
-    layer, table = network.inlier_weights, []
+    parts: list[list[Tensor]] = []
     for number in tqdm(range(count), unit="sample", mininterval=5.0):
         rng = np.random.default_rng((seed, number))
         sparse, truth, dense = sample(rng, frames)
         points = Points(sparse)
-        plain, of_prior = layer.statistics(points, Prior(dense, points))
-        assert of_prior is not None
+        prior = Prior(dense, points)
+        first = layer.statistics(points, prior, points.mask)
+        log_odds = layer.first(*first)
         at = sparse > 0
+        use = torch.zeros_like(sparse).masked_scatter(at, torch.sigmoid(log_odds))
+        second = layer.statistics(points, prior, use)
         error = (torch.log(sparse[at]) - torch.log(truth[at])).abs()
         target = ((OUTLIER_ERROR - error) / (OUTLIER_ERROR - INLIER_ERROR)).clamp(0.0, 1.0)
         known = torch.nonzero(truth[at] > 0).squeeze(1).numpy()
         chosen = torch.from_numpy(rng.permutation(known)[:POINTS_PER_SAMPLE])
-        table.append((plain[chosen], of_prior[chosen], target[chosen]))
-    statistics, of_prior, targets = (torch.cat(parts) for parts in zip(*table, strict=True))
-    return statistics, of_prior, targets
+        columns = [first[0], first[1], second[0], second[1], log_odds, target]
+        parts.append([column[chosen] for column in columns if column is not None])
+    a, b, c, d, log_odds, target = (torch.cat(column) for column in zip(*parts, strict=True))
+    return Table((a, b), (c, d), log_odds, target)
 
 
-def train_inliers(network: Compact, table: tuple[Tensor, Tensor, Tensor], steps: int) -> float:
-    """The inlier weights of the network are trained on a table of `rows`; returns the loss."""
-    layer = network.inlier_weights
-    optimiser = torch.optim.AdamW(layer.parameters(), lr=RATE, weight_decay=1e-4)
+def fit(score: PointScore, rows: tuple[Tensor, Tensor], offset: Tensor, target: Tensor,
+        steps: int) -> float:  # fmt: skip
+    """One pass is trained on its statistics; its log odds are added to `offset` (n,).
+
+    Returns:
+        The running mean of the cross entropy at the end.
+    """
+    optimiser = torch.optim.AdamW(score.parameters(), lr=RATE, weight_decay=1e-4)
     generator = torch.Generator().manual_seed(0)
     smooth = 0.0
     for step in tqdm(range(steps), unit="step", mininterval=5.0):
         for group in optimiser.param_groups:
             group["lr"] = RATE * 0.5 * (1.0 + math.cos(math.pi * step / steps))
-        chosen = torch.randint(len(table[0]), (BATCH,), generator=generator)
-        plain, of_prior, target = (part[chosen] for part in table)
-        loss = F.binary_cross_entropy_with_logits(layer.logits(plain, of_prior), target)
+        chosen = torch.randint(len(target), (BATCH,), generator=generator)
+        log_odds = offset[chosen] + score(rows[0][chosen], rows[1][chosen])
+        loss = F.binary_cross_entropy_with_logits(log_odds, target[chosen])
         optimiser.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
         optimiser.step()
@@ -102,12 +121,20 @@ def main() -> None:
     parser.add_argument("--samples", type=int, default=4000)
     parser.add_argument("--steps", type=int, default=STEPS)
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--second-only", action="store_true", help="keep the first pass")
     options = parser.parse_args()
     torch.manual_seed(options.seed)
     network = Compact()
     upgrade(network, load_file(options.start))
-    table = rows(network, Frames(*options.data), options.samples, options.seed)
-    print(f"{len(table[0])} points, loss {train_inliers(network, table, options.steps):.4f}")
+    layer, frames = network.inlier_weights, Frames(*options.data)
+    if not options.second_only:
+        data = table(layer, frames, options.samples, options.seed)
+        nothing = torch.zeros_like(data.target)
+        loss = fit(layer.first, data.first, nothing, data.target, options.steps)
+        print(f"first pass: {len(data.target)} points, cross entropy {loss:.4f}")
+    data = table(layer, frames, options.samples, options.seed + 1)
+    loss = fit(layer.second, data.second, data.log_odds, data.target, options.steps)
+    print(f"second pass: {len(data.target)} points, cross entropy {loss:.4f}")
     export(network, options.out)
 
 

@@ -26,6 +26,7 @@ pytest.importorskip("safetensors")
 train = pytest.importorskip("model_zoo_defs.training.train")
 validation = pytest.importorskip("model_zoo_defs.training.validation")
 encoder_weights = pytest.importorskip("model_zoo_defs.training.encoder_weights")
+train_inliers = pytest.importorskip("model_zoo_defs.training.train_inliers")
 
 SHAPE = (48, 64)
 seeds = st.integers(0, 2**32 - 1)
@@ -429,3 +430,17 @@ def stop_at(settings_: train.Settings, step: int) -> None:
         if run.step == step:
             run.save()
             return
+
+
+def test_inlier_weights_learn_which_points_are_wrong(shards: Path) -> None:
+    torch.manual_seed(0)
+    layer = Compact().inlier_weights
+    data = train_inliers.table(layer, Frames(shards), 60, seed=1)
+    loss = train_inliers.fit(
+        layer.first, data.first, torch.zeros_like(data.target), data.target, steps=60
+    )
+    with torch.no_grad():
+        log_odds = layer.first(*data.first)
+    wrong, right = data.target == 0, data.target == 1
+    assert loss < 0.7
+    assert float(log_odds[wrong].mean()) < float(log_odds[right].mean()) - 0.5
