@@ -54,6 +54,9 @@ STRIDES = {"s16": 16, "s8": 8, "s4": 4, "s2": 2}
 # The weight of a point as a function of its log odds of being an inlier: steep, because a softmax
 # over few candidates follows a doubtful point too far, and 1 for most inliers.
 STEEPNESS, SHIFT = 4.0, 2.0
+# Up to this expected share of outliers in an image their log odds gain the margin, which falls to
+# 0 at twice the share: isolated points of clean images are thin things.
+CLEAN_SHARE, CLEAN_MARGIN = 0.03, 7.0
 FIT_HEADS = 4
 FIT_KEY = 16
 FIT_CHUNK = 1024
@@ -252,8 +255,16 @@ class InlierWeights(nn.Module):
             log_odds = self.first(*self.statistics(points, prior, points.mask))
             use = nothing.masked_scatter(at, torch.sigmoid(log_odds.detach()))
             log_odds = log_odds + self.second(*self.statistics(points, prior, use))
-        weights = torch.sigmoid(STEEPNESS * log_odds + SHIFT)
-        return (nothing + 1.0).masked_scatter(at, weights), nothing.masked_scatter(at, log_odds)
+        logits = nothing.masked_scatter(at, log_odds)
+        weights = torch.sigmoid(STEEPNESS * (logits + self._margin(points, logits)) + SHIFT)
+        return torch.where(at, weights, 1.0), logits
+
+    @staticmethod
+    def _margin(points: Points, logits: Tensor) -> Tensor:
+        """Log odds (B, 1, 1, 1) that spare doubtful points of images with hardly any outlier."""
+        count = points.mask.sum((1, 2, 3), keepdim=True).clamp(min=1.0)
+        outliers = (points.mask * torch.sigmoid(-logits)).sum((1, 2, 3), keepdim=True) / count
+        return CLEAN_MARGIN * (1.0 - (outliers / CLEAN_SHARE - 1.0).clamp(0.0, 1.0))
 
     def statistics(
         self, points: Points, prior: Prior | None, use: Tensor

@@ -271,6 +271,28 @@ def test_the_shipped_weights_fit_and_are_small() -> None:
     assert bool(torch.isfinite(depth).all())
 
 
+@pytest.mark.skipif(
+    definition.checkpoint is None or not definition.checkpoint.exists(), reason="not trained yet"
+)
+def test_the_shipped_inlier_weights_tell_outliers_on_a_slope() -> None:
+    safetensors = pytest.importorskip("safetensors.torch")
+    network = definition.build().eval()
+    network.load_state_dict(safetensors.load_file(definition.checkpoint))
+    generator = torch.Generator().manual_seed(5)
+    rows, columns = torch.meshgrid(torch.arange(192.0), torch.arange(256.0), indexing="ij")
+    truth = (2.0 + 0.005 * rows + 0.003 * columns).view(1, 1, 192, 256)
+    known = torch.rand(truth.shape, generator=generator) < 0.01
+    wrong = known & (torch.rand(truth.shape, generator=generator) < 0.2)
+    with torch.no_grad():
+        clean, _ = network.inlier_weights(Points(truth * known), None)
+        mixed, _ = network.inlier_weights(
+            Points(truth * known * torch.where(wrong, 2.0, 1.0)), None
+        )
+    assert float(clean[known].mean()) > 0.98
+    assert float(mixed[known & ~wrong].mean()) > 0.95
+    assert float(mixed[wrong].mean()) < 0.3
+
+
 @pytest.mark.parametrize("layer", ["decoder.s32", "decoder.s8", "decoder.s2"])
 def test_the_path_is_the_same_for_every_frame_as_the_definition_promises(
     network: Compact, layer: str
