@@ -246,9 +246,7 @@ def _refined_in_time(
             return refined, ()
         if refined and budget_s is not None and spent * (number + 1) > budget_s * number:
             return refined, (f"auto: {tried} trials made; for more the time budget is too short",)
-        results = trajectories(
-            cache, variants, frame, point_sets, is_redundant=_aligns_the_aligned
-        )
+        results = trajectories(cache, variants, frame, point_sets, is_redundant=_aligns_the_aligned)
         tried += len(results)
         for config, each in results.items():
             good = [one for one in each if isinstance(one, Trajectory)]

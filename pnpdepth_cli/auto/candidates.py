@@ -8,17 +8,16 @@ number of updates that competes.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from pnpdepth_cli.completion.baselines import BASELINES
 from pnpdepth_cli.completion.propagation import propagate, propagated_at
-from pnpdepth_cli.core.refine import DepthOf, RefineSettings, refine_from
+from pnpdepth_cli.core.refine import RefineSettings, refine_from
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.errors import PnpDepthError
 from pnpdepth_cli.frames.frame import Frame, RefinedFrame
@@ -165,35 +164,25 @@ def trajectories(
 def _trajectory(
     split: Split, z0: Tensor, prepared: PreparedFrame, config: RefinementConfig
 ) -> Trajectory | PnpDepthError:
-    depths: dict[int, Tensor] = {}
     reader = prepared.depth_reader(config.settings)
     (result,) = refine_from(
         split,
         z0,
         (prepared.points,),
         config.settings,
-        depth_of=(_recorded(reader, depths, config.competing_iterations),),
+        depth_of=(reader,),
+        keep_depths={0, *config.competing_iterations},
     )
     refined = to_refined_frame(prepared, reader, result)
     if isinstance(refined, PnpDepthError):
         return refined
-    in_image = {k: torch.from_numpy(prepared.to_image(depth)) for k, depth in depths.items()}
-    return Trajectory(depths=in_image, frame=refined)
-
-
-def _recorded(depth_of: DepthOf, depths: dict[int, Tensor], wanted: Collection[int]) -> DepthOf:
-    """The same reader; it records depth where the number of updates is wanted, and is finite."""
-    updates = -1
-
-    def recorded(output: Any) -> Tensor:
-        nonlocal updates
-        updates += 1
-        depth = depth_of(output)
-        if updates == 0 or (updates in wanted and bool(depth.isfinite().all())):
-            depths[updates] = depth.detach()
-        return depth
-
-    return recorded
+    depths = {
+        updates: torch.from_numpy(prepared.to_image(depth))
+        for updates, depth in refined.refinement.depths.items()
+        if updates == 0 or bool(depth.isfinite().all())
+    }
+    refinement = replace(refined.refinement, depths={})
+    return Trajectory(depths=depths, frame=replace(refined, refinement=refinement))
 
 
 class CandidateDepths:
@@ -227,9 +216,9 @@ class CandidateDepths:
         if name is not None and candidate.propagate == "none":
             return BASELINES[name].at(xy, frame.points, self._prediction)
         if candidate.propagate == "none":
-            return SparsePoints(
-                xy=xy, depth=xy.new_ones(len(xy)), size=frame.size
-            ).sample(self._start(candidate))
+            return SparsePoints(xy=xy, depth=xy.new_ones(len(xy)), size=frame.size).sample(
+                self._start(candidate)
+            )
         return propagated_at(
             self._start(candidate), frame.points, frame.rgb, xy, kind=candidate.propagate
         )

@@ -69,5 +69,5 @@ def prepare(network: Network, frame: Frame) -> PreparedFrame:
         frame=frame,
         map=to_network,
         arguments=network.arguments(to_network, rgb, points),
-        points=points.to(network.device),
+        points=points.tensors(network.device),
     )

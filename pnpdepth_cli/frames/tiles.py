@@ -123,7 +123,9 @@ def refine_tiled(
         diverged = diverged or part.diverged
     note = f"tiles: {len(tiles)} of {tiles[0].width}×{tiles[0].height} pixels"
     if skipped:
-        note += f", {skipped} of them left as in the whole frame, with fewer than {MIN_POINTS} points"
+        note += (
+            f", {skipped} of them left as in the whole frame, with fewer than {MIN_POINTS} points"
+        )
     return replace(
         whole,
         before=before / total,
@@ -156,7 +158,7 @@ def _reduced(frame: Frame, longest: int) -> Frame:
     rgb = frame.rgb
     if rgb is not None:
         rgb = F.interpolate(rgb[None], size, mode="bilinear", antialias=True)[0]
-    return Frame(rgb=rgb, points=frame.points.in_frame(*size))
+    return Frame(rgb=rgb, points=frame.points.resized(*size))
 
 
 def _enlarged(depth: DepthMap, size: tuple[int, int]) -> DepthMap:

@@ -9,10 +9,11 @@ import torch
 
 from pnpdepth_cli.core.split import Split, gradient_at
 from pnpdepth_cli.errors import ModelError
+from pnpdepth_cli.frames.frame import Frame
+from pnpdepth_cli.frames.prepare import prepare
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.models.definition import Fixed
-from pnpdepth_cli.models.frame import FrameMap
-from pnpdepth_cli.models.made_up import made_up_arguments
+from pnpdepth_cli.models.made_up import made_up_frame
 from pnpdepth_cli.models.network import load_network, out_of_memory_is_a_device_error
 from pnpdepth_cli.points import SparsePoints
 
@@ -34,13 +35,14 @@ def check_model(
         if image is None:
             size = definition.size
             own = (size.height, size.width) if isinstance(size, Fixed) else _SIZE
-            frame = FrameMap.fit(size, *own)
-            arguments = made_up_arguments(network, frame)
+            rgb, points = made_up_frame(own)
+            prepared = prepare(network, Frame(rgb=rgb[0], points=points))
         else:
-            rgb = torch.from_numpy(read_rgb(image).values).permute(2, 0, 1)[None].contiguous()
-            frame = FrameMap.fit(definition.size, *rgb.shape[-2:])
-            nowhere = SparsePoints(xy=torch.zeros(0, 2), depth=torch.zeros(0), size=frame.network)
-            arguments = network.arguments(frame, rgb, nowhere)
+            values = torch.from_numpy(read_rgb(image).values).permute(2, 0, 1).contiguous()
+            height, width = values.shape[-2:]
+            points = SparsePoints(xy=torch.zeros(0, 2), depth=torch.zeros(0), size=(height, width))
+            prepared = prepare(network, Frame(rgb=values, points=points))
+        arguments = prepared.arguments
         notes += network.verified(arguments)
         with torch.no_grad():
             raw = network.raw_of(network.module(*arguments))
@@ -50,7 +52,7 @@ def check_model(
         }
     return {
         "name": definition.name,
-        "input": list(frame.network),
+        "input": list(prepared.map.network),
         "output": list(raw.shape[-2:]),
         "output_kind": definition.output_kind,
         "output_scale": definition.output_scale,

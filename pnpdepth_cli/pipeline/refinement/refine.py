@@ -34,7 +34,6 @@ from pnpdepth_cli.pipeline.refinement.resolve import (
     resolve_settings,
 )
 from pnpdepth_cli.pipeline.stopwatch import Stopwatch, peak_memory_mb, versions
-
 from pnpdepth_cli.points import SparsePoints
 
 

@@ -145,7 +145,7 @@ def _with_best_input_range(network: Network, frame: Frame) -> tuple[Network, str
 def _alignment_error(network: Network, frame: Frame) -> float:
     """Returns the relative error at the points after the best alignment."""
     prepared = prepare(network, frame)
-    points = prepared.points.to("cpu")
+    points = prepared.points.tensors()
     with torch.no_grad():
         output = network.module(*prepared.arguments)
     at_points = points.sample(network.raw_of(output).cpu())
