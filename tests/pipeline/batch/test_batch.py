@@ -16,6 +16,7 @@ import pytest
 from pnpdepth_cli.core.metrics import Scores
 from pnpdepth_cli.errors import InputError, LayerError, ModelError, OutputError, UsageError
 from pnpdepth_cli.io.depth import read_depth
+from pnpdepth_cli.cli.tables import print_batch
 from pnpdepth_cli.pipeline.batch import running as batch_running
 from pnpdepth_cli.pipeline.batch.batch import plan_batch
 from pnpdepth_cli.pipeline.batch.frames import BatchRequest
@@ -561,3 +562,68 @@ def test_frames_in_hdf5_files_are_cut_sampled_and_known_by_their_file(
     again = Heard()
     batch(rooms, again, refine=asked)
     assert again.names == []
+
+
+NEGATIVE_DEPTH = """
+import torch
+from torch import nn
+from pnpdepth_cli.models.definition import ModelDefinition, Multiple, RefineDefaults
+
+class Net(nn.Module):
+    def __init__(self):
+        super().__init__()
+        self.encode = nn.Conv2d(3, 8, 3, 1, 1)
+        self.decode = nn.Conv2d(8, 1, 3, 1, 1)
+        nn.init.constant_(self.decode.bias, -1.0)
+
+    def forward(self, rgb):
+        return -1 - torch.relu(self.decode(self.encode(rgb)))
+
+definition = ModelDefinition(
+    name="negative", input_kind="rgb", size=Multiple(4), build=Net, layers=("encode",),
+    defaults=RefineDefaults(layer="encode", iterations=1),
+)
+"""
+
+
+@pytest.mark.parametrize("html", [False, True])
+def test_a_plain_prediction_without_any_depth_has_no_scores_and_ends_no_batch(
+    tmp_path: Path, html: bool
+) -> None:
+    root = pairs_on_disk(tmp_path, ("a",))
+    (root / "net" / "negative.py").write_text(NEGATIVE_DEPTH)
+    model = str(root / "net" / "negative.py")
+    outcome = batch(
+        root,
+        refine={"model": model, "checkpoint": None, "align": "none", "propagate": "gp"},
+        html=root / "report" if html else None,
+    )
+    if outcome.summary["counts"]["done"]:
+        assert outcome.summary["mean"]["scores"]["before"]["rmse"] is None
+    print_batch(outcome.summary)
+
+
+def test_baselines_are_in_the_summary_the_table_the_csv_and_the_report(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    root = pairs_on_disk(tmp_path, ("a", "b"))
+    outcome = batch(root, refine={"baselines": True}, html=root / "report")
+    summary = json.loads((root / "out" / "summary.json").read_text())
+    rows = summary["frames"]
+    names = list(rows[0]["baselines"])
+    assert {"linear", "network", "result"} <= set(names)
+    mean = summary["baselines"]["linear"]
+    per_frame = [row["baselines"]["linear"] for row in rows]
+    assert mean["frames"] == 2
+    assert mean["mae"] == pytest.approx(np.mean([each["scores"]["mae"] for each in per_frame]))
+    assert mean["held_out_mae"] == pytest.approx(
+        np.mean([each["held_out_mae"] for each in per_frame])
+    )
+    with (root / "out" / "summary.csv").open() as file:
+        lines = list(csv.DictReader(file))
+    assert [float(line["baseline_linear_mae"]) for line in lines] == [
+        each["scores"]["mae"] for each in per_frame
+    ]
+    print_batch(outcome.summary)
+    assert "against every simple baseline" in capsys.readouterr().err
+    assert "Simple baselines: means over frames" in (root / "report" / "index.html").read_text()
