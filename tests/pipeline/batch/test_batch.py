@@ -13,16 +13,17 @@ import cv2
 import numpy as np
 import pytest
 
+from pnpdepth_cli.cli.tables import print_batch
 from pnpdepth_cli.core.metrics import Scores
 from pnpdepth_cli.errors import InputError, LayerError, ModelError, OutputError, UsageError
 from pnpdepth_cli.io.depth import read_depth
-from pnpdepth_cli.cli.tables import print_batch
 from pnpdepth_cli.pipeline.batch import running as batch_running
 from pnpdepth_cli.pipeline.batch.batch import plan_batch
 from pnpdepth_cli.pipeline.batch.frames import BatchRequest
-from pnpdepth_cli.pipeline.batch.summary import _SCORES
+from pnpdepth_cli.pipeline.batch.summary import _SCORES, Tally
 from pnpdepth_cli.pipeline.refinement.inputs import read_inputs
 from pnpdepth_cli.pipeline.refinement.refine import Refiner, refine_image
+from pnpdepth_cli.pipeline.report.batch import BatchReport
 from pnpdepth_cli.pipeline.sparse.scans import ScanOptions
 from pnpdepth_cli.sensors import SamplePattern
 from tests.pipeline.batches import (
@@ -36,6 +37,7 @@ from tests.pipeline.batches import (
     results,
     times,
 )
+from tests.pipeline.report_pages import frames_of
 from tests.pipeline.scan_frames import scan_on_disk
 
 
@@ -331,7 +333,7 @@ def test_an_output_folder_that_holds_the_frames_is_refused(root: Path, output: s
 def test_what_no_batch_made_is_not_replaced_unless_asked_for(root: Path) -> None:
     (root / "out").mkdir()
     (root / "out/c.json").write_text("mine")
-    with pytest.raises(OutputError, match=r"c\.json exists, and no batch made it; --overwrite"):
+    with pytest.raises(OutputError, match=r"c\.json exists, and no batch wrote it; --overwrite"):
         batch(root)
     assert [p.name for p in (root / "out").iterdir() if p.suffix != ".lock"] == ["c.json"]
     batch(root, refine={"overwrite": True})
@@ -342,7 +344,7 @@ def test_what_no_batch_made_is_not_replaced_unless_asked_for(root: Path) -> None
 def test_a_summary_that_no_batch_made_is_not_replaced(name: str, root: Path) -> None:
     (root / "out").mkdir()
     (root / "out" / name).write_text("mine")
-    with pytest.raises(OutputError, match="exists, and no batch made it; --overwrite"):
+    with pytest.raises(OutputError, match="exists, and no batch wrote it; --overwrite"):
         batch(root)
     assert (root / "out" / name).read_text() == "mine"
     batch(root, refine={"overwrite": True})
@@ -564,50 +566,32 @@ def test_frames_in_hdf5_files_are_cut_sampled_and_known_by_their_file(
     assert again.names == []
 
 
-NEGATIVE_DEPTH = """
-import torch
-from torch import nn
-from pnpdepth_cli.models.definition import ModelDefinition, Multiple, RefineDefaults
-
-class Net(nn.Module):
-    def __init__(self):
-        super().__init__()
-        self.encode = nn.Conv2d(3, 8, 3, 1, 1)
-        self.decode = nn.Conv2d(8, 1, 3, 1, 1)
-        nn.init.constant_(self.decode.bias, -1.0)
-
-    def forward(self, rgb):
-        return -1 - torch.relu(self.decode(self.encode(rgb)))
-
-definition = ModelDefinition(
-    name="negative", input_kind="rgb", size=Multiple(4), build=Net, layers=("encode",),
-    defaults=RefineDefaults(layer="encode", iterations=1),
-)
-"""
-
-
-@pytest.mark.parametrize("html", [False, True])
-def test_a_plain_prediction_without_any_depth_has_no_scores_and_ends_no_batch(
-    tmp_path: Path, html: bool
+def test_a_plain_prediction_without_scores_ends_no_batch(
+    root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    root = pairs_on_disk(tmp_path, ("a",))
-    (root / "net" / "negative.py").write_text(NEGATIVE_DEPTH)
-    model = str(root / "net" / "negative.py")
-    outcome = batch(
-        root,
-        refine={"model": model, "checkpoint": None, "align": "none", "propagate": "gp"},
-        html=root / "report" if html else None,
-    )
-    if outcome.summary["counts"]["done"]:
-        assert outcome.summary["mean"]["scores"]["before"]["rmse"] is None
-    print_batch(outcome.summary)
+    batch(root, html=tmp_path / "report")
+    summary = json.loads((root / "out" / "summary.json").read_text())
+    tally = Tally()
+    for row in summary["frames"]:
+        # what a record holds where no pixel of the plain prediction can be scored
+        row["scores"]["before"] |= dict.fromkeys(_SCORES) | {"pixels": 0}
+        tally.add(row)
+    mean = tally.mean()
+    assert mean["scores"]["before"]["rmse"] is None
+    assert mean["scores"]["after"]["rmse"] > 0
+    capsys.readouterr()
+    print_batch(summary | {"mean": mean})
+    assert "–" in capsys.readouterr().err
+    report = BatchReport(folder=tmp_path / "report", output=root / "out", workers=1)
+    report.write(summary | {"mean": mean}, lambda: summary["frames"])
+    assert frames_of(tmp_path / "report")["a"]["values"]["rmse_before"] is None
 
 
 def test_baselines_are_in_the_summary_the_table_the_csv_and_the_report(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    root = pairs_on_disk(tmp_path, ("a", "b"))
-    outcome = batch(root, refine={"baselines": True}, html=root / "report")
+    root, report = pairs_on_disk(tmp_path / "drive", ("a", "b")), tmp_path / "report"
+    outcome = batch(root, refine={"baselines": True}, html=report)
     summary = json.loads((root / "out" / "summary.json").read_text())
     rows = summary["frames"]
     names = list(rows[0]["baselines"])
@@ -626,4 +610,4 @@ def test_baselines_are_in_the_summary_the_table_the_csv_and_the_report(
     ]
     print_batch(outcome.summary)
     assert "against every simple baseline" in capsys.readouterr().err
-    assert "Simple baselines: means over frames" in (root / "report" / "index.html").read_text()
+    assert "Simple baselines: means over frames" in (report / "index.html").read_text()
