@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from pnpdepth_cli.errors import CheckpointError
-from pnpdepth_cli.models.weights.pickle_machine import Broken
+from pnpdepth_cli.models.weights.pickle_reader import BrokenFileError
 
 SUFFIX = ".index"
 
@@ -52,7 +52,7 @@ def read_tensor_bundle(index: Path) -> dict[str, Tensor]:
     """The variables by name, "layer/weights" as "layer.weights". CheckpointError if that fails."""
     try:
         return _Bundle(index).read()
-    except Broken as error:
+    except BrokenFileError as error:
         reason: object = error
     except (OSError, IndexError, RuntimeError, struct.error, UnicodeDecodeError) as error:
         reason = f"{type(error).__name__}: {' '.join(str(error).split())[:120]}"
@@ -69,7 +69,7 @@ class _Bundle:
         table = dict(_table(index.read_bytes()))
         header = dict(_fields(table.pop(b"", b"")))
         if header.get(2, 0) != 0:
-            raise Broken("it was written on a big-endian machine")
+            raise BrokenFileError("it was written on a big-endian machine")
         self._shards = _number(header.get(1, 0))
         self._places = {name.decode(): _place(entry) for name, entry in table.items()}
         self._contents: dict[int, bytes] = {}
@@ -86,7 +86,7 @@ class _Bundle:
                 left += len(self._contents[place.shard])
             left -= place.size
             if left < 0:
-                raise Broken("its variables are larger than its files")
+                raise BrokenFileError("its variables are larger than its files")
             found[name.replace("/", ".")] = _tensor(name, place, self._contents[place.shard])
         return found
 
@@ -94,17 +94,17 @@ class _Bundle:
         file = f"{self._prefix.name}.data-{shard:05d}-of-{self._shards:05d}"
         path = self._prefix.with_name(file)
         if not path.is_file():
-            raise Broken(f"{file} is not beside it")
+            raise BrokenFileError(f"{file} is not beside it")
         return path.read_bytes()
 
 
 def _tensor(name: str, place: _Place, content: bytes) -> Tensor:
     dtype = _TYPES.get(place.dtype)
     if dtype is None:
-        raise Broken(f"{name} is of TensorFlow's type {place.dtype}, not of numbers")
+        raise BrokenFileError(f"{name} is of TensorFlow's type {place.dtype}, not of numbers")
     count = math.prod(place.shape)
     if count * dtype.itemsize != place.size or place.offset + place.size > len(content):
-        raise Broken(f"{name} of shape {place.shape} goes beyond its {place.size} bytes")
+        raise BrokenFileError(f"{name} of shape {place.shape} goes beyond its {place.size} bytes")
     part = bytearray(content[place.offset : place.offset + place.size])
     flat = torch.frombuffer(part, dtype=dtype) if part else torch.empty(0, dtype=dtype)
     return flat.reshape(place.shape)
@@ -113,7 +113,7 @@ def _tensor(name: str, place: _Place, content: bytes) -> Tensor:
 def _place(entry: bytes) -> _Place:
     fields = dict(_fields(entry))
     if 7 in fields:
-        raise Broken("a variable is in slices")
+        raise BrokenFileError("a variable is in slices")
     shape = fields.get(2, b"")
     sides = _fields(shape) if isinstance(shape, bytes) else ()
     return _Place(
@@ -131,7 +131,7 @@ def _place(entry: bytes) -> _Place:
 
 def _number(value: int | bytes) -> int:
     if not isinstance(value, int) or value >= 1 << 63:
-        raise Broken("a size that is none")
+        raise BrokenFileError("a size that is none")
     return value
 
 
@@ -141,7 +141,7 @@ def _number(value: int | bytes) -> int:
 def _table(data: bytes) -> Iterator[tuple[bytes, bytes]]:
     """Keys and values of all blocks."""
     if len(data) < _FOOTER or struct.unpack("<Q", data[-8:])[0] != _MAGIC:
-        raise Broken("it does not end as an index does")
+        raise BrokenFileError("it does not end as an index does")
     _, at = _varint(data, len(data) - _FOOTER)  # the block of metadata comes first; it is empty
     _, at = _varint(data, at)
     for _, handle in _block(data, data[at:]):
@@ -153,9 +153,9 @@ def _block(data: bytes, handle: bytes) -> Iterator[tuple[bytes, bytes]]:
     offset, at = _varint(handle, 0)
     size, _ = _varint(handle, at)
     if offset + size >= len(data) or size < 4:
-        raise Broken("a block goes beyond its end")
+        raise BrokenFileError("a block goes beyond its end")
     if data[offset + size] != 0:
-        raise Broken("its index is compressed, which TensorFlow does not do")
+        raise BrokenFileError("its index is compressed, which TensorFlow does not do")
     (restarts,) = struct.unpack_from("<I", data, offset + size - 4)
     at, end = offset, offset + size - 4 * (restarts + 1)
     key = b""
@@ -164,7 +164,7 @@ def _block(data: bytes, handle: bytes) -> Iterator[tuple[bytes, bytes]]:
         fresh, at = _varint(data, at)
         length, at = _varint(data, at)
         if at + fresh + length > end or shared > len(key):
-            raise Broken("an entry goes beyond its block")
+            raise BrokenFileError("an entry goes beyond its block")
         key = key[:shared] + data[at : at + fresh]
         at += fresh
         yield key, data[at : at + length]
@@ -187,7 +187,7 @@ def _fields(message: bytes) -> Iterator[tuple[int, int | bytes]]:
         elif kind in (1, 5):
             at += 8 if kind == 1 else 4  # checksums
         else:
-            raise Broken("an entry that is no protocol buffer")
+            raise BrokenFileError("an entry that is no protocol buffer")
 
 
 def _varint(data: bytes, at: int) -> tuple[int, int]:
@@ -199,4 +199,4 @@ def _varint(data: bytes, at: int) -> tuple[int, int]:
         value |= (byte & 127) << shift
         if byte < 128:
             return value, at
-    raise Broken("a number without end")
+    raise BrokenFileError("a number without end")

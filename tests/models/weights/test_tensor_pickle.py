@@ -23,7 +23,7 @@ from hypothesis import strategies as st
 from torch import nn
 
 from pnpdepth_cli.errors import CheckpointError
-from pnpdepth_cli.models.weights.pickle_machine import Instance
+from pnpdepth_cli.models.weights.pickle_reader import StandIn
 from pnpdepth_cli.models.weights.tensor_pickle import is_module, module_state, read_tensor_file
 
 LAYOUTS = [True, False]
@@ -90,7 +90,7 @@ def test_published_completion_networks_are_read(shared_data: Path) -> None:
         assert sum(t.numel() for n, t in state.items() if "num_batches" not in n) >= 335_000
         assert state["nconv.nconv1.weight_p"].shape == (2, 1, 5, 5)
     whole = read_tensor_file(shared_data / "weights" / "nconv" / "whole_module.pth").content
-    assert isinstance(whole, Instance)
+    assert isinstance(whole, StandIn)
     assert module_state(whole)["nconv7.bias"].shape == (1,)
     path = shared_data / "weights" / "nconv" / "CNN_ep0003.pth.tar"
     ours = read_tensor_file(path).content
@@ -264,12 +264,12 @@ def test_entries_that_share_their_bytes_are_refused(tmp_path: Path) -> None:
 
 
 def test_modules_that_hold_themselves_again_and_again_are_refused() -> None:
-    inner = Instance("a.B", state={"_parameters": {"w": torch.ones(1)}, "_modules": {}})
+    inner = StandIn("a.B", state={"_parameters": {"w": torch.ones(1)}, "_modules": {}})
     for _ in range(40):
-        inner = Instance("a.B", state={"_parameters": {}, "_modules": {"a": inner, "b": inner}})
+        inner = StandIn("a.B", state={"_parameters": {}, "_modules": {"a": inner, "b": inner}})
     with pytest.raises(CheckpointError, match="without end"):
         module_state(inner)
-    ring = Instance("a.B", state={"_parameters": {}, "_modules": {}})
+    ring = StandIn("a.B", state={"_parameters": {}, "_modules": {}})
     ring.state["_modules"]["again"] = ring
     with pytest.raises(CheckpointError, match="without end"):
         module_state(ring)
