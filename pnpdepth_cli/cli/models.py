@@ -56,16 +56,16 @@ def models(
     if check is not None:
         from pnpdepth_cli.pipeline.networks.check import check_model
 
-        found = check_model(check, given["checkpoint"], given["image"], given["device"])
-        _show(found, as_json)
+        checked = check_model(check, given["checkpoint"], given["image"], given["device"])
+        _show(asdict(checked), as_json)
     elif convert is not None:
         from pnpdepth_cli.pipeline.networks.convert import convert_checkpoint
 
-        _show(convert_checkpoint(*convert, overwrite=given["overwrite"]), as_json)
+        _show(asdict(convert_checkpoint(*convert, overwrite=given["overwrite"])), as_json)
     elif fetch is not None:
         from pnpdepth_cli.pipeline.networks.fetch import fetch_model
 
-        _show(fetch_model(fetch, given["revision"], given["output"]), as_json)
+        _show(asdict(fetch_model(fetch, given["revision"], given["output"])), as_json)
     else:
         _list(every, as_json)
 
@@ -89,7 +89,7 @@ def _show(found: Mapping[str, Any], as_json: bool) -> None:
 
 
 def _list(every: bool, as_json: bool) -> None:
-    from pnpdepth_cli.pipeline.networks.models import list_models
+    from pnpdepth_cli.pipeline.networks.list_models import list_models
 
     listed = [asdict(model) for model in list_models()]
     left_out = Counter(model["family"] for model in listed if model["variant"] and not every)

@@ -245,6 +245,10 @@ def _storage_key(pid: tuple[Any, ...]) -> str:
 
 def _dtype(kind: Any) -> torch.dtype:
     name = kind.path.rpartition(".")[2] if isinstance(kind, Name) else ""
+    if name.startswith("Q"):
+        raise BrokenFileError(
+            f"its tensors are quantised, {name[:40]}; save their values as floats"
+        )
     if name not in _DTYPES:
         raise BrokenFileError(f"a storage of type {name[:40] or '?'}")
     return _DTYPES[name]
