@@ -85,13 +85,24 @@ def read_tensor_file(path: Path) -> TensorFile:
         CheckpointError: The file is broken, or is not one of torch.
     """
     try:
-        if zipfile.is_zipfile(path):
-            return _read_archive(path)
         with path.open("rb") as file:
-            return _read_row_of_pickles(file, path.stat().st_size)
+            return read_tensors(file)
     except (BrokenFileError, zipfile.BadZipFile, OSError, *READ_ERRORS) as error:
         reason = brief(error)
     raise CheckpointError(f"checkpoint {path} cannot be read as a torch file ({reason})")
+
+
+def read_tensors(file: IO[bytes]) -> TensorFile:
+    """Returns the content of an open torch file.
+
+    Raises:
+        BrokenFileError: The file is broken, or is not one of torch.
+        Exception: Another of READ_ERRORS, BadZipFile or OSError.
+    """
+    size = file.seek(0, io.SEEK_END)
+    is_archive = zipfile.is_zipfile(file)
+    file.seek(0)
+    return _read_archive(file, size) if is_archive else _read_row_of_pickles(file, size)
 
 
 def module_state(module: StandIn) -> dict[str, Tensor]:
@@ -139,8 +150,8 @@ def _names_in_set(value: Any) -> set[str]:
     return {element for element in elements if isinstance(element, str)}
 
 
-def _read_archive(path: Path) -> TensorFile:
-    with zipfile.ZipFile(path) as archive:
+def _read_archive(file: IO[bytes], size: int) -> TensorFile:
+    with zipfile.ZipFile(file) as archive:
         entries = {info.filename: info for info in archive.infolist()}
         if any("/code/" in name for name in entries):
             raise BrokenFileError(
@@ -151,15 +162,15 @@ def _read_archive(path: Path) -> TensorFile:
         pickles = [name for name in entries if name == "data.pkl" or name.endswith("/data.pkl")]
         if len(pickles) != 1:
             raise BrokenFileError(f"the archive has {len(pickles)} entries named data.pkl")
-        if sum(info.file_size for info in entries.values()) > path.stat().st_size:
+        if sum(info.file_size for info in entries.values()) > size:
             raise BrokenFileError("its entries are larger than the file")
         folder = pickles[0].removesuffix("data.pkl")
         order = entries.get(f"{folder}byteorder")
         if order is not None and archive.read(order).strip() == b"big":
             raise BrokenFileError("it was written on a big-endian machine")
         storages = _Storages(lambda key: archive.read(entries[f"{folder}data/{key}"]))
-        with archive.open(pickles[0]) as file:
-            return _read_pickle(file, storages)
+        with archive.open(pickles[0]) as pickled:
+            return _read_pickle(pickled, storages)
 
 
 def _read_row_of_pickles(file: IO[bytes], size: int) -> TensorFile:
