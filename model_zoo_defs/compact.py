@@ -382,7 +382,7 @@ definitions = {
         licence="Apache-2.0",
         input_kind="rgb+sparse",
         size=Multiple(32, longest=1280),
-        same_path=True,
+        static_graph=True,
         normalisation=Normalisation(mean=IMAGENET_MEAN, std=IMAGENET_STD),
         output_kind="depth",
         layers=("decoder.s32", "decoder.s16", "decoder.s8", "decoder.s4", "decoder.s2"),

@@ -13,7 +13,7 @@ import pkgutil
 from collections.abc import Iterator, Mapping
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args
 
 from pnpdepth_cli.errors import UsageError
 
@@ -86,6 +86,63 @@ class Table(Mapping[str, Any]):
         return {point.name: point for point in entry_points(group=f"pnpdepth.{self.group}")}
 
 
+LOSSES = Table(
+    "core/losses",
+    "loss",
+    group="losses",
+    noun="loss",
+    first=("l1", "l2", "huber", "berhu", "inverse", "log", "cauchy"),
+)
+"""L of equation 3: (N,) predicted and (N,) measured depth to a scalar."""
+
+UPDATES = Table(
+    "core/update_rules",
+    "update_rule",
+    group="updates",
+    noun="update rule",
+    first=("sign", "sgd", "normalised", "momentum", "adam", "lbfgs"),
+)
+"""U of equation 3: each entry makes a rule that turns gradients into directions."""
+
+Schedule = Literal["constant", "linear"]
+SCHEDULES: tuple[Schedule, ...] = get_args(Schedule)
+"""How the step size changes over the updates of z."""
+
+Parameters = Literal["elements", "channels"]
+PARAMETERS: tuple[Parameters, ...] = get_args(Parameters)
+"""What is updated: every element of z, or a scale and a shift of each channel of z."""
+
+Precision = Literal["fp32", "bf16", "fp16"]
+PRECISIONS: tuple[Precision, ...] = get_args(Precision)
+"""The number format of the network's convolutions and matrix products."""
+
+Align = Literal["none", "median", "scale", "affine", "auto"]
+ALIGNMENTS: tuple[Align, ...] = get_args(Align)
+"""How the network's output is fitted to the sparse points."""
+
+Space = Literal["depth", "inverse", "log"]
+SPACES: tuple[Space, ...] = get_args(Space)
+"""The quantities in which depth is predicted, fitted or interpolated."""
+
+OutputKind = Literal[Space, "unknown"]
+OUTPUT_KINDS: tuple[OutputKind, ...] = get_args(OutputKind)
+"""What the numbers of a network's output are."""
+
+OutputScale = Literal["metric", "scale", "affine", "unknown"]
+OUTPUT_SCALES: tuple[OutputScale, ...] = get_args(OutputScale)
+"""Up to what a network's output is known: metres, a factor, or a factor and a shift."""
+
+InputKind = Literal["rgb", "sparse", "rgb+sparse"]
+INPUT_KINDS: tuple[InputKind, ...] = get_args(InputKind)
+"""What a network takes as input."""
+
+Fit = Literal["stretch", "crop"]
+FITS: tuple[Fit, ...] = get_args(Fit)
+"""How an image is brought to a network's fixed input size."""
+
+NORMALISATIONS = ("unit", "imagenet", "symmetric", "bytes")
+"""The rgb ranges a network may expect: 0…1, ImageNet's mean and deviation, −1…1, 0…255."""
+
 NETWORKS = Table(
     "",
     None,
@@ -98,3 +155,15 @@ NETWORKS = Table(
     package="model_zoo_defs",
 )
 """The networks' files in `model_zoo_defs`, and what other packages enter as `pnpdepth.models`."""
+
+FORMATS = Table(
+    "io/formats",
+    "FORMAT",
+    group="formats",
+    noun="depth format",
+    first=("png", "exr", "npy", "npz", "pfm", "tiff"),
+)
+"""Depth file formats: `pnpdepth_cli.io.formats.DepthFormat`."""
+
+PROPAGATIONS = ("none", "gp", "diffusion")
+"""How the residual at the points is propagated."""

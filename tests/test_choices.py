@@ -5,14 +5,19 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+import torch
 
+from pnpdepth_cli import choices
 from pnpdepth_cli.choices import Table
+from pnpdepth_cli.core.step_sizes import SCHEDULES
 from pnpdepth_cli.errors import UsageError
+from pnpdepth_cli.models.precision import dtype_of
+from pnpdepth_cli.pipeline.refinement.resolve import NORMALISATIONS
 
 
 @pytest.fixture
 def table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Table:
-    """A table over the modules of `pnpdepth_cli.io`, and two entry points of another package."""
+    """A table over the modules of `io.formats`, and two entry points of another package."""
     info = tmp_path / "other-1.0.dist-info"
     info.mkdir()
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: other\nVersion: 1.0\n")
@@ -21,11 +26,11 @@ def table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Table:
     )
     (tmp_path / "other_package.py").write_text("entry = 'loaded from elsewhere'\n")
     monkeypatch.syspath_prepend(str(tmp_path))
-    return Table("io", "__name__", group="test_table", noun="entry", first=("png",))
+    return Table("io/formats", "__name__", group="test_table", noun="entry", first=("png",))
 
 
 def test_names_come_from_the_folder_and_from_entry_points(table: Table) -> None:
-    assert {"pfm", "png", "depth-reading", "elsewhere"} <= set(table)
+    assert {"pfm", "png", "elsewhere"} <= set(table)
     assert "--init--" not in table
     assert len(table) == len(list(table))
 
@@ -39,7 +44,7 @@ def test_names_given_first_are_listed_first_and_the_others_in_alphabetical_order
 
 
 def test_an_entry_of_this_package_is_loaded_from_its_module(table: Table) -> None:
-    assert table["pfm"] == "pnpdepth_cli.io.pfm"
+    assert table["pfm"] == "pnpdepth_cli.io.formats.pfm"
 
 
 def test_an_entry_of_another_package_is_loaded_from_its_entry_point(table: Table) -> None:
@@ -49,6 +54,19 @@ def test_an_entry_of_another_package_is_loaded_from_its_entry_point(table: Table
 def test_an_unknown_name_is_an_error_that_names_the_nearest(table: Table) -> None:
     with pytest.raises(UsageError, match=r"unknown entry 'pfmm'; did you mean 'pfm'\?"):
         table["pfmm"]
+
+
+def test_losses_and_update_rules_are_the_files_of_their_folders() -> None:
+    assert list(choices.LOSSES) == ["l1", "l2", "huber", "berhu", "inverse", "log", "cauchy"]
+    assert list(choices.UPDATES) == ["sign", "sgd", "normalised", "momentum", "adam", "lbfgs"]
+    assert all(callable(entry) for entry in (*choices.LOSSES.values(), *choices.UPDATES.values()))
+
+
+def test_every_name_of_a_closed_list_is_implemented() -> None:
+    assert tuple(SCHEDULES) == choices.SCHEDULES
+    assert tuple(NORMALISATIONS) == choices.NORMALISATIONS
+    for precision in choices.PRECISIONS:
+        dtype_of(precision, torch.device("cuda"))
 
 
 def test_a_table_of_modules_leaves_out_subpackages() -> None:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from pnpdepth_cli.cli import options
+from pnpdepth_cli.cli import grouped_help, options
 from pnpdepth_cli.cli.exit_codes import INTERRUPTED
 from pnpdepth_cli.cli.printable import printable
 from pnpdepth_cli.errors import FramesFailedError, StorageError, UsageError
@@ -27,49 +27,68 @@ LAYOUTS = (
     *("synthia", "pairs", "nyu-h5"),
 )
 PROTOCOLS = ("whole", "nyu", "kitti-odometry", "kitti-depth")
-_STOPPING = b"\nfinishing the frame in work; Ctrl-C again stops at once\n"
+_STOPPING = b"\nfinishing the current frame; press Ctrl-C again to stop at once\n"
 
 
-@click.command(short_help="Refine all frames of a folder or a list.")
+@click.command(
+    short_help="Refine all frames of a folder or a list.",
+    cls=grouped_help.GroupedCommand,
+    common=frozenset(
+        {
+            *("--layout", "--sample", "--limit", "--shard", "--calib", "--model", "--checkpoint"),
+            *("--auto", "--output", "--html", "--overwrite", "--json", "--workers", "--dry-run"),
+        }
+    ),
+    groups={
+        "Frames": ("--layout", "--protocol", "--sample", "--limit", "--shard"),
+        "Input": (*grouped_help.LIDAR, *grouped_help.FILE_READING),
+        "Network": grouped_help.NETWORK,
+        "Method": grouped_help.METHOD,
+        "Output": (*grouped_help.OUTPUT, "--html"),
+        "Run": ("--workers", "--batch-size", "--profile", "--dry-run"),
+    },
+)
 @click.argument("source", type=options.FILE, metavar="FOLDER|LIST")
-@click.option("-o", "--output", type=options.FILE, required=True, help="The folder for results.")
-@click.option("--layout", type=click.Choice(LAYOUTS), help="Of the folder.  [default: guessed]")
+@click.option("-o", "--output", type=options.FILE, required=True, help="Output folder.")
+@click.option(
+    "--layout", type=click.Choice(LAYOUTS), help="Layout of the folder.  [default: recognised]"
+)
 @click.option(
     "--protocol",
     type=click.Choice(PROTOCOLS),
-    help="What is cut out of the frames first.  [default: the layout's own]",
+    help="Crop and depth range of the frames.  [default: the layout's own]",
 )
 @click.option(
     "--sample",
     metavar="[PATTERN:]N|P%",
-    help="Points of the ground truth in place of sparse depth, as `pnpdepth sample` takes them.",
+    help="Sample the sparse depth from the ground truth, as `pnpdepth sample` does.",
 )
 @click.option("--limit", type=int, metavar="N", help="Only the first N frames.")
-@click.option("--shard", metavar="I/N", help="Every N-th frame from the I-th, 1/N to N/N.")
+@click.option("--shard", metavar="I/N", help="Every N-th frame, starting at the I-th.")
 @click.option(
     "--workers",
     type=int,
     default=2,
     show_default=True,
     metavar="N",
-    help="Threads that read, and as many that write.",
+    help="Number of threads that read, and of threads that write.",
 )
 @click.option(
     "--html",
     type=options.FILE,
     metavar="FOLDER",
-    help="A report to open in a browser: every frame before and after, the worst first.",
+    help="Write an HTML report: every frame before and after, the worst first.",
 )
 @click.option(
     "--batch-size",
     default="auto",
     show_default=True,
     metavar="auto|N",
-    help="Frames of one size that the network takes at once. auto: as many as gain time and leave"
-    " every bit of the results as it is.",
+    help="Number of frames per forward pass. auto: as many as save time without changing a bit of"
+    " the results.",
 )
-@click.option("--profile", is_flag=True, help="Say at the end where the time went.")
-@click.option("--dry-run", is_flag=True, help="List what would be done, and do nothing.")
+@click.option("--profile", is_flag=True, help="Print the time spent in each stage.")
+@click.option("--dry-run", is_flag=True, help="List the frames that would be refined, and exit.")
 @options.scan
 @options.refinement
 @options.as_json
@@ -94,34 +113,28 @@ def batch(
     \b
     pnpdepth batch drive_0001/ -o out/
     pnpdepth batch frames.csv -o out/ --workers 4 --model net.onnx
-    pnpdepth batch kitchen/ -o out/ --sample 500          # no sparse depth, but ground truth
+    pnpdepth batch kitchen/ -o out/ --sample 500          # sparse depth from the ground truth
     pnpdepth batch drive_0001/ -o out/ --shard 1/4        # one of four processes
-    pnpdepth batch drive_0001/ -o out/ --html report/     # and report/index.html to look at
+    pnpdepth batch drive_0001/ -o out/ --html report/     # then open report/index.html
 
-    \b
-    A folder is known by what is in it; the simplest layout has the same stems in
-      rgb/ sparse/ [gt/] [calib/]
-    A list has a header with image, sparse, gt, calib, name, …; paths are relative to it.
+    The layout of a folder is recognised from its content. The simplest layout has files of the same
+    stem in rgb/, sparse/, gt/ (optional) and calib/ (optional). A list has a header with image,
+    sparse, gt, calib, name, …; paths are relative to the list.
 
-    For each frame the results are those of `pnpdepth refine`; a frame that cannot be refined is
-    told, counted and passed over (exit code 7). The same command again does what is missing, or was
-    made with other settings or from other files, and leaves the rest. OUTPUT/summary.json and
-    OUTPUT/summary.csv have all frames, OUTPUT/batch.jsonl is the run's memory.
+    Each frame gets the files that `pnpdepth refine` writes. A frame that cannot be refined is
+    reported and skipped (exit code 7). The same command run again refines only frames that are
+    missing or whose settings or files have changed. OUTPUT/summary.json and OUTPUT/summary.csv list
+    all frames; OUTPUT/batch.jsonl is the journal of the run.
     """
     from pnpdepth_cli.pipeline.batch.batch import plan_batch
     from pnpdepth_cli.pipeline.batch.frames import BatchRequest
-    from pnpdepth_cli.pipeline.refinement.request import RefineRequest, sample_pattern
-    from pnpdepth_cli.pipeline.sparse.scans import ScanOptions
+    from pnpdepth_cli.pipeline.refinement.request import sample_pattern
 
-    scan, others = options.scan_given(given)
     pattern = None if sample is None else sample_pattern(*_sample(sample))
-    asked = RefineRequest(
-        image=None, sparse=None, scan=ScanOptions(**scan), sample=pattern, **others
-    )
     request = BatchRequest(
         source=source,
         output=output,
-        refine=asked,
+        refine=options.request_of(given, sample=pattern),
         layout=layout,
         protocol=protocol,
         workers=workers,
@@ -143,7 +156,7 @@ def batch(
 
 
 def _run(request: BatchRequest, as_json: bool) -> int:
-    """The exit code of a batch that went to its end, or was stopped by the user."""
+    """Runs the batch and prints its summary. Returns the exit code."""
     from pnpdepth_cli.cli.progress import BatchProgress
     from pnpdepth_cli.cli.tables import print_batch, print_profile
     from pnpdepth_cli.pipeline.batch.batch import run_batch
@@ -152,9 +165,9 @@ def _run(request: BatchRequest, as_json: bool) -> int:
         try:
             outcome = run_batch(request, progress, stopped)
         except StorageError as error:
-            raise StorageError(f"{error}; the same command goes on from there") from error
+            raise StorageError(f"{error}; run the same command to continue") from error
         except KeyboardInterrupt:
-            click.echo("stopped; the same command goes on from there", err=True)
+            click.echo("stopped; run the same command to continue", err=True)
             return INTERRUPTED
     counts = outcome.summary["counts"]
     if as_json:
@@ -167,40 +180,40 @@ def _run(request: BatchRequest, as_json: bool) -> int:
         click.echo(printable(f"wrote {request.html / 'index.html'}"), err=True)
     if outcome.stopped:
         click.echo(
-            f"stopped after {progress.done:,} of {progress.to_do:,} frames; the same command goes"
-            " on from there",
+            f"stopped after {progress.done:,} of {progress.to_do:,} frames; run the same command"
+            " to continue",
             err=True,
         )
         return INTERRUPTED
     bad = [f"{counts[kind]:,} {kind}" for kind in ("failed", "diverged") if counts[kind]]
     if bad:
         raise FramesFailedError(
-            f"{' and '.join(bad)} of {counts['frames']:,} frames; {request.output}/summary.csv says"
-            " why, and the same command tries the failed ones again"
+            f"{' and '.join(bad)} of {counts['frames']:,} frames; the reasons are in"
+            f" {request.output}/summary.csv; run the same command to retry the failed frames"
         )
     return 0
 
 
 @contextmanager
 def _finishing_on_interrupt() -> Iterator[Callable[[], bool]]:
-    """Inside, Ctrl-C only makes the yielded function say true; the second time it interrupts."""
-    asked = threading.Event()
+    """Yields a function that returns whether Ctrl-C was pressed; pressed again, it interrupts."""
+    pressed = threading.Event()
 
     def handle(number: int, frame: FrameType | None) -> None:
-        if asked.is_set():
+        if pressed.is_set():
             raise KeyboardInterrupt
-        asked.set()
-        os.write(2, _STOPPING)  # not by the buffered stderr, which may just be in use
+        pressed.set()
+        os.write(2, _STOPPING)  # not through the buffered stderr, which may be in use
 
     before = signal.signal(signal.SIGINT, handle)
     try:
-        yield asked.is_set
+        yield pressed.is_set
     finally:
         signal.signal(signal.SIGINT, before)
 
 
 def _sample(text: str) -> tuple[str, int | None, float | None]:
-    """(pattern, points, share) of `500`, `5%` or `lines:16`."""
+    """Returns (pattern, count, fraction) from `500`, `5%` or `lines:16`."""
     kind, colon, count = text.rpartition(":")
     return kind if colon else "uniform", *options.count_or_share(count)
 

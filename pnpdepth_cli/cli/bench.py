@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING
 
 import click
 
-from pnpdepth_cli.cli import options
+from pnpdepth_cli.cli import grouped_help, options
 from pnpdepth_cli.cli.printable import printable
+from pnpdepth_cli.cli.progress import progress_bar
 from pnpdepth_cli.errors import UsageError
 
 if TYPE_CHECKING:
@@ -17,24 +18,36 @@ if TYPE_CHECKING:
     from pnpdepth_cli.pipeline.bench.table import TableRow
 
 
-@click.command(short_help="Measure how long a refinement takes here.")
+@click.command(
+    short_help="Measure the run time of a refinement on this machine.",
+    cls=grouped_help.GroupedCommand,
+    groups={
+        "Input": ("--size", "--points"),
+        "Network": grouped_help.NETWORK,
+        "Method": grouped_help.METHOD,
+        "Run": ("--repeats", "--table"),
+        "Output": ("--json",),
+    },
+)
 @options.model
 @options.checkpoint
 @options.layer
 @click.option(
-    "--size", metavar="HxW", help="Of the frame.  [default: 480x640, or the network's own]"
+    "--size", metavar="HxW", help="Size of the frame.  [default: 480x640, or the network's]"
 )
 @click.option(
-    "--points", type=int, default=500, show_default=True, metavar="N", help="Of sparse depth."
+    "--points", type=int, default=500, show_default=True, metavar="N", help="Number of points."
 )
-@click.option("--iterations", type=int, metavar="K", help="Updates of z.")
+@click.option("--iterations", type=int, metavar="K", help="Number of updates of z.")
 @options.precision
 @options.device
 @click.option(
     "--repeats", type=int, default=10, show_default=True, metavar="N", help="Runs of each part."
 )
 @click.option(
-    "--table", is_flag=True, help="The paper's seven networks at full size, beside its Table V."
+    "--table",
+    is_flag=True,
+    help="Measure the paper's seven networks, beside its Table V.",
 )
 @options.as_json
 def bench(
@@ -50,7 +63,7 @@ def bench(
     table: bool,
     as_json: bool,
 ) -> None:
-    """Measure how long a refinement takes here, part by part, beside one forward pass.
+    """Measure the run time of a refinement on this machine, by part and in forward passes.
 
     \b
     pnpdepth bench
@@ -58,28 +71,26 @@ def bench(
     pnpdepth bench --precision bf16
     pnpdepth bench --table --repeats 5
 
-    The frame is made up; a network without weights gets random ones. The parts run in turn; each
-    has the median of its runs, the quartiles, and the median in units of a forward pass. The limit
-    is what K updates cost at least: (front + (2K+1) rear) / (front + rear). Memory is what a part
-    needs at its peak beyond what lay there before.
+    The frame is synthetic; a network without weights gets random ones. The parts run alternately.
+    The table has median, quartiles, and median in forward passes. The limit is the least cost of K
+    updates: (front + (2K+1) rear) / (front + rear). Memory is the peak of a part beyond the memory
+    in use before it.
     """
     if repeats < 1:
         raise UsageError(f"repeats {repeats}: there must be at least one")
     if table:
-        given = {
+        refused = {
             "--checkpoint": checkpoint,
             "--layer": layer,
             "--size": size,
             "--iterations": iterations,
         }
-        if clash := [name for name, value in given.items() if value is not None]:
+        if clash := [name for name, value in refused.items() if value is not None]:
             raise UsageError(
-                f"--table measures the paper's networks; it does not go with {clash[0]}"
+                f"--table measures the paper's networks and cannot be combined with {clash[0]}"
             )
         _table(repeats, precision, device, as_json)
         return
-    from tqdm import tqdm
-
     from pnpdepth_cli.pipeline.bench.bench import BenchRequest, run_bench
 
     request = BenchRequest(
@@ -93,39 +104,34 @@ def bench(
         device=device,
         repeats=repeats,
     )
-    with tqdm(desc="bench", unit="round", leave=False, delay=1) as bar:
-
-        def show(done: int, of: int) -> None:
-            bar.total = of
-            bar.update(done - bar.n)
-
-        found = run_bench(request, on_round=show)
+    with progress_bar("bench", "round") as show:
+        result = run_bench(request, on_round=show)
     if as_json:
-        click.echo(json.dumps(found.record(), indent=2))
+        click.echo(json.dumps(result.record(), indent=2))
         return
-    _print(found)
+    _print(result)
 
 
-def _print(found: Bench) -> None:
+def _print(result: Bench) -> None:
     from pnpdepth_cli.cli.tables import print_rows
 
-    _print_notes(found)
-    height, width = found.size
+    _print_notes(result)
+    height, width = result.size
     print_rows(
-        f"{found.model} cut at {found.layer}, {width}×{height}, {found.points:,} points,"
-        f" K = {found.iterations}, {found.precision}",
+        f"{result.model} cut at {result.layer}, {width}×{height}, {result.points:,} points,"
+        f" K = {result.iterations}, {result.precision}",
         ("", "median", "quartiles", "× forward", "memory"),
-        [_cells(part) for part in found.parts],
+        [_cells(part) for part in result.parts],
     )
-    limits = [f"{found.limit_measured:.2f} by the times of front and rear"]
-    if found.limit_by_flops is not None:
-        limits.append(f"{found.limit_by_flops:.2f} by counts of operations")
-    refinement = found.part("refinement").forwards
+    limits = [f"{result.limit_measured:.2f} by the times of front and rear"]
+    if result.limit_by_flops is not None:
+        limits.append(f"{result.limit_by_flops:.2f} by counts of operations")
+    refinement = result.part("refinement").forwards
     click.echo(
         f"a refinement takes {refinement:.2f} forward passes; the limit is {', '.join(limits)}"
     )
-    if found.depth_change is not None:
-        click.echo(f"depth differs from fp32 by {found.depth_change:.3%} on average")
+    if result.depth_change is not None:
+        click.echo(f"depth differs from fp32 by {result.depth_change:.3%} on average")
 
 
 def _cells(part: BenchPart) -> tuple[str, ...]:
@@ -140,17 +146,9 @@ def _cells(part: BenchPart) -> tuple[str, ...]:
 
 
 def _table(repeats: int, precision: str, device: str, as_json: bool) -> None:
-    from tqdm import tqdm
-
     from pnpdepth_cli.pipeline.bench.table import bench_table
 
-    with tqdm(desc="bench", unit="network", leave=False, delay=1) as bar:
-
-        def show(done: int, of: int, name: str) -> None:
-            bar.total = of
-            bar.set_postfix_str(name)
-            bar.update(done - bar.n)
-
+    with progress_bar("bench", "network") as show:
         rows = bench_table(repeats=repeats, precision=precision, device=device, on_network=show)
     if as_json:
         click.echo(json.dumps([row.record() for row in rows], indent=2))

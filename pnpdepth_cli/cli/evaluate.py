@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from pnpdepth_cli.cli import options
+from pnpdepth_cli.cli import grouped_help, options
 from pnpdepth_cli.cli.printable import printable
+from pnpdepth_cli.cli.progress import progress_bar
 from pnpdepth_cli.errors import FramesFailedError, UsageError
 
 if TYPE_CHECKING:
@@ -20,39 +19,73 @@ if TYPE_CHECKING:
 PROTOCOLS = ("paper", "nyu", "kitti", "kitti-devkit", "eigen", "garg")
 
 
-@click.command(name="eval", short_help="Score depth files against ground truth.")
+@click.command(
+    name="eval",
+    short_help="Score depth files against ground truth.",
+    cls=grouped_help.GroupedCommand,
+    common=frozenset(
+        {
+            *("--protocol", "--min-depth", "--max-depth", "--crop", "--average", "--gt-scale"),
+            *("--pred-scale", "--sparse", "--csv", "--markdown", "--latex", "--html", "--json"),
+            *("--overwrite", "--resize"),
+        }
+    ),
+    groups={
+        "Input": (
+            *("--pred-scale", "--gt-scale", "--channel", "--resize", "--mask", "--sparse"),
+            *("--sparse-scale", "--workers"),
+        ),
+        "Protocol": (
+            *("--protocol", "--min-depth", "--max-depth", "--clip", "--crop", "--average"),
+            *("--delta", "--exclude-sparse", "--bootstrap", "--no-groups", "--seed"),
+        ),
+        "Output": ("--csv", "--markdown", "--latex", "--html", "--overwrite", "--json"),
+    },
+)
 @click.argument("prediction", type=options.FILE, metavar="PRED")
 @click.argument("truth", type=options.FILE, metavar="GT")
-@click.option("--protocol", type=click.Choice(PROTOCOLS), default="paper", show_default=True)
-@click.option("--min-depth", type=float, metavar="M", help="Truth is scored above it.")
-@click.option("--max-depth", type=float, metavar="M", help="Truth is scored below it.")
-@click.option("--clip/--no-clip", default=None, help="Predictions are moved into these bounds.")
+@click.option(
+    "--protocol",
+    type=click.Choice(PROTOCOLS),
+    default="paper",
+    show_default=True,
+    help="Preset of the options below.",
+)
+@click.option("--min-depth", type=float, metavar="M", help="Score ground truth above M metres.")
+@click.option("--max-depth", type=float, metavar="M", help="Score ground truth below M metres.")
+@click.option("--clip/--no-clip", default=None, help="Clip predictions to these bounds.")
 @click.option("--crop", metavar="NAME|X,Y,W,H", help="none, nyu, eigen, garg, or a rectangle.")
-@click.option("--mask", type=options.FILE, help="A picture, or a folder of one for each frame.")
-@click.option("--average", type=click.Choice(("per-image", "pooled")), help="Pooled: over pixels.")
+@click.option("--mask", type=options.FILE, help="Mask image, or folder with a mask per frame.")
+@click.option(
+    "--average",
+    type=click.Choice(("per-image", "pooled")),
+    help="Mean over images, or over all pixels of all images.",
+)
 @click.option(
     "--delta",
     metavar="D|D1,D2,D3",
-    help="δk counts ratios below D^k, or below Dk; the paper's KITTI rows used 1.01."
+    help="Thresholds of δ1…δ3: D, D², D³, or D1, D2, D3. The paper's KITTI rows use 1.01."
     "  [default: 1.25]",
 )
 @click.option("--pred-scale", type=float, metavar="S", help="Integer predictions hold metres × S.")
-@click.option("--gt-scale", type=float, metavar="S", help="The same for GT.")
+@click.option("--gt-scale", type=float, metavar="S", help="Integer ground truth holds metres × S.")
 @options.channel
 @click.option(
     "--resize",
     type=click.Choice(("nearest", "bilinear")),
-    help="Bring predictions of another size to the truth's.",
+    help="Resize predictions to the size of the ground truth.",
 )
 @click.option(
     "--sparse",
     type=options.FILE,
     metavar="FILE|FOLDER",
-    help="The networks' sparse input: errors by distance to it and by depth, and what of it is in"
-    " the truth.",
+    help="Sparse depth the networks had: adds errors by distance to the points and by depth, and"
+    " reports points that are part of the ground truth.",
 )
-@click.option("--sparse-scale", type=float, metavar="S", help="The same for --sparse.")
-@click.option("--exclude-sparse", is_flag=True, help="Do not score pixels with a sparse point.")
+@click.option(
+    "--sparse-scale", type=float, metavar="S", help="Integer --sparse files hold metres × S."
+)
+@click.option("--exclude-sparse", is_flag=True, help="Leave out pixels that have a sparse point.")
 @click.option(
     "--bootstrap",
     "resamples",
@@ -60,18 +93,30 @@ PROTOCOLS = ("paper", "nyu", "kitti", "kitti-devkit", "eigen", "garg")
     default=2000,
     show_default=True,
     metavar="N",
-    help="Resamples behind the ±; 0 leaves it out.",
+    help="Number of bootstrap resamples for the intervals; 0 prints none.",
 )
-@click.option("--seed", type=options.SEED, default=0, show_default=True, help="Of the resampling.")
-@click.option("--workers", type=int, default=2, show_default=True, help="Frames read at once.")
-@click.option("--csv", type=options.FILE, metavar="FILE|-", help="A line for each frame.")
-@click.option("--markdown", type=options.FILE, metavar="FILE|-", help="The means as a table.")
-@click.option("--latex", type=options.FILE, metavar="FILE|-", help="The means as a tabular.")
+@click.option(
+    "--seed", type=options.SEED, default=0, show_default=True, metavar="N", help="Of --bootstrap."
+)
+@click.option(
+    "--workers",
+    type=int,
+    default=2,
+    show_default=True,
+    metavar="N",
+    help="Number of frames read at once.",
+)
+@click.option(
+    "--no-groups", is_flag=True, help="Treat all frames as independent, also those of a sequence."
+)
+@click.option("--csv", type=options.FILE, metavar="FILE|-", help="Write a row per frame.")
+@click.option("--markdown", type=options.FILE, metavar="FILE|-", help="Write a table of the means.")
+@click.option("--latex", type=options.FILE, metavar="FILE|-", help="Write a tabular of the means.")
 @click.option(
     "--html",
     type=options.FILE,
     metavar="FOLDER",
-    help="A report to open in a browser: every frame beside its truth, the worst first.",
+    help="Write an HTML report: every frame beside its ground truth, the worst first.",
 )
 @options.overwrite
 @options.as_json
@@ -86,7 +131,7 @@ def evaluate(
     as_json: bool,
     **given: Any,
 ) -> None:
-    """Score the depth PRED against the ground truth GT: two files, or two folders.
+    """Score the depth in PRED against the ground truth in GT: two files, or two folders.
 
     \b
     pnpdepth eval pred.png gt.png
@@ -94,16 +139,16 @@ def evaluate(
     pnpdepth eval out/ gt/ --sparse sparse/ --json > runs/a.json
     pnpdepth eval out/ gt/ --protocol eigen --max-depth 50 --average pooled
 
-    Folders are matched by name; x_depth.png belongs to x.png. GT can also be a data set of a known
-    layout. Frames of GT without a prediction are counted, and end the command with code 7. What a
-    protocol sets, the options change one by one.
+    Files in folders are matched by name; x_depth.png belongs to x.png. GT can also be a data set in
+    a known layout. Frames of GT without a prediction are counted, and the exit code is 7. Options
+    override single settings of the protocol.
 
     \b
-    paper         all known truth; mean over the images
-    nyu           truth in 0.001–10 m, predictions clipped to it, Eigen's crop of 640×480
-    kitti         the completion benchmark's measures in its units
-    kitti-devkit  the figures of KITTI's development kit: missing depth filled in, metres, 1/m
-    eigen, garg   truth in 0.001–80 m, predictions clipped to it, Eigen's or Garg's crop
+    paper         all known ground truth; mean over images
+    nyu           0.001–10 m, predictions clipped to it, Eigen's crop of 640×480
+    kitti         measures and units of the KITTI depth completion benchmark
+    kitti-devkit  figures of KITTI's development kit: missing depth filled in, metres, 1/m
+    eigen, garg   0.001–80 m, predictions clipped to it, Eigen's or Garg's crop
     """
     from pnpdepth_cli.cli import score_tables
     from pnpdepth_cli.pipeline.evaluation import score_files
@@ -131,7 +176,7 @@ def evaluate(
     elif not to_stdout:
         score_tables.print_evaluation(evaluation)
     if html is not None:
-        with _bar("report") as show:
+        with progress_bar("report", "frame") as show:
             report_eval.write_eval_report(html, evaluation, on_frame=show)
         click.echo(printable(f"wrote {html / 'index.html'}"), err=True)
     unscored = evaluation.unscored()
@@ -154,9 +199,10 @@ def _evaluate(
     workers: int,
     delta: str | None,
     exclude_sparse: bool,
+    no_groups: bool,
     **changes: Any,
 ) -> Evaluation:
-    """The evaluation, with a bar over the frames where it takes longer than a second."""
+    """Runs the evaluation with a progress bar."""
     from pnpdepth_cli.pipeline.evaluation.evaluate import evaluate
     from pnpdepth_cli.pipeline.evaluation.frame_reading import Scales
     from pnpdepth_cli.pipeline.evaluation.result import EvalRequest
@@ -164,40 +210,31 @@ def _evaluate(
     changes |= {"thresholds": _thresholds(delta), "exclude_sparse": exclude_sparse or None}
     request = EvalRequest(
         prediction=prediction,
-        truth=truth,
+        ground_truth=truth,
         sparse=sparse,
         protocol=protocol,
         changes=changes,
-        scales=Scales(prediction=pred_scale, truth=gt_scale, sparse=sparse_scale, channel=channel),
+        scales=Scales(
+            prediction=pred_scale, ground_truth=gt_scale, sparse=sparse_scale, channel=channel
+        ),
         resamples=resamples,
         seed=seed,
+        grouped=not no_groups,
         workers=workers,
     )
-    with _bar("eval") as show:
+    with progress_bar("eval", "frame") as show:
         return evaluate(request, on_frame=show)
 
 
-@contextmanager
-def _bar(title: str) -> Iterator[Callable[[int, int], None]]:
-    """Inside, the function that is told (done, of) draws a bar if it takes more than a second."""
-    from tqdm import tqdm
-
-    with tqdm(desc=title, unit="frame", delay=1, leave=False, disable=None) as bar:
-
-        def show(done: int, of: int) -> None:
-            bar.total = of
-            bar.update(done - bar.n)
-
-        yield show
-
-
 def _thresholds(text: str | None) -> tuple[float, float, float] | None:
-    """Of δ1…3, from one number that is raised to powers or from all three."""
+    """Returns the thresholds of δ1…δ3 from one number, which is raised to powers, or from three."""
     if text is None:
         return None
     try:
         first, *others = (float(word) for word in text.split(","))
         second, third = others or (first**2, first**3)
     except (ValueError, OverflowError):
-        raise UsageError(f"--delta {text!r} is neither a number such as 1.25 nor three") from None
+        raise UsageError(
+            f"--delta {text!r} is neither one number such as 1.25 nor three numbers"
+        ) from None
     return first, second, third

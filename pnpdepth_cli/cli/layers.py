@@ -10,15 +10,20 @@ from typing import Any
 import click
 
 from pnpdepth_cli.cli import options
+from pnpdepth_cli.cli.progress import progress_bar
 
 
 @click.command(short_help="List the layers a network can be cut at.")
 @options.model
 @options.checkpoint
-@click.option("--all", "every", is_flag=True, help="Every submodule, not the definition's choice.")
-@click.option("--size", metavar="HxW", help="Of the frame to measure with.")
 @click.option(
-    "--sparse", type=options.FILE, help="Rank the layers for sparse depth as dense as this map."
+    "--all", "every", is_flag=True, help="List every submodule, not only the definition's."
+)
+@click.option("--size", metavar="HxW", help="Size of the frame to measure with.")
+@click.option(
+    "--sparse",
+    type=options.FILE,
+    help="Rank the layers for the point density of this sparse depth.",
 )
 @options.device
 @options.as_json
@@ -33,20 +38,13 @@ def layers(
 ) -> None:
     """List the layers a network can be cut at.
 
-    Shape of z and its stride, the share of the network's cost behind the cut (what every update
-    repeats), and the influential field of one sparse point: in z, and in the depth map.
+    For each layer: shape and stride of z, the fraction of the network's cost behind the cut (which
+    every update repeats), and the influential field of one sparse point in z and in the depth map.
     """
-    from tqdm import tqdm
-
     from pnpdepth_cli.pipeline.networks.layers import list_layers
 
-    with tqdm(desc="layers", unit="layer", leave=False, delay=1) as bar:
-
-        def show(done: int, of: int) -> None:
-            bar.total = of
-            bar.update(done - bar.n)
-
-        found = list_layers(
+    with progress_bar("layers", "layer") as show:
+        result = list_layers(
             model,
             checkpoint,
             device,
@@ -56,13 +54,13 @@ def layers(
             on_layer=show,
         )
     if as_json:
-        click.echo(json.dumps([asdict(row) for row in found.rows], indent=2))
+        click.echo(json.dumps([asdict(row) for row in result.rows], indent=2))
         return
     from pnpdepth_cli.cli.tables import print_rows
 
-    apart = "" if found.spacing is None else f", points {found.spacing:.3g} pixels apart"
+    spacing = "" if result.spacing is None else f", points {result.spacing:.3g} pixels apart"
     print_rows(
-        f"layers of {model}{apart}",
+        f"layers of {model}{spacing}",
         (
             "layer",
             "z",
@@ -74,7 +72,7 @@ def layers(
             "field\nin depth",
             "rank",
         ),
-        [_cells(asdict(row)) for row in found.rows],
+        [_cells(asdict(row)) for row in result.rows],
     )
 
 

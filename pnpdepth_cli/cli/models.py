@@ -1,4 +1,4 @@
-"""`pnpdepth models`."""
+"""`pnpdepth models` and its subcommands."""
 
 from __future__ import annotations
 
@@ -13,86 +13,62 @@ import click
 
 from pnpdepth_cli.cli import options
 from pnpdepth_cli.cli.printable import printable
-from pnpdepth_cli.errors import UsageError
+
+_OLD_FLAGS = {"--check": 1, "--convert": 2, "--fetch": 1}
+"""Flags of version 0.1 that became subcommands, with their numbers of values."""
 
 
-@click.command(short_help="List the networks that can be named; check, convert or fetch one.")
-@click.option("--check", metavar="NAME|FILE|FOLDER", help="Load a network, run it, cut it.")
-@click.option("--image", type=options.FILE, help="For --check: a picture to run it on.")
-@options.checkpoint
-@click.option(
-    "--convert",
-    type=(options.FILE, options.FILE),
-    metavar="IN OUT",
-    help="Take the tensors of a published checkpoint out, as OUT.safetensors.",
-)
-@click.option("--fetch", metavar="ORG/NAME", help="Download a network from Hugging Face.")
-@click.option("--revision", metavar="REV", help="For --fetch: a branch, tag or commit.")
-@click.option("-o", "--output", type=options.FILE, help="For --fetch: the folder.")
-@click.option("--all", "every", is_flag=True, help="List every variant of a network.")
-@options.overwrite
-@options.device
-@options.as_json
-def models(
-    check: str | None,
-    convert: tuple[Path, Path] | None,
-    fetch: str | None,
-    every: bool,
-    as_json: bool,
-    **given: Any,
-) -> None:
-    """List the networks that can be named: what they take, and their defaults.
+class _Models(click.Group):
+    """Lists the networks where no subcommand is named, and takes the flags of version 0.1."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        return super().parse_args(ctx, _with_subcommand(args))
+
+
+def _with_subcommand(args: list[str]) -> list[str]:
+    """Returns the arguments, beginning with a subcommand unless they ask for help."""
+    if args and (not args[0].startswith("-") or args[0] in ("-h", "--help")):
+        return args
+    words = [part for word in args for part in _split_flag(word)]
+    for flag, count in _OLD_FLAGS.items():
+        if flag in words:
+            start = words.index(flag)
+            values = words[start + 1 : start + 1 + count]
+            name = flag.removeprefix("--")
+            click.echo(
+                f"pnpdepth: `models {flag}` is now `models {name}`; the old form will be removed",
+                err=True,
+            )
+            return [name, *words[:start], *words[start + 1 + count :], "--", *values]
+    return ["list", *args]
+
+
+def _split_flag(word: str) -> list[str]:
+    flag, equals, value = word.partition("=")
+    return [flag, value] if equals and flag in _OLD_FLAGS else [word]
+
+
+@click.group(short_help="List, check, convert or fetch networks.", cls=_Models)
+def models() -> None:
+    """List, check, convert or fetch networks; without a subcommand, list them.
 
     \b
-    pnpdepth models --check net.onnx --image img.png
-    pnpdepth models --convert model_best.pth.tar weights.safetensors
-    pnpdepth models --fetch depth-anything/Depth-Anything-V2-Small-hf
-
-    --convert runs nothing that is in the file. --fetch is the only thing in this program that
-    uses the network.
+    pnpdepth models
+    pnpdepth models check net.onnx --image img.png
+    pnpdepth models convert model_best.pth.tar weights.safetensors
+    pnpdepth models fetch depth-anything/Depth-Anything-V2-Small-hf
     """
-    if sum(task is not None for task in (check, convert, fetch)) > 1:
-        raise UsageError("--check, --convert and --fetch are three tasks; give one")
-    if check is not None:
-        from pnpdepth_cli.pipeline.networks.check import check_model
-
-        checked = check_model(check, given["checkpoint"], given["image"], given["device"])
-        _show(asdict(checked), as_json)
-    elif convert is not None:
-        from pnpdepth_cli.pipeline.networks.convert import convert_checkpoint
-
-        _show(asdict(convert_checkpoint(*convert, overwrite=given["overwrite"])), as_json)
-    elif fetch is not None:
-        from pnpdepth_cli.pipeline.networks.fetch import fetch_model
-
-        _show(asdict(fetch_model(fetch, given["revision"], given["output"])), as_json)
-    else:
-        _list(every, as_json)
 
 
-def _show(found: Mapping[str, Any], as_json: bool) -> None:
-    if as_json:
-        click.echo(json.dumps(found, indent=2))
-        return
-    for key, value in found.items():
-        if key == "notes":
-            for note in value:
-                click.echo(printable(note), err=True)
-        elif isinstance(value, dict):
-            click.echo(f"{key}:")
-            for name, text in value.items():
-                click.echo(f"  {name}: {text}")
-        elif isinstance(value, list):
-            click.echo(f"{key}: {' '.join(map(str, value))}")
-        else:
-            click.echo(f"{key}: {value}")
-
-
-def _list(every: bool, as_json: bool) -> None:
+@models.command(name="list", short_help="List the networks that --model takes by name.")
+@click.option("--all", "every", is_flag=True, help="List every variant of a network.")
+@options.as_json
+def list_command(every: bool, as_json: bool) -> None:
+    """List the networks that --model takes by name, with their inputs, outputs and defaults."""
     from pnpdepth_cli.pipeline.networks.list_models import list_models
 
     listed = [asdict(model) for model in list_models()]
-    left_out = Counter(model["family"] for model in listed if model["variant"] and not every)
+    hidden = Counter(model["family"] for model in listed if model["variant"] and not every)
     if as_json:
         click.echo(json.dumps(listed, indent=2))
         return
@@ -116,5 +92,65 @@ def _list(every: bool, as_json: bool) -> None:
             if every or not model["variant"]
         ],
     )
-    for family, count in left_out.items():
+    for family, count in hidden.items():
         click.echo(f"{family}: {count} more; --all lists them", err=True)
+
+
+@models.command(short_help="Load a network, run it and cut it at its layers.")
+@click.argument("network", metavar="NAME|FILE|FOLDER")
+@click.option("--image", type=options.FILE, help="Image to run the network on.")
+@options.checkpoint
+@options.device
+@options.as_json
+def check(
+    network: str, image: Path | None, checkpoint: Path | None, device: str, as_json: bool
+) -> None:
+    """Load a network, run it, and cut it at its layers.
+
+    A .py file is Python code and is run.
+    """
+    from pnpdepth_cli.pipeline.networks.check import check_model
+
+    _print(asdict(check_model(network, checkpoint, image, device)), as_json)
+
+
+@models.command(short_help="Extract the tensors of a checkpoint.")
+@click.argument("source", type=options.FILE, metavar="IN")
+@click.argument("target", type=options.FILE, metavar="OUT.safetensors")
+@options.overwrite
+@options.as_json
+def convert(source: Path, target: Path, overwrite: bool, as_json: bool) -> None:
+    """Write the tensors of the checkpoint IN to OUT.safetensors. No code in IN is run."""
+    from pnpdepth_cli.pipeline.networks.convert import convert_checkpoint
+
+    _print(asdict(convert_checkpoint(source, target, overwrite=overwrite)), as_json)
+
+
+@models.command(short_help="Download a network from Hugging Face.")
+@click.argument("repository", metavar="ORG/NAME")
+@click.option("--revision", metavar="REV", help="Branch, tag or commit.")
+@click.option("-o", "--output", type=options.FILE, help="Output folder.  [default: ./NAME]")
+@options.as_json
+def fetch(repository: str, revision: str | None, output: Path | None, as_json: bool) -> None:
+    """Download a network from Hugging Face. No other command uses the internet."""
+    from pnpdepth_cli.pipeline.networks.fetch import fetch_model
+
+    _print(asdict(fetch_model(repository, revision, output)), as_json)
+
+
+def _print(record: Mapping[str, Any], as_json: bool) -> None:
+    if as_json:
+        click.echo(json.dumps(record, indent=2))
+        return
+    for key, value in record.items():
+        if key == "notes":
+            for note in value:
+                click.echo(printable(note), err=True)
+        elif isinstance(value, dict):
+            click.echo(f"{key}:")
+            for name, text in value.items():
+                click.echo(f"  {name}: {text}")
+        elif isinstance(value, list):
+            click.echo(f"{key}: {' '.join(map(str, value))}")
+        else:
+            click.echo(f"{key}: {value}")

@@ -2,112 +2,142 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Any
 
 import click
 
 from pnpdepth_cli.errors import UsageError
+from pnpdepth_cli.pipeline.options import OptionField, options_of
+from pnpdepth_cli.pipeline.refinement import request
+from pnpdepth_cli.pipeline.refinement.request import (
+    LARGEST_SEED,
+    FrameFiles,
+    HoldOut,
+    MethodOptions,
+    NetworkChoice,
+    OutputOptions,
+    RefineRequest,
+)
 
 FILE = click.Path(path_type=Path)
-SEED = click.IntRange(0, 2**32 - 1)
-
-model = click.option(
-    "--model",
-    default="compact",
-    show_default=True,
-    metavar="NAME|FILE|FOLDER",
-    help="A network that `pnpdepth models` lists; FILE.py[:ATTR] with a definition or a torch"
-    " module; FILE.onnx[:OUTPUT]; FILE.pt2; or a Hugging Face folder.",
-)
-checkpoint = click.option(
-    "--checkpoint",
-    type=FILE,
-    help="Its weights: .safetensors, a torch, numpy or TensorFlow (.index) file, or a folder with"
-    " one file per part; nothing in them is run.",
-)
-layer = click.option(
-    "--layer",
-    metavar="NAME|0..1",
-    help="Where to cut: a submodule's name (NAME#2 its second call, NAME[KEY] one of several"
-    " outputs), or a share of the definition's layers, 0 the shallowest.",
-)
-ALIGNMENTS = ("none", "median", "scale", "affine", "auto")
-OUTPUT_KINDS = ("depth", "inverse", "log")
-NORMALISATIONS = ("unit", "imagenet", "symmetric", "bytes")
-
-_READING_OPTIONS = (
-    click.option(
-        "--align",
-        type=click.Choice(ALIGNMENTS),
-        help="Fit the network's output to the points: a factor, or a factor and a shift."
-        "  [default: the network's own; none where it gives metres]",
-    ),
-    click.option("--align-every", is_flag=True, help="Fit again at every update of z."),
-    click.option(
-        "--output-kind",
-        type=click.Choice(OUTPUT_KINDS),
-        help="What the network's output is, over what is known of it.",
-    ),
-    click.option(
-        "--normalise",
-        type=click.Choice(NORMALISATIONS),
-        help="The rgb that the network wants: 0…1, ImageNet's, −1…1, 0…255.",
-    ),
-)
+SEED = click.IntRange(0, LARGEST_SEED)
 
 
-def reading(command: Callable[..., Any]) -> Callable[..., Any]:
-    """The command has the options of how a network's input and output are to be read."""
-    for option in reversed(_READING_OPTIONS):
-        command = option(command)
-    return command
+class Renamed(click.Option):
+    """An option whose former spelling is still accepted and not shown in the help."""
+
+    def __init__(self, *args: Any, alias: str, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self.alias = alias
+
+    def add_to_parser(self, parser: Any, ctx: click.Context) -> None:
+        """Adds both spellings."""
+        super().add_to_parser(parser, ctx)
+        parser.add_option(obj=self, opts=[self.alias], dest=self.name, action="store")
 
 
-device = click.option("--device", default="cpu", show_default=True, help="cpu, cuda, cuda:1, mps …")
-PRECISIONS = ("fp32", "bf16", "fp16")
-precision = click.option(
-    "--precision",
-    type=click.Choice(PRECISIONS),
-    default="fp32",
-    show_default=True,
-    help="Of the network's convolutions and matrix products; z, loss and updates stay in fp32.",
-)
+def click_option(each: OptionField) -> Callable[[Any], Any]:
+    """Returns the click option of a field of a request."""
+    option = each.option
+    details: dict[str, Any] = {}
+    if each.type == "bool":
+        details["is_flag"] = True
+    else:
+        details["type"] = _type_of(each)
+    if option.show_default:
+        details["show_default"] = True
+    if option.alias is not None:
+        details |= {"cls": Renamed, "alias": option.alias}
+    return click.option(
+        each.flag,
+        each.name,
+        default=each.default,
+        metavar=option.metavar,
+        help=option.help,
+        **details,
+    )
+
+
+def _type_of(each: OptionField) -> Any:
+    option = each.option
+    if option.choices is not None:
+        return click.Choice(list(option.choices))
+    if option.parse is not None:
+        return option.parse
+    if option.least is not None or option.most is not None:
+        return click.IntRange(option.least, option.most)
+    return {"int": int, "float": float, "str": str, "Path": FILE}[each.type]
+
+
+def options_of_groups(
+    *groups: type, without: Collection[str] = ()
+) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """Returns a decorator that adds the options of these groups of a request to a command.
+
+    Args:
+        *groups: Dataclasses of `pnpdepth_cli.pipeline.refinement.request`.
+        without: Names of fields that are left out.
+    """
+
+    def decorate(command: Callable[..., Any]) -> Callable[..., Any]:
+        wanted = [each for group in groups for each in options_of(group)]
+        for each in reversed(wanted):
+            if each.name not in without:
+                command = click_option(each)(command)
+        return command
+
+    return decorate
+
+
+refinement = options_of_groups(FrameFiles, NetworkChoice, MethodOptions, HoldOut, OutputOptions)
+"""The options of how a frame is refined, named as the fields of a `RefineRequest`."""
+
+
+def _only(group: type, name: str) -> Callable[[Any], Any]:
+    return click_option(next(each for each in options_of(group) if each.name == name))
+
+
+model = _only(NetworkChoice, "model")
+checkpoint = _only(NetworkChoice, "checkpoint")
+precision = _only(NetworkChoice, "precision")
+device = _only(NetworkChoice, "device")
+layer = _only(MethodOptions, "layer")
+depth_scale = _only(FrameFiles, "depth_scale")
+channel = _only(FrameFiles, "channel")
+seed = _only(HoldOut, "seed")
+overwrite = _only(OutputOptions, "overwrite")
 as_json = click.option("--json", "as_json", is_flag=True, help="Print the result as JSON.")
-overwrite = click.option("--overwrite", is_flag=True, help="Replace results that exist.")
-depth_scale = click.option(
-    "--depth-scale",
-    type=float,
-    metavar="S",
-    help="Integer depth files hold metres × S.  [default: what the file says, else 256]",
-)
-channel = click.option(
-    "--channel", metavar="NAME", help="Which EXR channel or NPZ array holds the depth."
-)
 output_scale = click.option(
     "--output-scale",
     type=float,
     default=256.0,
     show_default=True,
     metavar="S",
-    help="A PNG holds metres × S.",
+    help="A written PNG holds metres × S.",
 )
 sparse_output = click.option(
     "-o",
     "--output",
     type=FILE,
     required=True,
-    help="Sparse depth: PNG, EXR, NPY, NPZ, PFM, TIFF; or CSV, points x y depth.",
+    help="Sparse depth file: PNG, EXR, NPY, NPZ, PFM or TIFF map, or CSV rows x y depth.",
 )
 camera = click.option(
-    "--camera", type=int, metavar="N", help="Of KITTI's four, 0 to 3.  [default: 2]"
+    "--camera", type=int, metavar="N", help="KITTI camera number, 0 to 3.  [default: 2]"
 )
 euclidean = click.option(
-    "--range", "euclidean", is_flag=True, help="Depth is the distance from the camera, not z."
+    "--range",
+    "euclidean",
+    is_flag=True,
+    help="Depth is the distance from the camera, not z.",
 )
 max_range = click.option(
-    "--max-range", type=float, metavar="M", help="Drop points farther from the scanner, metres."
+    "--max-range",
+    type=float,
+    metavar="M",
+    help="Drop points farther than M metres.",
 )
 
 _SCAN_OPTIONS = (
@@ -115,31 +145,35 @@ _SCAN_OPTIONS = (
         "--calib",
         type=FILE,
         metavar="FILE|FOLDER",
-        help="For a LiDAR scan: KITTI's calibration, its raw folder, or a file with K, R and t.",
+        help="Calibration of a LiDAR scan: a KITTI file or raw folder, or a file with K, R, t.",
     ),
     camera,
     euclidean,
     click.option(
         "--keep-occluded",
         is_flag=True,
-        help="Keep a scan's points that the camera sees something nearer in front of.",
+        help="Keep scan points that are occluded from the camera.",
     ),
     click.option(
-        "--min-range", type=float, default=0.0, metavar="M", help="Drop nearer points of a scan."
+        "--min-range",
+        type=float,
+        default=0.0,
+        metavar="M",
+        help="Drop points nearer than M metres.",
     ),
     max_range,
 )
 
 
 def scan(command: Callable[..., Any]) -> Callable[..., Any]:
-    """The command has the options of a LiDAR scan; `scan_given` takes them out of the rest."""
+    """Adds the options of a LiDAR scan; `scan_given` separates them from the others."""
     for option in reversed(_SCAN_OPTIONS):
         command = option(command)
     return command
 
 
 def scan_given(given: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """(the options of a LiDAR scan, the others) of what the user gave."""
+    """Returns (the options of a LiDAR scan, the others)."""
     names = ("calib", "camera", "euclidean", "keep_occluded", "min_range", "max_range")
     return (
         {name: given[name] for name in names},
@@ -147,144 +181,21 @@ def scan_given(given: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
     )
 
 
-LOSSES = ("l1", "l2", "huber", "berhu", "inverse", "log", "cauchy")
-UPDATES = ("sign", "sgd", "normalised", "momentum", "adam", "lbfgs")
-SCHEDULES = ("constant", "linear")
-PARAMETERS = ("elements", "channels")
-PROPAGATIONS = ("none", "gp", "diffusion")
-FORMATS = ("png", "exr", "npy", "npz", "pfm", "tiff")
+def request_of(given: dict[str, Any], **others: Any) -> RefineRequest:
+    """Returns the request that these options of a command make.
 
+    Args:
+        given: Values of the options of `scan` and `options_of_groups`, by their names.
+        **others: Other fields of the request.
+    """
+    from pnpdepth_cli.pipeline.sparse.scans import ScanOptions
 
-def _seconds(context: click.Context, parameter: click.Parameter, text: str | None) -> float | None:
-    """The seconds of `5`, `5s` or `500ms`. UsageError for any other text."""
-    if text is None:
-        return None
-    number, unit = (text[:-2], 1e-3) if text.endswith("ms") else (text.removesuffix("s"), 1.0)
-    try:
-        seconds = float(number) * unit
-    except ValueError:
-        seconds = -1.0
-    if not 0 < seconds < float("inf"):
-        raise UsageError(f"time budget {text!r} is no time; give seconds, such as 5s")
-    return seconds
-
-
-_REFINEMENT_OPTIONS = (
-    click.option(
-        "--format",
-        type=click.Choice(FORMATS),
-        default="png",
-        show_default=True,
-        help="Of the depth file in a folder.",
-    ),
-    overwrite,
-    model,
-    checkpoint,
-    layer,
-    click.option(
-        "--iterations", type=int, metavar="K", help="Updates of z; 0 gives the plain prediction."
-    ),
-    click.option(
-        "--lr", metavar="NUMBER|P%", help="Step: absolute, or per cent of z's standard deviation."
-    ),
-    click.option("--loss", type=click.Choice(LOSSES), help="Between prediction and sparse points."),
-    click.option(
-        "--update",
-        type=click.Choice(UPDATES),
-        help="From gradient to step; one that is not the network's default starts from the paper's"
-        " --lr, --schedule and --spread.",
-    ),
-    click.option(
-        "--schedule", type=click.Choice(SCHEDULES), help="Of the step: it stays, or falls to 0."
-    ),
-    click.option(
-        "--spread",
-        type=float,
-        metavar="S",
-        help="Blur the gradient over S spacings of the points, where z is a map; 0 does not.",
-    ),
-    click.option(
-        "--parameters",
-        type=click.Choice(PARAMETERS),
-        default="elements",
-        show_default=True,
-        help="What is updated: every element of z, or a scale and a shift of each channel.",
-    ),
-    click.option(
-        "--anchor",
-        type=float,
-        default=0.0,
-        metavar="W",
-        help="Add to the loss W times the mean squared change of log depth: stay near the network.",
-    ),
-    click.option(
-        "--line-search", is_flag=True, help="Take back updates that raise the loss; go half as far."
-    ),
-    click.option(
-        "--keep-best", is_flag=True, help="Give the depth of the lowest loss, not the last."
-    ),
-    click.option(
-        "--propagate",
-        type=click.Choice(PROPAGATIONS),
-        help="Spread what is left at the points: by a Gaussian process, or by diffusion that stops"
-        " at edges.  [default: none; with --auto what is best]",
-    ),
-    click.option(
-        "--auto",
-        is_flag=True,
-        help="Choose alignment, updates and propagation, or a baseline, by points held out in"
-        " turns; never worse at those than the network and every baseline.",
-    ),
-    click.option(
-        "--time-budget",
-        "time_budget_s",
-        metavar="SECONDS",
-        callback=_seconds,
-        help="With --auto: try more layers and steps for so long, such as 5s.",
-    ),
-    click.option(
-        "--baselines", is_flag=True, help="Score every simple baseline beside the result."
-    ),
-    click.option(
-        "--uncertainty",
-        is_flag=True,
-        help="Write <name>_sigma.exr, the depth's standard deviation.",
-    ),
-    reading,
-    depth_scale,
-    click.option("--gt-scale", type=float, metavar="S", help="The same for the ground truth."),
-    channel,
-    click.option(
-        "--sparse-size-ok", is_flag=True, help="Map points of a sparse map of another size."
-    ),
-    click.option(
-        "--holdout",
-        type=float,
-        default=0.0,
-        metavar="F",
-        help="Keep this share of the points out, and score them.",
-    ),
-    click.option("--seed", type=SEED, default=0, show_default=True, help="Of the hold-out choice."),
-    click.option(
-        "--tile",
-        type=click.IntRange(min=64),
-        metavar="PIXELS",
-        help="Refine a frame larger than that in tiles of this side, where memory is short.",
-    ),
-    precision,
-    device,
-)
-
-
-def refinement(command: Callable[..., Any]) -> Callable[..., Any]:
-    """The command has the options of how a frame is refined; they are named as in RefineRequest."""
-    for option in reversed(_REFINEMENT_OPTIONS):
-        command = option(command)
-    return command
+    scan_options, rest = scan_given(given)
+    return RefineRequest.from_fields(scan=ScanOptions(**scan_options), **rest, **others)
 
 
 def height_and_width(text: str) -> tuple[int, int]:
-    """(H, W) of a text such as 480x640. UsageError for any other."""
+    """Returns (H, W) from a text such as 480x640. Raises UsageError for any other text."""
     height, x, width = text.lower().partition("x")
     if not (x and height.isdecimal() and width.isdecimal() and int(height) and int(width)):
         raise UsageError(f"size {text!r} is not of the form HxW, such as 480x640")
@@ -292,7 +203,5 @@ def height_and_width(text: str) -> tuple[int, int]:
 
 
 def count_or_share(text: str | None) -> tuple[int | None, float | None]:
-    """(points, share) of `500` or `5%`; None for what it is not. UsageError for any other text."""
-    from pnpdepth_cli.pipeline.refinement import request
-
+    """Returns (count, None) for `500`, (None, fraction) for `5%`. Raises UsageError otherwise."""
     return (None, None) if text is None else request.count_or_share(text)

@@ -1,10 +1,11 @@
-"""How far a batch is: a bar on a terminal, a line a minute elsewhere."""
+"""Progress bars: drawn on a terminal only; a batch prints a line per minute elsewhere."""
 
 from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
@@ -16,10 +17,43 @@ if TYPE_CHECKING:
     from tqdm import tqdm
 
 _LINE_EVERY_S = 60.0
+_SHOWN_AFTER_S = 1.0
+
+
+def open_bar(title: str, unit: str, **settings: Any) -> tqdm[Any]:
+    """Returns a bar on stderr, which stays hidden where that is not a terminal."""
+    from tqdm import tqdm
+
+    return tqdm(desc=title, unit=unit, disable=None, dynamic_ncols=True, **settings)
+
+
+@contextmanager
+def progress_bar(title: str, unit: str) -> Iterator[Callable[..., None]]:
+    """Yields `show(done, total, text="")`, which draws a bar for work of more than a second.
+
+    The time counts from the first call of `show`.
+    """
+    bar: tqdm[Any] | None = None
+
+    def show(done: int, total: int, text: str = "") -> None:
+        nonlocal bar
+        if bar is None:
+            bar = open_bar(title, unit, total=total, leave=False, delay=_SHOWN_AFTER_S)
+        bar.set_postfix_str(text, refresh=False)
+        bar.update(done - bar.n)
+
+    try:
+        yield show
+    finally:
+        if bar is not None:
+            bar.close()
 
 
 class BatchProgress:
-    """Tells on stderr what happens; done, failed, to_do: how many frames, or what `unit` says."""
+    """Progress of a run over frames on stderr.
+
+    `done`, `failed` and `to_do` are numbers of frames, or of what `unit` names.
+    """
 
     def __init__(self, name: str = "batch", unit: str = "frame") -> None:
         self._name, self._unit = name, unit
@@ -39,7 +73,7 @@ class BatchProgress:
             self._bar.close()
 
     def say(self, text: str) -> None:
-        """A line on stderr, above the bar."""
+        """Prints a line on stderr, above the bar."""
         line = printable(text)
         if self._bar is None:
             click.echo(line, err=True)
@@ -47,31 +81,29 @@ class BatchProgress:
             self._bar.write(line, file=sys.stderr)
 
     def begin(self, to_do: int) -> None:
-        """So many frames are to be done from now on."""
+        """Starts counting; `to_do` frames follow."""
         self.to_do = to_do
-        self._began = self._told = time.monotonic()
+        self._began = self._printed_at = time.monotonic()
         if sys.stderr.isatty():
-            from tqdm import tqdm
-
-            self._bar = tqdm(total=to_do, desc=self._name, unit=self._unit, dynamic_ncols=True)
+            self._bar = open_bar(self._name, self._unit, total=to_do)
 
     def frame(self, row: Mapping[str, Any]) -> None:
-        """One of them is done, or has failed."""
+        """Counts a frame, and prints why it failed if it did."""
         if row["status"] != "done":
             self.say(f"{row['status']}: {row['name']}: {row['message']}")
         self.advance(failed=row["status"] == "failed")
 
     def advance(self, *, failed: bool) -> None:
-        """One more is done."""
+        """Counts one more."""
         self.done += 1
         self.failed += failed
         if self._bar is not None:
             self._bar.update()
             if self.failed:
                 self._bar.set_postfix_str(f"{self.failed:,} failed")
-        elif time.monotonic() - self._told >= _LINE_EVERY_S:
-            self._told = time.monotonic()
-            self.say(self._line(self._told - self._began))
+        elif time.monotonic() - self._printed_at >= _LINE_EVERY_S:
+            self._printed_at = time.monotonic()
+            self.say(self._line(self._printed_at - self._began))
 
     def _line(self, spent_s: float) -> str:
         rate = self.done / spent_s

@@ -11,14 +11,14 @@ import click
 from pnpdepth_cli.cli import options
 
 
-@click.command(short_help="Project a LiDAR scan into a camera's picture.")
+@click.command(short_help="Project a LiDAR scan into a camera image.")
 @click.argument("scan", type=options.FILE)
 @options.scan
-@click.option("--image", type=options.FILE, help="The picture; says the size, and is drawn on.")
-@click.option("--size", metavar="HxW", help="Of the picture, instead of --image.")
+@click.option("--image", type=options.FILE, help="Camera image: gives the size, and is drawn on.")
+@click.option("--size", metavar="HxW", help="Size of the image, instead of --image.")
 @options.sparse_output
 @options.output_scale
-@click.option("--overlay", type=options.FILE, help="Also a PNG of the points on the image.")
+@click.option("--overlay", type=options.FILE, help="Also write a PNG of the points on the image.")
 @options.overwrite
 @options.as_json
 def project(
@@ -32,14 +32,14 @@ def project(
     as_json: bool,
     **given: Any,
 ) -> None:
-    """Make sparse depth of a LiDAR SCAN: BIN (KITTI), NPY, PCD or PLY.
+    """Project a LiDAR SCAN (KITTI's BIN, NPY, PCD or PLY) to a sparse depth map.
 
     \b
     pnpdepth project 000001.bin --calib 000001.txt --image 000001.png -o sparse.png
     pnpdepth project 0000000005.bin --calib 2011_09_26/ --camera 3 -o sparse.exr
 
-    Points behind the camera, outside the picture, behind another in their pixel, or hidden by
-    foreground are dropped, and counted. Beside the output, a JSON file says how it was made.
+    Points behind the camera, outside the image, behind another point in their pixel, or occluded by
+    the foreground are dropped and counted. A JSON file beside the output records the settings.
     """
     from pnpdepth_cli.cli.tables import print_sparse
     from pnpdepth_cli.pipeline.sparse.outputs import SparseTarget

@@ -13,28 +13,40 @@ from pnpdepth_cli.errors import UsageError
 PATTERNS = ("uniform", "bernoulli", "grid", "lines", "features", "edges", "region")
 
 
-@click.command(short_help="Make sparse depth out of dense depth.")
+@click.command(short_help="Sample sparse depth from dense depth.")
 @click.argument("depth", type=options.FILE)
 @click.option("--pattern", type=click.Choice(PATTERNS), default="uniform", show_default=True)
 @click.option(
-    "--count", metavar="N|P%", help="Points, or per cent of the known pixels; lines of `lines`."
+    "--count", metavar="N|P%", help="Number of points (of lines for `lines`), or % of known pixels."
 )
-@click.option("--region", metavar="X,Y,W,H", help="The rectangle of the pattern `region`, pixels.")
-@click.option("--image", type=options.FILE, help="Of the same view, for `features` and `edges`.")
+@click.option("--region", metavar="X,Y,W,H", help="Rectangle of the pattern `region`.")
+@click.option("--image", type=options.FILE, help="Image for `features` and `edges`.")
 @click.option(
-    "--seed", type=options.SEED, default=0, show_default=True, help="Of everything random."
+    "--seed", type=options.SEED, default=0, show_default=True, metavar="N", help="Random seed."
 )
-@click.option("--noise", type=float, default=0.0, metavar="M", help="Gaussian, metres.")
-@click.option("--relative-noise", type=float, default=0.0, metavar="F", help="Share of the depth.")
+@click.option("--noise", type=float, default=0.0, metavar="M", help="Gaussian noise, metres.")
 @click.option(
-    "--outliers", type=float, default=0.0, metavar="F", help="Share of points of random depth."
+    "--relative-noise",
+    type=float,
+    default=0.0,
+    metavar="F",
+    help="Gaussian noise, as a fraction of the depth.",
 )
-@click.option("--jitter", type=float, default=0.0, metavar="PX", help="Of the points' places.")
+@click.option(
+    "--outliers", type=float, default=0.0, metavar="F", help="Fraction of points of random depth."
+)
+@click.option(
+    "--jitter",
+    type=float,
+    default=0.0,
+    metavar="PX",
+    help="Gaussian noise of the pixel coordinates.",
+)
 @options.depth_scale
 @options.channel
 @options.sparse_output
 @options.output_scale
-@click.option("--overlay", type=options.FILE, help="Also a PNG of the points on --image.")
+@click.option("--overlay", type=options.FILE, help="Also write a PNG of the points on --image.")
 @options.overwrite
 @options.as_json
 def sample(
@@ -56,7 +68,7 @@ def sample(
     overwrite: bool,
     as_json: bool,
 ) -> None:
-    """Make sparse depth out of the dense DEPTH.
+    """Sample sparse depth from the dense DEPTH.
 
     \b
     pnpdepth sample gt.png --pattern uniform --count 500 --seed 1 -o sparse.png
@@ -64,21 +76,21 @@ def sample(
     pnpdepth sample gt.png --pattern features --count 300 --image rgb.png -o sparse.png
 
     \b
-    uniform    exactly N known pixels, each as likely as any other
-    bernoulli  a coin for each known pixel; N is the expected number
-    grid       a square grid that has N nodes on a full map
+    uniform    N random known pixels
+    bernoulli  each known pixel with the same probability; N is the expected number
+    grid       square grid with N nodes on a full map
     lines      all known pixels of N evenly spaced rows
-    features   the N strongest ORB corners, as structure from motion gives
-    edges      N random pixels on the image's edges
-    region     all known pixels of a rectangle, or N random ones of them
+    features   the N strongest ORB corners, as in structure from motion
+    edges      N random pixels on image edges
+    region     all known pixels of a rectangle, or N random ones
 
-    The settings, the seed among them, are kept in the file (PNG, CSV) and in a JSON file beside it.
+    The settings, with the seed, are stored in the file (PNG, CSV) and in a JSON file beside it.
     """
     from pnpdepth_cli.cli.tables import print_sparse
     from pnpdepth_cli.pipeline.sparse.outputs import SparseTarget
     from pnpdepth_cli.pipeline.sparse.sample import SampleRequest, sample_depth
 
-    points, share = options.count_or_share(count)
+    points, fraction = options.count_or_share(count)
     record = sample_depth(
         SampleRequest(
             depth=depth,
@@ -87,7 +99,7 @@ def sample(
             ),
             pattern=pattern,
             count=points,
-            share=share,
+            share=fraction,
             region=_region(region) if region else None,
             noise={
                 "metres": noise,

@@ -19,14 +19,14 @@ SENSORS = ("vlp-16", "vlp-32c", "hdl-32e", "hdl-64e")
     "--sensor",
     required=True,
     metavar="NAME|FILE.toml",
-    help=f"{', '.join(SENSORS)}, the paper's idealised paper-{SENSORS[0]} and so on, or a file.",
+    help=f"{', '.join(SENSORS)}, the paper's idealised paper-{SENSORS[0]} etc., or a TOML file.",
 )
 @click.option(
     "--calib",
     type=options.FILE,
     required=True,
     metavar="FILE|FOLDER",
-    help="Intrinsics: nine numbers, a file with K, or one of KITTI's.",
+    help="Intrinsics: a file with nine numbers or K, or a KITTI calibration.",
 )
 @options.camera
 @click.option(
@@ -34,11 +34,11 @@ SENSORS = ("vlp-16", "vlp-32c", "hdl-32e", "hdl-64e")
     type=float,
     nargs=3,
     metavar="X Y Z",
-    help="The scanner is so many metres to the right of, below and in front of the camera.",
+    help="Position of the scanner right of, below and in front of the camera, metres.",
 )
-@click.option("--at-scanner", is_flag=True, help="It stands where the calibration has it.")
+@click.option("--at-scanner", is_flag=True, help="Place the scanner as in the calibration.")
 @click.option(
-    "--seed", type=options.SEED, default=0, show_default=True, help="Of everything random."
+    "--seed", type=options.SEED, default=0, show_default=True, metavar="N", help="Random seed."
 )
 @click.option(
     "--rotation-noise",
@@ -46,17 +46,19 @@ SENSORS = ("vlp-16", "vlp-32c", "hdl-32e", "hdl-64e")
     type=float,
     default=0.0,
     metavar="DEG",
-    help="The scanner is turned at random about each axis, standard deviation.",
+    help="Random rotation of the scanner about each axis, standard deviation.",
 )
 @click.option(
     "--angle-noise",
     "angle_noise_deg",
     type=float,
     metavar="DEG",
-    help="Of every single beam.  [default: the sensor's]",
+    help="Angular noise of each beam.  [default: the sensor's]",
 )
-@click.option("--range-noise", type=float, metavar="M", help="[default: the sensor's]")
-@click.option("--dropout", type=float, default=0.0, metavar="F", help="Share of lost beams.")
+@click.option(
+    "--range-noise", type=float, metavar="M", help="Range noise.  [default: the sensor's]"
+)
+@click.option("--dropout", type=float, default=0.0, metavar="F", help="Fraction of lost beams.")
 @options.max_range
 @options.euclidean
 @options.depth_scale
@@ -68,7 +70,7 @@ SENSORS = ("vlp-16", "vlp-32c", "hdl-32e", "hdl-64e")
 def simulate(
     output: Path, output_scale: float, overwrite: bool, as_json: bool, **given: Any
 ) -> None:
-    """Make the sparse depth that a LiDAR would give of the scene in the dense DEPTH.
+    """Simulate the sparse depth of a LiDAR in the scene of the dense DEPTH.
 
     \b
     pnpdepth simulate gt.exr --sensor hdl-64e --calib intrinsics.txt --seed 1 -o sparse.png

@@ -9,36 +9,50 @@ from typing import Any
 
 import click
 
-from pnpdepth_cli.cli import options
+from pnpdepth_cli.cli import grouped_help, options
 from pnpdepth_cli.cli.batch import LAYOUTS, PROTOCOLS
 from pnpdepth_cli.cli.exit_codes import INTERRUPTED
 from pnpdepth_cli.cli.progress import BatchProgress
 from pnpdepth_cli.errors import FramesFailedError, StorageError
-
-_OF_THE_REFINEMENT = {
-    *("model", "checkpoint", "layer", "iterations", "lr", "loss", "update", "schedule", "spread"),
-    *("parameters", "anchor", "line_search", "keep_best", "align", "align_every", "output_kind"),
-    *("normalise", "depth_scale", "gt_scale"),
-    *("channel", "sparse_size_ok", "seed", "device", "precision", "propagate"),
-}
-"""Of a refinement's options those that decide a depth; a sweep writes none and holds none out."""
+from pnpdepth_cli.pipeline.refinement.request import FrameFiles, MethodOptions, NetworkChoice
 
 
-@click.command(short_help="Vary the refinement or the points, and plot the errors.")
+@click.command(
+    short_help="Vary the refinement or the points, and plot the errors.",
+    cls=grouped_help.GroupedCommand,
+    common=frozenset(
+        {
+            *("--vary", "--one-by-one", "--sample", "--seeds", "--layout", "--limit", "--calib"),
+            *("--model", "--checkpoint", "--output", "--plots", "--json"),
+        }
+    ),
+    groups={
+        "Sweep": ("--vary", "--one-by-one", "--sample", "--seeds", "--seed"),
+        "Frames": ("--layout", "--protocol", "--limit"),
+        "Input": (*grouped_help.LIDAR, *grouped_help.FILE_READING),
+        "Network": grouped_help.NETWORK,
+        "Method": tuple(name for name in grouped_help.METHOD if name != "--seed"),
+        "Output": ("--output", "--plots", "--json"),
+    },
+)
 @click.argument("source", type=options.FILE, metavar="FOLDER|LIST")
-@click.option("-o", "--output", type=options.FILE, required=True, help="The folder for results.")
+@click.option("-o", "--output", type=options.FILE, required=True, help="Output folder.")
 @click.option(
     "--vary",
     multiple=True,
     required=True,
     metavar="NAME=V,V,…",
-    help="A parameter and its values; two make a grid.",
+    help="Parameter and its values; two --vary make a grid.",
 )
-@click.option("--one-by-one", is_flag=True, help="Vary each alone, the others at their defaults.")
+@click.option(
+    "--one-by-one",
+    is_flag=True,
+    help="Vary each parameter alone, with the others at their defaults.",
+)
 @click.option(
     "--sample",
     metavar="[SENSOR:]N|P%",
-    help="Where points come from unless that is varied.  [default: the frames' own]",
+    help="Source of the points, unless varied.  [default: the frames' own points]",
 )
 @click.option(
     "--seeds",
@@ -46,18 +60,21 @@ _OF_THE_REFINEMENT = {
     default=1,
     show_default=True,
     metavar="N",
-    help="Draws of the points, the first by --seed.",
+    help="Number of random draws of the points; the first uses --seed.",
 )
-@click.option("--layout", type=click.Choice(LAYOUTS), help="Of the folder.  [default: guessed]")
+@click.option(
+    "--layout", type=click.Choice(LAYOUTS), help="Layout of the folder.  [default: recognised]"
+)
 @click.option(
     "--protocol",
     type=click.Choice(PROTOCOLS),
-    help="What is cut out of the frames first.  [default: the layout's own]",
+    help="Crop and depth range of the frames.  [default: the layout's own]",
 )
 @click.option("--limit", type=int, metavar="N", help="Only the first N frames.")
-@click.option("--plots/--no-plots", default=True, help="Pictures, or tables alone.")
+@click.option("--plots/--no-plots", default=True, help="Draw plots, or write tables only.")
 @options.scan
-@options.refinement
+@options.options_of_groups(FrameFiles, NetworkChoice, MethodOptions, without=["tile"])
+@options.seed
 @options.as_json
 def sweep(
     source: Path,
@@ -80,42 +97,40 @@ def sweep(
     pnpdepth sweep frames.csv -o sweep/ --seeds 3 --vary points=20,100,500 --vary iterations=0,5,20
     pnpdepth sweep frames.csv -o sweep/ --one-by-one --sample 500 --vary lr=1%,3%,10% \\
         --vary layer=0,0.5,1 --vary loss=l1,l2,log --vary update=sign,adam
-    pnpdepth sweep kitti/ -o sweep/ --vary points=1%,3%,10%,30%,100%   # of the LiDAR's
+    pnpdepth sweep kitti/ -o sweep/ --vary points=1%,3%,10%,30%,100%   # of the LiDAR's points
     pnpdepth sweep street/ -o sweep/ --vary sensor=vlp-16,vlp-32c,hdl-32e,hdl-64e
 
     FOLDER or LIST is what `pnpdepth batch` takes.
 
     \b
-    points      N, or P% of the known pixels, or of the points that a frame or a LiDAR has
-    sensor      own; a pattern of `pnpdepth sample` such as grid, grid:500 or lines:16; a LiDAR
-                of `pnpdepth simulate` in the camera's place, which needs a calibration
+    points      N; or P% of the known pixels, of the frame's points or of the LiDAR's points
+    sensor      own; a pattern of `pnpdepth sample` such as grid, grid:500 or lines:16; or a LiDAR
+                of `pnpdepth simulate` at the camera, which needs a calibration
     noise, relative-noise, outliers, jitter
-                of the points, as `pnpdepth sample` has them
+                noise of the points, as in `pnpdepth sample`
     rotation-noise
-                of a LiDAR, degrees
-    iterations, layer, lr, loss, update, schedule, spread, parameters, anchor, align, propagate
-                the options of these names
+                rotation of a LiDAR, degrees
+    iterations, layer, lr, loss, update, schedule, blur, parameters, proximity, align, propagate
+                the options of the same names
 
-    One --vary makes a table and a picture of itself, two of their grid; with --one-by-one each of
-    any number its own. The plain network and linear interpolation of the same points stand beside
-    the refined depth. Means are over frames, of each frame's mean over the seeds; intervals (95 %)
-    are of the frames. Gains are in per cent, positive where refinement is better.
+    One --vary gives one table and one plot; two give a table and a plot of their grid; with
+    --one-by-one every --vary gives its own. Tables compare the refined depth with the network's
+    prediction and with linear interpolation of the same points. Means are over frames, after the
+    mean over seeds; 95 % intervals are over frames. Gains are in per cent, positive if refinement
+    is better.
 
-    OUTPUT has sweep.csv and sweep.json with all means, sweep_frames.csv with every frame, a PNG for
-    each picture, and sweep.jsonl, by which the same command, or one with other values, only
-    computes what is missing. Plots need the extra pnpdepth[plot].
+    OUTPUT gets sweep.csv and sweep.json (means), sweep_frames.csv (every frame), a PNG per plot,
+    and sweep.jsonl (the journal). Run again, also with other values, only missing values are
+    computed. Plots need the extra pnpdepth[plot].
     """
-    from pnpdepth_cli.pipeline.refinement.request import RefineRequest
-    from pnpdepth_cli.pipeline.sparse.scans import ScanOptions
     from pnpdepth_cli.pipeline.sweep.axes import read_axis, studies_of
     from pnpdepth_cli.pipeline.sweep.points import read_sampling
     from pnpdepth_cli.pipeline.sweep.sweep import SweepRequest, run_sweep
 
-    scan, others = options.scan_given(given)
     request = SweepRequest(
         source=source,
         output=output,
-        refine=RefineRequest(image=None, sparse=None, scan=ScanOptions(**scan), **others),
+        refine=options.request_of(given),
         studies=studies_of([read_axis(text) for text in vary], one_by_one=one_by_one),
         sampling=None if sample is None else read_sampling(sample),
         seeds=seeds,
@@ -128,9 +143,9 @@ def sweep(
         try:
             record = run_sweep(request, progress)
         except StorageError as error:
-            raise StorageError(f"{error}; the same command goes on from there") from error
+            raise StorageError(f"{error}; run the same command to continue") from error
         except KeyboardInterrupt:
-            progress.say("stopped; the same command goes on from there")
+            progress.say("stopped; run the same command to continue")
             raise click.exceptions.Exit(INTERRUPTED) from None
     if as_json:
         click.echo(json.dumps(record, indent=2))
@@ -139,37 +154,27 @@ def sweep(
     if progress.failed:
         raise FramesFailedError(
             f"{progress.failed:,} of {progress.to_do:,} runs failed; {output}/sweep.csv counts the"
-            " frames that each mean is without, and the same command tries them again"
+            " frames missing from each mean; run the same command to retry them"
         )
 
 
-@click.command()
-@options.refinement
-def _refinement() -> None:
-    """All options of a refinement."""
-
-
-_NOT_OF_A_SWEEP = {option.name for option in _refinement.params} - _OF_THE_REFINEMENT
-sweep.params = [option for option in sweep.params if option.name not in _NOT_OF_A_SWEEP]
-
-
 class _Progress(BatchProgress):
-    """How far a sweep is; what is wrong with a frame is said once, though many runs fail of it."""
+    """Progress of a sweep; the same message about the same frame is printed once."""
 
     def __init__(self) -> None:
         super().__init__("sweep", "run")
-        self._said: set[tuple[str, str]] = set()
+        self._printed: set[tuple[str, str]] = set()
 
     def frame(self, row: Mapping[str, Any]) -> None:
-        """A run is done, or has failed."""
+        """Counts a run that is done or has failed."""
         self.advance(failed=row["status"] == "failed")
-        if row["message"] and (row["name"], row["message"]) not in self._said:
-            self._said.add((row["name"], row["message"]))
+        if row["message"] and (row["name"], row["message"]) not in self._printed:
+            self._printed.add((row["name"], row["message"]))
             self.say(f"{row['status']}: {row['name']}: {row['message']}")
 
 
 def _print(record: Mapping[str, Any]) -> None:
-    """A table for each study on stdout, and where the files are on stderr."""
+    """Prints a table per study on stdout, and the names of the files on stderr."""
     from pnpdepth_cli.cli.tables import print_rows
 
     for study in record["studies"]:

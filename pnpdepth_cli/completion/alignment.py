@@ -24,9 +24,6 @@ from torch import Tensor
 from pnpdepth_cli.errors import ModelError, NoPointsError
 from pnpdepth_cli.points import SparsePoints
 
-ALIGNMENTS = ("none", "median", "scale", "affine", "auto")
-SPACES = ("depth", "inverse", "log")
-
 BEYOND = 10.0
 """Aligned depth is bounded to this factor in front of the nearest and behind the farthest point."""
 

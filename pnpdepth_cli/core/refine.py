@@ -17,11 +17,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from pnpdepth_cli.core.losses import LOSSES, departure
+from pnpdepth_cli.choices import LOSSES, UPDATES
+from pnpdepth_cli.core.losses import Loss
+from pnpdepth_cli.core.proximity import proximity_loss
 from pnpdepth_cli.core.split import Split, gradient_at
 from pnpdepth_cli.core.split.structure import map_tensors, tensors_in
-from pnpdepth_cli.core.step_sizes import SCHEDULES, Channels, spread, step_size
-from pnpdepth_cli.core.update_rules import UPDATES
+from pnpdepth_cli.core.step_sizes import SCHEDULES, Channels, blurred, step_size
+from pnpdepth_cli.core.update_rules import Update
 from pnpdepth_cli.errors import BatchError, DivergedError, LayerError, ModelError, PnpDepthError
 from pnpdepth_cli.points import SparsePoints
 
@@ -37,9 +39,9 @@ class RefineSettings:
 
     iterations: the number of updates of z, 0 for the plain prediction.
     lr: α as a number, or a text like "3%": that share of the standard deviation of z_0.
-    schedule: how α falls over the updates. spread: how far the gradient is blurred, in spacings of
+    schedule: how α falls over the updates. blur: how far the gradient is blurred, in spacings of
         the points. parameters: what is updated; see `pnpdepth_cli.core.step_sizes` for these three.
-    anchor: the weight of `pnpdepth_cli.core.losses.departure` in L.
+    proximity: the weight of `pnpdepth_cli.core.proximity.proximity_loss` in L.
     line_search: whether an update that raises L is taken back and made half as far instead.
     keep_best: whether the result is the depth of the lowest loss instead of the last; with a line
         search it always is.
@@ -52,9 +54,9 @@ class RefineSettings:
     loss: str = "l1"
     update: str = "sign"
     schedule: str = "constant"
-    spread: float = 0.0
+    blur: float = 0.0
     parameters: str = "elements"
-    anchor: float = 0.0
+    proximity: float = 0.0
     line_search: bool = False
     keep_best: bool = False
     align: str = "none"
@@ -165,7 +167,8 @@ class _Frame:
     ) -> None:
         self._settings, self._points, self._depth_of = settings, points, depth_of
         self._step, self._halvings = step_size(settings.lr, z0), 0
-        self._loss_of, self._update = LOSSES[settings.loss], UPDATES[settings.update]()
+        self._loss_of: Loss = LOSSES[settings.loss]
+        self._update: Update = UPDATES[settings.update]()
         self._channels = Channels(z0) if settings.parameters == "channels" else None
         self._way: tuple[Tensor, Tensor] | None = None  # the lowest loss's z, and where it points
         self._depths: list[Tensor] = []  # of z_0, and of z_kept
@@ -182,8 +185,8 @@ class _Frame:
             return None
         at_points = self._points.sample(depth)
         loss = self._loss_of(at_points, self._points.depth)
-        if self._settings.anchor and self._depths:
-            loss = loss + self._settings.anchor * departure(depth, self._depths[0])
+        if self._settings.proximity and self._depths:
+            loss = loss + self._settings.proximity * proximity_loss(depth, self._depths[0])
         if self._settings.iterations and not bool(loss.isfinite()):
             self.error = self._diverged("loss", len(self.losses))
             if not self.losses and not bool(at_points.isfinite().all()):
@@ -206,7 +209,7 @@ class _Frame:
             self._halvings += 1
             z, direction = self._way
         else:
-            direction = self._direction(spread(gradient, self._points, self._settings.spread))
+            direction = self._direction(blurred(gradient, self._points, self._settings.blur))
             if self._settings.line_search:
                 self._way = z, direction
         alpha = self._step * SCHEDULES[self._settings.schedule](made / self._settings.iterations)
@@ -215,7 +218,7 @@ class _Frame:
     def _direction(self, gradient: Tensor) -> Tensor:
         if self._channels is None:
             return self._update(gradient)
-        return self._channels.spread_out(self._update(self._channels.of(gradient)))
+        return self._channels.change_of_z(self._update(self._channels.gradient(gradient)))
 
     def refinement(self) -> Refinement:
         """What has come of it so far."""

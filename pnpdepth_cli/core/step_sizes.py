@@ -1,6 +1,4 @@
-"""How far z moves in one update: α, how it falls, how far a point's gradient reaches, and whether
-every element moves by itself or whole channels do.
-"""
+"""How z moves in one update: step size, schedule, blur of the gradient, and what is updated."""
 
 from __future__ import annotations
 
@@ -16,11 +14,20 @@ SCHEDULES: dict[str, Callable[[float], float]] = {
     "constant": lambda done: 1.0,
     "linear": lambda done: 1.0 - done,
 }
-"""The share of α that an update moves by, from the share 0 ≤ done < 1 of all updates made."""
+"""Factor of α at each update, from the fraction 0 ≤ done < 1 of the updates already made."""
 
 
 def step_size(lr: float | str, z0: Tensor) -> float:
-    """α: `lr` itself, or its per cent of the standard deviation of z_0. UsageError if no step."""
+    """Returns α as a number.
+
+    Args:
+        lr: A positive number, or a text such as "3%": that percentage of the standard deviation
+            of z_0.
+        z0: z_0, of any shape.
+
+    Raises:
+        UsageError: `lr` is neither.
+    """
     text = str(lr).strip()
     try:
         value = float(text.removesuffix("%"))
@@ -31,11 +38,16 @@ def step_size(lr: float | str, z0: Tensor) -> float:
     return value / 100 * float(z0.float().std(correction=0)) if text.endswith("%") else value
 
 
-def spread(gradient: Tensor, points: SparsePoints, spacings: float) -> Tensor:
-    """The gradient at a map z (1, C, h, w), blurred so that cells between the points follow them.
+def blurred(gradient: Tensor, points: SparsePoints, spacings: float) -> Tensor:
+    """Returns the gradient convolved with a Gaussian, so that it also reaches between the points.
 
-    The blur is a Gaussian whose standard deviation is so many spacings of the points, √(HW/N):
-    few points reach far, many hardly beyond their own cells. A z that is no map stays as it is.
+    The Gaussian's standard deviation is proportional to the mean spacing of the points: few points
+    reach far, many points hardly beyond their own cells.
+
+    Args:
+        gradient: (1, C, h, w) at z. Any other shape is returned unchanged.
+        points: The N sparse points of the frame of H × W pixels.
+        spacings: Standard deviation in units of √(HW/N) pixels; 0 returns the gradient unchanged.
     """
     if not spacings or gradient.ndim != 4:
         return gradient
@@ -49,23 +61,23 @@ def spread(gradient: Tensor, points: SparsePoints, spacings: float) -> Tensor:
 
 
 def _gaussian(cells: int, sigma: float, like: Tensor) -> Tensor:
-    """(cells, cells): row i weighs the cells around i, with a sum of 1 also at the border."""
+    """(cells, cells): row i has the weights around cell i; every row sums to 1, also at borders."""
     at = torch.arange(cells, device=like.device, dtype=like.dtype)
     weights = torch.exp(-0.5 * ((at[:, None] - at) / sigma).square())
     return weights / weights.sum(dim=1, keepdim=True)
 
 
-PARAMETERS = ("elements", "channels")
-"""What is updated: every element of z, or a scale and a shift of each of its channels."""
-
-
 class Channels:
-    """A scale and a shift of every channel of z_0, two numbers that a few points can tell.
+    """A scale and a shift of every channel of z_0, to be updated instead of the elements of z.
 
-    z_0 is a map (1, C, H, W) or tokens (1, N, C). `of` takes a gradient at z to the gradient at
-    those numbers, the scales above the shifts; `spread_out` takes a change of the numbers to that
-    of z: scale · (z_0 − its mean)/its deviation + shift, so that a change by 1 has a root mean
-    square of 1 in z, whichever of the two it is. LayerError for a z_0 without channels.
+    z = z_0 + scale · (z_0 − mean)/std + shift, per channel. A change of scale or shift by 1 changes
+    z by a root mean square of 1.
+
+    Args:
+        z0: A map (1, C, H, W) or tokens (1, N, C).
+
+    Raises:
+        LayerError: z_0 has another shape.
     """
 
     def __init__(self, z0: Tensor) -> None:
@@ -74,19 +86,18 @@ class Channels:
                 f"z of shape {tuple(z0.shape)} has no channels to scale and shift; update its"
                 " elements (--parameters elements)"
             )
-        inside = (1,) if z0.ndim == 3 else tuple(range(2, z0.ndim))
-        centred = z0 - z0.mean(dim=inside, keepdim=True)
-        deviation = centred.square().mean(dim=inside, keepdim=True).sqrt()
-        self._inside = inside
-        self._shape = centred / deviation.clamp_min(torch.finfo(z0.dtype).tiny)
+        self._dims = (1,) if z0.ndim == 3 else tuple(range(2, z0.ndim))
+        centred = z0 - z0.mean(dim=self._dims, keepdim=True)
+        deviation = centred.square().mean(dim=self._dims, keepdim=True).sqrt()
+        self._standardised = centred / deviation.clamp_min(torch.finfo(z0.dtype).tiny)
 
-    def of(self, gradient: Tensor) -> Tensor:
-        """The gradient at scale and shift, per element of z."""
-        each = (gradient * self._shape, gradient)
-        return torch.cat([one.mean(dim=self._inside, keepdim=True) for one in each])
+    def gradient(self, gradient_at_z: Tensor) -> Tensor:
+        """Returns the gradient at scale and shift, stacked along axis 0, per element of z."""
+        each = (gradient_at_z * self._standardised, gradient_at_z)
+        return torch.cat([one.mean(dim=self._dims, keepdim=True) for one in each])
 
-    def spread_out(self, change: Tensor) -> Tensor:
-        """The change of z for a change of scale and shift."""
+    def change_of_z(self, change: Tensor) -> Tensor:
+        """Returns the change of z for a change of scale and shift, stacked along axis 0."""
         scale, shift = change.tensor_split(2)
-        moved: Tensor = scale * self._shape + shift
-        return moved
+        change_of_z: Tensor = scale * self._standardised + shift
+        return change_of_z

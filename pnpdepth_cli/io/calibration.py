@@ -24,7 +24,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import FileFormatError, InputError, UsageError
-from pnpdepth_cli.io.file_bytes import kind_of, one_line, read_bytes
+from pnpdepth_cli.io.file_bytes import one_line, read_bytes
+from pnpdepth_cli.io.file_kind import kind_of
 
 CAMERA = 2
 """KITTI's left colour camera, whose pictures the benchmarks have."""

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from pnpdepth_cli.io.depth_range import describe_range, implausible
 from pnpdepth_cli.io.depth_reading import DepthImage, read_depth
-from pnpdepth_cli.io.depth_writing import DEPTH_SUFFIXES, write_depth
+from pnpdepth_cli.io.depth_writing import write_depth
+from pnpdepth_cli.io.formats import DEPTH_SUFFIXES
 from pnpdepth_cli.io.sparse_reading import SparseFile, read_sparse
 
 __all__ = [

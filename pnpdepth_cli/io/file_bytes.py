@@ -1,104 +1,116 @@
-"""The bytes of an input file, and what kind of file they are."""
+"""The bytes of an input file, within the budget of `pnpdepth_cli.budget`."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+import stat
 from pathlib import Path
-from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
+from pnpdepth_cli.budget import budget
 from pnpdepth_cli.errors import FileFormatError, InputError
-from pnpdepth_cli.io.shared_context import Together
-
-_MAGIC = (
-    (b"\x89PNG\r\n\x1a\n", "PNG"),
-    (b"\xff\xd8\xff", "JPEG"),
-    (b"II*\x00", "TIFF"),
-    (b"MM\x00*", "TIFF"),
-    (b"v/1\x01", "EXR"),
-    (b"\x93NUMPY", "NPY"),
-    (b"PK\x03\x04", "NPZ"),
-    (b"PK\x05\x06", "NPZ"),  # without any array
-    (b"Pf", "PFM"),
-    (b"PF", "PFM"),
-)
-
-MAX_PIXELS = 1 << 28
-"""Larger pictures are refused before memory is set aside for them (16384 x 16384)."""
 
 
 def read_bytes(path: Path) -> bytes:
-    """The whole file. Raises InputError when there is none, or nothing in it."""
+    """Returns the whole content of a regular file.
+
+    Raises:
+        InputError: There is no such file, or it is a folder, a device or a pipe.
+        FileFormatError: It is empty, or larger than the budget.
+    """
+    size = size_of_regular_file(path)
+    limit = budget().max_file_bytes
+    if size > limit:
+        raise FileFormatError(
+            f"{path} has {size:,} bytes, more than {limit:,}; make it smaller, or allow more with"
+            " --max-pixels"
+        )
     try:
         data = path.read_bytes()
-    except (FileNotFoundError, NotADirectoryError) as error:
-        raise InputError(f"{path}: no such file; check the path") from error
-    except IsADirectoryError as error:
-        raise InputError(f"{path} is a folder; give one file") from error
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or str(error)
-        raise InputError(f"{path} cannot be read ({reason.lower()}); check the path") from error
+    except OSError as error:
+        raise cannot_read(path, error) from error
     if not data:
         raise FileFormatError(f"{path} is empty (0 bytes); copy or create it again")
     return data
 
 
-def kind_of(data: bytes) -> str | None:
-    """`PNG`, `JPEG`, `TIFF`, `WEBP`, `EXR`, `NPY`, `NPZ`, `PFM`, or None; by content alone."""
-    if data[:4] == b"RIFF" and data[8:12] == b"WEBP":
-        return "WEBP"
-    return next((kind for magic, kind in _MAGIC if data.startswith(magic)), None)
+def size_of_regular_file(path: Path) -> int:
+    """Returns the size of a file in bytes.
+
+    Raises:
+        InputError: There is no such file, or it is a folder, a device or a pipe.
+    """
+    try:
+        status = path.stat()
+    except (OSError, ValueError) as error:
+        raise cannot_read(path, error) from error
+    if stat.S_ISDIR(status.st_mode):
+        raise InputError(f"{path} is a folder; give one file")
+    if not stat.S_ISREG(status.st_mode):
+        raise InputError(f"{path} is a device or a pipe; save its content to a file first")
+    return status.st_size
+
+
+def cannot_read(path: Path, error: OSError | ValueError) -> InputError:
+    """Returns the error that says why a file cannot be read."""
+    if isinstance(error, (FileNotFoundError, NotADirectoryError)):
+        return InputError(f"{path}: no such file; check the path")
+    reason = one_line(getattr(error, "strerror", None) or error).lower()
+    return InputError(f"{one_line(path)} cannot be read ({reason}); check the path")
 
 
 def damaged(path: Path, kind: str, fact: str) -> FileFormatError:
-    """The error for a file that ends early or is corrupt."""
+    """Returns the error for a file that ends early or is corrupt."""
     return FileFormatError(f"{path}: {kind} {one_line(fact)}; copy or create the file again")
 
 
 def one_line(text: object) -> str:
-    """The text with runs of white space made single spaces, cut to a readable length."""
+    """Returns the text with runs of white space made single spaces, cut to a readable length."""
     line = " ".join(str(text).split())
     return line if len(line) <= 160 else line[:159] + "…"
 
 
-def check_pixel_count(path: Path, width: int, height: int) -> None:
-    """Raises FileFormatError for an empty picture or one beyond `MAX_PIXELS`."""
+def check_pixel_count(
+    path: Path, width: int, height: int, *, channels: int = 1, file_bytes: int | None = None
+) -> None:
+    """Raises FileFormatError for an image without pixels, or with more than the budget.
+
+    Args:
+        path: Named in messages.
+        width: Pixels.
+        height: Pixels.
+        channels: Values of a pixel that are decoded.
+        file_bytes: Size of the file, where the format allows a few bytes to claim any size.
+    """
     if width < 1 or height < 1:
         raise FileFormatError(f"{path} has no pixels ({width}x{height}); create it again")
-    if width * height > MAX_PIXELS:
+    limit = budget().max_pixels
+    if width * height > limit:
         raise FileFormatError(
-            f"{path} is {width}x{height} pixels, more than {MAX_PIXELS:,}; make it smaller"
+            f"{path} is {width}x{height} pixels, more than {limit:,}; make it smaller, or allow"
+            " more with --max-pixels"
+        )
+    if file_bytes is not None and width * height * channels > budget().max_values_from(file_bytes):
+        raise FileFormatError(
+            f"{path} claims {width}x{height} pixels in {file_bytes:,} bytes, which cannot be true;"
+            " create it again"
         )
 
 
-@contextmanager
-def _silent_opencv() -> Iterator[None]:
-    """OpenCV does not print several lines of its own about a damaged file."""
-    import cv2
+def check_value_count(path: Path, count: int, file_bytes: int | None = None) -> None:
+    """Raises FileFormatError for an array of more values than the budget.
 
-    loudness = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
-    try:
-        yield
-    finally:
-        cv2.utils.logging.setLogLevel(loudness)
-
-
-_SILENT_OPENCV = Together(_silent_opencv)
-
-
-def decode_with_opencv(path: Path, data: bytes, kind: str) -> NDArray[Any]:
-    """The pixels as stored, (H, W) or (H, W, C) with blue first, in the file's own type."""
-    import cv2
-
-    buffer = np.frombuffer(data, dtype=np.uint8)
-    try:
-        with _SILENT_OPENCV:
-            pixels = cv2.imdecode(buffer, cv2.IMREAD_UNCHANGED)
-    except cv2.error as error:
-        raise damaged(path, kind, f"cannot be decoded ({error})") from error
-    if pixels is None:
-        raise damaged(path, kind, "cannot be decoded")
-    return pixels
+    Args:
+        path: Named in messages.
+        count: Values of the array.
+        file_bytes: Size of the file, where a few bytes can claim any count.
+    """
+    limit = budget().max_pixels
+    if count > limit:
+        raise FileFormatError(
+            f"{path} holds {count:,} values, more than {limit:,}; make it smaller, or allow more"
+            " with --max-pixels"
+        )
+    if file_bytes is not None and count > budget().max_values_from(file_bytes):
+        raise FileFormatError(
+            f"{path} claims {count:,} values in {file_bytes:,} bytes, which cannot be true;"
+            " create it again"
+        )

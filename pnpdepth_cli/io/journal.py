@@ -61,15 +61,14 @@ class Journal:
             self._end += len(data)
 
     def _write(self, data: bytes) -> None:
-        descriptor = os.open(self.path, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC, 0o666)
-        try:
-            if os.fstat(descriptor).st_size != self._end:
-                os.ftruncate(descriptor, self._end)
-            written = os.pwrite(descriptor, data, self._end)
-            while written < len(data):  # a disk that is nearly full takes a part
-                written += os.pwrite(descriptor, data[written:], self._end + written)
-        finally:
-            os.close(descriptor)
+        flags = os.O_RDWR | os.O_CREAT | getattr(os, "O_BINARY", 0)
+        with os.fdopen(os.open(self.path, flags, 0o666), "r+b", buffering=0) as file:
+            if file.seek(0, os.SEEK_END) != self._end:
+                file.truncate(self._end)
+            file.seek(self._end)
+            rest = memoryview(data)
+            while rest:  # a disk that is nearly full takes a part
+                rest = rest[file.write(rest) :]
 
     def _index(self) -> int:
         """Note where the lines are; returns the place behind the last whole one."""

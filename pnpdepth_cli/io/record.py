@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from pnpdepth_cli.errors import FileFormatError, InputError
+from pnpdepth_cli.errors import FileFormatError
 from pnpdepth_cli.io.atomic import atomic_path
-from pnpdepth_cli.io.file_bytes import one_line, read_bytes
+from pnpdepth_cli.io.file_bytes import cannot_read, one_line, read_bytes, size_of_regular_file
 
 
 def write_json(path: Path, mapping: Mapping[str, Any]) -> None:
@@ -49,13 +49,13 @@ def sha256_of(path: Path) -> str:
             if inside.is_file():
                 digest.update(f"{inside.name} {sha256_of(inside)}\n".encode())
         return digest.hexdigest()
+    size_of_regular_file(path)
     try:
         with path.open("rb") as file:
             while block := file.read(1 << 20):
                 digest.update(block)
     except OSError as error:
-        reason = (error.strerror or str(error)).lower()
-        raise InputError(f"{path} cannot be read ({reason}); check the path") from error
+        raise cannot_read(path, error) from error
     return digest.hexdigest()
 
 

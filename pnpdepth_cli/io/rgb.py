@@ -14,17 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import FileFormatError
-from pnpdepth_cli.io.file_bytes import (
-    check_pixel_count,
-    damaged,
-    decode_with_opencv,
-    kind_of,
-    one_line,
-    read_bytes,
-)
-from pnpdepth_cli.io.png import read_png_facts
-from pnpdepth_cli.io.shared_context import Together
-from pnpdepth_cli.io.tiff import read_tiff_facts
+from pnpdepth_cli.io.file_bytes import check_pixel_count, damaged, one_line, read_bytes
+from pnpdepth_cli.io.file_kind import kind_of
+from pnpdepth_cli.io.formats.png import read_png_facts
+from pnpdepth_cli.io.formats.tiff import read_tiff_facts
+from pnpdepth_cli.io.opencv import decode_with_opencv
+from pnpdepth_cli.io.shared_context import SharedContext
 
 if TYPE_CHECKING:
     import PIL.Image
@@ -83,7 +78,7 @@ def _decode_8_bit(
 
     try:
         with _QUIET_PILLOW, Image.open(io.BytesIO(data), formats=[kind]) as picture:
-            check_pixel_count(path, *picture.size)
+            check_pixel_count(path, *picture.size, file_bytes=len(data))
             picture.load()
             frames = getattr(picture, "n_frames", 1)
             orientation = _orientation(picture)
@@ -95,12 +90,15 @@ def _decode_8_bit(
         raise damaged(path, kind, f"{fact} ({_reason(error)})") from error
     # A camera's JPEG may carry a preview as a second frame; that is no choice to report.
     note = f"first of {frames} pictures" if frames > 1 and kind != "JPEG" else None
-    return pixels.astype(np.float32) / np.float32(255), orientation, note
+    values = pixels.astype(np.float32)
+    values /= np.float32(255)
+    return values, orientation, note
 
 
 def _decode_16_bit(path: Path, data: bytes, kind: str) -> tuple[NDArray[np.float32], int]:
     pixels = decode_with_opencv(path, data, kind)
-    values = pixels.astype(np.float32) / np.float32(np.iinfo(pixels.dtype).max)
+    values = pixels.astype(np.float32)
+    values /= np.float32(np.iinfo(pixels.dtype).max)
     if values.ndim == 2:
         values = values[:, :, None]
     if values.shape[2] in (1, 2):
@@ -124,13 +122,19 @@ def _orientation(picture: PIL.Image.Image) -> int:
 
 @contextmanager
 def _quiet_pillow() -> Iterator[None]:
-    """Pillow's warnings, of damaged EXIF or a large picture, are not shown inside."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        yield
+    """Pillow neither warns of damaged EXIF nor refuses large images, which the budget does."""
+    from PIL import Image
+
+    limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        Image.MAX_IMAGE_PIXELS = limit
 
 
-_QUIET_PILLOW = Together(_quiet_pillow)
+_QUIET_PILLOW = SharedContext(_quiet_pillow)
 
 
 def _turn_upright(values: NDArray[np.float32], orientation: int) -> NDArray[np.float32]:
@@ -145,7 +149,7 @@ def _turn_upright(values: NDArray[np.float32], orientation: int) -> NDArray[np.f
 
 
 def _from_linear_light(path: Path, data: bytes) -> RgbImage:
-    from pnpdepth_cli.io.exr import read_exr_channels
+    from pnpdepth_cli.io.formats.exr import read_exr_channels
 
     linear = _colour_of(path, read_exr_channels(path, data)).astype(np.float32)
     linear = np.nan_to_num(linear, nan=0.0, posinf=1e9, neginf=0.0)

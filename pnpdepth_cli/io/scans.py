@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import FileFormatError, NoPointsError
-from pnpdepth_cli.io.arrays import parse_npy
-from pnpdepth_cli.io.file_bytes import kind_of, read_bytes
+from pnpdepth_cli.io.file_bytes import read_bytes
+from pnpdepth_cli.io.file_kind import kind_of
+from pnpdepth_cli.io.formats.npy import parse_npy
 from pnpdepth_cli.io.point_files import parse_pcd, parse_ply
 
 _KITTI_BYTES = 16

@@ -8,7 +8,7 @@ from contextlib import AbstractContextManager
 from types import TracebackType
 
 
-class Together:
+class SharedContext:
     """The context that `make` gives, entered with the first thread and left with the last.
 
     What is put back is so what was there before all of them, whichever order they leave in.

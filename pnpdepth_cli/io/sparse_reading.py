@@ -11,13 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import FileFormatError, NoPointsError
-from pnpdepth_cli.io.depth_reading import (
-    check_scale,
-    depth_from_stored,
-    known_metres,
-    load_stored,
-)
-from pnpdepth_cli.io.file_bytes import kind_of, one_line, read_bytes
+from pnpdepth_cli.io.depth_reading import depth_from_stored, known_metres, load_stored
+from pnpdepth_cli.io.depth_scale import check_scale
+from pnpdepth_cli.io.file_bytes import one_line, read_bytes
+from pnpdepth_cli.io.file_kind import kind_of
 
 _TEXT_SUFFIXES = (".csv", ".txt")
 _SEPARATOR = re.compile(r"[\s,;]+")
@@ -55,12 +52,12 @@ def read_sparse(
         if kind_of(data) is None:
             return _from_rows(path, _parse_text(path, data), "point list")
     stored = load_stored(path, channel)
-    if not stored.shaped and stored.values.ndim == 2 and stored.values.shape[1] == 3:
+    if not stored.is_image and stored.values.ndim == 2 and stored.values.shape[1] == 3:
         if stored.values.dtype.kind != "f":
             raise FileFormatError(
                 f"{path}: a point list of {stored.values.dtype}; save x, y, depth as float metres"
             )
-        return _from_rows(path, stored.values, f"point list, {stored.what}")
+        return _from_rows(path, stored.values, f"point list, {stored.description}")
     image = depth_from_stored(path, stored, scale)
     rows, columns = np.nonzero(image.valid)
     if rows.size == 0:

@@ -7,7 +7,8 @@ from typing import Any
 
 from torch import Tensor
 
-from pnpdepth_cli.completion.alignment import SPACES, Alignment, align
+from pnpdepth_cli.choices import SPACES
+from pnpdepth_cli.completion.alignment import Alignment, align
 from pnpdepth_cli.models.network import Network
 from pnpdepth_cli.points import SparsePoints
 

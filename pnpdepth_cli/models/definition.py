@@ -14,24 +14,19 @@ sense raises ModelError as soon as the object is made.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
+from pnpdepth_cli import choices
+from pnpdepth_cli.choices import Align, Fit, OutputKind, OutputScale, Schedule
+from pnpdepth_cli.choices import InputKind as InputKind  # for definition files
 from pnpdepth_cli.models import validity
 
 if TYPE_CHECKING:
     from torch import Tensor, nn
-
-InputKind = Literal["rgb", "sparse", "rgb+sparse"]
-OutputKind = Literal["depth", "inverse", "log", "unknown"]
-OutputScale = Literal["metric", "scale", "affine", "unknown"]
-Fit = Literal["stretch", "crop"]
-Loss = Literal["l1", "l2", "huber", "berhu", "inverse", "log", "cauchy"]
-Update = Literal["sign", "sgd", "normalised", "momentum", "adam", "lbfgs"]
-Schedule = Literal["constant", "linear"]
-Align = Literal["none", "median", "scale", "affine", "auto"]
 
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
@@ -52,7 +47,7 @@ class Fixed:
     def __post_init__(self) -> None:
         validity.whole(self, "height", least=1)
         validity.whole(self, "width", least=1)
-        validity.one_of(self, "fit", Fit)
+        validity.one_of(self, "fit", choices.FITS)
 
 
 @dataclass(frozen=True)
@@ -107,7 +102,7 @@ class RefineDefaults:
     """How the network is refined when nobody says otherwise.
 
     `lr` is a number (absolute, as in the paper) or a text like "3%" (of the standard deviation of
-    z_0). `schedule` and `spread` are those of `pnpdepth_cli.core.refine.RefineSettings`. `layer`
+    z_0). `schedule` and `blur` are those of `pnpdepth_cli.core.refine.RefineSettings`. `layer`
     None is the definition's first layer. `align` None is "none" for a metric network and "auto" for
     any other. The values here are the paper's.
     """
@@ -115,27 +110,33 @@ class RefineDefaults:
     layer: str | None = None
     iterations: int = 5
     lr: float | str = 0.01
-    loss: Loss = "l1"
-    update: Update = "sign"
+    loss: str = "l1"
+    update: str = "sign"
     schedule: Schedule = "constant"
-    spread: float = 0.0
+    blur: float = 0.0
     align: Align | None = None
+    spread: float | None = None
+    """Deprecated name of `blur`."""
 
     def __post_init__(self) -> None:
+        if self.spread is not None:
+            warnings.warn("RefineDefaults.spread is now blur", DeprecationWarning, stacklevel=3)
+            object.__setattr__(self, "blur", self.spread)
+            object.__setattr__(self, "spread", None)
         if self.layer is not None:
             validity.instance(self, "layer", str, "the name of a layer")
         validity.whole(self, "iterations", least=0)
         validity.step(self, "lr")
-        validity.one_of(self, "loss", Loss)
-        validity.one_of(self, "update", Update)
-        validity.one_of(self, "schedule", Schedule)
-        validity.at_least_zero(self, "spread")
+        validity.one_of(self, "loss", choices.LOSSES)
+        validity.one_of(self, "update", choices.UPDATES)
+        validity.one_of(self, "schedule", choices.SCHEDULES)
+        validity.at_least_zero(self, "blur")
         if self.align is not None:
-            validity.one_of(self, "align", Align)
+            validity.one_of(self, "align", choices.ALIGNMENTS)
 
 
 FOREIGN = RefineDefaults(
-    iterations=20, lr="25%", loss="cauchy", update="normalised", schedule="linear", spread=1.0
+    iterations=20, lr="25%", loss="cauchy", update="normalised", schedule="linear", blur=1.0
 )
 """For networks that nobody here has tuned: steps that follow the feature map's own scale.
 
@@ -168,8 +169,9 @@ class ModelDefinition:
     defaults: the settings of refinement.
     build: makes the network (weights not loaded); called without arguments.
     checkpoint: the weights that come with the definition, or None where the user brings them.
-    same_path: the submodules that it runs, and their order, are the same for all pictures of one
-        size, whatever it does with values in Python; so they need to be learnt only once.
+    static_graph: the network runs the same submodules in the same order for all images of one size,
+        even where values of tensors reach Python code. Then the cut is learned only once.
+    same_path: deprecated name of static_graph.
     complete: `build` gives the network with its weights, `checkpoint` is only where they lie.
     read_checkpoint: renames or reshapes the tensors of a published checkpoint into the state
         dict of the network.
@@ -198,6 +200,7 @@ class ModelDefinition:
     defaults: RefineDefaults = RefineDefaults()
     checkpoint: Path | None = None
     complete: bool = False
+    static_graph: bool = False
     same_path: bool = False
     read_checkpoint: Callable[[Mapping[str, Tensor]], Mapping[str, Tensor]] | None = None
     arguments: Callable[[Tensor | None, Tensor | None], tuple[Tensor, ...]] | None = None
@@ -206,15 +209,21 @@ class ModelDefinition:
     assumed: str = ""
 
     def __post_init__(self) -> None:
+        if self.same_path:
+            warnings.warn(
+                "ModelDefinition.same_path is now static_graph", DeprecationWarning, stacklevel=3
+            )
+            object.__setattr__(self, "static_graph", True)
+            object.__setattr__(self, "same_path", False)
         validity.instance(self, "name", str, "a text")
-        validity.one_of(self, "input_kind", InputKind)
+        validity.one_of(self, "input_kind", choices.INPUT_KINDS)
         size = "Fixed(height, width), Multiple(of) or Near(of=…)"
         validity.instance(self, "size", (Fixed, Multiple, Near), size)
         validity.function(self, "build")
         if self.normalisation is not None:
             validity.instance(self, "normalisation", Normalisation, "Normalisation(mean=…, std=…)")
-        validity.one_of(self, "output_kind", OutputKind)
-        validity.one_of(self, "output_scale", OutputScale)
+        validity.one_of(self, "output_kind", choices.OUTPUT_KINDS)
+        validity.one_of(self, "output_scale", choices.OUTPUT_SCALES)
         validity.names(self, "layers")
         validity.instance(self, "defaults", RefineDefaults, "RefineDefaults(…)")
         if self.checkpoint is not None:

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.core.split.structure import tensors_in
-from pnpdepth_cli.core.split.user_code import blaming, is_out_of_memory
+from pnpdepth_cli.core.split.user_code import is_out_of_memory, wrap_user_errors
 from pnpdepth_cli.errors import CheckpointError, DeviceError, ModelError, UsageError
 from pnpdepth_cli.models.definition import Fixed, ModelDefinition, Normalisation
 from pnpdepth_cli.models.formats.python_file import importing_beside
@@ -43,7 +43,7 @@ class Network:
 
     def cut_at(self, layer: str) -> Split:
         """The network cut at the layer, to be opened. LayerError where there is none."""
-        return Split(self.module, layer, same_path=self.definition.same_path)
+        return Split(self.module, layer, static_graph=self.definition.static_graph)
 
     def arguments(
         self, frame: FrameMap, rgb: Tensor | None, points: SparsePoints
@@ -62,7 +62,7 @@ class Network:
             picture = ((frame.rgb_to_network(rgb) - mean) / std).to(self.device)
         if "sparse" in kind:
             sparse = points.scatter().to(self.device)
-        with blaming(f"arguments of network {self.definition.name!r}"):
+        with wrap_user_errors(f"arguments of network {self.definition.name!r}"):
             arguments = self.definition.call_arguments(picture, sparse)
         if not isinstance(arguments, tuple):
             raise ModelError(
@@ -75,7 +75,7 @@ class Network:
         """What the definition's `verify` has to say. ModelError if it raises or has no trust."""
         if self.definition.verify is None:
             return ()
-        with blaming(f"verify of network {self.definition.name!r}"):
+        with wrap_user_errors(f"verify of network {self.definition.name!r}"):
             said = self.definition.verify(self.module, arguments)
         return (str(said),) if said else ()
 
@@ -103,7 +103,7 @@ class Network:
 
     def _tensor_of(self, output: Any) -> Tensor:
         if self.definition.output is not None:
-            with blaming(f"output of network {self.definition.name!r}"):
+            with wrap_user_errors(f"output of network {self.definition.name!r}"):
                 chosen = self.definition.output(output)
             if not isinstance(chosen, Tensor):
                 raise ModelError(
@@ -180,7 +180,7 @@ def _built(definition: ModelDefinition, spec: str) -> nn.Module:
             f"build of network {definition.name!r} is a {type(definition.build).__name__} that is"
             " made already; a class or a function that makes it is expected, as in lambda: net"
         )
-    with blaming(f"build of network {definition.name!r}"), importing_beside(spec):
+    with wrap_user_errors(f"build of network {definition.name!r}"), importing_beside(spec):
         module = definition.build()
     if not isinstance(module, nn.Module):
         raise ModelError(f"build of {definition.name!r} gives no torch module")

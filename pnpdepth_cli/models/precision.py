@@ -8,10 +8,11 @@ from typing import Any
 import torch
 from torch import nn
 
+from pnpdepth_cli.choices import PRECISIONS
 from pnpdepth_cli.core.split.user_code import describe, is_out_of_memory
 from pnpdepth_cli.errors import DeviceError, ModelError, UsageError
 
-PRECISIONS = {"fp32": None, "bf16": torch.bfloat16, "fp16": torch.float16}
+_DTYPES = {"fp32": None, "bf16": torch.bfloat16, "fp16": torch.float16}
 
 _MAPS = (nn.Conv2d, nn.ConvTranspose2d)
 _CAST_ONCE = (nn.Linear, nn.Conv1d, nn.Conv3d, nn.ConvTranspose1d, nn.ConvTranspose3d, *_MAPS)
@@ -27,7 +28,7 @@ def dtype_of(precision: str, device: torch.device) -> torch.dtype | None:
         raise UsageError(f"precision {precision!r} is not one of {' '.join(PRECISIONS)}")
     if precision == "fp16" and device.type == "cpu":
         raise DeviceError("precision fp16 is for GPUs; on a CPU take --precision bf16 or fp32")
-    return PRECISIONS[precision]
+    return _DTYPES[precision]
 
 
 def lower(module: nn.Module, dtype: torch.dtype, device: torch.device) -> None:

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from pnpdepth_cli.core.split.structure import map_tensors
-from pnpdepth_cli.core.split.user_code import blaming
+from pnpdepth_cli.core.split.user_code import wrap_user_errors
 from pnpdepth_cli.errors import ModelError
 
 _SQUARE_ENOUGH = 1.3
@@ -59,7 +59,7 @@ def outline(
     useful = [s for s in run.seen if s.area > 1 and _same_proportions(s.output, sides)]
     if not useful:
         return ()
-    with blaming("the gradient of the network"):
+    with wrap_user_errors("the gradient of the network"):
         gradients = torch.autograd.grad(
             prediction.sum(), [s.output for s in useful], allow_unused=True
         )
@@ -117,7 +117,7 @@ def _observed(
         if name and not isinstance(part, torch.jit.ScriptModule)
     ]
     try:
-        with torch.enable_grad(), blaming("the network's forward"):
+        with torch.enable_grad(), wrap_user_errors("the network's forward"):
             given = tuple(
                 a.detach().requires_grad_(a.is_floating_point()).clone() for a in arguments
             )
@@ -137,7 +137,7 @@ def _reaches_features(run: _Run) -> bool:
     ]
     if not features or not run.prediction.requires_grad:
         return False
-    with blaming("the gradient of the network"):
+    with wrap_user_errors("the gradient of the network"):
         gradients = torch.autograd.grad(
             run.prediction.sum(), features, allow_unused=True, retain_graph=True
         )

@@ -6,9 +6,9 @@ Nothing here imports torch, as the definitions themselves do not.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from numbers import Integral, Real
-from typing import Any, NoReturn, get_args
+from typing import NoReturn
 
 from pnpdepth_cli.errors import ModelError
 
@@ -22,9 +22,9 @@ _MEANT = {
 """What the usual words are called here, by field and word."""
 
 
-def one_of(owner: object, field: str, literal: Any) -> None:
-    """The field is one of the values of a `Literal`."""
-    value, valid = getattr(owner, field), get_args(literal)
+def one_of(owner: object, field: str, valid: Collection[str]) -> None:
+    """The field is one of these names."""
+    value = getattr(owner, field)
     if not isinstance(value, str) or value not in valid:
         meant = _MEANT.get((field, str(value)), "")
         refuse(owner, field, f"is none of {', '.join(map(repr, valid))}{meant}")

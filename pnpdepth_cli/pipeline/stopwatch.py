@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import platform
-import resource
-import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib import metadata
 from pathlib import Path
 
+import psutil
 import torch
 
 from pnpdepth_cli import __version__
@@ -44,13 +43,13 @@ def peak_memory_mb(device: torch.device) -> dict[str, float]:
 
 
 def _peak_resident_bytes() -> int:
-    # Linux's ru_maxrss remembers the process that started this one, so /proc goes first.
+    # Linux says the peak only here; Windows through psutil; macOS not, so what is in use counts.
     status = Path("/proc/self/status")
     if status.exists():
         line = next(row for row in status.read_text().splitlines() if row.startswith("VmHWM"))
         return int(line.split()[1]) * 1024
-    unit = 1 if sys.platform == "darwin" else 1024
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
+    memory = psutil.Process().memory_info()
+    return int(getattr(memory, "peak_wset", memory.rss))
 
 
 def versions() -> dict[str, str]:

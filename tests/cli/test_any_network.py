@@ -74,10 +74,10 @@ def test_an_onnx_file_is_refined_layers_listed_and_checked(
     assert all(row["seconds_behind"] > 0 for row in rows)
     assert code_of(["layers", "--model", net, "--sparse", str(frame.sparse)]) == 0
     assert "pixels apart" in capsys.readouterr().out
-    assert code_of(["models", "--check", net, "--image", str(frame.image), "--json"]) == 0
+    assert code_of(["models", "check", net, "--image", str(frame.image), "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert set(found["layers"].values()) == {"ok"}
-    assert code_of(["models", "--check", net]) == 0
+    assert code_of(["models", "check", net]) == 0
     assert "Relu_d: ok" in capsys.readouterr().out
 
 
@@ -87,15 +87,15 @@ def test_a_published_checkpoint_is_converted_and_nothing_is_replaced(
     net = nn.Sequential(nn.Conv2d(1, 2, 3), nn.BatchNorm2d(2))
     source, target = tmp_path / "m.pth.tar", tmp_path / "w.safetensors"
     torch.save({"args": argparse.Namespace(a=1), "epoch": 2, "model": net}, source)
-    convert = ["models", "--convert", str(source), str(target)]
+    convert = ["models", "convert", str(source), str(target)]
     assert code_of([*convert, "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["tensors"] == 7
     state = load_file(target)
     assert all(torch.equal(state[name], value) for name, value in net.state_dict().items())
     assert code_of(convert) == 2
-    assert code_of(["models", "--convert", str(source), str(tmp_path / "w.pt")]) == 2
+    assert code_of(["models", "convert", str(source), str(tmp_path / "w.pt")]) == 2
     assert (
-        code_of(["models", "--convert", str(tmp_path / "no.pt"), str(tmp_path / "x.safetensors")])
+        code_of(["models", "convert", str(tmp_path / "no.pt"), str(tmp_path / "x.safetensors")])
         == 4
     )
     assert "does not exist" in capsys.readouterr().err
@@ -110,13 +110,13 @@ def test_fetch_offline_says_what_is_wrong_in_one_line(
         raise ConnectionError("no route\nto host")
 
     monkeypatch.setattr(hub.HfApi, "model_info", refuse)
-    fetch = ["models", "--fetch", "org/name", "-o", str(tmp_path / "name")]
+    fetch = ["models", "fetch", "org/name", "-o", str(tmp_path / "name")]
     assert code_of(fetch) == 4
     err = capsys.readouterr().err
     assert "no route to host" in err
     assert err.count("\n") == 1
     assert not (tmp_path / "name").exists()
-    assert code_of(["models", "--fetch", "name"]) == 2
+    assert code_of(["models", "fetch", "name"]) == 2
 
 
 def test_fetch_pins_the_revision_and_records_hashes(
@@ -135,7 +135,7 @@ def test_fetch_pins_the_revision_and_records_hashes(
 
     monkeypatch.setattr(hub.HfApi, "model_info", lambda *_, **__: Info())
     monkeypatch.setattr(hub, "snapshot_download", download)
-    fetch = ["models", "--fetch", "org/name", "-o", str(tmp_path / "name"), "--json"]
+    fetch = ["models", "fetch", "org/name", "-o", str(tmp_path / "name"), "--json"]
     assert code_of(fetch) == 0
     record = json.loads(capsys.readouterr().out)
     assert record["revision"] == "abc123"

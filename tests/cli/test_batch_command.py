@@ -68,7 +68,9 @@ def test_a_bad_frame_is_one_line_and_exit_code_7(
     err = capsys.readouterr().err
     (line,) = [line for line in err.splitlines() if line.startswith("failed")]
     assert line.startswith("failed: b: drive/rgb/b.png is empty")
-    assert err.splitlines()[-1].startswith("pnpdepth: 1 failed of 4 frames; out/summary.csv says")
+    assert err.splitlines()[-1].startswith(
+        "pnpdepth: 1 failed of 4 frames; the reasons are in out/summary.csv"
+    )
     assert "Traceback" not in err
 
 
@@ -182,7 +184,7 @@ def test_ctrl_c_finishes_the_frame_says_how_to_go_on_and_exits_130(
         _, err = running.communicate(timeout=60)
     assert running.returncode == 130
     assert "finishing the frame in work" in err
-    assert "of 4 frames; the same command goes on from there" in err.splitlines()[-1]
+    assert "of 4 frames; run the same command to continue" in err.splitlines()[-1]
     assert "Traceback" not in err
     states = [json.loads(line)["state"] for line in manifest.read_text().splitlines()]
     assert states.count("begun") == states.count("done") > 0

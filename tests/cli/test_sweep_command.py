@@ -135,7 +135,7 @@ def test_ctrl_c_says_how_to_go_on_and_exits_130(
     monkeypatch.setattr(sweep_running, "refined_curve", interrupted)
     vary = ("--vary", "lr=1%,3%", "--no-plots")
     assert code_of(arguments(*vary)) == 130
-    assert "stopped; the same command goes on from there" in capsys.readouterr().err
+    assert "stopped; run the same command to continue" in capsys.readouterr().err
     assert code_of(arguments(*vary)) == 0
     assert "6 runs: 2 done already, 4 to do" in capsys.readouterr().err
 

@@ -9,11 +9,10 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from pnpdepth_cli.core.losses import LOSSES
+from pnpdepth_cli.choices import LOSSES, UPDATES
 from pnpdepth_cli.core.refine import RefineSettings
 from pnpdepth_cli.core.split.layer_name import LayerName
 from pnpdepth_cli.core.split.structure import map_tensors, tensors_in
-from pnpdepth_cli.core.update_rules import UPDATES
 from pnpdepth_cli.points import SparsePoints
 
 

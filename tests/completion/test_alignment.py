@@ -9,7 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from pnpdepth_cli.completion.alignment import SPACES, align
+from pnpdepth_cli.choices import SPACES
+from pnpdepth_cli.completion.alignment import align
 from pnpdepth_cli.errors import ModelError, NoPointsError
 from pnpdepth_cli.points import SparsePoints
 

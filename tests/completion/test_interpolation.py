@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 from scipy.interpolate import LinearNDInterpolator
 from torch import Tensor
 
-from pnpdepth_cli.completion.alignment import SPACES, from_space, to_space
+from pnpdepth_cli.choices import SPACES
+from pnpdepth_cli.completion.alignment import from_space, to_space
 from pnpdepth_cli.completion.interpolation import inverse_distance, linear, morphological, nearest
 from pnpdepth_cli.errors import NoPointsError
 from pnpdepth_cli.points import SparsePoints

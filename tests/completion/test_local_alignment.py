@@ -6,7 +6,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from pnpdepth_cli.completion.alignment import BEYOND, SPACES, aligned, from_space, to_space
+from pnpdepth_cli.choices import SPACES
+from pnpdepth_cli.completion.alignment import BEYOND, aligned, from_space, to_space
 from pnpdepth_cli.completion.local_alignment import locally_aligned, trust
 from pnpdepth_cli.errors import NoPointsError
 from pnpdepth_cli.points import SparsePoints

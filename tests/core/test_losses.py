@@ -7,7 +7,11 @@ from math import inf, log
 import pytest
 import torch
 
-from pnpdepth_cli.core.losses import LEAST_GROSS, LOSSES, NEAREST_DEPTH, berhu, cauchy
+from pnpdepth_cli.choices import LOSSES
+from pnpdepth_cli.core.losses import MIN_DEPTH
+from pnpdepth_cli.core.losses.berhu import loss as berhu
+from pnpdepth_cli.core.losses.cauchy import MIN_SCALE
+from pnpdepth_cli.core.losses.cauchy import loss as cauchy
 
 PREDICTED, TRUE = torch.tensor([1.0, 2.0, 4.0, 10.0]), torch.tensor([1.0, 2.5, 2.0, 5.0])
 # errors 0, ½, 2, 5; c of berhu = 1, so ½ is linear there and 2 and 5 are quadratic
@@ -51,7 +55,7 @@ def test_no_error_is_no_loss_and_no_gradient(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", LOSSES)
-@pytest.mark.parametrize("value", [-5.0, 0.0, NEAREST_DEPTH / 2, 1e30, 1e-30])
+@pytest.mark.parametrize("value", [-5.0, 0.0, MIN_DEPTH / 2, 1e30, 1e-30])
 def test_any_finite_prediction_has_a_gradient_without_nan(name: str, value: float) -> None:
     predicted = torch.tensor([value, 1.0], requires_grad=True)
     loss = LOSSES[name](predicted, torch.tensor([2.0, 1.5]))
@@ -96,5 +100,5 @@ def test_what_counts_as_gross_grows_with_the_errors_of_most_points() -> None:
         (gradient,) = torch.autograd.grad(cauchy(predicted, true), predicted)
         pulls.append((gradient * predicted).abs())
     assert float(pulls[0][4]) < float(pulls[0][1])
-    assert 8 * log(1.1) > LEAST_GROSS
+    assert 8 * log(1.1) > MIN_SCALE
     assert float(pulls[1][1]) > 3 * float(pulls[0][1]) / 4

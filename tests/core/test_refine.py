@@ -12,10 +12,9 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from pnpdepth_cli.core.losses import LOSSES
+from pnpdepth_cli.choices import LOSSES, UPDATES
 from pnpdepth_cli.core.refine import Refinement, RefineSettings, refine, refine_batch
 from pnpdepth_cli.core.split import Split
-from pnpdepth_cli.core.update_rules import UPDATES
 from pnpdepth_cli.errors import (
     BatchError,
     DivergedError,
@@ -204,11 +203,11 @@ def test_a_linear_schedule_is_k_single_updates_with_falling_steps() -> None:
     assert result.after.flatten().tolist() == [6 + moved, 6 + moved]
 
 
-def test_a_spread_gradient_moves_what_no_point_reaches() -> None:
+def test_a_blurred_gradient_moves_what_no_point_reaches() -> None:
     torch.manual_seed(0)
     network = nn.Sequential(conv(3, 4), conv(4, 4), nn.ReLU(inplace=True), conv(4, 1))
     one = POINTS.select(torch.tensor([True, False, False, False, False]))
-    settings = RefineSettings(update="normalised", lr=0.1, spread=0.5)
+    settings = RefineSettings(update="normalised", lr=0.1, blur=0.5)
     result = refined(network, "0", settings, points=one)
     assert bool((result.after != result.before).all())
     assert result.losses[-1] < result.losses[0]
@@ -270,14 +269,14 @@ def test_channels_are_scaled_and_shifted_and_nothing_else() -> None:
     assert not torch.equal(seen[0], seen[-1])
 
 
-def test_an_anchor_adds_the_squared_change_of_log_depth_and_holds_it_back() -> None:
+def test_a_proximity_weight_adds_the_squared_change_of_log_depth_and_holds_it_back() -> None:
     def change(result: Refinement) -> float:
         return float((result.after.log() - result.before.log()).square().mean())
 
     settings = RefineSettings(iterations=8, lr=0.05, update="normalised")
     free, held = (
-        refined(build("unet"), "bottleneck", replace(settings, anchor=anchor))
-        for anchor in (0.0, 10.0)
+        refined(build("unet"), "bottleneck", replace(settings, proximity=proximity))
+        for proximity in (0.0, 10.0)
     )
     assert free.losses[0] == held.losses[0]
     assert change(held) < change(free)
@@ -484,7 +483,7 @@ def refined_alone(
             update="normalised",
             loss="cauchy",
             schedule="linear",
-            spread=1,
+            blur=1,
             keep_best=True,
         ),
     ],
@@ -521,9 +520,9 @@ class PerPixel(nn.Module):
 
 
 @pytest.mark.parametrize("update", UPDATES)
-@pytest.mark.parametrize("spread", [0.0, 0.7])
-def test_at_once_is_alone_bit_for_bit_where_the_network_is(update: str, spread: float) -> None:
-    settings = RefineSettings(lr="5%", update=update, schedule="linear", spread=spread)
+@pytest.mark.parametrize("blur", [0.0, 0.7])
+def test_at_once_is_alone_bit_for_bit_where_the_network_is(update: str, blur: float) -> None:
+    settings = RefineSettings(lr="5%", update=update, schedule="linear", blur=blur)
     network = PerPixel()
     for index, together in enumerate(refined_at_once(network, "cut", settings)):
         assert isinstance(together, Refinement)

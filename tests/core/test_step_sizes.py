@@ -9,7 +9,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pnpdepth_cli.core.step_sizes import SCHEDULES, Channels, spread, step_size
+from pnpdepth_cli.core.step_sizes import SCHEDULES, Channels, blurred, step_size
 from pnpdepth_cli.errors import LayerError, UsageError
 from pnpdepth_cli.points import SparsePoints
 
@@ -46,18 +46,18 @@ def test_a_linear_schedule_falls_by_the_same_amount_every_time() -> None:
     assert [SCHEDULES["linear"](k / 4) for k in range(4)] == [1, 0.75, 0.5, 0.25]
 
 
-def test_no_spread_and_a_z_that_is_no_map_leave_the_gradient_itself() -> None:
+def test_no_blur_and_a_z_that_is_no_map_leave_the_gradient_itself() -> None:
     gradient = torch.randn(1, 3, 5, 7)
-    assert spread(gradient, points(4, (50, 70)), 0.0) is gradient
+    assert blurred(gradient, points(4, (50, 70)), 0.0) is gradient
     tokens = torch.randn(1, 35, 3)
-    assert spread(tokens, points(4, (50, 70)), 2.0) is tokens
+    assert blurred(tokens, points(4, (50, 70)), 2.0) is tokens
 
 
 def test_the_reach_is_a_gaussian_of_so_many_spacings_of_the_points() -> None:
     # 4 points on 40 × 80 pixels are √800 pixels apart; a cell is 4 pixels high and 2 wide
     gradient = torch.zeros(1, 1, 10, 40)
     gradient[0, 0, 5, 20] = 1
-    blurred = spread(gradient, points(4, (40, 80)), 0.25)[0, 0]
+    result = blurred(gradient, points(4, (40, 80)), 0.25)[0, 0]
 
     def weight(cell: int, cells: int, of: int, sigma: float) -> float:
         """What cell `of` weighs in the mean that `cell` becomes."""
@@ -67,7 +67,7 @@ def test_the_reach_is_a_gaussian_of_so_many_spacings_of_the_points() -> None:
     down, across = 0.25 * math.sqrt(800) / 4, 0.25 * math.sqrt(800) / 2
     for row, column in ((5, 20), (4, 20), (9, 23), (0, 0), (7, 39)):
         expected = weight(row, 10, 5, down) * weight(column, 40, 20, across)
-        assert float(blurred[row, column]) == pytest.approx(expected, rel=1e-4)
+        assert float(result[row, column]) == pytest.approx(expected, rel=1e-4)
 
 
 @given(
@@ -79,12 +79,12 @@ def test_a_gradient_that_is_the_same_everywhere_stays_so_whatever_the_points(
     count: int, spacings: float, shape: tuple[int, int, int]
 ) -> None:
     gradient = torch.full((1, *shape), 0.7)
-    torch.testing.assert_close(spread(gradient, points(count, (64, 96)), spacings), gradient)
+    torch.testing.assert_close(blurred(gradient, points(count, (64, 96)), spacings), gradient)
 
 
 def test_many_points_keep_a_gradient_in_its_cell() -> None:
     gradient = torch.randn(1, 2, 6, 8, generator=torch.Generator().manual_seed(0))
-    torch.testing.assert_close(spread(gradient, points(4800, (60, 80)), 1.0), gradient)
+    torch.testing.assert_close(blurred(gradient, points(4800, (60, 80)), 1.0), gradient)
 
 
 @pytest.mark.parametrize(("shape", "inside"), [((1, 3, 4, 5), (2, 3)), ((1, 7, 3), (1,))])
@@ -94,20 +94,20 @@ def test_channels_move_by_a_scale_and_a_shift_each(
     torch.manual_seed(0)
     z0 = torch.randn(shape).double() * 4 + 1
     channels = Channels(z0)
-    change = torch.randn_like(channels.of(z0))
+    change = torch.randn_like(channels.gradient(z0))
     assert change.numel() == 2 * 3
     scale, shift = change.tensor_split(2)
     flat = (z0 - z0.mean(inside, keepdim=True)) / z0.std(inside, correction=0, keepdim=True)
-    torch.testing.assert_close(channels.spread_out(change), scale * flat + shift)
+    torch.testing.assert_close(channels.change_of_z(change), scale * flat + shift)
     # what `of` gives is the slope of the loss in these numbers, over the elements of a channel
     slope, count = torch.randn_like(z0), z0.numel() // 3
-    along = (slope * channels.spread_out(change)).sum()
-    torch.testing.assert_close((channels.of(slope) * change).sum() * count, along)
+    along = (slope * channels.change_of_z(change)).sum()
+    torch.testing.assert_close((channels.gradient(slope) * change).sum() * count, along)
 
 
 def test_a_channel_that_is_the_same_everywhere_is_shifted_only() -> None:
     channels = Channels(torch.ones(1, 1, 2, 2))
-    moved = channels.spread_out(torch.tensor([5.0, 2.0]).view(2, 1, 1, 1))
+    moved = channels.change_of_z(torch.tensor([5.0, 2.0]).view(2, 1, 1, 1))
     assert moved.flatten().tolist() == [2.0] * 4
 
 

@@ -8,17 +8,15 @@ import pytest
 import torch
 from torch import Tensor
 
-from pnpdepth_cli.core import update_rules as updates
-from pnpdepth_cli.core.update_rules import (
-    UPDATES,
-    Update,
-    adam,
-    lbfgs,
-    momentum,
-    normalised,
-    sgd,
-    sign,
-)
+from pnpdepth_cli.choices import UPDATES
+from pnpdepth_cli.core.update_rules import Update
+from pnpdepth_cli.core.update_rules import lbfgs as lbfgs_module
+from pnpdepth_cli.core.update_rules.adam import update_rule as adam
+from pnpdepth_cli.core.update_rules.lbfgs import update_rule as lbfgs
+from pnpdepth_cli.core.update_rules.momentum import update_rule as momentum
+from pnpdepth_cli.core.update_rules.normalised import update_rule as normalised
+from pnpdepth_cli.core.update_rules.sgd import update_rule as sgd
+from pnpdepth_cli.core.update_rules.sign import update_rule as sign
 
 
 def stepped(update: Update, steps: int = 20, lr: float = 0.1) -> Tensor:
@@ -96,7 +94,7 @@ def test_a_normalised_gradient_keeps_its_direction_and_has_a_root_mean_square_of
 def test_l_bfgs_moves_as_dense_bfgs_does_whatever_the_step(
     alpha: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(updates, "_LONGEST", 1e6)
+    monkeypatch.setattr(lbfgs_module, "MAX_RMS", 1e6)
     torch.manual_seed(0)
     curved = torch.randn(6, 6, dtype=torch.float64)
     curved = curved @ curved.T + torch.eye(6, dtype=torch.float64)

@@ -26,7 +26,7 @@ with locked_folder(Path(sys.argv[1]), None, lambda: None):
 
 @pytest.fixture(autouse=True)
 def no_long_wait(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(lock, "_CLEANING_S", 0.1)
+    monkeypatch.setattr(lock, "_START_S", 0.1)
 
 
 class Alone:

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 
 import pytest
 
-from pnpdepth_cli.io.shared_context import Together
+from pnpdepth_cli.io.shared_context import SharedContext
 
 
 def test_the_first_enters_and_the_last_leaves_whatever_the_order() -> None:
@@ -19,7 +19,7 @@ def test_the_first_enters_and_the_last_leaves_whatever_the_order() -> None:
         yield
         states.append("as before")
 
-    shared = Together(change)
+    shared = SharedContext(change)
     first_is_in, second_is_in = threading.Event(), threading.Event()
 
     def first() -> None:
@@ -52,7 +52,7 @@ def test_an_error_inside_passes_through_and_leaves() -> None:
         finally:
             states.append("as before")
 
-    shared = Together(change)
+    shared = SharedContext(change)
     with pytest.raises(ValueError, match="mine"), shared:
         raise ValueError("mine")
     assert states == ["as before"]

@@ -143,10 +143,10 @@ def test_the_shipped_weights_fit_and_are_small() -> None:
 def test_the_path_is_the_same_for_every_frame_as_the_definition_promises(
     network: Compact, layer: str
 ) -> None:
-    assert definition.same_path
-    with Split(network, layer, same_path=True) as split:
+    assert definition.static_graph
+    with Split(network, layer, static_graph=True) as split:
         split.rear(split.front(*frame(96, 128, 60)))
-        assert split.repeats
+        assert split.static_graph
         # from no point at all to nearly every cell seen
         found = []
         for count in (0, 1, 30, 3000):
@@ -156,4 +156,4 @@ def test_the_path_is_the_same_for_every_frame_as_the_definition_promises(
         with Split(network, layer) as fresh:
             assert torch.equal(fresh.front(*frame(96, 128, count, seed=count + 1)), z)
             assert torch.equal(fresh.rear(z + 0.1), depth)
-            assert not fresh.repeats
+            assert not fresh.static_graph

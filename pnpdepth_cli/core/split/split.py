@@ -32,7 +32,7 @@ from torch import Tensor, nn
 from pnpdepth_cli.core.split.layer_name import LayerName
 from pnpdepth_cli.core.split.state import NetworkState
 from pnpdepth_cli.core.split.structure import map_tensors, tensors_in
-from pnpdepth_cli.core.split.user_code import blaming
+from pnpdepth_cli.core.split.user_code import wrap_user_errors
 from pnpdepth_cli.core.split.watch import Call, Remembered, Watch
 from pnpdepth_cli.errors import LayerError
 
@@ -52,7 +52,7 @@ class Split:
 
     While open, the network is in eval mode and only z requires gradient. Raises LayerError for a
     layer that does not exist, never runs, or runs or returns several times without a choice.
-    same_path: the network runs the same submodules for all arguments of the same shapes, though
+    static_graph: the network runs the same submodules for all arguments of the same shapes, though
     values of tensors get out to Python; without a promise, each frame is then learnt anew.
     """
 
@@ -67,15 +67,15 @@ class Split:
     _cut_call: Call | None
     _path: tuple[str, ...]
     _learned: bool
-    _repeats: bool  # what was learned holds for all arguments of `_shapes`
+    _static: bool  # what was learned holds for all arguments of `_shapes`
     _shapes: Any
     _passing: bool
     _filling: bool  # inside a submodule that is remembered as a whole, as was learned
     _sealed: bool  # inside a submodule that is to be remembered as a whole
     _open: set[nn.Module]  # submodules that turned out not to be fit for that
 
-    def __init__(self, network: nn.Module, layer: str, *, same_path: bool = False) -> None:
-        self.layer, self._same_path = layer, same_path
+    def __init__(self, network: nn.Module, layer: str, *, static_graph: bool = False) -> None:
+        self.layer, self._promised_static = layer, static_graph
         self._network = network
         self._name = LayerName.parse(layer)
         self._modules = dict(network.named_modules(remove_duplicate=False))
@@ -121,20 +121,20 @@ class Split:
                 module.__dict__["forward"] = own_forward
 
     @property
-    def repeats(self) -> bool:
+    def static_graph(self) -> bool:
         """True once it is known that the network treats all arguments of these shapes alike.
 
         Then no value of a tensor gets out to Python, which could choose another path by it, or it
-        was promised (`same_path`) that it does not.
+        was promised (`static_graph`) that it does not.
         """
-        return self._learned and self._repeats
+        return self._learned and self._static
 
     def front(self, *arguments: Any) -> Tensor:
         """z_0, the output of the cut layer for these arguments of the network.
 
         In float32 where the layer gives fewer bits: small steps would get lost in them.
         """
-        if self._learned and self._repeats and self._shapes == _shapes(arguments):
+        if self._learned and self._static and self._shapes == _shapes(arguments):
             return self._front_of_another_frame(arguments)
         self._stand_in_for(self._forwards)
         while True:
@@ -149,7 +149,7 @@ class Split:
                 if len(self._open) > known_open:
                     continue  # once more, to remember what lies inside those
                 self._index()
-                self._repeats = self._same_path or not watch.escaped
+                self._static = self._promised_static or not watch.escaped
                 assert self._z0 is not None
                 return _handed_out(self._z0)
             raise LayerError(self._never_ran())
@@ -199,7 +199,7 @@ class Split:
             self._release_unread(watch)
         self._index()
         self._learned = True
-        self._repeats &= self._same_path or not watch.escaped
+        self._static &= self._promised_static or not watch.escaped
         self._stand_in_for({call.module for call in self._calls if self._matters(call)})
         return output
 
@@ -218,7 +218,7 @@ class Split:
         self._counts.clear()
         self._passing = True
         try:
-            with blaming("the network's forward"):
+            with wrap_user_errors("the network's forward"):
                 return self._network(*self._given.hand_back())
         finally:
             self._passing = False
@@ -231,7 +231,7 @@ class Split:
         self._calls, self._slots, self._ran = [], {}, set()
         self._counts = Counter()
         self._watch = self._cut_call = None
-        self._learned = self._repeats = self._passing = self._filling = self._sealed = False
+        self._learned = self._static = self._passing = self._filling = self._sealed = False
 
     def _index(self) -> None:
         self._slots = {}
@@ -390,7 +390,7 @@ def gradient_at(z: Tensor, value: Tensor) -> Tensor | None:
     ModelError if the network cannot be differentiated.
     """
     if value.requires_grad:
-        with blaming("the gradient of the network"):
+        with wrap_user_errors("the gradient of the network"):
             value.backward()  # type: ignore[no-untyped-call]
     return z.grad
 

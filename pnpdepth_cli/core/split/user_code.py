@@ -13,7 +13,7 @@ from pnpdepth_cli.errors import ModelError, PnpDepthError
 
 
 @contextmanager
-def blaming(what: str) -> Iterator[None]:
+def wrap_user_errors(what: str) -> Iterator[None]:
     """An exception inside becomes ModelError(`what` raises …); memory running out stays itself."""
     try:
         yield

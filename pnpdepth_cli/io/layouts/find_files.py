@@ -9,7 +9,7 @@ from pathlib import Path
 from pnpdepth_cli.io.layouts.frame import Unmatched
 
 
-def files_below(
+def find_files(
     folder: Path, suffixes: Iterable[str]
 ) -> tuple[dict[str, Path], tuple[Unmatched, ...]]:
     """The files with one of these suffixes, by their place in the folder without the suffix.

@@ -7,10 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pnpdepth_cli.errors import InputError
+from pnpdepth_cli.io.formats import DEPTH_SUFFIXES
 from pnpdepth_cli.io.layouts.protocols import WHOLE, Protocol
 
 PICTURES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".exr")
-DEPTHS = (".png", ".exr", ".npy", ".npz", ".pfm", ".tif", ".tiff")
+DEPTHS = DEPTH_SUFFIXES
 SCANS = (".bin", ".pcd", ".ply")
 
 
@@ -44,6 +45,7 @@ class Frame:
     contains a slash. sparse: a depth file, or a scan with calib; None where the protocol samples
     the truth. *_scale: codes per metre of integer files.
     calib, camera: as `read_calibration` takes them. protocol: what is cut out before anything else.
+    group: the sequence it belongs to; None leaves it to its name.
     pose: x_world = pose · (x, 1) for points of KITTI's camera 0, whichever camera took the image.
     """
 
@@ -57,6 +59,7 @@ class Frame:
     gt_scale: float | None = None
     protocol: Protocol = WHOLE
     pose: Pose | None = None
+    group: str | None = None
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from pnpdepth_cli.io.layouts.find_files import files_below
+from pnpdepth_cli.io.layouts.find_files import find_files
 from pnpdepth_cli.io.layouts.frame import DEPTHS, PICTURES, SCANS, Frame, Listing, without_partner
 
 _CALIBRATIONS = (".txt", ".json", ".yaml", ".yml")
@@ -21,10 +21,10 @@ def matches(root: Path) -> bool:
 
 def listing(root: Path) -> Listing:
     """One frame for each image with sparse depth."""
-    images, lost_images = files_below(root / "rgb", PICTURES)
-    sparse, lost_sparse = files_below(root / "sparse", (*DEPTHS, *SCANS, ".csv"))
-    gt, lost_gt = files_below(root / "gt", DEPTHS)
-    calib, lost_calib = files_below(root / "calib", _CALIBRATIONS)
+    images, lost_images = find_files(root / "rgb", PICTURES)
+    sparse, lost_sparse = find_files(root / "sparse", (*DEPTHS, *SCANS, ".csv"))
+    gt, lost_gt = find_files(root / "gt", DEPTHS)
+    calib, lost_calib = find_files(root / "calib", _CALIBRATIONS)
     shared = root / "calib.txt"
     frames = [
         Frame(

@@ -17,6 +17,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from pnpdepth_cli.choices import OutputKind, OutputScale
 from pnpdepth_cli.completion.interpolation import linear
 from pnpdepth_cli.core.split.user_code import describe
 from pnpdepth_cli.errors import CheckpointError, ModelError
@@ -26,8 +27,6 @@ from pnpdepth_cli.models.definition import (
     ModelDefinition,
     Near,
     Normalisation,
-    OutputKind,
-    OutputScale,
 )
 from pnpdepth_cli.points import SparsePoints
 
@@ -166,7 +165,7 @@ def _weights(folder: Path) -> Path:
             return folder / name
     if any((folder / name).is_file() for name in _PICKLED):
         raise CheckpointError(
-            f"{folder} has its weights as a pickle only; convert it: pnpdepth models --convert"
+            f"{folder} has its weights as a pickle only; convert it: pnpdepth models convert"
             f" {folder / _PICKLED[0]} {folder / _WEIGHTS[0]}"
         )
     raise CheckpointError(f"{folder} has no {_WEIGHTS[0]}")

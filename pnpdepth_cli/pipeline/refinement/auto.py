@@ -113,7 +113,7 @@ def usual_trials(definition: ModelDefinition, layer: str, settings: RefineSettin
     Those that differ from the first in their alignment alone are the usual ones; what takes more
     time comes after them, other layers last.
     """
-    adam = replace(settings, update="adam", lr="3%", schedule="constant", spread=0.0, iterations=10)
+    adam = replace(settings, update="adam", lr="3%", schedule="constant", blur=0.0, iterations=10)
     steps = [settings, adam]
     if settings == replace(RefineSettings(), align=settings.align):
         steps.reverse()  # nobody has tuned the paper's steps to this network

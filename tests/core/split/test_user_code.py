@@ -8,12 +8,12 @@ from pathlib import Path
 import pytest
 import torch
 
-from pnpdepth_cli.core.split.user_code import blaming, describe, is_out_of_memory
+from pnpdepth_cli.core.split.user_code import describe, is_out_of_memory, wrap_user_errors
 from pnpdepth_cli.errors import LayerError, ModelError
 
 
 def test_an_exception_inside_is_blamed_on_one_line_and_kept_as_the_cause() -> None:
-    with pytest.raises(ModelError) as error, blaming("the network's forward"):
+    with pytest.raises(ModelError) as error, wrap_user_errors("the network's forward"):
         raise ValueError("a\n  b\n\n c")
     assert str(error.value) == "the network's forward raises ValueError: a b c"
     assert isinstance(error.value.__cause__, ValueError)
@@ -21,7 +21,7 @@ def test_an_exception_inside_is_blamed_on_one_line_and_kept_as_the_cause() -> No
 
 def test_our_own_errors_and_ends_pass_through() -> None:
     for kind in (LayerError, KeyboardInterrupt, GeneratorExit):
-        with pytest.raises(kind), blaming("x"):
+        with pytest.raises(kind), wrap_user_errors("x"):
             raise kind
 
 
@@ -38,7 +38,7 @@ def test_our_own_errors_and_ends_pass_through() -> None:
 )
 def test_running_out_of_memory_stays_itself(error: Exception) -> None:
     assert is_out_of_memory(error)
-    with pytest.raises(type(error)), blaming("x"):
+    with pytest.raises(type(error)), wrap_user_errors("x"):
         raise error
 
 

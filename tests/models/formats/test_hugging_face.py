@@ -208,7 +208,7 @@ def test_unfinished_folders_are_refused_with_the_way_out(tmp_path: Path) -> None
     folder = saved(tmp_path / "net", "glpn")
     weights = folder / "model.safetensors"
     weights.rename(folder / "pytorch_model.bin")
-    with pytest.raises(CheckpointError, match=r"pnpdepth models --convert .*pytorch_model\.bin"):
+    with pytest.raises(CheckpointError, match=r"pnpdepth models convert .*pytorch_model\.bin"):
         hf_definition(folder)
     (folder / "pytorch_model.bin").unlink()
     with pytest.raises(CheckpointError, match="no model"):

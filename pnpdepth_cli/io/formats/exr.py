@@ -1,4 +1,4 @@
-"""OpenEXR: every flat channel of a file, in the frame of its display window."""
+"""OpenEXR: the flat channels of a file, in the frame of its display window."""
 
 from __future__ import annotations
 
@@ -9,17 +9,26 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pnpdepth_cli.errors import FileFormatError
+from pnpdepth_cli.errors import FileFormatError, UsageError
 from pnpdepth_cli.io.file_bytes import check_pixel_count, damaged
+from pnpdepth_cli.io.formats import DepthFormat, StoredArray, WriteOptions
 
+_DEPTH_NAMES = frozenset({"z", "depth"})
 _TILED, _DEEP, _MULTIPART = 0x200, 0x800, 0x1000  # bits of the version field
 
 
 def read_exr_channels(path: Path, data: bytes) -> dict[str, NDArray[Any]]:
-    """Name -> (H, W) array, float16, float32 or uint32; `data` is the content of `path`.
+    """Returns the channels by name: (H, W) arrays of float16, float32 or uint32.
 
     Channels of a file with several parts are called `part.channel`. Pixels of the display
     window outside the data window are 0.
+
+    Args:
+        path: The file.
+        data: Its content.
+
+    Raises:
+        FileFormatError: The file is damaged, deep or subsampled, or exceeds the budget.
     """
     _check_complete(path, data)
     import OpenEXR
@@ -28,7 +37,7 @@ def read_exr_channels(path: Path, data: bytes) -> dict[str, NDArray[Any]]:
         with OpenEXR.File(str(path), header_only=True) as file:
             count = len(file.parts)
             for index in range(count):
-                _check_header(path, file.header(index))
+                _check_header(path, file.header(index), len(data))
         with OpenEXR.File(str(path), separate_channels=True) as file:
             parts = [_part_channels(part) for part in file.parts]
             names = [str(part.name()) for part in file.parts]
@@ -51,24 +60,25 @@ def read_exr_channels(path: Path, data: bytes) -> dict[str, NDArray[Any]]:
     return channels
 
 
-def write_exr_channel(path: Path, name: str, values: NDArray[np.float32]) -> None:
-    """`path` holds the one float32 channel, ZIP compressed. Raises OSError if it cannot."""
+def _write(file: Path, metres: NDArray[np.float32], options: WriteOptions) -> None:
+    """One float32 channel Z, ZIP compressed."""
     import OpenEXR
 
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    channel = OpenEXR.Channel(np.ascontiguousarray(values, dtype=np.float32))
+    channel = OpenEXR.Channel(np.ascontiguousarray(metres, dtype=np.float32))
     try:
-        with OpenEXR.File(header, {name: channel}) as file:
-            file.write(str(path))
+        with OpenEXR.File(header, {"Z": channel}) as image:
+            image.write(str(file))
     except RuntimeError as error:  # how the binding reports a full disk, say
         raise OSError(str(error)) from error
 
 
-def _check_header(path: Path, header: dict[str, Any]) -> None:
+def _check_header(path: Path, header: dict[str, Any], file_bytes: int) -> None:
     for window in ("dataWindow", "displayWindow"):
         low, high = header[window]
         width, height = (int(b) - int(a) + 1 for a, b in zip(low, high, strict=True))
-        check_pixel_count(path, width, height)
+        channels = len(header["channels"])
+        check_pixel_count(path, width, height, channels=channels, file_bytes=file_bytes)
     for channel in header["channels"]:
         if (channel.xSampling, channel.ySampling) != (1, 1):
             raise FileFormatError(
@@ -163,3 +173,32 @@ def _skip_header(data: bytes, position: int) -> tuple[int, bool]:
             tiled = data[value : value + size] == b"tiledimage"
         position = value + size
     return position + 1, tiled
+
+
+def _read(path: Path, data: bytes, channel: str | None) -> StoredArray:
+    channels = read_exr_channels(path, data)
+    name = channel if channel is not None else _depth_channel(path, channels)
+    if name not in channels:
+        listing = ", ".join(channels)
+        raise UsageError(f"{path} has no channel {name!r}; --channel can be one of: {listing}")
+    return StoredArray(values=channels[name], description=f"EXR channel {name}")
+
+
+def _depth_channel(path: Path, channels: dict[str, NDArray[Any]]) -> str:
+    """The only channel, or the only one named for depth, or R of a grey image in R, G, B."""
+    names = [name for name in channels if name != "A"] or list(channels)
+    if len(names) == 1:
+        return names[0]
+    named = [name for name in names if not _DEPTH_NAMES.isdisjoint(name.lower().split("."))]
+    if len(named) == 1:
+        return named[0]
+    if sorted(names) == ["B", "G", "R"]:
+        first = channels["R"]
+        if all(np.array_equal(first, channels[k], equal_nan=True) for k in "GB"):
+            return "R"
+    raise FileFormatError(
+        f"{path} has several channels ({', '.join(channels)}); choose one with --channel"
+    )
+
+
+FORMAT = DepthFormat(name="EXR", suffixes=(".exr",), magic=(b"v/1\x01",), read=_read, write=_write)

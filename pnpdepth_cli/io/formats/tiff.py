@@ -1,4 +1,8 @@
-"""TIFF structure: what the first page says of itself, and whether all its data is there."""
+"""TIFF: one channel of float metres or 16-bit codes, of its first page.
+
+The tags are read here because tifffile takes 0.15 s to import and decodes LZW only with a compiled
+package more, where OpenCV decodes all that occurs.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +10,15 @@ import struct
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
+from pnpdepth_cli.errors import FileFormatError
+from pnpdepth_cli.io.depth_scale import scale_in_text
 from pnpdepth_cli.io.file_bytes import check_pixel_count, damaged
+from pnpdepth_cli.io.formats import DepthFormat, StoredArray, WriteOptions
+from pnpdepth_cli.io.formats.png import eight_bits
+from pnpdepth_cli.io.opencv import decode_with_opencv
 
 _WIDTH, _HEIGHT, _BITS, _DESCRIPTION, _SAMPLES, _FORMAT = 256, 257, 258, 270, 277, 339
 _ORIENTATION = 274
@@ -17,25 +29,42 @@ _SIZE = {_ASCII: 1, _SHORT: 2, _LONG: 4}
 
 @dataclass(frozen=True, kw_only=True)
 class TiffFacts:
-    """Of the first page: bits and kind ("uint", "int" or "float") of each of `samples`."""
+    """Tags of the first page."""
 
     width: int
+    """Pixels."""
+
     height: int
+    """Pixels."""
+
     bits: int
+    """Bits of one sample."""
+
     number: str
+    """Kind of the samples: "uint", "int" or "float"."""
+
     samples: int
+    """Channels of a pixel."""
+
     orientation: int
+    """1 to 8 as in EXIF."""
+
     description: str
+    """The image description; empty without one."""
 
 
 def read_tiff_facts(path: Path, data: bytes) -> TiffFacts:
-    """The facts of the first page of a TIFF whose pixel data lies within the file."""
+    """Returns the tags of the first page.
+
+    Raises:
+        FileFormatError: Tags or pixels lie outside the file, or the image exceeds the budget.
+    """
     try:
         tags = _first_page(data)
         width, height = int(tags[_WIDTH][0]), int(tags[_HEIGHT][0])
     except (struct.error, KeyError, IndexError) as error:
         raise damaged(path, "TIFF", "is cut short or corrupt") from error
-    check_pixel_count(path, width, height)
+    check_pixel_count(path, width, height, file_bytes=len(data))
     _check_extent(path, data, tags)
     return TiffFacts(
         width=width,
@@ -81,3 +110,38 @@ def _check_extent(path: Path, data: bytes, tags: dict[int, tuple[int, ...]]) -> 
                 raise damaged(path, "TIFF", f"is cut short: {len(data):,} of {needed:,} bytes")
             return
     raise damaged(path, "TIFF", "does not say where its pixels are")
+
+
+def _read(path: Path, data: bytes, channel: str | None) -> StoredArray:
+    facts = read_tiff_facts(path, data)
+    if facts.samples != 1:
+        raise FileFormatError(
+            f"{path} is a TIFF with {facts.samples} channels; depth is one channel, save it so"
+        )
+    if (facts.number, facts.bits) not in (("uint", 16), ("float", 32), ("float", 64)):
+        if facts.bits <= 8:
+            raise eight_bits(path, "TIFF")
+        raise FileFormatError(
+            f"{path} is a {facts.bits}-bit {facts.number} TIFF; save depth as float32 or uint16"
+        )
+    values = decode_with_opencv(path, data, "TIFF")
+    if values.ndim != 2 or values.dtype.itemsize * 8 != facts.bits:
+        raise damaged(path, "TIFF", "cannot be decoded as one channel")
+    description = f"{facts.bits}-bit {'float ' if facts.number == 'float' else ''}TIFF"
+    scale = scale_in_text(path, facts.description)
+    return StoredArray(values=values, description=description, scale=scale)
+
+
+def _write(file: Path, metres: NDArray[np.float32], options: WriteOptions) -> None:
+    from PIL import Image
+
+    Image.fromarray(metres).save(file, "TIFF", compression="tiff_adobe_deflate")
+
+
+FORMAT = DepthFormat(
+    name="TIFF",
+    suffixes=(".tif", ".tiff"),
+    magic=(b"II*\x00", b"MM\x00*"),
+    read=_read,
+    write=_write,
+)

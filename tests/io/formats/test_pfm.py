@@ -10,7 +10,7 @@ from hypothesis.extra.numpy import array_shapes, arrays
 
 from pnpdepth_cli.errors import FileFormatError
 from pnpdepth_cli.io.depth import read_depth
-from pnpdepth_cli.io.pfm import parse_pfm, pfm_bytes
+from pnpdepth_cli.io.formats.pfm import parse_pfm, pfm_bytes
 
 HERE = Path("a.pfm")
 

@@ -11,14 +11,18 @@ from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import FileFormatError
 from pnpdepth_cli.io.file_bytes import check_pixel_count, damaged
+from pnpdepth_cli.io.formats import DepthFormat, StoredArray, WriteOptions
 
 _HEADER = re.compile(rb"(Pf|PF)\s+(\d{1,9})\s+(\d{1,9})\s+([-+0-9.eE]{1,40})[ \t]*\r?\n")
 
 
 def parse_pfm(path: Path, data: bytes) -> tuple[NDArray[np.float32], float]:
-    """The (H, W) values, top row first, and the header's scale factor without its sign.
+    """Returns the (H, W) values, top row first, and the header's scale factor without its sign.
 
     The sign gives the byte order: negative is little-endian.
+
+    Raises:
+        FileFormatError: The content is damaged, in colour, or has too many pixels.
     """
     match = _HEADER.match(data)
     if match is None:
@@ -42,7 +46,20 @@ def parse_pfm(path: Path, data: bytes) -> tuple[NDArray[np.float32], float]:
 
 
 def pfm_bytes(depth: NDArray[np.float32]) -> bytes:
-    """A little-endian PFM of the (H, W) values."""
+    """Returns a little-endian PFM of the (H, W) values."""
     height, width = depth.shape
     body = np.ascontiguousarray(depth[::-1], dtype="<f4").tobytes()
     return f"Pf\n{width} {height}\n-1.0\n".encode() + body
+
+
+def _read(path: Path, data: bytes, channel: str | None) -> StoredArray:
+    values, factor = parse_pfm(path, data)
+    unused = "" if factor == 1 else f", scale factor {factor:g} of its header not applied"
+    return StoredArray(values=values, description=f"PFM{unused}")
+
+
+def _write(file: Path, metres: NDArray[np.float32], options: WriteOptions) -> None:
+    file.write_bytes(pfm_bytes(metres))
+
+
+FORMAT = DepthFormat(name="PFM", suffixes=(".pfm",), magic=(b"Pf", b"PF"), read=_read, write=_write)

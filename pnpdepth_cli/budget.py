@@ -1,0 +1,83 @@
+"""How much one input file may take: bytes read and values decoded, checked before allocation.
+
+Readers ask `budget()`. The default follows from the machine's memory; `set_max_pixels` replaces it
+for the whole process, all threads included.
+"""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+
+from pnpdepth_cli.errors import UsageError
+
+_MOST_PIXELS = 1 << 28
+_BYTES_PER_PIXEL = 64
+"""Memory that reading and drawing one pixel takes at most; fewer pixels than memory / 64 fit."""
+
+_FILE_BYTES_PER_PIXEL = 4
+_MEMORY_FRACTION = 0.5
+_UNBACKED_VALUES = 1 << 25
+_VALUES_PER_BYTE = 1032
+"""The highest compression ratio of deflate; no codec of the formats read here is far above it."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Budget:
+    """Limits for one input file."""
+
+    max_pixels: int
+    """Pixels of an image, and rows or elements of any other array of numbers."""
+
+    max_file_bytes: int
+    """Bytes of a file with an image, depth, points or text, as stored."""
+
+    max_decoded_bytes: int
+    """Bytes that one file's decoded content may take, such as the tensors of a checkpoint."""
+
+    def max_values_from(self, file_bytes: int) -> int:
+        """Values that so many stored bytes can hold without lying about it, at most max_pixels.
+
+        Small files may decode to 2²⁵ values whatever their size, as an image of one colour does.
+        """
+        return min(self.max_pixels, max(_UNBACKED_VALUES, _VALUES_PER_BYTE * file_bytes))
+
+
+def budget() -> Budget:
+    """The limits in force."""
+    return _chosen or _of_this_machine()
+
+
+def set_max_pixels(max_pixels: int | None) -> None:
+    """Allow images of this many pixels, and files in proportion; None restores the default.
+
+    Raises:
+        UsageError: The number is below 1.
+    """
+    global _chosen
+    if max_pixels is None:
+        _chosen = None
+        return
+    if max_pixels < 1:
+        raise UsageError(f"--max-pixels is {max_pixels}; give a number of pixels above 0")
+    _chosen = Budget(
+        max_pixels=max_pixels,
+        max_file_bytes=max(_FILE_BYTES_PER_PIXEL * max_pixels, 1 << 20),
+        max_decoded_bytes=_of_this_machine().max_decoded_bytes,
+    )
+
+
+_chosen: Budget | None = None
+
+
+@functools.cache
+def _of_this_machine() -> Budget:
+    import psutil  # 20 ms that `--help` does not pay
+
+    memory = int(psutil.virtual_memory().total)
+    max_pixels = min(_MOST_PIXELS, memory // _BYTES_PER_PIXEL)
+    return Budget(
+        max_pixels=max_pixels,
+        max_file_bytes=_FILE_BYTES_PER_PIXEL * max_pixels,
+        max_decoded_bytes=int(_MEMORY_FRACTION * memory),
+    )

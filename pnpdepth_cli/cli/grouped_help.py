@@ -1,0 +1,107 @@
+"""Help texts with the options in groups: `--help` shows the common ones, `--help-all` all.
+
+Plain click, because cloup and rich-click double the time of `pnpdepth --help`, and neither has a
+short and a long form of the help.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import click
+
+OTHER = "Other"
+"""Title of the options that no group lists."""
+
+LIDAR = ("--calib", "--camera", "--range", "--keep-occluded", "--min-range", "--max-range")
+FILE_READING = ("--depth-scale", "--gt-scale", "--channel", "--sparse-size-ok")
+NETWORK = (
+    *("--model", "--checkpoint", "--layer", "--align", "--align-every", "--output-kind"),
+    *("--normalise", "--precision", "--device", "--tile"),
+)
+METHOD = (
+    *("--auto", "--time-budget", "--iterations", "--lr", "--loss", "--update", "--schedule"),
+    *("--blur", "--parameters", "--proximity", "--line-search", "--keep-best", "--propagate"),
+    *("--holdout", "--seed"),
+)
+OUTPUT = ("--output", "--format", "--baselines", "--uncertainty", "--overwrite", "--json")
+COMMON = frozenset(
+    {
+        *("--sparse", "--gt", "--calib", "--output", "--overwrite"),
+        *("--json", "--model", "--checkpoint", "--layer", "--align", "--auto"),
+        *("--iterations", "--lr", "--loss", "--update", "--holdout"),
+        "--uncertainty",
+    }
+)
+"""The options of a refinement that `--help` shows."""
+
+
+class GroupedCommand(click.Command):
+    """A command whose help lists its options in groups.
+
+    Args:
+        groups: Long option names by the title of their group, in the order of the help. Names that
+            the command does not have are skipped, so that commands can share a group.
+        common: Long names of the options that `--help` shows; None shows all, and there is no
+            `--help-all`.
+    """
+
+    def __init__(
+        self,
+        *args: Any,
+        groups: Mapping[str, tuple[str, ...]],
+        common: frozenset[str] | None = None,
+        **kwargs: Any,
+    ) -> None:
+        super().__init__(*args, **kwargs)
+        self.groups, self.common = groups, common
+        if common is not None:
+            self.params.append(_help_all())
+
+    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Writes one section per group."""
+        shows_all = self.common is None or ctx.meta.get(_SHOW_ALL, False)
+        options = {long_name(o): o for o in self.get_params(ctx) if isinstance(o, click.Option)}
+        for title, names in {**self.groups, OTHER: self.ungrouped(ctx), "Help": _HELP}.items():
+            shown = [
+                options[name].get_help_record(ctx)
+                for name in names
+                if name in options and (shows_all or name in {*(self.common or ()), *_HELP})
+            ]
+            if rows := [row for row in shown if row is not None]:
+                with formatter.section(title):
+                    formatter.write_dl(rows, col_max=_NAME_COLUMN)
+
+    def ungrouped(self, ctx: click.Context) -> tuple[str, ...]:
+        """Returns the options that no group lists, without those for help."""
+        listed = {*_HELP, *(name for names in self.groups.values() for name in names)}
+        options = (o for o in self.get_params(ctx) if isinstance(o, click.Option) and not o.hidden)
+        return tuple(name for name in map(long_name, options) if name not in listed)
+
+
+def long_name(option: click.Option) -> str:
+    """Returns the first of the option's names that starts with two dashes."""
+    return next((name for name in option.opts if name.startswith("--")), option.opts[0])
+
+
+_NAME_COLUMN = 22
+_HELP = ("--help", "--help-all")
+_SHOW_ALL = "pnpdepth.help_all"
+
+
+def _help_all() -> click.Option:
+    def show(context: click.Context, parameter: click.Parameter, value: bool) -> None:
+        if value and not context.resilient_parsing:
+            context.meta[_SHOW_ALL] = True
+            click.echo(context.get_help(), color=context.color)
+            context.exit()
+
+    return click.Option(
+        ["--help-all"],
+        is_flag=True,
+        is_eager=True,
+        expose_value=False,
+        callback=show,
+        help="Show all options and exit.",
+    )

@@ -1,0 +1,87 @@
+"""The depth file formats: one file each, listed in `choices.FORMATS`.
+
+A new format is one new file in this folder, or an entry point of the group `pnpdepth.formats`, that
+holds a `DepthFormat` called `FORMAT`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pnpdepth_cli.choices import FORMATS
+
+
+@dataclass(frozen=True, kw_only=True)
+class StoredArray:
+    """The numbers of a depth file, as stored."""
+
+    values: NDArray[Any]
+    """Floats in metres, or integer codes; (H, W) or any shape that `is_image` allows."""
+
+    description: str
+    """What was read, for a person, such as "16-bit PNG"."""
+
+    is_image: bool = True
+    """False for NPY and NPZ, whose arrays may also be lists of points."""
+
+    scale: float | None = None
+    """Codes per metre that the file itself gives; None if it does not."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class WriteOptions:
+    """How a depth image is written."""
+
+    path: Path
+    """The output file that the user named; messages name it."""
+
+    scale: float
+    """Codes per metre of a format of integers."""
+
+    text: Mapping[str, str]
+    """Texts by key that the file carries, where the format has room for them."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class DepthFormat:
+    """One file format of depth images."""
+
+    name: str
+    """As messages call it, such as "PNG"."""
+
+    suffixes: tuple[str, ...]
+    """Of its files, in lower case; "." and the name in `choices.FORMATS` is one of them."""
+
+    magic: tuple[bytes, ...]
+    """What the content begins with; files are recognised by content, never by suffix."""
+
+    read: Callable[[Path, bytes, str | None], StoredArray]
+    """From path (for messages), content and `--channel`. Raises FileFormatError."""
+
+    write: Callable[[Path, NDArray[np.float32], WriteOptions], None]
+    """(H, W) metres, 0 where unknown, into an existing empty file. Raises OutputError."""
+
+
+def depth_formats() -> list[DepthFormat]:
+    """All formats, in the order of `choices.FORMATS`."""
+    return list(FORMATS.values())
+
+
+def format_of_content(data: bytes) -> DepthFormat | None:
+    """The format whose magic the content begins with; None for another kind of file."""
+    return next((each for each in depth_formats() if data.startswith(each.magic)), None)
+
+
+def format_of_suffix(suffix: str) -> DepthFormat | None:
+    """The format that is written for a suffix in any case; None for an unknown one."""
+    return next((each for each in depth_formats() if suffix.lower() in each.suffixes), None)
+
+
+DEPTH_SUFFIXES: tuple[str, ...] = tuple(s for each in depth_formats() for s in each.suffixes)
+"""The suffixes that depth can be written to; PNG holds integer codes, the others float32 metres."""

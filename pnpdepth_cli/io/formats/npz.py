@@ -1,0 +1,113 @@
+"""NPZ: named arrays of numbers in a ZIP archive, decompressed no further than an array needs."""
+
+from __future__ import annotations
+
+import io
+import math
+import zipfile
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pnpdepth_cli.errors import FileFormatError, UsageError
+from pnpdepth_cli.io.file_bytes import check_value_count, damaged, one_line
+from pnpdepth_cli.io.formats import DepthFormat, StoredArray, WriteOptions
+from pnpdepth_cli.io.formats.npy import npy_bytes, read_npy_header
+
+# A fixed time in the archive: the same depth gives the same bytes.
+_EPOCH = (1980, 1, 1, 0, 0, 0)
+_LONGEST_HEADER = 1 << 14
+_COMPRESSIONS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+"""Those that numpy writes. Python decompresses bz2 and LZMA without a bound on memory."""
+
+
+def parse_npz(path: Path, data: bytes, key: str | None) -> tuple[str, NDArray[Any]]:
+    """Returns the name and content of the array called `key`, or of the only one.
+
+    Args:
+        path: Named in messages.
+        data: Content of the file.
+        key: The array wanted; None if there is only one.
+
+    Raises:
+        FileFormatError: The archive is damaged or holds no such array of numbers, or sizes in it
+            are false or too large.
+        UsageError: There is no array `key`.
+    """
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
+            name = _choose(path, list(members), key)
+            if members[name].compress_type not in _COMPRESSIONS:
+                raise FileFormatError(
+                    f"{path}: array {name} is compressed in a way that numpy does not write;"
+                    " save it with numpy.savez_compressed"
+                )
+            with archive.open(members[name]) as member:
+                return name, _array(path, name, member, len(data))
+    except (FileFormatError, UsageError):
+        raise
+    except Exception as error:  # zipfile and zlib each have their own
+        raise damaged(path, "NPZ", f"cannot be read ({error})") from error
+
+
+def npz_bytes(name: str, array: NDArray[Any]) -> bytes:
+    """Returns a compressed NPZ file with the one array."""
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
+        member = zipfile.ZipInfo(f"{name}.npy", date_time=_EPOCH)
+        member.compress_type = zipfile.ZIP_DEFLATED
+        archive.writestr(member, npy_bytes(array))
+    return buffer.getvalue()
+
+
+def _array(path: Path, name: str, member: IO[bytes], file_bytes: int) -> NDArray[Any]:
+    beginning = member.read(_LONGEST_HEADER)
+    if not beginning.startswith(b"\x93NUMPY"):
+        raise FileFormatError(f"{path}: {name} is not an array; save it with numpy.savez")
+    shape, fortran_order, dtype, start = read_npy_header(path, beginning, "NPZ")
+    count = math.prod(shape)
+    check_value_count(path, count, file_bytes)
+    needed = start + count * dtype.itemsize
+    content = beginning + member.read(max(0, needed - len(beginning)))
+    if len(content) < needed:
+        fact = f"cannot be read ({name} has {len(content):,} bytes instead of {needed:,})"
+        raise damaged(path, "NPZ", fact)
+    member.read(1)  # at the end of the member, its checksum is compared
+    values = np.frombuffer(content, dtype, count=count, offset=start)
+    return values.reshape(shape, order="F" if fortran_order else "C")
+
+
+def _choose(path: Path, keys: list[str], key: str | None) -> str:
+    listing = one_line(", ".join(keys))
+    if not keys:
+        raise FileFormatError(f"{path} holds no array; save one with numpy.savez")
+    if key is not None:
+        if key not in keys:
+            raise UsageError(f"{path} has no array {key!r}; --channel can be one of: {listing}")
+        return key
+    if len(keys) > 1:
+        raise FileFormatError(
+            f"{path} holds {len(keys)} arrays ({listing}); choose one with --channel"
+        )
+    return keys[0]
+
+
+def _read(path: Path, data: bytes, channel: str | None) -> StoredArray:
+    name, array = parse_npz(path, data, channel)
+    return StoredArray(values=array, description=f"{array.dtype} NPZ array {name}", is_image=False)
+
+
+def _write(file: Path, metres: NDArray[np.float32], options: WriteOptions) -> None:
+    file.write_bytes(npz_bytes("depth", metres))
+
+
+FORMAT = DepthFormat(
+    name="NPZ",
+    suffixes=(".npz",),
+    magic=(b"PK\x03\x04", b"PK\x05\x06"),  # the second is an archive without any array
+    read=_read,
+    write=_write,
+)

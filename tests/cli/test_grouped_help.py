@@ -1,0 +1,63 @@
+"""The help of a command with many options: in groups, and short unless all is wanted."""
+
+from __future__ import annotations
+
+import click
+import pytest
+from click.testing import CliRunner
+
+from pnpdepth_cli.cli.grouped_help import GroupedCommand, long_name
+from pnpdepth_cli.cli.main import cli
+
+GROUPED = ("refine", "batch", "sweep", "eval", "bench")
+
+
+def help_of(*arguments: str) -> str:
+    result = CliRunner().invoke(cli, arguments, terminal_width=80, prog_name="pnpdepth")
+    assert result.exit_code == 0, result.output
+    return result.output
+
+
+def command(name: str) -> GroupedCommand:
+    found = cli.get_command(click.Context(cli), name)
+    assert isinstance(found, GroupedCommand)
+    return found
+
+
+@pytest.mark.parametrize("name", GROUPED)
+def test_every_option_has_a_group_and_only_one(name: str) -> None:
+    grouped = command(name)
+    assert grouped.ungrouped(click.Context(grouped)) == ()
+    names = [option for options in grouped.groups.values() for option in options]
+    assert len(names) == len(set(names))
+
+
+@pytest.mark.parametrize("name", GROUPED)
+def test_all_options_are_in_the_longer_help(name: str) -> None:
+    grouped = command(name)
+    shown = help_of(name, "--help-all" if grouped.common is not None else "--help")
+    for parameter in grouped.params:
+        if isinstance(parameter, click.Option) and not parameter.hidden:
+            assert f" {long_name(parameter)}" in shown
+
+
+@pytest.mark.parametrize("name", GROUPED)
+def test_the_common_options_exist(name: str) -> None:
+    grouped = command(name)
+    options = {long_name(p) for p in grouped.params if isinstance(p, click.Option)}
+    assert (grouped.common or frozenset()) <= options
+
+
+def test_the_help_of_refine_is_at_most_60_lines_in_four_groups() -> None:
+    short = help_of("refine", "--help")
+    assert len(short.splitlines()) <= 60
+    titles = [line for line in short.splitlines() if line.endswith(":") and line[0] != " "]
+    assert titles == ["Input:", "Network:", "Method:", "Output:", "Help:"]
+    assert "--line-search" not in short
+    assert "--help-all" in short
+    assert "--line-search" in help_of("refine", "--help-all")
+
+
+@pytest.mark.parametrize("arguments", [("refine",), ("models", "check")])
+def test_the_help_says_that_a_python_file_is_run(arguments: tuple[str, ...]) -> None:
+    assert "is Python code and is run" in " ".join(help_of(*arguments, "--help").split())

@@ -1,0 +1,77 @@
+"""A depth format of another package is read, written and offered like one of ours."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+from pnpdepth_cli.choices import FORMATS
+from pnpdepth_cli.io.formats import DEPTH_SUFFIXES
+
+FORMAT_MODULE = """
+import numpy as np
+from pnpdepth_cli.io.formats import DepthFormat, StoredArray
+
+
+def read(path, data, channel):
+    rows = [line.split() for line in data.decode().splitlines()[1:]]
+    return StoredArray(values=np.array(rows, np.float32), description="table of metres")
+
+
+def write(file, metres, options):
+    lines = ["METRES", *(" ".join(map(repr, row)) for row in metres.tolist())]
+    file.write_text("\\n".join(lines))
+
+
+FORMAT = DepthFormat(
+    name="METRES", suffixes=(".metres",), magic=(b"METRES",), read=read, write=write
+)
+"""
+
+USE = """
+import sys
+from pathlib import Path
+import numpy as np
+from pnpdepth_cli.choices import FORMATS
+from pnpdepth_cli.io.depth import DEPTH_SUFFIXES, read_depth, write_depth
+from pnpdepth_cli.io.layouts.frame import DEPTHS
+from pnpdepth_cli.io.sparse_writing import SPARSE_SUFFIXES
+from pnpdepth_cli.cli.refine import refine
+
+depth = np.array([[1.5, 0], [2.25, 80]], np.float32)
+path = Path(sys.argv[1]) / "depth.metres"
+write_depth(path, depth)
+image = read_depth(path)
+assert np.array_equal(image.values, depth), image
+assert image.source == "table of metres", image
+assert "metres" in FORMATS
+for suffixes in (DEPTH_SUFFIXES, DEPTHS, SPARSE_SUFFIXES):
+    assert ".metres" in suffixes, suffixes
+option = next(each for each in refine.params if each.name == "format")
+assert "metres" in option.type.choices, option.type.choices
+"""
+
+
+def test_a_format_of_another_package_is_one_file_and_one_entry_point(tmp_path: Path) -> None:
+    info = tmp_path / "site" / "other-1.0.dist-info"
+    info.mkdir(parents=True)
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: other\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text("[pnpdepth.formats]\nmetres = other_format:FORMAT\n")
+    (tmp_path / "site" / "other_format.py").write_text(FORMAT_MODULE)
+    path = os.pathsep.join([str(tmp_path / "site"), *sys.path])
+    done = subprocess.run(
+        [sys.executable, "-c", USE, str(tmp_path)],
+        env={**os.environ, "PYTHONPATH": path},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+
+
+def test_every_format_has_a_file_name_made_of_its_own_name() -> None:
+    for name, depth_format in FORMATS.items():
+        assert f".{name}" in depth_format.suffixes
+        assert set(depth_format.suffixes) <= set(DEPTH_SUFFIXES)

@@ -1,0 +1,36 @@
+"""What only Unix has is on the way of no command."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+SAMPLES = Path(__file__).parents[2] / "samples"
+
+WITHOUT_UNIX = """
+import importlib, pkgutil, sys
+import psutil  # has a module for each system; the one for Linux needs `resource`
+for name in ("fcntl", "resource", "pwd", "grp", "termios"):
+    sys.modules[name] = None
+import pnpdepth_cli
+for module in pkgutil.walk_packages(pnpdepth_cli.__path__, "pnpdepth_cli."):
+    if not module.name.endswith("__main__"):
+        importlib.import_module(module.name)
+from pnpdepth_cli.cli.main import main
+main(sys.argv[1:])
+"""
+
+
+def test_refine_runs_where_python_has_neither_fcntl_nor_resource(tmp_path: Path) -> None:
+    done = subprocess.run(
+        [
+            *(sys.executable, "-c", WITHOUT_UNIX, "refine", SAMPLES / "indoor/rgb.png"),
+            *("--sparse", SAMPLES / "indoor/sparse.png", "-o", tmp_path, "--iterations", "1"),
+        ],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "rgb_depth.png").is_file()
