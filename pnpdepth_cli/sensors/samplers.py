@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import NoPointsError, SizeError, UsageError
-from pnpdepth_cli.sensors.sparse import SparseDepth, Steps, in_picture
+from pnpdepth_cli.points import SparsePoints, in_frame
+from pnpdepth_cli.sensors.sparse import Points, Steps
 
 Depth = NDArray[np.float32]
 Picture = NDArray[np.float32]
@@ -81,7 +82,7 @@ def sample_points(
     *,
     image: Picture | None = None,
     noise: SampleNoise | None = None,
-) -> SparseDepth:
+) -> Points:
     """Points of a dense depth map; the same seed gives the same points.
 
     depth: (H, W) metres, 0 = unknown. image: (H, W, 3) in 0..1 of the same view, for `features`
@@ -100,7 +101,7 @@ def sample_points(
     if not chosen.size:
         raise NoPointsError(f"pattern {pattern.kind!r} leaves no point; ask for more")
     row, column = np.divmod(chosen, depth.shape[1])
-    points = SparseDepth(
+    points = SparsePoints(
         xy=np.stack([column, row], axis=1).astype(np.float32),
         depth=depth.ravel()[chosen].astype(np.float32),
         size=(depth.shape[0], depth.shape[1]),
@@ -249,7 +250,7 @@ PATTERNS: dict[str, Sampler] = {
 """The patterns that can be named: row-major indices of the pixels each keeps."""
 
 
-def disturbed(points: SparseDepth, noise: SampleNoise, rng: np.random.Generator) -> SparseDepth:
+def disturbed(points: Points, noise: SampleNoise, rng: np.random.Generator) -> Points:
     """The points with noise; those that it makes impossible or moves out of the picture are gone.
 
     NoPointsError if that is all of them.
@@ -269,10 +270,10 @@ def disturbed(points: SparseDepth, noise: SampleNoise, rng: np.random.Generator)
     steps = Steps(len(values))
     positive = steps.keep(values.astype(np.float32) > 0, "noise left no depth")
     xy, values = xy[positive], values[positive]
-    inside = steps.keep(in_picture(xy, (height, width)), "outside the picture")
+    inside = steps.keep(in_frame(xy, (height, width)), "outside the picture")
     if not inside.any():
         raise NoPointsError(f"noise leaves no point ({steps}); make it smaller")
-    return SparseDepth(
+    return SparsePoints(
         xy=xy[inside].astype(np.float32),
         depth=values[inside].astype(np.float32),
         size=(height, width),

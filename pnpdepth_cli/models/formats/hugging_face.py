@@ -136,7 +136,7 @@ def _with_prompt(rgb: Tensor | None, sparse: Tensor | None) -> tuple[Tensor, ...
         depth=sparse[0, 0, rows, columns],
         size=(sparse.shape[-2], sparse.shape[-1]),
     )
-    return rgb, linear(points.in_frame(*PROMPT_SIZE))[None, None].to(sparse)
+    return rgb, linear(points.resized(*PROMPT_SIZE))[None, None].to(sparse)
 
 
 def _predicted_depth(output: Any) -> Tensor:

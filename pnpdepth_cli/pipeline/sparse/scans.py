@@ -110,7 +110,7 @@ def read_scan_points(
             "min_range": options.min_range,
             "max_range": options.max_range,
             "keep_occluded": options.keep_occluded,
-            "dropped": points.dropped,
+            "dropped": dict(points.dropped),
         },
         notes=(*notes, *doubt),
     )
