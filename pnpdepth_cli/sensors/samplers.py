@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import NoPointsError, SizeError, UsageError
 from pnpdepth_cli.points import SparsePoints, in_frame
-from pnpdepth_cli.sensors.sparse import Points, Steps
+from pnpdepth_cli.sensors.sparse import FARTHEST_M, Points, Steps
 
 Depth = NDArray[np.float32]
 Picture = NDArray[np.float32]
@@ -258,16 +258,20 @@ def disturbed(points: Points, noise: SampleNoise, rng: np.random.Generator) -> P
     xy, values = points.xy.astype(np.float64), points.depth.astype(np.float64)
     height, width = points.size
     low, high = values.min(), values.max()
-    if noise.metres > 0:
-        values = values + rng.normal(0, noise.metres, len(values))
-    if noise.relative > 0:
-        values = values * (1 + rng.normal(0, noise.relative, len(values)))
+    with np.errstate(over="ignore", invalid="ignore"):
+        if noise.metres > 0:
+            values = values + rng.normal(0, noise.metres, len(values))
+        if noise.relative > 0:
+            values = values * (1 + rng.normal(0, noise.relative, len(values)))
     if noise.outliers > 0:
         wrong = rng.permutation(len(values))[: round(noise.outliers * len(values))]
         values[wrong] = rng.uniform(low, high, len(wrong))
     if noise.jitter_px > 0:
         xy = xy + rng.normal(0, noise.jitter_px, xy.shape)
     steps = Steps(len(values))
+    if noise.metres > 0 or noise.relative > 0:
+        near = steps.keep(np.abs(values) < FARTHEST_M, "noise put it too far")
+        xy, values = xy[near], values[near]
     positive = steps.keep(values.astype(np.float32) > 0, "noise left no depth")
     xy, values = xy[positive], values[positive]
     inside = steps.keep(in_frame(xy, (height, width)), "outside the picture")

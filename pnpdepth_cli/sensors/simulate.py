@@ -12,6 +12,7 @@ from pnpdepth_cli.points import SparsePoints, in_frame
 from pnpdepth_cli.sensors.camera import Camera
 from pnpdepth_cli.sensors.lidar import Lidar
 from pnpdepth_cli.sensors.sparse import (
+    FARTHEST_M,
     Floats,
     Mask,
     Points,
@@ -82,6 +83,9 @@ def simulate_lidar(
     points = camera.translation + beams * distance[:, None]
     ahead = steps.keep((distance > 0) & (points[:, 2] > 0), "noise put it behind the camera")
     points = points[ahead]
+    near = np.abs(points).max(axis=1, initial=0) < FARTHEST_M
+    if not near.all():
+        points = points[steps.keep(near, "noise put it too far")]
     xy = camera.pixels_of(points)
     inside = steps.keep(in_frame(xy, size), "outside the picture")
     points, xy = points[inside], xy[inside]

@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import FileFormatError, InputError, SizeError
+from pnpdepth_cli.io.dataset.frame import PICTURES
 from pnpdepth_cli.io.depth import DepthImage, read_sparse
 from pnpdepth_cli.io.depth_reading import depth_from_stored, known_metres, load_stored
 from pnpdepth_cli.io.layouts import Hdf5Array, read_frame_truth
-from pnpdepth_cli.io.layouts.frame import PICTURES
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.pipeline.evaluation.pairing import FramePair
 from pnpdepth_cli.pipeline.evaluation.protocols import EvalProtocol

@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from pnpdepth_cli.errors import InputError, NoPointsError, SizeError, UsageError
+from pnpdepth_cli.io.dataset.frame import Hdf5Array, Source
+from pnpdepth_cli.io.dataset.hdf5 import depth_of, rgb_of
 from pnpdepth_cli.io.depth import (
     DepthImage,
     describe_range,
@@ -20,8 +22,6 @@ from pnpdepth_cli.io.depth import (
     read_sparse,
 )
 from pnpdepth_cli.io.fingerprint import fingerprint
-from pnpdepth_cli.io.layouts.frame import Hdf5Array, Source
-from pnpdepth_cli.io.layouts.hdf5 import depth_of, rgb_of
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.pipeline.refinement.request import FrameFiles, RefineRequest
 from pnpdepth_cli.pipeline.sparse.scans import read_scan_points

@@ -10,7 +10,7 @@ import numpy as np
 
 from pnpdepth_cli.errors import InputError, UsageError
 from pnpdepth_cli.io.calibration import read_calibration
-from pnpdepth_cli.io.layouts.frame import Frame
+from pnpdepth_cli.io.dataset.frame import Frame
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest, count_or_share
 from pnpdepth_cli.pipeline.sparse.scans import camera_of, check_size
