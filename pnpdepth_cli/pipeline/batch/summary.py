@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from pnpdepth_cli.io.atomic import atomic_path
+from pnpdepth_cli.io.csv_text import text_cell
 from pnpdepth_cli.io.record import plain
 
 CSV, JSON = "summary.csv", "summary.json"
@@ -183,7 +184,7 @@ def write_table(
             }
             writer.writerow(
                 [
-                    *(row["name"], row["status"], row["message"]),
+                    *(text_cell(row["name"]), row["status"], text_cell(row["message"] or "")),
                     *(points.get("used"), points.get("held_out"), row.get("improved_share")),
                     *(
                         measured.get((kind, stage, measure))
@@ -191,7 +192,7 @@ def write_table(
                         for stage in _STAGES
                         for measure in measures
                     ),
-                    "; ".join(row.get("warnings") or ()),
+                    text_cell("; ".join(row.get("warnings") or ())),
                     *(seconds.get(stage) for stage in ("read", "refine", "write")),
                     *(
                         of_baselines.get(name, {}).get(measure)
