@@ -204,7 +204,8 @@ def score(
     arrays = [np.asarray(values, dtype=np.float32) for values in (depth, ground_truth)]
     if arrays[0].shape != arrays[1].shape:
         raise SizeError(f"depth is {arrays[0].shape} but ground truth is {arrays[1].shape}")
-    return score_tensors(*(torch.from_numpy(values) for values in arrays), thresholds)
+    predicted, known = (torch.from_numpy(values) for values in arrays)
+    return score_tensors(predicted, known, thresholds)
 
 
 def _inputs(image: ArrayLike | None, sparse: ArrayLike | SparsePoints) -> Inputs:
