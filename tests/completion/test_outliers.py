@@ -59,13 +59,13 @@ def test_wrong_points_are_named_in_the_order_of_the_points_and_right_ones_are_no
     assert not bool(found[150])  # nothing is known there
 
 
-def test_a_point_alone_among_its_neighbours_is_not_believed() -> None:
-    points = seen(scene(), 50)
-    missing = 0.01 * torch.randn(50, generator=torch.Generator().manual_seed(2)).double()
-    missing[7] = 1.0
-    believed = inlier_weights(points, missing)
-    assert float(believed[7]) == 0
-    assert float(believed[torch.arange(50) != 7].min()) > 0.5
+def test_a_point_alone_among_its_neighbours_has_no_weight() -> None:
+    points = seen(scene()[0], 50)
+    residual = 0.01 * torch.randn(50, generator=torch.Generator().manual_seed(2)).double()
+    residual[7] = 1.0
+    weights = inlier_weights(points, residual)
+    assert float(weights[7]) == 0
+    assert float(weights[torch.arange(50) != 7].min()) > 0.5
     assert torch.equal(
-        inlier_weights(points.select(torch.arange(50) < 2), missing[:2]), torch.ones(2).double()
+        inlier_weights(points.select(torch.arange(50) < 2), residual[:2]), torch.ones(2).double()
     )
