@@ -199,7 +199,7 @@ def load_network(
     elif path is not None:
         notes = load_checkpoint(module, definition, path)
     elif untrained:
-        notes = ["weights: random, for none are given; times are right, depths are not"]
+        notes = ["weights: random, none are named; times are right, depths are not"]
     elif module.state_dict():
         raise CheckpointError(
             f"network {definition.name!r} comes without weights; name them with --checkpoint, or,"
