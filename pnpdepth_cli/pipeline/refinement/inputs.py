@@ -30,6 +30,9 @@ from pnpdepth_cli.sensors import sample_points
 
 Picture = NDArray[np.float32]
 
+_LEAK_FRACTION = 0.5
+"""Of the ground truth's pixels; as much in common with the sparse depth gives a warning."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Inputs:
@@ -105,14 +108,34 @@ def read_inputs(request: RefineRequest) -> Inputs:
     if truth is not None and truth.values.shape != sparse.points.size:
         raise _of_another_size(files, truth.values.shape, sparse.points.size)
     parts = {"image": image, "sparse": sparse, "gt": truth}
+    notes = [note for part in parts.values() if part is not None for note in part.notes]
+    if truth is not None and files.sparse is not None:
+        notes += _leak_warning(sparse.points, truth.values)
     return Inputs(
         rgb=None if image is None else image.values,
         points=sparse.points,
         gt=None if truth is None else truth.values,
         sparse_scale=sparse.scale,
         record={name: part.record for name, part in parts.items() if part is not None},
-        notes=tuple(note for part in parts.values() if part is not None for note in part.notes),
+        notes=tuple(notes),
     )
+
+
+def _leak_warning(points: SparsePoints, gt: Picture) -> list[str]:
+    """A warning if most of the ground truth is the sparse depth itself.
+
+    KITTI's ground truth holds the points of its own scan by design, which is less than half of it.
+    """
+    known = gt > 0
+    leaked = int((known & (points.scatter()[0, 0].numpy() == gt)).sum())
+    fraction = leaked / int(known.sum())
+    if fraction < _LEAK_FRACTION:
+        return []
+    return [
+        f"warning: {leaked:,} of {int(known.sum()):,} pixels ({fraction:.1%}) of the ground truth"
+        " are the sparse depth itself, so errors against it show nothing; give another --gt, or"
+        " keep points out with --holdout"
+    ]
 
 
 def _read_image(files: FrameFiles, source: Source) -> _Part:
@@ -213,7 +236,7 @@ def _in_protocol(files: FrameFiles, path: Path, points: SparsePoints) -> SparseP
     size = (left.shape[0], left.shape[1])
     if size == points.size:
         return points
-    xy = files.protocol.places(points.xy.numpy(), points.size)
+    xy = files.protocol.in_crop(points.xy.numpy(), points.size)
     return _inside(path, SparsePoints(xy=torch.from_numpy(xy), depth=points.depth, size=size))
 
 

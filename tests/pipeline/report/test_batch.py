@@ -203,7 +203,10 @@ def test_where_only_some_frames_have_truth_the_others_have_no_figures(
     frames = frames_of(report)
     assert frames["a"]["values"]["rmse_gain"] is not None
     assert set(frames["b"]["values"].values()) == {None}
-    assert (frames["a"]["tag"], frames["b"]["tag"]) == ("against the truth", "at the points used")
+    assert (frames["a"]["tag"], frames["b"]["tag"]) == (
+        "against ground truth",
+        "at the points used",
+    )
 
 
 def test_the_shard_that_ends_last_reports_all_frames(root: Path, report: Path) -> None:
@@ -279,7 +282,7 @@ def test_a_disk_that_is_full_while_drawing_ends_the_run_and_the_next_one_goes_on
     root: Path, report: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     drawn: list[str] = []
-    save = report_batch.save_pictures
+    save = report_batch.save_images
 
     def full_at_the_second(folder: Path, key: str, *views: Any, **others: Any) -> None:
         drawn.append(key)
@@ -287,7 +290,7 @@ def test_a_disk_that_is_full_while_drawing_ends_the_run_and_the_next_one_goes_on
             raise StorageError("the disk is full")
         save(folder, key, *views, **others)
 
-    monkeypatch.setattr(report_batch, "save_pictures", full_at_the_second)
+    monkeypatch.setattr(report_batch, "save_images", full_at_the_second)
     with pytest.raises(StorageError):
         batch(root, html=report)
     assert not (report / "index.html").exists()
