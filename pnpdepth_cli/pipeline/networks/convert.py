@@ -19,6 +19,8 @@ def convert_checkpoint(source: Path, target: Path, *, overwrite: bool = False) -
     """
     if target.suffix != ".safetensors":
         raise UsageError(f"{target}: name the converted file .safetensors")
+    if target.resolve() == source.resolve():
+        raise OutputError(f"{target} is the file to convert; name another output")
     if target.exists() and not overwrite:
         raise OutputError(f"{target} exists; --overwrite replaces it")
     state = {name: tensor.clone().contiguous() for name, tensor in read_checkpoint(source).items()}
