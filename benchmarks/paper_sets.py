@@ -257,9 +257,7 @@ def _data_frame(root: Path, frame: Frame) -> TableFrame:
         truth = read_frame_truth(frame)
         return TableFrame(rgb=read_frame_image(frame), truth=truth, pool=truth)
     # No output is written; the batch's own reading of scans and scales is wanted.
-    batch = BatchRequest(
-        source=root, output=root / "out", refine=RefineRequest(image=None, sparse=None)
-    )
+    batch = BatchRequest(source=root, output=root / "out", refine=RefineRequest())
     inputs = read_inputs(replace(task_of(batch, frame).request, output=None))
     assert inputs.rgb is not None
     scan = inputs.points.scatter()[0, 0].numpy()

@@ -21,12 +21,12 @@ from pnpdepth_cli.models import network as networks
 from pnpdepth_cli.models.network import Network
 from pnpdepth_cli.pipeline.refinement import refine as pipeline
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs
-from pnpdepth_cli.pipeline.refinement.request import (
-    RefineRequest,
-    effective_settings,
-    layer_name,
+from pnpdepth_cli.pipeline.refinement.request import RefineRequest
+from pnpdepth_cli.pipeline.refinement.resolve import (
+    resolve_definition,
+    resolve_layer,
+    resolve_settings,
 )
-from pnpdepth_cli.pipeline.refinement.settle import settled
 from pnpdepth_cli.points import SparsePoints
 
 FULL_SCALE = {np.dtype(np.uint8): 255.0, np.dtype(np.uint16): 65535.0}
@@ -105,16 +105,14 @@ class Refiner:
         seed: int = 0,
     ) -> None:
         self._network, self._layer, self._settings = network, layer, settings
-        self._request = RefineRequest(
-            image=None,
-            sparse=None,
+        self._request = RefineRequest.from_fields(
             propagate=propagate,
             auto=auto,
             uncertainty=uncertainty,
             tile=tile,
             seed=seed,
         )
-        if tile is not None and self._request.needs_folds:
+        if tile is not None and self._request.hold_out.needs_folds:
             raise UsageError("tile cannot be combined with auto and uncertainty")
         self._open = ExitStack()
         self._opened: tuple[pipeline.Refiner, Split] | None = None
@@ -166,12 +164,12 @@ class Refiner:
         return refined
 
     def _resolve(self, inputs: Inputs) -> pipeline.Refiner:
-        network = settled(self._network, inputs, self._request)
+        network = resolve_definition(self._network, inputs, self._request.network)
         return pipeline.Refiner(
             request=self._request,
             network=network,
-            layer=layer_name(network.definition, self._layer),
-            settings=self._settings or effective_settings(network.definition, self._request),
+            layer=resolve_layer(network.definition, self._layer),
+            settings=self._settings or resolve_settings(network.definition, self._request.method),
         )
 
 

@@ -164,3 +164,6 @@ FORMATS = Table(
     first=("png", "exr", "npy", "npz", "pfm", "tiff"),
 )
 """Depth file formats: `pnpdepth_cli.io.formats.DepthFormat`."""
+
+PROPAGATIONS = ("none", "gp", "diffusion")
+"""How the residual at the points is propagated."""

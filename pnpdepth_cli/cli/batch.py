@@ -128,18 +128,13 @@ def batch(
     """
     from pnpdepth_cli.pipeline.batch.batch import plan_batch
     from pnpdepth_cli.pipeline.batch.frames import BatchRequest
-    from pnpdepth_cli.pipeline.refinement.request import RefineRequest, sample_pattern
-    from pnpdepth_cli.pipeline.sparse.scans import ScanOptions
+    from pnpdepth_cli.pipeline.refinement.request import sample_pattern
 
-    scan, others = options.scan_given(given)
     pattern = None if sample is None else sample_pattern(*_sample(sample))
-    asked = RefineRequest(
-        image=None, sparse=None, scan=ScanOptions(**scan), sample=pattern, **others
-    )
     request = BatchRequest(
         source=source,
         output=output,
-        refine=asked,
+        refine=options.request_of(given, sample=pattern),
         layout=layout,
         protocol=protocol,
         workers=workers,

@@ -22,16 +22,7 @@ NETWORK = (
 )
 METHOD = (
     *("--auto", "--time-budget", "--iterations", "--lr", "--loss", "--update", "--schedule"),
-    *(
-        "--spread",
-        "--blur",
-        "--parameters",
-        "--anchor",
-        "--proximity",
-        "--line-search",
-        "--keep-best",
-        "--propagate",
-    ),
+    *("--blur", "--parameters", "--proximity", "--line-search", "--keep-best", "--propagate"),
     *("--holdout", "--seed"),
 )
 OUTPUT = ("--output", "--format", "--baselines", "--uncertainty", "--overwrite", "--json")

@@ -10,7 +10,7 @@ from pnpdepth_cli.errors import InputError, OutputError, UsageError
 from pnpdepth_cli.io.layouts import LAYOUTS, find_protocol, list_frames
 from pnpdepth_cli.io.layouts.frame import SCANS, Frame, Source, Unmatched
 from pnpdepth_cli.pipeline.refinement.output_files import Outputs
-from pnpdepth_cli.pipeline.refinement.request import RefineRequest
+from pnpdepth_cli.pipeline.refinement.request import FrameFiles, RefineRequest
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,7 +87,7 @@ def find_frames(request: BatchRequest) -> BatchFrames:
             f"{request.source} looks like {layout.name!r} but has no frame in it{first};"
             f" layouts are {', '.join(LAYOUTS)}"
         )
-    if request.refine.sample is None and all(frame.sparse is None for frame in frames):
+    if request.refine.files.sample is None and all(frame.sparse is None for frame in frames):
         raise UsageError(
             f"{request.source} looks like {layout.name!r}, which has no sparse depth; --sample 500"
             " takes so many points of the ground truth"
@@ -103,7 +103,7 @@ def find_frames(request: BatchRequest) -> BatchFrames:
 
 def task_of(request: BatchRequest, frame: Frame) -> Task:
     """What is to be done with a frame; what the user said goes before what the data set says."""
-    asked = request.refine
+    asked = request.refine.files
     sparse = frame.sparse if asked.sample is None else None
     protocol = frame.protocol if request.protocol is None else find_protocol(request.protocol)
     is_scan = sparse is not None and (
@@ -113,7 +113,7 @@ def task_of(request: BatchRequest, frame: Frame) -> Task:
     if is_scan:
         camera = frame.camera if scan.camera is None else scan.camera
         scan = replace(scan, calib=scan.calib or frame.calib, camera=camera)
-    wanted = replace(
+    files = replace(
         asked,
         image=frame.image,
         sparse=sparse,
@@ -125,9 +125,9 @@ def task_of(request: BatchRequest, frame: Frame) -> Task:
     )
     return Task(
         name=frame.name,
-        request=wanted,
-        inputs=dict(_input_files(wanted, is_scan=is_scan)),
-        outputs=Outputs.in_folder(request.output, frame.name, asked),
+        request=replace(request.refine, files=files),
+        inputs=dict(_input_files(files, is_scan=is_scan)),
+        outputs=Outputs.in_folder(request.output, frame.name, request.refine),
     )
 
 
@@ -137,16 +137,16 @@ def source_files(frame: Frame) -> list[Path]:
     return [part if isinstance(part, Path) else part.path for part in parts if part is not None]
 
 
-def _input_files(request: RefineRequest, *, is_scan: bool) -> Iterator[tuple[str, Path]]:
+def _input_files(files: FrameFiles, *, is_scan: bool) -> Iterator[tuple[str, Path]]:
     parts: dict[str, Source | None] = {
-        "image": request.image,
-        "sparse": request.sparse,
-        "gt": request.gt,
+        "image": files.image,
+        "sparse": files.sparse,
+        "gt": files.gt,
     }
     for part, source in parts.items():
         if source is not None:
             yield part, source if isinstance(source, Path) else source.path
-    calib = request.scan.calib
+    calib = files.scan.calib
     if is_scan and calib is not None:
         if calib.is_dir():
             yield from ((f"calib {p.name}", p) for p in sorted(calib.glob("calib_*.txt")))

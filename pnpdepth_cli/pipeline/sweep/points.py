@@ -152,7 +152,7 @@ def _found(
     rng = np.random.default_rng(seed)
     if sampling.lidar is not None:
         points = _scanned(sampling, sampling.lidar, seed, inputs, request, frame)
-    elif request.sparse is None:
+    elif request.files.sparse is None:
         raise InputError("there is no sparse depth; --sample 500 takes points of the truth")
     else:
         own = inputs.points
@@ -174,10 +174,11 @@ def _scanned(
             f"sensor {sampling.sensor!r} needs to know the camera; give --calib, or a list with a"
             " column calib"
         )
-    if request.protocol.halved or request.protocol.crop:
+    protocol = request.files.protocol
+    if protocol.halved or protocol.crop:
         raise InputError(
             f"sensor {sampling.sensor!r} needs the picture that the calibration is of, but protocol"
-            f" {request.protocol.name!r} cuts it; --protocol whole does not"
+            f" {protocol.name!r} cuts it; --protocol whole does not"
         )
     calibration = read_calibration(frame.calib, frame.camera)
     check_size(frame.calib, calibration, inputs.size)
