@@ -37,7 +37,7 @@ PROTOCOLS = ("paper", "nyu", "kitti", "kitti-devkit", "eigen", "garg")
         ),
         "Protocol": (
             *("--protocol", "--min-depth", "--max-depth", "--clip", "--crop", "--average"),
-            *("--delta", "--exclude-sparse", "--bootstrap", "--seed"),
+            *("--delta", "--exclude-sparse", "--bootstrap", "--no-groups", "--seed"),
         ),
         "Output": ("--csv", "--markdown", "--latex", "--html", "--overwrite", "--json"),
     },
@@ -105,6 +105,9 @@ PROTOCOLS = ("paper", "nyu", "kitti", "kitti-devkit", "eigen", "garg")
     show_default=True,
     metavar="N",
     help="Number of frames read at once.",
+)
+@click.option(
+    "--no-groups", is_flag=True, help="Treat all frames as independent, also those of a sequence."
 )
 @click.option("--csv", type=options.FILE, metavar="FILE|-", help="Write a row per frame.")
 @click.option("--markdown", type=options.FILE, metavar="FILE|-", help="Write a table of the means.")
@@ -196,6 +199,7 @@ def _evaluate(
     workers: int,
     delta: str | None,
     exclude_sparse: bool,
+    no_groups: bool,
     **changes: Any,
 ) -> Evaluation:
     """Runs the evaluation with a progress bar."""
@@ -206,13 +210,16 @@ def _evaluate(
     changes |= {"thresholds": _thresholds(delta), "exclude_sparse": exclude_sparse or None}
     request = EvalRequest(
         prediction=prediction,
-        truth=truth,
+        ground_truth=truth,
         sparse=sparse,
         protocol=protocol,
         changes=changes,
-        scales=Scales(prediction=pred_scale, truth=gt_scale, sparse=sparse_scale, channel=channel),
+        scales=Scales(
+            prediction=pred_scale, ground_truth=gt_scale, sparse=sparse_scale, channel=channel
+        ),
         resamples=resamples,
         seed=seed,
+        grouped=not no_groups,
         workers=workers,
     )
     with progress_bar("eval", "frame") as show:

@@ -45,6 +45,7 @@ class Frame:
     contains a slash. sparse: a depth file, or a scan with calib; None where the protocol samples
     the truth. *_scale: codes per metre of integer files.
     calib, camera: as `read_calibration` takes them. protocol: what is cut out before anything else.
+    group: the sequence it belongs to; None leaves it to its name.
     pose: x_world = pose · (x, 1) for points of KITTI's camera 0, whichever camera took the image.
     """
 
@@ -58,6 +59,7 @@ class Frame:
     gt_scale: float | None = None
     protocol: Protocol = WHOLE
     pose: Pose | None = None
+    group: str | None = None
 
 
 @dataclass(frozen=True, kw_only=True)

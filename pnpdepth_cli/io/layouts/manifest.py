@@ -1,9 +1,9 @@
 """`manifest`: a CSV with a header line, or JSON lines, of frames whose files lie anywhere.
 
-Columns or keys: image, sparse, gt, calib, camera, sparse_scale, gt_scale, name, protocol; all may
-be left out or empty but one of image and sparse. Paths are relative to the manifest. A frame
-without a name is called by its image's stem; if stems come twice, by its place below the folder
-that all of the images are in.
+Columns or keys: image, sparse, gt, calib, camera, sparse_scale, gt_scale, name, group, protocol;
+all may be left out or empty but one of image and sparse. Paths are relative to the manifest. A
+frame without a name is called by its image's stem; if stems come twice, by its path below the
+folder that all of the images are in. Frames of one group are of one sequence.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from pnpdepth_cli.io.layouts.protocols import WHOLE, find_protocol
 
 _PATHS = ("image", "sparse", "gt", "calib")
 _NUMBERS = {"camera": int, "sparse_scale": float, "gt_scale": float}
-_KEYS = (*_PATHS, *_NUMBERS, "name", "protocol")
+_KEYS = (*_PATHS, *_NUMBERS, "name", "group", "protocol")
 
 
 def matches(root: Path) -> bool:
@@ -107,5 +107,5 @@ def _parts(path: Path, number: int, row: dict[str, Any]) -> dict[str, Any]:
     except ValueError as error:
         raise FileFormatError(f"{where}: {one_line(error)}") from error
     protocol = find_protocol(given["protocol"]) if "protocol" in given else WHOLE
-    named = {"name": given["name"]} if "name" in given else {}
+    named = {key: given[key] for key in ("name", "group") if key in given}
     return {"protocol": protocol, **named, **files, **numbers}

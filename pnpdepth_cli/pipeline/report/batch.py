@@ -25,7 +25,7 @@ from pnpdepth_cli.io.report import (
     write_report,
 )
 from pnpdepth_cli.io.report_pictures import gain_colours, picture_paths, save_pictures
-from pnpdepth_cli.pipeline.evaluation.score_files import heading, shown
+from pnpdepth_cli.pipeline.evaluation.score_files import column_title, format_value
 from pnpdepth_cli.pipeline.ordered_pool import in_order
 from pnpdepth_cli.pipeline.report.columns import (
     Column,
@@ -263,7 +263,7 @@ def _tiles(summary: Mapping[str, Any], measured: bool) -> list[dict[str, str]]:
         mean = summary["mean"][basis]
         for key, measure in _ERRORS.items() if mean else ():
             before, after = (mean[stage][key] for stage in ("before", "after"))
-            change = f"{shown(measure, before)} → {shown(measure, after)}"
+            change = f"{format_value(measure, before)} → {format_value(measure, after)}"
             gain = _gain(before, after)
             said = ""
             if gain is not None and basis != _USED:
@@ -304,7 +304,7 @@ def _means(basis: str, mean: Mapping[str, Any]) -> dict[str, Any]:
     rows = []
     for measure in measures:
         before, after = (mean[stage].get(measure.key) for stage in ("before", "after"))
-        row = [heading(measure), shown(measure, before), shown(measure, after)]
+        row = [column_title(measure), format_value(measure, before), format_value(measure, after)]
         if basis != _USED:
             row.append(_gain_text(measure, before, after))
         rows.append(row)
@@ -325,7 +325,7 @@ def _gain_text(measure: Measure, before: float | None, after: float | None) -> s
 
 
 def _signed(value: float, decimals: int, unit: str) -> str:
-    """The value with its sign, and with none where nothing but noughts is shown."""
+    """The value with its sign, and with none where nothing but zeros is shown."""
     text = f"{abs(value):.{decimals}f}"
     sign = "" if float(text) == 0 else "+" if value > 0 else "−"
     return f"{sign}{text}{unit}"
