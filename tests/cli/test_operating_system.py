@@ -175,7 +175,7 @@ def test_a_bug_stays_a_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
         run([])
 
 
-def python(code: str, environment: Mapping[str, str] = {}) -> subprocess.CompletedProcess[str]:  # noqa: B006
+def python(code: str, environment: Mapping[str, str] = {}) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
         [sys.executable, "-c", code], env={**os.environ, **environment},
         capture_output=True, text=True, check=False,
