@@ -1,65 +1,84 @@
-"""Sparse depth as points: coordinates and depths, never a resampled image."""
+"""Sparse depth as points: pixel coordinates and depths, never a resampled image.
+
+Files and sensors give numpy arrays; `core` and everything above it work on torch tensors, which
+`SparsePoints.tensors` makes of them. Importing this module imports neither library.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Generic, overload
 
-import torch
-from torch import Tensor
+if TYPE_CHECKING:
+    import numpy as np
+    import torch
+    from numpy.typing import NDArray
+    from torch import Tensor
+    from typing_extensions import TypeVar
+
+    A = TypeVar("A", Tensor, NDArray[np.float32], default=Tensor)
+else:
+    from typing import TypeVar
+
+    A = TypeVar("A")
 
 
 @dataclass(frozen=True, kw_only=True)
-class SparsePoints:
-    """N true depths at pixel coordinates of a frame.
+class SparsePoints(Generic[A]):
+    """N measured depths at pixel coordinates of a frame, as tensors unless stated otherwise."""
 
-    xy: (N, 2) float32, x to the right and y down, pixel centres at whole numbers.
-    depth: (N,) float32 metres, all finite and positive.
-    size: (height, width) of the frame the coordinates live in.
-    """
-
-    xy: Tensor
-    depth: Tensor
+    xy: A
+    """(N, 2) float32 pixel coordinates, x right, y down, whole numbers at pixel centres."""
+    depth: A
+    """(N,) float32 metres, all finite and positive."""
     size: tuple[int, int]
+    """(height, width) of the frame."""
+    dropped: Mapping[str, int] = field(default_factory=dict)
+    """How many points were dropped when a sensor made these, by reason, in the order of steps."""
 
     def __len__(self) -> int:
-        return int(self.depth.numel())
+        return len(self.depth)
 
-    def in_frame(self, height: int, width: int) -> SparsePoints:
-        """The same points in the same field of view sampled by height × width pixels.
+    def resized(self, height: int, width: int) -> SparsePoints[A]:
+        """Returns the points in a frame of the same field of view with height × width pixels.
 
-        Coordinates move with the pixel areas (half-pixel convention); depths are untouched.
+        Coordinates scale with the pixel areas (half-pixel convention); depths do not change.
         """
         if (height, width) == self.size:
             return self
-        scale = self.xy.new_tensor([width / self.size[1], height / self.size[0]])
-        return SparsePoints(
-            xy=(self.xy + 0.5) * scale - 0.5, depth=self.depth, size=(height, width)
-        )
+        scale = self._row(width / self.size[1], height / self.size[0])
+        return self._with((self.xy + 0.5) * scale - 0.5, self.depth, (height, width))
 
-    def cropped(self, top: int, left: int, height: int, width: int) -> SparsePoints:
-        """The points in these rows and columns of the frame, at their places in that part."""
-        x, y = self.xy[:, 0] - left, self.xy[:, 1] - top
-        inside = (x >= -0.5) & (x < width - 0.5) & (y >= -0.5) & (y < height - 0.5)
-        return SparsePoints(
-            xy=torch.stack([x, y], dim=1)[inside], depth=self.depth[inside], size=(height, width)
-        )
+    def cropped(self, top: int, left: int, height: int, width: int) -> SparsePoints[A]:
+        """Returns the points inside these rows and columns, in coordinates of that crop."""
+        xy = self.xy - self._row(left, top)
+        inside: Any = in_frame(xy, (height, width))
+        return self._with(xy[inside], self.depth[inside], (height, width))
 
-    def select(self, mask: Tensor) -> SparsePoints:
-        """The points where mask (N,) is true."""
-        return SparsePoints(xy=self.xy[mask], depth=self.depth[mask], size=self.size)
+    def select(self, mask: Any) -> SparsePoints[A]:
+        """Returns the points where mask, (N,) bool of the same library, is true."""
+        return self._with(self.xy[mask], self.depth[mask], self.size)
 
-    def to(self, device: torch.device | str) -> SparsePoints:
-        """The same points on another device."""
-        return SparsePoints(xy=self.xy.to(device), depth=self.depth.to(device), size=self.size)
+    def tensors(self, device: torch.device | str = "cpu") -> SparsePoints[Tensor]:
+        """Returns the points as tensors on the device; arrays already there are not copied."""
+        import torch
 
-    def sample(self, dense: Tensor) -> Tensor:
-        """The values (N,) of a dense map (..., h, w) of this field of view at the points.
+        xy, depth = (torch.as_tensor(array, device=device) for array in (self.xy, self.depth))
+        return SparsePoints(xy=xy, depth=depth, size=self.size, dropped=self.dropped)
 
-        Plain indexing where every point sits on the map's grid, bilinear otherwise; beyond the
-        outermost pixel centres the border value holds. Differentiable in `dense`.
+    def sample(self: SparsePoints[Tensor], dense: Tensor) -> Tensor:
+        """Returns the values (N,) of a dense map at the points, differentiable in `dense`.
+
+        Plain indexing where all points lie on the map's grid, bilinear interpolation otherwise.
+        Beyond the outermost pixel centres the border value holds.
+
+        Args:
+            dense: (…, h, w), one map of the same field of view.
         """
         height, width = dense.shape[-2:]
-        xy = self.in_frame(height, width).xy
+        xy = self.resized(height, width).xy
         flat = dense.reshape(-1)
         if flat.numel() != height * width:
             raise ValueError(f"one map is expected, not shape {tuple(dense.shape)}")
@@ -69,19 +88,50 @@ class SparsePoints:
         fx, fy = x - left, y - top
         if not bool((fx != 0).any()) and not bool((fy != 0).any()):
             return flat[top * width + left]
-        # On the grid both neighbours are one: a pixel without weight may be infinite.
+        # On the grid both neighbours are the same pixel: one of weight 0 may be infinite.
         right, bottom = x.ceil().long(), y.ceil().long()
         upper = flat[top * width + left] * (1 - fx) + flat[top * width + right] * fx
         lower = flat[bottom * width + left] * (1 - fx) + flat[bottom * width + right] * fx
         return upper * (1 - fy) + lower * fy
 
-    def scatter(self) -> Tensor:
-        """(1, 1, H, W) metres, 0 = unknown: each point on its nearest pixel, nearest point wins."""
+    def scatter(self: SparsePoints[Tensor]) -> Tensor:
+        """Returns (1, 1, H, W) metres, 0 = unknown: each point on its pixel, the nearest wins."""
         height, width = self.size
-        x, y = self.xy[:, 0], self.xy[:, 1]
-        inside = (x >= -0.5) & (x <= width - 0.5) & (y >= -0.5) & (y <= height - 0.5)
-        column, row = x.round().clamp(0, width - 1), y.round().clamp(0, height - 1)
-        flat = self.depth.new_full((height * width,), torch.inf)
-        places = row.long() * width + column.long()
-        flat.scatter_reduce_(0, places[inside], self.depth[inside], "amin")
-        return torch.where(flat.isinf(), 0.0, flat).reshape(1, 1, height, width)
+        # Resizing may round a point onto the right or bottom edge of the frame.
+        inside = in_frame(self.xy, self.size, closed=True)
+        column = self.xy[:, 0].round().clamp(0, width - 1).long()
+        row = self.xy[:, 1].round().clamp(0, height - 1).long()
+        flat = self.depth.new_full((height * width,), math.inf)
+        flat.scatter_reduce_(0, (row * width + column)[inside], self.depth[inside], "amin")
+        return flat.masked_fill(flat.isinf(), 0.0).reshape(1, 1, height, width)
+
+    def _row(self, x: float, y: float) -> Any:
+        """(1, 2), or (2,), of the type and on the device of `xy`."""
+        if hasattr(self.xy, "new_tensor"):
+            return self.xy.new_tensor([x, y])
+        import numpy as np
+
+        return np.array([x, y], self.xy.dtype)
+
+    def _with(self, xy: Any, depth: Any, size: tuple[int, int]) -> SparsePoints[A]:
+        return SparsePoints(xy=xy, depth=depth, size=size, dropped=self.dropped)
+
+
+@overload
+def in_frame(xy: Tensor, size: tuple[int, int], *, closed: bool = ...) -> Tensor: ...
+@overload
+def in_frame(
+    xy: NDArray[np.floating], size: tuple[int, int], *, closed: bool = ...
+) -> NDArray[np.bool_]: ...
+def in_frame(xy: Any, size: tuple[int, int], *, closed: bool = False) -> Any:
+    """Returns (N,) true where the nearest pixel lies in the frame; false for NaN.
+
+    Args:
+        xy: (N, 2) pixel coordinates.
+        size: (height, width) of the frame.
+        closed: Whether the right and bottom edges of the frame belong to it.
+    """
+    x, y = xy[:, 0], xy[:, 1]
+    right, bottom = size[1] - 0.5, size[0] - 0.5
+    inside = (x <= right) & (y <= bottom) if closed else (x < right) & (y < bottom)
+    return (x >= -0.5) & (y >= -0.5) & inside

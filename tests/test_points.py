@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+
+import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pnpdepth_cli.points import SparsePoints
+from pnpdepth_cli.points import SparsePoints, in_frame
 
 sides = st.integers(1, 400)
 shares = st.floats(0, 1, exclude_max=True, width=32)
@@ -24,22 +28,22 @@ def test_a_frame_there_and_back_is_the_same_frame(
     height: int, width: int, h: int, w: int, places: list[tuple[float, float]]
 ) -> None:
     here = points([(u * width - 0.5, v * height - 0.5) for u, v in places], (height, width))
-    there = here.in_frame(h, w)
+    there = here.resized(h, w)
     assert there.size == (h, w)
     assert torch.equal(there.depth, here.depth)
     assert bool((there.xy >= -0.501).all())
     assert bool((there.xy <= torch.tensor([w, h]) - 0.499).all())
-    back = there.in_frame(height, width)
+    back = there.resized(height, width)
     torch.testing.assert_close(back.xy, here.xy, rtol=1e-5, atol=1e-4)
 
 
 def test_the_same_frame_moves_no_bit() -> None:
     here = points([(0.1, 0.2), (7.3, 4.9)], (6, 9))
-    assert here.in_frame(6, 9) is here
+    assert here.resized(6, 9) is here
 
 
 def test_pixel_areas_move_not_pixel_centres() -> None:
-    there = points([(0, 0), (3, 1)], (2, 4)).in_frame(4, 8)
+    there = points([(0, 0), (3, 1)], (2, 4)).resized(4, 8)
     assert there.xy.tolist() == [[0.5, 0.5], [6.5, 2.5]]
 
 
@@ -122,6 +126,34 @@ def test_a_point_outside_the_frame_is_not_scattered() -> None:
 
 def test_selecting_and_moving_keep_points_together() -> None:
     here = points([(0, 1), (2, 3), (4, 5)], (6, 6))
-    chosen = here.select(torch.tensor([True, False, True])).to("cpu")
+    chosen = here.select(torch.tensor([True, False, True])).tensors()
     assert (chosen.xy.tolist(), chosen.depth.tolist()) == ([[0, 1], [4, 5]], [1, 3])
     assert (len(here), len(chosen), chosen.size) == (3, 2, (6, 6))
+
+
+def test_arrays_become_tensors_without_copy_and_follow_the_same_rules() -> None:
+    xy = np.array([[0.1, 0.2], [7.3, 4.9], [8.5, 1]], np.float32)
+    arrays = SparsePoints(xy=xy, depth=np.ones(3, np.float32), size=(6, 9), dropped={"far": 2})
+    tensors = arrays.tensors()
+    assert tensors.xy.data_ptr() == xy.ctypes.data
+    assert tensors.dropped == {"far": 2}
+    for change in (
+        lambda points: points.resized(5, 7),
+        lambda points: points.cropped(1, 2, 4, 5),
+        lambda points: points.select([0, 2]),
+    ):
+        assert torch.equal(change(arrays).tensors().xy, change(tensors).xy)
+        assert change(arrays).size == change(tensors).size
+
+
+def test_a_frame_reaches_half_a_pixel_beyond_its_outermost_pixel_centres() -> None:
+    xy = np.array([[-0.5, -0.5], [2.4, 1.4], [2.5, 0], [0, 1.5], [-0.6, 0], [np.nan, 0]])
+    for array in (xy, torch.from_numpy(xy)):
+        assert in_frame(array, (2, 3)).tolist() == [True, True, False, False, False, False]
+        closed = in_frame(array, (2, 3), closed=True)
+        assert closed.tolist() == [True, True, True, True, False, False]
+
+
+def test_points_can_be_read_without_torch() -> None:
+    code = "import sys, pnpdepth_cli.points; assert not {'torch', 'numpy'} & set(sys.modules)"
+    subprocess.run([sys.executable, "-c", code], check=True)

@@ -33,7 +33,7 @@ PROTOCOLS = ("paper", "nyu", "kitti", "kitti-devkit", "eigen", "garg")
     groups={
         "Input": (
             *("--pred-scale", "--gt-scale", "--channel", "--resize", "--mask", "--sparse"),
-            *("--sparse-scale", "--workers"),
+            *("--sparse-scale", "--workers", "--max-pixels"),
         ),
         "Protocol": (
             *("--protocol", "--min-depth", "--max-depth", "--clip", "--crop", "--average"),
@@ -70,6 +70,7 @@ PROTOCOLS = ("paper", "nyu", "kitti", "kitti-devkit", "eigen", "garg")
 @click.option("--pred-scale", type=float, metavar="S", help="Integer predictions hold metres × S.")
 @click.option("--gt-scale", type=float, metavar="S", help="Integer ground truth holds metres × S.")
 @options.channel
+@options.max_pixels
 @click.option(
     "--resize",
     type=click.Choice(("nearest", "bilinear")),

@@ -14,8 +14,11 @@ import click
 OTHER = "Other"
 """Title of the options that no group lists."""
 
-LIDAR = ("--calib", "--camera", "--range", "--keep-occluded", "--min-range", "--max-range")
-FILE_READING = ("--depth-scale", "--gt-scale", "--channel", "--sparse-size-ok")
+LIDAR = (
+    *("--calib", "--camera", "--range", "--keep-occluded", "--min-range", "--max-range"),
+    "--point-fields",
+)
+FILE_READING = ("--depth-scale", "--gt-scale", "--channel", "--sparse-size-ok", "--max-pixels")
 NETWORK = (
     *("--model", "--checkpoint", "--layer", "--align", "--align-every", "--output-kind"),
     *("--normalise", "--precision", "--device", "--tile"),

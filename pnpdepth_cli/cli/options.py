@@ -8,6 +8,7 @@ from typing import Any
 
 import click
 
+from pnpdepth_cli.budget import set_max_pixels
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.pipeline.options import OptionField, options_of
 from pnpdepth_cli.pipeline.refinement import request
@@ -109,6 +110,22 @@ channel = _only(FrameFiles, "channel")
 seed = _only(HoldOut, "seed")
 overwrite = _only(OutputOptions, "overwrite")
 as_json = click.option("--json", "as_json", is_flag=True, help="Print the result as JSON.")
+
+
+def _allow_pixels(
+    context: click.Context, parameter: click.Parameter, max_pixels: int | None
+) -> None:
+    set_max_pixels(max_pixels)
+
+
+max_pixels = click.option(
+    "--max-pixels",
+    type=click.IntRange(1),
+    metavar="N",
+    expose_value=False,
+    callback=_allow_pixels,
+    help="Largest image to read; files may have 4 N bytes.  [default: memory / 64, at most 2^28]",
+)
 output_scale = click.option(
     "--output-scale",
     type=float,
@@ -162,6 +179,13 @@ _SCAN_OPTIONS = (
         help="Drop points nearer than M metres.",
     ),
     max_range,
+    click.option(
+        "--point-fields",
+        type=click.IntRange(3, 64),
+        metavar="N",
+        help="Float32 numbers of a point in a .bin: KITTI 4, nuScenes 5.  [default: recognised]",
+    ),
+    max_pixels,
 )
 
 
@@ -174,7 +198,10 @@ def scan(command: Callable[..., Any]) -> Callable[..., Any]:
 
 def scan_given(given: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
     """Returns (the options of a LiDAR scan, the others)."""
-    names = ("calib", "camera", "euclidean", "keep_occluded", "min_range", "max_range")
+    names = (
+        *("calib", "camera", "euclidean", "keep_occluded", "min_range", "max_range"),
+        "point_fields",
+    )
     return (
         {name: given[name] for name in names},
         {name: value for name, value in given.items() if name not in names},

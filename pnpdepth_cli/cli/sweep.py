@@ -9,8 +9,8 @@ from typing import Any
 
 import click
 
+from pnpdepth_cli.choices import FRAME_PROTOCOLS, LAYOUTS
 from pnpdepth_cli.cli import grouped_help, options
-from pnpdepth_cli.cli.batch import LAYOUTS, PROTOCOLS
 from pnpdepth_cli.cli.exit_codes import INTERRUPTED
 from pnpdepth_cli.cli.progress import BatchProgress
 from pnpdepth_cli.errors import FramesFailedError, StorageError
@@ -63,11 +63,13 @@ from pnpdepth_cli.pipeline.refinement.request import FrameFiles, MethodOptions, 
     help="Number of random draws of the points; the first uses --seed.",
 )
 @click.option(
-    "--layout", type=click.Choice(LAYOUTS), help="Layout of the folder.  [default: recognised]"
+    "--layout",
+    type=click.Choice(tuple(LAYOUTS)),
+    help="Layout of the folder.  [default: recognised]",
 )
 @click.option(
     "--protocol",
-    type=click.Choice(PROTOCOLS),
+    type=click.Choice(FRAME_PROTOCOLS),
     help="Crop and depth range of the frames.  [default: the layout's own]",
 )
 @click.option("--limit", type=int, metavar="N", help="Only the first N frames.")

@@ -71,7 +71,7 @@ def _readings(field: Field, rows: int, columns: int) -> Any:
     """The sparse matrix (N, nodes) that reads a map of the nodes at the points, bilinearly."""
     from scipy.sparse import coo_array
 
-    xy = field.points.in_frame(rows, columns).xy.double()
+    xy = field.points.resized(rows, columns).xy.double()
     x, y = xy[:, 0].clamp(0, columns - 1), xy[:, 1].clamp(0, rows - 1)
     left, top = x.floor(), y.floor()
     fx, fy = x - left, y - top

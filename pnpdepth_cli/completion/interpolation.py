@@ -98,7 +98,7 @@ def morphological(points: SparsePoints) -> Tensor:
     points = distinct(points)
     height, width = points.size
     shrink = min(1.0, math.sqrt(len(points) / (FILL_SHARE * height * width)))
-    coarse = points.in_frame(max(1, round(height * shrink)), max(1, round(width * shrink)))
+    coarse = points.resized(max(1, round(height * shrink)), max(1, round(width * shrink)))
     sparse = _within_frame(coarse).scatter().cpu()
     # minus depth: the maximum is what is near, and minus infinity is unknown
     value = torch.where(sparse > 0, -sparse, -torch.inf)

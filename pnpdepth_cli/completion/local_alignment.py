@@ -52,7 +52,7 @@ def locally_aligned(
     of all pixels. space: in which of `alignment.SPACES` the lines are fitted. Never nearer or
     farther than a global alignment's bounds. NoPointsError if no point has a prediction.
     """
-    device, prediction, points = prediction.device, prediction.detach().cpu(), points.to("cpu")
+    device, prediction, points = prediction.device, prediction.detach().cpu(), points.tensors()
     known, points = where_predicted(prediction, points)
     points = distinct(points)
     x = to_space(torch.where(known, prediction, 1.0).double(), space)

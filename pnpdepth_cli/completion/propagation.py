@@ -23,7 +23,7 @@ from pnpdepth_cli.completion.diffusion import diffused
 from pnpdepth_cli.completion.gaussian_process import Field, at_places, believed, fitted, spread
 from pnpdepth_cli.completion.interpolation import distinct
 from pnpdepth_cli.errors import UsageError
-from pnpdepth_cli.points import SparsePoints
+from pnpdepth_cli.points import SparsePoints, in_frame
 
 PROPAGATIONS = ("none", "gp", "diffusion")
 
@@ -96,7 +96,7 @@ def propagated_at(
     predicted = asked.sample(torch.where(known, prediction, torch.nan)).nan_to_num(0.0)
     if kind == "none":
         return predicted.float()
-    field, asked = _field(prediction, points, rgb), asked.to("cpu")
+    field, asked = _field(prediction, points, rgb), asked.tensors()
     if kind == "diffusion":
         correction = asked.sample(diffused(field))
     else:
@@ -162,7 +162,7 @@ def wrong(prediction: Tensor, points: SparsePoints, rgb: Tensor | None) -> Tenso
     field = _all_points(prediction, points, rgb)
     places = _keys(field.points)
     places = places[~torch.isin(places, _keys(_without_wrong(field).points))]
-    return torch.isin(_keys(points.to("cpu")), places).to(points.xy.device)
+    return torch.isin(_keys(points.tensors()), places).to(points.xy.device)
 
 
 def _keys(points: SparsePoints) -> Tensor:
@@ -186,10 +186,8 @@ def _without_wrong(field: Field) -> Field:
 
 def _all_points(prediction: Tensor, points: SparsePoints, rgb: Tensor | None) -> Field:
     """The same with those that are not believed, too."""
-    prediction, points = prediction.detach().cpu(), points.to("cpu")
-    height, width = points.size
-    x, y = points.xy.unbind(1)
-    inside = (x >= -0.5) & (x <= width - 0.5) & (y >= -0.5) & (y <= height - 0.5)
+    prediction, points = prediction.detach().cpu(), points.tensors()
+    inside = in_frame(points.xy, points.size, closed=True)
     known, points = where_predicted(prediction, points.select(inside))
     points = distinct(points)
     features = features_of(

@@ -10,11 +10,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pnpdepth_cli.errors import FileFormatError, NoPointsError
+from pnpdepth_cli.errors import FileFormatError, NoPointsError, SizeError
 from pnpdepth_cli.io.depth_reading import depth_from_stored, known_metres, load_stored
 from pnpdepth_cli.io.depth_scale import check_scale
 from pnpdepth_cli.io.file_bytes import one_line, read_bytes
 from pnpdepth_cli.io.file_kind import kind_of
+from pnpdepth_cli.points import SparsePoints
 
 _TEXT_SUFFIXES = (".csv", ".txt")
 _SEPARATOR = re.compile(r"[\s,;]+")
@@ -22,58 +23,69 @@ _SEPARATOR = re.compile(r"[\s,;]+")
 
 @dataclass(frozen=True, kw_only=True)
 class SparseFile:
-    """N points with known depth.
+    """The points of a file, and how it was read."""
 
-    `xy` is (N, 2) float32 pixel coordinates, x right, y down, whole numbers at pixel centres.
-    `depth` is (N,) float32 metres, all above 0. `size` is (H, W) of the image the points came
-    from, None for a list. `source`, `scale` and `assumed_scale` are as in DepthImage.
-    """
-
-    xy: NDArray[np.float32]
-    depth: NDArray[np.float32]
-    size: tuple[int, int] | None
+    points: SparsePoints[NDArray[np.float32]]
+    """The points with known depth."""
     source: str
+    """What the file is, for messages."""
     assumed_scale: bool
+    """Whether the scale of an integer file was assumed, because neither user nor file states it."""
     scale: float | None = None
+    """Codes per metre of an integer file."""
 
 
 def read_sparse(
-    path: Path, *, scale: float | None = None, channel: str | None = None
+    path: Path,
+    *,
+    size: tuple[int, int] | None = None,
+    scale: float | None = None,
+    channel: str | None = None,
 ) -> SparseFile:
-    """The points with known depth in a depth image or a point list.
+    """Returns the points with known depth of a depth image or a point list.
 
-    Images give their points row by row. A list is a float array of shape (N, 3) in NPY or NPZ,
-    or text with one `x y depth` per line (.csv, .txt), in metres; it keeps its own order.
-    Raises NoPointsError when no depth is known.
+    Points of an image are in row-major order. A list is a float array of shape (N, 3) in NPY or
+    NPZ, or text with one `x y depth` per line (.csv, .txt), in metres; its order is kept.
+
+    Args:
+        path: The file.
+        size: (H, W) of the frame that a list belongs to; an image has its own.
+        scale: Codes per metre of an integer image.
+        channel: Name of an EXR channel or NPZ array.
+
+    Raises:
+        NoPointsError: No depth is known.
+        SizeError: The file is a list, and no size was given.
     """
     check_scale(scale)
     if path.suffix.lower() in _TEXT_SUFFIXES:
         data = read_bytes(path)
         if kind_of(data) is None:
-            return _from_rows(path, _parse_text(path, data), "point list")
+            return _from_rows(path, _parse_text(path, data), "point list", size)
     stored = load_stored(path, channel)
     if not stored.is_image and stored.values.ndim == 2 and stored.values.shape[1] == 3:
         if stored.values.dtype.kind != "f":
             raise FileFormatError(
                 f"{path}: a point list of {stored.values.dtype}; save x, y, depth as float metres"
             )
-        return _from_rows(path, stored.values, f"point list, {stored.description}")
+        return _from_rows(path, stored.values, f"point list, {stored.description}", size)
     image = depth_from_stored(path, stored, scale)
     rows, columns = np.nonzero(image.valid)
     if rows.size == 0:
         raise NoPointsError(f"{path} holds no depth above 0; give a file with sparse depth")
     height, width = image.values.shape
+    xy = np.stack([columns, rows], axis=1).astype(np.float32)
     return SparseFile(
-        xy=np.stack([columns, rows], axis=1).astype(np.float32),
-        depth=image.values[rows, columns],
-        size=(height, width),
+        points=SparsePoints(xy=xy, depth=image.values[rows, columns], size=(height, width)),
         source=image.source,
         assumed_scale=image.assumed_scale,
         scale=image.scale,
     )
 
 
-def _from_rows(path: Path, rows: NDArray[np.floating], source: str) -> SparseFile:
+def _from_rows(
+    path: Path, rows: NDArray[np.floating], source: str, size: tuple[int, int] | None
+) -> SparseFile:
     depth = known_metres(rows[:, 2])
     known = depth > 0
     if not known.any():
@@ -84,7 +96,10 @@ def _from_rows(path: Path, rows: NDArray[np.floating], source: str) -> SparseFil
         raise FileFormatError(
             f"{path}: point {row + 1} has no finite coordinates; correct or remove it"
         )
-    return SparseFile(xy=xy, depth=depth[known], size=None, source=source, assumed_scale=False)
+    if size is None:
+        raise SizeError(f"{path} is a list of points, which needs an image to say the frame's size")
+    points = SparsePoints(xy=xy, depth=depth[known], size=size)
+    return SparseFile(points=points, source=source, assumed_scale=False)
 
 
 def _parse_text(path: Path, data: bytes) -> NDArray[np.float64]:

@@ -59,7 +59,7 @@ class FrameMap:
 
     def points_to_network(self, points: SparsePoints) -> SparsePoints:
         """The points inside the crop, at their places in the network's frame."""
-        resized = points.cropped(*self.crop).in_frame(*self.resized)
+        resized = points.cropped(*self.crop).resized(*self.resized)
         return SparsePoints(xy=resized.xy, depth=resized.depth, size=self.network)
 
     def depth_to_image(self, depth: Tensor) -> Tensor:

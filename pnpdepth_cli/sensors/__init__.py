@@ -2,8 +2,8 @@
 
     from pnpdepth_cli.sensors import LIDARS, Camera, project_velodyne, sample_points, simulate_lidar
 
-All give `SparseDepth`: N depths in metres at pixel coordinates of one picture, x to the right and
-y down, whole numbers at pixel centres. numpy only; nothing here reads a file.
+All return `SparsePoints` of numpy arrays: N depths in metres at pixel coordinates of one image,
+x right, y down, whole numbers at pixel centres. numpy only; nothing here reads a file.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from pnpdepth_cli.sensors.samplers import (
     sample_points,
 )
 from pnpdepth_cli.sensors.simulate import SimulationSettings, simulate_lidar
-from pnpdepth_cli.sensors.sparse import SparseDepth, as_picture
+from pnpdepth_cli.sensors.sparse import Points, as_picture
 from pnpdepth_cli.sensors.velodyne import ProjectedScan, ProjectionSettings, project_velodyne
 
 __all__ = [
@@ -29,12 +29,12 @@ __all__ = [
     "Camera",
     "Lidar",
     "OcclusionFilter",
+    "Points",
     "ProjectedScan",
     "ProjectionSettings",
     "SampleNoise",
     "SamplePattern",
     "SimulationSettings",
-    "SparseDepth",
     "as_picture",
     "disturbed",
     "project_velodyne",

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import NoPointsError, SizeError, UsageError
-from pnpdepth_cli.sensors.sparse import SparseDepth, Steps, in_picture
+from pnpdepth_cli.points import SparsePoints, in_frame
+from pnpdepth_cli.sensors.sparse import FARTHEST_M, Points, Steps
 
 Depth = NDArray[np.float32]
 Picture = NDArray[np.float32]
@@ -81,7 +82,7 @@ def sample_points(
     *,
     image: Picture | None = None,
     noise: SampleNoise | None = None,
-) -> SparseDepth:
+) -> Points:
     """Points of a dense depth map; the same seed gives the same points.
 
     depth: (H, W) metres, 0 = unknown. image: (H, W, 3) in 0..1 of the same view, for `features`
@@ -100,7 +101,7 @@ def sample_points(
     if not chosen.size:
         raise NoPointsError(f"pattern {pattern.kind!r} leaves no point; ask for more")
     row, column = np.divmod(chosen, depth.shape[1])
-    points = SparseDepth(
+    points = SparsePoints(
         xy=np.stack([column, row], axis=1).astype(np.float32),
         depth=depth.ravel()[chosen].astype(np.float32),
         size=(depth.shape[0], depth.shape[1]),
@@ -249,7 +250,7 @@ PATTERNS: dict[str, Sampler] = {
 """The patterns that can be named: row-major indices of the pixels each keeps."""
 
 
-def disturbed(points: SparseDepth, noise: SampleNoise, rng: np.random.Generator) -> SparseDepth:
+def disturbed(points: Points, noise: SampleNoise, rng: np.random.Generator) -> Points:
     """The points with noise; those that it makes impossible or moves out of the picture are gone.
 
     NoPointsError if that is all of them.
@@ -257,22 +258,26 @@ def disturbed(points: SparseDepth, noise: SampleNoise, rng: np.random.Generator)
     xy, values = points.xy.astype(np.float64), points.depth.astype(np.float64)
     height, width = points.size
     low, high = values.min(), values.max()
-    if noise.metres > 0:
-        values = values + rng.normal(0, noise.metres, len(values))
-    if noise.relative > 0:
-        values = values * (1 + rng.normal(0, noise.relative, len(values)))
+    with np.errstate(over="ignore", invalid="ignore"):
+        if noise.metres > 0:
+            values = values + rng.normal(0, noise.metres, len(values))
+        if noise.relative > 0:
+            values = values * (1 + rng.normal(0, noise.relative, len(values)))
     if noise.outliers > 0:
         wrong = rng.permutation(len(values))[: round(noise.outliers * len(values))]
         values[wrong] = rng.uniform(low, high, len(wrong))
     if noise.jitter_px > 0:
         xy = xy + rng.normal(0, noise.jitter_px, xy.shape)
     steps = Steps(len(values))
+    if noise.metres > 0 or noise.relative > 0:
+        near = steps.keep(np.abs(values) < FARTHEST_M, "noise put it too far")
+        xy, values = xy[near], values[near]
     positive = steps.keep(values.astype(np.float32) > 0, "noise left no depth")
     xy, values = xy[positive], values[positive]
-    inside = steps.keep(in_picture(xy, (height, width)), "outside the picture")
+    inside = steps.keep(in_frame(xy, (height, width)), "outside the picture")
     if not inside.any():
         raise NoPointsError(f"noise leaves no point ({steps}); make it smaller")
-    return SparseDepth(
+    return SparsePoints(
         xy=xy[inside].astype(np.float32),
         depth=values[inside].astype(np.float32),
         size=(height, width),

@@ -8,14 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import NoPointsError, UsageError
+from pnpdepth_cli.points import SparsePoints, in_frame
 from pnpdepth_cli.sensors.camera import Camera
 from pnpdepth_cli.sensors.lidar import Lidar
 from pnpdepth_cli.sensors.sparse import (
+    FARTHEST_M,
     Floats,
     Mask,
-    SparseDepth,
+    Points,
     Steps,
-    in_picture,
     nearest_in_pixel,
     pixel_index,
 )
@@ -57,7 +58,7 @@ def simulate_lidar(
     sensor: Lidar,
     seed: int,
     settings: SimulationSettings | None = None,
-) -> SparseDepth:
+) -> Points:
     """Sparse depth of one turn of the scanner, in the picture the depth belongs to.
 
     depth: (H, W) metres along the camera's axis, 0 = unknown. camera: how it sees, and where the
@@ -82,8 +83,11 @@ def simulate_lidar(
     points = camera.translation + beams * distance[:, None]
     ahead = steps.keep((distance > 0) & (points[:, 2] > 0), "noise put it behind the camera")
     points = points[ahead]
+    near = np.abs(points).max(axis=1, initial=0) < FARTHEST_M
+    if not near.all():
+        points = points[steps.keep(near, "noise put it too far")]
     xy = camera.pixels_of(points)
-    inside = steps.keep(in_picture(xy, size), "outside the picture")
+    inside = steps.keep(in_frame(xy, size), "outside the picture")
     points, xy = points[inside], xy[inside]
     front = steps.keep(nearest_in_pixel(xy, points[:, 2], size), "behind another in their pixel")
     points, xy = points[front], xy[front]
@@ -93,7 +97,7 @@ def simulate_lidar(
             " intrinsics and where the scanner stands"
         )
     values = np.linalg.norm(points, axis=1) if settings.euclidean else points[:, 2]
-    return SparseDepth(
+    return SparsePoints(
         xy=xy.astype(np.float32),
         depth=values.astype(np.float32),
         size=size,
@@ -185,7 +189,7 @@ def _walk_length(camera: Camera, beams: Floats, near: float, far: float, depth: 
         reached = camera.translation + beams * ((z - camera.translation[2]) / beams[:, 2])[:, None]
         ends.append(camera.pixels_of(reached))
     size = (depth.shape[0], depth.shape[1])
-    seen = in_picture(ends[0], size) | in_picture(ends[1], size)
+    seen = in_frame(ends[0], size) | in_frame(ends[1], size)
     if not seen.any():
         return 1
     moved = np.hypot(*(ends[1] - ends[0])[seen].T)
@@ -196,7 +200,7 @@ def _map_at(depth: Floats, camera: Camera, points: Floats) -> tuple[Floats, Mask
     """(M,) the depth map at the pixels of points, 0 outside the picture; and (M,) if inside."""
     xy = camera.pixels_of(points)
     size = (depth.shape[0], depth.shape[1])
-    inside = in_picture(xy, size)
+    inside = in_frame(xy, size)
     values = np.zeros(len(points))
     values[inside] = depth.ravel()[pixel_index(xy[inside], size)]
     return values, inside

@@ -1,42 +1,28 @@
-"""What every source of sparse depth gives: points in a picture, at most one per pixel."""
+"""What the sources of sparse depth share: one point per pixel, and counts of dropped points."""
 
 from __future__ import annotations
-
-from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pnpdepth_cli.points import SparsePoints
+
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-
-@dataclass(frozen=True, kw_only=True)
-class SparseDepth:
-    """N depths at pixel coordinates.
-
-    xy: (N, 2) float32, x right and y down, pixel centres at whole numbers, not rounded.
-    depth: (N,) float32 metres, all above 0. size: (H, W) of the picture.
-    dropped: how many points went on the way, and why, in the order of the steps.
-    """
-
-    xy: NDArray[np.float32]
-    depth: NDArray[np.float32]
-    size: tuple[int, int]
-    dropped: dict[str, int] = field(default_factory=dict)
+FARTHEST_M = 1e9
+"""Metres; what noise moves farther is no measurement, and would overflow float32 in products."""
 
 
-def as_picture(points: SparseDepth) -> NDArray[np.float32]:
+Points = SparsePoints[NDArray[np.float32]]
+"""Sparse depth in numpy arrays."""
+
+
+def as_picture(points: Points) -> NDArray[np.float32]:
     """(H, W) float32 metres, 0 = unknown: each point on its pixel, the nearest wins."""
     flat = np.full(points.size[0] * points.size[1], np.inf, np.float32)
     np.minimum.at(flat, pixel_index(points.xy, points.size), points.depth)
     return np.where(np.isinf(flat), np.float32(0), flat).reshape(points.size)
-
-
-def in_picture(xy: NDArray[np.floating], size: tuple[int, int]) -> Mask:
-    """(N,) true where the nearest pixel exists in a picture of `size` (H, W); false for NaN."""
-    x, y = xy[:, 0], xy[:, 1]
-    return (x >= -0.5) & (x < size[1] - 0.5) & (y >= -0.5) & (y < size[0] - 0.5)
 
 
 def pixel_index(xy: NDArray[np.floating], size: tuple[int, int]) -> NDArray[np.intp]:

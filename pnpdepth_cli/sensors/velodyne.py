@@ -8,9 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import NoPointsError, UsageError
+from pnpdepth_cli.points import in_frame
 from pnpdepth_cli.sensors.camera import Camera
 from pnpdepth_cli.sensors.occlusion import OcclusionFilter, hidden_points
-from pnpdepth_cli.sensors.sparse import SparseDepth, Steps, in_picture, nearest_in_pixel
+from pnpdepth_cli.sensors.sparse import Points, Steps, nearest_in_pixel
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,7 +37,7 @@ class ProjectionSettings:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ProjectedScan(SparseDepth):
+class ProjectedScan(Points):
     """The points of a scan that the camera sees, in the scan's order; index (N,): their rows."""
 
     index: NDArray[np.intp]
@@ -61,7 +62,7 @@ def project_velodyne(
     seen = camera.from_scanner(place[steps.keep(in_range, "out of range")])
     seen = seen[steps.keep(seen[:, 2] > 0, "behind the camera")]
     xy = camera.pixels_of(seen)
-    inside = steps.keep(in_picture(xy, size), "outside the picture")
+    inside = steps.keep(in_frame(xy, size), "outside the picture")
     seen, xy = seen[inside], xy[inside]
     front = steps.keep(nearest_in_pixel(xy, seen[:, 2], size), "behind another in their pixel")
     seen, xy = seen[front], xy[front]

@@ -228,5 +228,5 @@ def test_a_conversion_into_its_own_source_is_refused(
     source.write_bytes(b"kept")
     for target in (source, tmp_path / "." / "a.safetensors"):
         assert run(["models", "convert", str(source), str(target), "--overwrite"]) == 2
-        assert "is the file to convert" in capsys.readouterr().err
+        assert "is the checkpoint itself" in capsys.readouterr().err
         assert source.read_bytes() == b"kept"

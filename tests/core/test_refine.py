@@ -182,6 +182,25 @@ def test_grad_mode_and_random_state_of_the_caller_stay() -> None:
     assert torch.equal(torch.get_rng_state(), before)
 
 
+@pytest.mark.parametrize("keep_best", [False, True])
+def test_depths_are_kept_after_the_chosen_numbers_of_updates(keep_best: bool) -> None:
+    settings = RefineSettings(iterations=5, lr=0.05, keep_best=keep_best)
+    result = refined(build("unet"), "bottleneck", settings, keep_depths=(0, 2, 5, 9))
+    assert list(result.depths) == [0, 2, 5]
+    assert result.depths[0] is result.before
+    for updates in (2, 5):
+        shorter = RefineSettings(iterations=updates, lr=0.05)
+        alone = refined(build("unet"), "bottleneck", shorter)
+        assert torch.equal(result.depths[updates], alone.after)
+
+
+def test_depths_of_a_refinement_that_diverges_are_those_before() -> None:
+    torch.manual_seed(0)
+    with pytest.raises(DivergedError) as error:
+        refined(Breaking(3, float("nan")), "cut", RefineSettings(), keep_depths=range(6))
+    assert list(error.value.last_good.depths) == [0, 1]
+
+
 # ------------------------------------------------------------------ the step size
 
 

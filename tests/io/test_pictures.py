@@ -256,12 +256,13 @@ def test_pictures_of_real_frames_are_written(shared_data: Path, tmp_path: Path, 
     if kind == "kitti_dc":
         folder = shared_data / kind
         rgb = read_rgb(sorted((folder / "image").glob("*"))[0]).values
-        sparse = read_sparse(sorted((folder / "velodyne_raw").glob("*"))[0])
+        sparse = read_sparse(sorted((folder / "velodyne_raw").glob("*"))[0]).points
         gt = read_depth(sorted((folder / "groundtruth").glob("*"))[0]).values
     else:
         rgb = read_rgb(shared_data / kind / "frame-000100.color.jpg").values
         depth = shared_data / kind / "frame-000100.depth.png"
-        sparse, gt = read_sparse(depth, scale=1000), read_depth(depth, scale=1000).values
+        sparse = read_sparse(depth, scale=1000).points
+        gt = read_depth(depth, scale=1000).values
     dense = np.where(gt > 0, gt, np.float32(np.median(gt[gt > 0])))
     preview(rgb, sparse.xy[::40], sparse.depth[::40], dense * 1.2, dense, tmp_path / "p.png")
     assert improvement(dense * 1.2, dense, gt, tmp_path / "i.png", rgb) == 1

@@ -97,7 +97,7 @@ def test_what_a_point_reads_in_the_network_is_what_is_at_its_pixel(
     network = frame.rgb_to_network(ramps(height, width))
     here = every_pixel(height, width)
     there = frame.points_to_network(here)
-    inside = there.in_frame(*frame.network).xy
+    inside = there.resized(*frame.network).xy
     middle = (inside > 2).all(1) & (inside < torch.tensor([37, 27])).all(1)
     back = there.select(middle)
     index = (back.depth - 1).long()

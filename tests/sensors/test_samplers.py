@@ -183,3 +183,14 @@ def test_features_of_a_real_frame_spread_over_it(shared_data: Path) -> None:
     got = sample_points(depth, SamplePattern(kind="features", count=300), 0, image=rgb)
     assert len(got.depth) == 300
     assert (got.xy.max(axis=0) - got.xy.min(axis=0) > np.array([320, 240])).all()
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("noise", [SampleNoise(metres=1e300), SampleNoise(relative=1e308)])
+def test_noise_never_makes_an_infinite_depth(noise: SampleNoise) -> None:
+    depth = np.full((20, 20), 5, np.float32)
+    try:
+        points = sample_points(depth, SamplePattern(count=100), 0, noise=noise)
+    except NoPointsError:
+        return
+    assert np.isfinite(points.depth).all()

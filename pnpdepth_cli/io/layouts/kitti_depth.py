@@ -11,7 +11,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from pnpdepth_cli.io.layouts.frame import (
+from pnpdepth_cli.io.dataset.frame import (
     PICTURES,
     Frame,
     Listing,
@@ -19,7 +19,8 @@ from pnpdepth_cli.io.layouts.frame import (
     by_stem,
     without_partner,
 )
-from pnpdepth_cli.io.layouts.protocols import PROTOCOLS
+from pnpdepth_cli.io.dataset.protocols import PROTOCOLS
+from pnpdepth_cli.io.layouts import Layout
 
 _PNG = (".png",)
 _SCALE = 256.0
@@ -136,3 +137,6 @@ def _without_images(root: Path, drive: Path, camera: str) -> Unmatched:
         why=f"has no {camera}/data with images; put KITTI's raw drive {drive.name} there, or into"
         f" {place}",
     )
+
+
+LAYOUT = Layout(matches=matches, listing=listing)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from pnpdepth_cli.io.layouts.frame import (
+from pnpdepth_cli.io.dataset.frame import (
     PICTURES,
     Frame,
     Listing,
@@ -12,6 +12,7 @@ from pnpdepth_cli.io.layouts.frame import (
     by_stem,
     without_partner,
 )
+from pnpdepth_cli.io.layouts import Layout
 
 
 def matches(root: Path) -> bool:
@@ -50,3 +51,6 @@ def _parts(root: Path) -> list[Path]:
     candidates = (root, root / "training", root / "testing")
     needed = ("image_2", "velodyne", "calib")
     return [p for p in candidates if all((p / name).is_dir() for name in needed)]
+
+
+LAYOUT = Layout(matches=matches, listing=listing)

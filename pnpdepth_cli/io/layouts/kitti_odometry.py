@@ -11,8 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from pnpdepth_cli.errors import FileFormatError, InputError
-from pnpdepth_cli.io.file_bytes import one_line, read_bytes
-from pnpdepth_cli.io.layouts.frame import (
+from pnpdepth_cli.io.dataset.frame import (
     PICTURES,
     Frame,
     Listing,
@@ -21,7 +20,9 @@ from pnpdepth_cli.io.layouts.frame import (
     by_stem,
     without_partner,
 )
-from pnpdepth_cli.io.layouts.protocols import PROTOCOLS
+from pnpdepth_cli.io.dataset.protocols import PROTOCOLS
+from pnpdepth_cli.io.file_bytes import one_line, read_bytes
+from pnpdepth_cli.io.layouts import Layout
 
 
 def matches(root: Path) -> bool:
@@ -99,3 +100,6 @@ def _pose(path: Path, number: int, line: str) -> Pose:
             f"{path}, line {number}: {one_line(line)[:60]!r} is not 12 finite numbers"
         )
     return tuple(tuple(values[start : start + 4]) for start in (0, 4, 8))
+
+
+LAYOUT = Layout(matches=matches, listing=listing)

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from pnpdepth_cli.io.layouts.find_files import find_files
-from pnpdepth_cli.io.layouts.frame import DEPTHS, PICTURES, SCANS, Frame, Listing, without_partner
+from pnpdepth_cli.io.dataset.find_files import find_files
+from pnpdepth_cli.io.dataset.frame import DEPTHS, PICTURES, SCANS, Frame, Listing, without_partner
+from pnpdepth_cli.io.layouts import Layout
 
 _CALIBRATIONS = (".txt", ".json", ".yaml", ".yml")
 
@@ -52,3 +53,6 @@ def listing(root: Path) -> Listing:
             for each in without_partner(others, images, root / "rgb")
         ),
     )
+
+
+LAYOUT = Layout(matches=matches, listing=listing)

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 from pnpdepth_cli.errors import InputError, OutputError, UsageError
+from pnpdepth_cli.io.dataset.frame import SCANS, Frame, Source, Unmatched
+from pnpdepth_cli.io.dataset.frame_names import name_problem
+from pnpdepth_cli.io.file_bytes import one_line
 from pnpdepth_cli.io.layouts import LAYOUTS, find_protocol, list_frames
-from pnpdepth_cli.io.layouts.frame import SCANS, Frame, Source, Unmatched
 from pnpdepth_cli.pipeline.refinement.output_files import Outputs
 from pnpdepth_cli.pipeline.refinement.request import FrameFiles, RefineRequest
 
@@ -84,17 +86,17 @@ def find_frames(request: BatchRequest) -> BatchFrames:
     if not frames:
         first = f" ({lost[0]})" if lost else ""
         raise InputError(
-            f"{request.source} looks like {layout.name!r} but has no frame in it{first};"
+            f"{request.source} looks like {layout!r} but has no frame in it{first};"
             f" layouts are {', '.join(LAYOUTS)}"
         )
     if request.refine.files.sample is None and all(frame.sparse is None for frame in frames):
         raise UsageError(
-            f"{request.source} looks like {layout.name!r}, which has no sparse depth; --sample 500"
+            f"{request.source} looks like {layout!r}, which has no sparse depth; --sample 500"
             " takes so many points of the ground truth"
         )
     number, of = request.shard or (1, 1)
     return BatchFrames(
-        layout=layout.name,
+        layout=layout,
         frames=frames,
         chosen=frames[: request.limit][number - 1 :: of],
         unmatched=tuple(unmatched),
@@ -186,9 +188,9 @@ def _own_names(found: tuple[list[Frame], list[Unmatched]]) -> tuple[list[Frame],
         why = f"is a second frame {frame.name!r}; rename it" if frame.name in kept else None
         if frame.name == "summary":
             why = "would be recorded in summary.json, which is the batch's own; rename it"
-        place = PurePosixPath(frame.name)
-        if place.is_absolute() or ".." in place.parts:
-            why = f"is named {frame.name!r}, which leads out of the output folder; rename it"
+        problem = name_problem(frame.name)
+        if problem is not None:
+            why = f"is named {one_line(frame.name)!r}, which {problem}; rename it"
         if why is None:
             kept[frame.name] = frame
         else:

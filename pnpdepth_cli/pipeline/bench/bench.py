@@ -274,7 +274,7 @@ class _Subject:
         spaces = (stated,) if stated in SPACES else ("depth", "inverse")
         at_points = self.points.sample(self.network.raw_of(output))
         depth = self.network.depth_of(output)
-        points = self.points.in_frame(*depth.shape[-2:])
+        points = self.points.resized(*depth.shape[-2:])
         rgb = F.interpolate(self.rgb, points.size, mode="bilinear")[0]
         todo = {
             "alignment": Timed(run=lambda _: align(at_points, self.points, spaces, "auto")),

@@ -11,14 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import FileFormatError, InputError, SizeError
+from pnpdepth_cli.io.dataset.frame import PICTURES
 from pnpdepth_cli.io.depth import DepthImage, read_sparse
 from pnpdepth_cli.io.depth_reading import depth_from_stored, known_metres, load_stored
 from pnpdepth_cli.io.layouts import Hdf5Array, read_frame_truth
-from pnpdepth_cli.io.layouts.frame import PICTURES
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.pipeline.evaluation.pairing import FramePair
 from pnpdepth_cli.pipeline.evaluation.protocols import EvalProtocol
-from pnpdepth_cli.sensors.sparse import SparseDepth, as_picture, in_picture
+from pnpdepth_cli.points import SparsePoints, in_frame
+from pnpdepth_cli.sensors.sparse import as_picture
 
 Depth = NDArray[np.float32]
 Mask = NDArray[np.bool_]
@@ -142,18 +143,18 @@ def _read_sparse(
     if pair.sparse is None:
         return None, None
     scale = scales.sparse if scales.sparse is not None else pair.frame.sparse_scale
-    points = read_sparse(pair.sparse, scale=scale)
-    if points.assumed_scale and protocol.scale != points.scale:
-        points = read_sparse(pair.sparse, scale=protocol.scale)
-    xy, source_size = points.xy, points.size or size
+    sparse = read_sparse(pair.sparse, size=size, scale=scale)
+    if sparse.assumed_scale and protocol.scale != sparse.scale:
+        sparse = read_sparse(pair.sparse, size=size, scale=protocol.scale)
+    xy, source_size = sparse.points.xy, sparse.points.size
     if source_size != size:
         xy = pair.frame.protocol.places(xy, source_size)
         cut = pair.frame.protocol.apply(np.zeros(source_size, bool)).shape
         if cut != size:
             raise _different(pair, "sparse depth", pair.sparse, source_size, size, advice="")
-    inside = in_picture(xy, size)
-    depths = SparseDepth(xy=xy[inside], depth=points.depth[inside], size=size)
-    return as_picture(depths), points.scale
+    inside = in_frame(xy, size)
+    points = SparsePoints(xy=xy[inside], depth=sparse.points.depth[inside], size=size)
+    return as_picture(points), sparse.scale
 
 
 def _scored_mask(pair: FramePair, ground_truth: Depth, protocol: EvalProtocol) -> Mask:

@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from pnpdepth_cli.errors import InputError, PnpDepthError, UsageError
+from pnpdepth_cli.io.dataset.frame import DEPTHS, PICTURES
 from pnpdepth_cli.io.file_bytes import one_line
 from pnpdepth_cli.io.layouts import Frame, Source, find_layout, list_frames
-from pnpdepth_cli.io.layouts.frame import DEPTHS, PICTURES
 from pnpdepth_cli.io.record import read_json
 from pnpdepth_cli.pipeline.evaluation.dependence import groups_by_name
 
@@ -139,7 +139,7 @@ def some_names(names: Iterable[str]) -> str:
 def _layout_of(ground_truth: Path) -> str | None:
     """The layout that the ground truth is a data set of; None for files and folders of files."""
     try:
-        return find_layout(ground_truth).name
+        return find_layout(ground_truth)
     except (InputError, OSError):
         return None
 

@@ -11,6 +11,7 @@ from pathlib import Path
 from pnpdepth_cli.core.metrics import Measure
 from pnpdepth_cli.errors import OutputError
 from pnpdepth_cli.io.atomic import atomic_path
+from pnpdepth_cli.io.csv_text import text_cell
 from pnpdepth_cli.pipeline.evaluation.compare import Comparison
 from pnpdepth_cli.pipeline.evaluation.result import ErrorBin, Evaluation, frame_record
 
@@ -75,7 +76,7 @@ def frames_csv(evaluation: Evaluation) -> str:
     columns = [name for name in records[0] if name not in ("values", "error")]
     rows = [
         [*(_cell(r[name]) for name in columns), *(_cell(r["values"].get(key)) for key in keys),
-         r["error"] or ""]
+         text_cell(r["error"] or "")]
         for r in records
     ]  # fmt: skip
     return csv_text([*columns, *keys, "error"], rows)
@@ -189,4 +190,4 @@ def _in_markdown(cell: str) -> str:
 def _cell(value: object) -> str:
     if value is None or (isinstance(value, float) and math.isnan(value)):
         return ""
-    return str(value)
+    return text_cell(value) if isinstance(value, str) else str(value)

@@ -73,11 +73,12 @@ def list_layers(
     size: (H, W) of the frame; default that of `sparse`, the network's own, or 240×320. With
     `sparse`, a sparse depth map, the layers are ranked by the paper's rule of thumb.
     """
-    count = None
-    if sparse is not None:
-        points = read_sparse(sparse)
-        size, count = size or points.size, len(points.depth)
     network = load_network(model, checkpoint, device)
+    policy, count = network.definition.size, None
+    own = (policy.height, policy.width) if isinstance(policy, Fixed) else DEFAULT_SIZE
+    if sparse is not None:
+        points = read_sparse(sparse, size=size or own).points
+        size, count = size or points.size, len(points)
     names = list(network.definition.layers)
     if every:
         names = [name for name, _ in network.module.named_modules() if name]
@@ -85,8 +86,6 @@ def list_layers(
         raise UsageError(
             f"the definition of {network.definition.name!r} lists no layers; --all lists every one"
         )
-    policy = network.definition.size
-    own = (policy.height, policy.width) if isinstance(policy, Fixed) else DEFAULT_SIZE
     frame = FrameMap.fit(policy, *(size or own))
     rows = []
     with out_of_memory_is_a_device_error(network.device):

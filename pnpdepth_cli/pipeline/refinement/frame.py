@@ -150,7 +150,7 @@ def ready_frame(
             f"none of the {len(task.used)} sparse points lies inside the part of the image that"
             f" network {network.definition.name!r} sees (rows and columns {frame.crop})"
         )
-    at = points.to(network.device)
+    at = points.tensors(network.device)
     return ReadyFrame(
         task=task,
         frame=frame,

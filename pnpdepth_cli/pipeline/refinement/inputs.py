@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from pnpdepth_cli.errors import InputError, NoPointsError, SizeError, UsageError
+from pnpdepth_cli.io.dataset.frame import Hdf5Array, Source
+from pnpdepth_cli.io.dataset.hdf5 import depth_of, rgb_of
 from pnpdepth_cli.io.depth import (
     DepthImage,
     describe_range,
@@ -20,8 +22,6 @@ from pnpdepth_cli.io.depth import (
     read_sparse,
 )
 from pnpdepth_cli.io.fingerprint import fingerprint
-from pnpdepth_cli.io.layouts.frame import Hdf5Array, Source
-from pnpdepth_cli.io.layouts.hdf5 import depth_of, rgb_of
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.pipeline.refinement.request import FrameFiles, RefineRequest
 from pnpdepth_cli.pipeline.sparse.scans import read_scan_points
@@ -169,9 +169,7 @@ def _sampled(files: FrameFiles, image: _Part | None, truth: _Part | None, seed: 
         raise InputError(f"{files.gt}: {error}") from error
     source = f"{files.sample.kind} of the ground truth, seed {seed}"
     return _Sparse(
-        points=SparsePoints(
-            xy=torch.from_numpy(found.xy), depth=torch.from_numpy(found.depth), size=found.size
-        ),
+        points=found.tensors(),
         scale=truth.scale,
         record={"sampled_from": str(files.gt), **asdict(files.sample), "seed": seed},
         notes=(f"sparse: {describe_range(found.depth, source)}",),
@@ -181,37 +179,25 @@ def _sampled(files: FrameFiles, image: _Part | None, truth: _Part | None, seed: 
 def _read_scan(files: FrameFiles, path: Path, image_size: tuple[int, int] | None) -> _Sparse:
     picture = files.image if isinstance(files.image, Path) else None
     scan = read_scan_points(path, files.scan, image_size, picture)
-    points = SparsePoints(
-        xy=torch.from_numpy(scan.points.xy),
-        depth=torch.from_numpy(scan.points.depth),
-        size=scan.points.size,
-    )
-    points = _in_protocol(files, path, points)
+    points = _in_protocol(files, path, scan.points.tensors())
     return _Sparse(points=points, scale=None, record=scan.record, notes=scan.notes)
 
 
 def _read_points(files: FrameFiles, path: Path, image_size: tuple[int, int] | None) -> _Sparse:
     scale = files.sparse_scale or files.depth_scale
-    sparse = read_sparse(path, scale=scale, channel=files.channel)
-    size = image_size or sparse.size
-    if size is None:
-        raise SizeError(f"{path} is a list of points, which needs an image to say the frame's size")
-    sparse_size = sparse.size or size
+    sparse = read_sparse(path, size=image_size, scale=scale, channel=files.channel)
+    sparse_size, depth = sparse.points.size, sparse.points.depth
+    size = image_size or sparse_size
     if sparse_size != size and not files.sparse_size_ok:
         raise SizeError(
             f"{path} is {sparse_size[1]}×{sparse_size[0]} but {files.image} is"
             f" {size[1]}×{size[0]}; --sparse-size-ok maps the points if both show the same view"
         )
-    points = SparsePoints(
-        xy=torch.from_numpy(sparse.xy), depth=torch.from_numpy(sparse.depth), size=sparse_size
-    )
-    points = _inside(path, points.in_frame(*size))
-    notes = [
-        f"sparse: {describe_range(sparse.depth, sparse.source, assumed_scale=sparse.assumed_scale)}"
-    ]
-    if len(points) < len(sparse.depth):
-        notes.append(f"sparse: {len(sparse.depth) - len(points):,} points outside the image")
-    notes += [f"warning: {text}" for text in [implausible(sparse.depth, sparse.scale)] if text]
+    points = _inside(path, sparse.points.tensors().resized(*size))
+    notes = [f"sparse: {describe_range(depth, sparse.source, assumed_scale=sparse.assumed_scale)}"]
+    if len(points) < len(depth):
+        notes.append(f"sparse: {len(depth) - len(points):,} points outside the image")
+    notes += [f"warning: {text}" for text in [implausible(depth, sparse.scale)] if text]
     return _Sparse(
         points=_in_protocol(files, path, points),
         scale=sparse.scale,

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from pnpdepth_cli.errors import OutputError, UsageError
+from pnpdepth_cli.io.dataset.frame import DEPTHS, PICTURES, SCANS
 from pnpdepth_cli.io.depth import DEPTH_SUFFIXES
-from pnpdepth_cli.io.layouts.frame import DEPTHS, PICTURES, SCANS
 from pnpdepth_cli.io.record import write_json
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest
 

@@ -16,8 +16,8 @@ from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.pipeline.options import Axis, option
 
 if TYPE_CHECKING:
-    from pnpdepth_cli.io.layouts.frame import Source
-    from pnpdepth_cli.io.layouts.protocols import Protocol
+    from pnpdepth_cli.io.dataset.frame import Source
+    from pnpdepth_cli.io.dataset.protocols import Protocol
     from pnpdepth_cli.pipeline.sparse.scans import ScanOptions
     from pnpdepth_cli.sensors import SamplePattern
 
@@ -31,7 +31,7 @@ def _default_scan() -> ScanOptions:
 
 
 def _whole_frame() -> Protocol:
-    from pnpdepth_cli.io.layouts.protocols import WHOLE
+    from pnpdepth_cli.io.dataset.protocols import WHOLE
 
     return WHOLE
 

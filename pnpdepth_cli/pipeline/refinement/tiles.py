@@ -143,7 +143,7 @@ def _reduced(task: FrameToRefine, longest: int) -> FrameToRefine:
     rgb = task.inputs.rgb_tensor()
     if rgb is not None:
         rgb = F.interpolate(rgb, size, mode="bilinear", antialias=True)[0].permute(1, 2, 0)
-    points = task.used.in_frame(*size)
+    points = task.used.resized(*size)
     inputs = replace(task.inputs, rgb=None if rgb is None else rgb.numpy(), points=points, gt=None)
     return FrameToRefine.with_points(inputs, points)
 

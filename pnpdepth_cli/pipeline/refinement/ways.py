@@ -9,15 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from pnpdepth_cli.completion.baselines import BASELINES
 from pnpdepth_cli.completion.propagation import propagate, propagated_at
-from pnpdepth_cli.core.refine import DepthOf, RefineSettings, refine_from
+from pnpdepth_cli.core.refine import RefineSettings, refine_from
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.errors import PnpDepthError
 from pnpdepth_cli.models.network import Network, out_of_memory_is_a_device_error
@@ -162,30 +161,20 @@ def _trajectory(
     settings: RefineSettings,
     wanted: Collection[int],
 ) -> Trajectory | PnpDepthError:
-    depths: dict[int, Tensor] = {}
     (result,) = refine_from(
-        split, z0, (frame.points,), settings, depth_of=(_noted(frame.depth_of, depths, wanted),)
+        split, z0, (frame.points,), settings, depth_of=(frame.depth_of,), keep_depths={0, *wanted}
     )
     done = finished_frame(frame, result)
     if isinstance(done, PnpDepthError):
         return done
-    kept = {made: torch.from_numpy(to_image(frame.frame, depth)) for made, depth in depths.items()}
-    return Trajectory(depths=kept, frame=done)
-
-
-def _noted(depth_of: DepthOf, depths: dict[int, Tensor], wanted: Collection[int]) -> DepthOf:
-    """The same, its depth kept where the number of updates is wanted and it is finite."""
-    made = -1
-
-    def noted(output: Any) -> Tensor:
-        nonlocal made
-        made += 1
-        depth = depth_of(output)
-        if made == 0 or (made in wanted and bool(depth.isfinite().all())):
-            depths[made] = depth.detach()
-        return depth
-
-    return noted
+    depths = {
+        updates: torch.from_numpy(to_image(frame.frame, depth))
+        for updates, depth in done.refinement.depths.items()
+        if updates == 0 or bool(depth.isfinite().all())
+    }
+    return Trajectory(
+        depths=depths, frame=replace(done, refinement=replace(done.refinement, depths={}))
+    )
 
 
 class Depths:

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import InputError, PnpDepthError
 from pnpdepth_cli.io.colours import depth_scale, grey_of
+from pnpdepth_cli.io.dataset.hdf5 import rgb_of
 from pnpdepth_cli.io.layouts import Hdf5Array
-from pnpdepth_cli.io.layouts.hdf5 import rgb_of
 from pnpdepth_cli.io.report import (
     begin_report,
     check_report_folder,

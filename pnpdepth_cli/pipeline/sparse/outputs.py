@@ -15,7 +15,7 @@ from pnpdepth_cli.errors import OutputError, UsageError
 from pnpdepth_cli.io.overlay import overlay
 from pnpdepth_cli.io.record import write_json
 from pnpdepth_cli.io.sparse_writing import SPARSE_SUFFIXES, write_sparse
-from pnpdepth_cli.sensors import SparseDepth, as_picture
+from pnpdepth_cli.sensors import Points, as_picture
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,7 +53,7 @@ class SparseTarget:
 
 def write_sparse_outputs(
     target: SparseTarget,
-    points: SparseDepth,
+    points: Points,
     *,
     command: str,
     settings: dict[str, Any],
@@ -83,7 +83,7 @@ def write_sparse_outputs(
             "share_of_pixels": len(points.depth) / (height * width),
             "nearest": float(points.depth.min()),
             "farthest": float(points.depth.max()),
-            "dropped": points.dropped,
+            "dropped": dict(points.dropped),
         },
         "size": [width, height],
         "notes": list(notes),

@@ -10,7 +10,7 @@ from typing import Any
 
 from pnpdepth_cli.core.refine import RefineSettings
 from pnpdepth_cli.errors import UsageError
-from pnpdepth_cli.io.layouts.frame import Frame
+from pnpdepth_cli.io.dataset.frame import Frame
 from pnpdepth_cli.io.record import plain
 from pnpdepth_cli.models.definition import ModelDefinition
 from pnpdepth_cli.pipeline.batch.frames import Task

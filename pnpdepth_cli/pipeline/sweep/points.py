@@ -7,11 +7,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from pnpdepth_cli.errors import InputError, UsageError
 from pnpdepth_cli.io.calibration import read_calibration
-from pnpdepth_cli.io.layouts.frame import Frame
+from pnpdepth_cli.io.dataset.frame import Frame
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest, count_or_share
 from pnpdepth_cli.pipeline.sparse.scans import camera_of, check_size
@@ -22,10 +21,10 @@ from pnpdepth_cli.sensors import (
     LIDARS,
     PATTERNS,
     Lidar,
+    Points,
     SampleNoise,
     SamplePattern,
     SimulationSettings,
-    SparseDepth,
     disturbed,
     sample_points,
     simulate_lidar,
@@ -136,14 +135,12 @@ def frame_points(
         found = _found(sampling, seed, inputs, request, frame)
     except UsageError as error:  # the sensor itself is good, this frame is too poor for it
         raise InputError(str(error)) from error
-    return SparsePoints(
-        xy=torch.from_numpy(found.xy), depth=torch.from_numpy(found.depth), size=found.size
-    )
+    return found.tensors()
 
 
 def _found(
     sampling: Sampling, seed: int, inputs: Inputs, request: RefineRequest, frame: Frame
-) -> SparseDepth:
+) -> Points:
     truth, noise = inputs.gt, sampling.sample_noise
     if truth is None:
         raise InputError("there is no ground truth")
@@ -156,7 +153,7 @@ def _found(
         raise InputError("there is no sparse depth; --sample 500 takes points of the truth")
     else:
         own = inputs.points
-        points = SparseDepth(xy=own.xy.numpy(), depth=own.depth.numpy(), size=own.size)
+        points = SparsePoints(xy=own.xy.numpy(), depth=own.depth.numpy(), size=own.size)
     return disturbed(_thinned(points, sampling.points, rng), noise, rng)
 
 
@@ -167,7 +164,7 @@ def _scanned(
     inputs: Inputs,
     request: RefineRequest,
     frame: Frame,
-) -> SparseDepth:
+) -> Points:
     """What the LiDAR, standing in the camera's place, measures in the frame's true depth."""
     if frame.calib is None:
         raise InputError(
@@ -188,7 +185,7 @@ def _scanned(
     return simulate_lidar(inputs.gt, here, lidar, seed, settings)
 
 
-def _thinned(points: SparseDepth, wanted: str | None, rng: np.random.Generator) -> SparseDepth:
+def _thinned(points: Points, wanted: str | None, rng: np.random.Generator) -> Points:
     """So many of the points, each as likely as any other."""
     if wanted is None:
         return points

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -12,7 +12,7 @@ from torch import Tensor
 from pnpdepth_cli.completion.interpolation import linear
 from pnpdepth_cli.completion.propagation import propagate
 from pnpdepth_cli.core.metrics import score
-from pnpdepth_cli.core.refine import DepthOf, Refinement, RefineSettings, refine
+from pnpdepth_cli.core.refine import Refinement, RefineSettings, refine
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.errors import DivergedError, NoPointsError
 from pnpdepth_cli.models.aligned import AlignedDepth
@@ -77,15 +77,15 @@ def refined_curve(
     points = frame.points_to_network(inputs.points)
     if not len(points):
         raise NoPointsError(f"none of the {len(inputs.points)} points is where the network looks")
-    at = points.to(network.device)
+    at = points.tensors(network.device)
     settings = replace(method.settings, iterations=max(wanted))
     aligned = AlignedDepth(network, at, settings.align, every=settings.align_every)
-    seen = _Seen(aligned, None if settings.gives_best else {0, *wanted})
+    keep = range(settings.iterations + 1) if settings.gives_best else {0, *wanted}
     diverged: DivergedError | None = None
     with out_of_memory_is_a_device_error(network.device):
         arguments = network.arguments(frame, inputs.rgb_tensor(), points)
         try:
-            result = refine(split, arguments, at, settings, depth_of=seen)
+            result = refine(split, arguments, at, settings, depth_of=aligned, keep_depths=keep)
         except DivergedError as error:
             if not isinstance(error.last_good, Refinement):
                 raise
@@ -93,7 +93,8 @@ def refined_curve(
         made = len(result.losses) - 1
         kept = {k: _kept(result.losses, min(k, made), settings) for k in wanted}
         truth = seen_truth(network, inputs)
-        depths = {k: frame.depth_to_image(seen.depths[k]).cpu() for k in {0, *kept.values()}}
+        seen = {**result.depths, result.kept: result.after}
+        depths = {k: frame.depth_to_image(seen[k]).cpu() for k in {0, *kept.values()}}
         found = {
             place: asdict(score(_spread(depths[place], inputs, method.propagate), truth))
             for place in set(kept.values())
@@ -120,24 +121,6 @@ def seen_truth(network: Network, inputs: Inputs) -> Tensor:
     here = (slice(top, top + height), slice(left, left + width))
     truth[here] = torch.from_numpy(inputs.gt)[here]
     return truth
-
-
-class _Seen:
-    """Reads depth as another does, and remembers what it read of z_0, z_1, …: those places that are
-    wanted (None: all), and the last two, of which one is good if the other is not.
-    """
-
-    def __init__(self, depth_of: DepthOf, wanted: Collection[int] | None) -> None:
-        self._depth_of, self._wanted, self._read = depth_of, wanted, 0
-        self.depths: dict[int, Tensor] = {}
-
-    def __call__(self, output: Any) -> Tensor:
-        depth = self._depth_of(output)
-        self.depths[self._read] = depth.detach()
-        if self._wanted is not None and self._read - 2 not in self._wanted:
-            self.depths.pop(self._read - 2, None)
-        self._read += 1
-        return depth
 
 
 def _kept(losses: Sequence[float], updates: int, settings: RefineSettings) -> int:

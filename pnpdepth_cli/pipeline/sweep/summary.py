@@ -15,6 +15,7 @@ from torch import Tensor
 
 from pnpdepth_cli.core.metrics import MEASURES
 from pnpdepth_cli.io.atomic import atomic_path
+from pnpdepth_cli.io.csv_text import text_cell
 from pnpdepth_cli.io.record import plain, write_json
 from pnpdepth_cli.pipeline.evaluation.averages import Floats, FrameTable
 from pnpdepth_cli.pipeline.evaluation.dependence import (
@@ -206,7 +207,7 @@ def write_frames(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
             yield [
                 row["study"],
                 *(row["parameters"].get(name) for name in names),
-                *(figures.name, figures.seed),
+                *(text_cell(figures.name), figures.seed),
                 *("failed" if figures.values is None else status, figures.points),
                 *values,
             ]

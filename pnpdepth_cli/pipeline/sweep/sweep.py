@@ -16,7 +16,7 @@ from pnpdepth_cli.errors import (
     UsageError,
 )
 from pnpdepth_cli.io.atomic import make_folder, remove_leftovers
-from pnpdepth_cli.io.layouts.frame import Frame
+from pnpdepth_cli.io.dataset.frame import Frame
 from pnpdepth_cli.io.lock import locked_folder
 from pnpdepth_cli.models.definition import ModelDefinition
 from pnpdepth_cli.pipeline.batch.batch import Listener

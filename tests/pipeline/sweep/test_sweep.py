@@ -23,7 +23,7 @@ from pnpdepth_cli.errors import (
     PnpDepthError,
     UsageError,
 )
-from pnpdepth_cli.io.layouts.frame import Frame
+from pnpdepth_cli.io.dataset.frame import Frame
 from pnpdepth_cli.io.lock import locked_folder
 from pnpdepth_cli.pipeline.refinement import refine as refining
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs, read_inputs

@@ -6,9 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import InputError
+from pnpdepth_cli.io.dataset.frame import Frame, Hdf5Array
+from pnpdepth_cli.io.dataset.hdf5 import depth_of, rgb_of
 from pnpdepth_cli.io.depth import read_depth
-from pnpdepth_cli.io.layouts.frame import Frame, Hdf5Array
-from pnpdepth_cli.io.layouts.hdf5 import depth_of, rgb_of
 from pnpdepth_cli.io.rgb import read_rgb
 
 

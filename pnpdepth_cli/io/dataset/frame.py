@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pnpdepth_cli.errors import InputError
+from pnpdepth_cli.io.dataset.protocols import WHOLE, Protocol
 from pnpdepth_cli.io.formats import DEPTH_SUFFIXES
-from pnpdepth_cli.io.layouts.protocols import WHOLE, Protocol
 
 PICTURES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".exr")
 DEPTHS = DEPTH_SUFFIXES

@@ -128,7 +128,7 @@ def test_a_layout_is_guessed_from_its_folder_and_gives_its_frames(
 ) -> None:
     make, names = MAKERS[name]
     make(tmp_path / "set")
-    assert find_layout(tmp_path / "set").name == name
+    assert find_layout(tmp_path / "set") == name
     frames = read_frames(tmp_path / "set")
     assert [frame.name for frame in frames] == names
     assert frames == read_frames(tmp_path / "set", name)
@@ -217,7 +217,7 @@ def test_synthias_random_set_has_centimetres_in_either_folder(
     codes = np.rint(100 * DEPTH).astype(np.uint16)
     codes[0, 0] = 65535  # sky
     cv2.imwrite(str(tmp_path / folder / "0000000.png"), np.stack([codes] * channels, axis=2))
-    assert find_layout(tmp_path).name == "synthia"
+    assert find_layout(tmp_path) == "synthia"
     (frame,) = read_frames(tmp_path)
     assert (frame.name, frame.gt) == ("0000000", tmp_path / folder / "0000000.png")
     truth = read_frame_truth(frame)
@@ -334,7 +334,7 @@ def test_an_hdf5_file_that_is_damaged_or_of_another_kind_is_named(tmp_path: Path
     other = read_frames(tmp_path)[1]
     assert isinstance(other.image, Hdf5Array)
     wrong = Hdf5Array(path=other.image.path, name="infra", axes=(0, 1))
-    from pnpdepth_cli.io.layouts.hdf5 import depth_of
+    from pnpdepth_cli.io.dataset.hdf5 import depth_of
 
     with pytest.raises(FileFormatError, match="has no array infra"):
         depth_of(wrong)
@@ -457,7 +457,7 @@ def test_a_listing_tells_what_is_in_no_frame(tmp_path: Path) -> None:
     touch(tmp_path / "rgb/c.png", tmp_path / "sparse/d.png", tmp_path / "gt/e.exr")
     touch(tmp_path / "calib/f.txt", tmp_path / "rgb/.hidden.png", tmp_path / "rgb/notes.txt")
     layout, listing = list_frames(tmp_path)
-    assert layout.name == "pairs"
+    assert layout == "pairs"
     assert [frame.name for frame in listing.frames] == ["a", "b"]
     assert [each.path.name for each in listing.broken] == ["c.png"]
     assert [each.path.name for each in listing.spare] == ["d.png", "e.exr", "f.txt"]
