@@ -8,11 +8,9 @@ from pathlib import Path
 
 from pnpdepth_cli.errors import InputError
 from pnpdepth_cli.io.dataset.protocols import WHOLE, Protocol
-from pnpdepth_cli.io.formats import DEPTH_SUFFIXES
 
-PICTURES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".exr")
-DEPTHS = DEPTH_SUFFIXES
-SCANS = (".bin", ".pcd", ".ply")
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".exr")
+SCAN_ONLY_SUFFIXES = (".bin", ".pcd", ".ply")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -21,7 +21,7 @@ def read_frame_image(frame: Frame) -> NDArray[np.float32]:
     return np.ascontiguousarray(frame.protocol.apply(rgb))
 
 
-def read_frame_truth(frame: Frame) -> NDArray[np.float32]:
+def read_frame_ground_truth(frame: Frame) -> NDArray[np.float32]:
     """(H, W) float32 metres, 0 where unknown. InputError if the frame has no ground truth."""
     if frame.gt is None:
         raise InputError(f"frame {frame.name} has no ground truth")

@@ -12,7 +12,7 @@ import re
 from pathlib import Path
 
 from pnpdepth_cli.io.dataset.frame import (
-    PICTURES,
+    IMAGE_SUFFIXES,
     Frame,
     Listing,
     Unmatched,
@@ -46,7 +46,7 @@ def _selection(root: Path) -> Listing:
     truth_folder = next(
         (p for p in (root / "groundtruth_depth", root / "groundtruth") if p.is_dir()), root / "none"
     )
-    images = _by_frame(root / "image", PICTURES)
+    images = _by_frame(root / "image", IMAGE_SUFFIXES)
     scans = _by_frame(root / "velodyne_raw", _PNG)
     truth = _by_frame(truth_folder, _PNG)
     intrinsics = _by_frame(root / "intrinsics", (".txt",))
@@ -95,7 +95,7 @@ def _drives(root: Path) -> Listing:
             broken.append(_without_images(root, drive, camera))
             continue
         truth = by_stem(drive / "proj_depth" / "groundtruth" / camera, _PNG)
-        pictures, scans = by_stem(images, PICTURES), by_stem(folder, _PNG)
+        pictures, scans = by_stem(images, IMAGE_SUFFIXES), by_stem(folder, _PNG)
         frames += [
             Frame(
                 name=f"{drive.name}_{stem}_{camera}",

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from pnpdepth_cli.io.dataset.frame import (
-    PICTURES,
+    IMAGE_SUFFIXES,
     Frame,
     Listing,
     Unmatched,
@@ -26,7 +26,7 @@ def listing(root: Path) -> Listing:
     broken: list[Unmatched] = []
     spare: list[Unmatched] = []
     for part in _parts(root):
-        images = by_stem(part / "image_2", PICTURES)
+        images = by_stem(part / "image_2", IMAGE_SUFFIXES)
         scans = by_stem(part / "velodyne", (".bin",))
         calibrations = by_stem(part / "calib", (".txt",))
         prefix = "" if part == root else f"{part.name}_"

@@ -12,7 +12,7 @@ import numpy as np
 
 from pnpdepth_cli.errors import FileFormatError, InputError
 from pnpdepth_cli.io.dataset.frame import (
-    PICTURES,
+    IMAGE_SUFFIXES,
     Frame,
     Listing,
     Pose,
@@ -41,7 +41,7 @@ def listing(root: Path) -> Listing:
     spare: list[Unmatched] = []
     for sequence in _sequences(root):
         scans = by_stem(sequence / "velodyne", (".bin",))
-        images = by_stem(sequence / "image_2", PICTURES)
+        images = by_stem(sequence / "image_2", IMAGE_SUFFIXES)
         poses = _poses(sequence)
         frames += [
             Frame(

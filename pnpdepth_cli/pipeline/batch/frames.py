@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from pnpdepth_cli.errors import InputError, OutputError, UsageError
-from pnpdepth_cli.io.dataset.frame import SCANS, Frame, Source, Unmatched
+from pnpdepth_cli.io.dataset.frame import SCAN_ONLY_SUFFIXES, Frame, Source, Unmatched
 from pnpdepth_cli.io.dataset.frame_names import name_problem
 from pnpdepth_cli.io.file_bytes import one_line
 from pnpdepth_cli.io.layouts import LAYOUTS, find_protocol, list_frames
@@ -109,7 +109,7 @@ def task_of(request: BatchRequest, frame: Frame) -> Task:
     sparse = frame.sparse if asked.sample is None else None
     protocol = frame.protocol if request.protocol is None else find_protocol(request.protocol)
     is_scan = sparse is not None and (
-        asked.scan.calib is not None or sparse.suffix.lower() in SCANS
+        asked.scan.calib is not None or sparse.suffix.lower() in SCAN_ONLY_SUFFIXES
     )
     scan = asked.scan
     if is_scan:

@@ -11,15 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import FileFormatError, InputError, SizeError
-from pnpdepth_cli.io.dataset.frame import PICTURES
+from pnpdepth_cli.io.dataset.frame import IMAGE_SUFFIXES
 from pnpdepth_cli.io.depth import DepthImage, read_sparse
 from pnpdepth_cli.io.depth_reading import depth_from_stored, known_metres, load_stored
-from pnpdepth_cli.io.layouts import Hdf5Array, read_frame_truth
+from pnpdepth_cli.io.layouts import Hdf5Array, read_frame_ground_truth
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.pipeline.evaluation.pairing import FramePair
 from pnpdepth_cli.pipeline.evaluation.protocols import EvalProtocol
 from pnpdepth_cli.points import SparsePoints, in_frame
-from pnpdepth_cli.sensors.sparse import as_picture
+from pnpdepth_cli.sensors.sparse import as_depth_image
 
 Depth = NDArray[np.float32]
 Mask = NDArray[np.bool_]
@@ -101,8 +101,8 @@ def load_frame(pair: FramePair, protocol: EvalProtocol, scales: Scales) -> Loade
 def _read_ground_truth(pair: FramePair, protocol: EvalProtocol, scales: Scales) -> DepthImage:
     frame = pair.frame
     if isinstance(frame.gt, Hdf5Array):
-        return DepthImage(values=read_frame_truth(frame), source=f"{frame.gt.path.suffix} array",
-                          assumed_scale=False)  # fmt: skip
+        values, source = read_frame_ground_truth(frame), f"{frame.gt.path.suffix} array"
+        return DepthImage(values=values, source=source, assumed_scale=False)
     if frame.gt is None:
         raise InputError(f"frame {pair.name} has no ground truth")
     scale = scales.ground_truth if scales.ground_truth is not None else frame.gt_scale
@@ -148,13 +148,13 @@ def _read_sparse(
         sparse = read_sparse(pair.sparse, size=size, scale=protocol.scale)
     xy, source_size = sparse.points.xy, sparse.points.size
     if source_size != size:
-        xy = pair.frame.protocol.places(xy, source_size)
+        xy = pair.frame.protocol.in_crop(xy, source_size)
         cut = pair.frame.protocol.apply(np.zeros(source_size, bool)).shape
         if cut != size:
             raise _different(pair, "sparse depth", pair.sparse, source_size, size, advice="")
     inside = in_frame(xy, size)
     points = SparsePoints(xy=xy[inside], depth=sparse.points.depth[inside], size=size)
-    return as_picture(points), sparse.scale
+    return as_depth_image(points), sparse.scale
 
 
 def _scored_mask(pair: FramePair, ground_truth: Depth, protocol: EvalProtocol) -> Mask:
@@ -177,7 +177,7 @@ def _scored_mask(pair: FramePair, ground_truth: Depth, protocol: EvalProtocol) -
 
 def _read_mask(path: Path) -> Mask:
     """(H, W) true where an image has any channel above 0, or an array a number above 0."""
-    if path.suffix.lower() in PICTURES:
+    if path.suffix.lower() in IMAGE_SUFFIXES:
         return np.asarray(read_rgb(path).values.max(axis=2) > 0)
     values = load_stored(path, None).values
     if values.ndim != 2:

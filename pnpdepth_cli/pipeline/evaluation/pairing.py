@@ -10,13 +10,14 @@ from pathlib import Path
 from typing import Any
 
 from pnpdepth_cli.errors import InputError, PnpDepthError, UsageError
-from pnpdepth_cli.io.dataset.frame import DEPTHS, PICTURES
+from pnpdepth_cli.io.dataset.frame import IMAGE_SUFFIXES
+from pnpdepth_cli.io.depth import DEPTH_SUFFIXES
 from pnpdepth_cli.io.file_bytes import one_line
 from pnpdepth_cli.io.layouts import Frame, Source, find_layout, list_frames
 from pnpdepth_cli.io.record import read_json
 from pnpdepth_cli.pipeline.evaluation.dependence import groups_by_name
 
-_POINTS = (*DEPTHS, ".csv", ".txt")
+_POINTS = (*DEPTH_SUFFIXES, ".csv", ".txt")
 _DEPTH_MARKS = ("_depth", ".depth")
 _COMPANIONS = ("_preview", "_improvement")
 # KITTI's selection names the kind of file in the middle.
@@ -122,9 +123,10 @@ def depth_files(folder: Path) -> tuple[dict[str, Path], list[str]]:
     Raises:
         InputError: If there is none.
     """
-    files, notes = _files(folder, DEPTHS)
+    files, notes = _files(folder, DEPTH_SUFFIXES)
     if not files:
-        raise InputError(f"{folder} holds no depth file ({' '.join(DEPTHS)}); check the path")
+        suffixes = " ".join(DEPTH_SUFFIXES)
+        raise InputError(f"{folder} holds no depth file ({suffixes}); check the path")
     return files, notes
 
 
@@ -195,7 +197,7 @@ def _pairs(
             f" and are not scored: {some_names(extra)}"
         )
     points = _by_frame(sparse, _POINTS, names)
-    masks = _by_frame(mask, (*DEPTHS, *PICTURES), names)
+    masks = _by_frame(mask, (*DEPTH_SUFFIXES, *IMAGE_SUFFIXES), names)
     groups = groups_by_name([frame.name for frame in frames])
     return Pairs(
         frames=tuple(
@@ -268,4 +270,4 @@ def _dict(value: Any) -> dict[str, Any]:
 
 
 def _depth_file(path: Path | None) -> Path | None:
-    return path if path is not None and path.suffix.lower() in DEPTHS else None
+    return path if path is not None and path.suffix.lower() in DEPTH_SUFFIXES else None

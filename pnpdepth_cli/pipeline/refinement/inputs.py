@@ -213,7 +213,7 @@ def _in_protocol(files: FrameFiles, path: Path, points: SparsePoints) -> SparseP
     size = (left.shape[0], left.shape[1])
     if size == points.size:
         return points
-    xy = files.protocol.places(points.xy.numpy(), points.size)
+    xy = files.protocol.in_crop(points.xy.numpy(), points.size)
     return _inside(path, SparsePoints(xy=torch.from_numpy(xy), depth=points.depth, size=size))
 
 

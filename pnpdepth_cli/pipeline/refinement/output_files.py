@@ -7,12 +7,15 @@ from pathlib import Path
 from typing import Any
 
 from pnpdepth_cli.errors import OutputError, UsageError
-from pnpdepth_cli.io.dataset.frame import DEPTHS, PICTURES, SCANS
+from pnpdepth_cli.io.dataset.frame import IMAGE_SUFFIXES, SCAN_ONLY_SUFFIXES
 from pnpdepth_cli.io.depth import DEPTH_SUFFIXES
 from pnpdepth_cli.io.record import write_json
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest
 
-_NO_FOLDERS = {*PICTURES, *DEPTHS, *SCANS, ".hdr", ".bmp", ".mat", ".h5", ".csv", ".json"}
+_NO_FOLDERS = {
+    *(*IMAGE_SUFFIXES, *DEPTH_SUFFIXES, *SCAN_ONLY_SUFFIXES),
+    *(".hdr", ".bmp", ".mat", ".h5", ".csv", ".json"),
+}
 """A folder's name may have a dot in it, but who writes these means a file."""
 
 

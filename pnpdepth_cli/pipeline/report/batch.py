@@ -18,13 +18,13 @@ from pnpdepth_cli.errors import InputError, OutputError
 from pnpdepth_cli.io.fingerprint import fingerprint
 from pnpdepth_cli.io.page import SavedPage, open_page
 from pnpdepth_cli.io.report import (
-    PICTURES,
+    IMAGES,
     begin_report,
     check_report_folder,
-    picture_key,
+    image_key,
     write_report,
 )
-from pnpdepth_cli.io.report_pictures import gain_colours, picture_paths, save_pictures
+from pnpdepth_cli.io.report_images import gain_colours, image_paths, save_images
 from pnpdepth_cli.pipeline.evaluation.score_files import column_title, format_value
 from pnpdepth_cli.pipeline.ordered_pool import in_order
 from pnpdepth_cli.pipeline.report.columns import (
@@ -105,15 +105,15 @@ class BatchReport:
         """As `drawn`; what the page says of the pictures."""
         paths = [self.output / row["outputs"][kind] for kind in ("preview", "improvement")]
         try:
-            key = picture_key(*(fingerprint(path).sha256 for path in paths))
+            key = image_key(*(fingerprint(path).sha256 for path in paths))
             preview, improvement = (open_page(path) for path in paths)
             views = _views(preview, improvement)
-            pictures = self.folder / PICTURES
-            if not all(path.exists() for path in picture_paths(pictures, key, views)):
+            pictures = self.folder / IMAGES
+            if not all(path.exists() for path in image_paths(pictures, key, views)):
                 panels = preview.panels() | improvement.panels()
                 named = {_PANELS[title]: panels[title] for title in panels if title in _PANELS}
                 thumb = "image" if "image" in views else "second"
-                save_pictures(pictures, key, named, thumb=thumb)
+                save_images(pictures, key, named, thumb=thumb)
         except InputError:  # a result that was there has gone or changed; the next run redoes it
             return {"key": None}
         return {

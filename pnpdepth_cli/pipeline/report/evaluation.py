@@ -16,11 +16,11 @@ from pnpdepth_cli.io.layouts import Hdf5Array
 from pnpdepth_cli.io.report import (
     begin_report,
     check_report_folder,
-    picture_key,
+    image_key,
     remove_report_leftovers,
     write_report,
 )
-from pnpdepth_cli.io.report_pictures import error_colours, error_map, save_pictures
+from pnpdepth_cli.io.report_images import error_colours, error_map, save_images
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.pipeline.evaluation.frame_reading import Depth, load_frame
 from pnpdepth_cli.pipeline.evaluation.frame_scoring import FrameScores
@@ -213,8 +213,8 @@ def _drawn(frame: FrameScores, evaluation: Evaluation, pictures: Path) -> dict[s
     views = {"first": scale.paint(depth), "second": scale.paint(gt), "map": errors.pixels}
     if image is not None:
         views["image"] = np.asarray(np.rint(255 * np.clip(image, 0, 1)), np.uint8)
-    key = picture_key(frame.name)
-    save_pictures(pictures, key, views, thumb="first" if image is None else "image")
+    key = image_key(frame.name)
+    save_images(pictures, key, views, thumb="first" if image is None else "image")
     amount = f"by {errors.strongest_m:.3g} m or more"
     return {
         "key": key,

@@ -25,9 +25,9 @@ from pnpdepth_cli.sensors import (
     SampleNoise,
     SamplePattern,
     SimulationSettings,
-    disturbed,
     sample_points,
     simulate_lidar,
+    with_noise,
 )
 
 OWN = "own"
@@ -154,7 +154,7 @@ def _found(
     else:
         own = inputs.points
         points = SparsePoints(xy=own.xy.numpy(), depth=own.depth.numpy(), size=own.size)
-    return disturbed(_thinned(points, sampling.points, rng), noise, rng)
+    return with_noise(_thinned(points, sampling.points, rng), noise, rng)
 
 
 def _scanned(
