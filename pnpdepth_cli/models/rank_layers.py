@@ -20,9 +20,7 @@ from pnpdepth_cli.core.influence import influential_field
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.core.split.layer_name import LayerName
 from pnpdepth_cli.errors import ModelError
-from pnpdepth_cli.models.frame import FrameMap
-from pnpdepth_cli.models.made_up import made_up_arguments
-from pnpdepth_cli.models.network import Network, out_of_memory_is_a_device_error
+from pnpdepth_cli.models.network import Network
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,12 +50,15 @@ class MeasuredLayer:
     """Why the network cannot be cut here."""
 
 
-def best_layer(network: Network, frame: FrameMap, point_count: int) -> str | None:
+def best_layer(
+    network: Network, arguments: tuple[Tensor, ...], size: tuple[int, int], point_count: int
+) -> str | None:
     """Returns the layer of the definition that is ranked first for so many points in a frame.
 
     Args:
-        network: Its definition's layers are measured on a synthetic frame.
-        frame: Gives the size of the network's input.
+        network: Its definition's layers are measured.
+        arguments: The network's arguments for the frame, real or synthetic.
+        size: Rows and columns of the network's input.
         point_count: Sparse points in the frame, taken to be spread evenly.
 
     Returns:
@@ -65,8 +66,8 @@ def best_layer(network: Network, frame: FrameMap, point_count: int) -> str | Non
     """
     if not point_count:
         return None
-    layers = measure_layers(network, network.definition.layers, frame)
-    ranked = rank_layers(layers, point_spacing(frame.network, point_count))
+    layers = measure_layers(network, network.definition.layers, arguments, size)
+    ranked = rank_layers(layers, point_spacing(size, point_count))
     return next((layer.name for layer in ranked if layer.rank == 1), None)
 
 
@@ -107,33 +108,30 @@ def rank_layers(layers: Iterable[MeasuredLayer], spacing: float) -> list[Measure
 def measure_layers(
     network: Network,
     names: Sequence[str],
-    frame: FrameMap,
+    arguments: tuple[Tensor, ...],
+    size: tuple[int, int],
     on_layer: Callable[[int, int], None] = lambda done, of: None,
 ) -> list[MeasuredLayer]:
-    """Returns the layers, each measured by a cut there, on a synthetic frame.
+    """Returns the layers, each measured by a cut there.
 
     Args:
         network: The network.
         names: The layers, in the order of the result.
-        frame: Gives the size of the network's input.
+        arguments: The network's arguments for one frame, real or synthetic.
+        size: Rows and columns of the network's input.
         on_layer: Called after each layer with the number of layers done and of all.
-
-    Raises:
-        DeviceError: The device's memory does not suffice.
     """
     measured = []
-    with out_of_memory_is_a_device_error(network.device):
-        arguments = made_up_arguments(network, frame)
-        with torch.no_grad(), FlopCounterMode(display=False) as whole:
-            network.depth_of(network.module(*arguments))
-        for done, name in enumerate(names, start=1):
-            measured.append(_measure(network, name, arguments, frame, whole.get_total_flops()))
-            on_layer(done, len(names))
+    with torch.no_grad(), FlopCounterMode(display=False) as whole:
+        network.depth_of(network.module(*arguments))
+    for done, name in enumerate(names, start=1):
+        measured.append(_measure(network, name, arguments, size[0], whole.get_total_flops()))
+        on_layer(done, len(names))
     return measured
 
 
 def _measure(
-    network: Network, name: str, arguments: tuple[Tensor, ...], frame: FrameMap, whole_flops: int
+    network: Network, name: str, arguments: tuple[Tensor, ...], rows: int, whole_flops: int
 ) -> MeasuredLayer:
     try:
         with Split(network.module, name) as split, torch.no_grad():
@@ -151,7 +149,7 @@ def _measure(
     return MeasuredLayer(
         name=name,
         shape=tuple(z.shape),
-        stride=frame.network[0] / z.shape[-2] if z.ndim == 4 else None,
+        stride=rows / z.shape[-2] if z.ndim == 4 else None,
         cost_behind=behind.get_total_flops() / whole_flops if whole_flops else None,
         seconds_behind=seconds,
         parameters=_parameter_count(network, name),

@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+import torch
 
-from pnpdepth_cli.models.frame import FrameMap
 from pnpdepth_cli.models.network import Network, load_network
 from pnpdepth_cli.models.rank_layers import (
     MeasuredLayer,
@@ -15,6 +15,8 @@ from pnpdepth_cli.models.rank_layers import (
     point_spacing,
     rank_layers,
 )
+
+IMAGE = torch.rand(1, 3, 64, 96, generator=torch.Generator().manual_seed(0))
 
 
 def layer(name: str, field: int, cost: float) -> MeasuredLayer:
@@ -78,16 +80,16 @@ def network(tmp_path: Path) -> Network:
 
 
 def test_few_points_want_a_deep_layer_and_many_a_late_one(network: Network) -> None:
-    frame = FrameMap.fit(network.definition.size, 64, 96)
-    assert best_layer(network, frame, 20) == "deep"
-    assert best_layer(network, frame, 64 * 96) == "late"
-    assert best_layer(network, frame, 0) is None
+    assert best_layer(network, (IMAGE,), (64, 96), 20) == "deep"
+    assert best_layer(network, (IMAGE,), (64, 96), 64 * 96) == "late"
+    assert best_layer(network, (IMAGE,), (64, 96), 0) is None
 
 
 def test_a_layer_that_cannot_be_cut_at_is_measured_as_a_problem(network: Network) -> None:
-    frame = FrameMap.fit(network.definition.size, 64, 96)
     seen: list[tuple[int, int]] = []
-    layers = measure_layers(network, ["deep", "nowhere"], frame, lambda *at: seen.append(at))
+    layers = measure_layers(
+        network, ["deep", "nowhere"], (IMAGE,), (64, 96), lambda *counts: seen.append(counts)
+    )
     assert seen == [(1, 2), (2, 2)]
     assert layers[0].stride == 16
     assert "nowhere" in (layers[1].problem or "")

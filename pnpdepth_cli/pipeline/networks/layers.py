@@ -7,10 +7,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pnpdepth_cli.errors import UsageError
+from pnpdepth_cli.frames.frame import Frame
+from pnpdepth_cli.frames.prepare import prepare
 from pnpdepth_cli.io.depth import read_sparse
 from pnpdepth_cli.models.definition import Fixed
-from pnpdepth_cli.models.frame import FrameMap
-from pnpdepth_cli.models.network import load_network
+from pnpdepth_cli.models.made_up import made_up_frame
+from pnpdepth_cli.models.network import load_network, out_of_memory_is_a_device_error
 from pnpdepth_cli.models.rank_layers import (
     MeasuredLayer,
     measure_layers,
@@ -73,9 +75,11 @@ def list_layers(
         raise UsageError(
             f"the definition of {network.definition.name!r} lists no layers; --all lists every one"
         )
-    frame = FrameMap.fit(policy, *(size or own))
-    rows = measure_layers(network, names, frame, on_layer)
-    spacing = point_spacing(frame.network, count) if count else None
+    with out_of_memory_is_a_device_error(network.device):
+        rgb, synthetic_points = made_up_frame(size or own)
+        prepared = prepare(network, Frame(rgb=rgb[0], points=synthetic_points))
+        rows = measure_layers(network, names, prepared.arguments, prepared.map.network, on_layer)
+    spacing = point_spacing(prepared.map.network, count) if count else None
     return LayerList(
         rows=rank_layers(rows, spacing) if spacing else rows, spacing=spacing, notes=network.notes
     )
