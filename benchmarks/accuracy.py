@@ -41,7 +41,8 @@ from pnpdepth_cli.models.definition import Normalisation
 from pnpdepth_cli.models.network import Network, load_network
 from pnpdepth_cli.pipeline.refinement.auto import refine_automatically, usual_trials
 from pnpdepth_cli.pipeline.refinement.held_out import uncertainty
-from pnpdepth_cli.pipeline.refinement.request import RefineRequest, effective_settings, layer_name
+from pnpdepth_cli.pipeline.refinement.request import MethodOptions
+from pnpdepth_cli.pipeline.refinement.resolve import resolve_layer, resolve_settings
 from pnpdepth_cli.points import SparsePoints
 
 PAPER = RefineSettings()
@@ -122,8 +123,8 @@ def measure(
     points, wrong = with_outliers(points, outliers, seed)
     inputs = frame_inputs(frame.rgb, points, frame.truth)
     definition = network.definition
-    layer = layer_name(definition, None)
-    settings = effective_settings(definition, RefineRequest(image=None, sparse=None))
+    layer = resolve_layer(definition, None)
+    settings = resolve_settings(definition, MethodOptions())
     start = time.perf_counter()
     raw = refined(network, layer, replace(settings, iterations=0), inputs)
     plain_s = time.perf_counter() - start

@@ -21,7 +21,7 @@ import torch
 from pnpdepth_cli.io.depth import write_depth
 from pnpdepth_cli.pipeline.batch.batch import run_batch
 from pnpdepth_cli.pipeline.batch.frames import BatchRequest
-from pnpdepth_cli.pipeline.refinement.request import RefineRequest
+from pnpdepth_cli.pipeline.refinement.request import NetworkChoice, RefineRequest
 from pnpdepth_cli.pipeline.stopwatch import peak_memory_mb
 
 PAGE = 4096
@@ -79,7 +79,7 @@ def measure(
     request = BatchRequest(
         source=root,
         output=root / "out",
-        refine=RefineRequest(image=None, sparse=None, model=model),
+        refine=RefineRequest(network=NetworkChoice(model=model)),
         workers=workers,
         batch_size=batch_size,
         profile=True,

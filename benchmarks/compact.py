@@ -27,7 +27,8 @@ from benchmarks.frames import (
 from pnpdepth_cli.completion.interpolation import linear, nearest
 from pnpdepth_cli.core.metrics import score
 from pnpdepth_cli.models.network import Network, load_network
-from pnpdepth_cli.pipeline.refinement.request import RefineRequest, effective_settings, layer_name
+from pnpdepth_cli.pipeline.refinement.request import MethodOptions
+from pnpdepth_cli.pipeline.refinement.resolve import resolve_layer, resolve_settings
 
 CELLS = (
     ("7scenes", 500),
@@ -56,14 +57,11 @@ def measure_frame(
     rows, columns, depth = frame_pixels(frame, count, seed)
     points = points_on_grid(rows, columns, depth, frame.truth.shape)
     inputs = frame_inputs(frame.rgb, points, frame.truth)
-    request = RefineRequest(
-        image=None, sparse=Path(), iterations=settings.iterations, lr=settings.lr,
-        update=settings.update,
-    )  # fmt: skip
+    method = MethodOptions(iterations=settings.iterations, lr=settings.lr, update=settings.update)
     result = refined(
         network,
-        layer_name(network.definition, settings.layer),
-        effective_settings(network.definition, request),
+        resolve_layer(network.definition, settings.layer),
+        resolve_settings(network.definition, method),
         inputs,
     )
     depths = {

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 from pnpdepth_cli.core.refine import RefineSettings
-from pnpdepth_cli.io.layouts.protocols import PROTOCOLS, WHOLE, Protocol
+from pnpdepth_cli.io.dataset.protocols import PROTOCOLS, WHOLE, Protocol
 
 SETTING = RefineSettings(iterations=5, lr=0.01, loss="l1", update="sign")
 """Section "Implementation Details": for all experiments."""

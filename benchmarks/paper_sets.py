@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 
 from benchmarks.frames import SETS, Depth, EvalFrame, points_on_grid, sampled
 from pnpdepth_cli.errors import NoPointsError, UsageError
-from pnpdepth_cli.io.layouts import Frame, read_frame_image, read_frame_truth, read_frames
-from pnpdepth_cli.io.layouts.protocols import PROTOCOLS, Protocol
+from pnpdepth_cli.io.dataset.protocols import PROTOCOLS, Protocol
+from pnpdepth_cli.io.layouts import Frame, read_frame_ground_truth, read_frame_image, read_frames
 from pnpdepth_cli.pipeline.batch.frames import BatchRequest, task_of
 from pnpdepth_cli.pipeline.refinement.inputs import read_inputs
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest
 from pnpdepth_cli.points import SparsePoints
-from pnpdepth_cli.sensors import FORWARD_LEFT_UP, LIDARS, Camera, as_picture, simulate_lidar
+from pnpdepth_cli.sensors import FORWARD_LEFT_UP, LIDARS, Camera, as_depth_image, simulate_lidar
 
 T = TypeVar("T")
 
@@ -164,7 +164,7 @@ def scan_of(truth: Depth, lens: NDArray[np.float32], seed: int) -> Depth:
         rotation=FORWARD_LEFT_UP,
         translation=SCANNER_IN_CAMERA,
     )
-    return as_picture(simulate_lidar(truth, camera, SCANNER, seed))
+    return as_depth_image(simulate_lidar(truth, camera, SCANNER, seed))
 
 
 def shared(root: Path, most: int) -> list[FrameSet]:
@@ -254,12 +254,10 @@ def _parts(root: Path, frame: Frame) -> tuple[str, ...]:
 def _data_frame(root: Path, frame: Frame) -> TableFrame:
     """A frame in memory; without another truth, the scan is the truth, as in KITTI odometry."""
     if frame.sparse is None:
-        truth = read_frame_truth(frame)
+        truth = read_frame_ground_truth(frame)
         return TableFrame(rgb=read_frame_image(frame), truth=truth, pool=truth)
     # No output is written; the batch's own reading of scans and scales is wanted.
-    batch = BatchRequest(
-        source=root, output=root / "out", refine=RefineRequest(image=None, sparse=None)
-    )
+    batch = BatchRequest(source=root, output=root / "out", refine=RefineRequest())
     inputs = read_inputs(replace(task_of(batch, frame).request, output=None))
     assert inputs.rgb is not None
     scan = inputs.points.scatter()[0, 0].numpy()

@@ -48,7 +48,8 @@ from pnpdepth_cli.io.atomic import atomic_path
 from pnpdepth_cli.models.network import Network, load_network
 from pnpdepth_cli.models.registry import names
 from pnpdepth_cli.models.weights.checkpoint import WEIGHT_SUFFIXES
-from pnpdepth_cli.pipeline.refinement.request import RefineRequest, effective_settings, layer_name
+from pnpdepth_cli.pipeline.refinement.request import MethodOptions
+from pnpdepth_cli.pipeline.refinement.resolve import resolve_layer, resolve_settings
 
 KINDS = {"rgb": "rgb", "sparse": "sd", "rgb+sparse": "rgb + sd"}  # as the paper writes them
 ROOM_FRAMES = 96  # of streets, which are three times as wide, a quarter
@@ -74,9 +75,9 @@ def entry_of(row: PaperRow, network: Network) -> Entry:
     definition = network.definition
     # One factor, as in the evaluation of networks that know depth up to one; "auto" might take two.
     align = "scale" if definition.output_scale == "scale" else definition.default_alignment
-    request = RefineRequest(image=None, sparse=None, align=align)
-    tuned, paper = effective_settings(definition, request), replace(SETTING, align=align)
-    settings = {"paper": (row.layer, paper), "tuned": (layer_name(definition, None), tuned)}
+    tuned = resolve_settings(definition, MethodOptions(align=align))
+    paper = replace(SETTING, align=align)
+    settings = {"paper": (row.layer, paper), "tuned": (resolve_layer(definition, None), tuned)}
     return Entry(row=row, network=network, settings=settings)
 
 

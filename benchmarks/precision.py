@@ -19,7 +19,8 @@ from benchmarks.frames import refined as refined_frame
 from pnpdepth_cli.core.metrics import score
 from pnpdepth_cli.models.network import load_network
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs, read_inputs
-from pnpdepth_cli.pipeline.refinement.request import RefineRequest, effective_settings, layer_name
+from pnpdepth_cli.pipeline.refinement.request import FrameFiles, MethodOptions, RefineRequest
+from pnpdepth_cli.pipeline.refinement.resolve import resolve_layer, resolve_settings
 
 PRECISIONS, DEPTHS = ("fp32", "bf16"), ("before", "after")
 SAMPLES = Path(__file__).parent.parent / "samples"
@@ -33,7 +34,11 @@ def samples() -> Iterator[tuple[str, Inputs]]:
             name,
             read_inputs(
                 RefineRequest(
-                    image=folder / "rgb.png", sparse=folder / "sparse.png", gt=folder / "gt.png"
+                    files=FrameFiles(
+                        image=folder / "rgb.png",
+                        sparse=folder / "sparse.png",
+                        gt=folder / "gt.png",
+                    )
                 )
             ),
         )
@@ -57,8 +62,8 @@ def main() -> None:
     given = parser.parse_args()
     networks = {name: load_network(given.model, None, precision=name) for name in PRECISIONS}
     definition = networks["fp32"].definition
-    layer = layer_name(definition, None)
-    settings = effective_settings(definition, RefineRequest(image=None, sparse=None))
+    layer = resolve_layer(definition, None)
+    settings = resolve_settings(definition, MethodOptions())
     print("| frame | plain fp32 | plain bf16 | change | refined fp32 | refined bf16 | change |")
     print("|" + "---|" * 7)
     frames = real(given.data, given.set, given.frames) if given.data else samples()

@@ -164,3 +164,27 @@ FORMATS = Table(
     first=("png", "exr", "npy", "npz", "pfm", "tiff"),
 )
 """Depth file formats: `pnpdepth_cli.io.formats.DepthFormat`."""
+
+PROPAGATIONS = ("none", "gp", "diffusion")
+"""How the residual at the points is propagated."""
+
+LAYOUTS = Table(
+    "io/layouts",
+    "LAYOUT",
+    group="layouts",
+    noun="layout",
+    first=(
+        *("manifest", "nyu-mat", "kitti-odometry", "kitti-object", "kitti-depth", "tum"),
+        *("7scenes", "synthia", "pairs", "nyu-h5"),
+    ),
+)
+"""Data set layouts, in the order in which they are guessed: `pnpdepth_cli.io.layouts.Layout`."""
+
+FRAME_PROTOCOLS = ("whole", "nyu", "kitti-odometry", "kitti-depth")
+"""What of a frame the paper's experiments use: `pnpdepth_cli.io.dataset.protocols.PROTOCOLS`."""
+
+PATTERNS = ("uniform", "bernoulli", "grid", "lines", "features", "edges", "region")
+"""Which pixels of dense depth become sparse points: `pnpdepth_cli.sensors.samplers`."""
+
+SENSORS = ("vlp-16", "vlp-32c", "hdl-32e", "hdl-64e")
+"""LiDARs by data sheet; `pnpdepth_cli.sensors.LIDARS` has the paper's of each as "paper-<name>"."""

@@ -12,7 +12,7 @@ from pnpdepth_cli.choices import Table
 from pnpdepth_cli.core.step_sizes import SCHEDULES
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.models.precision import dtype_of
-from pnpdepth_cli.pipeline.refinement.settle import NORMALISATIONS
+from pnpdepth_cli.pipeline.refinement.resolve import NORMALISATIONS
 
 
 @pytest.fixture

@@ -69,7 +69,7 @@ def test_the_network_of_the_readme_is_refined(tmp_path: Path) -> None:
     network = find_definition(str(tmp_path / "my_net.py")).build()
     save_file(network.state_dict(), tmp_path / "my_net.safetensors")
     outcome = refine_image(
-        RefineRequest(
+        RefineRequest.from_fields(
             image=frame.image,
             sparse=frame.sparse,
             model=str(tmp_path / "my_net.py"),

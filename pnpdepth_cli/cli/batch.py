@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from pnpdepth_cli.choices import FRAME_PROTOCOLS, LAYOUTS
 from pnpdepth_cli.cli import grouped_help, options
 from pnpdepth_cli.cli.exit_codes import INTERRUPTED
 from pnpdepth_cli.cli.printable import printable
@@ -22,11 +23,6 @@ from pnpdepth_cli.errors import FramesFailedError, StorageError, UsageError
 if TYPE_CHECKING:
     from pnpdepth_cli.pipeline.batch.frames import BatchRequest
 
-LAYOUTS = (
-    *("manifest", "nyu-mat", "kitti-odometry", "kitti-object", "kitti-depth", "tum", "7scenes"),
-    *("synthia", "pairs", "nyu-h5"),
-)
-PROTOCOLS = ("whole", "nyu", "kitti-odometry", "kitti-depth")
 _STOPPING = b"\nfinishing the current frame; press Ctrl-C again to stop at once\n"
 
 
@@ -51,11 +47,13 @@ _STOPPING = b"\nfinishing the current frame; press Ctrl-C again to stop at once\
 @click.argument("source", type=options.FILE, metavar="FOLDER|LIST")
 @click.option("-o", "--output", type=options.FILE, required=True, help="Output folder.")
 @click.option(
-    "--layout", type=click.Choice(LAYOUTS), help="Layout of the folder.  [default: recognised]"
+    "--layout",
+    type=click.Choice(tuple(LAYOUTS)),
+    help="Layout of the folder.  [default: recognised]",
 )
 @click.option(
     "--protocol",
-    type=click.Choice(PROTOCOLS),
+    type=click.Choice(FRAME_PROTOCOLS),
     help="Crop and depth range of the frames.  [default: the layout's own]",
 )
 @click.option(
@@ -128,18 +126,13 @@ def batch(
     """
     from pnpdepth_cli.pipeline.batch.batch import plan_batch
     from pnpdepth_cli.pipeline.batch.frames import BatchRequest
-    from pnpdepth_cli.pipeline.refinement.request import RefineRequest, sample_pattern
-    from pnpdepth_cli.pipeline.sparse.scans import ScanOptions
+    from pnpdepth_cli.pipeline.refinement.request import sample_pattern
 
-    scan, others = options.scan_given(given)
     pattern = None if sample is None else sample_pattern(*_sample(sample))
-    asked = RefineRequest(
-        image=None, sparse=None, scan=ScanOptions(**scan), sample=pattern, **others
-    )
     request = BatchRequest(
         source=source,
         output=output,
-        refine=asked,
+        refine=options.request_of(given, sample=pattern),
         layout=layout,
         protocol=protocol,
         workers=workers,

@@ -24,6 +24,9 @@ from pnpdepth_cli.cli import options
 @click.option(
     "--seed", type=options.SEED, default=0, show_default=True, metavar="N", help="Of --bootstrap."
 )
+@click.option(
+    "--no-groups", is_flag=True, help="Treat all frames as independent, also those of a sequence."
+)
 @click.option("--csv", type=options.FILE, metavar="FILE|-", help="Write the table as CSV.")
 @click.option(
     "--markdown", type=options.FILE, metavar="FILE|-", help="Write the table as Markdown."
@@ -35,6 +38,7 @@ def compare(
     runs: tuple[str, ...],
     resamples: int,
     seed: int,
+    no_groups: bool,
     csv: Path | None,
     markdown: Path | None,
     latex: Path | None,
@@ -50,16 +54,21 @@ def compare(
     A RUN is the output of `pnpdepth eval --json`, the summary.json of a batch, or the record of a
     refinement with ground truth; FILE:before takes the depth before refinement. Gains are in per
     cent of the first run and positive if the other run is better. p is the p-value of a paired
-    permutation test, exact for few frames, else with N random permutations.
+    permutation test over groups of frames (manifest column group, sequence or folder), in a single
+    sequence over blocks as long as its errors are correlated, adjusted for the number of measures
+    (Holm); it is exact for few groups, else with N random permutations.
     """
     from pnpdepth_cli.cli import score_tables
     from pnpdepth_cli.pipeline.evaluation import score_files
+    from pnpdepth_cli.pipeline.evaluation.compare import CompareRequest
     from pnpdepth_cli.pipeline.evaluation.compare import compare as compare_runs
 
     targets = (csv, markdown, latex)
     score_tables.check_stdout(targets, as_json)
     score_files.check_targets(targets, [Path(run) for run in runs], overwrite=overwrite)
-    comparison = compare_runs(runs, resamples=resamples, seed=seed)
+    comparison = compare_runs(
+        CompareRequest(paths=runs, resamples=resamples, seed=seed, grouped=not no_groups)
+    )
     score_tables.print_notes(comparison.notes)
     table = score_files.comparison_table(comparison)
     caption = score_files.comparison_caption(comparison)

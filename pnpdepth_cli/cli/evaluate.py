@@ -33,11 +33,11 @@ PROTOCOLS = ("paper", "nyu", "kitti", "kitti-devkit", "eigen", "garg")
     groups={
         "Input": (
             *("--pred-scale", "--gt-scale", "--channel", "--resize", "--mask", "--sparse"),
-            *("--sparse-scale", "--workers"),
+            *("--sparse-scale", "--workers", "--max-pixels"),
         ),
         "Protocol": (
             *("--protocol", "--min-depth", "--max-depth", "--clip", "--crop", "--average"),
-            *("--delta", "--exclude-sparse", "--bootstrap", "--seed"),
+            *("--delta", "--exclude-sparse", "--bootstrap", "--no-groups", "--seed"),
         ),
         "Output": ("--csv", "--markdown", "--latex", "--html", "--overwrite", "--json"),
     },
@@ -70,6 +70,7 @@ PROTOCOLS = ("paper", "nyu", "kitti", "kitti-devkit", "eigen", "garg")
 @click.option("--pred-scale", type=float, metavar="S", help="Integer predictions hold metres × S.")
 @click.option("--gt-scale", type=float, metavar="S", help="Integer ground truth holds metres × S.")
 @options.channel
+@options.max_pixels
 @click.option(
     "--resize",
     type=click.Choice(("nearest", "bilinear")),
@@ -105,6 +106,9 @@ PROTOCOLS = ("paper", "nyu", "kitti", "kitti-devkit", "eigen", "garg")
     show_default=True,
     metavar="N",
     help="Number of frames read at once.",
+)
+@click.option(
+    "--no-groups", is_flag=True, help="Treat all frames as independent, also those of a sequence."
 )
 @click.option("--csv", type=options.FILE, metavar="FILE|-", help="Write a row per frame.")
 @click.option("--markdown", type=options.FILE, metavar="FILE|-", help="Write a table of the means.")
@@ -196,6 +200,7 @@ def _evaluate(
     workers: int,
     delta: str | None,
     exclude_sparse: bool,
+    no_groups: bool,
     **changes: Any,
 ) -> Evaluation:
     """Runs the evaluation with a progress bar."""
@@ -206,13 +211,16 @@ def _evaluate(
     changes |= {"thresholds": _thresholds(delta), "exclude_sparse": exclude_sparse or None}
     request = EvalRequest(
         prediction=prediction,
-        truth=truth,
+        ground_truth=truth,
         sparse=sparse,
         protocol=protocol,
         changes=changes,
-        scales=Scales(prediction=pred_scale, truth=gt_scale, sparse=sparse_scale, channel=channel),
+        scales=Scales(
+            prediction=pred_scale, ground_truth=gt_scale, sparse=sparse_scale, channel=channel
+        ),
         resamples=resamples,
         seed=seed,
+        grouped=not no_groups,
         workers=workers,
     )
     with progress_bar("eval", "frame") as show:

@@ -14,15 +14,18 @@ import click
 OTHER = "Other"
 """Title of the options that no group lists."""
 
-LIDAR = ("--calib", "--camera", "--range", "--keep-occluded", "--min-range", "--max-range")
-FILE_READING = ("--depth-scale", "--gt-scale", "--channel", "--sparse-size-ok")
+LIDAR = (
+    *("--calib", "--camera", "--range", "--keep-occluded", "--min-range", "--max-range"),
+    "--point-fields",
+)
+FILE_READING = ("--depth-scale", "--gt-scale", "--channel", "--sparse-size-ok", "--max-pixels")
 NETWORK = (
     *("--model", "--checkpoint", "--layer", "--align", "--align-every", "--output-kind"),
     *("--normalise", "--precision", "--device", "--tile"),
 )
 METHOD = (
     *("--auto", "--time-budget", "--iterations", "--lr", "--loss", "--update", "--schedule"),
-    *("--spread", "--parameters", "--anchor", "--line-search", "--keep-best", "--propagate"),
+    *("--blur", "--parameters", "--proximity", "--line-search", "--keep-best", "--propagate"),
     *("--holdout", "--seed"),
 )
 OUTPUT = ("--output", "--format", "--baselines", "--uncertainty", "--overwrite", "--json")

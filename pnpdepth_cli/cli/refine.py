@@ -54,11 +54,8 @@ def refine(as_json: bool, **given: Any) -> None:
     """
     from pnpdepth_cli.cli.tables import print_refinement
     from pnpdepth_cli.pipeline.refinement.refine import refine_image
-    from pnpdepth_cli.pipeline.refinement.request import RefineRequest
-    from pnpdepth_cli.pipeline.sparse.scans import ScanOptions
 
-    scan, others = options.scan_given(given)
-    request = RefineRequest(scan=ScanOptions(**scan), **others)
+    request = options.request_of(given)
     with progress_bar("refine", "update") as show:
 
         def show_update(done: int, of: int, loss: float) -> None:

@@ -7,10 +7,9 @@ from pathlib import Path
 
 import click
 
+from pnpdepth_cli.choices import PATTERNS
 from pnpdepth_cli.cli import options
 from pnpdepth_cli.errors import UsageError
-
-PATTERNS = ("uniform", "bernoulli", "grid", "lines", "features", "edges", "region")
 
 
 @click.command(short_help="Sample sparse depth from dense depth.")
@@ -44,6 +43,7 @@ PATTERNS = ("uniform", "bernoulli", "grid", "lines", "features", "edges", "regio
 )
 @options.depth_scale
 @options.channel
+@options.max_pixels
 @options.sparse_output
 @options.output_scale
 @click.option("--overlay", type=options.FILE, help="Also write a PNG of the points on --image.")

@@ -15,12 +15,18 @@ from rich.table import Table
 
 from pnpdepth_cli.cli.printable import printable
 from pnpdepth_cli.errors import UsageError
-from pnpdepth_cli.pipeline.evaluation.score_files import part_cells, shown, unit_of, write_bytes
+from pnpdepth_cli.pipeline.evaluation.score_files import (
+    bin_rows,
+    format_value,
+    interval_text,
+    unit_of,
+    write_bytes,
+)
 
 if TYPE_CHECKING:
     from pnpdepth_cli.pipeline.evaluation.compare import Comparison
     from pnpdepth_cli.pipeline.evaluation.frame_scoring import FrameScores
-    from pnpdepth_cli.pipeline.evaluation.result import Evaluation, Part
+    from pnpdepth_cli.pipeline.evaluation.result import ErrorBin, Evaluation
 
 _ALL_FRAMES_SHOWN = 12
 _WORST_SHOWN = 5
@@ -54,24 +60,23 @@ def write_texts(texts: Sequence[tuple[Path | None, str]]) -> bool:
 
 
 def print_evaluation(evaluation: Evaluation) -> None:
-    """The means, the frames or the worst of them, and the parts by distance and by depth."""
+    """Prints the means, the frames or the worst of them, and errors by distance and by depth."""
     console = _stdout()
     _print(console, _means(evaluation))
     if evaluation.interval is not None:
-        caption = "±: half of the 95 % interval, bootstrap over the frames"
-        console.print(caption, style="dim", soft_wrap=True)
+        console.print(evaluation.describe_interval(), style="dim", soft_wrap=True)
     if len(evaluation.frames) > 1:
         _print(console, _frames(evaluation))
-    for title, column, parts in (
+    for title, column, bins in (
         ("by distance to the nearest sparse point", "pixels away", evaluation.by_distance),
-        ("by depth of the truth", "metres", evaluation.by_depth),
+        ("by depth of the ground truth", "metres", evaluation.by_depth),
     ):
-        if parts:
-            _print(console, _parts(title, column, parts))
+        if bins:
+            _print(console, _bins(title, column, bins))
 
 
 def print_comparison(comparison: Comparison) -> None:
-    """Each measure of the first run, and of the others with their gain on it."""
+    """Prints each measure of the first run, and of the others with their gain."""
     console = _stdout()
     base, *others = comparison.runs
     frames = len(comparison.names)
@@ -84,20 +89,22 @@ def print_comparison(comparison: Comparison) -> None:
             table.add_column(title, justify="right")
     for measure in comparison.measures:
         unit = f" [dim]{unit_of(measure)}[/]" if unit_of(measure) else ""
-        cells = [f"{measure.title}{unit}", shown(measure, base.mean[measure.key])]
+        cells = [f"{measure.title}{unit}", format_value(measure, base.mean[measure.key])]
         for run, gains in zip(others, comparison.gains, strict=True):
             gain = gains[measure.key]
             cells += [
-                shown(measure, run.mean[measure.key]),
-                _coloured(gain.percent, significant=gain.p_value < 0.05),
+                format_value(measure, run.mean[measure.key]),
+                _coloured(gain.percent, significant=gain.p_adjusted < 0.05),
                 _range(gain.low_percent, gain.high_percent),
-                _p_value(gain.p_value),
+                _p_value(gain.p_adjusted),
             ]
         table.add_row(*cells)
     how = "all swaps" if comparison.exact else f"{comparison.resamples:,} random swaps"
     _print(console, table)
     caption = (
         f"gain: in per cent of {base.label}, positive is better; p: of no difference, from {how}"
+        f" of {comparison.clusters.describe()}, adjusted for {len(comparison.measures)} measures"
+        " (Holm)"
     )
     console.print(_one_line(caption), style="dim", soft_wrap=True)
 
@@ -111,12 +118,12 @@ def _means(evaluation: Evaluation) -> Table:
     table.add_column("")
     table.add_column("mean", justify="right")
     if interval is not None:
-        table.add_column("±", justify="right")
+        table.add_column("95 %", justify="right")
     table.add_column("")
     for measure in measures:
-        cells = [measure.title, shown(measure, evaluation.mean[measure.key])]
+        cells = [measure.title, format_value(measure, evaluation.mean[measure.key])]
         if interval is not None:
-            cells.append(shown(measure, interval.half_width(measure.key)))
+            cells.append(interval_text(evaluation, measure))
         better = "higher is better" if measure.higher_is_better else ""
         table.add_row(*cells, f"[dim]{unit_of(measure) or better}[/]")
     pixels = sum(frame.pixels for frame in evaluation.frames)
@@ -139,7 +146,7 @@ def _frames(evaluation: Evaluation) -> Table:
         table.add_column(f"{measure.title}{unit}", justify="right")
     table.add_column("coverage", justify="right")
     for frame in frames:
-        cells = [shown(measure, frame.values.get(measure.key)) for measure in measures]
+        cells = [format_value(measure, frame.values.get(measure.key)) for measure in measures]
         table.add_row(_one_line(frame.name), *cells, _coverage(frame))
     return table
 
@@ -154,12 +161,12 @@ def _coverage(frame: FrameScores) -> str:
     return f"{frame.coverage:.2%}" if frame.scored else "[red]not scored[/]"
 
 
-def _parts(title: str, column: str, parts: Sequence[Part]) -> Table:
+def _bins(title: str, column: str, bins: Sequence[ErrorBin]) -> Table:
     table = _table(f"{title}, all pixels together")
     table.add_column(column)
-    for name in ("of the truth", "RMSE [dim]m[/]", "MAE [dim]m[/]", "MRE", "coverage"):
+    for name in ("of the ground truth", "RMSE [dim]m[/]", "MAE [dim]m[/]", "MRE", "coverage"):
         table.add_column(name, justify="right")
-    for cells in part_cells(parts):
+    for cells in bin_rows(bins):
         table.add_row(*cells)
     return table
 

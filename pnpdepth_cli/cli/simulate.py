@@ -8,9 +8,8 @@ from typing import Any
 
 import click
 
+from pnpdepth_cli.choices import SENSORS
 from pnpdepth_cli.cli import options
-
-SENSORS = ("vlp-16", "vlp-32c", "hdl-32e", "hdl-64e")
 
 
 @click.command(short_help="Simulate a LiDAR in a scene with dense depth.")
@@ -63,6 +62,7 @@ SENSORS = ("vlp-16", "vlp-32c", "hdl-32e", "hdl-64e")
 @options.euclidean
 @options.depth_scale
 @options.channel
+@options.max_pixels
 @options.sparse_output
 @options.output_scale
 @options.overwrite

@@ -9,19 +9,12 @@ from typing import Any
 
 import click
 
+from pnpdepth_cli.choices import FRAME_PROTOCOLS, LAYOUTS
 from pnpdepth_cli.cli import grouped_help, options
-from pnpdepth_cli.cli.batch import LAYOUTS, PROTOCOLS
 from pnpdepth_cli.cli.exit_codes import INTERRUPTED
 from pnpdepth_cli.cli.progress import BatchProgress
 from pnpdepth_cli.errors import FramesFailedError, StorageError
-
-_OF_THE_REFINEMENT = {
-    *("model", "checkpoint", "layer", "iterations", "lr", "loss", "update", "schedule", "spread"),
-    *("parameters", "anchor", "line_search", "keep_best", "align", "align_every", "output_kind"),
-    *("normalise", "depth_scale", "gt_scale"),
-    *("channel", "sparse_size_ok", "seed", "device", "precision", "propagate"),
-}
-"""Options of a refinement that change the depth; a sweep writes and holds out nothing."""
+from pnpdepth_cli.pipeline.refinement.request import FrameFiles, MethodOptions, NetworkChoice
 
 
 @click.command(
@@ -70,17 +63,20 @@ _OF_THE_REFINEMENT = {
     help="Number of random draws of the points; the first uses --seed.",
 )
 @click.option(
-    "--layout", type=click.Choice(LAYOUTS), help="Layout of the folder.  [default: recognised]"
+    "--layout",
+    type=click.Choice(tuple(LAYOUTS)),
+    help="Layout of the folder.  [default: recognised]",
 )
 @click.option(
     "--protocol",
-    type=click.Choice(PROTOCOLS),
+    type=click.Choice(FRAME_PROTOCOLS),
     help="Crop and depth range of the frames.  [default: the layout's own]",
 )
 @click.option("--limit", type=int, metavar="N", help="Only the first N frames.")
 @click.option("--plots/--no-plots", default=True, help="Draw plots, or write tables only.")
 @options.scan
-@options.refinement
+@options.options_of_groups(FrameFiles, NetworkChoice, MethodOptions, without=["tile"])
+@options.seed
 @options.as_json
 def sweep(
     source: Path,
@@ -116,7 +112,7 @@ def sweep(
                 noise of the points, as in `pnpdepth sample`
     rotation-noise
                 rotation of a LiDAR, degrees
-    iterations, layer, lr, loss, update, schedule, spread, parameters, anchor, align, propagate
+    iterations, layer, lr, loss, update, schedule, blur, parameters, proximity, align, propagate
                 the options of the same names
 
     One --vary gives one table and one plot; two give a table and a plot of their grid; with
@@ -129,17 +125,14 @@ def sweep(
     and sweep.jsonl (the journal). Run again, also with other values, only missing values are
     computed. Plots need the extra pnpdepth[plot].
     """
-    from pnpdepth_cli.pipeline.refinement.request import RefineRequest
-    from pnpdepth_cli.pipeline.sparse.scans import ScanOptions
     from pnpdepth_cli.pipeline.sweep.axes import read_axis, studies_of
     from pnpdepth_cli.pipeline.sweep.points import read_sampling
     from pnpdepth_cli.pipeline.sweep.sweep import SweepRequest, run_sweep
 
-    scan, others = options.scan_given(given)
     request = SweepRequest(
         source=source,
         output=output,
-        refine=RefineRequest(image=None, sparse=None, scan=ScanOptions(**scan), **others),
+        refine=options.request_of(given),
         studies=studies_of([read_axis(text) for text in vary], one_by_one=one_by_one),
         sampling=None if sample is None else read_sampling(sample),
         seeds=seeds,
@@ -165,16 +158,6 @@ def sweep(
             f"{progress.failed:,} of {progress.to_do:,} runs failed; {output}/sweep.csv counts the"
             " frames missing from each mean; run the same command to retry them"
         )
-
-
-@click.command()
-@options.refinement
-def _refinement() -> None:
-    """All options of a refinement."""
-
-
-_NOT_OF_A_SWEEP = {option.name for option in _refinement.params} - _OF_THE_REFINEMENT
-sweep.params = [option for option in sweep.params if option.name not in _NOT_OF_A_SWEEP]
 
 
 class _Progress(BatchProgress):

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import FileFormatError, InputError, UsageError
-from pnpdepth_cli.io.file_bytes import one_line, read_bytes
+from pnpdepth_cli.io.file_bytes import check_pixel_count, one_line, read_bytes
 from pnpdepth_cli.io.file_kind import kind_of
 
 CAMERA = 2
@@ -35,6 +35,8 @@ _PLAIN = {"K": (9,), "R": (9,), "t": (3,), "distortion": (0, 4, 5, 8), "size": (
 _SEPARATORS = re.compile(r"[\[\](),;\s]+")
 _FIELD = re.compile(r"^\s*([A-Za-z_]\w*)\s*:(.*)$")
 _ROTATION_TOLERANCE = 1e-3
+_LARGEST = 1e9
+"""Of the numbers of a calibration, in pixels or metres; beyond it, products overflow."""
 
 Floats = NDArray[np.float64]
 
@@ -223,6 +225,10 @@ def _numbers(path: Path, fields: dict[str, str], name: str, counts: Sequence[int
         numbers = [np.nan]
     if not np.isfinite(numbers).all():
         raise FileFormatError(f"{path}: {name} is not made of finite numbers; correct it")
+    if max(map(abs, numbers), default=0) > _LARGEST:
+        raise FileFormatError(
+            f"{path}: {name} holds {max(numbers, key=abs):g}, which no camera has; correct it"
+        )
     if len(numbers) not in counts:
         wanted = " or ".join(str(count) for count in counts)
         raise FileFormatError(f"{path}: {name} has {len(numbers)} numbers instead of {wanted}")
@@ -251,12 +257,13 @@ def _check_intrinsics(path: Path, matrix: Floats) -> None:
 
 def _check_rotation(path: Path, name: str, matrix: Floats) -> None:
     off = np.abs(matrix @ matrix.T - np.eye(3)).max()
-    if off > _ROTATION_TOLERANCE or np.linalg.det(matrix) < 0:
+    if not off <= _ROTATION_TOLERANCE or np.linalg.det(matrix) < 0:
         raise FileFormatError(f"{path}: the {name} is no rotation (R·Rᵀ is off by {off:.2g})")
 
 
 def _height_width(path: Path, size: Sequence[float]) -> tuple[int, int]:
     width, height = (round(value) for value in size)
     if width < 1 or height < 1:
-        raise FileFormatError(f"{path}: a picture of {width}×{height} pixels is no picture")
+        raise FileFormatError(f"{path}: an image of {width}×{height} pixels is no image")
+    check_pixel_count(path, width, height)
     return height, width

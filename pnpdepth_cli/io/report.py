@@ -16,7 +16,7 @@ from pnpdepth_cli.io.atomic import atomic_path, cannot_write, make_folder, remov
 from pnpdepth_cli.io.record import plain, read_json, write_json
 
 PAGE = "index.html"
-PICTURES = "pictures"
+IMAGES = "pictures"
 _MADE_OF = "report.json"
 _PICTURE = re.compile(r"([0-9a-f]{20})_[a-z_]+\.jpg")
 
@@ -49,7 +49,7 @@ def check_report_folder(
 
 def begin_report(folder: Path, made_of: Mapping[str, Any]) -> Path:
     """The folder is there, says what it is made of, and has a folder for pictures, the result."""
-    pictures = folder / PICTURES
+    pictures = folder / IMAGES
     make_folder(pictures)
     write_json(folder / _MADE_OF, made_of)
     return pictures
@@ -60,14 +60,14 @@ def remove_report_leftovers(folder: Path) -> int:
 
     To be called only while nobody writes there.
     """
-    folders = [each for each in (folder, folder / PICTURES) if each.is_dir()]
+    folders = [each for each in (folder, folder / IMAGES) if each.is_dir()]
     try:
         return sum(remove_leftovers(each) for each in folders)
     except OSError as error:
         raise cannot_write(folder, error) from error
 
 
-def picture_key(*parts: str) -> str:
+def image_key(*parts: str) -> str:
     """The start of a frame's picture names: fit for a file, and another one for other parts."""
     text = "\0".join(parts)
     return hashlib.sha256(text.encode("utf-8", "surrogateescape")).hexdigest()[:20]
@@ -94,7 +94,7 @@ def write_report(folder: Path, head: Mapping[str, Any], frames: Iterable[Mapping
         file.write("\n]}")
         file.write(end)
     try:
-        for path in (folder / PICTURES).iterdir():
+        for path in (folder / IMAGES).iterdir():
             name = _PICTURE.fullmatch(path.name)
             if name is not None and name[1] not in keys:
                 path.unlink(missing_ok=True)

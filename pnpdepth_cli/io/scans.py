@@ -15,37 +15,50 @@ from pnpdepth_cli.io.file_kind import kind_of
 from pnpdepth_cli.io.formats.npy import parse_npy
 from pnpdepth_cli.io.point_files import parse_pcd, parse_ply
 
-_KITTI_BYTES = 16
-"""x, y, z and reflectance of one point in KITTI's .bin, float32 each."""
-
 _FARTHEST_M = 1e5
+_KITTI_FIELDS = 4
+"""x, y, z and reflectance."""
+
+_NUSCENES_FIELDS = 5
+"""x, y, z, intensity and the index of the laser, a whole number."""
+
+_NEARLY_ALL = 0.95
+"""Fraction of points; read with the wrong number of fields, at most half of them look right."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ScanFile:
-    """points: (N, 3) float32 metres, x y z in the scanner's frame; all finite, in file order.
-
-    source describes the file for a person.
-    """
+    """A LiDAR scan as read from a file."""
 
     points: NDArray[np.float32]
+    """(N, 3) metres, x y z in the scanner's frame; all finite, in file order."""
+
     source: str
+    """What was read, for a person."""
 
 
-def read_scan(path: Path) -> ScanFile:
-    """The points of a KITTI .bin, .npy (N, 3 or more columns), .pcd or .ply file.
+def read_scan(path: Path, point_fields: int | None = None) -> ScanFile:
+    """Returns the points of a KITTI or nuScenes .bin, .npy (N, 3 or more columns), .pcd or .ply.
 
-    Raises FileFormatError for a damaged file and for points that are no numbers, NoPointsError
-    for a scan without any.
+    Args:
+        path: The file; its suffix says the format.
+        point_fields: Float32 numbers of a point in a .bin; None to tell from name and content.
+
+    Raises:
+        FileFormatError: The file is damaged, ambiguous, or holds points that are no numbers.
+        NoPointsError: It holds no point.
     """
     suffix = path.suffix.lower()
-    if suffix not in _READERS:
-        raise FileFormatError(f"{path} is not a scan; give a file of {', '.join(_READERS)}")
+    if suffix not in SCAN_SUFFIXES:
+        raise FileFormatError(f"{path} is not a scan; give a file of {', '.join(SCAN_SUFFIXES)}")
     data = read_bytes(path)
     kind = kind_of(data)
     if kind not in (None, "NPY"):
         raise FileFormatError(f"{path} is a {kind} file, not a scan; check what is given as scan")
-    points, source = _READERS[suffix](path, data)
+    if suffix == ".bin":
+        points, source = _parse_bin(path, data, point_fields)
+    else:
+        points, source = _READERS[suffix](path, data)
     if not len(points):
         raise NoPointsError(f"{path} holds no point; give a scan with points")
     bad = ~np.isfinite(points).all(axis=1)
@@ -62,14 +75,49 @@ def read_scan(path: Path) -> ScanFile:
     return ScanFile(points=points, source=source)
 
 
-def _parse_bin(path: Path, data: bytes) -> tuple[NDArray[np.float32], str]:
-    if len(data) % _KITTI_BYTES:
+def _parse_bin(
+    path: Path, data: bytes, point_fields: int | None
+) -> tuple[NDArray[np.float32], str]:
+    fields = point_fields or _fields_of_bin(path, data)
+    if len(data) % (4 * fields):
         raise FileFormatError(
-            f"{path}: {len(data):,} bytes are not a multiple of {_KITTI_BYTES} (x, y, z and"
-            " reflectance as float32); it is cut short or no KITTI scan"
+            f"{path}: {len(data):,} bytes are not a multiple of {4 * fields} ({fields} float32"
+            " numbers a point); it is cut short, or its points have another number of fields"
         )
-    points = np.frombuffer(data, "<f4").reshape(-1, 4)
-    return np.ascontiguousarray(points[:, :3], np.float32), "KITTI scan"
+    points = np.frombuffer(data, "<f4").reshape(-1, fields)
+    names = {_KITTI_FIELDS: "KITTI scan", _NUSCENES_FIELDS: "nuScenes scan"}
+    source = names.get(fields, f"scan of {fields} fields a point")
+    return np.ascontiguousarray(points[:, :3], np.float32), source
+
+
+def _fields_of_bin(path: Path, data: bytes) -> int:
+    """4 for KITTI, 5 for nuScenes, by name and size, and by content where both sizes fit."""
+    if path.name.lower().endswith(".pcd.bin"):  # nuScenes' own name
+        return _NUSCENES_FIELDS
+    by_size = [n for n in (_KITTI_FIELDS, _NUSCENES_FIELDS) if len(data) % (4 * n) == 0]
+    if by_size == [_KITTI_FIELDS]:
+        return _KITTI_FIELDS
+    numbers = np.frombuffer(data[: len(data) // 4 * 4], "<f4")
+    by_content = [n for n in by_size if _looks_like_scan(numbers.reshape(-1, n))]
+    if len(by_content) == 1:
+        return by_content[0]
+    if _KITTI_FIELDS not in by_size:
+        raise FileFormatError(
+            f"{path}: {len(data):,} bytes are not a multiple of 16 (KITTI: x, y, z and reflectance"
+            " as float32) nor of 20 (nuScenes); it is cut short or no such scan"
+        )
+    raise FileFormatError(
+        f"{path} may hold 4 numbers a point (KITTI) or 5 (nuScenes); say which with --point-fields"
+    )
+
+
+def _looks_like_scan(rows: NDArray[np.float32]) -> bool:
+    """True if nearly all points have no negative reflectance, and the index of a laser as fifth."""
+    with np.errstate(invalid="ignore"):
+        near = (np.abs(rows[:, :3]) <= _FARTHEST_M).all(axis=1) & (rows[:, 3] >= 0)
+        laser = rows[:, 4:]
+        named = ((laser >= 0) & (laser < 256) & (laser == np.floor(laser))).all(axis=1)
+    return bool(np.mean(near & named) >= _NEARLY_ALL)
 
 
 def _parse_npy(path: Path, data: bytes) -> tuple[NDArray[np.float32], str]:
@@ -87,11 +135,10 @@ def _parse_npy(path: Path, data: bytes) -> tuple[NDArray[np.float32], str]:
 
 
 _READERS: dict[str, Callable[[Path, bytes], tuple[NDArray[np.float32], str]]] = {
-    ".bin": _parse_bin,
     ".npy": _parse_npy,
     ".pcd": parse_pcd,
     ".ply": parse_ply,
 }
 
-SCAN_SUFFIXES = tuple(_READERS)
+SCAN_SUFFIXES = (".bin", *_READERS)
 """What `read_scan` can read."""

@@ -25,6 +25,7 @@ else:
     import tomli as tomllib
 
 _EVEN = ("top_deg", "step_deg", "beams")
+_MOST_BEAMS = 4096
 _OPTIONAL = {"max_range": math.inf, "range_noise": 0.0, "angle_noise_deg": 0.0}
 
 
@@ -44,7 +45,7 @@ def read_sensor(path: Path) -> SensorFile:
     """The scanner that a TOML file describes. Raises FileFormatError for what it cannot mean."""
     try:
         table = tomllib.loads(read_bytes(path).decode("utf-8"))
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise FileFormatError(
             f"{path} is not valid TOML ({one_line(error)}); correct it"
         ) from error
@@ -69,16 +70,33 @@ def _elevations(path: Path, table: dict[str, Any]) -> tuple[float, ...]:
         listed = table["elevations_deg"]
         if not isinstance(listed, list) or not listed:
             raise FileFormatError(f"{path}: elevations_deg is not a list of degrees")
+        if len(listed) > _MOST_BEAMS:
+            raise FileFormatError(
+                f"{path}: {len(listed):,} elevations; give at most {_MOST_BEAMS:,}"
+            )
         return tuple(_number(path, {"elevations_deg": item}, "elevations_deg") for item in listed)
     top, step, beams = (_number(path, table, key) for key in _EVEN)
-    if not (1 <= beams <= 4096 and beams == int(beams)):
-        raise FileFormatError(f"{path}: beams is {beams:g}; give a whole number from 1 to 4096")
+    if not (1 <= beams <= _MOST_BEAMS and beams == int(beams)):
+        raise FileFormatError(
+            f"{path}: beams is {beams:g}; give a whole number from 1 to {_MOST_BEAMS}"
+        )
     return tuple(top - step * beam for beam in range(int(beams)))
 
 
 def _number(path: Path, table: dict[str, Any], key: str) -> float:
     value = table.get(key)
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or math.isnan(value):
-        fact = "is missing" if value is None else f"is {one_line(value)[:40]}, not a number"
+    try:
+        number = math.nan if isinstance(value, bool) else float(value)
+    except (TypeError, ValueError, OverflowError):
+        number = math.nan
+    if math.isnan(number) or not isinstance(value, (int, float)):
+        fact = "is missing" if value is None else f"is {_short(value)}, not a number"
         raise FileFormatError(f"{path}: {key} {fact}; write {key} = NUMBER")
-    return float(value)
+    return number
+
+
+def _short(value: Any) -> str:
+    try:
+        return one_line(value)[:40]
+    except (ValueError, RecursionError):  # more digits than Python writes, or lists in lists
+        return "too long"

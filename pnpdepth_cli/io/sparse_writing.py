@@ -18,7 +18,7 @@ from pnpdepth_cli.io.formats import DEPTH_SUFFIXES
 SPARSE_SUFFIXES = (*DEPTH_SUFFIXES, ".csv")
 """What `write_sparse` can write; .csv keeps the places within the pixels."""
 
-MADE_KEY = "pnpdepth:made"
+PROVENANCE_KEY = "pnpdepth:made"
 """Where a PNG keeps how its sparse depth was made."""
 
 
@@ -38,9 +38,9 @@ def write_sparse(
     """
     text = json.dumps(made, sort_keys=True)
     if path.suffix.lower() != ".csv":
-        write_depth(path, picture, scale=scale, text={MADE_KEY: text})
+        write_depth(path, picture, scale=scale, text={PROVENANCE_KEY: text})
         return
     rows = [f"{x:.9g},{y:.9g},{z:.9g}" for (x, y), z in zip(xy, depth, strict=True)]
     with atomic_path(path) as temporary:
-        content = "\n".join([f"# {MADE_KEY} {text}", "x,y,depth", *rows]) + "\n"
+        content = "\n".join([f"# {PROVENANCE_KEY} {text}", "x,y,depth", *rows]) + "\n"
         temporary.write_text(content, encoding="utf-8", newline="\n")

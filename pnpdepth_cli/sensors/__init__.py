@@ -15,11 +15,11 @@ from pnpdepth_cli.sensors.samplers import (
     PATTERNS,
     SampleNoise,
     SamplePattern,
-    disturbed,
     sample_points,
+    with_noise,
 )
 from pnpdepth_cli.sensors.simulate import SimulationSettings, simulate_lidar
-from pnpdepth_cli.sensors.sparse import Points, as_picture
+from pnpdepth_cli.sensors.sparse import Points, as_depth_image
 from pnpdepth_cli.sensors.velodyne import ProjectedScan, ProjectionSettings, project_velodyne
 
 __all__ = [
@@ -35,9 +35,9 @@ __all__ = [
     "SampleNoise",
     "SamplePattern",
     "SimulationSettings",
-    "as_picture",
-    "disturbed",
+    "as_depth_image",
     "project_velodyne",
     "sample_points",
     "simulate_lidar",
+    "with_noise",
 ]

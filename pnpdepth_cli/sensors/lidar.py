@@ -19,6 +19,10 @@ FORWARD_LEFT_UP: Floats = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.
 """The rotation from a scanner's frame to that of a camera which looks the same way."""
 
 
+_MOST_RAYS = 1 << 23
+"""Points of one turn, so that simulating them fits into memory; a 128-beam scanner has 460,000."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Lidar:
     """A turning scanner.
@@ -43,6 +47,12 @@ class Lidar:
             raise UsageError(
                 f"sensor {self.name!r}: azimuth step {self.azimuth_step_deg:g}° is not"
                 " between 0.001° and 360°"
+            )
+        rays = angles.size * round(360 / self.azimuth_step_deg)
+        if rays > _MOST_RAYS:
+            raise UsageError(
+                f"sensor {self.name!r} measures {rays:,} points a turn; give fewer beams or a"
+                f" larger azimuth step, at most {_MOST_RAYS:,}"
             )
         noise = (self.range_noise, self.angle_noise_deg)
         if not self.max_range > 0 or not all(0 <= size < np.inf for size in noise):

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import NoPointsError, SizeError, UsageError
 from pnpdepth_cli.points import SparsePoints, in_frame
-from pnpdepth_cli.sensors.sparse import Points, Steps
+from pnpdepth_cli.sensors.sparse import FARTHEST_M, DropCounter, Points
 
 Depth = NDArray[np.float32]
 Picture = NDArray[np.float32]
@@ -106,7 +106,7 @@ def sample_points(
         depth=depth.ravel()[chosen].astype(np.float32),
         size=(depth.shape[0], depth.shape[1]),
     )
-    return disturbed(points, noise or SampleNoise(), rng)
+    return with_noise(points, noise or SampleNoise(), rng)
 
 
 def _uniform(
@@ -250,7 +250,7 @@ PATTERNS: dict[str, Sampler] = {
 """The patterns that can be named: row-major indices of the pixels each keeps."""
 
 
-def disturbed(points: Points, noise: SampleNoise, rng: np.random.Generator) -> Points:
+def with_noise(points: Points, noise: SampleNoise, rng: np.random.Generator) -> Points:
     """The points with noise; those that it makes impossible or moves out of the picture are gone.
 
     NoPointsError if that is all of them.
@@ -258,24 +258,28 @@ def disturbed(points: Points, noise: SampleNoise, rng: np.random.Generator) -> P
     xy, values = points.xy.astype(np.float64), points.depth.astype(np.float64)
     height, width = points.size
     low, high = values.min(), values.max()
-    if noise.metres > 0:
-        values = values + rng.normal(0, noise.metres, len(values))
-    if noise.relative > 0:
-        values = values * (1 + rng.normal(0, noise.relative, len(values)))
+    with np.errstate(over="ignore", invalid="ignore"):
+        if noise.metres > 0:
+            values = values + rng.normal(0, noise.metres, len(values))
+        if noise.relative > 0:
+            values = values * (1 + rng.normal(0, noise.relative, len(values)))
     if noise.outliers > 0:
         wrong = rng.permutation(len(values))[: round(noise.outliers * len(values))]
         values[wrong] = rng.uniform(low, high, len(wrong))
     if noise.jitter_px > 0:
         xy = xy + rng.normal(0, noise.jitter_px, xy.shape)
-    steps = Steps(len(values))
-    positive = steps.keep(values.astype(np.float32) > 0, "noise left no depth")
+    drops = DropCounter(len(values))
+    if noise.metres > 0 or noise.relative > 0:
+        near = drops.keep(np.abs(values) < FARTHEST_M, "noise put it too far")
+        xy, values = xy[near], values[near]
+    positive = drops.keep(values.astype(np.float32) > 0, "noise left no depth")
     xy, values = xy[positive], values[positive]
-    inside = steps.keep(in_frame(xy, (height, width)), "outside the picture")
+    inside = drops.keep(in_frame(xy, (height, width)), "outside the picture")
     if not inside.any():
-        raise NoPointsError(f"noise leaves no point ({steps}); make it smaller")
+        raise NoPointsError(f"noise leaves no point ({drops}); make it smaller")
     return SparsePoints(
         xy=xy[inside].astype(np.float32),
         depth=values[inside].astype(np.float32),
         size=(height, width),
-        dropped={why: count for why, count in steps.dropped.items() if count},
+        dropped={why: count for why, count in drops.dropped.items() if count},
     )

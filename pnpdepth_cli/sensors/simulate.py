@@ -12,10 +12,11 @@ from pnpdepth_cli.points import SparsePoints, in_frame
 from pnpdepth_cli.sensors.camera import Camera
 from pnpdepth_cli.sensors.lidar import Lidar
 from pnpdepth_cli.sensors.sparse import (
+    FARTHEST_M,
+    DropCounter,
     Floats,
     Mask,
     Points,
-    Steps,
     nearest_in_pixel,
     pixel_index,
 )
@@ -70,26 +71,29 @@ def simulate_lidar(
     rng = np.random.default_rng(seed)
     turned = _turned(camera, settings.rotation_noise_deg, rng)
     beams = sensor.directions(rng) @ turned.rotation.T
-    steps = Steps(len(beams))
+    drops = DropCounter(len(beams))
     z = _depth_at_first_hit(np.asarray(depth, np.float64), turned, beams)
-    met = steps.keep(np.isfinite(z), "meets nothing that the camera sees")
+    met = drops.keep(np.isfinite(z), "meets nothing that the camera sees")
     distance = (z[met] - camera.translation[2]) / beams[met, 2]
-    kept = steps.keep(distance <= sensor.max_range, "out of range")
-    returned = steps.keep(rng.random(np.count_nonzero(kept)) >= settings.dropout, "dropped out")
+    kept = drops.keep(distance <= sensor.max_range, "out of range")
+    returned = drops.keep(rng.random(np.count_nonzero(kept)) >= settings.dropout, "dropped out")
     distance, beams = distance[kept][returned], beams[met][kept][returned]
     if sensor.range_noise > 0:
         distance = distance + rng.normal(0, sensor.range_noise, len(distance))
     points = camera.translation + beams * distance[:, None]
-    ahead = steps.keep((distance > 0) & (points[:, 2] > 0), "noise put it behind the camera")
+    ahead = drops.keep((distance > 0) & (points[:, 2] > 0), "noise put it behind the camera")
     points = points[ahead]
+    near = np.abs(points).max(axis=1, initial=0) < FARTHEST_M
+    if not near.all():
+        points = points[drops.keep(near, "noise put it too far")]
     xy = camera.pixels_of(points)
-    inside = steps.keep(in_frame(xy, size), "outside the picture")
+    inside = drops.keep(in_frame(xy, size), "outside the picture")
     points, xy = points[inside], xy[inside]
-    front = steps.keep(nearest_in_pixel(xy, points[:, 2], size), "behind another in their pixel")
+    front = drops.keep(nearest_in_pixel(xy, points[:, 2], size), "behind another in their pixel")
     points, xy = points[front], xy[front]
     if not len(xy):
         raise NoPointsError(
-            f"no beam of {sensor.name} gives a point in the picture ({steps}); check depth,"
+            f"no beam of {sensor.name} gives a point in the picture ({drops}); check depth,"
             " intrinsics and where the scanner stands"
         )
     values = np.linalg.norm(points, axis=1) if settings.euclidean else points[:, 2]
@@ -97,7 +101,7 @@ def simulate_lidar(
         xy=xy.astype(np.float32),
         depth=values.astype(np.float32),
         size=size,
-        dropped=steps.dropped,
+        dropped=drops.dropped,
     )
 
 

@@ -10,12 +10,15 @@ from pnpdepth_cli.points import SparsePoints
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
+FARTHEST_M = 1e9
+"""Metres; what noise moves farther is no measurement, and would overflow float32 in products."""
+
 
 Points = SparsePoints[NDArray[np.float32]]
 """Sparse depth in numpy arrays."""
 
 
-def as_picture(points: Points) -> NDArray[np.float32]:
+def as_depth_image(points: Points) -> NDArray[np.float32]:
     """(H, W) float32 metres, 0 = unknown: each point on its pixel, the nearest wins."""
     flat = np.full(points.size[0] * points.size[1], np.inf, np.float32)
     np.minimum.at(flat, pixel_index(points.xy, points.size), points.depth)
@@ -42,7 +45,7 @@ def nearest_in_pixel(
     return mask
 
 
-class Steps:
+class DropCounter:
     """Which rows of an array are left after each step, and how many each step dropped."""
 
     def __init__(self, count: int) -> None:

@@ -11,7 +11,7 @@ from pnpdepth_cli.errors import NoPointsError, UsageError
 from pnpdepth_cli.points import in_frame
 from pnpdepth_cli.sensors.camera import Camera
 from pnpdepth_cli.sensors.occlusion import OcclusionFilter, hidden_points
-from pnpdepth_cli.sensors.sparse import Points, Steps, nearest_in_pixel
+from pnpdepth_cli.sensors.sparse import DropCounter, Points, nearest_in_pixel
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,15 +56,15 @@ def project_velodyne(
     """
     settings = settings or ProjectionSettings()
     place = np.asarray(points)[:, :3]
-    steps = Steps(len(place))
+    drops = DropCounter(len(place))
     distance = np.sqrt(np.einsum("ij,ij->i", place, place))
     in_range = (distance >= settings.min_range) & (distance <= settings.max_range)
-    seen = camera.from_scanner(place[steps.keep(in_range, "out of range")])
-    seen = seen[steps.keep(seen[:, 2] > 0, "behind the camera")]
+    seen = camera.from_scanner(place[drops.keep(in_range, "out of range")])
+    seen = seen[drops.keep(seen[:, 2] > 0, "behind the camera")]
     xy = camera.pixels_of(seen)
-    inside = steps.keep(in_frame(xy, size), "outside the picture")
+    inside = drops.keep(in_frame(xy, size), "outside the picture")
     seen, xy = seen[inside], xy[inside]
-    front = steps.keep(nearest_in_pixel(xy, seen[:, 2], size), "behind another in their pixel")
+    front = drops.keep(nearest_in_pixel(xy, seen[:, 2], size), "behind another in their pixel")
     seen, xy = seen[front], xy[front]
     if settings.occlusion is not None:
         hidden = hidden_points(
@@ -75,18 +75,18 @@ def project_velodyne(
             scanner=np.asarray(camera.intrinsics @ camera.translation),
             settings=settings.occlusion,
         )
-        visible = steps.keep(~hidden, "hidden by foreground")
+        visible = drops.keep(~hidden, "hidden by foreground")
         seen, xy = seen[visible], xy[visible]
     if not len(xy):
         raise NoPointsError(
-            f"none of the scan's {len(place):,} points lies in the picture ({steps}); check that"
+            f"none of the scan's {len(place):,} points lies in the picture ({drops}); check that"
             " scan and calibration belong to this camera"
         )
     depth = np.linalg.norm(seen, axis=1) if settings.euclidean else seen[:, 2]
     return ProjectedScan(
         xy=xy.astype(np.float32),
         depth=depth.astype(np.float32),
-        index=steps.index,
+        index=drops.index,
         size=size,
-        dropped=steps.dropped,
+        dropped=drops.dropped,
     )

@@ -11,10 +11,11 @@ from typing import Any
 
 import pytest
 
+from pnpdepth_cli.choices import FRAME_PROTOCOLS, LAYOUTS
 from pnpdepth_cli.cli import batch as command
 from pnpdepth_cli.cli import progress
 from pnpdepth_cli.cli.progress import BatchProgress
-from pnpdepth_cli.io.layouts import LAYOUTS, PROTOCOLS
+from pnpdepth_cli.io.layouts import PROTOCOLS
 from tests.cli.test_commands import code_of
 from tests.pipeline.batches import pairs_on_disk, results
 
@@ -246,8 +247,7 @@ def test_durations_are_said_shortly(seconds: float, said: str) -> None:
 
 
 def test_the_choices_are_those_that_there_are() -> None:
-    assert list(command.LAYOUTS) == list(LAYOUTS)
-    assert list(command.PROTOCOLS) == list(PROTOCOLS)
+    assert list(FRAME_PROTOCOLS) == list(PROTOCOLS)
 
 
 def test_real_frames_of_a_drive_are_told_as_what_they_are(

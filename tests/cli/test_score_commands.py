@@ -27,10 +27,10 @@ def code_of(*arguments: str | Path) -> int:
 
 @pytest.fixture
 def frames(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """out/ and gt/ of three frames, one with a strange name; the work goes on beside them."""
+    """out/ and gt/ of six frames, one with a strange name; the work goes on beside them."""
     monkeypatch.chdir(tmp_path)
     rng = np.random.default_rng(0)
-    for name in ("a", "b ü_1", "c\nd"):
+    for name in ("a", "b ü_1", "c\nd", "e", "f", "g"):
         truth = rng.uniform(1, 9, (6, 8)).astype(np.float32)
         for folder, depth in (("out", truth * 1.1), ("better", truth * 1.05), ("gt", truth)):
             Path(folder).mkdir(exist_ok=True)
@@ -43,9 +43,19 @@ def test_the_table_is_data_and_what_was_assumed_is_talk(
 ) -> None:
     assert code_of("eval", "out", "gt") == 0
     out, err = capsys.readouterr()
-    for word in ("3 frames", "RMSE", "SILog", "δ3", "±", "coverage", "100.00%", "b ü_1", "c\\nd"):
+    for word in (
+        "6 frames",
+        "RMSE",
+        "SILog",
+        "δ3",
+        "95 %",
+        "coverage",
+        "100.00%",
+        "b ü_1",
+        "c\\nd",
+    ):
         assert word in out, word
-    assert err.startswith("protocol paper: all known truth, no crop")
+    assert err.startswith("protocol paper: all known ground truth, no crop")
     assert "float32 NPY" in err
 
 
@@ -54,7 +64,7 @@ def test_json_is_the_whole_result_and_nothing_else_on_stdout(
 ) -> None:
     assert code_of("eval", "out", "gt", "--json", "--protocol", "garg", "--max-depth", "5") == 0
     record = json.loads(capsys.readouterr().out)
-    assert [frame["name"] for frame in record["frames"]] == ["a", "b ü_1", "c\nd"]
+    assert [frame["name"] for frame in record["frames"]] == ["a", "b ü_1", "c\nd", "e", "f", "g"]
     assert record["protocol"]["name"] == "garg"
     assert record["protocol"]["scoring"]["max_depth"] == 5
     assert "garg (changed)" in record["protocol"]["described"]
@@ -62,7 +72,7 @@ def test_json_is_the_whole_result_and_nothing_else_on_stdout(
         [frame["values"]["mre"] for frame in record["frames"]]
     ))  # fmt: skip
     assert record["interval"]["level"] == 0.95
-    assert record["counts"]["scored"] == 3
+    assert record["counts"]["scored"] == 6
 
 
 def test_the_same_command_gives_the_same_bytes(
@@ -81,7 +91,7 @@ def test_csv_has_a_line_for_each_frame_also_those_without_score(
     Path("out/a.npy").unlink()
     assert code_of("eval", "out", "gt", "--csv", "scores.csv") == 7
     text = Path("scores.csv").read_bytes().decode()
-    a, b, c = csv.DictReader(io.StringIO(text, newline=""))
+    a, b, c, *_ = csv.DictReader(io.StringIO(text, newline=""))
     assert (a["name"], a["rmse"], a["coverage"], a["error"]) == (
         "a", "", "0.0", "there is no prediction",
     )  # fmt: skip
@@ -89,8 +99,8 @@ def test_csv_has_a_line_for_each_frame_also_those_without_score(
     assert float(b["mre"]) == pytest.approx(0.1, rel=1e-5)
     err = capsys.readouterr().err
     assert err.splitlines()[-1] == (
-        "pnpdepth: 1 of 3 frames were not scored (1 without prediction, 0 with a faulty file); the"
-        " means are over the other 2"
+        "pnpdepth: 1 of 6 frames were not scored (1 without prediction, 0 with a faulty file); the"
+        " means are over the other 5"
     )
 
 
@@ -102,7 +112,7 @@ def test_markdown_and_latex_hold_the_means(
     header, rule, row, *_ = out.splitlines()
     assert header.startswith("|  | RMSE [m] ↓ | MAE [m] ↓ | MRE ↓ |")
     assert header.count("|") == rule.count("|") == row.count("|")
-    assert "| 0.1000 ± 0.0000 |" in row
+    assert "| 0.1000 (0.1000 … 0.1000) |" in row
     latex = Path("t.tex").read_text()
     assert latex.count("&") == 2 * 14
     assert r"$\delta$1 $\uparrow$" in latex
@@ -113,7 +123,7 @@ def test_only_one_thing_goes_to_stdout(frames: Path, capsys: pytest.CaptureFixtu
     assert code_of("eval", "out", "gt", "--json", "--csv", "-") == 2
     assert capsys.readouterr().err.count("\n") == 1
     assert code_of("eval", "out", "gt", "--csv", "-") == 0
-    assert capsys.readouterr().out.startswith("name,prediction,truth,")
+    assert capsys.readouterr().out.startswith("name,group,prediction,truth,")
 
 
 def test_files_are_not_overwritten_unasked_and_inputs_never(
@@ -176,7 +186,7 @@ def test_runs_are_compared_as_a_table_as_json_and_as_files(
     assert code_of("compare", "out.json", "better.json", "--csv", "c.csv", "--latex", "c.tex") == 0
     out, err = capsys.readouterr()
     assert err == ""
-    for word in ("the 3 frames that all runs have", "+50.00 %", "0.250", "from all swaps"):
+    for word in ("the 6 frames that all runs have", "+50.00 %", "0.375", "from all swaps"):
         assert word in out, word
     (rmse, *_) = csv.DictReader(io.StringIO(Path("c.csv").read_text()))
     assert rmse["gain [%]"] == "+50.00"
@@ -206,7 +216,7 @@ def test_a_refinement_scores_the_same_when_its_files_are_evaluated(
     assert record["mean"]["mae"] == pytest.approx(refined["scores"]["after"]["mae"], abs=code)
     assert record["frames"][0]["image"] == str(frame.image)
     assert record["frames"][0]["pixels_given_as_sparse"] == 60
-    assert "60 of the scored pixels (2.10%) hold a value of the sparse input" in err
+    assert "60 of the scored pixels (2.10%) have a point of the sparse input" in err
     evaluated = tmp_path / "img.json"
     evaluated.write_text(text)
     assert code_of("compare", f"{out}/img.json:before", evaluated) == 0

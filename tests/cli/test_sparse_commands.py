@@ -3,10 +3,10 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from pnpdepth_cli.cli.sample import PATTERNS
-from pnpdepth_cli.cli.simulate import SENSORS
+from pnpdepth_cli.choices import PATTERNS, SENSORS
 from tests.cli.test_commands import code_of
 from tests.pipeline.frames import frame_on_disk
 from tests.pipeline.scan_frames import ScanOnDisk, scan_on_disk
@@ -115,3 +115,25 @@ def test_refine_takes_a_scan_with_its_calibration(
     assert "needs --calib" in capsys.readouterr().err
     assert code_of([*arguments[:3], str(scan.gt), *arguments[4:], "--keep-occluded"]) == 2
     assert "is no scan" in capsys.readouterr().err
+
+
+def test_max_pixels_refuses_and_allows_an_image_by_its_size(
+    frame: ScanOnDisk, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ["sample", str(frame.gt), "--count", "5", "-o", str(frame.folder / "few.png")]
+    assert code_of([*arguments, "--max-pixels", "10"]) == 3
+    assert "pixels, more than 10; make it smaller" in capsys.readouterr().err
+    assert code_of(arguments) == 0
+
+
+def test_point_fields_says_how_the_points_of_a_scan_are_stored(
+    frame: ScanOnDisk, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scan = np.fromfile(frame.scan, "<f4").reshape(-1, 4)
+    wide = frame.folder / "wide.bin"
+    np.column_stack([scan, scan[:, :2]]).astype("<f4").tofile(wide)
+    arguments = ["project", str(wide), "--calib", str(frame.calib), "--image", str(frame.image)]
+    arguments += ["-o", str(frame.folder / "sparse.png"), "--point-fields"]
+    assert code_of([*arguments, "6"]) == 0
+    assert "scan of 6 fields a point" in capsys.readouterr().err
+    assert json.loads((frame.folder / "sparse.json").read_text())["point_fields"] == 6

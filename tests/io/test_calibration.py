@@ -101,7 +101,7 @@ BROKEN = [
     (YAML.replace("K:", "k:"), "'k' is not part of a calibration"),
     (YAML.replace("t:", "#t:"), "has R but no t"),
     (YAML.replace("[-0.3, 0.1, 0.0, 0.001]", "[-0.3]"), "distortion has 1 numbers"),
-    (YAML.replace("1242", "0"), "no picture"),
+    (YAML.replace("1242", "0"), "no image"),
     ("1 2 3", "K has 3 numbers instead of 9"),
     ('{"K": [1, 2', "is not valid JSON"),
     ("\0\0\0\0", "not a text file"),
@@ -180,3 +180,21 @@ def test_kittis_object_files_are_near_the_published_set_up(shared_data: Path) ->
         got = read_calibration(path)
         np.testing.assert_allclose(got.translation, [0.06, -0.08, -0.3], atol=0.05)
         assert got.rotation @ [1, 0, 0] == pytest.approx([0, 0, 1], abs=0.03)
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("700.5", "1e308"),
+        ("0.06", "-1e308"),
+        ("[0, -1, 0]", "[0, -1e308, 1e308]"),
+        ("-0.3", "1e300"),
+        ("size: [1242, 375]", "size: [1000000000, 1000000000]"),
+        ("size: [1242, 375]", "size: [50000, 50000]"),
+    ],
+)
+@pytest.mark.filterwarnings("error")
+def test_numbers_that_no_camera_has_are_refused(tmp_path: Path, old: str, new: str) -> None:
+    assert old in YAML
+    with pytest.raises(FileFormatError, match=r"which no camera has|pixels, more than"):
+        read_calibration(write(tmp_path, YAML.replace(old, new)))

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import time
 from pathlib import Path
 
 import pytest
@@ -37,3 +38,13 @@ def test_a_new_time_alone_is_no_change_new_content_is(tmp_path: Path) -> None:
 def test_a_file_that_is_not_there_is_said(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="cannot be read"):
         fingerprint(tmp_path / "no")
+
+
+def test_another_content_of_the_same_size_and_time_is_a_change(tmp_path: Path) -> None:
+    path = tmp_path / "f"
+    path.write_bytes(b"abc")
+    known = fingerprint(path)
+    time.sleep(0.02)
+    path.write_bytes(b"abd")
+    os.utime(path, ns=(known.mtime_ns, known.mtime_ns))
+    assert not is_unchanged(path, known)

@@ -205,3 +205,40 @@ def test_kittis_scans_are_read_whole(shared_data: Path) -> None:
         assert len(got) == path.stat().st_size // 16
         assert 100_000 < len(got) < 130_000
         assert np.abs(got).max() < 125
+
+
+def nuscenes_bytes(points: NDArray[np.float32]) -> bytes:
+    """x, y, z, intensity 0 to 255, and the index of one of 32 lasers."""
+    numbers = np.arange(len(points))
+    return np.column_stack([points, numbers % 256, numbers % 32]).astype("<f4").tobytes()
+
+
+@pytest.mark.parametrize("name", ["LIDAR_TOP__1532402927647951.pcd.bin", "renamed.bin"])
+@pytest.mark.parametrize("count", [37, 40])
+def test_a_nuscenes_scan_is_told_from_kittis_by_name_and_content(
+    tmp_path: Path, name: str, count: int
+) -> None:
+    points = np.resize(POINTS, (count, 3))
+    (tmp_path / name).write_bytes(nuscenes_bytes(points))
+    scan = read_scan(tmp_path / name)
+    assert np.array_equal(scan.points, points)
+    assert scan.source == "nuScenes scan"
+
+
+def test_a_kitti_scan_whose_size_also_fits_nuscenes_stays_kittis(tmp_path: Path) -> None:
+    points = np.resize(POINTS, (40, 3))
+    (tmp_path / "kitti.bin").write_bytes(bin_bytes(points))
+    scan = read_scan(tmp_path / "kitti.bin")
+    assert np.array_equal(scan.points, points)
+    assert scan.source == "KITTI scan"
+
+
+def test_an_ambiguous_scan_is_refused_until_the_number_of_fields_is_given(tmp_path: Path) -> None:
+    path = tmp_path / "zeros.bin"
+    path.write_bytes(bytes(80))
+    with pytest.raises(FileFormatError, match="--point-fields"):
+        read_scan(path)
+    assert len(read_scan(path, 4).points) == 5
+    assert len(read_scan(path, 5).points) == 4
+    with pytest.raises(FileFormatError, match="not a multiple of 24"):
+        read_scan(path, 6)

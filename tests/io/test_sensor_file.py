@@ -52,3 +52,21 @@ def test_what_is_missing_or_wrong_is_named_in_one_line(
         read_sensor(write(tmp_path, text))
     assert said in str(error.value)
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("elevations_deg = " + "[" * 5000 + "]" * 5000, "not valid TOML"),
+        ("elevations_deg = [1]\nazimuth_step_deg = 1" + "0" * 400 + "\n", "not a number"),
+        ("elevations_deg = [1]\nazimuth_step_deg = 1" + "0" * 5000 + "\n", "not valid TOML"),
+        (f"elevations_deg = {[0] * 300_000}\nazimuth_step_deg = 1\n", "300,000 elevations"),
+        ("elevations_deg = [[[[]]]]\nazimuth_step_deg = 1\n", "not a number"),
+    ],
+    ids=["nested", "400-digits", "5000-digits", "many-beams", "list-in-list"],
+)
+def test_a_hostile_file_is_refused_in_one_line(tmp_path: Path, text: str, said: str) -> None:
+    with pytest.raises(FileFormatError, match=said) as error:
+        read_sensor(write(tmp_path, text))
+    assert "\n" not in str(error.value)
+    assert len(str(error.value)) < 500

@@ -67,12 +67,10 @@ def add_frame(root: Path, name: str, image: Any = None, gt: bool = True) -> None
 def refinement(root: Path, **changes: Any) -> RefineRequest:
     """A request to refine with the network in net/."""
     given: dict[str, Any] = {
-        "image": None,
-        "sparse": None,
         "model": str(root / "net" / "my_net.py"),
         "checkpoint": root / "net" / "my_net.safetensors",
     }
-    return RefineRequest(**given | changes)
+    return RefineRequest.from_fields(**given | changes)
 
 
 def batch(

@@ -85,4 +85,4 @@ def run(frame: FrameOnDisk, **changes: Any) -> RefineOutcome:
         "model": str(frame.model),
         "checkpoint": frame.checkpoint,
     }
-    return refine_image(RefineRequest(**(request | changes)))
+    return refine_image(RefineRequest.from_fields(**(request | changes)))

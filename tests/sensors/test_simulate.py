@@ -174,3 +174,15 @@ def test_the_real_sensor_seen_on_the_street_has_the_density_of_kitti() -> None:
     )
     got = simulate_lidar(read_depth(street / "gt.png").values, camera, LIDARS["hdl-64e"], seed=0)
     assert 0.035 < len(got.depth) / (375 * 1242) < 0.055
+
+
+@pytest.mark.filterwarnings("error")
+def test_noise_beyond_all_bounds_leaves_no_point_and_is_refused() -> None:
+    settings = SimulationSettings(range_noise=1e300)
+    with pytest.raises(NoPointsError, match="noise put it"):
+        simulate_lidar(np.full((240, 320), 8.0), CAMERA, IDEAL, 0, settings)
+
+
+def test_a_scanner_of_too_many_points_a_turn_is_refused_before_they_are_made() -> None:
+    with pytest.raises(UsageError, match="1,474,560,000 points a turn"):
+        Lidar(name="x", elevations_deg=(0.0,) * 4096, azimuth_step_deg=0.001, max_range=9)

@@ -11,15 +11,16 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from pnpdepth_cli.io.layouts.frame import (
-    PICTURES,
+from pnpdepth_cli.io.dataset.frame import (
+    IMAGE_SUFFIXES,
     Frame,
     Listing,
     Unmatched,
     by_stem,
     without_partner,
 )
-from pnpdepth_cli.io.layouts.protocols import PROTOCOLS
+from pnpdepth_cli.io.dataset.protocols import PROTOCOLS
+from pnpdepth_cli.io.layouts import Layout
 
 _PNG = (".png",)
 _SCALE = 256.0
@@ -45,7 +46,7 @@ def _selection(root: Path) -> Listing:
     truth_folder = next(
         (p for p in (root / "groundtruth_depth", root / "groundtruth") if p.is_dir()), root / "none"
     )
-    images = _by_frame(root / "image", PICTURES)
+    images = _by_frame(root / "image", IMAGE_SUFFIXES)
     scans = _by_frame(root / "velodyne_raw", _PNG)
     truth = _by_frame(truth_folder, _PNG)
     intrinsics = _by_frame(root / "intrinsics", (".txt",))
@@ -94,7 +95,7 @@ def _drives(root: Path) -> Listing:
             broken.append(_without_images(root, drive, camera))
             continue
         truth = by_stem(drive / "proj_depth" / "groundtruth" / camera, _PNG)
-        pictures, scans = by_stem(images, PICTURES), by_stem(folder, _PNG)
+        pictures, scans = by_stem(images, IMAGE_SUFFIXES), by_stem(folder, _PNG)
         frames += [
             Frame(
                 name=f"{drive.name}_{stem}_{camera}",
@@ -136,3 +137,6 @@ def _without_images(root: Path, drive: Path, camera: str) -> Unmatched:
         why=f"has no {camera}/data with images; put KITTI's raw drive {drive.name} there, or into"
         f" {place}",
     )
+
+
+LAYOUT = Layout(matches=matches, listing=listing)

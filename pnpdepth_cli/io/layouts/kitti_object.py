@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from pnpdepth_cli.io.layouts.frame import (
-    PICTURES,
+from pnpdepth_cli.io.dataset.frame import (
+    IMAGE_SUFFIXES,
     Frame,
     Listing,
     Unmatched,
     by_stem,
     without_partner,
 )
+from pnpdepth_cli.io.layouts import Layout
 
 
 def matches(root: Path) -> bool:
@@ -25,7 +26,7 @@ def listing(root: Path) -> Listing:
     broken: list[Unmatched] = []
     spare: list[Unmatched] = []
     for part in _parts(root):
-        images = by_stem(part / "image_2", PICTURES)
+        images = by_stem(part / "image_2", IMAGE_SUFFIXES)
         scans = by_stem(part / "velodyne", (".bin",))
         calibrations = by_stem(part / "calib", (".txt",))
         prefix = "" if part == root else f"{part.name}_"
@@ -50,3 +51,6 @@ def _parts(root: Path) -> list[Path]:
     candidates = (root, root / "training", root / "testing")
     needed = ("image_2", "velodyne", "calib")
     return [p for p in candidates if all((p / name).is_dir() for name in needed)]
+
+
+LAYOUT = Layout(matches=matches, listing=listing)

@@ -11,9 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from pnpdepth_cli.errors import FileFormatError, InputError
-from pnpdepth_cli.io.file_bytes import one_line, read_bytes
-from pnpdepth_cli.io.layouts.frame import (
-    PICTURES,
+from pnpdepth_cli.io.dataset.frame import (
+    IMAGE_SUFFIXES,
     Frame,
     Listing,
     Pose,
@@ -21,7 +20,9 @@ from pnpdepth_cli.io.layouts.frame import (
     by_stem,
     without_partner,
 )
-from pnpdepth_cli.io.layouts.protocols import PROTOCOLS
+from pnpdepth_cli.io.dataset.protocols import PROTOCOLS
+from pnpdepth_cli.io.file_bytes import one_line, read_bytes
+from pnpdepth_cli.io.layouts import Layout
 
 
 def matches(root: Path) -> bool:
@@ -40,7 +41,7 @@ def listing(root: Path) -> Listing:
     spare: list[Unmatched] = []
     for sequence in _sequences(root):
         scans = by_stem(sequence / "velodyne", (".bin",))
-        images = by_stem(sequence / "image_2", PICTURES)
+        images = by_stem(sequence / "image_2", IMAGE_SUFFIXES)
         poses = _poses(sequence)
         frames += [
             Frame(
@@ -99,3 +100,6 @@ def _pose(path: Path, number: int, line: str) -> Pose:
             f"{path}, line {number}: {one_line(line)[:60]!r} is not 12 finite numbers"
         )
     return tuple(tuple(values[start : start + 4]) for start in (0, 4, 8))
+
+
+LAYOUT = Layout(matches=matches, listing=listing)

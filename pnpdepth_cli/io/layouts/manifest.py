@@ -1,9 +1,9 @@
 """`manifest`: a CSV with a header line, or JSON lines, of frames whose files lie anywhere.
 
-Columns or keys: image, sparse, gt, calib, camera, sparse_scale, gt_scale, name, protocol; all may
-be left out or empty but one of image and sparse. Paths are relative to the manifest. A frame
-without a name is called by its image's stem; if stems come twice, by its place below the folder
-that all of the images are in.
+Columns or keys: image, sparse, gt, calib, camera, sparse_scale, gt_scale, name, group, protocol;
+all may be left out or empty but one of image and sparse. Paths are relative to the manifest. A
+frame without a name is called by its image's stem; if stems come twice, by its path below the
+folder that all of the images are in. Frames of one group are of one sequence.
 """
 
 from __future__ import annotations
@@ -17,13 +17,15 @@ from pathlib import Path
 from typing import Any
 
 from pnpdepth_cli.errors import FileFormatError
+from pnpdepth_cli.io.dataset.frame import Frame, Listing, Unmatched
+from pnpdepth_cli.io.dataset.frame_names import normalised_name, portable_name_problem
+from pnpdepth_cli.io.dataset.protocols import WHOLE, find_protocol
 from pnpdepth_cli.io.file_bytes import one_line, read_bytes
-from pnpdepth_cli.io.layouts.frame import Frame, Listing, Unmatched
-from pnpdepth_cli.io.layouts.protocols import WHOLE, find_protocol
+from pnpdepth_cli.io.layouts import Layout
 
 _PATHS = ("image", "sparse", "gt", "calib")
 _NUMBERS = {"camera": int, "sparse_scale": float, "gt_scale": float}
-_KEYS = (*_PATHS, *_NUMBERS, "name", "protocol")
+_KEYS = (*_PATHS, *_NUMBERS, "name", "group", "protocol")
 
 
 def matches(root: Path) -> bool:
@@ -37,15 +39,19 @@ def listing(root: Path) -> Listing:
         text = read_bytes(root).decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise FileFormatError(f"{root} is not a text file; give CSV or JSON lines") from error
-    rows = _csv_rows(text) if root.suffix.lower() == ".csv" else _json_rows(root, text)
+    rows = _csv_rows(root, text) if root.suffix.lower() == ".csv" else _json_rows(root, text)
     parts = [(number, _parts(root, number, row)) for number, row in rows]
     frames: list[Frame] = []
     broken: list[Unmatched] = []
-    taken: set[str] = set()
+    taken: dict[str, str] = {}
     for (number, given), name in zip(parts, _names([p for _, p in parts]), strict=True):
-        if name in taken:
-            raise FileFormatError(f"{root}, line {number}: a second frame {name!r}; name it")
-        taken.add(name)
+        same = taken.get(name.casefold())
+        if same is not None:
+            alike = "" if same == name else f", which some disks take for {same!r}"
+            raise FileFormatError(
+                f"{root}, line {number}: a second frame {one_line(name)!r}{alike}; name it"
+            )
+        taken[name.casefold()] = name
         frames.append(Frame(**given | {"name": name}))
         lost = [file for file in _files(given) if not file.exists()]
         why = f"does not exist; correct line {number} of {root}"
@@ -70,10 +76,13 @@ def _names(parts: Sequence[dict[str, Any]]) -> list[str]:
     ]
 
 
-def _csv_rows(text: str) -> Iterator[tuple[int, dict[str, Any]]]:
+def _csv_rows(path: Path, text: str) -> Iterator[tuple[int, dict[str, Any]]]:
     reader = csv.DictReader(io.StringIO(text, newline=""), restkey="more than the header has")
-    for row in reader:
-        yield reader.line_num, {str(k).strip(): v for k, v in row.items()}
+    try:
+        for row in reader:
+            yield reader.line_num, {str(k).strip(): v for k, v in row.items()}
+    except csv.Error as error:
+        raise FileFormatError(f"{path}, line {reader.line_num}: {one_line(error)}") from error
 
 
 def _json_rows(path: Path, text: str) -> Iterator[tuple[int, dict[str, Any]]]:
@@ -100,12 +109,29 @@ def _parts(path: Path, number: int, row: dict[str, Any]) -> dict[str, Any]:
             f"{where}: column {unknown[0]!r} is not one of {', '.join(_KEYS)}{commas}"
         )
     files: dict[str, Any] = {k: path.parent / given[k] for k in _PATHS if k in given}
+    nul = next((k for k, v in given.items() if "\0" in v), None)
+    if nul is not None:
+        raise FileFormatError(f"{where}: {nul} holds a NUL character; correct it")
     if "image" not in files and "sparse" not in files:
         raise FileFormatError(f"{where}: has neither image nor sparse; give one")
     try:
         numbers: dict[str, Any] = {k: f(given[k]) for k, f in _NUMBERS.items() if k in given}
-    except ValueError as error:
+    except (ValueError, OverflowError) as error:
         raise FileFormatError(f"{where}: {one_line(error)}") from error
     protocol = find_protocol(given["protocol"]) if "protocol" in given else WHOLE
-    named = {"name": given["name"]} if "name" in given else {}
-    return {"protocol": protocol, **named, **files, **numbers}
+    group = {"group": given["group"]} if "group" in given else {}
+    return {"protocol": protocol, **_given_name(where, given), **group, **files, **numbers}
+
+
+def _given_name(where: str, given: dict[str, str]) -> dict[str, str]:
+    if "name" not in given:
+        return {}
+    problem = portable_name_problem(given["name"])
+    if problem is not None:
+        raise FileFormatError(
+            f"{where}: name {one_line(given['name'])[:60]!r} {problem}; choose another"
+        )
+    return {"name": normalised_name(given["name"])}
+
+
+LAYOUT = Layout(matches=matches, listing=listing)

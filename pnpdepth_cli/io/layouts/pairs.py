@@ -8,9 +8,18 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from pnpdepth_cli.io.layouts.find_files import find_files
-from pnpdepth_cli.io.layouts.frame import DEPTHS, PICTURES, SCANS, Frame, Listing, without_partner
+from pnpdepth_cli.io.dataset.find_files import find_files
+from pnpdepth_cli.io.dataset.frame import (
+    IMAGE_SUFFIXES,
+    SCAN_ONLY_SUFFIXES,
+    Frame,
+    Listing,
+    without_partner,
+)
+from pnpdepth_cli.io.formats import DEPTH_SUFFIXES
+from pnpdepth_cli.io.layouts import Layout
 
+_SPARSE_SUFFIXES = (*DEPTH_SUFFIXES, *SCAN_ONLY_SUFFIXES, ".csv")
 _CALIBRATIONS = (".txt", ".json", ".yaml", ".yml")
 
 
@@ -21,9 +30,9 @@ def matches(root: Path) -> bool:
 
 def listing(root: Path) -> Listing:
     """One frame for each image with sparse depth."""
-    images, lost_images = find_files(root / "rgb", PICTURES)
-    sparse, lost_sparse = find_files(root / "sparse", (*DEPTHS, *SCANS, ".csv"))
-    gt, lost_gt = find_files(root / "gt", DEPTHS)
+    images, lost_images = find_files(root / "rgb", IMAGE_SUFFIXES)
+    sparse, lost_sparse = find_files(root / "sparse", _SPARSE_SUFFIXES)
+    gt, lost_gt = find_files(root / "gt", DEPTH_SUFFIXES)
     calib, lost_calib = find_files(root / "calib", _CALIBRATIONS)
     shared = root / "calib.txt"
     frames = [
@@ -52,3 +61,6 @@ def listing(root: Path) -> Listing:
             for each in without_partner(others, images, root / "rgb")
         ),
     )
+
+
+LAYOUT = Layout(matches=matches, listing=listing)

@@ -15,13 +15,16 @@ No file here is a calibration that `read_calibration` takes, so frames have none
 from __future__ import annotations
 
 import re
+import struct
 from collections.abc import Iterator
 from pathlib import Path
 
-from pnpdepth_cli.io.layouts.frame import Frame, Listing, Unmatched, by_stem, without_partner
+from pnpdepth_cli.io.dataset.frame import Frame, Listing, Unmatched, by_stem, without_partner
+from pnpdepth_cli.io.layouts import Layout
 
 _PNG = (".png",)
 _SCALE = 100.0
+_SIZE = (1280, 760)
 _CAMERAS = "Stereo_*/Omni_*"
 _RANDOM_STEM = re.compile(r"\d{7}")
 
@@ -48,6 +51,15 @@ def listing(root: Path) -> Listing:
     return Listing(frames=frames, broken=tuple(broken), spare=tuple(spare))
 
 
+def _has_synthias_size(image: Path) -> bool:
+    """False for a PNG of another size; a file that is no PNG is reported when it is read."""
+    with image.open("rb") as file:
+        header = file.read(24)
+    if len(header) < 24 or not header.startswith(b"\x89PNG"):
+        return True
+    return struct.unpack_from(">II", header, 16) == _SIZE
+
+
 def _cameras(root: Path) -> Iterator[tuple[list[str], Path, Path]]:
     """What its frames' names begin with, its pictures and its depth, for each camera."""
     for pictures in sorted(p for start in ("", "*/") for p in root.glob(f"{start}RGB")):
@@ -58,6 +70,11 @@ def _cameras(root: Path) -> Iterator[tuple[list[str], Path, Path]]:
         for camera in sorted(p for p in pictures.glob(_CAMERAS) if p.is_dir()):
             place = camera.relative_to(pictures)
             yield [*prefix, *place.parts], camera, depth / place
-        # RGB and Depth are common names: only the numbers tell the random set from other data
-        if any(_RANDOM_STEM.fullmatch(p.stem) for p in pictures.glob("*.png")):
+        # RGB and Depth are common names; numbers and size tell the random set from other data.
+        random = (p for p in sorted(pictures.glob("*.png")) if _RANDOM_STEM.fullmatch(p.stem))
+        first = next(random, None)
+        if first is not None and _has_synthias_size(first):
             yield prefix, pictures, depth / "Depth" if (depth / "Depth").is_dir() else depth
+
+
+LAYOUT = Layout(matches=matches, listing=listing)

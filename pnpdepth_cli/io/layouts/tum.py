@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from pnpdepth_cli.errors import FileFormatError
+from pnpdepth_cli.io.dataset.frame import Frame, Listing, Unmatched
 from pnpdepth_cli.io.file_bytes import one_line, read_bytes
-from pnpdepth_cli.io.layouts.frame import Frame, Listing, Unmatched
+from pnpdepth_cli.io.layouts import Layout
 
 _SCALE = 5000.0
 _LONGEST_GAP_S = 0.02
@@ -69,3 +70,6 @@ def _listed(path: Path) -> list[tuple[float, Path]]:
                 f"{path}, line {number}: {one_line(line)[:60]!r} is not a time and a path"
             ) from error
     return sorted(entries)
+
+
+LAYOUT = Layout(matches=matches, listing=listing)

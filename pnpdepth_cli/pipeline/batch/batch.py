@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol
 
 from pnpdepth_cli.io.atomic import make_folder
-from pnpdepth_cli.io.layouts.frame import Frame
+from pnpdepth_cli.io.dataset.frame import Frame
 from pnpdepth_cli.io.lock import in_turn, locked_folder
 from pnpdepth_cli.io.report import remove_report_leftovers
 from pnpdepth_cli.pipeline.batch.frames import (
@@ -129,14 +129,14 @@ def _to_do(
     OutputError if one would replace a file that is not a batch's, unless that is allowed.
     """
     frames, reasons = [], Counter[str]()
-    if state.fresh and not request.refine.overwrite:
+    if state.fresh and not request.refine.outputs.overwrite:
         state.check_foreign(request.output / name for name in (CSV, JSON))
     for frame in found.chosen:
         task = task_of(request, frame)
         why = state.why_to_do(task)
         if why is None:
             continue
-        if why == NEW and not request.refine.overwrite:
+        if why == NEW and not request.refine.outputs.overwrite:
             state.check_foreign(task.outputs.paths())
         frames.append(frame)
         reasons[why] += 1
@@ -179,7 +179,7 @@ def _report_of(request: BatchRequest, found: BatchFrames) -> BatchReport | None:
     report = BatchReport(folder=request.html, output=request.output, workers=request.workers)
     files = (path for frame in found.frames for path in source_files(frame))
     inputs = [request.source, *(files if request.html.exists() else ())]
-    report.check(inputs, overwrite=request.refine.overwrite)
+    report.check(inputs, overwrite=request.refine.outputs.overwrite)
     return report
 
 

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 from pnpdepth_cli.errors import InputError, OutputError, UsageError
+from pnpdepth_cli.io.dataset.frame import SCAN_ONLY_SUFFIXES, Frame, Source, Unmatched
+from pnpdepth_cli.io.dataset.frame_names import name_problem
+from pnpdepth_cli.io.file_bytes import one_line
 from pnpdepth_cli.io.layouts import LAYOUTS, find_protocol, list_frames
-from pnpdepth_cli.io.layouts.frame import SCANS, Frame, Source, Unmatched
 from pnpdepth_cli.pipeline.refinement.output_files import Outputs
-from pnpdepth_cli.pipeline.refinement.request import RefineRequest
+from pnpdepth_cli.pipeline.refinement.request import FrameFiles, RefineRequest
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,17 +86,17 @@ def find_frames(request: BatchRequest) -> BatchFrames:
     if not frames:
         first = f" ({lost[0]})" if lost else ""
         raise InputError(
-            f"{request.source} looks like {layout.name!r} but has no frame in it{first};"
+            f"{request.source} looks like {layout!r} but has no frame in it{first};"
             f" layouts are {', '.join(LAYOUTS)}"
         )
-    if request.refine.sample is None and all(frame.sparse is None for frame in frames):
+    if request.refine.files.sample is None and all(frame.sparse is None for frame in frames):
         raise UsageError(
-            f"{request.source} looks like {layout.name!r}, which has no sparse depth; --sample 500"
+            f"{request.source} looks like {layout!r}, which has no sparse depth; --sample 500"
             " takes so many points of the ground truth"
         )
     number, of = request.shard or (1, 1)
     return BatchFrames(
-        layout=layout.name,
+        layout=layout,
         frames=frames,
         chosen=frames[: request.limit][number - 1 :: of],
         unmatched=tuple(unmatched),
@@ -103,17 +105,17 @@ def find_frames(request: BatchRequest) -> BatchFrames:
 
 def task_of(request: BatchRequest, frame: Frame) -> Task:
     """What is to be done with a frame; what the user said goes before what the data set says."""
-    asked = request.refine
+    asked = request.refine.files
     sparse = frame.sparse if asked.sample is None else None
     protocol = frame.protocol if request.protocol is None else find_protocol(request.protocol)
     is_scan = sparse is not None and (
-        asked.scan.calib is not None or sparse.suffix.lower() in SCANS
+        asked.scan.calib is not None or sparse.suffix.lower() in SCAN_ONLY_SUFFIXES
     )
     scan = asked.scan
     if is_scan:
         camera = frame.camera if scan.camera is None else scan.camera
         scan = replace(scan, calib=scan.calib or frame.calib, camera=camera)
-    wanted = replace(
+    files = replace(
         asked,
         image=frame.image,
         sparse=sparse,
@@ -125,9 +127,9 @@ def task_of(request: BatchRequest, frame: Frame) -> Task:
     )
     return Task(
         name=frame.name,
-        request=wanted,
-        inputs=dict(_input_files(wanted, is_scan=is_scan)),
-        outputs=Outputs.in_folder(request.output, frame.name, asked),
+        request=replace(request.refine, files=files),
+        inputs=dict(_input_files(files, is_scan=is_scan)),
+        outputs=Outputs.in_folder(request.output, frame.name, request.refine),
     )
 
 
@@ -137,16 +139,16 @@ def source_files(frame: Frame) -> list[Path]:
     return [part if isinstance(part, Path) else part.path for part in parts if part is not None]
 
 
-def _input_files(request: RefineRequest, *, is_scan: bool) -> Iterator[tuple[str, Path]]:
+def _input_files(files: FrameFiles, *, is_scan: bool) -> Iterator[tuple[str, Path]]:
     parts: dict[str, Source | None] = {
-        "image": request.image,
-        "sparse": request.sparse,
-        "gt": request.gt,
+        "image": files.image,
+        "sparse": files.sparse,
+        "gt": files.gt,
     }
     for part, source in parts.items():
         if source is not None:
             yield part, source if isinstance(source, Path) else source.path
-    calib = request.scan.calib
+    calib = files.scan.calib
     if is_scan and calib is not None:
         if calib.is_dir():
             yield from ((f"calib {p.name}", p) for p in sorted(calib.glob("calib_*.txt")))
@@ -186,9 +188,9 @@ def _own_names(found: tuple[list[Frame], list[Unmatched]]) -> tuple[list[Frame],
         why = f"is a second frame {frame.name!r}; rename it" if frame.name in kept else None
         if frame.name == "summary":
             why = "would be recorded in summary.json, which is the batch's own; rename it"
-        place = PurePosixPath(frame.name)
-        if place.is_absolute() or ".." in place.parts:
-            why = f"is named {frame.name!r}, which leads out of the output folder; rename it"
+        problem = name_problem(frame.name)
+        if problem is not None:
+            why = f"is named {one_line(frame.name)!r}, which {problem}; rename it"
         if why is None:
             kept[frame.name] = frame
         else:

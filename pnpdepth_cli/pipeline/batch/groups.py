@@ -141,7 +141,7 @@ class FrameGroups:
     def _pass(
         self, tasks: Sequence[FrameToRefine], settings: RefineSettings
     ) -> list[RefinedFrame | PnpDepthError]:
-        torch.manual_seed(self._refiner.request.seed)
+        torch.manual_seed(self._refiner.request.hold_out.seed)
         return refine_frames(self._refiner.network, self._split, settings, tasks)
 
     def _tried(self, size: tuple[int, int], alone: Sequence[_Alone]) -> int:
@@ -210,9 +210,9 @@ class FrameGroups:
 
 def _why_alone(request: RefineRequest) -> str | None:
     """Why each frame has to be refined by itself, None where it has not."""
-    if request.needs_folds:
+    if request.hold_out.needs_folds:
         return "what goes by held-out points is chosen for each frame alone"
-    if request.tile is not None:
+    if request.network.tile is not None:
         return "tiles go through the network one by one"
     return None
 

@@ -73,7 +73,7 @@ def settle_refiner(tasks: Iterable[Task], say: Callable[[str], None]) -> Refiner
         refiner = load_refiner(task.request, first)
         for note in refiner.network.notes:
             say(note)
-        if task.request.auto:
+        if task.request.hold_out.auto:
             return _with_ways(refiner, list(tasks), first, say)
         s = refiner.settings
         say(

@@ -12,19 +12,24 @@ from pnpdepth_cli import __version__
 from pnpdepth_cli.io.record import plain, sha256_of
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest
 
-_FILES = ("image", "sparse", "gt", "output", "overwrite", "model", "checkpoint")
-"""Fields of a request that say where something lies; what lies there has digests of its own."""
 
+def settings_of(request: RefineRequest, model: dict[str, Any], *groups: str) -> dict[str, Any]:
+    """Returns all that decides the result except the frame's own files, in JSON's own types.
 
-def settings_of(request: RefineRequest, model: dict[str, Any]) -> dict[str, Any]:
-    """All that decides the result but the frame's own files, in JSON's own types.
-
-    model: what `model_identity` says.
+    Args:
+        request: What is asked for.
+        model: What `model_identity` returns.
+        *groups: Names of the request's groups. None: all of them.
     """
-    asked = {name: value for name, value in asdict(request).items() if name not in _FILES}
-    # Two devices of a kind give the same, so shards may have one each.
-    asked["device"] = request.device.split(":")[0]
-    asked["scan"].pop("calib")
+    asked = request.settings(*groups)
+    if "device" in asked:  # two devices of a kind give the same, so shards may have one each
+        asked["device"] = asked["device"].split(":")[0]
+    if "scan" in asked:
+        asked["scan"] = asdict(asked["scan"])
+        del asked["scan"]["calib"]
+    for name in ("sample", "protocol"):
+        if asked.get(name) is not None:
+            asked[name] = asdict(asked[name])
     settings: dict[str, Any] = plain(asked | model)
     return settings
 
@@ -40,7 +45,7 @@ def model_identity(request: RefineRequest) -> dict[str, Any]:
 
     A file's name, which may have an :ATTRIBUTE or :OUTPUT behind it, counts; its folder does not.
     """
-    spec, checkpoint = request.model, request.checkpoint
+    spec, checkpoint = request.network.model, request.network.checkpoint
     path, colon, choice = Path(spec), "", ""
     if not path.exists() and ":" in spec:
         start, colon, choice = spec.rpartition(":")

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from pnpdepth_cli.io.atomic import atomic_path
+from pnpdepth_cli.io.csv_text import text_cell
 from pnpdepth_cli.io.record import plain
 
 CSV, JSON = "summary.csv", "summary.json"
@@ -132,7 +133,7 @@ def write_table(path: Path, rows: Iterable[Mapping[str, Any]]) -> None:
             measured = dict(_measures(row))
             writer.writerow(
                 [
-                    *(row["name"], row["status"], row["message"]),
+                    *(text_cell(row["name"]), row["status"], text_cell(row["message"] or "")),
                     *(points.get("used"), points.get("held_out"), row.get("improved_share")),
                     *(
                         measured.get((kind, stage, measure))
@@ -140,7 +141,7 @@ def write_table(path: Path, rows: Iterable[Mapping[str, Any]]) -> None:
                         for stage in _STAGES
                         for measure in measures
                     ),
-                    "; ".join(row.get("warnings") or ()),
+                    text_cell("; ".join(row.get("warnings") or ())),
                     *(seconds.get(stage) for stage in ("read", "refine", "write")),
                 ]
             )

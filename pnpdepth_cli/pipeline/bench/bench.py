@@ -32,7 +32,14 @@ from pnpdepth_cli.pipeline.refinement.frame import FrameToRefine, refine_frame
 from pnpdepth_cli.pipeline.refinement.inputs import read_inputs
 from pnpdepth_cli.pipeline.refinement.output_files import plan_outputs
 from pnpdepth_cli.pipeline.refinement.outputs import write_outputs
-from pnpdepth_cli.pipeline.refinement.request import RefineRequest, effective_settings, layer_name
+from pnpdepth_cli.pipeline.refinement.request import (
+    FrameFiles,
+    MethodOptions,
+    NetworkChoice,
+    OutputOptions,
+    RefineRequest,
+)
+from pnpdepth_cli.pipeline.refinement.resolve import resolve_layer, resolve_settings
 from pnpdepth_cli.pipeline.stopwatch import versions
 from pnpdepth_cli.points import SparsePoints
 
@@ -151,17 +158,17 @@ class _Subject:
         own = (policy.height, policy.width) if isinstance(policy, Fixed) else DEFAULT_SIZE
         rgb, points = made_up_frame(request.size or own, request.points)
         asked = RefineRequest(
-            image=folder / "rgb.png",
-            sparse=folder / "sparse.png",
-            output=folder / "out",
-            overwrite=True,
-            model=request.model,
-            layer=request.layer,
-            iterations=request.iterations,
-            # What random weights give has nothing to do with the points.
-            align=None if network.checkpoint or definition.complete else "none",
+            files=FrameFiles(image=folder / "rgb.png", sparse=folder / "sparse.png"),
+            network=NetworkChoice(model=request.model),
+            method=MethodOptions(
+                layer=request.layer,
+                iterations=request.iterations,
+                # What random weights give has nothing to do with the points.
+                align=None if network.checkpoint or definition.complete else "none",
+            ),
+            outputs=OutputOptions(output=folder / "out", overwrite=True),
         )
-        _write_frame(asked, rgb, points)
+        _write_frame(asked.files, rgb, points)
         frame = FrameMap.fit(definition.size, *points.size)
         at = frame.points_to_network(points).to(network.device)
         if not len(at):
@@ -172,8 +179,8 @@ class _Subject:
             request=request,
             asked=asked,
             network=network,
-            layer=layer_name(definition, request.layer),
-            settings=effective_settings(definition, asked),
+            layer=resolve_layer(definition, request.layer),
+            settings=resolve_settings(definition, asked.method),
             frame=frame,
             rgb=rgb,
             points=at,
@@ -314,11 +321,11 @@ def _network(request: BenchRequest, precision: str) -> Network:
     )
 
 
-def _write_frame(asked: RefineRequest, rgb: Tensor, points: SparsePoints) -> None:
-    assert isinstance(asked.image, Path)
-    assert asked.sparse is not None
-    cv2.imwrite(str(asked.image), (255 * rgb[0].permute(1, 2, 0)).round().byte().numpy())
-    write_depth(asked.sparse, points.scatter()[0, 0].numpy(), scale=_CODES)
+def _write_frame(files: FrameFiles, rgb: Tensor, points: SparsePoints) -> None:
+    assert isinstance(files.image, Path)
+    assert files.sparse is not None
+    cv2.imwrite(str(files.image), (255 * rgb[0].permute(1, 2, 0)).round().byte().numpy())
+    write_depth(files.sparse, points.scatter()[0, 0].numpy(), scale=_CODES)
 
 
 def _limit(front: float, rear: float, iterations: int) -> float | None:

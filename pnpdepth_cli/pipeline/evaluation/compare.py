@@ -4,66 +4,99 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from pnpdepth_cli.core.metrics import Measure
 from pnpdepth_cli.errors import InputError, UsageError
 from pnpdepth_cli.io.record import plain
-from pnpdepth_cli.pipeline.evaluation.averages import (
-    LEVEL,
-    Floats,
-    FrameTable,
-    bootstrap,
-    sign_flip_p_values,
+from pnpdepth_cli.pipeline.evaluation.averages import Floats, FrameTable
+from pnpdepth_cli.pipeline.evaluation.dependence import (
+    MIN_CLUSTERS,
+    Clusters,
+    find_clusters,
+    independent_frames,
 )
 from pnpdepth_cli.pipeline.evaluation.pairing import some_names
+from pnpdepth_cli.pipeline.evaluation.resampling import (
+    LEVEL,
+    holm,
+    sign_flip_p_values,
+    studentised_interval,
+)
 from pnpdepth_cli.pipeline.evaluation.runs import Run, read_run
+
+ALPHA = 0.05
+_LEAST_COVERAGE_DIFFERENCE = 0.001
+"""Runs whose scored fractions of the ground truth differ by more are not ranked silently."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Gain:
-    """How much better than the first run; positive is better, whichever way the measure points.
+    """How much better a run is than the first one; positive is better for every measure.
 
-    percent: of the first run's mean. low_percent, high_percent: its 95 % interval, bootstrap over
-    the frames. difference: of the means, this run's minus the first's. p_value: of no difference,
-    two-sided, by swapping the runs frame by frame. NaN where there is none, as for a single frame.
+    Values are NaN where there is none, as for a single frame.
     """
 
     percent: float
+    """Of the first run's mean."""
     low_percent: float
+    """Lower end of its 95 % interval, a studentised bootstrap over the clusters of frames."""
     high_percent: float
+    """Upper end."""
     difference: float
+    """This run's mean minus the first run's, in the measure's unit."""
     p_value: float
+    """Two-sided, of no difference, by swapping the runs cluster by cluster."""
+    p_adjusted: float
+    """The same, adjusted for the number of measures (Holm 1979)."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class RunMean:
-    """A run's means over the frames that all runs have, by the measure's key."""
+    """A run's means over the frames that all runs have."""
 
     label: str
+    """The run's name in tables."""
     path: str
+    """Its file, as the user gave it."""
     mean: dict[str, float]
+    """By the measure's key."""
+    coverage: float | None = None
+    """Fraction of the ground truth's pixels that is scored; None where files do not say."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Comparison:
-    """Runs on the frames they share. gains: of each run but the first, by the measure's key."""
+    """Runs on the frames they share."""
 
     names: tuple[str, ...]
+    """The shared frames."""
     measures: tuple[Measure, ...]
+    """Those that all runs have."""
     scoring: dict[str, Any]
+    """The rules by which all runs were scored."""
     runs: tuple[RunMean, ...]
+    """In the user's order; the first is what the others are compared with."""
     gains: tuple[dict[str, Gain], ...]
+    """Of each run but the first, by the measure's key."""
+    clusters: Clusters
+    """What is resampled and swapped as a whole."""
     exact: bool
+    """True if the p-values are of all swaps, not of random ones."""
     resamples: int
+    """Bootstrap samples, and the most swaps."""
     seed: int
-    notes: tuple[str, ...]
+    """Of the random numbers."""
+    notes: tuple[str, ...] = field(default=())
+    """Warnings, one line each."""
 
     def as_record(self) -> dict[str, Any]:
-        """What `--json` prints; NaN is null."""
+        """Returns what `--json` prints; NaN is null."""
         record = {
             "command": "compare",
             "frames": list(self.names),
@@ -72,26 +105,42 @@ class Comparison:
             "runs": [asdict(run) for run in self.runs],
             "gains": [{key: asdict(gain) for key, gain in gains.items()} for gains in self.gains],
             "level": LEVEL,
+            "clusters": {"count": self.clusters.count, "unit": self.clusters.unit},
             "resamples": self.resamples,
             "seed": self.seed,
             "exact_p_values": self.exact,
             "notes": list(self.notes),
         }
-        found: dict[str, Any] = plain(record)
-        return found
+        result: dict[str, Any] = plain(record)
+        return result
 
 
-def compare(paths: Sequence[str], *, resamples: int = 10_000, seed: int = 0) -> Comparison:
-    """The runs in these files (see `read_run`), on the frames that all of them scored.
+@dataclass(frozen=True, kw_only=True)
+class CompareRequest:
+    """Which runs to compare, and how their differences are tested."""
 
-    UsageError for fewer than two; InputError where they were scored by different rules, or have
-    no frame in common.
+    paths: Sequence[str]
+    """Files as `read_run` takes them; the first is the reference."""
+    resamples: int = 10_000
+    """Bootstrap samples, and the most swaps of the permutation test."""
+    seed: int = 0
+    """Of both."""
+    grouped: bool = True
+    """False if every frame counts as independent."""
+
+
+def compare(request: CompareRequest) -> Comparison:
+    """Returns the runs on the frames that all of them scored, compared with the first.
+
+    Raises:
+        UsageError: For fewer than two runs.
+        InputError: If they were scored by different rules, or have no frame in common.
     """
-    if len(paths) < 2:
+    if len(request.paths) < 2:
         raise UsageError("two runs at least are needed to compare")
-    if resamples < 1:
-        raise UsageError(f"--bootstrap {resamples}: at least one resample is needed")
-    runs = [read_run(path) for path in paths]
+    if request.resamples < 1:
+        raise UsageError(f"--bootstrap {request.resamples}: at least one resample is needed")
+    runs = [read_run(path) for path in request.paths]
     for run in runs[1:]:
         _check_rules(runs[0], run)
     names = tuple(name for name in runs[0].frames if all(name in run.frames for run in runs))
@@ -102,85 +151,116 @@ def compare(paths: Sequence[str], *, resamples: int = 10_000, seed: int = 0) -> 
     measures = tuple(measure for measure in runs[0].measures if measure.key in shared)
     keys = [measure.key for measure in measures]
     tables = [_table(run, names, keys) for run in runs]
-    means = [table.mean() for table in tables]
-    gains, exact = [], True
-    for table in tables[1:]:
-        found, exact = _gains(tables[0], table, measures, resamples, seed)
-        gains.append(found)
+    clusters = _clusters(runs, names, keys, grouped=request.grouped)
+    tests = [_gains(tables[0], table, measures, clusters, request) for table in tables[1:]]
     return Comparison(
         names=names,
         measures=measures,
         scoring=runs[0].scoring,
         runs=tuple(
-            RunMean(label=label, path=run.path, mean=dict(zip(keys, mean.tolist(), strict=True)))
-            for label, run, mean in zip(_labels(runs), runs, means, strict=True)
+            RunMean(
+                label=label,
+                path=run.path,
+                mean=dict(zip(keys, table.mean().tolist(), strict=True)),
+                coverage=_coverage(run, names),
+            )
+            for label, run, table in zip(_labels(runs), runs, tables, strict=True)
         ),
-        gains=tuple(gains),
-        exact=exact,
-        resamples=resamples,
-        seed=seed,
-        notes=tuple(_notes(runs, names)),
+        gains=tuple(gains for gains, _ in tests),
+        clusters=clusters,
+        exact=all(exact for _, exact in tests),
+        resamples=request.resamples,
+        seed=request.seed,
+        notes=(*_notes(runs, names), *_cluster_notes(clusters, len(names))),
     )
 
 
 def _check_rules(first: Run, other: Run) -> None:
     rules = sorted({*first.scoring, *other.scoring})
-    unlike = [
+    differing = [
         f"{rule} {first.scoring.get(rule)} and {other.scoring.get(rule)}"
         for rule in rules
         if first.scoring.get(rule) != other.scoring.get(rule)
     ]
-    if unlike:
+    if differing:
         raise InputError(
             f"{first.path} and {other.path} were scored by different rules"
-            f" ({'; '.join(unlike)}); score both by one protocol"
+            f" ({'; '.join(differing)}); score both by one protocol"
         )
 
 
-def _table(run: Run, names: Sequence[str], keys: Sequence[str]) -> FrameTable:
+def _values(run: Run, names: Sequence[str], keys: Sequence[str]) -> Floats:
+    """(N, M) the measures of the frames."""
     frames = [run.frames[name] for name in names]
+    return np.array([[frame.values.get(key, math.nan) for key in keys] for frame in frames])
+
+
+def _table(run: Run, names: Sequence[str], keys: Sequence[str]) -> FrameTable:
     if run.pooled:
-        return FrameTable(rows=np.array([frame.sums for frame in frames]), pooled=True)
-    rows = np.array([[frame.values.get(key, math.nan) for key in keys] for frame in frames])
-    return FrameTable(rows=rows)
+        return FrameTable(rows=np.array([run.frames[name].sums for name in names]), pooled=True)
+    return FrameTable(rows=_values(run, names, keys))
+
+
+def _clusters(
+    runs: Sequence[Run], names: Sequence[str], keys: Sequence[str], *, grouped: bool
+) -> Clusters:
+    if not grouped:
+        return independent_frames(len(names))
+    first, *others = (_values(run, names, keys) for run in runs)
+    differences = np.concatenate([other - first for other in others], axis=1)
+    return find_clusters([runs[0].frames[name].group for name in names], differences)
 
 
 def _gains(
     first: FrameTable,
     other: FrameTable,
     measures: Sequence[Measure],
-    resamples: int,
-    seed: int,
+    clusters: Clusters,
+    request: CompareRequest,
 ) -> tuple[dict[str, Gain], bool]:
-    frames = len(first.rows)
-    better = np.array([1.0 if m.higher_is_better else -1.0 for m in measures])
+    """The gains of a run by measure, and whether their p-values are exact."""
+    better = torch.tensor([1.0 if m.higher_is_better else -1.0 for m in measures]).double()
+    first_totals, other_totals = (table.cluster_totals(clusters.ids) for table in (first, other))
+    columns = first_totals.shape[1]
 
-    def percent(a: Floats, b: Floats) -> Floats:
-        with np.errstate(divide="ignore", invalid="ignore"):
-            change = np.where(a == b, 0.0, 100 * better * (b - a) / np.abs(a))
-        return np.where(np.isfinite(change), change, math.nan)
+    def percent(a: Tensor, b: Tensor) -> Tensor:
+        change = torch.where(a == b, torch.zeros_like(a), 100 * better * (b - a) / a.abs())
+        return torch.where(change.isfinite(), change, torch.full_like(change, math.nan))
 
-    def resampled(weights: Floats) -> Floats:
-        return percent(first.means(weights), other.means(weights))
+    def percent_of(totals: Tensor) -> Tensor:
+        return percent(first.means_of(totals[..., :columns]), other.means_of(totals[..., columns:]))
 
-    def swapped(flips: Floats) -> Floats:
-        moved = flips @ (other.rows - first.rows)
-        a = first.of_totals(first.rows.sum(axis=0) + moved)
-        b = other.of_totals(other.rows.sum(axis=0) - moved)
-        return b - a
+    def swapped_difference(flips: Floats) -> Floats:
+        moved = torch.from_numpy(flips @ (other_totals - first_totals))
+        a = first.means_of(torch.from_numpy(first_totals.sum(axis=0)) + moved)
+        b = other.means_of(torch.from_numpy(other_totals.sum(axis=0)) - moved)
+        return np.asarray((b - a).numpy())
 
-    a, b = first.mean(), other.mean()
-    nothing = np.full(len(measures), math.nan)
-    low, high, p_values, exact = nothing, nothing, nothing, True
-    if frames > 1:
-        low, high = bootstrap(resampled, frames, resamples, seed)
-        p_values, exact = sign_flip_p_values(swapped, frames, resamples, seed)
-    rows = zip(percent(a, b), low, high, b - a, p_values, strict=True)
-    fields = ("percent", "low_percent", "high_percent", "difference", "p_value")
+    totals = np.concatenate([first_totals, other_totals], axis=1)
+    none = np.full(len(measures), math.nan)
+    low, high, p_values, exact = none, none, none, True
+    if clusters.count >= MIN_CLUSTERS:
+        low, high = studentised_interval(percent_of, totals, request.resamples, request.seed)
+    if clusters.count > 1:
+        p_values, exact = sign_flip_p_values(
+            swapped_difference, clusters.count, request.resamples, request.seed
+        )
+    first_mean, other_mean = first.mean(), other.mean()
+    gains = percent(torch.from_numpy(first_mean), torch.from_numpy(other_mean)).numpy()
+    rows = zip(gains, low, high, other_mean - first_mean, p_values, holm(p_values), strict=True)
+    names = ("percent", "low_percent", "high_percent", "difference", "p_value", "p_adjusted")
     return {
-        measure.key: Gain(**dict(zip(fields, map(float, row), strict=True)))
+        measure.key: Gain(**dict(zip(names, map(float, row), strict=True)))
         for measure, row in zip(measures, rows, strict=True)
     }, exact
+
+
+def _coverage(run: Run, names: Sequence[str]) -> float | None:
+    frames = [run.frames[name] for name in names]
+    known = [frame.known for frame in frames if frame.known is not None]
+    if len(known) < len(frames) or not sum(known):
+        return None
+    return sum(frame.pixels for frame in frames) / sum(known)
 
 
 def _labels(runs: Sequence[Run]) -> list[str]:
@@ -190,29 +270,54 @@ def _labels(runs: Sequence[Run]) -> list[str]:
 
 
 def _notes(runs: Sequence[Run], names: Sequence[str]) -> list[str]:
+    """Warnings of frames and pixels that not all runs scored."""
     lines = []
     shared = set(names)
     for run in runs:
-        alone = [name for name in run.frames if name not in shared]
-        if alone:
+        unshared = [name for name in run.frames if name not in shared]
+        if unshared:
             lines.append(
-                f"warning: {len(alone):,} frames of {run.path} are not scored in all runs and left"
-                f" out: {some_names(alone)}"
+                f"warning: {len(unshared):,} frames of {run.path} are not scored in all runs and"
+                f" left out: {some_names(unshared)}"
             )
     frames = {name: [run.frames[name] for run in runs] for name in names}
     other_truth = [n for n, of in frames.items() if len({f.known for f in of} - {None}) > 1]
     other_pixels = [n for n, of in frames.items() if len({frame.pixels for frame in of}) > 1]
     if other_truth:
         lines.append(
-            f"warning: {len(other_truth):,} frames have another number of pixels with truth in"
-            f" another run, so they were not scored on the same: {some_names(other_truth)}"
+            f"warning: {len(other_truth):,} frames have another number of pixels with ground truth"
+            f" in another run, so the runs were not scored on the same: {some_names(other_truth)}"
         )
     elif other_pixels:
-        pixels = ", ".join(
-            f"{sum(run.frames[name].pixels for name in names):,} in {run.path}" for run in runs
-        )
-        lines.append(
-            f"warning: predictions do not cover the same pixels ({pixels}), and errors are over"
-            " what each covers; score them with one --mask"
-        )
+        lines.append(_coverage_warning(runs, names))
     return lines
+
+
+def _coverage_warning(runs: Sequence[Run], names: Sequence[str]) -> str:
+    coverages = [_coverage(run, names) for run in runs]
+    known = [coverage for coverage in coverages if coverage is not None]
+    if len(known) == len(runs) and max(known) - min(known) > _LEAST_COVERAGE_DIFFERENCE:
+        listed = ", ".join(f"{c:.2%} in {run.path}" for c, run in zip(known, runs, strict=True))
+        return (
+            f"warning: coverage differs ({listed}), and a run that leaves hard pixels empty looks"
+            " better; this is no ranking. Score with --missing max, or with one --mask"
+        )
+    pixels = ", ".join(
+        f"{sum(run.frames[name].pixels for name in names):,} in {run.path}" for run in runs
+    )
+    return (
+        f"warning: predictions do not cover the same pixels ({pixels}), and errors are over what"
+        " each covers; score them with --missing max, or with one --mask"
+    )
+
+
+def _cluster_notes(clusters: Clusters, frames: int) -> list[str]:
+    """A warning where the frames are too dependent, or too few, to conclude anything."""
+    smallest = 2.0 ** (1 - clusters.count)
+    if frames == 1 or smallest < ALPHA:
+        return []
+    return [
+        f"warning: {clusters.describe()} are too few to conclude anything: the smallest possible p"
+        f" is {smallest:.2g}" + ("" if clusters.count >= MIN_CLUSTERS else ", and there is no"
+        f" interval below {MIN_CLUSTERS}")
+    ]  # fmt: skip

@@ -1,4 +1,4 @@
-"""`pnpdepth eval`: depth files against ground truth, by a protocol."""
+"""`pnpdepth eval`: scores depth files against ground truth by a protocol."""
 
 from __future__ import annotations
 
@@ -10,36 +10,48 @@ import torch
 
 from pnpdepth_cli.core.metrics import MEASURES, SUMS, measures_of
 from pnpdepth_cli.errors import InputError, PnpDepthError, UsageError
-from pnpdepth_cli.pipeline.evaluation.averages import FrameTable, bootstrap
-from pnpdepth_cli.pipeline.evaluation.findings import FileKinds, findings
+from pnpdepth_cli.pipeline.evaluation.averages import Floats, FrameTable
+from pnpdepth_cli.pipeline.evaluation.dependence import (
+    MIN_CLUSTERS,
+    Clusters,
+    find_clusters,
+    independent_frames,
+)
+from pnpdepth_cli.pipeline.evaluation.diagnostics import FileKinds, diagnose
 from pnpdepth_cli.pipeline.evaluation.frame_scoring import (
     DEPTH_EDGES_M,
     DISTANCE_EDGES_PX,
     FrameScores,
     ScoredFrame,
-    Sums,
     score_pair,
 )
 from pnpdepth_cli.pipeline.evaluation.kitti_devkit import devkit_mean
 from pnpdepth_cli.pipeline.evaluation.pairing import FramePair, pair_frames
 from pnpdepth_cli.pipeline.evaluation.protocols import EvalProtocol, choose_protocol
-from pnpdepth_cli.pipeline.evaluation.result import EvalRequest, Evaluation, Interval, Part
+from pnpdepth_cli.pipeline.evaluation.resampling import studentised_interval
+from pnpdepth_cli.pipeline.evaluation.result import ErrorBin, EvalRequest, Evaluation, Interval
 from pnpdepth_cli.pipeline.ordered_pool import in_order
 
 
 def evaluate(
     request: EvalRequest, *, on_frame: Callable[[int, int], None] = lambda done, of: None
 ) -> Evaluation:
-    """Every frame of the truth has a row, scored or with the reason why not; and the means.
+    """Returns a row for each frame of the ground truth, scored or with the reason why not; means.
 
-    on_frame(done, of) is called after each frame. Frames are read one after the other, so memory
-    does not grow with their number. Raises the errors of `pnpdepth_cli.errors`: of two single files
-    whatever is wrong with them, of folders only what concerns all frames.
+    Frames are read one after the other, so memory does not grow with their number.
+
+    Args:
+        request: What to score, and how.
+        on_frame: Called with (done, of) after each frame.
+
+    Raises:
+        PnpDepthError: For two single files whatever is wrong with them, for folders only what
+            concerns all frames.
     """
     protocol = choose_protocol(request.protocol, **request.changes)
     _check(request)
     pairs = pair_frames(
-        request.prediction, request.truth, sparse=request.sparse, mask=protocol.mask
+        request.prediction, request.ground_truth, sparse=request.sparse, mask=protocol.mask
     )
     rows: list[FrameScores] = []
     kinds = FileKinds()
@@ -52,19 +64,31 @@ def evaluate(
             by_distance += scored.by_distance
             by_depth += scored.by_depth
         on_frame(len(rows), len(pairs.frames))
-    good = [row for row in rows if row.scored]
-    if not good:
+    scored_rows = [row for row in rows if row.scored]
+    if not scored_rows:
         raise InputError(f"no frame could be scored; the first: {rows[0].error}")
-    mean, interval = _means(good, protocol, request)
+    keys = [measure.key for measure in protocol.measures]
+    values = np.array([[row.values[key] for key in keys] for row in scored_rows])
+    table = FrameTable(rows=values)
+    if protocol.average == "pooled":
+        table = FrameTable(rows=np.array([row.sums for row in scored_rows]), pooled=True)
+    mean = devkit_mean(values) if protocol.is_devkit else table.mean()
+    clusters = _clusters(scored_rows, values, request)
     return Evaluation(
         request=request,
         protocol=protocol,
         frames=tuple(rows),
-        mean=mean,
-        interval=interval,
-        by_distance=_parts(by_distance, DISTANCE_EDGES_PX),
-        by_depth=_parts(by_depth, DEPTH_EDGES_M),
-        notes=(*pairs.notes, *kinds.notes(), *findings(rows, protocol, kinds)),
+        mean=_by_key(keys, mean),
+        interval=_interval(table, clusters, protocol, request),
+        clusters=clusters,
+        by_distance=_bins(by_distance, DISTANCE_EDGES_PX),
+        by_depth=_bins(by_depth, DEPTH_EDGES_M),
+        notes=(
+            *pairs.notes,
+            *kinds.notes(),
+            *diagnose(rows, protocol, kinds),
+            *_interval_notes(clusters, len(scored_rows), request),
+        ),
     )
 
 
@@ -72,7 +96,7 @@ def _check(request: EvalRequest) -> None:
     scales = request.scales
     for option, scale in (
         ("--pred-scale", scales.prediction),
-        ("--gt-scale", scales.truth),
+        ("--gt-scale", scales.ground_truth),
         ("--sparse-scale", scales.sparse),
     ):
         if scale is not None and not (math.isfinite(scale) and scale > 0):
@@ -102,43 +126,56 @@ def _scored(
     return in_order(scored, frames, request.workers)
 
 
-def _means(
-    good: Sequence[FrameScores], protocol: EvalProtocol, request: EvalRequest
-) -> tuple[dict[str, float], Interval | None]:
+def _clusters(rows: Sequence[FrameScores], values: Floats, request: EvalRequest) -> Clusters:
+    if not request.grouped:
+        return independent_frames(len(rows))
+    return find_clusters([row.pair.group for row in rows], values)
+
+
+def _interval(
+    table: FrameTable, clusters: Clusters, protocol: EvalProtocol, request: EvalRequest
+) -> Interval | None:
+    """The interval of each mean, inside the range that the measure can have."""
+    if clusters.count < MIN_CLUSTERS or not request.resamples:
+        return None
+    totals = table.cluster_totals(clusters.ids)
+    low, high = studentised_interval(table.means_of, totals, request.resamples, request.seed)
+    highest = [1.0 if measure.percent else math.inf for measure in protocol.measures]
     keys = [measure.key for measure in protocol.measures]
-    values = np.array([[row.values[key] for key in keys] for row in good])
-    pooled = protocol.average == "pooled"
-    table = FrameTable(
-        rows=np.array([row.sums for row in good]) if pooled else values, pooled=pooled
+    return Interval(
+        low=_by_key(keys, np.maximum(low, 0.0)), high=_by_key(keys, np.minimum(high, highest))
     )
-    mean = devkit_mean(values) if protocol.is_devkit else table.mean()
-    interval = None
-    if len(good) > 1 and request.resamples:
-        low, high = bootstrap(table.means, len(good), request.resamples, request.seed)
-        interval = Interval(low=_named(keys, low), high=_named(keys, high))
-    return _named(keys, mean), interval
 
 
-def _named(keys: Sequence[str], values: Sums) -> dict[str, float]:
+def _interval_notes(clusters: Clusters, frames: int, request: EvalRequest) -> list[str]:
+    if frames == 1 or clusters.count >= MIN_CLUSTERS or not request.resamples:
+        return []
+    return [
+        f"no interval: {clusters.describe()} are too few to tell how sure the means are;"
+        f" {MIN_CLUSTERS} are needed"
+    ]
+
+
+def _by_key(keys: Sequence[str], values: Floats) -> dict[str, float]:
     return dict(zip(keys, values.tolist(), strict=True))
 
 
-def _parts(sums: Sums, edges: tuple[float, ...]) -> tuple[Part, ...]:
-    """The parts that have truth in them."""
+def _bins(sums: Floats, edges: tuple[float, ...]) -> tuple[ErrorBin, ...]:
+    """The bins that have ground truth in them."""
     keys = [measure.key for measure in MEASURES]
     measures = measures_of(torch.from_numpy(sums)).tolist()
-    parts = []
+    bins = []
     for low, high, row, values in zip(edges, edges[1:], sums, measures, strict=False):
-        of, errors = dict(zip(SUMS, row, strict=True)), dict(zip(keys, values, strict=True))
-        if of["known"]:
-            part = Part(
+        counts, errors = dict(zip(SUMS, row, strict=True)), dict(zip(keys, values, strict=True))
+        if counts["known"]:
+            error_bin = ErrorBin(
                 low=low,
                 high=high,
-                pixels=int(of["pixels"]),
-                known=int(of["known"]),
+                pixels=int(counts["pixels"]),
+                known=int(counts["known"]),
                 rmse=errors["rmse"],
                 mae=errors["mae"],
                 mre=errors["mre"],
             )
-            parts.append(part)
-    return tuple(parts)
+            bins.append(error_bin)
+    return tuple(bins)

@@ -1,4 +1,4 @@
-"""The depths of one frame to score: read, checked against each other, and cut to what counts."""
+"""Reads the depths of one frame, checks their sizes, and masks what the protocol does not score."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import FileFormatError, InputError, SizeError
+from pnpdepth_cli.io.dataset.frame import IMAGE_SUFFIXES
 from pnpdepth_cli.io.depth import DepthImage, read_sparse
 from pnpdepth_cli.io.depth_reading import depth_from_stored, known_metres, load_stored
-from pnpdepth_cli.io.layouts import Hdf5Array, read_frame_truth
-from pnpdepth_cli.io.layouts.frame import PICTURES
+from pnpdepth_cli.io.layouts import Hdf5Array, read_frame_ground_truth
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.pipeline.evaluation.pairing import FramePair
 from pnpdepth_cli.pipeline.evaluation.protocols import EvalProtocol
 from pnpdepth_cli.points import SparsePoints, in_frame
-from pnpdepth_cli.sensors.sparse import as_picture
+from pnpdepth_cli.sensors.sparse import as_depth_image
 
 Depth = NDArray[np.float32]
 Mask = NDArray[np.bool_]
@@ -27,85 +27,99 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True, kw_only=True)
 class Scales:
-    """Codes per metre of integer files, as the user gave them; channel: of EXR and NPZ files."""
+    """How the user says that stored numbers are to be read; None leaves it to the files."""
 
     prediction: float | None = None
-    truth: float | None = None
+    """Codes per metre of integer predictions."""
+    ground_truth: float | None = None
+    """Codes per metre of integer ground truth."""
     sparse: float | None = None
+    """Codes per metre of integer sparse depth."""
     channel: str | None = None
+    """Which EXR channel or NPZ array holds the depth."""
+
+    def as_record(self) -> dict[str, float | str | None]:
+        """Returns the scales as records have them."""
+        return {
+            "prediction": self.prediction,
+            "truth": self.ground_truth,
+            "sparse": self.sparse,
+            "channel": self.channel,
+        }
 
 
 @dataclass(frozen=True, kw_only=True)
 class LoadedFrame:
-    """Depths of one size (H, W) in float32 metres, 0 where unknown.
-
-    prediction: None where there is no file. truth: 0 also where the protocol does not score.
-    sparse: the points on their pixels, None where no file is known. tolerance: how far two depths
-    that were the same before they became codes can be apart.
-    """
+    """Depths of one size (H, W) in float32 metres, 0 where unknown."""
 
     prediction: DepthImage | None
-    truth: DepthImage
+    """None where there is no file."""
+    ground_truth: DepthImage
+    """0 also where the protocol does not score."""
     sparse: Depth | None
+    """The points on their pixels; None where no file is known."""
     tolerance: float = 0.0
+    """Metres that rounding to integer codes can put between equal depths."""
 
 
 def load_frame(pair: FramePair, protocol: EvalProtocol, scales: Scales) -> LoadedFrame:
-    """The frame's files in memory, as the protocol wants them.
+    """Returns the frame's depths as the protocol scores them.
 
-    Raises the errors of reading, and SizeError where sizes differ.
+    Raises:
+        InputError: For a file that cannot be read.
+        SizeError: Where sizes differ.
     """
-    truth = _read_truth(pair, protocol, scales)
-    size = (truth.values.shape[0], truth.values.shape[1])
+    ground_truth = _read_ground_truth(pair, protocol, scales)
+    size = (ground_truth.values.shape[0], ground_truth.values.shape[1])
     prediction = None
     if pair.prediction is not None:
-        prediction = _read(
-            pair.prediction, scales.prediction, protocol.scale, scales.channel, protocol
-        )
+        prediction = _read(pair.prediction, scales.prediction, scales.channel, protocol)
         prediction = replace(
             prediction, values=_to_size(pair, prediction.values, size, protocol.resize)
         )
         if protocol.clip:
             prediction = replace(prediction, values=_clipped(prediction.values, protocol))
     sparse, sparse_scale = _known_sparse(pair, protocol, scales, size)
-    counts = _counts(pair, truth.values, protocol)
+    mask = _scored_mask(pair, ground_truth.values, protocol)
     if protocol.exclude_sparse:
         if sparse is None:
             raise InputError(
                 f"frame {pair.name} has no sparse depth file to exclude; give it with --sparse"
             )
-        counts &= sparse == 0
-    half_codes = [0.5 / scale for scale in {truth.scale, sparse_scale} if scale is not None]
+        mask &= sparse == 0
+    half_codes = [0.5 / scale for scale in {ground_truth.scale, sparse_scale} if scale is not None]
     return LoadedFrame(
         prediction=prediction,
-        truth=replace(truth, values=np.where(counts, truth.values, np.float32(0))),
+        ground_truth=replace(
+            ground_truth, values=np.where(mask, ground_truth.values, np.float32(0))
+        ),
         sparse=sparse,
         tolerance=sum(half_codes),
     )
 
 
-def _read_truth(pair: FramePair, protocol: EvalProtocol, scales: Scales) -> DepthImage:
-    frame = pair.truth
+def _read_ground_truth(pair: FramePair, protocol: EvalProtocol, scales: Scales) -> DepthImage:
+    frame = pair.frame
     if isinstance(frame.gt, Hdf5Array):
-        return DepthImage(values=read_frame_truth(frame), source=f"{frame.gt.path.suffix} array",
-                          assumed_scale=False)  # fmt: skip
+        values, source = read_frame_ground_truth(frame), f"{frame.gt.path.suffix} array"
+        return DepthImage(values=values, source=source, assumed_scale=False)
     if frame.gt is None:
         raise InputError(f"frame {pair.name} has no ground truth")
-    scale = scales.truth if scales.truth is not None else frame.gt_scale
-    image = _read(frame.gt, scale, protocol.scale, scales.channel, protocol)
+    scale = scales.ground_truth if scales.ground_truth is not None else frame.gt_scale
+    image = _read(frame.gt, scale, scales.channel, protocol)
     return replace(image, values=np.ascontiguousarray(frame.protocol.apply(image.values)))
 
 
 def _read(
-    path: Path, given: float | None, usual: float, channel: str | None, protocol: EvalProtocol
+    path: Path, scale: float | None, channel: str | None, protocol: EvalProtocol
 ) -> DepthImage:
-    """The depth image; codes are metres × the given scale, else the file's own, else the usual."""
+    """The depth image; codes are metres × the scale, else the file's own, else the protocol's."""
     stored = load_stored(path, channel)
-    assumed = given is None and stored.scale is None and stored.values.dtype.kind != "f"
-    scale = usual if assumed else given
+    assumed = scale is None and stored.scale is None and stored.values.dtype.kind != "f"
+    scale = protocol.scale if assumed else scale
     image = depth_from_stored(path, stored, scale)
     if protocol.is_devkit and image.scale is not None and stored.values.ndim == 2:
-        # the development kit takes every code but 0 for a depth, also the largest
+        # the development kit reads every code but 0 as a depth, the largest too
         image = replace(image, values=known_metres(stored.values / image.scale))
     return replace(image, assumed_scale=assumed)
 
@@ -113,8 +127,8 @@ def _read(
 def _known_sparse(
     pair: FramePair, protocol: EvalProtocol, scales: Scales, size: tuple[int, int]
 ) -> tuple[Depth | None, float | None]:
-    """As `_read_sparse`; nothing where a file that the user did not name cannot be used."""
-    if pair.sparse_asked or protocol.exclude_sparse:
+    """As `_read_sparse`; (None, None) for an unusable file that the user did not name."""
+    if pair.sparse_named or protocol.exclude_sparse:
         return _read_sparse(pair, protocol, scales, size)
     try:
         return _read_sparse(pair, protocol, scales, size)
@@ -128,42 +142,42 @@ def _read_sparse(
     """(H, W) metres of the points on their pixels, 0 elsewhere; and the file's codes per metre."""
     if pair.sparse is None:
         return None, None
-    scale = scales.sparse if scales.sparse is not None else pair.truth.sparse_scale
+    scale = scales.sparse if scales.sparse is not None else pair.frame.sparse_scale
     sparse = read_sparse(pair.sparse, size=size, scale=scale)
     if sparse.assumed_scale and protocol.scale != sparse.scale:
         sparse = read_sparse(pair.sparse, size=size, scale=protocol.scale)
     xy, source_size = sparse.points.xy, sparse.points.size
     if source_size != size:
-        xy = pair.truth.protocol.places(xy, source_size)
-        cut = pair.truth.protocol.apply(np.zeros(source_size, bool)).shape
+        xy = pair.frame.protocol.in_crop(xy, source_size)
+        cut = pair.frame.protocol.apply(np.zeros(source_size, bool)).shape
         if cut != size:
             raise _different(pair, "sparse depth", pair.sparse, source_size, size, advice="")
     inside = in_frame(xy, size)
     points = SparsePoints(xy=xy[inside], depth=sparse.points.depth[inside], size=size)
-    return as_picture(points), sparse.scale
+    return as_depth_image(points), sparse.scale
 
 
-def _counts(pair: FramePair, truth: Depth, protocol: EvalProtocol) -> Mask:
-    """(H, W) true where the protocol scores the truth, if it is known there."""
-    top, bottom, left, right = protocol.window((truth.shape[0], truth.shape[1]))
-    counts = np.zeros(truth.shape, bool)
-    counts[top:bottom, left:right] = True
-    counts &= truth > protocol.min_depth
+def _scored_mask(pair: FramePair, ground_truth: Depth, protocol: EvalProtocol) -> Mask:
+    """(H, W) true where the protocol scores known ground truth."""
+    top, bottom, left, right = protocol.window((ground_truth.shape[0], ground_truth.shape[1]))
+    scored = np.zeros(ground_truth.shape, bool)
+    scored[top:bottom, left:right] = True
+    scored &= ground_truth > protocol.min_depth
     if protocol.max_depth is not None:
-        counts &= truth < protocol.max_depth
+        scored &= ground_truth < protocol.max_depth
     if pair.mask is not None:
         mask = _read_mask(pair.mask)
-        if mask.shape != truth.shape:
-            raise _different(pair, "mask", pair.mask, mask.shape, truth.shape, advice="")
-        counts &= mask
+        if mask.shape != ground_truth.shape:
+            raise _different(pair, "mask", pair.mask, mask.shape, ground_truth.shape, advice="")
+        scored &= mask
     elif protocol.mask is not None:
         raise InputError(f"frame {pair.name} has no mask in {protocol.mask}; add it")
-    return counts
+    return scored
 
 
 def _read_mask(path: Path) -> Mask:
-    """(H, W) true where a picture has any channel above 0, or an array a number above 0."""
-    if path.suffix.lower() in PICTURES:
+    """(H, W) true where an image has any channel above 0, or an array a number above 0."""
+    if path.suffix.lower() in IMAGE_SUFFIXES:
         return np.asarray(read_rgb(path).values.max(axis=2) > 0)
     values = load_stored(path, None).values
     if values.ndim != 2:
@@ -172,7 +186,7 @@ def _read_mask(path: Path) -> Mask:
 
 
 def _to_size(pair: FramePair, depth: Depth, size: tuple[int, int], method: str | None) -> Depth:
-    """The depth map at the truth's size: as it is, or resized as the protocol allows."""
+    """The depth map at the ground truth's size: as it is, or resized as the protocol allows."""
     if depth.shape == size:
         return depth
     if method is None:
@@ -188,7 +202,7 @@ def _to_size(pair: FramePair, depth: Depth, size: tuple[int, int], method: str |
     total, weight = (
         cv2.resize(part, (width, height), interpolation=cv2.INTER_LINEAR) for part in (depth, known)
     )
-    # a new pixel is known where most of what it is interpolated from is
+    # a resized pixel is known where most of its interpolation weight is on known pixels
     return np.asarray(
         np.where(weight > 0.5, total / np.maximum(weight, np.float32(0.5)), 0), np.float32
     )
@@ -210,6 +224,6 @@ def _different(
 ) -> SizeError:
     (height, width), (rows, columns) = shape, size
     return SizeError(
-        f"{what} {path} is {width}×{height} but the truth {pair.truth.gt} is"
+        f"{what} {path} is {width}×{height} but the ground truth {pair.frame.gt} is"
         f" {columns}×{rows}{advice}"
     )

@@ -1,4 +1,4 @@
-"""What one frame contributes: its measures, sums that can be added up, and what is odd about it."""
+"""Scores one frame: its measures, sums over pixels that can be added up, and facts for warnings."""
 
 from __future__ import annotations
 
@@ -20,37 +20,42 @@ from pnpdepth_cli.pipeline.evaluation.protocols import EvalProtocol
 
 DISTANCE_EDGES_PX = (0.0, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0, math.inf)
 DEPTH_EDGES_M = (0.0, 1.0, 2.0, 3.0, 5.0, 10.0, 20.0, 40.0, 80.0, math.inf)
-"""Parts are half open: from an edge up to, and without, the next."""
+"""Bins hold their lower edge and not their upper one."""
 
 Sums = NDArray[np.float64]
+"""(bins, len(SUMS)) sums over pixels, in the order of core.metrics.SUMS."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class FrameScores:
-    """One frame's row.
-
-    values: of each measure by its key, empty where the frame was not scored; `error` says why,
-    `missing` that there is no prediction. pixels: scored. known: pixels of truth that count.
-    ratio: median of prediction / truth. given: scored pixels whose truth is the sparse input's
-    own value. holes: pixels of truth that even the development kit's fill left without depth.
-    sums: over the pixels, in the order of core.metrics.SUMS.
-    """
+    """The scores of one frame, or why it has none."""
 
     pair: FramePair
+    """The frame's files."""
     values: dict[str, float]
+    """Each measure by its key; empty where the frame was not scored."""
     pixels: int = 0
+    """Scored pixels."""
     known: int = 0
+    """Pixels with ground truth that the protocol scores."""
     ratio: float = math.nan
-    given: int = 0
+    """Median of prediction / ground truth."""
+    leaked: int = 0
+    """Scored pixels whose ground truth is a value of the network's sparse input."""
     has_sparse: bool = False
+    """True if the sparse input is known."""
     holes: int = 0
+    """Pixels with ground truth that the development kit's fill leaves without depth."""
     sums: tuple[float, ...] = ()
+    """Over the pixels, in the order of core.metrics.SUMS."""
     missing: bool = False
+    """True if there is no prediction."""
     error: str | None = None
+    """Why the frame was not scored; None if it was."""
 
     @property
     def name(self) -> str:
-        """The frame's name, by which evaluations are compared."""
+        """The frame's name, by which runs are compared."""
         return self.pair.name
 
     @property
@@ -60,104 +65,107 @@ class FrameScores:
 
     @property
     def coverage(self) -> float:
-        """The share of the truth's pixels that has a prediction."""
+        """Fraction of the pixels with ground truth that has a prediction."""
         return self.pixels / self.known if self.known else math.nan
 
 
 @dataclass(frozen=True, kw_only=True)
 class FileFacts:
-    """What a depth file is, for a person.
-
-    scale: codes per metre, None for floats; either the file says it, or nobody does and it is
-    assumed, or else the user or the data set gave it.
-    """
+    """What kind of depth file was read."""
 
     source: str
+    """The kind in words, such as `16-bit PNG ÷ 256`."""
     scale: float | None
+    """Codes per metre; None for floats."""
     assumed_scale: bool
+    """True if neither the file nor the user nor the data set states the scale."""
 
     @property
     def scale_in_file(self) -> bool:
-        """True if the file itself says its scale, which the source tells."""
+        """True if the file itself states its scale."""
         return "(from the file)" in self.source
 
 
 @dataclass(frozen=True, kw_only=True)
 class ScoredFrame:
-    """A frame's row, what its files are, and its sums by distance from a point and by depth.
-
-    by_distance, by_depth: (parts, len(SUMS)), None where the user gave no sparse depth.
-    """
+    """All that one frame contributes to an evaluation."""
 
     row: FrameScores
-    truth: FileFacts | None = None
+    """Its scores."""
+    ground_truth: FileFacts | None = None
+    """What kind of file its ground truth is."""
     prediction: FileFacts | None = None
+    """What kind of file its prediction is."""
     by_distance: Sums | None = None
+    """By distance to the nearest sparse point; None unless the user named sparse depth."""
     by_depth: Sums | None = None
+    """By depth of the ground truth; None unless the user named sparse depth."""
 
 
 def score_pair(pair: FramePair, protocol: EvalProtocol, scales: Scales) -> ScoredFrame:
-    """The frame's files, scored. Raises the errors of reading, and InputError without truth.
+    """Returns the scores of a frame's files; a missing or empty prediction has a row without any.
 
-    A missing or empty prediction is no error here: its row says so.
+    Raises:
+        InputError: For a file that cannot be read, or no ground truth where the protocol scores.
+        SizeError: Where sizes differ.
     """
     loaded = load_frame(pair, protocol, scales)
-    truth = loaded.truth
-    known = int(np.count_nonzero(truth.values))
+    ground_truth = loaded.ground_truth
+    known = int(np.count_nonzero(ground_truth.values))
     if not known:
         raise InputError(
-            f"{pair.truth.gt} has no known depth where protocol {protocol.name} scores"
+            f"{pair.frame.gt} has no known depth where protocol {protocol.name} scores"
         )
     if loaded.prediction is None:
         row = FrameScores(
             pair=pair, values={}, known=known, missing=True, error="there is no prediction"
         )
-        return ScoredFrame(row=row, truth=_facts(truth))
+        return ScoredFrame(row=row, ground_truth=_facts(ground_truth))
     prediction = loaded.prediction
     row = _row(pair, prediction.values, loaded, protocol)
-    scored = ScoredFrame(row=row, prediction=_facts(prediction), truth=_facts(truth))
-    if loaded.sparse is None or not row.scored or not pair.sparse_asked:
+    scored = ScoredFrame(row=row, prediction=_facts(prediction), ground_truth=_facts(ground_truth))
+    if loaded.sparse is None or not row.scored or not pair.sparse_named:
         return scored
     depth = _filled(prediction.values) if protocol.is_devkit else prediction.values
     return replace(
         scored,
-        by_distance=_sums(
-            depth, truth.values, protocol, _distance(loaded.sparse), DISTANCE_EDGES_PX
+        by_distance=_binned_sums(
+            depth, ground_truth.values, protocol, _distance_px(loaded.sparse), DISTANCE_EDGES_PX
         ),
-        by_depth=_sums(depth, truth.values, protocol, truth.values, DEPTH_EDGES_M),
+        by_depth=_binned_sums(
+            depth, ground_truth.values, protocol, ground_truth.values, DEPTH_EDGES_M
+        ),
     )
 
 
 def _row(pair: FramePair, depth: Depth, loaded: LoadedFrame, protocol: EvalProtocol) -> FrameScores:
-    truth = loaded.truth.values
-    sums = error_sums(
-        torch.from_numpy(depth), torch.from_numpy(truth), protocol.thresholds
-    )[0]  # fmt: skip
+    gt = loaded.ground_truth.values
+    sums = error_sums(torch.from_numpy(depth), torch.from_numpy(gt), protocol.thresholds)[0]
     pixels, known = (int(sums[SUMS.index(name)]) for name in ("pixels", "known"))
     row = FrameScores(pair=pair, values={}, pixels=pixels, known=known, sums=tuple(sums.tolist()))
     if not (depth > 0).any():
         return replace(row, error=f"{pair.prediction} holds no valid depth")
     if not (pixels or protocol.is_devkit):
-        return replace(row, error=f"{pair.prediction} has no depth where the truth is known")
-    both = (truth > 0) & (depth > 0)
-    ratio = float(np.median(depth[both] / truth[both])) if pixels else math.nan
+        return replace(row, error=f"{pair.prediction} has no depth where the ground truth is known")
+    both = (gt > 0) & (depth > 0)
+    ratio = float(np.median(depth[both] / gt[both])) if pixels else math.nan
     if protocol.is_devkit:
-        values = devkit_errors(depth, truth)
-        holes = int(np.count_nonzero((fill_background(depth) < 0) & (truth > 0)))
+        values = devkit_errors(depth, gt)
+        holes = int(np.count_nonzero((fill_background(depth) < 0) & (gt > 0)))
     else:
         keys = (measure.key for measure in protocol.measures)
         values, holes = dict(zip(keys, measures_of(sums).tolist(), strict=True)), 0
-    given = min(pair.sampled, pixels)
+    leaked = min(pair.sampled, pixels)
     if loaded.sparse is not None:
         points = loaded.sparse
-        tolerance = loaded.tolerance + 1e-6 * truth
-        given = int(np.count_nonzero(both & (points > 0) & (np.abs(points - truth) <= tolerance)))
+        tolerance = loaded.tolerance + 1e-6 * gt
+        leaked = int(np.count_nonzero(both & (points > 0) & (np.abs(points - gt) <= tolerance)))
     return replace(
         row,
         values=values,
         ratio=ratio,
-        given=given,
-        has_sparse=loaded.sparse is not None or bool(given),
+        leaked=leaked,
+        has_sparse=loaded.sparse is not None or bool(leaked),
         holes=holes,
     )
 
@@ -170,19 +178,19 @@ def _filled(depth: Depth) -> Depth:
     return np.maximum(fill_background(depth), np.float32(0))
 
 
-def _distance(points: Depth) -> Depth:
+def _distance_px(points: Depth) -> Depth:
     """(H, W) pixels to the nearest pixel with a point."""
     empty = (points == 0).astype(np.uint8)
     return np.asarray(cv2.distanceTransform(empty, cv2.DIST_L2, cv2.DIST_MASK_PRECISE), np.float32)
 
 
-def _sums(
-    depth: Depth, truth: Depth, protocol: EvalProtocol, quantity: Depth, edges: tuple[float, ...]
+def _binned_sums(
+    depth: Depth, gt: Depth, protocol: EvalProtocol, quantity: Depth, edges: tuple[float, ...]
 ) -> Sums:
     part = np.digitize(quantity, edges[1:-1])
     sums = error_sums(
         torch.from_numpy(depth),
-        torch.from_numpy(truth),
+        torch.from_numpy(gt),
         protocol.thresholds,
         torch.from_numpy(part),
         len(edges) - 1,

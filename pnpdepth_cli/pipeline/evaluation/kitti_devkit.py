@@ -1,9 +1,9 @@
-"""The figures that KITTI's depth development kit prints, digit for digit.
+"""Computes the figures that KITTI's depth development kit prints, digit for digit.
 
 Definitions: the kit's readme and its `evaluate_depth` (Uhrig et al., Sparsity Invariant CNNs, 3DV
 2017; devkit of cvlibs.net/datasets/kitti/eval_depth.php). A missing prediction is filled from its
-row, then from its column; all truth is scored. The kit computes in single precision and adds up
-pixel by pixel, column by column, which shows in the fifth digit: so does this.
+row, then from its column; all ground truth is scored. The kit computes in single precision and adds
+up pixel by pixel, column by column, which shows in the fifth digit; this does the same.
 
 Units are the kit's own: metres, 1/m, and no factor on the logarithmic and relative errors. KITTI's
 web pages multiply: RMSE and MAE by 1000 (mm), the inverse errors by 1000 (1/km), SILog and the
@@ -37,11 +37,14 @@ _MISSING = np.float32(-1)
 
 
 def fill_background(depth: Floats) -> Floats:
-    """(H, W) metres in which each unknown depth (0) took one from its row, or its row from others.
+    """Returns (H, W) metres in which unknown depths are filled in from their row, or other rows.
 
-    In a row: between two known depths the nearer of both, outside the outermost known depth that
-    one. Rows without any take the first such row below them, else the last above; one between
-    filled rows stays −1, which the kit then scores as if it were a depth.
+    In a row, a gap between two known depths takes the nearer of both, and what is outside the
+    outermost known depth takes that one. Empty rows above and below all filled rows take the
+    nearest of these; an empty row between filled ones becomes −1, which the kit scores as a depth.
+
+    Args:
+        depth: (H, W) metres, 0 where unknown.
     """
     known = depth > 0
     column = np.arange(depth.shape[1])
@@ -62,9 +65,11 @@ def fill_background(depth: Floats) -> Floats:
 
 
 def devkit_errors(predicted: Floats, truth: Floats) -> dict[str, float]:
-    """The measures of one frame, (H, W) metres each, 0 where unknown.
+    """Returns the measures of one frame; the logarithmic ones are NaN where the fill left −1.
 
-    Not a number for the logarithmic ones where a depth stayed −1. There must be truth.
+    Args:
+        predicted: (H, W) metres, 0 where unknown.
+        truth: (H, W) metres, 0 where unknown; some of it known.
     """
     filled = fill_background(predicted)
     known = truth.T > 0  # the kit walks down each column
@@ -91,7 +96,7 @@ def devkit_errors(predicted: Floats, truth: Floats) -> dict[str, float]:
 
 
 def devkit_mean(values: NDArray[Any]) -> NDArray[np.float64]:
-    """(M,) the mean of (N, M) values of N frames, added up in their order in single precision."""
+    """Returns (M,) the mean of (N, M) values of N frames, summed in order in single precision."""
     total = np.cumsum(values, axis=0, dtype=np.float32)[-1] / np.float32(len(values))
     return np.asarray(total, np.float64)
 

@@ -1,4 +1,4 @@
-"""What of a frame is scored, how it is scored, and how frames are averaged: published protocols."""
+"""Published evaluation protocols: which pixels are scored, how, and how frames are averaged."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ KITTI_DEVKIT = "kitti-devkit"
 AVERAGES = ("per-image", "pooled")
 RESIZES = ("nearest", "bilinear")
 
-# (top, bottom, left, right) as shares of the height and the width, cut to whole pixels.
+# (top, bottom, left, right) as fractions of the height and the width, cut to whole pixels.
 # Garg et al. 2016 for KITTI; and what Godard et al. (monodepth, utils/evaluate_kitti.py) found by
-# trial to reproduce Eigen et al. 2014. Both are those of practically every later evaluation.
-_SHARES = {
+# trial to reproduce Eigen et al. 2014. Nearly all later evaluations use these two.
+_CROP_FRACTIONS = {
     "garg": (0.40810811, 0.99189189, 0.03594771, 0.96405229),
     "eigen": (0.3324324, 0.91351351, 0.0359477, 0.96405229),
 }
 # Eigen et al. 2014 for NYU Depth v2: rows 45 to 470, columns 41 to 600 of 480x640 pixels.
 _NYU_SIZE = (480, 640)
 _NYU_WINDOW = (45, 471, 41, 601)
-CROPS = ("none", "nyu", *_SHARES)
+CROPS = ("none", "nyu", *_CROP_FRACTIONS)
 
 Window = tuple[int, int, int, int]
 """(top, bottom, left, right) in pixels; bottom and right are just outside."""
@@ -33,47 +33,54 @@ Window = tuple[int, int, int, int]
 
 @dataclass(frozen=True, kw_only=True)
 class EvalProtocol:
-    """How predictions are scored. Depths in metres.
-
-    scale: codes per metre of integer files that say nothing themselves, where nobody else does.
-    min_depth, max_depth: truth is scored strictly between them (None: no bound); clip moves
-    predictions into them. crop: one of CROPS, or X,Y,WIDTH,HEIGHT in pixels. mask: a picture, or a
-    folder of them, whose pixels above 0 are scored. average: of the frames' measures, or pooled
-    over the pixels of all. thresholds: of δ1…3. exclude_sparse: pixels with a sparse point are
-    not scored. resize: how a prediction of another size than the truth is brought to it, if it may.
-    """
+    """How predictions are scored."""
 
     name: str
+    """One of PROTOCOLS."""
     scale: float = 256.0
+    """Codes per metre of integer files that neither the file nor the user states."""
     min_depth: float = 0.0
+    """Ground truth is scored above it, metres."""
     max_depth: float | None = None
+    """Ground truth is scored below it, metres; None for no bound."""
     clip: bool = False
+    """True to clip predictions to these bounds."""
     crop: str = "none"
+    """One of CROPS, or X,Y,WIDTH,HEIGHT in pixels."""
     mask: Path | None = None
+    """An image, or a folder of one per frame, whose pixels above 0 are scored."""
     average: str = "per-image"
+    """Of the frames' measures, or "pooled" over the pixels of all frames."""
     thresholds: tuple[float, float, float] = DELTA_THRESHOLDS
+    """Of δ1, δ2 and δ3."""
     exclude_sparse: bool = False
+    """True not to score pixels with a sparse point."""
     resize: str | None = None
+    """How a prediction of another size is resized to the ground truth's; None refuses it."""
 
     @property
     def is_devkit(self) -> bool:
-        """True if the development kit's definitions take the place of the usual ones."""
+        """True if the development kit's definitions replace those of core.metrics."""
         return self.name == KITTI_DEVKIT
 
     @property
     def measures(self) -> tuple[Measure, ...]:
-        """What is measured, in order, and how to show it."""
+        """The measures in order, and how tables show them."""
         if self.is_devkit:
             return DEVKIT_MEASURES
         return _IN_MILLIMETRES if self.name == "kitti" else MEASURES
 
     def window(self, size: tuple[int, int]) -> Window:
-        """The part of a frame of `size` (H, W) that is scored. SizeError if there is no such."""
+        """Returns the rows and columns that are scored of a frame of `size` (H, W) pixels.
+
+        Raises:
+            SizeError: If the crop does not fit the frame.
+        """
         height, width = size
         if self.crop == "none":
             return 0, height, 0, width
-        if self.crop in _SHARES:
-            top, bottom, left, right = _SHARES[self.crop]
+        if self.crop in _CROP_FRACTIONS:
+            top, bottom, left, right = _CROP_FRACTIONS[self.crop]
             return int(top * height), int(bottom * height), int(left * width), int(right * width)
         if self.crop == "nyu":
             if size != _NYU_SIZE:
@@ -88,10 +95,10 @@ class EvalProtocol:
         return y, y + h, x, x + w
 
     def scoring(self) -> dict[str, Any]:
-        """What decides the figures: equal for two evaluations that can be compared."""
+        """Returns what decides the figures; equal for two evaluations that can be compared."""
         rules = asdict(self)
-        for of_reading in ("name", "scale", "resize", "mask"):
-            rules.pop(of_reading)
+        for field_of_reading in ("name", "scale", "resize", "mask"):
+            rules.pop(field_of_reading)
         return rules | {
             "thresholds": list(self.thresholds),
             "definitions": KITTI_DEVKIT if self.is_devkit else "usual",
@@ -99,21 +106,21 @@ class EvalProtocol:
         }
 
     def describe(self) -> str:
-        """One line, such as `eigen: truth in 0.001–80 m, clipped predictions, crop eigen, …`."""
+        """Returns one line, such as `eigen: ground truth in 0.001–80 m, crop eigen, …`."""
         published = PROTOCOLS[self.name]
         own = replace(
             published, mask=self.mask, exclude_sparse=self.exclude_sparse, resize=self.resize
         )
         return ", ".join(
-            (f"{self.name}{'' if self == own else ' (changed)'}: {self._truth()}", *self._rest())
+            (f"{self.name}{'' if self == own else ' (changed)'}: {self._range()}", *self._rest())
         )
 
-    def _truth(self) -> str:
+    def _range(self) -> str:
         if self.max_depth is None:
             bounds = f" above {self.min_depth:g} m" if self.min_depth else ""
         else:
             bounds = f" in {self.min_depth:g}–{self.max_depth:g} m"
-        return f"all known truth{bounds}"
+        return f"all known ground truth{bounds}"
 
     def _rest(self) -> list[str]:
         parts = [f"crop {self.crop}" if self.crop != "none" else "no crop"]
@@ -156,21 +163,26 @@ PROTOCOLS = {
 
 
 def choose_protocol(name: str, **changes: Any) -> EvalProtocol:
-    """The protocol of this name with what the user changes; None leaves a field as it is.
+    """Returns the protocol of this name with the fields that the user changes.
 
-    UsageError for a name nobody knows, and for a setting that makes no sense.
+    Args:
+        name: One of PROTOCOLS.
+        **changes: Fields of EvalProtocol; None leaves a field as it is.
+
+    Raises:
+        UsageError: For an unknown name or a setting out of its range.
     """
     if name not in PROTOCOLS:
         raise UsageError(f"no protocol {name!r}; there are {', '.join(PROTOCOLS)}")
-    given = {field: value for field, value in changes.items() if value is not None}
+    changed = {field: value for field, value in changes.items() if value is not None}
     published = PROTOCOLS[name]
     if published.is_devkit:
         for field, option in (("average", "--average"), ("thresholds", "--delta")):
-            if given.get(field, getattr(published, field)) != getattr(published, field):
+            if changed.get(field, getattr(published, field)) != getattr(published, field):
                 raise UsageError(
                     f"{option} does not apply to {name}: it has no δ and averages over the images"
                 )
-    protocol = replace(published, **given)
+    protocol = replace(published, **changed)
     _check(protocol)
     return protocol
 

@@ -1,4 +1,4 @@
-"""Saved scores read back: of `pnpdepth eval --json`, of a batch's summary, of a refine record."""
+"""Reads saved scores: of `pnpdepth eval --json`, of a batch's summary, of a refinement record."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from typing import Any
 from pnpdepth_cli.core.metrics import MEASURES, Measure
 from pnpdepth_cli.errors import FileFormatError, UsageError
 from pnpdepth_cli.io.record import read_json
+from pnpdepth_cli.pipeline.evaluation.dependence import groups_by_name
 from pnpdepth_cli.pipeline.evaluation.protocols import PROTOCOLS
 
 _STAGES = ("before", "after")
@@ -18,29 +19,34 @@ _STAGES = ("before", "after")
 
 @dataclass(frozen=True, kw_only=True)
 class RunFrame:
-    """A frame's measures by their key, NaN for what was no number.
-
-    pixels: scored. known: of truth, None where the file does not say. sums: of a pooled run.
-    """
+    """The saved scores of one frame."""
 
     values: dict[str, float]
+    """Measures by their key; NaN for null."""
     pixels: int
+    """Scored pixels."""
+    group: str
+    """The sequence the frame belongs to."""
     known: int | None = None
+    """Pixels with ground truth; None where the file does not say."""
     sums: tuple[float, ...] = ()
+    """Of a pooled run: over the pixels, in the order of core.metrics.SUMS."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Run:
-    """The scored frames of a run by their name. scoring: what decides the figures.
-
-    label: the file's name without its folder. path: as the user gave it.
-    """
+    """The scored frames of one saved run."""
 
     label: str
+    """The file's name without its folder."""
     path: str
+    """As the user gave it."""
     measures: tuple[Measure, ...]
+    """Those of all frames."""
     scoring: dict[str, Any]
+    """The rules that decide the figures."""
     frames: dict[str, RunFrame]
+    """By their name."""
 
     @property
     def pooled(self) -> bool:
@@ -49,9 +55,15 @@ class Run:
 
 
 def read_run(text: str) -> Run:
-    """The run in a file; `FILE:before` is what a refinement started from, else its result counts.
+    """Returns the run in a file, or in the summary of a batch's folder.
 
-    FileFormatError for a file without scores.
+    Args:
+        text: The path; `FILE:before` means the prediction that a refinement started from, without
+            it its result is meant.
+
+    Raises:
+        FileFormatError: For a file without scores.
+        UsageError: For `:before` of an evaluation.
     """
     path, stage = Path(text), "after"
     start, colon, end = text.rpartition(":")
@@ -63,9 +75,9 @@ def read_run(text: str) -> Run:
     try:
         if record.get("command") == "eval":
             if stage == "before":
-                raise UsageError(f"{path} is of eval, which knows no before; leave out :before")
-            return _of_eval(text, path.stem, record)
-        frames = _of_refinements(path, record, stage)
+                raise UsageError(f"{path} is of eval, which has no before; leave out :before")
+            return _eval_run(text, path.stem, record)
+        frames = _refinement_frames(path, record, stage)
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise FileFormatError(
             f"{path} does not hold scores as pnpdepth writes them ({error!r}); create it again"
@@ -85,7 +97,9 @@ def read_run(text: str) -> Run:
     )
 
 
-def _of_eval(text: str, label: str, record: Mapping[str, Any]) -> Run:
+def _eval_run(text: str, label: str, record: Mapping[str, Any]) -> Run:
+    scored = [frame for frame in record["frames"] if frame["error"] is None]
+    groups = groups_by_name([frame["name"] for frame in scored])
     return Run(
         label=label,
         path=text,
@@ -95,29 +109,31 @@ def _of_eval(text: str, label: str, record: Mapping[str, Any]) -> Run:
             frame["name"]: RunFrame(
                 values=_numbers(frame["values"]),
                 pixels=frame["pixels"],
+                group=frame.get("group", group),
                 known=frame["known"],
                 sums=tuple(frame.get("sums", ())),
             )
-            for frame in record["frames"]
-            if frame["error"] is None
+            for frame, group in zip(scored, groups, strict=True)
         },
     )
 
 
-def _of_refinements(path: Path, record: Mapping[str, Any], stage: str) -> dict[str, RunFrame]:
-    """The frames of a batch's summary, or the one of a record."""
+def _refinement_frames(path: Path, record: Mapping[str, Any], stage: str) -> dict[str, RunFrame]:
+    """The frames of a batch's summary, or the one frame of a record."""
     if isinstance(record.get("frames"), list):
-        entries = {entry["name"]: entry.get("scores") for entry in record["frames"]}
+        scores = {entry["name"]: entry.get("scores") for entry in record["frames"]}
     else:
-        entries = {path.stem: record.get("scores")}
-    found = {}
-    for name, scores in entries.items():
-        if scores is not None:
-            values = _numbers(scores[stage])
-            pixels, coverage = round(values["pixels"]), values["coverage"]
-            known = round(pixels / coverage) if coverage else None
-            found[name] = RunFrame(values=values, pixels=pixels, known=known)
-    return found
+        scores = {path.stem: record.get("scores")}
+    values = {name: _numbers(each[stage]) for name, each in scores.items() if each is not None}
+    return {
+        name: RunFrame(
+            values=each,
+            pixels=round(each["pixels"]),
+            group=group,
+            known=round(each["pixels"] / each["coverage"]) if each["coverage"] else None,
+        )
+        for (name, each), group in zip(values.items(), groups_by_name(list(values)), strict=True)
+    }
 
 
 def _numbers(values: Mapping[str, Any]) -> dict[str, float]:

@@ -1,4 +1,4 @@
-"""Scores as CSV, Markdown and LaTeX text."""
+"""Formats scores as text: cells of tables, CSV, Markdown and LaTeX."""
 
 from __future__ import annotations
 
@@ -11,8 +11,9 @@ from pathlib import Path
 from pnpdepth_cli.core.metrics import Measure
 from pnpdepth_cli.errors import OutputError
 from pnpdepth_cli.io.atomic import atomic_path
+from pnpdepth_cli.io.csv_text import text_cell
 from pnpdepth_cli.pipeline.evaluation.compare import Comparison
-from pnpdepth_cli.pipeline.evaluation.result import Evaluation, Part, frame_record
+from pnpdepth_cli.pipeline.evaluation.result import ErrorBin, Evaluation, frame_record
 
 Rows = Sequence[Sequence[str]]
 
@@ -29,7 +30,7 @@ _LATEX = str.maketrans(
 def check_targets(
     targets: Sequence[Path | None], inputs: Sequence[Path], *, overwrite: bool
 ) -> None:
-    """Raises OutputError for a file that cannot be written, or may not be; `-` is stdout."""
+    """Raises OutputError for a file that cannot or may not be written; `-` is stdout."""
     for path in targets:
         if path is None or str(path) == "-":
             continue
@@ -42,13 +43,13 @@ def check_targets(
 
 
 def write_bytes(path: Path, data: bytes) -> None:
-    """`path` holds the bytes; its folder has to exist."""
+    """Writes the bytes whole or not at all; the folder has to exist."""
     with atomic_path(path) as temporary:
         temporary.write_bytes(data)
 
 
-def shown(measure: Measure, value: float | None, *, unit: bool = False) -> str:
-    """The value as a person reads it, in the measure's shown unit; – where there is none."""
+def format_value(measure: Measure, value: float | None, *, unit: bool = False) -> str:
+    """Returns the value as text in the measure's shown unit; – for NaN and None."""
     if value is None or math.isnan(value):
         return "–"
     if measure.percent:
@@ -58,86 +59,96 @@ def shown(measure: Measure, value: float | None, *, unit: bool = False) -> str:
 
 
 def unit_of(measure: Measure) -> str:
-    """The unit that `shown` shows; empty for ratios and shares."""
+    """Returns the unit of `format_value`; empty for ratios and percentages."""
     return measure.shown_unit or measure.unit
 
 
-def heading(measure: Measure) -> str:
-    """A column's title such as `RMSE [m] ↓`."""
+def column_title(measure: Measure) -> str:
+    """Returns a title such as `RMSE [m] ↓`."""
     unit = "" if not unit_of(measure) else f" [{unit_of(measure)}]"
     return f"{measure.title}{unit} {'↑' if measure.higher_is_better else '↓'}"
 
 
 def frames_csv(evaluation: Evaluation) -> str:
-    """A line for each frame of the truth: its files, its counts, and its measures as stored."""
+    """Returns a line for each frame: its files, its counts, and its measures as stored."""
     keys = [measure.key for measure in evaluation.protocol.measures]
     records = [frame_record(frame) for frame in evaluation.frames]
     columns = [name for name in records[0] if name not in ("values", "error")]
     rows = [
         [*(_cell(r[name]) for name in columns), *(_cell(r["values"].get(key)) for key in keys),
-         r["error"] or ""]
+         text_cell(r["error"] or "")]
         for r in records
     ]  # fmt: skip
     return csv_text([*columns, *keys, "error"], rows)
 
 
+def interval_text(evaluation: Evaluation, measure: Measure) -> str:
+    """Returns the interval of a mean such as `1.02 … 1.31`; – where there is none."""
+    if evaluation.interval is None:
+        return "–"
+    ends = (evaluation.interval.low[measure.key], evaluation.interval.high[measure.key])
+    return " … ".join(format_value(measure, end) for end in ends)
+
+
 def means_table(evaluation: Evaluation, name: str) -> tuple[list[str], list[list[str]]]:
-    """(header, one row): the means with their intervals, and the coverage."""
+    """Returns (header, one row) of the means with their intervals, and the coverage."""
     measures, interval = evaluation.protocol.measures, evaluation.interval
-    cells = [shown(measure, evaluation.mean[measure.key]) for measure in measures]
+    cells = [format_value(measure, evaluation.mean[measure.key]) for measure in measures]
     if interval is not None:
-        halves = [shown(measure, interval.half_width(measure.key)) for measure in measures]
-        cells = [f"{cell} ± {half}" for cell, half in zip(cells, halves, strict=True)]
-    header = ["", *(heading(measure) for measure in measures), "frames", "coverage"]
+        ends = [interval_text(evaluation, measure) for measure in measures]
+        cells = [f"{cell} ({end})" for cell, end in zip(cells, ends, strict=True)]
+    header = ["", *(column_title(measure) for measure in measures), "frames", "coverage"]
     frames = f"{len(evaluation.scored):,} of {len(evaluation.frames):,}"
     return header, [[name, *cells, frames, f"{evaluation.coverage:.2%}"]]
 
 
-def part_cells(parts: Sequence[Part]) -> list[list[str]]:
-    """A row for each part: its bounds, its share of the truth, RMSE, MAE, MRE and coverage."""
-    total = sum(part.known for part in parts)
+def bin_rows(bins: Sequence[ErrorBin]) -> list[list[str]]:
+    """Returns a row for each bin: edges, fraction of the ground truth, errors and coverage."""
+    total = sum(each.known for each in bins)
     rows = []
-    for part in parts:
-        low, high = f"{part.low:g}", f"{part.high:g}"
+    for each in bins:
+        low, high = f"{each.low:g}", f"{each.high:g}"
         rows.append([
-            f"{low} or more" if math.isinf(part.high) else f"{low} to {high}",
-            f"{part.known / total:.1%}",
-            *("–" if math.isnan(v) else f"{v:.4f}" for v in (part.rmse, part.mae, part.mre)),
-            f"{part.pixels / part.known:.2%}",
+            f"{low} or more" if math.isinf(each.high) else f"{low} to {high}",
+            f"{each.known / total:.1%}",
+            *("–" if math.isnan(v) else f"{v:.4f}" for v in (each.rmse, each.mae, each.mre)),
+            f"{each.pixels / each.known:.2%}",
         ])  # fmt: skip
     return rows
 
 
 def comparison_table(comparison: Comparison) -> tuple[list[str], list[list[str]]]:
-    """(header, a row for each measure): the first run, and the others with gain, interval, p."""
+    """Returns (header, a row for each measure): the runs, each but the first with gain and p."""
     base, *others = comparison.runs
     header = ["", base.label]
     for run in others:
         header += [run.label, "gain [%]", "low", "high", "p"]
     rows = []
     for measure in comparison.measures:
-        row = [heading(measure), shown(measure, base.mean[measure.key])]
+        row = [column_title(measure), format_value(measure, base.mean[measure.key])]
         for run, gains in zip(others, comparison.gains, strict=True):
             gain = gains[measure.key]
             bounds = (gain.percent, gain.low_percent, gain.high_percent)
             row += [
-                shown(measure, run.mean[measure.key]),
+                format_value(measure, run.mean[measure.key]),
                 *("–" if math.isnan(value) else f"{value:+.2f}" for value in bounds),
-                "–" if math.isnan(gain.p_value) else f"{gain.p_value:.4f}",
+                "–" if math.isnan(gain.p_adjusted) else f"{gain.p_adjusted:.4f}",
             ]
         rows.append(row)
     return header, rows
 
 
 def comparison_caption(comparison: Comparison) -> str:
-    """What the table is of."""
+    """Returns what the table shows, in one line."""
     return (
-        f"{len(comparison.names):,} shared frames, gains in per cent of {comparison.runs[0].label}"
+        f"{len(comparison.names):,} shared frames; gains in per cent of {comparison.runs[0].label};"
+        f" intervals (95 %) and p-values over {comparison.clusters.describe()}, p adjusted for"
+        f" {len(comparison.measures)} measures (Holm)"
     )
 
 
 def csv_text(header: Sequence[str], rows: Rows) -> str:
-    """RFC 4180, but with lines that end as on Unix."""
+    """Returns CSV (RFC 4180, but lines end in \\n)."""
     buffer = io.StringIO()
     writer = csv.writer(buffer, lineterminator="\n")
     writer.writerow(header)
@@ -146,14 +157,14 @@ def csv_text(header: Sequence[str], rows: Rows) -> str:
 
 
 def markdown_text(header: Sequence[str], rows: Rows, caption: str) -> str:
-    """A table in GitHub's Markdown, the numbers to the right, with its caption below."""
+    """Returns a table in GitHub's Markdown, numbers right-aligned, and its caption below."""
     lines = [header, ["---", *["---:"] * (len(header) - 1)], *rows]
     body = "".join(f"| {' | '.join(_in_markdown(cell) for cell in line)} |\n" for line in lines)
     return f"{body}\n{caption}\n"
 
 
 def latex_text(header: Sequence[str], rows: Rows, caption: str) -> str:
-    """A tabular with the rules of the package booktabs, with its caption as a comment above."""
+    """Returns a tabular with rules of the package booktabs, and its caption as a comment above."""
     lines = [
         " & ".join(cell.translate(_LATEX) for cell in line) + r" \\" for line in (header, *rows)
     ]
@@ -179,4 +190,4 @@ def _in_markdown(cell: str) -> str:
 def _cell(value: object) -> str:
     if value is None or (isinstance(value, float) and math.isnan(value)):
         return ""
-    return str(value)
+    return text_cell(value) if isinstance(value, str) else str(value)

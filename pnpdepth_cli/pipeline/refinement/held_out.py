@@ -52,8 +52,8 @@ def refine_with_folds(
     """
     asked = Trial(layer=layer, settings=settings)
     fixed = Way(trial=asked, iterations=settings.iterations, propagate=task.propagate)
-    trials, budget_s = [asked], request.time_budget_s
-    if request.auto and ways is None:
+    trials, budget_s = [asked], request.hold_out.time_budget_s
+    if request.hold_out.auto and ways is None:
         trials = usual_trials(network.definition, layer, settings)
     elif ways is not None:
         first = usual_trials(network.definition, layer, settings)[0]
@@ -64,24 +64,24 @@ def refine_with_folds(
         task.inputs,
         task.used,
         ways=ways,
-        fixed=None if request.auto else fixed,
+        fixed=None if request.hold_out.auto else fixed,
         spreading=_spreading(request),
         budget_s=budget_s,
-        seed=request.seed,
+        seed=request.hold_out.seed,
     )
     frame = replace(
         found.frame,
         held_out=task.held_out,
-        choice=_record(found.choice) if request.auto else None,
+        choice=_record(found.choice) if request.hold_out.auto else None,
         notes=(
             *found.frame.notes,
             *found.notes,
             *auto_notes(found.choice, request, network.definition),
         ),
     )
-    if request.baselines:
+    if request.hold_out.baselines:
         frame = replace(frame, baselines=baseline_scores(found, task.inputs))
-    if request.uncertainty:
+    if request.hold_out.uncertainty:
         sigma, note = uncertainty(found, frame.after)
         frame = replace(frame, sigma=sigma, notes=(*frame.notes, note))
     return frame
@@ -109,8 +109,8 @@ def ways_of(
                 task.inputs,
                 task.used,
                 spreading=_spreading(request),
-                budget_s=request.time_budget_s,
-                seed=request.seed,
+                budget_s=request.hold_out.time_budget_s,
+                seed=request.hold_out.seed,
             )
         except PnpDepthError as error:
             errors.append(error)
@@ -123,9 +123,9 @@ def ways_of(
 
 def _spreading(request: RefineRequest) -> tuple[str, ...]:
     """How --auto may spread what is left at the points: as asked, or in any way."""
-    if request.propagate is None:
+    if request.method.propagate is None:
         return SPREADING
-    return () if request.propagate == "none" else (request.propagate,)
+    return () if request.method.propagate == "none" else (request.method.propagate,)
 
 
 def auto_notes(
@@ -135,10 +135,10 @@ def auto_notes(
     if choice.error is None:
         return (
             (f"auto: with fewer than {FEWEST} points none can be held out; taken is {choice}",)
-            if request.auto
+            if request.hold_out.auto
             else ()
         )
-    if not request.auto:
+    if not request.hold_out.auto:
         return ()
     by_name = {str(one.way): one.error for one in choice.scored}
     best = min((name for name in BASELINES if name in by_name), key=lambda name: by_name[name])

@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from pnpdepth_cli.errors import InputError, NoPointsError, SizeError, UsageError
+from pnpdepth_cli.io.dataset.frame import Hdf5Array, Source
+from pnpdepth_cli.io.dataset.hdf5 import depth_of, rgb_of
 from pnpdepth_cli.io.depth import (
     DepthImage,
     describe_range,
@@ -20,10 +22,8 @@ from pnpdepth_cli.io.depth import (
     read_sparse,
 )
 from pnpdepth_cli.io.fingerprint import fingerprint
-from pnpdepth_cli.io.layouts.frame import Hdf5Array, Source
-from pnpdepth_cli.io.layouts.hdf5 import depth_of, rgb_of
 from pnpdepth_cli.io.rgb import read_rgb
-from pnpdepth_cli.pipeline.refinement.request import RefineRequest
+from pnpdepth_cli.pipeline.refinement.request import FrameFiles, RefineRequest
 from pnpdepth_cli.pipeline.sparse.scans import read_scan_points
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.sensors import sample_points
@@ -84,15 +84,20 @@ class _Sparse:
     notes: tuple[str, ...]
 
 
-def read_inputs(files: RefineRequest) -> Inputs:
-    """The frame of these files. InputError if one cannot be used or they do not fit together."""
+def read_inputs(request: RefineRequest) -> Inputs:
+    """Returns the frame that is asked for.
+
+    Raises:
+        InputError: A file cannot be used, or the files do not fit together.
+    """
+    files = request.files
     image = None if files.image is None else _read_image(files, files.image)
     truth = None if files.gt is None else _read_truth(files, files.gt)
     whole = None if image is None else image.whole
     if truth is not None:
         _check_truth(files, truth, whole)
     if files.sparse is None:
-        sparse = _sampled(files, image, truth)
+        sparse = _sampled(files, image, truth, request.hold_out.seed)
     elif files.scan.describes(files.sparse):
         sparse = _read_scan(files, files.sparse, whole)
     else:
@@ -110,7 +115,7 @@ def read_inputs(files: RefineRequest) -> Inputs:
     )
 
 
-def _read_image(files: RefineRequest, source: Source) -> _Part:
+def _read_image(files: FrameFiles, source: Source) -> _Part:
     if isinstance(source, Hdf5Array):
         rgb, note = rgb_of(source), None
     else:
@@ -124,7 +129,7 @@ def _read_image(files: RefineRequest, source: Source) -> _Part:
     )
 
 
-def _read_truth(files: RefineRequest, source: Source) -> _Part:
+def _read_truth(files: FrameFiles, source: Source) -> _Part:
     if isinstance(source, Hdf5Array):
         truth = DepthImage(values=depth_of(source), source="HDF5", assumed_scale=False)
     else:
@@ -151,7 +156,7 @@ def _file_record(source: Source) -> dict[str, Any]:
     return {"path": str(source), "sha256": fingerprint(path).sha256}
 
 
-def _sampled(files: RefineRequest, image: _Part | None, truth: _Part | None) -> _Sparse:
+def _sampled(files: FrameFiles, image: _Part | None, truth: _Part | None, seed: int) -> _Sparse:
     """Points of the truth instead of sparse depth."""
     if files.sample is None:
         raise InputError(f"{files.image} has no sparse depth; add it, or sample the ground truth")
@@ -159,26 +164,26 @@ def _sampled(files: RefineRequest, image: _Part | None, truth: _Part | None) -> 
         raise InputError(f"{files.image} has no ground truth to sample points from; add it")
     picture = None if image is None else image.values
     try:
-        found = sample_points(truth.values, files.sample, files.seed, image=picture)
+        found = sample_points(truth.values, files.sample, seed, image=picture)
     except UsageError as error:  # the pattern itself is good, this frame is too poor for it
         raise InputError(f"{files.gt}: {error}") from error
-    source = f"{files.sample.kind} of the ground truth, seed {files.seed}"
+    source = f"{files.sample.kind} of the ground truth, seed {seed}"
     return _Sparse(
         points=found.tensors(),
         scale=truth.scale,
-        record={"sampled_from": str(files.gt), **asdict(files.sample), "seed": files.seed},
+        record={"sampled_from": str(files.gt), **asdict(files.sample), "seed": seed},
         notes=(f"sparse: {describe_range(found.depth, source)}",),
     )
 
 
-def _read_scan(files: RefineRequest, path: Path, image_size: tuple[int, int] | None) -> _Sparse:
+def _read_scan(files: FrameFiles, path: Path, image_size: tuple[int, int] | None) -> _Sparse:
     picture = files.image if isinstance(files.image, Path) else None
     scan = read_scan_points(path, files.scan, image_size, picture)
     points = _in_protocol(files, path, scan.points.tensors())
     return _Sparse(points=points, scale=None, record=scan.record, notes=scan.notes)
 
 
-def _read_points(files: RefineRequest, path: Path, image_size: tuple[int, int] | None) -> _Sparse:
+def _read_points(files: FrameFiles, path: Path, image_size: tuple[int, int] | None) -> _Sparse:
     scale = files.sparse_scale or files.depth_scale
     sparse = read_sparse(path, size=image_size, scale=scale, channel=files.channel)
     sparse_size, depth = sparse.points.size, sparse.points.depth
@@ -201,14 +206,14 @@ def _read_points(files: RefineRequest, path: Path, image_size: tuple[int, int] |
     )
 
 
-def _in_protocol(files: RefineRequest, path: Path, points: SparsePoints) -> SparsePoints:
+def _in_protocol(files: FrameFiles, path: Path, points: SparsePoints) -> SparsePoints:
     """The points, of the whole image, that are in the part of it that the protocol leaves."""
     # An array of the image's size that takes no memory; the protocol says what is left of it.
     left = files.protocol.apply(np.broadcast_to(np.False_, points.size))
     size = (left.shape[0], left.shape[1])
     if size == points.size:
         return points
-    xy = files.protocol.places(points.xy.numpy(), points.size)
+    xy = files.protocol.in_crop(points.xy.numpy(), points.size)
     return _inside(path, SparsePoints(xy=torch.from_numpy(xy), depth=points.depth, size=size))
 
 
@@ -219,7 +224,7 @@ def _inside(path: Path, points: SparsePoints) -> SparsePoints:
     return inside
 
 
-def _check_truth(files: RefineRequest, truth: _Part, image_size: tuple[int, int] | None) -> None:
+def _check_truth(files: FrameFiles, truth: _Part, image_size: tuple[int, int] | None) -> None:
     if image_size is not None and truth.whole != image_size:
         raise _of_another_size(files, truth.whole, image_size)
     if not bool((truth.values > 0).any()):
@@ -227,7 +232,7 @@ def _check_truth(files: RefineRequest, truth: _Part, image_size: tuple[int, int]
 
 
 def _of_another_size(
-    files: RefineRequest, size: tuple[int, ...], image_size: tuple[int, int]
+    files: FrameFiles, size: tuple[int, ...], image_size: tuple[int, int]
 ) -> SizeError:
     return SizeError(
         f"ground truth {files.gt} is {size[1]}×{size[0]} but the image is"

@@ -7,12 +7,15 @@ from pathlib import Path
 from typing import Any
 
 from pnpdepth_cli.errors import OutputError, UsageError
+from pnpdepth_cli.io.dataset.frame import IMAGE_SUFFIXES, SCAN_ONLY_SUFFIXES
 from pnpdepth_cli.io.depth import DEPTH_SUFFIXES
-from pnpdepth_cli.io.layouts.frame import DEPTHS, PICTURES, SCANS
 from pnpdepth_cli.io.record import write_json
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest
 
-_NO_FOLDERS = {*PICTURES, *DEPTHS, *SCANS, ".hdr", ".bmp", ".mat", ".h5", ".csv", ".json"}
+_NO_FOLDERS = {
+    *(*IMAGE_SUFFIXES, *DEPTH_SUFFIXES, *SCAN_ONLY_SUFFIXES),
+    *(".hdr", ".bmp", ".mat", ".h5", ".csv", ".json"),
+}
 """A folder's name may have a dot in it, but who writes these means a file."""
 
 
@@ -30,8 +33,8 @@ class Outputs:
     def in_folder(cls, folder: Path, name: str, request: RefineRequest) -> Outputs:
         """All that are asked for, in a folder; a name with slashes is a place in folders below."""
         return cls(
-            depth=folder / f"{name}_depth.{request.format}",
-            sigma=folder / f"{name}_sigma.exr" if request.uncertainty else None,
+            depth=folder / f"{name}_depth.{request.outputs.format}",
+            sigma=folder / f"{name}_sigma.exr" if request.hold_out.uncertainty else None,
             preview=folder / f"{name}_preview.png",
             improvement=folder / f"{name}_improvement.png",
             record=folder / f"{name}.json",
@@ -63,13 +66,14 @@ def plan_outputs(request: RefineRequest) -> Outputs:
 
     OutputError if one exists already and may not be replaced, or is one of the inputs.
     """
-    given = [request.image, request.sparse, request.gt, request.scan.calib]
+    files, asked = request.files, request.outputs
+    given = [files.image, files.sparse, files.gt, files.scan.calib]
     inputs = [path for path in given if isinstance(path, Path)]
     stem = inputs[0].stem
-    output = request.output or Path(f"{stem}_refined")
-    if f".{request.format}" not in DEPTH_SUFFIXES:
-        raise UsageError(f"format {request.format!r} is not one of {' '.join(DEPTH_SUFFIXES)}")
-    if output.suffix.lower() in DEPTH_SUFFIXES and request.uncertainty:
+    output = asked.output or Path(f"{stem}_refined")
+    if f".{asked.format}" not in DEPTH_SUFFIXES:
+        raise UsageError(f"format {asked.format!r} is not one of {' '.join(DEPTH_SUFFIXES)}")
+    if output.suffix.lower() in DEPTH_SUFFIXES and request.hold_out.uncertainty:
         raise UsageError(
             f"--uncertainty writes a second file; name a folder, not {output}, with -o"
         )
@@ -89,6 +93,6 @@ def plan_outputs(request: RefineRequest) -> Outputs:
     for path in outputs.paths():
         if path.resolve() in resolved:
             raise OutputError(f"{path} is one of the inputs; name another output with -o")
-        if path.exists() and not request.overwrite:
+        if path.exists() and not asked.overwrite:
             raise OutputError(f"{path} exists; --overwrite replaces it, -o names another place")
     return outputs

@@ -30,8 +30,12 @@ from pnpdepth_cli.pipeline.refinement.held_out import refine_with_folds, ways_of
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs, read_inputs
 from pnpdepth_cli.pipeline.refinement.output_files import Outputs, plan_outputs
 from pnpdepth_cli.pipeline.refinement.outputs import write_outputs
-from pnpdepth_cli.pipeline.refinement.request import RefineRequest, effective_settings, layer_name
-from pnpdepth_cli.pipeline.refinement.settle import settled
+from pnpdepth_cli.pipeline.refinement.request import RefineRequest
+from pnpdepth_cli.pipeline.refinement.resolve import (
+    resolve_definition,
+    resolve_layer,
+    resolve_settings,
+)
 from pnpdepth_cli.pipeline.refinement.tiles import refine_tiled
 from pnpdepth_cli.pipeline.refinement.ways import Way
 from pnpdepth_cli.pipeline.stopwatch import Stopwatch, peak_memory_mb, versions
@@ -95,13 +99,13 @@ class Refiner:
         on_iteration: Callable[[int, float], None] = lambda done, loss: None,
     ) -> RefinedFrame:
         """One frame refined in memory, the same whatever was refined before."""
-        torch.manual_seed(self.request.seed)
+        torch.manual_seed(self.request.hold_out.seed)
         task = self.task(inputs)
-        if self.request.needs_folds:
+        if self.request.hold_out.needs_folds:
             return refine_with_folds(
                 self.network, self.layer, self.settings, self.request, task, self.ways
             )
-        if side := self.request.tile:
+        if side := self.request.network.tile:
             return refine_tiled(
                 self.network, split, self.settings, task, side, on_iteration=on_iteration
             )
@@ -115,12 +119,13 @@ class Refiner:
 
     def task(self, inputs: Inputs) -> FrameToRefine:
         """The frame with its points as the request shares them out."""
-        used, held_out = split_points(inputs.points, self.request.holdout, self.request.seed)
+        asked = self.request.hold_out
+        used, held_out = split_points(inputs.points, asked.holdout, asked.seed)
         return FrameToRefine(
             inputs=inputs,
             used=used,
             held_out=held_out,
-            propagate=self.request.propagate or "none",
+            propagate=self.request.method.propagate or "none",
         )
 
     @functools.cached_property
@@ -129,7 +134,7 @@ class Refiner:
         checkpoint = self.network.checkpoint
         return {
             "name": self.network.definition.name,
-            "spec": self.request.model,
+            "spec": self.request.network.model,
             "checkpoint": str(checkpoint) if checkpoint else None,
             "checkpoint_sha256": sha256_of(checkpoint) if checkpoint else None,
         }
@@ -140,19 +145,20 @@ def load_refiner(request: RefineRequest, first: Inputs) -> Refiner:
 
     UsageError if the request asks for what does not go together.
     """
-    if request.time_budget_s is not None and not request.auto:
+    choice, hold_out = request.network, request.hold_out
+    if hold_out.time_budget_s is not None and not hold_out.auto:
         raise UsageError("--time-budget is for the trials of --auto; give that too")
-    if request.tile is not None and request.needs_folds:
+    if choice.tile is not None and hold_out.needs_folds:
         raise UsageError("--tile goes with none of --auto, --baselines and --uncertainty")
     network = load_network(
-        request.model, request.checkpoint, request.device, precision=request.precision
+        choice.model, choice.checkpoint, choice.device, precision=choice.precision
     )
-    network = settled(network, first, request)
+    network = resolve_definition(network, first, choice)
     return Refiner(
         request=request,
         network=network,
-        layer=layer_name(network.definition, request.layer),
-        settings=effective_settings(network.definition, request),
+        layer=resolve_layer(network.definition, request.method.layer),
+        settings=resolve_settings(network.definition, request.method),
     )
 
 
@@ -175,6 +181,7 @@ def write_refined(
 
 def _record(refiner: Refiner, inputs: Inputs, frame: RefinedFrame) -> dict[str, Any]:
     request, network = refiner.request, refiner.network
+    hold_out, propagate = request.hold_out, request.method.propagate
     return {
         "versions": versions(),
         "inputs": inputs.record,
@@ -183,13 +190,13 @@ def _record(refiner: Refiner, inputs: Inputs, frame: RefinedFrame) -> dict[str, 
             "layer": refiner.layer,
             **asdict(refiner.settings),
             "step": frame.refinement.step,
-            "propagate": request.propagate if request.auto else request.propagate or "none",
+            "propagate": propagate if hold_out.auto else propagate or "none",
             "output_kind": network.definition.output_kind,
-            "normalise": request.normalise,
-            "holdout": request.holdout,
-            "seed": request.seed,
-            "precision": request.precision,
-            "tile": request.tile,
+            "normalise": request.network.normalise,
+            "holdout": hold_out.holdout,
+            "seed": hold_out.seed,
+            "precision": request.network.precision,
+            "tile": request.network.tile,
             "device": str(network.device),
         },
         "alignment": asdict(frame.alignment) if frame.alignment else None,

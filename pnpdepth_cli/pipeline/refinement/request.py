@@ -1,93 +1,308 @@
-"""What the user asks of a refinement, and the settings that follow from it."""
+"""What the user asks of a refinement, in groups. None means the network's own default.
+
+Each field is declared here once. Command line options, sweep axes and batch cache keys are derived
+from these declarations (`pnpdepth_cli.pipeline.options`). Imports neither numpy nor torch.
+"""
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, field
+from collections.abc import Collection
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+from pnpdepth_cli import choices
 from pnpdepth_cli.errors import UsageError
-from pnpdepth_cli.io.layouts.frame import Source
-from pnpdepth_cli.io.layouts.protocols import WHOLE, Protocol
-from pnpdepth_cli.models.definition import ModelDefinition, RefineDefaults
-from pnpdepth_cli.pipeline.sparse.scans import ScanOptions
-from pnpdepth_cli.sensors import SamplePattern
+from pnpdepth_cli.pipeline.options import Axis, option
 
-if TYPE_CHECKING:  # it imports torch, which `pnpdepth batch` can do without when all is done
-    from pnpdepth_cli.core.refine import RefineSettings
+if TYPE_CHECKING:
+    from pnpdepth_cli.io.dataset.frame import Source
+    from pnpdepth_cli.io.dataset.protocols import Protocol
+    from pnpdepth_cli.pipeline.sparse.scans import ScanOptions
+    from pnpdepth_cli.sensors import SamplePattern
+
+LARGEST_SEED = 2**32 - 1
+
+
+def _default_scan() -> ScanOptions:
+    from pnpdepth_cli.pipeline.sparse.scans import ScanOptions
+
+    return ScanOptions()
+
+
+def _whole_frame() -> Protocol:
+    from pnpdepth_cli.io.dataset.protocols import WHOLE
+
+    return WHOLE
+
+
+def parse_seconds(text: str) -> float:
+    """Returns the seconds of `5`, `5s` or `500ms`. Raises UsageError for any other text."""
+    number, unit = (text[:-2], 1e-3) if text.endswith("ms") else (text.removesuffix("s"), 1.0)
+    try:
+        seconds = float(number) * unit
+    except ValueError:
+        seconds = -1.0
+    if not 0 < seconds < float("inf"):
+        raise UsageError(f"time budget {text!r} is not a duration; give seconds, such as 5s")
+    return seconds
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrameFiles:
+    """The files of a frame and how they are read."""
+
+    image: Source | None = None
+    """Input image. None for a network that takes sparse depth alone."""
+    sparse: Path | None = None
+    """Sparse depth, or a LiDAR scan. None: `sample` takes points of the ground truth."""
+    gt: Source | None = None
+    """Ground truth depth."""
+    depth_scale: float | None = option(
+        None,
+        "Integer depth files hold metres × S.  [default: from the file, else 256]",
+        metavar="S",
+    )
+    sparse_scale: float | None = None
+    """The same for the sparse depth, over `depth_scale`."""
+    gt_scale: float | None = option(None, "--depth-scale of the ground truth.", metavar="S")
+    channel: str | None = option(
+        None, "EXR channel or NPZ array that holds the depth.", metavar="NAME"
+    )
+    sparse_size_ok: bool = option(
+        False, "Accept a sparse depth map of another size; its points are moved to the image."
+    )
+    scan: ScanOptions = field(default_factory=_default_scan)
+    """How `sparse` is projected where it is a LiDAR scan."""
+    sample: SamplePattern | None = None
+    """Which pixels of the ground truth serve as sparse depth."""
+    protocol: Protocol = field(default_factory=_whole_frame)
+    """Which part of the frame is used."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class NetworkChoice:
+    """Which network, with which weights, and where it runs."""
+
+    model: str = option(
+        "compact",
+        "A name of `pnpdepth models`, FILE.onnx[:OUTPUT], FILE.pt2, a Hugging Face folder, or"
+        " FILE.py[:ATTR], which is Python code and is run.",
+        metavar="NETWORK",
+        show_default=True,
+    )
+    checkpoint: Path | None = option(
+        None,
+        "Weights: a safetensors, torch, numpy or TensorFlow (.index) file, or a folder of them. No"
+        " code in them is run.",
+    )
+    output_kind: str | None = option(
+        None,
+        "Meaning of the network's output, replacing what its definition says.",
+        choices=choices.SPACES,
+    )
+    normalise: str | None = option(
+        None,
+        "RGB range of the network's input: 0…1, ImageNet's mean and std, −1…1, 0…255.",
+        choices=choices.NORMALISATIONS,
+    )
+    tile: int | None = option(
+        None,
+        "Refine larger frames in overlapping tiles of this side length, to save memory.",
+        metavar="PIXELS",
+        least=64,
+    )
+    precision: str = option(
+        "fp32",
+        "Precision of convolutions and matrix products; z, loss and updates stay in fp32.",
+        choices=choices.PRECISIONS,
+        show_default=True,
+    )
+    device: str = option("cpu", "cpu, cuda, cuda:1, mps, …", metavar="NAME", show_default=True)
+
+
+@dataclass(frozen=True, kw_only=True)
+class MethodOptions:
+    """Where the network is cut, how z is updated, and what follows. These decide the method."""
+
+    layer: str | None = option(
+        None,
+        "Layer to cut at: the name of a submodule (NAME#2: its second call, NAME[KEY]: one of its"
+        " outputs), or a fraction of the network's depth, 0 the shallowest layer.",
+        metavar="NAME|0..1",
+        axis=Axis(title="layer cut at (0 first, 1 last)"),
+    )
+    iterations: int | None = option(
+        None,
+        "Number of updates of z; 0 is no refinement.",
+        metavar="K",
+        axis=Axis(title="updates of z"),
+    )
+    lr: str | None = option(
+        None,
+        "Step size: absolute, or % of the std of z.",
+        metavar="NUMBER|P%",
+        axis=Axis(title="step", title_percent="step (% of the deviation of z)", log=True),
+    )
+    loss: str | None = option(
+        None,
+        "Loss at the sparse points.",
+        choices=choices.LOSSES,
+        axis=Axis(title="loss"),
+    )
+    update: str | None = option(
+        None,
+        "Update rule; another than the network's resets --lr, --schedule and --blur.",
+        choices=choices.UPDATES,
+        axis=Axis(title="update rule"),
+    )
+    schedule: str | None = option(
+        None,
+        "Step size over the updates; linear decays to 0.",
+        choices=choices.SCHEDULES,
+        axis=Axis(title="schedule of the step"),
+    )
+    blur: float | None = option(
+        None,
+        "Blur the gradient over S times the spacing of the points; 0 is off.",
+        alias="--spread",
+        metavar="S",
+        axis=Axis(title="blur of the gradient (spacings of the points)"),
+    )
+    parameters: str = option(
+        "elements",
+        "Update every element of z, or a scale and a shift of each channel.",
+        choices=choices.PARAMETERS,
+        show_default=True,
+        axis=Axis(title="what is updated"),
+    )
+    proximity: float = option(
+        0.0,
+        "Add W times the mean squared change of log depth to the loss.",
+        alias="--anchor",
+        metavar="W",
+        axis=Axis(title="weight of staying near the network"),
+    )
+    line_search: bool = option(False, "Undo updates that raise the loss and halve the step.")
+    keep_best: bool = option(False, "Return the depth with the lowest loss, not the last.")
+    align: str | None = option(
+        None,
+        "Fit the network's output to the points by scale, or scale and shift."
+        "  [default: the network's own]",
+        choices=choices.ALIGNMENTS,
+        axis=Axis(title="alignment"),
+    )
+    align_every: bool = option(False, "Repeat the alignment at every update of z.")
+    propagate: str | None = option(
+        None,
+        "Propagate the residuals at the points to all pixels: Gaussian process or edge-aware"
+        " diffusion.  [default: none; chosen by --auto]",
+        choices=choices.PROPAGATIONS,
+        axis=Axis(title="propagation of the residual"),
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class HoldOut:
+    """Which points are held out, and what is decided or measured by them."""
+
+    auto: bool = option(
+        False,
+        "Choose alignment, updates and propagation by cross-validation over the points.",
+    )
+    time_budget_s: float | None = option(
+        None,
+        "With --auto: also try other layers and step sizes for this long, such as 5s.",
+        flag="--time-budget",
+        metavar="SECONDS",
+        parse=parse_seconds,
+    )
+    baselines: bool = option(False, "Also score every baseline, such as linear interpolation.")
+    uncertainty: bool = option(
+        False, "Write <name>_sigma.exr, the standard deviation of the depth."
+    )
+    holdout: float = option(0.0, "Hold out this fraction of the points to score at.", metavar="F")
+    seed: int = option(
+        0, "Random seed.", metavar="N", least=0, most=LARGEST_SEED, show_default=True
+    )
+
+    @property
+    def needs_folds(self) -> bool:
+        """Whether points are held out in turns, to choose, to compare or to calibrate."""
+        return self.auto or self.baselines or self.uncertainty
+
+
+@dataclass(frozen=True, kw_only=True)
+class OutputOptions:
+    """Where results go, and in which form."""
+
+    output: Path | None = None
+    """A folder, or one depth file. None: a folder named after the image."""
+    format: str = option(
+        "png",
+        "Format of the depth file in an output folder.",
+        choices=choices.FORMATS,
+        show_default=True,
+    )
+    overwrite: bool = option(False, "Replace existing results.")
+
+
+_PLACES = {"image", "sparse", "gt", "model", "checkpoint", "output", "overwrite"}
+"""Fields that say where something lies. A cache key has digests of what lies there instead."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class RefineRequest:
-    """What the user asks for; None means the network's own default.
+    """Everything the user asks of the refinement of one frame."""
 
-    sparse: None where `sample` says which pixels of the truth to take instead. depth_scale,
-    sparse_scale, gt_scale: integer depth files hold metres × scale; the first holds for both.
-    holdout: the share of the points kept from the network and the loss, and only scored.
-    output_kind, normalise: what the network's numbers are and which rgb it wants, over what its
-    definition says. propagate: how what is left at the points is spread, one of
-    `completion.propagation.PROPAGATIONS`. auto, time_budget_s, baselines, uncertainty: see
-    `pipeline.refinement.held_out`. scan: how to project `sparse` where it is a LiDAR scan.
-    protocol: what is cut out of a frame first of all. tile: the longest side, in pixels, of what
-    goes through the network at once; None: the whole frame.
-    """
+    files: FrameFiles = field(default_factory=FrameFiles)
+    """The frame."""
+    network: NetworkChoice = field(default_factory=NetworkChoice)
+    """The network."""
+    method: MethodOptions = field(default_factory=MethodOptions)
+    """The refinement."""
+    hold_out: HoldOut = field(default_factory=HoldOut)
+    """The points held out."""
+    outputs: OutputOptions = field(default_factory=OutputOptions)
+    """The results."""
 
-    image: Source | None
-    sparse: Path | None
-    gt: Source | None = None
-    output: Path | None = None
-    format: str = "png"
-    overwrite: bool = False
-    model: str = "compact"
-    checkpoint: Path | None = None
-    layer: str | None = None
-    iterations: int | None = None
-    lr: str | None = None
-    loss: str | None = None
-    update: str | None = None
-    schedule: str | None = None
-    spread: float | None = None
-    parameters: str = "elements"
-    anchor: float = 0.0
-    line_search: bool = False
-    keep_best: bool = False
-    align: str | None = None
-    align_every: bool = False
-    output_kind: str | None = None
-    normalise: str | None = None
-    depth_scale: float | None = None
-    sparse_scale: float | None = None
-    gt_scale: float | None = None
-    channel: str | None = None
-    sparse_size_ok: bool = False
-    scan: ScanOptions = field(default_factory=ScanOptions)
-    sample: SamplePattern | None = None
-    protocol: Protocol = WHOLE
-    propagate: str | None = None
-    auto: bool = False
-    time_budget_s: float | None = None
-    baselines: bool = False
-    uncertainty: bool = False
-    holdout: float = 0.0
-    tile: int | None = None
-    seed: int = 0
-    precision: str = "fp32"
-    device: str = "cpu"
+    @classmethod
+    def from_fields(cls, **values: Any) -> RefineRequest:
+        """Returns the request with these fields of its groups, whichever group each is in."""
+        return cls().with_fields(**values)
 
-    @property
-    def needs_folds(self) -> bool:
-        """Whether points are to be held out in turns, to choose, to compare or to calibrate."""
-        return self.auto or self.baselines or self.uncertainty
+    def with_fields(self, **values: Any) -> RefineRequest:
+        """Returns a copy with other values of these fields, whichever group each is in."""
+        groups = {}
+        for group in fields(self):
+            own = getattr(self, group.name)
+            names = values.keys() & {each.name for each in fields(own)}
+            groups[group.name] = replace(own, **{name: values.pop(name) for name in names})
+        if values:
+            raise TypeError(f"a RefineRequest has no fields {', '.join(sorted(values))}")
+        return RefineRequest(**groups)
+
+    def settings(self, *groups: str) -> dict[str, Any]:
+        """Returns all fields that decide the result except the frame's files, by name.
+
+        Args:
+            *groups: Names of groups. None: all of them.
+        """
+        chosen = [getattr(self, each.name) for each in fields(self) if _wanted(each.name, groups)]
+        return {
+            each.name: getattr(group, each.name)
+            for group in chosen
+            for each in fields(group)
+            if each.name not in _PLACES
+        }
 
 
-def sample_pattern(kind: str, count: int | None, share: float | None) -> SamplePattern:
-    """So many points, or this share of the known pixels, by one of the samplers' patterns."""
-    return SamplePattern(kind=kind, count=count, share=share)
+def _wanted(name: str, names: Collection[str]) -> bool:
+    return not names or name in names
 
 
 def count_or_share(text: str) -> tuple[int | None, float | None]:
-    """(points, share) of `500` or `5%`; None for what it is not. UsageError for any other text."""
+    """Returns (points, fraction) of `500` or `5%`; the other is None. Raises UsageError."""
     try:
         if text.strip().endswith("%"):
             return None, float(text.strip()[:-1]) / 100
@@ -96,50 +311,8 @@ def count_or_share(text: str) -> tuple[int | None, float | None]:
         raise UsageError(f"count {text!r} is neither a number such as 500 nor 5%") from None
 
 
-def layer_name(definition: ModelDefinition, wanted: str | None) -> str:
-    """The layer to cut at: a name as it stands, or a share 0…1 of the definition's own layers."""
-    wanted = wanted if wanted is not None else definition.default_layer
-    if wanted is None:
-        raise UsageError(f"network {definition.name!r} has no default layer; name one with --layer")
-    try:
-        share = float(wanted)
-    except ValueError:
-        return wanted
-    if not 0 <= share <= 1 or not definition.layers:
-        raise UsageError(
-            f"layer {wanted!r}: a number is a share between 0 and 1 of the layers that the"
-            f" definition of {definition.name!r} lists ({len(definition.layers)} of them)"
-        )
-    return definition.layers[round(share * (len(definition.layers) - 1))]
+def sample_pattern(kind: str, count: int | None, share: float | None) -> SamplePattern:
+    """Returns the pattern of so many points, or this fraction of the known pixels."""
+    from pnpdepth_cli.sensors import SamplePattern
 
-
-def effective_settings(definition: ModelDefinition, request: RefineRequest) -> RefineSettings:
-    """The request's settings, filled up with the network's defaults. UsageError if one is amiss."""
-    from pnpdepth_cli.core.refine import RefineSettings
-
-    defaults = definition.defaults
-    iterations = defaults.iterations if request.iterations is None else request.iterations
-    if iterations < 0:
-        raise UsageError(f"iterations {iterations} is negative; 0 gives the plain prediction")
-    update = request.update or defaults.update
-    # How far to go depends on how: with another update the rest of a step is the paper's as well.
-    steps = defaults if update == defaults.update else RefineDefaults()
-    spread = steps.blur if request.spread is None else request.spread
-    if not 0 <= spread < math.inf:
-        raise UsageError(f"spread {spread} is no distance; give 0 or more spacings of the points")
-    if not 0 <= request.anchor < math.inf:
-        raise UsageError(f"anchor {request.anchor} is no weight; give 0 or more")
-    return RefineSettings(
-        iterations=iterations,
-        lr=steps.lr if request.lr is None else request.lr,
-        loss=request.loss or defaults.loss,
-        update=update,
-        schedule=request.schedule or steps.schedule,
-        blur=spread,
-        parameters=request.parameters,
-        proximity=request.anchor,
-        line_search=request.line_search,
-        keep_best=request.keep_best,
-        align=request.align or definition.default_alignment,
-        align_every=request.align_every,
-    )
+    return SamplePattern(kind=kind, count=count, share=share)

@@ -18,14 +18,14 @@ from pnpdepth_cli.errors import InputError, OutputError
 from pnpdepth_cli.io.fingerprint import fingerprint
 from pnpdepth_cli.io.page import SavedPage, open_page
 from pnpdepth_cli.io.report import (
-    PICTURES,
+    IMAGES,
     begin_report,
     check_report_folder,
-    picture_key,
+    image_key,
     write_report,
 )
-from pnpdepth_cli.io.report_pictures import gain_colours, picture_paths, save_pictures
-from pnpdepth_cli.pipeline.evaluation.score_files import heading, shown
+from pnpdepth_cli.io.report_images import gain_colours, image_paths, save_images
+from pnpdepth_cli.pipeline.evaluation.score_files import column_title, format_value
 from pnpdepth_cli.pipeline.ordered_pool import in_order
 from pnpdepth_cli.pipeline.report.columns import (
     Column,
@@ -105,15 +105,15 @@ class BatchReport:
         """As `drawn`; what the page says of the pictures."""
         paths = [self.output / row["outputs"][kind] for kind in ("preview", "improvement")]
         try:
-            key = picture_key(*(fingerprint(path).sha256 for path in paths))
+            key = image_key(*(fingerprint(path).sha256 for path in paths))
             preview, improvement = (open_page(path) for path in paths)
             views = _views(preview, improvement)
-            pictures = self.folder / PICTURES
-            if not all(path.exists() for path in picture_paths(pictures, key, views)):
+            pictures = self.folder / IMAGES
+            if not all(path.exists() for path in image_paths(pictures, key, views)):
                 panels = preview.panels() | improvement.panels()
                 named = {_PANELS[title]: panels[title] for title in panels if title in _PANELS}
                 thumb = "image" if "image" in views else "second"
-                save_pictures(pictures, key, named, thumb=thumb)
+                save_images(pictures, key, named, thumb=thumb)
         except InputError:  # a result that was there has gone or changed; the next run redoes it
             return {"key": None}
         return {
@@ -263,7 +263,7 @@ def _tiles(summary: Mapping[str, Any], measured: bool) -> list[dict[str, str]]:
         mean = summary["mean"][basis]
         for key, measure in _ERRORS.items() if mean else ():
             before, after = (mean[stage][key] for stage in ("before", "after"))
-            change = f"{shown(measure, before)} → {shown(measure, after)}"
+            change = f"{format_value(measure, before)} → {format_value(measure, after)}"
             gain = _gain(before, after)
             said = ""
             if gain is not None and basis != _USED:
@@ -304,7 +304,7 @@ def _means(basis: str, mean: Mapping[str, Any]) -> dict[str, Any]:
     rows = []
     for measure in measures:
         before, after = (mean[stage].get(measure.key) for stage in ("before", "after"))
-        row = [heading(measure), shown(measure, before), shown(measure, after)]
+        row = [column_title(measure), format_value(measure, before), format_value(measure, after)]
         if basis != _USED:
             row.append(_gain_text(measure, before, after))
         rows.append(row)
@@ -325,7 +325,7 @@ def _gain_text(measure: Measure, before: float | None, after: float | None) -> s
 
 
 def _signed(value: float, decimals: int, unit: str) -> str:
-    """The value with its sign, and with none where nothing but noughts is shown."""
+    """The value with its sign, and with none where nothing but zeros is shown."""
     text = f"{abs(value):.{decimals}f}"
     sign = "" if float(text) == 0 else "+" if value > 0 else "−"
     return f"{sign}{text}{unit}"

@@ -1,4 +1,4 @@
-"""`pnpdepth eval --html`: each frame's prediction beside its truth, and where it is wrong."""
+"""`pnpdepth eval --html`: each frame's prediction, its ground truth, and a map of its errors."""
 
 from __future__ import annotations
 
@@ -11,23 +11,28 @@ from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import InputError, PnpDepthError
 from pnpdepth_cli.io.colours import depth_scale, grey_of
+from pnpdepth_cli.io.dataset.hdf5 import rgb_of
 from pnpdepth_cli.io.layouts import Hdf5Array
-from pnpdepth_cli.io.layouts.hdf5 import rgb_of
 from pnpdepth_cli.io.report import (
     begin_report,
     check_report_folder,
-    picture_key,
+    image_key,
     remove_report_leftovers,
     write_report,
 )
-from pnpdepth_cli.io.report_pictures import error_colours, error_map, save_pictures
+from pnpdepth_cli.io.report_images import error_colours, error_map, save_images
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.pipeline.evaluation.frame_reading import Depth, load_frame
 from pnpdepth_cli.pipeline.evaluation.frame_scoring import FrameScores
 from pnpdepth_cli.pipeline.evaluation.kitti_devkit import fill_background
 from pnpdepth_cli.pipeline.evaluation.pairing import FramePair
-from pnpdepth_cli.pipeline.evaluation.result import Evaluation, Part
-from pnpdepth_cli.pipeline.evaluation.score_files import heading, part_cells, shown
+from pnpdepth_cli.pipeline.evaluation.result import ErrorBin, Evaluation
+from pnpdepth_cli.pipeline.evaluation.score_files import (
+    bin_rows,
+    column_title,
+    format_value,
+    interval_text,
+)
 from pnpdepth_cli.pipeline.ordered_pool import in_order
 from pnpdepth_cli.pipeline.report.columns import (
     Column,
@@ -38,12 +43,12 @@ from pnpdepth_cli.pipeline.report.columns import (
     tile,
 )
 
-_MADE_OF = {"command": "eval"}
+_SOURCE = {"command": "eval"}
 _LISTED = ("rmse", "mae", "mre", "irmse", "delta1")
 
 
 def check_eval_report(folder: Path, inputs: list[Path], *, overwrite: bool) -> None:
-    """Raises OutputError for a folder that the report cannot, or may not, be written to."""
+    """Raises OutputError for a folder that the report cannot or may not be written to."""
     check_report_folder(folder, inputs, made_of=None, overwrite=overwrite)
 
 
@@ -53,11 +58,17 @@ def write_eval_report(
     *,
     on_frame: Callable[[int, int], None] = lambda done, of: None,
 ) -> None:
-    """The report is on disk. Its pictures are of the files as they are now, read once more.
+    """Writes the report; the files are read once more for its images.
 
-    on_frame(done, of) is called after each frame. Raises OutputError if it cannot be written.
+    Args:
+        folder: Where the page and its images are written.
+        evaluation: The scores.
+        on_frame: Called with (done, of) after each frame.
+
+    Raises:
+        OutputError: If the report cannot be written.
     """
-    pictures = begin_report(folder, _MADE_OF)
+    pictures = begin_report(folder, _SOURCE)
     remove_report_leftovers(folder)
     columns = _columns(evaluation)
     scored = evaluation.scored
@@ -95,7 +106,7 @@ def _head(evaluation: Evaluation, columns: list[Column]) -> dict[str, Any]:
         "tiles": _tiles(evaluation),
         "facts": [
             ["Prediction", str(request.prediction)],
-            ["Truth", str(request.truth)],
+            ["Ground truth", str(request.ground_truth)],
             *([["Sparse depth", str(request.sparse)]] if request.sparse else []),
             ["Protocol", evaluation.protocol.describe()],
             ["Pixels scored", f"{sum(frame.pixels for frame in evaluation.frames):,}"],
@@ -103,11 +114,12 @@ def _head(evaluation: Evaluation, columns: list[Column]) -> dict[str, Any]:
         "notes": list(evaluation.notes),
         "tables": [
             _means(evaluation),
-            *_parts("By distance to the nearest sparse point", "px", evaluation.by_distance),
-            *_parts("By depth of the truth", "m", evaluation.by_depth),
+            *_bins("By distance to the nearest sparse point", "px", evaluation.by_distance),
+            *_bins("By depth of the ground truth", "m", evaluation.by_depth),
         ],
         "labels": {
-            "first": f"Prediction{filled}", "second": "Truth", "map": "Error", "image": "Image",
+            "first": f"Prediction{filled}", "second": "Ground truth", "map": "Error",
+            "image": "Image",
         },
         "map_colours": error_colours(),
         "without_title": f"Not scored: {len(without):,}",
@@ -118,60 +130,62 @@ def _head(evaluation: Evaluation, columns: list[Column]) -> dict[str, Any]:
 
 def _tiles(evaluation: Evaluation) -> list[dict[str, str]]:
     frames, scored = len(evaluation.frames), len(evaluation.scored)
-    out = [
-        f"{len(some):,} {what}"
-        for some, what in (
+    unscored = [
+        f"{len(some):,} {reason}"
+        for some, reason in (
             (evaluation.missing, "without prediction"),
             (evaluation.failed, "with a faulty file"),
         )
         if some
     ]
     means = [
-        tile(measure.title, f"{shown(measure, evaluation.mean[measure.key], unit=True)}")
+        tile(measure.title, f"{format_value(measure, evaluation.mean[measure.key], unit=True)}")
         for measure in evaluation.protocol.measures
         if measure.key in ("rmse", "mae", "delta1")
     ]
-    coverage = tile("Coverage", f"{evaluation.coverage:.2%}", "of the truth has a prediction")
+    coverage = tile(
+        "Coverage", f"{evaluation.coverage:.2%}", "of the ground truth has a prediction"
+    )
     of = f"{scored:,} of {frames:,}" if scored != frames else f"{frames:,}"
-    return [tile("Frames scored", of, ", ".join(out)), *means, coverage]
+    return [tile("Frames scored", of, ", ".join(unscored)), *means, coverage]
 
 
 def _means(evaluation: Evaluation) -> dict[str, Any]:
     measures, interval = evaluation.protocol.measures, evaluation.interval
     header, rows = ["", "mean"], []
     for measure in measures:
-        rows.append([heading(measure), shown(measure, evaluation.mean[measure.key])])
+        rows.append([column_title(measure), format_value(measure, evaluation.mean[measure.key])])
         if interval is not None:
-            rows[-1].append(f"± {shown(measure, interval.half_width(measure.key))}")
+            rows[-1].append(interval_text(evaluation, measure))
     of = frames_text(len(evaluation.scored))
     caption = f"Means over {of}"
     if evaluation.protocol.average == "pooled":
         caption = f"Over all pixels of {of} together"
     if interval is not None:
         header.append("95 %")
-        caption += "; ±: half of the 95 % interval, bootstrap over the frames"
+        caption += f"; {evaluation.describe_interval()}"
     return table(caption, header, rows)
 
 
-def _parts(caption: str, unit: str, parts: tuple[Part, ...]) -> list[dict[str, Any]]:
-    if not parts:
+def _bins(caption: str, unit: str, bins: tuple[ErrorBin, ...]) -> list[dict[str, Any]]:
+    if not bins:
         return []
-    header = [f"[{unit}]", "of the truth", "RMSE [m]", "MAE [m]", "MRE", "coverage"]
-    return [table(f"{caption}, all pixels together", header, part_cells(parts))]
+    header = [f"[{unit}]", "of the ground truth", "RMSE [m]", "MAE [m]", "MRE", "coverage"]
+    return [table(f"{caption}, all pixels together", header, bin_rows(bins))]
 
 
 def _entry(
     frame: FrameScores, evaluation: Evaluation, columns: list[Column], pictures: Path
 ) -> dict[str, Any]:
     values = frame.values | {"coverage": frame.coverage}
-    notes = [f"Scored: {frame.pixels:,} of {frame.known:,} pixels of the truth."]
-    if frame.given:
-        notes.append(f"{frame.given:,} of them were given to the network as sparse depth.")
+    notes = [f"Scored: {frame.pixels:,} of {frame.known:,} pixels of the ground truth."]
+    if frame.leaked:
+        notes.append(f"{frame.leaked:,} of them were given to the network as sparse depth.")
     notes.append(f"Prediction: {frame.pair.prediction}")
-    notes.append(f"Truth: {frame.pair.truth.gt}")
+    notes.append(f"Ground truth: {frame.pair.frame.gt}")
     try:
         drawn = _drawn(frame, evaluation, pictures)
-    except InputError as error:  # a file that could be read to be scored, and now cannot
+    except InputError as error:  # the file has changed since it was scored
         notes.append(str(error))
         drawn = {"key": None}
     return {
@@ -184,23 +198,23 @@ def _entry(
 
 
 def _drawn(frame: FrameScores, evaluation: Evaluation, pictures: Path) -> dict[str, Any]:
-    """The pictures of a frame are on disk; what the page says of them."""
+    """Writes the images of a frame and returns the page's entry of them."""
     protocol = evaluation.protocol
     loaded = load_frame(frame.pair, protocol, evaluation.request.scales)
-    truth = loaded.truth.values
+    gt = loaded.ground_truth.values
     if loaded.prediction is None:
         return {"key": None}
     depth = loaded.prediction.values
     if protocol.is_devkit:
         depth = np.maximum(fill_background(depth), np.float32(0))
-    image = _image(frame.pair, truth)
-    errors = error_map(depth, truth, None if image is None else grey_of(image))
-    scale = depth_scale(depth, truth)
-    views = {"first": scale.paint(depth), "second": scale.paint(truth), "map": errors.pixels}
+    image = _image(frame.pair, gt)
+    errors = error_map(depth, gt, None if image is None else grey_of(image))
+    scale = depth_scale(depth, gt)
+    views = {"first": scale.paint(depth), "second": scale.paint(gt), "map": errors.pixels}
     if image is not None:
         views["image"] = np.asarray(np.rint(255 * np.clip(image, 0, 1)), np.uint8)
-    key = picture_key(frame.name)
-    save_pictures(pictures, key, views, thumb="first" if image is None else "image")
+    key = image_key(frame.name)
+    save_images(pictures, key, views, thumb="first" if image is None else "image")
     amount = f"by {errors.strongest_m:.3g} m or more"
     return {
         "key": key,
@@ -208,14 +222,14 @@ def _drawn(frame: FrameScores, evaluation: Evaluation, pictures: Path) -> dict[s
         "scale_m": [scale.low_m, scale.high_m],
         "map": {
             "ends": [f"too near {amount}", f"too far {amount}"],
-            "unknown": None if ((truth > 0) & (depth > 0)).all() else "not scored",
-            "footer": "prediction against truth",
+            "unknown": None if ((gt > 0) & (depth > 0)).all() else "not scored",
+            "footer": "prediction against ground truth",
         },
     }
 
 
-def _image(pair: FramePair, truth: Depth) -> NDArray[np.float32] | None:
-    """The frame's picture (H, W, 3) in 0…1, if one is known, can be read and fits the truth."""
+def _image(pair: FramePair, gt: Depth) -> NDArray[np.float32] | None:
+    """The frame's image (H, W, 3) in 0…1, if one is known, can be read and fits the depth."""
     if pair.image is None:
         return None
     try:
@@ -224,6 +238,6 @@ def _image(pair: FramePair, truth: Depth) -> NDArray[np.float32] | None:
         )
     except PnpDepthError:
         return None
-    if rgb.shape[:2] != truth.shape:
-        rgb = pair.truth.protocol.apply(rgb)
-    return rgb if rgb.shape[:2] == truth.shape else None
+    if rgb.shape[:2] != gt.shape:
+        rgb = pair.frame.protocol.apply(rgb)
+    return rgb if rgb.shape[:2] == gt.shape else None

@@ -15,7 +15,7 @@ from pnpdepth_cli.errors import OutputError, UsageError
 from pnpdepth_cli.io.overlay import overlay
 from pnpdepth_cli.io.record import write_json
 from pnpdepth_cli.io.sparse_writing import SPARSE_SUFFIXES, write_sparse
-from pnpdepth_cli.sensors import Points, as_picture
+from pnpdepth_cli.sensors import Points, as_depth_image
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,7 +68,7 @@ def write_sparse_outputs(
     made = {"command": command, "version": __version__, **settings}
     for path in filter(None, (target.output, target.overlay)):
         _make_folder_of(path)
-    picture = as_picture(points)
+    picture = as_depth_image(points)
     write_sparse(
         target.output, points.xy, points.depth, picture, made=made, scale=target.depth_scale
     )

@@ -44,6 +44,8 @@ def project_scan(request: ProjectRequest) -> dict[str, Any]:
         inputs["image"] = {"path": str(image), "sha256": sha256_of(image)}
     scan = read_scan_points(request.scan, request.options, size, image)
     settings = asdict(request.options) | {"calib": str(request.options.calib)}
+    if request.options.point_fields is None:
+        del settings["point_fields"]
     return write_sparse_outputs(
         target,
         scan.points,

@@ -27,19 +27,28 @@ _OFF_CENTRE = 0.15
 
 @dataclass(frozen=True, kw_only=True)
 class ScanOptions:
-    """How a scan becomes sparse depth of a picture.
-
-    calib: a calibration file, or the folder of KITTI's raw calibration. camera: of KITTI's four.
-    euclidean: distances from the camera instead of z. min_range, max_range: metres from the
-    scanner. keep_occluded: also what the camera sees something nearer in front of.
-    """
+    """How a scan becomes sparse depth of an image."""
 
     calib: Path | None = None
+    """A calibration file, or the folder of KITTI's raw calibration."""
+
     camera: int | None = None
+    """One of KITTI's four, 0 to 3; None for the left colour camera."""
+
     euclidean: bool = False
+    """Depth is the distance from the camera's centre instead of z."""
+
     keep_occluded: bool = False
+    """Points stay that the camera sees something nearer in front of."""
+
     min_range: float = 0.0
+    """Metres from the scanner; nearer points are dropped."""
+
     max_range: float | None = None
+    """Metres from the scanner; farther points are dropped."""
+
+    point_fields: int | None = None
+    """Float32 numbers of a point in a .bin file; None to tell from the file."""
 
     def describes(self, sparse: Path) -> bool:
         """True if the sparse depth is a scan: by its suffix, or because of a calibration.
@@ -50,8 +59,8 @@ class ScanOptions:
             return True
         if self != ScanOptions():
             raise UsageError(
-                f"{sparse} is no scan, so --camera, --range, --keep-occluded, --min-range and"
-                " --max-range do not apply; a scan needs --calib"
+                f"{sparse} is no scan, so --camera, --range, --keep-occluded, --min-range,"
+                " --max-range and --point-fields do not apply; a scan needs --calib"
             )
         return False
 
@@ -86,7 +95,7 @@ def read_scan_points(
     if size is None:
         raise SizeError(f"{options.calib} does not say the picture's size; give the image too")
     doubt = check_size(options.calib, calibration, size, picture)
-    scan = read_scan(path)
+    scan = read_scan(path, options.point_fields)
     settings = ProjectionSettings(
         euclidean=options.euclidean,
         min_range=options.min_range,

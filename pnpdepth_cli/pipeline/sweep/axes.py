@@ -10,12 +10,10 @@ from typing import Any
 
 import torch
 
-from pnpdepth_cli.choices import ALIGNMENTS, LOSSES, SCHEDULES, UPDATES
-from pnpdepth_cli.choices import PARAMETERS as PARAMETERS_OF_Z
-from pnpdepth_cli.completion.propagation import PROPAGATIONS
 from pnpdepth_cli.core.step_sizes import step_size
 from pnpdepth_cli.errors import UsageError
-from pnpdepth_cli.pipeline.refinement.request import count_or_share
+from pnpdepth_cli.pipeline.options import options_of
+from pnpdepth_cli.pipeline.refinement.request import MethodOptions, count_or_share
 from pnpdepth_cli.pipeline.sweep.points import known_sensor
 
 Cell = Mapping[str, str]
@@ -84,6 +82,7 @@ class Study:
 def read_axis(text: str) -> Axis:
     """The axis that a text such as `points=20,100,500` says. UsageError if it says none."""
     name, equals, listed = text.partition("=")
+    name = FORMER_NAMES.get(name, name)
     if name not in PARAMETERS:
         raise UsageError(f"no parameter {name!r} to vary; there are {', '.join(PARAMETERS)}")
     values = tuple(value.strip() for value in listed.split(","))
@@ -166,6 +165,26 @@ def _step(text: str) -> str:
 
 
 _ANY = _within(math.inf)
+_VALUES: Mapping[str, Callable[[str], Any]] = {"int": _whole, "float": _ANY, "str": str}
+
+
+def _method_parameters() -> Iterator[tuple[str, Parameter]]:
+    """Yields the options of the method that have an axis."""
+    for each in options_of(MethodOptions):
+        axis, names = each.option.axis, each.option.choices
+        if axis is None:
+            continue
+        value = _VALUES[each.type] if names is None else _one_of(tuple(names))
+        yield (
+            each.name,
+            Parameter(
+                title=axis.title,
+                of_percent=axis.title_percent,
+                value=_step if each.name == "lr" else value,
+                log=axis.log,
+            ),
+        )
+
 
 PARAMETERS: Mapping[str, Parameter] = {
     "points": Parameter(
@@ -185,18 +204,13 @@ PARAMETERS: Mapping[str, Parameter] = {
     "rotation-noise": Parameter(
         title="rotation noise of the scanner (°)", value=_within(360), of_points=True
     ),
-    "iterations": Parameter(title="updates of z", value=_whole),
-    "layer": Parameter(title="layer cut at (0 first, 1 last)", value=str),
-    "lr": Parameter(
-        title="step", of_percent="step (% of the deviation of z)", value=_step, log=True
-    ),
-    "loss": Parameter(title="loss", value=_one_of(tuple(LOSSES))),
-    "update": Parameter(title="update rule", value=_one_of(tuple(UPDATES))),
-    "schedule": Parameter(title="schedule of the step", value=_one_of(SCHEDULES)),
-    "spread": Parameter(title="blur of the gradient (spacings of the points)", value=_ANY),
-    "parameters": Parameter(title="what is updated", value=_one_of(PARAMETERS_OF_Z)),
-    "anchor": Parameter(title="weight of staying near the network", value=_ANY),
-    "align": Parameter(title="alignment", value=_one_of(ALIGNMENTS)),
-    "propagate": Parameter(title="propagation of what is left", value=_one_of(PROPAGATIONS)),
+    **dict(_method_parameters()),
 }
 """All that can be varied, in the order of the help."""
+
+FORMER_NAMES = {
+    each.option.alias.removeprefix("--"): each.name
+    for each in options_of(MethodOptions)
+    if each.option.alias is not None
+}
+"""Present names of parameters by their former ones, which are still accepted."""

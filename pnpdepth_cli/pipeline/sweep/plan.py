@@ -10,12 +10,13 @@ from typing import Any
 
 from pnpdepth_cli.core.refine import RefineSettings
 from pnpdepth_cli.errors import UsageError
-from pnpdepth_cli.io.layouts.frame import Frame
+from pnpdepth_cli.io.dataset.frame import Frame
 from pnpdepth_cli.io.record import plain
 from pnpdepth_cli.models.definition import ModelDefinition
 from pnpdepth_cli.pipeline.batch.frames import Task
 from pnpdepth_cli.pipeline.batch.settings import settings_of
-from pnpdepth_cli.pipeline.refinement.request import RefineRequest, effective_settings, layer_name
+from pnpdepth_cli.pipeline.refinement.request import RefineRequest
+from pnpdepth_cli.pipeline.refinement.resolve import resolve_layer, resolve_settings
 from pnpdepth_cli.pipeline.sweep.axes import PARAMETERS, Cell, Study, read_value
 from pnpdepth_cli.pipeline.sweep.points import Sampling, read_sensor_text
 
@@ -81,7 +82,7 @@ class Plan:
         model: dict[str, Any],
     ) -> None:
         self._definition, self._base, self._sampling = definition, base, sampling
-        self._seeds, self._model = range(base.seed, base.seed + seeds), model
+        self._seeds, self._model = range(base.hold_out.seed, base.hold_out.seed + seeds), model
         self._wanted: dict[Sampling, dict[Method, set[int]]] = {}
         for study in studies:
             for cell in study.cells():
@@ -106,24 +107,26 @@ class Plan:
             for name, text in cell.items()
             if not PARAMETERS[name].of_points
         }
-        request = replace(self._base, **of_update)
-        settings = effective_settings(self._definition, request)
+        method = replace(self._base.method, **of_update)
+        settings = resolve_settings(self._definition, method)
         settings = replace(settings, lr=_one_spelling(settings.lr))
         iterations = settings.iterations
         if settings.schedule == "constant":  # then more updates begin like fewer
             settings = replace(settings, iterations=0)
-        method = Method(
-            layer=layer_name(self._definition, request.layer),
-            settings=settings,
-            propagate=request.propagate or "none",
+        return Place(
+            sampling=sampling_of(cell, self._sampling),
+            method=Method(
+                layer=resolve_layer(self._definition, method.layer),
+                settings=settings,
+                propagate=method.propagate or "none",
+            ),
+            iterations=iterations,
         )
-        sampling = sampling_of(cell, self._sampling)
-        return Place(sampling=sampling, method=method, iterations=iterations)
 
     def runs(self, task: Task, frame: Frame) -> Iterator[Run]:
         """Of one frame, those with the same points one after the other."""
-        said = settings_of(task.request, self._model)
-        read = {name: value for name, value in said.items() if name not in _OF_THE_RUN}
+        read = settings_of(task.request, self._model, "files", "network")
+        del read["sample"]  # `sampling` says it
         for sampling, methods in self._wanted.items():
             for seed in self.seeds(sampling):
                 none: set[int] = set()
@@ -182,11 +185,3 @@ def run_key(
         "read": read,
     }
     return hashlib.sha256(json.dumps(plain(said), sort_keys=True).encode()).hexdigest()
-
-
-_OF_THE_RUN = (
-    *("layer", "iterations", "lr", "loss", "update", "schedule", "spread", "parameters"),
-    *("anchor", "line_search", "keep_best", "align", "align_every", "propagate", "sample", "seed"),
-    *("holdout", "format"),
-)
-"""Fields of a request that a run states itself, or that do not matter to it."""

@@ -10,7 +10,7 @@ import numpy as np
 
 from pnpdepth_cli.errors import InputError, UsageError
 from pnpdepth_cli.io.calibration import read_calibration
-from pnpdepth_cli.io.layouts.frame import Frame
+from pnpdepth_cli.io.dataset.frame import Frame
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest, count_or_share
 from pnpdepth_cli.pipeline.sparse.scans import camera_of, check_size
@@ -25,9 +25,9 @@ from pnpdepth_cli.sensors import (
     SampleNoise,
     SamplePattern,
     SimulationSettings,
-    disturbed,
     sample_points,
     simulate_lidar,
+    with_noise,
 )
 
 OWN = "own"
@@ -149,12 +149,12 @@ def _found(
     rng = np.random.default_rng(seed)
     if sampling.lidar is not None:
         points = _scanned(sampling, sampling.lidar, seed, inputs, request, frame)
-    elif request.sparse is None:
+    elif request.files.sparse is None:
         raise InputError("there is no sparse depth; --sample 500 takes points of the truth")
     else:
         own = inputs.points
         points = SparsePoints(xy=own.xy.numpy(), depth=own.depth.numpy(), size=own.size)
-    return disturbed(_thinned(points, sampling.points, rng), noise, rng)
+    return with_noise(_thinned(points, sampling.points, rng), noise, rng)
 
 
 def _scanned(
@@ -171,10 +171,11 @@ def _scanned(
             f"sensor {sampling.sensor!r} needs to know the camera; give --calib, or a list with a"
             " column calib"
         )
-    if request.protocol.halved or request.protocol.crop:
+    protocol = request.files.protocol
+    if protocol.halved or protocol.crop:
         raise InputError(
             f"sensor {sampling.sensor!r} needs the picture that the calibration is of, but protocol"
-            f" {request.protocol.name!r} cuts it; --protocol whole does not"
+            f" {protocol.name!r} cuts it; --protocol whole does not"
         )
     calibration = read_calibration(frame.calib, frame.camera)
     check_size(frame.calib, calibration, inputs.size)

@@ -1,4 +1,4 @@
-"""Means over frames of a sweep's cells, with their intervals, and the files that hold them."""
+"""Averages a sweep's cells over frames, with intervals, and writes the files that hold them."""
 
 from __future__ import annotations
 
@@ -10,18 +10,27 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from pnpdepth_cli.core.metrics import MEASURES
 from pnpdepth_cli.io.atomic import atomic_path
+from pnpdepth_cli.io.csv_text import text_cell
 from pnpdepth_cli.io.record import plain, write_json
-from pnpdepth_cli.pipeline.evaluation.averages import Floats, bootstrap
+from pnpdepth_cli.pipeline.evaluation.averages import Floats, FrameTable
+from pnpdepth_cli.pipeline.evaluation.dependence import (
+    MIN_CLUSTERS,
+    find_clusters,
+    groups_by_name,
+)
+from pnpdepth_cli.pipeline.evaluation.resampling import studentised_interval
 
 METHODS = ("plain", "linear", "refined")
 SWEPT = tuple(m for m in MEASURES if m.key in ("mae", "rmse", "mre", "delta1"))
 """The measures of a sweep."""
 
-_BETTER = np.array([1.0 if m.higher_is_better else -1.0 for m in SWEPT])
-_OF_A_MEASURE = (
+_BETTER = torch.tensor([1.0 if m.higher_is_better else -1.0 for m in SWEPT]).double()
+_MEASURE_COLUMNS = (
     *(*METHODS, "refined_low", "refined_high"),
     *("gain", "gain_low", "gain_high", "gain_over_linear"),
 )
@@ -29,17 +38,18 @@ _OF_A_MEASURE = (
 
 @dataclass(frozen=True, kw_only=True)
 class FrameFigures:
-    """One frame with one draw of its points.
-
-    values: (methods, measures), None if something failed. points: how many. diverged: the
-    refinement did not get as far as it was to.
-    """
+    """The scores of one frame with one draw of its points."""
 
     name: str
+    """The frame's name."""
     seed: int
+    """Of the draw."""
     values: Floats | None
+    """(methods, measures); None if something failed."""
     points: int = 0
+    """How many points were drawn."""
     diverged: bool = False
+    """True if the refinement made fewer updates than it should."""
 
     @classmethod
     def of(
@@ -51,7 +61,15 @@ class FrameFigures:
         linear: Mapping[str, Any] | None,
         curve: Mapping[str, Any] | None,
     ) -> FrameFigures:
-        """From the journal's lines of the interpolation and the refinement, None for a failure."""
+        """Returns the scores in the journal's lines.
+
+        Args:
+            name: The frame's name.
+            seed: Of the draw.
+            iterations: The number of updates whose scores are wanted.
+            linear: The line of linear interpolation; None if it failed.
+            curve: The line of the refinement; None if it failed.
+        """
         if linear is None or curve is None:
             return cls(name=name, seed=seed, values=None)
         by_method = {
@@ -63,18 +81,22 @@ class FrameFigures:
         return cls(
             name=name,
             seed=seed,
-            values=np.array(rows, np.float64),  # None, which is no number in JSON, becomes NaN
+            values=np.array(rows, np.float64),  # null in JSON becomes NaN
             points=curve["points"],
             diverged=by_method["refined"]["updates"] < iterations,
         )
 
 
 def summarise(figures: Sequence[FrameFigures], resamples: int) -> dict[str, Any]:
-    """A cell's means over the frames all draws of which went through, of each frame's over those.
+    """Returns a cell's means over frames, of each frame's mean over its draws.
 
-    Intervals are of frames drawn again and again (bootstrap), None for a single frame. Gains are
-    in per cent, positive where the refinement is better: over the plain network, and over linear
-    interpolation.
+    Frames of which a draw failed are left out. Gains are in per cent, positive where the refinement
+    is better: over the plain network, and over linear interpolation.
+
+    Args:
+        figures: All draws of all frames of the cell.
+        resamples: Bootstrap samples behind the intervals, which are studentised and over sequences
+            of frames; there are none with fewer than MIN_CLUSTERS of these.
     """
     by_frame: dict[str, list[FrameFigures]] = {}
     for each in figures:
@@ -90,53 +112,66 @@ def summarise(figures: Sequence[FrameFigures], resamples: int) -> dict[str, Any]
     table = np.stack(
         [np.mean([each.values for each in of if each.values is not None], axis=0) for of in whole]
     )
-    mean = _figures(table.mean(axis=0)[None])[0]
-    low = high = np.full_like(mean, np.nan)
-    if len(table) > 1:
-        low, high = bootstrap(
-            lambda weights: _figures(np.tensordot(weights, table, axes=1) / len(table)).reshape(
-                len(weights), -1
-            ),
-            len(table),
-            resamples,
-            seed=0,
-        )
-        low, high = low.reshape(mean.shape), high.reshape(mean.shape)
+    mean, low, high = _mean_and_interval(table, [of[0].name for of in whole], resamples)
     points = float(np.mean([each.points for of in whole for each in of]))
-    found: dict[str, Any] = plain(
+    result: dict[str, Any] = plain(
         counts | {"points": points, "measures": _by_measure(mean, low, high)}
     )
-    return found
+    return result
 
 
-def _figures(means: Floats) -> Floats:
-    """(B, 5, measures) of means (B, methods, measures): these, and the gains over the others."""
-    before, refined = means[:, :2], means[:, 2:]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        change = 100 * _BETTER * (refined - before) / np.abs(before)
-        gains = np.where(before == refined, 0.0, change)
-    return np.concatenate([means, np.where(np.isfinite(gains), gains, np.nan)], axis=1)
+def _mean_and_interval(
+    table: Floats, names: Sequence[str], resamples: int
+) -> tuple[Floats, Floats, Floats]:
+    """(5, measures) each, of a table (frames, methods, measures): means and gains, their ends."""
+    frames = FrameTable(rows=table.reshape(len(table), -1))
+    clusters = find_clusters(groups_by_name(names), frames.rows)
+    shape = (len(METHODS) + 2, len(SWEPT))
+
+    def statistic(totals: Tensor) -> Tensor:
+        means = frames.means_of(totals).unflatten(-1, table.shape[1:])
+        return _with_gains(means).flatten(-2)
+
+    mean = _with_gains(torch.from_numpy(table.mean(axis=0)))
+    low = high = np.full(shape, np.nan)
+    if clusters.count >= MIN_CLUSTERS:
+        totals = frames.cluster_totals(clusters.ids)
+        low, high = (
+            end.reshape(shape) for end in studentised_interval(statistic, totals, resamples, seed=0)
+        )
+    return np.asarray(mean.numpy()), low, high
+
+
+def _with_gains(means: Tensor) -> Tensor:
+    """(…, 5, measures) of means (…, methods, measures): these, and the gains over the others."""
+    before, refined = means[..., :2, :], means[..., 2:, :]
+    change = 100 * _BETTER * (refined - before) / before.abs()
+    gains = torch.where(before == refined, torch.zeros_like(change), change)
+    gains = torch.where(gains.isfinite(), gains, torch.full_like(gains, torch.nan))
+    return torch.cat([means, gains], dim=-2)
 
 
 def _by_measure(mean: Floats, low: Floats, high: Floats) -> dict[str, dict[str, float]]:
     rows = {method: number for number, method in enumerate((*METHODS, "gain", "gain_over_linear"))}
-    places = {
+    entries = {
         **{name: (mean, row) for name, row in rows.items()},
         **{f"{name}_low": (low, rows[name]) for name in ("refined", "gain")},
         **{f"{name}_high": (high, rows[name]) for name in ("refined", "gain")},
     }
     return {
-        measure.key: {name: float(places[name][0][places[name][1], m]) for name in _OF_A_MEASURE}
+        measure.key: {
+            name: float(entries[name][0][entries[name][1], m]) for name in _MEASURE_COLUMNS
+        }
         for m, measure in enumerate(SWEPT)
     }
 
 
 def write_sweep(folder: Path, record: Mapping[str, Any]) -> None:
-    """sweep.json holds the record, sweep.csv a line for each of its cells."""
+    """Writes the record to sweep.json, and a line for each of its cells to sweep.csv."""
     write_json(folder / "sweep.json", record)
     names = _parameters(record["studies"])
-    header = ["study", *names, "frames", "failed", "diverged", "points"]
-    header += [f"{measure.key}_{name}" for measure in SWEPT for name in _OF_A_MEASURE]
+    header = ["study", *names, "frames", "failed", "diverged", "points_used"]
+    header += [f"{measure.key}_{name}" for measure in SWEPT for name in _MEASURE_COLUMNS]
 
     def rows() -> Iterator[list[Any]]:
         for study in record["studies"]:
@@ -149,7 +184,7 @@ def write_sweep(folder: Path, record: Mapping[str, Any]) -> None:
                     *(
                         measures.get(measure.key, {}).get(name)
                         for measure in SWEPT
-                        for name in _OF_A_MEASURE
+                        for name in _MEASURE_COLUMNS
                     ),
                 ]
 
@@ -157,9 +192,9 @@ def write_sweep(folder: Path, record: Mapping[str, Any]) -> None:
 
 
 def write_frames(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """The file holds a line for each cell, frame and seed: study, parameters and figures."""
+    """Writes a line for each cell, frame and seed: study, parameters and scores."""
     names = list(dict.fromkeys(name for row in rows for name in row["parameters"]))
-    header = ["study", *names, "frame", "seed", "status", "points"]
+    header = ["study", *names, "frame", "seed", "status", "points_used"]
     header += [f"{measure.key}_{method}" for measure in SWEPT for method in METHODS]
 
     def lines() -> Iterator[list[Any]]:
@@ -172,7 +207,7 @@ def write_frames(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
             yield [
                 row["study"],
                 *(row["parameters"].get(name) for name in names),
-                *(figures.name, figures.seed),
+                *(text_cell(figures.name), figures.seed),
                 *("failed" if figures.values is None else status, figures.points),
                 *values,
             ]
@@ -181,7 +216,7 @@ def write_frames(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
 
 
 def _parameters(studies: Sequence[Mapping[str, Any]]) -> list[str]:
-    """All that are varied, each once."""
+    """The parameters that are varied, each once."""
     return list(dict.fromkeys(name for study in studies for name in study["parameters"]))
 
 
@@ -191,5 +226,5 @@ def _write_csv(path: Path, header: Sequence[str], rows: Iterator[list[Any]]) -> 
     writer.writerow(header)
     writer.writerows(rows)
     with atomic_path(path) as temporary:
-        # A file name that is no UTF-8 has characters that are none.
+        # a file name that is no UTF-8 has surrogates
         temporary.write_bytes(text.getvalue().encode("utf-8", "backslashreplace"))

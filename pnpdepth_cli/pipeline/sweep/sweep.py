@@ -16,7 +16,7 @@ from pnpdepth_cli.errors import (
     UsageError,
 )
 from pnpdepth_cli.io.atomic import make_folder, remove_leftovers
-from pnpdepth_cli.io.layouts.frame import Frame
+from pnpdepth_cli.io.dataset.frame import Frame
 from pnpdepth_cli.io.lock import locked_folder
 from pnpdepth_cli.models.definition import ModelDefinition
 from pnpdepth_cli.pipeline.batch.batch import Listener
@@ -24,7 +24,8 @@ from pnpdepth_cli.pipeline.batch.frames import BatchRequest, Task, find_frames, 
 from pnpdepth_cli.pipeline.batch.settings import model_identity
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs, read_inputs
 from pnpdepth_cli.pipeline.refinement.refine import Refiner, load_refiner
-from pnpdepth_cli.pipeline.refinement.request import RefineRequest, effective_settings, layer_name
+from pnpdepth_cli.pipeline.refinement.request import RefineRequest
+from pnpdepth_cli.pipeline.refinement.resolve import resolve_layer, resolve_settings
 from pnpdepth_cli.pipeline.refinement.ways import HeldCut
 from pnpdepth_cli.pipeline.sweep.axes import Study
 from pnpdepth_cli.pipeline.sweep.plan import Place, Plan, Run, RunPlace, sampling_of
@@ -117,7 +118,7 @@ def _frames(request: SweepRequest, listener: Listener) -> tuple[Sampling, list[t
     asked = BatchRequest(
         source=request.source,
         output=request.output,
-        refine=replace(request.refine, sample=_TRUTH_ALONE),
+        refine=request.refine.with_fields(sample=_TRUTH_ALONE),
         layout=request.layout,
         protocol=request.protocol,
         limit=request.limit,
@@ -140,7 +141,7 @@ def _frames(request: SweepRequest, listener: Listener) -> tuple[Sampling, list[t
         said = "the frames' own" if own else "uniform of the ground truth, for they have no others"
         listener.say(f"points: {said}; --sample says otherwise")
     samplings = [sampling_of(cell, sampling) for study in request.studies for cell in study.cells()]
-    scan = request.refine.scan
+    scan = request.refine.files.scan
     if any(each.lidar for each in samplings):  # then it is the camera's, not of a scan
         frames = [
             replace(f, calib=scan.calib or f.calib, camera=_given(scan.camera, f.camera))
@@ -148,7 +149,7 @@ def _frames(request: SweepRequest, listener: Listener) -> tuple[Sampling, list[t
         ]
         scan = replace(scan, calib=None, camera=None)
     own_wanted = any(each.sensor == OWN for each in samplings)
-    reading_own = replace(asked, refine=replace(request.refine, scan=scan, sample=None))
+    reading_own = replace(asked, refine=request.refine.with_fields(scan=scan, sample=None))
     return sampling, [
         (task_of(reading_own if own_wanted and frame.sparse else asked, frame), frame)
         for frame in frames
@@ -172,15 +173,15 @@ def _settled(
             inputs = read_inputs(task.request)
             known = 0 if inputs.gt is None else int((inputs.gt > 0).sum())
             some = Sampling(sensor="uniform", points=str(min(_TO_SETTLE_ON, known)))
-            points = frame_points(some, request.refine.seed, inputs, task.request, frame)
+            points = frame_points(some, request.refine.hold_out.seed, inputs, task.request, frame)
         except InputError as error:
             errors.append(error)
             continue
         refiner = load_refiner(
-            replace(task.request, layer=_some_layer(request)), replace(inputs, points=points)
+            task.request.with_fields(layer=_some_layer(request)), replace(inputs, points=points)
         )
         for note in inputs.notes:
-            if task.request.sample is None or not note.startswith("sparse"):
+            if task.request.files.sample is None or not note.startswith("sparse"):
                 listener.say(f"{task.name}: {note}")
         for note in refiner.network.notes:
             listener.say(note)
@@ -197,17 +198,17 @@ def _settled(
 def _some_layer(request: SweepRequest) -> str | None:
     """The layer that is asked for, or one that is: a network may have none that it is cut at."""
     axes = [axis for study in request.studies for axis in study.axes if axis.name == "layer"]
-    return axes[0].values[0] if axes else request.refine.layer
+    return axes[0].values[0] if axes else request.refine.method.layer
 
 
 def _base(definition: ModelDefinition, request: RefineRequest) -> dict[str, Any]:
     """What holds where it is not varied."""
-    settings = effective_settings(definition, request)
-    layer = request.layer or definition.default_layer
+    settings = resolve_settings(definition, request.method)
+    layer = request.method.layer or definition.default_layer
     return {
-        "layer": None if layer is None else layer_name(definition, layer),
+        "layer": None if layer is None else resolve_layer(definition, layer),
         **asdict(settings),
-        "propagate": request.propagate or "none",
+        "propagate": request.method.propagate or "none",
     }
 
 

@@ -513,7 +513,7 @@ def test_reading_and_writing_go_on_while_the_network_runs(
     refine, write = Refiner.refine, batch_running.write_refined
 
     def reading(request: Any) -> Any:
-        read.add(str(request.image))
+        read.add(str(request.files.image))
         if len(read) == 2:
             second_is_read.set()
         return read_inputs(request)

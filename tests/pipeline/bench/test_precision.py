@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +16,7 @@ from tests.pipeline.frames import frame_on_disk
 @pytest.fixture
 def asked(tmp_path: Path) -> RefineRequest:
     frame = frame_on_disk(tmp_path)
-    return RefineRequest(
+    return RefineRequest.from_fields(
         image=frame.image,
         sparse=frame.sparse,
         model=str(frame.model),
@@ -33,7 +32,7 @@ def test_bf16_refines_to_nearly_the_depth_of_fp32_and_the_record_says_so(
 ) -> None:
     records, depths = {}, {}
     for precision in ("fp32", "bf16"):
-        record = refine_image(replace(asked, precision=precision)).record
+        record = refine_image(asked.with_fields(precision=precision)).record
         records[precision] = json.loads(json.dumps(record))["settings"]["precision"]
         depths[precision] = read_depth(Path(record["outputs"]["depth"])).values
         assert record["sparse_error"]["after"]["mae"] < record["sparse_error"]["before"]["mae"]
@@ -43,5 +42,5 @@ def test_bf16_refines_to_nearly_the_depth_of_fp32_and_the_record_says_so(
 
 
 def test_a_batch_in_another_precision_is_done_again(asked: RefineRequest) -> None:
-    other = replace(asked, precision="bf16")
+    other = asked.with_fields(precision="bf16")
     assert settings_digest(asked, {}) != settings_digest(other, {})

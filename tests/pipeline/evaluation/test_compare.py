@@ -12,9 +12,14 @@ import pytest
 from pnpdepth_cli.errors import FileFormatError, InputError, UsageError
 from pnpdepth_cli.io.depth import write_depth
 from pnpdepth_cli.io.record import write_json
-from pnpdepth_cli.pipeline.evaluation.compare import compare
+from pnpdepth_cli.pipeline.evaluation.compare import CompareRequest, Comparison
+from pnpdepth_cli.pipeline.evaluation.compare import compare as compare_runs
 from pnpdepth_cli.pipeline.evaluation.evaluate import evaluate
 from pnpdepth_cli.pipeline.evaluation.result import EvalRequest
+
+
+def compare(paths: list[str], **settings: Any) -> Comparison:
+    return compare_runs(CompareRequest(paths=paths, **settings))
 
 
 def run(root: Path, name: str, errors: dict[str, list[float]], **given: Any) -> str:
@@ -23,7 +28,7 @@ def run(root: Path, name: str, errors: dict[str, list[float]], **given: Any) -> 
         for folder, depth in ((name, 10 + np.array([error])), ("gt", np.full((1, len(error)), 10))):
             (root / folder).mkdir(exist_ok=True)
             write_depth(root / folder / f"{frame}.npy", depth.astype(np.float32))
-    request = EvalRequest(prediction=root / name, truth=root / "gt", resamples=0, **given)
+    request = EvalRequest(prediction=root / name, ground_truth=root / "gt", resamples=0, **given)
     path = root / f"{name}.json"
     write_json(path, evaluate(request).as_record())
     return str(path)
@@ -39,11 +44,15 @@ def test_a_lower_error_is_a_positive_gain(tmp_path: Path) -> None:
     assert gain.percent == pytest.approx(100 * 2.5 / 7)
     assert gain.difference == pytest.approx(-2.5 / 3)
     assert gain.p_value == 2 / 8  # all three got better: two of the eight swaps differ as much
-    assert gain.low_percent <= gain.percent <= gain.high_percent
+    assert np.isnan([gain.low_percent, gain.high_percent]).all()  # three frames are too few
     assert found.exact
     assert [r.label for r in found.runs] == ["one", "two"]
     assert found.runs[0].mean["mae"] == pytest.approx(7 / 3)
-    assert found.notes == ()
+    (note,) = found.notes
+    assert note == (
+        "warning: 3 frames are too few to conclude anything: the smallest possible p is 0.25, and"
+        " there is no interval below 5"
+    )
 
 
 def test_a_higher_share_below_the_threshold_is_a_positive_gain(tmp_path: Path) -> None:
@@ -59,8 +68,7 @@ def test_a_run_is_no_better_than_itself(tmp_path: Path) -> None:
     path = run(tmp_path, "one", FIRST)
     found = compare([path, path])
     for gain in found.gains[0].values():
-        assert (gain.percent, gain.low_percent, gain.high_percent) == (0, 0, 0)
-        assert gain.p_value == 1
+        assert (gain.percent, gain.p_value, gain.p_adjusted) == (0, 1, 1)
     assert [r.label for r in found.runs] == [path, path]
 
 
@@ -71,7 +79,7 @@ def test_frames_are_paired_by_name_and_the_others_told(tmp_path: Path) -> None:
     found = compare([one, two])
     assert found.names == ("a", "b")
     assert found.runs[0].mean["mae"] == pytest.approx(3)
-    (note,) = found.notes
+    note = found.notes[0]
     assert "1 frames of" in note
     assert note.endswith("left out: only one")
 
@@ -112,6 +120,58 @@ def test_many_frames_are_tested_with_random_swaps_of_the_seed(tmp_path: Path) ->
     assert found.gains != compare(paths, resamples=500, seed=2).gains
 
 
+SIX = {f"{n:04}": [error] for n, error in enumerate((2.0, 5.0, 1.0, 4.0, 1.5, 3.0))}
+
+
+def scaled(errors: dict[str, list[float]], factors: list[float]) -> dict[str, list[float]]:
+    rows = zip(errors.items(), factors, strict=True)
+    return {name: [error * factor for error in row] for (name, row), factor in rows}
+
+
+def test_six_frames_have_an_interval_around_the_gain(tmp_path: Path) -> None:
+    better = scaled(SIX, [0.5, 0.8, 0.6, 0.7, 0.9, 0.55])
+    found = compare([run(tmp_path, "one", SIX), run(tmp_path, "two", better)])
+    gain = found.gains[0]["mae"]
+    assert gain.low_percent < gain.percent < gain.high_percent
+    assert gain.p_value == 2 / 64
+    assert found.notes == ()
+    same = compare([run(tmp_path, "one", SIX), run(tmp_path, "half", scaled(SIX, [0.5] * 6))])
+    equal = same.gains[0]["mae"]
+    assert (equal.low_percent, equal.high_percent) == pytest.approx((50, 50))
+
+
+def test_p_values_are_adjusted_for_the_number_of_measures(tmp_path: Path) -> None:
+    better = scaled(SIX, [0.5, 0.8, 0.6, 0.7, 0.9, 0.55])
+    found = compare([run(tmp_path, "one", SIX), run(tmp_path, "two", better)])
+    p_values = [gain.p_value for gain in found.gains[0].values()]
+    smallest = min(found.gains[0].values(), key=lambda gain: gain.p_value)
+    assert len(p_values) == len(found.measures) == 12
+    assert smallest.p_adjusted == pytest.approx(min(1, 12 * min(p_values)))
+
+
+def test_frames_of_one_group_are_swapped_together(tmp_path: Path) -> None:
+    first = {f"{drive}_{n:04}": [2.0 + n] for drive in "abc" for n in range(4)}
+    paths = [run(tmp_path, "one", first), run(tmp_path, "two", scaled(first, [0.5] * 12))]
+    grouped = compare(paths)
+    assert grouped.clusters.describe() == "3 groups of frames"
+    assert grouped.gains[0]["mae"].p_value == 2 / 8
+    assert grouped.notes[-1].startswith("warning: 3 groups of frames are too few")
+    assert grouped.as_record()["clusters"] == {"count": 3, "unit": "groups of frames"}
+    alone = compare(paths, grouped=False)
+    assert alone.clusters.describe() == "12 frames"
+    assert alone.gains[0]["mae"].p_value == 2 / 4096
+
+
+def test_a_correlated_sequence_is_swapped_in_blocks(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    drift = np.cumsum(rng.normal(0, 0.05, 120))
+    first = {f"{n:04}": [3.0] for n in range(120)}
+    second = {f"{n:04}": [3.0 + float(drift[n])] for n in range(120)}
+    found = compare([run(tmp_path, "one", first), run(tmp_path, "two", second)])
+    assert found.clusters.count < 12
+    assert "consecutive frames" in found.clusters.describe()
+
+
 def test_different_rules_are_refused_and_named(tmp_path: Path) -> None:
     one = run(tmp_path, "one", FIRST)
     two = run(tmp_path, "two", FIRST, changes={"max_depth": 50.0})
@@ -143,10 +203,11 @@ def test_other_pixels_and_other_truth_are_warned_of(tmp_path: Path) -> None:
     one = run(tmp_path, "one", {"a": [1.0, 1.0]})
     less = run(tmp_path, "less", {"a": [1.0, -10.0]})
     (note,) = compare([one, less]).notes
-    assert "do not cover the same pixels (2 in" in note
+    assert "coverage differs (100.00% in" in note
+    assert "this is no ranking" in note
     other = run(tmp_path, "other", {"a": [1.0, 1.0, 1.0]})
     (note,) = compare([one, other]).notes
-    assert "another number of pixels with truth" in note
+    assert "another number of pixels with ground truth" in note
 
 
 SCORES = {

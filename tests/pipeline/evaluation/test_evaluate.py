@@ -29,10 +29,10 @@ def scored(root: Path, **given: Any) -> Evaluation:
     changes = {
         name: given.pop(name)
         for name in list(given)
-        if name not in ("protocol", "sparse", "scales", "resamples", "seed", "workers")
+        if name not in ("protocol", "sparse", "scales", "resamples", "seed", "grouped", "workers")
     }
     return evaluate(
-        EvalRequest(prediction=root / "out", truth=root / "gt", changes=changes, **given)
+        EvalRequest(prediction=root / "out", ground_truth=root / "gt", changes=changes, **given)
     )
 
 
@@ -61,7 +61,7 @@ def test_coverage_is_of_each_frame_and_of_all(two: Path) -> None:
         ("a", 2, 2, 1.0), ("ü b", 1, 2, 0.5),
     ]  # fmt: skip
     assert found.coverage == 0.75
-    assert any("1 pixels (25.00%) of the truth have no prediction" in n for n in found.notes)
+    assert any("1 pixels (25.00%) of the ground truth have no prediction" in n for n in found.notes)
     assert found.unscored() is None
 
 
@@ -81,7 +81,7 @@ def test_a_frame_without_prediction_is_counted_and_lowers_the_coverage(two: Path
 FAULTS = [
     (lambda p: p.write_bytes(b"no depth"), "is not a depth file"),
     (lambda p: depth_file(p, [[0, 0]]), "holds no valid depth"),
-    (lambda p: depth_file(p, [[1, 1, 1]]), "is 3×1 but the truth"),
+    (lambda p: depth_file(p, [[1, 1, 1]]), "is 3×1 but the ground truth"),
 ]
 
 
@@ -105,19 +105,19 @@ def test_where_nothing_can_be_scored_the_first_reason_is_the_error(two: Path) ->
 
 def test_two_single_files_raise_what_is_wrong_with_them(two: Path) -> None:
     prediction, truth = two / "out" / "a_depth.npy", two / "gt" / "a.npy"
-    found = evaluate(EvalRequest(prediction=prediction, truth=truth))
+    found = evaluate(EvalRequest(prediction=prediction, ground_truth=truth))
     assert (found.mean["rmse"], found.interval) == (1, None)
     depth_file(prediction, [[1, 1, 1]])
     with pytest.raises(
-        SizeError, match=r"a_depth\.npy is 3×1 but the truth .*a\.npy is 2×1; --res"
+        SizeError, match=r"a_depth\.npy is 3×1 but the ground truth .*a\.npy is 2×1; --res"
     ):
-        evaluate(EvalRequest(prediction=prediction, truth=truth))
+        evaluate(EvalRequest(prediction=prediction, ground_truth=truth))
     depth_file(prediction, [[0, 0]])
     with pytest.raises(InputError, match="holds no valid depth"):
-        evaluate(EvalRequest(prediction=prediction, truth=truth))
+        evaluate(EvalRequest(prediction=prediction, ground_truth=truth))
     depth_file(truth, [[0, 0]])
     with pytest.raises(InputError, match=r"a\.npy has no known depth where protocol paper scores"):
-        evaluate(EvalRequest(prediction=prediction, truth=truth))
+        evaluate(EvalRequest(prediction=prediction, ground_truth=truth))
 
 
 def brute(p: np.ndarray, g: np.ndarray, counts: np.ndarray) -> dict[str, float]:
@@ -140,13 +140,13 @@ def brute(p: np.ndarray, g: np.ndarray, counts: np.ndarray) -> dict[str, float]:
 
 @pytest.fixture(scope="module")
 def random_frames(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, np.ndarray, np.ndarray]:
-    """Four frames of 640×480 with truth from 0.2 to 12 m, and predictions with holes."""
+    """Six frames of 640×480 with truth from 0.2 to 12 m, and predictions with holes."""
     root, rng = tmp_path_factory.mktemp("random"), np.random.default_rng(0)
-    truth = rng.uniform(0.2, 12, (4, 480, 640)).astype(np.float32)
+    truth = rng.uniform(0.2, 12, (6, 480, 640)).astype(np.float32)
     prediction = (truth * np.exp(rng.normal(0, 0.2, truth.shape))).astype(np.float32)
     truth[rng.random(truth.shape) < 0.3] = 0
     prediction[rng.random(truth.shape) < 0.1] = 0
-    for number in range(4):
+    for number in range(6):
         depth_file(root / "out" / f"{number}_depth.npy", prediction[number])
         depth_file(root / "gt" / f"{number}.npy", truth[number])
     return root, prediction, truth
@@ -206,11 +206,36 @@ def test_the_interval_holds_the_mean_and_is_of_the_seed(
     assert found.interval == scored(root, resamples=500, seed=1).interval
     assert found.interval != scored(root, resamples=500, seed=2).interval
     assert scored(root, resamples=0).interval is None
+    assert found.describe_interval().endswith("studentised bootstrap over 6 frames")
+
+
+def test_few_groups_of_frames_have_no_interval_and_say_so(tmp_path: Path) -> None:
+    for drive in ("a", "b"):
+        for number in range(4):
+            depth_file(tmp_path / "out" / drive / f"{number:04}_depth.npy", [[2 + number]])
+            depth_file(tmp_path / "gt" / drive / f"{number:04}.npy", [[2]])
+    found = scored(tmp_path)
+    assert found.interval is None
+    assert "no interval: 2 groups of frames are too few" in found.notes[-1]
+    assert [frame["group"] for frame in found.as_record()["frames"]] == ["a"] * 4 + ["b"] * 4
+    assert scored(tmp_path, grouped=False).interval is not None
+
+
+def test_the_group_of_a_manifest_goes_before_the_name(tmp_path: Path) -> None:
+    lines = ["image,gt,group"]
+    for number in range(3):
+        depth_file(tmp_path / "out" / f"{number}_depth.npy", [[2]])
+        depth_file(tmp_path / "gt" / f"{number}.npy", [[2]])
+        lines.append(f"{number}.png,gt/{number}.npy,{'ab'[number % 2]}")
+        cv2.imwrite(str(tmp_path / f"{number}.png"), np.zeros((1, 1, 3), np.uint8))
+    (tmp_path / "list.csv").write_text("\n".join(lines))
+    found = evaluate(EvalRequest(prediction=tmp_path / "out", ground_truth=tmp_path / "list.csv"))
+    assert [frame.pair.group for frame in found.frames] == ["a", "b", "a"]
 
 
 def test_a_mask_of_another_size_or_missing_for_a_frame_is_a_fault(two: Path) -> None:
     depth_file(two / "masks" / "a.npy", [[1, 0, 1]])
-    with pytest.raises(InputError, match=r"mask .*a\.npy is 3×1 but the truth"):
+    with pytest.raises(InputError, match=r"mask .*a\.npy is 3×1 but the ground truth"):
         scored(two, mask=two / "masks")
     depth_file(two / "masks" / "a.npy", [[1, 0]])
     found = scored(two, mask=two / "masks")
@@ -257,14 +282,14 @@ def test_the_scale_that_would_help_is_named_and_helps(tmp_path: Path) -> None:
     (tmp_path / "gt").mkdir()
     cv2.imwrite(str(tmp_path / "gt" / "a.png"), np.rint(truth * 1000).astype(np.uint16))
     (warning,) = (n for n in scored(tmp_path).notes if n.startswith("warning"))
-    assert warning.endswith("; --gt-scale 1000 (now 256) would take it away")
+    assert warning.endswith("; --gt-scale 1000 (now 256) would remove it")
     (warning,) = (
         n
         for n in scored(tmp_path, scales=Scales(prediction=256_000.0)).notes
         if n.startswith("warning")
     )
     assert "--pred-scale 256 (now 256000) or --gt-scale 256000 (now 256) would" in warning
-    right = scored(tmp_path, scales=Scales(truth=1000.0))
+    right = scored(tmp_path, scales=Scales(ground_truth=1000.0))
     assert right.mean["rmse"] == pytest.approx(0, abs=1e-6)
     assert not [n for n in right.notes if n.startswith("warning")]
 
@@ -284,7 +309,7 @@ def test_sparse_input_in_the_truth_is_warned_of_and_can_be_left_out(tmp_path: Pa
     depth_file(tmp_path / "sparse.npy", points)
     found = scored(tmp_path, sparse=tmp_path / "sparse.npy")
     (warning,) = (n for n in found.notes if n.startswith("warning"))
-    assert "4 of the scored pixels (4.00%) hold a value of the sparse input" in warning
+    assert "4 of the scored pixels (4.00%) have a point of the sparse input" in warning
     assert "--exclude-sparse" in warning
     without = scored(tmp_path, sparse=tmp_path / "sparse.npy", exclude_sparse=True)
     assert without.frames[0].known == 93
@@ -297,7 +322,7 @@ def test_the_same_depth_in_other_codes_is_still_the_sparse_input(tmp_path: Path)
     depth_file(tmp_path / "gt" / "a.png", truth, scale=256)
     depth_file(tmp_path / "out" / "a.png", truth, scale=1000)
     depth_file(tmp_path / "s.png", np.where(np.eye(10) > 0, truth, 0), scale=1000)
-    assert scored(tmp_path, sparse=tmp_path / "s.png").frames[0].given == 10
+    assert scored(tmp_path, sparse=tmp_path / "s.png").frames[0].leaked == 10
 
 
 def test_the_record_beside_a_prediction_is_enough_to_find_the_leak(two: Path) -> None:
@@ -305,11 +330,11 @@ def test_the_record_beside_a_prediction_is_enough_to_find_the_leak(two: Path) ->
     record = {"inputs": {"sparse": {"path": str(sparse)}}}
     (two / "out" / "a.json").write_text(json.dumps(record))
     found = scored(two)
-    assert [(f.has_sparse, f.given) for f in found.frames] == [(True, 1), (False, 0)]
+    assert [(f.has_sparse, f.leaked) for f in found.frames] == [(True, 1), (False, 0)]
     assert (found.by_distance, found.by_depth) == ((), ())
     sampled = {"inputs": {"sparse": {"sampled_from": "gt"}}, "points": {"used": 2}}
     (two / "out" / "a.json").write_text(json.dumps(sampled))
-    assert scored(two).frames[0].given == 2
+    assert scored(two).frames[0].leaked == 2
     with pytest.raises(InputError, match="no sparse depth file to exclude; give it with --sparse"):
         scored(two, exclude_sparse=True)
 
@@ -319,7 +344,7 @@ def test_a_sparse_file_that_the_record_names_but_is_spoilt_does_no_harm(two: Pat
     record = {"inputs": {"sparse": {"path": str(two / "s.npy")}}}
     (two / "out" / "a.json").write_text(json.dumps(record))
     assert [f.has_sparse for f in scored(two).scored] == [False, False]
-    assert scored(two, sparse=two / "out").frames[0].given == 0
+    assert scored(two, sparse=two / "out").frames[0].leaked == 0
 
 
 def test_the_parts_by_distance_and_by_depth_are_plain_numpy(tmp_path: Path) -> None:
@@ -386,7 +411,7 @@ def test_empty_rows_that_the_kit_does_not_fill_are_told(tmp_path: Path) -> None:
     found = scored(tmp_path, protocol="kitti-devkit")
     assert found.mean["mae"] == pytest.approx(2 / 3)
     assert math.isnan(found.mean["log_mae"])
-    assert any("empty rows between others" in note for note in found.notes)
+    assert any("empty rows between filled ones" in note for note in found.notes)
     assert found.as_record()["mean"]["log_mae"] is None
 
 
@@ -403,7 +428,7 @@ def test_the_truth_of_a_data_set_is_cut_as_its_layout_says(tmp_path: Path) -> No
 
 
 REFUSED = [
-    ({"scales": Scales(truth=0.0)}, "--gt-scale"),
+    ({"scales": Scales(ground_truth=0.0)}, "--gt-scale"),
     ({"scales": Scales(prediction=math.nan)}, "--pred-scale"),
     ({"workers": 0}, "--workers"),
     ({"resamples": -1}, "--bootstrap"),
@@ -424,7 +449,7 @@ def test_the_worst_frames_come_first_in_either_direction(two: Path) -> None:
 
 def test_progress_is_told_frame_by_frame(two: Path) -> None:
     told: list[tuple[int, int]] = []
-    request = EvalRequest(prediction=two / "out", truth=two / "gt")
+    request = EvalRequest(prediction=two / "out", ground_truth=two / "gt")
     evaluate(request, on_frame=lambda done, of: told.append((done, of)))
     assert told == [(1, 2), (2, 2)]
 
@@ -433,7 +458,7 @@ def test_real_frames_of_kitti_score_as_plain_numpy_does(shared_data: Path) -> No
     """The scan itself against the accumulated truth: where it hits, it is good but not perfect."""
     folder = shared_data / "kitti_dc"
     request = EvalRequest(
-        prediction=folder / "velodyne_raw", truth=folder / "groundtruth", protocol="kitti"
+        prediction=folder / "velodyne_raw", ground_truth=folder / "groundtruth", protocol="kitti"
     )
     found = evaluate(request)
     assert len(found.scored) == 6

@@ -62,7 +62,7 @@ def test_the_files_of_a_refinement_find_their_truth_and_pictures_are_left_aside(
     pairs = pair_frames(out, gt)
     assert matched(pairs) == {"b": "b_depth.png", "ä ö": "ä ö_depth.exr"}
     assert not pairs.single
-    assert pairs.notes == (f"{out}: left aside, as there is a _depth of each: b.png",)
+    assert pairs.notes == (f"{out}: ignored, as there is a _depth of each: b.png",)
 
 
 def test_a_preview_without_a_depth_beside_it_is_a_frame(tmp_path: Path) -> None:
@@ -84,7 +84,9 @@ def test_a_truth_without_prediction_stays_in_the_list_and_an_extra_prediction_is
     out, gt = folders(tmp_path, ["a.png", "x.png", "y.png"], ["a.png", "b.png"])
     pairs = pair_frames(out, gt)
     assert matched(pairs) == {"a": "a.png", "b": None}
-    assert pairs.notes == ("warning: 2 of 3 predictions have no truth and are not scored: x, y",)
+    assert pairs.notes == (
+        "warning: 2 of 3 predictions have no ground truth and are not scored: x, y",
+    )
 
 
 def test_hidden_files_links_in_circles_and_unreadable_folders_do_no_harm(tmp_path: Path) -> None:
@@ -126,7 +128,7 @@ def test_folders_without_a_common_name_are_refused_with_both_kinds_of_names(tmp_
     with pytest.raises(InputError) as error:
         pair_frames(out, gt)
     assert str(error.value) == (
-        "no prediction has the name of a truth: predictions are 1; truths are 0001"
+        "no prediction has the name of a ground truth file: predictions are 1; ground truth is 0001"
     )
 
 
@@ -134,7 +136,7 @@ def test_two_files_are_one_frame_whatever_they_are_called(tmp_path: Path) -> Non
     pairs = pair_frames(depth_at(tmp_path / "p_depth.png"), depth_at(tmp_path / "g.npy"))
     assert pairs.single
     assert matched(pairs) == {"p": "p_depth.png"}
-    assert pairs.frames[0].truth.gt == tmp_path / "g.npy"
+    assert pairs.frames[0].frame.gt == tmp_path / "g.npy"
 
 
 def test_a_file_and_a_folder_or_nothing_at_all_are_refused(tmp_path: Path) -> None:
@@ -154,7 +156,7 @@ def test_sparse_depth_and_masks_are_one_for_all_or_one_for_each(tmp_path: Path) 
     pairs = pair_frames(out, gt, sparse=one, mask=tmp_path / "each")
     assert [f.sparse for f in pairs.frames] == [one, one]
     assert [f.mask for f in pairs.frames] == [None, tmp_path / "each" / "b.png"]
-    assert all(f.sparse_asked for f in pairs.frames)
+    assert all(f.sparse_named for f in pairs.frames)
 
 
 def test_the_record_beside_a_prediction_names_its_sparse_depth(tmp_path: Path) -> None:
@@ -168,7 +170,7 @@ def test_the_record_beside_a_prediction_names_its_sparse_depth(tmp_path: Path) -
     (out / "c.json").write_text("not JSON at all")
     frames = pair_frames(out, gt).frames
     assert [(f.sparse, f.image) for f in frames] == [(sparse, image), (None, None), (None, None)]
-    assert not frames[0].sparse_asked
+    assert not frames[0].sparse_named
 
 
 def test_the_truth_can_be_a_data_set_of_a_known_layout(tmp_path: Path) -> None:
@@ -178,7 +180,7 @@ def test_the_truth_can_be_a_data_set_of_a_known_layout(tmp_path: Path) -> None:
         depth_at(data / name)
     pairs = pair_frames(out, data)
     assert matched(pairs) == {"a": "a_depth.png"}
-    assert pairs.notes[0] == "truth: layout pairs; frames with ground truth: 1"
+    assert pairs.notes[0] == "gt: layout pairs; frames with ground truth: 1"
     assert pairs.frames[0].sparse == data / "sparse" / "a.png"
 
 

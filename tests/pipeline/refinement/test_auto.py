@@ -151,7 +151,7 @@ def test_of_a_network_that_takes_the_points_it_is_said_what_holding_some_out_doe
     choice = Choice(
         ways=(best.way,), weights=(1.0,), error=best.error, network=network_m, scored=tuple(scored)
     )
-    request = RefineRequest(image=frame.image, sparse=frame.sparse, auto=True)
+    request = RefineRequest.from_fields(image=frame.image, sparse=frame.sparse, auto=True)
     notes = held_out.auto_notes(choice, request, replace(network.definition, input_kind=kind))
     assert notes[0].startswith("auto: ")
     assert any("takes the points itself" in note for note in notes[1:]) == warned
@@ -167,7 +167,7 @@ def test_the_networks_error_is_that_of_the_network_alone(
     errors = {str(one.way): one.error for one in found.choice.scored}
     assert found.choice.network == errors["network"]
     assert any("network" in name and name != "network" for name in errors)  # none of it alone
-    request = RefineRequest(image=frame.image, sparse=frame.sparse, auto=True)
+    request = RefineRequest.from_fields(image=frame.image, sparse=frame.sparse, auto=True)
     note = held_out.auto_notes(found.choice, request, network.definition)[0]
     assert f"network {errors['network']:.4f} m" in note
 

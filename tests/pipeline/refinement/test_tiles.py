@@ -172,7 +172,7 @@ def test_propagation_follows_once_over_all_tiles() -> None:
 
 def test_tiles_and_folds_do_not_go_together(tmp_path_factory: pytest.TempPathFactory) -> None:
     frame = frame_on_disk(tmp_path_factory.mktemp("frame"))
-    request = RefineRequest(image=frame.image, sparse=frame.sparse, tile=64, auto=True)
+    request = RefineRequest.from_fields(image=frame.image, sparse=frame.sparse, tile=64, auto=True)
     with pytest.raises(UsageError, match="--tile goes with none of --auto"):
         load_refiner(request, everywhere((64, 64)).inputs)
 

@@ -279,7 +279,7 @@ def test_a_disk_that_is_full_while_drawing_ends_the_run_and_the_next_one_goes_on
     root: Path, report: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     drawn: list[str] = []
-    save = report_batch.save_pictures
+    save = report_batch.save_images
 
     def full_at_the_second(folder: Path, key: str, *views: Any, **others: Any) -> None:
         drawn.append(key)
@@ -287,7 +287,7 @@ def test_a_disk_that_is_full_while_drawing_ends_the_run_and_the_next_one_goes_on
             raise StorageError("the disk is full")
         save(folder, key, *views, **others)
 
-    monkeypatch.setattr(report_batch, "save_pictures", full_at_the_second)
+    monkeypatch.setattr(report_batch, "save_images", full_at_the_second)
     with pytest.raises(StorageError):
         batch(root, html=report)
     assert not (report / "index.html").exists()

@@ -33,7 +33,7 @@ def root(tmp_path: Path) -> Path:
 
 
 def reported(root: Path, **given: Any) -> Evaluation:
-    found = evaluate(EvalRequest(prediction=root / "out", truth=root / "gt", **given))
+    found = evaluate(EvalRequest(prediction=root / "out", ground_truth=root / "gt", **given))
     write_eval_report(root / "report", found)
     return found
 
@@ -126,7 +126,7 @@ def test_with_sparse_points_the_errors_by_distance_and_depth_are_on_the_page(roo
     captions = [table["caption"] for table in page_data(root / "report")["tables"]]
     assert captions[1:] == [
         "By distance to the nearest sparse point, all pixels together",
-        "By depth of the truth, all pixels together",
+        "By depth of the ground truth, all pixels together",
     ]
 
 
@@ -143,7 +143,7 @@ def test_what_the_development_kit_fills_in_is_shown_filled(root: Path) -> None:
 
 
 def test_a_file_that_goes_after_scoring_costs_one_frame_its_pictures(root: Path) -> None:
-    found = evaluate(EvalRequest(prediction=root / "out", truth=root / "gt"))
+    found = evaluate(EvalRequest(prediction=root / "out", ground_truth=root / "gt"))
     (root / "out/a.npy").unlink()
     write_eval_report(root / "report", found)
     frames = frames_of(root / "report")

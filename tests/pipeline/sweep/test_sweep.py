@@ -23,7 +23,7 @@ from pnpdepth_cli.errors import (
     PnpDepthError,
     UsageError,
 )
-from pnpdepth_cli.io.layouts.frame import Frame
+from pnpdepth_cli.io.dataset.frame import Frame
 from pnpdepth_cli.io.lock import locked_folder
 from pnpdepth_cli.pipeline.refinement import refine as refining
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs, read_inputs
@@ -161,7 +161,7 @@ def test_a_grid_holds_the_scores_of_batch_and_of_linear_interpolation(root: Path
     assert float(line["rmse_plain"]) == wanted["before"]["rmse"]
     assert float(line["delta1_linear"]) == interpolated.delta1
     assert line["status"] == "done"
-    assert int(line["points"]) == 60
+    assert int(line["points_used"]) == 60
     cells = record["studies"][0]["cells"]
     assert [cell["parameters"] for cell in cells] == [
         {"iterations": k, "lr": lr} for k in ("0", "2") for lr in ("1%", "10%")
@@ -222,7 +222,11 @@ def test_a_refinement_that_diverges_counts_with_its_last_good_depth(root: Path) 
     found = lines(root / "out/sweep_frames.csv")
     (line,) = [e for e in found if e["status"] == "diverged" and e["frame"] == "a"]
     assert float(line["mae_refined"]) == last_good
-    assert values["refined_low"] <= last_good <= values["refined_high"]
+    assert values["refined"] == pytest.approx(
+        np.mean(
+            [float(e["mae_refined"]) for e in found if e["lr"] == "1e4" and e["iterations"] == "5"]
+        )
+    )
     (told, _) = [row["message"] for row in heard.rows if row["status"] == "diverged"]
     assert "try a smaller --lr" in told
 
@@ -393,13 +397,26 @@ def test_a_mean_is_over_frames_of_each_frames_mean_over_seeds() -> None:
     rmse, mae, delta1 = (found["measures"][key] for key in ("rmse", "mae", "delta1"))
     assert found["frames"] == 2
     assert rmse["refined"] == (1.5 + 3) / 2
-    assert (rmse["refined_low"], rmse["refined_high"]) == (1.5, 3)
+    assert (rmse["refined_low"], rmse["refined_high"]) == (None, None)  # of two frames
     assert mae["gain"] == 50
-    assert (mae["gain_low"], mae["gain_high"]) == (50, 50)
     assert mae["gain_over_linear"] == 75
     assert delta1["gain"] == 50  # of δ1 more is better
     assert delta1["gain_over_linear"] == -25
     assert found["points"] == (10 + 20 + 10) / 3
+
+
+def test_the_interval_of_a_cell_is_over_its_frames() -> None:
+    rows = [
+        figures(name, 0, [value, 1, 1, 3])
+        for name, value in zip("abcdef", range(1, 7), strict=True)
+    ]
+    rmse, mae = (summarise(rows, resamples=500)["measures"][key] for key in ("rmse", "mae"))
+    assert 1 < rmse["refined_low"] < rmse["refined"] == 3.5 < rmse["refined_high"]
+    assert rmse["gain_low"] < rmse["gain"] < rmse["gain_high"]
+    assert (mae["gain_low"], mae["gain_high"]) == pytest.approx((50, 50))
+    one_sequence = [figures(f"a_{n:03}", 0, [1, 1, 1, 3]) for n in range(3)]
+    two_sequences = one_sequence + [figures(f"b_{n:03}", 0, [1, 1, 1, 3]) for n in range(3)]
+    assert summarise(two_sequences, resamples=50)["measures"]["rmse"]["refined_low"] is None
 
 
 def test_one_frame_has_no_interval_and_a_frame_that_failed_once_is_left_out() -> None:

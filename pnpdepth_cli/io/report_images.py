@@ -35,13 +35,13 @@ class ErrorMap:
     strongest_m: float
 
 
-def picture_paths(folder: Path, key: str, views: Sequence[str]) -> list[Path]:
+def image_paths(folder: Path, key: str, views: Sequence[str]) -> list[Path]:
     """The files of a frame that has these views."""
     return [folder / f"{key}_{name}.jpg" for name in (*views, "thumb", "map_thumb")]
 
 
-def save_pictures(folder: Path, key: str, views: Mapping[str, Pixels], *, thumb: str) -> None:
-    """The files of `picture_paths` are there; the first small one is of the view `thumb`."""
+def save_images(folder: Path, key: str, views: Mapping[str, Pixels], *, thumb: str) -> None:
+    """The files of `image_paths` are there; the first small one is of the view `thumb`."""
     for name, pixels in views.items():
         _save(folder / f"{key}_{name}.jpg", _fitted(pixels))
     for name, view in (("thumb", thumb), ("map_thumb", "map")):

@@ -6,7 +6,7 @@ import os
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-from pnpdepth_cli.io.layouts.frame import Unmatched
+from pnpdepth_cli.io.dataset.frame import Unmatched
 
 
 def find_files(

@@ -7,12 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pnpdepth_cli.errors import InputError
-from pnpdepth_cli.io.formats import DEPTH_SUFFIXES
-from pnpdepth_cli.io.layouts.protocols import WHOLE, Protocol
+from pnpdepth_cli.io.dataset.protocols import WHOLE, Protocol
 
-PICTURES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".exr")
-DEPTHS = DEPTH_SUFFIXES
-SCANS = (".bin", ".pcd", ".ply")
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".exr")
+SCAN_ONLY_SUFFIXES = (".bin", ".pcd", ".ply")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,6 +43,7 @@ class Frame:
     contains a slash. sparse: a depth file, or a scan with calib; None where the protocol samples
     the truth. *_scale: codes per metre of integer files.
     calib, camera: as `read_calibration` takes them. protocol: what is cut out before anything else.
+    group: the sequence it belongs to; None leaves it to its name.
     pose: x_world = pose · (x, 1) for points of KITTI's camera 0, whichever camera took the image.
     """
 
@@ -58,6 +57,7 @@ class Frame:
     gt_scale: float | None = None
     protocol: Protocol = WHOLE
     pose: Pose | None = None
+    group: str | None = None
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -18,8 +18,8 @@ from pnpdepth_cli.io.colours import (
 )
 from pnpdepth_cli.io.depth import read_depth, read_sparse
 from pnpdepth_cli.io.page import draw_discs, magnification
-from pnpdepth_cli.io.pictures import improvement, improvement_at_points, preview
 from pnpdepth_cli.io.rgb import read_rgb
+from pnpdepth_cli.io.visualisation import improvement, improvement_at_points, preview
 
 RED, GREEN = [214, 26, 30], [16, 140, 52]
 

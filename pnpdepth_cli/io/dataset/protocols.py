@@ -29,7 +29,7 @@ class Protocol:
         small = picture[1::2, 1::2] if self.halved else picture
         return small[top : top + height, left : left + width]
 
-    def places(self, xy: NDArray[np.floating], size: tuple[int, int]) -> NDArray[np.float32]:
+    def in_crop(self, xy: NDArray[np.floating], size: tuple[int, int]) -> NDArray[np.float32]:
         """Where the pixel coordinates (N, 2) of a picture of `size` (H, W) are in that part."""
         top, left, _, _ = self._window(size)
         moved = (np.asarray(xy, np.float64) + 0.5) / 2 - 0.5 if self.halved else xy

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -10,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import FileFormatError, InputError, PnpDepthError, UsageError
+from pnpdepth_cli.io.dataset.frame import Hdf5Array
 from pnpdepth_cli.io.depth_reading import known_metres
-from pnpdepth_cli.io.file_bytes import one_line
-from pnpdepth_cli.io.layouts.frame import Hdf5Array
+from pnpdepth_cli.io.file_bytes import check_value_count, one_line, size_of_regular_file
 
 
 def shape_of(path: Path, name: str) -> tuple[int, ...]:
@@ -38,6 +39,10 @@ def depth_of(source: Hdf5Array) -> NDArray[np.float32]:
 
 def _read(source: Hdf5Array) -> NDArray[Any]:
     def pick(array: Any) -> NDArray[Any]:
+        if array.dtype.kind not in "fiu":
+            raise FileFormatError(f"{source} holds {array.dtype} values, not numbers")
+        one = array.shape if source.index is None else array.shape[1:]
+        check_value_count(source.path, math.prod(one), size_of_regular_file(source.path))
         if source.index is not None and source.index >= array.shape[0]:
             raise FileFormatError(f"{source}: there are only {array.shape[0]}")
         return np.asarray(array[()] if source.index is None else array[source.index])
@@ -57,9 +62,15 @@ def _with_array(path: Path, name: str, use: Callable[[Any], Any]) -> Any:
         raise InputError(f"{path}: no such file; check the path")
     try:
         with h5py.File(path, "r") as file:
-            if name not in file:
+            link = file.get(name, getlink=True)
+            if link is None:
                 raise FileFormatError(f"{path} has no array {name}; it is of another kind")
-            return use(file[name])
+            array = file[name] if isinstance(link, h5py.HardLink) else None
+            if array is None or array.external or array.is_virtual:
+                raise FileFormatError(
+                    f"{path}: {name} lies in another file or place; copy its values into this one"
+                )
+            return use(array)
     except PnpDepthError:
         raise
     except Exception as error:  # h5py raises many kinds for a damaged file

@@ -6,9 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import InputError
+from pnpdepth_cli.io.dataset.frame import Frame, Hdf5Array
+from pnpdepth_cli.io.dataset.hdf5 import depth_of, rgb_of
 from pnpdepth_cli.io.depth import read_depth
-from pnpdepth_cli.io.layouts.frame import Frame, Hdf5Array
-from pnpdepth_cli.io.layouts.hdf5 import depth_of, rgb_of
 from pnpdepth_cli.io.rgb import read_rgb
 
 
@@ -21,7 +21,7 @@ def read_frame_image(frame: Frame) -> NDArray[np.float32]:
     return np.ascontiguousarray(frame.protocol.apply(rgb))
 
 
-def read_frame_truth(frame: Frame) -> NDArray[np.float32]:
+def read_frame_ground_truth(frame: Frame) -> NDArray[np.float32]:
     """(H, W) float32 metres, 0 where unknown. InputError if the frame has no ground truth."""
     if frame.gt is None:
         raise InputError(f"frame {frame.name} has no ground truth")

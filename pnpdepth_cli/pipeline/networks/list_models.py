@@ -1,4 +1,4 @@
-"""`pnpdepth models`: the networks that can be named."""
+"""`pnpdepth models list`: the networks that can be named."""
 
 from __future__ import annotations
 
@@ -17,32 +17,46 @@ from pnpdepth_cli.models.registry import (
 
 @dataclass(frozen=True, kw_only=True)
 class ListedModel:
-    """One row of the list; the last fields are the defaults of refinement.
-
-    variant: its family's name alone means another, and no weights of it are shipped.
-    """
+    """One network that can be named; see `ModelDefinition` and `RefineDefaults` for the values."""
 
     name: str
+    """What `--model` takes."""
     family: str
+    """The file or entry point that defines it."""
     variant: bool
+    """True if the family's name stands for another network and no weights of this one ship."""
     summary: str
+    """One line."""
     paper: str
+    """Authors, title, venue and year."""
     licence: str
+    """Licence of its weights."""
     input_kind: str
+    """rgb, sparse or rgb+sparse."""
     size: str
+    """The image sizes it takes, in words."""
     output_kind: str
+    """depth, inverse, log or unknown."""
     parameters: int
+    """Number of its weights."""
     checkpoint: str | None
+    """Path of the weights that ship with it."""
     layers: tuple[str, ...]
+    """The layers worth cutting at."""
     layer: str | None
+    """Default layer of refinement."""
     iterations: int
+    """Default number of updates."""
     lr: float | str
+    """Default step size."""
     loss: str
+    """Default loss."""
     update: str
+    """Default update rule."""
 
 
 def list_models() -> list[ListedModel]:
-    """Every network that can be named, in the registry's order."""
+    """Returns every network that can be named, in the order of `registry.names`."""
     return [_listed(name) for name in names()]
 
 

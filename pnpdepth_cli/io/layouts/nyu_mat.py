@@ -1,9 +1,7 @@
-"""NYU Depth v2: `nyu-h5`, one .h5 a frame as Ma et al. have it, and `nyu-mat`, the official file.
+"""`nyu-mat`: nyu_depth_v2_labeled.mat, the official file of NYU Depth v2.
 
-Ma et al. have KITTI odometry in .h5 files too, the scan on its pixels as depth; what is as wide as
-that is cut as the paper cuts KITTI. nyu-mat is nyu_depth_v2_labeled.mat; a splits.mat (testNdxs),
-or a test.txt with the numbers from 1 of its frames, beside it says which are the test set. Without
-one, all frames are meant.
+A splits.mat (testNdxs), or a test.txt with the numbers of its frames from 1, beside it names the
+test set. Without one, all frames are meant.
 """
 
 from __future__ import annotations
@@ -12,42 +10,21 @@ from pathlib import Path
 from typing import Any
 
 from pnpdepth_cli.errors import FileFormatError
+from pnpdepth_cli.io.dataset.frame import Frame, Hdf5Array, Listing
+from pnpdepth_cli.io.dataset.hdf5 import shape_of
+from pnpdepth_cli.io.dataset.protocols import PROTOCOLS
 from pnpdepth_cli.io.file_bytes import one_line, read_bytes
-from pnpdepth_cli.io.layouts.frame import Frame, Hdf5Array, Listing
-from pnpdepth_cli.io.layouts.hdf5 import shape_of
-from pnpdepth_cli.io.layouts.protocols import PROTOCOLS, Protocol
+from pnpdepth_cli.io.layouts import Layout
 
-_WIDEST_KINECT = 1000  # pixels; NYU's frames have 640, KITTI's 1224 or more
 _LABELED = "nyu_depth_v2_labeled.mat"
 
 
-def h5_matches(root: Path) -> bool:
-    """True if .h5 files are in the folder or at most two below it."""
-    return bool(_h5_files(root))
-
-
-def h5_listing(root: Path) -> Listing:
-    """One frame a file, with rgb (3, H, W) and depth (H, W) in it."""
-    files = _h5_files(root)
-    protocol = _protocol_of(files)
-    frames = [
-        Frame(
-            name="_".join(path.relative_to(root).with_suffix("").parts),
-            image=Hdf5Array(path=path, name="rgb", axes=(1, 2, 0)),
-            gt=Hdf5Array(path=path, name="depth", axes=(0, 1)),
-            protocol=protocol,
-        )
-        for path in files
-    ]
-    return Listing(frames=frames)
-
-
-def mat_matches(root: Path) -> bool:
+def matches(root: Path) -> bool:
     """True for the official file, or a folder with it."""
     return _labeled(root).is_file()
 
 
-def mat_listing(root: Path) -> Listing:
+def listing(root: Path) -> Listing:
     """The frames of the split beside the file, or all of them; numbered from 1 as there."""
     path = _labeled(root)
     count = shape_of(path, "depths")[0]
@@ -61,21 +38,6 @@ def mat_listing(root: Path) -> Listing:
         for number in _split(path.parent, count) or range(1, count + 1)
     ]
     return Listing(frames=frames)
-
-
-def _h5_files(root: Path) -> list[Path]:
-    return sorted(p for start in ("", "*/", "*/*/") for p in root.glob(f"{start}*.h5"))
-
-
-def _protocol_of(files: list[Path]) -> Protocol:
-    """What the first file that can be read asks for."""
-    for path in files:
-        try:
-            width = shape_of(path, "depth")[-1]
-        except FileFormatError:
-            continue  # it is named when it is its turn
-        return PROTOCOLS["kitti-odometry" if width > _WIDEST_KINECT else "nyu"]
-    return PROTOCOLS["nyu"]
 
 
 def _labeled(root: Path) -> Path:
@@ -110,3 +72,6 @@ def _test_numbers(path: Path) -> Any:
         return loadmat(path, variable_names=["testNdxs"])["testNdxs"].ravel().tolist()
     except Exception as error:  # scipy raises many kinds for a damaged file
         raise FileFormatError(f"{path} has no testNdxs ({one_line(error)})") from error
+
+
+LAYOUT = Layout(matches=matches, listing=listing)

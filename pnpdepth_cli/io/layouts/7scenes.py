@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from pnpdepth_cli.io.layouts.frame import PICTURES, Frame, Listing, Unmatched
+from pnpdepth_cli.io.dataset.frame import IMAGE_SUFFIXES, Frame, Listing, Unmatched
+from pnpdepth_cli.io.layouts import Layout
 
 _SCALE = 1000.0
 
@@ -39,4 +40,7 @@ def listing(root: Path) -> Listing:
 
 def _images(root: Path) -> list[Path]:
     found = [*root.glob("frame-*.color.*"), *root.glob("seq-*/frame-*.color.*")]
-    return sorted(p for p in found if p.suffix.lower() in PICTURES)
+    return sorted(p for p in found if p.suffix.lower() in IMAGE_SUFFIXES)
+
+
+LAYOUT = Layout(matches=matches, listing=listing)

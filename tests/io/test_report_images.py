@@ -9,14 +9,14 @@ from PIL import Image
 from pnpdepth_cli.errors import FileFormatError, InputError
 from pnpdepth_cli.io.colours import paint_gain
 from pnpdepth_cli.io.page import open_page
-from pnpdepth_cli.io.pictures import improvement, preview
-from pnpdepth_cli.io.report_pictures import (
+from pnpdepth_cli.io.report_images import (
     error_colours,
     error_map,
     gain_colours,
-    picture_paths,
-    save_pictures,
+    image_paths,
+    save_images,
 )
+from pnpdepth_cli.io.visualisation import improvement, preview
 
 ORANGE, BLUE = [220, 105, 0], [25, 90, 190]
 
@@ -42,8 +42,8 @@ def test_views_and_thumbs_are_of_bounded_size(
 ) -> None:
     pixels = np.zeros((height, width, 3), np.uint8)
     views = {"first": pixels, "second": pixels, "map": pixels}
-    save_pictures(tmp_path, "k", views, thumb="first")
-    assert sorted(tmp_path.iterdir()) == sorted(picture_paths(tmp_path, "k", list(views)))
+    save_images(tmp_path, "k", views, thumb="first")
+    assert sorted(tmp_path.iterdir()) == sorted(image_paths(tmp_path, "k", list(views)))
     assert size_of(tmp_path / "k_second.jpg") == view
     assert size_of(tmp_path / "k_thumb.jpg") == size_of(tmp_path / "k_map_thumb.jpg") == thumb
 

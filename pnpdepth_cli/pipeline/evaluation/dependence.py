@@ -1,0 +1,109 @@
+"""Which frames are independent of each other: sequences, and blocks of a single sequence.
+
+Errors of neighbouring frames of a video are alike, so n frames say less than n independent ones.
+Resampling whole clusters of frames accounts for that.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pnpdepth_cli.pipeline.evaluation.averages import Floats
+
+MIN_CLUSTERS = 5
+"""Fewer give no interval: with lognormal errors (σ 0.5) even a studentised one misses too often."""
+
+_FRAME_NUMBER = re.compile(r"(?:^|[_\-/])\d+(?:_image_\d+)?$")
+_SIGNIFICANT = 1.645
+"""One-sided 5 % point of the normal distribution."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Clusters:
+    """A partition of the frames into clusters that count as independent."""
+
+    ids: NDArray[np.int64]
+    """(N,) the cluster of each frame, from 0 to count − 1."""
+    unit: str
+    """What a cluster is, in the plural: "frames", "groups of frames", "blocks of 6 frames"."""
+
+    @property
+    def count(self) -> int:
+        """How many clusters there are."""
+        return int(self.ids.max()) + 1
+
+    def describe(self) -> str:
+        """Returns text such as `12 groups of frames`."""
+        return f"{self.count:,} {self.unit}"
+
+
+def groups_by_name(names: Sequence[str]) -> list[str]:
+    """Returns the sequence of each frame: its name before the frame number, or else its folder.
+
+    `drive_0002_sync_0000000008_image_02` is of `drive_0002_sync`, and `office/0012` of `office`.
+    Unless all names end in a number, only folders make groups.
+    """
+    stems = [_FRAME_NUMBER.sub("", name) for name in names]
+    if all(stem != name for stem, name in zip(stems, names, strict=True)):
+        return stems
+    return [name.rpartition("/")[0] for name in names]
+
+
+def find_clusters(groups: Sequence[str], series: Floats) -> Clusters:
+    """Returns the groups; inside a single group, blocks as long as its errors are correlated.
+
+    Args:
+        groups: The sequence of each of N frames.
+        series: (N, M) what is averaged, in the order of the frames; its autocorrelation decides
+            the length of the blocks. NaN columns are ignored.
+    """
+    names = list(dict.fromkeys(groups))
+    frames = len(groups)
+    if len(names) > 1:
+        ids = np.array([names.index(group) for group in groups])
+        return Clusters(ids=ids, unit="frames" if len(names) == frames else "groups of frames")
+    length = block_length(series)
+    if length == 1:
+        return independent_frames(frames)
+    blocks = max(1, frames // length)
+    return Clusters(
+        ids=np.minimum(np.arange(frames) // length, blocks - 1),
+        unit=f"blocks of {length} consecutive frames, as their errors are correlated",
+    )
+
+
+def independent_frames(frames: int) -> Clusters:
+    """Returns a cluster for each frame."""
+    return Clusters(ids=np.arange(frames), unit="frames")
+
+
+def block_length(series: Floats) -> int:
+    """Returns the length of blocks that makes the mean's block bootstrap most accurate; 1 if none.
+
+    The optimum for a first-order autoregression (Carlstein 1986; Politis and White 2004), with the
+    median lag-1 autocorrelation of the columns, corrected for its bias (Kendall 1954). A series
+    without significant autocorrelation counts as independent.
+
+    Args:
+        series: (N, M) in order of time.
+    """
+    frames = len(series)
+    if frames < MIN_CLUSTERS:
+        return 1
+    centred = series - series.mean(axis=0)
+    with np.errstate(divide="ignore", invalid="ignore"), warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)
+        lag_one = (centred[1:] * centred[:-1]).sum(axis=0) / (centred**2).sum(axis=0)
+        correlation = float(np.nanmedian(lag_one))
+    if math.isnan(correlation) or correlation <= _SIGNIFICANT / math.sqrt(frames):
+        return 1
+    correlation = min(correlation + (1 + 3 * correlation) / frames, 0.99)
+    ratio = math.sqrt(6) * correlation / (1 - correlation**2)
+    return min(frames, math.ceil(ratio ** (2 / 3) * frames ** (1 / 3)))

@@ -1,0 +1,158 @@
+"""What the request and the definition leave open, resolved: input range, output kind, settings."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import torch
+
+from pnpdepth_cli.choices import SPACES
+from pnpdepth_cli.completion.alignment import align
+from pnpdepth_cli.core.refine import RefineSettings
+from pnpdepth_cli.errors import ModelError, NoPointsError, UsageError
+from pnpdepth_cli.models.definition import (
+    IMAGENET_MEAN,
+    IMAGENET_STD,
+    ModelDefinition,
+    Normalisation,
+    RefineDefaults,
+)
+from pnpdepth_cli.models.frame import FrameMap
+from pnpdepth_cli.models.network import Network, out_of_memory_is_a_device_error
+from pnpdepth_cli.pipeline.refinement.inputs import Inputs
+from pnpdepth_cli.pipeline.refinement.request import MethodOptions, NetworkChoice
+
+NORMALISATIONS = {
+    "unit": Normalisation(),
+    "imagenet": Normalisation(mean=IMAGENET_MEAN, std=IMAGENET_STD),
+    "symmetric": Normalisation(mean=(0.5, 0.5, 0.5), std=(0.5, 0.5, 0.5)),
+    "bytes": Normalisation(std=(1 / 255, 1 / 255, 1 / 255)),
+}
+"""rgb as the network may want it: 0…1, ImageNet's mean and deviation, −1…1, 0…255."""
+
+
+def resolve_definition(network: Network, inputs: Inputs, choice: NetworkChoice) -> Network:
+    """Returns the network with a definition that leaves nothing open, and notes on the decisions.
+
+    The user's choice wins over the definition. An input range that neither states is the one whose
+    prediction fits the points of this first frame best.
+
+    Raises:
+        UsageError: The choice is not one of the possible values.
+        ModelError: The network's own check fails.
+    """
+    definition = network.definition
+    if choice.output_kind is not None:
+        if choice.output_kind not in SPACES:
+            raise UsageError(f"output kind {choice.output_kind!r} is not one of {SPACES}")
+        definition = replace(definition, output_kind=choice.output_kind)
+    notes = list(network.notes)
+    if choice.normalise is not None:
+        if choice.normalise not in NORMALISATIONS:
+            raise UsageError(f"normalise {choice.normalise!r} is none of {list(NORMALISATIONS)}")
+        definition = replace(definition, normalisation=NORMALISATIONS[choice.normalise])
+    network = replace(network, definition=definition)
+    with out_of_memory_is_a_device_error(network.device):
+        if definition.normalisation is None and inputs.rgb is not None:
+            network, note = _with_best_input_range(network, inputs)
+            notes.append(note)
+        if definition.verify is not None:
+            frame = FrameMap.fit(definition.size, *inputs.size)
+            points = frame.points_to_network(inputs.points)
+            arguments = network.arguments(frame, inputs.rgb_tensor(), points)
+            notes += network.verified(arguments)
+    return replace(network, notes=tuple(notes))
+
+
+def resolve_layer(definition: ModelDefinition, layer: str | None) -> str:
+    """Returns the name of the layer to cut at.
+
+    Args:
+        definition: Of the network.
+        layer: A name, a fraction 0…1 of the definition's layers, or None for its default.
+
+    Raises:
+        UsageError: There is no default, or a fraction is out of range.
+    """
+    wanted = layer if layer is not None else definition.default_layer
+    if wanted is None:
+        raise UsageError(f"network {definition.name!r} has no default layer; name one with --layer")
+    try:
+        fraction = float(wanted)
+    except ValueError:
+        return wanted
+    if not 0 <= fraction <= 1 or not definition.layers:
+        raise UsageError(
+            f"layer {wanted!r}: a number is a fraction between 0 and 1 of the layers that the"
+            f" definition of {definition.name!r} lists ({len(definition.layers)} of them)"
+        )
+    return definition.layers[round(fraction * (len(definition.layers) - 1))]
+
+
+def resolve_settings(definition: ModelDefinition, method: MethodOptions) -> RefineSettings:
+    """Returns the settings of refinement: the user's, else the network's defaults.
+
+    Another update rule than the network's default starts from the paper's step size, schedule and
+    blur, because those of the network were tuned for its own rule.
+
+    Raises:
+        UsageError: A value is out of range.
+    """
+    defaults = definition.defaults
+    iterations = defaults.iterations if method.iterations is None else method.iterations
+    if iterations < 0:
+        raise UsageError(f"iterations {iterations} is negative; 0 gives the plain prediction")
+    update = method.update or defaults.update
+    steps = defaults if update == defaults.update else RefineDefaults()
+    blur = steps.blur if method.blur is None else method.blur
+    if not 0 <= blur < math.inf:
+        raise UsageError(f"blur {blur} is no distance; give 0 or more spacings of the points")
+    if not 0 <= method.proximity < math.inf:
+        raise UsageError(f"proximity {method.proximity} is no weight; give 0 or more")
+    return RefineSettings(
+        iterations=iterations,
+        lr=steps.lr if method.lr is None else method.lr,
+        loss=method.loss or defaults.loss,
+        update=update,
+        schedule=method.schedule or steps.schedule,
+        blur=blur,
+        parameters=method.parameters,
+        proximity=method.proximity,
+        line_search=method.line_search,
+        keep_best=method.keep_best,
+        align=method.align or definition.default_alignment,
+        align_every=method.align_every,
+    )
+
+
+def _with_best_input_range(network: Network, inputs: Inputs) -> tuple[Network, str]:
+    errors: dict[str, float] = {}
+    candidates = {
+        name: replace(network, definition=replace(network.definition, normalisation=how))
+        for name, how in NORMALISATIONS.items()
+    }
+    for name, candidate in candidates.items():
+        try:
+            errors[name] = _alignment_error(candidate, inputs)
+        except (ModelError, NoPointsError):
+            errors[name] = float("inf")
+    best = min(errors, key=lambda name: errors[name])
+    listed = ", ".join(f"{name} {error:.1%}" for name, error in errors.items())
+    return candidates[best], (
+        f"input: rgb range {best!r} fits the points best (error after alignment: {listed});"
+        " --normalise says otherwise"
+    )
+
+
+def _alignment_error(network: Network, inputs: Inputs) -> float:
+    """Returns the relative error at the points after the best alignment."""
+    definition = network.definition
+    frame = FrameMap.fit(definition.size, *inputs.size)
+    points = frame.points_to_network(inputs.points)
+    with torch.no_grad():
+        output = network.module(*network.arguments(frame, inputs.rgb_tensor(), points))
+    at_points = points.sample(network.raw_of(output).cpu())
+    stated = definition.output_kind
+    spaces = (stated,) if stated in SPACES else ("depth", "inverse")
+    return align(at_points, points, spaces, "auto").error

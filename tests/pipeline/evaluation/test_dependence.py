@@ -1,0 +1,72 @@
+"""Which frames count as independent: groups by name, and blocks of a correlated sequence."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+from pnpdepth_cli.pipeline.evaluation.dependence import (
+    block_length,
+    find_clusters,
+    groups_by_name,
+)
+
+NAMES = [
+    ("2011_09_26_drive_0002_sync_0000000008_image_02", "2011_09_26_drive_0002_sync"),
+    ("seq-01_000012", "seq-01"),
+    ("office/0012", "office"),
+    ("office/frame_0012", "office/frame"),
+    ("00_000004", "00"),
+    ("0012", ""),
+    ("1305031102.175304", ""),
+    ("left", ""),
+    ("run/left", "run"),
+]
+
+
+@pytest.mark.parametrize(("name", "group"), NAMES)
+def test_the_group_of_a_frame_is_its_name_before_the_frame_number(name: str, group: str) -> None:
+    assert groups_by_name([name, name]) == [group, group]
+
+
+def test_names_of_which_some_have_no_number_are_grouped_by_folder() -> None:
+    assert groups_by_name(["a", "b_1", "office/c_2"]) == ["", "", "office"]
+
+
+def autoregression(correlation: float, frames: int, seed: int) -> np.ndarray:
+    noise = np.random.default_rng(seed).normal(size=(frames + 200, 1))
+    return np.asarray(lfilter([1.0], [1.0, -correlation], noise, axis=0)[200:])
+
+
+def test_groups_are_clusters_in_the_order_of_the_frames() -> None:
+    clusters = find_clusters(["b", "a", "b", "c"], np.zeros((4, 1)))
+    assert clusters.ids.tolist() == [0, 1, 0, 2]
+    assert clusters.describe() == "3 groups of frames"
+    assert find_clusters(["b", "a"], np.zeros((2, 1))).describe() == "2 frames"
+
+
+def test_one_sequence_of_independent_frames_has_a_cluster_for_each() -> None:
+    lengths = [block_length(autoregression(0.0, 100, seed)) for seed in range(40)]
+    assert np.mean([length == 1 for length in lengths]) >= 0.9
+    assert find_clusters([""] * 6, np.arange(6.0)[:, None] % 2).describe() == "6 frames"
+
+
+def test_one_correlated_sequence_is_cut_into_blocks() -> None:
+    series = autoregression(0.5, 1000, 0)
+    # Politis and White 2004 for an AR(1): (sqrt(6) 0.5 / 0.75)^(2/3) 1000^(1/3) = 13.9
+    assert block_length(series) == pytest.approx(14, abs=3)
+    clusters = find_clusters(["drive"] * 1000, series)
+    sizes = np.bincount(clusters.ids)
+    assert (np.diff(clusters.ids) >= 0).all()
+    assert set(sizes[:-1]) == {block_length(series)}
+    assert sizes[-1] >= sizes[0]
+    assert "consecutive frames" in clusters.describe()
+
+
+def test_columns_without_a_number_do_not_decide_the_blocks() -> None:
+    series = autoregression(0.8, 200, 1)
+    with_nan = np.column_stack([series, np.full(200, np.nan)])
+    assert block_length(with_nan) == block_length(series) > 1
+    assert block_length(np.full((200, 1), np.nan)) == 1
+    assert block_length(np.ones((200, 1))) == 1

@@ -1,0 +1,39 @@
+"""One budget for all readers."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+
+from pnpdepth_cli.budget import budget, set_max_pixels
+from pnpdepth_cli.errors import UsageError
+
+
+@pytest.fixture(autouse=True)
+def default_afterwards() -> Iterator[None]:
+    yield
+    set_max_pixels(None)
+
+
+def test_the_default_follows_from_the_machines_memory_and_has_an_upper_limit() -> None:
+    assert 1 << 20 < budget().max_pixels <= 1 << 28
+    assert budget().max_file_bytes == 4 * budget().max_pixels
+
+
+def test_max_pixels_replaces_the_default_and_files_grow_with_it() -> None:
+    set_max_pixels(1 << 30)
+    assert (budget().max_pixels, budget().max_file_bytes) == (1 << 30, 1 << 32)
+    set_max_pixels(None)
+    assert budget().max_pixels <= 1 << 28
+
+
+@pytest.mark.parametrize("number", [0, -1])
+def test_no_pixels_at_all_is_wrong_usage(number: int) -> None:
+    with pytest.raises(UsageError, match="--max-pixels"):
+        set_max_pixels(number)
+
+
+def test_a_small_file_may_hold_an_image_of_one_colour_but_not_any_number_of_values() -> None:
+    assert budget().max_values_from(1) == 1 << 25
+    assert budget().max_values_from(1 << 20) == min(budget().max_pixels, 1032 << 20)
