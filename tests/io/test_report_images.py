@@ -82,7 +82,7 @@ def test_a_saved_page_can_be_taken_apart_again(tmp_path: Path) -> None:
     xy = np.array([[5, 6]], np.float32)
     preview(rgb, xy, np.array([3], np.float32), depth, depth + 1, tmp_path / "p.png")
     page = open_page(tmp_path / "p.png")
-    assert (page.content["low_m"], page.said["high_m"]) == pytest.approx((2, 7), abs=0.2)
+    assert (page.content["low_m"], page.content["high_m"]) == pytest.approx((2, 7), abs=0.2)
     panels = page.panels()
     assert list(panels) == ["Image", "Sparse depth", "Depth before", "Depth after"]
     assert np.array_equal(panels["Image"], np.rint(255 * rgb).astype(np.uint8))
