@@ -102,8 +102,8 @@ def _with_ways(
             frames.append(read_inputs(others[number].request))
     refiner = refiner.with_ways_of(frames)
     assert refiner.ways is not None
-    found = "; ".join(str(way) for way in refiner.ways)
-    say(f"auto: best on {len(frames)} frames, and to be checked on each: {found}")
+    names = "; ".join(str(way) for way in refiner.ways)
+    say(f"auto: best on {len(frames)} frames, and to be checked on each: {names}")
     return refiner
 
 
