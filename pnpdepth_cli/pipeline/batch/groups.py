@@ -15,13 +15,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from pnpdepth_cli.core.refine import RefineSettings
 from pnpdepth_cli.core.split import Split
-from pnpdepth_cli.errors import DeviceError, NoPointsError, PnpDepthError
-from pnpdepth_cli.pipeline.refinement.frame import FrameToRefine, RefinedFrame, refine_frames
+from pnpdepth_cli.errors import DeviceError, NoPointsError, PnpDepthError, UsageError
+from pnpdepth_cli.frames.frame import RefinedFrame
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs
 from pnpdepth_cli.pipeline.refinement.refine import Refiner
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest
@@ -122,14 +121,12 @@ class FrameGroups:
         """The frames refined in one pass; None if they are to be refined one at a time."""
         size = group[0].size
         try:
-            tasks = [self._refiner.task(inputs) for inputs in group]
-        except PnpDepthError:  # concerns this frame only
-            return None
-        try:
-            frames = self._pass(tasks, self._refiner.settings)
+            frames = self._pass(group, self._refiner.settings)
         except DeviceError:  # out of memory
             self._limit[size] = len(group) // 2
             del self._count[size]
+            return None
+        except UsageError:  # concerns one frame only, such as too few points to hold some out
             return None
         except Exception:
             self._count[size] = 1
@@ -145,10 +142,9 @@ class FrameGroups:
         return list(frames)
 
     def _pass(
-        self, tasks: Sequence[FrameToRefine], settings: RefineSettings
+        self, group: Sequence[Inputs], settings: RefineSettings
     ) -> list[RefinedFrame | PnpDepthError]:
-        torch.manual_seed(self._refiner.request.hold_out.seed)
-        return refine_frames(self._refiner.network, self._split, settings, tasks)
+        return self._refiner.refine_together(self._split, group, settings)
 
     def _tried(self, size: tuple[int, int], alone: Sequence[_Alone]) -> int:
         """How many frames of the size are to go together from now on."""
@@ -164,8 +160,8 @@ class FrameGroups:
         return 1
 
     def _may_go_together(self, size: tuple[int, int], alone: Sequence[_Alone]) -> bool:
-        tasks = [self._refiner.task(each.inputs) for each in alone]
-        plain = self._pass(tasks, replace(self._refiner.settings, iterations=0))
+        group = [each.inputs for each in alone]
+        plain = self._pass(group, replace(self._refiner.settings, iterations=0))
         if not self._split.static_graph:
             self._say(
                 f"batch size: 1 for {_name(size)}; the network's control flow depends on image"
@@ -181,7 +177,7 @@ class FrameGroups:
         spent_s = expected_s = 0.0
         if exact:
             start = time.perf_counter()
-            frames = self._pass(tasks, self._refiner.settings)
+            frames = self._pass(group, self._refiner.settings)
             spent_s = time.perf_counter() - start
             expected_s = len(alone) * statistics.median(each.seconds for each in alone)
             exact = len(list(_frames(frames, alone))) == len(alone) and all(

@@ -24,6 +24,7 @@ from pnpdepth_cli.errors import (
     StorageError,
     UsageError,
 )
+from pnpdepth_cli.frames.frame import RefinedFrame
 from pnpdepth_cli.io.fingerprint import Fingerprint
 from pnpdepth_cli.pipeline.batch.frames import Task
 from pnpdepth_cli.pipeline.batch.groups import FrameGroups
@@ -38,7 +39,6 @@ from pnpdepth_cli.pipeline.batch.profile import (
 from pnpdepth_cli.pipeline.batch.run import BatchRun
 from pnpdepth_cli.pipeline.batch.state import BatchState, Status, input_fingerprints
 from pnpdepth_cli.pipeline.batch.summary import failed_row, row_of
-from pnpdepth_cli.pipeline.refinement.frame import RefinedFrame
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs, read_inputs
 from pnpdepth_cli.pipeline.refinement.refine import Refiner, load_refiner, write_refined
 from pnpdepth_cli.pipeline.stopwatch import Stopwatch
@@ -82,7 +82,7 @@ def resolve_refiner(tasks: Iterable[Task], say: Callable[[str], None]) -> Refine
         for note in refiner.network.notes:
             say(note)
         if task.request.hold_out.auto:
-            return _with_ways(refiner, list(tasks), first, say)
+            return _with_shortlist(refiner, list(tasks), first, say)
         s = refiner.settings
         say(
             f"network: {refiner.network.definition.name} cut at {refiner.layer}, {s.iterations}"
@@ -92,17 +92,17 @@ def resolve_refiner(tasks: Iterable[Task], say: Callable[[str], None]) -> Refine
     return None
 
 
-def _with_ways(
+def _with_shortlist(
     refiner: Refiner, others: Sequence[Task], first: Inputs, say: Callable[[str], None]
 ) -> Refiner:
-    """The refiner with the ways that are best on the first frame and on a few of the others."""
+    """The refiner with the candidates that are best on a few of the frames."""
     frames = [first]
     for number in sorted({len(others) // 2, len(others) - 1}) if others else ():
         with contextlib.suppress(PnpDepthError):  # it is read again later, which reports its error
             frames.append(read_inputs(others[number].request))
-    refiner = refiner.with_ways_of(frames)
-    assert refiner.ways is not None
-    names = "; ".join(str(way) for way in refiner.ways)
+    refiner = refiner.with_shortlist_of(frames)
+    assert refiner.shortlist is not None
+    names = "; ".join(str(candidate) for candidate in refiner.shortlist)
     say(f"auto: best on {len(frames)} frames, and to be checked on each: {names}")
     return refiner
 

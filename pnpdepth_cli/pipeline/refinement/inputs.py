@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from pnpdepth_cli.errors import InputError, NoPointsError, SizeError, UsageError
+from pnpdepth_cli.frames.frame import Frame
 from pnpdepth_cli.io.dataset.frame import Hdf5Array, Source
 from pnpdepth_cli.io.dataset.hdf5 import depth_of, rgb_of
 from pnpdepth_cli.io.depth import (
@@ -54,16 +54,12 @@ class Inputs:
         """(H, W) of the image frame."""
         return self.points.size
 
-    def rgb_tensor(self) -> Tensor | None:
-        """(1, 3, H, W) float32 in 0..1."""
-        picture = self.picture()
-        return None if picture is None else picture[None]
-
-    def picture(self) -> Tensor | None:
-        """(3, H, W) float32 in 0..1."""
-        if self.rgb is None:
-            return None
-        return torch.from_numpy(np.ascontiguousarray(self.rgb.transpose(2, 0, 1)))
+    def frame(self) -> Frame:
+        """Returns the image and all points as tensors."""
+        rgb = self.rgb
+        if rgb is not None:
+            rgb = np.ascontiguousarray(rgb.transpose(2, 0, 1))
+        return Frame(rgb=None if rgb is None else torch.from_numpy(rgb), points=self.points)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -9,17 +9,17 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from pnpdepth_cli.auto.candidates import SplitCache
 from pnpdepth_cli.completion.interpolation import linear
 from pnpdepth_cli.completion.propagation import propagate
 from pnpdepth_cli.core.metrics import score
 from pnpdepth_cli.core.refine import Refinement, RefineSettings, refine
 from pnpdepth_cli.core.split import Split
-from pnpdepth_cli.errors import DivergedError, NoPointsError
-from pnpdepth_cli.models.aligned import AlignedDepth
+from pnpdepth_cli.errors import DivergedError
+from pnpdepth_cli.frames.prepare import prepare
 from pnpdepth_cli.models.frame import FrameMap
 from pnpdepth_cli.models.network import Network, out_of_memory_is_a_device_error
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs
-from pnpdepth_cli.pipeline.refinement.ways import HeldCut
 from pnpdepth_cli.pipeline.sweep.plan import Method, Run
 
 
@@ -39,23 +39,23 @@ class Curve:
     """Why it diverged; None if it did not."""
 
 
-def result_of(run: Run, inputs: Inputs, cut: HeldCut) -> dict[str, Any]:
+def result_of(run: Run, inputs: Inputs, cache: SplitCache) -> dict[str, Any]:
     """Returns the result of a run as the journal has it.
 
     Args:
         run: What to compute.
         inputs: The frame with the run's points.
-        cut: Keeps the network cut at the last layer.
+        cache: Keeps the network cut at the last layer.
     """
     done = {"state": "done", "points": len(inputs.points)}
     if run.method is None:
-        return done | {"scores": {"linear": interpolated(cut.network, inputs)}}
+        return done | {"scores": {"linear": interpolated(cache.network, inputs)}}
     torch.manual_seed(run.seed)
     try:
-        split = cut.at(run.method.layer)
-        curve = refined_curve(cut.network, split, run.method, inputs, run.iterations)
+        split = cache.at(run.method.layer)
+        curve = refined_curve(cache.network, split, run.method, inputs, run.iterations)
     except BaseException:
-        cut.close()
+        cache.close()
         raise
     return done | {
         "plain": curve.plain,
@@ -86,19 +86,23 @@ def refined_curve(
         inputs: The frame with its points.
         wanted: Numbers of updates.
     """
-    frame = FrameMap.fit(network.definition.size, *inputs.size)
-    points = frame.points_to_network(inputs.points)
-    if not len(points):
-        raise NoPointsError(f"none of the {len(inputs.points)} points is where the network looks")
-    at = points.tensors(network.device)
+    prepared = prepare(network, inputs.frame())
+    if not len(prepared.points):
+        raise prepared.no_points_error()
     settings = replace(method.settings, iterations=max(wanted))
-    aligned = AlignedDepth(network, at, settings.align, every=settings.align_every)
+    reader = prepared.depth_reader(settings)
     keep = range(settings.iterations + 1) if settings.gives_best else {0, *wanted}
     diverged: DivergedError | None = None
     with out_of_memory_is_a_device_error(network.device):
-        arguments = network.arguments(frame, inputs.rgb_tensor(), points)
         try:
-            result = refine(split, arguments, at, settings, depth_of=aligned, keep_depths=keep)
+            result = refine(
+                split,
+                prepared.arguments,
+                prepared.points,
+                settings,
+                depth_of=reader,
+                keep_depths=keep,
+            )
         except DivergedError as error:
             if not isinstance(error.last_good, Refinement):
                 raise
@@ -107,7 +111,7 @@ def refined_curve(
         kept = {k: _kept(result.losses, min(k, updates), settings) for k in wanted}
         truth = ground_truth_in_view(network, inputs)
         seen = {**result.depths, result.kept: result.after}
-        depths = {k: frame.depth_to_image(seen[k]).cpu() for k in {0, *kept.values()}}
+        depths = {k: prepared.map.depth_to_image(seen[k]).cpu() for k in {0, *kept.values()}}
         scores = {
             index: asdict(score(_propagated(depths[index], inputs, method.propagate), truth))
             for index in set(kept.values())
@@ -147,4 +151,4 @@ def _propagated(depth: Tensor, inputs: Inputs, kind: str) -> Tensor:
     """(H, W) the depth with the residuals at the points propagated."""
     if kind == "none":
         return depth
-    return propagate(depth, inputs.points, inputs.picture(), kind=kind).depth
+    return propagate(depth, inputs.points, inputs.frame().rgb, kind=kind).depth

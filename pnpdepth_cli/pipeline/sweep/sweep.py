@@ -8,6 +8,7 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any, TypeVar
 
+from pnpdepth_cli.auto.candidates import SplitCache
 from pnpdepth_cli.errors import (
     DeviceError,
     InputError,
@@ -26,7 +27,6 @@ from pnpdepth_cli.pipeline.refinement.inputs import Inputs, read_inputs
 from pnpdepth_cli.pipeline.refinement.refine import Refiner, load_refiner
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest
 from pnpdepth_cli.pipeline.refinement.resolve import resolve_layer, resolve_settings
-from pnpdepth_cli.pipeline.refinement.ways import HeldCut
 from pnpdepth_cli.pipeline.sweep.axes import Study
 from pnpdepth_cli.pipeline.sweep.plan import Plan, Run, RunId, Setup, sampling_of
 from pnpdepth_cli.pipeline.sweep.plots import draw_study, need_matplotlib
@@ -228,7 +228,7 @@ def _base(definition: ModelDefinition, request: RefineRequest) -> dict[str, Any]
 
 def _rows(runs: Sequence[Run], refiner: Refiner, state: SweepState) -> Iterator[dict[str, Any]]:
     """Computes and records each run; yields a row for each. Frames are read once."""
-    with HeldCut(refiner.network) as cut:
+    with SplitCache(refiner.network) as cache:
         for _, of_frame in groupby(runs, key=lambda run: run.frame.name):
             frame_runs = list(of_frame)
             inputs = _result_or_error(read_inputs, frame_runs[0].task.request)
@@ -237,7 +237,7 @@ def _rows(runs: Sequence[Run], refiner: Refiner, state: SweepState) -> Iterator[
                 failed = isinstance(inputs, PnpDepthError)
                 drawn = inputs if failed else _result_or_error(_drawn, same_points[0], inputs)
                 for run in same_points:
-                    yield _done(run, drawn, cut, state)
+                    yield _done(run, drawn, cache, state)
 
 
 def _result_or_error(read: Callable[..., T], *arguments: Any) -> T | PnpDepthError:
@@ -257,13 +257,13 @@ def _drawn(run: Run, inputs: Inputs) -> Inputs:
 
 
 def _done(
-    run: Run, inputs: Inputs | PnpDepthError, cut: HeldCut, state: SweepState
+    run: Run, inputs: Inputs | PnpDepthError, cache: SplitCache, state: SweepState
 ) -> dict[str, Any]:
     """Computes and records the run; returns its row for a listener."""
     result = (
         inputs
         if isinstance(inputs, PnpDepthError)
-        else _result_or_error(result_of, run, inputs, cut)
+        else _result_or_error(result_of, run, inputs, cache)
     )
     row = {"name": run.frame.name, "status": "done", "message": None}
     if isinstance(result, PnpDepthError):
