@@ -4,7 +4,7 @@ For each network, set and number of points, MAE and RMSE in metres, means over f
 each frame's error: the network as it is, aligned with the points, refined at the paper's setting,
 every baseline of `pnpdepth_cli.completion.baselines`, and `--auto`. The same network, points and
 pixels for all: those with known ground truth in the network's crop. `wins` counts frames where
-`--auto` is not above the aligned network, and at most 3 per cent above the best baseline of that frame.
+`--auto` is not above the aligned network, and at most 3 per cent above the frame's best baseline.
 `--outliers 0.2` puts so many points at random depths; the last column is `--auto` given the others
 alone, as if the outliers were known. `--sigma` adds the fraction of the ground truth that lies
 within ± one standard deviation of `--uncertainty`, which should be 68 %. `--render FOLDER` takes

@@ -1,9 +1,9 @@
 """Public networks on real frames: `python -m benchmarks.foreign --data PATH [--every 4]`.
 
 FastDepth (ONNX) on 7-Scenes and two NYU frames with 100 and 500 random points: plain, with each
-alignment, refined with the paper's setting at three layers, and with the untuned defaults for users'
-networks. Frames are a 250/480 resize, its centre 228×304, scaled to the network's 224×224, scored
-at that size; one NYU frame is published in that form.
+alignment, refined with the paper's setting at three layers, and with the untuned defaults for
+users' networks. Frames are a 250/480 resize, its centre 228×304, scaled to the network's 224×224,
+scored at that size; one NYU frame is published in that form.
 nconv and pncnn on KITTI with its own LiDAR, before and after refinement.
 """
 

@@ -24,7 +24,7 @@ Depth = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class EvalFrame:
-    """A frame: rgb (H, W, 3) in 0..1, gt (H, W) metres, 0 = unknown, sensor depth (H, W) or None."""
+    """rgb (H, W, 3) in 0..1, gt (H, W) metres with 0 unknown, sensor depth (H, W) or None."""
 
     name: str
     rgb: NDArray[np.float32]

@@ -196,7 +196,8 @@ def reason(row: Result, state: str) -> str:
         if fraction * SETTING.iterations <= SMALL_MOVE:
             return (
                 f"all {SETTING.iterations} steps together are"
-                f" {SETTING.iterations * fraction:.2%} of std(z) = {row['std_z']:.3g}, too short to move anything; {losses}"
+                f" {SETTING.iterations * fraction:.2%} of std(z) = {row['std_z']:.3g}, too"
+                f" short to move anything; {losses}"
             )
     if after < before:
         return f"{losses}, so the points are met, at the cost of what lies between them"

@@ -252,7 +252,7 @@ def _parts(root: Path, frame: Frame) -> tuple[str, ...]:
 
 
 def _data_frame(root: Path, frame: Frame) -> TableFrame:
-    """A frame in memory; the scan is the ground truth if there is no other, as in KITTI odometry."""
+    """A frame in memory; without ground truth the scan is it, as in KITTI odometry."""
     if frame.sparse is None:
         gt = read_frame_ground_truth(frame)
         return TableFrame(rgb=read_frame_image(frame), gt=gt, pool=gt)

@@ -47,13 +47,14 @@ Floats = NDArray[np.floating]
 
 
 def agreement(hidden: NDArray[np.bool_], depth: Floats, gt: Floats) -> str:
-    """Fractions kept of the points that agree with ground truth within 10 %, and removed of others."""
+    """Fractions of points kept if they agree with ground truth within 10 %, else removed."""
     known = gt > 0
     agrees = np.abs(depth[known] - gt[known]) <= 0.1 * gt[known]
     gone = hidden[known]
     return (
         f"{agrees.sum():,} points agree with the ground truth,"
-        f" {np.mean(~gone[agrees]):.1%} of them kept; {(~agrees).sum():,} do not, {np.mean(gone[~agrees]):.1%} of them removed"
+        f" {np.mean(~gone[agrees]):.1%} of them kept; {(~agrees).sum():,} do not,"
+        f" {np.mean(gone[~agrees]):.1%} of them removed"
     )
 
 
