@@ -156,7 +156,7 @@ def evaluate(
     from pnpdepth_cli.pipeline.report import evaluation as report_eval
 
     targets = (csv, markdown, latex)
-    score_tables.check_stdout(targets, as_json)
+    score_tables.check_outputs(targets, as_json)
     score_files.check_targets(targets, (prediction, truth), overwrite=overwrite)
     if html is not None:
         inputs = [p for p in (prediction, truth, given["sparse"], given["mask"]) if p is not None]

@@ -41,10 +41,16 @@ def print_notes(notes: Sequence[str]) -> None:
         console.print(escape(printable(note)), style=style, soft_wrap=True)
 
 
-def check_stdout(targets: Sequence[Path | None], as_json: bool) -> None:
-    """Raises UsageError if more than one output is to go to stdout."""
+def check_outputs(targets: Sequence[Path | None], as_json: bool) -> None:
+    """Raises UsageError if two of --csv, --markdown, --latex and --json go to one place."""
     if sum(str(path) == "-" for path in targets) + as_json > 1:
         raise UsageError("only one of --json, --csv -, --markdown - and --latex - can go to stdout")
+    options: dict[Path, str] = {}
+    for option, path in zip(("--csv", "--markdown", "--latex"), targets, strict=True):
+        if path is not None and str(path) != "-":
+            first = options.setdefault(path.resolve(), option)
+            if first != option:
+                raise UsageError(f"{first} and {option} are the same file {path}; name two files")
 
 
 def write_texts(texts: Sequence[tuple[Path | None, str]]) -> bool:
