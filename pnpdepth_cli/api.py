@@ -204,14 +204,15 @@ def score(
     arrays = [np.asarray(values, dtype=np.float32) for values in (depth, ground_truth)]
     if arrays[0].shape != arrays[1].shape:
         raise SizeError(f"depth is {arrays[0].shape} but ground truth is {arrays[1].shape}")
-    return score_tensors(*(torch.from_numpy(values) for values in arrays), thresholds)
+    predicted, known = (torch.from_numpy(values) for values in arrays)
+    return score_tensors(predicted, known, thresholds)
 
 
 def _inputs(image: ArrayLike | None, sparse: ArrayLike | SparsePoints) -> Inputs:
     """Returns the frame as the pipeline has it after reading its files."""
     rgb = None if image is None else _rgb(image)
     size = None if rgb is None else (rgb.shape[0], rgb.shape[1])
-    points = _points(sparse, size).in_frame(*size) if size else _points(sparse, None)
+    points = _points(sparse, size).resized(*size) if size else _points(sparse, None)
     inside = points.cropped(0, 0, *points.size)
     if not len(inside):
         raise NoPointsError(f"none of the {len(points)} sparse points lies in the image")

@@ -84,7 +84,7 @@ def _elevations(path: Path, table: dict[str, Any]) -> tuple[float, ...]:
 
 
 def _number(path: Path, table: dict[str, Any], key: str) -> float:
-    value = table.get(key)
+    value: Any = table.get(key)
     try:
         number = math.nan if isinstance(value, bool) else float(value)
     except (TypeError, ValueError, OverflowError):

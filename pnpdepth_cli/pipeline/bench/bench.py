@@ -170,7 +170,7 @@ class _Subject:
         )
         _write_frame(asked.files, rgb, points)
         frame = FrameMap.fit(definition.size, *points.size)
-        at = frame.points_to_network(points).to(network.device)
+        at = frame.points_to_network(points).tensors(network.device)
         if not len(at):
             raise NoPointsError(
                 f"none of {len(points)} points lies in the network's view; take more"
