@@ -236,7 +236,7 @@ def _rgb(image: ArrayLike) -> NDArray[np.float32]:
 def _points(sparse: ArrayLike | SparsePoints, size: tuple[int, int] | None) -> SparsePoints:
     """Returns the points in their own frame, which is the image's for rows of x, y, depth."""
     if isinstance(sparse, SparsePoints):
-        return sparse
+        return sparse.tensors()
     values = np.asarray(sparse, dtype=np.float32)
     if values.ndim != 2:
         raise InputError(f"sparse depth has shape (H, W) or (N, 3), not {values.shape}")
@@ -254,8 +254,4 @@ def _points(sparse: ArrayLike | SparsePoints, size: tuple[int, int] | None) -> S
         depth = values[rows, columns]
     if not len(depth):
         raise NoPointsError("the sparse depth has no value above 0")
-    return SparsePoints(
-        xy=torch.from_numpy(np.ascontiguousarray(xy)),
-        depth=torch.from_numpy(np.ascontiguousarray(depth)),
-        size=size,
-    )
+    return SparsePoints(xy=xy, depth=depth, size=size).tensors()

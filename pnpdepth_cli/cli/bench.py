@@ -157,7 +157,7 @@ def _table(repeats: int, precision: str, device: str, as_json: bool) -> None:
 
     print_rows(
         f"Table V: random weights, K = 5, {precision}, {device}, {rows[0].bench.threads} threads,"
-        f" medians of {repeats}; beside it what the paper prints",
+        f" medians of {repeats}; beside the paper's figures",
         (
             "network",
             "paper's\nname",
@@ -177,9 +177,9 @@ def _table(repeats: int, precision: str, device: str, as_json: bool) -> None:
 
 
 def _row_cells(row: TableRow) -> tuple[str, ...]:
-    found, paper = row.bench, row.paper
-    refinement, forward = found.part("refinement"), found.part("forward")
-    flops, memory = found.limit_by_flops, refinement.peak_mb
+    bench, paper = row.bench, row.paper
+    refinement, forward = bench.part("refinement"), bench.part("forward")
+    flops, memory = bench.limit_by_flops, refinement.peak_mb
     printed = (paper.before, paper.after)
     return (
         paper.model,
@@ -188,7 +188,7 @@ def _row_cells(row: TableRow) -> tuple[str, ...]:
         _ms(forward.seconds.median),
         _ms(refinement.seconds.median),
         f"{refinement.forwards:.2f}",
-        f"{found.limit_measured:.2f}",
+        f"{bench.limit_measured:.2f}",
         "–" if flops is None else f"{flops:.2f}",
         "–" if memory is None else f"{memory:,.0f} MB",
         *("–" if seconds is None else _ms(seconds) for seconds in printed),
@@ -196,10 +196,10 @@ def _row_cells(row: TableRow) -> tuple[str, ...]:
     )
 
 
-def _print_notes(found: Bench) -> None:
-    threads = f"{found.threads} thread{'' if found.threads == 1 else 's'}"
-    click.echo(f"{found.device}, {threads}, torch {found.versions['torch']}", err=True)
-    for note in found.notes:
+def _print_notes(bench: Bench) -> None:
+    threads = f"{bench.threads} thread{'' if bench.threads == 1 else 's'}"
+    click.echo(f"{bench.device}, {threads}, torch {bench.versions['torch']}", err=True)
+    for note in bench.notes:
         click.echo(printable(note), err=True)
 
 
