@@ -34,13 +34,14 @@ from benchmarks.frames import (
     refined,
 )
 from model_zoo_defs.training.dataset import Frames
+from pnpdepth_cli.auto.auto import refine_automatically
+from pnpdepth_cli.auto.candidates import default_configs
+from pnpdepth_cli.auto.uncertainty import uncertainty
 from pnpdepth_cli.completion.baselines import BASELINES
 from pnpdepth_cli.core.metrics import score
 from pnpdepth_cli.core.refine import RefineSettings
 from pnpdepth_cli.models.definition import Normalisation
 from pnpdepth_cli.models.network import Network, load_network
-from pnpdepth_cli.pipeline.refinement.auto import refine_automatically, usual_trials
-from pnpdepth_cli.pipeline.refinement.held_out import uncertainty
 from pnpdepth_cli.pipeline.refinement.request import MethodOptions
 from pnpdepth_cli.pipeline.refinement.resolve import resolve_layer, resolve_settings
 from pnpdepth_cli.points import SparsePoints
@@ -139,15 +140,15 @@ def measure(
         "tuned": torch.from_numpy(refined(network, layer, settings, inputs).after),
     }
     depths |= {name: made.depth(points, prediction) for name, made in BASELINES.items()}
-    trials = usual_trials(network.definition, layer, settings)
+    configs = default_configs(network.definition, layer, settings)
     start = time.perf_counter()
-    auto = refine_automatically(network, trials, inputs, points)
+    auto = refine_automatically(network, configs, inputs.frame())
     auto_s = time.perf_counter() - start
     depths["auto"] = torch.from_numpy(auto.frame.after)
     if bool(wrong.any()):
         right = points.select(~wrong)
         of_right = frame_inputs(frame.rgb, right, frame.truth)
-        told = refine_automatically(network, trials, of_right, right)
+        told = refine_automatically(network, configs, of_right.frame())
         depths[TOLD] = torch.from_numpy(told.frame.after)
     within = {}
     if with_sigma:

@@ -11,10 +11,11 @@ import torch
 from numpy.typing import NDArray
 
 from pnpdepth_cli.core.refine import RefineSettings
+from pnpdepth_cli.frames.frame import RefinedFrame
+from pnpdepth_cli.frames.refine import refine_frame
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.models.network import Network
-from pnpdepth_cli.pipeline.refinement.frame import FrameToRefine, RefinedFrame, refine_frame
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs
 from pnpdepth_cli.points import SparsePoints
 
@@ -96,5 +97,4 @@ def frame_inputs(rgb: NDArray[np.float32], points: SparsePoints, truth: Depth) -
 def refined(network: Network, layer: str, settings: RefineSettings, inputs: Inputs) -> RefinedFrame:
     """The refinement of a frame with all of its points."""
     with network.cut_at(layer) as split:
-        task = FrameToRefine.with_points(inputs, inputs.points)
-        return refine_frame(network, split, settings, task)
+        return refine_frame(network, split, settings, inputs.frame())

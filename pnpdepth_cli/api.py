@@ -164,7 +164,7 @@ class Refiner:
         return refined
 
     def _resolve(self, inputs: Inputs) -> pipeline.Refiner:
-        network = resolve_definition(self._network, inputs, self._request.network)
+        network = resolve_definition(self._network, inputs.frame(), self._request.network)
         return pipeline.Refiner(
             request=self._request,
             network=network,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -78,21 +79,20 @@ def print_refinement(record: Mapping[str, Any]) -> None:
 
 def _baselines(rows: Mapping[str, Any]) -> Table:
     """Returns the baselines, the network and the result, best first at the held-out points."""
-    scored = any(row["scores"] for row in rows.values())
+    with_gt = any(row["scores"] for row in rows.values())
     table = Table(title="against every simple baseline")
-    columns = ["", "MAE, held-out points"]
-    columns += ["MAE, ground truth", "RMSE, ground truth"] if scored else []
+    of_gt = ["MAE, ground truth", "RMSE, ground truth"] if with_gt else []
+    columns = ["", "MAE, held-out points", *of_gt]
     for column in columns:
         table.add_column(column, justify="left" if not column else "right")
     known = {name: row for name, row in rows.items() if row["held_out_mae"] is not None}
     order = sorted(known, key=lambda name: known[name]["held_out_mae"]) or list(rows)
     for name in order:
-        row, cells = rows[name], []
-        error = row["held_out_mae"]
-        cells.append("–" if error is None else f"{error:.4f} m")
-        if scored:
-            scores = row["scores"]
-            cells += [f"{scores[k]:.4f} m" if scores else "–" for k in ("mae", "rmse")]
+        row = rows[name]
+        cells = [_metres(row["held_out_mae"])]
+        if with_gt:
+            scores = row["scores"] or {}
+            cells += [_metres(scores.get(key)) for key in ("mae", "rmse")]
         table.add_row(name, *cells, style="bold" if name == "result" else None)
     return table
 
@@ -111,6 +111,12 @@ def print_batch(summary: Mapping[str, Any]) -> None:
             _score_rows(table, mean["scores"])
             table.caption = f"scored on the ground truth of {mean['scores']['frames']:,} frames"
         console.print(table)
+    if summary["baselines"]:
+        rows = {
+            name: {"held_out_mae": row["held_out_mae"], "scores": row}
+            for name, row in summary["baselines"].items()
+        }
+        console.print(_baselines(rows))
     parts = [f"{counts['done']:,} of {counts['frames']:,} frames done"]
     parts += [
         f"{counts[kind]:,} {kind}" for kind in ("diverged", "failed", "pending") if counts[kind]
@@ -190,9 +196,9 @@ def _point_rows(table: Table, title: str, error: Mapping[str, Any] | None) -> No
         for name, key in (("MAE", "mae"), ("RMSE", "rmse")):
             table.add_row(
                 f"{title}, {name}",
-                f"{before[key]:.4f} m",
-                f"{after[key]:.4f} m",
-                _change(key, before, after),
+                _metres(before.get(key)),
+                _metres(after.get(key)),
+                _change(key, before.get(key), after.get(key)),
             )
 
 
@@ -200,16 +206,24 @@ def _score_rows(table: Table, scores: Mapping[str, Any]) -> None:
     before, after = scores["before"], scores["after"]
     table.add_section()
     for title, key, show in _SCORES:
-        table.add_row(title, show(before[key]), show(after[key]), _change(key, before, after))
+        values = (before.get(key), after.get(key))
+        cells = ["–" if value is None or math.isnan(value) else show(value) for value in values]
+        table.add_row(title, *cells, _change(key, *values))
 
 
-def _change(key: str, before: Mapping[str, float], after: Mapping[str, float]) -> str:
+def _metres(value: float | None) -> str:
+    return "–" if value is None or math.isnan(value) else f"{value:.4f} m"
+
+
+def _change(key: str, before: float | None, after: float | None) -> str:
+    if before is None or after is None or math.isnan(before) or math.isnan(after):
+        return "[dim]–[/]"
     if key.startswith("delta"):
-        points = 100 * (after[key] - before[key])
+        points = 100 * (after - before)
         colour = "green" if points > 0 else "red" if points < 0 else "dim"
         return f"[{colour}]{points:+.2f} pt[/]"
-    if before[key] == 0:
+    if before == 0:
         return "[dim]–[/]"
-    change = after[key] / before[key] - 1
+    change = after / before - 1
     colour = "green" if change < 0 else "red" if change > 0 else "dim"
     return f"[{colour}]{change:+.1%}[/]"

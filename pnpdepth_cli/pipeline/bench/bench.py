@@ -5,7 +5,7 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,14 +21,14 @@ from pnpdepth_cli.completion.propagation import propagate
 from pnpdepth_cli.core.refine import RefineSettings, refine
 from pnpdepth_cli.core.split import Split, gradient_at
 from pnpdepth_cli.errors import NoPointsError, PnpDepthError, UsageError
+from pnpdepth_cli.frames.frame import Frame
+from pnpdepth_cli.frames.prepare import PreparedFrame, prepare
+from pnpdepth_cli.frames.refine import refine_frame
 from pnpdepth_cli.io.depth import write_depth
-from pnpdepth_cli.models.aligned import AlignedDepth
 from pnpdepth_cli.models.definition import Fixed
-from pnpdepth_cli.models.frame import FrameMap
 from pnpdepth_cli.models.made_up import made_up_frame
 from pnpdepth_cli.models.network import Network, load_network, out_of_memory_is_a_device_error
 from pnpdepth_cli.pipeline.bench.timing import Spread, Timed, in_turn, peak_mb
-from pnpdepth_cli.pipeline.refinement.frame import FrameToRefine, refine_frame
 from pnpdepth_cli.pipeline.refinement.inputs import read_inputs
 from pnpdepth_cli.pipeline.refinement.output_files import plan_outputs
 from pnpdepth_cli.pipeline.refinement.outputs import write_outputs
@@ -145,10 +145,7 @@ class _Subject:
     network: Network
     layer: str
     settings: RefineSettings
-    frame: FrameMap
-    rgb: Tensor
-    points: SparsePoints
-    arguments: tuple[Tensor, ...]
+    prepared: PreparedFrame
 
     @classmethod
     def load(cls, request: BenchRequest, folder: Path) -> _Subject:
@@ -169,9 +166,8 @@ class _Subject:
             outputs=OutputOptions(output=folder / "out", overwrite=True),
         )
         _write_frame(asked.files, rgb, points)
-        frame = FrameMap.fit(definition.size, *points.size)
-        at = frame.points_to_network(points).tensors(network.device)
-        if not len(at):
+        prepared = prepare(network, Frame(rgb=rgb[0], points=points))
+        if not len(prepared.points):
             raise NoPointsError(
                 f"none of {len(points)} points lies in the network's view; take more"
             )
@@ -181,10 +177,7 @@ class _Subject:
             network=network,
             layer=resolve_layer(definition, request.layer),
             settings=resolve_settings(definition, asked.method),
-            frame=frame,
-            rgb=rgb,
-            points=at,
-            arguments=network.arguments(frame, rgb, at),
+            prepared=prepared,
         )
 
     def measured(self, stack: ExitStack, on_round: Callable[[int, int], None]) -> Bench:
@@ -193,7 +186,7 @@ class _Subject:
         opened = _network(self.request, self.request.precision)
         split = stack.enter_context(opened.cut_at(self.layer))
         with torch.no_grad():
-            z = split.front(*self.arguments)
+            z = split.front(*self.prepared.arguments)
             output = split.rear(z)
             limit = _limit(*self._operations(split, z), self.settings.iterations)
         todo = self._engine_parts(split, z)
@@ -215,9 +208,9 @@ class _Subject:
             model=self.request.model,
             checkpoint=str(self.network.checkpoint) if self.network.checkpoint else None,
             layer=self.layer,
-            size=self.frame.image,
-            network_size=self.frame.network,
-            points=len(self.points),
+            size=self.prepared.map.image,
+            network_size=self.prepared.map.network,
+            points=len(self.prepared.points),
             iterations=self.settings.iterations,
             precision=self.request.precision,
             device=str(device),
@@ -247,15 +240,15 @@ class _Subject:
             leaf = z.clone().requires_grad_(True)
             with torch.enable_grad():
                 depth = self.network.depth_of(split.rear(leaf))
-                return leaf, loss_of(self.points.sample(depth), self.points.depth)
+                return leaf, loss_of(self.prepared.points.sample(depth), self.prepared.points.depth)
 
         def first_frame(_: object) -> None:
             with self.network.cut_at(self.layer) as fresh:
                 self._refined(fresh, self.network)
 
         return {
-            "forward": Timed(run=no_grad(lambda _: module(*self.arguments))),
-            "front": Timed(run=no_grad(lambda _: split.front(*self.arguments))),
+            "forward": Timed(run=no_grad(lambda _: module(*self.prepared.arguments))),
+            "front": Timed(run=no_grad(lambda _: split.front(*self.prepared.arguments))),
             "rear": Timed(run=no_grad(lambda _: split.rear(z))),
             "rear backward": Timed(run=lambda prepared: gradient_at(*prepared), prepare=loss),
             "refinement": Timed(run=lambda _: self._refined(split, self.network)),
@@ -263,21 +256,28 @@ class _Subject:
         }
 
     def _refined(self, split: Split, network: Network) -> Tensor:
-        read = AlignedDepth(
-            network, self.points, self.settings.align, every=self.settings.align_every
-        )
-        return refine(split, self.arguments, self.points, self.settings, depth_of=read).after
+        prepared = replace(self.prepared, network=network)
+        return refine(
+            split,
+            prepared.arguments,
+            prepared.points,
+            self.settings,
+            depth_of=prepared.depth_reader(self.settings),
+        ).after
 
     def _fitting_parts(self, output: Any, notes: list[str]) -> dict[str, Timed]:
         """What else may be done to a prediction."""
         stated = self.network.definition.output_kind
         spaces = (stated,) if stated in SPACES else ("depth", "inverse")
-        at_points = self.points.sample(self.network.raw_of(output))
+        at = self.prepared.points
+        at_points = at.sample(self.network.raw_of(output))
         depth = self.network.depth_of(output)
-        points = self.points.resized(*depth.shape[-2:])
-        rgb = F.interpolate(self.rgb, points.size, mode="bilinear")[0]
+        points = at.resized(*depth.shape[-2:])
+        image = self.prepared.frame.rgb
+        assert image is not None
+        rgb = F.interpolate(image[None], points.size, mode="bilinear")[0]
         todo = {
-            "alignment": Timed(run=lambda _: align(at_points, self.points, spaces, "auto")),
+            "alignment": Timed(run=lambda _: align(at_points, at, spaces, "auto")),
             "propagation": Timed(run=lambda _: propagate(depth[0, 0], points, rgb, kind="gp")),
         }
         for name in list(todo):
@@ -292,8 +292,7 @@ class _Subject:
         """From files and to files, as `pnpdepth refine` does it."""
         inputs, outputs = read_inputs(self.asked), plan_outputs(self.asked)
         with self.network.cut_at(self.layer) as split:
-            task = FrameToRefine.with_points(inputs, inputs.points)
-            frame = refine_frame(self.network, split, self.settings, task)
+            frame = refine_frame(self.network, split, self.settings, inputs.frame())
         return {
             "reading": Timed(run=lambda _: read_inputs(self.asked)),
             "writing": Timed(run=lambda _: write_outputs(outputs, inputs, frame)),
@@ -302,7 +301,7 @@ class _Subject:
     def _operations(self, split: Split, z: Tensor) -> tuple[float, float]:
         """Floating-point operations of the front and of the rear."""
         with FlopCounterMode(display=False) as whole:
-            self.network.module(*self.arguments)
+            self.network.module(*self.prepared.arguments)
         with FlopCounterMode(display=False) as behind:
             split.rear(z)
         rear = behind.get_total_flops()

@@ -12,10 +12,11 @@ from torch import Tensor, nn
 
 from pnpdepth_cli.core.split import Split, gradient_at
 from pnpdepth_cli.errors import ModelError
+from pnpdepth_cli.frames.frame import Frame
+from pnpdepth_cli.frames.prepare import prepare
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.models.definition import Fixed
-from pnpdepth_cli.models.frame import FrameMap
-from pnpdepth_cli.models.made_up import made_up_arguments
+from pnpdepth_cli.models.made_up import made_up_frame
 from pnpdepth_cli.models.network import Network, load_network, out_of_memory_is_a_device_error
 from pnpdepth_cli.points import SparsePoints
 
@@ -69,7 +70,8 @@ def check_model(
     network = load_network(model, checkpoint, device)
     definition = network.definition
     with out_of_memory_is_a_device_error(network.device):
-        frame, arguments = _synthetic(network) if image is None else _on_image(network, image)
+        prepared = prepare(network, _synthetic(network) if image is None else _read(image))
+        arguments = prepared.arguments
         notes = [*network.notes, *network.verified(arguments)]
         with torch.no_grad():
             raw = network.raw_of(network.module(*arguments))
@@ -79,7 +81,7 @@ def check_model(
         }
     return CheckedModel(
         name=definition.name,
-        input=list(frame.network),
+        input=list(prepared.map.network),
         output=list(raw.shape[-2:]),
         output_kind=definition.output_kind,
         output_scale=definition.output_scale,
@@ -90,18 +92,17 @@ def check_model(
     )
 
 
-def _synthetic(network: Network) -> tuple[FrameMap, tuple[Tensor, ...]]:
+def _synthetic(network: Network) -> Frame:
     size = network.definition.size
-    own = (size.height, size.width) if isinstance(size, Fixed) else _SIZE
-    frame = FrameMap.fit(size, *own)
-    return frame, made_up_arguments(network, frame)
+    rgb, points = made_up_frame((size.height, size.width) if isinstance(size, Fixed) else _SIZE)
+    return Frame(rgb=rgb[0], points=points)
 
 
-def _on_image(network: Network, image: Path) -> tuple[FrameMap, tuple[Tensor, ...]]:
-    rgb = torch.from_numpy(read_rgb(image).values).permute(2, 0, 1)[None].contiguous()
-    frame = FrameMap.fit(network.definition.size, *rgb.shape[-2:])
-    no_points = SparsePoints(xy=torch.zeros(0, 2), depth=torch.zeros(0), size=frame.network)
-    return frame, network.arguments(frame, rgb, no_points)
+def _read(image: Path) -> Frame:
+    rgb = torch.from_numpy(read_rgb(image).values).permute(2, 0, 1).contiguous()
+    height, width = rgb.shape[-2:]
+    no_points = SparsePoints(xy=torch.zeros(0, 2), depth=torch.zeros(0), size=(height, width))
+    return Frame(rgb=rgb, points=no_points)
 
 
 def _check_layer(

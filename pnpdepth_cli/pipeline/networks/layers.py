@@ -16,10 +16,12 @@ from pnpdepth_cli.core.influence import influential_field
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.core.split.layer_name import LayerName
 from pnpdepth_cli.errors import ModelError, UsageError
+from pnpdepth_cli.frames.frame import Frame
+from pnpdepth_cli.frames.prepare import prepare
 from pnpdepth_cli.io.depth import read_sparse
 from pnpdepth_cli.models.definition import Fixed
 from pnpdepth_cli.models.frame import FrameMap
-from pnpdepth_cli.models.made_up import made_up_arguments
+from pnpdepth_cli.models.made_up import made_up_frame
 from pnpdepth_cli.models.network import Network, load_network, out_of_memory_is_a_device_error
 
 DEFAULT_SIZE = (240, 320)
@@ -86,16 +88,17 @@ def list_layers(
         raise UsageError(
             f"the definition of {network.definition.name!r} lists no layers; --all lists every one"
         )
-    frame = FrameMap.fit(policy, *(size or own))
     rows = []
     with out_of_memory_is_a_device_error(network.device):
-        arguments = made_up_arguments(network, frame)
+        rgb, synthetic_points = made_up_frame(size or own)
+        prepared = prepare(network, Frame(rgb=rgb[0], points=synthetic_points))
+        arguments = prepared.arguments
         with torch.no_grad(), FlopCounterMode(display=False) as whole:
             network.depth_of(network.module(*arguments))
         for done, name in enumerate(names, start=1):
-            rows.append(_measure(network, name, arguments, frame, whole.get_total_flops()))
+            rows.append(_measure(network, name, arguments, prepared.map, whole.get_total_flops()))
             on_layer(done, len(names))
-    height, width = frame.network
+    height, width = prepared.map.network
     spacing = math.sqrt(height * width / count) if count else None
     return LayerList(
         rows=ranked(rows, spacing) if spacing else rows, spacing=spacing, notes=network.notes

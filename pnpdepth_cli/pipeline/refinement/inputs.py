@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from pnpdepth_cli.errors import InputError, NoPointsError, SizeError, UsageError
+from pnpdepth_cli.frames.frame import Frame
 from pnpdepth_cli.io.dataset.frame import Hdf5Array, Source
 from pnpdepth_cli.io.dataset.hdf5 import depth_of, rgb_of
 from pnpdepth_cli.io.depth import (
@@ -29,6 +29,9 @@ from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.sensors import sample_points
 
 Picture = NDArray[np.float32]
+
+_LEAK_FRACTION = 0.5
+"""Of the ground truth's pixels; as much in common with the sparse depth gives a warning."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,16 +54,12 @@ class Inputs:
         """(H, W) of the image frame."""
         return self.points.size
 
-    def rgb_tensor(self) -> Tensor | None:
-        """(1, 3, H, W) float32 in 0..1."""
-        picture = self.picture()
-        return None if picture is None else picture[None]
-
-    def picture(self) -> Tensor | None:
-        """(3, H, W) float32 in 0..1."""
-        if self.rgb is None:
-            return None
-        return torch.from_numpy(np.ascontiguousarray(self.rgb.transpose(2, 0, 1)))
+    def frame(self) -> Frame:
+        """Returns the image and all points as tensors."""
+        rgb = self.rgb
+        if rgb is not None:
+            rgb = np.ascontiguousarray(rgb.transpose(2, 0, 1))
+        return Frame(rgb=None if rgb is None else torch.from_numpy(rgb), points=self.points)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,14 +104,34 @@ def read_inputs(request: RefineRequest) -> Inputs:
     if truth is not None and truth.values.shape != sparse.points.size:
         raise _of_another_size(files, truth.values.shape, sparse.points.size)
     parts = {"image": image, "sparse": sparse, "gt": truth}
+    notes = [note for part in parts.values() if part is not None for note in part.notes]
+    if truth is not None and files.sparse is not None:
+        notes += _leak_warning(sparse.points, truth.values)
     return Inputs(
         rgb=None if image is None else image.values,
         points=sparse.points,
         gt=None if truth is None else truth.values,
         sparse_scale=sparse.scale,
         record={name: part.record for name, part in parts.items() if part is not None},
-        notes=tuple(note for part in parts.values() if part is not None for note in part.notes),
+        notes=tuple(notes),
     )
+
+
+def _leak_warning(points: SparsePoints, gt: Picture) -> list[str]:
+    """A warning if most of the ground truth is the sparse depth itself.
+
+    KITTI's ground truth holds the points of its own scan by design, which is less than half of it.
+    """
+    known = gt > 0
+    leaked = int((known & (points.scatter()[0, 0].numpy() == gt)).sum())
+    fraction = leaked / int(known.sum())
+    if fraction < _LEAK_FRACTION:
+        return []
+    return [
+        f"warning: {leaked:,} of {int(known.sum()):,} pixels ({fraction:.1%}) of the ground truth"
+        " are the sparse depth itself, so errors against it show nothing; give another --gt, or"
+        " keep points out with --holdout"
+    ]
 
 
 def _read_image(files: FrameFiles, source: Source) -> _Part:

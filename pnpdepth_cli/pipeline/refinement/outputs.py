@@ -7,10 +7,10 @@ from typing import Any
 
 import torch
 
+from pnpdepth_cli.frames.frame import RefinedFrame
 from pnpdepth_cli.io.atomic import make_folder
 from pnpdepth_cli.io.depth import write_depth
 from pnpdepth_cli.io.visualisation import improvement, improvement_at_points, preview
-from pnpdepth_cli.pipeline.refinement.frame import RefinedFrame
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs
 from pnpdepth_cli.pipeline.refinement.output_files import Outputs
 

@@ -9,17 +9,17 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from pnpdepth_cli.auto.candidates import SplitCache
 from pnpdepth_cli.completion.interpolation import linear
 from pnpdepth_cli.completion.propagation import propagate
 from pnpdepth_cli.core.metrics import score
 from pnpdepth_cli.core.refine import Refinement, RefineSettings, refine
 from pnpdepth_cli.core.split import Split
-from pnpdepth_cli.errors import DivergedError, NoPointsError
-from pnpdepth_cli.models.aligned import AlignedDepth
+from pnpdepth_cli.errors import DivergedError
+from pnpdepth_cli.frames.prepare import prepare
 from pnpdepth_cli.models.frame import FrameMap
 from pnpdepth_cli.models.network import Network, out_of_memory_is_a_device_error
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs
-from pnpdepth_cli.pipeline.refinement.ways import HeldCut
 from pnpdepth_cli.pipeline.sweep.plan import Method, Run
 
 
@@ -39,17 +39,17 @@ class Curve:
     diverged: str | None
 
 
-def result_of(run: Run, inputs: Inputs, cut: HeldCut) -> dict[str, Any]:
+def result_of(run: Run, inputs: Inputs, cache: SplitCache) -> dict[str, Any]:
     """The result of a run of this frame with these points, as the journal has it."""
     done = {"state": "done", "points": len(inputs.points)}
     if run.method is None:
-        return done | {"scores": {"linear": interpolated(cut.network, inputs)}}
+        return done | {"scores": {"linear": interpolated(cache.network, inputs)}}
     torch.manual_seed(run.seed)
     try:
-        split = cut.at(run.method.layer)
-        curve = refined_curve(cut.network, split, run.method, inputs, run.iterations)
+        split = cache.at(run.method.layer)
+        curve = refined_curve(cache.network, split, run.method, inputs, run.iterations)
     except BaseException:
-        cut.close()
+        cache.close()
         raise
     return done | {
         "plain": curve.plain,
@@ -73,19 +73,23 @@ def refined_curve(
     It is the same as a refinement of each number alone, unless the step falls with their share.
     split: the network at the method's layer, open.
     """
-    frame = FrameMap.fit(network.definition.size, *inputs.size)
-    points = frame.points_to_network(inputs.points)
-    if not len(points):
-        raise NoPointsError(f"none of the {len(inputs.points)} points is where the network looks")
-    at = points.tensors(network.device)
+    prepared = prepare(network, inputs.frame())
+    if not len(prepared.points):
+        raise prepared.no_points_error()
     settings = replace(method.settings, iterations=max(wanted))
-    aligned = AlignedDepth(network, at, settings.align, every=settings.align_every)
+    reader = prepared.depth_reader(settings)
     keep = range(settings.iterations + 1) if settings.gives_best else {0, *wanted}
     diverged: DivergedError | None = None
     with out_of_memory_is_a_device_error(network.device):
-        arguments = network.arguments(frame, inputs.rgb_tensor(), points)
         try:
-            result = refine(split, arguments, at, settings, depth_of=aligned, keep_depths=keep)
+            result = refine(
+                split,
+                prepared.arguments,
+                prepared.points,
+                settings,
+                depth_of=reader,
+                keep_depths=keep,
+            )
         except DivergedError as error:
             if not isinstance(error.last_good, Refinement):
                 raise
@@ -94,7 +98,7 @@ def refined_curve(
         kept = {k: _kept(result.losses, min(k, made), settings) for k in wanted}
         truth = seen_truth(network, inputs)
         seen = {**result.depths, result.kept: result.after}
-        depths = {k: frame.depth_to_image(seen[k]).cpu() for k in {0, *kept.values()}}
+        depths = {k: prepared.map.depth_to_image(seen[k]).cpu() for k in {0, *kept.values()}}
         found = {
             place: asdict(score(_spread(depths[place], inputs, method.propagate), truth))
             for place in set(kept.values())
@@ -134,4 +138,4 @@ def _spread(depth: Tensor, inputs: Inputs, kind: str) -> Tensor:
     """The depth (H, W) with what is left at the points spread over it."""
     if kind == "none":
         return depth
-    return propagate(depth, inputs.points, inputs.picture(), kind=kind).depth
+    return propagate(depth, inputs.points, inputs.frame().rgb, kind=kind).depth

@@ -8,6 +8,7 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any, TypeVar
 
+from pnpdepth_cli.auto.candidates import SplitCache
 from pnpdepth_cli.errors import (
     DeviceError,
     InputError,
@@ -26,7 +27,6 @@ from pnpdepth_cli.pipeline.refinement.inputs import Inputs, read_inputs
 from pnpdepth_cli.pipeline.refinement.refine import Refiner, load_refiner
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest
 from pnpdepth_cli.pipeline.refinement.resolve import resolve_layer, resolve_settings
-from pnpdepth_cli.pipeline.refinement.ways import HeldCut
 from pnpdepth_cli.pipeline.sweep.axes import Study
 from pnpdepth_cli.pipeline.sweep.plan import Place, Plan, Run, RunPlace, sampling_of
 from pnpdepth_cli.pipeline.sweep.plots import draw_study, need_matplotlib
@@ -214,7 +214,7 @@ def _base(definition: ModelDefinition, request: RefineRequest) -> dict[str, Any]
 
 def _rows(runs: Sequence[Run], refiner: Refiner, state: SweepState) -> Iterator[dict[str, Any]]:
     """Each run is done and recorded; a row for each. Frames are read once, points drawn once."""
-    with HeldCut(refiner.network) as cut:
+    with SplitCache(refiner.network) as cache:
         for _, of_frame in groupby(runs, key=lambda run: run.frame.name):
             of_one = list(of_frame)
             inputs = _tried(read_inputs, of_one[0].task.request)
@@ -223,7 +223,7 @@ def _rows(runs: Sequence[Run], refiner: Refiner, state: SweepState) -> Iterator[
                 failed = isinstance(inputs, PnpDepthError)
                 drawn = inputs if failed else _tried(_drawn, alike[0], inputs)
                 for run in alike:
-                    yield _done(run, drawn, cut, state)
+                    yield _done(run, drawn, cache, state)
 
 
 def _tried(read: Callable[..., T], *arguments: Any) -> T | PnpDepthError:
@@ -243,10 +243,10 @@ def _drawn(run: Run, inputs: Inputs) -> Inputs:
 
 
 def _done(
-    run: Run, inputs: Inputs | PnpDepthError, cut: HeldCut, state: SweepState
+    run: Run, inputs: Inputs | PnpDepthError, cache: SplitCache, state: SweepState
 ) -> dict[str, Any]:
     """The run's result is recorded; its row for a listener."""
-    result = inputs if isinstance(inputs, PnpDepthError) else _tried(result_of, run, inputs, cut)
+    result = inputs if isinstance(inputs, PnpDepthError) else _tried(result_of, run, inputs, cache)
     row = {"name": run.frame.name, "status": "done", "message": None}
     if isinstance(result, PnpDepthError):
         state.fail(run, str(result))

@@ -53,6 +53,16 @@ def test_refinement_lowers_the_error_at_the_points_and_against_the_truth(
     assert 0 < record["improved_share"] < 1
 
 
+def test_ground_truth_that_is_the_sparse_depth_is_warned_of(frame: FrameOnDisk) -> None:
+    leaked = run(frame, gt=frame.sparse).record["notes"]
+    assert any(
+        "warning: 60 of 60 pixels (100.0%) of the ground truth are the sparse depth" in note
+        for note in leaked
+    )
+    notes = run(frame, gt=frame.gt, overwrite=True).record["notes"]
+    assert not any("sparse depth itself" in note for note in notes)
+
+
 def test_the_scores_of_the_record_are_those_of_the_written_file(frame: FrameOnDisk) -> None:
     record = run(frame, gt=frame.gt, format="npy").record
     written = read_depth(frame.folder / "out" / "img_depth.npy").values

@@ -203,7 +203,10 @@ def test_where_only_some_frames_have_truth_the_others_have_no_figures(
     frames = frames_of(report)
     assert frames["a"]["values"]["rmse_gain"] is not None
     assert set(frames["b"]["values"].values()) == {None}
-    assert (frames["a"]["tag"], frames["b"]["tag"]) == ("against the truth", "at the points used")
+    assert (frames["a"]["tag"], frames["b"]["tag"]) == (
+        "against ground truth",
+        "at the points used",
+    )
 
 
 def test_the_shard_that_ends_last_reports_all_frames(root: Path, report: Path) -> None:

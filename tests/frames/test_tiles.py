@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,13 +14,14 @@ from torch import nn
 from pnpdepth_cli.core.refine import RefineSettings
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.errors import UsageError
+from pnpdepth_cli.frames.frame import Frame, RefinedFrame
+from pnpdepth_cli.frames.refine import refine_frame
+from pnpdepth_cli.frames.tiles import OVERLAP, refine_tiled, tiles_of
 from pnpdepth_cli.models.definition import ModelDefinition, Multiple
 from pnpdepth_cli.models.network import Network, load_network
-from pnpdepth_cli.pipeline.refinement.frame import FrameToRefine, RefinedFrame, refine_frame
-from pnpdepth_cli.pipeline.refinement.inputs import Inputs
+from pnpdepth_cli.pipeline.refinement.inputs import read_inputs
 from pnpdepth_cli.pipeline.refinement.refine import load_refiner
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest
-from pnpdepth_cli.pipeline.refinement.tiles import OVERLAP, refine_tiled, tiles_of
 from pnpdepth_cli.points import SparsePoints
 from tests.pipeline.frames import frame_on_disk
 
@@ -57,23 +57,24 @@ def network(module: nn.Module) -> Network:
     return Network(definition=definition, module=module.eval(), checkpoint=None, device=CPU)
 
 
-def task(xy: list[tuple[int, int]], depth: list[float], size: tuple[int, int]) -> FrameToRefine:
+def frame_of(xy: list[tuple[int, int]], depth: list[float], size: tuple[int, int]) -> Frame:
     points = SparsePoints(
         xy=torch.tensor(xy, dtype=torch.float32), depth=torch.tensor(depth), size=size
     )
     rgb = np.random.default_rng(0).random((*size, 3), dtype=np.float32)
-    inputs = Inputs(rgb=rgb, points=points, gt=None, sparse_scale=None, record={}, notes=())
-    return FrameToRefine.with_points(inputs, points)
+    return Frame(rgb=torch.from_numpy(rgb).permute(2, 0, 1).contiguous(), points=points)
 
 
-def everywhere(size: tuple[int, int], step: int = 8) -> FrameToRefine:
+def everywhere(size: tuple[int, int], step: int = 8) -> Frame:
     xy = [(x, y) for y in range(0, size[0], step) for x in range(0, size[1], step)]
-    return task(xy, [2.0 if x < size[1] // 2 else 2.4 for x, _ in xy], size)
+    return frame_of(xy, [2.0 if x < size[1] // 2 else 2.4 for x, _ in xy], size)
 
 
-def tiled(module: nn.Module, settings: RefineSettings, one: FrameToRefine) -> RefinedFrame:
+def tiled(
+    module: nn.Module, settings: RefineSettings, one: Frame, propagation: str = "none"
+) -> RefinedFrame:
     with Split(module, "features") as split:
-        return refine_tiled(network(module), split, settings, one, SIDE)
+        return refine_tiled(network(module), split, settings, one, SIDE, propagation=propagation)
 
 
 @given(height=st.integers(1, 300), width=st.integers(1, 300), side=st.integers(16, 128))
@@ -152,7 +153,7 @@ def test_the_depths_of_tiles_run_into_each_other_without_a_step() -> None:
 def test_tiles_with_too_few_points_show_the_depth_of_the_whole_frame_and_it_is_said() -> None:
     torch.manual_seed(0)
     module = OneNumber()
-    one = task([(x, 10 + x) for x in range(10)], [3.0] * 10, (64, 300))
+    one = frame_of([(x, 10 + x) for x in range(10)], [3.0] * 10, (64, 300))
     found = tiled(module, RefineSettings(iterations=200, lr=0.01), one)
     assert np.unique(found.after[:, 100:]).size <= 3  # one number, to the last bit of a division
     np.testing.assert_allclose(found.after[:, 100:], found.after[0, 299], rtol=1e-6)
@@ -162,11 +163,12 @@ def test_tiles_with_too_few_points_show_the_depth_of_the_whole_frame_and_it_is_s
 def test_propagation_follows_once_over_all_tiles() -> None:
     torch.manual_seed(0)
     module, one = PixelByPixel(), everywhere((64, 150))
-    found = tiled(module, PLAIN, replace(one, propagate="gp"))
-    at_points = one.used.sample(torch.from_numpy(found.after))
-    assert float((at_points - one.used.depth).abs().mean()) < 0.05
+    found = tiled(module, PLAIN, one, "gp")
+    at_points = one.points.sample(torch.from_numpy(found.after))
+    assert float((at_points - one.points.depth).abs().mean()) < 0.05
     assert (
-        float((one.used.sample(torch.from_numpy(found.before)) - one.used.depth).abs().mean()) > 0.2
+        float((one.points.sample(torch.from_numpy(found.before)) - one.points.depth).abs().mean())
+        > 0.2
     )
 
 
@@ -174,7 +176,7 @@ def test_tiles_and_folds_do_not_go_together(tmp_path_factory: pytest.TempPathFac
     frame = frame_on_disk(tmp_path_factory.mktemp("frame"))
     request = RefineRequest.from_fields(image=frame.image, sparse=frame.sparse, tile=64, auto=True)
     with pytest.raises(UsageError, match="--tile goes with none of --auto"):
-        load_refiner(request, everywhere((64, 64)).inputs)
+        load_refiner(request, read_inputs(request))
 
 
 def test_the_split_is_as_before_for_the_next_frame(
