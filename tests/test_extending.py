@@ -65,3 +65,12 @@ def test_the_files_of_the_page_work_from_another_package(package: Path) -> None:
     assert record["loss"][-1] < record["loss"][0]
     scores = run(["eval", "out/rgb_depth.raw", "indoor/gt.png", "--json"], package)
     assert json.loads(scores)
+
+
+def test_the_layout_of_the_page_lists_frames(package: Path) -> None:
+    data = package / "data"
+    data.mkdir()
+    shutil.copy(package / "indoor" / "rgb.png", data / "a_image.png")
+    shutil.copy(package / "indoor" / "sparse.png", data / "a_lidar.png")
+    listed = json.loads(run(["batch", "data", "-o", "planned", "--dry-run", "--json"], package))
+    assert [frame["name"] for frame in listed] == ["a"]

@@ -36,6 +36,7 @@ class Baseline:
 
     @property
     def needs_prediction(self) -> bool:
+        """Whether the baseline uses the network's depth."""
         return self.of_prediction is not None
 
     def depth(self, points: SparsePoints, prediction: Tensor | None = None) -> Tensor:

@@ -29,9 +29,11 @@ class ExportedOperation(nn.Module):
         self._operation = operation
 
     def forward(self, *args: Any, **kwargs: Any) -> Any:
+        """Calls the operation."""
         return self._operation(*args, **kwargs)
 
     def extra_repr(self) -> str:
+        """Returns the name of the operation."""
         return str(self._operation)
 
 

@@ -66,6 +66,7 @@ class Run:
 
     @property
     def place(self) -> RunPlace:
+        """What tells the run from all others of the sweep."""
         return self.frame.name, self.seed, self.sampling, self.method
 
 

@@ -56,14 +56,17 @@ class Sampling:
 
     @property
     def is_pattern(self) -> bool:
+        """Whether the points come from a pattern of `pnpdepth sample`."""
         return self.sensor in PATTERNS
 
     @property
     def lidar(self) -> Lidar | None:
+        """The simulated LiDAR, or None."""
         return None if self.is_pattern or self.sensor == OWN else find_sensor(self.sensor)
 
     @property
     def sample_noise(self) -> SampleNoise:
+        """The noise of the points."""
         return SampleNoise(
             metres=self.noise,
             relative=self.relative_noise,
