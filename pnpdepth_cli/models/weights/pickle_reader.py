@@ -29,7 +29,7 @@ MAX_NAME = 1_000
 """Characters of a name in a pickle."""
 
 _MAX_BYTES = 1 << 28  # of a pickle beside its storages; real ones are far smaller
-_MAX_EXPANDED = 1 << 24  # elements of a tensor with strides of 0 over a smaller storage
+_MAX_EXPANDED = 1 << 28  # elements of a tensor with strides of 0; nothing is allocated for them
 _MAX_AXES = 64
 _TENSOR_STEPS = 20
 _MAPPINGS = (

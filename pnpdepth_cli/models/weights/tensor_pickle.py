@@ -36,6 +36,7 @@ from pnpdepth_cli.models.weights.pickle_reader import (
 )
 
 _MAGIC = 0x1950A86A20F9469CFC6C
+_CHUNK = 1 << 20  # bytes read at once
 _MAX_DEPTH = 100
 _MAX_MODULES = 100_000
 
@@ -168,7 +169,13 @@ def _read_archive(file: IO[bytes], size: int) -> TensorFile:
         order = entries.get(f"{folder}byteorder")
         if order is not None and archive.read(order).strip() == b"big":
             raise BrokenFileError("it was written on a big-endian machine")
-        storages = _Storages(lambda key: archive.read(entries[f"{folder}data/{key}"]))
+
+        def load(key: str) -> Tensor:
+            info = entries[f"{folder}data/{key}"]
+            with archive.open(info) as storage:
+                return _bytes_of(storage, info.file_size)
+
+        storages = _Storages(load)
         with archive.open(pickles[0]) as pickled:
             return _read_pickle(pickled, storages)
 
@@ -204,10 +211,10 @@ def _read_row_of_pickles(file: IO[bytes], size: int) -> TensorFile:
         places[str(key)] = (file.tell(), length)
         file.seek(length, 1)
 
-    def load(key: str) -> bytes:
+    def load(key: str) -> Tensor:
         place, length = places[key]
         file.seek(place)
-        return file.read(length)
+        return _bytes_of(file, length)
 
     file.seek(start)
     pickled = io.BytesIO(file.read(end - start))  # loading storages moves the file's own position
@@ -225,16 +232,14 @@ def _read_pickle(file: IO[bytes], storages: _Storages) -> TensorFile:
 class _Storages:
     """The storages of a file, each read once."""
 
-    def __init__(self, read: Callable[[str], bytes]) -> None:
+    def __init__(self, read: Callable[[str], Tensor]) -> None:
         self._read, self._loaded = read, dict[str, Tensor]()
 
     def load(self, pid: tuple[Any, ...]) -> Tensor:
         """The storage for ("storage", type, key, location, elements, ...) as a flat tensor."""
         key, dtype, count = _storage_key(pid), _dtype(pid[1]), int(pid[4])
         if key not in self._loaded:
-            self._loaded[key] = torch.frombuffer(
-                bytearray(self._read(key)) or bytearray(1), dtype=torch.uint8
-            )
+            self._loaded[key] = self._read(key)
         data = self._loaded[key]
         view = pid[5] if len(pid) > 5 else None
         start = int(view[1]) if view else 0
@@ -246,6 +251,19 @@ class _Storages:
             )
         part = data[first : first + length]
         return part.view(dtype) if length else torch.empty(0, dtype=dtype)
+
+
+def _bytes_of(file: IO[bytes], size: int) -> Tensor:
+    """The next bytes of a file, in memory that tensors can share."""
+    content = torch.empty(size, dtype=torch.uint8)
+    view = memoryview(content.numpy())
+    filled = 0
+    while filled < size:
+        count = file.readinto(view[filled : filled + _CHUNK])  # type: ignore[attr-defined]
+        if not count:
+            raise BrokenFileError("a storage goes beyond the end of the file")
+        filled += count
+    return content
 
 
 def _storage_key(pid: tuple[Any, ...]) -> str:

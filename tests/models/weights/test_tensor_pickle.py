@@ -303,10 +303,10 @@ def test_a_small_pickle_that_is_large_when_printed_or_hashed_takes_no_time(
 ) -> None:
     path = archive_of(tmp_path / "x.pt", HANGS[kind])
     assert path.stat().st_size < 2500
-    start = time.perf_counter()
+    start = time.process_time()
     with pytest.raises(CheckpointError) as error:
         read_checkpoint(path)
-    assert time.perf_counter() - start < 5
+    assert time.process_time() - start < 5
     assert len(str(error.value)) < 500 + len(str(path))
 
 
@@ -314,9 +314,9 @@ def test_a_set_of_buffers_that_is_large_when_hashed_takes_no_time(tmp_path: Path
     fleeting = StandIn("builtins.set", ([(), [], "fleeting", pickle.loads(NESTED + b".")],))
     buffers = {"fleeting": torch.ones(1), "kept": torch.ones(2)}
     state = {"_buffers": buffers, "_parameters": {}, "_non_persistent_buffers_set": fleeting}
-    start = time.perf_counter()
+    start = time.process_time()
     assert list(module_state(StandIn("a.B", state=state))) == ["kept"]
-    assert time.perf_counter() - start < 5
+    assert time.process_time() - start < 5
 
 
 LONG_NAME = b"X" + struct.pack("<I", 10**6) + b"a" * 10**6

@@ -226,7 +226,7 @@ BAD = [
     ({"layer": "1.5"}, UsageError, "between 0 and 1"),
     ({"layer": "midle"}, LayerError, "did you mean middle"),
     ({"layer": "unused"}, LayerError, "never runs"),
-    ({"image": None}, PnpDepthError, "looks at a picture"),
+    ({"image": None}, PnpDepthError, "takes an rgb image"),
     ({"device": "cuda:7"}, PnpDepthError, "--device cpu"),
     ({"device": "tpu"}, PnpDepthError, "--device cpu"),
     ({"format": "jpg"}, UsageError, "not one of"),

@@ -43,23 +43,24 @@ class OnnxNode(nn.Module):
         super().__init__()
         self.node = node
         self._run = OPERATORS[node.op]
-        self._places: list[str | None] = []  # the constant at each place; "" for what is handed in
-        for place, value in enumerate(inputs):
-            self._places.append(None if value is None else "")
+        # Of each input the name of its buffer, "" if the call gives it, None if it is left out.
+        self._buffer_names: list[str | None] = []
+        for index, value in enumerate(inputs):
+            self._buffer_names.append(None if value is None else "")
             if isinstance(value, Tensor):
-                self._places[-1] = f"input{place}"
+                self._buffer_names[-1] = f"input{index}"
                 if value.is_floating_point():
                     constant = nn.Parameter(value, requires_grad=False)
-                    self.register_parameter(f"input{place}", constant)
+                    self.register_parameter(f"input{index}", constant)
                 else:
-                    self.register_buffer(f"input{place}", value)
+                    self.register_buffer(f"input{index}", value)
 
     def forward(self, *handed_in: Tensor) -> Tensor | tuple[Tensor, ...]:
         """Returns the node's output, or its outputs."""
         rest = iter(handed_in)
         inputs: list[Any] = [
-            None if place is None else getattr(self, place) if place else next(rest)
-            for place in self._places
+            None if name is None else getattr(self, name) if name else next(rest)
+            for name in self._buffer_names
         ]
         try:
             return self._run(self.node, inputs)
@@ -233,7 +234,7 @@ def _check_operators(nodes: Sequence[Any], path: Path) -> None:
 def order_of_nodes(
     nodes: Sequence[Any], known: set[str], outputs: Sequence[str], path: Path
 ) -> list[int]:
-    """Returns the places of the nodes that the outputs need, each after those it reads.
+    """Returns the indices of the nodes that the outputs need, each after those it reads.
 
     Otherwise the order is that of the file. Files converted to half precision are not in order.
 

@@ -343,9 +343,9 @@ def test_constants_far_larger_than_the_file_are_refused_before_they_are_made(
     ]
     path = write_network(tmp_path / "x.onnx", nodes=(*BOMBS[kind], *tail), outputs=("out",))
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    start = time.perf_counter()
+    start = time.process_time()
     assert "a constant of" in refused(path)
-    assert time.perf_counter() - start < 5
+    assert time.process_time() - start < 5
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 500_000  # kB
 
 
@@ -383,6 +383,6 @@ def test_functions_are_written_out_but_neither_recursive_nor_exponential_ones(
     ring = with_functions(tmp_path / "b.onnx", lambda n: [f"f{1 - n}"], 2)
     assert "calls itself" in refused(ring)
     doubling = lambda n: [f"f{n + 1}"] * 2 if n < 39 else []  # noqa: E731
-    start = time.perf_counter()
+    start = time.process_time()
     assert "written out" in refused(with_functions(tmp_path / "c.onnx", doubling, 40))
-    assert time.perf_counter() - start < 5
+    assert time.process_time() - start < 5
