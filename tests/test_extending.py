@@ -57,11 +57,14 @@ def test_the_files_of_the_page_work_from_another_package(package: Path) -> None:
     files = ["indoor/rgb.png", "--sparse", "indoor/sparse.png"]
     network = ["--model", "my-net", "--checkpoint", "my_net.safetensors", "--align", "none"]
     method = ["--loss", "charbonnier", "--update", "rmsprop", "--lr", "1%"]
+    method += ["--propagate", "offset", "--baselines"]
     output = ["--format", "raw", "-o", "out", "--json"]
     record = json.loads(run(["refine", *files, *network, *method, *output], package))
     assert record["model"]["name"] == "my-net"
     assert record["settings"]["loss"] == "charbonnier"
     assert record["settings"]["update"] == "rmsprop"
+    assert record["settings"]["propagate"] == "offset"
+    assert record["baselines"]["mean"]["held_out_mae"] > 0
     assert record["loss"][-1] < record["loss"][0]
     scores = run(["eval", "out/rgb_depth.raw", "indoor/gt.png", "--json"], package)
     assert json.loads(scores)

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -50,19 +49,7 @@ if TYPE_CHECKING:
     help="Measure the paper's seven networks, beside its Table V.",
 )
 @options.as_json
-def bench(
-    model: str,
-    checkpoint: Path | None,
-    layer: str | None,
-    size: str | None,
-    points: int,
-    iterations: int | None,
-    precision: str,
-    device: str,
-    repeats: int,
-    table: bool,
-    as_json: bool,
-) -> None:
+def bench(size: str | None, repeats: int, table: bool, as_json: bool, **given: Any) -> None:
     """Measure the run time of a refinement on this machine, by part and in forward passes.
 
     \b
@@ -79,30 +66,19 @@ def bench(
     if repeats < 1:
         raise UsageError(f"repeats {repeats}: there must be at least one")
     if table:
-        refused = {
-            "--checkpoint": checkpoint,
-            "--layer": layer,
-            "--size": size,
-            "--iterations": iterations,
+        refused = {"--size": size} | {
+            f"--{name}": given[name] for name in ("checkpoint", "layer", "iterations")
         }
         if clash := [name for name, value in refused.items() if value is not None]:
             raise UsageError(
                 f"--table measures the paper's networks and cannot be combined with {clash[0]}"
             )
-        _table(repeats, precision, device, as_json)
+        _table(repeats, given["precision"], given["device"], as_json)
         return
     from pnpdepth_cli.pipeline.bench.bench import BenchRequest, run_bench
 
     request = BenchRequest(
-        model=model,
-        checkpoint=checkpoint,
-        layer=layer,
-        size=options.height_and_width(size) if size else None,
-        points=points,
-        iterations=iterations,
-        precision=precision,
-        device=device,
-        repeats=repeats,
+        size=options.height_and_width(size) if size else None, repeats=repeats, **given
     )
     with progress_bar("bench", "round") as show:
         result = run_bench(request, on_round=show)
