@@ -64,7 +64,7 @@ class Table(Mapping[str, Any]):
 
     def __iter__(self) -> Iterator[str]:
         names = {**self._modules, **self._entry_points}
-        order = {name: place for place, name in enumerate(self._first)}
+        order = {name: index for index, name in enumerate(self._first)}
         return iter(sorted(names, key=lambda name: (order.get(name, len(order)), name)))
 
     def __len__(self) -> int:
