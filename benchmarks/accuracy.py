@@ -2,7 +2,7 @@
 
 For each network, set and number of points, MAE and RMSE in metres, means over frames and seeds of
 each frame's error: the network as it is, aligned with the points, refined at the paper's setting,
-every baseline of `pnpdepth_cli.completion.baselines`, and `--auto`. The same network, points and
+every baseline of `pnpdepth_cli.choices.BASELINES`, and `--auto`. The same network, points and
 pixels for all: those with known truth where the network sees. `wins` counts frames where `--auto`
 is not above the aligned network, and at most 3 per cent above the best baseline of that frame.
 `--outliers 0.2` puts so many points at wrong depths; the last column is `--auto` given the others
@@ -37,7 +37,7 @@ from model_zoo_defs.training.dataset import Frames
 from pnpdepth_cli.auto.auto import refine_automatically
 from pnpdepth_cli.auto.candidates import default_configs
 from pnpdepth_cli.auto.uncertainty import uncertainty
-from pnpdepth_cli.completion.baselines import BASELINES
+from pnpdepth_cli.choices import BASELINES
 from pnpdepth_cli.core.metrics import score
 from pnpdepth_cli.core.refine import RefineSettings
 from pnpdepth_cli.models.definition import Normalisation

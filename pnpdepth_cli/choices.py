@@ -165,8 +165,26 @@ FORMATS = Table(
 )
 """Depth file formats: `pnpdepth_cli.io.formats.DepthFormat`."""
 
-PROPAGATIONS = ("none", "gp", "diffusion")
-"""How the residual at the points is propagated."""
+PROPAGATIONS = Table(
+    "completion/propagations",
+    "propagation",
+    group="propagations",
+    noun="propagation",
+    first=("gp", "diffusion"),
+)
+"""How the residual at the points is propagated: `pnpdepth_cli.completion.propagation`."""
+
+BASELINES = Table(
+    "completion/baselines",
+    "baseline",
+    group="baselines",
+    noun="baseline",
+    first=(
+        *("nearest", "linear", "linear-log", "idw", "morphological", "median", "scale", "affine"),
+        *("scale-disparity", "affine-disparity", "local"),
+    ),
+)
+"""Dense depth without refinement: `pnpdepth_cli.completion.baseline`."""
 
 LAYOUTS = Table(
     "io/layouts",
