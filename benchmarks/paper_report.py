@@ -57,7 +57,7 @@ def _measures(rows: Sequence[Result], street: bool, *, beside: bool) -> str:
             points = published.points or "LiDAR"
             start = f"| *{published.name}, published* | {published.kind} |"
             lines.append(f"{start} | | before | {_cells(before, fine=published.fine)} |")
-            after_cells = _cells(after, before, fine=published.fine)
+            after_cells = _cells(after, before, fine=published.fine, printed=published.gains)
             lines.append(f"| | | {points} | | after | {after_cells} |")
         points = f"{row['points']:.0f}"
         start = f"| `{row['network']}` | {row['kind']} | | {row['frames']} | before |"
@@ -85,13 +85,19 @@ def described(settings: dict[str, dict[str, Any]]) -> str:
 
 
 def _cells(
-    values: dict[str, float], before: dict[str, float] | None = None, *, fine: bool = False
+    values: dict[str, float],
+    before: dict[str, float] | None = None,
+    *,
+    fine: bool = False,
+    printed: Sequence[float] = (),
 ) -> str:
-    """Six cells; with the errors' gains over `before` in per cent."""
+    """Six cells; with the gains over `before` in per cent, the first as printed."""
     cells = []
-    for name in MEASURES:
+    for place, name in enumerate(MEASURES):
         if name in ERRORS:
             gain = f" ({_gain(values[name], before[name])})" if before else ""
+            if place < len(printed):
+                gain = f" ({printed[place]:+.1f} %)"
             cells.append(f"{values[name]:.4f}{gain}")
         else:
             cells.append("†" if fine else f"{values[name]:.1f}")

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from pnpdepth_cli.core.split.user_code import describe
 from pnpdepth_cli.errors import ModelError
-from pnpdepth_cli.models.definition import FOREIGN, Fixed, ModelDefinition, Multiple
+from pnpdepth_cli.models.definition import UNTUNED_DEFAULTS, Fixed, ModelDefinition, Multiple
 from pnpdepth_cli.models.formats.onnx.functions import inlined
 from pnpdepth_cli.models.formats.onnx.graph import OnnxGraph, order_of_nodes
 
@@ -52,7 +52,7 @@ def onnx_definition(file: Path, output: str | None = None) -> ModelDefinition:
         build=lambda: OnnxGraph(model, file, [chosen]),
         complete=True,
         normalisation=None,
-        defaults=FOREIGN,
+        defaults=UNTUNED_DEFAULTS,
         summary=f"ONNX, opset {_opset(model)}, from {model.producer_name or 'an unknown program'}",
         output_kind="unknown",
         output_scale="unknown",
