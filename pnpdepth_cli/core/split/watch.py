@@ -148,7 +148,7 @@ class Watch(TorchDispatchMode):
                 with self._function_mode:
                     yield
             elif outer and not self._sees_escapes and self._function_mode.is_innermost():
-                with overrides._pop_mode_temporarily():  # type: ignore[no-untyped-call]
+                with overrides._pop_mode_temporarily():
                     yield
             else:
                 yield
@@ -231,7 +231,8 @@ class _EscapeMode(TorchFunctionMode):
 
     def is_innermost(self) -> bool:
         """Whether no other torch function mode was entered after this one."""
-        return overrides._get_current_function_mode() is self
+        innermost: object = overrides._get_current_function_mode()  # type: ignore[no-untyped-call]
+        return innermost is self
 
 
 _NO_STORAGE = 0
