@@ -66,7 +66,7 @@ class Recorder:
         if self._inside_one and module is not self._cut.module:
             return run()
         self.ran.add(module)
-        call, place, since = _Call(module), len(self._calls), self.watch.now()
+        call, index, since = _Call(module), len(self._calls), self.watch.now()
         self._calls.append(call)
         before = list(tensors_in(given))
         outer, self._inside_one = self._inside_one, self._may_be_one(module)
@@ -79,7 +79,7 @@ class Recorder:
             and module not in self._cut.around_hooks
             and _same_tensors(before, tensors_in(given))
         ):
-            self._drop_from(place + 1)
+            self._drop_from(index + 1)
             call.saved = RecordedCall(module=module, cached=True).save(output)
             self.watch.protect(call.saved)
         elif tried and next(module.children(), None) is not None:
@@ -87,7 +87,7 @@ class Recorder:
         if self._is_cut(module):
             path, z0 = self._cut.choose(output)
             self._replay.z0 = z0
-            self._replay.recording = Recording(cut=place, path=path)
+            self._replay.recording = Recording(cut=index, path=path)
             raise CutReached
         return output
 
@@ -146,7 +146,7 @@ class Recorder:
     def _release_unread(self) -> None:
         """Saved outputs that only go into other cached submodules lose their memory.
 
-        Something of their shape is returned in their place; every pass reads the same ones.
+        An expanded number of the same shape replaces them; every pass reads the same tensors.
         """
         for call in self._calls:
             if call.saved is None or call.saved.copied:  # copies were handed out and may be read
@@ -156,11 +156,11 @@ class Recorder:
             )
             call.saved.value = call.recorded().save(call.saved.value).value
 
-    def _drop_from(self, place: int) -> None:
-        for call in self._calls[place:]:
+    def _drop_from(self, first: int) -> None:
+        for call in self._calls[first:]:
             if call.saved is not None:
                 call.saved.value = None  # the watch would hold its tensors
-        del self._calls[place:]
+        del self._calls[first:]
 
 
 def _is_read(tensor: Tensor, watch: Watch) -> bool:

@@ -116,7 +116,7 @@ class Watch(TorchDispatchMode):
         consists of tensors that it created, no two of them in the same memory.
         """
         if self._marked and not (is_transparent(given) and not self._any_marked(given)):
-            self._touches += 1  # a native extension may read its arguments unseen
+            self._touches += 1  # a native extension may read its arguments unnoticed
         made_inside = [_storage(tensor) for _, tensor in tensors_in(output)]
         made_inside = [s for s in made_inside if self._made.get(s, 0) > since.operations]
         if self._touches > since.touches:
@@ -171,7 +171,7 @@ class Watch(TorchDispatchMode):
             given = [t for value in (*args, *kwargs.values()) for t in _tensors(value)]
             self.note_reads(given)
         self.torn |= bool(self._stale) and any(_storage(tensor) in self._stale for tensor in given)
-        written = [t for place, name in facts.writes for t in _argument(place, name, args, kwargs)]
+        written = [t for index, name in facts.writes for t in _argument(index, name, args, kwargs)]
         for tensor in written:
             self._before_write(tensor)
         marked = bool(self._marked) and any(map(self._is_marked, given))
@@ -211,7 +211,7 @@ class Watch(TorchDispatchMode):
         return any(self._is_marked(tensor) for _, tensor in tensors_in(value))
 
     def _is_marked(self, tensor: Tensor) -> bool:
-        # Only z requires gradient, so what does comes from it, by whatever way.
+        # Only z requires gradient, so a tensor that does was computed from it.
         return tensor.requires_grad or _storage(tensor) in self._marked
 
 
@@ -236,7 +236,7 @@ class _EscapeMode(TorchFunctionMode):
 
 
 _NO_STORAGE = 0
-"""Sparse tensors have none; they all share this mark."""
+"""The mark of sparse tensors, which have no storage."""
 
 
 def _storage(tensor: Tensor) -> int:
@@ -248,15 +248,14 @@ def _storage(tensor: Tensor) -> int:
 
 @dataclass(frozen=True)
 class _Facts:
-    """What an operation may do.
-
-    writes: the arguments it changes in place, by place and name. fresh: its results are always
-    new memory. escapes: values can get out of it to Python.
-    """
+    """What an operation may do, by its schema and tags."""
 
     writes: tuple[tuple[int, str], ...]
+    """Index and name of the arguments that it changes in place."""
     fresh: bool
+    """Whether its results are always new memory."""
     escapes: bool
+    """Whether it gives values, or shapes that depend on values, to Python."""
 
 
 @functools.cache
@@ -264,8 +263,8 @@ def _facts(func: Any) -> _Facts:
     schema = func._schema
     return _Facts(
         writes=tuple(
-            (place, argument.name)
-            for place, argument in enumerate(schema.arguments)
+            (index, argument.name)
+            for index, argument in enumerate(schema.arguments)
             if argument.alias_info is not None and argument.alias_info.is_write
         ),
         fresh=func.namespace == "aten" and all(r.alias_info is None for r in schema.returns),
@@ -274,8 +273,8 @@ def _facts(func: Any) -> _Facts:
     )
 
 
-def _argument(place: int, name: str, args: Sequence[Any], kwargs: Any) -> list[Tensor]:
-    return _tensors(args[place] if place < len(args) else kwargs.get(name))
+def _argument(index: int, name: str, args: Sequence[Any], kwargs: Any) -> list[Tensor]:
+    return _tensors(args[index] if index < len(args) else kwargs.get(name))
 
 
 def _tensors(value: Any) -> list[Tensor]:
