@@ -93,7 +93,7 @@ LOSSES = Table(
     noun="loss",
     first=("l1", "l2", "huber", "berhu", "inverse", "log", "cauchy"),
 )
-"""L of equation 3: (N,) predicted and (N,) measured depth to a scalar."""
+"""L: (N,) predicted and (N,) measured depth to a scalar."""
 
 UPDATES = Table(
     "core/update_rules",
@@ -102,7 +102,7 @@ UPDATES = Table(
     noun="update rule",
     first=("sign", "sgd", "normalised", "momentum", "adam", "lbfgs"),
 )
-"""U of equation 3: each entry makes a rule that turns gradients into directions."""
+"""U: each entry creates a rule that turns gradients into directions of z."""
 
 Schedule = Literal["constant", "linear"]
 SCHEDULES: tuple[Schedule, ...] = get_args(Schedule)
@@ -165,8 +165,26 @@ FORMATS = Table(
 )
 """Depth file formats: `pnpdepth_cli.io.formats.DepthFormat`."""
 
-PROPAGATIONS = ("none", "gp", "diffusion")
-"""How the residual at the points is propagated."""
+PROPAGATIONS = Table(
+    "completion/propagations",
+    "propagation",
+    group="propagations",
+    noun="propagation",
+    first=("gp", "diffusion"),
+)
+"""How the residual at the points is propagated: `pnpdepth_cli.completion.propagation`."""
+
+BASELINES = Table(
+    "completion/baselines",
+    "baseline",
+    group="baselines",
+    noun="baseline",
+    first=(
+        *("nearest", "linear", "linear-log", "idw", "morphological", "median", "scale", "affine"),
+        *("scale-disparity", "affine-disparity", "local"),
+    ),
+)
+"""Dense depth without refinement: `pnpdepth_cli.completion.baseline`."""
 
 LAYOUTS = Table(
     "io/layouts",

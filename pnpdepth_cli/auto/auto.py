@@ -28,10 +28,9 @@ from pnpdepth_cli.auto.candidates import (
     trajectories,
 )
 from pnpdepth_cli.auto.cross_validation import spatial_folds
+from pnpdepth_cli.choices import BASELINES, PROPAGATIONS
 from pnpdepth_cli.completion.alignment import align, where_predicted
-from pnpdepth_cli.completion.baselines import BASELINES
-from pnpdepth_cli.completion.local_alignment import trust
-from pnpdepth_cli.completion.propagation import wrong
+from pnpdepth_cli.completion.outliers import inlier_weights, outliers
 from pnpdepth_cli.errors import ModelError, PnpDepthError
 from pnpdepth_cli.frames.frame import Frame, RefinedFrame
 from pnpdepth_cli.models.network import Network
@@ -44,7 +43,6 @@ ENOUGH_HELD_OUT = 250
 """With this many held-out points no further fold is scored."""
 MIN_POINTS_FOR_JOINT_OUTLIERS = 50
 """From this many points on, points inconsistent with other points alone are outliers too."""
-PROPAGATIONS = ("gp", "diffusion")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -122,7 +120,7 @@ def refine_automatically(
     *,
     shortlist: Sequence[Candidate] | None = None,
     fixed: Candidate | None = None,
-    propagations: Sequence[str] = PROPAGATIONS,
+    propagations: Sequence[str] | None = None,
     budget_s: float | None = None,
     seed: int = 0,
 ) -> AutoRefined:
@@ -136,7 +134,7 @@ def refine_automatically(
         shortlist: Only these, the network and the baselines compete, such as those that were best
             on other frames.
         fixed: This candidate is taken; the others are only scored.
-        propagations: Propagations that compete.
+        propagations: Propagations that compete. None: all in `choices.PROPAGATIONS`.
         budget_s: No refinement is begun that would end after this many seconds, judged by those
             before it. Configurations that differ in alignment alone count as one.
         seed: Of the folds.
@@ -165,8 +163,9 @@ def refine_automatically(
         Fold(held_out=frame.points.select(held), inlier_weights=weights[held], depths=each)
         for (_, held), each in zip(folds, depths[1:], strict=True)
     )
+    competing = tuple(PROPAGATIONS) if propagations is None else propagations
     choice = _choose(
-        scored_folds, tuple(refined), shortlist if fixed is None else (fixed,), fixed, propagations
+        scored_folds, tuple(refined), shortlist if fixed is None else (fixed,), fixed, competing
     )
     return AutoRefined(
         frame=_blended(choice, depths[0], refined),
@@ -203,19 +202,19 @@ def _without_outliers(
     a point may be all that is seen of a small object.
     """
     points = frame.points
-    suspected = wrong(torch.ones(points.size), points, frame.rgb)
+    suspected = outliers(torch.ones(points.size), points, frame.rgb)
     plain = replace(config, settings=replace(config.settings, iterations=0))
     (result,) = trajectories(cache, [plain], frame, [points.select(~suspected)])[plain]
     if isinstance(result, PnpDepthError):
         return frame, ()
-    outliers = wrong(result.depths[0], points, frame.rgb)
+    found = outliers(result.depths[0], points, frame.rgb)
     if len(points) >= MIN_POINTS_FOR_JOINT_OUTLIERS:
-        outliers = outliers | suspected
-    count = int(outliers.sum())
+        found = found | suspected
+    count = int(found.sum())
     if not count:
         return frame, ()
     note = f"auto: {count:,} of {len(points):,} points left out; all around tells them otherwise"
-    return frame.with_points(points.select(~outliers)), (note,)
+    return frame.with_points(points.select(~found)), (note,)
 
 
 def _folds(points: SparsePoints, seed: int) -> list[tuple[SparsePoints, Tensor]]:
@@ -284,7 +283,7 @@ def _inlier_weights(points: SparsePoints, prediction: Tensor) -> Tensor:
     """(N,) 0…1: the weight of each point in a score; outliers would decide all."""
     at_points = points.sample(prediction)
     residual = points.depth.double().log() - at_points.clamp_min(1e-6).double().log()
-    return torch.where(at_points > 0, trust(points, residual), 0.0)
+    return torch.where(at_points > 0, inlier_weights(points, residual), 0.0)
 
 
 class _Scoreboard:

@@ -15,8 +15,8 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from pnpdepth_cli.completion.baselines import BASELINES
-from pnpdepth_cli.completion.propagation import propagate, propagated_at
+from pnpdepth_cli.choices import BASELINES
+from pnpdepth_cli.completion.propagation import propagate, propagate_at
 from pnpdepth_cli.core.refine import RefineSettings, refine_from
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.errors import PnpDepthError
@@ -219,7 +219,7 @@ class CandidateDepths:
             return SparsePoints(xy=xy, depth=xy.new_ones(len(xy)), size=frame.size).sample(
                 self._start(candidate)
             )
-        return propagated_at(
+        return propagate_at(
             self._start(candidate), frame.points, frame.rgb, xy, kind=candidate.propagate
         )
 

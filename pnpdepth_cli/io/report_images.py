@@ -1,4 +1,4 @@
-"""The pictures of a report: views of bounded size, small ones for its list, and the error map."""
+"""The images of a report: views of bounded size, thumbnails, and the error map."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from pnpdepth_cli.io.colours import Pixels, dimmed, paint_error, paint_gain
 from pnpdepth_cli.io.page import resized
 
 VIEWS = ("first", "second", "map", "image", "sparse")
-"""What a frame can be looked at in: the two sides of a slider, the map of errors, its inputs."""
+"""Views of a frame: the two sides of a slider, the map of errors, and its inputs."""
 
 _VIEW_SIZE = 960  # of the longer side, at most
 _SMALL = 480  # smaller views are enlarged by a whole number, so that their pixels stay square
@@ -29,19 +29,32 @@ Depth = NDArray[np.float32]
 
 @dataclass(frozen=True, kw_only=True)
 class ErrorMap:
-    """A map of errors, and the metres from which on an error has the full colour."""
+    """A map of errors."""
 
     pixels: Pixels
+    """(H, W, 3) colours."""
+
     strongest_m: float
+    """Error from which on the colour is full, metres."""
 
 
 def image_paths(folder: Path, key: str, views: Sequence[str]) -> list[Path]:
-    """The files of a frame that has these views."""
+    """Returns the files of a frame that has these views."""
     return [folder / f"{key}_{name}.jpg" for name in (*views, "thumb", "map_thumb")]
 
 
 def save_images(folder: Path, key: str, views: Mapping[str, Pixels], *, thumb: str) -> None:
-    """The files of `image_paths` are there; the first small one is of the view `thumb`."""
+    """Writes the files of `image_paths`.
+
+    Args:
+        folder: The report's folder for images.
+        key: Start of their names.
+        views: (H, W, 3) by the name of the view.
+        thumb: The view that the first thumbnail shows.
+
+    Raises:
+        OutputError: A file cannot be written.
+    """
     for name, pixels in views.items():
         _save(folder / f"{key}_{name}.jpg", _fitted(pixels))
     for name, view in (("thumb", thumb), ("map_thumb", "map")):
@@ -50,28 +63,31 @@ def save_images(folder: Path, key: str, views: Mapping[str, Pixels], *, thumb: s
         _save(folder / f"{key}_{name}.jpg", resized(pixels, factor))
 
 
-def error_map(prediction: Depth, truth: Depth, grey: NDArray[np.float32] | None) -> ErrorMap:
-    """Where the prediction is too far and where too near, over a grey picture where neither is.
+def error_map(prediction: Depth, ground_truth: Depth, grey: NDArray[np.float32] | None) -> ErrorMap:
+    """Returns the map of where the prediction is too far or too near, over the grey image.
 
-    All are (H, W); depths in metres, 0 where there is none or it does not count.
+    Args:
+        prediction: (H, W) metres, 0 where there is none.
+        ground_truth: (H, W) metres, 0 where it is unknown or does not count.
+        grey: (H, W) in 0..1; None for a uniform ground.
     """
-    both = (prediction > 0) & (truth > 0)
-    error = prediction[both].astype(np.float64) - truth[both]
-    wrong = np.abs(error[error != 0])
-    strongest = float(np.percentile(wrong, _STRONGEST_PERCENTILE)) if wrong.size else 1.0
-    ground = np.full(truth.shape, 0.3, np.float32) if grey is None else grey
+    both = (prediction > 0) & (ground_truth > 0)
+    error = prediction[both].astype(np.float64) - ground_truth[both]
+    sizes = np.abs(error[error != 0])
+    strongest = float(np.percentile(sizes, _STRONGEST_PERCENTILE)) if sizes.size else 1.0
+    ground = np.full(ground_truth.shape, 0.3, np.float32) if grey is None else grey
     pixels = dimmed(np.asarray(0.6 * ground, np.float32))
     pixels[both] = paint_error(error / strongest, 0.66 + 0.3 * ground[both])
     return ErrorMap(pixels=pixels, strongest_m=strongest)
 
 
 def gain_colours() -> list[str]:
-    """The colours of an improvement map as #rrggbb, from worse to better."""
+    """Returns the colours of an improvement map as #rrggbb, from worse to better."""
     return _hexadecimal(paint_gain(*_strengths()))
 
 
 def error_colours() -> list[str]:
-    """The colours of an error map, from too near to too far."""
+    """Returns the colours of an error map as #rrggbb, from too near to too far."""
     return _hexadecimal(paint_error(*_strengths()))
 
 
@@ -93,7 +109,7 @@ def _save(path: Path, pixels: Pixels) -> None:
     from PIL import Image
 
     with atomic_path(path) as temporary:
-        # Without the usual subsampling of colours, which blurs edges between them.
+        # Without chroma subsampling, which blurs edges between colours.
         Image.fromarray(np.ascontiguousarray(pixels)).save(
             temporary, "JPEG", quality=_QUALITY, subsampling=0
         )

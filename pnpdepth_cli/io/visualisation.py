@@ -1,4 +1,4 @@
-"""Pictures for people: what went in and came out, and where refinement helped."""
+"""PNGs for people: inputs and depth before and after, and where refinement helped."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from pnpdepth_cli.io.page import (
 
 Depth = NDArray[np.float32]
 
-# Wider pictures than this (KITTI is 3.3 : 1) are stacked, two in a row would be too small.
+# Wider images than this (KITTI is 3.3 : 1) are stacked; two in a row would be too small.
 _WIDE = 2.0
 _STRONGEST_PERCENTILE = 95.0
 _GAIN = "|before - ground truth| - |after - ground truth|"
@@ -36,17 +36,26 @@ def preview(
     after: Depth,
     path: Path,
 ) -> None:
-    """`path` shows image, sparse depth, depth before and after, in colours of one scale.
+    """Writes a PNG of image, sparse depth, depth before and after, in colours of one scale.
 
-    `rgb` is (H, W, 3) in 0..1, None for a network without image; `before` and `after` are
-    (H, W) metres; `sparse_xy` (N, 2) in pixels of the same image, `sparse_depth` (N,).
+    Args:
+        rgb: (H, W, 3) in 0..1; None for a network without image.
+        sparse_xy: (N, 2) pixel coordinates.
+        sparse_depth: (N,) metres.
+        before: (H, W) metres before refinement.
+        after: (H, W) metres after refinement.
+        path: The PNG.
+
+    Raises:
+        SizeError: Image and depth differ in size.
+        OutputError: The file cannot be written.
     """
     _check_same_size(before, after=after, image=rgb)
     height, width = before.shape
     columns = 1 if width > _WIDE * height else 2
     factor = magnification(before.shape, columns=columns, legend=True)
     scale = depth_scale(sparse_depth, before, after)
-    # Without an image, the depth itself in grey gives the eye something to hold on to.
+    # Without an image, the depth in grey is the ground of the points.
     grey = grey_of(rgb) if rgb is not None else (1 - scale.position(after)).astype(np.float32)
     first = rgb if rgb is not None else np.repeat(0.25 + 0.65 * grey[:, :, None], 3, axis=2)
     ground = resized(dimmed(grey), factor, smooth=True)
@@ -73,10 +82,24 @@ def improvement(
     path: Path,
     rgb: NDArray[np.float32] | None = None,
 ) -> float:
-    """`path` shows where |depth - gt| fell (red) and rose (green); the share that fell, 0..1.
+    """Writes a PNG of where |depth - gt| fell (red) and rose (green), as figure 4(d) of the paper.
 
-    As in figure 4(d) of the paper. All are (H, W) metres; only pixels with known ground truth
-    count, and equal errors are neither better nor worse.
+    Only pixels with known ground truth count; equal errors are neither better nor worse.
+
+    Args:
+        before: (H, W) metres before refinement.
+        after: (H, W) metres after refinement.
+        gt: (H, W) metres of ground truth, 0 where unknown.
+        path: The PNG.
+        rgb: (H, W, 3) in 0..1, the ground of the map; None for grey.
+
+    Returns:
+        The fraction of pixels whose error fell.
+
+    Raises:
+        InputError: No ground truth is known.
+        SizeError: The images differ in size.
+        OutputError: The file cannot be written.
     """
     _check_same_size(before, after=after, gt=gt, image=rgb)
     known = np.isfinite(gt) & (gt > 0)
@@ -105,10 +128,24 @@ def improvement_at_points(
     held_out: bool,
     path: Path,
 ) -> float:
-    """`path` shows the same at N sparse points as discs on the grey image; the share, 0..1.
+    """Writes a PNG of where the error at sparse points fell and rose, as discs on the grey image.
 
-    `depth`, `before_at` and `after_at` are (N,) metres at `xy`. `held_out` says that
-    refinement did not see the points, which the picture then says too.
+    Args:
+        rgb_or_grey: (H, W, 3) or (H, W) in 0..1.
+        xy: (N, 2) pixel coordinates.
+        depth: (N,) metres measured there.
+        before_at: (N,) metres before refinement.
+        after_at: (N,) metres after refinement.
+        held_out: Whether refinement did not use the points, which the PNG says.
+        path: The PNG.
+
+    Returns:
+        The fraction of points whose error fell.
+
+    Raises:
+        NoPointsError: There is no point.
+        SizeError: Points and depths differ in number.
+        OutputError: The file cannot be written.
     """
     if len(depth) == 0:
         raise NoPointsError("there is no sparse point to compare at; give more points")
@@ -133,10 +170,10 @@ def improvement_at_points(
 
 
 def _gain(before: Depth, after: Depth, gt: Depth) -> NDArray[np.float64]:
-    """Metres by which the error fell; a depth that is not finite counts as an endless error."""
-    truth = gt.astype(np.float64)
+    """Metres by which the error fell; a depth that is not finite counts as an error of 1e9."""
+    ground_truth = gt.astype(np.float64)
     was, now = (
-        np.nan_to_num(np.abs(np.asarray(d, dtype=np.float64) - truth), nan=1e9, posinf=1e9)
+        np.nan_to_num(np.abs(np.asarray(d, dtype=np.float64) - ground_truth), nan=1e9, posinf=1e9)
         for d in (before, after)
     )
     return np.asarray(was - now, dtype=np.float64)
@@ -167,8 +204,8 @@ def _save_gain(
     return improved
 
 
-def _bytes(picture: NDArray[np.floating]) -> NDArray[np.uint8]:
-    return np.asarray(np.rint(255 * np.clip(np.nan_to_num(picture), 0, 1)), dtype=np.uint8)
+def _bytes(image: NDArray[np.floating]) -> NDArray[np.uint8]:
+    return np.asarray(np.rint(255 * np.clip(np.nan_to_num(image), 0, 1)), dtype=np.uint8)
 
 
 def _check_same_size(before: Depth, **others: NDArray[Any] | None) -> None:

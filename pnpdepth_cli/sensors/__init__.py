@@ -1,4 +1,4 @@
-"""Where sparse depth comes from: scans, dense depth, and scanners that were never there.
+"""Sources of sparse depth: projected scans, sampled dense depth, and simulated LiDARs.
 
     from pnpdepth_cli.sensors import LIDARS, Camera, project_velodyne, sample_points, simulate_lidar
 

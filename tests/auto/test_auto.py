@@ -19,7 +19,7 @@ from pnpdepth_cli.auto.candidates import (
     default_configs,
     trajectories,
 )
-from pnpdepth_cli.completion.baselines import BASELINES
+from pnpdepth_cli.choices import BASELINES
 from pnpdepth_cli.core.refine import RefineSettings
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.frames.frame import Frame
@@ -103,7 +103,7 @@ def test_held_out_points_do_not_tell_the_depth_that_they_score(
 def test_held_out_points_of_which_none_is_believed_count_alike(
     frame: FrameOnDisk, network: Network, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(auto, "trust", lambda points, missing: torch.zeros_like(missing))
+    monkeypatch.setattr(auto, "inlier_weights", lambda points, residual: torch.zeros_like(residual))
     inputs = in_memory(frame)
     found = refine_automatically(network, [CONFIG], inputs)
     assert found.choice.error is not None

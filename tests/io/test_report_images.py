@@ -82,16 +82,16 @@ def test_a_saved_page_can_be_taken_apart_again(tmp_path: Path) -> None:
     xy = np.array([[5, 6]], np.float32)
     preview(rgb, xy, np.array([3], np.float32), depth, depth + 1, tmp_path / "p.png")
     page = open_page(tmp_path / "p.png")
-    assert (page.said["low_m"], page.said["high_m"]) == pytest.approx((2, 7), abs=0.2)
+    assert (page.content["low_m"], page.content["high_m"]) == pytest.approx((2, 7), abs=0.2)
     panels = page.panels()
     assert list(panels) == ["Image", "Sparse depth", "Depth before", "Depth after"]
     assert np.array_equal(panels["Image"], np.rint(255 * rgb).astype(np.uint8))
     assert panels["Depth before"].shape == (480, 640, 3)
     improvement(depth, depth + 1, depth, tmp_path / "i.png")
     page = open_page(tmp_path / "i.png")
-    assert page.said["ends"] == ["worse by 1 m or more", "better by 1 m or more"]
-    assert page.said["footer"] == "0.0 % of 307,200 pixels improved, 100.0 % worse"
-    assert page.said["unknown"] is None
+    assert page.content["ends"] == ["worse by 1 m or more", "better by 1 m or more"]
+    assert page.content["footer"] == "0.0 % of 307,200 pixels improved, 100.0 % worse"
+    assert page.content["unknown"] is None
     assert page.panels()["Change of error"].shape == (960, 1280, 3)
 
 

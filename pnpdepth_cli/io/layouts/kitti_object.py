@@ -16,12 +16,12 @@ from pnpdepth_cli.io.layouts import Layout
 
 
 def matches(root: Path) -> bool:
-    """True if image_2/, velodyne/ and calib/ are in the folder or in its training/."""
+    """Returns whether image_2/, velodyne/ and calib/ are in the folder or in its training/."""
     return bool(_parts(root))
 
 
 def listing(root: Path) -> Listing:
-    """One frame for each image of the left colour camera with a scan and a calibration."""
+    """Returns one frame for each image of the left colour camera with scan and calibration."""
     frames: list[Frame] = []
     broken: list[Unmatched] = []
     spare: list[Unmatched] = []

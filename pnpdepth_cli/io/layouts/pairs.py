@@ -1,7 +1,7 @@
-"""`pairs`: rgb/ and sparse/, and perhaps gt/ and calib/, with the same stems.
+"""`pairs`: rgb/ and sparse/, and optionally gt/ and calib/, with files of the same stems.
 
-Folders in them are looked into as well: rgb/drive_1/000.png goes with sparse/drive_1/000.png.
-calib/ has one file a frame; a calib.txt beside the folders holds for all.
+Folders in them are searched too: rgb/drive_1/000.png belongs to sparse/drive_1/000.png. calib/ has
+one file per frame; a calib.txt beside the folders applies to all.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ _CALIBRATIONS = (".txt", ".json", ".yaml", ".yml")
 
 
 def matches(root: Path) -> bool:
-    """True if the folder has rgb/ and sparse/."""
+    """Returns whether the folder has rgb/ and sparse/."""
     return (root / "rgb").is_dir() and (root / "sparse").is_dir()
 
 
 def listing(root: Path) -> Listing:
-    """One frame for each image with sparse depth."""
+    """Returns one frame for each image with sparse depth."""
     images, lost_images = find_files(root / "rgb", IMAGE_SUFFIXES)
     sparse, lost_sparse = find_files(root / "sparse", _SPARSE_SUFFIXES)
     gt, lost_gt = find_files(root / "gt", DEPTH_SUFFIXES)

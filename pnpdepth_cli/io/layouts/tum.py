@@ -1,4 +1,4 @@
-"""`tum`: TUM RGB-D, rgb.txt and depth.txt with a time and a path a line, paired by time."""
+"""`tum`: TUM RGB-D, rgb.txt and depth.txt with a time and a path per line, paired by time."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ _LONGEST_GAP_S = 0.02
 
 
 def matches(root: Path) -> bool:
-    """True if the folder has rgb.txt and depth.txt."""
+    """Returns whether the folder has rgb.txt and depth.txt."""
     return (root / "rgb.txt").is_file() and (root / "depth.txt").is_file()
 
 
 def listing(root: Path) -> Listing:
-    """One frame for each image with a depth image at most 0.02 s away; each is used once."""
+    """Returns one frame for each image with a depth image within 0.02 s; each is used once."""
     images, depths = _listed(root / "rgb.txt"), _listed(root / "depth.txt")
     gap = np.abs(np.subtract.outer([t for t, _ in images], [t for t, _ in depths]))
     close = np.argwhere(gap <= _LONGEST_GAP_S)

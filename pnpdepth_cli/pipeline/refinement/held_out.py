@@ -12,14 +12,13 @@ from torch import Tensor
 
 from pnpdepth_cli.auto.auto import (
     MIN_POINTS,
-    PROPAGATIONS,
     AutoRefined,
     Choice,
     refine_automatically,
 )
 from pnpdepth_cli.auto.candidates import Candidate, RefinementConfig, default_configs
 from pnpdepth_cli.auto.uncertainty import uncertainty
-from pnpdepth_cli.completion.baselines import BASELINES
+from pnpdepth_cli.choices import BASELINES, PROPAGATIONS
 from pnpdepth_cli.core.metrics import score
 from pnpdepth_cli.core.refine import RefineSettings
 from pnpdepth_cli.errors import PnpDepthError
@@ -128,7 +127,7 @@ def _competing_propagations(request: RefineRequest) -> tuple[str, ...]:
     """The propagation that was asked for, or all."""
     kind = request.method.propagate
     if kind is None:
-        return PROPAGATIONS
+        return tuple(PROPAGATIONS)
     return () if kind == "none" else (kind,)
 
 

@@ -127,8 +127,8 @@ class BatchReport:
         return {
             "key": key,
             "views": views,
-            "scale_m": [preview.said["low_m"], preview.said["high_m"]],
-            "map": {name: improvement.said[name] for name in ("ends", "unknown", "footer")},
+            "scale_m": [preview.content["low_m"], preview.content["high_m"]],
+            "map": {name: improvement.content[name] for name in ("ends", "unknown", "footer")},
         }
 
     def _entry(
@@ -175,7 +175,7 @@ def _holds_results(path: Path, output: Path, folder: Path) -> bool:
 
 
 def _views(preview: SavedPage, improvement: SavedPage) -> list[str]:
-    titles = [panel["title"] for page in (preview, improvement) for panel in page.said["panels"]]
+    titles = [panel["title"] for page in (preview, improvement) for panel in page.content["panels"]]
     return [view for title, view in _PANELS.items() if title in titles]
 
 

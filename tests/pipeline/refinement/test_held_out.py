@@ -17,7 +17,7 @@ from pnpdepth_cli.auto.candidates import (
     RefinementConfig,
     default_configs,
 )
-from pnpdepth_cli.completion.baselines import BASELINES
+from pnpdepth_cli.choices import BASELINES
 from pnpdepth_cli.core.refine import RefineSettings
 from pnpdepth_cli.errors import ModelError, UsageError
 from pnpdepth_cli.frames.frame import Frame

@@ -81,8 +81,8 @@ def test_the_pictures_are_the_panels_of_the_files_on_disk(root: Path, report: Pa
         shown = np.asarray(Image.open(io.BytesIO(pictures[f"{frame['key']}_{view}.jpg"])))
         scaled = cv2.resize(panel, shown.shape[1::-1], interpolation=cv2.INTER_AREA)
         assert np.abs(shown.astype(int) - scaled).mean() < 6, view
-    assert frame["scale_m"] == [preview.said["low_m"], preview.said["high_m"]]
-    assert frame["map"]["footer"] == improvement.said["footer"]
+    assert frame["scale_m"] == [preview.content["low_m"], preview.content["high_m"]]
+    assert frame["map"]["footer"] == improvement.content["footer"]
 
 
 def test_frames_of_an_earlier_run_without_a_report_are_in_it(root: Path, report: Path) -> None:
