@@ -47,7 +47,7 @@ class PaperRow:
     def takes(self, network: str) -> bool:
         """True if a network of this name belongs in the row."""
         parts = network.split("-")
-        # editions for a picture or for depth alone have no row in the paper
+        # editions for an image or for depth alone have no row in the paper
         if parts[0] != self.family or {"selfsup", "rgb", "d"} & set(parts):
             return False
         sized = self.family in ("eigen", "sparse2dense")  # these have an edition for each size

@@ -47,7 +47,7 @@ if TYPE_CHECKING:
 @click.option(
     "--table",
     is_flag=True,
-    help="Measure the paper's seven networks, beside its Table V.",
+    help="Measure the paper's seven networks, beside its Table IV.",
 )
 @options.as_json
 def bench(
@@ -156,7 +156,7 @@ def _table(repeats: int, precision: str, device: str, as_json: bool) -> None:
     from pnpdepth_cli.cli.tables import print_rows
 
     print_rows(
-        f"Table V: random weights, K = 5, {precision}, {device}, {rows[0].bench.threads} threads,"
+        f"Table IV: random weights, K = 5, {precision}, {device}, {rows[0].bench.threads} threads,"
         f" medians of {repeats}; beside it what the paper prints",
         (
             "network",

@@ -31,12 +31,13 @@ if TYPE_CHECKING:
     ),
     groups={
         "Input": (
-            *("--pred-scale", "--gt-scale", "--channel", "--resize", "--mask", "--sparse"),
-            *("--sparse-scale", "--workers", "--max-pixels"),
+            *("--pred-scale", "--gt-scale", "--pred-kind", "--channel", "--resize", "--mask"),
+            *("--sparse", "--sparse-scale", "--workers", "--max-pixels"),
         ),
         "Protocol": (
             *("--protocol", "--min-depth", "--max-depth", "--clip", "--crop", "--average"),
-            *("--delta", "--exclude-sparse", "--bootstrap", "--no-groups", "--seed"),
+            *("--delta", "--exclude-sparse", "--missing", "--scale-by", "--bootstrap"),
+            *("--no-groups", "--seed"),
         ),
         "Output": ("--csv", "--markdown", "--latex", "--html", "--overwrite", "--json"),
     },
@@ -65,6 +66,23 @@ if TYPE_CHECKING:
     metavar="D|D1,D2,D3",
     help="Thresholds of δ1…δ3: D, D², D³, or D1, D2, D3. The paper's KITTI rows use 1.01."
     "  [default: 1.25]",
+)
+@click.option(
+    "--missing",
+    type=click.Choice(("skip", "min", "max", "fail")),
+    help="Empty predictions: not scored, scored as --min-depth or --max-depth, or an error."
+    "  [default: the protocol's]",
+)
+@click.option(
+    "--scale-by",
+    type=click.Choice(("none", "median", "affine", "affine-disparity", "log")),
+    help="Scale each image to its ground truth, for relative predictions.  [default: none]",
+)
+@click.option(
+    "--pred-kind",
+    "prediction_kind",
+    type=click.Choice(("depth", "disparity")),
+    help="What predictions are.  [default: depth]",
 )
 @click.option("--pred-scale", type=float, metavar="S", help="Integer predictions hold metres × S.")
 @click.option("--gt-scale", type=float, metavar="S", help="Integer ground truth holds metres × S.")

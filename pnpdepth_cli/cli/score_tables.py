@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from pnpdepth_cli.pipeline.evaluation.compare import Comparison
     from pnpdepth_cli.pipeline.evaluation.frame_scoring import FrameScores
     from pnpdepth_cli.pipeline.evaluation.result import ErrorBin, Evaluation
+    from pnpdepth_cli.pipeline.evaluation.uncertainty import Uncertainty
 
 _ALL_FRAMES_SHOWN = 12
 _WORST_SHOWN = 5
@@ -73,6 +74,8 @@ def print_evaluation(evaluation: Evaluation) -> None:
         console.print(evaluation.describe_interval(), style="dim", soft_wrap=True)
     if len(evaluation.frames) > 1:
         _print(console, _frames(evaluation))
+    if evaluation.uncertainty is not None:
+        _print(console, _uncertainty(evaluation.uncertainty))
     for title, column, bins in (
         ("by distance to the nearest sparse point", "pixels away", evaluation.by_distance),
         ("by depth of the ground truth", "metres", evaluation.by_depth),
@@ -154,6 +157,16 @@ def _frames(evaluation: Evaluation) -> Table:
     for frame in frames:
         cells = [format_value(measure, frame.values.get(measure.key)) for measure in measures]
         table.add_row(_one_line(frame.name), *cells, _coverage(frame))
+    return table
+
+
+def _uncertainty(uncertainty: Uncertainty) -> Table:
+    table = _table(f"standard deviation of {uncertainty.frames:,} frames")
+    for column in ("", "observed", "calibrated"):
+        table.add_column(column, justify="left" if not column else "right")
+    table.add_row("errors within 1σ", f"{uncertainty.within_1_sigma:.1%}", "68.3%")
+    table.add_row("errors within 2σ", f"{uncertainty.within_2_sigma:.1%}", "95.4%")
+    table.add_row("AUSE (MAE, normalised)", f"{uncertainty.ause:.4f}", "0")
     return table
 
 

@@ -27,6 +27,8 @@ _PLY_KINDS = {
 }  # fmt: skip
 _PLY_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
 _LONGEST_HEADER = 1 << 16
+_MOST_DIGITS = 18
+"""Of a count; Python refuses to convert thousands of them."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -169,13 +171,15 @@ def _from_text(
     if len(lines) < number or (exact and len(lines) > number):
         raise damaged(path, kind, f"has {len(lines):,} lines for {number:,} points")
     try:
-        table = np.array([line.split() for line in lines[:number]], np.float64)
+        table = np.loadtxt(lines[:number], np.float64, comments=None, ndmin=2) if number else None
     except ValueError as error:
         raise damaged(path, kind, f"has a line that is not made of numbers ({error})") from error
-    if number and table.shape[1] != width:
+    if table is None:
+        return np.empty((0, 3), np.float32)
+    if table.shape[1] != width:
         raise damaged(path, kind, f"has {table.shape[1]} numbers in a line instead of {width}")
     starts = np.cumsum([0, *(column.count for column in columns)])
-    return _float32([table.reshape(number, width)[:, starts[index]] for index in wanted])
+    return _float32([table[:, starts[index]] for index in wanted])
 
 
 def _xyz_columns(path: Path, kind: str, columns: list[_Column]) -> list[int]:
@@ -194,7 +198,7 @@ def _float32(columns: list[NDArray[Any]]) -> NDArray[np.float32]:
 
 
 def _whole(path: Path, text: str) -> int:
-    if not text.isdecimal():
+    if not text.isdecimal() or len(text) > _MOST_DIGITS:
         raise FileFormatError(
             f"{path}: {one_line(text)[:40]!r} in its header is no count; correct it"
         )

@@ -102,8 +102,8 @@ def _with_shortlist(
             frames.append(read_inputs(others[number].request))
     refiner = refiner.with_shortlist_of(frames)
     assert refiner.shortlist is not None
-    found = "; ".join(str(candidate) for candidate in refiner.shortlist)
-    say(f"auto: best on {len(frames)} frames, and to be checked on each: {found}")
+    names = "; ".join(str(candidate) for candidate in refiner.shortlist)
+    say(f"auto: best on {len(frames)} frames, and to be checked on each: {names}")
     return refiner
 
 

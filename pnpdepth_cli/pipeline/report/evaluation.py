@@ -114,6 +114,7 @@ def _head(evaluation: Evaluation, columns: list[Column]) -> dict[str, Any]:
         "notes": list(evaluation.notes),
         "tables": [
             _means(evaluation),
+            *_uncertainty(evaluation),
             *_bins("By distance to the nearest sparse point", "px", evaluation.by_distance),
             *_bins("By depth of the ground truth", "m", evaluation.by_depth),
         ],
@@ -165,6 +166,37 @@ def _means(evaluation: Evaluation) -> dict[str, Any]:
         header.append("95 %")
         caption += f"; {evaluation.describe_interval()}"
     return table(caption, header, rows)
+
+
+def _uncertainty(evaluation: Evaluation) -> list[dict[str, Any]]:
+    """Calibration and sparsification of the predicted standard deviation, if there is one."""
+    uncertainty = evaluation.uncertainty
+    if uncertainty is None:
+        return []
+    calibration = [
+        [f"{expected:.1%}", f"{observed:.1%}"]
+        for expected, observed in zip(uncertainty.expected, uncertainty.observed, strict=True)
+    ]
+    sparsification = [
+        [f"{removed:.0%}", f"{error:.4f}", f"{best:.4f}"]
+        for removed, error, best in zip(
+            uncertainty.removed, uncertainty.sparsification, uncertainty.oracle, strict=True
+        )
+    ]
+    frames = frames_text(uncertainty.frames)
+    return [
+        table(
+            f"Calibration of the standard deviation, {frames}: {uncertainty.within_1_sigma:.1%}"
+            f" within 1σ, {uncertainty.within_2_sigma:.1%} within 2σ",
+            ["normal distribution", "observed"],
+            calibration,
+        ),
+        table(
+            f"Sparsification, {frames}: AUSE {uncertainty.ause:.4f} of the MAE",
+            ["removed", "MAE by σ [m]", "MAE by error [m]"],
+            sparsification,
+        ),
+    ]
 
 
 def _bins(caption: str, unit: str, bins: tuple[ErrorBin, ...]) -> list[dict[str, Any]]:
