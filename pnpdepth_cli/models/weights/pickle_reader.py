@@ -97,8 +97,7 @@ class PickleReader(pickle._Unpickler):
     if TYPE_CHECKING:  # attributes of the standard unpickler that its type stubs leave out
         stack: list[Any]
         readline: Callable[[], bytes]
-
-        def pop_mark(self) -> list[Any]: ...
+        pop_mark: Callable[[], list[Any]]
 
     def __init__(
         self,
