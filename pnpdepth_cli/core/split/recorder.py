@@ -55,29 +55,29 @@ class Recorder:
         self._known = len(self._calls)
         self._inside_one = False  # in a submodule that is to be cached as a whole
 
-    def run(self, module: nn.Module, given: Any, run: Callable[[], Any]) -> Any:
+    def run(self, module: nn.Module, inputs: Any, run: Callable[[], Any]) -> Any:
         """Runs a submodule, watched."""
-        self.watch.note_reads(given)
+        self.watch.note_reads(inputs)
         with self.watch.seeing_escapes_of(module):
             return run()
 
-    def record(self, module: nn.Module, given: Any, run: Callable[[], Any]) -> Any:
+    def record(self, module: nn.Module, inputs: Any, run: Callable[[], Any]) -> Any:
         """Runs a call and notes it; it is cached if its output can stand for all that it does."""
         if self._inside_one and module is not self._cut.module:
             return run()
         self.ran.add(module)
         call, index, since = _Call(module), len(self._calls), self.watch.now()
         self._calls.append(call)
-        before = list(tensors_in(given))
+        before = list(tensors_in(inputs))
         outer, self._inside_one = self._inside_one, self._may_be_one(module)
         try:
             output = run()
         finally:
             tried, self._inside_one = self._inside_one, outer
         if (
-            self.watch.can_stand_for(since, given, output)
+            self.watch.can_stand_for(since, inputs, output)
             and module not in self._cut.around_hooks
-            and _same_tensors(before, tensors_in(given))
+            and _same_tensors(before, tensors_in(inputs))
         ):
             self._drop_from(index + 1)
             call.saved = RecordedCall(module=module, cached=True).save(output)
@@ -134,9 +134,9 @@ class Recorder:
         )
 
     def _is_cut(self, module: nn.Module) -> bool:
-        found = self._replay.recording.cut is not None
+        reached = self._replay.recording.cut is not None
         chosen = self._cut.name.call in (None, self._replay.calls[module])
-        return not found and module is self._cut.module and chosen
+        return not reached and module is self._cut.module and chosen
 
     def _may_be_one(self, module: nn.Module) -> bool:
         """True if it ends before the cut, so that what is inside needs no record."""
@@ -169,5 +169,5 @@ def _is_read(tensor: Tensor, watch: Watch) -> bool:
 
 
 def _same_tensors(one: Iterable[tuple[Any, Tensor]], other: Iterable[tuple[Any, Tensor]]) -> bool:
-    """False where a call has changed the lists or dicts it was given."""
+    """False where a call has changed the lists or dicts among its inputs."""
     return [(path, id(tensor)) for path, tensor in one] == [(p, id(t)) for p, t in other]
