@@ -70,6 +70,15 @@ def test_the_files_of_the_page_work_from_another_package(package: Path) -> None:
     assert json.loads(scores)
 
 
+def test_the_layout_of_the_page_lists_frames(package: Path) -> None:
+    data = package / "data"
+    data.mkdir()
+    shutil.copy(package / "indoor" / "rgb.png", data / "a_image.png")
+    shutil.copy(package / "indoor" / "sparse.png", data / "a_lidar.png")
+    listed = json.loads(run(["batch", "data", "-o", "planned", "--dry-run", "--json"], package))
+    assert [frame["name"] for frame in listed] == ["a"]
+
+
 def test_with_auto_a_propagation_and_a_baseline_of_another_package_compete(package: Path) -> None:
     files = ["indoor/rgb.png", "--sparse", "indoor/sparse.png"]
     network = ["--model", "my-net", "--checkpoint", "my_net.safetensors", "--iterations", "2"]

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from pnpdepth_cli.choices import AVERAGES, EVAL_PROTOCOLS, RESIZES
 from pnpdepth_cli.cli import grouped_help, options
 from pnpdepth_cli.cli.printable import printable
 from pnpdepth_cli.cli.progress import progress_bar
@@ -15,8 +16,6 @@ from pnpdepth_cli.errors import FramesFailedError, UsageError
 
 if TYPE_CHECKING:
     from pnpdepth_cli.pipeline.evaluation.result import Evaluation
-
-PROTOCOLS = ("paper", "nyu", "kitti", "kitti-devkit", "eigen", "garg")
 
 
 @click.command(
@@ -47,7 +46,7 @@ PROTOCOLS = ("paper", "nyu", "kitti", "kitti-devkit", "eigen", "garg")
 @click.argument("truth", type=options.FILE, metavar="GT")
 @click.option(
     "--protocol",
-    type=click.Choice(PROTOCOLS),
+    type=click.Choice(EVAL_PROTOCOLS),
     default="paper",
     show_default=True,
     help="Preset of the options below.",
@@ -59,7 +58,7 @@ PROTOCOLS = ("paper", "nyu", "kitti", "kitti-devkit", "eigen", "garg")
 @click.option("--mask", type=options.FILE, help="Mask image, or folder with a mask per frame.")
 @click.option(
     "--average",
-    type=click.Choice(("per-image", "pooled")),
+    type=click.Choice(AVERAGES),
     help="Mean over images, or over all pixels of all images.",
 )
 @click.option(
@@ -91,7 +90,7 @@ PROTOCOLS = ("paper", "nyu", "kitti", "kitti-devkit", "eigen", "garg")
 @options.max_pixels
 @click.option(
     "--resize",
-    type=click.Choice(("nearest", "bilinear")),
+    type=click.Choice(RESIZES),
     help="Resize predictions to the size of the ground truth.",
 )
 @click.option(

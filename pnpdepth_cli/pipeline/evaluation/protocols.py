@@ -7,14 +7,13 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from pnpdepth_cli.choices import AVERAGES, RESIZES
 from pnpdepth_cli.core.metrics import DELTA_THRESHOLDS, MEASURES, Measure
 from pnpdepth_cli.errors import SizeError, UsageError
 from pnpdepth_cli.pipeline.evaluation.kitti_devkit import DEVKIT_MEASURES
 from pnpdepth_cli.pipeline.evaluation.scaling import PREDICTION_KINDS, SCALINGS
 
 KITTI_DEVKIT = "kitti-devkit"
-AVERAGES = ("per-image", "pooled")
-RESIZES = ("nearest", "bilinear")
 MISSING = ("skip", "min", "max", "fail")
 
 # (top, bottom, left, right) as fractions of the height and the width, cut to whole pixels.

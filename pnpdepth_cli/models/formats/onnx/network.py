@@ -24,6 +24,7 @@ MISMATCH = 1e-3
 
 _HALF_MISMATCH = 1e-2  # half precision itself is no better
 _NEWEST_OPSET = 24
+_MAX_BYTES = 1 << 31  # of a protocol buffer; larger weights lie in files beside it
 _ASSUMED_MULTIPLE = 32
 
 
@@ -77,6 +78,8 @@ def _as_map(output: Any) -> Tensor:
 def _read(file: Path) -> Any:
     if not file.is_file():
         raise ModelError(f"ONNX file {file} does not exist")
+    if file.stat().st_size > _MAX_BYTES:
+        raise ModelError(f"ONNX file {file} is larger than 2 GB, which no ONNX file is")
     try:
         import onnx
         import onnxruntime  # noqa: F401
