@@ -6,7 +6,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import TYPE_CHECKING, TypedDict
 
 import numpy as np
 import torch
@@ -28,6 +28,9 @@ from pnpdepth_cli.pipeline.refinement.resolve import (
     resolve_settings,
 )
 from pnpdepth_cli.points import SparsePoints
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
 
 FULL_SCALE = {np.dtype(np.uint8): 255.0, np.dtype(np.uint16): 65535.0}
 """Value of white by the type of an image's integers."""
@@ -72,6 +75,18 @@ def load_network(
     """
     path = None if checkpoint is None else Path(checkpoint)
     return networks.load_network(spec, path, device, precision=precision)
+
+
+class RefinerOptions(TypedDict, total=False):
+    """The options of `Refiner`."""
+
+    layer: str | None
+    settings: RefineSettings | None
+    propagate: str | None
+    auto: bool
+    uncertainty: bool
+    tile: int | None
+    seed: int
 
 
 class Refiner:
@@ -177,9 +192,20 @@ def refine(
     network: Network,
     image: ArrayLike | None,
     sparse: ArrayLike | SparsePoints,
-    **options: Any,
+    **options: Unpack[RefinerOptions],
 ) -> Refined:
-    """Returns the refined depth of one frame; see `Refiner` for the options."""
+    """Returns the refined depth of one frame.
+
+    Args:
+        network: From `load_network`.
+        image: As of `Refiner.refine`.
+        sparse: As of `Refiner.refine`.
+        **options: As of `Refiner`.
+
+    Raises:
+        InputError: Image or points cannot be used.
+        DivergedError: As of `Refiner.refine`.
+    """
     with Refiner(network, **options) as refiner:
         return refiner.refine(image, sparse)
 
@@ -236,7 +262,7 @@ def _rgb(image: ArrayLike) -> NDArray[np.float32]:
 def _points(sparse: ArrayLike | SparsePoints, size: tuple[int, int] | None) -> SparsePoints:
     """Returns the points in their own frame, which is the image's for rows of x, y, depth."""
     if isinstance(sparse, SparsePoints):
-        return sparse
+        return sparse.tensors()
     values = np.asarray(sparse, dtype=np.float32)
     if values.ndim != 2:
         raise InputError(f"sparse depth has shape (H, W) or (N, 3), not {values.shape}")
@@ -254,8 +280,4 @@ def _points(sparse: ArrayLike | SparsePoints, size: tuple[int, int] | None) -> S
         depth = values[rows, columns]
     if not len(depth):
         raise NoPointsError("the sparse depth has no value above 0")
-    return SparsePoints(
-        xy=torch.from_numpy(np.ascontiguousarray(xy)),
-        depth=torch.from_numpy(np.ascontiguousarray(depth)),
-        size=size,
-    )
+    return SparsePoints(xy=xy, depth=depth, size=size).tensors()

@@ -57,11 +57,33 @@ def test_the_files_of_the_page_work_from_another_package(package: Path) -> None:
     files = ["indoor/rgb.png", "--sparse", "indoor/sparse.png"]
     network = ["--model", "my-net", "--checkpoint", "my_net.safetensors", "--align", "none"]
     method = ["--loss", "charbonnier", "--update", "rmsprop", "--lr", "1%"]
+    more = ["--propagate", "median", "--baselines"]
     output = ["--format", "raw", "-o", "out", "--json"]
-    record = json.loads(run(["refine", *files, *network, *method, *output], package))
+    record = json.loads(run(["refine", *files, *network, *method, *more, *output], package))
     assert record["model"]["name"] == "my-net"
     assert record["settings"]["loss"] == "charbonnier"
     assert record["settings"]["update"] == "rmsprop"
+    assert record["settings"]["propagate"] == "median"
+    assert record["baselines"]["farthest"]["held_out_mae"] > 0
     assert record["loss"][-1] < record["loss"][0]
     scores = run(["eval", "out/rgb_depth.raw", "indoor/gt.png", "--json"], package)
     assert json.loads(scores)
+
+
+def test_the_layout_of_the_page_lists_frames(package: Path) -> None:
+    data = package / "data"
+    data.mkdir()
+    shutil.copy(package / "indoor" / "rgb.png", data / "a_image.png")
+    shutil.copy(package / "indoor" / "sparse.png", data / "a_lidar.png")
+    listed = json.loads(run(["batch", "data", "-o", "planned", "--dry-run", "--json"], package))
+    assert [frame["name"] for frame in listed] == ["a"]
+
+
+def test_with_auto_a_propagation_and_a_baseline_of_another_package_compete(package: Path) -> None:
+    files = ["indoor/rgb.png", "--sparse", "indoor/sparse.png"]
+    network = ["--model", "my-net", "--checkpoint", "my_net.safetensors", "--iterations", "2"]
+    output = ["--auto", "-o", "auto.npy", "--json"]
+    record = json.loads(run(["refine", *files, *network, *output], package))
+    tried = record["auto"]["tried"]
+    assert "median" in {each.get("propagate") for each in tried}
+    assert "farthest" in {each.get("baseline") for each in tried}

@@ -321,8 +321,8 @@ class _Scoreboard:
             torch.stack(list(self.predicted.values())),
             self.depth,
             self.weights,
-            usual=candidates.index(default),
-            simple=[number for number, each in enumerate(candidates) if each in baselines],
+            default=candidates.index(default),
+            baselines=[number for number, each in enumerate(candidates) if each in baselines],
         )
 
 

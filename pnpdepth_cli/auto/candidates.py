@@ -214,7 +214,8 @@ class CandidateDepths:
         """Returns the candidate's depth (M,) metres at pixel coordinates (M, 2)."""
         frame, name = self._frame, candidate.baseline
         if name is not None and candidate.propagate == "none":
-            return BASELINES[name].at(xy, frame.points, self._prediction)
+            depth: Tensor = BASELINES[name].at(xy, frame.points, self._prediction)
+            return depth
         if candidate.propagate == "none":
             return SparsePoints(xy=xy, depth=xy.new_ones(len(xy)), size=frame.size).sample(
                 self._start(candidate)
@@ -235,7 +236,9 @@ class CandidateDepths:
 
     def _start(self, candidate: Candidate) -> Tensor:
         if candidate.baseline is not None:
-            return BASELINES[candidate.baseline].depth(self._frame.points, self._prediction)
+            baseline = BASELINES[candidate.baseline]
+            depth: Tensor = baseline.depth(self._frame.points, self._prediction)
+            return depth
         if candidate.config is None:
             return self._prediction
         return self._refinements[candidate.config].after(candidate.iterations)

@@ -8,6 +8,14 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from pnpdepth_cli.choices import (
+    AVERAGES,
+    EVAL_PROTOCOLS,
+    MISSING,
+    PREDICTION_KINDS,
+    RESIZES,
+    SCALINGS,
+)
 from pnpdepth_cli.cli import grouped_help, options
 from pnpdepth_cli.cli.printable import printable
 from pnpdepth_cli.cli.progress import progress_bar
@@ -15,8 +23,6 @@ from pnpdepth_cli.errors import FramesFailedError, UsageError
 
 if TYPE_CHECKING:
     from pnpdepth_cli.pipeline.evaluation.result import Evaluation
-
-PROTOCOLS = ("paper", "nyu", "kitti", "kitti-devkit", "eigen", "garg")
 
 
 @click.command(
@@ -47,7 +53,7 @@ PROTOCOLS = ("paper", "nyu", "kitti", "kitti-devkit", "eigen", "garg")
 @click.argument("truth", type=options.FILE, metavar="GT")
 @click.option(
     "--protocol",
-    type=click.Choice(PROTOCOLS),
+    type=click.Choice(EVAL_PROTOCOLS),
     default="paper",
     show_default=True,
     help="Preset of the options below.",
@@ -59,7 +65,7 @@ PROTOCOLS = ("paper", "nyu", "kitti", "kitti-devkit", "eigen", "garg")
 @click.option("--mask", type=options.FILE, help="Mask image, or folder with a mask per frame.")
 @click.option(
     "--average",
-    type=click.Choice(("per-image", "pooled")),
+    type=click.Choice(AVERAGES),
     help="Mean over images, or over all pixels of all images.",
 )
 @click.option(
@@ -70,19 +76,19 @@ PROTOCOLS = ("paper", "nyu", "kitti", "kitti-devkit", "eigen", "garg")
 )
 @click.option(
     "--missing",
-    type=click.Choice(("skip", "min", "max", "fail")),
+    type=click.Choice(MISSING),
     help="Empty predictions: not scored, scored as --min-depth or --max-depth, or an error."
     "  [default: the protocol's]",
 )
 @click.option(
     "--scale-by",
-    type=click.Choice(("none", "median", "affine", "affine-disparity", "log")),
+    type=click.Choice(SCALINGS),
     help="Scale each image to its ground truth, for relative predictions.  [default: none]",
 )
 @click.option(
     "--pred-kind",
     "prediction_kind",
-    type=click.Choice(("depth", "disparity")),
+    type=click.Choice(PREDICTION_KINDS),
     help="What predictions are.  [default: depth]",
 )
 @click.option("--pred-scale", type=float, metavar="S", help="Integer predictions hold metres × S.")
@@ -91,7 +97,7 @@ PROTOCOLS = ("paper", "nyu", "kitti", "kitti-devkit", "eigen", "garg")
 @options.max_pixels
 @click.option(
     "--resize",
-    type=click.Choice(("nearest", "bilinear")),
+    type=click.Choice(RESIZES),
     help="Resize predictions to the size of the ground truth.",
 )
 @click.option(

@@ -216,7 +216,7 @@ def _stdout() -> Console:
 
 
 def _print(console: Console, table: Table) -> None:
-    """The table on the terminal; as wide as it likes where that is none."""
+    """Prints the table, as wide as needed unless stdout is a terminal."""
     if not console.is_terminal:
         wide = console.options.update(max_width=1000)
         console.width = max(console.width, console.measure(table, options=wide).maximum)

@@ -19,7 +19,7 @@ class StdoutError(Exception):
 
 
 class _Raw(io.RawIOBase):
-    """The raw stream of stdout or stderr, whose errors are told from those of files."""
+    """The raw stream of stdout or stderr, with errors that differ from those of files."""
 
     def __init__(self, stream: Any, *, ignore_errors: bool) -> None:
         self._stream, self.ignore_errors = stream, ignore_errors

@@ -35,7 +35,7 @@ _STAGES = {
 
 
 def print_refinement(record: Mapping[str, Any]) -> None:
-    """The end of `pnpdepth refine`: what was assumed, errors before and after, files, time."""
+    """Prints the end of `pnpdepth refine`: notes, errors before and after, files, times."""
     console = Console(stderr=True, highlight=False)
     _print_notes(console, record["notes"])
     settings, points = record["settings"], record["points"]
@@ -43,7 +43,7 @@ def print_refinement(record: Mapping[str, Any]) -> None:
     table = Table(
         title=escape(f"{name} cut at {settings['layer']}")
         if record["auto"] is None
-        else f"{escape(name)} and the points, by what was best at held-out points"
+        else f"{escape(name)}, best candidates at held-out points"
     )
     for column in ("", "before", "after", "change"):
         table.add_column(column, justify="left" if not column else "right")
@@ -60,7 +60,7 @@ def print_refinement(record: Mapping[str, Any]) -> None:
     if record["baselines"] is not None:
         console.print(_baselines(record["baselines"]))
     if record["improved_share"] is not None:
-        where = "pixels with truth" if record["scores"] else "points"
+        where = "pixels with ground truth" if record["scores"] else "points"
         console.print(f"improved: {record['improved_share']:.1%} of the {where}")
     seconds = record["seconds"]
     updates = (
@@ -78,7 +78,7 @@ def print_refinement(record: Mapping[str, Any]) -> None:
 
 
 def _baselines(rows: Mapping[str, Any]) -> Table:
-    """The simple baselines, the network and the result, the best at the held-out points first."""
+    """Returns the baselines, the network and the result, best first at the held-out points."""
     with_gt = any(row["scores"] for row in rows.values())
     table = Table(title="against every simple baseline")
     of_gt = ["MAE, ground truth", "RMSE, ground truth"] if with_gt else []
@@ -98,7 +98,7 @@ def _baselines(rows: Mapping[str, Any]) -> Table:
 
 
 def print_batch(summary: Mapping[str, Any]) -> None:
-    """The end of `pnpdepth batch`: errors before and after, means over the frames; the files."""
+    """Prints the end of `pnpdepth batch`: mean errors before and after, counts, files."""
     console = Console(stderr=True, highlight=False)
     mean, counts = summary["mean"], summary["counts"]
     if any(mean.values()):
@@ -117,22 +117,22 @@ def print_batch(summary: Mapping[str, Any]) -> None:
             for name, row in summary["baselines"].items()
         }
         console.print(_baselines(rows))
-    said = [f"{counts['done']:,} of {counts['frames']:,} frames done"]
-    said += [
+    parts = [f"{counts['done']:,} of {counts['frames']:,} frames done"]
+    parts += [
         f"{counts[kind]:,} {kind}" for kind in ("diverged", "failed", "pending") if counts[kind]
     ]
-    said += [f"{counts['with_warnings']:,} with warnings"] if counts["with_warnings"] else []
-    console.print(", ".join(said))
+    parts += [f"{counts['with_warnings']:,} with warnings"] if counts["with_warnings"] else []
+    console.print(", ".join(parts))
     output = summary["output"]
     console.print("wrote " + escape(f"{output}/summary.json  {output}/summary.csv"), soft_wrap=True)
 
 
 def print_profile(profile: Mapping[str, Any]) -> None:
-    """Where the time of a batch went: in the thread of the network, and in those beside it."""
+    """Prints the time of each stage of a batch, in the thread of the network and beside it."""
     console = Console(stderr=True, highlight=False)
     seconds, frames = profile["seconds"], profile["frames"]
     if not frames:
-        console.print("no frame was done; there is no time to share out")
+        console.print("no frame was refined; there are no times")
         return
     table = Table(title="where the time went")
     for column in ("", "seconds", "ms a frame", "of the time"):
@@ -156,7 +156,7 @@ def print_profile(profile: Mapping[str, Any]) -> None:
 
 
 def print_sparse(record: Mapping[str, Any]) -> None:
-    """The end of `pnpdepth project`, `sample` and `simulate`: what was read, and what came out."""
+    """Prints the end of `pnpdepth project`, `sample` and `simulate`: notes, points, files."""
     console = Console(stderr=True, highlight=False)
     _print_notes(console, record["notes"])
     points, (width, height) = record["points"], record["size"]
@@ -169,7 +169,7 @@ def print_sparse(record: Mapping[str, Any]) -> None:
 
 
 def print_rows(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    """A table of text on stdout; as wide as it likes where that is no terminal."""
+    """Prints a table on stdout, as wide as needed unless stdout is a terminal."""
     console = Console(highlight=False)
     table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
     for number, column in enumerate(columns):

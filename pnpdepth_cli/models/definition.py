@@ -158,7 +158,7 @@ class RefineDefaults:
             validity.one_of(self, "align", choices.ALIGNMENTS)
 
 
-FOREIGN = RefineDefaults(
+UNTUNED_DEFAULTS = RefineDefaults(
     iterations=20, lr="25%", loss="cauchy", update="normalised", schedule="linear", blur=1.0
 )
 """For networks that nobody here has tuned: steps that follow the feature map's own scale.

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pnpdepth_cli.choices import EVAL_PROTOCOLS
 from pnpdepth_cli.cli.main import main
 from pnpdepth_cli.io.depth import write_depth
 from pnpdepth_cli.pipeline.evaluation.protocols import PROTOCOLS
@@ -251,9 +252,7 @@ def test_help_imports_neither_torch_nor_numpy_nor_rich(command: str) -> None:
 
 
 def test_the_help_names_every_protocol() -> None:
-    from pnpdepth_cli.cli import evaluate
-
-    assert tuple(PROTOCOLS) == evaluate.PROTOCOLS
+    assert tuple(PROTOCOLS) == EVAL_PROTOCOLS
 
 
 def test_relative_predictions_and_missing_pixels_are_options_of_eval(

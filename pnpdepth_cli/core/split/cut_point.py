@@ -1,4 +1,4 @@
-"""The place where a network is cut: found by name, and the errors of a place that is no cut."""
+"""The layer where a network is cut: found by name, with the errors of one that cannot be cut."""
 
 from __future__ import annotations
 

@@ -10,7 +10,7 @@ from typing import Any
 from torch import nn
 
 Handler = Callable[[nn.Module, Any, Callable[[], Any]], Any]
-"""Called with a submodule, its (args, kwargs), and a function that runs it; returns its output."""
+"""Called with a submodule, its inputs (args, kwargs) and a function that runs it."""
 
 
 class Interception:
@@ -61,5 +61,5 @@ class Interception:
         return forward
 
 
-def _run_only(module: nn.Module, given: Any, run: Callable[[], Any]) -> Any:
+def _run_only(module: nn.Module, inputs: Any, run: Callable[[], Any]) -> Any:
     return run()

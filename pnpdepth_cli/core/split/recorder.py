@@ -55,31 +55,31 @@ class Recorder:
         self._known = len(self._calls)
         self._inside_one = False  # in a submodule that is to be cached as a whole
 
-    def run(self, module: nn.Module, given: Any, run: Callable[[], Any]) -> Any:
+    def run(self, module: nn.Module, inputs: Any, run: Callable[[], Any]) -> Any:
         """Runs a submodule, watched."""
-        self.watch.note_reads(given)
+        self.watch.note_reads(inputs)
         with self.watch.seeing_escapes_of(module):
             return run()
 
-    def record(self, module: nn.Module, given: Any, run: Callable[[], Any]) -> Any:
+    def record(self, module: nn.Module, inputs: Any, run: Callable[[], Any]) -> Any:
         """Runs a call and notes it; it is cached if its output can stand for all that it does."""
         if self._inside_one and module is not self._cut.module:
             return run()
         self.ran.add(module)
-        call, place, since = _Call(module), len(self._calls), self.watch.now()
+        call, index, since = _Call(module), len(self._calls), self.watch.now()
         self._calls.append(call)
-        before = list(tensors_in(given))
+        before = list(tensors_in(inputs))
         outer, self._inside_one = self._inside_one, self._may_be_one(module)
         try:
             output = run()
         finally:
             tried, self._inside_one = self._inside_one, outer
         if (
-            self.watch.can_stand_for(since, given, output)
+            self.watch.can_stand_for(since, inputs, output)
             and module not in self._cut.around_hooks
-            and _same_tensors(before, tensors_in(given))
+            and _same_tensors(before, tensors_in(inputs))
         ):
-            self._drop_from(place + 1)
+            self._drop_from(index + 1)
             call.saved = RecordedCall(module=module, cached=True).save(output)
             self.watch.protect(call.saved)
         elif tried and next(module.children(), None) is not None:
@@ -87,7 +87,7 @@ class Recorder:
         if self._is_cut(module):
             path, z0 = self._cut.choose(output)
             self._replay.z0 = z0
-            self._replay.recording = Recording(cut=place, path=path)
+            self._replay.recording = Recording(cut=index, path=path)
             raise CutReached
         return output
 
@@ -134,9 +134,9 @@ class Recorder:
         )
 
     def _is_cut(self, module: nn.Module) -> bool:
-        found = self._replay.recording.cut is not None
+        reached = self._replay.recording.cut is not None
         chosen = self._cut.name.call in (None, self._replay.calls[module])
-        return not found and module is self._cut.module and chosen
+        return not reached and module is self._cut.module and chosen
 
     def _may_be_one(self, module: nn.Module) -> bool:
         """True if it ends before the cut, so that what is inside needs no record."""
@@ -146,7 +146,7 @@ class Recorder:
     def _release_unread(self) -> None:
         """Saved outputs that only go into other cached submodules lose their memory.
 
-        Something of their shape is returned in their place; every pass reads the same ones.
+        An expanded number of the same shape replaces them; every pass reads the same tensors.
         """
         for call in self._calls:
             if call.saved is None or call.saved.copied:  # copies were handed out and may be read
@@ -156,11 +156,11 @@ class Recorder:
             )
             call.saved.value = call.recorded().save(call.saved.value).value
 
-    def _drop_from(self, place: int) -> None:
-        for call in self._calls[place:]:
+    def _drop_from(self, first: int) -> None:
+        for call in self._calls[first:]:
             if call.saved is not None:
                 call.saved.value = None  # the watch would hold its tensors
-        del self._calls[place:]
+        del self._calls[first:]
 
 
 def _is_read(tensor: Tensor, watch: Watch) -> bool:
@@ -169,5 +169,5 @@ def _is_read(tensor: Tensor, watch: Watch) -> bool:
 
 
 def _same_tensors(one: Iterable[tuple[Any, Tensor]], other: Iterable[tuple[Any, Tensor]]) -> bool:
-    """False where a call has changed the lists or dicts it was given."""
+    """False where a call has changed the lists or dicts among its inputs."""
     return [(path, id(tensor)) for path, tensor in one] == [(p, id(t)) for p, t in other]

@@ -51,16 +51,16 @@ class Replay:
         self.arguments = SavedTensors(_copies(arguments), self.arguments.copied)
         self.outputs, self.z0, self.z = [None] * len(self.recording.calls), None, None
 
-    def handle(self, module: nn.Module, given: Any, run: Callable[[], Any]) -> Any:
+    def handle(self, module: nn.Module, inputs: Any, run: Callable[[], Any]) -> Any:
         """Returns the output of a call in a pass: saved, with z in it, or of the submodule."""
         if self._fills:
             return run()
         if self.recorder is not None:
-            run = functools.partial(self.recorder.run, module, given, run)
+            run = functools.partial(self.recorder.run, module, inputs, run)
         index = self.recording.index(module, self.calls[module])
         self.calls[module] += 1
         if index is None:
-            return run() if self.recorder is None else self.recorder.record(module, given, run)
+            return run() if self.recorder is None else self.recorder.record(module, inputs, run)
         is_cut = index == self.recording.cut
         if is_cut and self.z0 is not None:
             return self._output_with_z(run)
@@ -70,7 +70,7 @@ class Replay:
             raise CutReached
         return output
 
-    def handle_outside(self, module: nn.Module, given: Any, run: Callable[[], Any]) -> Any:
+    def handle_outside(self, module: nn.Module, inputs: Any, run: Callable[[], Any]) -> Any:
         """Returns the output of a call between passes, with z if checkpointing repeats the cut."""
         in_backward = torch._C._current_graph_task_id() != -1
         is_cut = module is self._cut.module and self.calls[module] == 1

@@ -33,8 +33,8 @@ def describe(error: BaseException, file: Path | None = None) -> str:
     text = " ".join(str(error).split())[:300]
     frames = traceback.extract_tb(error.__traceback__)
     lines = [f.lineno for f in frames if file and Path(f.filename).resolve() == file.resolve()]
-    place = f" (line {lines[-1]})" if lines else ""
-    return f"{type(error).__name__}: {text}{place}" if text else f"{type(error).__name__}{place}"
+    line = f" (line {lines[-1]})" if lines else ""
+    return f"{type(error).__name__}: {text}{line}" if text else f"{type(error).__name__}{line}"
 
 
 def is_out_of_memory(error: BaseException) -> bool:

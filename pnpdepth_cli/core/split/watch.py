@@ -75,8 +75,8 @@ class Watch(TorchDispatchMode):
         self.data_dependent = self.escaped = False
         self._operations = 0
         self._touches = 0
-        self._writes: list[int] = []  # which operation had made what was changed; 0: none seen here
-        self._made: dict[int, int] = {}
+        self._writes: list[int] = []  # operation that created the changed storage; 0: none
+        self._created: dict[int, int] = {}
         self._marked: set[int] = set()
         self._protected: dict[int, list[SavedTensors]] = {}
         self._twins: tuple[Tensor, ...] = ()
@@ -109,23 +109,23 @@ class Watch(TorchDispatchMode):
         """Returns this moment, for `can_stand_for`."""
         return Moment(self._operations, self._touches, len(self._writes))
 
-    def can_stand_for(self, since: Moment, given: Any, output: Any) -> bool:
+    def can_stand_for(self, since: Moment, inputs: Any, output: Any) -> bool:
         """Whether returning `output` does all that the call did which began at `since`.
 
         So it did not depend on z, changed nothing older than itself in place, and its output
         consists of tensors that it created, no two of them in the same memory.
         """
-        if self._marked and not (is_transparent(given) and not self._any_marked(given)):
-            self._touches += 1  # a native extension may read its arguments unseen
-        made_inside = [_storage(tensor) for _, tensor in tensors_in(output)]
-        made_inside = [s for s in made_inside if self._made.get(s, 0) > since.operations]
+        if self._marked and not (is_transparent(inputs) and not self._any_marked(inputs)):
+            self._touches += 1  # a native extension may read its arguments unnoticed
+        created_inside = [_storage(tensor) for _, tensor in tensors_in(output)]
+        created_inside = [s for s in created_inside if self._created.get(s, 0) > since.operations]
         if self._touches > since.touches:
-            self._marked.update(made_inside)
+            self._marked.update(created_inside)
             return False
         return (
             is_transparent(output)
-            and len(set(made_inside)) == sum(1 for _ in tensors_in(output))
-            and all(made > since.operations for made in self._writes[since.writes :])
+            and len(set(created_inside)) == sum(1 for _ in tensors_in(output))
+            and all(created > since.operations for created in self._writes[since.writes :])
         )
 
     @contextmanager
@@ -148,7 +148,7 @@ class Watch(TorchDispatchMode):
                 with self._function_mode:
                     yield
             elif outer and not self._sees_escapes and self._function_mode.is_innermost():
-                with overrides._pop_mode_temporarily():  # type: ignore[no-untyped-call]
+                with overrides._pop_mode_temporarily():
                     yield
             else:
                 yield
@@ -166,21 +166,21 @@ class Watch(TorchDispatchMode):
         kwargs = kwargs or {}
         facts = _facts(func)
         self._operations += 1
-        given: list[Tensor] = []
+        inputs: list[Tensor] = []
         if not facts.fresh or self._reads is not None:
-            given = [t for value in (*args, *kwargs.values()) for t in _tensors(value)]
-            self.note_reads(given)
-        self.torn |= bool(self._stale) and any(_storage(tensor) in self._stale for tensor in given)
-        written = [t for place, name in facts.writes for t in _argument(place, name, args, kwargs)]
+            inputs = [t for value in (*args, *kwargs.values()) for t in _tensors(value)]
+            self.note_reads(inputs)
+        self.torn |= bool(self._stale) and any(_storage(tensor) in self._stale for tensor in inputs)
+        written = [t for index, name in facts.writes for t in _argument(index, name, args, kwargs)]
         for tensor in written:
             self._before_write(tensor)
-        marked = bool(self._marked) and any(map(self._is_marked, given))
+        marked = bool(self._marked) and any(map(self._is_marked, inputs))
         result = func(*args, **kwargs)
         results = {_storage(tensor) for tensor in _tensors(result)}
-        made = results - {_storage(tensor) for tensor in given} - {_NO_STORAGE}
-        self._made.update(dict.fromkeys(made, self._operations))
-        # An address seen before may have been freed and given out again.
-        self._marked -= made
+        created = results - {_storage(tensor) for tensor in inputs} - {_NO_STORAGE}
+        self._created.update(dict.fromkeys(created, self._operations))
+        # An address seen before may have been freed and reused.
+        self._marked -= created
         if marked:
             self._touches += 1
             self._marked |= results | {_storage(tensor) for tensor in written}
@@ -199,7 +199,7 @@ class Watch(TorchDispatchMode):
 
     def _before_write(self, tensor: Tensor) -> None:
         storage = _storage(tensor)
-        self._writes.append(self._made.get(storage, 0))
+        self._writes.append(self._created.get(storage, 0))
         twins = {_storage(twin) for twin in self._twins}
         if storage in twins:
             self._stale |= twins - {storage}
@@ -211,7 +211,7 @@ class Watch(TorchDispatchMode):
         return any(self._is_marked(tensor) for _, tensor in tensors_in(value))
 
     def _is_marked(self, tensor: Tensor) -> bool:
-        # Only z requires gradient, so what does comes from it, by whatever way.
+        # Only z requires gradient, so a tensor that does was computed from it.
         return tensor.requires_grad or _storage(tensor) in self._marked
 
 
@@ -231,11 +231,12 @@ class _EscapeMode(TorchFunctionMode):
 
     def is_innermost(self) -> bool:
         """Whether no other torch function mode was entered after this one."""
-        return overrides._get_current_function_mode() is self
+        innermost: object = overrides._get_current_function_mode()  # type: ignore[no-untyped-call]
+        return innermost is self
 
 
 _NO_STORAGE = 0
-"""Sparse tensors have none; they all share this mark."""
+"""The mark of sparse tensors, which have no storage."""
 
 
 def _storage(tensor: Tensor) -> int:
@@ -247,15 +248,14 @@ def _storage(tensor: Tensor) -> int:
 
 @dataclass(frozen=True)
 class _Facts:
-    """What an operation may do.
-
-    writes: the arguments it changes in place, by place and name. fresh: its results are always
-    new memory. escapes: values can get out of it to Python.
-    """
+    """What an operation may do, by its schema and tags."""
 
     writes: tuple[tuple[int, str], ...]
+    """Index and name of the arguments that it changes in place."""
     fresh: bool
+    """Whether its results are always new memory."""
     escapes: bool
+    """Whether it gives values, or shapes that depend on values, to Python."""
 
 
 @functools.cache
@@ -263,8 +263,8 @@ def _facts(func: Any) -> _Facts:
     schema = func._schema
     return _Facts(
         writes=tuple(
-            (place, argument.name)
-            for place, argument in enumerate(schema.arguments)
+            (index, argument.name)
+            for index, argument in enumerate(schema.arguments)
             if argument.alias_info is not None and argument.alias_info.is_write
         ),
         fresh=func.namespace == "aten" and all(r.alias_info is None for r in schema.returns),
@@ -273,8 +273,8 @@ def _facts(func: Any) -> _Facts:
     )
 
 
-def _argument(place: int, name: str, args: Sequence[Any], kwargs: Any) -> list[Tensor]:
-    return _tensors(args[place] if place < len(args) else kwargs.get(name))
+def _argument(index: int, name: str, args: Sequence[Any], kwargs: Any) -> list[Tensor]:
+    return _tensors(args[index] if index < len(args) else kwargs.get(name))
 
 
 def _tensors(value: Any) -> list[Tensor]:

@@ -170,7 +170,7 @@ def _is_arithmetic(node: ast.AST) -> bool:
         short = len(node.value) <= _MAX_DIGITS or not node.value.isdigit()
         return short and _WORD.fullmatch(node.value) is not None
     if isinstance(node, ast.Constant) and isinstance(node.value, int):
-        return abs(node.value) < 10**_MAX_DIGITS
+        return bool(abs(node.value) < 10**_MAX_DIGITS)
     return isinstance(node, _EXPRESSIONS)
 
 

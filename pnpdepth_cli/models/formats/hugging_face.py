@@ -22,7 +22,7 @@ from pnpdepth_cli.completion.interpolation import linear
 from pnpdepth_cli.core.split.user_code import describe
 from pnpdepth_cli.errors import CheckpointError, ModelError
 from pnpdepth_cli.models.definition import (
-    FOREIGN,
+    UNTUNED_DEFAULTS,
     Fixed,
     ModelDefinition,
     Near,
@@ -100,7 +100,7 @@ def hf_definition(folder: Path) -> ModelDefinition:
         checkpoint=weights,
         arguments=_with_prompt if prompted else None,
         output=_predicted_depth,
-        defaults=FOREIGN,
+        defaults=UNTUNED_DEFAULTS,
     )
 
 

@@ -15,7 +15,7 @@ from torch import Tensor, fx, nn
 
 from pnpdepth_cli.core.split.user_code import describe
 from pnpdepth_cli.errors import ModelError
-from pnpdepth_cli.models.definition import FOREIGN, Fixed, ModelDefinition, Multiple
+from pnpdepth_cli.models.definition import UNTUNED_DEFAULTS, Fixed, ModelDefinition, Multiple
 from pnpdepth_cli.models.formats.export_archive import check_archive
 
 _ASSUMED_MULTIPLE = 32
@@ -80,7 +80,7 @@ def exported_definition(file: Path) -> ModelDefinition:
         build=lambda: _with_operations_as_modules(graph),
         complete=True,
         checkpoint=file,
-        defaults=FOREIGN,
+        defaults=UNTUNED_DEFAULTS,
     )
 
 

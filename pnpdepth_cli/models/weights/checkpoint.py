@@ -16,7 +16,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from pnpdepth_cli.core.split.user_code import describe
+from pnpdepth_cli.core.split.user_code import describe, wrap_user_errors
 from pnpdepth_cli.errors import CheckpointError, ModelError
 from pnpdepth_cli.models import registry
 from pnpdepth_cli.models.definition import ModelDefinition
@@ -137,9 +137,34 @@ def _networks_it_fits(stored: Mapping[str, Tensor], path: Path, wanted: str) -> 
 
     Tensor names and shapes decide, so variants for other image sizes (`-kitti`) fit too.
     """
-    fitting = [name for name in registry.names() if _fits(name, stored, path)]
+    by_class: dict[Any, list[str]] = {}
+    for name in registry.names():
+        build = registry.find_definition(name).build
+        by_class.setdefault(getattr(build, "func", build), []).append(name)
+    fitting = [
+        name
+        for names in by_class.values()
+        if any(_shares_names(name, names[0], stored, path) for name in names)
+        for name in names
+        if _fits(name, stored, path)
+    ]
     ending = wanted.rpartition("-")[2]
     return sorted(fitting, key=lambda name: name.rpartition("-")[2] != ending)
+
+
+def _shares_names(name: str, built: str, stored: Mapping[str, Tensor], path: Path) -> bool:
+    """True if tensors, as the network `name` reads them, have names of the network `built`.
+
+    Building every network would take seconds.
+    """
+    definition = registry.find_definition(name)
+    try:
+        state = (
+            stored if definition.read_checkpoint is None else _converted(definition, stored, path)
+        )
+        return not _shapes_of(built).keys().isdisjoint(state)
+    except ModelError:
+        return False
 
 
 def _fits(name: str, stored: Mapping[str, Tensor], path: Path) -> bool:
@@ -153,7 +178,7 @@ def _fits(name: str, stored: Mapping[str, Tensor], path: Path) -> bool:
 @functools.cache
 def _shapes_of(name: str) -> dict[str, Tensor]:
     """The state dict of a network that can be named, without its values."""
-    with torch.device("meta"):
+    with wrap_user_errors(f"build of network {name!r}"), torch.device("meta"):
         return registry.find_definition(name).build().state_dict()
 
 

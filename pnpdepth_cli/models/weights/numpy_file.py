@@ -78,7 +78,7 @@ def _read_archive(path: Path) -> dict[str, Tensor]:
 
 
 def _inflated(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> bytes:
-    """The entry's bytes, no more than the directory says; inflating by chunks shows what lies."""
+    """The bytes of an entry, inflated in chunks, no more of them than the directory says."""
     if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
         raise BrokenFileError(f"{info.filename[:60]} is compressed as numpy never does")
     content = bytearray()
@@ -99,11 +99,11 @@ def _plain_array(content: bytes, name: str) -> Tensor:
 
 
 def _header(file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
-    """Shape, whether in Fortran's order, and type; the file stands behind it."""
+    """Shape, whether in Fortran order, and type; afterwards the file stands behind the header."""
     try:
         read = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
         return read[npy.read_magic(file)](file)
-    except Exception as error:  # numpy lets out whatever Python's own parser raises at it
+    except Exception as error:  # numpy passes on whatever Python's parser raises
         raise BrokenFileError(
             f"its header makes no sense, {type(error).__name__}: {error}"
         ) from None
@@ -131,14 +131,14 @@ def _is_array(value: Any) -> bool:
 
 
 class _Arrays:
-    """Tensors from the arrays of a pickled dict, no more than the file can hold."""
+    """Makes tensors from the arrays of a pickled dict; together no larger than the file."""
 
     def __init__(self, size: int) -> None:
         self._left, self._entries = size, _MAX_ENTRIES
-        self._made: dict[int, Tensor] = {}
+        self._tensors: dict[int, Tensor] = {}
 
     def named(self, content: Mapping[Any, Any]) -> dict[str, Tensor]:
-        """Every array of the dict and of the dicts in it, by the keys that lead to it."""
+        """Returns every array of the dict and of the dicts in it; "." joins the keys."""
         return dict(self._walk(content, "", _MAX_DEPTH))
 
     def _walk(
@@ -160,7 +160,7 @@ class _Arrays:
         if not _is_array(value):
             kind = value.path if isinstance(value, StandIn) else type(value).__name__
             raise BrokenFileError(f"{name} is no array but a {kind}")
-        if id(value) not in self._made:
+        if id(value) not in self._tensors:
             _, shape, dtype, fortran, data = value.built
             if not isinstance(shape, tuple) or len(shape) > _MAX_AXES:
                 raise BrokenFileError(f"{name} is an array without a shape")
@@ -169,12 +169,12 @@ class _Arrays:
             if self._left < 0:
                 raise BrokenFileError("its arrays are larger than the file")
             sizes = tuple(map(int, shape))
-            self._made[id(value)] = _tensor(content, _type(dtype), sizes, bool(fortran), name)
-        return self._made[id(value)]
+            self._tensors[id(value)] = _tensor(content, _type(dtype), sizes, bool(fortran), name)
+        return self._tensors[id(value)]
 
 
 def _bytes(data: Any, name: str) -> bytes:
-    """An array's data: Python 2 pickles bytes as text, Python 3 in old protocols as encoded text"""
+    """An array's data; Python 2 pickles bytes as text, Python 3's old protocols as encoded text."""
     if isinstance(data, StandIn) and data.path in _ENCODED:
         data = data.arguments[0] if data.arguments else b""
     if isinstance(data, str):
@@ -185,7 +185,7 @@ def _bytes(data: Any, name: str) -> bytes:
 
 
 def _type(dtype: Any) -> str:
-    """A pickled numpy.dtype as its code, such as "<f4"."""
+    """The code of a pickled numpy.dtype, such as "<f4"."""
     if not isinstance(dtype, StandIn) or dtype.path != "numpy.dtype" or not dtype.arguments:
         raise BrokenFileError("an array without a type")
     order = dtype.built[1] if isinstance(dtype.built, tuple) and len(dtype.built) > 1 else "|"

@@ -17,7 +17,7 @@ import struct
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any, cast
 
 import torch
 from torch import Tensor
@@ -93,6 +93,11 @@ class PickleReader(pickle._Unpickler):
         max_bytes: The most bytes that the pickle may have.
         skip_tensors: Tensors are None instead, as when their storages cannot be read yet.
     """
+
+    if TYPE_CHECKING:  # attributes of the standard unpickler that its type stubs leave out
+        stack: list[Any]
+        readline: Callable[[], bytes]
+        pop_mark: Callable[[], list[Any]]
 
     def __init__(
         self,
@@ -232,7 +237,8 @@ class PickleReader(pickle._Unpickler):
         if path in _TENSOR or path == _TENSOR_OF_DTYPE:
             self.charge(_TENSOR_STEPS)
             dtype = arguments[6] if path == _TENSOR_OF_DTYPE else None
-            return None if self._skip_tensors else _view(*arguments[:4], dtype)
+            storage, offset, shape, stride = arguments[:4]
+            return None if self._skip_tensors else _view(storage, offset, shape, stride, dtype)
         if path == _TYPED_TENSOR:  # a parameter or tensor with attributes of its own
             return self._called(arguments[0], arguments[2])
         if path.startswith(_PARAMETERS):
@@ -306,7 +312,7 @@ def _view(storage: Any, offset: Any, shape: Any, stride: Any, dtype: Any) -> Ten
     if offset < 0 or any(n < 0 for n in (*shape, *stride)):
         raise BrokenFileError("a tensor of negative sizes or strides")
     if 0 in shape:
-        return storage.as_strided(shape, stride, 0)
+        return cast(Tensor, storage.as_strided(shape, stride, 0))
     reach = sum((n - 1) * s for n, s in zip(shape, stride, strict=True))
     count = 1
     for n in shape:
@@ -315,7 +321,7 @@ def _view(storage: Any, offset: Any, shape: Any, stride: Any, dtype: Any) -> Ten
         raise BrokenFileError(
             f"a tensor of {count:.6g} elements goes beyond its storage of {len(storage):,}"
         )
-    return storage.as_strided(shape, stride, offset)
+    return cast(Tensor, storage.as_strided(shape, stride, offset))
 
 
 _INHERITED = (
@@ -327,7 +333,7 @@ _INHERITED = (
     *("EMPTY_TUPLE", "TUPLE", "TUPLE1", "TUPLE2", "TUPLE3", "EMPTY_LIST", "LIST", "EMPTY_DICT"),
     *("GLOBAL", "STACK_GLOBAL", "BINPERSID"),  # these go through find_class, persistent_load
 )
-_REPLACED: dict[str, Callable[[PickleReader], None]] = {
+_REPLACED: dict[str, Callable[[Any], None]] = {
     "REDUCE": PickleReader.load_reduce,
     "NEWOBJ": PickleReader.load_reduce,
     "NEWOBJ_EX": PickleReader.load_newobj_ex,

@@ -256,7 +256,8 @@ class _Storages:
 def _bytes_of(file: IO[bytes], size: int) -> Tensor:
     """The next bytes of a file, in memory that tensors can share."""
     content = torch.empty(size, dtype=torch.uint8)
-    view = memoryview(content.numpy())
+    array: Any = content.numpy()
+    view = memoryview(array)
     filled = 0
     while filled < size:
         count = file.readinto(view[filled : filled + _CHUNK])  # type: ignore[attr-defined]

@@ -29,6 +29,7 @@ class BatchProfile:
 
     @contextmanager
     def __call__(self, stage: str) -> Iterator[None]:
+        """Adds the time spent inside to the stage."""
         start = time.perf_counter()
         try:
             yield

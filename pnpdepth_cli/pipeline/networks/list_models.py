@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import torch
 
+from pnpdepth_cli.core.split.user_code import wrap_user_errors
 from pnpdepth_cli.models.definition import Fixed, Multiple, Near
 from pnpdepth_cli.models.registry import (
     family_definitions,
@@ -62,7 +63,8 @@ def list_models() -> list[ListedModel]:
 
 def _listed(name: str) -> ListedModel:
     definition = find_definition(name)
-    with torch.device("meta"):  # shapes only: counting needs no memory
+    # On the meta device counting needs no memory.
+    with wrap_user_errors(f"build of network {name!r}"), torch.device("meta"):
         module = definition.build()
     defaults, family = definition.defaults, family_of(name)
     return ListedModel(

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from pnpdepth_cli import __version__
 from pnpdepth_cli.errors import OutputError, UsageError
+from pnpdepth_cli.io.atomic import make_folder
 from pnpdepth_cli.io.overlay import overlay
 from pnpdepth_cli.io.record import write_json
 from pnpdepth_cli.io.sparse_writing import SPARSE_SUFFIXES, write_sparse
@@ -88,7 +89,7 @@ def write_sparse_outputs(
     """
     provenance = {"command": command, "version": __version__, **settings}
     for path in filter(None, (target.output, target.overlay)):
-        _make_folder_of(path)
+        make_folder(path.parent)
     write_sparse(
         target.output,
         points.xy,
@@ -120,10 +121,3 @@ def write_sparse_outputs(
     }
     write_json(target.record, record)
     return record
-
-
-def _make_folder_of(path: Path) -> None:
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"folder {path.parent} cannot be made: {error.strerror}") from None

@@ -47,6 +47,7 @@ class Axis:
 
     @property
     def parameter(self) -> Parameter:
+        """The parameter that is varied."""
         return PARAMETERS[self.name]
 
     def numbers(self) -> list[float] | None:
@@ -73,6 +74,7 @@ class Study:
 
     @property
     def name(self) -> str:
+        """The names of the axes, joined."""
         return "_".join(axis.name for axis in self.axes)
 
     def cells(self) -> Iterator[Cell]:

@@ -521,3 +521,20 @@ def test_a_folder_that_may_not_be_read_is_an_input_error(
     monkeypatch.setattr(Path, "is_dir", locked)
     with pytest.raises(InputError, match=r"cannot be read \(permission denied\)"):
         list_frames(tmp_path)
+
+
+def test_tum_pairs_long_lists_without_a_matrix_of_all_times(tmp_path: Path) -> None:
+    count = 40_000  # every image with every depth would be 13 GB
+    for name, offset in (("rgb", 0.0), ("depth", 0.005)):
+        lines = (f"{n / 30 + offset:.6f} {name}/{n}.png\n" for n in range(count))
+        (tmp_path / f"{name}.txt").write_text("".join(lines))
+    frames = read_frames(tmp_path)
+    assert len(frames) == count
+    assert all(frame.image.stem == frame.gt.stem for frame in frames)  # type: ignore[union-attr]
+
+
+def test_a_time_of_tum_that_is_no_number_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "rgb.txt").write_text("nan rgb/a.png\n")
+    (tmp_path / "depth.txt").write_text("1 depth/a.png\n")
+    with pytest.raises(FileFormatError, match=r"rgb\.txt, line 1"):
+        read_frames(tmp_path)

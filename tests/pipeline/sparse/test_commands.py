@@ -131,7 +131,7 @@ def test_results_are_replaced_only_when_that_is_said(frame: ScanOnDisk) -> None:
     calib.write_text('{"K": [60, 0, 31.5, 0, 60, 23.5, 0, 0, 1]}')
     refused(frame, OutputError, "is an input", target=into, options=ScanOptions(calib=calib))
     below = SparseTarget(output=frame.gt / "s.png")
-    refused(frame, OutputError, "cannot be made", target=below)
+    refused(frame, OutputError, "cannot be written (file exists)", target=below)
     scale = SparseTarget(output=frame.folder / "s.png", depth_scale=0)
     refused(frame, UsageError, "--output-scale", target=scale)
     refused(frame, OutputError, ".jpg", target=SparseTarget(output=frame.folder / "s.jpg"))

@@ -73,7 +73,7 @@ def _elements_at_most(func: Any, args: Any, kwargs: dict[str, Any], largest: int
     numbers = [abs(leaf) for leaf in leaves if isinstance(leaf, int | float)]
     if name in _ELEMENTWISE and sizes:
         return _broadcast(sizes)
-    bound = math.prod(max(2, size.numel()) for size in sizes)
+    bound: float = math.prod(max(2, size.numel()) for size in sizes)
     bound *= math.prod(2 + number for number in numbers)
     if bound <= largest and name != "arange":  # whose result is larger the smaller its step
         return bound

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from pnpdepth_cli.core.split.user_code import describe
 from pnpdepth_cli.errors import ModelError
-from pnpdepth_cli.models.definition import FOREIGN, Fixed, ModelDefinition, Multiple
+from pnpdepth_cli.models.definition import UNTUNED_DEFAULTS, Fixed, ModelDefinition, Multiple
 from pnpdepth_cli.models.formats.onnx.functions import inlined
 from pnpdepth_cli.models.formats.onnx.graph import OnnxGraph, order_of_nodes
 
@@ -24,6 +24,7 @@ MISMATCH = 1e-3
 
 _HALF_MISMATCH = 1e-2  # half precision itself is no better
 _NEWEST_OPSET = 24
+_MAX_BYTES = 1 << 31  # of a protocol buffer; larger weights lie in files beside it
 _ASSUMED_MULTIPLE = 32
 
 
@@ -52,7 +53,7 @@ def onnx_definition(file: Path, output: str | None = None) -> ModelDefinition:
         build=lambda: OnnxGraph(model, file, [chosen]),
         complete=True,
         normalisation=None,
-        defaults=FOREIGN,
+        defaults=UNTUNED_DEFAULTS,
         summary=f"ONNX, opset {_opset(model)}, from {model.producer_name or 'an unknown program'}",
         output_kind="unknown",
         output_scale="unknown",
@@ -77,6 +78,8 @@ def _as_map(output: Any) -> Tensor:
 def _read(file: Path) -> Any:
     if not file.is_file():
         raise ModelError(f"ONNX file {file} does not exist")
+    if file.stat().st_size > _MAX_BYTES:
+        raise ModelError(f"ONNX file {file} is larger than 2 GB, which no ONNX file is")
     try:
         import onnx
         import onnxruntime  # noqa: F401
