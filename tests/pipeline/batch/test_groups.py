@@ -179,7 +179,7 @@ def test_a_batch_stopped_among_groups_goes_on_to_the_same_results(root: Path) ->
 def test_what_auto_does_never_shows_in_the_results(
     root: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(batch_groups, "_MOST", 3)
+    monkeypatch.setattr(batch_groups, "_MAX_FRAMES", 3)
     heard = Heard()
     batch(root, heard, refine={"lr": "5%"})
     assert sum("batch size" in text for text in heard.said) == 1
@@ -196,8 +196,8 @@ def test_auto_takes_frames_together_only_where_that_is_faster(
     faster: float,
     goes_together: bool,
 ) -> None:
-    monkeypatch.setattr(batch_groups, "_MOST", 3)
-    monkeypatch.setattr(batch_groups, "_FASTER", faster)
+    monkeypatch.setattr(batch_groups, "_MAX_FRAMES", 3)
+    monkeypatch.setattr(batch_groups, "_MAX_TIME_RATIO", faster)
     heard = Heard()
     batch(root, heard)
     assert passes == ([3, 3, 3] if goes_together else [3, 3])
@@ -214,7 +214,7 @@ ROUNDS = (FORMULA, f"{FORMULA} + 1e-5 * rgb.mean()")
 def test_where_bits_differ_auto_goes_on_one_at_a_time(
     root: Path, passes: list[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(batch_groups, "_MOST", 3)
+    monkeypatch.setattr(batch_groups, "_MAX_FRAMES", 3)
     paint_in_shades(root)
     change_network(root, ROUNDS)
     heard = Heard()
@@ -252,7 +252,10 @@ CHOOSES = ("        return", "        rgb = rgb / 2 if float(rgb.mean()) > 0.9 e
 @pytest.mark.usefixtures("plain_convolutions")
 @pytest.mark.parametrize(
     ("change", "why"),
-    [(MIXED, "frames that go together change one another"), (CHOOSES, "goes by values")],
+    [
+        (MIXED, "frames that go together influence each other"),
+        (CHOOSES, "control flow depends on image"),
+    ],
 )
 def test_a_network_that_mixes_frames_gets_them_one_at_a_time_whatever_is_asked(
     root: Path, passes: list[int], change: tuple[str, str], why: str
@@ -361,4 +364,4 @@ def test_what_is_chosen_for_each_frame_by_itself_is_never_refined_together(
     batch(root, heard, batch_size=2, limit=3, refine={"uncertainty": True})
     assert passes == []
     assert [row["status"] for row in heard.rows] == ["done"] * 3
-    assert any("chosen for each frame alone" in text for text in heard.said)
+    assert any("choose the method for each frame alone" in text for text in heard.said)
