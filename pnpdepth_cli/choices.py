@@ -215,3 +215,12 @@ AVERAGES = ("per-image", "pooled")
 
 RESIZES = ("nearest", "bilinear")
 """How a prediction of another size is resized to the ground truth."""
+
+MISSING = ("skip", "min", "max", "fail")
+"""Empty predictions are not scored, scored as the lower or the upper bound, or refused."""
+
+SCALINGS = ("none", "median", "affine", "affine-disparity", "log")
+"""How the prediction of an image is scaled to its ground truth: `pipeline.evaluation.scaling`."""
+
+PREDICTION_KINDS = ("depth", "disparity")
+"""What the files of a prediction hold."""

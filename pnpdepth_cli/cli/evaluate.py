@@ -8,7 +8,14 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from pnpdepth_cli.choices import AVERAGES, EVAL_PROTOCOLS, RESIZES
+from pnpdepth_cli.choices import (
+    AVERAGES,
+    EVAL_PROTOCOLS,
+    MISSING,
+    PREDICTION_KINDS,
+    RESIZES,
+    SCALINGS,
+)
 from pnpdepth_cli.cli import grouped_help, options
 from pnpdepth_cli.cli.printable import printable
 from pnpdepth_cli.cli.progress import progress_bar
@@ -69,19 +76,19 @@ if TYPE_CHECKING:
 )
 @click.option(
     "--missing",
-    type=click.Choice(("skip", "min", "max", "fail")),
+    type=click.Choice(MISSING),
     help="Empty predictions: not scored, scored as --min-depth or --max-depth, or an error."
     "  [default: the protocol's]",
 )
 @click.option(
     "--scale-by",
-    type=click.Choice(("none", "median", "affine", "affine-disparity", "log")),
+    type=click.Choice(SCALINGS),
     help="Scale each image to its ground truth, for relative predictions.  [default: none]",
 )
 @click.option(
     "--pred-kind",
     "prediction_kind",
-    type=click.Choice(("depth", "disparity")),
+    type=click.Choice(PREDICTION_KINDS),
     help="What predictions are.  [default: depth]",
 )
 @click.option("--pred-scale", type=float, metavar="S", help="Integer predictions hold metres × S.")

@@ -27,7 +27,7 @@ class Baseline:
     of_prediction: Callable[..., Tensor] | None = None
     """Depth from a prediction (H, W), up to scale and shift with 0 unknown, and the points."""
     pointwise: bool = False
-    """Whether the function takes `places` (M, 2), so that few pixels cost less than all."""
+    """Whether the function takes `xy` (M, 2), so that few pixels cost less than all."""
 
     @property
     def needs_prediction(self) -> bool:
@@ -53,8 +53,8 @@ class Baseline:
             return queries.sample(self.depth(points, prediction))
         bound = replace(
             self,
-            of_points=self.of_points and partial(self.of_points, places=xy),
-            of_prediction=self.of_prediction and partial(self.of_prediction, places=xy),
+            of_points=self.of_points and partial(self.of_points, xy=xy),
+            of_prediction=self.of_prediction and partial(self.of_prediction, xy=xy),
         )
         return bound.depth(points, prediction)
 

@@ -7,14 +7,12 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from pnpdepth_cli.choices import AVERAGES, RESIZES
+from pnpdepth_cli.choices import AVERAGES, MISSING, PREDICTION_KINDS, RESIZES, SCALINGS
 from pnpdepth_cli.core.metrics import DELTA_THRESHOLDS, MEASURES, Measure
 from pnpdepth_cli.errors import SizeError, UsageError
 from pnpdepth_cli.pipeline.evaluation.kitti_devkit import DEVKIT_MEASURES
-from pnpdepth_cli.pipeline.evaluation.scaling import PREDICTION_KINDS, SCALINGS
 
 KITTI_DEVKIT = "kitti-devkit"
-MISSING = ("skip", "min", "max", "fail")
 
 # (top, bottom, left, right) as fractions of the height and the width, cut to whole pixels.
 # Garg et al. 2016 for KITTI; and what Godard et al. (monodepth, utils/evaluate_kitti.py) found by

@@ -1,7 +1,12 @@
 """Scales the prediction of one image to its ground truth, by the published conventions.
 
 Relative networks give depth or disparity up to a factor, or a factor and a shift. Papers fit these
-to the ground truth of each image before they score.
+to the ground truth of each image before they score:
+
+- median: Zhou et al. 2017, monodepth2.
+- affine: least squares in depth, Marigold (Ke et al. 2024).
+- affine-disparity: least squares in 1/m, MiDaS (Ranftl et al. 2020).
+- log: the mean of the logarithm, Eigen et al. 2014.
 """
 
 from __future__ import annotations
@@ -16,12 +21,6 @@ from pnpdepth_cli.errors import InputError
 Depth = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
-SCALINGS = ("none", "median", "affine", "affine-disparity", "log")
-"""median: Zhou et al. 2017, monodepth2. affine: least squares in depth, Marigold (Ke et al. 2024).
-affine-disparity: least squares in 1/m, MiDaS (Ranftl et al. 2020). log: the mean of the logarithm,
-Eigen et al. 2014."""
-
-PREDICTION_KINDS = ("depth", "disparity")
 _MIN_PIXELS = 2
 
 
@@ -40,7 +39,7 @@ def depth_of_kind(values: Depth, kind: str) -> Depth:
 
     Args:
         values: (H, W) predictions, 0 where unknown.
-        kind: One of PREDICTION_KINDS.
+        kind: One of choices.PREDICTION_KINDS.
     """
     return _inverse(values) if kind == "disparity" else values
 
@@ -56,8 +55,8 @@ def scaled(
         values: (H, W) predictions of the kind, 0 where unknown.
         gt: (H, W) ground truth in metres.
         where: (H, W) true where the protocol scores the ground truth.
-        kind: One of PREDICTION_KINDS.
-        scale_by: One of SCALINGS.
+        kind: One of choices.PREDICTION_KINDS.
+        scale_by: One of choices.SCALINGS.
 
     Raises:
         InputError: If fewer than two pixels have both, or the prediction is constant.

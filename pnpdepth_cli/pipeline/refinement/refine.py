@@ -179,7 +179,7 @@ class Refiner:
 
     @functools.cached_property
     def model_record(self) -> dict[str, Any]:
-        """What a record says of the network."""
+        """Entries of the network in a record."""
         checkpoint = self.network.checkpoint
         return {
             "name": self.network.definition.name,
@@ -190,9 +190,11 @@ class Refiner:
 
 
 def load_refiner(request: RefineRequest, first: Inputs) -> Refiner:
-    """The network that is asked for, with what it leaves open settled on this first frame.
+    """Returns the refiner that is asked for; this first frame decides what the network leaves open.
 
-    UsageError if the request asks for what does not go together.
+    Raises:
+        UsageError: The request combines what cannot be combined.
+        ModelError: The network cannot be loaded.
     """
     choice, hold_out = request.network, request.hold_out
     if hold_out.time_budget_s is not None and not hold_out.auto:
@@ -214,9 +216,9 @@ def load_refiner(request: RefineRequest, first: Inputs) -> Refiner:
 def write_refined(
     outputs: Outputs, refiner: Refiner, inputs: Inputs, frame: RefinedFrame, watch: Stopwatch
 ) -> RefineOutcome:
-    """The refined frame is scored, and it and its record are on disk.
+    """Scores the refined frame and writes it with its record.
 
-    The record is the same from run to run, but for `seconds` and `peak_memory_mb`.
+    The record is the same from run to run, except `seconds` and `peak_memory_mb`.
     """
     record = _record(refiner, inputs, frame)
     with all_or_none(outputs.paths()):

@@ -49,13 +49,13 @@ def plain_convolutions() -> Iterator[None]:
 def passes(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """How many frames went together each time, trials included."""
     found: list[int] = []
-    refine_frames = batch_groups.refine_frames
+    refine_together = Refiner.refine_together
 
-    def counted(network: Any, split: Any, settings: Any, tasks: Any) -> Any:
-        found.append(len(tasks))
-        return refine_frames(network, split, settings, tasks)
+    def counted(refiner: Refiner, split: Any, group: Any, settings: Any) -> Any:
+        found.append(len(group))
+        return refine_together(refiner, split, group, settings)
 
-    monkeypatch.setattr(batch_groups, "refine_frames", counted)
+    monkeypatch.setattr(Refiner, "refine_together", counted)
     return found
 
 
@@ -279,19 +279,19 @@ def test_a_network_for_one_frame_alone_gets_one_at_a_time(root: Path, passes: li
 def test_out_of_memory_halves_the_group_and_goes_on(
     root: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    refine_frames = batch_groups.refine_frames
+    refine_together = Refiner.refine_together
     tried: list[int] = []
     room = 4
 
-    def with_little_room(network: Any, split: Any, settings: Any, tasks: Any) -> Any:
+    def with_little_room(refiner: Refiner, split: Any, group: Any, settings: Any) -> Any:
         nonlocal room
-        tried.append(len(tasks))
+        tried.append(len(group))
         room = 2 if len(tried) == 4 else room  # the memory is needed elsewhere
-        if len(tasks) > room:
+        if len(group) > room:
             raise DeviceError("device 'cpu' is out of memory")
-        return refine_frames(network, split, settings, tasks)
+        return refine_together(refiner, split, group, settings)
 
-    monkeypatch.setattr(batch_groups, "refine_frames", with_little_room)
+    monkeypatch.setattr(Refiner, "refine_together", with_little_room)
     for name in ("i", "j", "k", "l", "m", "n"):
         add_frame(root, name)
     outcome = batch(root, batch_size=8)
@@ -299,7 +299,7 @@ def test_out_of_memory_halves_the_group_and_goes_on(
     assert tried == [8, 4, 4, 4, 2, 2, 2]
     assert outcome.summary["counts"]["done"] == 14
     together = results(root / "out")
-    monkeypatch.setattr(batch_groups, "refine_frames", refine_frames)
+    monkeypatch.setattr(Refiner, "refine_together", refine_together)
     assert together == alone(root)
 
 

@@ -222,7 +222,7 @@ BAD = [
     ({"lr": "nan"}, UsageError, "not a step size"),
     ({"lr": "0"}, UsageError, "not a step size"),
     ({"lr": "fast"}, UsageError, "not a step size"),
-    ({"holdout": 1.0}, UsageError, "not a share"),
+    ({"holdout": 1.0}, UsageError, "not a fraction"),
     ({"layer": "1.5"}, UsageError, "between 0 and 1"),
     ({"layer": "midle"}, LayerError, "did you mean middle"),
     ({"layer": "unused"}, LayerError, "never runs"),
