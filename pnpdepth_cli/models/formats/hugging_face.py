@@ -43,7 +43,9 @@ class _Family:
     """What the networks of one model type predict."""
 
     kind: OutputKind
+    """See `ModelDefinition.output_kind`."""
     scale: OutputScale
+    """See `ModelDefinition.output_scale`."""
     of: int = 1
     """The sides of the image must be multiples of this."""
 
