@@ -2,11 +2,11 @@
 
 For each network, set and number of points, MAE and RMSE in metres, means over frames and seeds of
 each frame's error: the network as it is, aligned with the points, refined at the paper's setting,
-every baseline of `pnpdepth_cli.completion.baselines`, and `--auto`. The same network, points and
-pixels for all: those with known truth where the network sees. `wins` counts frames where `--auto`
-is not above the aligned network, and at most 3 per cent above the best baseline of that frame.
-`--outliers 0.2` puts so many points at wrong depths; the last column is `--auto` given the others
-alone, as if somebody had told which are wrong. `--sigma` adds the share of the truth that lies
+every baseline of `pnpdepth_cli.choices.BASELINES`, and `--auto`. The same network, points and
+pixels for all: those with known ground truth in the network's crop. `wins` counts frames where
+`--auto` is not above the aligned network, and at most 3 per cent above the frame's best baseline.
+`--outliers 0.2` puts so many points at random depths; the last column is `--auto` given the others
+alone, as if the outliers were known. `--sigma` adds the fraction of the ground truth that lies
 within ± one standard deviation of `--uncertainty`, which should be 68 %. `--render FOLDER` takes
 frames rendered by this project instead. Nothing was tuned on the real frames.
 """
@@ -34,13 +34,14 @@ from benchmarks.frames import (
     refined,
 )
 from model_zoo_defs.training.dataset import Frames
-from pnpdepth_cli.completion.baselines import BASELINES
+from pnpdepth_cli.auto.auto import refine_automatically
+from pnpdepth_cli.auto.candidates import default_configs
+from pnpdepth_cli.auto.uncertainty import uncertainty
+from pnpdepth_cli.choices import BASELINES
 from pnpdepth_cli.core.metrics import score
 from pnpdepth_cli.core.refine import RefineSettings
 from pnpdepth_cli.models.definition import Normalisation
 from pnpdepth_cli.models.network import Network, load_network
-from pnpdepth_cli.pipeline.refinement.auto import refine_automatically, usual_trials
-from pnpdepth_cli.pipeline.refinement.held_out import uncertainty
 from pnpdepth_cli.pipeline.refinement.request import MethodOptions
 from pnpdepth_cli.pipeline.refinement.resolve import resolve_layer, resolve_settings
 from pnpdepth_cli.points import SparsePoints
@@ -50,7 +51,7 @@ COUNTS: tuple[int | None, ...] = (20, 100, 500)
 ROOMS = ("7scenes", "icl_nuim", "nyu")
 RGB = ("compact", "fastdepth", "eigen-tiny", "fcrn-tiny")
 STREETS = ("pncnn", "nconv", "sparse2dense-tiny-kitti", "compact")
-TOLD = "auto, told which points are wrong"
+INLIERS_ONLY = "auto, outliers known"
 Errors = dict[str, tuple[float, float]]
 
 
@@ -95,18 +96,18 @@ def frames_of(name: str, data: Path, network: str, every: int) -> list[EvalFrame
 
 
 def with_outliers(
-    points: SparsePoints, share: float, seed: int
+    points: SparsePoints, fraction: float, seed: int
 ) -> tuple[SparsePoints, torch.Tensor]:
     """So many of the points at random depths, from half the nearest to twice the farthest.
 
     And which they are, (N,) bool.
     """
     generator = torch.Generator().manual_seed(seed)
-    wrong = torch.rand(len(points), generator=generator) < share
+    outlier = torch.rand(len(points), generator=generator) < fraction
     low, high = float(points.depth.min()) / 2, float(points.depth.max()) * 2
     random = low + (high - low) * torch.rand(len(points), generator=generator)
-    depth = torch.where(wrong, random, points.depth)
-    return SparsePoints(xy=points.xy, depth=depth, size=points.size), wrong
+    depth = torch.where(outlier, random, points.depth)
+    return SparsePoints(xy=points.xy, depth=depth, size=points.size), outlier
 
 
 def measure(
@@ -117,11 +118,11 @@ def measure(
     outliers: float,
     with_sigma: bool = False,
 ) -> dict[str, object]:
-    """Errors of every way on one frame, what --auto chose, and what it cost."""
+    """Errors of every variant on one frame, what --auto chose, and what it cost."""
     rows, columns, depth = frame_pixels(frame, count, seed)
-    points = points_on_grid(rows, columns, depth, frame.truth.shape)
-    points, wrong = with_outliers(points, outliers, seed)
-    inputs = frame_inputs(frame.rgb, points, frame.truth)
+    points = points_on_grid(rows, columns, depth, frame.gt.shape)
+    points, outlier = with_outliers(points, outliers, seed)
+    inputs = frame_inputs(frame.rgb, points, frame.gt)
     definition = network.definition
     layer = resolve_layer(definition, None)
     settings = resolve_settings(definition, MethodOptions())
@@ -139,35 +140,35 @@ def measure(
         "tuned": torch.from_numpy(refined(network, layer, settings, inputs).after),
     }
     depths |= {name: made.depth(points, prediction) for name, made in BASELINES.items()}
-    trials = usual_trials(network.definition, layer, settings)
+    configs = default_configs(network.definition, layer, settings)
     start = time.perf_counter()
-    auto = refine_automatically(network, trials, inputs, points)
+    auto = refine_automatically(network, configs, inputs.frame())
     auto_s = time.perf_counter() - start
     depths["auto"] = torch.from_numpy(auto.frame.after)
-    if bool(wrong.any()):
-        right = points.select(~wrong)
-        of_right = frame_inputs(frame.rgb, right, frame.truth)
-        told = refine_automatically(network, trials, of_right, right)
-        depths[TOLD] = torch.from_numpy(told.frame.after)
+    if bool(outlier.any()):
+        right = points.select(~outlier)
+        of_right = frame_inputs(frame.rgb, right, frame.gt)
+        inliers_only = refine_automatically(network, configs, of_right.frame())
+        depths[INLIERS_ONLY] = torch.from_numpy(inliers_only.frame.after)
     within = {}
     if with_sigma:
         sigma, _ = uncertainty(auto, auto.frame.after)
-        known = (frame.truth > 0) & (auto.frame.after > 0)
-        inside = np.abs(frame.truth - auto.frame.after)[known] <= sigma[known]
+        known = (frame.gt > 0) & (auto.frame.after > 0)
+        inside = np.abs(frame.gt - auto.frame.after)[known] <= sigma[known]
         within = {"within_sigma": float(inside.mean())}
     return within | {
-        "errors": errors_of(depths, torch.from_numpy(frame.truth)),
+        "errors": errors_of(depths, torch.from_numpy(frame.gt)),
         "choice": str(auto.choice),
         "plain_s": plain_s,
         "auto_s": auto_s,
     }
 
 
-def errors_of(depths: dict[str, torch.Tensor], truth: torch.Tensor) -> Errors:
-    """(MAE, RMSE) over the pixels with truth where all are known."""
+def errors_of(depths: dict[str, torch.Tensor], gt: torch.Tensor) -> Errors:
+    """(MAE, RMSE) over the pixels with ground truth where all are known."""
     seen = torch.stack([depth > 0 for depth in depths.values()]).all(dim=0)
-    truth = torch.where(seen, truth, 0.0)
-    scores = {name: score(depth, truth) for name, depth in depths.items()}
+    gt = torch.where(seen, gt, 0.0)
+    scores = {name: score(depth, gt) for name, depth in depths.items()}
     return {name: (s.mae, s.rmse) for name, s in scores.items()}
 
 
@@ -193,9 +194,9 @@ def summary(rows: list[dict[str, object]]) -> dict[str, object]:
     }
 
 
-def shown(case: Case, found: dict[str, object]) -> str:
+def table_row(case: Case, measured: dict[str, object]) -> str:
     """A line of the table."""
-    mean: dict[str, tuple[float, float]] = found["mean"]  # type: ignore[assignment]
+    mean: dict[str, tuple[float, float]] = measured["mean"]  # type: ignore[assignment]
     lowest = min(BASELINES, key=lambda name: mean[name][0])
     columns = ("raw", "aligned", "paper", "tuned", "linear", lowest, "auto")
     cells = [f"{mean[name][0]:.3f} / {mean[name][1]:.3f}" for name in columns]
@@ -204,22 +205,26 @@ def shown(case: Case, found: dict[str, object]) -> str:
         f"{100 * (mean['auto'][0] / mean[name][0] - 1):+.0f} %" for name in ("paper", "linear")
     ]
     wins = [
-        f"{found[name]:.0%}" for name in ("not above aligned", "within 3 % of the best baseline")
+        f"{measured[name]:.0%}" for name in ("not above aligned", "within 3 % of the best baseline")
     ]
     below = sum(mean["auto"][k] < mean[name][k] for name in (*BASELINES, "aligned") for k in (0, 1))
     points = case.points or "LiDAR"
-    cost = f"{found['auto_s']:.2f} s ({found['plain_s']:.2f})"
-    head = [case.network, f"{Path(case.frames).name}, {found['frames']}", str(points)]
+    cost = f"{measured['auto_s']:.2f} s ({measured['plain_s']:.2f})"
+    head = [case.network, f"{Path(case.frames).name}, {measured['frames']}", str(points)]
     tally = f"{below}/{2 * (len(BASELINES) + 1)}"
-    within = f"{found['within_sigma']:.0%}"
-    told = f"{mean[TOLD][0]:.3f} / {mean[TOLD][1]:.3f}" if TOLD in mean else ""
-    return "| " + " | ".join([*head, *cells, *gains, tally, *wins, cost, within, told]) + " |"
+    within = f"{measured['within_sigma']:.0%}"
+    inliers_only = (
+        f"{mean[INLIERS_ONLY][0]:.3f} / {mean[INLIERS_ONLY][1]:.3f}" if INLIERS_ONLY in mean else ""
+    )
+    return (
+        "| " + " | ".join([*head, *cells, *gains, tally, *wins, cost, within, inliers_only]) + " |"
+    )
 
 
 HEAD = (
     "network", "set, frames", "points", "raw", "aligned", "paper's setting", "tuned", "linear",
     "best baseline", "--auto", "vs paper", "vs linear", "below", "≤ aligned", "≤ best +3 %",
-    "auto (plain)", "± 1 σ", TOLD,
+    "auto (plain)", "± 1 σ", INLIERS_ONLY,
 )  # fmt: skip
 
 
@@ -264,9 +269,9 @@ def main() -> None:
             measure(network, frame, case.points, seed, args.outliers, args.sigma)
             for frame, seed in tqdm(runs, leave=False, desc=f"{case.network} {case.frames}")
         ]
-        found = summary(rows)
-        print(shown(case, found), flush=True)
-        everything.append({"case": vars(case), "summary": found, "frames": rows})
+        measured = summary(rows)
+        print(table_row(case, measured), flush=True)
+        everything.append({"case": vars(case), "summary": measured, "frames": rows})
         if args.json:
             args.json.write_text(json.dumps(everything, indent=1))
 

@@ -33,13 +33,13 @@ class Watcher:
 
     def __init__(self) -> None:
         self.memory_mb: dict[int, float] = {}
-        self.said: list[str] = []
+        self.notes: list[str] = []
         self.done = 0
 
     def say(self, text: str) -> None:
-        """What is said of frames that go together is kept."""
+        """Keeps notes on frames that go together."""
         if "batch size" in text:
-            self.said.append(text)
+            self.notes.append(text)
 
     def begin(self, to_do: int) -> None:
         """The network is loaded."""
@@ -55,7 +55,7 @@ class Watcher:
 
 
 def make_frames(root: Path, count: int, height: int, width: int) -> None:
-    """rgb/ sparse/ gt/ with smooth pictures and slanted depth, no two alike."""
+    """rgb/ sparse/ gt/ with smooth images and slanted depth, no two alike."""
     rng = np.random.default_rng(0)
     y, x = np.mgrid[:height, :width] / max(height, width)
     for part in ("rgb", "sparse", "gt"):
@@ -63,8 +63,8 @@ def make_frames(root: Path, count: int, height: int, width: int) -> None:
     for number in range(count):
         a, b, c = rng.uniform(0.5, 2, 3)
         depth = (1 + a * x + b * y).astype(np.float32)
-        picture = 127 + 120 * np.sin(6 * np.stack([a * x, b * y, c * (x + y)], axis=-1))
-        cv2.imwrite(str(root / "rgb" / f"{number:06}.png"), picture.astype(np.uint8))
+        image = 127 + 120 * np.sin(6 * np.stack([a * x, b * y, c * (x + y)], axis=-1))
+        cv2.imwrite(str(root / "rgb" / f"{number:06}.png"), image.astype(np.uint8))
         points = np.zeros(depth.size, np.float32)
         chosen = rng.choice(depth.size, POINTS, replace=False)
         points[chosen] = depth.reshape(-1)[chosen]
@@ -95,7 +95,7 @@ def measure(
         "frames": watcher.done,
         "memory_mb": watcher.memory_mb,
         "peak_mb": peak,
-        "said": watcher.said,
+        "said": watcher.notes,
         "profile": profile,
         "seconds_of_nothing_to_do": again,
     }
@@ -111,29 +111,29 @@ def main() -> None:
     parser.add_argument("--batch-size", type=int, help="auto if not given")
     parser.add_argument("--html", action="store_true", help="with a report")
     parser.add_argument("--json", action="store_true")
-    given = parser.parse_args()
-    height, width = (int(side) for side in given.size.split("x"))
+    args = parser.parse_args()
+    height, width = (int(side) for side in args.size.split("x"))
     with tempfile.TemporaryDirectory() as folder:
-        make_frames(Path(folder) / "frames", given.frames, height, width)
+        make_frames(Path(folder) / "frames", args.frames, height, width)
         root = Path(folder) / "frames"
-        found = measure(root, given.workers, given.model, given.batch_size, given.html)
-    if given.json:
-        print(json.dumps(found, indent=2))
+        result = measure(root, args.workers, args.model, args.batch_size, args.html)
+    if args.json:
+        print(json.dumps(result, indent=2))
         return
-    print(f"{found['frames']:,} frames of {width}×{height}, {given.workers} workers")
-    for count, memory in found["memory_mb"].items():
+    print(f"{result['frames']:,} frames of {width}×{height}, {args.workers} workers")
+    for count, memory in result["memory_mb"].items():
         print(f"  after {count:6,} frames: {memory:6.1f} MB in use")
-    print(f"  peak: {found['peak_mb']:.1f} MB")
-    for text in found["said"]:
+    print(f"  peak: {result['peak_mb']:.1f} MB")
+    for text in result["said"]:
         print(f"  {text}")
-    profile = found["profile"]
+    profile = result["profile"]
     for stage, seconds in profile["seconds"].items():
-        print(f"  {stage.replace('_', ' ')}: {1000 * seconds / found['frames']:.1f} ms a frame")
+        print(f"  {stage.replace('_', ' ')}: {1000 * seconds / result['frames']:.1f} ms a frame")
     print(
         f"  {profile['frames_per_second']:.2f} frames a second;"
         f" network busy {profile['network_busy']:.1%}"
     )
-    print(f"  a second run, with nothing to do: {found['seconds_of_nothing_to_do']:.1f} s")
+    print(f"  a second run, with nothing to do: {result['seconds_of_nothing_to_do']:.1f} s")
 
 
 if __name__ == "__main__":

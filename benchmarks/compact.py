@@ -67,8 +67,8 @@ def measure_frame(
 ) -> dict[str, tuple[float, float]]:
     """(MAE, RMSE) of every method on one frame."""
     rows, columns, depth = frame_pixels(frame, count, seed)
-    points = points_on_grid(rows, columns, depth, frame.truth.shape)
-    inputs = frame_inputs(frame.rgb, points, frame.truth)
+    points = points_on_grid(rows, columns, depth, frame.gt.shape)
+    inputs = frame_inputs(frame.rgb, points, frame.gt)
     method = MethodOptions(iterations=settings.iterations, lr=settings.lr, update=settings.update)
     result = refined(
         network,
@@ -82,7 +82,7 @@ def measure_frame(
         "plain": torch.from_numpy(result.before),
         "refined": torch.from_numpy(result.after),
     }
-    truth = torch.from_numpy(frame.truth)
+    truth = torch.from_numpy(frame.gt)
     scores = {name: score(depth, truth) for name, depth in depths.items()}
     return {name: (s.mae, s.rmse) for name, s in scores.items()}
 

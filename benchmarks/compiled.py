@@ -60,7 +60,7 @@ def measure(case: Case, precision: str, batch: int, runs: int) -> dict[str, obje
     compiled = refined(case, precision, batch, lambda part: torch.compile(part, dynamic=False))
     expected = eager()
     began = time.perf_counter()
-    found = compiled()
+    measured = compiled()
     compiling = time.perf_counter() - began
     spent = in_turn(
         {
@@ -80,7 +80,9 @@ def measure(case: Case, precision: str, batch: int, runs: int) -> dict[str, obje
         "eager / compiled": one / other,
         "compiling, s": compiling,
         "won back after frames": won,
-        "difference": float(((found - expected).abs() / expected.abs().clamp(min=1e-3)).median()),
+        "difference": float(
+            ((measured - expected).abs() / expected.abs().clamp(min=1e-3)).median()
+        ),
     }
 
 

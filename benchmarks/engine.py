@@ -143,7 +143,7 @@ def by_papers_code(case: Case, network: nn.Module, inputs: Inputs, points: Spars
 
 
 @contextlib.contextmanager
-def ways(case: Case) -> Iterator[dict[str, Callable[[], object]]]:
+def variants(case: Case) -> Iterator[dict[str, Callable[[], object]]]:
     """What is timed, by name."""
     network, inputs, points = setup(case)
     no_grad = torch.no_grad()
@@ -157,23 +157,23 @@ def ways(case: Case) -> Iterator[dict[str, Callable[[], object]]]:
         low.load_state_dict(network.state_dict())
         lower(low, torch.bfloat16, CPU)
         low_split = stack.enter_context(Split(low, case.layer))
-        given = (case, network, inputs, points)
+        arguments = (case, network, inputs, points)
         yield {
             "forward": no_grad(lambda: network(*inputs)),
             "front": no_grad(lambda: case.front(network, *inputs)),
             "rear": no_grad(lambda: case.rear(network, z, kept)),
-            "by hand": lambda: by_hand(*given),
+            "by hand": lambda: by_hand(*arguments),
             "ours": lambda: by_split(split, inputs, points),
-            "ours, one frame": lambda: by_new_split(*given),
+            "ours, one frame": lambda: by_new_split(*arguments),
             LOWERED: lambda: by_split(low_split, inputs, points),
-            "by hook": lambda: by_hook(*given),
-            "paper's code": lambda: by_papers_code(*given),
+            "by hook": lambda: by_hook(*arguments),
+            "paper's code": lambda: by_papers_code(*arguments),
         }
 
 
 def measure(case: Case, runs: int, *, memory: bool) -> dict[str, float | str]:
-    """Medians of every way, taken in turn, and the ratios."""
-    with ways(case) as todo:
+    """Medians of every variant, taken in turn, and the ratios."""
+    with variants(case) as todo:
         results = [todo[name]() for name in COMPARED]
         for name, result in zip(COMPARED, results, strict=True):
             assert torch.equal(results[0], result), f"{case.name}: {name} differs"
@@ -205,17 +205,17 @@ def measure(case: Case, runs: int, *, memory: bool) -> dict[str, float | str]:
     }
 
 
-def peak_of(case: Case, way: str) -> float:
+def peak_of(case: Case, variant: str) -> float:
     """What this needs at its peak, in a new process that has done it once, after a forward pass."""
-    command = [sys.executable, "-m", "benchmarks.engine", "--peak", case.name, way]
+    command = [sys.executable, "-m", "benchmarks.engine", "--peak", case.name, variant]
     return float(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
 
 
-def print_peak(name: str, way: str) -> None:
-    with ways(next(case for case in (*ZOO, *CASES) if case.name == name)) as todo:
+def print_peak(name: str, variant: str) -> None:
+    with variants(next(case for case in (*ZOO, *CASES) if case.name == name)) as todo:
         todo["forward"]()
-        todo[way]()
-        print(peak_mb(todo[way], CPU))
+        todo[variant]()
+        print(peak_mb(todo[variant], CPU))
 
 
 def print_rows(rows: Sequence[Mapping[str, object]]) -> None:

@@ -1,9 +1,9 @@
 """Public networks on real frames: `python -m benchmarks.foreign --data PATH [--every 4]`.
 
-FastDepth (ONNX) on 7-Scenes and two NYU frames with 100 and 500 random points: as it is, aligned in
-each way, refined with the paper's setting at three layers, and with the program's own for foreign
-networks. Frames are a 250/480 resize, its centre 228×304, scaled to the network's 224×224, scored
-at that size; one NYU frame is published in that form.
+FastDepth (ONNX) on 7-Scenes and two NYU frames with 100 and 500 random points: plain, with each
+alignment, refined with the paper's setting at three layers, and with the untuned defaults for
+users' networks. Frames are a 250/480 resize, its centre 228×304, scaled to the network's 224×224,
+scored at that size; one NYU frame is published in that form.
 nconv and pncnn on KITTI with its own LiDAR, before and after refinement.
 """
 
@@ -47,33 +47,29 @@ COMPLETION = (
 def as_fastdepth_sees_it(frame: EvalFrame) -> EvalFrame:
     """The frame at 224×224, cropped as the network's own evaluation does."""
 
-    def cut(picture: np.ndarray, how: int) -> np.ndarray:
-        height, width = picture.shape[0] * 250 // 480, picture.shape[1] * 250 // 480
-        picture = cv2.resize(picture, (width, height), interpolation=how)
+    def cut(image: np.ndarray, how: int) -> np.ndarray:
+        height, width = image.shape[0] * 250 // 480, image.shape[1] * 250 // 480
+        image = cv2.resize(image, (width, height), interpolation=how)
         top, left = (height - 228) // 2, (width - 304) // 2
-        return cv2.resize(
-            picture[top : top + 228, left : left + 304], (224, 224), interpolation=how
-        )
+        return cv2.resize(image[top : top + 228, left : left + 304], (224, 224), interpolation=how)
 
-    return EvalFrame(
-        frame.name, cut(frame.rgb, cv2.INTER_AREA), cut(frame.truth, cv2.INTER_NEAREST)
-    )
+    return EvalFrame(frame.name, cut(frame.rgb, cv2.INTER_AREA), cut(frame.gt, cv2.INTER_NEAREST))
 
 
 def nyu(data: Path) -> list[EvalFrame]:
     """The two NYU frames, as FastDepth sees them."""
     folder = data / "nyu"
     ready = (np.load(folder / f"{name}.npy").squeeze() for name in ("rgb", "depth"))
-    rgb, truth = (values.astype(np.float32) for values in ready)
-    found = [EvalFrame("nyu", np.ascontiguousarray(rgb), np.ascontiguousarray(truth))]
+    rgb, gt = (values.astype(np.float32) for values in ready)
+    frames = [EvalFrame("nyu", np.ascontiguousarray(rgb), np.ascontiguousarray(gt))]
     for path in sorted((folder / "metric3d").glob("rgb_*.jpg")):
         depth = path.with_name(path.name.replace("rgb", "sync_depth")).with_suffix(".png")
         frame = EvalFrame(path.stem, read_rgb(path).values, read_depth(depth, scale=1000).values)
-        found.append(as_fastdepth_sees_it(frame))
-    return found
+        frames.append(as_fastdepth_sees_it(frame))
+    return frames
 
 
-def ways(network: Network) -> Iterator[tuple[str, str, RefineSettings]]:
+def variants(network: Network) -> Iterator[tuple[str, str, RefineSettings]]:
     """(title, layer, settings) of each row."""
     layers = network.definition.layers
     yield "raw", layers[0], PLAIN
@@ -90,12 +86,12 @@ def ways(network: Network) -> Iterator[tuple[str, str, RefineSettings]]:
 def error(
     network: Network, layer: str, settings: RefineSettings, frame: EvalFrame, count: int | None
 ) -> tuple[float, float, float, float]:
-    """MAE and RMSE before and after, on all pixels with known truth."""
+    """MAE and RMSE before and after, on all pixels with known ground truth."""
     rows, columns, depth = frame_pixels(frame, count, seed=0)
-    points = points_on_grid(rows, columns, depth, frame.truth.shape)
-    result = refined(network, layer, settings, frame_inputs(frame.rgb, points, frame.truth))
-    truth = torch.from_numpy(frame.truth)
-    before, after = (score(torch.from_numpy(d), truth) for d in (result.before, result.after))
+    points = points_on_grid(rows, columns, depth, frame.gt.shape)
+    result = refined(network, layer, settings, frame_inputs(frame.rgb, points, frame.gt))
+    gt = torch.from_numpy(frame.gt)
+    before, after = (score(torch.from_numpy(d), gt) for d in (result.before, result.after))
     return before.mae, before.rmse, after.mae, after.rmse
 
 
@@ -117,7 +113,7 @@ def fastdepth_table(data: Path, every: int, points: list[int]) -> None:
 def print_rows(network: Network, frames: list[EvalFrame], points: list[int]) -> None:
     print("| | " + " | ".join(f"{count} points" for count in points) + " |")
     print("|---|" + "---|" * len(points))
-    for title, layer, settings in ways(network):
+    for title, layer, settings in variants(network):
         cells = []
         for count in points:
             table = np.array([error(network, layer, settings, f, count) for f in frames])

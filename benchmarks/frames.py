@@ -11,10 +11,11 @@ import torch
 from numpy.typing import NDArray
 
 from pnpdepth_cli.core.refine import RefineSettings
+from pnpdepth_cli.frames.frame import RefinedFrame
+from pnpdepth_cli.frames.refine import refine_frame
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.models.network import Network
-from pnpdepth_cli.pipeline.refinement.frame import FrameToRefine, RefinedFrame, refine_frame
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs
 from pnpdepth_cli.points import SparsePoints
 
@@ -23,11 +24,11 @@ Depth = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class EvalFrame:
-    """rgb (H, W, 3) in 0..1, truth (H, W) metres with 0 unknown, sensor depth (H, W) or None."""
+    """rgb (H, W, 3) in 0..1, gt (H, W) metres with 0 unknown, sensor depth (H, W) or None."""
 
     name: str
     rgb: NDArray[np.float32]
-    truth: Depth
+    gt: Depth
     sensor: Depth | None = None
 
 
@@ -46,22 +47,22 @@ def icl_nuim(root: Path) -> Iterator[EvalFrame]:
 
 
 def kitti_dc(root: Path) -> Iterator[EvalFrame]:
-    """Street frames with one LiDAR scan each and the accumulated truth."""
+    """Street frames with one LiDAR scan each and the accumulated ground truth."""
     folder = root / "kitti_dc"
     for path in sorted((folder / "image").glob("*.jpg")):
-        truth, scan = (
+        gt, scan = (
             read_depth(folder / kind / f"{path.stem}.png", scale=256).values
             for kind in ("groundtruth", "velodyne_raw")
         )
-        yield EvalFrame(path.stem, read_rgb(path).values, truth, scan)
+        yield EvalFrame(path.stem, read_rgb(path).values, gt, scan)
 
 
 SETS = {"7scenes": seven_scenes, "icl_nuim": icl_nuim, "kitti_dc": kitti_dc}
 
 
-def sampled(truth: Depth, count: int, seed: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Rows and columns of `count` pixels with known truth, drawn uniformly."""
-    rows, columns = np.nonzero(truth > 0)
+def sampled(gt: Depth, count: int, seed: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Rows and columns of `count` pixels with known ground truth, drawn uniformly."""
+    rows, columns = np.nonzero(gt > 0)
     chosen = np.random.default_rng(seed).choice(len(rows), min(count, len(rows)), replace=False)
     return rows[chosen], columns[chosen]
 
@@ -69,13 +70,13 @@ def sampled(truth: Depth, count: int, seed: int) -> tuple[NDArray[np.int64], NDA
 def frame_pixels(
     frame: EvalFrame, count: int | None, seed: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], Depth]:
-    """Rows, columns and depths of the sensor's points, or of `count` pixels of the truth."""
+    """Rows, columns and depths of the sensor's points, or of `count` pixels of the ground truth."""
     if count is None:
         assert frame.sensor is not None
         rows, columns = np.nonzero(frame.sensor > 0)
         return rows, columns, frame.sensor[rows, columns]
-    rows, columns = sampled(frame.truth, count, seed)
-    return rows, columns, frame.truth[rows, columns]
+    rows, columns = sampled(frame.gt, count, seed)
+    return rows, columns, frame.gt[rows, columns]
 
 
 def points_on_grid(
@@ -88,13 +89,12 @@ def points_on_grid(
     )
 
 
-def frame_inputs(rgb: NDArray[np.float32], points: SparsePoints, truth: Depth) -> Inputs:
+def frame_inputs(rgb: NDArray[np.float32], points: SparsePoints, gt: Depth) -> Inputs:
     """A frame in memory, as the program reads one from files."""
-    return Inputs(rgb=rgb, points=points, gt=truth, sparse_scale=None, record={}, notes=())
+    return Inputs(rgb=rgb, points=points, gt=gt, sparse_scale=None, record={}, notes=())
 
 
 def refined(network: Network, layer: str, settings: RefineSettings, inputs: Inputs) -> RefinedFrame:
     """The refinement of a frame with all of its points."""
     with network.cut_at(layer) as split:
-        task = FrameToRefine.with_points(inputs, inputs.points)
-        return refine_frame(network, split, settings, task)
+        return refine_frame(network, split, settings, inputs.frame())

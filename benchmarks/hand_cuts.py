@@ -121,17 +121,17 @@ def sparse2dense_rear(network: SparseToDense, z: Tensor, size: Any) -> Tensor:
 
 def latefusion_front(network: LateFusion, rgb: Tensor, sparse: Tensor) -> Any:
     """`decoder.s8`; the encoders' features at 1/4 and 1/2 and the size stay."""
-    picture, points = network.rgb(rgb), network.sparse(sparse)
-    x = network.fuse(torch.cat([picture.pop(), points.pop()], dim=1))
+    image, points = network.rgb(rgb), network.sparse(sparse)
+    x = network.fuse(torch.cat([image.pop(), points.pop()], dim=1))
     for level in LEVELS[:2]:
-        x = network.decoder[level](x, picture.pop(), points.pop())
-    return x, (picture, points, rgb.shape[-2:])
+        x = network.decoder[level](x, image.pop(), points.pop())
+    return x, (image, points, rgb.shape[-2:])
 
 
 def latefusion_rear(network: LateFusion, z: Tensor, kept: Any) -> Tensor:
-    picture, points, size = kept
+    image, points, size = kept
     for place, level in enumerate(LEVELS[2:], start=1):
-        z = network.decoder[level](z, picture[-place], points[-place])
+        z = network.decoder[level](z, image[-place], points[-place])
     x = F.interpolate(network.inverse(z), size, mode="bilinear", align_corners=False)
     return 1 / (F.softplus(x) + 1 / FARTHEST)
 

@@ -1,4 +1,4 @@
-"""The tables of `benchmarks.paper_tables` as Markdown and as a picture."""
+"""The tables of `benchmarks.paper_tables` as Markdown and as an image."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def _measures(rows: Sequence[Result], street: bool, *, beside: bool) -> str:
             points = published.points or "LiDAR"
             start = f"| *{published.name}, published* | {published.kind} |"
             lines.append(f"{start} | | before | {_cells(before, fine=published.fine)} |")
-            after_cells = _cells(after, before, fine=published.fine)
+            after_cells = _cells(after, before, fine=published.fine, printed=published.gains)
             lines.append(f"| | | {points} | | after | {after_cells} |")
         points = f"{row['points']:.0f}"
         start = f"| `{row['network']}` | {row['kind']} | | {row['frames']} | before |"
@@ -85,13 +85,19 @@ def described(settings: dict[str, dict[str, Any]]) -> str:
 
 
 def _cells(
-    values: dict[str, float], before: dict[str, float] | None = None, *, fine: bool = False
+    values: dict[str, float],
+    before: dict[str, float] | None = None,
+    *,
+    fine: bool = False,
+    printed: Sequence[float] = (),
 ) -> str:
-    """Six cells; with the errors' gains over `before` in per cent."""
+    """Six cells; with the gains over `before` in per cent, the first as printed."""
     cells = []
-    for name in MEASURES:
+    for place, name in enumerate(MEASURES):
         if name in ERRORS:
             gain = f" ({_gain(values[name], before[name])})" if before else ""
+            if place < len(printed):
+                gain = f" ({printed[place]:+.1f} %)"
             cells.append(f"{values[name]:.4f}{gain}")
         else:
             cells.append("†" if fine else f"{values[name]:.1f}")
@@ -127,19 +133,19 @@ def _fine(rows: Sequence[Result], *, beside: bool) -> str:
 def _steps(rows: Sequence[Result]) -> str:
     """How far the paper's step moves z, and what both settings do at the points themselves."""
     lines = [
-        "\nThe step against the feature map: standard deviation of the paper's z, α as its share,"
-        " and the mean L1 in metres at the points before → after\n",
+        "\nThe step against the feature map: standard deviation of the paper's z, α as its"
+        " fraction, and the mean L1 in metres at the points before → after\n",
         "| network | z | std(z) | α | L1, the paper's setting | loss, our setting | MAE fell in |",
         "|---|---|---|---|---|---|---|",
     ]
     for row in rows:
         paper, tuned = (row["settings"][state] for state in STATES)
-        share = 100 * paper["lr"] / row["std_z"]
+        fraction = 100 * paper["lr"] / row["std_z"]
         cells = (
             f"`{row['network']}`",
             f"`{paper['layer']}`",
             f"{row['std_z']:.3g}",
-            f"{share:.2g} %" if share < 10 else f"{share:.0f} %",
+            f"{fraction:.2g} %" if fraction < 10 else f"{fraction:.0f} %",
             *(f"{how['loss_before']:.3f} → {how['loss_after']:.3f}" for how in (paper, tuned)),
             " / ".join(f"{how['frames_with_lower_mae']:.0%}" for how in (paper, tuned)),
         )
@@ -149,33 +155,33 @@ def _steps(rows: Sequence[Result]) -> str:
 
 def remarks(rows: Sequence[Result]) -> list[str]:
     """For how many MAE falls; where not, and why; alignments, pixels not scored, divergence."""
-    found = [
+    notes_found = [
         f"MAE falls for {_count(rows, state, 'before')} at {STATES[state]}" for state in STATES
     ]
     below = _count(rows, "tuned", "linear")
-    found.append(f"at our setting, MAE is below that of the points interpolated for {below}")
+    notes_found.append(f"at our setting, MAE is below that of the points interpolated for {below}")
     for row in rows:
         if row["aligned"]:
             kinds = ", ".join(f"{kind} in {count}" for kind, count in row["aligned"].items())
-            found.append(
+            notes_found.append(
                 f"`{row['network']}` does not give metres: its output is aligned with the same"
                 f" points, once for before and after alike ({kinds} frames)"
             )
         for state, title in STATES.items():
             gain = row["settings"][state]["gains"]["mae"]
             if gain <= 0:
-                found.append(
+                notes_found.append(
                     f"`{row['network']}`: {title} does not improve MAE ({gain:+.2f} %): "
                     + reason(row, state)
                 )
         if row["coverage"] < 0.9995:
-            found.append(
+            notes_found.append(
                 f"`{row['network']}`: {100 * (1 - row['coverage']):.2f} % of the pixels with known"
-                " truth have no positive depth before or after, and are not scored"
+                " ground truth have no positive depth before or after, and are not scored"
             )
         if row["diverged"]:
-            found.append(f"`{row['network']}`: {row['diverged']} refinements diverged")
-    return found
+            notes_found.append(f"`{row['network']}`: {row['diverged']} refinements diverged")
+    return notes_found
 
 
 def _count(rows: Sequence[Result], state: str, other: str) -> str:
@@ -190,13 +196,14 @@ def reason(row: Result, state: str) -> str:
     before, after = how["loss_before"], how["loss_after"]
     losses = f"the loss at the points goes from {before:.3f} to {after:.3f}"
     if state == "paper":
-        share = SETTING.lr / row["std_z"] if isinstance(SETTING.lr, float) else 0.0
-        if share >= LARGE_STEP:
-            return f"a step is {share:.0%} of std(z) = {row['std_z']:.2g}, too long; {losses}"
-        if share * SETTING.iterations <= SMALL_MOVE:
+        fraction = SETTING.lr / row["std_z"] if isinstance(SETTING.lr, float) else 0.0
+        if fraction >= LARGE_STEP:
+            return f"a step is {fraction:.0%} of std(z) = {row['std_z']:.2g}, too long; {losses}"
+        if fraction * SETTING.iterations <= SMALL_MOVE:
             return (
-                f"all {SETTING.iterations} steps together are {SETTING.iterations * share:.2%} of"
-                f" std(z) = {row['std_z']:.3g}, too short to move anything; {losses}"
+                f"all {SETTING.iterations} steps together are"
+                f" {SETTING.iterations * fraction:.2%} of std(z) = {row['std_z']:.3g}, too"
+                f" short to move anything; {losses}"
             )
     if after < before:
         return f"{losses}, so the points are met, at the cost of what lies between them"
@@ -204,7 +211,7 @@ def reason(row: Result, state: str) -> str:
 
 
 def plot(tables: Sequence[Table], path: Path) -> None:
-    """A picture of the gains in MAE: published, at the paper's setting, and with our defaults.
+    """An image of the gains in MAE: published, at the paper's setting, and with our defaults.
 
     UsageError without matplotlib.
     """
@@ -212,12 +219,14 @@ def plot(tables: Sequence[Table], path: Path) -> None:
         from matplotlib.figure import Figure
     except ImportError:
         raise UsageError("--plot needs matplotlib: pip install matplotlib") from None
-    shown = [table for table in tables if table["rows"]]
-    if not shown:
+    table_row = [table for table in tables if table["rows"]]
+    if not table_row:
         raise UsageError("--plot: there is no table to draw")
-    figure = Figure(figsize=(9, 2.4 * len(shown) + 0.4), layout="constrained")
+    figure = Figure(figsize=(9, 2.4 * len(table_row) + 0.4), layout="constrained")
     drawn: dict[str, Any] = {}
-    for table, axes in zip(shown, figure.subplots(len(shown), squeeze=False)[:, 0], strict=True):
+    for table, axes in zip(
+        table_row, figure.subplots(len(table_row), squeeze=False)[:, 0], strict=True
+    ):
         bars = bars_of(table)
         width = 0.8 / len(bars)
         for number, (title, heights) in enumerate(bars.items()):

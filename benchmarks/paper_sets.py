@@ -14,17 +14,17 @@ from numpy.typing import NDArray
 from benchmarks.frames import SETS, Depth, EvalFrame, points_on_grid, sampled
 from pnpdepth_cli.errors import NoPointsError, UsageError
 from pnpdepth_cli.io.dataset.protocols import PROTOCOLS, Protocol
-from pnpdepth_cli.io.layouts import Frame, read_frame_image, read_frame_truth, read_frames
+from pnpdepth_cli.io.layouts import Frame, read_frame_ground_truth, read_frame_image, read_frames
 from pnpdepth_cli.pipeline.batch.frames import BatchRequest, task_of
 from pnpdepth_cli.pipeline.refinement.inputs import read_inputs
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest
 from pnpdepth_cli.points import SparsePoints
-from pnpdepth_cli.sensors import FORWARD_LEFT_UP, LIDARS, Camera, as_picture, simulate_lidar
+from pnpdepth_cli.sensors import FORWARD_LEFT_UP, LIDARS, Camera, as_depth_image, simulate_lidar
 
 T = TypeVar("T")
 
 ROOM_LIMIT, STREET_LIMIT = 10.0, 80.0
-"""Metres beyond which rendered truth counts as unknown: a Kinect's range, and KITTI's."""
+"""Metres beyond which rendered ground truth counts as unknown: a Kinect's range, and KITTI's."""
 
 SCANNER = LIDARS["hdl-64e"]
 SCANNER_IN_CAMERA = np.array([0.0, -0.08, -0.27])  # metres; as KITTI's stands to its left cameras
@@ -36,11 +36,11 @@ class TableFrame:
     """rgb (H, W, 3) in 0..1; depths (H, W) in metres, 0 = unknown.
 
     pool: the pixels that uniform points are drawn from. scan: a LiDAR's points on their pixels,
-    None where there is none besides the truth.
+    None where there is none besides the ground truth.
     """
 
     rgb: NDArray[np.float32]
-    truth: Depth
+    gt: Depth
     pool: Depth
     scan: Depth | None = None
 
@@ -48,7 +48,7 @@ class TableFrame:
         """What the protocol leaves of the frame."""
         return TableFrame(
             rgb=np.ascontiguousarray(protocol.apply(self.rgb)),
-            truth=np.ascontiguousarray(protocol.apply(self.truth)),
+            gt=np.ascontiguousarray(protocol.apply(self.gt)),
             pool=protocol.apply(self.pool),
             scan=None if self.scan is None else protocol.apply(self.scan),
         )
@@ -142,12 +142,12 @@ def _rendered_frames(scenes: Scenes, shards: list[Path], count: int) -> Iterator
         with np.load(path) as shard:
             views = list(zip(shard["rgb"], shard["depth"], shard["intrinsics"], strict=True))
         for number, (rgb, depth, lens) in enumerate(views[: count - first], start=first):
-            truth = within(depth, scenes.limit)
+            gt = within(depth, scenes.limit)
             yield TableFrame(
                 rgb=rgb.astype(np.float32) / 255,
-                truth=truth,
-                pool=truth,
-                scan=scan_of(truth, lens, number) if scenes.kind == "street" else None,
+                gt=gt,
+                pool=gt,
+                scan=scan_of(gt, lens, number) if scenes.kind == "street" else None,
             )
 
 
@@ -156,7 +156,7 @@ def within(depth: Depth, limit: float) -> Depth:
     return np.where(depth <= limit, depth, np.float32(0))
 
 
-def scan_of(truth: Depth, lens: NDArray[np.float32], seed: int) -> Depth:
+def scan_of(gt: Depth, lens: NDArray[np.float32], seed: int) -> Depth:
     """(H, W) one turn of the 64-line scanner on KITTI's roof; lens: fx, fy, cx, cy in pixels."""
     fx, fy, cx, cy = (float(value) for value in lens)
     camera = Camera(
@@ -164,17 +164,17 @@ def scan_of(truth: Depth, lens: NDArray[np.float32], seed: int) -> Depth:
         rotation=FORWARD_LEFT_UP,
         translation=SCANNER_IN_CAMERA,
     )
-    return as_picture(simulate_lidar(truth, camera, SCANNER, seed))
+    return as_depth_image(simulate_lidar(gt, camera, SCANNER, seed))
 
 
 def shared(root: Path, most: int) -> list[FrameSet]:
     """The real frames at hand, at most so many of each, evenly taken."""
-    found = []
+    sets = []
     for name, read in SETS.items():
         every = [_shared_frame(frame) for frame in read(root)]
         if every:
             chosen = _evenly(every, most)
-            found.append(
+            sets.append(
                 FrameSet(
                     name=name,
                     street=every[0].scan is not None,
@@ -183,9 +183,9 @@ def shared(root: Path, most: int) -> list[FrameSet]:
                     beside_paper=False,
                 )
             )
-    if not found:
+    if not sets:
         raise UsageError(f"{root} holds none of {', '.join(SETS)}; check --shared")
-    return found
+    return sets
 
 
 def _evenly(every: Sequence[T], most: int | None) -> list[T]:
@@ -195,10 +195,10 @@ def _evenly(every: Sequence[T], most: int | None) -> list[T]:
 
 def _shared_frame(frame: EvalFrame) -> TableFrame:
     if frame.sensor is None:
-        truth = within(frame.truth, ROOM_LIMIT)
-        return TableFrame(rgb=frame.rgb, truth=truth, pool=truth).cut_by(PROTOCOLS["nyu"])
-    truth, scan = (within(depth, STREET_LIMIT) for depth in (frame.truth, frame.sensor))
-    return TableFrame(rgb=frame.rgb, truth=truth, pool=scan, scan=scan)
+        gt = within(frame.gt, ROOM_LIMIT)
+        return TableFrame(rgb=frame.rgb, gt=gt, pool=gt).cut_by(PROTOCOLS["nyu"])
+    gt, scan = (within(depth, STREET_LIMIT) for depth in (frame.gt, frame.sensor))
+    return TableFrame(rgb=frame.rgb, gt=gt, pool=scan, scan=scan)
 
 
 def data_set(what: str, most: int | None) -> FrameSet:
@@ -245,22 +245,22 @@ def test_frames(root: Path, every: Sequence[Frame]) -> tuple[Sequence[Frame], st
 
 
 def _parts(root: Path, frame: Frame) -> tuple[str, ...]:
-    """The folders that the frame's truth, or its image, lies in, from the root on."""
+    """The folders that the frame's ground truth, or its image, lies in, from the root on."""
     source = frame.gt or frame.image
     path = source if isinstance(source, Path) else source.path if source else root
     return path.absolute().parts[len(root.absolute().parts) - 1 : -1]
 
 
 def _data_frame(root: Path, frame: Frame) -> TableFrame:
-    """A frame in memory; without another truth, the scan is the truth, as in KITTI odometry."""
+    """A frame in memory; without ground truth the scan is it, as in KITTI odometry."""
     if frame.sparse is None:
-        truth = read_frame_truth(frame)
-        return TableFrame(rgb=read_frame_image(frame), truth=truth, pool=truth)
+        gt = read_frame_ground_truth(frame)
+        return TableFrame(rgb=read_frame_image(frame), gt=gt, pool=gt)
     # No output is written; the batch's own reading of scans and scales is wanted.
     batch = BatchRequest(source=root, output=root / "out", refine=RefineRequest())
     inputs = read_inputs(replace(task_of(batch, frame).request, output=None))
     assert inputs.rgb is not None
     scan = inputs.points.scatter()[0, 0].numpy()
     if inputs.gt is None:
-        return TableFrame(rgb=inputs.rgb, truth=scan, pool=scan)
-    return TableFrame(rgb=inputs.rgb, truth=inputs.gt, pool=scan, scan=scan)
+        return TableFrame(rgb=inputs.rgb, gt=scan, pool=scan)
+    return TableFrame(rgb=inputs.rgb, gt=inputs.gt, pool=scan, scan=scan)

@@ -13,8 +13,8 @@ eigen/ with its two files.
 Each network: as it is, refined at the paper's setting (sign, α = 0.01, K = 5, L1, the paper's z)
 and with its definition's defaults; beside it, the points interpolated linearly without any network.
 Points are drawn per frame by its number: all networks with as many points get the same. Measures
-are averaged over frames, each over the pixels with known truth where all depths are positive;
-`coverage` says which share that is. A network that knows depth up to scale is given the factor that
+are averaged over frames, each over the pixels with known ground truth where all depths are
+positive; `coverage` is the fraction of these. A network with depth up to scale gets the factor that
 fits the points, once for before and after alike.
 """
 
@@ -81,30 +81,30 @@ def entry_of(row: PaperRow, network: Network) -> Entry:
     return Entry(row=row, network=network, settings=settings)
 
 
-def scores_of(depths: dict[str, Depth], truth: Depth) -> tuple[dict[str, dict[str, float]], float]:
-    """The measures of each depth over the pixels where the truth and all depths are known.
+def scores_of(depths: dict[str, Depth], gt: Depth) -> tuple[dict[str, dict[str, float]], float]:
+    """The measures of each depth over the pixels where the ground truth and all depths are known.
 
-    δ in per cent, `fine…` those at 1.01^k; and the share of the known truth that these pixels are.
+    δ in per cent, `fine…` those at 1.01^k; and the coverage of the known ground truth.
     """
-    known = truth > 0
+    known = gt > 0
     scored = known & np.logical_and.reduce([np.isfinite(d) & (d > 0) for d in depths.values()])
-    kept = torch.from_numpy(np.where(scored, truth, np.float32(0)))
-    found = {}
+    kept = torch.from_numpy(np.where(scored, gt, np.float32(0)))
+    measured = {}
     for state, depth in depths.items():
-        usual, fine = (
+        standard, fine = (
             score(torch.from_numpy(depth), kept, *limits) for limits in ((), (FINE_THRESHOLDS,))
         )
-        found[state] = {name: getattr(usual, name) for name in MEASURES[:3]}
-        found[state] |= {f"delta{k}": 100 * getattr(usual, f"delta{k}") for k in (1, 2, 3)}
-        found[state] |= {f"fine{k}": 100 * getattr(fine, f"delta{k}") for k in (1, 2, 3)}
-    return found, float(scored.sum() / known.sum())
+        measured[state] = {name: getattr(standard, name) for name in MEASURES[:3]}
+        measured[state] |= {f"delta{k}": 100 * getattr(standard, f"delta{k}") for k in (1, 2, 3)}
+        measured[state] |= {f"fine{k}": 100 * getattr(fine, f"delta{k}") for k in (1, 2, 3)}
+    return measured, float(scored.sum() / known.sum())
 
 
 def frame_figures(entry: Entry, frame: TableFrame, number: int) -> dict[str, Any]:
     """What one frame shows of a network: its scores, the loss at the points, the spread of z."""
     frame = frame.cut_by(entry.row.cut)
     points = frame.points(entry.row.points, number)
-    inputs = frame_inputs(frame.rgb, points, frame.truth)
+    inputs = frame_inputs(frame.rgb, points, frame.gt)
     layer, paper = entry.settings["paper"]
     results = {"paper": refined(entry.network, layer, paper, inputs)}
     same = entry.settings["tuned"] == entry.settings["paper"]
@@ -115,7 +115,7 @@ def frame_figures(entry: Entry, frame: TableFrame, number: int) -> dict[str, Any
     spread = refined(entry.network, layer, replace(paper, iterations=0, lr="100%"), inputs)
     depths = {"linear": linear(points).numpy(), "before": results["paper"].before}
     depths |= {state: result.after for state, result in results.items()}
-    scores, coverage = scores_of(depths, frame.truth)
+    scores, coverage = scores_of(depths, frame.gt)
     return {
         "points": len(points),
         "coverage": coverage,
@@ -128,7 +128,7 @@ def frame_figures(entry: Entry, frame: TableFrame, number: int) -> dict[str, Any
 
 
 def gains(before: dict[str, float], after: dict[str, float]) -> dict[str, float]:
-    """Per cent by which the errors fell, and points by which the shares rose."""
+    """Per cent by which the errors fell, and points by which the fractions rose."""
     errors = MEASURES[:3]
     return {
         name: 100 * (1 - after[name] / before[name]) if name in errors else value - before[name]
@@ -146,8 +146,8 @@ def result_of(entry: Entry, frames: Sequence[dict[str, Any]]) -> dict[str, Any]:
         return float(np.mean(values))
 
     states = {
-        state: {name: mean("scores", state, name) for name in found}
-        for state, found in frames[0]["scores"].items()
+        state: {name: mean("scores", state, name) for name in measured}
+        for state, measured in frames[0]["scores"].items()
     }
     settings = {}
     for state, (layer, how) in entry.settings.items():
@@ -182,15 +182,17 @@ def table_of(frame_set: FrameSet, entries: Sequence[Entry]) -> dict[str, Any]:
     figures: list[list[dict[str, Any]]] = [[] for _ in entries]
     bar = tqdm(frame_set.frames(), frame_set.name, frame_set.count, unit="frame", disable=None)
     for number, frame in enumerate(bar):
-        for entry, found in zip(entries, figures, strict=True):
+        for entry, measured in zip(entries, figures, strict=True):
             if entry.row.points is not None or frame.scan is not None:
-                found.append(frame_figures(entry, frame, number))
+                measured.append(frame_figures(entry, frame, number))
     rows = []
-    for entry, found in zip(entries, figures, strict=True):
-        if found:
-            rows.append(result_of(entry, found))
+    for entry, measured in zip(entries, figures, strict=True):
+        if measured:
+            rows.append(result_of(entry, measured))
         else:
-            notes.append(f"`{entry.name}` needs a LiDAR and a truth besides it; there is none here")
+            notes.append(
+                f"`{entry.name}` needs a LiDAR and a ground truth besides it; there is none here"
+            )
     return {
         "set": frame_set.name,
         "street": frame_set.street,
@@ -208,17 +210,17 @@ def checkpoints_in(folder: Path | None) -> dict[str, Path | None]:
     if not folder.is_dir():
         raise UsageError(f"--checkpoints {folder} is no folder; put the files of weights into one")
     known += ["sparse2dense", "sparse2dense-kitti"]
-    found: dict[str, Path | None] = {}
+    measured: dict[str, Path | None] = {}
     for path in sorted(folder.iterdir()):
         name = path.name.split(".")[0]
         if name not in known or not (path.is_dir() or path.suffix in WEIGHT_SUFFIXES):
             continue
-        if name in found:
-            raise UsageError(f"{found[name]} and {path} are both for {name}; keep one of them")
-        found[name] = path
-    if not found:
+        if name in measured:
+            raise UsageError(f"{measured[name]} and {path} are both for {name}; keep one of them")
+        measured[name] = path
+    if not measured:
         raise UsageError(f"no file in {folder} is called after a network, such as fcrn.npy")
-    return found
+    return measured
 
 
 def entries_of(
@@ -274,7 +276,7 @@ def parsed(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--checkpoints", type=Path, help="folder with published weights")
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1, help="that render")
     parser.add_argument("--json", type=Path, help="write everything into this file")
-    parser.add_argument("--plot", type=Path, help="draw the gains into this picture")
+    parser.add_argument("--plot", type=Path, help="draw the gains into this image")
     chosen = parser.parse_args(arguments)
     if chosen.frames is not None and chosen.frames < 1:
         parser.error("--frames: give 1 or more")

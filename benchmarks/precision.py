@@ -1,8 +1,8 @@
 """What bf16 changes: `python -m benchmarks.precision [--data PATH --set icl_nuim --frames 4]`.
 
 The MAE in metres of the plain and of the refined prediction in fp32 and in bf16, with the network's
-defaults, over the pixels with known truth: on the program's own samples, or with --data on the
-first frames of a set (500 points of the truth; KITTI's own LiDAR).
+defaults, over the pixels with known ground truth: on the program's samples, or with --data on the
+first frames of a set (500 points of the ground truth; KITTI's own LiDAR).
 """
 
 from __future__ import annotations
@@ -48,8 +48,8 @@ def real(data: Path, name: str, count: int) -> Iterator[tuple[str, Inputs]]:
     """The first frames of a set."""
     number = None if name == "kitti_dc" else 500
     for frame in islice(SETS[name](data), count):
-        points = points_on_grid(*frame_pixels(frame, number, seed=0), frame.truth.shape)
-        yield frame.name, frame_inputs(frame.rgb, points, frame.truth)
+        points = points_on_grid(*frame_pixels(frame, number, seed=0), frame.gt.shape)
+        yield frame.name, frame_inputs(frame.rgb, points, frame.gt)
 
 
 def main() -> None:
@@ -59,24 +59,22 @@ def main() -> None:
     parser.add_argument("--set", choices=SETS, default="icl_nuim")
     parser.add_argument("--frames", type=int, default=4)
     parser.add_argument("--model", default="compact")
-    given = parser.parse_args()
-    networks = {name: load_network(given.model, None, precision=name) for name in PRECISIONS}
+    args = parser.parse_args()
+    networks = {name: load_network(args.model, None, precision=name) for name in PRECISIONS}
     definition = networks["fp32"].definition
     layer = resolve_layer(definition, None)
     settings = resolve_settings(definition, MethodOptions())
     print("| frame | plain fp32 | plain bf16 | change | refined fp32 | refined bf16 | change |")
     print("|" + "---|" * 7)
-    frames = real(given.data, given.set, given.frames) if given.data else samples()
+    frames = real(args.data, args.set, args.frames) if args.data else samples()
     total = {(p, depths): 0.0 for p in PRECISIONS for depths in DEPTHS}
     for name, inputs in frames:
         assert inputs.gt is not None
-        truth = torch.from_numpy(inputs.gt)
+        gt = torch.from_numpy(inputs.gt)
         made = {p: refined_frame(networks[p], layer, settings, inputs) for p in PRECISIONS}
         cells = []
         for depths in DEPTHS:
-            maes = [
-                score(torch.from_numpy(getattr(made[p], depths)), truth).mae for p in PRECISIONS
-            ]
+            maes = [score(torch.from_numpy(getattr(made[p], depths)), gt).mae for p in PRECISIONS]
             cells += compared(*maes)
             for precision, mae in zip(PRECISIONS, maes, strict=True):
                 total[precision, depths] += mae

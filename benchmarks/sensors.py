@@ -1,8 +1,8 @@
 """Evidence for the sensors: python -m benchmarks.sensors DATA, DATA the folder of real frames.
 
-Projection against rendered truth (samples/street), the occlusion filter against KITTI's
-accumulated truth, the shares of samples of the paper's LiDARs, and the time of a projection.
-Without DATA, only what the samples can show.
+Projection against rendered ground truth (samples/street), the occlusion filter against KITTI's
+accumulated ground truth, the fractions of samples of the paper's LiDARs, and the time of a
+projection. Without DATA, only what the samples can show.
 """
 
 from __future__ import annotations
@@ -46,41 +46,42 @@ SYNTHIA_SIZE = (304, 512)
 Floats = NDArray[np.floating]
 
 
-def agreement(hidden: NDArray[np.bool_], depth: Floats, truth: Floats) -> str:
-    """What the filter did to the points that agree with truth within 10 %, and to the others."""
-    known = truth > 0
-    agrees = np.abs(depth[known] - truth[known]) <= 0.1 * truth[known]
+def agreement(hidden: NDArray[np.bool_], depth: Floats, gt: Floats) -> str:
+    """Fractions of points kept if they agree with ground truth within 10 %, else removed."""
+    known = gt > 0
+    agrees = np.abs(depth[known] - gt[known]) <= 0.1 * gt[known]
     gone = hidden[known]
     return (
-        f"{agrees.sum():,} points agree with the truth, {np.mean(~gone[agrees]):.1%} of them kept;"
-        f" {(~agrees).sum():,} do not, {np.mean(gone[~agrees]):.1%} of them removed"
+        f"{agrees.sum():,} points agree with the ground truth,"
+        f" {np.mean(~gone[agrees]):.1%} of them kept; {(~agrees).sum():,} do not,"
+        f" {np.mean(gone[~agrees]):.1%} of them removed"
     )
 
 
 def street() -> None:
-    """The rendered scan, whose truth is exact and dense."""
+    """The rendered scan, whose ground truth is exact and dense."""
     camera = camera_of(read_calibration(STREET / "calib.txt"))
     scan = read_scan(STREET / "000000.bin").points
-    truth = read_depth(STREET / "gt.png").values
-    points = project_velodyne(scan, camera, truth.shape, KEEP_ALL)
+    gt = read_depth(STREET / "gt.png").values
+    points = project_velodyne(scan, camera, gt.shape, KEEP_ALL)
     column, row = np.floor(points.xy + 0.5).astype(int).T
-    there = truth[row, column]
+    there = gt[row, column]
     error = np.abs(points.depth - there)[there > 0]
     print(f"samples/street, {len(points.depth):,} points: median error {np.median(error):.3f} m")
-    kept = project_velodyne(scan, camera, truth.shape).index
+    kept = project_velodyne(scan, camera, gt.shape).index
     print("  filter:", agreement(~np.isin(points.index, kept), points.depth, there))
 
 
 def kitti(data: Path) -> None:
-    """Single scans, projected by the data set, against truth accumulated over eleven of them."""
+    """Single scans, projected by the data set, against ground truth of eleven accumulated scans."""
     folder = data / "kitti_dc"
     calibration = read_calibration(folder)
-    hidden, depth, truth = [], [], []
+    hidden, depth, gt = [], [], []
     for path in sorted((folder / "velodyne_raw").glob("*.png")):
         raw = read_depth(path).values
         row, column = np.nonzero(raw)
         depth.append(raw[row, column].astype(np.float64))
-        truth.append(read_depth(folder / "groundtruth" / path.name).values[row, column])
+        gt.append(read_depth(folder / "groundtruth" / path.name).values[row, column])
         hidden.append(
             hidden_points(
                 np.column_stack([column, row]).astype(np.float64),
@@ -91,12 +92,12 @@ def kitti(data: Path) -> None:
                 settings=OcclusionFilter(),
             )
         )
-    joined = [np.concatenate(x) for x in (hidden, depth, truth)]
+    joined = [np.concatenate(x) for x in (hidden, depth, gt)]
     print(f"kitti_dc, {len(hidden)} frames, {len(joined[0]):,} points")
     print(f"  filter: {agreement(*joined)}; {joined[0].mean():.1%} of all removed")
 
 
-def shares() -> None:
+def fractions() -> None:
     """The paper's LiDARs in SYNTHIA's view of a scene without holes."""
     depth = np.full(SYNTHIA_SIZE, 10.0)
     print("samples, % of SYNTHIA's pixels: ours (the paper's)")
@@ -132,7 +133,7 @@ def main() -> None:
     parser.add_argument("--runs", type=int, default=15)
     args = parser.parse_args()
     street()
-    shares()
+    fractions()
     if args.data is not None:
         kitti(args.data)
         speed(args.data, args.runs)

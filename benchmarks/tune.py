@@ -4,8 +4,8 @@
 
 For every layer, update and step: the geometric mean over frames and patterns (100 and 500 uniform
 points and LiDAR lines, or what --patterns names, as in 500,5%,lidar) of MAE and RMSE after
-refinement over those before, against the perfect depth, in per cent, and the share of frames whose
-MAE got worse. Never run it on frames that are reported.
+refinement over those before, against the perfect depth, in per cent, and the fraction of frames
+whose MAE got worse. Never run it on frames that are reported.
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ def drawn(pattern: str, rng: np.random.Generator, depth: Depth) -> Depth:
     """Sparse depth: a number of uniform points, a percentage of all pixels, or `lidar` lines."""
     if pattern == "lidar":
         return scan_lines(rng, depth)
-    share = pattern.endswith("%")
-    number = float(pattern.rstrip("%")) * (depth.size / 100 if share else 1)
+    fraction = pattern.endswith("%")
+    number = float(pattern.rstrip("%")) * (depth.size / 100 if fraction else 1)
     return keep(depth, uniform(rng, depth, round(number)))
 
 
 def rendered_inputs(folder: Path, count: int, patterns: list[str]) -> list[Inputs]:
     """`count` frames evenly taken from the folder's shards, each with every pattern."""
-    frames, found = Frames(folder), []
+    frames, ratios_of_frames = Frames(folder), []
     for index in np.linspace(0, len(frames) - 1, count).astype(int):
         rgb, depth = frames[int(index)]
         for pattern in patterns:
@@ -45,22 +45,22 @@ def rendered_inputs(folder: Path, count: int, patterns: list[str]) -> list[Input
             rows, columns = np.nonzero(sparse)
             if len(rows) >= 3:
                 points = points_on_grid(rows, columns, sparse[rows, columns], depth.shape)
-                found.append(frame_inputs((rgb / 255).astype(np.float32), points, depth))
-    return found
+                ratios_of_frames.append(frame_inputs((rgb / 255).astype(np.float32), points, depth))
+    return ratios_of_frames
 
 
 def ratios(
     network: Network, layer: str, settings: RefineSettings, some: list[Inputs]
 ) -> list[tuple[float, float]]:
     """MAE and RMSE after over those before, of every frame."""
-    found = []
+    ratios_of_frames = []
     for inputs in some:
         assert inputs.gt is not None
         result = refined(network, layer, settings, inputs)
-        truth = torch.from_numpy(inputs.gt)
-        before, after = (score(torch.from_numpy(d), truth) for d in (result.before, result.after))
-        found.append((after.mae / before.mae, after.rmse / before.rmse))
-    return found
+        gt = torch.from_numpy(inputs.gt)
+        before, after = (score(torch.from_numpy(d), gt) for d in (result.before, result.after))
+        ratios_of_frames.append((after.mae / before.mae, after.rmse / before.rmse))
+    return ratios_of_frames
 
 
 def main() -> None:
@@ -86,9 +86,9 @@ def main() -> None:
     for layer, *chosen in product(layers, *(text.split(",") for text in choices)):
         update, lr, iterations, loss = chosen
         settings = RefineSettings(iterations=int(iterations), lr=lr, loss=loss, update=update)
-        found = np.array(ratios(network, layer, settings, some))
-        mae, rmse = 100 * np.exp(np.log(found).mean(axis=0))
-        worse = 100 * (found[:, 0] > 1).mean()
+        ratios_of_frames = np.array(ratios(network, layer, settings, some))
+        mae, rmse = 100 * np.exp(np.log(ratios_of_frames).mean(axis=0))
+        worse = 100 * (ratios_of_frames[:, 0] > 1).mean()
         row = " | ".join((layer, *chosen, f"{mae:.2f}", f"{rmse:.2f}", f"{worse:.0f}"))
         print(f"| {row} |", flush=True)
 

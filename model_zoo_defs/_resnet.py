@@ -1,6 +1,6 @@
-"""The trunk of a residual network, with torchvision's names (He et al., CVPR 2016).
+"""The stages of a ResNet, with torchvision's parameter names (He et al., CVPR 2016).
 
-Own code from the paper and the names; no weights come with it.
+Own code from the paper and the names; no weights ship.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ WIDTH = 64  # channels of the first stage, as published
 
 
 class BasicBlock(nn.Module):
-    """Two 3×3 convolutions beside the identity; (B, c, h, w) → (B, width, h/stride, w/stride)."""
+    """Two 3×3 convolutions plus the identity; (B, c, h, w) → (B, width, h/stride, w/stride)."""
 
     expansion = 1
 
@@ -32,7 +32,7 @@ class BasicBlock(nn.Module):
 
 
 class Bottleneck(nn.Module):
-    """1×1, 3×3 (with the stride), 1×1 convolutions beside the identity; 4·width channels out."""
+    """1×1, 3×3 (with the stride), 1×1 convolutions plus the identity; 4·width output channels."""
 
     expansion = 4
 
@@ -54,24 +54,26 @@ class Bottleneck(nn.Module):
 
 
 def shortcut(channels: int, out: int, stride: int) -> nn.Sequential | None:
-    """What brings a block's input to its output's shape; None where it has that shape."""
+    """Returns a projection of a block's input to its output's shape; None if they are the same."""
     if stride == 1 and channels == out:
         return None
     return nn.Sequential(nn.Conv2d(channels, out, 1, stride, bias=False), nn.BatchNorm2d(out))
 
 
 def stages(depth: int, width: int = WIDTH) -> tuple[list[nn.Sequential], int]:
-    """The four stages of ResNet-`depth` at 1/4, 1/8, 1/16, 1/32, and the last one's channels.
+    """Returns the four stages of a ResNet at 1/4, 1/8, 1/16, 1/32, and the last one's channels.
 
-    The first stage takes `width` channels.
+    Args:
+        depth: Number of layers of the ResNet, 18, 34 or 50.
+        width: Input channels of the first stage.
     """
     block = Bottleneck if depth >= 50 else BasicBlock
-    channels, made = width, []
+    channels, built = width, []
     for place, count in enumerate(BLOCKS[depth]):
         inner = width * 2**place
         blocks = []
         for number in range(count):
             blocks.append(block(channels, inner, 2 if place and not number else 1))
             channels = inner * block.expansion
-        made.append(nn.Sequential(*blocks))
-    return made, channels
+        built.append(nn.Sequential(*blocks))
+    return built, channels

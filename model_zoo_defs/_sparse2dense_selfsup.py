@@ -1,12 +1,12 @@
 """Self-supervised sparse-to-dense (Ma, Cavalheiro & Karaman, ICRA 2019): a U-Net of ResNet-34.
 
-rgb in 0…255 and sparse depth in metres (0 = unknown) have a first layer each; four ResNet stages
-and one more convolution go down to 1/16, transposed convolutions come back with skips at every
-size. Depth in metres, at least 0.9 (the nearest a Velodyne measures). The authors looked at the
-lowest 352×1216 pixels of KITTI frames; any size of multiples of 16 works.
+Input: rgb in 0…255 and sparse depth in metres (0 = unknown), each with a first layer of its own.
+Four ResNet stages and one more convolution go down to 1/16, transposed convolutions with skips go
+back up. Output: depth in metres, at least 0.9 (the least a Velodyne measures). The authors used the
+lowest 352×1216 pixels of KITTI frames; any size in multiples of 16 works.
 
-Written from facts of fangchangma/self-supervised-depth-completion (MIT); names of parameters are
-its own. The weights are the authors', none come with this.
+Written from the published description of fangchangma/self-supervised-depth-completion (MIT);
+parameter names are the same. No weights ship.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ SLOPE = 0.2
 
 
 def down(channels: int, out: int, stride: int = 1) -> nn.Sequential:
-    """3×3 convolution, batch norm, leaky ReLU."""
+    """Returns 3×3 convolution, batch norm, leaky ReLU."""
     convolution = nn.Conv2d(channels, out, 3, stride, 1, bias=False)
     return nn.Sequential(convolution, nn.BatchNorm2d(out), nn.LeakyReLU(SLOPE))
 
 
 def up(channels: int, out: int, stride: int = 2) -> nn.Sequential:
-    """3×3 transposed convolution, batch norm, leaky ReLU."""
+    """Returns 3×3 transposed convolution, batch norm, leaky ReLU."""
     convolution = nn.ConvTranspose2d(channels, out, 3, stride, 1, stride - 1, bias=False)
     return nn.Sequential(convolution, nn.BatchNorm2d(out), nn.LeakyReLU(SLOPE))
 

@@ -1,18 +1,18 @@
-"""Deep convolutional compressed sensing (Chodosh, Wang & Lucey, ACCV 2018): a network that solves.
+"""Deep convolutional compressed sensing (Chodosh, Wang & Lucey, ACCV 2018).
 
-Three layers of convolutional dictionaries (8, 16, 32 filters; 11, 5, 3 pixels; stride 2 each).
-Depth is what the codes of the last layer give when they are sent back through all three; the codes
-are found by ten ADMM iterations against the sparse depth. Sparse depth in metres (0 = unknown)
-goes in, dense depth in metres comes out, at any size; nothing keeps it positive.
+Three layers of convolutional dictionaries (8, 16, 32 filters; 11, 5, 3 pixels; stride 2 each). Ten
+ADMM iterations find the codes of the last layer that explain the sparse depth; synthesis through
+all three layers turns them into depth. Input: sparse depth in metres (0 = unknown), any size.
+Output: dense depth in metres; it may be negative.
 
 The paper's z (Wang et al.) is "the optimal x", the codes of the last layer; here the output of
-`solve`. The authors' TensorFlow code for it does more: it steps codes, copies and multipliers of
-all layers, each time followed by ten further iterations. Cutting inside the solve
-(`solve.step#5[0][2]`) does the like of that: the iterations behind the cut run again each time.
+`solve`. The authors' TensorFlow code does more: it updates codes, copies and multipliers of all
+layers, and runs ten further iterations after each update. A cut inside the solver
+(`solve.step#5[0][2]`) comes close: the iterations behind the cut run again after each update.
 
-Written from facts of nchodosh/Super-LiDAR, which names no licence; the names of parameters are its
-own. No weights of the authors' were ever published. Who has trained theirs saves its variables by
-name, `numpy.savez("adnn.npz", kernel0=…, …, bias2=…)`; `-tiny` is this project's own.
+Written from the published description and the graph of nchodosh/Super-LiDAR, which names no
+licence; parameter names are the same. The authors published no weights. To use your own, save the
+variables by name, `numpy.savez("adnn.npz", kernel0=…, …, bias2=…)`. `-tiny` is this project's own.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ KERNELS = (11, 5, 3)
 STRIDE = 2
 ITERATIONS = 10
 TUNED = RefineDefaults(layer="solve", lr="3%", update="adam")  # of `-tiny`
-BIAS_SCALE = 1e-3  # the stored biases are a thousand times those of the shrinkage
+BIAS_SCALE = 1e-3  # stored biases are a thousand times the thresholds
 
 Three = tuple[Tensor, Tensor, Tensor]
 
@@ -47,21 +47,23 @@ class State(NamedTuple):
 
 
 def analysed(x: Tensor, kernel: Tensor) -> Tensor:
-    """x (B, c, h, w) seen through the filters (n, c, k, k): (B, n, ⌈h/2⌉, ⌈w/2⌉), SAME padding."""
+    """Returns x (B, c, h, w) convolved with (n, c, k, k), SAME padding: (B, n, ⌈h/2⌉, ⌈w/2⌉)."""
     rows, columns = (same_padding(length, kernel.shape[-1], STRIDE) for length in x.shape[-2:])
     return F.conv2d(F.pad(x, (*columns, *rows)), kernel, stride=STRIDE)
 
 
 def synthesised(codes: Tensor, kernel: Tensor, size: tuple[int, int]) -> Tensor:
-    """The codes (B, n, ⌈h/2⌉, ⌈w/2⌉) as a sum of filters (n, c, k, k): (B, c, h, w), the adjoint
-    of `analysed`."""
+    """Returns the sum of filters (n, c, k, k) weighted by codes: (B, c, h, w).
+
+    The adjoint of `analysed`; codes are (B, n, ⌈h/2⌉, ⌈w/2⌉), size is (h, w).
+    """
     top, left = (same_padding(length, kernel.shape[-1], STRIDE)[0] for length in size)
     x = F.conv_transpose2d(codes, kernel, stride=STRIDE)
     return x[..., top : top + size[0], left : left + size[1]]
 
 
 def shrunk(x: Tensor, bias: Tensor, multiplier: Tensor) -> Tensor:
-    """What is left of x when the penalty |bias| and the multiplier are paid; never negative."""
+    """Returns x soft-thresholded by |bias| minus the multiplier, and not below 0."""
     return F.relu(x - (bias.abs() * BIAS_SCALE - multiplier))
 
 
@@ -71,7 +73,7 @@ class Step(nn.Module):
     def forward(
         self, state: State, sparse: Tensor, known: Three, kernels: Three, biases: Three
     ) -> State:
-        """`known`, 1 or 0, says which pixels and codes each layer answers for."""
+        """Returns the state after the iteration; `known` (1 or 0) masks what each layer fits."""
         codes, copies, multipliers = (list(part) for part in state)
         for i, kernel in enumerate(kernels):
             target = known[i] * copies[i - 1] if i else sparse
@@ -104,7 +106,7 @@ class Solve(nn.Module):
 
 
 class Synthesis(nn.Module):
-    """Codes of one layer → the map they stand for, of the given size."""
+    """Codes of one layer → the map of the given size that they synthesise."""
 
     def forward(self, codes: Tensor, kernel: Tensor, size: tuple[int, int]) -> Tensor:
         return synthesised(codes, kernel, size)
@@ -140,7 +142,7 @@ class Adnn(nn.Module):
 
 
 def covered(mask: Tensor, kernels: Three) -> Three:
-    """The mask of known pixels (B, 1, H, W), and which codes of the layers behind see any."""
+    """Returns the mask of known pixels (B, 1, H, W), and of the codes that cover any of them."""
     masks = [mask]
     for kernel in kernels[:-1]:
         count = analysed(masks[-1], torch.ones_like(kernel[:1, :1]))
@@ -149,7 +151,7 @@ def covered(mask: Tensor, kernels: Three) -> Three:
 
 
 def first_state(sparse: Tensor, known: Three, kernels: Three, biases: Three) -> State:
-    """The codes of one pass forward, no multiplier paid yet."""
+    """Returns the codes of one forward pass, with multipliers of 0."""
     codes: list[Tensor] = []
     copies: list[Tensor] = []
     for i, kernel in enumerate(kernels):
@@ -159,7 +161,7 @@ def first_state(sparse: Tensor, known: Three, kernels: Three, biases: Three) -> 
 
 
 def from_tensorflow(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Kernels (k, k, c, n) of the authors' variables become (n, c, k, k); any other stay."""
+    """Returns the state dict with kernels (k, k, c, n), TensorFlow's order, as (n, c, k, k)."""
     return {
         name: tensor.permute(3, 2, 0, 1)
         if tensor.ndim == 4 and tensor.shape[2] != tensor.shape[3]

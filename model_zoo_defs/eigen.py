@@ -1,16 +1,14 @@
-"""`eigen`, a coarse and a fine network for depth from one picture (Eigen et al., NIPS 2014).
+"""`eigen`, a coarse and a fine network for depth from one image (Eigen et al., NIPS 2014).
 
-The coarse network sees the whole picture through two fully connected layers and gives log depth
-at about a quarter of its size; the fine one corrects that with local features. Log depth comes
-out, exp of it is metres.
+The coarse network predicts log depth at about a quarter of the image's size, through two fully
+connected layers; the fine network corrects it with local features. Input: rgb in 0…1, 228×304, or
+172×576 for KITTI. Output: the logarithm of depth in metres, over the whole image.
 
-No weights of it are published. imran3180/depth-map-prediction trains it and writes two files of
-tensors, coarse_model_N.pth and fine_model_N.pth: put the two into a folder of their own and name
-that, `--checkpoint FOLDER`. rgb goes in as 0..1, 228 x 304 or, for KITTI, 172 x 576; the output
-covers all of it.
+No weights are published. imran3180/depth-map-prediction trains it and writes two files,
+coarse_model_N.pth and fine_model_N.pth: put both into a folder, `--checkpoint FOLDER`.
 
-The paper of this method goes back into the coarse network; where, it does not say. Here z is what
-its last convolution gives, before the ReLU. Own code from the papers and the layers' names.
+The paper of this method cuts the coarse network and does not say where. Here z is the output of its
+last convolution, before the ReLU. Own code from the papers and the layers' names.
 """
 
 from __future__ import annotations
@@ -36,12 +34,12 @@ KITTI = (172, 576)
 
 
 def out_size(length: int) -> int:
-    """Rows or columns of the output for an input of that length: about a quarter."""
+    """Returns the rows or columns of the output for those of the input: about a quarter."""
     return (length - 11) // 4 + 1
 
 
 def deep_size(length: int) -> int:
-    """Rows or columns of the coarse network's last feature map: about a 32nd."""
+    """Returns the rows or columns of the coarse network's last feature map: about a 32nd."""
     return (out_size(length) // 2 // 2 - 3) // 2 + 1
 
 
@@ -92,7 +90,7 @@ class Fine(nn.Module):
 
 
 class Eigen(nn.Module):
-    """Log depth (B, 1, h, w), a quarter of the size, from rgb (B, 3, H, W) of the one `size`."""
+    """Log depth (B, 1, h, w), a quarter of the size, from rgb (B, 3, H, W) of `size` only."""
 
     def __init__(
         self,
@@ -112,10 +110,13 @@ class Eigen(nn.Module):
 
 
 def read_two_files(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """The tensors of a coarse and a fine file under the names of `Eigen`.
+    """Returns the tensors of a coarse and a fine file under the names of `Eigen`.
 
-    The file's name comes before each tensor's, as in "coarse_model_12.conv1.weight". ValueError for
-    one file without the other, or for two of a kind.
+    Args:
+        state: Each name is preceded by that of its file, as in "coarse_model_12.conv1.weight".
+
+    Raises:
+        ValueError: One of the two files is missing, or there are two of a kind.
     """
     if "fc1.weight" in state or "conv3.weight" in state:
         part = "coarse" if "fc1.weight" in state else "fine"
@@ -123,15 +124,15 @@ def read_two_files(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
             f"this is the {part} network only; name a folder with one file coarse*.pth and one"
             " fine*.pth in it"
         )
-    found: dict[str, Tensor] = {}
+    renamed: dict[str, Tensor] = {}
     files: dict[str, str] = {}
     for name, tensor in state.items():
         file, _, rest = name.partition(".")
         part = next((p for p in ("coarse", "fine") if file.startswith(p)), file)
         if files.setdefault(part, file) != file:
             raise ValueError(f"{files[part]} and {file} are both the {part} network; keep one")
-        found[f"{part}.{rest}"] = tensor
-    return found
+        renamed[f"{part}.{rest}"] = tensor
+    return renamed
 
 
 LAYERS = ("coarse.conv2", "coarse.conv3", "coarse.conv4", "coarse.conv5", "coarse.fc1", "coarse")

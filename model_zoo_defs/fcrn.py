@@ -1,16 +1,15 @@
 """`fcrn`, a residual network with up-projections (Laina et al., 3DV 2016), metres.
 
 ResNet-50 down to 1/32, one convolution without a non-linearity (the paper's z), four
-up-projections to about half the size. The graph is that of the authors' own code, in what ports
-get wrong too: strides on the first 1 x 1 convolution of a stage, a bias in `conv1` and `layer1`,
-pooling padded as TensorFlow does, an up-projection as four small convolutions whose outputs
+up-projections to about half the size. The graph is that of the authors' own code, including what
+ports get wrong: strides on the first 1×1 convolution of a stage, a bias in `conv1` and `layer1`,
+TensorFlow's padding of the pooling, up-projections as four small convolutions whose outputs
 interleave, and a last ReLU.
 
-rgb goes in as 0..255, 228 x 304, no mean taken off; 128 x 160 metres come out. The authors'
-`NYU_ResNet-UpProj.npy` (iro-cp/FCRN-DepthPrediction, Simplified BSD) loads, and so does their
-TensorFlow checkpoint, which is easier to find today: `--checkpoint NYU_FCRN.ckpt.index`. numpy
-would run the pickle in the former, here nothing is run. Files of PyTorch ports do not load: their
-networks differ.
+Input: rgb in 0…255, 228×304, no mean subtracted. Output: depth in metres, 128×160. The authors'
+`NYU_ResNet-UpProj.npy` (iro-cp/FCRN-DepthPrediction, Simplified BSD) loads; the pickle in it is
+not run. Their TensorFlow checkpoint, easier to find today, loads too:
+`--checkpoint NYU_FCRN.ckpt.index`. Files of PyTorch ports do not load: their networks differ.
 Own code from the paper and from what is known of that graph.
 """
 
@@ -41,12 +40,12 @@ UP_PROJECTIONS = ("layer2x", "layer4x", "layer8x", "layer16x")
 
 
 def batch_norm(channels: int) -> nn.BatchNorm2d:
-    """A batch normalisation as the authors have it."""
+    """Returns a batch normalisation with the authors' epsilon."""
     return nn.BatchNorm2d(channels, eps=1e-4)
 
 
 class MaxPoolSame(nn.Module):
-    """The largest of 3 x 3 at stride 2, padded as SAME."""
+    """3×3 max pooling at stride 2 with TensorFlow's SAME padding."""
 
     def forward(self, x: Tensor) -> Tensor:
         rows, columns = (same_padding(length, 3, 2) for length in x.shape[-2:])
@@ -54,7 +53,7 @@ class MaxPoolSame(nn.Module):
 
 
 class Bottleneck(nn.Module):
-    """1 x 1 (with the stride), 3 x 3, 1 x 1, added to the input or to its 1 x 1 projection."""
+    """1×1 (with the stride), 3×3, 1×1, added to the input or to its 1×1 projection."""
 
     def __init__(self, channels: int, middle: int, stride: int, *, project: bool) -> None:
         super().__init__()
@@ -78,7 +77,7 @@ class Bottleneck(nn.Module):
 
 
 class Unpooling(nn.Module):
-    """Twice the size: four convolutions, each of which gives every other row and column."""
+    """Twice the size: four convolutions whose outputs interleave, each a quarter of the pixels."""
 
     def __init__(self, channels: int, out: int) -> None:
         super().__init__()
@@ -120,7 +119,7 @@ class UpProjection(nn.Module):
 class FCRN(nn.Module):
     """Depth (B, 1, 128, 160) in metres from rgb (B, 3, 228, 304).
 
-    Any other size goes too: the output is 16 times the 32nd of it, rounded up.
+    At any other input size, the output's sides are 16 × ⌈side / 32⌉.
     """
 
     def __init__(self, width: int = 64) -> None:
@@ -145,7 +144,9 @@ class FCRN(nn.Module):
             self.add_module(name, UpProjection(channels))
             channels //= 2
         self.ConvPred = nn.Conv2d(channels, 1, 3, padding=1)
-        self.ConvPred.bias = nn.Parameter(torch.full((1,), 2.0))  # at 0 m the ReLU may stay shut
+        self.ConvPred.bias = nn.Parameter(
+            torch.full((1,), 2.0)
+        )  # at 0 m the ReLU would pass no gradient
 
     def forward(self, rgb: Tensor) -> Tensor:
         x = self.pool(self.relu(self.bn_conv1(self.conv1(rgb))))
@@ -173,34 +174,39 @@ PORTS = {
 
 
 def read_authors(state: Mapping[str, Tensor]) -> Mapping[str, Tensor]:
-    """The state dict from the authors' arrays or variables, such as "res2a_branch2a.weights".
+    """Returns the state dict from the authors' arrays or variables.
 
-    Their kernels are (rows, columns, in, out). A state dict of `FCRN` stays as it is. ValueError
-    for a port's file, KeyError for an array that has no place.
+    Args:
+        state: Names such as "res2a_branch2a.weights", kernels (rows, columns, in, out); or a state
+            dict of `FCRN`, which is returned as it is.
+
+    Raises:
+        ValueError: The file is of a PyTorch port.
+        KeyError: An array is of no known kind.
     """
     for name, port in PORTS.items():
         if name in state:
             raise ValueError(
-                f"this is of the port {port}, another network (strides, biases, interleaving);"
+                f"this is of the port {port}, a different network (strides, biases, interleaving);"
                 " take the authors' NYU_ResNet-UpProj.npy"
             )
     if "conv1.weights" not in state:
         return state
-    found = {}
+    renamed = {}
     for name, tensor in state.items():
         layer, _, kind = name.rpartition(".")
         if layer in state or name in COUNTERS:
             continue  # the optimiser's own, such as conv1.weights.Momentum
         if kind not in KINDS:
             raise KeyError(f"{name} is none of {', '.join(KINDS)}")
-        found[f"{module_of(layer)}.{KINDS[kind]}"] = (
+        renamed[f"{module_of(layer)}.{KINDS[kind]}"] = (
             tensor.permute(3, 2, 0, 1) if kind == "weights" else tensor
         )
-    return found
+    return renamed
 
 
 def module_of(layer: str) -> str:
-    """The module that the authors call so: bn2a_branch2b is res2a.bn_branch2b."""
+    """Returns the submodule for an authors' name: bn2a_branch2b is res2a.bn_branch2b."""
     layer = re.sub(r"^bn(\d[a-f])_", r"res\1.bn_", layer)
     layer = re.sub(r"^(res\d[a-f])_", r"\1.", layer)
     layer = re.sub(r"^(layer\d+x)_", r"\1.", layer)

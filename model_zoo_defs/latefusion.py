@@ -1,15 +1,15 @@
 """Late fusion of rgb and sparse depth (Jaritz et al., 3DV 2018): two NASNet encoders, one decoder.
 
-Own building from the paper; neither code nor weights of the authors' are public. From the paper:
-an encoder of NASNet cells for each modality, no batch norm behind their first strided convolution
-(zeros of the sparse map would move its statistics), no mask of known pixels, fusion by putting
-both encoders' features side by side before the decoder, skips, and inverse depth as what is learnt.
-Chosen here, as no public source settles them: NASNet-A as its mobile edition (4 cells a stage,
-44 filters), skips from both encoders, a decoder of bilinear enlargement and one 3×3 convolution a
-level up to 1/2, and softplus for inverse depth, which keeps depth between 0 and 200 m.
+Own implementation of the paper; the authors published neither code nor weights. From the paper: an
+encoder of NASNet cells for each modality, no batch norm behind its first strided convolution (the
+zeros of the sparse map would shift the statistics), no mask of known pixels, both encoders'
+features concatenated before the decoder, skips, and training on inverse depth. Chosen here, as no
+public source says: the mobile NASNet-A (4 cells a stage, 44 filters), skips from both encoders, a
+decoder of bilinear upsampling and one 3×3 convolution a level up to 1/2, and softplus for inverse
+depth, which keeps depth between 0 and 200 m.
 
-rgb is (x − 0.5) / 0.5, sparse depth metres (0 = unknown); H and W are multiples of 32. The
-paper's z (Wang et al.) is "the 8× feature map": here the decoder's, which has seen both encoders.
+Input: rgb as (x − 0.5) / 0.5, sparse depth in metres (0 = unknown); H and W are multiples of 32.
+Output: depth in metres. The paper's z (Wang et al.) is "the 8× feature map": here the decoder's.
 """
 
 from __future__ import annotations
@@ -34,12 +34,12 @@ LEVELS = ("s16", "s8", "s4", "s2")
 
 
 def pointwise(channels: int, out: int) -> nn.Sequential:
-    """ReLU, 1×1 convolution, batch norm: brings features to `out` channels."""
+    """Returns ReLU, 1×1 convolution, batch norm: `channels` → `out` channels."""
     return nn.Sequential(nn.ReLU(), nn.Conv2d(channels, out, 1, bias=False), nn.BatchNorm2d(out))
 
 
 def separable(channels: int, out: int, kernel: int, stride: int = 1) -> nn.Sequential:
-    """ReLU, separable convolution, batch norm, twice; the first has the stride."""
+    """Returns ReLU, separable convolution, batch norm, twice; the first has the stride."""
     parts: list[nn.Module] = []
     for count, step in ((channels, stride), (out, 1)):
         parts += [
@@ -52,7 +52,7 @@ def separable(channels: int, out: int, kernel: int, stride: int = 1) -> nn.Seque
 
 
 class Halved(nn.Module):
-    """Features at half the size: every other pixel, and every other one from (1, 1) on."""
+    """Features at half the size: of the pixels (2i, 2j), and of the pixels (2i + 1, 2j + 1)."""
 
     def __init__(self, channels: int, out: int) -> None:
         super().__init__()
@@ -67,19 +67,23 @@ class Halved(nn.Module):
 
 
 def fitted(channels: int, width: int, halved: bool) -> nn.Module:
-    """What brings the earlier features to the later ones' size and `width` channels."""
+    """Returns a layer that brings earlier features to `width` channels and the later ones' size."""
     return Halved(channels, width) if halved else pointwise(channels, width)
 
 
 def averaged(x: Tensor, stride: int = 1) -> Tensor:
-    """The mean of 3×3 pixels, those outside not counted."""
+    """Returns the mean of 3×3 pixels; those outside are not counted."""
     return F.avg_pool2d(x, 3, stride, 1, count_include_pad=False)
 
 
 class NormalCell(nn.Module):
     """NASNet-A's normal cell on the last two features: 6·width channels, same size.
 
-    halved: the earlier features are twice as large as the later ones.
+    Args:
+        earlier: Channels of the features before the last.
+        later: Channels of the last features.
+        width: Channels inside the cell.
+        halved: Whether the earlier features are twice as large as the later ones.
     """
 
     def __init__(self, earlier: int, later: int, width: int, *, halved: bool) -> None:
@@ -107,7 +111,11 @@ class NormalCell(nn.Module):
 class ReductionCell(nn.Module):
     """NASNet-A's reduction cell on the last two features: 4·width channels, half the size.
 
-    earlier None: there are none yet; the later ones take their place as they are.
+    Args:
+        earlier: Channels of the features before the last; None if there are none yet.
+        later: Channels of the last features.
+        width: Channels inside the cell.
+        halved: Whether the earlier features are twice as large as the later ones.
     """
 
     def __init__(self, earlier: int | None, later: int, width: int, *, halved: bool) -> None:
@@ -132,7 +140,7 @@ class ReductionCell(nn.Module):
 
 
 class Stage(nn.Module):
-    """A reduction cell and `count` normal ones; the last two features in, the last two out."""
+    """A reduction cell and `count` normal cells: the last two features → the last two features."""
 
     def __init__(
         self,
@@ -164,7 +172,7 @@ class Encoder(nn.Module):
     def __init__(self, channels: int, width: int, cells: int) -> None:
         super().__init__()
         stem = width * 8 // 11  # NASNet's 32 before its 44
-        self.stem = nn.Conv2d(channels, stem, 3, 2, 1)  # no batch norm behind it, as in the paper
+        self.stem = nn.Conv2d(channels, stem, 3, 2, 1)  # without batch norm, as in the paper
         earlier, later, halved = None, stem, False
         self.channels = [stem]
         self.stages = nn.ModuleList()
@@ -181,22 +189,22 @@ class Encoder(nn.Module):
 
     def forward(self, x: Tensor) -> list[Tensor]:
         later = self.stem(x)
-        earlier, found = later, [later]
+        earlier, features = later, [later]
         for stage in self.stages:
             earlier, later = stage(earlier, later)
-            found.append(later)
-        return found
+            features.append(later)
+        return features
 
 
 def convolved(channels: int, out: int) -> nn.Sequential:
-    """3×3 convolution, batch norm, ReLU."""
+    """Returns 3×3 convolution, batch norm, ReLU."""
     return nn.Sequential(
         nn.Conv2d(channels, out, 3, padding=1, bias=False), nn.BatchNorm2d(out), nn.ReLU()
     )
 
 
 class Level(nn.Sequential):
-    """Features at twice the size, joined with what both encoders found there."""
+    """Features at twice the size, from coarser ones and both encoders' skips of that size."""
 
     def __init__(self, channels: int, out: int) -> None:
         super().__init__(*convolved(channels, out))
@@ -209,7 +217,9 @@ class Level(nn.Sequential):
 class LateFusion(nn.Module):
     """Depth (B, 1, H, W) in metres from rgb (B, 3, H, W) and sparse (B, 1, H, W) in metres.
 
-    width: filters of the cells at 1/8, doubled at each halving behind; cells: normal cells a stage.
+    Args:
+        width: Filters of the cells at 1/8; each later stage has twice as many.
+        cells: Normal cells a stage.
     """
 
     def __init__(self, width: int = 44, cells: int = 4) -> None:
@@ -227,10 +237,10 @@ class LateFusion(nn.Module):
         nn.init.constant_(self.inverse.bias, -1.5)  # type: ignore[arg-type]  # about 5 m
 
     def forward(self, rgb: Tensor, sparse: Tensor) -> Tensor:
-        picture, points = self.rgb(rgb), self.sparse(sparse)
-        x = self.fuse(torch.cat([picture.pop(), points.pop()], dim=1))
+        rgb_skips, sparse_skips = self.rgb(rgb), self.sparse(sparse)
+        x = self.fuse(torch.cat([rgb_skips.pop(), sparse_skips.pop()], dim=1))
         for layer in self.decoder.values():
-            x = layer(x, picture.pop(), points.pop())
+            x = layer(x, rgb_skips.pop(), sparse_skips.pop())
         x = F.interpolate(self.inverse(x), rgb.shape[-2:], mode="bilinear", align_corners=False)
         return 1 / (F.softplus(x) + 1 / FARTHEST)
 

@@ -1,8 +1,8 @@
 """Normalised convolutions for depth completion (Eldesokey, Felsberg & Khan, BMVC 2018; PAMI 2019).
 
-Depth and its confidence go through together: a layer divides the weighted sum of depth × confidence
-by that of the confidence, so that unknown pixels weigh nothing. 481 parameters, KITTI, sparse depth
-only. No weights come with it; the published checkpoints are read.
+Every layer maps depth and its confidence: the weighted sum of depth × confidence is divided by the
+weighted sum of confidence, so that unknown pixels have no weight. 481 parameters, trained on KITTI,
+sparse depth only. Published checkpoints load; no weights ship.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ class NormalisedConv(nn.Module):
         self.bias = nn.Parameter(torch.zeros(out))
 
     def positive_weight(self) -> Tensor:
-        """The weights of the sums, none negative."""
+        """Returns the weights of the sums, none of them negative."""
         return self.weight
 
     def forward(self, depth: Tensor, confidence: Tensor) -> tuple[Tensor, Tensor]:
@@ -33,12 +33,12 @@ class NormalisedConv(nn.Module):
         padding = weight.shape[-1] // 2
         total = F.conv2d(confidence, weight, padding=padding)
         depth = F.conv2d(depth * confidence, weight, padding=padding) / (total + _TINY)
-        share = total / weight.sum(dim=(1, 2, 3)).reshape(1, -1, 1, 1)
-        return depth + self.bias.reshape(1, -1, 1, 1), share
+        confidence = total / weight.sum(dim=(1, 2, 3)).reshape(1, -1, 1, 1)
+        return depth + self.bias.reshape(1, -1, 1, 1), confidence
 
 
 class NormalisedUNet(nn.Module):
-    """Three full-size layers, the same two at half, quarter and eighth size, and back up."""
+    """Layers at full, 1/2, 1/4 and 1/8 size, which share weights going down, and back up."""
 
     def __init__(self, layer: type[NormalisedConv] = NormalisedConv, channels: int = 2) -> None:
         super().__init__()
@@ -59,20 +59,20 @@ class NormalisedUNet(nn.Module):
         eighth = self.nconv2(*halved(*quarter))
         quarter = self.nconv4(*beside(quarter, eighth))
         half = self.nconv5(*beside(half, quarter))
-        full = self.nconv6(*beside(half, full))  # the other way round, as published
+        full = self.nconv6(*beside(half, full))  # in the other order, as published
         depth, confidence = self.nconv7(*full)
         return depth, confidence
 
 
 def halved(depth: Tensor, confidence: Tensor) -> tuple[Tensor, Tensor]:
-    """Each 2×2 block's most confident element; its confidence counts a quarter, as its area."""
-    kept, places = F.max_pool2d(confidence, 2, return_indices=True)
-    picked = depth.flatten(2).gather(2, places.flatten(2)).reshape(kept.shape)
-    return picked, kept / 4
+    """Returns the most confident depth of each 2×2 block, and a quarter of its confidence."""
+    largest, index = F.max_pool2d(confidence, 2, return_indices=True)
+    chosen = depth.flatten(2).gather(2, index.flatten(2)).reshape(largest.shape)
+    return chosen, largest / 4
 
 
 def beside(first: tuple[Tensor, Tensor], second: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
-    """Both pairs of maps as channels side by side, the coarser enlarged to the finer's size."""
+    """Returns both pairs concatenated along channels, the coarser upsampled to the finer's size."""
     size = max(first[0].shape[-2:], second[0].shape[-2:])
     depth, confidence = (
         torch.cat([F.interpolate(a, size), F.interpolate(b, size)], dim=1)

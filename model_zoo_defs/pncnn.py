@@ -1,8 +1,8 @@
 """Normalised convolutions whose input confidence is learned (Eldesokey et al., CVPR 2020).
 
-A small U-Net looks at the sparse depth and says how far each point is to be trusted; the normalised
-convolutions of `nconv` do the rest. This is the published `ncnn_conf` variant, 335,792 values,
-KITTI or NYU, sparse depth only. No weights come with it; the published checkpoints are read.
+A small U-Net predicts the confidence of each sparse point; the normalised convolutions of `nconv`
+complete the depth. This is the published `ncnn_conf` variant, 335,792 weights, trained on KITTI or
+NYU, sparse depth only. Published checkpoints load; no weights ship.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ class SoftplusNormalisedConv(NormalisedConv):
         del self.weight
 
     def positive_weight(self) -> Tensor:
-        """The weights of the sums, none negative."""
+        """Returns the weights of the sums, none of them negative."""
         return F.softplus(self.weight_p, beta=10)
 
 
@@ -69,7 +69,7 @@ class Down(nn.Module):
 
 
 class Up(nn.Module):
-    """Twice the size, beside the map of that size from the way down, two convolutions."""
+    """Twice the size, concatenated with the skip of that size, two convolutions."""
 
     def __init__(self, channels: int, out: int) -> None:
         super().__init__()
@@ -81,7 +81,7 @@ class Up(nn.Module):
 
 
 class Outward(nn.Module):
-    """One channel out."""
+    """A 1×1 convolution to one channel."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()

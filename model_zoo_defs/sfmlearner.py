@@ -1,12 +1,12 @@
-"""`sfmlearner`, the disparity network learnt from video alone (Zhou et al., CVPR 2017): DispNetS.
+"""`sfmlearner`, a disparity network trained on video alone (Zhou et al., CVPR 2017): DispNetS.
 
-An encoder of seven strided steps, a decoder of seven steps up with the encoder's features beside
-them, and the coarser disparity beside those of the last three. What comes out is
-10 · sigmoid + 0.01, an inverse depth up to one factor per picture: the points fix it.
+An encoder of seven strided steps and a decoder of seven steps with skips; the last three also take
+the coarser disparity. Output: 10 · sigmoid + 0.01, inverse depth up to one factor per image, which
+the alignment with the points fits.
 
 Layers, names and sizes are those of ClementPinard/SfmLearner-Pytorch, whose
 `dispnet_model_best.pth.tar` ({"epoch", "state_dict"}) loads. The paper's z is the bottleneck,
-512 x 1 x 4; the features beside the decoder stay as they are.
+512×1×4; the skips stay as they are.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ PREDICTED = (1, 2, 3, 4)  # the levels that predict a disparity; 1 is full size
 
 
 def down(channels: int, out: int, kernel: int) -> nn.Sequential:
-    """Half the size: a strided convolution and another one."""
+    """Returns a strided convolution and another one: half the size."""
     padding = (kernel - 1) // 2
     return nn.Sequential(
         nn.Conv2d(channels, out, kernel, stride=2, padding=padding),
@@ -39,7 +39,7 @@ def down(channels: int, out: int, kernel: int) -> nn.Sequential:
 
 
 def up(channels: int, out: int) -> nn.Sequential:
-    """Twice the size."""
+    """Returns a transposed convolution: twice the size."""
     return nn.Sequential(
         nn.ConvTranspose2d(channels, out, 3, stride=2, padding=1, output_padding=1),
         nn.ReLU(inplace=True),
@@ -47,17 +47,17 @@ def up(channels: int, out: int) -> nn.Sequential:
 
 
 def joined(channels: int, out: int) -> nn.Sequential:
-    """What lies side by side becomes one feature map."""
+    """Returns a convolution of concatenated features."""
     return nn.Sequential(nn.Conv2d(channels, out, 3, padding=1), nn.ReLU(inplace=True))
 
 
 def disparity(channels: int) -> nn.Sequential:
-    """Disparity of one level, in 0…1."""
+    """Returns the layers that predict the disparity of one level, in 0…1."""
     return nn.Sequential(nn.Conv2d(channels, 1, 3, padding=1), nn.Sigmoid())
 
 
 def cropped(x: Tensor, like: Tensor) -> Tensor:
-    """The upper left part of x that is as large as `like`."""
+    """Returns the upper left part of x of the size of `like`."""
     return x[..., : like.shape[-2], : like.shape[-1]]
 
 
@@ -73,12 +73,12 @@ class DispNet(nn.Module):
             step = down(channels, encoded[level - 1], DOWN_KERNELS[level - 1])
             self.add_module(f"conv{level}", step)
         for level in range(7, 0, -1):
-            below = decoded[level] if level < 7 else encoded[-1]
+            coarser = decoded[level] if level < 7 else encoded[-1]
             out = decoded[level - 1]
-            beside = encoded[level - 2] if level > 1 else 0
-            hint = 1 if level < max(PREDICTED) else 0
-            self.add_module(f"upconv{level}", up(below, out))
-            self.add_module(f"iconv{level}", joined(out + beside + hint, out))
+            skip = encoded[level - 2] if level > 1 else 0
+            coarse_disparity = 1 if level < max(PREDICTED) else 0
+            self.add_module(f"upconv{level}", up(coarser, out))
+            self.add_module(f"iconv{level}", joined(out + skip + coarse_disparity, out))
             if level in PREDICTED:
                 self.add_module(f"predict_disp{level}", disparity(out))
         for layer in self.modules():
@@ -91,19 +91,19 @@ class DispNet(nn.Module):
         return self.pyramid(rgb)[0]
 
     def pyramid(self, rgb: Tensor) -> list[Tensor]:
-        """Disparities at full, 1/2, 1/4 and 1/8 size; training looks at all of them."""
+        """Returns disparities at full, 1/2, 1/4 and 1/8 size; the training loss is on all four."""
         features = [rgb]
         for level in range(1, 8):
             features.append(self.get_submodule(f"conv{level}")(features[-1]))
         x = features.pop()
         disparities: list[Tensor] = []
         for level in range(7, 0, -1):
-            beside = features.pop()
-            x = cropped(self.get_submodule(f"upconv{level}")(x), beside)
-            parts = [x, beside] if level > 1 else [x]
+            skip = features.pop()
+            x = cropped(self.get_submodule(f"upconv{level}")(x), skip)
+            parts = [x, skip] if level > 1 else [x]
             if disparities:
                 larger = F.interpolate(disparities[-1], scale_factor=2.0, mode="bilinear")
-                parts.append(cropped(larger, beside))
+                parts.append(cropped(larger, skip))
             x = self.get_submodule(f"iconv{level}")(torch.cat(parts, dim=1))
             if level in PREDICTED:
                 disparities.append(GAIN * self.get_submodule(f"predict_disp{level}")(x) + FLOOR)
@@ -111,7 +111,11 @@ class DispNet(nn.Module):
 
 
 def read_published(state: Mapping[str, Tensor]) -> Mapping[str, Tensor]:
-    """The state dict as it is. ValueError for the pose network, which is published beside it."""
+    """Returns the state dict as it is.
+
+    Raises:
+        ValueError: It is that of the pose network, which is published beside it.
+    """
     if "pose_pred.weight" in state:
         raise ValueError("this is the pose network; the other file, dispnet_…, gives disparity")
     return state

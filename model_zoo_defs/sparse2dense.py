@@ -1,15 +1,15 @@
 """Sparse-to-dense (Ma & Karaman, ICRA 2018): a ResNet encoder on rgb and sparse depth, a decoder.
 
-rgb (0..1, neither mean nor deviation taken off) and sparse depth in metres (0 = unknown) are
-stacked to four channels. The encoder goes down to 1/32, a 1×1 convolution with batch norm halves
-its channels (the paper's z: no ReLU follows), four decoder layers go up to 1/2, and a bilinear
-resize (corners aligned) gives depth in metres at the size of the input; nothing keeps it positive.
+Input: rgb in 0…1 and sparse depth in metres (0 = unknown), concatenated to four channels. The
+encoder goes down to 1/32, a 1×1 convolution with batch norm halves its channels (the paper's z: no
+ReLU follows), four decoder layers go up to 1/2, and a bilinear resize (corners aligned) gives depth
+in metres at the size of the input; it may be negative.
 
-The authors trained at 228×304 (NYU) and 228×912 (KITTI), with any of four decoders. Their 228×912
-are cut out of a frame at its own scale; so do `batch` and `eval` with folders of KITTI, while
-`refine` shrinks a whole frame until its columns fit, which costs metric scale. Written from
-facts of fangchangma/sparse-to-dense.pytorch; names of parameters are its own. The weights are the
-authors'; that repository names no licence, so none come with this one.
+The authors trained at 228×304 (NYU) and 228×912 (KITTI), with each of four decoders. They crop
+228×912 from a frame without resizing it; so do `batch` and `eval` with KITTI folders, while
+`refine` shrinks a whole frame until its columns fit, which costs metric scale. Written from the
+published description of fangchangma/sparse-to-dense.pytorch; parameter names are the same. That
+repository names no licence for its weights, so none ship.
 """
 
 from __future__ import annotations
@@ -33,10 +33,10 @@ CHANNELS: dict[InputKind, int] = {"rgb": 3, "sparse": 1, "rgb+sparse": 4}
 
 
 class Unpooled(nn.Conv2d):
-    """A 5×5 convolution of the input with zeros put between its pixels: (B, c, h, w) → 2h × 2w.
+    """A 5×5 convolution of the input with zeros between its pixels: (B, c, h, w) → 2h × 2w.
 
-    Pixel (i, j) goes to (2i, 2j), the rest is 0. Done as the transposed convolution that it is,
-    which never multiplies those zeros.
+    Pixel (i, j) moves to (2i, 2j), the others are 0. Computed as the equal transposed convolution,
+    which does not multiply those zeros.
     """
 
     def __init__(self, channels: int, out: int) -> None:
@@ -48,7 +48,7 @@ class Unpooled(nn.Conv2d):
 
 
 class UpProjection(nn.Module):
-    """Two convolutions beside one, both on the unpooled input (Laina et al. 2016)."""
+    """A branch of two convolutions plus one of one, both on the unpooled input (Laina et al.)."""
 
     def __init__(self, channels: int, out: int) -> None:
         super().__init__()
@@ -70,7 +70,7 @@ class UpProjection(nn.Module):
 
 
 def decoder_layer(kind: Decoder, channels: int) -> nn.Module:
-    """One layer of the decoder: (B, channels, h, w) → (B, channels/2, 2h, 2w)."""
+    """Returns one layer of the decoder: (B, channels, h, w) → (B, channels/2, 2h, 2w)."""
     out = channels // 2
     if kind == "upproj":
         return UpProjection(channels, out)
@@ -85,8 +85,13 @@ def decoder_layer(kind: Decoder, channels: int) -> nn.Module:
 
 
 class SparseToDense(nn.Module):
-    """Depth (B, 1, H, W) in metres from what `input_kind` names: rgb (B, 3, H, W), sparse
-    (B, 1, H, W) metres, or both in this order. `width` is that of the first stage, 64 as published.
+    """Depth (B, 1, H, W) in metres from rgb (B, 3, H, W), sparse depth (B, 1, H, W), or both.
+
+    Args:
+        depth: Layers of the ResNet encoder, 18 or 50.
+        decoder: The kind of its decoder layers.
+        input_kind: What its forward takes, in this order.
+        width: Channels of the first stage, 64 as published.
     """
 
     def __init__(
@@ -130,7 +135,7 @@ TINY = partial(SparseToDense, 18, "upproj", width=16)
 
 
 def published(depth: int, decoder: Decoder, modality: str, place: str) -> ModelDefinition:
-    """The definition of one published variant."""
+    """Returns the definition of one published variant."""
     return ModelDefinition(
         name=f"sparse2dense-r{depth}-{decoder}{modality}{place}",
         summary=f"ResNet-{depth} with the {decoder} decoder, {'KITTI' if place else 'NYU'} size",
@@ -145,7 +150,7 @@ def published(depth: int, decoder: Decoder, modality: str, place: str) -> ModelD
 
 
 def tiny(place: str) -> ModelDefinition:
-    """The small edition that comes with the program, for one picture size."""
+    """Returns the definition of the small edition that ships, for one image size."""
     return ModelDefinition(
         name=f"sparse2dense-tiny{place}",
         summary=f"sparse2dense-r18-upproj at a quarter of its width, trained on {SCENES[place]}",

@@ -1,17 +1,17 @@
 """Sparsity-invariant CNN (Uhrig et al., 3DV 2017): convolutions that count known pixels only.
 
-Sparse depth in metres (0 = unknown) goes in, dense depth in metres comes out, at any size. Five
-layers (11, 7, 5, 3, 3; 16 channels) carry a mask of known pixels beside the features, and a last
-1×1 convolution gives depth. The paper's z is the features behind the first layer; its mask stays.
+Input: sparse depth in metres (0 = unknown), any size. Output: dense depth in metres. Five layers
+(11, 7, 5, 3, 3; 16 channels) map features and a mask of known pixels; a last 1×1 convolution gives
+depth. The paper's z is the features behind the first layer; the mask is not changed.
 
-Two forms of the network are around:
-- `sparseconv`, the port most used (yxgeee/DepthComplete, MIT): a layer divides by the number of
-  known values over all its input channels, the last convolution sees features and mask (17 → 1).
-- `sparseconv-nomask`, the paper's and that of nchodosh/Super-LiDAR (no licence named), on which
-  Wang et al. built: a layer divides by the number of known pixels, the last convolution sees the
-  features alone. Its TensorFlow variables (`sp_conv1/kernel` … `conv/kernel`) are read from .npz.
+There are two forms of the network:
+- `sparseconv`, the most used port (yxgeee/DepthComplete, MIT): a layer divides by the number of
+  known values over all its input channels; the last convolution takes features and mask (17 → 1).
+- `sparseconv-nomask`, that of the paper and of nchodosh/Super-LiDAR (no licence named), which Wang
+  et al. used: a layer divides by the number of known pixels; the last convolution takes the
+  features only. Its TensorFlow variables (`sp_conv1/kernel` … `conv/kernel`) are read from .npz.
 
-Written from facts of both; the weights are their authors', none but `-tiny` come with this.
+Written from the published description of both. Only the weights of `-tiny` ship.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from pnpdepth_cli.models.definition import ModelDefinition, Multiple, RefineDefa
 KERNELS = (11, 7, 5, 3, 3)
 CHANNELS = 16
 TUNED = RefineDefaults(layer="sparse_convs.1[0]", lr="3%", update="adam")  # of `-tiny`
-FEWEST = 1e-5  # what the port divides by where nothing is known
+MIN_COUNT = 1e-5  # what the port divides by where nothing is known
 EPSILON = 1e-8  # what the paper's form adds to the number of known pixels
 VARIABLES = {  # of Super-LiDAR
     "conv/kernel": "mask_conv.weight",
@@ -46,15 +46,15 @@ class SparseConv(nn.Module):
         self.per_channel = per_channel
         self.conv = nn.Conv2d(channels, out, kernel, padding=kernel // 2, bias=False)
         self.bias = nn.Parameter(torch.zeros(out))
-        # Untrained, the layers average what they know, each with weights of its own.
-        share = 1 if per_channel else 1 / channels
-        self.conv.weight.data.normal_(share, share)
+        # Untrained, every layer averages its known inputs with random weights.
+        mean = 1 if per_channel else 1 / channels
+        self.conv.weight.data.normal_(mean, mean)
 
     def forward(self, x: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
         kernel = self.conv.kernel_size[0]
         known = F.avg_pool2d(mask, kernel, 1, kernel // 2, divisor_override=1)
         per_channel = self.per_channel
-        count = (known * x.shape[1]).clamp_min(FEWEST) if per_channel else known + EPSILON
+        count = (known * x.shape[1]).clamp_min(MIN_COUNT) if per_channel else known + EPSILON
         x = self.conv(x * mask) / count + self.bias.reshape(1, -1, 1, 1)
         return x, F.max_pool2d(mask, kernel, 1, kernel // 2)
 
@@ -74,7 +74,10 @@ class Block(nn.Module):
 class SparseConvNet(nn.Module):
     """Sparse depth (B, 1, H, W) in metres, 0 = unknown → depth (B, 1, H, W) in metres.
 
-    with_mask: the last convolution sees the mask too, and layers count per input channel.
+    Args:
+        with_mask: Whether the last convolution takes the mask too, and layers count known values
+            over all input channels.
+        width: Channels of the features.
     """
 
     def __init__(self, *, with_mask: bool = True, width: int = CHANNELS) -> None:
@@ -97,16 +100,16 @@ class SparseConvNet(nn.Module):
 
 
 def from_tensorflow(state: Mapping[str, Tensor]) -> Mapping[str, Tensor]:
-    """Super-LiDAR's variables under this file's names; any other state dict as it is."""
+    """Returns Super-LiDAR's variables under this file's names; any other state dict as it is."""
     if "conv/kernel" not in state:
         return state
-    found = {
+    renamed = {
         VARIABLES.get(name, name): tensor.permute(3, 2, 0, 1)
         if name.endswith("/kernel")
         else tensor.flatten()
         for name, tensor in state.items()
     }
-    return {"mask_conv.bias": torch.zeros(1), **found}  # theirs has none
+    return {"mask_conv.bias": torch.zeros(1), **renamed}  # theirs has none
 
 
 def _definition(name: str, summary: str, with_mask: bool = True) -> ModelDefinition:

@@ -6,7 +6,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import TYPE_CHECKING, TypedDict
 
 import numpy as np
 import torch
@@ -28,6 +28,9 @@ from pnpdepth_cli.pipeline.refinement.resolve import (
     resolve_settings,
 )
 from pnpdepth_cli.points import SparsePoints
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
 
 FULL_SCALE = {np.dtype(np.uint8): 255.0, np.dtype(np.uint16): 65535.0}
 """Value of white by the type of an image's integers."""
@@ -72,6 +75,18 @@ def load_network(
     """
     path = None if checkpoint is None else Path(checkpoint)
     return networks.load_network(spec, path, device, precision=precision)
+
+
+class RefinerOptions(TypedDict, total=False):
+    """The options of `Refiner`."""
+
+    layer: str | None
+    settings: RefineSettings | None
+    propagate: str | None
+    auto: bool
+    uncertainty: bool
+    tile: int | None
+    seed: int
 
 
 class Refiner:
@@ -164,7 +179,7 @@ class Refiner:
         return refined
 
     def _resolve(self, inputs: Inputs) -> pipeline.Refiner:
-        network = resolve_definition(self._network, inputs, self._request.network)
+        network = resolve_definition(self._network, inputs.frame(), self._request.network)
         return pipeline.Refiner(
             request=self._request,
             network=network,
@@ -177,9 +192,20 @@ def refine(
     network: Network,
     image: ArrayLike | None,
     sparse: ArrayLike | SparsePoints,
-    **options: Any,
+    **options: Unpack[RefinerOptions],
 ) -> Refined:
-    """Returns the refined depth of one frame; see `Refiner` for the options."""
+    """Returns the refined depth of one frame.
+
+    Args:
+        network: From `load_network`.
+        image: As of `Refiner.refine`.
+        sparse: As of `Refiner.refine`.
+        **options: As of `Refiner`.
+
+    Raises:
+        InputError: Image or points cannot be used.
+        DivergedError: As of `Refiner.refine`.
+    """
     with Refiner(network, **options) as refiner:
         return refiner.refine(image, sparse)
 
@@ -204,14 +230,15 @@ def score(
     arrays = [np.asarray(values, dtype=np.float32) for values in (depth, ground_truth)]
     if arrays[0].shape != arrays[1].shape:
         raise SizeError(f"depth is {arrays[0].shape} but ground truth is {arrays[1].shape}")
-    return score_tensors(*(torch.from_numpy(values) for values in arrays), thresholds)
+    predicted, known = (torch.from_numpy(values) for values in arrays)
+    return score_tensors(predicted, known, thresholds)
 
 
 def _inputs(image: ArrayLike | None, sparse: ArrayLike | SparsePoints) -> Inputs:
     """Returns the frame as the pipeline has it after reading its files."""
     rgb = None if image is None else _rgb(image)
     size = None if rgb is None else (rgb.shape[0], rgb.shape[1])
-    points = _points(sparse, size).in_frame(*size) if size else _points(sparse, None)
+    points = _points(sparse, size).resized(*size) if size else _points(sparse, None)
     inside = points.cropped(0, 0, *points.size)
     if not len(inside):
         raise NoPointsError(f"none of the {len(points)} sparse points lies in the image")
@@ -235,7 +262,7 @@ def _rgb(image: ArrayLike) -> NDArray[np.float32]:
 def _points(sparse: ArrayLike | SparsePoints, size: tuple[int, int] | None) -> SparsePoints:
     """Returns the points in their own frame, which is the image's for rows of x, y, depth."""
     if isinstance(sparse, SparsePoints):
-        return sparse
+        return sparse.tensors()
     values = np.asarray(sparse, dtype=np.float32)
     if values.ndim != 2:
         raise InputError(f"sparse depth has shape (H, W) or (N, 3), not {values.shape}")
@@ -253,8 +280,4 @@ def _points(sparse: ArrayLike | SparsePoints, size: tuple[int, int] | None) -> S
         depth = values[rows, columns]
     if not len(depth):
         raise NoPointsError("the sparse depth has no value above 0")
-    return SparsePoints(
-        xy=torch.from_numpy(np.ascontiguousarray(xy)),
-        depth=torch.from_numpy(np.ascontiguousarray(depth)),
-        size=size,
-    )
+    return SparsePoints(xy=xy, depth=depth, size=size).tensors()

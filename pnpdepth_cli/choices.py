@@ -64,7 +64,7 @@ class Table(Mapping[str, Any]):
 
     def __iter__(self) -> Iterator[str]:
         names = {**self._modules, **self._entry_points}
-        order = {name: place for place, name in enumerate(self._first)}
+        order = {name: index for index, name in enumerate(self._first)}
         return iter(sorted(names, key=lambda name: (order.get(name, len(order)), name)))
 
     def __len__(self) -> int:
@@ -93,7 +93,7 @@ LOSSES = Table(
     noun="loss",
     first=("l1", "l2", "huber", "berhu", "inverse", "log", "cauchy"),
 )
-"""L of equation 3: (N,) predicted and (N,) measured depth to a scalar."""
+"""L: (N,) predicted and (N,) measured depth to a scalar."""
 
 UPDATES = Table(
     "core/update_rules",
@@ -102,7 +102,7 @@ UPDATES = Table(
     noun="update rule",
     first=("sign", "sgd", "normalised", "momentum", "adam", "lbfgs"),
 )
-"""U of equation 3: each entry makes a rule that turns gradients into directions."""
+"""U: each entry creates a rule that turns gradients into directions of z."""
 
 Schedule = Literal["constant", "linear"]
 SCHEDULES: tuple[Schedule, ...] = get_args(Schedule)
@@ -165,8 +165,26 @@ FORMATS = Table(
 )
 """Depth file formats: `pnpdepth_cli.io.formats.DepthFormat`."""
 
-PROPAGATIONS = ("none", "gp", "diffusion")
-"""How the residual at the points is propagated."""
+PROPAGATIONS = Table(
+    "completion/propagations",
+    "propagation",
+    group="propagations",
+    noun="propagation",
+    first=("gp", "diffusion"),
+)
+"""How the residual at the points is propagated: `pnpdepth_cli.completion.propagation`."""
+
+BASELINES = Table(
+    "completion/baselines",
+    "baseline",
+    group="baselines",
+    noun="baseline",
+    first=(
+        *("nearest", "linear", "linear-log", "idw", "morphological", "median", "scale", "affine"),
+        *("scale-disparity", "affine-disparity", "local"),
+    ),
+)
+"""Dense depth without refinement: `pnpdepth_cli.completion.baseline`."""
 
 LAYOUTS = Table(
     "io/layouts",
@@ -188,3 +206,21 @@ PATTERNS = ("uniform", "bernoulli", "grid", "lines", "features", "edges", "regio
 
 SENSORS = ("vlp-16", "vlp-32c", "hdl-32e", "hdl-64e")
 """LiDARs by data sheet; `pnpdepth_cli.sensors.LIDARS` has the paper's of each as "paper-<name>"."""
+
+EVAL_PROTOCOLS = ("paper", "nyu", "kitti", "kitti-devkit", "eigen", "garg")
+"""Published ways to score depth: `pnpdepth_cli.pipeline.evaluation.protocols.PROTOCOLS`."""
+
+AVERAGES = ("per-image", "pooled")
+"""How errors are averaged: every image or every pixel has equal weight."""
+
+RESIZES = ("nearest", "bilinear")
+"""How a prediction of another size is resized to the ground truth."""
+
+MISSING = ("skip", "min", "max", "fail")
+"""Empty predictions are not scored, scored as the lower or the upper bound, or refused."""
+
+SCALINGS = ("none", "median", "affine", "affine-disparity", "log")
+"""How the prediction of an image is scaled to its ground truth: `pipeline.evaluation.scaling`."""
+
+PREDICTION_KINDS = ("depth", "disparity")
+"""What the files of a prediction hold."""

@@ -2,21 +2,21 @@
 
     PnpDepthError                1  our own bug, when raised as itself
     ├── UsageError               2  an option or argument makes no sense
-    │   └── OutputError          2  the place to write to cannot be used
-    │       └── StorageError     2  nothing more can be written there: it is full, say
-    ├── InputError               3  a file with image or depth data is at fault
-    │   ├── FileFormatError      3  it cannot be read as what it should be
-    │   ├── SizeError            3  image, sparse depth and ground truth do not fit together
+    │   └── OutputError          2  the output path cannot be used
+    │       └── StorageError     2  nothing more can be written: full, gone or read-only
+    ├── InputError               3  a file with image or depth data is invalid
+    │   ├── FileFormatError      3  a file is not of the expected format
+    │   ├── SizeError            3  image, sparse depth and ground truth differ in size
     │   └── NoPointsError        3  there is no sparse depth to work with
-    ├── ModelError               4  the network or its definition is at fault
-    │   ├── LayerError           4  the layer cannot be cut at
+    ├── ModelError               4  the network or its definition is invalid
+    │   ├── LayerError           4  the network cannot be cut at the layer
     │   ├── BatchError           4  the network does not take several frames at once
     │   └── CheckpointError      4  the weights cannot be used
     ├── DivergedError            5  refinement produced non-finite numbers
     ├── DeviceError              6  the device is absent or out of memory
-    └── FramesFailedError        7  a batch went through, but not all of its frames
+    └── FramesFailedError        7  a batch finished, but some of its frames failed
 
-A message names the thing, the fact and the way out, on one line.
+A message names the object, the fact and the remedy, on one line.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from typing import Any, ClassVar
 
 
 class PnpDepthError(Exception):
-    """The root of the tree; `exit_code` is what the process returns."""
+    """The root of the tree; `exit_code` is the exit status of the process."""
 
     exit_code: ClassVar[int] = 1
 
@@ -37,25 +37,25 @@ class UsageError(PnpDepthError):
 
 
 class OutputError(UsageError):
-    """The place to write to cannot be used."""
+    """The output path cannot be used."""
 
 
 class StorageError(OutputError):
-    """Nothing more can be written there, whatever it is: the disk is full or gone, or read-only."""
+    """Nothing more can be written: the disk is full, gone or read-only."""
 
 
 class InputError(PnpDepthError):
-    """A file with image or depth data is at fault."""
+    """A file with image or depth data is invalid."""
 
     exit_code = 3
 
 
 class FileFormatError(InputError):
-    """A file cannot be read as what it should be."""
+    """A file is not of the expected format."""
 
 
 class SizeError(InputError):
-    """Image, sparse depth and ground truth do not fit together."""
+    """Image, sparse depth and ground truth differ in size."""
 
 
 class NoPointsError(InputError):
@@ -63,17 +63,17 @@ class NoPointsError(InputError):
 
 
 class ModelError(PnpDepthError):
-    """The network or its definition is at fault."""
+    """The network or its definition is invalid."""
 
     exit_code = 4
 
 
 class LayerError(ModelError):
-    """The layer cannot be cut at."""
+    """The network cannot be cut at the layer."""
 
 
 class BatchError(ModelError):
-    """The network does not take several frames at once; one at a time it may."""
+    """The network does not take several frames at once, only one at a time."""
 
 
 class CheckpointError(ModelError):
@@ -97,6 +97,6 @@ class DeviceError(PnpDepthError):
 
 
 class FramesFailedError(PnpDepthError):
-    """A batch went through, but not all of its frames."""
+    """A batch finished, but some of its frames failed."""
 
     exit_code = 7

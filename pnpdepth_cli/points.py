@@ -107,11 +107,12 @@ class SparsePoints(Generic[A]):
 
     def _row(self, x: float, y: float) -> Any:
         """(1, 2), or (2,), of the type and on the device of `xy`."""
-        if hasattr(self.xy, "new_tensor"):
-            return self.xy.new_tensor([x, y])
+        xy: Any = self.xy
+        if hasattr(xy, "new_tensor"):
+            return xy.new_tensor([x, y])
         import numpy as np
 
-        return np.array([x, y], self.xy.dtype)
+        return np.asarray((x, y), dtype=xy.dtype)
 
     def _with(self, xy: Any, depth: Any, size: tuple[int, int]) -> SparsePoints[A]:
         return SparsePoints(xy=xy, depth=depth, size=size, dropped=self.dropped)

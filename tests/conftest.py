@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import pytest
@@ -11,14 +12,23 @@ from hypothesis import settings
 settings.register_profile("steady", deadline=None, derandomize=True)
 settings.load_profile("steady")
 
+_SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
+
 
 @pytest.fixture
 def shared_data() -> Path:
-    """The real frames and weights beside the checkout; the test is skipped where they are not."""
-    folder = Path(__file__).resolve().parents[2] / "shared" / "data"
+    """The folder with real frames and weights, named by PNPDEPTH_TEST_DATA; skips without it."""
+    folder = Path(os.environ.get("PNPDEPTH_TEST_DATA", _SHARED_DATA))
     if not folder.is_dir():
-        pytest.skip("needs the real frames in ../shared/data")
+        pytest.skip(f"needs real frames in {folder}; name their folder in PNPDEPTH_TEST_DATA")
     return folder
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Marks the tests that need the real frames, so that -m "not shared_data" leaves them out."""
+    for item in items:
+        if "shared_data" in getattr(item, "fixturenames", ()):
+            item.add_marker(pytest.mark.shared_data)
 
 
 @pytest.fixture

@@ -24,8 +24,9 @@ MAY_IMPORT = {
     "io": GROUND_FLOOR,
     "completion": {*GROUND_FLOOR, "core"},
     "models": {*GROUND_FLOOR, "core", "completion"},
-    "auto": {*GROUND_FLOOR, "core", "completion", "models"},
-    "pipeline": {*GROUND_FLOOR, "core", "completion", "models", "auto", "sensors", "io"},
+    "frames": {*GROUND_FLOOR, "core", "completion", "models"},
+    "auto": {*GROUND_FLOOR, "core", "completion", "models", "frames"},
+    "pipeline": {*GROUND_FLOOR, "core", "completion", "models", "frames", "auto", "sensors", "io"},
     "cli": {*GROUND_FLOOR, "pipeline"},
     "api": {*GROUND_FLOOR, "core", "models", "pipeline"},
 }

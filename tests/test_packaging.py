@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import os
+import shutil
 import subprocess
 import sys
+import zipfile
 from pathlib import Path
 
 import pytest
@@ -54,3 +57,45 @@ def test_the_package_runs_as_a_module_like_the_command() -> None:
     wrong = subprocess.run([*command, "refin"], capture_output=True, text=True, check=False)
     assert wrong.returncode == 2
     assert "Usage: pnpdepth " in wrong.stderr
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The wheel, built from a copy of the sources."""
+    source = tmp_path_factory.mktemp("wheel")
+    for name in ("pyproject.toml", "README.md", "LICENSE"):
+        shutil.copy(ROOT / name, source)
+    for name in ("pnpdepth_cli", "model_zoo_defs"):
+        shutil.copytree(ROOT / name, source / name, ignore=shutil.ignore_patterns("__pycache__"))
+    build = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", "dist"]
+    done = subprocess.run(build, cwd=source, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    (built,) = (source / "dist").glob("*.whl")
+    return built
+
+
+def test_the_wheel_is_below_25_mb_and_has_no_training_code(wheel: Path) -> None:
+    assert wheel.stat().st_size < 25e6
+    names = zipfile.ZipFile(wheel).namelist()
+    assert "model_zoo_defs/weights/compact.safetensors" in names
+    assert not [name for name in names if "training" in name or name.startswith("tests")]
+
+
+def test_the_wheel_refines_a_sample_from_an_empty_folder(wheel: Path, tmp_path: Path) -> None:
+    zipfile.ZipFile(wheel).extractall(tmp_path / "installed")
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    sample = ROOT / "samples" / "indoor"
+    files = [str(sample / "rgb.png"), "--sparse", str(sample / "sparse.png")]
+    code = (
+        "import pnpdepth_cli; print(pnpdepth_cli.__file__)\n"
+        "from pnpdepth_cli.cli.start import main; main()"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code, "refine", *files, "-o", "out"],
+        env={**os.environ, "PYTHONPATH": str(tmp_path / "installed")},
+        cwd=empty, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert Path(done.stdout.splitlines()[0]).is_relative_to(tmp_path / "installed")
+    assert (empty / "out" / "rgb_depth.png").is_file()

@@ -1,7 +1,8 @@
-"""Every command that the README shows does what it says, on a copy of the samples."""
+"""README and docs: every command and every Python example runs, on a copy of the samples."""
 
 from __future__ import annotations
 
+import os
 import re
 import shlex
 import shutil
@@ -13,73 +14,89 @@ import pytest
 from safetensors.torch import save_file
 
 from pnpdepth_cli.models.registry import find_definition
-from pnpdepth_cli.pipeline.refinement.refine import refine_image
-from pnpdepth_cli.pipeline.refinement.request import RefineRequest
-from tests.pipeline.frames import frame_on_disk
 
 ROOT = Path(__file__).parent.parent
-README = (ROOT / "README.md").read_text()
+README = ROOT / "README.md"
+PAGES = [README, *sorted((ROOT / "docs").rglob("*.md"))]
+WRITES_FILES = ("refine", "project", "sample", "simulate")
 
 
-def shown_commands() -> list[str]:
-    """The `pnpdepth …` lines of the console blocks, continued lines joined."""
-    blocks = re.findall(r"```console\n(.*?)```", README, flags=re.DOTALL)
-    lines = "\n".join(blocks).replace("\\\n", " ").splitlines()
-    return [line.removeprefix("$ ").split("  #")[0] for line in lines if "pnpdepth " in line]
+def blocks(page: Path, language: str) -> list[str]:
+    """The code blocks of a page in this language, with or without a title."""
+    pattern = rf"^```{language}(?: [^\n]*)?\n(.*?)^```"
+    return re.findall(pattern, page.read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE)
 
 
-def arguments(command: str) -> list[str]:
-    return shlex.split(command.partition("pnpdepth ")[2])
+def shown_commands(page: Path) -> list[list[str]]:
+    """The arguments of the `pnpdepth …` lines of the console blocks, continued lines joined."""
+    lines = "\n".join(blocks(page, "console")).replace("\\\n", " ").splitlines()
+    commands = (line.removeprefix("$ ").split("  #")[0] for line in lines)
+    return [shlex.split(text.removeprefix("pnpdepth ")) for text in commands if text.strip()]
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("readme")
-    shutil.copytree(ROOT / "samples", folder / "samples")
-    return folder
+def named(page: Path) -> str:
+    return page.relative_to(ROOT).as_posix()
 
 
-def test_the_readme_shows_the_main_commands() -> None:
-    shown = {arguments(command)[0] for command in shown_commands()}
-    assert {"refine", "models", "layers"} <= shown
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A folder with the samples, and the network of the README with weights."""
+    shutil.copytree(ROOT / "samples", tmp_path / "samples")
+    (code,) = [block for block in blocks(README, "python") if "ModelDefinition(" in block]
+    (tmp_path / "my_net.py").write_text(code)
+    network = find_definition(str(tmp_path / "my_net.py")).build()
+    save_file(network.state_dict(), tmp_path / "my_net.safetensors")
+    return tmp_path
 
 
-@pytest.mark.parametrize("command", shown_commands())
-def test_a_command_of_the_readme_runs(command: str, folder: Path) -> None:
-    code = "from pnpdepth_cli.cli.main import main; main()"
+def run(arguments: list[str], folder: Path) -> str:
+    """What the finished Python process printed. Fails with its stderr if it failed."""
     done = subprocess.run(
-        [sys.executable, "-c", code, *arguments(command), *overwrite(command)],
+        [sys.executable, *arguments],
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
         capture_output=True,
         text=True,
         check=False,
         cwd=folder,
     )
     assert done.returncode == 0, done.stderr
+    return done.stdout
 
 
-def overwrite(command: str) -> list[str]:
-    writes = arguments(command)[0] in ("refine", "project", "sample", "simulate")
-    return ["--overwrite"] if writes else []
+def test_the_readme_shows_the_main_commands() -> None:
+    shown = {arguments[0] for arguments in shown_commands(README)}
+    assert {"refine", "batch"} <= shown
 
 
-def test_the_network_of_the_readme_is_refined(tmp_path: Path) -> None:
-    (code,) = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)
-    frame = frame_on_disk(tmp_path)
-    (tmp_path / "my_net.py").write_text(code)
-    network = find_definition(str(tmp_path / "my_net.py")).build()
-    save_file(network.state_dict(), tmp_path / "my_net.safetensors")
-    outcome = refine_image(
-        RefineRequest.from_fields(
-            image=frame.image,
-            sparse=frame.sparse,
-            model=str(tmp_path / "my_net.py"),
-            checkpoint=tmp_path / "my_net.safetensors",
-            output=tmp_path / "depth.npy",
-        )
-    )
-    assert outcome.record["loss"][-1] < outcome.record["loss"][0]
+@pytest.mark.parametrize("page", [p for p in PAGES if shown_commands(p)], ids=named)
+def test_the_commands_of_a_page_run(page: Path, folder: Path) -> None:
+    for arguments in shown_commands(page):
+        overwrite = ["--overwrite"] if arguments[0] in WRITES_FILES else []
+        run(["-m", "pnpdepth_cli", *arguments, *overwrite], folder)
 
 
-def test_the_links_of_the_readme_lead_somewhere() -> None:
-    for target in re.findall(r"\]\(([^)#]+)\)", README):
-        assert target.startswith("http") or (ROOT / target).exists(), target
+@pytest.mark.parametrize("page", [README, ROOT / "docs" / "python-api.md"], ids=named)
+def test_the_python_example_of_a_page_runs(page: Path, folder: Path) -> None:
+    (code,) = [block for block in blocks(page, "python") if "import pnpdepth_cli as pnp" in block]
+    assert run(["-c", code], folder)
+
+
+def test_the_example_of_the_readme_has_ten_lines() -> None:
+    (code,) = [block for block in blocks(README, "python") if "import pnpdepth_cli as pnp" in block]
+    assert len([line for line in code.splitlines() if line]) <= 10
+
+
+def test_the_readme_is_short() -> None:
+    assert len(README.read_text(encoding="utf-8").splitlines()) <= 160
+
+
+@pytest.mark.parametrize("page", PAGES, ids=named)
+def test_the_links_of_a_page_lead_somewhere(page: Path) -> None:
+    for target in re.findall(r"\]\(([^)#]+)(?:#[^)]*)?\)", page.read_text(encoding="utf-8")):
+        assert target.startswith("http") or (page.parent / target).exists(), target
+
+
+def test_the_commands_that_ci_runs_are_marked() -> None:
+    text = README.read_text(encoding="utf-8")
+    for name in ("main-job", "tests"):
+        assert re.search(rf"<!-- {name} -->\n```sh\n.*\.venv/bin/", text)

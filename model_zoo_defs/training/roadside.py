@@ -32,6 +32,7 @@ def leaves(kit: Kit, centres: np.ndarray, size: float, material: int) -> Group:
 
 
 def leaf_green(kit: Kit) -> tuple[float, float, float]:
+    """Returns a random colour of leaves."""
     if kit.chance(0.15):
         return kit.size(0.4, 0.7), kit.size(0.3, 0.45), kit.size(0.08, 0.2)
     return kit.size(0.16, 0.36), kit.size(0.26, 0.46), kit.size(0.06, 0.2)

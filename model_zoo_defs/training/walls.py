@@ -160,6 +160,7 @@ def decorate(kit: Kit, side: Group, length: float, height: float, holes: Sequenc
 
 
 def openings(kit: Kit, length: float, height: float) -> list[Hole]:
+    """Returns random windows and doors of a wall of this length and height, metres."""
     found: list[Hole] = []
     u = kit.size(0.2, 0.8)
     while u < length - 1.0:

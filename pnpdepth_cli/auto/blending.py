@@ -1,8 +1,8 @@
-"""Which of several depths, or which mean of a few, is nearest to points that none of them saw.
+"""Which of several candidates, or which mean of a few, is nearest to held-out points.
 
-Of candidates scored on few points the best one is best partly by luck, and a mean of two good ones
-is mostly better than either (stacked generalisation, Wolpert 1992; Breiman 1996). So means of the
-best few are looked at as well, with round weights, and whatever is not the usual way has to be
+Of candidates scored on few points, the best one is best partly by chance, and a mean of two good
+ones is mostly better than either (stacked generalisation, Wolpert 1992; Breiman 1996). So means of
+the best few compete as well, with round weights. Anything but the default candidate has to be
 better than it by more than chance: by the standard error of the mean difference over the points.
 """
 
@@ -16,72 +16,83 @@ from itertools import combinations
 import torch
 from torch import Tensor
 
-AMONG = 4
-"""So many of the best candidates are mixed."""
-SHARES = (0.25, 0.5, 0.75)
+BLENDED = 4
+"""Number of the best candidates that are blended."""
+PAIR_WEIGHTS = (0.25, 0.5, 0.75)
 """Weights of the first of two."""
 CAUTION = 1.0
-"""Standard errors by which another than the usual way has to be better."""
+"""Standard errors by which anything but the default has to be better."""
 _ROUNDING = 1e-6
 
 
 @dataclass(frozen=True)
 class Blend:
-    """Candidates by number, their weights with a sum of 1, and the error of their weighted mean."""
+    """A weighted mean of candidates."""
 
     members: tuple[int, ...]
+    """Numbers of the candidates."""
     weights: tuple[float, ...]
+    """Their weights, with a sum of 1."""
     error: float
+    """Mean absolute error of the weighted mean, metres."""
 
 
-def held_out_error(predicted: Tensor, depth: Tensor, believed: Tensor) -> Tensor:
-    """Mean |predicted − depth| (...,) in metres over points (..., M), each as much as believed.
+def held_out_error(predicted: Tensor, depth: Tensor, weights: Tensor) -> Tensor:
+    """Returns the weighted mean absolute error (...,) in metres.
 
-    A point without prediction (0) counts as far off as the prediction of depth 0 is.
+    A point without prediction (0) counts as far off as a depth of 0 is.
+
+    Args:
+        predicted: (..., M) metres at M held-out points.
+        depth: (M,) metres, measured.
+        weights: (M,) 0…1 of each point.
     """
-    return ((predicted - depth).abs() * believed).sum(dim=-1) / believed.sum()
+    return ((predicted - depth).abs() * weights).sum(dim=-1) / weights.sum()
 
 
 def best_blend(
     predicted: Tensor,
     depth: Tensor,
-    believed: Tensor,
+    weights: Tensor,
     *,
-    usual: int,
-    simple: Sequence[int] = (),
+    default: int,
+    baselines: Sequence[int] = (),
 ) -> Blend:
-    """The candidate, or mean of a few, that is best beyond chance at points it did not see.
+    """Returns the candidate, or mean of a few, that is best beyond chance at held-out points.
 
-    predicted: (C, M) metres of C candidates at M held-out points of this depth (M,).
-    believed: (M,) 0…1, the weight of each point. usual: the candidate to take where no other is
-    better by more than chance. simple: what is returned is never worse than any of these.
+    Args:
+        predicted: (C, M) metres of C candidates at M held-out points.
+        depth: (M,) metres, measured.
+        weights: (M,) 0…1 of each point.
+        default: The candidate to take where no other is better by more than chance.
+        baselines: Candidates that the result is never worse than.
     """
-    errors = held_out_error(predicted, depth, believed)
-    bound = min((float(errors[one]) for one in simple), default=math.inf)
-    usual_errors = (predicted[usual] - depth).abs()
+    errors = held_out_error(predicted, depth, weights)
+    bound = min((float(errors[one]) for one in baselines), default=math.inf)
+    default_errors = (predicted[default] - depth).abs()
     blends = []
-    for members, weights in _means(errors, usual):
-        mean = (torch.tensor(weights)[:, None] * predicted[list(members)]).sum(dim=0)
-        error = float(held_out_error(mean, depth, believed))
-        doubt = _standard_error((mean - depth).abs() - usual_errors, believed)
+    for members, parts in _means(errors, default):
+        mean = (torch.tensor(parts)[:, None] * predicted[list(members)]).sum(dim=0)
+        error = float(held_out_error(mean, depth, weights))
+        margin = _standard_error((mean - depth).abs() - default_errors, weights)
         if error <= bound * (1 + _ROUNDING):
-            blends.append((error + CAUTION * doubt, Blend(members, weights, error)))
+            blends.append((error + CAUTION * margin, Blend(members, parts, error)))
     return min(blends, key=lambda one: one[0])[1]
 
 
-def _means(errors: Tensor, usual: int) -> Iterator[tuple[tuple[int, ...], tuple[float, ...]]]:
-    """Members and weights of what is looked at, every candidate alone among them."""
+def _means(errors: Tensor, default: int) -> Iterator[tuple[tuple[int, ...], tuple[float, ...]]]:
+    """Members and weights of all blends that compete, every candidate alone among them."""
     yield from (((one,), (1.0,)) for one in range(len(errors)))
-    order = [int(i) for i in errors.argsort(stable=True)[:AMONG]]
-    mixed = order if usual in order else [*order, usual]
-    for pair in combinations(mixed, 2):
-        yield from ((pair, (share, 1 - share)) for share in SHARES)
+    order = [int(i) for i in errors.argsort(stable=True)[:BLENDED]]
+    paired = order if default in order else [*order, default]
+    for pair in combinations(paired, 2):
+        yield from ((pair, (weight, 1 - weight)) for weight in PAIR_WEIGHTS)
     for count in range(3, len(order) + 1):
         yield from ((some, (1 / count,) * count) for some in combinations(order, count))
 
 
-def _standard_error(difference: Tensor, believed: Tensor) -> float:
+def _standard_error(difference: Tensor, weights: Tensor) -> float:
     """Of the weighted mean of differences (M,)."""
-    share = believed / believed.sum()
-    mean = (share * difference).sum()
-    return float((share.square() * (difference - mean).square()).sum().sqrt())
+    fraction = weights / weights.sum()
+    mean = (fraction * difference).sum()
+    return float((fraction.square() * (difference - mean).square()).sum().sqrt())

@@ -7,7 +7,7 @@ import os
 import signal
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any
@@ -201,7 +201,8 @@ def _finishing_on_interrupt() -> Iterator[Callable[[], bool]]:
         if pressed.is_set():
             raise KeyboardInterrupt
         pressed.set()
-        os.write(2, _STOPPING)  # not through the buffered stderr, which may be in use
+        with suppress(OSError):
+            os.write(2, _STOPPING)  # not through the buffered stderr, which may be in use
 
     before = signal.signal(signal.SIGINT, handle)
     try:

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -47,22 +46,10 @@ if TYPE_CHECKING:
 @click.option(
     "--table",
     is_flag=True,
-    help="Measure the paper's seven networks, beside its Table V.",
+    help="Measure the paper's seven networks, beside its Table IV.",
 )
 @options.as_json
-def bench(
-    model: str,
-    checkpoint: Path | None,
-    layer: str | None,
-    size: str | None,
-    points: int,
-    iterations: int | None,
-    precision: str,
-    device: str,
-    repeats: int,
-    table: bool,
-    as_json: bool,
-) -> None:
+def bench(size: str | None, repeats: int, table: bool, as_json: bool, **given: Any) -> None:
     """Measure the run time of a refinement on this machine, by part and in forward passes.
 
     \b
@@ -79,30 +66,19 @@ def bench(
     if repeats < 1:
         raise UsageError(f"repeats {repeats}: there must be at least one")
     if table:
-        refused = {
-            "--checkpoint": checkpoint,
-            "--layer": layer,
-            "--size": size,
-            "--iterations": iterations,
+        refused = {"--size": size} | {
+            f"--{name}": given[name] for name in ("checkpoint", "layer", "iterations")
         }
         if clash := [name for name, value in refused.items() if value is not None]:
             raise UsageError(
                 f"--table measures the paper's networks and cannot be combined with {clash[0]}"
             )
-        _table(repeats, precision, device, as_json)
+        _table(repeats, given["precision"], given["device"], as_json)
         return
     from pnpdepth_cli.pipeline.bench.bench import BenchRequest, run_bench
 
     request = BenchRequest(
-        model=model,
-        checkpoint=checkpoint,
-        layer=layer,
-        size=options.height_and_width(size) if size else None,
-        points=points,
-        iterations=iterations,
-        precision=precision,
-        device=device,
-        repeats=repeats,
+        size=options.height_and_width(size) if size else None, repeats=repeats, **given
     )
     with progress_bar("bench", "round") as show:
         result = run_bench(request, on_round=show)
@@ -156,8 +132,8 @@ def _table(repeats: int, precision: str, device: str, as_json: bool) -> None:
     from pnpdepth_cli.cli.tables import print_rows
 
     print_rows(
-        f"Table V: random weights, K = 5, {precision}, {device}, {rows[0].bench.threads} threads,"
-        f" medians of {repeats}; beside it what the paper prints",
+        f"Table IV: random weights, K = 5, {precision}, {device}, {rows[0].bench.threads} threads,"
+        f" medians of {repeats}; beside the paper's figures",
         (
             "network",
             "paper's\nname",
@@ -177,9 +153,9 @@ def _table(repeats: int, precision: str, device: str, as_json: bool) -> None:
 
 
 def _row_cells(row: TableRow) -> tuple[str, ...]:
-    found, paper = row.bench, row.paper
-    refinement, forward = found.part("refinement"), found.part("forward")
-    flops, memory = found.limit_by_flops, refinement.peak_mb
+    bench, paper = row.bench, row.paper
+    refinement, forward = bench.part("refinement"), bench.part("forward")
+    flops, memory = bench.limit_by_flops, refinement.peak_mb
     printed = (paper.before, paper.after)
     return (
         paper.model,
@@ -188,7 +164,7 @@ def _row_cells(row: TableRow) -> tuple[str, ...]:
         _ms(forward.seconds.median),
         _ms(refinement.seconds.median),
         f"{refinement.forwards:.2f}",
-        f"{found.limit_measured:.2f}",
+        f"{bench.limit_measured:.2f}",
         "–" if flops is None else f"{flops:.2f}",
         "–" if memory is None else f"{memory:,.0f} MB",
         *("–" if seconds is None else _ms(seconds) for seconds in printed),
@@ -196,10 +172,10 @@ def _row_cells(row: TableRow) -> tuple[str, ...]:
     )
 
 
-def _print_notes(found: Bench) -> None:
-    threads = f"{found.threads} thread{'' if found.threads == 1 else 's'}"
-    click.echo(f"{found.device}, {threads}, torch {found.versions['torch']}", err=True)
-    for note in found.notes:
+def _print_notes(bench: Bench) -> None:
+    threads = f"{bench.threads} thread{'' if bench.threads == 1 else 's'}"
+    click.echo(f"{bench.device}, {threads}, torch {bench.versions['torch']}", err=True)
+    for note in bench.notes:
         click.echo(printable(note), err=True)
 
 

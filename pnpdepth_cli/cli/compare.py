@@ -64,7 +64,7 @@ def compare(
     from pnpdepth_cli.pipeline.evaluation.compare import compare as compare_runs
 
     targets = (csv, markdown, latex)
-    score_tables.check_stdout(targets, as_json)
+    score_tables.check_outputs(targets, as_json)
     score_files.check_targets(targets, [Path(run) for run in runs], overwrite=overwrite)
     comparison = compare_runs(
         CompareRequest(paths=runs, resamples=resamples, seed=seed, grouped=not no_groups)

@@ -8,6 +8,14 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from pnpdepth_cli.choices import (
+    AVERAGES,
+    EVAL_PROTOCOLS,
+    MISSING,
+    PREDICTION_KINDS,
+    RESIZES,
+    SCALINGS,
+)
 from pnpdepth_cli.cli import grouped_help, options
 from pnpdepth_cli.cli.printable import printable
 from pnpdepth_cli.cli.progress import progress_bar
@@ -15,8 +23,6 @@ from pnpdepth_cli.errors import FramesFailedError, UsageError
 
 if TYPE_CHECKING:
     from pnpdepth_cli.pipeline.evaluation.result import Evaluation
-
-PROTOCOLS = ("paper", "nyu", "kitti", "kitti-devkit", "eigen", "garg")
 
 
 @click.command(
@@ -32,12 +38,13 @@ PROTOCOLS = ("paper", "nyu", "kitti", "kitti-devkit", "eigen", "garg")
     ),
     groups={
         "Input": (
-            *("--pred-scale", "--gt-scale", "--channel", "--resize", "--mask", "--sparse"),
-            *("--sparse-scale", "--workers", "--max-pixels"),
+            *("--pred-scale", "--gt-scale", "--pred-kind", "--channel", "--resize", "--mask"),
+            *("--sparse", "--sparse-scale", "--workers", "--max-pixels"),
         ),
         "Protocol": (
             *("--protocol", "--min-depth", "--max-depth", "--clip", "--crop", "--average"),
-            *("--delta", "--exclude-sparse", "--bootstrap", "--no-groups", "--seed"),
+            *("--delta", "--exclude-sparse", "--missing", "--scale-by", "--bootstrap"),
+            *("--no-groups", "--seed"),
         ),
         "Output": ("--csv", "--markdown", "--latex", "--html", "--overwrite", "--json"),
     },
@@ -46,7 +53,7 @@ PROTOCOLS = ("paper", "nyu", "kitti", "kitti-devkit", "eigen", "garg")
 @click.argument("truth", type=options.FILE, metavar="GT")
 @click.option(
     "--protocol",
-    type=click.Choice(PROTOCOLS),
+    type=click.Choice(EVAL_PROTOCOLS),
     default="paper",
     show_default=True,
     help="Preset of the options below.",
@@ -58,7 +65,7 @@ PROTOCOLS = ("paper", "nyu", "kitti", "kitti-devkit", "eigen", "garg")
 @click.option("--mask", type=options.FILE, help="Mask image, or folder with a mask per frame.")
 @click.option(
     "--average",
-    type=click.Choice(("per-image", "pooled")),
+    type=click.Choice(AVERAGES),
     help="Mean over images, or over all pixels of all images.",
 )
 @click.option(
@@ -67,13 +74,30 @@ PROTOCOLS = ("paper", "nyu", "kitti", "kitti-devkit", "eigen", "garg")
     help="Thresholds of δ1…δ3: D, D², D³, or D1, D2, D3. The paper's KITTI rows use 1.01."
     "  [default: 1.25]",
 )
+@click.option(
+    "--missing",
+    type=click.Choice(MISSING),
+    help="Empty predictions: not scored, scored as --min-depth or --max-depth, or an error."
+    "  [default: the protocol's]",
+)
+@click.option(
+    "--scale-by",
+    type=click.Choice(SCALINGS),
+    help="Scale each image to its ground truth, for relative predictions.  [default: none]",
+)
+@click.option(
+    "--pred-kind",
+    "prediction_kind",
+    type=click.Choice(PREDICTION_KINDS),
+    help="What predictions are.  [default: depth]",
+)
 @click.option("--pred-scale", type=float, metavar="S", help="Integer predictions hold metres × S.")
 @click.option("--gt-scale", type=float, metavar="S", help="Integer ground truth holds metres × S.")
 @options.channel
 @options.max_pixels
 @click.option(
     "--resize",
-    type=click.Choice(("nearest", "bilinear")),
+    type=click.Choice(RESIZES),
     help="Resize predictions to the size of the ground truth.",
 )
 @click.option(
@@ -156,7 +180,7 @@ def evaluate(
     from pnpdepth_cli.pipeline.report import evaluation as report_eval
 
     targets = (csv, markdown, latex)
-    score_tables.check_stdout(targets, as_json)
+    score_tables.check_outputs(targets, as_json)
     score_files.check_targets(targets, (prediction, truth), overwrite=overwrite)
     if html is not None:
         inputs = [p for p in (prediction, truth, given["sparse"], given["mask"]) if p is not None]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict
-from pathlib import Path
 from typing import Any
 
 import click
@@ -27,15 +26,7 @@ from pnpdepth_cli.cli.progress import progress_bar
 )
 @options.device
 @options.as_json
-def layers(
-    model: str,
-    checkpoint: Path | None,
-    every: bool,
-    size: str | None,
-    sparse: Path | None,
-    device: str,
-    as_json: bool,
-) -> None:
+def layers(model: str, size: str | None, as_json: bool, **given: Any) -> None:
     """List the layers a network can be cut at.
 
     For each layer: shape and stride of z, the fraction of the network's cost behind the cut (which
@@ -46,11 +37,11 @@ def layers(
     with progress_bar("layers", "layer") as show:
         result = list_layers(
             model,
-            checkpoint,
-            device,
-            every=every,
+            given["checkpoint"],
+            given["device"],
+            every=given["every"],
             size=options.height_and_width(size) if size else None,
-            sparse=sparse,
+            sparse=given["sparse"],
             on_layer=show,
         )
     if as_json:

@@ -2,32 +2,52 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import gc
 import importlib
-import io
 import os
 import sys
-from typing import Any
+from pathlib import Path
+from typing import NoReturn
 
 import click
 
 from pnpdepth_cli import __version__
 from pnpdepth_cli.cli.exit_codes import INTERRUPTED
-from pnpdepth_cli.cli.printable import printable
-from pnpdepth_cli.errors import OutputError, PnpDepthError
+from pnpdepth_cli.cli.printable import printable, shortened
+from pnpdepth_cli.cli.streams import StdoutError, drop_stdout, guard_streams
+from pnpdepth_cli.errors import DeviceError, InputError, ModelError, OutputError, PnpDepthError
 
 _EXIT_CODES = """\b
-Exit codes: 0 done · 1 a bug of ours · 2 wrong usage · 3 an input file · 4 network, layer or
-checkpoint · 5 refinement diverged · 6 device · 7 some frames of a batch failed · 130 interrupted"""
+Exit codes: 0 done · 1 a bug of this program · 2 wrong usage or output · 3 input file · 4 network,
+layer or checkpoint · 5 refinement diverged · 6 device or memory · 7 some frames failed ·
+130 interrupted. Networks in .py files are code and are run."""
 
 _GARBAGE = 50_000
-"""Objects between two looks for garbage. The usual 700 make them a tenth of what imports take."""
+"""Allocations between garbage collections. With the default of 700, they take 10 % of imports."""
 
 _SPINS = "3000"
-"""Turns that an idle thread of GNU OpenMP, which torch computes with, waits for work before it
-sleeps. With the usual 300,000 a frame takes 13 times as long as soon as another program keeps one
-of two cores busy; with this, twice as long, and no longer than before on an idle machine."""
+"""Spins of an idle GNU OpenMP thread (which torch uses) before it sleeps. With the default of
+300,000 a frame takes 13 times as long if another program keeps one of two cores busy; with this
+value twice as long, and no longer on an idle machine."""
+
+_COMPLETION = "_PNPDEPTH_COMPLETE"
+"""Set by the shell that asks for completions."""
+
+_MEMORY_MESSAGES = ("allocate memory", "failed to map segment", "bad_alloc")
+"""Parts of the messages of torch and of the loader when memory is exhausted."""
+
+_NO_MEMORY = "memory is exhausted; use a smaller image, or --tile"
+
+_CODES_OF_OPTIONS = {
+    **dict.fromkeys(
+        ("-o", "--output", "--csv", "--markdown", "--latex", "--html", "--overlay"),
+        OutputError.exit_code,
+    ),
+    **dict.fromkeys(("--model", "--checkpoint", "check"), ModelError.exit_code),
+}
+"""Exit codes of errors of the operating system by the word before the file; any other is 3."""
 
 COMMANDS = {
     "refine": "refine:refine",
@@ -42,11 +62,11 @@ COMMANDS = {
     "sweep": "sweep:sweep",
     "bench": "bench:bench",
 }
-"""The subcommands in the order of the help: where each is below `pnpdepth_cli.cli`."""
+"""The subcommands in the order of the help, as `module:function` in `pnpdepth_cli.cli`."""
 
 
 class _Commands(click.Group):
-    """A group that imports a subcommand only when it is needed."""
+    """Imports a subcommand only when it is used."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         return list(COMMANDS)
@@ -59,40 +79,91 @@ class _Commands(click.Group):
         assert isinstance(command, click.Command)
         return command
 
-    def invoke(self, ctx: click.Context) -> Any:
-        try:
-            return super().invoke(ctx)
-        except KeyboardInterrupt:
-            click.echo("pnpdepth: interrupted", err=True)
-            ctx.exit(INTERRUPTED)
-
 
 @click.group(
     cls=_Commands, epilog=_EXIT_CODES, context_settings={"help_option_names": ["-h", "--help"]}
 )
 @click.version_option(__version__, prog_name="pnpdepth")
 def cli() -> None:
-    """Better depth from any depth network and a few true points, without training."""
+    """Refine the depth of any depth network with sparse depth, without training."""
 
 
-def main(arguments: list[str] | None = None) -> Any:
-    """Run the command line; the process ends with the exit code of what happened."""
+def main(arguments: list[str] | None = None) -> NoReturn:
+    """Runs the command line and raises SystemExit with the exit code of what happened."""
+    sys.exit(run(sys.argv[1:] if arguments is None else arguments))
+
+
+def run(arguments: list[str]) -> int:
+    """Returns the exit code. Every error but our own bugs becomes one line on stderr."""
     gc.set_threshold(_GARBAGE)
     if "OMP_WAIT_POLICY" not in os.environ:
         os.environ.setdefault("GOMP_SPINCOUNT", _SPINS)  # read when torch is imported
-    if isinstance(sys.stdout, io.TextIOWrapper):
-        sys.stdout.reconfigure(errors="replace")  # who cannot be shown a σ still sees the rest
+    guard_streams()
     try:
-        try:
-            return cli.main(arguments, prog_name="pnpdepth")
-        finally:
-            sys.stdout.flush()
+        code = _run_command(arguments)
+        sys.stdout.flush()
     except PnpDepthError as error:
-        click.echo(f"pnpdepth: {printable(error)}", err=True)
-        sys.exit(error.exit_code)
-    except OSError as error:
-        if error.errno != errno.ENOSPC:
+        return _end(error, error.exit_code)
+    except StdoutError as error:
+        drop_stdout()
+        if error.reason.errno == errno.EPIPE:  # as in `pnpdepth models | head -1`
+            return 0
+        return _end(error, OutputError.exit_code)
+    except KeyboardInterrupt:
+        return _end("interrupted", INTERRUPTED)
+    except MemoryError:
+        return _end(_NO_MEMORY, DeviceError.exit_code)
+    except (ImportError, RuntimeError) as error:
+        if not any(text in str(error) for text in _MEMORY_MESSAGES):
             raise
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what is left goes nowhere
-        click.echo(f"pnpdepth: stdout cannot be written to: {error.strerror}", err=True)
-        sys.exit(OutputError.exit_code)
+        return _end(_NO_MEMORY, DeviceError.exit_code)
+    except OSError as error:
+        return _end(_describe(error), _exit_code(error, arguments))
+    return code
+
+
+def _run_command(arguments: list[str]) -> int:
+    """Runs the command of these arguments. Returns its exit code."""
+    if _COMPLETION in os.environ:
+        cli.main(arguments, prog_name="pnpdepth", complete_var=_COMPLETION)
+    try:
+        with cli.make_context("pnpdepth", list(arguments)) as context:
+            cli.invoke(context)
+    except click.exceptions.Exit as stop:
+        return stop.exit_code
+    except click.ClickException as error:
+        error.show()
+        return error.exit_code
+    except click.Abort:
+        raise KeyboardInterrupt from None
+    return 0
+
+
+def _end(message: object, code: int) -> int:
+    """Prints the message as one line. Returns the code."""
+    with contextlib.suppress(StdoutError):  # what was printed before comes first
+        sys.stdout.flush()
+    click.echo(f"pnpdepth: {shortened(printable(message))}", err=True)
+    return code
+
+
+def _describe(error: OSError) -> str:
+    reason = error.strerror or str(error)
+    return reason if error.filename is None else f"{os.fsdecode(error.filename)}: {reason}"
+
+
+def _exit_code(error: OSError, arguments: list[str]) -> int:
+    """Returns the code for the file at fault: an output, a network, or an input.
+
+    The file is looked for among the arguments. A file that is not there and does not exist was to
+    be written.
+    """
+    if error.filename is None:
+        full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG)
+        return OutputError.exit_code if full else InputError.exit_code
+    path = Path(os.fsdecode(error.filename)).absolute()
+    words = [part for word in arguments for part in word.split("=", 1)]
+    for before, word in zip(["", *words], words, strict=False):
+        if path.is_relative_to(Path(word).absolute()):
+            return _CODES_OF_OPTIONS.get(before, InputError.exit_code)
+    return InputError.exit_code if os.access(path, os.F_OK) else OutputError.exit_code

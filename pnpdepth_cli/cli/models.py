@@ -65,7 +65,7 @@ def models() -> None:
 @options.as_json
 def list_command(every: bool, as_json: bool) -> None:
     """List the networks that --model takes by name, with their inputs, outputs and defaults."""
-    from pnpdepth_cli.pipeline.networks.models import list_models
+    from pnpdepth_cli.pipeline.networks.list_models import list_models
 
     listed = [asdict(model) for model in list_models()]
     hidden = Counter(model["family"] for model in listed if model["variant"] and not every)
@@ -111,7 +111,7 @@ def check(
     """
     from pnpdepth_cli.pipeline.networks.check import check_model
 
-    _print(check_model(network, checkpoint, image, device), as_json)
+    _print(asdict(check_model(network, checkpoint, image, device)), as_json)
 
 
 @models.command(short_help="Extract the tensors of a checkpoint.")
@@ -123,7 +123,7 @@ def convert(source: Path, target: Path, overwrite: bool, as_json: bool) -> None:
     """Write the tensors of the checkpoint IN to OUT.safetensors. No code in IN is run."""
     from pnpdepth_cli.pipeline.networks.convert import convert_checkpoint
 
-    _print(convert_checkpoint(source, target, overwrite=overwrite), as_json)
+    _print(asdict(convert_checkpoint(source, target, overwrite=overwrite)), as_json)
 
 
 @models.command(short_help="Download a network from Hugging Face.")
@@ -135,7 +135,7 @@ def fetch(repository: str, revision: str | None, output: Path | None, as_json: b
     """Download a network from Hugging Face. No other command uses the internet."""
     from pnpdepth_cli.pipeline.networks.fetch import fetch_model
 
-    _print(fetch_model(repository, revision, output), as_json)
+    _print(asdict(fetch_model(repository, revision, output)), as_json)
 
 
 def _print(record: Mapping[str, Any], as_json: bool) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -21,6 +21,9 @@ from pnpdepth_cli.pipeline.refinement.request import (
     OutputOptions,
     RefineRequest,
 )
+
+if TYPE_CHECKING:
+    from pnpdepth_cli.pipeline.sparse.outputs import SparseTarget
 
 FILE = click.Path(path_type=Path)
 SEED = click.IntRange(0, LARGEST_SEED)
@@ -219,6 +222,18 @@ def request_of(given: dict[str, Any], **others: Any) -> RefineRequest:
 
     scan_options, rest = scan_given(given)
     return RefineRequest.from_fields(scan=ScanOptions(**scan_options), **rest, **others)
+
+
+def sparse_target(given: dict[str, Any]) -> SparseTarget:
+    """Returns where sparse depth is written; its options are taken out of `given`."""
+    from pnpdepth_cli.pipeline.sparse.outputs import SparseTarget
+
+    return SparseTarget(
+        output=given.pop("output"),
+        overlay=given.pop("overlay", None),
+        depth_scale=given.pop("output_scale"),
+        overwrite=given.pop("overwrite"),
+    )
 
 
 def height_and_width(text: str) -> tuple[int, int]:

@@ -21,17 +21,7 @@ from pnpdepth_cli.cli import options
 @click.option("--overlay", type=options.FILE, help="Also write a PNG of the points on the image.")
 @options.overwrite
 @options.as_json
-def project(
-    scan: Path,
-    image: Path | None,
-    size: str | None,
-    output: Path,
-    output_scale: float,
-    overlay: Path | None,
-    overwrite: bool,
-    as_json: bool,
-    **given: Any,
-) -> None:
+def project(scan: Path, image: Path | None, size: str | None, as_json: bool, **given: Any) -> None:
     """Project a LiDAR SCAN (KITTI's BIN, NPY, PCD or PLY) to a sparse depth map.
 
     \b
@@ -42,18 +32,16 @@ def project(
     the foreground are dropped and counted. A JSON file beside the output records the settings.
     """
     from pnpdepth_cli.cli.tables import print_sparse
-    from pnpdepth_cli.pipeline.sparse.outputs import SparseTarget
     from pnpdepth_cli.pipeline.sparse.project import ProjectRequest, project_scan
     from pnpdepth_cli.pipeline.sparse.scans import ScanOptions
 
+    target = options.sparse_target(given)
     scan_options, _ = options.scan_given(given)
     record = project_scan(
         ProjectRequest(
             scan=scan,
             options=ScanOptions(**scan_options),
-            target=SparseTarget(
-                output=output, overlay=overlay, depth_scale=output_scale, overwrite=overwrite
-            ),
+            target=target,
             image=image,
             size=options.height_and_width(size) if size else None,
         )

@@ -3,13 +3,21 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
+from typing import Any
 
 import click
 
 from pnpdepth_cli.choices import PATTERNS
 from pnpdepth_cli.cli import options
 from pnpdepth_cli.errors import UsageError
+
+_NOISE = {
+    "metres": "noise",
+    "relative": "relative_noise",
+    "outliers": "outliers",
+    "jitter_px": "jitter",
+}
+"""Options by the kind of noise that they set."""
 
 
 @click.command(short_help="Sample sparse depth from dense depth.")
@@ -49,25 +57,7 @@ from pnpdepth_cli.errors import UsageError
 @click.option("--overlay", type=options.FILE, help="Also write a PNG of the points on --image.")
 @options.overwrite
 @options.as_json
-def sample(
-    depth: Path,
-    pattern: str,
-    count: str | None,
-    region: str | None,
-    image: Path | None,
-    seed: int,
-    noise: float,
-    relative_noise: float,
-    outliers: float,
-    jitter: float,
-    depth_scale: float | None,
-    channel: str | None,
-    output: Path,
-    output_scale: float,
-    overlay: Path | None,
-    overwrite: bool,
-    as_json: bool,
-) -> None:
+def sample(count: str | None, region: str | None, as_json: bool, **given: Any) -> None:
     """Sample sparse depth from the dense DEPTH.
 
     \b
@@ -87,30 +77,19 @@ def sample(
     The settings, with the seed, are stored in the file (PNG, CSV) and in a JSON file beside it.
     """
     from pnpdepth_cli.cli.tables import print_sparse
-    from pnpdepth_cli.pipeline.sparse.outputs import SparseTarget
     from pnpdepth_cli.pipeline.sparse.sample import SampleRequest, sample_depth
 
     points, fraction = options.count_or_share(count)
+    target = options.sparse_target(given)
+    noise = {key: given.pop(name) for key, name in _NOISE.items()}
     record = sample_depth(
         SampleRequest(
-            depth=depth,
-            target=SparseTarget(
-                output=output, overlay=overlay, depth_scale=output_scale, overwrite=overwrite
-            ),
-            pattern=pattern,
+            target=target,
             count=points,
             share=fraction,
             region=_region(region) if region else None,
-            noise={
-                "metres": noise,
-                "relative": relative_noise,
-                "outliers": outliers,
-                "jitter_px": jitter,
-            },
-            seed=seed,
-            image=image,
-            depth_scale=depth_scale,
-            channel=channel,
+            noise=noise,
+            **given,
         )
     )
     if as_json:

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from pnpdepth_cli.pipeline.evaluation.compare import Comparison
     from pnpdepth_cli.pipeline.evaluation.frame_scoring import FrameScores
     from pnpdepth_cli.pipeline.evaluation.result import ErrorBin, Evaluation
+    from pnpdepth_cli.pipeline.evaluation.uncertainty import Uncertainty
 
 _ALL_FRAMES_SHOWN = 12
 _WORST_SHOWN = 5
@@ -41,10 +42,16 @@ def print_notes(notes: Sequence[str]) -> None:
         console.print(escape(printable(note)), style=style, soft_wrap=True)
 
 
-def check_stdout(targets: Sequence[Path | None], as_json: bool) -> None:
-    """Raises UsageError if more than one output is to go to stdout."""
+def check_outputs(targets: Sequence[Path | None], as_json: bool) -> None:
+    """Raises UsageError if two of --csv, --markdown, --latex and --json go to one place."""
     if sum(str(path) == "-" for path in targets) + as_json > 1:
         raise UsageError("only one of --json, --csv -, --markdown - and --latex - can go to stdout")
+    options: dict[Path, str] = {}
+    for option, path in zip(("--csv", "--markdown", "--latex"), targets, strict=True):
+        if path is not None and str(path) != "-":
+            first = options.setdefault(path.resolve(), option)
+            if first != option:
+                raise UsageError(f"{first} and {option} are the same file {path}; name two files")
 
 
 def write_texts(texts: Sequence[tuple[Path | None, str]]) -> bool:
@@ -67,6 +74,8 @@ def print_evaluation(evaluation: Evaluation) -> None:
         console.print(evaluation.describe_interval(), style="dim", soft_wrap=True)
     if len(evaluation.frames) > 1:
         _print(console, _frames(evaluation))
+    if evaluation.uncertainty is not None:
+        _print(console, _uncertainty(evaluation.uncertainty))
     for title, column, bins in (
         ("by distance to the nearest sparse point", "pixels away", evaluation.by_distance),
         ("by depth of the ground truth", "metres", evaluation.by_depth),
@@ -151,6 +160,16 @@ def _frames(evaluation: Evaluation) -> Table:
     return table
 
 
+def _uncertainty(uncertainty: Uncertainty) -> Table:
+    table = _table(f"standard deviation of {uncertainty.frames:,} frames")
+    for column in ("", "observed", "calibrated"):
+        table.add_column(column, justify="left" if not column else "right")
+    table.add_row("errors within 1σ", f"{uncertainty.within_1_sigma:.1%}", "68.3%")
+    table.add_row("errors within 2σ", f"{uncertainty.within_2_sigma:.1%}", "95.4%")
+    table.add_row("AUSE (MAE, normalised)", f"{uncertainty.ause:.4f}", "0")
+    return table
+
+
 def _one_line(name: str) -> str:
     return escape(printable(name))
 
@@ -197,7 +216,7 @@ def _stdout() -> Console:
 
 
 def _print(console: Console, table: Table) -> None:
-    """The table on the terminal; as wide as it likes where that is none."""
+    """Prints the table, as wide as needed unless stdout is a terminal."""
     if not console.is_terminal:
         wide = console.options.update(max_width=1000)
         console.width = max(console.width, console.measure(table, options=wide).maximum)

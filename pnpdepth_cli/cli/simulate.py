@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 from typing import Any
 
 import click
@@ -67,9 +66,7 @@ from pnpdepth_cli.cli import options
 @options.output_scale
 @options.overwrite
 @options.as_json
-def simulate(
-    output: Path, output_scale: float, overwrite: bool, as_json: bool, **given: Any
-) -> None:
+def simulate(as_json: bool, **given: Any) -> None:
     """Simulate the sparse depth of a LiDAR in the scene of the dense DEPTH.
 
     \b
@@ -83,10 +80,9 @@ def simulate(
                     range_noise = 0.02
     """
     from pnpdepth_cli.cli.tables import print_sparse
-    from pnpdepth_cli.pipeline.sparse.outputs import SparseTarget
     from pnpdepth_cli.pipeline.sparse.simulate import SimulateRequest, simulate_scan
 
-    target = SparseTarget(output=output, depth_scale=output_scale, overwrite=overwrite)
+    target = options.sparse_target(given)
     record = simulate_scan(SimulateRequest(target=target, **given))
     if as_json:
         click.echo(json.dumps(record, indent=2))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -34,7 +35,7 @@ _STAGES = {
 
 
 def print_refinement(record: Mapping[str, Any]) -> None:
-    """The end of `pnpdepth refine`: what was assumed, errors before and after, files, time."""
+    """Prints the end of `pnpdepth refine`: notes, errors before and after, files, times."""
     console = Console(stderr=True, highlight=False)
     _print_notes(console, record["notes"])
     settings, points = record["settings"], record["points"]
@@ -42,7 +43,7 @@ def print_refinement(record: Mapping[str, Any]) -> None:
     table = Table(
         title=escape(f"{name} cut at {settings['layer']}")
         if record["auto"] is None
-        else f"{escape(name)} and the points, by what was best at held-out points"
+        else f"{escape(name)}, best candidates at held-out points"
     )
     for column in ("", "before", "after", "change"):
         table.add_column(column, justify="left" if not column else "right")
@@ -59,7 +60,7 @@ def print_refinement(record: Mapping[str, Any]) -> None:
     if record["baselines"] is not None:
         console.print(_baselines(record["baselines"]))
     if record["improved_share"] is not None:
-        where = "pixels with truth" if record["scores"] else "points"
+        where = "pixels with ground truth" if record["scores"] else "points"
         console.print(f"improved: {record['improved_share']:.1%} of the {where}")
     seconds = record["seconds"]
     updates = (
@@ -76,28 +77,28 @@ def print_refinement(record: Mapping[str, Any]) -> None:
     console.print("wrote " + escape("  ".join(written)), soft_wrap=True)
 
 
-def _baselines(found: Mapping[str, Any]) -> Table:
-    """The simple baselines, the network and the result, the best at the held-out points first."""
-    with_truth = any(row["scores"] for row in found.values())
+def _baselines(rows: Mapping[str, Any]) -> Table:
+    """Returns the baselines, the network and the result, best first at the held-out points."""
+    with_gt = any(row["scores"] for row in rows.values())
     table = Table(title="against every simple baseline")
-    columns = ["", "MAE, held-out points", *(["MAE, truth", "RMSE, truth"] if with_truth else [])]
+    of_gt = ["MAE, ground truth", "RMSE, ground truth"] if with_gt else []
+    columns = ["", "MAE, held-out points", *of_gt]
     for column in columns:
         table.add_column(column, justify="left" if not column else "right")
-    known = {name: row for name, row in found.items() if row["held_out_mae"] is not None}
-    order = sorted(known, key=lambda name: known[name]["held_out_mae"]) or list(found)
+    known = {name: row for name, row in rows.items() if row["held_out_mae"] is not None}
+    order = sorted(known, key=lambda name: known[name]["held_out_mae"]) or list(rows)
     for name in order:
-        row, cells = found[name], []
-        error = row["held_out_mae"]
-        cells.append("–" if error is None else f"{error:.4f} m")
-        if with_truth:
-            scores = row["scores"]
-            cells += [f"{scores[k]:.4f} m" if scores else "–" for k in ("mae", "rmse")]
+        row = rows[name]
+        cells = [_metres(row["held_out_mae"])]
+        if with_gt:
+            scores = row["scores"] or {}
+            cells += [_metres(scores.get(key)) for key in ("mae", "rmse")]
         table.add_row(name, *cells, style="bold" if name == "result" else None)
     return table
 
 
 def print_batch(summary: Mapping[str, Any]) -> None:
-    """The end of `pnpdepth batch`: errors before and after, means over the frames; the files."""
+    """Prints the end of `pnpdepth batch`: mean errors before and after, counts, files."""
     console = Console(stderr=True, highlight=False)
     mean, counts = summary["mean"], summary["counts"]
     if any(mean.values()):
@@ -110,22 +111,28 @@ def print_batch(summary: Mapping[str, Any]) -> None:
             _score_rows(table, mean["scores"])
             table.caption = f"scored on the ground truth of {mean['scores']['frames']:,} frames"
         console.print(table)
-    said = [f"{counts['done']:,} of {counts['frames']:,} frames done"]
-    said += [
+    if summary["baselines"]:
+        rows = {
+            name: {"held_out_mae": row["held_out_mae"], "scores": row}
+            for name, row in summary["baselines"].items()
+        }
+        console.print(_baselines(rows))
+    parts = [f"{counts['done']:,} of {counts['frames']:,} frames done"]
+    parts += [
         f"{counts[kind]:,} {kind}" for kind in ("diverged", "failed", "pending") if counts[kind]
     ]
-    said += [f"{counts['with_warnings']:,} with warnings"] if counts["with_warnings"] else []
-    console.print(", ".join(said))
+    parts += [f"{counts['with_warnings']:,} with warnings"] if counts["with_warnings"] else []
+    console.print(", ".join(parts))
     output = summary["output"]
     console.print("wrote " + escape(f"{output}/summary.json  {output}/summary.csv"), soft_wrap=True)
 
 
 def print_profile(profile: Mapping[str, Any]) -> None:
-    """Where the time of a batch went: in the thread of the network, and in those beside it."""
+    """Prints the time of each stage of a batch, in the thread of the network and beside it."""
     console = Console(stderr=True, highlight=False)
     seconds, frames = profile["seconds"], profile["frames"]
     if not frames:
-        console.print("no frame was done; there is no time to share out")
+        console.print("no frame was refined; there are no times")
         return
     table = Table(title="where the time went")
     for column in ("", "seconds", "ms a frame", "of the time"):
@@ -149,7 +156,7 @@ def print_profile(profile: Mapping[str, Any]) -> None:
 
 
 def print_sparse(record: Mapping[str, Any]) -> None:
-    """The end of `pnpdepth project`, `sample` and `simulate`: what was read, and what came out."""
+    """Prints the end of `pnpdepth project`, `sample` and `simulate`: notes, points, files."""
     console = Console(stderr=True, highlight=False)
     _print_notes(console, record["notes"])
     points, (width, height) = record["points"], record["size"]
@@ -162,7 +169,7 @@ def print_sparse(record: Mapping[str, Any]) -> None:
 
 
 def print_rows(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    """A table of text on stdout; as wide as it likes where that is no terminal."""
+    """Prints a table on stdout, as wide as needed unless stdout is a terminal."""
     console = Console(highlight=False)
     table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
     for number, column in enumerate(columns):
@@ -189,9 +196,9 @@ def _point_rows(table: Table, title: str, error: Mapping[str, Any] | None) -> No
         for name, key in (("MAE", "mae"), ("RMSE", "rmse")):
             table.add_row(
                 f"{title}, {name}",
-                f"{before[key]:.4f} m",
-                f"{after[key]:.4f} m",
-                _change(key, before, after),
+                _metres(before.get(key)),
+                _metres(after.get(key)),
+                _change(key, before.get(key), after.get(key)),
             )
 
 
@@ -199,16 +206,24 @@ def _score_rows(table: Table, scores: Mapping[str, Any]) -> None:
     before, after = scores["before"], scores["after"]
     table.add_section()
     for title, key, show in _SCORES:
-        table.add_row(title, show(before[key]), show(after[key]), _change(key, before, after))
+        values = (before.get(key), after.get(key))
+        cells = ["–" if value is None or math.isnan(value) else show(value) for value in values]
+        table.add_row(title, *cells, _change(key, *values))
 
 
-def _change(key: str, before: Mapping[str, float], after: Mapping[str, float]) -> str:
+def _metres(value: float | None) -> str:
+    return "–" if value is None or math.isnan(value) else f"{value:.4f} m"
+
+
+def _change(key: str, before: float | None, after: float | None) -> str:
+    if before is None or after is None or math.isnan(before) or math.isnan(after):
+        return "[dim]–[/]"
     if key.startswith("delta"):
-        points = 100 * (after[key] - before[key])
+        points = 100 * (after - before)
         colour = "green" if points > 0 else "red" if points < 0 else "dim"
         return f"[{colour}]{points:+.2f} pt[/]"
-    if before[key] == 0:
+    if before == 0:
         return "[dim]–[/]"
-    change = after[key] / before[key] - 1
+    change = after / before - 1
     colour = "green" if change < 0 else "red" if change > 0 else "dim"
     return f"[{colour}]{change:+.1%}[/]"

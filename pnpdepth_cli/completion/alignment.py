@@ -1,4 +1,4 @@
-"""What a network's numbers mean in metres, fitted to the sparse points.
+"""Alignment: what a network's numbers mean in metres, fitted to the sparse points.
 
 A network gives depth, inverse depth or log depth, often only up to a scale, or a scale and a
 shift. The fit is made in the network's own space: with x its output at a point of depth d,
@@ -7,10 +7,10 @@ shift. The fit is made in the network's own space: with x its output at a point 
     inverse:  1/d   = scale·x + shift
     log:      log d = scale·x + shift
 
-`scale` leaves the shift at 0 (in log space, where a factor of depth is an addend, it leaves the
-scale at 1), `median` is the same by the median of the points' own ratios. Wrong points do not pull:
-a line through two points is drawn for many pairs, the one with the smallest median residual wins
-(LMedS, Rousseeuw 1984), and reweighted least squares with Tukey's biweight goes on from there.
+`scale` keeps the shift at 0 (in log space, where a factor of depth is an addend, it keeps the scale
+at 1). `median` is the same by the median of the points' own ratios. The fit is robust to outliers:
+of lines through many pairs of points, the one with the smallest median residual wins (LMedS,
+Rousseeuw 1984), and starts reweighted least squares with Tukey's biweight.
 """
 
 from __future__ import annotations
@@ -25,59 +25,63 @@ from pnpdepth_cli.errors import ModelError, NoPointsError
 from pnpdepth_cli.points import SparsePoints
 
 BEYOND = 10.0
-"""Aligned depth is bounded to this factor in front of the nearest and behind the farthest point."""
+"""Aligned depth is clamped to this factor in front of the nearest and behind the farthest point."""
 
 _PAIRS = 1024
 _SCORED = 1024
 _BIWEIGHT = 4.685  # of Tukey's weights: 95 % efficient for normal errors (Holland, Welsch 1977)
 _NORMAL_MAD = 1.4826  # standard deviation over median absolute deviation, normal errors
-_TRUSTED = 0.7  # share of the points that `error` is measured on: the best ones
-_WRONG = 1.0  # |log| error beyond which a point counts as wrong, not as more wrong
-_NO_BETTER = 1e-3  # relative errors below this do not tell one alignment from another
+_BEST = 0.7  # fraction of the points that `error` is measured on
+_MAX_ERROR = 1.0  # |log| error above which a point counts no more
+_MIN_ERROR = 1e-3  # relative errors below this do not distinguish alignments
 
 
 @dataclass(frozen=True, kw_only=True)
 class Alignment:
-    """How the network's numbers read as metres.
-
-    space, kind, scale, shift: as above. bounds: (nearest, farthest) in metres; what comes out
-    beyond them, or at no positive depth at all, reads as the bound. points: how many were
-    fitted. error: mean |log(aligned / true depth)| of the best 70 % of them. misfit: the same of
-    all, none counting more than 1.0. outliers: share of points that are far off.
-    """
+    """How the network's numbers are converted to metres."""
 
     space: str
+    """Quantity in which the line is fitted, one of `choices.SPACES`."""
     kind: str
+    """Kind of the fit, one of `choices.ALIGNMENTS`."""
     scale: float
+    """Slope of the line."""
     shift: float
+    """Intercept of the line."""
     bounds: tuple[float, float]
+    """(nearest, farthest) metres; depth outside, or no positive depth at all, becomes the bound."""
     points: int
+    """Number of points that were fitted."""
     error: float = math.nan
+    """Mean |log(aligned / measured depth)| of the best 70 % of the points."""
     misfit: float = math.nan
+    """The same of all points, none counting more than 1.0."""
     outliers: float = 0.0
+    """Fraction of the points that are far off."""
 
     def depth(self, x: Tensor) -> Tensor:
-        """Metres, all within `bounds`. The gradient is that of the unbounded reading at the bound:
+        """Returns metres within `bounds`, of the shape of x.
 
-        a point where the aligned depth went beyond it still pulls it back.
+        The gradient is that of the unclamped depth, so that a loss still pulls back a pixel that
+        is outside.
         """
         line = self.scale * x + self.shift
         near, far = self.bounds
         if self.space == "inverse":
-            return _held(line, 1 / far, 1 / near).reciprocal()
+            return _clamped(line, 1 / far, 1 / near).reciprocal()
         if self.space == "log":
-            return _held(line, math.log(near), math.log(far)).exp()
-        return _held(line, near, far)
+            return _clamped(line, math.log(near), math.log(far)).exp()
+        return _clamped(line, near, far)
 
     def beyond(self, x: Tensor) -> float:
-        """Share of the values that `depth` holds at a bound."""
+        """Returns the fraction of the values that `depth` clamps."""
         line = self.scale * x + self.shift
         near, far = (float(to_space(torch.tensor(b), self.space)) for b in self.bounds)
         return float(((line < min(near, far)) | (line > max(near, far))).double().mean())
 
     @property
     def falling(self) -> bool:
-        """True if a larger number of the network means a nearer point."""
+        """Whether a larger number of the network means a nearer point."""
         return (self.scale < 0) != (self.space == "inverse")
 
     def __str__(self) -> str:
@@ -89,37 +93,53 @@ class Alignment:
 
 
 def align(x: Tensor, points: SparsePoints, spaces: tuple[str, ...], kind: str) -> Alignment:
-    """The alignment of the network's numbers at the points, x (N,), with their depths.
+    """Returns the alignment of the network's numbers with the points.
 
-    spaces: what the network may give; with several, or with kind "auto", the best by BIC of a
-    Laplace model of the relative errors: a more elaborate one must earn its parameters.
-    NoPointsError with too few points, ModelError if the numbers do not vary (or are not finite).
+    With several spaces, or with kind "auto", it is the best by BIC of a Laplace model of the
+    relative errors, so that a fit with more parameters must be worth them.
+
+    Args:
+        x: (N,) the network's numbers at the points.
+        points: N points.
+        spaces: Quantities that the network may predict, of `choices.SPACES`.
+        kind: One of `choices.ALIGNMENTS`.
+
+    Raises:
+        NoPointsError: There are too few points.
+        ModelError: The numbers do not vary, or are not finite.
     """
     x, d = x.detach().double().cpu(), points.depth.detach().double().cpu()
     good = x.isfinite()
     if not bool(good.any()):
         raise ModelError("the network's output is not finite at any sparse point; nothing to align")
     x, d = x[good], d[good]
-    tried = ("none", "scale", "affine") if kind == "auto" else (kind,)
-    found = [made for s in spaces for k in tried if (made := _fitted(x, d, s, k)) is not None]
-    if not found and len(x) < 2:
+    kinds = ("none", "scale", "affine") if kind == "auto" else (kind,)
+    fits = [fit for s in spaces for k in kinds if (fit := _fitted(x, d, s, k)) is not None]
+    if not fits and len(x) < 2:
         raise NoPointsError(
             f"alignment {kind!r} needs at least 2 sparse points where the network sees them,"
             f" here is {len(x)}; --align scale needs only one"
         )
-    if not found:
+    if not fits:
         raise ModelError(
             f"alignment {kind!r} is not possible: the network's output is the same at all"
             f" {len(x)} sparse points, or zero"
         )
-    return min(found, key=lambda a: _bic(a))
+    return min(fits, key=_bic)
 
 
 def aligned(prediction: Tensor, points: SparsePoints, *, kind: str, space: str = "depth") -> Tensor:
-    """Depth (H, W) float32 of a prediction (H, W), aligned with the points in one of SPACES.
+    """Returns the prediction aligned with the points, (H, W) float32 metres, 0 = unknown.
 
-    prediction: depth, metric or not; what is not positive and finite is unknown, and is 0 in the
-    result. Errors as of `align`; NoPointsError if no point lies where there is a prediction.
+    Args:
+        prediction: (H, W) depth, metric or not; not positive or not finite is unknown.
+        points: Sparse depth in the same frame.
+        kind: One of `choices.ALIGNMENTS`.
+        space: Quantity in which the line is fitted, one of `choices.SPACES`.
+
+    Raises:
+        NoPointsError: No point has a prediction.
+        ModelError: As of `align`.
     """
     known, points = where_predicted(prediction, points)
     x = to_space(torch.where(known, prediction, 1.0), space)
@@ -128,7 +148,11 @@ def aligned(prediction: Tensor, points: SparsePoints, *, kind: str, space: str =
 
 
 def where_predicted(prediction: Tensor, points: SparsePoints) -> tuple[Tensor, SparsePoints]:
-    """(where a prediction (H, W) is depth, the points that lie there). NoPointsError if none."""
+    """Returns where a prediction (H, W) is known, and the points that lie there.
+
+    Raises:
+        NoPointsError: There is no such point.
+    """
     known = prediction.isfinite() & (prediction > 0)
     seen = points.select(points.sample(torch.where(known, prediction, torch.nan)).isfinite())
     if not len(seen):
@@ -148,17 +172,17 @@ def _fitted(x: Tensor, d: Tensor, space: str, kind: str) -> Alignment | None:
         space=space, kind=kind, scale=line[0], shift=line[1], bounds=bounds, points=len(x)
     )
     off = (made.depth(x).log() - d.log()).abs()
-    error = float(off.sort().values[: max(1, round(_TRUSTED * len(off)))].mean())
+    error = float(off.sort().values[: max(1, round(_BEST * len(off)))].mean())
     gross = max(3 * _NORMAL_MAD * float(off.median()), 0.05)
-    misfit = float(off.clamp_max(_WRONG).mean())
+    misfit = float(off.clamp_max(_MAX_ERROR).mean())
     return replace(made, error=error, misfit=misfit, outliers=float((off > gross).double().mean()))
 
 
 def _bic(made: Alignment) -> float:
     parameters = {"none": 0, "affine": 2}.get(made.kind, 1)
-    error = max(made.misfit, _NO_BETTER)
-    # Wrong points leave room for a parameter to fit them: on rendered frames, with and without
-    # outliers, twice the usual price of one chose best.
+    error = max(made.misfit, _MIN_ERROR)
+    # A parameter can fit outliers: on rendered frames, with and without outliers, twice BIC's
+    # price of a parameter chose best.
     return 2 * (made.points * math.log(error) + parameters * math.log(max(2, made.points)))
 
 
@@ -212,13 +236,13 @@ def _least_median(x: Tensor, y: Tensor) -> tuple[float, float]:
 def _reweighted(
     x: Tensor, y: Tensor, start: tuple[float, float], *, shifted: bool
 ) -> tuple[float, float]:
-    """Least squares of y = a·x + b from a start, points far off the line weighing nothing."""
+    """Least squares of y = a·x + b from a start; points far off the line have no weight."""
     a, b = start
     least = 1e-9 * float(y.abs().median()) + torch.finfo(y.dtype).tiny
     for _ in range(30):
         residual = (y - a * x - b).abs()
-        spread = _BIWEIGHT * max(_NORMAL_MAD * float(residual.median()), least)
-        w = (1 - (residual / spread).square()).clamp_min(0).square()
+        cutoff = _BIWEIGHT * max(_NORMAL_MAD * float(residual.median()), least)
+        w = (1 - (residual / cutoff).square()).clamp_min(0).square()
         total = w.sum()
         mx, my = ((w * x).sum() / total, (w * y).sum() / total) if shifted else (0.0, 0.0)
         power = (w * (x - mx).square()).sum()
@@ -232,16 +256,16 @@ def _reweighted(
 
 
 def to_space(depth: Tensor, space: str) -> Tensor:
-    """Depth as one of SPACES has it."""
+    """Returns depth as one of `choices.SPACES`."""
     return {"depth": lambda: depth, "inverse": depth.reciprocal, "log": depth.log}[space]()
 
 
 def from_space(value: Tensor, space: str) -> Tensor:
-    """The depth of a value of one of SPACES."""
+    """Returns the depth of a value in one of `choices.SPACES`."""
     return {"depth": lambda: value, "inverse": value.reciprocal, "log": value.exp}[space]()
 
 
-def _held(x: Tensor, low: float, high: float) -> Tensor:
-    """x within low … high; the gradient passes through as if it were not held."""
-    held = x.clamp(low, high)
-    return held if not x.requires_grad else held.detach() + (x - x.detach())
+def _clamped(x: Tensor, low: float, high: float) -> Tensor:
+    """x within low … high; the gradient is that of x."""
+    clamped = x.clamp(low, high)
+    return clamped if not x.requires_grad else clamped.detach() + (x - x.detach())

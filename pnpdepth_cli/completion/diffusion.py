@@ -1,13 +1,13 @@
-"""What is left at the points, diffused over the picture up to the edges.
+"""The residual at the points, diffused over the image up to the edges.
 
 With r the residual in log depth at the points and c the correction on a grid of nodes,
 
     min over c of  Σ_points (c(p) − r_p)² + λ·Σ_edges w_ij·(c_i − c_j)² + ε·Σ_i (c_i − median r)²,
 
-w_ij = 1 / (place² + (u_i − u_j)² + (colour_i − colour_j)²), each over its length: one sparse linear
-system, as in Levin, Lischinski, Weiss, "Colorization using optimization", 2004, with the weights of
-Perona and Malik 1990. The grid is the coarser the fewer the points are: between them each node
-counts as one more step, so that on a fine grid what they tell stays close to them.
+w_ij = 1 / (position² + (u_i − u_j)² + (colour_i − colour_j)²), each over its length: one sparse
+linear system, as in Levin, Lischinski, Weiss, "Colorization using optimization", 2004, with the
+weights of Perona and Malik 1990. The fewer the points, the coarser the grid: each node between two
+points counts as one more step, so that on a fine grid the residual stays close to the points.
 """
 
 from __future__ import annotations
@@ -19,25 +19,25 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from pnpdepth_cli.completion.gaussian_process import Field
+from pnpdepth_cli.completion.residual_field import ResidualField
 
 STIFFNESS = 1e-4
 """λ, with the weights at 1 where neighbours look the same."""
 EDGE_DEPTH, EDGE_COLOUR = 0.1, 0.5
-"""Differences of neighbouring nodes, in standard deviations of the picture, that halve a weight."""
+"""Differences of neighbouring nodes, in standard deviations of the image, that halve a weight."""
 
-_NODES_A_POINT, _FEWEST_NODES, _MOST_NODES = 10, 2_000, 30_000
-_ANCHOR = 1e-9  # ε: where nothing tells a node anything
+_NODES_PER_POINT, _MIN_NODES, _MAX_NODES = 10, 2_000, 30_000
+_REGULARISATION = 1e-9  # ε: for nodes that no point reaches
 
 
-def diffused(field: Field) -> Tensor:
-    """The residual in every pixel (H, W) float32."""
+def diffuse(field: ResidualField) -> Tensor:
+    """Returns the residual (H, W) float32 at every pixel."""
     from scipy.sparse import coo_array, csc_array, eye_array
     from scipy.sparse.csgraph import laplacian
     from scipy.sparse.linalg import splu
 
     height, width = field.points.size
-    wanted = min(max(_NODES_A_POINT * len(field.points), _FEWEST_NODES), _MOST_NODES)
+    wanted = min(max(_NODES_PER_POINT * len(field.points), _MIN_NODES), _MAX_NODES)
     shrink = min(1.0, math.sqrt(wanted / (height * width)))
     rows, columns = max(1, round(height * shrink)), max(1, round(width * shrink))
     nodes = F.interpolate(field.features.permute(2, 0, 1)[None], (rows, columns), mode="area")[0]
@@ -54,7 +54,7 @@ def diffused(field: Field) -> Tensor:
     adjacent = coo_array((weight.repeat(2).numpy(), ends), shape=(total, total)).tocsr()
     reads = _readings(field, rows, columns)
     middle = float(field.residual.median())
-    system = reads.T @ reads + laplacian(adjacent) + _ANCHOR * eye_array(total)
+    system = reads.T @ reads + laplacian(adjacent) + _REGULARISATION * eye_array(total)
     right = reads.T @ (field.residual - middle).numpy()
     # positive definite: its own diagonal will do for pivots, and others would fill the factors
     found = splu(
@@ -67,7 +67,7 @@ def diffused(field: Field) -> Tensor:
     return F.interpolate(correction, (height, width), mode="bilinear", align_corners=False)[0, 0]
 
 
-def _readings(field: Field, rows: int, columns: int) -> Any:
+def _readings(field: ResidualField, rows: int, columns: int) -> Any:
     """The sparse matrix (N, nodes) that reads a map of the nodes at the points, bilinearly."""
     from scipy.sparse import coo_array
 

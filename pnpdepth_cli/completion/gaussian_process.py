@@ -1,29 +1,29 @@
-"""What is left at the points, spread over the picture by a Gaussian process (kriging).
+"""A Gaussian process over the image that predicts the residual at the sparse points (kriging).
 
-The residual r in log depth is the value of a random field at the points,
+The residual r in log depth is a random field observed at the points,
 
     r(p) = β₀ + β₁·u(p) + f(p) + noise,   cov f(p), f(q) = exp(−|φ(p) − φ(q)|),
 
-β₀ and β₁ normal with variances 100 and 1, u the predicted log depth. φ holds the place in the
-picture, u, and the colour in CIELAB, each over a length: what looks alike, is predicted alike and
-is near has about the same residual, and an edge of the picture or the prediction stops it. The mean
-and the variance of r anywhere, given the points, are
+β₀ and β₁ normal with variances 100 and 1, u the predicted log depth. φ holds the position in the
+image, u, and the colour in CIELAB, each divided by a length scale: pixels that are near, look alike
+and are predicted alike have about the same residual, and an edge of the image or of the prediction
+stops it. The mean and variance of r anywhere, given the points, are
 
     mean = k·α,   α = (K + N)⁻¹ r,    variance = k(p, p) − k·(K + N)⁻¹·k,
 
 K of all covariances among the points, k of those with p, N diagonal of the noise (Rasmussen and
 Williams, "Gaussian Processes for Machine Learning", 2006, sections 2.2 and 2.7; universal kriging
-in Cressie, "Statistics for Spatial Data", 1993, section 3.4). The lengths are those of a few that
-tell each point best from the others, which costs no more than solving once (ibid., eq. 5.12).
+in Cressie, "Statistics for Spatial Data", 1993, section 3.4). Of a few length scales, those with
+the smallest leave-one-out error are taken, which costs no more than solving once (ibid., eq. 5.12).
 
-With many points every block of the picture is told by the points nearest to it, all blocks at once;
-two layers of blocks, half a block apart, are blended so that no seam is seen.
+With many points, each image block is predicted from its nearest points, all blocks at once. Two
+layers of blocks, half a block apart, are blended so that no seam is seen.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import product
 
 import torch
@@ -31,170 +31,140 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from pnpdepth_cli.completion.interpolation import nearest_points
-from pnpdepth_cli.completion.local_alignment import trust
+from pnpdepth_cli.completion.residual_field import Kernel, ResidualField
 from pnpdepth_cli.points import SparsePoints
 
 CONSTANT, SLOPE = 100.0, 1.0
-"""Variances of β₀ and β₁, those of f being 1."""
+"""Variances of β₀ and β₁, in units of the variance of f."""
 LENGTHS_DEPTH = (1.0, 2.5, 8.0, 25.0)
 LENGTHS_COLOUR = (2.5, 8.0, 25.0)
 NOISES = (1e-4, 1e-3, 1e-2, 1.0)
-"""Lengths in standard deviations over the picture (of the place, in longer sides: 1), and variance
-of the noise. Chosen on rendered frames, with predictions of three networks; the longest lengths
-and the least and most noise are there for frames unlike those."""
+"""Length scales in standard deviations over the image (of the position, in longer sides: 1), and
+variance of the noise. Chosen on rendered frames with predictions of three networks; the longest
+lengths and the least and most noise are there for frames unlike those."""
 NEIGHBOURS = 48
+"""Points that predict a block, or a single pixel, where there are many points."""
+MIN_POINTS = 5
+"""Fewer points cannot tell which length scales are best."""
+DEFAULT_SCALE = 0.2
+"""Standard deviation of f with fewer points: typical relative errors of networks."""
 
-_EXACT = 128  # points up to which all of them tell every pixel,
-_EXACT_MOST = 256  # and up to which they do where the picture is small:
-_EXACT_PRODUCT = 40_000_000  # points × pixels
-_AT_ONCE = 1 << 19  # covariances made at once: what bounds the memory
-_ASKED = 24  # neighbourhoods in which the lengths are tried out, when there are many points,
+_MAX_EXACT = 128  # points up to which all of them predict every pixel,
+_MAX_EXACT_SMALL = 256  # and up to which they do where the image is small:
+_MAX_EXACT_PRODUCT = 40_000_000  # points × pixels
+_AT_ONCE = 1 << 19  # covariances computed at once: what bounds the memory
+_NEIGHBOURHOODS = 24  # in which the length scales are tried, when there are many points,
 _INNER = 16  # and points of each that are left out: the middle ones
-_IN_BLOCK = 3  # a block has at most 1/3 of the points that tell it,
-_SMALLEST = 8  # pixels, a block's side
-_CROWDED = 0.05  # but for so many of all points
-_WRONG = (4.0, 4.0, 5.0, 6.0, 8.0)  # times the usual error, beyond which a point is wrong, in turn
-_NOTHING = 1e-6  # the weight of a point that tells nothing
-_DOUBTED = 0.05  # weight of 0…1; points with less are left out,
-_AROUND, _MOST_DOUBTED, _HALF = 6, 4, 3  # neighbours: of a fifth of wrong points 2 % have 4 such
-_FAR_BETTER = 0.5  # if that makes the others' errors at most so much of what they were,
-_FAR_BETTER_MANY = 0.65  # or so much where there are many points, whose errors are well known
-_LEAST = 1e-3  # of the usual error over its standard deviation if f had 1; less is none
-_NORMAL_MEDIAN = 1.4826  # standard deviation over median of |x|, normal errors
-_FEW = 5  # points; fewer cannot tell which lengths are best
-_UNTOLD = 0.2  # standard deviation of f where nothing tells it: what networks are off by
-_WITHIN = 0.68  # share within ± one standard deviation
+_IN_BLOCK = 3  # a block contains at most 1/3 of the points that predict it,
+_MIN_BLOCK = 8  # pixels, a block's side
+_CROWDED = 0.05  # except for this fraction of all points
+_MIN_SCORED_WEIGHT = 1e-6  # the weight of a point that predicts nothing
+_WITHIN = 0.68  # fraction within ± one standard deviation
 
 
-@dataclass(frozen=True, kw_only=True)
-class Kernel:
-    """Lengths of the predicted log depth and of the colour, and the variance of the noise."""
+def fit(field: ResidualField) -> ResidualField:
+    """Returns the field with the kernel of smallest leave-one-out error, and its scale.
 
-    depth: float = 2.5
-    colour: float = 8.0
-    noise: float = 1e-3
-
-    def scaled(self, features: Tensor) -> Tensor:
-        """Features (..., 3 or 6) over their lengths."""
-        lengths = [1.0, 1.0, self.depth, *[self.colour] * (features.shape[-1] - 3)]
-        return features / features.new_tensor(lengths)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Field:
-    """A residual known at points of a picture.
-
-    features: (H, W, 3 or 6) of `propagation.features_of`. at: (N, 3 or 6), those of the points.
-    residual: (N,) float64. kernel: the covariances. scale: standard deviation of f.
+    The length scales are chosen first, then the noise: on rendered frames as good as all together.
+    With fewer than 5 points the kernel stays and the scale is a default.
     """
+    if len(field.points) < MIN_POINTS:
+        return replace(field, scale=DEFAULT_SCALE)
+    near = neighbourhoods(field, _MAX_EXACT)
 
-    features: Tensor
-    points: SparsePoints
-    at: Tensor
-    residual: Tensor
-    kernel: Kernel = Kernel()
-    scale: float = 1.0
-
-    def select(self, mask: Tensor) -> Field:
-        """The field of the points where mask (N,) is true."""
-        points, at, residual = self.points.select(mask), self.at[mask], self.residual[mask]
-        return replace(self, points=points, at=at, residual=residual)
-
-
-def believed(field: Field) -> Tensor:
-    """(N,) bool: the points that are not wrong; all of them, unless some clearly are.
-
-    Each point is weighted by how well its neighbours tell it: loosely by `trust`, then, unless
-    there are very many, by the process, told by the others as they are weighted. A point on a small
-    thing is as alone as a wrong one; but only where there are wrong ones do the others tell each
-    other far better without all that are alone. Where those lie together they are not wrong, but
-    what the network has not seen: a corridor behind a door.
-    """
-    weight, near = trust(field.points, field.residual), _neighbourhoods(field, _EXACT_MOST)
-    if len(near) == 1 and near.shape[1] >= _FEW:
-        for many in _WRONG:
-            error, variance = _left_out(field, near, weight)
-            beyond = error[0].abs() / variance[0].sqrt()
-            usual = max(_NORMAL_MEDIAN * float(beyond.median()), _LEAST)
-            weight = (1 - (beyond / (many * usual)).square()).clamp_min(0).square()
-    kept = weight > _DOUBTED
-    kept = kept | _together(field.points, ~kept)
-    weight = torch.where(kept, weight.clamp_min(_DOUBTED), weight)
-    if bool(kept.all()) or not bool(kept.any()):
-        return torch.ones_like(kept)
-    with_all, without = (
-        float((error.abs() * weight[near[:, : error.shape[1]]]).sum())
-        for error, _ in (_left_out(field, near), _left_out(field, near, weight))
-    )
-    enough = _FAR_BETTER if len(near) == 1 else _FAR_BETTER_MANY
-    return kept if without < enough * with_all else torch.ones_like(kept)
-
-
-def _together(points: SparsePoints, doubted: Tensor) -> Tensor:
-    """(N,) bool: the doubted points most of whose neighbours are doubted, and those beside such."""
-    if len(points) <= _AROUND or not bool(doubted.any()):
-        return torch.zeros_like(doubted)
-    _, near = nearest_points(points, points.xy.double(), _AROUND + 1)
-    near = near[:, 1:]
-    found = doubted & (doubted[near].sum(dim=1) >= _MOST_DOUBTED)
-    while True:
-        more = found | (doubted & (found[near].sum(dim=1) >= _HALF))
-        if torch.equal(more, found):
-            return found
-        found = more
-
-
-def fitted(field: Field) -> Field:
-    """The field with the kernel that tells each point best from the others, and its scale.
-
-    First the lengths, then the noise: on rendered frames as good as all of them together. Fewer
-    than 5 points cannot choose: the kernel stays, and the scale is a usual one.
-    """
-    if len(field.points) < _FEW:
-        return replace(field, scale=_UNTOLD)
-    near = _neighbourhoods(field, _EXACT)
-
-    def tried(kernel: Kernel) -> tuple[float, float, Kernel]:
-        error, variance = _left_out(replace(field, kernel=kernel), near)
+    def score(kernel: Kernel) -> tuple[float, float, Kernel]:
+        error, variance = leave_one_out(replace(field, kernel=kernel), near)
         scale = (error.abs() / variance.sqrt()).flatten().quantile(_WITHIN)
         return float(error.abs().mean()), float(scale), kernel
 
     colours = LENGTHS_COLOUR if field.at.shape[1] > 3 else LENGTHS_COLOUR[:1]
     lengths = product(LENGTHS_DEPTH, colours)
-    best = min((tried(Kernel(depth=d, colour=c)) for d, c in lengths), key=lambda one: one[0])
+    best = min((score(Kernel(depth=d, colour=c)) for d, c in lengths), key=lambda one: one[0])
     others = [noise for noise in NOISES if noise != best[2].noise]
-    noises = (tried(replace(best[2], noise=noise)) for noise in others)
+    noises = (score(replace(best[2], noise=noise)) for noise in others)
     _, scale, kernel = min([best, *noises], key=lambda one: one[0])
     return replace(field, kernel=kernel, scale=scale)
 
 
-def spread(field: Field, *, sigma: bool = False) -> tuple[Tensor, Tensor | None]:
-    """The residual in every pixel (H, W), and its standard deviation if asked for; float32."""
+def predict(field: ResidualField) -> Tensor:
+    """Returns the mean residual (H, W) float32 at every pixel."""
+    return _predict(field, sigma=False)[0]
+
+
+def predict_with_sigma(field: ResidualField) -> tuple[Tensor, Tensor]:
+    """Returns the mean residual and its standard deviation, (H, W) float32 each."""
+    mean, variance = _predict(field, sigma=True)
+    return mean, variance.clamp_min(0).sqrt() * field.scale
+
+
+def predict_at(field: ResidualField, xy: Tensor, features: Tensor) -> Tensor:
+    """Returns the mean residual (M,) at single pixels.
+
+    Args:
+        field: The fitted field.
+        xy: (M, 2) pixel coordinates.
+        features: (M, 3 or 6), the features there.
+    """
+    if _is_exact(field) or len(field.points) <= NEIGHBOURS:
+        return _solve(field, _all_points(field), features[None], False)[0, 0]
+    _, near = nearest_points(field.points, xy.double(), NEIGHBOURS)
+    return _solve(field, near, features[:, None], False)[0, :, 0]
+
+
+def leave_one_out(
+    field: ResidualField, near: Tensor, weight: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
+    """Returns error and variance (B, ≤ k) at points predicted from their neighbourhood's others.
+
+    Computed without solving again: Rasmussen and Williams, eq. 5.12.
+
+    Args:
+        field: The field.
+        near: (B, k) numbers of points of each neighbourhood.
+        weight: (N,) 0…1 of each point as a predictor; one of 0 predicts nothing.
+    """
+    _, u, system = _systems(field, near)
+    weight = torch.ones_like(field.residual) if weight is None else weight
+    extra_noise = field.kernel.noise * (weight[near].clamp_min(_MIN_SCORED_WEIGHT) ** -2 - 1)
+    system = system + torch.diag_embed(extra_noise)
+    inverse = torch.cholesky_inverse(torch.linalg.cholesky(system + _trend(u)))
+    variance = 1 / inverse.diagonal(dim1=1, dim2=2)
+    error = (inverse @ field.residual[near][..., None])[..., 0] * variance
+    inner = _INNER if near.shape[0] > 1 else None
+    return error[:, :inner], (variance - extra_noise)[:, :inner]
+
+
+def neighbourhoods(field: ResidualField, max_exact: int) -> Tensor:
+    """Returns (B, k) numbers of points near each other, the middle one first.
+
+    One neighbourhood of all points, up to `max_exact` of them.
+    """
+    count = len(field.points)
+    if count <= max_exact:
+        return _all_points(field)
+    middles = torch.linspace(0, count - 1, _NEIGHBOURHOODS).long()
+    _, near = nearest_points(field.points, field.points.xy[middles].double(), NEIGHBOURS)
+    return near
+
+
+def _predict(field: ResidualField, *, sigma: bool) -> Tensor:
+    """(1 or 2, H, W): mean and, if wanted, variance in units of the scale."""
     height, width = field.points.size
-    if _all_tell(field):
+    if _is_exact(field):
         queries = field.features.reshape(1, height * width, -1)
-        told = _told(field, _everyone(field), queries, sigma).reshape(-1, height, width)
-    else:
-        side = _block_side(field.points)
-        parts = [_layer(field, side, shift, sigma) for shift in (0, side // 2)]
-        total = parts[0][1] + parts[1][1]
-        told = torch.stack([told * (weight / total) for told, weight in parts]).sum(dim=0)
-    return told[0], (told[1].clamp_min(0).sqrt() * field.scale if sigma else None)
+        return _solve(field, _all_points(field), queries, sigma).reshape(-1, height, width)
+    side = _block_side(field.points)
+    layers = [_predict_blocks(field, side, shift, sigma) for shift in (0, side // 2)]
+    total = layers[0][1] + layers[1][1]
+    blended = torch.stack([values * (weight / total) for values, weight in layers])
+    return blended.sum(dim=0)
 
 
-def at_places(field: Field, places: Tensor, at: Tensor) -> Tensor:
-    """The residual (M,) at places (M, 2) xy in pixels with these features (M, 3 or 6)."""
-    if _all_tell(field) or len(field.points) <= NEIGHBOURS:
-        return _told(field, _everyone(field), at[None], False)[0, 0]
-    _, near = nearest_points(field.points, places.double(), NEIGHBOURS)
-    return _told(field, near, at[:, None], False)[0, :, 0]
-
-
-def _told(field: Field, near: Tensor, queries: Tensor, sigma: bool) -> Tensor:
-    """(1 or 2, B, Q) float32: mean and variance at B × Q features, told by points near (B, k)."""
-    (blocks, count), asked = near.shape, queries.shape[1]
-    found = queries.new_empty(1 + sigma, blocks, asked)
-    many = max(1, _AT_ONCE // (asked * count))
+def _solve(field: ResidualField, near: Tensor, queries: Tensor, sigma: bool) -> Tensor:
+    """(1 or 2, B, Q) float32: mean and variance at B × Q features, from points near (B, k)."""
+    (blocks, count), per_block = near.shape, queries.shape[1]
+    result = queries.new_empty(1 + sigma, blocks, per_block)
+    many = max(1, _AT_ONCE // (per_block * count))
     step = max(1, _AT_ONCE // (many * count))
     for first in range(0, blocks, many):
         some = slice(first, first + many)
@@ -204,20 +174,20 @@ def _told(field: Field, near: Tensor, queries: Tensor, sigma: bool) -> Tensor:
         beta = torch.stack([CONSTANT * alpha[..., 0].sum(1), SLOPE * (u * alpha[..., 0]).sum(1)])
         if sigma:
             root = torch.linalg.cholesky(system)
-        for start in range(0, asked, step):
+        for start in range(0, per_block, step):
             part = queries[some, start : start + step]
             v = part[..., 2]
             k = _covariance(field.kernel.scaled(part), at.float())
             mean = (k @ alpha.float())[..., 0] + beta.float()[0, :, None]
-            found[0, some, start : start + step] = mean + beta.float()[1, :, None] * v
+            result[0, some, start : start + step] = mean + beta.float()[1, :, None] * v
             if sigma:
                 variance = _variance(root, u, k, v) + field.kernel.noise
-                found[1, some, start : start + step] = variance
-    return found
+                result[1, some, start : start + step] = variance
+    return result
 
 
-def _systems(field: Field, near: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Features over their lengths, u, and the covariances of f and noise, of points near (B, k)."""
+def _systems(field: ResidualField, near: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Scaled features, u, and the covariances of f and noise, of points near (B, k)."""
     at = field.at.double()[near]
     scaled = field.kernel.scaled(at)
     noise = field.kernel.noise * torch.eye(near.shape[1], dtype=at.dtype)
@@ -242,9 +212,9 @@ def _variance(root: Tensor, u: Tensor, k: Tensor, v: Tensor) -> Tensor:
     inverse = torch.linalg.solve_triangular(
         root, torch.eye(u.shape[1], dtype=u.dtype).expand_as(root), upper=False
     )
-    told = inverse.float() @ k.transpose(1, 2)
-    left = torch.stack([torch.ones_like(v), v], dim=1) - lines.float().transpose(1, 2) @ told
-    variance: Tensor = 1 - told.square().sum(dim=1) + (left * (rest @ left)).sum(dim=1)
+    explained = inverse.float() @ k.transpose(1, 2)
+    left = torch.stack([torch.ones_like(v), v], dim=1) - lines.float().transpose(1, 2) @ explained
+    variance: Tensor = 1 - explained.square().sum(dim=1) + (left * (rest @ left)).sum(dim=1)
     return variance
 
 
@@ -258,48 +228,23 @@ def _covariance(a: Tensor, b: Tensor) -> Tensor:
     return closeness
 
 
-def _left_out(field: Field, near: Tensor, weight: Tensor | None = None) -> tuple[Tensor, Tensor]:
-    """Error and variance (B, ≤ k) at points, each told by the others of its neighbourhood.
-
-    Without solving again: Rasmussen and Williams, eq. 5.12. weight: (N,) 0…1 of what the others
-    tell; one of 0 tells nothing.
-    """
-    _, u, system = _systems(field, near)
-    weight = torch.ones_like(field.residual) if weight is None else weight
-    more = field.kernel.noise * (weight[near].clamp_min(_NOTHING) ** -2 - 1)
-    system = system + torch.diag_embed(more)
-    inverse = torch.cholesky_inverse(torch.linalg.cholesky(system + _trend(u)))
-    variance = 1 / inverse.diagonal(dim1=1, dim2=2)
-    error = (inverse @ field.residual[near][..., None])[..., 0] * variance
-    inner = _INNER if near.shape[0] > 1 else None
-    return error[:, :inner], (variance - more)[:, :inner]
-
-
-def _neighbourhoods(field: Field, most: int) -> Tensor:
-    """Numbers (B, k) of points near each other, the middle one first; all of them up to most."""
-    count = len(field.points)
-    if count <= most:
-        return _everyone(field)
-    middles = torch.linspace(0, count - 1, _ASKED).long()
-    _, near = nearest_points(field.points, field.points.xy[middles].double(), NEIGHBOURS)
-    return near
-
-
-def _everyone(field: Field) -> Tensor:
+def _all_points(field: ResidualField) -> Tensor:
     return torch.arange(len(field.points))[None]
 
 
-def _all_tell(field: Field) -> bool:
-    """True if every pixel is told by all points."""
+def _is_exact(field: ResidualField) -> bool:
+    """Whether every pixel is predicted from all points."""
     count, (height, width) = len(field.points), field.points.size
-    small = count <= _EXACT_MOST and count * height * width <= _EXACT_PRODUCT
-    return small or count <= _EXACT
+    small = count <= _MAX_EXACT_SMALL and count * height * width <= _MAX_EXACT_PRODUCT
+    return small or count <= _MAX_EXACT
 
 
-def _layer(field: Field, side: int, shift: int, sigma: bool) -> tuple[Tensor, Tensor]:
-    """(1 or 2, H, W) mean and variance, told block by block, and the pixels' weights (H, W).
+def _predict_blocks(
+    field: ResidualField, side: int, shift: int, sigma: bool
+) -> tuple[Tensor, Tensor]:
+    """(1 or 2, H, W) mean and variance, predicted block by block, and the pixels' weights (H, W).
 
-    Blocks of side × side pixels, the first of which begins `shift` pixels before the picture. A
+    Blocks of side × side pixels, the first of which begins `shift` pixels before the image. A
     pixel's weight is its distance to the edge of its block.
     """
     height, width = field.points.size
@@ -309,25 +254,25 @@ def _layer(field: Field, side: int, shift: int, sigma: bool) -> tuple[Tensor, Te
     blocks = padded.reshape(-1, rows, side, columns, side).permute(1, 3, 2, 4, 0)
     middles = torch.cartesian_prod(torch.arange(rows), torch.arange(columns)).flip(1).double()
     _, near = nearest_points(field.points, (middles + 0.5) * side - 0.5 - shift, NEIGHBOURS)
-    told = _told(field, near, blocks.reshape(rows * columns, side * side, -1), sigma)
-    told = told.reshape(-1, rows, columns, side, side).permute(0, 1, 3, 2, 4)
-    told = told.reshape(-1, rows * side, columns * side)
-    place = torch.arange(float(side)) + 0.5
-    inside = torch.minimum(place, side - place)
+    values = _solve(field, near, blocks.reshape(rows * columns, side * side, -1), sigma)
+    values = values.reshape(-1, rows, columns, side, side).permute(0, 1, 3, 2, 4)
+    values = values.reshape(-1, rows * side, columns * side)
+    position = torch.arange(float(side)) + 0.5
+    inside = torch.minimum(position, side - position)
     y, x = (inside.repeat(n)[shift:] for n in (rows, columns))
     weight = torch.minimum(y[:height, None], x[None, :width])
-    return told[:, shift : shift + height, shift : shift + width], weight
+    return values[:, shift : shift + height, shift : shift + width], weight
 
 
 def _block_side(points: SparsePoints) -> int:
     """The largest side in pixels for which nearly no block has too many points."""
     side = max(points.size)
     x, y = points.xy.unbind(1)
-    while side > _SMALLEST:
+    while side > _MIN_BLOCK:
         cell = (y / side).floor().clamp_min(0) * points.size[1] + (x / side).floor().clamp_min(0)
         count = torch.bincount(cell.long())
         crowded = count[count > NEIGHBOURS / _IN_BLOCK].sum()
         if float(crowded) <= _CROWDED * len(points):
             break
-        side = max(_SMALLEST, round(side / 1.4))
+        side = max(_MIN_BLOCK, round(side / 1.4))
     return side

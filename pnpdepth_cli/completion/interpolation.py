@@ -1,9 +1,9 @@
 """Dense depth from sparse points alone: what a network has to beat.
 
-All take points at any coordinates and give depth (H, W) float32 of their frame, or with `places`
-(M, 2) depth (M,) at those pixel coordinates, positive everywhere; of points at one place the
-nearest counts, and the order of the points does not. Any number of points has an answer, down to
-one, whose depth is everywhere. NoPointsError without any.
+Each function takes points at any coordinates and returns positive depth (H, W) float32 metres of
+their frame, or with `xy` (M, 2) depth (M,) at those pixel coordinates. Of points at the same
+coordinates the nearest counts; the order of the points has no effect. One point gives its depth
+everywhere. Without any, NoPointsError is raised.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from pnpdepth_cli.points import SparsePoints
 IDW_NEIGHBOURS = 6
 IDW_POWER = 4.0
 FILL_SHARE = 0.03
-"""Share of the pixels with a point for which the kernels of `morphological` are as published."""
+"""Fraction of the pixels with a point for which the kernels of `morphological` are as published."""
 
 _IDW_PIXELS = 1 << 18  # pixels looked up at once: what bounds the memory
 _AT_A_POINT = 0.25  # pixels; closer than this, a point is as close as can be
@@ -29,24 +29,28 @@ _WORTH_THREADS = 1 << 15  # neighbours; for fewer, threads cost more than they s
 _BLUR_SIGMA = 1.1  # pixels; what OpenCV makes of the 5 × 5 Gaussian kernel of the paper's code
 
 
-def nearest(points: SparsePoints, places: Tensor | None = None) -> Tensor:
-    """Each pixel has the depth of the point nearest in the picture."""
+def nearest(points: SparsePoints, xy: Tensor | None = None) -> Tensor:
+    """Returns the depth of the nearest point in the image."""
     points = distinct(points)
-    _, number = nearest_points(points, _places(points, places), 1)
-    return _shaped(points.depth.cpu()[number[:, 0]], points, places)
+    _, number = nearest_points(points, _queries(points, xy), 1)
+    return _shaped(points.depth.cpu()[number[:, 0]], points, xy)
 
 
-def linear(points: SparsePoints, places: Tensor | None = None, *, space: str = "depth") -> Tensor:
-    """Each pixel is interpolated linearly in its Delaunay triangle of points.
+def linear(points: SparsePoints, xy: Tensor | None = None, *, space: str = "depth") -> Tensor:
+    """Returns linear interpolation in the Delaunay triangles of the points.
 
-    The nearest point's depth outside the points' hull, and everywhere if all are on one line.
-    space: in which of `alignment.SPACES` it is linear.
+    Outside the points' hull, and everywhere if all are on one line, the nearest point's depth.
+
+    Args:
+        points: Sparse depth.
+        xy: (M, 2) pixel coordinates. None: every pixel.
+        space: Quantity that is linear, one of `choices.SPACES`.
     """
     from scipy.interpolate import LinearNDInterpolator
     from scipy.spatial import QhullError
 
     points = distinct(points)
-    pixels = _places(points, places)
+    pixels = _queries(points, xy)
     dense = torch.full((len(pixels),), torch.nan, dtype=torch.float64)
     if len(points) >= 3:
         value = to_space(points.depth.double().cpu(), space)
@@ -58,40 +62,47 @@ def linear(points: SparsePoints, places: Tensor | None = None, *, space: str = "
     outside = dense.isnan()
     _, number = nearest_points(points, pixels[outside], 1)
     dense[outside] = points.depth.double().cpu()[number[:, 0]]
-    return _shaped(dense, points, places)
+    return _shaped(dense, points, xy)
 
 
 def inverse_distance(
     points: SparsePoints,
-    places: Tensor | None = None,
+    xy: Tensor | None = None,
     *,
     neighbours: int = IDW_NEIGHBOURS,
     power: float = IDW_POWER,
     space: str = "log",
 ) -> Tensor:
-    """Each pixel is the mean of its nearest points, weighted by 1 / distance^power.
+    """Returns the mean of the nearest points, weighted by 1 / distance^power.
 
     Shepard, "A two-dimensional interpolation function for irregularly-spaced data", 1968, of the
-    nearest points only; the mean is taken in one of `alignment.SPACES`.
+    nearest points only.
+
+    Args:
+        points: Sparse depth.
+        xy: (M, 2) pixel coordinates. None: every pixel.
+        neighbours: Number of nearest points.
+        power: Of the distance.
+        space: Quantity that is averaged, one of `choices.SPACES`.
     """
     points = distinct(points)
     value = to_space(points.depth.double().cpu(), space)
-    pixels, means = _places(points, places), []
+    pixels, means = _queries(points, xy), []
     for some in torch.split(pixels, _IDW_PIXELS):
         distance, number = nearest_points(points, some, min(neighbours, len(points)))
         weight = distance.clamp_min(_AT_A_POINT).pow(-power)
         means.append((weight * value[number]).sum(dim=1) / weight.sum(dim=1))
-    return _shaped(from_space(torch.cat(means), space), points, places)
+    return _shaped(from_space(torch.cat(means), space), points, xy)
 
 
 def morphological(points: SparsePoints) -> Tensor:
-    """Filled as pictures are: what is near grows over what is far, small holes are closed.
+    """Returns depth filled by morphology: near depth grows over far depth, holes are closed.
 
     The steps of Ku, Harakeh, Waslander, "In Defense of Classical Image Processing: Fast Depth
     Completion on the CPU", 2018: dilation by a 5 × 5 diamond, closing by 5 × 5, holes filled by a
     7 × 7 dilation, median and Gaussian blur of 5 × 5. Their kernels are for a LiDAR's density;
-    with fewer points all is done on as much coarser a grid. What they leave to a 31 × 31 dilation
-    and to each column's topmost value is filled with the nearest depth here, which is better.
+    with fewer points the grid is coarser in proportion. Holes that they fill by a 31 × 31 dilation
+    and by each column's topmost value are filled with the nearest depth here, which is better.
     """
     from scipy.ndimage import distance_transform_edt, median_filter
 
@@ -100,16 +111,16 @@ def morphological(points: SparsePoints) -> Tensor:
     shrink = min(1.0, math.sqrt(len(points) / (FILL_SHARE * height * width)))
     coarse = points.resized(max(1, round(height * shrink)), max(1, round(width * shrink)))
     sparse = _within_frame(coarse).scatter().cpu()
-    # minus depth: the maximum is what is near, and minus infinity is unknown
+    # minus depth: the maximum is the nearest, and minus infinity is unknown
     value = torch.where(sparse > 0, -sparse, -torch.inf)
     for _ in range(2):  # two crosses of 3 × 3 make the diamond
         value = torch.maximum(_dilated(value, 3, 1), _dilated(value, 1, 3))
     value = -_dilated(-_dilated(value, 5, 5), 5, 5)
     value = torch.where(value.isinf(), _dilated(value, 7, 7), value)
-    place = distance_transform_edt(
+    nearest_known = distance_transform_edt(
         value[0, 0].isinf().numpy(), return_distances=False, return_indices=True
     )
-    filled = value[0, 0].numpy()[tuple(place)]
+    filled = value[0, 0].numpy()[tuple(nearest_known)]
     smooth = torch.from_numpy(median_filter(filled, 5, mode="nearest"))
     dense = -_blurred(smooth[None, None])
     if dense.shape[-2:] != points.size:
@@ -118,7 +129,11 @@ def morphological(points: SparsePoints) -> Tensor:
 
 
 def distinct(points: SparsePoints) -> SparsePoints:
-    """The points in the order of their places, of several at one place the nearest."""
+    """Returns the points ordered by coordinates; of several at the same coordinates the nearest.
+
+    Raises:
+        NoPointsError: There is no point.
+    """
     if not len(points):
         raise NoPointsError("there is no sparse point to interpolate; give at least one")
     xy, which = torch.unique(points.xy, dim=0, return_inverse=True)
@@ -128,33 +143,36 @@ def distinct(points: SparsePoints) -> SparsePoints:
     )
 
 
-def _places(points: SparsePoints, places: Tensor | None) -> Tensor:
-    """(M, 2) float64: x and y of the places, or of every pixel of the frame, row after row."""
-    if places is not None:
-        return places.double().cpu()
+def _queries(points: SparsePoints, xy: Tensor | None) -> Tensor:
+    """(M, 2) float64: the coordinates, or those of every pixel of the frame, row after row."""
+    if xy is not None:
+        return xy.double().cpu()
     rows, columns = (torch.arange(n, dtype=torch.float64) for n in points.size)
     return torch.cartesian_prod(rows, columns).flip(1)
 
 
-def _shaped(values: Tensor, points: SparsePoints, places: Tensor | None) -> Tensor:
-    """The values (M,) as the depth that was asked for, where the points are."""
-    shape = points.size if places is None else (len(places),)
+def _shaped(values: Tensor, points: SparsePoints, xy: Tensor | None) -> Tensor:
+    """The values (M,) in the shape that was asked for, on the points' device."""
+    shape = points.size if xy is None else (len(xy),)
     return values.float().reshape(shape).to(points.depth.device)
 
 
-def nearest_points(points: SparsePoints, places: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """Distance in pixels and number (M, count) of the points nearest to places (M, 2), in order."""
+def nearest_points(points: SparsePoints, xy: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """Returns distance in pixels and number, (M, count) each, of the points nearest to xy (M, 2).
+
+    The nearest point comes first.
+    """
     from scipy.spatial import cKDTree
 
     tree = cKDTree(points.xy.double().cpu().numpy())
     among = torch.arange(1, count + 1).numpy()
-    many = len(places) * count > _WORTH_THREADS
-    distance, number = tree.query(places.numpy(), among, workers=-1 if many else 1)
+    many = len(xy) * count > _WORTH_THREADS
+    distance, number = tree.query(xy.numpy(), among, workers=-1 if many else 1)
     return torch.from_numpy(distance), torch.from_numpy(number)
 
 
 def _within_frame(points: SparsePoints) -> SparsePoints:
-    """The points, those beyond the frame's border moved onto its outermost pixels."""
+    """The points; those outside the frame are moved onto its outermost pixels."""
     height, width = points.size
     last = points.xy.new_tensor([width - 1, height - 1])
     xy = torch.minimum(points.xy.clamp_min(0), last)
@@ -167,8 +185,8 @@ def _dilated(value: Tensor, height: int, width: int) -> Tensor:
 
 
 def _blurred(value: Tensor) -> Tensor:
-    place = torch.arange(-2.0, 3.0)
-    kernel = torch.exp(-0.5 * (place / _BLUR_SIGMA) ** 2)
+    offset = torch.arange(-2.0, 3.0)
+    kernel = torch.exp(-0.5 * (offset / _BLUR_SIGMA) ** 2)
     kernel = (kernel / kernel.sum()).reshape(1, 1, 1, 5)
     padded = F.pad(value, (2, 2, 2, 2), mode="replicate")
     return F.conv2d(F.conv2d(padded, kernel), kernel.transpose(2, 3))

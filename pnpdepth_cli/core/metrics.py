@@ -1,11 +1,11 @@
-"""The error measures of depth estimation: of a picture, of many together, of parts of one.
+"""The error measures of depth estimation: of an image, of many images, of parts of an image.
 
 Definitions: Eigen et al. 2014 (RMSE, RMSE of the logarithm, AbsRel = MRE, SqRel, δ < 1.25^k,
 SILog), the paper and NYU's tables (log10), the KITTI depth completion benchmark (iRMSE, iMAE).
-The paper's KITTI rows use δ thresholds of 1.01^k; here that is a choice of the thresholds.
+The paper's KITTI rows use δ thresholds of 1.01^k; the thresholds are an argument here.
 
-Every measure is a function of sums over pixels. So the sums of several pictures can be added
-before (all pixels count alike) or the measures averaged after (all pictures count alike).
+Every measure is a function of sums over pixels. So either the sums of several images are added
+(all pixels have equal weight), or the measures are averaged (all images have equal weight).
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 DELTA_THRESHOLDS = (1.25, 1.25**2, 1.25**3)
-"""Eigen et al. 2014."""
+"""Thresholds of δ1 to δ3 (Eigen et al. 2014)."""
 
 SUMS = (
     "pixels",
@@ -35,28 +35,32 @@ SUMS = (
     "delta2",
     "delta3",
 )
-"""What is added up over the pixels, in the order of the tensors that hold it."""
+"""The quantities summed over pixels, in the order of the last axis of sums tensors."""
 
 _CHUNK = 1 << 20
-"""Pixels worked on at once, so that memory stays bounded for any picture."""
+"""Pixels processed at once, so that memory is bounded for any image."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Measure:
-    """One measure for a person: its key in files, title and the unit its values are stored in.
-
-    A table shows value × shown_factor in shown_unit (the unit itself where that is empty), with so
-    many decimals; `percent` shows a share as per cent.
-    """
+    """A measure and how it is shown."""
 
     key: str
+    """Name in files."""
     title: str
+    """Name in tables."""
     unit: str = ""
+    """Unit of its values in files."""
     higher_is_better: bool = False
+    """Whether larger values are better."""
     decimals: int = 4
+    """Decimals in tables."""
     percent: bool = False
+    """Whether tables show the fraction as a percentage."""
     shown_unit: str = ""
+    """Unit in tables; empty: `unit`."""
     shown_factor: float = 1.0
+    """Factor from `unit` to the unit in tables."""
 
 
 MEASURES = (
@@ -73,34 +77,41 @@ MEASURES = (
     Measure(key="delta2", title="δ2", higher_is_better=True, percent=True, decimals=2),
     Measure(key="delta3", title="δ3", higher_is_better=True, percent=True, decimals=2),
 )
-"""All of them, in the order of `measures_of`."""
+"""All measures, in the order of `measures_of`."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Scores:
-    """Errors over the pixels where the truth is known and the prediction valid.
-
-    SI units but for two that nobody writes so: irmse and imae are in 1/km (SI × 1000), silog is
-    100·std(log p − log g). rmse, mae, sq_rel (mean (p − g)²/g): metres. mre: mean |p − g|/g.
-    log10: mean |log10 p − log10 g|. rmse_log: of the natural logarithm. delta1…3: share of pixels
-    with max(p/g, g/p) below the thresholds. pixels: how many were scored. coverage: which share
-    of the pixels with known truth that is.
-    """
+    """Errors of a prediction p over the pixels with known ground truth g and valid p."""
 
     rmse: float
+    """√ mean (p − g)², metres."""
     mae: float
+    """Mean |p − g|, metres."""
     mre: float
+    """Mean |p − g|/g."""
     sq_rel: float
+    """Mean (p − g)²/g, metres."""
     log10: float
+    """Mean |log10 p − log10 g|."""
     rmse_log: float
+    """√ mean (log p − log g)², natural logarithm."""
     irmse: float
+    """√ mean (1/p − 1/g)², 1/km."""
     imae: float
+    """Mean |1/p − 1/g|, 1/km."""
     silog: float
+    """100 · standard deviation of log p − log g."""
     delta1: float
+    """Fraction of pixels with max(p/g, g/p) below the first threshold."""
     delta2: float
+    """The same for the second threshold."""
     delta3: float
+    """The same for the third threshold."""
     pixels: int
+    """Number of scored pixels."""
     coverage: float
+    """Scored pixels over pixels with known ground truth."""
 
 
 def score(
@@ -108,9 +119,12 @@ def score(
     truth: Tensor,
     thresholds: tuple[float, float, float] = DELTA_THRESHOLDS,
 ) -> Scores:
-    """Scores of a prediction against the truth, any equal shapes, metres.
+    """Returns the scores of a prediction against the ground truth.
 
-    Unknown truth and missing predictions are 0, negative or not finite.
+    Args:
+        predicted: Depth in metres, of any shape; 0, negative or not finite where missing.
+        truth: Ground truth depth of the same shape, likewise.
+        thresholds: Of δ1 to δ3.
     """
     (sums,) = error_sums(predicted, truth, thresholds)
     values = measures_of(sums).tolist()
@@ -129,35 +143,42 @@ def error_sums(
     part: Tensor | None = None,
     parts: int = 1,
 ) -> Tensor:
-    """(parts, len(SUMS)) float64: the sums over each part of a picture.
+    """Returns the sums over each part of an image, (parts, len(SUMS)) float64.
 
-    part: of the picture's shape, the number from 0 to parts − 1 of the part that a pixel belongs
-    to; without it there is one. Depths as for `score`.
+    Args:
+        predicted: Depth as for `score`.
+        truth: Ground truth as for `score`.
+        thresholds: Of δ1 to δ3.
+        part: Number, 0 to parts − 1, of the part that each pixel belongs to, of the image's shape.
+            None: the image is one part.
+        parts: Number of parts.
     """
     if predicted.shape != truth.shape:
-        raise ValueError(f"a prediction of {tuple(predicted.shape)}, truth of {tuple(truth.shape)}")
+        raise ValueError(
+            f"prediction is {tuple(predicted.shape)}, ground truth {tuple(truth.shape)}"
+        )
     sums = torch.zeros(parts, len(SUMS), dtype=torch.float64, device=truth.device)
     predicted, truth = predicted.reshape(-1), truth.reshape(-1)
-    places = None if part is None else part.reshape(-1)
+    labels = None if part is None else part.reshape(-1)
     for start in range(0, truth.numel(), _CHUNK):
         piece = slice(start, start + _CHUNK)
         p, g = predicted[piece].double(), truth[piece].double()
         known = g.isfinite() & (g > 0)
         scored = known & p.isfinite() & (p > 0)
         terms = _terms(p[scored], g[scored], thresholds)
-        if places is None:
+        if labels is None:
             added = {name: term.sum()[None] for name, term in terms.items()}
             added["known"] = known.sum()[None]
         else:
-            place = places[piece]
-            added = {name: place[scored].bincount(term, parts) for name, term in terms.items()}
-            added["known"] = place[known].bincount(minlength=parts)
+            label = labels[piece]
+            added = {name: label[scored].bincount(term, parts) for name, term in terms.items()}
+            added["known"] = label[known].bincount(minlength=parts)
         sums += torch.stack([added[name].double() for name in SUMS], dim=-1)
     return sums
 
 
 def _terms(p: Tensor, g: Tensor, thresholds: tuple[float, float, float]) -> dict[str, Tensor]:
-    """What each of N scored pixels adds to the sums, (N,) float64 each."""
+    """The summands of each of N scored pixels, (N,) float64 each."""
     error, log_error, inverse_error = p - g, p.log() - g.log(), 1 / p - 1 / g
     ratio = torch.maximum(p / g, g / p)
     return {
@@ -176,7 +197,7 @@ def _terms(p: Tensor, g: Tensor, thresholds: tuple[float, float, float]) -> dict
 
 
 def measures_of(sums: Tensor) -> Tensor:
-    """(…, len(MEASURES)) of sums (…, len(SUMS)); not a number where no pixel was scored."""
+    """Returns measures (…, len(MEASURES)) of sums (…, len(SUMS)); NaN where no pixel was scored."""
     of = dict(zip(SUMS, sums.unbind(-1), strict=True))
     mean = {name: total / of["pixels"] for name, total in of.items()}
     measures = {

@@ -82,7 +82,7 @@ def refine_batch(
     keep_depths: Collection[int] = (),
     on_iteration: Callable[[int, float], None] = lambda iteration, loss: None,
 ) -> list[Refinement | PnpDepthError]:
-    """Returns the refinements of B frames, or in a frame's place the error that ended it.
+    """Returns for each of B frames its refinement, or the error that ended it.
 
     The frames share the passes of the network; each has its own α, loss and end, as if alone.
 

@@ -1,0 +1,1 @@
+"""Files: images, depth in every format, calibrations, scans, data sets, records and reports."""

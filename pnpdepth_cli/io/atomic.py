@@ -21,11 +21,13 @@ _OF_THE_NAME = {errno.ENAMETOOLONG, errno.EILSEQ, errno.EINVAL, errno.EISDIR, er
 
 @contextmanager
 def atomic_path(path: Path) -> Iterator[Path]:
-    """`path` holds what was written to the yielded path, or is untouched if anything failed.
+    """Replaces `path` by what is written to the yielded path; untouched if anything fails.
 
     The yielded path is an empty file in the same folder with the same suffix. A link is
-    followed, so the file it points to is the one replaced. Raises OutputError when the
-    folder cannot be written to, also when that shows only inside the block.
+    followed, so the file it points to is the one replaced.
+
+    Raises:
+        OutputError: The folder cannot be written to, also when that shows only inside the block.
     """
     target = Path(os.path.realpath(path))
     _check_target(target, named=path)
@@ -43,7 +45,7 @@ def atomic_path(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def all_or_none(paths: Iterable[Path]) -> Iterator[None]:
-    """None of the files that were not there before is there if anything inside failed."""
+    """Removes those of the files that did not exist before, if anything inside fails."""
     new = [path for path in paths if not path.exists()]
     try:
         yield
@@ -55,7 +57,7 @@ def all_or_none(paths: Iterable[Path]) -> Iterator[None]:
 
 
 def make_folder(folder: Path) -> None:
-    """The folder exists, and those above it. OutputError if it cannot be made."""
+    """Creates the folder and those above it. Raises OutputError if that fails."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -63,9 +65,9 @@ def make_folder(folder: Path) -> None:
 
 
 def remove_leftovers(folder: Path) -> int:
-    """What writers that were killed left in the folder is gone; returns how many files that were.
+    """Removes temporary files of killed writers and returns how many there were.
 
-    To be called only while nobody writes there.
+    To be called only while nobody writes to the folder.
     """
     leftovers = [p for p in folder.iterdir() if _TEMPORARY.fullmatch(p.name) and p.is_file()]
     for path in leftovers:
@@ -74,7 +76,7 @@ def remove_leftovers(folder: Path) -> int:
 
 
 def cannot_write(path: Path, error: OSError) -> OutputError:
-    """The error that says why; a StorageError where no other name would help."""
+    """Returns the error that says why; a StorageError where no other file name would help."""
     reason = one_line(error.strerror or error).lower()
     kind = OutputError if error.errno in _OF_THE_NAME else StorageError
     room = "make room, or " if error.errno in _FULL else ""

@@ -1,7 +1,7 @@
-"""Where a scanner stands to a camera, and how the camera sees: KITTI's files, and plain ones.
+"""Camera intrinsics and the pose of a scanner: KITTI's calibration files, and plain ones.
 
 A plain file is JSON, or lines of `name: numbers` in which brackets, commas and list dashes only
-separate, and a value may go on over several lines:
+separate, and a value may continue over several lines:
 
     K: [721.5, 0, 609.6,  0, 721.5, 172.9,  0, 0, 1]
     R: [[0, -1, 0], [0, 0, -1], [1, 0, 0]]     # x_camera = R · x_scanner + t
@@ -28,7 +28,7 @@ from pnpdepth_cli.io.file_bytes import check_pixel_count, one_line, read_bytes
 from pnpdepth_cli.io.file_kind import kind_of
 
 CAMERA = 2
-"""KITTI's left colour camera, whose pictures the benchmarks have."""
+"""KITTI's left colour camera, whose images the benchmarks have."""
 
 _RAW_FILES = ("calib_cam_to_cam.txt", "calib_velo_to_cam.txt")
 _PLAIN = {"K": (9,), "R": (9,), "t": (3,), "distortion": (0, 4, 5, 8), "size": (2,)}
@@ -43,27 +43,41 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, kw_only=True)
 class Calibration:
-    """x_camera = rotation · x_scanner + translation (metres); pixels by intrinsics, distortion.
-
-    intrinsics, rotation: (3, 3). translation: (3,). distortion: OpenCV's coefficients, or none.
-    size: (H, W) of the pictures, None where the file does not say. has_pose: False when the file
-    says nothing of a scanner, and rotation and translation are those of standing in the camera.
-    """
+    """A camera and a scanner: x_camera = rotation · x_scanner + translation."""
 
     intrinsics: Floats
+    """(3, 3), last row 0 0 1, in pixels."""
+
     rotation: Floats
+    """(3, 3), from the scanner's frame to the camera's."""
+
     translation: Floats
+    """(3,) metres, the scanner's origin in the camera's frame."""
+
     distortion: tuple[float, ...]
+    """OpenCV's coefficients, or none."""
+
     size: tuple[int, int] | None
+    """(H, W) of the images; None if the file does not give it."""
+
     has_pose: bool
+    """False if the file has no pose of a scanner; rotation and translation are then identity."""
+
     source: str
+    """What was read, for a person."""
 
 
 def read_calibration(path: Path, camera: int | None = None) -> Calibration:
-    """The calibration in a file, or in a folder as KITTI's raw data has it.
+    """Returns the calibration in a file, or in a folder of KITTI's raw data.
 
-    camera: 0…3 of KITTI's, 2 if None. Raises FileFormatError for what is missing or no number,
-    UsageError for a camera that is not there.
+    Args:
+        path: File or folder.
+        camera: 0 to 3 of KITTI's; None for 2, the left colour camera.
+
+    Raises:
+        FileFormatError: A matrix is missing, or is not made of numbers that a camera can have.
+        InputError: The file cannot be read.
+        UsageError: There is no such camera.
     """
     if path.is_dir() or path.name in _RAW_FILES:
         return _kitti_raw(path if path.is_dir() else path.parent, camera)
@@ -99,10 +113,12 @@ def _kitti_raw(folder: Path, camera: int | None) -> Calibration:
             f" {_RAW_FILES[1]}, or one calibration file"
         )
     fields = _fields(cameras, _text(cameras))
-    there = [int(n.removeprefix("P_rect_")) for n in fields if re.fullmatch(r"P_rect_\d\d", n)]
-    number = _camera(cameras, camera, there)
+    cameras_there = [
+        int(n.removeprefix("P_rect_")) for n in fields if re.fullmatch(r"P_rect_\d\d", n)
+    ]
+    number = _camera(cameras, camera, cameras_there)
     pose = _fields(scanner, _text(scanner))
-    # The raw data's development kit turns every camera by camera 0's rectification.
+    # The raw data's development kit rotates every camera by camera 0's rectification.
     return _rectified(
         cameras,
         _matrix(cameras, fields, f"P_rect_{number:02}", (3, 4)),
@@ -121,7 +137,7 @@ def _rectified(
     source: str,
     size: Sequence[float] | None = None,
 ) -> Calibration:
-    """P · R_rect · [R t] with the camera's own offset, in P's last column, made a translation."""
+    """P · R_rect · [R t], with the camera's own offset in P's last column as a translation."""
     intrinsics = projection[:, :3]
     _check_intrinsics(path, intrinsics)
     _check_rotation(path, "rectification", rectify)
@@ -148,8 +164,8 @@ def _plain(path: Path, fields: dict[str, str], camera: int | None) -> Calibratio
     intrinsics = _matrix(path, fields, "K", (3, 3))
     _check_intrinsics(path, intrinsics)
     if ("R" in fields) != ("t" in fields):
-        there, missing = ("R", "t") if "R" in fields else ("t", "R")
-        raise FileFormatError(f"{path} has {there} but no {missing}; give both")
+        present, missing = ("R", "t") if "R" in fields else ("t", "R")
+        raise FileFormatError(f"{path} has {present} but no {missing}; give both")
     has_pose = "R" in fields
     rotation = _matrix(path, fields, "R", (3, 3)) if has_pose else np.eye(3)
     _check_rotation(path, "R", rotation)
@@ -182,7 +198,7 @@ def _text(path: Path) -> str:
 
 
 def _fields(path: Path, text: str) -> dict[str, str]:
-    """`name: value`; a line without a name goes on with the value before it."""
+    """`name: value`; a line without a name continues the value before it."""
     fields: dict[str, str] = {}
     name = None
     for number, line in enumerate(text.splitlines(), start=1):
@@ -191,7 +207,7 @@ def _fields(path: Path, text: str) -> dict[str, str]:
         if match:
             name = match[1]
             if name in fields:
-                raise FileFormatError(f"{path}, line {number}: {name} is there twice; keep one")
+                raise FileFormatError(f"{path}, line {number}: {name} occurs twice; keep one")
             fields[name] = match[2]
         elif content.strip() and content.strip() != "---":
             if name is None:
@@ -239,10 +255,10 @@ def _matrix(path: Path, fields: dict[str, str], name: str, shape: tuple[int, ...
     return np.reshape(_numbers(path, fields, name, (int(np.prod(shape)),)), shape)
 
 
-def _camera(path: Path, wanted: int | None, there: list[int]) -> int:
+def _camera(path: Path, wanted: int | None, present: list[int]) -> int:
     number = CAMERA if wanted is None else wanted
-    if number not in there:
-        listing = ", ".join(str(n) for n in sorted(there)) or "none"
+    if number not in present:
+        listing = ", ".join(str(n) for n in sorted(present)) or "none"
         raise UsageError(f"{path} has no camera {number}; --camera can be one of: {listing}")
     return number
 

@@ -1,4 +1,4 @@
-"""Colours for depth and for improvement, and the ticks that say what they mean."""
+"""Colours for depth and for change of error, and the ticks of their colour bars."""
 
 from __future__ import annotations
 
@@ -18,39 +18,44 @@ _RED = np.array([214, 26, 30], dtype=np.float32)
 _GREEN = np.array([16, 140, 52], dtype=np.float32)
 _BLUE = np.array([25, 90, 190], dtype=np.float32)
 _ORANGE = np.array([220, 105, 0], dtype=np.float32)
-# A range wider than this is shown on a logarithmic scale; on a linear one nearly all of a
-# street would have the colour of its far end.
 LOGARITHMIC_FROM = 8.0
+"""Ratio of far to near from which the scale is logarithmic.
+
+On a linear scale, nearly all of a street would have the colour of its far end.
+"""
 
 
 @dataclass(frozen=True, kw_only=True)
 class DepthScale:
-    """Which depth has which colour: turbo from `low_m` (warm) to `high_m` (cold)."""
+    """The colour of each depth: turbo from near (warm) to far (cold)."""
 
     low_m: float
+    """Near end, metres."""
+
     high_m: float
+    """Far end, metres."""
 
     @property
     def logarithmic(self) -> bool:
-        """True when the colours follow log depth."""
+        """True if the colours follow log depth."""
         return self.high_m / self.low_m > LOGARITHMIC_FROM
 
     def position(self, depth: NDArray[np.floating]) -> NDArray[np.float64]:
-        """0 at the near end, 1 at the far end, clipped there."""
+        """Returns 0 at the near end to 1 at the far end, clipped, for depths of any shape."""
         bounded = np.clip(np.asarray(depth, dtype=np.float64), self.low_m, self.high_m)
         if self.logarithmic:
             return np.log(bounded / self.low_m) / math.log(self.high_m / self.low_m)
         return (bounded - self.low_m) / (self.high_m - self.low_m)
 
     def paint(self, depth: NDArray[np.floating]) -> Pixels:
-        """(..., 3) colours of depths of any shape; `UNKNOWN` where there is none."""
+        """Returns (..., 3) colours of depths of any shape; `UNKNOWN` where there is none."""
         known = np.isfinite(depth) & (depth > 0)
         pixels = _turbo(1 - self.position(np.where(known, depth, self.low_m)))
         pixels[~known] = UNKNOWN
         return pixels
 
     def ticks(self) -> list[float]:
-        """Round depths within the range, ascending."""
+        """Returns round depths within the range, ascending."""
         if not self.logarithmic:
             return round_steps(self.low_m, self.high_m)
         decades = range(math.floor(math.log10(self.low_m)), math.ceil(math.log10(self.high_m)))
@@ -60,19 +65,19 @@ class DepthScale:
 
 
 def depth_scale(*depths: NDArray[np.floating]) -> DepthScale:
-    """The scale over the 2nd to 98th percentile of all known depths together."""
+    """Returns the scale over the 2nd to 98th percentile of all known depths together."""
     values = [np.asarray(d, dtype=np.float64).ravel() for d in depths]
     known = np.concatenate([v[np.isfinite(v) & (v > 0)] for v in values])
     if known.size == 0:
         return DepthScale(low_m=1.0, high_m=2.0)
     low, high = (float(v) for v in np.percentile(known, (2, 98)))
-    if high - low < 0.01 * low:  # one single depth still needs a bar with two ends
+    if high - low < 0.01 * low:  # a single depth still needs a bar with two ends
         low, high = 0.95 * low, 1.05 * high
     return DepthScale(low_m=low, high_m=high)
 
 
 def round_steps(low: float, high: float) -> list[float]:
-    """Multiples of 1, 2 or 5 times a power of ten within the range, at most eleven."""
+    """Returns multiples of 1, 2 or 5 times a power of ten within the range, at most eleven."""
     rough = (high - low) / 10
     power = 10.0 ** math.floor(math.log10(rough))
     step = next(m * power for m in (1, 2, 5, 10) if m * power >= rough)
@@ -81,27 +86,27 @@ def round_steps(low: float, high: float) -> list[float]:
 
 
 def grey_of(rgb: NDArray[np.floating]) -> NDArray[np.float32]:
-    """(H, W) luma 0..1 of an (H, W, 3) or (H, W) picture in 0..1."""
-    picture = np.clip(np.nan_to_num(np.asarray(rgb, dtype=np.float32)), 0, 1)
-    if picture.ndim == 2:
-        return picture
+    """Returns (H, W) luma in 0..1 of an (H, W, 3) or (H, W) image in 0..1."""
+    image = np.clip(np.nan_to_num(np.asarray(rgb, dtype=np.float32)), 0, 1)
+    if image.ndim == 2:
+        return image
     weights = np.array([0.299, 0.587, 0.114], dtype=np.float32)
-    return np.asarray(picture @ weights, dtype=np.float32)
+    return np.asarray(image @ weights, dtype=np.float32)
 
 
 def dimmed(grey: NDArray[np.float32]) -> Pixels:
-    """(H, W, 3) dark grey picture, on which coloured points stand out."""
+    """Returns an (H, W, 3) dark grey image, on which coloured points stand out."""
     levels = np.rint(20 + 115 * grey).astype(np.uint8)
     return np.repeat(levels[:, :, None], 3, axis=2)
 
 
 def paint_gain(strength: NDArray[np.floating], light: NDArray[np.floating]) -> Pixels:
-    """(..., 3) colours: red at strength 1 (better), green at -1 (worse), `light` grey at 0."""
+    """Returns (..., 3) colours: red at strength 1 (better), green at -1 (worse), `light` at 0."""
     return _between(strength, light, _RED, _GREEN)
 
 
 def paint_error(strength: NDArray[np.floating], light: NDArray[np.floating]) -> Pixels:
-    """(..., 3) colours: orange at strength 1 (too far), blue at -1 (too near), `light` at 0."""
+    """Returns (..., 3) colours: orange at 1 (too far), blue at -1 (too near), `light` at 0."""
     return _between(strength, light, _ORANGE, _BLUE)
 
 

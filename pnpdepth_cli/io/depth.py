@@ -1,4 +1,4 @@
-"""Depth files: everything the rest of the program needs of them, in one place to import from."""
+"""Reading, writing and describing depth files; the one module to import for them."""
 
 from __future__ import annotations
 

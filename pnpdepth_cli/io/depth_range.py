@@ -1,4 +1,4 @@
-"""What a person should see of a depth file: its range, and a word when that cannot be metres."""
+"""The range of a depth file for a person, and a warning when it cannot be metres."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 _SHORTEST_M, _LONGEST_M = 0.02, 1000.0
-_USUAL_M = (0.2, 200.0)
-# Codes per metre in use, likeliest first: millimetres, KITTI, TUM RGB-D, centimetres.
+_COMMON_M = (0.2, 200.0)
+# Codes per metre in use, most likely first: millimetres, KITTI, TUM RGB-D, centimetres.
 _COMMON_SCALES = (1000.0, 256.0, 5000.0, 100.0, 10.0, 1.0)
 
 
@@ -21,7 +21,15 @@ def describe_range(
     noun: str = "points",
     option: str = "--depth-scale",
 ) -> str:
-    """One line such as `1,842 points, 2.1–63.4 m (16-bit PNG ÷ 256; --depth-scale to change)`."""
+    """Returns a line such as `1,842 points, 2.1–63.4 m (16-bit PNG ÷ 256)`.
+
+    Args:
+        depth: Metres of any shape; 0 and values that are not finite are unknown.
+        source: What was read.
+        assumed_scale: Name the option that changes the scale.
+        noun: What is counted, in the plural.
+        option: That option.
+    """
     known = _known(depth)
     hint = f"; {option} to change" if assumed_scale else ""
     if known.size == 0:
@@ -33,9 +41,11 @@ def describe_range(
 
 
 def implausible(depth: NDArray[Any], scale: float | None = None) -> str | None:
-    """A warning when half of the known depths cannot be metres, else None.
+    """Returns a warning if half of the known depths cannot be metres, else None.
 
-    `scale` is what integers were divided by, None for a float file.
+    Args:
+        depth: Metres of any shape; 0 and values that are not finite are unknown.
+        scale: Codes per metre that integers were divided by; None for a float file.
     """
     known = _known(depth)
     if known.size == 0:
@@ -45,12 +55,12 @@ def implausible(depth: NDArray[Any], scale: float | None = None) -> str | None:
         return None
     fact = f"median depth {metres(median)} m is implausible, the scale is probably wrong"
     if scale is None:
-        divisor = next((s for s in (1000.0, 100.0) if _usual(median / s)), None)
+        divisor = next((s for s in (1000.0, 100.0) if _is_common(median / s)), None)
         advice = (
             f"; divided by {divisor:g} it would be {metres(median / divisor)} m" if divisor else ""
         )
         return f"{fact}: a float file must hold metres{advice}"
-    better = next((s for s in _COMMON_SCALES if _usual(median * scale / s)), None)
+    better = next((s for s in _COMMON_SCALES if _is_common(median * scale / s)), None)
     if better is None:
         return f"{fact}: give codes per metre with --depth-scale (now {scale:g})"
     return (
@@ -60,14 +70,14 @@ def implausible(depth: NDArray[Any], scale: float | None = None) -> str | None:
 
 
 def metres(value: float) -> str:
-    """The number as a person writes it: one decimal from 1 m on, two digits below."""
+    """Returns the number as a person writes it: one decimal from 1 m on, two digits below."""
     if value >= 1e6 or (0 < value < 1e-3):
         return f"{value:.1e}"
     return f"{value:,.1f}" if value >= 0.95 else f"{value:.2g}"
 
 
-def _usual(median: float) -> bool:
-    return _USUAL_M[0] <= median <= _USUAL_M[1]
+def _is_common(median: float) -> bool:
+    return _COMMON_M[0] <= median <= _COMMON_M[1]
 
 
 def _known(depth: NDArray[Any]) -> NDArray[np.float64]:

@@ -15,5 +15,5 @@ def kind_of(data: bytes) -> str | None:
         return "JPEG"
     if data[:4] == b"RIFF" and data[8:12] == b"WEBP":
         return "WEBP"
-    found = format_of_content(data)
-    return None if found is None else found.name
+    depth_format = format_of_content(data)
+    return None if depth_format is None else depth_format.name

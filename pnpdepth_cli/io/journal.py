@@ -1,7 +1,7 @@
-"""A file that only grows: a JSON object a line, of which the newest of each key counts.
+"""An append-only file with a JSON object per line, of which the newest of each key counts.
 
-A process that is killed while it writes leaves a torn last line. It is cut off before the next
-line is written, and lines that mean nothing are passed over, so all the others stay good.
+A process that is killed while it writes leaves an incomplete last line. It is cut off before the
+next line is written, and lines that are not JSON objects are skipped, so all others stay valid.
 """
 
 from __future__ import annotations
@@ -19,37 +19,47 @@ from pnpdepth_cli.io.record import plain
 
 
 class Journal:
-    """The lines of a file by their `key`; only their places in the file are kept in memory.
+    """The lines of a file by their `key`; only their offsets in the file are kept in memory.
 
-    `lost` says how many lines mean nothing. Appending may be done by several threads; several
-    processes must not.
+    Several threads may append, several processes must not.
+
+    Args:
+        path: The file; it need not exist yet.
+        key: The field of a line that identifies it.
+
+    Attributes:
+        lost: Number of lines that are not JSON objects.
     """
 
     def __init__(self, path: Path, key: str) -> None:
         self.path = path
         self.lost = 0
         self._key = key
-        self._places: dict[str, int] = {}
+        self._offsets: dict[str, int] = {}
         self._writing = threading.Lock()
         self._end = self._index()
 
     def keys(self) -> list[str]:
-        """In the order in which they first appeared."""
-        return list(self._places)
+        """Returns the keys in the order in which they first appeared."""
+        return list(self._offsets)
 
     def newest(self, key: str) -> dict[str, Any] | None:
-        """The newest line with this key; None if there is none."""
-        if key not in self._places:
+        """Returns the newest line with this key; None if there is none."""
+        if key not in self._offsets:
             return None
         try:
             with self.path.open("rb") as file:
-                file.seek(self._places[key])
+                file.seek(self._offsets[key])
                 return _object(file.readline())
         except OSError as error:
             raise _cannot_read(self.path, error) from error
 
     def append(self, line: Mapping[str, Any]) -> None:
-        """The line is in the file. Else StorageError, and at most a torn end is there."""
+        """Appends a line.
+
+        Raises:
+            StorageError: The disk is full or gone; at most an incomplete line was written.
+        """
         data = (json.dumps(plain(line), allow_nan=False) + "\n").encode("ascii")
         with self._writing:
             try:
@@ -57,7 +67,7 @@ class Journal:
             except OSError as error:
                 raise cannot_write(self.path, error) from error
             if isinstance(line.get(self._key), str):
-                self._places[line[self._key]] = self._end
+                self._offsets[line[self._key]] = self._end
             self._end += len(data)
 
     def _write(self, data: bytes) -> None:
@@ -71,32 +81,32 @@ class Journal:
                 rest = rest[file.write(rest) :]
 
     def _index(self) -> int:
-        """Note where the lines are; returns the place behind the last whole one."""
-        place = 0
+        """Notes the offsets of the lines; returns the offset behind the last complete one."""
+        offset = 0
         try:
             with self.path.open("rb") as file:
                 for data in file:
                     if not data.endswith(b"\n"):
                         break
-                    found = _object(data)
-                    if found is None:
+                    line = _object(data)
+                    if line is None:
                         self.lost += 1
-                    elif isinstance(found.get(self._key), str):
-                        self._places[found[self._key]] = place
-                    place += len(data)
+                    elif isinstance(line.get(self._key), str):
+                        self._offsets[line[self._key]] = offset
+                    offset += len(data)
         except FileNotFoundError:
             return 0
         except OSError as error:
             raise _cannot_read(self.path, error) from error
-        return place
+        return offset
 
 
 def _object(data: bytes) -> dict[str, Any] | None:
     try:
-        found = json.loads(data)
+        line = json.loads(data)
     except (ValueError, RecursionError):
         return None
-    return found if isinstance(found, dict) else None
+    return line if isinstance(line, dict) else None
 
 
 def _cannot_read(path: Path, error: OSError) -> InputError:

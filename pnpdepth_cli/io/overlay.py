@@ -1,4 +1,4 @@
-"""Sparse depth on its image, for the eye to check that the two belong together."""
+"""Sparse depth drawn on its image, to check by eye that the two belong together."""
 
 from __future__ import annotations
 
@@ -17,9 +17,16 @@ def overlay(
     depth: NDArray[np.float32],
     path: Path,
 ) -> None:
-    """`path` shows N points in the colours of their depth on the grey image, nearest on top.
+    """Writes a PNG with N points in the colours of their depth on the grey image, nearest on top.
 
-    rgb: (H, W, 3) in 0..1. xy: (N, 2) pixels of it. depth: (N,) metres.
+    Args:
+        rgb: (H, W, 3) in 0..1.
+        xy: (N, 2) pixel coordinates.
+        depth: (N,) metres.
+        path: The PNG.
+
+    Raises:
+        OutputError: The file cannot be written.
     """
     scale = depth_scale(depth)
     factor = magnification(rgb.shape, columns=1, legend=True)

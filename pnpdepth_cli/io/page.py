@@ -1,4 +1,8 @@
-"""A white page with titled panels and a legend: the frame of every picture written here."""
+"""A white page with titled panels and a colour bar: the frame of every PNG for people.
+
+The PNG's text says where its panels are, so that a report can show frames of earlier runs too: the
+depth before refinement is in no other file.
+"""
 
 from __future__ import annotations
 
@@ -35,23 +39,34 @@ _SMALL_FONT_SIZE = 17
 _INK = (32, 33, 36)
 _FAINT_INK = (95, 99, 104)
 _LINE = (200, 202, 206)
-_FAST = 2  # zlib's level: a third of the time of its usual 6, files a tenth larger
-_SAID = "pnpdepth"  # the PNG text that says what is where on the page
+_FAST = 2  # zlib's level: a third of the time of its default 6, files a tenth larger
+_CONTENT_KEY = "pnpdepth"  # of the PNG text that describes the page
 
 Ink = tuple[int, int, int]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Panel:
-    """A picture of uint8 RGB with a title above it, and a remark in fainter ink."""
+    """An image with a title above it."""
 
     title: str
+    """Above the image."""
+
     pixels: Pixels
+    """(H, W, 3)."""
+
     remark: str = ""
+    """Beside the title, in fainter ink."""
 
 
 def magnification(shape: tuple[int, ...], *, columns: int, legend: bool) -> float:
-    """The factor that makes an (H, W) picture fit its column: whole when it enlarges."""
+    """Returns the factor by which an image fits its column, a whole number if it enlarges.
+
+    Args:
+        shape: (H, W, ...) of the image.
+        columns: Columns of the page.
+        legend: Whether the page has a colour bar beside the columns.
+    """
     height, width = shape[:2]
     room = PAGE_WIDTH - 2 * MARGIN - (columns - 1) * GAP - (_LEGEND_WIDTH if legend else 0)
     fit = min(room / columns / width, _MAX_PANEL_HEIGHT / height)
@@ -59,7 +74,7 @@ def magnification(shape: tuple[int, ...], *, columns: int, legend: bool) -> floa
 
 
 def resized(pixels: NDArray[Any], factor: float, *, smooth: bool = False) -> NDArray[Any]:
-    """The picture at `factor` times its size; enlarged pixels stay square unless `smooth`."""
+    """Returns the image at `factor` times its size; enlarged pixels stay square unless `smooth`."""
     height, width = pixels.shape[:2]
     size = (max(1, round(width * factor)), max(1, round(height * factor)))
     enlarging = cv2.INTER_CUBIC if smooth else cv2.INTER_NEAREST
@@ -74,7 +89,15 @@ def draw_discs(
     factor: float,
     order: NDArray[np.intp],
 ) -> Pixels:
-    """A copy of the enlarged picture with a disc at each point of the original, in `order`."""
+    """Returns a copy of an enlarged image with a disc at each point.
+
+    Args:
+        pixels: (H, W, 3), already enlarged.
+        xy: (N, 2) pixel coordinates in the original image.
+        colours: (N, 3).
+        factor: Of the enlargement.
+        order: (N,) indices of points, the last on top.
+    """
     canvas = np.ascontiguousarray(pixels).copy()
     if len(xy) == 0:
         return canvas
@@ -94,9 +117,9 @@ def draw_discs(
 
 
 def depth_page(panels: list[Panel], columns: int, scale: DepthScale) -> PIL.Image.Image:
-    """The panels, `columns` to a row, with the depth colours in a bar to their right."""
+    """Returns a page of panels, `columns` to a row, with a bar of depth colours to their right."""
     page, draw = _lay_out(panels, columns, legend_width=_LEGEND_WIDTH)
-    page.info[_SAID] |= {"low_m": scale.low_m, "high_m": scale.high_m}
+    page.info[_CONTENT_KEY] |= {"low_m": scale.low_m, "high_m": scale.high_m}
     left = page.width - MARGIN - _LEGEND_WIDTH + GAP
     top, bottom = MARGIN + _TITLE_HEIGHT, page.height - MARGIN
     draw.text((left, MARGIN + 5), "metres", font=_font(_FONT_SIZE), fill=_INK)
@@ -120,10 +143,18 @@ def depth_page(panels: list[Panel], columns: int, scale: DepthScale) -> PIL.Imag
 def gain_page(
     panel: Panel, bar: Pixels, ends: tuple[str, str], swatch: tuple[Ink, str] | None, footer: str
 ) -> PIL.Image.Image:
-    """One panel; under it the colour bar between its two `ends`, a swatch, and the footer."""
+    """Returns a page of one panel with a colour bar, a swatch and a footer under it.
+
+    Args:
+        panel: The image.
+        bar: (H, W, 3) colours from one end to the other.
+        ends: Meaning of the two ends.
+        swatch: A colour outside the bar and its meaning; None for none.
+        footer: The last line.
+    """
     page, draw = _lay_out([panel], 1, least_width=_GAIN_LEGEND[0], legend_height=_GAIN_LEGEND[1])
     unknown = swatch[1] if swatch is not None else None
-    page.info[_SAID] |= {"ends": ends, "unknown": unknown, "footer": footer}
+    page.info[_CONTENT_KEY] |= {"ends": ends, "unknown": unknown, "footer": footer}
     font, small = _font(_FONT_SIZE), _font(_SMALL_FONT_SIZE)
     y = page.height - MARGIN - 56
     x = float(MARGIN)
@@ -142,24 +173,31 @@ def gain_page(
 
 
 def save_page(page: PIL.Image.Image, path: Path) -> None:
-    """`path` holds the page as a PNG, whatever its suffix, and `read_panels` can take it apart."""
+    """Writes the page as a PNG, whatever the suffix, from which `open_page` reads its panels.
+
+    Raises:
+        OutputError: The file cannot be written.
+    """
     from PIL.PngImagePlugin import PngInfo
 
     text = PngInfo()
-    text.add_text(_SAID, json.dumps(page.info[_SAID]))
+    text.add_text(_CONTENT_KEY, json.dumps(page.info[_CONTENT_KEY]))
     with atomic_path(path) as temporary:
         page.save(temporary, "PNG", pnginfo=text, compress_level=_FAST)
 
 
 @dataclass(frozen=True, kw_only=True)
 class SavedPage:
-    """A page on disk. said: low_m and high_m of its depth colours, or ends, unknown and footer."""
+    """A page on disk."""
 
     path: Path
-    said: dict[str, Any]
+    """The PNG."""
+
+    content: dict[str, Any]
+    """`panels` with title and box; low_m and high_m of depth colours, or ends, unknown, footer."""
 
     def panels(self) -> dict[str, Pixels]:
-        """The panels by their titles. InputError if the file cannot be read."""
+        """Returns (H, W, 3) of the panels by title. Raises InputError for an unreadable file."""
         try:
             with _opened(self.path) as page:
                 pixels = np.asarray(page.convert("RGB"))
@@ -167,19 +205,21 @@ class SavedPage:
             raise damaged(self.path, "PNG", str(error)) from error
         return {
             each["title"]: pixels[y : y + height, x : x + width]
-            for each in self.said["panels"]
+            for each in self.content["panels"]
             for x, y, width, height in [each["box"]]
         }
 
 
 def open_page(path: Path) -> SavedPage:
-    """What is said in a file of `save_page`; only its first bytes are read.
+    """Returns the content of a file of `save_page`, of which only the first bytes are read.
 
-    InputError if there is none, FileFormatError if it is another picture.
+    Raises:
+        InputError: There is no such file.
+        FileFormatError: It is another image.
     """
     try:
         with _opened(path) as page:
-            return SavedPage(path=path, said=json.loads(page.info[_SAID]))
+            return SavedPage(path=path, content=json.loads(page.info[_CONTENT_KEY]))
     except (SyntaxError, KeyError, ValueError) as error:
         raise FileFormatError(f"{path} is no page of this program's; create it again") from error
 
@@ -212,7 +252,7 @@ def _lay_out(
     page_height = 2 * MARGIN + rows * row_height + (rows - 1) * (GAP // 2) + legend_height
     page = Image.new("RGB", (page_width, page_height), "white")
     draw = ImageDraw.Draw(page)
-    said = []
+    placed = []
     for index, panel in enumerate(panels):
         row, column = divmod(index, columns)
         x = MARGIN + column * (width + GAP)
@@ -222,8 +262,8 @@ def _lay_out(
         indent = draw.textlength(panel.title, font=font) + 14
         draw.text((x + indent, y + 5), panel.remark, font=_font(_SMALL_FONT_SIZE), fill=_FAINT_INK)
         _paste(page, panel.pixels, x, y + _TITLE_HEIGHT)
-        said.append({"title": panel.title, "box": (x, y + _TITLE_HEIGHT, width, height)})
-    page.info[_SAID] = {"panels": said}
+        placed.append({"title": panel.title, "box": (x, y + _TITLE_HEIGHT, width, height)})
+    page.info[_CONTENT_KEY] = {"panels": placed}
     return page, draw
 
 

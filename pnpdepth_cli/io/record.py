@@ -1,4 +1,4 @@
-"""Run records: JSON written whole, read strictly, and the digests that go into it."""
+"""Run records: JSON that is written whole and read strictly, and the digests in it."""
 
 from __future__ import annotations
 
@@ -17,15 +17,23 @@ from pnpdepth_cli.io.file_bytes import cannot_read, one_line, read_bytes, size_o
 
 
 def write_json(path: Path, mapping: Mapping[str, Any]) -> None:
-    """`path` holds the mapping as indented JSON in its own order; NaN and infinity are null."""
+    """Writes the mapping as indented JSON in its own order; NaN and infinity become null.
+
+    Raises:
+        OutputError: The file cannot be written.
+    """
     text = json.dumps(plain(mapping), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
     with atomic_path(path) as temporary:
-        # A file name that is no UTF-8 has characters that are none; \udcff is how JSON spells them.
+        # A file name that is not UTF-8 has surrogates, which JSON spells as \udcff.
         temporary.write_text(text, encoding="utf-8", errors="backslashreplace", newline="\n")
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """The object in a JSON file. Raises FileFormatError for anything else."""
+    """Returns the object in a JSON file.
+
+    Raises:
+        InputError: The file cannot be read, or holds anything else.
+    """
     data = read_bytes(path)
     try:
         content = json.loads(data.decode("utf-8-sig"), parse_constant=_refuse_constant)
@@ -39,9 +47,12 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def sha256_of(path: Path) -> str:
-    """The SHA-256 of the file's content, 64 hexadecimal digits.
+    """Returns the SHA-256 of the file's content, 64 hexadecimal digits.
 
     Of a folder, that of its files' names and digests, in the order of the names.
+
+    Raises:
+        InputError: The file cannot be read, or is a device or a pipe.
     """
     digest = hashlib.sha256()
     if path.is_dir():
@@ -60,7 +71,7 @@ def sha256_of(path: Path) -> str:
 
 
 def plain(value: Any) -> Any:
-    """The value in JSON's own types; NaN and infinity are None."""
+    """Returns the value in JSON's own types; NaN and infinity become None."""
     if isinstance(value, Mapping):
         return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):

@@ -1,4 +1,4 @@
-"""A report as a folder: one page that opens from disk, and its pictures beside it."""
+"""A report as a folder: one page that opens from disk, and its images beside it."""
 
 from __future__ import annotations
 
@@ -16,26 +16,32 @@ from pnpdepth_cli.io.atomic import atomic_path, cannot_write, make_folder, remov
 from pnpdepth_cli.io.record import plain, read_json, write_json
 
 PAGE = "index.html"
-PICTURES = "pictures"
+IMAGES = "pictures"
 _MADE_OF = "report.json"
-_PICTURE = re.compile(r"([0-9a-f]{20})_[a-z_]+\.jpg")
+_IMAGE = re.compile(r"([0-9a-f]{20})_[a-z_]+\.jpg")
 
 
 def check_report_folder(
     folder: Path, inputs: Sequence[Path], *, made_of: Mapping[str, Any] | None, overwrite: bool
 ) -> None:
-    """Raises OutputError for a folder that holds inputs or lies among them, or may not be written.
+    """Raises OutputError for a folder that a report must not be written to.
 
-    It may if it is empty, if `overwrite`, or if it is a report that was begun as made of the same.
+    It must not hold inputs or lie in one. It must be empty, or an earlier report of the same.
+
+    Args:
+        folder: The report's folder.
+        inputs: Files and folders that are read.
+        made_of: What the report is of, as given to `begin_report`; None for anything.
+        overwrite: Whether any other content may be replaced.
     """
     if folder.exists() and not folder.is_dir():
         raise OutputError(f"{folder} is a file; name a folder for the report")
-    place = folder.resolve()
+    resolved = folder.resolve()
     for source in inputs:
         read = source.resolve()
-        if place.is_relative_to(read):
+        if resolved.is_relative_to(read):
             raise OutputError(f"{folder} lies in {source}, which is read; name another folder")
-        if read.is_relative_to(place):
+        if read.is_relative_to(resolved):
             raise OutputError(f"{folder} holds {source}, which is read; name another folder")
     try:
         empty = not folder.exists() or next(folder.iterdir(), None) is None
@@ -48,36 +54,52 @@ def check_report_folder(
 
 
 def begin_report(folder: Path, made_of: Mapping[str, Any]) -> Path:
-    """The folder is there, says what it is made of, and has a folder for pictures, the result."""
-    pictures = folder / PICTURES
-    make_folder(pictures)
+    """Creates the report's folder and returns its folder for images.
+
+    Args:
+        folder: The report's folder.
+        made_of: What the report is of, by which a later run recognises it.
+
+    Raises:
+        OutputError: The folder cannot be written to.
+    """
+    images = folder / IMAGES
+    make_folder(images)
     write_json(folder / _MADE_OF, made_of)
-    return pictures
+    return images
 
 
 def remove_report_leftovers(folder: Path) -> int:
-    """No half-written file is left in the report's folder; returns how many were.
+    """Removes temporary files of killed writers and returns how many there were.
 
-    To be called only while nobody writes there.
+    To be called only while nobody writes to the report.
     """
-    folders = [each for each in (folder, folder / PICTURES) if each.is_dir()]
+    folders = [each for each in (folder, folder / IMAGES) if each.is_dir()]
     try:
         return sum(remove_leftovers(each) for each in folders)
     except OSError as error:
         raise cannot_write(folder, error) from error
 
 
-def picture_key(*parts: str) -> str:
-    """The start of a frame's picture names: fit for a file, and another one for other parts."""
+def image_key(*parts: str) -> str:
+    """Returns the start of a frame's image names: fit for a file, and different for other parts."""
     text = "\0".join(parts)
     return hashlib.sha256(text.encode("utf-8", "surrogateescape")).hexdigest()[:20]
 
 
 def write_report(folder: Path, head: Mapping[str, Any], frames: Iterable[Mapping[str, Any]]) -> int:
-    """The page is on disk, and pictures of which it has no frame are not; returns its bytes.
+    """Writes the page, removes images of frames that it does not have, and returns its size.
 
-    head: what report_page.js shows of the whole. frames: a mapping each, taken one by one; its
-    `key` is that of its pictures, None where it has none.
+    Args:
+        folder: The report's folder.
+        head: What report_page.js shows of all frames.
+        frames: A mapping per frame, taken one by one; its `key` is that of its images, or None.
+
+    Returns:
+        Bytes of the page.
+
+    Raises:
+        OutputError: The page cannot be written.
     """
     keys: set[str] = set()
     start, end = _page().split("@DATA@")
@@ -94,8 +116,8 @@ def write_report(folder: Path, head: Mapping[str, Any], frames: Iterable[Mapping
         file.write("\n]}")
         file.write(end)
     try:
-        for path in (folder / PICTURES).iterdir():
-            name = _PICTURE.fullmatch(path.name)
+        for path in (folder / IMAGES).iterdir():
+            name = _IMAGE.fullmatch(path.name)
             if name is not None and name[1] not in keys:
                 path.unlink(missing_ok=True)
         return page.stat().st_size
@@ -111,7 +133,7 @@ def _is_of(folder: Path, made_of: Mapping[str, Any] | None) -> bool:
 
 
 def _page() -> str:
-    """The page with style and script in it; nothing else can run, and nothing is fetched."""
+    """The page with style and script in it; its policy allows no other script and no request."""
     html, style, script = (_template(kind) for kind in ("html", "css", "js"))
     policy = (
         f"default-src 'none'; img-src 'self' file: data:; style-src {_digest(style)};"
@@ -133,6 +155,6 @@ def _digest(text: str) -> str:
 
 
 def _embedded(mapping: Mapping[str, Any]) -> str:
-    """JSON in ASCII that an HTML page can hold: names are somebody else's, and may say anything."""
+    """JSON in ASCII that an HTML page can hold: frame names are untrusted text."""
     text = json.dumps(plain(mapping), allow_nan=False, separators=(",", ":"))
     return text.replace("<", "\\u003c")

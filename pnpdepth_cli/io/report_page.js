@@ -38,7 +38,7 @@ function shown(column, value) {
 }
 
 const titled = (column) => column.title + (column.unit ? ` [${column.unit}]` : "");
-const picture = (frame, view) => `pictures/${frame.key}_${view}.jpg`;
+const imageOf = (frame, view) => `pictures/${frame.key}_${view}.jpg`;
 
 // ---- the head of the page ----
 
@@ -96,7 +96,7 @@ function roundStep(rough) {
 // Bins of a round width, with an edge at 0; what lies far out is counted in the bin at the end.
 function binned(values) {
   const sorted = [...values].sort((a, b) => a - b);
-  const at = (share) => sorted[Math.round(share * (sorted.length - 1))];
+  const at = (fraction) => sorted[Math.round(fraction * (sorted.length - 1))];
   let [low, high] = [at(0), at(1)];
   const room = 3 * (at(0.9) - at(0.1));
   if (room > 0) [low, high] = [Math.max(low, at(0.1) - room), Math.min(high, at(0.9) + room)];
@@ -107,8 +107,8 @@ function binned(values) {
   const bins = Array.from({ length: count }, (_, i) => ({
     low: (first + i) * step, high: (first + i + 1) * step, frames: 0 }));
   for (const value of values) {
-    const place = Math.floor(value / step + 1e-9) - first;
-    bins[Math.min(Math.max(place, 0), count - 1)].frames += 1;
+    const position = Math.floor(value / step + 1e-9) - first;
+    bins[Math.min(Math.max(position, 0), count - 1)].frames += 1;
   }
   return { bins, median: (at(0.5) + sorted[Math.floor((sorted.length - 1) / 2)]) / 2 };
 }
@@ -143,18 +143,18 @@ function drawChart() {
   const [low, high] = [bins[0].low, bins[bins.length - 1].high];
   const apart = roundStep((high - low) / (W / 80));
   for (let n = Math.ceil(low / apart - 1e-9); n * apart <= high + 1e-9 * apart; n += 1) {
-    const place = ((n * apart - low) / (high - low)) * bins.length;
-    chart.append(svg("text", { x: x(place), y: H - bottom + 17 }, tick(column, n * apart)));
+    const position = ((n * apart - low) / (high - low)) * bins.length;
+    chart.append(svg("text", { x: x(position), y: H - bottom + 17 }, tick(column, n * apart)));
   }
   const label = titled(column) + (column.percent ? " [%]" : "");
   chart.append(svg("text", { x: (left + W - right) / 2, y: H - 3 }, label));
   const better = values.filter((v) => v > 0).length;
   const worse = values.filter((v) => v < 0).length;
   const count = values.length.toLocaleString("en");
-  const said = `${count} frames, median ${shown(column, median)} ${column.unit}`.trim() +
+  const summary = `${count} frames, median ${shown(column, median)} ${column.unit}`.trim() +
     (column.signed ? `; ${better} better, ${worse} worse` : "");
-  chart.setAttribute("aria-label", `Histogram of ${titled(column)}: ${said}`);
-  figure.replaceChildren(chart, make("figcaption", { text: said }));
+  chart.setAttribute("aria-label", `Histogram of ${titled(column)}: ${summary}`);
+  figure.replaceChildren(chart, make("figcaption", { text: summary }));
 }
 
 function tick(column, value) {
@@ -229,7 +229,7 @@ function makeRow(index) {
   const thumbs = make("span", { class: "thumbs" });
   for (const view of frame.key ? ["thumb", "map_thumb"] : []) {
     thumbs.append(make("img", { loading: "lazy", decoding: "async", width: "96", height: "72",
-      alt: "", src: picture(frame, view) })); // src last: nothing is read before it is in view
+      alt: "", src: imageOf(frame, view) })); // src last: nothing is read before it is in view
   }
   const button = make("button", { type: "button", class: "open", text: name,
     "aria-label": `Open frame ${name}`, "aria-haspopup": "dialog" });
@@ -264,11 +264,11 @@ function fillHeader() {
   byId("chart-column").value = String(data.sort_by === NAME ? 0 : data.sort_by);
 }
 
-function moveTo(place) {
+function moveTo(position) {
   const shownRows = Math.min(list.limit, list.order.length);
   if (!shownRows) return;
   opener(list.order[list.at]).tabIndex = -1;
-  list.at = Math.min(Math.max(place, 0), shownRows - 1);
+  list.at = Math.min(Math.max(position, 0), shownRows - 1);
   const button = opener(list.order[list.at]);
   button.tabIndex = 0;
   button.focus({ preventScroll: true });
@@ -304,17 +304,17 @@ function listenToList() {
 
 // ---- one frame ----
 
-function openFrame(place) {
-  const frame = frames[list.order[place]];
-  moveTo(place);
+function openFrame(position) {
+  const frame = frames[list.order[position]];
+  moveTo(position);
   byId("frame-title").textContent = visible(frame.name);
   byId("views").replaceChildren(...viewsOf(frame));
   byId("values").replaceChildren(...columns.map((column, i) => make("div", {},
     make("dt", { text: titled(column) }), make("dd", { text: shown(column, frame.values[i]) }))));
   byId("frame-notes").replaceChildren(...frame.notes.map(noted));
   const shownRows = Math.min(list.limit, list.order.length);
-  byId("previous").disabled = place === 0;
-  byId("next").disabled = place === shownRows - 1;
+  byId("previous").disabled = position === 0;
+  byId("next").disabled = position === shownRows - 1;
   const dialog = byId("frame");
   if (!dialog.open) dialog.showModal();
   dialog.scrollTop = 0;
@@ -322,7 +322,7 @@ function openFrame(place) {
 }
 
 function viewsOf(frame) {
-  if (!frame.key) return [make("p", { text: "There are no pictures of this frame." })];
+  if (!frame.key) return [make("p", { text: "There are no images of this frame." })];
   const views = [slider(frame), mapView(frame)];
   for (const view of ["image", "sparse"]) {
     if (frame.views.includes(view)) views.push(plainView(frame, view));
@@ -331,7 +331,7 @@ function viewsOf(frame) {
 }
 
 function bigPicture(frame, view) {
-  return make("img", { src: picture(frame, view), draggable: "false",
+  return make("img", { src: imageOf(frame, view), draggable: "false",
     alt: `${data.labels[view]} of ${visible(frame.name)}` });
 }
 
@@ -348,7 +348,7 @@ function slider(frame) {
   const over = make("div", { class: "over" }, bigPicture(frame, "first"));
   const handle = make("div", { class: "handle", "aria-hidden": "true" });
   const range = make("input", { type: "range", min: "0", max: "100", value: "50", step: "1",
-    "aria-label": `${first} to the left, ${second} to the right: place of the border` });
+    "aria-label": `${first} to the left, ${second} to the right: position of the border` });
   const stage = make("div", { class: "stage" }, bigPicture(frame, "second"), over, handle,
     make("span", { class: "label left", text: first, "aria-hidden": "true" }),
     make("span", { class: "label right", text: second, "aria-hidden": "true" }), range);
@@ -382,8 +382,8 @@ function plainView(frame, view) {
 function listenToFrame() {
   const dialog = byId("frame");
   const step = (by) => {
-    const place = list.at + by;
-    if (place >= 0 && place < Math.min(list.limit, list.order.length)) openFrame(place);
+    const position = list.at + by;
+    if (position >= 0 && position < Math.min(list.limit, list.order.length)) openFrame(position);
   };
   byId("previous").addEventListener("click", () => step(-1));
   byId("next").addEventListener("click", () => step(1));

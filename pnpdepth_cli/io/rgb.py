@@ -1,4 +1,4 @@
-"""The image a network sees, from any common picture file."""
+"""RGB images from PNG, JPEG, TIFF, WebP and EXR files."""
 
 from __future__ import annotations
 
@@ -29,26 +29,30 @@ _EXIF_ORIENTATION = 0x0112
 
 @dataclass(frozen=True, kw_only=True)
 class RgbImage:
-    """An upright picture: `values` is (H, W, 3) float32 in 0..1, sRGB-encoded.
-
-    `note` says what was assumed or changed on the way, if anything was.
-    """
+    """An upright image."""
 
     values: NDArray[np.float32]
+    """(H, W, 3) in 0..1, sRGB-encoded."""
+
     note: str | None
+    """What was assumed or changed, for a person; None if nothing was."""
 
 
 def read_rgb(path: Path) -> RgbImage:
-    """The picture in a PNG, JPEG, TIFF, WebP or EXR file; grey is repeated, alpha dropped.
+    """Returns the image in a file; grey is repeated, alpha dropped, EXIF rotation applied.
 
-    EXIF rotation is applied. A file that ends early is refused rather than filled with grey.
+    Args:
+        path: A PNG, JPEG, TIFF, WebP or EXR file.
+
+    Raises:
+        InputError: The file is missing, damaged, cut short, beyond the budget, or no image.
     """
     data = read_bytes(path)
     kind = kind_of(data)
     if kind == "EXR":
         return _from_linear_light(path, data)
     if kind not in ("PNG", "JPEG", "TIFF", "WEBP"):
-        raise FileFormatError(f"{path} is not a picture; give a PNG, JPEG, TIFF, WebP or EXR file")
+        raise FileFormatError(f"{path} is not an image; give a PNG, JPEG, TIFF, WebP or EXR file")
     if _is_16_bit(path, data, kind):
         values, orientation = _decode_16_bit(path, data, kind)
         note = None
@@ -66,7 +70,7 @@ def _is_16_bit(path: Path, data: bytes, kind: str) -> bool:
     facts = read_tiff_facts(path, data)
     if facts.number != "uint" or facts.bits > 16:
         raise FileFormatError(
-            f"{path} is a {facts.bits}-bit {facts.number} TIFF; save the picture with 8 or 16 bits"
+            f"{path} is a {facts.bits}-bit {facts.number} TIFF; save the image with 8 or 16 bits"
         )
     return facts.bits == 16
 
@@ -77,19 +81,19 @@ def _decode_8_bit(
     from PIL import Image
 
     try:
-        with _QUIET_PILLOW, Image.open(io.BytesIO(data), formats=[kind]) as picture:
-            check_pixel_count(path, *picture.size, file_bytes=len(data))
-            picture.load()
-            frames = getattr(picture, "n_frames", 1)
-            orientation = _orientation(picture)
-            pixels = np.asarray(picture.convert("RGB"), dtype=np.uint8)
+        with _QUIET_PILLOW, Image.open(io.BytesIO(data), formats=[kind]) as image:
+            check_pixel_count(path, *image.size, file_bytes=len(data))
+            image.load()
+            frames = getattr(image, "n_frames", 1)
+            orientation = _orientation(image)
+            pixels = np.asarray(image.convert("RGB"), dtype=np.uint8)
     except FileFormatError:
         raise
     except Exception as error:  # Pillow's plugins raise many kinds on damaged files
         fact = "is cut short" if "truncated" in str(error).lower() else "cannot be decoded"
         raise damaged(path, kind, f"{fact} ({_reason(error)})") from error
-    # A camera's JPEG may carry a preview as a second frame; that is no choice to report.
-    note = f"first of {frames} pictures" if frames > 1 and kind != "JPEG" else None
+    # A camera's JPEG may carry a preview as a second frame, which is not worth a note.
+    note = f"first of {frames} images" if frames > 1 and kind != "JPEG" else None
     values = pixels.astype(np.float32)
     values /= np.float32(255)
     return values, orientation, note
@@ -103,20 +107,20 @@ def _decode_16_bit(path: Path, data: bytes, kind: str) -> tuple[NDArray[np.float
         values = values[:, :, None]
     if values.shape[2] in (1, 2):
         values = np.repeat(values[:, :, :1], 3, axis=2)
-    values = values[:, :, 2::-1]  # OpenCV hands out blue first
-    # OpenCV has turned a TIFF upright by now, a PNG not.
+    values = values[:, :, 2::-1]  # OpenCV returns blue first
+    # OpenCV applies the orientation of a TIFF, not that of a PNG.
     if kind != "PNG":
         return values, 1
     from PIL import Image
 
-    with _QUIET_PILLOW, Image.open(io.BytesIO(data), formats=["PNG"]) as picture:
-        return values, _orientation(picture)
+    with _QUIET_PILLOW, Image.open(io.BytesIO(data), formats=["PNG"]) as image:
+        return values, _orientation(image)
 
 
-def _orientation(picture: PIL.Image.Image) -> int:
+def _orientation(image: PIL.Image.Image) -> int:
     try:
-        return int(picture.getexif().get(_EXIF_ORIENTATION, 1))
-    except Exception:  # unreadable EXIF in a good picture says nothing of its rotation
+        return int(image.getexif().get(_EXIF_ORIENTATION, 1))
+    except Exception:  # unreadable EXIF in a valid image says nothing of its rotation
         return 1
 
 
@@ -138,7 +142,7 @@ _QUIET_PILLOW = SharedContext(_quiet_pillow)
 
 
 def _turn_upright(values: NDArray[np.float32], orientation: int) -> NDArray[np.float32]:
-    """Undoes EXIF orientation 1..8 (TIFF 6.0, tag 274); other numbers mean nothing."""
+    """Applies EXIF orientation 1..8 (TIFF 6.0, tag 274); other numbers are ignored."""
     if orientation in (5, 6, 7, 8):
         values = values.transpose(1, 0, 2)
     if orientation in (3, 4, 7, 8):
@@ -161,7 +165,7 @@ def _from_linear_light(path: Path, data: bytes) -> RgbImage:
 
 
 def srgb_from_linear(linear: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Linear light in 0..1, sRGB-encoded (IEC 61966-2-1)."""
+    """Returns linear light in 0..1 of any shape, sRGB-encoded (IEC 61966-2-1)."""
     light = linear.astype(np.float64)  # in float32 white would come out just below 1
     curve = 1.055 * np.power(light, 1 / 2.4) - 0.055
     return np.where(light <= 0.0031308, 12.92 * light, curve).astype(np.float32)
@@ -179,7 +183,7 @@ def _colour_of(path: Path, channels: dict[str, NDArray[Any]]) -> NDArray[Any]:
         return np.repeat(channels[grey[0]][:, :, None], 3, axis=2)
     listing = ", ".join(channels)
     raise FileFormatError(
-        f"{path} has no one picture in its channels ({listing}); export R, G and B"
+        f"{path} has no single image in its channels ({listing}); export R, G and B"
     )
 
 

@@ -22,6 +22,9 @@ _KITTI_FIELDS = 4
 _NUSCENES_FIELDS = 5
 """x, y, z, intensity and the index of the laser, a whole number."""
 
+_NEARLY_ALL = 0.95
+"""Fraction of points; read with the wrong number of fields, at most half of them look right."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class ScanFile:
@@ -109,12 +112,12 @@ def _fields_of_bin(path: Path, data: bytes) -> int:
 
 
 def _looks_like_scan(rows: NDArray[np.float32]) -> bool:
-    """True if no reflectance is negative, and the fifth number of each point names a laser."""
+    """True if nearly all points have no negative reflectance, and the index of a laser as fifth."""
     with np.errstate(invalid="ignore"):
-        if not (np.abs(rows[:, :3]) <= _FARTHEST_M).all() or not (rows[:, 3] >= 0).all():
-            return False
+        near = (np.abs(rows[:, :3]) <= _FARTHEST_M).all(axis=1) & (rows[:, 3] >= 0)
         laser = rows[:, 4:]
-        return bool(((laser >= 0) & (laser < 256) & (laser == np.floor(laser))).all())
+        named = ((laser >= 0) & (laser < 256) & (laser == np.floor(laser))).all(axis=1)
+    return bool(np.mean(near & named) >= _NEARLY_ALL)
 
 
 def _parse_npy(path: Path, data: bytes) -> tuple[NDArray[np.float32], str]:

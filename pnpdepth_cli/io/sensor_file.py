@@ -1,4 +1,4 @@
-"""A scanner of one's own, described in a small TOML file.
+"""A user's own LiDAR, described in a small TOML file.
 
 name = "my-lidar"
 elevations_deg = [10, 5, 0, -5, -10]      # or: top_deg, step_deg and beams
@@ -31,18 +31,33 @@ _OPTIONAL = {"max_range": math.inf, "range_noise": 0.0, "angle_noise_deg": 0.0}
 
 @dataclass(frozen=True, kw_only=True)
 class SensorFile:
-    """What the file says of a scanner: degrees and metres, elevations from the first beam on."""
+    """A LiDAR as the file describes it; the fields are those of `sensors.Lidar`."""
 
     name: str
+    """As users and records call it."""
+
     elevations_deg: tuple[float, ...]
+    """Elevation of each beam."""
+
     azimuth_step_deg: float
+    """Angle between firings."""
+
     max_range: float
+    """Metres; may be infinite."""
+
     range_noise: float
+    """Standard deviation of a range, metres."""
+
     angle_noise_deg: float
+    """Standard deviation of a direction."""
 
 
 def read_sensor(path: Path) -> SensorFile:
-    """The scanner that a TOML file describes. Raises FileFormatError for what it cannot mean."""
+    """Returns the LiDAR that a TOML file describes.
+
+    Raises:
+        InputError: The file cannot be read, or does not describe one.
+    """
     try:
         table = tomllib.loads(read_bytes(path).decode("utf-8"))
     except (ValueError, RecursionError) as error:
@@ -53,7 +68,7 @@ def read_sensor(path: Path) -> SensorFile:
     unknown = sorted(set(table) - known)
     if unknown:
         raise FileFormatError(
-            f"{path}: {unknown[0]!r} says nothing of a sensor; use {', '.join(sorted(known))}"
+            f"{path}: {unknown[0]!r} is not part of a sensor; use {', '.join(sorted(known))}"
         )
     return SensorFile(
         name=str(table.get("name", path.stem)),
@@ -84,7 +99,7 @@ def _elevations(path: Path, table: dict[str, Any]) -> tuple[float, ...]:
 
 
 def _number(path: Path, table: dict[str, Any], key: str) -> float:
-    value = table.get(key)
+    value: Any = table.get(key)
     try:
         number = math.nan if isinstance(value, bool) else float(value)
     except (TypeError, ValueError, OverflowError):

@@ -1,4 +1,4 @@
-"""A change of something global that several threads may want at the same time."""
+"""A change of global state that several threads may need at the same time."""
 
 from __future__ import annotations
 
@@ -9,9 +9,12 @@ from types import TracebackType
 
 
 class SharedContext:
-    """The context that `make` gives, entered with the first thread and left with the last.
+    """A context that is entered by the first thread and left by the last.
 
-    What is put back is so what was there before all of them, whichever order they leave in.
+    The state before all of them is restored, in whichever order they leave.
+
+    Args:
+        make: Returns the context.
     """
 
     def __init__(self, make: Callable[[], AbstractContextManager[object]]) -> None:

@@ -16,31 +16,39 @@ from pnpdepth_cli.io.depth_writing import write_depth
 from pnpdepth_cli.io.formats import DEPTH_SUFFIXES
 
 SPARSE_SUFFIXES = (*DEPTH_SUFFIXES, ".csv")
-"""What `write_sparse` can write; .csv keeps the places within the pixels."""
+"""What `write_sparse` can write; .csv keeps coordinates between pixel centres."""
 
-MADE_KEY = "pnpdepth:made"
-"""Where a PNG keeps how its sparse depth was made."""
+PROVENANCE_KEY = "pnpdepth:made"
+"""Key of the text in a PNG or CSV that says how its sparse depth was made."""
 
 
 def write_sparse(
     path: Path,
     xy: NDArray[np.float32],
     depth: NDArray[np.float32],
-    picture: NDArray[np.float32],
+    image: NDArray[np.float32],
     *,
-    made: Mapping[str, Any],
+    provenance: Mapping[str, Any],
     scale: float = KITTI_SCALE,
 ) -> None:
-    """`path` holds the N points (xy (N, 2) pixels, depth (N,) metres), as its suffix says.
+    """Writes N points in the format that the suffix names.
 
-    picture: the same points as (H, W) metres, for every format but .csv. made: how they came
-    about; a PNG and a CSV keep it. scale: codes per metre of a PNG.
+    Args:
+        path: The file to write, with a suffix of `SPARSE_SUFFIXES`.
+        xy: (N, 2) pixel coordinates.
+        depth: (N,) metres.
+        image: The same points as (H, W) metres, for every format but .csv.
+        provenance: How they were made; a PNG and a CSV keep it.
+        scale: Codes per metre of a PNG.
+
+    Raises:
+        OutputError: The file cannot be written.
     """
-    text = json.dumps(made, sort_keys=True)
+    text = json.dumps(provenance, sort_keys=True)
     if path.suffix.lower() != ".csv":
-        write_depth(path, picture, scale=scale, text={MADE_KEY: text})
+        write_depth(path, image, scale=scale, text={PROVENANCE_KEY: text})
         return
     rows = [f"{x:.9g},{y:.9g},{z:.9g}" for (x, y), z in zip(xy, depth, strict=True)]
     with atomic_path(path) as temporary:
-        content = "\n".join([f"# {MADE_KEY} {text}", "x,y,depth", *rows]) + "\n"
+        content = "\n".join([f"# {PROVENANCE_KEY} {text}", "x,y,depth", *rows]) + "\n"
         temporary.write_text(content, encoding="utf-8", newline="\n")

@@ -33,6 +33,7 @@ class AlignedDepth:
         self.notes: tuple[str, ...] = ()
 
     def __call__(self, output: Any) -> Tensor:
+        """Returns depth in metres, (1, 1, h, w), from the network's output."""
         if self._kind == "none":
             depth = self._network.depth_of(output)
             self.notes = self.notes or self._plain_notes(depth)

@@ -1,12 +1,27 @@
-"""The contract between the program and a network: one frozen dataclass says all there is to know.
+"""What the program knows of a network: one frozen dataclass, `ModelDefinition`.
 
-A user's own network is a Python file with such an object in it, named `definition`:
+Your own network is a Python file with such an object in it, named `definition`:
 
-    from pnpdepth_cli.models.definition import Metric, ModelDefinition, Multiple
+    # my_net.py, used as: pnpdepth refine img.png --sparse s.png --model my_net.py --checkpoint w.pt
+    from pnpdepth_cli.models.definition import (
+        IMAGENET_MEAN, IMAGENET_STD, ModelDefinition, Multiple, Normalisation
+    )
+    from my_package import MyNet  # beside this file, or installed
 
     definition = ModelDefinition(
-        name="my-net", input_kind="rgb", size=Multiple(32), build=MyNet, layers=("decoder.up1",)
+        name="my-net",
+        input_kind="rgb",                  # its forward takes one rgb image (1, 3, H, W)
+        size=Multiple(32),                 # of any size in multiples of 32
+        normalisation=Normalisation(mean=IMAGENET_MEAN, std=IMAGENET_STD),
+        output_kind="inverse",             # its numbers are inverse depth,
+        output_scale="affine",             # up to a scale and a shift
+        layers=("decoder.up1",),           # where to cut; without any, they are suggested
+        build=MyNet,                       # called without arguments
     )
+
+Every field has a line of description below it. `pnpdepth models check my_net.py` tries the
+definition. The same file in `model_zoo_defs`, or its object as an entry point `pnpdepth.models` of
+an installed package, makes the network one that can be named.
 
 Nothing here imports torch, so that listing networks stays cheap. A field with a value that makes no
 sense raises ModelError as soon as the object is made.
@@ -34,15 +49,18 @@ IMAGENET_STD = (0.229, 0.224, 0.225)
 
 @dataclass(frozen=True)
 class Fixed:
-    """The network takes pictures of one size only.
-
-    `stretch` resizes the whole picture to it, `crop` cuts the largest centred part of its aspect
-    ratio first; pixels outside the crop then have no depth.
-    """
+    """The network takes images of one size only."""
 
     height: int
+    """Rows."""
     width: int
+    """Columns."""
     fit: Fit = "stretch"
+    """How an image of another size is brought to it.
+
+    "stretch" resizes the whole image. "crop" first cuts out the largest centred part of the same
+    aspect ratio; pixels outside it have no depth.
+    """
 
     def __post_init__(self) -> None:
         validity.whole(self, "height", least=1)
@@ -52,14 +70,12 @@ class Fixed:
 
 @dataclass(frozen=True)
 class Multiple:
-    """The network takes any picture whose sides are multiples of `of`.
-
-    The picture is padded at the right and the bottom (edge pixels repeated); a longest side above
-    `longest` is shrunk first.
-    """
+    """The network takes any image whose sides are multiples of a number."""
 
     of: int
+    """The number. Other images are padded at the right and the bottom by repeating edge pixels."""
     longest: int | None = None
+    """Images with a longer side, in pixels, are shrunk to it first; None shrinks none."""
 
     def __post_init__(self) -> None:
         validity.whole(self, "of", least=1)
@@ -69,14 +85,14 @@ class Multiple:
 
 @dataclass(frozen=True, kw_only=True)
 class Near:
-    """The picture is resized to sides that are multiples of `of`, about in its own proportions.
-
-    Towards height × width, whichever of the two asks for less change; with neither, its own size.
-    """
+    """The image is resized to sides that are multiples of a number, nearly in its aspect ratio."""
 
     of: int
+    """The number."""
     height: int | None = None
+    """Rows to approach, or None. Of height and width, the one that needs less resizing is taken."""
     width: int | None = None
+    """Columns to approach, or None. With neither, the image keeps about its own size."""
 
     def __post_init__(self) -> None:
         validity.whole(self, "of", least=1)
@@ -87,10 +103,12 @@ class Near:
 
 @dataclass(frozen=True, kw_only=True)
 class Normalisation:
-    """(rgb in 0..1 − mean) / std, per channel; the default hands 0..1 to the network."""
+    """The network's input is (rgb − mean) / std with rgb in 0…1; by default rgb itself."""
 
     mean: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Of red, green and blue."""
     std: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    """Of red, green and blue, each above 0; 1/255 each makes the input 0…255."""
 
     def __post_init__(self) -> None:
         validity.per_channel(self, "mean")
@@ -99,22 +117,27 @@ class Normalisation:
 
 @dataclass(frozen=True, kw_only=True)
 class RefineDefaults:
-    """How the network is refined when nobody says otherwise.
+    """The network's settings of refinement where no option sets them.
 
-    `lr` is a number (absolute, as in the paper) or a text like "3%" (of the standard deviation of
-    z_0). `schedule` and `blur` are those of `pnpdepth_cli.core.refine.RefineSettings`. `layer`
-    None is the definition's first layer. `align` None is "none" for a metric network and "auto" for
-    any other. The values here are the paper's.
+    The defaults here are the paper's. See `pnpdepth_cli.core.refine.RefineSettings`.
     """
 
     layer: str | None = None
+    """Where to cut; None is the first of the definition's layers."""
     iterations: int = 5
+    """Number of updates of z, K."""
     lr: float | str = 0.01
+    """Step size, α: a number, or a text such as "3%" of the standard deviation of z_0."""
     loss: str = "l1"
+    """Loss at the sparse points, L: a name in `choices.LOSSES`."""
     update: str = "sign"
+    """Update rule, U: a name in `choices.UPDATES`."""
     schedule: Schedule = "constant"
+    """How the step size changes over the updates."""
     blur: float = 0.0
+    """Standard deviation, in elements of z, of the Gaussian that gradients are blurred by."""
     align: Align | None = None
+    """How the output is fitted to the points; None is "none" for metric networks, else "auto"."""
     spread: float | None = None
     """Deprecated name of `blur`."""
 
@@ -135,7 +158,7 @@ class RefineDefaults:
             validity.one_of(self, "align", choices.ALIGNMENTS)
 
 
-FOREIGN = RefineDefaults(
+UNTUNED_DEFAULTS = RefineDefaults(
     iterations=20, lr="25%", loss="cauchy", update="normalised", schedule="linear", blur=1.0
 )
 """For networks that nobody here has tuned: steps that follow the feature map's own scale.
@@ -144,7 +167,7 @@ Chosen with FastDepth on rendered rooms; Adam with steps of 3 % left a quarter m
 """
 
 
-def _inputs_as_named(
+def _inputs_in_order(
     input_kind: InputKind, rgb: Tensor | None, sparse: Tensor | None
 ) -> tuple[Tensor, ...]:
     wanted = {"rgb": (rgb,), "sparse": (sparse,), "rgb+sparse": (rgb, sparse)}[input_kind]
@@ -156,57 +179,59 @@ def _inputs_as_named(
 
 @dataclass(frozen=True, kw_only=True)
 class ModelDefinition:
-    """Everything the program needs to know of a network.
-
-    name, summary, paper, licence: what `pnpdepth models` shows.
-    input_kind: what the network looks at.
-    size: which picture sizes it takes.
-    normalisation: of the rgb input.
-    output_kind: what its numbers are; depth is out, 1/out or exp(out).
-    output_scale: whether that is in metres, or up to a scale, or a scale and a shift, which are
-        then fitted to the sparse points.
-    layers: the layers worth cutting at, from shallow to deep (`pnpdepth layers` lists them).
-    defaults: the settings of refinement.
-    build: makes the network (weights not loaded); called without arguments.
-    checkpoint: the weights that come with the definition, or None where the user brings them.
-    static_graph: the network runs the same submodules in the same order for all images of one size,
-        even where values of tensors reach Python code. Then the cut is learned only once.
-    same_path: deprecated name of static_graph.
-    complete: `build` gives the network with its weights, `checkpoint` is only where they lie.
-    read_checkpoint: renames or reshapes the tensors of a published checkpoint into the state
-        dict of the network.
-    arguments: how to call the network; given rgb (1, 3, H, W) normalised and sparse depth
-        (1, 1, H, W) in metres with 0 = unknown (None where the network does not take it),
-        returns the positional arguments. Default: in the order of `input_kind`.
-    output: picks the prediction, (1, 1, h, w) or (1, h, w), out of what the network returns;
-        default: the tensor itself, the only tensor of a structure.
-    verify: called with the network and its arguments for the first frame; returns what to say, if
-        anything, or raises ModelError where the network cannot be trusted.
-    normalisation None: which one is decided from the first frame's points.
-    assumed: what this definition takes for granted because nobody said; it is printed.
-    """
+    """Everything the program needs to know of a network."""
 
     name: str
+    """What the network is called in messages and records."""
     input_kind: InputKind
+    """What its forward takes: "rgb", "sparse" (depth with 0 = unknown), or both, "rgb+sparse"."""
     size: Fixed | Multiple | Near
+    """Which image sizes it takes."""
     build: Callable[[], nn.Module]
+    """Returns the network, its weights not loaded; a class or function without arguments."""
     summary: str = ""
+    """One line for `pnpdepth models`."""
     paper: str = ""
+    """Authors, title, venue and year."""
     licence: str = ""
+    """Licence of the weights."""
     normalisation: Normalisation | None = Normalisation()
+    """How the rgb image is normalised; None chooses by the first frame's points."""
     output_kind: OutputKind = "depth"
+    """What its numbers are: "depth", "inverse" depth, "log" depth, or "unknown" (the points
+    decide)."""
     output_scale: OutputScale = "metric"
+    """Up to what they are right: "metric" (nothing), a "scale", "affine" (a scale and a shift), or
+    "unknown". What is missing is fitted to the points."""
     layers: tuple[str, ...] = ()
+    """Names of the submodules worth cutting at, from shallow to deep; `pnpdepth layers` lists all.
+    Without any, they are suggested by the shapes of the feature maps."""
     defaults: RefineDefaults = RefineDefaults()
+    """Its settings of refinement where no option sets them."""
     checkpoint: Path | None = None
+    """The weights that come with the definition; None if the user names them."""
     complete: bool = False
+    """True if `build` returns the network with its weights; `checkpoint` then only says where they
+    are."""
     static_graph: bool = False
+    """True if the network runs the same submodules in the same order for all images of one size,
+    even where values of tensors reach Python code. Then the cut is learned only once."""
     same_path: bool = False
+    """Deprecated name of `static_graph`."""
     read_checkpoint: Callable[[Mapping[str, Tensor]], Mapping[str, Tensor]] | None = None
+    """Renames or reshapes the tensors of a published checkpoint into the network's state dict."""
     arguments: Callable[[Tensor | None, Tensor | None], tuple[Tensor, ...]] | None = None
+    """Returns the positional arguments of forward, for rgb (1, 3, H, W), normalised, and sparse
+    depth (1, 1, H, W) in metres with 0 = unknown; each None if `input_kind` lacks it. By default
+    they are passed in the order of `input_kind`."""
     output: Callable[[Any], Tensor] | None = None
+    """Returns the prediction, (1, 1, h, w) or (1, h, w), from what forward returns. By default that
+    is the tensor itself, or the only tensor in it."""
     verify: Callable[[nn.Module, tuple[Tensor, ...]], str | None] | None = None
+    """Called with the network and its arguments for the first frame; returns a note or None, or
+    raises ModelError if the network cannot be trusted."""
     assumed: str = ""
+    """What was assumed where no definition was given; it is printed."""
 
     def __post_init__(self) -> None:
         if self.same_path:
@@ -234,17 +259,22 @@ class ModelDefinition:
 
     @property
     def default_layer(self) -> str | None:
-        """The layer to cut at when nobody says otherwise."""
+        """The layer to cut at where no option names one; None if the definition has none."""
         return self.defaults.layer or (self.layers[0] if self.layers else None)
 
     @property
     def default_alignment(self) -> str:
-        """How the output is aligned with the points when nobody says otherwise."""
+        """How the output is aligned with the points where no option says so."""
         metric = self.output_scale == "metric" and self.output_kind != "unknown"
         return self.defaults.align or ("none" if metric else "auto")
 
     def call_arguments(self, rgb: Tensor | None, sparse: Tensor | None) -> tuple[Tensor, ...]:
-        """The positional arguments of the network for one frame."""
+        """Returns the positional arguments of the network's forward for one frame.
+
+        Args:
+            rgb: (1, 3, H, W), normalised, or None.
+            sparse: (1, 1, H, W) in metres with 0 = unknown, or None.
+        """
         if self.arguments is not None:
             return self.arguments(rgb, sparse)
-        return _inputs_as_named(self.input_kind, rgb, sparse)
+        return _inputs_in_order(self.input_kind, rgb, sparse)

@@ -21,49 +21,68 @@ from pnpdepth_cli.models.frame import FrameMap
 from pnpdepth_cli.models.made_up import made_up_arguments
 from pnpdepth_cli.models.precision import dtype_of, lower
 from pnpdepth_cli.models.registry import find_definition
-from pnpdepth_cli.models.suggest_layers import outline
+from pnpdepth_cli.models.suggest_layers import suggest_layers
 from pnpdepth_cli.models.weights.checkpoint import load_checkpoint
 from pnpdepth_cli.points import SparsePoints
 
 FARTHEST_DEPTH = 1e4
 """Metres; inverse depth below 1/FARTHEST_DEPTH reads as this depth."""
 
-_OUTLINED = 128  # pixels a side of the frame that layers are looked for with
+_SUGGESTION_SIDE = 128  # pixels of the synthetic frame that suggests layers
 
 
 @dataclass(frozen=True, kw_only=True)
 class Network:
-    """A definition and its module in eval mode; `checkpoint` is the file the weights came from."""
+    """A network with its weights on its device, in eval mode, its parameters without gradients."""
 
     definition: ModelDefinition
+    """What the program knows of it."""
     module: nn.Module
+    """The network itself."""
     device: torch.device
+    """Where it computes."""
     checkpoint: Path | None
+    """The file that the weights came from."""
     notes: tuple[str, ...] = ()
+    """What was assumed or done when it was loaded, to be printed."""
 
     def cut_at(self, layer: str) -> Split:
-        """The network cut at the layer, to be opened. LayerError where there is none."""
+        """Returns the network cut at a layer, to be opened by `with`.
+
+        Raises:
+            LayerError: The network has no such layer.
+        """
         return Split(self.module, layer, static_graph=self.definition.static_graph)
 
     def arguments(
         self, frame: FrameMap, rgb: Tensor | None, points: SparsePoints
     ) -> tuple[Tensor, ...]:
-        """The network's arguments for an image (1, 3, H, W) in 0..1 and points in its own frame."""
+        """Returns the positional arguments of the network's forward for one frame.
+
+        Args:
+            frame: Maps the image frame to the network's frame.
+            rgb: (1, 3, H, W) in 0…1 in the image frame; None if the network takes none.
+            points: In the network's frame.
+
+        Raises:
+            UsageError: The network takes an rgb image and there is none.
+            ModelError: The definition's `arguments` raises or does not return a tuple.
+        """
         kind = self.definition.input_kind
-        picture = sparse = None
+        image = sparse = None
         if "rgb" in kind:
             if rgb is None:
                 raise UsageError(
-                    f"network {self.definition.name!r} looks at a picture; name one before --sparse"
+                    f"network {self.definition.name!r} takes an rgb image; name one before --sparse"
                 )
             normalise = self.definition.normalisation or Normalisation()
             mean = rgb.new_tensor(normalise.mean).reshape(1, 3, 1, 1)
             std = rgb.new_tensor(normalise.std).reshape(1, 3, 1, 1)
-            picture = ((frame.rgb_to_network(rgb) - mean) / std).to(self.device)
+            image = ((frame.rgb_to_network(rgb) - mean) / std).to(self.device)
         if "sparse" in kind:
             sparse = points.scatter().to(self.device)
         with wrap_user_errors(f"arguments of network {self.definition.name!r}"):
-            arguments = self.definition.call_arguments(picture, sparse)
+            arguments = self.definition.call_arguments(image, sparse)
         if not isinstance(arguments, tuple):
             raise ModelError(
                 f"arguments of network {self.definition.name!r} gives a"
@@ -72,31 +91,47 @@ class Network:
         return arguments
 
     def verified(self, arguments: tuple[Tensor, ...]) -> tuple[str, ...]:
-        """What the definition's `verify` has to say. ModelError if it raises or has no trust."""
+        """Returns the notes of the definition's `verify` on the network's arguments for a frame.
+
+        Raises:
+            ModelError: The network cannot be trusted, or `verify` itself raises.
+        """
         if self.definition.verify is None:
             return ()
         with wrap_user_errors(f"verify of network {self.definition.name!r}"):
-            said = self.definition.verify(self.module, arguments)
-        return (str(said),) if said else ()
+            note = self.definition.verify(self.module, arguments)
+        return (str(note),) if note else ()
 
     def depth_of(self, output: Any) -> Tensor:
-        """Depth (1, 1, h, w) in float32 of what the module returns, taken to be in metres."""
+        """Returns depth (1, 1, h, w) in float32, for a network whose output needs no alignment.
+
+        Args:
+            output: What the module returns.
+        """
         tensor = self.raw_of(output)
         if self.definition.output_kind == "inverse":
             return tensor.clamp_min(1 / FARTHEST_DEPTH).reciprocal()
         return tensor.exp() if self.definition.output_kind == "log" else tensor
 
     def raw_of(self, output: Any) -> Tensor:
-        """The prediction (1, 1, h, w) in float32 as the network gives it. ModelError if none."""
-        given = self._tensor_of(output)
-        tensor = given.float()
+        """Returns the prediction (1, 1, h, w) in float32, in the network's own numbers.
+
+        Args:
+            output: What the module returns.
+
+        Raises:
+            ModelError: It holds no prediction, or several tensors that `output` of the definition
+                does not choose from.
+        """
+        chosen = self._tensor_of(output)
+        tensor = chosen.float()
         if tensor.ndim == 3:
             tensor = tensor[:, None]
         if tensor.ndim == 2:
             tensor = tensor[None, None]
         if tensor.ndim != 4 or tuple(tensor.shape[:2]) != (1, 1):
             raise ModelError(
-                f"network {self.definition.name!r} gives a tensor of shape {tuple(given.shape)},"
+                f"network {self.definition.name!r} gives a tensor of shape {tuple(chosen.shape)},"
                 " where one depth map (1, 1, h, w) is expected; pick it by the definition's output"
             )
         return tensor
@@ -111,19 +146,19 @@ class Network:
                     f" {type(chosen).__name__}, where a tensor is expected"
                 )
             return chosen
-        found: list[tuple[tuple[str, ...], Tensor]] = list(tensors_in(output))
-        if not found:
+        tensors: list[tuple[tuple[str, ...], Tensor]] = list(tensors_in(output))
+        if not tensors:
             raise ModelError(
                 f"network {self.definition.name!r} returns a {type(output).__name__} without a"
                 " tensor in it; its forward, or `output` of its definition, must give the depth"
             )
-        if len(found) != 1:
-            names = ", ".join(".".join(path) for path, _ in found)
+        if len(tensors) != 1:
+            names = ", ".join(".".join(path) for path, _ in tensors)
             raise ModelError(
-                f"network {self.definition.name!r} returns {len(found)} tensors ({names}); its"
+                f"network {self.definition.name!r} returns {len(tensors)} tensors ({names}); its"
                 " definition must pick the depth with `output`"
             )
-        return found[0][1]
+        return tensors[0][1]
 
 
 def load_network(
@@ -134,14 +169,23 @@ def load_network(
     precision: str = "fp32",
     untrained: bool = False,
 ) -> Network:
-    """The network named by `spec`, with the weights of `checkpoint` or the definition's own.
+    """Returns a network, built, with its weights, on its device.
 
-    untrained: where there are none, random weights, which is noted, will do; without it they never
-    do. precision: see `pnpdepth_cli.models.precision`. Raises ModelError, CheckpointError or
-    DeviceError.
+    Args:
+        spec: A name, file or folder; see `find_definition`.
+        checkpoint: The weights; None takes those of the definition.
+        device: Name of a torch device.
+        precision: "fp32", "bf16" or "fp16"; see `pnpdepth_cli.models.precision`.
+        untrained: Whether random weights will do if there are no others, as for measuring times.
+
+    Raises:
+        ModelError: There is no such network, or it cannot be built.
+        CheckpointError: Its weights are missing, or do not fit.
+        DeviceError: The device is missing or too small.
+        UsageError: A checkpoint is named for a network that brings its own weights.
     """
-    on = find_device(device)
-    dtype = dtype_of(precision, on)
+    torch_device = find_device(device)
+    dtype = dtype_of(precision, torch_device)
     definition = find_definition(spec)
     path = checkpoint or definition.checkpoint
     module = _built(definition, spec)
@@ -155,26 +199,32 @@ def load_network(
     elif path is not None:
         notes = load_checkpoint(module, definition, path)
     elif untrained:
-        notes = ["weights: random, for none are given; times are right, depths are not"]
+        notes = ["weights: random, none are named; times are right, depths are not"]
     elif module.state_dict():
         raise CheckpointError(
             f"network {definition.name!r} comes without weights; name them with --checkpoint, or,"
             " where its build loads them itself, say complete=True in a definition"
         )
     module.eval().requires_grad_(False)
-    with out_of_memory_is_a_device_error(on):
-        module.to(on)
+    with out_of_memory_is_a_device_error(torch_device):
+        module.to(torch_device)
     if dtype is not None:
-        lower(module, dtype, on)
+        lower(module, dtype, torch_device)
     notes = [f"model: {definition.assumed}", *notes] if definition.assumed else notes
     network = Network(
-        definition=definition, module=module, device=on, checkpoint=path, notes=tuple(notes)
+        definition=definition,
+        module=module,
+        device=torch_device,
+        checkpoint=path,
+        notes=tuple(notes),
     )
-    return network if definition.layers or definition.defaults.layer else _outlined(network)
+    if definition.layers or definition.defaults.layer:
+        return network
+    return _with_suggested_layers(network)
 
 
 def _built(definition: ModelDefinition, spec: str) -> nn.Module:
-    """What `build` makes; it may import what lies beside the model file."""
+    """The network that `build` returns; it may import modules beside the model file."""
     if isinstance(definition.build, nn.Module):
         raise ModelError(
             f"build of network {definition.name!r} is a {type(definition.build).__name__} that is"
@@ -187,16 +237,16 @@ def _built(definition: ModelDefinition, spec: str) -> nn.Module:
     return module
 
 
-def _outlined(network: Network) -> Network:
-    """The network with layers to cut at, where its definition lists none."""
+def _with_suggested_layers(network: Network) -> Network:
+    """The network with layers to cut at, for a definition that lists none."""
     size = network.definition.size
     if isinstance(size, Fixed):
         height, width = size.height, size.width
     else:
-        height = width = -(-_OUTLINED // size.of) * size.of
+        height = width = -(-_SUGGESTION_SIDE // size.of) * size.of
     with out_of_memory_is_a_device_error(network.device):
         arguments = made_up_arguments(network, FrameMap.fit(size, height, width))
-        layers = outline(network.module, arguments, network.raw_of)
+        layers = suggest_layers(network.module, arguments, network.raw_of)
     if not layers:
         return network
     return replace(
@@ -204,18 +254,22 @@ def _outlined(network: Network) -> Network:
         definition=replace(network.definition, layers=layers),
         notes=(
             *network.notes,
-            f"layers: none are named for {network.definition.name!r}; by their shapes"
-            f" {', '.join(layers)} are worth a cut, the first is the bottleneck",
+            f"layers: the definition of {network.definition.name!r} lists none; suggested by shape:"
+            f" {', '.join(layers)}; the first is the bottleneck",
         ),
     )
 
 
 def find_device(name: str) -> torch.device:
-    """The torch device of that name. DeviceError if it is not there."""
+    """Returns the torch device of that name.
+
+    Raises:
+        DeviceError: The device is not there or does not work.
+    """
     try:
         device = torch.device(name)
         float(torch.zeros(1, device=device))  # "meta" has no values
-    except Exception as error:  # every backend has its own way to say that it is not there
+    except Exception as error:  # every backend raises another type if it is not there
         reason = (str(error).splitlines() or [""])[0][:120]
         raise DeviceError(f"device {name!r} cannot be used: {reason}; try --device cpu") from None
     return device
@@ -223,7 +277,7 @@ def find_device(name: str) -> torch.device:
 
 @contextmanager
 def out_of_memory_is_a_device_error(device: torch.device) -> Iterator[None]:
-    """Running out of memory becomes a DeviceError."""
+    """Inside, running out of memory becomes a DeviceError."""
     try:
         yield
     except Exception as error:

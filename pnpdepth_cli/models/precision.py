@@ -1,4 +1,4 @@
-"""In which precision a network computes: fp32, or bf16 or fp16 with float32 around it."""
+"""The precision a network computes in: fp32, or bf16 or fp16 with float32 inputs and outputs."""
 
 from __future__ import annotations
 
@@ -16,13 +16,19 @@ _DTYPES = {"fp32": None, "bf16": torch.bfloat16, "fp16": torch.float16}
 
 _MAPS = (nn.Conv2d, nn.ConvTranspose2d)
 _CAST_ONCE = (nn.Linear, nn.Conv1d, nn.Conv3d, nn.ConvTranspose1d, nn.ConvTranspose3d, *_MAPS)
-"""Submodules whose weights autocast would cast in every pass: it keeps those of training only."""
+"""Submodules whose weights autocast would cast in every pass: it caches trainable weights only."""
 
 
 def dtype_of(precision: str, device: torch.device) -> torch.dtype | None:
-    """What convolutions and matrix products are computed in; None is float32, as it stands.
+    """Returns the type that convolutions and matrix products compute in; None leaves float32.
 
-    DeviceError for fp16 on a CPU: hardly any computes in it, and those that do have bf16 too.
+    Args:
+        precision: One of `choices.PRECISIONS`.
+        device: Where the network computes.
+
+    Raises:
+        UsageError: There is no such precision.
+        DeviceError: fp16 on a CPU. Hardly any CPU computes in it, and those that do have bf16 too.
     """
     if precision not in PRECISIONS:
         raise UsageError(f"precision {precision!r} is not one of {' '.join(PRECISIONS)}")
@@ -32,10 +38,15 @@ def dtype_of(precision: str, device: torch.device) -> torch.dtype | None:
 
 
 def lower(module: nn.Module, dtype: torch.dtype, device: torch.device) -> None:
-    """Convolutions and matrix products of the module compute in `dtype`, the rest as before.
+    """Makes the convolutions and matrix products of a module compute in a lower precision.
 
-    By torch's autocast, which knows what must stay in float32; weights are cast once, and laid out
-    channels last, which low precision is fastest in. Depths and gradients come out in float32.
+    torch's autocast decides which operations stay in float32. Weights are cast once, and laid out
+    channels last, the fastest layout in low precision. Depth and gradients come out in float32.
+
+    Args:
+        module: Changed in place.
+        dtype: torch.bfloat16 or torch.float16.
+        device: Where the module computes.
     """
     for part in module.modules():
         if type(part) in _CAST_ONCE:

@@ -1,4 +1,4 @@
-"""Layers worth cutting at, for a network whose definition names none."""
+"""Suggests layers worth cutting at, for a network whose definition names none."""
 
 from __future__ import annotations
 
@@ -13,140 +13,172 @@ from pnpdepth_cli.core.split.structure import map_tensors
 from pnpdepth_cli.core.split.user_code import wrap_user_errors
 from pnpdepth_cli.errors import ModelError
 
-_SQUARE_ENOUGH = 1.3
+_SIMILAR_ASPECT = 1.3
+"""A feature map's aspect ratio is at most this factor away from the image's."""
 
 
 @dataclass(frozen=True)
-class _Seen:
+class _FeatureMap:
+    """What a submodule returned, if that is one map (1, c, h, w) that has a gradient."""
+
     name: str
-    area: int
     output: Tensor
+
+    @property
+    def area(self) -> int:
+        """Rows times columns."""
+        return self.output.shape[2] * self.output.shape[3]
 
 
 @dataclass(frozen=True)
 class _Run:
-    """seen: single maps of submodules, in order. copies: where gradients were let in afresh."""
+    """One pass of the network."""
 
-    seen: list[_Seen]
+    maps: list[_FeatureMap]
+    """Of the submodules that ran once, in the order in which they ran."""
     copies: list[Tensor]
+    """Copies of submodules' outputs that gradients were made to reach."""
     prediction: Tensor
+    """(1, 1, h, w)."""
 
 
-def outline(
-    module: nn.Module, arguments: tuple[Tensor, ...], read: Callable[[Any], Tensor]
+def suggest_layers(
+    module: nn.Module,
+    arguments: tuple[Tensor, ...],
+    prediction_of: Callable[[Any], Tensor],
 ) -> tuple[str, ...]:
-    """From the bottleneck on, the last layer of each resolution, coarse to fine; () if none.
+    """Returns the bottleneck and, behind it, the last layer of each finer resolution.
 
-    The bottleneck is the coarsest feature map; the paper cuts where it has just been made. Only
-    layers that give one map (1, c, h, w) of the picture's proportions, that run once, and that the
-    prediction depends on are counted. read: the prediction of what the network returns. ModelError
-    if no gradient comes back from it, wherever the network were cut.
+    The bottleneck is the coarsest feature map; the paper cuts right behind it. Counted are layers
+    that return one map (1, c, h, w) of the image's aspect ratio, that run once, and that the
+    prediction depends on.
+
+    Args:
+        module: The network.
+        arguments: Its arguments for one frame.
+        prediction_of: Returns the prediction (1, 1, h, w) from what the network returns.
+
+    Returns:
+        Names of submodules, from coarse to fine; empty if none qualifies.
+
+    Raises:
+        ModelError: The network raises, or no gradient comes back from its prediction to any layer.
     """
-    picture = next((a for a in arguments if a.ndim == 4), None)
-    if picture is None:
+    image = next((a for a in arguments if a.ndim == 4), None)
+    if image is None:
         return ()
-    sides = picture.shape[1:3] if picture.shape[-1] <= 4 else picture.shape[2:4]
-    run = _observed(module, arguments, read)
-    if not run.prediction.requires_grad:  # a front without gradients leaves the layers behind it
-        run = _observed(module, arguments, read, afresh=True)
+    sides = image.shape[1:3] if image.shape[-1] <= 4 else image.shape[2:4]
+    run = _observe(module, arguments, prediction_of)
+    if not run.prediction.requires_grad:  # the front has no gradients, the layers behind it may
+        run = _observe(module, arguments, prediction_of, reach_all=True)
         if not _reaches_features(run):
             raise ModelError(
                 "no gradient comes back from the network's prediction to any of its layers; does"
                 " its forward run under torch.no_grad or inference_mode, detach, or go through"
                 " numpy? take that out"
             )
-    prediction = run.prediction
-    useful = [s for s in run.seen if s.area > 1 and _same_proportions(s.output, sides)]
-    if not useful:
-        return ()
-    with wrap_user_errors("the gradient of the network"):
+    useful = [m for m in run.maps if m.area > 1 and _has_aspect_of(m.output, sides)]
+    used = [m for m in _with_gradient(run.prediction, useful) if m.output.shape[1] > 1]
+    chosen = _last_of_each_resolution(used)
+    finest = run.prediction.shape[-2] * run.prediction.shape[-1]
+    return tuple(m.name for m in chosen if m.area < finest or len(chosen) == 1)
+
+
+def _with_gradient(prediction: Tensor, maps: list[_FeatureMap]) -> list[_FeatureMap]:
+    """The maps that the prediction depends on."""
+    if not maps:
+        return []
+    with torch.enable_grad(), wrap_user_errors("the gradient of the network"):
         gradients = torch.autograd.grad(
-            prediction.sum(), [s.output for s in useful], allow_unused=True
+            prediction.sum(), [m.output for m in maps], allow_unused=True
         )
-    last = prediction.shape[-2] * prediction.shape[-1]
-    reached = [
-        s
-        for s, gradient in zip(useful, gradients, strict=True)
-        if gradient is not None and bool((gradient != 0).any()) and s.output.shape[1] > 1
+    return [
+        m
+        for m, gradient in zip(maps, gradients, strict=True)
+        if gradient is not None and bool((gradient != 0).any())
     ]
-    if not reached:
-        return ()
-    chosen: list[_Seen] = []
-    coarsest = min(s.area for s in reached)
-    for s in reached[[s.area for s in reached].index(coarsest) :]:
-        if chosen and chosen[-1].area == s.area:
-            chosen[-1] = s
-        elif not chosen or s.area > chosen[-1].area:
-            chosen.append(s)
-    return tuple(s.name for s in chosen if s.area < last or len(chosen) == 1)
 
 
-def _observed(
+def _last_of_each_resolution(maps: list[_FeatureMap]) -> list[_FeatureMap]:
+    """From the first of the coarsest maps on, the last map before each finer one."""
+    chosen: list[_FeatureMap] = []
+    areas = [m.area for m in maps]
+    first = areas.index(min(areas)) if areas else 0
+    for m in maps[first:]:
+        if chosen and chosen[-1].area == m.area:
+            chosen[-1] = m
+        elif not chosen or m.area > chosen[-1].area:
+            chosen.append(m)
+    return chosen
+
+
+def _observe(
     module: nn.Module,
     arguments: tuple[Tensor, ...],
-    read: Callable[[Any], Tensor],
+    prediction_of: Callable[[Any], Tensor],
     *,
-    afresh: bool = False,
+    reach_all: bool = False,
 ) -> _Run:
-    """The network's run with these arguments.
+    """Runs the network once and keeps the feature maps of its submodules.
 
-    afresh: gradients reach what a submodule gave even where they would not, as if cut there.
+    reach_all: outputs that gradients do not reach are replaced by copies that they do reach, as a
+    cut there would.
     """
-    seen: dict[str, _Seen] = {}
+    maps: dict[str, _FeatureMap] = {}
     ran: set[str] = set()
-    twice: set[str] = set()
+    ran_twice: set[str] = set()
     copies: list[Tensor] = []
 
-    def let_in(path: tuple[str, ...], tensor: Tensor) -> Tensor:
+    def with_gradient(path: tuple[str, ...], tensor: Tensor) -> Tensor:
         if tensor.requires_grad or not tensor.is_floating_point():
             return tensor
         with torch.inference_mode(False), torch.enable_grad():
             copies.append(tensor.clone().detach().requires_grad_(True))
             return copies[-1].clone()  # in-place operations on the copy itself are forbidden
 
-    def note(name: str, output: Any) -> Any:
-        output = map_tensors(output, let_in) if afresh else output
-        (twice if name in ran else ran).add(name)
+    def keep(name: str, output: Any) -> Any:
+        output = map_tensors(output, with_gradient) if reach_all else output
+        (ran_twice if name in ran else ran).add(name)
         if isinstance(output, Tensor) and output.ndim == 4 and output.requires_grad:
-            seen[name] = _Seen(name, output.shape[2] * output.shape[3], output)
+            maps[name] = _FeatureMap(name, output)
         return output
 
     hooks = [
-        part.register_forward_hook(lambda m, given, output, name=name: note(name, output))
+        part.register_forward_hook(lambda m, inputs, output, name=name: keep(name, output))
         for name, part in module.named_modules()
         if name and not isinstance(part, torch.jit.ScriptModule)
     ]
     try:
         with torch.enable_grad(), wrap_user_errors("the network's forward"):
-            given = tuple(
+            inputs = tuple(
                 a.detach().requires_grad_(a.is_floating_point()).clone() for a in arguments
             )
-            prediction = read(module(*given))
+            prediction = prediction_of(module(*inputs))
     finally:
         for hook in hooks:
             hook.remove()
-    once = [s for name, s in seen.items() if name not in twice]
+    once = [m for name, m in maps.items() if name not in ran_twice]
     return _Run(once, copies, prediction)
 
 
 def _reaches_features(run: _Run) -> bool:
-    """Whether a gradient comes back to a copy that is more than the depth map itself."""
+    """True if a gradient comes back to a copy that is more than the depth map itself."""
     depth = run.prediction.squeeze().shape
     features = [
         t for t in run.copies if t.ndim > 2 and t.shape[1] > 1 and t.squeeze().shape != depth
     ]
     if not features or not run.prediction.requires_grad:
         return False
-    with wrap_user_errors("the gradient of the network"):
+    with torch.enable_grad(), wrap_user_errors("the gradient of the network"):
         gradients = torch.autograd.grad(
             run.prediction.sum(), features, allow_unused=True, retain_graph=True
         )
     return any(gradient is not None for gradient in gradients)
 
 
-def _same_proportions(output: Tensor, sides: tuple[int, ...]) -> bool:
+def _has_aspect_of(output: Tensor, sides: tuple[int, ...]) -> bool:
     height, width = output.shape[2:4]
     if min(height, width) < 2:
         return False
     ratio = (height / width) / (sides[0] / sides[1])
-    return 1 / _SQUARE_ENOUGH < ratio < _SQUARE_ENOUGH
+    return 1 / _SIMILAR_ASPECT < ratio < _SIMILAR_ASPECT

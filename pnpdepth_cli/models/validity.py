@@ -1,4 +1,4 @@
-"""Whether the fields of a definition hold what they should; each function raises ModelError if not.
+"""Checks the fields of a definition; each function raises ModelError if its field is wrong.
 
 Nothing here imports torch, as the definitions themselves do not.
 """
@@ -12,40 +12,40 @@ from typing import NoReturn
 
 from pnpdepth_cli.errors import ModelError
 
-_LONGEST = 60  # characters of a wrong value that are shown
-_MEANT = {
+_MAX_SHOWN = 60  # characters of a wrong value that are shown
+_SYNONYMS = {
     ("output_kind", "disparity"): "; disparity is 'inverse'",
     ("output_scale", "relative"): (
         "; relative depth is 'scale' (up to a factor) or 'affine' (a shift as well)"
     ),
 }
-"""What the usual words are called here, by field and word."""
+"""Hints for words that others use, by field and word."""
 
 
 def one_of(owner: object, field: str, valid: Collection[str]) -> None:
-    """The field is one of these names."""
+    """Checks that the field is one of these names."""
     value = getattr(owner, field)
     if not isinstance(value, str) or value not in valid:
-        meant = _MEANT.get((field, str(value)), "")
-        refuse(owner, field, f"is none of {', '.join(map(repr, valid))}{meant}")
+        hint = _SYNONYMS.get((field, str(value)), "")
+        refuse(owner, field, f"is none of {', '.join(map(repr, valid))}{hint}")
 
 
 def whole(owner: object, field: str, *, least: int) -> None:
-    """The field is a whole number, and no less than `least`."""
+    """Checks that the field is a whole number of at least `least`."""
     value = getattr(owner, field)
     if not isinstance(value, Integral) or isinstance(value, bool) or int(value) < least:
         refuse(owner, field, f"is not a whole number of at least {least}")
 
 
 def at_least_zero(owner: object, field: str) -> None:
-    """The field is a finite number, and not negative."""
+    """Checks that the field is a finite number of at least 0."""
     value = getattr(owner, field)
     if not _is_number(value) or value < 0:
         refuse(owner, field, "is not a number of at least 0")
 
 
 def step(owner: object, field: str) -> None:
-    """The field is a positive number, or a text with such a number and perhaps a % behind it."""
+    """Checks that the field is a positive number, or a text such as "0.5" or "3%"."""
     value = getattr(owner, field)
     try:
         number = float(str(value).strip().removesuffix("%"))
@@ -56,7 +56,7 @@ def step(owner: object, field: str) -> None:
 
 
 def per_channel(owner: object, field: str, *, positive: bool = False) -> None:
-    """The field holds three finite numbers, for red, green and blue."""
+    """Checks that the field holds three finite numbers, for red, green and blue."""
     value = getattr(owner, field)
     numbers = list(value) if isinstance(value, Iterable) else []
     good = len(numbers) == 3 and all(map(_is_number, numbers))
@@ -66,32 +66,34 @@ def per_channel(owner: object, field: str, *, positive: bool = False) -> None:
 
 
 def names(owner: object, field: str) -> None:
-    """The field is a tuple or a list of texts."""
+    """Checks that the field is a tuple or a list of texts."""
     value = getattr(owner, field)
     if not isinstance(value, tuple | list) or not all(isinstance(name, str) for name in value):
         refuse(owner, field, "is not a tuple of texts, as in ('encoder', 'decoder.up1')")
 
 
 def instance(owner: object, field: str, kinds: type | tuple[type, ...], wanted: str) -> None:
-    """The field is of one of these types; `wanted` says so in words."""
+    """Checks that the field is of one of these types; `wanted` names them in the message."""
     value = getattr(owner, field)
     if not isinstance(value, kinds):
         refuse(owner, field, f"is a {type(value).__name__}, where {wanted} is expected")
 
 
 def function(owner: object, field: str) -> None:
-    """The field can be called."""
+    """Checks that the field can be called."""
     if not callable(getattr(owner, field)):
         refuse(owner, field, "cannot be called; give a function or a class")
 
 
 def refuse(owner: object, field: str, why: str) -> NoReturn:
-    """ModelError: the type and name of the owner, the field and its value, and why not."""
+    """Raises ModelError with type and name of the owner, the field, its value, and the reason."""
     name = getattr(owner, "name", None)
-    whose = f"{type(owner).__name__} {name!r}" if isinstance(name, str) else type(owner).__name__
+    owner_name = (
+        f"{type(owner).__name__} {name!r}" if isinstance(name, str) else type(owner).__name__
+    )
     shown = " ".join(repr(getattr(owner, field)).split())
-    shown = shown if len(shown) <= _LONGEST else shown[: _LONGEST - 1] + "…"
-    raise ModelError(f"{whose}: {field}={shown} {why}")
+    shown = shown if len(shown) <= _MAX_SHOWN else shown[: _MAX_SHOWN - 1] + "…"
+    raise ModelError(f"{owner_name}: {field}={shown} {why}")
 
 
 def _is_number(value: object) -> bool:

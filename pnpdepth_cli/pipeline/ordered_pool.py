@@ -1,4 +1,4 @@
-"""Work on several things at once whose results come one by one, in their order."""
+"""A thread pool whose results come one by one, in the order of the items."""
 
 from __future__ import annotations
 
@@ -14,9 +14,14 @@ Result = TypeVar("Result")
 def in_order(
     work: Callable[[Item], Result], items: Iterable[Item], workers: int
 ) -> Generator[Result, None, None]:
-    """work(item) of each item, in the items' order, made by so many threads.
+    """Yields work(item) of each item in order, computed by several threads.
 
-    Few items are taken ahead, so memory does not grow with their number.
+    Only a few items are taken in advance, so memory does not grow with their number.
+
+    Args:
+        work: The function.
+        items: Its arguments.
+        workers: Number of threads.
     """
     waiting: deque[Future[Result]] = deque()
     with ThreadPoolExecutor(workers) as pool:

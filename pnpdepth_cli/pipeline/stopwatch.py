@@ -1,4 +1,4 @@
-"""What a run took: seconds per stage, peak memory, and the versions it ran with."""
+"""Measures a run: seconds per stage, peak memory, and versions of libraries."""
 
 from __future__ import annotations
 
@@ -23,6 +23,7 @@ class Stopwatch:
 
     @contextmanager
     def __call__(self, stage: str) -> Iterator[None]:
+        """Adds the time spent inside to the stage."""
         start = time.perf_counter()
         try:
             yield
@@ -30,12 +31,12 @@ class Stopwatch:
             self.add(stage, time.perf_counter() - start)
 
     def add(self, stage: str, seconds: float) -> None:
-        """So many more seconds of it."""
+        """Adds seconds to a stage."""
         self.seconds[stage] = round(self.seconds.get(stage, 0.0) + seconds, 4)
 
 
 def peak_memory_mb(device: torch.device) -> dict[str, float]:
-    """The process's peak resident memory, and the GPU's where one is used, in 10^6 bytes."""
+    """Returns the peak memory of the process, and of the GPU if one is used, in 10^6 bytes."""
     peak = {"process": round(_peak_resident_bytes() / 1e6, 1)}
     if device.type == "cuda":
         peak["gpu"] = round(torch.cuda.max_memory_allocated(device) / 1e6, 1)
@@ -53,7 +54,7 @@ def _peak_resident_bytes() -> int:
 
 
 def versions() -> dict[str, str]:
-    """Of the program, Python and the libraries that make the numbers."""
+    """Returns the versions of the program, Python and the numerical libraries."""
     libraries = ("numpy", "opencv-python-headless", "OpenEXR")
     return {
         "pnpdepth": __version__,

@@ -1,4 +1,4 @@
-"""Where sparse depth comes from: scans, dense depth, and scanners that were never there.
+"""Sources of sparse depth: projected scans, sampled dense depth, and simulated LiDARs.
 
     from pnpdepth_cli.sensors import LIDARS, Camera, project_velodyne, sample_points, simulate_lidar
 
@@ -15,11 +15,11 @@ from pnpdepth_cli.sensors.samplers import (
     PATTERNS,
     SampleNoise,
     SamplePattern,
-    disturbed,
     sample_points,
+    with_noise,
 )
 from pnpdepth_cli.sensors.simulate import SimulationSettings, simulate_lidar
-from pnpdepth_cli.sensors.sparse import Points, as_picture
+from pnpdepth_cli.sensors.sparse import Points, as_depth_image
 from pnpdepth_cli.sensors.velodyne import ProjectedScan, ProjectionSettings, project_velodyne
 
 __all__ = [
@@ -35,9 +35,9 @@ __all__ = [
     "SampleNoise",
     "SamplePattern",
     "SimulationSettings",
-    "as_picture",
-    "disturbed",
+    "as_depth_image",
     "project_velodyne",
     "sample_points",
     "simulate_lidar",
+    "with_noise",
 ]

@@ -1,4 +1,4 @@
-"""A camera in a scanner's world: pinhole, OpenCV distortion, and the pose between the two."""
+"""Pinhole camera with OpenCV distortion, and its pose relative to a scanner."""
 
 from __future__ import annotations
 
@@ -17,36 +17,50 @@ class Camera:
     """x_camera = rotation · x_scanner + translation; pixels = intrinsics · distorted(x / z).
 
     Camera axes are x right, y down, z forward, in metres; whole pixel numbers are pixel centres.
-    intrinsics: (3, 3) with last row 0 0 1. rotation: (3, 3). translation: (3,).
-    distortion: OpenCV's k1 k2 p1 p2 [k3 [k4 k5 k6]], or none.
     """
 
     intrinsics: Floats
+    """(3, 3), last row 0 0 1, in pixels."""
+
     rotation: Floats = field(default_factory=lambda: np.eye(3))
+    """(3, 3), from the scanner's frame to the camera's."""
+
     translation: Floats = field(default_factory=lambda: np.zeros(3))
+    """(3,) metres, the scanner's origin in the camera's frame."""
+
     distortion: tuple[float, ...] = ()
+    """OpenCV's k1 k2 p1 p2 [k3 [k4 k5 k6]], or none."""
 
     def from_scanner(self, points: NDArray[np.floating]) -> Floats:
-        """(N, 3) points of the scanner's frame in the camera's frame."""
+        """Returns (N, 3) points of the scanner's frame in the camera's frame, metres."""
         return np.asarray(points, np.float64) @ self.rotation.T + self.translation
 
     def to_scanner(self, points: NDArray[np.floating]) -> Floats:
-        """(N, 3) points of the camera's frame in the scanner's frame."""
+        """Returns (N, 3) points of the camera's frame in the scanner's frame, metres."""
         return (np.asarray(points, np.float64) - self.translation) @ self.rotation
 
     def pixels_of(self, points: NDArray[np.floating]) -> Floats:
-        """(N, 2) pixel coordinates of (N, 3) points of the camera's frame, all with z > 0.
+        """Returns the (N, 2) pixel coordinates of points.
 
         NaN for a direction beyond the one where the distortion turns back on itself: there the
-        model would put points from outside the view into the picture.
+        model would project points from outside the field of view into the image.
+
+        Args:
+            points: (N, 3) metres in the camera's frame, all with z > 0.
         """
         plane = points[:, :2] / points[:, 2:3]
         if any(self.distortion):
-            plane = _distorted(plane, self.distortion)
+            with np.errstate(over="ignore", invalid="ignore"):
+                plane = _distorted(plane, self.distortion)
         return np.asarray(plane @ self.intrinsics[:2, :2].T + self.intrinsics[:2, 2])
 
     def unproject(self, xy: NDArray[np.floating], depth: NDArray[np.floating]) -> Floats:
-        """(N, 3) points of the camera's frame whose z is depth (N,) at the pixels xy (N, 2)."""
+        """Returns the (N, 3) points, metres in the camera's frame, at pixel coordinates.
+
+        Args:
+            xy: (N, 2) pixel coordinates.
+            depth: (N,) metres along the camera's axis.
+        """
         inverse = np.linalg.inv(self.intrinsics)
         plane = np.asarray(xy, np.float64) @ inverse[:2, :2].T + inverse[:2, 2]
         if any(self.distortion):
@@ -56,7 +70,7 @@ class Camera:
 
 
 def _distorted(plane: Floats, coefficients: tuple[float, ...]) -> Floats:
-    """The image plane (N, 2) as the lens shows it; NaN where the lens model does not hold."""
+    """(N, 2) image plane coordinates after the lens; NaN where the lens model does not hold."""
     shown, square = _through_lens(plane, coefficients)
     shown[square > _largest_radius(coefficients) ** 2] = np.nan
     return shown
@@ -79,7 +93,7 @@ def _through_lens(plane: Floats, coefficients: tuple[float, ...]) -> tuple[Float
 
 
 def _largest_radius(coefficients: tuple[float, ...]) -> float:
-    """The radius on the image plane up to which a larger angle lands farther from the centre."""
+    """Radius on the image plane up to which the distortion is monotonic."""
     radial_only = (*coefficients[:2], 0.0, 0.0, *coefficients[4:])
     radius = np.linspace(0, 10, 8192)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -89,10 +103,9 @@ def _largest_radius(coefficients: tuple[float, ...]) -> float:
 
 
 def _undistorted(shown: Floats, coefficients: tuple[float, ...]) -> Floats:
-    """The image plane (N, 2) that the lens shows at `shown`, by fixed-point iteration.
+    """(N, 2) image plane coordinates before the lens, by fixed-point iteration as in OpenCV.
 
-    As in OpenCV, this settles where the lens moves a point by less than its distance from the
-    centre changes: within some 45° of the axis for the usual lens.
+    Converges within about 45° of the axis for common lenses.
     """
     plane = shown.copy()
     for _ in range(_UNDISTORT_STEPS):

@@ -1,7 +1,7 @@
-"""Scanners as lists of beams: the paper's four by their data sheets, and as the paper has them.
+"""Rotating LiDARs as lists of beams: the paper's four by data sheet, and as the paper has them.
 
-A turning scanner fires all its beams at every azimuth step. Elevations are degrees above the
-horizontal; frames are the makers': x forward, y left, z up.
+A rotating LiDAR fires all its beams at every azimuth step. Elevations are degrees above the
+horizontal; its frame is x forward, y left, z up.
 """
 
 from __future__ import annotations
@@ -11,33 +11,40 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from pnpdepth_cli.choices import SENSORS
 from pnpdepth_cli.errors import UsageError
 
 Floats = NDArray[np.float64]
 
 FORWARD_LEFT_UP: Floats = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
-"""The rotation from a scanner's frame to that of a camera which looks the same way."""
+"""The rotation from a scanner's frame to that of a camera facing the same way."""
 
 
 _MOST_RAYS = 1 << 23
-"""Points of one turn, so that simulating them fits into memory; a 128-beam scanner has 460,000."""
+"""Points of one revolution, so that simulating them fits into memory; 128 beams give 460,000."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Lidar:
-    """A turning scanner.
-
-    elevations_deg: one per beam. azimuth_step_deg: between firings. max_range: metres.
-    range_noise: standard deviation in metres. angle_noise_deg: standard deviation of every single
-    beam's direction, up and sideways.
-    """
+    """A rotating LiDAR."""
 
     name: str
+    """As users and records call it."""
+
     elevations_deg: tuple[float, ...]
+    """Elevation of each beam, −90° to 90°."""
+
     azimuth_step_deg: float
+    """Angle between firings."""
+
     max_range: float
+    """Metres; may be infinite."""
+
     range_noise: float = 0.0
+    """Standard deviation of a range, metres."""
+
     angle_noise_deg: float = 0.0
+    """Standard deviation of the direction of each measurement, in elevation and in azimuth."""
 
     def __post_init__(self) -> None:
         angles = np.array(self.elevations_deg, np.float64)
@@ -51,8 +58,8 @@ class Lidar:
         rays = angles.size * round(360 / self.azimuth_step_deg)
         if rays > _MOST_RAYS:
             raise UsageError(
-                f"sensor {self.name!r} measures {rays:,} points a turn; give fewer beams or a"
-                f" larger azimuth step, at most {_MOST_RAYS:,}"
+                f"sensor {self.name!r} measures {rays:,} points per revolution; give fewer beams or"
+                f" a larger azimuth step, at most {_MOST_RAYS:,}"
             )
         noise = (self.range_noise, self.angle_noise_deg)
         if not self.max_range > 0 or not all(0 <= size < np.inf for size in noise):
@@ -61,18 +68,19 @@ class Lidar:
             )
 
     def directions(self, rng: np.random.Generator) -> Floats:
-        """(M, 3) unit vectors of one turn in the scanner's frame, beam by beam.
+        """Returns (M, 3) unit vectors of one revolution in the scanner's frame, beam by beam.
 
-        rng draws the beams' own noise, and nothing if there is none.
+        Args:
+            rng: Draws the angle noise; unused if there is none.
         """
         elevation = np.radians(self.elevations_deg)[:, None]
         steps = round(360 / self.azimuth_step_deg)
         azimuth = np.radians(np.arange(steps) * self.azimuth_step_deg)[None, :]
         elevation, azimuth = np.broadcast_arrays(elevation, azimuth)
         if self.angle_noise_deg > 0:
-            spread = np.radians(self.angle_noise_deg)
-            elevation = elevation + rng.normal(0, spread, elevation.shape)
-            azimuth = azimuth + rng.normal(0, spread, azimuth.shape)
+            std = np.radians(self.angle_noise_deg)
+            elevation = elevation + rng.normal(0, std, elevation.shape)
+            azimuth = azimuth + rng.normal(0, std, azimuth.shape)
         level = np.cos(elevation)
         return np.stack(
             [level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)], axis=-1
@@ -80,11 +88,11 @@ class Lidar:
 
 
 def evenly_spaced(top_deg: float, step_deg: float, beams: int) -> tuple[float, ...]:
-    """Elevations from the top downwards."""
+    """Returns elevations in degrees from the top downwards."""
     return tuple(round(top_deg - step_deg * beam, 6) for beam in range(beams))
 
 
-# Azimuth steps are those at 10 turns a second; firing times and angles from the makers' manuals:
+# Azimuth steps are those at 10 revolutions a second; firing times and angles from the manuals:
 # Velodyne VLP-16 user manual 63-9243, VLP-32C 63-9325, HDL-32E 63-9113, HDL-64E S2 63-HDL64ES2.
 _VLP_32C_DEG = (
     15.0, 10.333, 7.0, 4.667, 3.333, 2.333, 1.667, 1.333, 1.0, 0.667, 0.333, 0.0, -0.333, -0.667,
@@ -123,9 +131,9 @@ _SHEETS = (
 )
 
 # Wang et al. 2019, table on LiDAR types: field of view and vertical resolution, beams evenly
-# spaced. Where the top beam points is the data sheet's; the table does not say. Nor does it say
-# how fine the azimuth is or how strong the "random noise on rotation": these two are ours, chosen
-# once for all four so that their shares of samples come out about as printed there, in SYNTHIA's
+# spaced. The table gives no elevation of the top beam, which is the data sheet's here. It gives no
+# azimuth step and no size of its "random noise on rotation" either: these two are ours, chosen once
+# for all four so that their fractions of sampled pixels are about those printed there, in SYNTHIA's
 # view of 100° by 71° at 512×304 pixels.
 _PAPER_FOV = {
     "vlp-16": (30, 2.0, 15.0),
@@ -149,6 +157,6 @@ def _paper(name: str) -> Lidar:
 
 
 LIDARS: dict[str, Lidar] = {
-    sensor.name: sensor for sensor in (*_SHEETS, *(_paper(name) for name in _PAPER_FOV))
+    sensor.name: sensor for sensor in (*_SHEETS, *(_paper(name) for name in SENSORS))
 }
-"""The scanners that can be named."""
+"""The scanners that can be named; `choices.SENSORS` lists those by data sheet."""

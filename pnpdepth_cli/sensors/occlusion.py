@@ -1,9 +1,9 @@
-"""Which points of a scan the camera cannot see, because something nearer is in the way.
+"""Points of a scan that are occluded in the camera's image by something nearer.
 
-Scanner and camera stand apart, so the scanner looks past edges that the camera does not look past.
-A point behind such an edge lands on the foreground in the picture. From the scanner's place, its
-own beam passed the foreground's depth at another pixel: by the parallax between the two depths. A
-hidden point therefore has foreground near the stretch between these two pixels.
+Scanner and camera are at different positions, so the scanner sees past edges that occlude the
+camera's view. A point behind such an edge projects onto the foreground. Its beam passed the
+foreground's depth at another pixel, displaced by the parallax between the two depths. An occluded
+point therefore has foreground near the segment between these two pixels.
 """
 
 from __future__ import annotations
@@ -20,18 +20,22 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, kw_only=True)
 class OcclusionFilter:
-    """When a point counts as hidden behind another.
-
-    nearer: foreground is nearer by more than this share of the point's depth. margin_deg: how far
-    from the middle of the parallax foreground counts; about half the gap between scan lines, as
-    the foreground itself is known only on them. stretch: of half the parallax, added to that.
-    reach_deg: foreground farther away than this, to each side, is not looked for.
-    """
+    """When a point counts as occluded by another."""
 
     nearer: float = 0.08
+    """Foreground is nearer by more than this fraction of the point's depth."""
+
     margin_deg: float = 0.24
+    """Largest distance of the foreground from the middle of the parallax segment.
+
+    About half the gap between scan lines, as foreground is measured only on them.
+    """
+
     stretch: float = 1.5
+    """Multiple of half the parallax that is added to the margin."""
+
     reach_deg: float = 0.8
+    """Foreground is searched up to this far to each side."""
 
     def __post_init__(self) -> None:
         if not 0 < self.nearer < 1 or min(self.margin_deg, self.stretch, self.reach_deg) < 0:
@@ -47,10 +51,15 @@ def hidden_points(
     scanner: Floats,
     settings: OcclusionFilter,
 ) -> NDArray[np.bool_]:
-    """(N,) true for the points that something nearer hides.
+    """Returns (N,) true for the points that are occluded by something nearer.
 
-    xy: (N, 2) pixel coordinates inside the picture of `size` (H, W), one point a pixel. depth:
-    (N,) z in metres. scanner: (3,) its place as the camera projects it, u·z v·z z.
+    Args:
+        xy: (N, 2) pixel coordinates inside the image, at most one point per pixel.
+        depth: (N,) z in metres.
+        size: (H, W) of the image.
+        focal_px: Focal length in pixels.
+        scanner: (3,) the scanner's origin in homogeneous pixel coordinates, u·z v·z z.
+        settings: When a point counts as occluded.
     """
     reach = max(1, round(np.radians(settings.reach_deg) * focal_px))
     margin = np.radians(settings.margin_deg) * focal_px
@@ -97,21 +106,21 @@ def _neighbours(
 def _ranges(
     first: NDArray[np.intp], count: NDArray[np.intp]
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """For every range first … first + count − 1: its number, and its values."""
+    """The values of the ranges first … first + count − 1, and the index of each one's range."""
     which = np.repeat(np.arange(len(count)), count)
     return which, np.arange(len(which)) + np.repeat(first - np.cumsum(count) + count, count)
 
 
 def _beam_at(near: Floats, xy: Floats, depth: Floats, scanner: Floats) -> Floats:
-    """(M, 2) the pixel at which the beam to each point passes the depth `near` (M,).
+    """(M, 2) pixel coordinates at which the beam to each point passes the depth `near` (M,).
 
-    The point's own pixel where the beam never passes that depth, as it starts beyond it.
+    The point's own where the beam starts beyond that depth.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
-        share = (near - scanner[2]) / (depth - scanner[2])
-        passed = (share > 0) & (share < 1)
-        there = (1 - share)[:, None] * scanner[:2] + (share * depth)[:, None] * xy
-        return np.where(passed[:, None], there / near[:, None], xy)
+        fraction = (near - scanner[2]) / (depth - scanner[2])
+        passed = (fraction > 0) & (fraction < 1)
+        at = (1 - fraction)[:, None] * scanner[:2] + (fraction * depth)[:, None] * xy
+        return np.where(passed[:, None], at / near[:, None], xy)
 
 
 def _window_minimum(grid: NDArray[np.float32], reach: int) -> NDArray[np.float32]:

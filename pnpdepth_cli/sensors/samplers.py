@@ -1,4 +1,4 @@
-"""Sparse depth out of dense depth: which pixels are kept, and what a sensor would add to them."""
+"""Sparse depth sampled from dense depth by a pattern, with the noise of a sensor."""
 
 from __future__ import annotations
 
@@ -10,35 +10,37 @@ from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import NoPointsError, SizeError, UsageError
 from pnpdepth_cli.points import SparsePoints, in_frame
-from pnpdepth_cli.sensors.sparse import FARTHEST_M, Points, Steps
+from pnpdepth_cli.sensors.sparse import FARTHEST_M, DropCounter, Points
 
 Depth = NDArray[np.float32]
-Picture = NDArray[np.float32]
+Image = NDArray[np.float32]
 Pixels = NDArray[np.intp]
 
 
 @dataclass(frozen=True, kw_only=True)
 class SamplePattern:
-    """Which of the N known pixels are kept.
-
-    kind: one of `PATTERNS`. count, share: how many points, or which share (0…1) of the known
-    pixels; at most one of the two. For `lines`, count is the number of lines. region: x, y,
-    width and height in pixels, for `region` alone.
-    """
+    """Which of the pixels with known depth are sampled."""
 
     kind: str = "uniform"
+    """One of `choices.PATTERNS`."""
+
     count: int | None = None
+    """Number of points, or of lines for `lines`; None with a share."""
+
     share: float | None = None
+    """Fraction of the known pixels, 0 to 1; None with a count."""
+
     region: tuple[int, int, int, int] | None = None
+    """x, y, width and height in pixels, for `region` alone."""
 
     def __post_init__(self) -> None:
         if self.kind not in PATTERNS:
             raise UsageError(f"pattern {self.kind!r} is not one of {', '.join(PATTERNS)}")
         if self.count is not None and self.share is not None:
-            raise UsageError("give a number of points or a share of the pixels, not both")
+            raise UsageError("give a number of points or a fraction of the pixels, not both")
         too_few = self.count is not None and self.count < 1
         if too_few or (self.share is not None and not 0 < self.share <= 1):
-            raise UsageError("give at least one point, or a share above 0 and at most 100 %")
+            raise UsageError("give at least one point, or a fraction above 0 and at most 100 %")
         if self.kind == "lines" and self.count is None:
             raise UsageError("pattern 'lines' needs the number of lines as its count")
         if self.kind not in ("lines", "region") and self.count is None and self.share is None:
@@ -49,7 +51,7 @@ class SamplePattern:
             )
 
     def wanted(self, known: int) -> int:
-        """The number of points among `known` pixels."""
+        """Returns the number of points to sample from `known` pixels."""
         if self.share is not None:
             return max(1, round(self.share * known))
         return known if self.count is None else self.count
@@ -57,22 +59,26 @@ class SamplePattern:
 
 @dataclass(frozen=True, kw_only=True)
 class SampleNoise:
-    """What a sensor adds to true depth; all zero for nothing.
-
-    metres: standard deviation. relative: the same as a share of the depth. outliers: the share of
-    points whose depth is drawn anew between the nearest and the farthest. jitter_px: standard
-    deviation of the place, in x and in y.
-    """
+    """Noise that a sensor adds to true depth; all zero for none."""
 
     metres: float = 0.0
+    """Standard deviation of the depth, metres."""
+
     relative: float = 0.0
+    """Standard deviation of the depth as a fraction of it."""
+
     outliers: float = 0.0
+    """Fraction of points whose depth is redrawn between the smallest and the largest."""
+
     jitter_px: float = 0.0
+    """Standard deviation of the pixel coordinates, in x and in y."""
 
     def __post_init__(self) -> None:
         sizes = (self.metres, self.relative, self.jitter_px)
         if not all(0 <= size < np.inf for size in sizes) or not 0 <= self.outliers <= 1:
-            raise UsageError("give noise that is not negative, and outliers as a share of 0 to 1")
+            raise UsageError(
+                "give noise that is not negative, and a fraction of outliers from 0 to 1"
+            )
 
 
 def sample_points(
@@ -80,13 +86,22 @@ def sample_points(
     pattern: SamplePattern,
     seed: int,
     *,
-    image: Picture | None = None,
+    image: Image | None = None,
     noise: SampleNoise | None = None,
 ) -> Points:
-    """Points of a dense depth map; the same seed gives the same points.
+    """Returns points sampled from a dense depth map; the same seed gives the same points.
 
-    depth: (H, W) metres, 0 = unknown. image: (H, W, 3) in 0..1 of the same view, for `features`
-    and `edges`. Raises NoPointsError if nothing is left, UsageError for more points than known.
+    Args:
+        depth: (H, W) metres, 0 = unknown.
+        pattern: Which pixels are sampled.
+        seed: Of the pattern and the noise.
+        image: (H, W, 3) in 0..1 of the same view, for `features` and `edges`.
+        noise: Added to the points; None for none.
+
+    Raises:
+        NoPointsError: The depth map, the pattern or the noise leaves no point.
+        UsageError: More points are asked for than are known.
+        SizeError: Image and depth differ in size.
     """
     if image is not None and image.shape[:2] != depth.shape:
         raise SizeError(
@@ -106,14 +121,14 @@ def sample_points(
         depth=depth.ravel()[chosen].astype(np.float32),
         size=(depth.shape[0], depth.shape[1]),
     )
-    return disturbed(points, noise or SampleNoise(), rng)
+    return with_noise(points, noise or SampleNoise(), rng)
 
 
 def _uniform(
     depth: Depth,
     known: Pixels,
     pattern: SamplePattern,
-    image: Picture | None,
+    image: Image | None,
     rng: np.random.Generator,
 ) -> Pixels:
     count = pattern.wanted(known.size)
@@ -126,10 +141,10 @@ def _bernoulli(
     depth: Depth,
     known: Pixels,
     pattern: SamplePattern,
-    image: Picture | None,
+    image: Image | None,
     rng: np.random.Generator,
 ) -> Pixels:
-    """A coin for each known pixel, so that the wanted number is only the expected one."""
+    """Each known pixel with the same probability; the count is only the expected one."""
     return known[rng.random(known.size) < pattern.wanted(known.size) / known.size]
 
 
@@ -137,10 +152,10 @@ def _grid(
     depth: Depth,
     known: Pixels,
     pattern: SamplePattern,
-    image: Picture | None,
+    image: Image | None,
     rng: np.random.Generator,
 ) -> Pixels:
-    """Known pixels of a square grid, of a spacing that gives a full map the wanted number."""
+    """Known pixels of a square grid whose spacing gives a full map the wanted count."""
     height, width = depth.shape
     if pattern.share is not None:
         spacing = pattern.share**-0.5
@@ -158,7 +173,7 @@ def _lines(
     depth: Depth,
     known: Pixels,
     pattern: SamplePattern,
-    image: Picture | None,
+    image: Image | None,
     rng: np.random.Generator,
 ) -> Pixels:
     """All known pixels of evenly spaced rows."""
@@ -174,17 +189,17 @@ def _region(
     depth: Depth,
     known: Pixels,
     pattern: SamplePattern,
-    image: Picture | None,
+    image: Image | None,
     rng: np.random.Generator,
 ) -> Pixels:
-    """Pixels of a rectangle; all known ones, or as many as wanted at random."""
+    """Known pixels of a rectangle: all, or a random choice of the wanted count."""
     left, top, width, height = pattern.region or (0, 0, 0, 0)
     row, column = np.divmod(known, depth.shape[1])
     inside = (column >= left) & (column < left + width) & (row >= top) & (row < top + height)
     if not inside.any():
         raise NoPointsError(
             f"region {left},{top},{width},{height} holds no pixel with known depth of the"
-            f" {depth.shape[1]}×{depth.shape[0]} picture"
+            f" {depth.shape[1]}×{depth.shape[0]} image"
         )
     return _uniform(depth, known[inside], pattern, image, rng)
 
@@ -193,19 +208,19 @@ def _features(
     depth: Depth,
     known: Pixels,
     pattern: SamplePattern,
-    image: Picture | None,
+    image: Image | None,
     rng: np.random.Generator,
 ) -> Pixels:
-    """The strongest ORB corners with known depth: where structure from motion has its points."""
+    """The strongest ORB corners with known depth, as structure from motion has its points."""
     import cv2
 
-    # Corners in a pyramid crowd the same places; three times as many leave enough after merging.
+    # Corners of several pyramid levels share pixels; three times as many leave enough when merged.
     wanted = pattern.wanted(known.size)
     detector = cv2.ORB_create(nfeatures=3 * wanted + 100, edgeThreshold=4, fastThreshold=5)  # type: ignore[attr-defined]
     corners = detector.detect(_grey_bytes(pattern, image))
     corners = sorted(corners, key=lambda corner: -corner.response)
-    places = np.array([corner.pt for corner in corners], np.float64).reshape(-1, 2)
-    column, row = np.rint(places).astype(np.intp).T
+    xy = np.array([corner.pt for corner in corners], np.float64).reshape(-1, 2)
+    column, row = np.rint(xy).astype(np.intp).T
     pixels = row * depth.shape[1] + column
     _, first = np.unique(pixels, return_index=True)
     strongest = pixels[np.sort(first)]
@@ -217,10 +232,10 @@ def _edges(
     depth: Depth,
     known: Pixels,
     pattern: SamplePattern,
-    image: Picture | None,
+    image: Image | None,
     rng: np.random.Generator,
 ) -> Pixels:
-    """Known pixels on the picture's edges (Canny), as many as wanted at random."""
+    """Known pixels on the image's edges (Canny), a random choice of the wanted count."""
     import cv2
 
     grey = cv2.GaussianBlur(_grey_bytes(pattern, image), (5, 5), 0)
@@ -230,14 +245,14 @@ def _edges(
     return rng.choice(candidates, count, replace=False)
 
 
-def _grey_bytes(pattern: SamplePattern, image: Picture | None) -> NDArray[np.uint8]:
+def _grey_bytes(pattern: SamplePattern, image: Image | None) -> NDArray[np.uint8]:
     if image is None:
         raise UsageError(f"pattern {pattern.kind!r} needs the image that the depth belongs to")
     grey = image @ np.array([0.299, 0.587, 0.114], np.float32)
     return np.rint(255 * np.clip(grey, 0, 1)).astype(np.uint8)
 
 
-Sampler = Callable[[Depth, Pixels, SamplePattern, "Picture | None", np.random.Generator], Pixels]
+Sampler = Callable[[Depth, Pixels, SamplePattern, "Image | None", np.random.Generator], Pixels]
 PATTERNS: dict[str, Sampler] = {
     "uniform": _uniform,
     "bernoulli": _bernoulli,
@@ -247,13 +262,19 @@ PATTERNS: dict[str, Sampler] = {
     "edges": _edges,
     "region": _region,
 }
-"""The patterns that can be named: row-major indices of the pixels each keeps."""
+"""The patterns by name, as in `choices.PATTERNS`; each returns row-major indices of pixels."""
 
 
-def disturbed(points: Points, noise: SampleNoise, rng: np.random.Generator) -> Points:
-    """The points with noise; those that it makes impossible or moves out of the picture are gone.
+def with_noise(points: Points, noise: SampleNoise, rng: np.random.Generator) -> Points:
+    """Returns the points with noise, without those that it makes impossible or moves outside.
 
-    NoPointsError if that is all of them.
+    Args:
+        points: Points of one image.
+        noise: What is added.
+        rng: Draws the noise.
+
+    Raises:
+        NoPointsError: No point is left.
     """
     xy, values = points.xy.astype(np.float64), points.depth.astype(np.float64)
     height, width = points.size
@@ -264,22 +285,22 @@ def disturbed(points: Points, noise: SampleNoise, rng: np.random.Generator) -> P
         if noise.relative > 0:
             values = values * (1 + rng.normal(0, noise.relative, len(values)))
     if noise.outliers > 0:
-        wrong = rng.permutation(len(values))[: round(noise.outliers * len(values))]
-        values[wrong] = rng.uniform(low, high, len(wrong))
+        outliers = rng.permutation(len(values))[: round(noise.outliers * len(values))]
+        values[outliers] = rng.uniform(low, high, len(outliers))
     if noise.jitter_px > 0:
         xy = xy + rng.normal(0, noise.jitter_px, xy.shape)
-    steps = Steps(len(values))
+    drops = DropCounter(len(values))
     if noise.metres > 0 or noise.relative > 0:
-        near = steps.keep(np.abs(values) < FARTHEST_M, "noise put it too far")
+        near = drops.keep(np.abs(values) < FARTHEST_M, "noise put it too far")
         xy, values = xy[near], values[near]
-    positive = steps.keep(values.astype(np.float32) > 0, "noise left no depth")
+    positive = drops.keep(values.astype(np.float32) > 0, "noise left no depth")
     xy, values = xy[positive], values[positive]
-    inside = steps.keep(in_frame(xy, (height, width)), "outside the picture")
+    inside = drops.keep(in_frame(xy, (height, width)), "outside the picture")
     if not inside.any():
-        raise NoPointsError(f"noise leaves no point ({steps}); make it smaller")
+        raise NoPointsError(f"noise leaves no point ({drops}); make it smaller")
     return SparsePoints(
         xy=xy[inside].astype(np.float32),
         depth=values[inside].astype(np.float32),
         size=(height, width),
-        dropped={why: count for why, count in steps.dropped.items() if count},
+        dropped={why: count for why, count in drops.dropped.items() if count},
     )

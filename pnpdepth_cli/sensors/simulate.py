@@ -1,4 +1,4 @@
-"""What a scanner would measure in a scene of which a camera's dense depth is known."""
+"""Points that a LiDAR would measure in a scene of which a camera's dense depth is known."""
 
 from __future__ import annotations
 
@@ -13,43 +13,51 @@ from pnpdepth_cli.sensors.camera import Camera
 from pnpdepth_cli.sensors.lidar import Lidar
 from pnpdepth_cli.sensors.sparse import (
     FARTHEST_M,
+    DropCounter,
     Floats,
     Mask,
     Points,
-    Steps,
     nearest_in_pixel,
     pixel_index,
 )
 
 _SAME_SURFACE = 1.1
-"""Depths of neighbouring pixels within this ratio are taken for one surface."""
+"""Neighbouring pixels whose depths are within this ratio belong to one surface."""
 
 _FIRST_M = 0.01
-"""How far ahead of the scanner its beams can first meet something."""
+"""Metres ahead of the scanner at which its beams can first hit a surface."""
 
 _LONGEST_WALK = 2048
-"""Steps; beams that cross more pixels than this, next to the scanner, take longer ones."""
+"""Steps; beams that cross more pixels, close to the scanner, take longer steps."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class SimulationSettings:
-    """What is between the scanner and ideal measurement; None means the sensor's own value.
-
-    rotation_noise_deg: standard deviation of one turn of the whole scanner about each axis.
-    angle_noise_deg: the same of every single beam. range_noise: metres. dropout: the share of
-    beams that never return. max_range: metres from the scanner. euclidean: as in projection.
-    """
+    """Noise and limits of a simulated scan; None means the sensor's own value."""
 
     rotation_noise_deg: float = 0.0
+    """Standard deviation of a rotation of the whole scanner about each axis."""
+
     angle_noise_deg: float | None = None
+    """Standard deviation of the direction of each measurement."""
+
     range_noise: float | None = None
+    """Standard deviation of a range, metres."""
+
     dropout: float = 0.0
+    """Fraction of beams without return."""
+
     max_range: float | None = None
+    """Metres from the scanner."""
+
     euclidean: bool = False
+    """Depth is the distance from the camera's centre instead of z."""
 
     def __post_init__(self) -> None:
         if not 0 <= self.rotation_noise_deg <= 360 or not 0 <= self.dropout < 1:
-            raise UsageError("give a rotation noise of 0° to 360° and a drop-out of 0 ≤ share < 1")
+            raise UsageError(
+                "give a rotation noise of 0° to 360° and a drop-out of at least 0 and below 1"
+            )
 
 
 def simulate_lidar(
@@ -59,41 +67,47 @@ def simulate_lidar(
     seed: int,
     settings: SimulationSettings | None = None,
 ) -> Points:
-    """Sparse depth of one turn of the scanner, in the picture the depth belongs to.
+    """Returns sparse depth of one revolution of the scanner, in the image of the dense depth.
 
-    depth: (H, W) metres along the camera's axis, 0 = unknown. camera: how it sees, and where the
-    scanner stands to it (`FORWARD_LEFT_UP` and zero: in its place). The same seed gives the same
-    points. Raises NoPointsError when no beam meets anything that the camera sees.
+    Args:
+        depth: (H, W) metres along the camera's axis, 0 = unknown.
+        camera: Intrinsics, and the scanner's pose (`FORWARD_LEFT_UP` and zero: at the camera).
+        sensor: The scanner.
+        seed: Of all noise; the same seed gives the same points.
+        settings: Noise and limits; None for the sensor's own.
+
+    Raises:
+        NoPointsError: No beam hits anything that the camera sees.
     """
     settings = settings or SimulationSettings()
-    sensor = _as_set(sensor, settings)
+    sensor = _with_settings(sensor, settings)
     size = (depth.shape[0], depth.shape[1])
     rng = np.random.default_rng(seed)
-    turned = _turned(camera, settings.rotation_noise_deg, rng)
+    turned = _rotated(camera, settings.rotation_noise_deg, rng)
     beams = sensor.directions(rng) @ turned.rotation.T
-    steps = Steps(len(beams))
+    drops = DropCounter(len(beams))
     z = _depth_at_first_hit(np.asarray(depth, np.float64), turned, beams)
-    met = steps.keep(np.isfinite(z), "meets nothing that the camera sees")
+    met = drops.keep(np.isfinite(z), "meets nothing that the camera sees")
     distance = (z[met] - camera.translation[2]) / beams[met, 2]
-    kept = steps.keep(distance <= sensor.max_range, "out of range")
-    returned = steps.keep(rng.random(np.count_nonzero(kept)) >= settings.dropout, "dropped out")
+    kept = drops.keep(distance <= sensor.max_range, "out of range")
+    returned = drops.keep(rng.random(np.count_nonzero(kept)) >= settings.dropout, "dropped out")
     distance, beams = distance[kept][returned], beams[met][kept][returned]
     if sensor.range_noise > 0:
         distance = distance + rng.normal(0, sensor.range_noise, len(distance))
     points = camera.translation + beams * distance[:, None]
-    ahead = steps.keep((distance > 0) & (points[:, 2] > 0), "noise put it behind the camera")
+    ahead = drops.keep((distance > 0) & (points[:, 2] > 0), "noise put it behind the camera")
     points = points[ahead]
     near = np.abs(points).max(axis=1, initial=0) < FARTHEST_M
     if not near.all():
-        points = points[steps.keep(near, "noise put it too far")]
+        points = points[drops.keep(near, "noise put it too far")]
     xy = camera.pixels_of(points)
-    inside = steps.keep(in_frame(xy, size), "outside the picture")
+    inside = drops.keep(in_frame(xy, size), "outside the picture")
     points, xy = points[inside], xy[inside]
-    front = steps.keep(nearest_in_pixel(xy, points[:, 2], size), "behind another in their pixel")
+    front = drops.keep(nearest_in_pixel(xy, points[:, 2], size), "behind another in their pixel")
     points, xy = points[front], xy[front]
     if not len(xy):
         raise NoPointsError(
-            f"no beam of {sensor.name} gives a point in the picture ({steps}); check depth,"
+            f"no beam of {sensor.name} gives a point in the image ({drops}); check depth,"
             " intrinsics and where the scanner stands"
         )
     values = np.linalg.norm(points, axis=1) if settings.euclidean else points[:, 2]
@@ -101,11 +115,11 @@ def simulate_lidar(
         xy=xy.astype(np.float32),
         depth=values.astype(np.float32),
         size=size,
-        dropped=steps.dropped,
+        dropped=drops.dropped,
     )
 
 
-def _as_set(sensor: Lidar, settings: SimulationSettings) -> Lidar:
+def _with_settings(sensor: Lidar, settings: SimulationSettings) -> Lidar:
     return replace(
         sensor,
         angle_noise_deg=_first(settings.angle_noise_deg, sensor.angle_noise_deg),
@@ -118,11 +132,11 @@ def _first(wanted: float | None, otherwise: float) -> float:
     return otherwise if wanted is None else wanted
 
 
-def _turned(camera: Camera, spread_deg: float, rng: np.random.Generator) -> Camera:
-    """The scanner turned at random about its own place."""
-    if spread_deg == 0:
+def _rotated(camera: Camera, std_deg: float, rng: np.random.Generator) -> Camera:
+    """The camera with the scanner rotated at random about its own origin."""
+    if std_deg == 0:
         return camera
-    x, y, z = np.radians(rng.normal(0, spread_deg, 3))
+    x, y, z = np.radians(rng.normal(0, std_deg, 3))
     about_x = np.array([[1, 0, 0], [0, np.cos(x), -np.sin(x)], [0, np.sin(x), np.cos(x)]])
     about_y = np.array([[np.cos(y), 0, np.sin(y)], [0, 1, 0], [-np.sin(y), 0, np.cos(y)]])
     about_z = np.array([[np.cos(z), -np.sin(z), 0], [np.sin(z), np.cos(z), 0], [0, 0, 1]])
@@ -130,11 +144,11 @@ def _turned(camera: Camera, spread_deg: float, rng: np.random.Generator) -> Came
 
 
 def _depth_at_first_hit(depth: Floats, camera: Camera, directions: Floats) -> Floats:
-    """(M,) the depth z at which each beam first meets the depth map; NaN where it does not.
+    """(M,) depth z at which each beam first hits the depth map; NaN where it does not.
 
-    directions: (M, 3) unit vectors in the camera's frame, from the scanner's place. A beam is
-    followed outwards in steps of about a pixel. One that slips behind an edge is lost: what is
-    there, the camera does not see.
+    directions are (M, 3) unit vectors in the camera's frame, from the scanner's origin. A beam is
+    followed outwards in steps of about a pixel. One that passes behind an edge has no hit, because
+    the camera does not see what is there.
     """
     hit = np.full(len(directions), np.nan)
     known = depth[depth > 0]
@@ -160,30 +174,30 @@ def _depth_at_first_hit(depth: Floats, camera: Camera, directions: Floats) -> Fl
         slanted = met & ~straight_on & same
         hit[forward[walking[straight_on]]] = ahead[straight_on]
         gap_before = before_map[walking[slanted]] - before_z
-        share = gap_before / (gap_before + z - ahead[slanted])
-        hit[forward[walking[slanted]]] = before_z + share * (z - before_z)
+        fraction = gap_before / (gap_before + z - ahead[slanted])
+        hit[forward[walking[slanted]]] = before_z + fraction * (z - before_z)
         before_map[walking] = np.where(ahead > 0, ahead, np.inf)
         before_z = z
-        left = been_inside[walking] & ~inside  # a straight line in the picture never comes back
+        left = been_inside[walking] & ~inside  # a straight line never re-enters the image
         been_inside[walking] |= inside
         walking = walking[~(met | left)]
     return _on_their_surface(hit, depth, camera, directions)
 
 
 def _on_their_surface(hit: Floats, depth: Floats, camera: Camera, beams: Floats) -> Floats:
-    """The hits whose own pixel shows that surface; one that grazed an edge by a pixel is lost."""
-    found = np.flatnonzero(np.isfinite(hit))
-    z, start = hit[found], camera.translation
-    reached = start + beams[found] * ((z - start[2]) / beams[found, 2])[:, None]
-    there, _ = _map_at(depth, camera, reached)
-    same = (z <= _SAME_SURFACE * there) & (there <= _SAME_SURFACE * z)
+    """The hits whose own pixel shows that surface; NaN for one that grazed an edge by a pixel."""
+    index = np.flatnonzero(np.isfinite(hit))
+    z, start = hit[index], camera.translation
+    reached = start + beams[index] * ((z - start[2]) / beams[index, 2])[:, None]
+    shown, _ = _map_at(depth, camera, reached)
+    same = (z <= _SAME_SURFACE * shown) & (shown <= _SAME_SURFACE * z)
     checked = hit.copy()
-    checked[found[~same]] = np.nan
+    checked[index[~same]] = np.nan
     return checked
 
 
 def _walk_length(camera: Camera, beams: Floats, near: float, far: float, depth: Floats) -> int:
-    """Steps that no beam in the picture needs more of to move by at most a pixel in each."""
+    """The number of steps in which no beam in the image moves by more than a pixel."""
     ends = []
     for z in (near, far):
         reached = camera.translation + beams * ((z - camera.translation[2]) / beams[:, 2])[:, None]
@@ -197,7 +211,7 @@ def _walk_length(camera: Camera, beams: Floats, near: float, far: float, depth: 
 
 
 def _map_at(depth: Floats, camera: Camera, points: Floats) -> tuple[Floats, Mask]:
-    """(M,) the depth map at the pixels of points, 0 outside the picture; and (M,) if inside."""
+    """(M,) depth map at the pixels of points, 0 outside the image; and (M,) whether inside."""
     xy = camera.pixels_of(points)
     size = (depth.shape[0], depth.shape[1])
     inside = in_frame(xy, size)

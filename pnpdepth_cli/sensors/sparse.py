@@ -18,15 +18,15 @@ Points = SparsePoints[NDArray[np.float32]]
 """Sparse depth in numpy arrays."""
 
 
-def as_picture(points: Points) -> NDArray[np.float32]:
-    """(H, W) float32 metres, 0 = unknown: each point on its pixel, the nearest wins."""
+def as_depth_image(points: Points) -> NDArray[np.float32]:
+    """Returns (H, W) float32 metres, 0 = unknown: each point on its pixel, the nearest wins."""
     flat = np.full(points.size[0] * points.size[1], np.inf, np.float32)
     np.minimum.at(flat, pixel_index(points.xy, points.size), points.depth)
     return np.where(np.isinf(flat), np.float32(0), flat).reshape(points.size)
 
 
 def pixel_index(xy: NDArray[np.floating], size: tuple[int, int]) -> NDArray[np.intp]:
-    """(N,) the row-major index of the pixel around each point inside the picture."""
+    """Returns the (N,) row-major indices of the pixels of points inside the image."""
     column, row = np.floor(np.asarray(xy, np.float64) + 0.5).astype(np.intp).T
     index: NDArray[np.intp] = row * size[1] + column
     return index
@@ -35,7 +35,7 @@ def pixel_index(xy: NDArray[np.floating], size: tuple[int, int]) -> NDArray[np.i
 def nearest_in_pixel(
     xy: NDArray[np.floating], depth: NDArray[np.floating], size: tuple[int, int]
 ) -> Mask:
-    """(N,) true for the one point of each pixel that is nearest; the first of equals."""
+    """Returns (N,) true for the nearest point of each pixel, the first of equal ones."""
     pixel = pixel_index(xy, size)
     order = np.lexsort((depth, pixel))
     first = np.ones(len(order), bool)
@@ -45,15 +45,20 @@ def nearest_in_pixel(
     return mask
 
 
-class Steps:
-    """Which rows of an array are left after each step, and how many each step dropped."""
+class DropCounter:
+    """Rows of an array that are left after each step, and how many each step dropped."""
 
     def __init__(self, count: int) -> None:
         self.index: NDArray[np.intp] = np.arange(count)
         self.dropped: dict[str, int] = {}
 
     def keep(self, mask: Mask, otherwise: str) -> Mask:
-        """Only the rows where mask is true are left; `otherwise` says why the others went."""
+        """Keeps the rows where `mask` is true and returns it.
+
+        Args:
+            mask: Over the rows that were left by the step before.
+            otherwise: Why the other rows are dropped.
+        """
         self.dropped[otherwise] = int(len(mask) - np.count_nonzero(mask))
         self.index = self.index[mask]
         return mask

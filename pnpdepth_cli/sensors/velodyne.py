@@ -1,4 +1,4 @@
-"""From a scan to sparse depth in the picture: what the camera sees of what the scanner saw."""
+"""LiDAR scans projected into a camera's image, without the points that the camera cannot see."""
 
 from __future__ import annotations
 
@@ -11,22 +11,24 @@ from pnpdepth_cli.errors import NoPointsError, UsageError
 from pnpdepth_cli.points import in_frame
 from pnpdepth_cli.sensors.camera import Camera
 from pnpdepth_cli.sensors.occlusion import OcclusionFilter, hidden_points
-from pnpdepth_cli.sensors.sparse import Points, Steps, nearest_in_pixel
+from pnpdepth_cli.sensors.sparse import DropCounter, Points, nearest_in_pixel
 
 
 @dataclass(frozen=True, kw_only=True)
 class ProjectionSettings:
-    """How a scan becomes sparse depth.
-
-    euclidean: depth is the distance from the camera's centre instead of z, along its axis.
-    min_range, max_range: metres from the scanner; what lies outside is dropped.
-    occlusion: None keeps the points that the camera sees something nearer in front of.
-    """
+    """How a scan becomes sparse depth."""
 
     euclidean: bool = False
+    """Depth is the distance from the camera's centre instead of z, along its axis."""
+
     min_range: float = 0.0
+    """Metres from the scanner; nearer points are dropped."""
+
     max_range: float = np.inf
+    """Metres from the scanner; farther points are dropped."""
+
     occlusion: OcclusionFilter | None = field(default_factory=OcclusionFilter)
+    """When a point counts as occluded; None keeps occluded points."""
 
     def __post_init__(self) -> None:
         if not 0 <= self.min_range < self.max_range:
@@ -38,9 +40,10 @@ class ProjectionSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class ProjectedScan(Points):
-    """The points of a scan that the camera sees, in the scan's order; index (N,): their rows."""
+    """The points of a scan that the camera sees, in the scan's order."""
 
     index: NDArray[np.intp]
+    """(N,) row of each point in the scan."""
 
 
 def project_velodyne(
@@ -49,22 +52,28 @@ def project_velodyne(
     size: tuple[int, int],
     settings: ProjectionSettings | None = None,
 ) -> ProjectedScan:
-    """The scan as sparse depth in the picture of `size` (H, W).
+    """Returns the scan as sparse depth in an image.
 
-    points: (N, 3) or more columns, x y z in metres in the scanner's frame. Raises NoPointsError
-    when the picture shows none of them.
+    Args:
+        points: (N, 3) or more columns, x y z in metres in the scanner's frame.
+        camera: Intrinsics and the scanner's pose.
+        size: (H, W) of the image.
+        settings: Ranges and occlusion; None for the defaults.
+
+    Raises:
+        NoPointsError: No point is visible in the image.
     """
     settings = settings or ProjectionSettings()
-    place = np.asarray(points)[:, :3]
-    steps = Steps(len(place))
-    distance = np.sqrt(np.einsum("ij,ij->i", place, place))
+    xyz = np.asarray(points)[:, :3]
+    drops = DropCounter(len(xyz))
+    distance = np.sqrt(np.einsum("ij,ij->i", xyz, xyz))
     in_range = (distance >= settings.min_range) & (distance <= settings.max_range)
-    seen = camera.from_scanner(place[steps.keep(in_range, "out of range")])
-    seen = seen[steps.keep(seen[:, 2] > 0, "behind the camera")]
+    seen = camera.from_scanner(xyz[drops.keep(in_range, "out of range")])
+    seen = seen[drops.keep(seen[:, 2] > 0, "behind the camera")]
     xy = camera.pixels_of(seen)
-    inside = steps.keep(in_frame(xy, size), "outside the picture")
+    inside = drops.keep(in_frame(xy, size), "outside the picture")
     seen, xy = seen[inside], xy[inside]
-    front = steps.keep(nearest_in_pixel(xy, seen[:, 2], size), "behind another in their pixel")
+    front = drops.keep(nearest_in_pixel(xy, seen[:, 2], size), "behind another in their pixel")
     seen, xy = seen[front], xy[front]
     if settings.occlusion is not None:
         hidden = hidden_points(
@@ -75,18 +84,18 @@ def project_velodyne(
             scanner=np.asarray(camera.intrinsics @ camera.translation),
             settings=settings.occlusion,
         )
-        visible = steps.keep(~hidden, "hidden by foreground")
+        visible = drops.keep(~hidden, "hidden by foreground")
         seen, xy = seen[visible], xy[visible]
     if not len(xy):
         raise NoPointsError(
-            f"none of the scan's {len(place):,} points lies in the picture ({steps}); check that"
+            f"none of the scan's {len(xyz):,} points lies in the image ({drops}); check that"
             " scan and calibration belong to this camera"
         )
     depth = np.linalg.norm(seen, axis=1) if settings.euclidean else seen[:, 2]
     return ProjectedScan(
         xy=xy.astype(np.float32),
         depth=depth.astype(np.float32),
-        index=steps.index,
+        index=drops.index,
         size=size,
-        dropped=steps.dropped,
+        dropped=drops.dropped,
     )

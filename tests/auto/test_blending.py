@@ -10,25 +10,25 @@ from pnpdepth_cli.auto.blending import best_blend, held_out_error
 def test_a_candidate_without_error_is_taken_alone() -> None:
     depth = torch.tensor([1.0, 2.0, 3.0])
     blend = best_blend(
-        torch.stack([depth + 0.1, depth, depth - 0.3]), depth, torch.ones(3), usual=0
+        torch.stack([depth + 0.1, depth, depth - 0.3]), depth, torch.ones(3), default=0
     )
     assert (blend.members, blend.weights, blend.error) == ((1,), (1.0,), 0.0)
 
 
 def test_two_that_are_wrong_in_opposite_ways_are_mixed() -> None:
     depth = torch.tensor([1.0, 2.0, 3.0, 4.0])
-    blend = best_blend(torch.stack([depth + 0.1, depth - 0.3]), depth, torch.ones(4), usual=0)
+    blend = best_blend(torch.stack([depth + 0.1, depth - 0.3]), depth, torch.ones(4), default=0)
     assert blend.members == (0, 1)
     assert blend.weights == (0.75, 0.25)
     assert blend.error < 1e-6
 
 
-def test_a_point_that_is_not_believed_does_not_count() -> None:
+def test_a_point_without_weight_does_not_count() -> None:
     depth = torch.tensor([1.0, 2.0, 50.0])
-    believed = torch.tensor([1.0, 1.0, 0.0])
+    weights = torch.tensor([1.0, 1.0, 0.0])
     predicted = torch.tensor([[1.0, 2.0, 3.0], [1.1, 2.1, 50.0]])
-    assert best_blend(predicted, depth, believed, usual=1).members == (0,)
-    assert torch.allclose(held_out_error(predicted, depth, believed), torch.tensor([0.0, 0.1]))
+    assert best_blend(predicted, depth, weights, default=1).members == (0,)
+    assert torch.allclose(held_out_error(predicted, depth, weights), torch.tensor([0.0, 0.1]))
 
 
 @given(seed=st.integers(0, 1000), candidates=st.integers(1, 9), points=st.integers(1, 30))
@@ -38,10 +38,10 @@ def test_what_is_chosen_is_never_worse_than_the_best_candidate(
     generator = torch.Generator().manual_seed(seed)
     depth = 1 + torch.rand(points, generator=generator)
     predicted = depth + torch.randn(candidates, points, generator=generator)
-    believed = torch.rand(points, generator=generator) + 0.1
-    blend = best_blend(predicted, depth, believed, usual=0, simple=range(candidates))
-    assert blend.error <= float(held_out_error(predicted, depth, believed).min()) + 1e-6
+    weights = torch.rand(points, generator=generator) + 0.1
+    blend = best_blend(predicted, depth, weights, default=0, baselines=range(candidates))
+    assert blend.error <= float(held_out_error(predicted, depth, weights).min()) + 1e-6
     assert abs(sum(blend.weights) - 1) < 1e-9
     mean = sum(w * predicted[m] for w, m in zip(blend.weights, blend.members, strict=True))
     assert isinstance(mean, torch.Tensor)
-    assert abs(float(held_out_error(mean, depth, believed)) - blend.error) < 1e-5
+    assert abs(float(held_out_error(mean, depth, weights)) - blend.error) < 1e-5

@@ -19,24 +19,12 @@ from model_zoo_defs.sparseconv import SparseConvNet
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.models.registry import names
 
-PRINTED_GAINS = {  # of RMSE and MAE, per cent
-    ("Eigen", False): (43.8, 46.8),
-    ("FCRN", False): (27.2, 33.5),
-    ("Uhrig", False): (8.9, 11.8),
-    ("Ma", False): (10.1, 22.7),
-    ("Jaritz", False): (6.7, 17.9),
-    ("Eigen", True): (22.3, 27.0),
-    ("Zhou", True): (16.5, 17.8),
-    ("Uhrig", True): (2.2, 12.6),
-    ("Chodosh", True): (1.9, 12.9),
-    ("Ma", True): (1.7, 13.79),
-}
 LENS = np.array([721.3, 721.3, 455.5, 36.4], np.float32)
 
 
 @pytest.mark.parametrize("row", ROWS, ids=lambda row: f"{row.name}-{row.street}")
 def test_the_papers_figures_give_the_gains_printed_beside_them(row: PaperRow) -> None:
-    for place, printed in enumerate(PRINTED_GAINS[row.name, row.street]):
+    for place, printed in enumerate(row.gains):
         gain = 100 * (1 - row.after[place] / row.before[place])
         assert gain == pytest.approx(printed, abs=0.12)  # four decimals are printed of the errors
 
@@ -107,7 +95,7 @@ def test_rendered_frames_come_from_the_cache_and_end_at_the_kinects_range(tmp_pa
     frames = list(rendered(ROOMS, tmp_path, 3, workers=1).frames())
     assert len(frames) == 3
     assert frames[0].rgb.max() == np.float32(0.2)
-    assert set(np.unique(frames[0].truth)) == {0, 3}
+    assert set(np.unique(frames[0].gt)) == {0, 3}
     assert frames[0].scan is None
 
 
@@ -122,8 +110,8 @@ def test_in_kitti_odometry_the_scan_is_the_truth(tmp_path: Path) -> None:
     frame = next(data_set(f"kitti={odometry(tmp_path)}", None).frames())
     assert frame.rgb.shape == (228, 912, 3)
     assert frame.scan is None
-    assert (frame.truth > 0).sum() > 1000
-    assert np.array_equal(frame.truth, frame.pool)
+    assert (frame.gt > 0).sum() > 1000
+    assert np.array_equal(frame.gt, frame.pool)
 
 
 def test_frames_that_networks_are_trained_on_are_left_out(tmp_path: Path) -> None:
@@ -175,7 +163,7 @@ def test_data_under_the_name_of_the_other_kind_is_refused(tmp_path: Path) -> Non
 
 
 def test_real_frames_at_hand_are_cut_as_the_paper_cuts_them(shared_data: Path) -> None:
-    sizes = {one.name: next(one.frames()).truth.shape for one in shared(shared_data, 1)}
+    sizes = {one.name: next(one.frames()).gt.shape for one in shared(shared_data, 1)}
     assert sizes == {"7scenes": (228, 304), "icl_nuim": (228, 304), "kitti_dc": (375, 1242)}
 
 
@@ -201,7 +189,7 @@ def test_published_weights_are_scored_on_data_sets_on_disk(
         assert len(bars_of(table)["published"]) == len(table["rows"])
         assert all(row["std_z"] > 0 and row["frames"] == 1 for row in table["rows"])
     assert "*Chodosh, published*" in printed
-    assert "`adnn` needs a LiDAR and a truth besides it" in printed
+    assert "`adnn` needs a LiDAR and a ground truth besides it" in printed
 
 
 def nyu(folder: Path) -> Path:

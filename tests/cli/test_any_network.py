@@ -6,13 +6,11 @@ import argparse
 import json
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file
 from torch import nn
 
-from pnpdepth_cli.pipeline.networks.layers import LayerRow, ranked
 from tests.cli.test_commands import code_of, frame, refine
 from tests.pipeline.frames import FrameOnDisk
 
@@ -141,14 +139,3 @@ def test_fetch_pins_the_revision_and_records_hashes(
     assert record["revision"] == "abc123"
     assert record == json.loads((tmp_path / "name" / "fetched.json").read_text())
     assert code_of(fetch) == 2
-
-
-def test_the_rule_of_thumb_picks_the_cheapest_layer_whose_field_spans_the_gap() -> None:
-    def row(name: str, field: int, cost: float) -> LayerRow:
-        return LayerRow(name=name, field_in_output=(field, field + 4), cost_behind=cost)
-
-    rows = [row("deep", 90, 0.9), row("middle", 40, 0.5), row("late", 9, 0.1)]
-    rows.append(LayerRow(name="never", problem="never runs"))
-    assert [r.rank for r in ranked(rows, spacing=30)] == [2, 1, 3, None]
-    assert [r.rank for r in ranked(rows, spacing=100)] == [1, 2, 3, None]
-    assert np.isclose(ranked(rows, spacing=5)[2].rank or 0, 1)

@@ -129,7 +129,7 @@ def test_the_profile_is_a_table_on_stderr_and_part_of_the_summary(
     for said in ("where the time went", "waiting for a frame to be written", "4 frames, "):
         assert said in err
     assert code_of(arguments("--profile", "--batch-size", "auto")) == 0
-    assert "no frame was done; there is no time to share out" in capsys.readouterr().err
+    assert "no frame was refined; there are no times" in capsys.readouterr().err
 
 
 def test_a_dry_run_lists_what_would_be_done_and_does_nothing(

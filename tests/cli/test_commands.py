@@ -168,7 +168,7 @@ def test_with_auto_the_table_does_not_claim_updates_that_may_not_be_in_the_resul
 ) -> None:
     assert code_of(refine(frame, "--auto")) == 0
     err = capsys.readouterr().err
-    assert "by what was best at held-out points" in " ".join(err.split())
+    assert "best candidates at held-out points" in " ".join(err.split())
     assert "updates (sign" not in err
     assert code_of(refine(frame, "--overwrite")) == 0
     assert "5 updates (sign" in capsys.readouterr().err

@@ -12,7 +12,7 @@ from pnpdepth_cli.cli.refine import refine
 from pnpdepth_cli.cli.sweep import sweep
 from pnpdepth_cli.core.refine import RefineSettings
 from pnpdepth_cli.errors import UsageError
-from pnpdepth_cli.models.definition import FOREIGN, ModelDefinition, Multiple
+from pnpdepth_cli.models.definition import UNTUNED_DEFAULTS, ModelDefinition, Multiple
 from pnpdepth_cli.pipeline.options import options_of
 from pnpdepth_cli.pipeline.refinement.request import MethodOptions, RefineRequest
 from pnpdepth_cli.pipeline.refinement.resolve import resolve_settings
@@ -20,14 +20,14 @@ from tests.core.networks import UNet
 
 METHOD = MethodOptions()
 STRANGER = ModelDefinition(
-    name="stranger", input_kind="rgb", size=Multiple(8), build=UNet, defaults=FOREIGN
+    name="stranger", input_kind="rgb", size=Multiple(8), build=UNet, defaults=UNTUNED_DEFAULTS
 )
 
 
 def test_without_a_word_the_settings_are_the_networks() -> None:
     settings = resolve_settings(STRANGER, METHOD)
     for name in ("iterations", "lr", "loss", "update", "schedule", "blur"):
-        assert getattr(settings, name) == getattr(FOREIGN, name)
+        assert getattr(settings, name) == getattr(UNTUNED_DEFAULTS, name)
     plain = ModelDefinition(name="plain", input_kind="rgb", size=Multiple(8), build=UNet)
     assert resolve_settings(plain, METHOD) == RefineSettings()
 
@@ -39,7 +39,10 @@ def test_another_update_starts_from_the_papers_step() -> None:
     assert (settings.lr, settings.schedule, settings.blur) == (
         paper.lr, paper.schedule, paper.blur,
     )  # fmt: skip
-    assert (settings.iterations, settings.loss) == (FOREIGN.iterations, FOREIGN.loss)
+    assert (settings.iterations, settings.loss) == (
+        UNTUNED_DEFAULTS.iterations,
+        UNTUNED_DEFAULTS.loss,
+    )
 
 
 def test_what_the_user_says_holds() -> None:

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pnpdepth_cli.choices import EVAL_PROTOCOLS
 from pnpdepth_cli.cli.main import main
 from pnpdepth_cli.io.depth import write_depth
 from pnpdepth_cli.pipeline.evaluation.protocols import PROTOCOLS
@@ -251,6 +252,19 @@ def test_help_imports_neither_torch_nor_numpy_nor_rich(command: str) -> None:
 
 
 def test_the_help_names_every_protocol() -> None:
-    from pnpdepth_cli.cli import evaluate
+    assert tuple(PROTOCOLS) == EVAL_PROTOCOLS
 
-    assert tuple(PROTOCOLS) == evaluate.PROTOCOLS
+
+def test_relative_predictions_and_missing_pixels_are_options_of_eval(
+    frames: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ("--scale-by", "median", "--missing", "max", "--max-depth", "10", "--json")
+    assert code_of("eval", "out", "gt", *arguments) == 0
+    out, err = capsys.readouterr()
+    record = json.loads(out)
+    assert record["mean"]["mre"] == pytest.approx(0, abs=1e-6)  # predictions are 1.1 × too far
+    assert record["frames"][0]["factor"] == pytest.approx(1 / 1.1)
+    assert "scale-by median: factor 0.9091" in err
+    assert record["protocol"]["scoring"]["missing"] == "max"
+    assert code_of("eval", "out", "gt", "--missing", "max") == 2
+    assert "--missing max scores empty predictions as --max-depth" in capsys.readouterr().err

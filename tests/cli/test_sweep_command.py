@@ -37,7 +37,7 @@ def test_a_sweep_prints_a_table_a_study_and_says_what_it_wrote(
     titles = [line for line in out.splitlines() if "means over frames" in line]
     assert [title.split(":")[0] for title in titles] == ["points", "loss"]
     assert re.search(r"^ 20 +20 +2 +0\.\d{4}", out, re.MULTILINE)
-    assert "points: the frames' own; --sample says otherwise" in err
+    assert "points: the frames' own; --sample to change" in err
     assert "2 frames, 22 runs: 0 done already, 22 to do" in err
     last = err.splitlines()[-1]
     assert last.startswith("wrote out/sweep.csv")
@@ -99,8 +99,8 @@ def test_why_frames_failed_is_said_once_for_each(
     assert code_of(arguments("--vary", "points=500", "--vary", "lr=1,2", "--no-plots")) == 7
     failed = [e for e in capsys.readouterr().err.splitlines() if e.startswith("failed")]
     assert failed == [
-        f"failed: {name}: 500 points of 60; ask for fewer, or take them of the truth with --sample"
-        " 500"
+        f"failed: {name}: 500 points of 60; ask for fewer, or draw them from the ground"
+        " truth with --sample 500"
         for name in ("a", "b")
     ]
 

@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from pnpdepth_cli.completion.baselines import BASELINES
+from pnpdepth_cli.choices import BASELINES
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.points import SparsePoints
 

@@ -9,15 +9,14 @@ from scipy.sparse.linalg import splu
 from torch import Tensor
 
 from pnpdepth_cli.completion import diffusion
-from pnpdepth_cli.completion.diffusion import EDGE_DEPTH, STIFFNESS, diffused
-from pnpdepth_cli.completion.gaussian_process import Field
-from pnpdepth_cli.completion.propagation import features_of
+from pnpdepth_cli.completion.diffusion import EDGE_DEPTH, STIFFNESS, diffuse
+from pnpdepth_cli.completion.residual_field import ResidualField, features_of
 from pnpdepth_cli.points import SparsePoints
 
 SIZE = (6, 8)
 
 
-def field(xy: list[tuple[float, float]], residual: list[float], log_depth: Tensor) -> Field:
+def field(xy: list[tuple[float, float]], residual: list[float], log_depth: Tensor) -> ResidualField:
     points = SparsePoints(
         xy=torch.tensor(xy),
         depth=torch.ones(len(xy)),
@@ -25,7 +24,9 @@ def field(xy: list[tuple[float, float]], residual: list[float], log_depth: Tenso
     )
     features = features_of(log_depth, None)
     at = torch.stack([points.sample(one) for one in features.unbind(2)], dim=1)
-    return Field(features=features, points=points, at=at, residual=torch.tensor(residual).double())
+    return ResidualField(
+        features=features, points=points, at=at, residual=torch.tensor(residual).double()
+    )
 
 
 def step(size: tuple[int, int] = SIZE) -> Tensor:
@@ -51,11 +52,11 @@ def test_it_is_the_least_squares_solution_of_its_equation() -> None:
         lines.append(np.sqrt(weight) * (np.eye(48)[a] - np.eye(48)[b]))
         right.append(0.0)
     expected = np.linalg.lstsq(np.array(lines), np.array(right), rcond=None)[0]
-    assert np.allclose(diffused(made).numpy(), expected.reshape(SIZE), atol=1e-3)
+    assert np.allclose(diffuse(made).numpy(), expected.reshape(SIZE), atol=1e-3)
 
 
 def test_an_edge_of_the_prediction_stops_it() -> None:
-    made = diffused(field([(0.0, 3.0), (7.0, 3.0)], [0.5, -0.5], step()))
+    made = diffuse(field([(0.0, 3.0), (7.0, 3.0)], [0.5, -0.5], step()))
     assert float((made[:, :4] - 0.5).abs().max()) < 0.05
     assert float((made[:, 4:] + 0.5).abs().max()) < 0.05
 
@@ -64,9 +65,9 @@ def test_an_edge_of_the_prediction_stops_it() -> None:
 def test_one_point_is_everywhere_also_on_a_coarser_grid(
     nodes: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(diffusion, "_FEWEST_NODES", nodes)
-    monkeypatch.setattr(diffusion, "_MOST_NODES", nodes)
-    made = diffused(field([(3.4, 2.6)], [0.25], step()))
+    monkeypatch.setattr(diffusion, "_MIN_NODES", nodes)
+    monkeypatch.setattr(diffusion, "_MAX_NODES", nodes)
+    made = diffuse(field([(3.4, 2.6)], [0.25], step()))
     assert torch.allclose(made, torch.full(SIZE, 0.25), atol=1e-5)
 
 
@@ -82,5 +83,5 @@ def test_the_grid_is_finer_where_points_are_many(
 
     monkeypatch.setattr("scipy.sparse.linalg.splu", noted)
     places = torch.rand(count, 2, generator=torch.Generator().manual_seed(0)) * 199
-    diffused(field([(x, y) for x, y in places.tolist()], [0.1] * count, step((200, 300))))
+    diffuse(field([(x, y) for x, y in places.tolist()], [0.1] * count, step((200, 300))))
     assert solved[0] == pytest.approx(nodes, rel=0.02)

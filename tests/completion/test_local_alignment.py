@@ -8,7 +8,7 @@ from torch import Tensor
 
 from pnpdepth_cli.choices import SPACES
 from pnpdepth_cli.completion.alignment import BEYOND, aligned, from_space, to_space
-from pnpdepth_cli.completion.local_alignment import locally_aligned, trust
+from pnpdepth_cli.completion.local_alignment import locally_aligned
 from pnpdepth_cli.errors import NoPointsError
 from pnpdepth_cli.points import SparsePoints
 
@@ -96,20 +96,8 @@ def test_20_percent_gross_outliers_move_the_depth_by_a_share_of_what_they_would(
         return sum(errors)
 
     doubted = rise()
-    monkeypatch.setattr("pnpdepth_cli.completion.local_alignment.ALONE", 1e9)
+    monkeypatch.setattr("pnpdepth_cli.completion.outliers.ALONE", 1e9)
     assert doubted < share * rise()
-
-
-def test_a_point_alone_among_its_neighbours_is_not_believed() -> None:
-    points = seen(scene(), 50)
-    missing = 0.01 * torch.randn(50, generator=torch.Generator().manual_seed(2)).double()
-    missing[7] = 1.0
-    believed = trust(points, missing)
-    assert float(believed[7]) == 0
-    assert float(believed[torch.arange(50) != 7].min()) > 0.5
-    assert torch.equal(
-        trust(points.select(torch.arange(50) < 2), missing[:2]), torch.ones(2).double()
-    )
 
 
 def test_where_the_network_has_nothing_there_is_nothing() -> None:

@@ -1,25 +1,16 @@
 from __future__ import annotations
 
-import math
-
 import pytest
 import torch
 from torch import Tensor
 
-from pnpdepth_cli.completion.propagation import (
-    PROPAGATIONS,
-    calibration,
-    cielab,
-    features_of,
-    propagate,
-    propagated_at,
-    wrong,
-)
+from pnpdepth_cli.choices import PROPAGATIONS
+from pnpdepth_cli.completion.propagation import propagate, propagate_at
 from pnpdepth_cli.errors import NoPointsError, UsageError
 from pnpdepth_cli.points import SparsePoints
 
 SIZE = (48, 64)
-SPREADING = [kind for kind in PROPAGATIONS if kind != "none"]
+KINDS = ("none", *PROPAGATIONS)
 
 
 def scene() -> tuple[Tensor, Tensor, Tensor]:
@@ -50,7 +41,7 @@ def mean_error(depth: Tensor, truth: Tensor) -> float:
     return float((depth.log() - truth.log()).abs().mean())
 
 
-@pytest.mark.parametrize("kind", SPREADING)
+@pytest.mark.parametrize("kind", PROPAGATIONS)
 @pytest.mark.parametrize("count", [30, 400])
 @pytest.mark.parametrize("coloured", [True, False])
 def test_a_prediction_that_drifts_is_put_right(kind: str, count: int, coloured: bool) -> None:
@@ -60,7 +51,7 @@ def test_a_prediction_that_drifts_is_put_right(kind: str, count: int, coloured: 
     assert mean_error(made.depth, truth) < 0.5 * mean_error(prediction, truth)
 
 
-@pytest.mark.parametrize("kind", PROPAGATIONS)
+@pytest.mark.parametrize("kind", KINDS)
 def test_nothing_left_leaves_the_prediction(kind: str) -> None:
     truth, rgb, _ = scene()
     assert torch.allclose(propagate(truth, seen(truth, 50), rgb, kind=kind).depth, truth, rtol=1e-6)
@@ -71,14 +62,14 @@ def test_without_propagation_the_prediction_is_the_result() -> None:
     assert torch.equal(propagate(prediction, seen(truth, 9), rgb, kind="none").depth, prediction)
 
 
-@pytest.mark.parametrize("kind", SPREADING)
+@pytest.mark.parametrize("kind", PROPAGATIONS)
 def test_one_point_moves_all_by_its_factor(kind: str) -> None:
     truth, rgb, _ = scene()
     made = propagate(truth / 1.5, seen(truth, 1), rgb, kind=kind)
     assert torch.allclose(made.depth, truth, rtol=0.01)
 
 
-@pytest.mark.parametrize("kind", SPREADING)
+@pytest.mark.parametrize("kind", PROPAGATIONS)
 @pytest.mark.parametrize("count", [2, 3, 4, 5, 6])
 def test_few_points_bring_no_depth_beyond_what_they_say(kind: str, count: int) -> None:
     truth, rgb, prediction = scene()
@@ -97,7 +88,7 @@ def test_the_points_keep_their_depth(count: int) -> None:
     assert mean_error(points.sample(made), points.depth) < 0.01
 
 
-@pytest.mark.parametrize("kind", SPREADING)
+@pytest.mark.parametrize("kind", PROPAGATIONS)
 @pytest.mark.parametrize("count", [60, 400])
 def test_wrong_points_do_not_spread(kind: str, count: int) -> None:
     truth, rgb, prediction = scene()
@@ -109,7 +100,7 @@ def test_wrong_points_do_not_spread(kind: str, count: int) -> None:
     assert made < 1.5 * clean + 0.01
 
 
-@pytest.mark.parametrize("kind", SPREADING)
+@pytest.mark.parametrize("kind", PROPAGATIONS)
 @pytest.mark.parametrize("count", [7, 300])
 def test_the_order_of_the_points_does_not_matter(kind: str, count: int) -> None:
     truth, rgb, prediction = scene()
@@ -120,7 +111,7 @@ def test_the_order_of_the_points_does_not_matter(kind: str, count: int) -> None:
     assert torch.equal(made, again)
 
 
-@pytest.mark.parametrize("kind", PROPAGATIONS)
+@pytest.mark.parametrize("kind", KINDS)
 def test_an_unknown_prediction_stays_unknown_and_its_points_tell_nothing(kind: str) -> None:
     truth, rgb, prediction = scene()
     points = seen(truth, 40)
@@ -136,7 +127,7 @@ def test_an_unknown_prediction_stays_unknown_and_its_points_tell_nothing(kind: s
     assert torch.equal(propagate(unknown, lying, rgb, kind=kind).depth, made)
 
 
-@pytest.mark.parametrize("kind", SPREADING)
+@pytest.mark.parametrize("kind", PROPAGATIONS)
 def test_points_beyond_the_frame_and_farther_ones_at_one_place_tell_nothing(kind: str) -> None:
     truth, rgb, prediction = scene()
     points = seen(truth, 30)
@@ -147,7 +138,7 @@ def test_points_beyond_the_frame_and_farther_ones_at_one_place_tell_nothing(kind
     assert torch.equal(made, again)
 
 
-@pytest.mark.parametrize("kind", SPREADING)
+@pytest.mark.parametrize("kind", PROPAGATIONS)
 def test_a_flat_prediction_and_picture_become_a_surface_through_the_points(kind: str) -> None:
     truth = scene()[0]
     points = seen(truth, 100)
@@ -156,14 +147,14 @@ def test_a_flat_prediction_and_picture_become_a_surface_through_the_points(kind:
     assert mean_error(made, truth) < 0.5 * mean_error(torch.full(SIZE, 2.0), truth)
 
 
-@pytest.mark.parametrize("kind", PROPAGATIONS)
+@pytest.mark.parametrize("kind", KINDS)
 def test_places_have_the_depth_of_the_picture(kind: str) -> None:
     truth, rgb, prediction = scene()
     points = seen(truth, 40)
     places = torch.tensor([[3.0, 4.0], [63.0, 47.0], [20.0, 30.0]])
     asked = SparsePoints(xy=places, depth=torch.ones(3), size=SIZE)
     made = propagate(prediction, points, rgb, kind=kind).depth
-    found = propagated_at(prediction, points, rgb, places, kind=kind)
+    found = propagate_at(prediction, points, rgb, places, kind=kind)
     assert torch.allclose(found, asked.sample(made), rtol=1e-4)
 
 
@@ -175,57 +166,12 @@ def test_sigma_has_two_thirds_of_the_truth_within_it() -> None:
     assert 0.5 < float(within) < 0.9
 
 
-def test_wrong_points_are_named_in_the_order_of_the_points_and_right_ones_are_not() -> None:
-    truth, rgb, prediction = scene()
-    points = seen(truth, 150)
-    assert not bool(wrong(prediction, points, rgb).any())
-    bad = torch.arange(150) % 6 == 0
-    outside = SparsePoints(
-        xy=torch.tensor([[-9.0, 3.0]]), depth=torch.tensor([50.0]), size=points.size
-    )
-    spoiled = SparsePoints(
-        xy=torch.cat([points.xy, outside.xy]),
-        depth=torch.cat([torch.where(bad, 3 * points.depth, points.depth), outside.depth]),
-        size=points.size,
-    )
-    found = wrong(prediction, spoiled, rgb)
-    assert int(found[:150][bad].sum()) > 0.9 * int(bad.sum())
-    assert int(found.sum()) < 2 * int(bad.sum())
-    assert not bool(found[150])  # nothing is known there
-
-
-def test_calibration_brings_two_thirds_of_the_residuals_within_sigma() -> None:
-    residual = torch.randn(2000, generator=torch.Generator().manual_seed(0)) * 3
-    factor = calibration(residual, torch.ones(2000))
-    assert float((residual.abs() <= factor).double().mean()) == pytest.approx(0.68, abs=1e-3)
-    assert calibration(residual[:0], residual[:0]) == 1.0
-
-
 def test_what_cannot_be_done_is_said() -> None:
     truth, rgb, prediction = scene()
     points = seen(truth, 9)
-    with pytest.raises(UsageError, match="no propagation 'magic'"):
+    with pytest.raises(UsageError, match="unknown propagation 'magic'"):
         propagate(prediction, points, rgb, kind="magic")
     with pytest.raises(UsageError, match="no standard deviation"):
         propagate(prediction, points, rgb, kind="diffusion", sigma=True)
     with pytest.raises(NoPointsError):
         propagate(torch.zeros(SIZE), points, rgb)
-
-
-def test_grey_has_no_colour_and_white_is_the_lightest() -> None:
-    grey = torch.linspace(0, 1, 11).expand(3, 1, 11)
-    lab = cielab(grey)[0]
-    assert torch.allclose(lab[:, 1:], torch.zeros(11, 2), atol=1e-3)
-    assert lab[-1, 0] == pytest.approx(100, abs=1e-3)
-    assert bool((lab[1:, 0] > lab[:-1, 0]).all())
-
-
-def test_pure_red_is_where_it_is_in_tables_of_cielab() -> None:
-    lab: Tensor = cielab(torch.tensor([1.0, 0.0, 0.0])[:, None, None])[0, 0]
-    assert torch.allclose(lab, torch.tensor([53.24, 80.09, 67.20]), atol=0.05)
-
-
-def test_features_of_a_flat_prediction_and_picture_are_finite() -> None:
-    features = features_of(torch.full(SIZE, math.log(3.0)), torch.full((3, *SIZE), 0.5))
-    assert bool(features.isfinite().all())
-    assert float(features[..., 2:].abs().max()) < 1e-3

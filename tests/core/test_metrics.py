@@ -124,7 +124,7 @@ def test_the_thresholds_of_delta_can_be_the_papers_kitti_ones() -> None:
 
 
 def test_shapes_that_differ_are_refused() -> None:
-    with pytest.raises(ValueError, match="truth of"):
+    with pytest.raises(ValueError, match="ground truth"):
         score(torch.ones(2, 3), torch.ones(3, 2))
 
 

@@ -96,7 +96,7 @@ BROKEN = [
     (KITTI.replace("P2: 700", "P2: -700"), "intrinsics are not of the form"),
     (KITTI.replace("R0_rect: 1", "R0_rect: 1.2"), "rectification is no rotation"),
     (KITTI.replace("velo_to_cam: 0 -1", "velo_to_cam: 0 1"), "scanner is no rotation"),
-    (KITTI + KITTI, "P0 is there twice"),
+    (KITTI + KITTI, "P0 occurs twice"),
     ("hello\n" + KITTI, "line 1: 'hello' has no name"),
     (YAML.replace("K:", "k:"), "'k' is not part of a calibration"),
     (YAML.replace("t:", "#t:"), "has R but no t"),

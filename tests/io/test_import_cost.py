@@ -7,7 +7,7 @@ import sys
 def test_importing_io_leaves_out_what_only_some_files_need() -> None:
     code = (
         "import sys\n"
-        "import pnpdepth_cli.io.depth, pnpdepth_cli.io.pictures, pnpdepth_cli.io.record\n"
+        "import pnpdepth_cli.io.depth, pnpdepth_cli.io.visualisation, pnpdepth_cli.io.record\n"
         "import pnpdepth_cli.io.rgb\n"
         "print(sorted({'OpenEXR', 'PIL', 'torch', 'scipy'} & set(sys.modules)))\n"
     )

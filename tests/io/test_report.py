@@ -16,7 +16,7 @@ from pnpdepth_cli.io.report import (
     _embedded,
     begin_report,
     check_report_folder,
-    picture_key,
+    image_key,
     remove_report_leftovers,
     write_report,
 )
@@ -85,7 +85,7 @@ def test_frames_are_taken_one_by_one(tmp_path: Path) -> None:
 
 def test_pictures_of_no_frame_are_removed_and_nothing_else(tmp_path: Path) -> None:
     pictures = begin_report(tmp_path, {})
-    kept, stale = picture_key("a"), picture_key("b")
+    kept, stale = image_key("a"), image_key("b")
     for name in (f"{kept}_map.jpg", f"{stale}_map.jpg", "mine.jpg", f"{stale}.txt"):
         (pictures / name).write_bytes(b"x")
     write_report(tmp_path, HEAD, [frame("a", kept), frame("without")])
@@ -95,10 +95,10 @@ def test_pictures_of_no_frame_are_removed_and_nothing_else(tmp_path: Path) -> No
 
 def test_keys_tell_parts_apart() -> None:
     keys = {
-        picture_key("a", "bc"),
-        picture_key("ab", "c"),
-        picture_key("abc"),
-        picture_key("\udcff"),
+        image_key("a", "bc"),
+        image_key("ab", "c"),
+        image_key("abc"),
+        image_key("\udcff"),
     }
     assert len(keys) == 4
 

@@ -17,8 +17,8 @@ from selenium.webdriver.common.by import By
 from selenium.webdriver.remote.webelement import WebElement
 from selenium.webdriver.support.ui import WebDriverWait
 
-from pnpdepth_cli.io.report import begin_report, picture_key, write_report
-from pnpdepth_cli.io.report_pictures import save_pictures
+from pnpdepth_cli.io.report import begin_report, image_key, write_report
+from pnpdepth_cli.io.report_images import save_images
 from tests.pipeline.batches import add_frame, batch, pairs_on_disk
 from tests.pipeline.report_pages import frames_of, page_data
 
@@ -267,13 +267,13 @@ def thousand(tmp_path_factory: pytest.TempPathFactory, report: Path) -> Path:
     folder = tmp_path_factory.mktemp("thousand")
     pictures = begin_report(folder, {})
     pixels = np.random.default_rng(0).integers(0, 255, (120, 160, 3), np.uint8)
-    save_pictures(pictures, "0", {"map": pixels, "second": pixels}, thumb="second")
+    save_images(pictures, "0", {"map": pixels, "second": pixels}, thumb="second")
     head = page_data(report)
     head.pop("frames")
     example = frames_of(report)["a"]
 
     def frame(number: int) -> dict[str, Any]:
-        key = picture_key(str(number))
+        key = image_key(str(number))
         for thumb in ("thumb", "map_thumb"):
             shutil.copy(pictures / f"0_{thumb}.jpg", pictures / f"{key}_{thumb}.jpg")
         values = [number % 97 / 100 - 0.3] * len(head["columns"])

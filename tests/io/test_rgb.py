@@ -163,7 +163,7 @@ def test_exr_without_one_picture_lists_its_channels(tmp_path: Path) -> None:
 
 def test_a_float_tiff_is_refused(tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "a.tif"), np.ones((3, 4, 3), np.float32))
-    with pytest.raises(FileFormatError, match="32-bit float TIFF; save the picture with 8 or 16"):
+    with pytest.raises(FileFormatError, match="32-bit float TIFF; save the image with 8 or 16"):
         read_rgb(tmp_path / "a.tif")
 
 
@@ -171,7 +171,7 @@ def test_only_the_first_page_is_read_and_that_is_said(tmp_path: Path) -> None:
     first, second = Image.fromarray(COLOURS), Image.new("RGB", (11, 7))
     first.save(tmp_path / "a.tif", save_all=True, append_images=[second])
     image = read_rgb(tmp_path / "a.tif")
-    assert image.note == "first of 2 pictures"
+    assert image.note == "first of 2 images"
     assert np.array_equal(np.rint(image.values * 255), COLOURS)
 
 
@@ -183,7 +183,7 @@ def test_damaged_exif_does_not_spoil_a_good_picture(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("content", "fact"),
-    [(b"", "is empty"), (b"hello, world", "is not a picture"), (b"\x93NUMPY\x01\x00", "not a pic")],
+    [(b"", "is empty"), (b"hello, world", "is not an image"), (b"\x93NUMPY\x01\x00", "not an im")],
 )
 def test_what_is_no_picture_is_refused(tmp_path: Path, content: bytes, fact: str) -> None:
     path = tmp_path / "a.png"

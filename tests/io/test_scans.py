@@ -242,3 +242,18 @@ def test_an_ambiguous_scan_is_refused_until_the_number_of_fields_is_given(tmp_pa
     assert len(read_scan(path, 5).points) == 4
     with pytest.raises(FileFormatError, match="not a multiple of 24"):
         read_scan(path, 6)
+
+
+@pytest.mark.parametrize("count", ["9" * 5000, "9" * 12, "-1", "1e3"])
+@pytest.mark.parametrize("kind", ["pcd", "ply"])
+def test_a_count_of_points_beyond_the_file_is_refused_in_one_line(
+    tmp_path: Path, count: str, kind: str
+) -> None:
+    content = pcd_bytes(POINTS) if kind == "pcd" else ply_bytes(POINTS)
+    name = b"POINTS" if kind == "pcd" else b"vertex"
+    path = tmp_path / f"scan.{kind}"
+    path.write_bytes(content.replace(name + b" 37", name + b" " + count.encode()))
+    with pytest.raises(FileFormatError) as error:
+        read_scan(path)
+    assert "\n" not in str(error.value)
+    assert len(str(error.value)) < 300

@@ -41,7 +41,7 @@ def test_even_elevations_go_down_from_the_top(tmp_path: Path) -> None:
         ('elevations_deg = ["up"]\nazimuth_step_deg = 1\n', "not a number"),
         ("elevations_deg = [1]\ntop_deg = 1\nazimuth_step_deg = 1\n", "not both"),
         ("top_deg = 1\nstep_deg = 1\nbeams = 1.5\nazimuth_step_deg = 1\n", "whole number"),
-        ("elevations_deg = [1]\nazimut_step_deg = 1\n", "'azimut_step_deg' says nothing"),
+        ("elevations_deg = [1]\nazimut_step_deg = 1\n", "'azimut_step_deg' is not part"),
         ("elevations_deg = [nan]\nazimuth_step_deg = 1\n", "not a number"),
     ],
 )

@@ -55,7 +55,7 @@ def test_a_picture_is_normalised_and_points_are_scattered() -> None:
 
 def test_a_network_of_points_alone_needs_no_picture_and_one_of_pictures_does() -> None:
     assert len(arguments(network(input_kind="sparse"), None)) == 1
-    with pytest.raises(UsageError, match="looks at a picture"):
+    with pytest.raises(UsageError, match="takes an rgb image"):
         arguments(network(), None)
 
 

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from pnpdepth_cli.errors import ModelError
-from pnpdepth_cli.models.suggest_layers import outline
+from pnpdepth_cli.models.suggest_layers import suggest_layers
 
 PICTURE = torch.rand(1, 3, 32, 48, generator=torch.Generator().manual_seed(0))
 
@@ -53,7 +53,7 @@ CUTS = {
 
 
 def layers_of(network: nn.Module) -> tuple[str, ...]:
-    return outline(network, (PICTURE,), lambda output: output)
+    return suggest_layers(network, (PICTURE,), lambda output: output)
 
 
 def test_the_last_layer_of_each_resolution_from_the_bottleneck_on_is_listed() -> None:

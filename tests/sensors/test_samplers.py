@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pnpdepth_cli.errors import NoPointsError, SizeError, UsageError
-from pnpdepth_cli.sensors import PATTERNS, SampleNoise, SamplePattern, as_picture, sample_points
+from pnpdepth_cli.sensors import PATTERNS, SampleNoise, SamplePattern, as_depth_image, sample_points
 
 DEPTH = np.random.default_rng(7).uniform(1, 9, (60, 80)).astype(np.float32)
 HOLES = np.where(np.random.default_rng(8).random((60, 80)) < 0.3, 0, DEPTH).astype(np.float32)
@@ -41,7 +41,7 @@ def test_the_same_seed_gives_the_same_points(kind: str) -> None:
     assert np.array_equal(first.xy, again.xy)
     if kind in ("uniform", "bernoulli", "edges", "region"):
         other = sample_points(HOLES, pattern(kind), 6, image=checkerboard())
-        assert not np.array_equal(as_picture(first), as_picture(other))
+        assert not np.array_equal(as_depth_image(first), as_depth_image(other))
 
 
 @settings(deadline=None, max_examples=30)

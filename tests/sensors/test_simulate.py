@@ -184,5 +184,5 @@ def test_noise_beyond_all_bounds_leaves_no_point_and_is_refused() -> None:
 
 
 def test_a_scanner_of_too_many_points_a_turn_is_refused_before_they_are_made() -> None:
-    with pytest.raises(UsageError, match="1,474,560,000 points a turn"):
+    with pytest.raises(UsageError, match="1,474,560,000 points per revolution"):
         Lidar(name="x", elevations_deg=(0.0,) * 4096, azimuth_step_deg=0.001, max_range=9)

@@ -11,7 +11,7 @@ from pnpdepth_cli.sensors import (
     FORWARD_LEFT_UP,
     Camera,
     ProjectionSettings,
-    as_picture,
+    as_depth_image,
     project_velodyne,
 )
 
@@ -72,7 +72,7 @@ def test_of_two_points_on_a_pixel_the_nearer_wins_and_keeps_its_place_in_it() ->
     assert got.index.tolist() == [1, 2]
     np.testing.assert_allclose(got.xy[0], [49.7, 40], atol=1e-5)
     assert got.dropped["behind another in their pixel"] == 1
-    assert as_picture(got)[40, 50] == 10
+    assert as_depth_image(got)[40, 50] == 10
 
 
 def test_minimum_and_maximum_range_are_distances_from_the_scanner() -> None:

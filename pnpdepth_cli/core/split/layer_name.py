@@ -1,4 +1,4 @@
-"""How a place to cut is written."""
+"""The notation of a layer to cut at."""
 
 from __future__ import annotations
 
@@ -10,15 +10,18 @@ from pnpdepth_cli.errors import LayerError
 
 @dataclass(frozen=True)
 class LayerName:
-    """A place to cut: `module`, `module#2` for its second call, `module[key]` for one output."""
+    """A layer: `module`, `module#2` for its second call, `module[key]` for one of its outputs."""
 
     module: str
+    """Name of the submodule."""
     call: int | None = None
+    """Number of the call, from 1; None if there is one call."""
     key: tuple[str, ...] | None = None
+    """Path of the output in nested containers; None if there is one."""
 
     @classmethod
     def parse(cls, text: str) -> LayerName:
-        """The name in its parts. LayerError if it has no such form."""
+        """Returns the parts of a name. Raises LayerError if it is not of this form."""
         match = re.fullmatch(
             r"(?P<module>[^#\[\]]*)(?:#(?P<call>\d+))?(?P<keys>(?:\[[^\[\]]+\])*)", text
         )
@@ -28,5 +31,5 @@ class LayerName:
         return cls(match["module"], int(match["call"]) if match["call"] else None, keys or None)
 
     def of_output(self, path: tuple[str, ...]) -> str:
-        """The name of one output of this module."""
+        """Returns the name of the output of this module at a path."""
         return self.module + "".join(f"[{key}]" for key in path)

@@ -1,4 +1,4 @@
-"""Tensors inside what a module returns: tuples, lists, dicts, named tuples, dataclasses."""
+"""Tensors in nested containers: tuples, lists, dicts, named tuples, dataclasses."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from torch import Tensor
 def tensors_in(
     structure: Any, path: tuple[str, ...] = ()
 ) -> Iterator[tuple[tuple[str, ...], Tensor]]:
-    """Every tensor of a nested structure with its path, such as ("hidden_states", "0")."""
+    """Yields every tensor of a nested structure with its path, such as ("hidden_states", "0")."""
     if isinstance(structure, Tensor):
         yield path, structure
         return
@@ -24,7 +24,7 @@ def tensors_in(
 def map_tensors(
     structure: Any, change: Callable[[tuple[str, ...], Tensor], Tensor], path: tuple[str, ...] = ()
 ) -> Any:
-    """The structure with every tensor t at path p replaced by change(p, t); containers are new."""
+    """Returns the structure with tensor t at path p replaced by change(p, t), in new containers."""
     if isinstance(structure, Tensor):
         return change(path, structure)
     children = [map_tensors(child, change, (*path, key)) for key, child in _children(structure)]
@@ -33,20 +33,20 @@ def map_tensors(
         return type(structure)(*children) if named else type(structure)(children)
     if not _is_container(structure):
         return structure
-    made: Any = copy.copy(structure)
+    result: Any = copy.copy(structure)
     if isinstance(structure, list):
-        made[:] = children
+        result[:] = children
     elif isinstance(structure, MutableMapping):
         for key, child in zip(structure, children, strict=True):
-            made[key] = child
+            result[key] = child
     else:
         for field, child in zip(dataclasses.fields(structure), children, strict=True):
-            object.__setattr__(made, field.name, child)  # the dataclass may be frozen
-    return made
+            object.__setattr__(result, field.name, child)  # the dataclass may be frozen
+    return result
 
 
 def is_transparent(structure: Any) -> bool:
-    """True if nothing in the structure could hide a tensor from `tensors_in`."""
+    """Whether `tensors_in` is sure to find every tensor of the structure."""
     if structure is None or isinstance(structure, Tensor | int | float | str | bool):
         return True
     return _is_container(structure) and all(

@@ -1,4 +1,4 @@
-"""Code that is not ours: what a network or a model file raises, said on one line."""
+"""Exceptions of user code, such as a network's forward, as errors with one-line messages."""
 
 from __future__ import annotations
 
@@ -14,7 +14,10 @@ from pnpdepth_cli.errors import ModelError, PnpDepthError
 
 @contextmanager
 def wrap_user_errors(what: str) -> Iterator[None]:
-    """An exception inside becomes ModelError(`what` raises …); memory running out stays itself."""
+    """Turns exceptions inside the block into a ModelError "`what` raises …".
+
+    Errors of this program and exhausted memory are raised as they are.
+    """
     try:
         yield
     except PnpDepthError:
@@ -26,17 +29,17 @@ def wrap_user_errors(what: str) -> Iterator[None]:
 
 
 def describe(error: BaseException, file: Path | None = None) -> str:
-    """The exception on one line, with the line of `file` it came through, if it did."""
+    """Returns the exception on one line, with the number of the line of `file` that raised it."""
     text = " ".join(str(error).split())[:300]
     frames = traceback.extract_tb(error.__traceback__)
     lines = [f.lineno for f in frames if file and Path(f.filename).resolve() == file.resolve()]
-    place = f" (line {lines[-1]})" if lines else ""
-    return f"{type(error).__name__}: {text}{place}" if text else f"{type(error).__name__}{place}"
+    line = f" (line {lines[-1]})" if lines else ""
+    return f"{type(error).__name__}: {text}{line}" if text else f"{type(error).__name__}{line}"
 
 
 def is_out_of_memory(error: BaseException) -> bool:
-    """True for the several ways torch and Python say so."""
-    said = ("out of memory", "can't allocate memory", "ALLOC_FAILED")
+    """Whether the exception is one of those by which torch and Python report exhausted memory."""
+    messages = ("out of memory", "can't allocate memory", "ALLOC_FAILED")
     return isinstance(error, torch.cuda.OutOfMemoryError | MemoryError) or (
-        isinstance(error, RuntimeError) and any(words in str(error) for words in said)
+        isinstance(error, RuntimeError) and any(message in str(error) for message in messages)
     )

@@ -1,80 +1,67 @@
-"""Watching a pass of a network operation by operation, for `Split`."""
+"""Watching a pass of a network operation by operation, for `Split`.
+
+Two modes of torch, active in this thread and this pass only: a dispatch mode sees every tensor
+operation; a torch function mode sees `Tensor.numpy` and the like, by which values reach Python
+without an operation. The latter is off within torch's fused transformer layers, which would
+otherwise take other kernels, and so other bits, than in later passes.
+"""
 
 from __future__ import annotations
 
 import functools
-import threading
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor, nn, overrides
+from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from pnpdepth_cli.core.split.saved import SavedTensors
 from pnpdepth_cli.core.split.structure import is_transparent, map_tensors, tensors_in
 
+_ESCAPES = (Tensor.numpy, Tensor.tolist, Tensor.__array__, Tensor.__dlpack__)
+"""Methods that give values to Python and are no tensor operations."""
 
-@dataclass(eq=False)
-class Remembered:
-    """Tensors as they were at one time; `copied` where the network changes them in place."""
-
-    output: Any = None
-    copied: bool = False
-
-    def hand_back(self) -> Any:
-        """What is remembered, in containers of its own, and safe from what is done to it."""
-        return map_tensors(
-            self.output, lambda _, t: t.clone() if self.copied or t.is_inference() else t
-        )
-
-
-@dataclass(eq=False, kw_only=True)
-class Call(Remembered):
-    """One call of a submodule that every later pass makes too.
-
-    `kept` is true where the pass hands back `output` instead of running the submodule, `known`
-    where that is the output for the arguments at hand. `unread`: its tensors nobody looks into.
-    """
-
-    module: nn.Module
-    kept: bool = False
-    known: bool = False
-    unread: frozenset[tuple[str, ...]] = frozenset()
-
-    def remember(self, output: Any) -> None:
-        """`output` is what is handed back; of unread tensors only the shape, in one number."""
-
-        def kept(path: tuple[str, ...], tensor: Tensor) -> Tensor:
-            if path in self.unread:
-                return tensor.new_empty(()).expand(tensor.shape)
-            return tensor.clone() if self.copied else tensor
-
-        self.output, self.known = map_tensors(output, kept), True
-
-    def forget(self) -> None:
-        """Nothing is remembered, until the submodule has run for other arguments."""
-        self.output, self.known = None, False
+_FUSED = (
+    nn.MultiheadAttention.forward,
+    nn.TransformerEncoder.forward,
+    nn.TransformerEncoderLayer.forward,
+)
+"""Torch's own forwards that use a fused kernel only where no torch function mode is active."""
 
 
 @dataclass(frozen=True)
 class Moment:
-    """A time in a watched pass, by how much had happened before it."""
+    """A time in a watched pass, by the numbers of events before it."""
 
     operations: int
+    """Tensor operations."""
     touches: int
+    """Results that depend on z."""
     writes: int
+    """In-place changes."""
 
 
 class Watch(TorchDispatchMode):
-    """Sees every tensor operation of a pass.
+    """Sees every tensor operation of a pass, by the storages of its tensors.
 
-    It marks what depends on z by its storage, notes which operation made which storage and which
-    storages are changed in place, notes where a value (not a shape) gets out to Python (`escaped`;
-    `data_dependent` where it depends on z), and gives a remembered tensor its own copy just before
-    it would be changed in place.
+    It tracks which tensors depend on z, which operation created which storage, and which storages
+    change in place. A saved tensor is cloned just before it would be changed in place.
+
+    Args:
+        saved: Tensors to protect from in-place operations.
+        reads: Whether to note which storages are read.
     """
+
+    escaped: bool
+    """Whether a value of a tensor (not a shape) reached Python, which may branch on it."""
+    data_dependent: bool
+    """Whether such a value depended on z."""
+    torn: bool
+    """Whether z or the tensor it stands for was read after the other had been changed."""
 
     @classmethod
     def _should_skip_dynamo(cls) -> bool:
@@ -82,87 +69,96 @@ class Watch(TorchDispatchMode):
         # the whole compiler, a second in every run of the program.
         return False
 
-    def __init__(self, remembered: Iterable[Remembered], *, reads: bool = False) -> None:
+    def __init__(self, saved: Iterable[SavedTensors], *, reads: bool = False) -> None:
         super().__init__()  # type: ignore[no-untyped-call]
         self._reads: set[int] | None = set() if reads else None
         self.data_dependent = self.escaped = False
         self._operations = 0
         self._touches = 0
-        self._writes: list[int] = []  # which operation had made what was changed; 0: none seen here
-        self._made: dict[int, int] = {}
+        self._writes: list[int] = []  # operation that created the changed storage; 0: none
+        self._created: dict[int, int] = {}
         self._marked: set[int] = set()
-        self._protected: dict[int, list[Remembered]] = {}
+        self._protected: dict[int, list[SavedTensors]] = {}
         self._twins: tuple[Tensor, ...] = ()
         self._stale: set[int] = set()  # storages of a twin whose other was changed
         self.torn = False
-        for each in remembered:
+        self._function_mode, self._sees_escapes = _EscapeMode(self), False
+        for each in saved:
             self.protect(each)
 
     def touch(self, tensor: Tensor) -> None:
-        """Mark a tensor as depending on z."""
+        """Marks a tensor as depending on z."""
         self._touches += 1
         self._marked.add(_storage(tensor))
 
-    def replace(self, original: Tensor, z: Tensor) -> None:
-        """z stands for `original`; `torn` turns true if one is read after the other is changed."""
-        self._twins = (original, z)
+    def injected(self, z: Tensor, original: Tensor | None) -> None:
+        """Notes that the network goes on with z, in the place of `original` if that exists."""
+        self.touch(z)
+        if original is not None:
+            self._twins = (original, z)
 
-    def protect(self, remembered: Remembered) -> None:
-        """Save these tensors from in-place operations."""
-        output = remembered.output
+    def protect(self, saved: SavedTensors) -> None:
+        """Protects these tensors from in-place operations."""
+        value = saved.value
         # Parameters, of which there are many, come as tensors.
-        tensors = [output] if isinstance(output, Tensor) else [t for _, t in tensors_in(output)]
+        tensors = [value] if isinstance(value, Tensor) else [t for _, t in tensors_in(value)]
         for tensor in tensors:
-            self._protected.setdefault(_storage(tensor), []).append(remembered)
+            self._protected.setdefault(_storage(tensor), []).append(saved)
 
     def now(self) -> Moment:
-        """This moment, for `can_stand_for`."""
+        """Returns this moment, for `can_stand_for`."""
         return Moment(self._operations, self._touches, len(self._writes))
 
-    def can_stand_for(self, since: Moment, given: Any, output: Any) -> bool:
-        """True if handing back `output` does all that the call did which began at `since`.
+    def can_stand_for(self, since: Moment, inputs: Any, output: Any) -> bool:
+        """Whether returning `output` does all that the call did which began at `since`.
 
-        So it read nothing of z, changed nothing older than itself in place, and its output is
-        nothing but tensors that it made, no two of them in one memory.
+        So it did not depend on z, changed nothing older than itself in place, and its output
+        consists of tensors that it created, no two of them in the same memory.
         """
-        if self._marked and not (is_transparent(given) and not self._any_marked(given)):
-            self._touches += 1  # a native extension may read its arguments unseen
-        made_inside = [_storage(tensor) for _, tensor in tensors_in(output)]
-        made_inside = [s for s in made_inside if self._made.get(s, 0) > since.operations]
+        if self._marked and not (is_transparent(inputs) and not self._any_marked(inputs)):
+            self._touches += 1  # a native extension may read its arguments unnoticed
+        created_inside = [_storage(tensor) for _, tensor in tensors_in(output)]
+        created_inside = [s for s in created_inside if self._created.get(s, 0) > since.operations]
         if self._touches > since.touches:
-            self._marked.update(made_inside)
+            self._marked.update(created_inside)
             return False
         return (
             is_transparent(output)
-            and len(set(made_inside)) == sum(1 for _ in tensors_in(output))
-            and all(made > since.operations for made in self._writes[since.writes :])
+            and len(set(created_inside)) == sum(1 for _ in tensors_in(output))
+            and all(created > since.operations for created in self._writes[since.writes :])
         )
 
     @contextmanager
     def seeing_escapes(self) -> Iterator[None]:
-        """The two ways for values to get out that are no tensor operations are watched too.
-
-        In this thread alone; others may read and write files meanwhile.
-        """
-        names = ("numpy", "tolist")
-        for name in names:
-            setattr(Tensor, name, self._noticing(getattr(Tensor, name)))
+        """Watches the methods that give values to Python, too."""
+        self._sees_escapes = True
         try:
-            yield
+            with self._function_mode:
+                yield
         finally:
-            for name in names:
-                delattr(Tensor, name)
+            self._sees_escapes = False
 
-    def _noticing(self, method: Callable[..., Any]) -> Callable[..., Any]:
-        thread = threading.get_ident()
+    @contextmanager
+    def seeing_escapes_of(self, module: nn.Module) -> Iterator[None]:
+        """The same while this submodule runs, unless it is one of torch's fused layers."""
+        outer = self._sees_escapes
+        self._sees_escapes = getattr(type(module), "forward", None) not in _FUSED
+        try:
+            if self._sees_escapes and not outer:
+                with self._function_mode:
+                    yield
+            elif outer and not self._sees_escapes and self._function_mode.is_innermost():
+                with overrides._pop_mode_temporarily():
+                    yield
+            else:
+                yield
+        finally:
+            self._sees_escapes = outer
 
-        def wrapped(tensor: Tensor, *args: Any, **kwargs: Any) -> Any:
-            if threading.get_ident() == thread:
-                self.escaped = True
-                self.data_dependent |= self._any_marked(tensor)
-            return method(tensor, *args, **kwargs)
-
-        return wrapped
+    def note_escape(self, tensor: Tensor) -> None:
+        """Notes that values of the tensor reach Python."""
+        self.escaped = True
+        self.data_dependent |= self._is_marked(tensor)
 
     def __torch_dispatch__(
         self, func: Any, types: Any, args: Sequence[Any] = (), kwargs: Any = None
@@ -170,21 +166,21 @@ class Watch(TorchDispatchMode):
         kwargs = kwargs or {}
         facts = _facts(func)
         self._operations += 1
-        given: list[Tensor] = []
+        inputs: list[Tensor] = []
         if not facts.fresh or self._reads is not None:
-            given = [t for value in (*args, *kwargs.values()) for t in _tensors(value)]
-            self.note_reads(given)
-        self.torn |= bool(self._stale) and any(_storage(tensor) in self._stale for tensor in given)
-        written = [t for place, name in facts.writes for t in _argument(place, name, args, kwargs)]
+            inputs = [t for value in (*args, *kwargs.values()) for t in _tensors(value)]
+            self.note_reads(inputs)
+        self.torn |= bool(self._stale) and any(_storage(tensor) in self._stale for tensor in inputs)
+        written = [t for index, name in facts.writes for t in _argument(index, name, args, kwargs)]
         for tensor in written:
             self._before_write(tensor)
-        marked = bool(self._marked) and any(map(self._is_marked, given))
+        marked = bool(self._marked) and any(map(self._is_marked, inputs))
         result = func(*args, **kwargs)
         results = {_storage(tensor) for tensor in _tensors(result)}
-        made = results - {_storage(tensor) for tensor in given} - {_NO_STORAGE}
-        self._made.update(dict.fromkeys(made, self._operations))
-        # An address seen before may have been freed and given out again.
-        self._marked -= made
+        created = results - {_storage(tensor) for tensor in inputs} - {_NO_STORAGE}
+        self._created.update(dict.fromkeys(created, self._operations))
+        # An address seen before may have been freed and reused.
+        self._marked -= created
         if marked:
             self._touches += 1
             self._marked |= results | {_storage(tensor) for tensor in written}
@@ -193,34 +189,54 @@ class Watch(TorchDispatchMode):
         return result
 
     def note_reads(self, structure: Any) -> None:
-        """These tensors are used, as `was_read` will say; only where reads are wanted."""
+        """Notes that these tensors are read, if reads are noted at all."""
         if self._reads is not None:
             self._reads.update(_storage(tensor) for _, tensor in tensors_in(structure))
 
     def was_read(self, tensor: Tensor) -> bool:
-        """True if an operation or somebody else may have looked into the tensor's memory."""
+        """Whether an operation or anything else may have read the tensor's values."""
         return self._reads is None or _storage(tensor) in self._reads
 
     def _before_write(self, tensor: Tensor) -> None:
         storage = _storage(tensor)
-        self._writes.append(self._made.get(storage, 0))
+        self._writes.append(self._created.get(storage, 0))
         twins = {_storage(twin) for twin in self._twins}
         if storage in twins:
             self._stale |= twins - {storage}
-        for remembered in self._protected.pop(storage, []):
-            remembered.output = map_tensors(remembered.output, lambda _, t: t.clone())
-            remembered.copied = True
+        for saved in self._protected.pop(storage, []):
+            saved.value = map_tensors(saved.value, lambda _, t: t.clone())
+            saved.copied = True
 
     def _any_marked(self, value: Any) -> bool:
         return any(self._is_marked(tensor) for _, tensor in tensors_in(value))
 
     def _is_marked(self, tensor: Tensor) -> bool:
-        # Only z requires gradient, so what does comes from it, by whatever way.
+        # Only z requires gradient, so a tensor that does was computed from it.
         return tensor.requires_grad or _storage(tensor) in self._marked
 
 
+class _EscapeMode(TorchFunctionMode):
+    """Sees the methods by which values reach Python without a tensor operation."""
+
+    def __init__(self, watch: Watch) -> None:
+        super().__init__()
+        self._watch = watch
+
+    def __torch_function__(
+        self, func: Any, types: Any, args: Sequence[Any] = (), kwargs: Any = None
+    ) -> Any:
+        if func in _ESCAPES:
+            self._watch.note_escape(args[0])
+        return func(*args, **(kwargs or {}))
+
+    def is_innermost(self) -> bool:
+        """Whether no other torch function mode was entered after this one."""
+        innermost: object = overrides._get_current_function_mode()  # type: ignore[no-untyped-call]
+        return innermost is self
+
+
 _NO_STORAGE = 0
-"""Sparse tensors have none; they all share this mark."""
+"""The mark of sparse tensors, which have no storage."""
 
 
 def _storage(tensor: Tensor) -> int:
@@ -232,15 +248,14 @@ def _storage(tensor: Tensor) -> int:
 
 @dataclass(frozen=True)
 class _Facts:
-    """What an operation may do.
-
-    writes: the arguments it changes in place, by place and name. fresh: its results are always
-    new memory. escapes: values can get out of it to Python.
-    """
+    """What an operation may do, by its schema and tags."""
 
     writes: tuple[tuple[int, str], ...]
+    """Index and name of the arguments that it changes in place."""
     fresh: bool
+    """Whether its results are always new memory."""
     escapes: bool
+    """Whether it gives values, or shapes that depend on values, to Python."""
 
 
 @functools.cache
@@ -248,8 +263,8 @@ def _facts(func: Any) -> _Facts:
     schema = func._schema
     return _Facts(
         writes=tuple(
-            (place, argument.name)
-            for place, argument in enumerate(schema.arguments)
+            (index, argument.name)
+            for index, argument in enumerate(schema.arguments)
             if argument.alias_info is not None and argument.alias_info.is_write
         ),
         fresh=func.namespace == "aten" and all(r.alias_info is None for r in schema.returns),
@@ -258,8 +273,8 @@ def _facts(func: Any) -> _Facts:
     )
 
 
-def _argument(place: int, name: str, args: Sequence[Any], kwargs: Any) -> list[Tensor]:
-    return _tensors(args[place] if place < len(args) else kwargs.get(name))
+def _argument(index: int, name: str, args: Sequence[Any], kwargs: Any) -> list[Tensor]:
+    return _tensors(args[index] if index < len(args) else kwargs.get(name))
 
 
 def _tensors(value: Any) -> list[Tensor]:

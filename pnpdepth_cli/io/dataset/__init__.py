@@ -1,0 +1,1 @@
+"""A frame of a data set, and how its parts are read."""

@@ -1,4 +1,4 @@
-"""All files below a folder."""
+"""All files in a folder and in the folders in it."""
 
 from __future__ import annotations
 
@@ -12,26 +12,33 @@ from pnpdepth_cli.io.dataset.frame import Unmatched
 def find_files(
     folder: Path, suffixes: Iterable[str]
 ) -> tuple[dict[str, Path], tuple[Unmatched, ...]]:
-    """The files with one of these suffixes, by their place in the folder without the suffix.
+    """Returns the files with one of these suffixes, by relative path without suffix, and problems.
 
-    Links are followed, but not round in circles; hidden files and folders are left out. Sorted by
-    place. Also what is in the way: folders that cannot be read, and two files of one place.
+    Links are followed, except into a folder that they lie in. Hidden files and folders are skipped.
+
+    Args:
+        folder: Where to search; need not exist.
+        suffixes: In lower case.
+
+    Returns:
+        Files, sorted by path; and folders that cannot be read, and files that differ in suffix
+        only, which are left out.
     """
     wanted = set(suffixes)
     files: dict[str, Path] = {}
     broken: list[Unmatched] = []
-    twice: set[str] = set()
-    found = sorted(_walk(folder, frozenset(), broken)) if folder.is_dir() else ()
-    for path in found:
+    ambiguous: set[str] = set()
+    paths = sorted(_walk(folder, frozenset(), broken)) if folder.is_dir() else ()
+    for path in paths:
         if path.suffix.lower() not in wanted:
             continue
-        place = path.relative_to(folder).with_suffix("").as_posix()
-        if place in files:
-            why = f"and {files[place].name} are one frame; keep one"
+        name = path.relative_to(folder).with_suffix("").as_posix()
+        if name in files:
+            why = f"and {files[name].name} are one frame; keep one"
             broken.append(Unmatched(path=path, why=why))
-            twice.add(place)
-        files.setdefault(place, path)
-    return {place: path for place, path in files.items() if place not in twice}, tuple(broken)
+            ambiguous.add(name)
+        files.setdefault(name, path)
+    return {name: path for name, path in files.items() if name not in ambiguous}, tuple(broken)
 
 
 def _walk(folder: Path, above: frozenset[str], broken: list[Unmatched]) -> Iterator[Path]:

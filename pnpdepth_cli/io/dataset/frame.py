@@ -1,4 +1,4 @@
-"""One frame of a data set: where its parts are, and what is needed to read them."""
+"""One frame of a data set: its files, and what is needed to read them."""
 
 from __future__ import annotations
 
@@ -8,24 +8,26 @@ from pathlib import Path
 
 from pnpdepth_cli.errors import InputError
 from pnpdepth_cli.io.dataset.protocols import WHOLE, Protocol
-from pnpdepth_cli.io.formats import DEPTH_SUFFIXES
 
-PICTURES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".exr")
-DEPTHS = DEPTH_SUFFIXES
-SCANS = (".bin", ".pcd", ".ply")
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".exr")
+SCAN_ONLY_SUFFIXES = (".bin", ".pcd", ".ply")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Hdf5Array:
-    """An array in an HDF5 or MATLAB 7.3 file; index picks one of its first axis, if any.
-
-    axes: the order that makes the rest (H, W) or (H, W, 3).
-    """
+    """An array in an HDF5 or MATLAB 7.3 file."""
 
     path: Path
+    """The file."""
+
     name: str
+    """The array's name in the file."""
+
     axes: tuple[int, ...]
+    """Order of the axes that makes the array, without its indexed axis, (H, W) or (H, W, 3)."""
+
     index: int | None = None
+    """Which element of the first axis; None for the whole array."""
 
     def __str__(self) -> str:
         return f"{self.path}[{self.name}{'' if self.index is None else f', {self.index}'}]"
@@ -34,40 +36,56 @@ class Hdf5Array:
 Source = Path | Hdf5Array
 
 Pose = tuple[tuple[float, ...], ...]
-"""(3, 4): the rotation and, in the last column, the translation in metres."""
+"""(3, 4): rotation and, in the last column, translation in metres."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Frame:
-    """Parts that a frame does not have are None.
-
-    name: unique in its data set, and fit for the name of a file, in a folder of its own where it
-    contains a slash. sparse: a depth file, or a scan with calib; None where the protocol samples
-    the truth. *_scale: codes per metre of integer files.
-    calib, camera: as `read_calibration` takes them. protocol: what is cut out before anything else.
-    group: the sequence it belongs to; None leaves it to its name.
-    pose: x_world = pose · (x, 1) for points of KITTI's camera 0, whichever camera took the image.
-    """
+    """One frame; parts that it does not have are None."""
 
     name: str
+    """Unique in its data set, and fit for a file name; slashes separate folders."""
+
     image: Source | None = None
+    """The RGB image."""
+
     sparse: Path | None = None
+    """A depth file, a list of points, or a scan; None where points are sampled from `gt`."""
+
     gt: Source | None = None
+    """The ground truth depth."""
+
     calib: Path | None = None
+    """The calibration, as `read_calibration` takes it."""
+
     camera: int | None = None
+    """Which camera of the calibration."""
+
     sparse_scale: float | None = None
+    """Codes per metre of integer sparse depth."""
+
     gt_scale: float | None = None
+    """Codes per metre of integer ground truth."""
+
     protocol: Protocol = WHOLE
+    """The part of the frame that is used."""
+
     pose: Pose | None = None
+    """x_world = pose · (x, 1) for points of KITTI's camera 0, whichever camera took the image."""
+
     group: str | None = None
+    """The sequence it belongs to; None derives it from the name."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Unmatched:
-    """A file or folder that is no part of a frame, and why."""
+    """A file or folder that belongs to no frame."""
 
     path: Path
+    """The file or folder."""
+
     why: str
+    """The reason, as the end of a sentence that begins with the path."""
 
     def __str__(self) -> str:
         return f"{self.path} {self.why}"
@@ -75,17 +93,27 @@ class Unmatched:
 
 @dataclass(frozen=True, kw_only=True)
 class Listing:
-    """frames: in a fixed order. broken: why there are not more. spare: what lies there as well."""
+    """What a data set holds."""
 
     frames: list[Frame]
+    """Complete frames, in a fixed order."""
+
     broken: tuple[Unmatched, ...] = ()
+    """Files of frames that lack a part, or cannot be read."""
+
     spare: tuple[Unmatched, ...] = ()
+    """Other files beside them."""
 
 
 def by_stem(folder: Path, suffixes: Iterable[str]) -> dict[str, Path]:
-    """The files of a folder with one of these suffixes, by their stem and in its order.
+    """Returns the files of a folder with one of these suffixes by their stem, sorted.
 
-    InputError if two have the same stem.
+    Args:
+        folder: Need not exist.
+        suffixes: In lower case.
+
+    Raises:
+        InputError: Two files have the same stem.
     """
     wanted = set(suffixes)
     files: dict[str, Path] = {}
@@ -100,7 +128,7 @@ def by_stem(folder: Path, suffixes: Iterable[str]) -> dict[str, Path]:
 def without_partner(
     files: Mapping[str, Path], others: Mapping[str, Path], folder: Path
 ) -> tuple[Unmatched, ...]:
-    """The files of whose stem the folder, which holds the others, has none."""
+    """Returns the files whose stem is not among the others, which `folder` holds."""
     return tuple(
         Unmatched(path=path, why=f"has no partner {stem}.* in {folder}; add or remove one")
         for stem, path in files.items()

@@ -1,4 +1,4 @@
-"""Arrays out of HDF5 and MATLAB 7.3 files."""
+"""Arrays of HDF5 and MATLAB 7.3 files."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from pnpdepth_cli.io.file_bytes import check_value_count, one_line, size_of_regu
 
 
 def shape_of(path: Path, name: str) -> tuple[int, ...]:
-    """The shape of one array of the file."""
+    """Returns the shape of an array of the file. Raises InputError if it has none."""
     return tuple(_with_array(path, name, lambda array: array.shape))
 
 
 def rgb_of(source: Hdf5Array) -> NDArray[np.float32]:
-    """(H, W, 3) float32 in 0..1 of an array of bytes."""
+    """Returns (H, W, 3) float32 in 0..1 of an array of bytes. Raises InputError for another."""
     pixels = _read(source)
     if pixels.dtype != np.uint8 or pixels.ndim != 3 or pixels.shape[2] != 3:
         raise FileFormatError(f"{source} is {pixels.dtype} of shape {pixels.shape}, not an image")
@@ -30,7 +30,7 @@ def rgb_of(source: Hdf5Array) -> NDArray[np.float32]:
 
 
 def depth_of(source: Hdf5Array) -> NDArray[np.float32]:
-    """(H, W) float32 metres, 0 where unknown, of an array of floats."""
+    """Returns (H, W) float32 metres, 0 where unknown, of floats. Raises InputError for others."""
     metres = _read(source)
     if metres.dtype.kind != "f" or metres.ndim != 2:
         raise FileFormatError(f"{source} is {metres.dtype} of shape {metres.shape}, not depth")

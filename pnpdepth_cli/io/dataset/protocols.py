@@ -1,4 +1,4 @@
-"""What of a frame the paper's experiments use: halved or not, and a window of it."""
+"""The part of a frame that the paper's experiments use: halved or not, and a crop of it."""
 
 from __future__ import annotations
 
@@ -13,24 +13,34 @@ from pnpdepth_cli.errors import SizeError, UsageError
 
 @dataclass(frozen=True, kw_only=True)
 class Protocol:
-    """halved: every second pixel in both directions (nearest neighbour). crop: (H, W) of a window
-    in the middle, or at the bottom and in the middle across; None for all of it.
-    """
+    """The part of a frame that is used."""
 
     name: str
-    halved: bool = False
-    crop: tuple[int, int] | None = None
-    anchor: Literal["centre", "bottom"] = "centre"
+    """One of `choices.FRAME_PROTOCOLS`."""
 
-    def apply(self, picture: NDArray[Any]) -> NDArray[Any]:
-        """The part of a picture (H, W) or (H, W, C) that counts. SizeError if it is too small."""
-        top, left, height, width = self._window((picture.shape[0], picture.shape[1]))
+    halved: bool = False
+    """Every second pixel in both directions (nearest neighbour) is used."""
+
+    crop: tuple[int, int] | None = None
+    """(H, W) of the crop after halving; None for the whole image."""
+
+    anchor: Literal["centre", "bottom"] = "centre"
+    """Vertical position of the crop, which is centred horizontally."""
+
+    def apply(self, image: NDArray[Any]) -> NDArray[Any]:
+        """Returns the part of an image (H, W) or (H, W, C). Raises SizeError if it is too small."""
+        top, left, height, width = self._window((image.shape[0], image.shape[1]))
         # nearest neighbour at half the size: the pixel whose area holds the new pixel's centre
-        small = picture[1::2, 1::2] if self.halved else picture
+        small = image[1::2, 1::2] if self.halved else image
         return small[top : top + height, left : left + width]
 
-    def places(self, xy: NDArray[np.floating], size: tuple[int, int]) -> NDArray[np.float32]:
-        """Where the pixel coordinates (N, 2) of a picture of `size` (H, W) are in that part."""
+    def in_crop(self, xy: NDArray[np.floating], size: tuple[int, int]) -> NDArray[np.float32]:
+        """Returns pixel coordinates in that part.
+
+        Args:
+            xy: (N, 2) pixel coordinates in the whole image.
+            size: (H, W) of the whole image.
+        """
         top, left, _, _ = self._window(size)
         moved = (np.asarray(xy, np.float64) + 0.5) / 2 - 0.5 if self.halved else xy
         return np.asarray(moved - np.array([left, top]), np.float32)
@@ -58,7 +68,7 @@ PROTOCOLS = {
         WHOLE,
         Protocol(name="nyu", halved=True, crop=(228, 304)),
         Protocol(name="kitti-odometry", crop=(228, 912), anchor="bottom"),
-        # The benchmark scores all pixels with truth; its selection is cropped already.
+        # The benchmark scores all pixels with ground truth; its selection is cropped already.
         Protocol(name="kitti-depth"),
     )
 }
@@ -66,7 +76,7 @@ PROTOCOLS = {
 
 
 def find_protocol(name: str) -> Protocol:
-    """The protocol of this name. UsageError if there is none."""
+    """Returns the protocol of this name. Raises UsageError if there is none."""
     if name not in PROTOCOLS:
         raise UsageError(f"no protocol {name!r}; there are {', '.join(PROTOCOLS)}")
     return PROTOCOLS[name]

@@ -1,4 +1,4 @@
-"""The pictures of a frame in memory, cut to what its protocol uses."""
+"""Image and ground truth of a frame, cropped to what its protocol uses."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from pnpdepth_cli.io.rgb import read_rgb
 
 
 def read_frame_image(frame: Frame) -> NDArray[np.float32]:
-    """(H, W, 3) float32 in 0..1. InputError if the frame has no image."""
+    """Returns (H, W, 3) float32 in 0..1. Raises InputError if the frame has no image."""
     if frame.image is None:
         raise InputError(f"frame {frame.name} has no image")
     source = frame.image
@@ -21,12 +21,12 @@ def read_frame_image(frame: Frame) -> NDArray[np.float32]:
     return np.ascontiguousarray(frame.protocol.apply(rgb))
 
 
-def read_frame_truth(frame: Frame) -> NDArray[np.float32]:
-    """(H, W) float32 metres, 0 where unknown. InputError if the frame has no ground truth."""
+def read_frame_ground_truth(frame: Frame) -> NDArray[np.float32]:
+    """Returns (H, W) metres, 0 where unknown. Raises InputError if there is no ground truth."""
     if frame.gt is None:
         raise InputError(f"frame {frame.name} has no ground truth")
     if isinstance(frame.gt, Hdf5Array):
-        truth = depth_of(frame.gt)
+        depth = depth_of(frame.gt)
     else:
-        truth = read_depth(frame.gt, scale=frame.gt_scale).values
-    return np.ascontiguousarray(frame.protocol.apply(truth))
+        depth = read_depth(frame.gt, scale=frame.gt_scale).values
+    return np.ascontiguousarray(frame.protocol.apply(depth))

@@ -4,19 +4,19 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from pnpdepth_cli.io.dataset.frame import PICTURES, Frame, Listing, Unmatched
+from pnpdepth_cli.io.dataset.frame import IMAGE_SUFFIXES, Frame, Listing, Unmatched
 from pnpdepth_cli.io.layouts import Layout
 
 _SCALE = 1000.0
 
 
 def matches(root: Path) -> bool:
-    """True if there is a frame-*.color.* picture."""
+    """Returns whether there is a frame-*.color.* image."""
     return bool(_images(root))
 
 
 def listing(root: Path) -> Listing:
-    """One frame for each colour picture with depth."""
+    """Returns one frame for each colour image with depth."""
     shared = root / "camera-intrinsics.txt"
     frames, broken = [], []
     for image in _images(root):
@@ -39,8 +39,8 @@ def listing(root: Path) -> Listing:
 
 
 def _images(root: Path) -> list[Path]:
-    found = [*root.glob("frame-*.color.*"), *root.glob("seq-*/frame-*.color.*")]
-    return sorted(p for p in found if p.suffix.lower() in PICTURES)
+    paths = [*root.glob("frame-*.color.*"), *root.glob("seq-*/frame-*.color.*")]
+    return sorted(p for p in paths if p.suffix.lower() in IMAGE_SUFFIXES)
 
 
 LAYOUT = Layout(matches=matches, listing=listing)

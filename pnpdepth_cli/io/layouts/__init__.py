@@ -17,7 +17,7 @@ from pnpdepth_cli.choices import LAYOUTS
 from pnpdepth_cli.errors import InputError, UsageError
 from pnpdepth_cli.io.dataset.frame import Frame, Hdf5Array, Listing, Source, Unmatched
 from pnpdepth_cli.io.dataset.protocols import PROTOCOLS, Protocol, find_protocol
-from pnpdepth_cli.io.dataset.reading import read_frame_image, read_frame_truth
+from pnpdepth_cli.io.dataset.reading import read_frame_ground_truth, read_frame_image
 
 __all__ = [
     "LAYOUTS",
@@ -32,8 +32,8 @@ __all__ = [
     "find_layout",
     "find_protocol",
     "list_frames",
+    "read_frame_ground_truth",
     "read_frame_image",
-    "read_frame_truth",
     "read_frames",
 ]
 

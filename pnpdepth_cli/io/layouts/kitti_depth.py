@@ -2,8 +2,8 @@
 
 The selection (and the anonymous test set) has image/ velodyne_raw/ [groundtruth_depth/]
 [intrinsics/]. The tree has <drive>/proj_depth/{velodyne_raw,groundtruth}/image_0{2,3}/; the images
-come from the raw data, whose <drive>/image_0{2,3}/data/ is looked for in the same drive's folder,
-or below <date>/ or raw/<date>/.
+come from the raw data, whose <drive>/image_0{2,3}/data/ is searched in the same drive's folder, in
+<date>/ and in raw/<date>/.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import re
 from pathlib import Path
 
 from pnpdepth_cli.io.dataset.frame import (
-    PICTURES,
+    IMAGE_SUFFIXES,
     Frame,
     Listing,
     Unmatched,
@@ -29,12 +29,12 @@ _RAW = "proj_depth/velodyne_raw/image_0[23]"
 
 
 def matches(root: Path) -> bool:
-    """True for a folder of the selection, or one with drives in it or one folder below."""
+    """Returns whether this is the selection, or a folder with drives at most two levels below."""
     return _is_selection(root) or bool(_cameras(root))
 
 
 def listing(root: Path) -> Listing:
-    """One frame for each projected scan with an image."""
+    """Returns one frame for each projected scan with an image."""
     return _selection(root) if _is_selection(root) else _drives(root)
 
 
@@ -43,12 +43,12 @@ def _is_selection(root: Path) -> bool:
 
 
 def _selection(root: Path) -> Listing:
-    truth_folder = next(
+    gt_folder = next(
         (p for p in (root / "groundtruth_depth", root / "groundtruth") if p.is_dir()), root / "none"
     )
-    images = _by_frame(root / "image", PICTURES)
+    images = _by_frame(root / "image", IMAGE_SUFFIXES)
     scans = _by_frame(root / "velodyne_raw", _PNG)
-    truth = _by_frame(truth_folder, _PNG)
+    ground_truth = _by_frame(gt_folder, _PNG)
     intrinsics = _by_frame(root / "intrinsics", (".txt",))
     raw = root if (root / "calib_cam_to_cam.txt").is_file() else None
     frames = [
@@ -56,7 +56,7 @@ def _selection(root: Path) -> Listing:
             name=name,
             image=image,
             sparse=scans[name],
-            gt=truth.get(name),
+            gt=ground_truth.get(name),
             calib=intrinsics.get(name, raw),
             sparse_scale=_SCALE,
             gt_scale=_SCALE,
@@ -70,13 +70,13 @@ def _selection(root: Path) -> Listing:
         broken=without_partner(images, scans, root / "velodyne_raw"),
         spare=(
             *without_partner(scans, images, root / "image"),
-            *without_partner(truth, images, root / "image"),
+            *without_partner(ground_truth, images, root / "image"),
         ),
     )
 
 
 def _by_frame(folder: Path, suffixes: tuple[str, ...]) -> dict[str, Path]:
-    """The selection's names without the kind of file that stands in their middle."""
+    """The selection's files by name, without the kind of file in the middle of the name."""
     return {_KIND.sub("_sync_", stem): path for stem, path in by_stem(folder, suffixes).items()}
 
 
@@ -94,14 +94,14 @@ def _drives(root: Path) -> Listing:
         if images is None:
             broken.append(_without_images(root, drive, camera))
             continue
-        truth = by_stem(drive / "proj_depth" / "groundtruth" / camera, _PNG)
-        pictures, scans = by_stem(images, PICTURES), by_stem(folder, _PNG)
+        ground_truth = by_stem(drive / "proj_depth" / "groundtruth" / camera, _PNG)
+        rgb, scans = by_stem(images, IMAGE_SUFFIXES), by_stem(folder, _PNG)
         frames += [
             Frame(
                 name=f"{drive.name}_{stem}_{camera}",
-                image=pictures[stem],
+                image=rgb[stem],
                 sparse=scan,
-                gt=truth.get(stem),
+                gt=ground_truth.get(stem),
                 calib=calib,
                 camera=int(camera[-1]),
                 sparse_scale=_SCALE,
@@ -109,33 +109,33 @@ def _drives(root: Path) -> Listing:
                 protocol=PROTOCOLS["kitti-depth"],
             )
             for stem, scan in scans.items()
-            if stem in pictures
+            if stem in rgb
         ]
-        broken += without_partner(scans, pictures, images)
-        spare += without_partner(pictures, scans, folder)
-        spare += without_partner(truth, pictures, images)
+        broken += without_partner(scans, rgb, images)
+        spare += without_partner(rgb, scans, folder)
+        spare += without_partner(ground_truth, rgb, images)
     return Listing(frames=frames, broken=tuple(broken), spare=tuple(spare))
 
 
 def _images_of(root: Path, drive: Path, camera: str) -> tuple[Path | None, Path | None]:
-    """The folders of a drive's images and of its calibration, each if it is there."""
+    """The folders of a drive's images and of its calibration; None for one that is missing."""
     date = drive.name[:10]
-    for place in (drive, root / date / drive.name, root / "raw" / date / drive.name):
-        images = place / camera / "data"
+    for parent in (drive, root / date / drive.name, root / "raw" / date / drive.name):
+        images = parent / camera / "data"
         if images.is_dir():
             calib = next(
-                (p for p in (place.parent, place) if (p / "calib_cam_to_cam.txt").is_file()), None
+                (p for p in (parent.parent, parent) if (p / "calib_cam_to_cam.txt").is_file()), None
             )
             return images, calib
     return None, None
 
 
 def _without_images(root: Path, drive: Path, camera: str) -> Unmatched:
-    place = root / drive.name[:10]
+    date_folder = root / drive.name[:10]
     return Unmatched(
         path=drive,
         why=f"has no {camera}/data with images; put KITTI's raw drive {drive.name} there, or into"
-        f" {place}",
+        f" {date_folder}",
     )
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from pnpdepth_cli.io.dataset.frame import (
-    PICTURES,
+    IMAGE_SUFFIXES,
     Frame,
     Listing,
     Unmatched,
@@ -16,17 +16,17 @@ from pnpdepth_cli.io.layouts import Layout
 
 
 def matches(root: Path) -> bool:
-    """True if image_2/, velodyne/ and calib/ are in the folder or in its training/."""
+    """Returns whether image_2/, velodyne/ and calib/ are in the folder or in its training/."""
     return bool(_parts(root))
 
 
 def listing(root: Path) -> Listing:
-    """One frame for each image of the left colour camera with a scan and a calibration."""
+    """Returns one frame for each image of the left colour camera with scan and calibration."""
     frames: list[Frame] = []
     broken: list[Unmatched] = []
     spare: list[Unmatched] = []
     for part in _parts(root):
-        images = by_stem(part / "image_2", PICTURES)
+        images = by_stem(part / "image_2", IMAGE_SUFFIXES)
         scans = by_stem(part / "velodyne", (".bin",))
         calibrations = by_stem(part / "calib", (".txt",))
         prefix = "" if part == root else f"{part.name}_"

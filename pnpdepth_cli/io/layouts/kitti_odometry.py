@@ -1,7 +1,7 @@
 """`kitti-odometry`: sequences/NN/ with image_2/, velodyne/ and calib.txt, or one such sequence.
 
-The truth of its experiments is the scan itself. The training sequences, 00 to 10, have the poses
-of camera 0 in poses/NN.txt beside sequences/, a row of 12 numbers a frame.
+The ground truth of its experiments is the scan itself. The training sequences, 00 to 10, have the
+poses of camera 0 in poses/NN.txt beside sequences/, a row of 12 numbers per frame.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import numpy as np
 
 from pnpdepth_cli.errors import FileFormatError, InputError
 from pnpdepth_cli.io.dataset.frame import (
-    PICTURES,
+    IMAGE_SUFFIXES,
     Frame,
     Listing,
     Pose,
@@ -26,22 +26,24 @@ from pnpdepth_cli.io.layouts import Layout
 
 
 def matches(root: Path) -> bool:
-    """True if the folder holds sequences with scans, or is one."""
+    """Returns whether the folder holds sequences with scans, or is one."""
     return bool(_sequences(root))
 
 
 def listing(root: Path) -> Listing:
-    """One frame for each image of the left colour camera with a scan, sequence by sequence.
+    """Returns one frame for each image of the left colour camera with a scan, by sequence.
 
-    InputError for one without a row in a file of poses. Rows belong to frames by their number, so
-    that a part of a sequence keeps its own.
+    Poses belong to frames by number, so that a part of a sequence keeps its own.
+
+    Raises:
+        InputError: A frame has no row in an existing file of poses.
     """
     frames: list[Frame] = []
     broken: list[Unmatched] = []
     spare: list[Unmatched] = []
     for sequence in _sequences(root):
         scans = by_stem(sequence / "velodyne", (".bin",))
-        images = by_stem(sequence / "image_2", PICTURES)
+        images = by_stem(sequence / "image_2", IMAGE_SUFFIXES)
         poses = _poses(sequence)
         frames += [
             Frame(
@@ -73,7 +75,7 @@ def _sequences(root: Path) -> list[Path]:
 
 def _poses(sequence: Path) -> list[Pose] | None:
     """The poses of the sequence by frame number; None without a file."""
-    # the folders above "." are only in its absolute path
+    # the parents of "." are only in its absolute path
     folder = sequence.absolute()
     path = folder.parents[1] / "poses" / f"{folder.name}.txt"
     if not path.is_file():

@@ -29,12 +29,16 @@ _KEYS = (*_PATHS, *_NUMBERS, "name", "group", "protocol")
 
 
 def matches(root: Path) -> bool:
-    """True for a .csv or .jsonl file."""
+    """Returns whether this is a .csv or .jsonl file."""
     return root.is_file() and root.suffix.lower() in (".csv", ".jsonl")
 
 
 def listing(root: Path) -> Listing:
-    """One frame a line, also with files that do not exist. FileFormatError for a senseless line."""
+    """Returns one frame per line, also with files that do not exist.
+
+    Raises:
+        FileFormatError: A line is invalid, or two frames would share the files of their results.
+    """
     try:
         text = read_bytes(root).decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -44,7 +48,7 @@ def listing(root: Path) -> Listing:
     frames: list[Frame] = []
     broken: list[Unmatched] = []
     taken: dict[str, str] = {}
-    for (number, given), name in zip(parts, _names([p for _, p in parts]), strict=True):
+    for (number, values), name in zip(parts, _names([p for _, p in parts]), strict=True):
         same = taken.get(name.casefold())
         if same is not None:
             alike = "" if same == name else f", which some disks take for {same!r}"
@@ -52,27 +56,27 @@ def listing(root: Path) -> Listing:
                 f"{root}, line {number}: a second frame {one_line(name)!r}{alike}; name it"
             )
         taken[name.casefold()] = name
-        frames.append(Frame(**given | {"name": name}))
-        lost = [file for file in _files(given) if not file.exists()]
+        frames.append(Frame(**values | {"name": name}))
+        lost = [file for file in _files(values) if not file.exists()]
         why = f"does not exist; correct line {number} of {root}"
         broken += [Unmatched(path=file, why=why) for file in lost]
     return Listing(frames=frames, broken=tuple(broken))
 
 
-def _files(given: dict[str, Any]) -> list[Path]:
-    return [given[key] for key in _PATHS if key in given]
+def _files(values: dict[str, Any]) -> list[Path]:
+    return [values[key] for key in _PATHS if key in values]
 
 
 def _names(parts: Sequence[dict[str, Any]]) -> list[str]:
-    """A name for each frame: the given one, or the stem, or the place if stems come twice."""
-    unnamed = [_files(given)[0] for given in parts if "name" not in given]
+    """A name per frame: the line's own, else the stem, else the path if stems are not unique."""
+    unnamed = [_files(values)[0] for values in parts if "name" not in values]
     if len({path.stem for path in unnamed}) == len(unnamed):
-        return [given.get("name") or _files(given)[0].stem for given in parts]
+        return [values.get("name") or _files(values)[0].stem for values in parts]
     folder = os.path.commonpath([path.parent.absolute() for path in unnamed])
     return [
-        given.get("name")
-        or _files(given)[0].absolute().relative_to(folder).with_suffix("").as_posix()
-        for given in parts
+        values.get("name")
+        or _files(values)[0].absolute().relative_to(folder).with_suffix("").as_posix()
+        for values in parts
     ]
 
 
@@ -99,39 +103,39 @@ def _json_rows(path: Path, text: str) -> Iterator[tuple[int, dict[str, Any]]]:
 
 
 def _parts(path: Path, number: int, row: dict[str, Any]) -> dict[str, Any]:
-    """What a row says of its frame, by the frame's own names."""
+    """The fields of a `Frame` that a row gives."""
     where = f"{path}, line {number}"
-    given = {k: str(v).strip() for k, v in row.items() if v is not None and str(v).strip()}
-    unknown = sorted(set(given) - set(_KEYS))
+    values = {k: str(v).strip() for k, v in row.items() if v is not None and str(v).strip()}
+    unknown = sorted(set(values) - set(_KEYS))
     if unknown:
         commas = "; columns are parted by commas" if ";" in unknown[0] else ""
         raise FileFormatError(
             f"{where}: column {unknown[0]!r} is not one of {', '.join(_KEYS)}{commas}"
         )
-    files: dict[str, Any] = {k: path.parent / given[k] for k in _PATHS if k in given}
-    nul = next((k for k, v in given.items() if "\0" in v), None)
+    files: dict[str, Any] = {k: path.parent / values[k] for k in _PATHS if k in values}
+    nul = next((k for k, v in values.items() if "\0" in v), None)
     if nul is not None:
         raise FileFormatError(f"{where}: {nul} holds a NUL character; correct it")
     if "image" not in files and "sparse" not in files:
         raise FileFormatError(f"{where}: has neither image nor sparse; give one")
     try:
-        numbers: dict[str, Any] = {k: f(given[k]) for k, f in _NUMBERS.items() if k in given}
+        numbers: dict[str, Any] = {k: f(values[k]) for k, f in _NUMBERS.items() if k in values}
     except (ValueError, OverflowError) as error:
         raise FileFormatError(f"{where}: {one_line(error)}") from error
-    protocol = find_protocol(given["protocol"]) if "protocol" in given else WHOLE
-    group = {"group": given["group"]} if "group" in given else {}
-    return {"protocol": protocol, **_given_name(where, given), **group, **files, **numbers}
+    protocol = find_protocol(values["protocol"]) if "protocol" in values else WHOLE
+    group = {"group": values["group"]} if "group" in values else {}
+    return {"protocol": protocol, **_given_name(where, values), **group, **files, **numbers}
 
 
-def _given_name(where: str, given: dict[str, str]) -> dict[str, str]:
-    if "name" not in given:
+def _given_name(where: str, values: dict[str, str]) -> dict[str, str]:
+    if "name" not in values:
         return {}
-    problem = portable_name_problem(given["name"])
+    problem = portable_name_problem(values["name"])
     if problem is not None:
         raise FileFormatError(
-            f"{where}: name {one_line(given['name'])[:60]!r} {problem}; choose another"
+            f"{where}: name {one_line(values['name'])[:60]!r} {problem}; choose another"
         )
-    return {"name": normalised_name(given["name"])}
+    return {"name": normalised_name(values["name"])}
 
 
 LAYOUT = Layout(matches=matches, listing=listing)

@@ -17,12 +17,12 @@ _WIDEST_KINECT = 1000  # pixels; NYU's frames have 640, KITTI's 1224 or more
 
 
 def matches(root: Path) -> bool:
-    """True if .h5 files are in the folder or at most two below it."""
+    """Returns whether .h5 files are in the folder or at most two levels below."""
     return bool(_h5_files(root))
 
 
 def listing(root: Path) -> Listing:
-    """One frame a file, with rgb (3, H, W) and depth (H, W) in it."""
+    """Returns one frame per file, with rgb (3, H, W) and depth (H, W) in it."""
     files = _h5_files(root)
     protocol = _protocol_of(files)
     frames = [
@@ -42,12 +42,12 @@ def _h5_files(root: Path) -> list[Path]:
 
 
 def _protocol_of(files: list[Path]) -> Protocol:
-    """What the first file that can be read asks for."""
+    """The protocol for the width of the first file that can be read."""
     for path in files:
         try:
             width = shape_of(path, "depth")[-1]
         except FileFormatError:
-            continue  # it is named when it is its turn
+            continue  # it is reported when the frame is read
         return PROTOCOLS["kitti-odometry" if width > _WIDEST_KINECT else "nyu"]
     return PROTOCOLS["nyu"]
 

@@ -20,12 +20,12 @@ _LABELED = "nyu_depth_v2_labeled.mat"
 
 
 def matches(root: Path) -> bool:
-    """True for the official file, or a folder with it."""
+    """Returns whether this is the official file, or a folder with it."""
     return _labeled(root).is_file()
 
 
 def listing(root: Path) -> Listing:
-    """The frames of the split beside the file, or all of them; numbered from 1 as there."""
+    """Returns the frames of the test set, or all without a split; numbered from 1."""
     path = _labeled(root)
     count = shape_of(path, "depths")[0]
     frames = [
@@ -45,7 +45,7 @@ def _labeled(root: Path) -> Path:
 
 
 def _split(folder: Path, count: int) -> list[int]:
-    """The numbers of the test set, sorted; empty if there is no file that says them."""
+    """The numbers of the test set, sorted; empty without a file of them."""
     text, matlab = folder / "test.txt", folder / "splits.mat"
     if text.is_file():
         source = text

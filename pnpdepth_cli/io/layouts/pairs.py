@@ -1,7 +1,7 @@
-"""`pairs`: rgb/ and sparse/, and perhaps gt/ and calib/, with the same stems.
+"""`pairs`: rgb/ and sparse/, and optionally gt/ and calib/, with files of the same stems.
 
-Folders in them are looked into as well: rgb/drive_1/000.png goes with sparse/drive_1/000.png.
-calib/ has one file a frame; a calib.txt beside the folders holds for all.
+Folders in them are searched too: rgb/drive_1/000.png belongs to sparse/drive_1/000.png. calib/ has
+one file per frame; a calib.txt beside the folders applies to all.
 """
 
 from __future__ import annotations
@@ -9,22 +9,30 @@ from __future__ import annotations
 from pathlib import Path
 
 from pnpdepth_cli.io.dataset.find_files import find_files
-from pnpdepth_cli.io.dataset.frame import DEPTHS, PICTURES, SCANS, Frame, Listing, without_partner
+from pnpdepth_cli.io.dataset.frame import (
+    IMAGE_SUFFIXES,
+    SCAN_ONLY_SUFFIXES,
+    Frame,
+    Listing,
+    without_partner,
+)
+from pnpdepth_cli.io.formats import DEPTH_SUFFIXES
 from pnpdepth_cli.io.layouts import Layout
 
+_SPARSE_SUFFIXES = (*DEPTH_SUFFIXES, *SCAN_ONLY_SUFFIXES, ".csv")
 _CALIBRATIONS = (".txt", ".json", ".yaml", ".yml")
 
 
 def matches(root: Path) -> bool:
-    """True if the folder has rgb/ and sparse/."""
+    """Returns whether the folder has rgb/ and sparse/."""
     return (root / "rgb").is_dir() and (root / "sparse").is_dir()
 
 
 def listing(root: Path) -> Listing:
-    """One frame for each image with sparse depth."""
-    images, lost_images = find_files(root / "rgb", PICTURES)
-    sparse, lost_sparse = find_files(root / "sparse", (*DEPTHS, *SCANS, ".csv"))
-    gt, lost_gt = find_files(root / "gt", DEPTHS)
+    """Returns one frame for each image with sparse depth."""
+    images, lost_images = find_files(root / "rgb", IMAGE_SUFFIXES)
+    sparse, lost_sparse = find_files(root / "sparse", _SPARSE_SUFFIXES)
+    gt, lost_gt = find_files(root / "gt", DEPTH_SUFFIXES)
     calib, lost_calib = find_files(root / "calib", _CALIBRATIONS)
     shared = root / "calib.txt"
     frames = [

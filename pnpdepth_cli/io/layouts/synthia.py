@@ -5,8 +5,8 @@ NNNNNN.png in both. SYNTHIA-RAND-CITYSCAPES has RGB/NNNNNNN.png and Depth/Depth/
 Depth/NNNNNNN.png. Depth is in centimetres, in 16-bit PNGs of one channel or three equal ones; the
 sky's 65535 is unknown.
 
-No file here is a calibration that `read_calibration` takes, so frames have none. All pictures have
-1280×760 pixels and fx = fy = 532.740352, cx = 640, cy = 380, as a plain file says it:
+The data set has no calibration that `read_calibration` reads, so frames have none. All images have
+1280×760 pixels and fx = fy = 532.740352, cx = 640, cy = 380. As a plain file:
 
     K: [532.740352, 0, 640,  0, 532.740352, 380,  0, 0, 1]
     size: [1280, 760]
@@ -30,24 +30,24 @@ _RANDOM_STEM = re.compile(r"\d{7}")
 
 
 def matches(root: Path) -> bool:
-    """True if the folder, or one in it, is a video sequence or the random set."""
+    """Returns whether the folder, or one in it, is a video sequence or the random set."""
     return any(True for _ in _cameras(root))
 
 
 def listing(root: Path) -> Listing:
-    """One frame for each picture of each camera with depth."""
+    """Returns one frame for each image of each camera with depth."""
     frames: list[Frame] = []
     broken: list[Unmatched] = []
     spare: list[Unmatched] = []
-    for prefix, pictures, folder in _cameras(root):
-        images, depths = by_stem(pictures, _PNG), by_stem(folder, _PNG)
+    for prefix, rgb, folder in _cameras(root):
+        images, depths = by_stem(rgb, _PNG), by_stem(folder, _PNG)
         frames += [
             Frame(name="_".join([*prefix, stem]), image=image, gt=depths[stem], gt_scale=_SCALE)
             for stem, image in images.items()
             if stem in depths
         ]
         broken += without_partner(images, depths, folder)
-        spare += without_partner(depths, images, pictures)
+        spare += without_partner(depths, images, rgb)
     return Listing(frames=frames, broken=tuple(broken), spare=tuple(spare))
 
 
@@ -61,20 +61,20 @@ def _has_synthias_size(image: Path) -> bool:
 
 
 def _cameras(root: Path) -> Iterator[tuple[list[str], Path, Path]]:
-    """What its frames' names begin with, its pictures and its depth, for each camera."""
-    for pictures in sorted(p for start in ("", "*/") for p in root.glob(f"{start}RGB")):
-        part, depth = pictures.parent, pictures.with_name("Depth")
+    """The start of its frames' names, its folder of images and of depth, for each camera."""
+    for rgb in sorted(p for start in ("", "*/") for p in root.glob(f"{start}RGB")):
+        part, depth = rgb.parent, rgb.with_name("Depth")
         if not depth.is_dir():
             continue
         prefix = [] if part == root else [part.name]
-        for camera in sorted(p for p in pictures.glob(_CAMERAS) if p.is_dir()):
-            place = camera.relative_to(pictures)
-            yield [*prefix, *place.parts], camera, depth / place
+        for camera in sorted(p for p in rgb.glob(_CAMERAS) if p.is_dir()):
+            name = camera.relative_to(rgb)
+            yield [*prefix, *name.parts], camera, depth / name
         # RGB and Depth are common names; numbers and size tell the random set from other data.
-        random = (p for p in sorted(pictures.glob("*.png")) if _RANDOM_STEM.fullmatch(p.stem))
+        random = (p for p in sorted(rgb.glob("*.png")) if _RANDOM_STEM.fullmatch(p.stem))
         first = next(random, None)
         if first is not None and _has_synthias_size(first):
-            yield prefix, pictures, depth / "Depth" if (depth / "Depth").is_dir() else depth
+            yield prefix, rgb, depth / "Depth" if (depth / "Depth").is_dir() else depth
 
 
 LAYOUT = Layout(matches=matches, listing=listing)

@@ -1,14 +1,15 @@
-"""`tum`: TUM RGB-D, rgb.txt and depth.txt with a time and a path a line, paired by time."""
+"""`tum`: TUM RGB-D, rgb.txt and depth.txt with a time and a path per line, paired by time."""
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import numpy as np
 
 from pnpdepth_cli.errors import FileFormatError
 from pnpdepth_cli.io.dataset.frame import Frame, Listing, Unmatched
-from pnpdepth_cli.io.file_bytes import one_line, read_bytes
+from pnpdepth_cli.io.file_bytes import check_value_count, one_line, read_bytes
 from pnpdepth_cli.io.layouts import Layout
 
 _SCALE = 5000.0
@@ -17,18 +18,16 @@ _LONGEST_GAP_S = 0.02
 
 
 def matches(root: Path) -> bool:
-    """True if the folder has rgb.txt and depth.txt."""
+    """Returns whether the folder has rgb.txt and depth.txt."""
     return (root / "rgb.txt").is_file() and (root / "depth.txt").is_file()
 
 
 def listing(root: Path) -> Listing:
-    """One frame for each image with a depth image at most 0.02 s away; each is used once."""
+    """Returns one frame for each image with a depth image within 0.02 s; each is used once."""
     images, depths = _listed(root / "rgb.txt"), _listed(root / "depth.txt")
-    gap = np.abs(np.subtract.outer([t for t, _ in images], [t for t, _ in depths]))
-    close = np.argwhere(gap <= _LONGEST_GAP_S)
     partner_of: dict[int, int] = {}
     taken: set[int] = set()
-    for image, depth in close[np.argsort(gap[tuple(close.T)], kind="stable")].tolist():
+    for image, depth in _close_pairs(root, [t for t, _ in images], [t for t, _ in depths]):
         if image not in partner_of and depth not in taken:
             partner_of[image] = depth
             taken.add(depth)
@@ -57,6 +56,22 @@ def listing(root: Path) -> Listing:
     return Listing(frames=frames, spare=tuple(spare))
 
 
+def _close_pairs(
+    root: Path, image_times: list[float], depth_times: list[float]
+) -> list[tuple[int, int]]:
+    """Indices of images and depths at most 0.02 s apart, the closest first; times are sorted."""
+    images, depths = np.array(image_times), np.array(depth_times)
+    first = np.searchsorted(depths, images - 2 * _LONGEST_GAP_S)
+    count = np.searchsorted(depths, images + 2 * _LONGEST_GAP_S, side="right") - first
+    check_value_count(root, int(count.sum()))
+    image = np.repeat(np.arange(len(images)), count)
+    depth = np.arange(len(image)) + np.repeat(first - np.cumsum(count) + count, count)
+    gap = np.abs(images[image] - depths[depth])
+    pairs = np.column_stack([image, depth])[gap <= _LONGEST_GAP_S]
+    order = np.argsort(gap[gap <= _LONGEST_GAP_S], kind="stable")
+    return [(int(i), int(j)) for i, j in pairs[order]]
+
+
 def _listed(path: Path) -> list[tuple[float, Path]]:
     entries = []
     for number, line in enumerate(read_bytes(path).decode("utf-8", "replace").splitlines(), 1):
@@ -64,6 +79,8 @@ def _listed(path: Path) -> list[tuple[float, Path]]:
         if not words:
             continue
         try:
+            if not math.isfinite(float(words[0])):
+                raise ValueError("not finite")
             entries.append((float(words[0]), path.parent / words[1]))
         except (ValueError, IndexError) as error:
             raise FileFormatError(

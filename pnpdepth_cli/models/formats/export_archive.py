@@ -1,8 +1,8 @@
-"""What a torch.export archive may hold, looked at before torch reads it.
+"""Checks a torch.export archive before torch reads it.
 
 `torch.export.load` trusts its file: it unpickles constants and inputs, evaluates expressions of
 sizes and the code of guards, loads compiled libraries, finds functions by dotted names and writes
-names into source code. Here everything but tensors as plain bytes, operators of torch and
+names into source code. Here everything but tensors as plain bytes, operators of torch and small
 arithmetic is refused (layout and schema: torch/export/pt2_archive, torch/_export/serde/schema.py).
 """
 
@@ -17,11 +17,11 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-import torch
 from torch.export.pt2_archive import PT2ArchiveReader
 
-from pnpdepth_cli.core.split.user_code import describe
 from pnpdepth_cli.errors import ModelError
+from pnpdepth_cli.models.weights.pickle_reader import READ_ERRORS, BrokenFileError, brief
+from pnpdepth_cli.models.weights.tensor_pickle import read_tensors
 
 _MODEL = "models/model.json"
 _INPUTS = "data/sample_inputs/model.pt"
@@ -53,6 +53,11 @@ _FUNCTIONS = frozenset(
         *("Identity", "IsNonOverlappingAndDenseIndicator"),
     }
 )
+_POWERS = frozenset({"Pow", "PowByNatural", "FloatPow", "LShift"})
+_MAX_EXPONENT = 8
+_MAX_POWERS = 4  # in one expression; together they keep every number below a few thousand digits
+_MAX_EXPRESSION = 10_000  # characters
+_MAX_DIGITS = 20
 _EXPRESSIONS = (
     *(ast.Expression, ast.Call, ast.keyword, ast.Name, ast.Load, ast.Constant),
     *(ast.BinOp, ast.UnaryOp, ast.operator, ast.unaryop, ast.Compare, ast.cmpop),
@@ -60,11 +65,15 @@ _EXPRESSIONS = (
 
 
 class _Refused(Exception):
-    """What is not taken, in a few words."""
+    """What is refused, in a few words."""
 
 
 def check_archive(file: Path) -> None:
-    """ModelError if reading or running the archive could do anything but compute with tensors."""
+    """Checks that reading and running the archive can only compute with tensors.
+
+    Raises:
+        ModelError: It could do something else.
+    """
     reader = PT2ArchiveReader(str(file))
     try:
         names = reader.get_file_names()
@@ -74,6 +83,8 @@ def check_archive(file: Path) -> None:
         with zipfile.ZipFile(file) as archive:  # torch reads an older layout by this, if it fails
             if sorted(name.partition("/")[2] for name in archive.namelist()) != sorted(names):
                 raise _Refused("it holds other files for one reader than for another")
+            if any(info.compress_type != zipfile.ZIP_STORED for info in archive.infolist()):
+                raise _Refused("it is compressed, which torch never does")
         for name in _CONFIGS:
             _check_tensors(json.loads(reader.read_bytes(name)))
         _check_inputs(reader.read_bytes(_INPUTS))
@@ -93,16 +104,18 @@ def _check_tensors(config: Any) -> None:
 
 
 def _check_inputs(content: bytes) -> None:
+    """The inputs are tensors in plain containers; anything else torch would unpickle and run."""
     try:
-        torch.load(io.BytesIO(content), weights_only=True)
-    except Exception as error:  # torch raises many kinds, all of which make it unpickle the rest
-        raise _Refused(
-            f"its example inputs are more than tensors ({describe(error)[:60]})"
-        ) from None
+        inputs = read_tensors(io.BytesIO(content))
+    except (BrokenFileError, zipfile.BadZipFile, *READ_ERRORS) as error:
+        raise _Refused(f"its example inputs are no tensors ({brief(error)[:60]})") from None
+    names = [name for name in inputs.named if not name.startswith(("torch.", "collections."))]
+    if names or inputs.has_stand_ins:
+        raise _Refused(f"its example inputs are more than tensors ({', '.join(names)[:60]})")
 
 
 def _check(value: Any) -> None:
-    """Everything in the program: what is called, what is evaluated, what is written as source."""
+    """Checks everything in the program that is called, evaluated or written as source code."""
     if isinstance(value, str):
         _word(value)
     elif isinstance(value, list):
@@ -115,7 +128,7 @@ def _check(value: Any) -> None:
 
 def _check_entry(key: str, value: Any) -> None:
     if key in ("metadata", "guards_code", "as_string", "as_strings"):
-        return  # for people; not asked for (see `exported_definition`); quoted wherever it stands
+        return  # for people, or not evaluated (see `exported_definition`), or quoted
     if key == "range_constraints":
         _expressions(value)
     elif key == "expr_str":
@@ -140,16 +153,45 @@ def _word(text: str) -> None:
 def _expressions(texts: Iterable[str]) -> None:
     for text in texts:
         try:
-            nodes = list(ast.walk(ast.parse(text, mode="eval")))
+            nodes = list(ast.walk(ast.parse(text[:_MAX_EXPRESSION], mode="eval")))
         except (SyntaxError, ValueError, RecursionError, MemoryError):
             nodes = []
         if not nodes or not all(map(_is_arithmetic, nodes)):
             raise _Refused(f"the size {text[:80]!r} is no arithmetic")
+        powers = [exponent for node in nodes for exponent in _exponents(node)]
+        if len(powers) > _MAX_POWERS or any(not _is_small(power) for power in powers):
+            raise _Refused(f"the size {text[:80]!r} has powers without end")
 
 
 def _is_arithmetic(node: ast.AST) -> bool:
     if isinstance(node, ast.Call):
         return isinstance(node.func, ast.Name) and node.func.id in _FUNCTIONS
     if isinstance(node, ast.Constant) and isinstance(node.value, str):
-        return _WORD.fullmatch(node.value) is not None
+        short = len(node.value) <= _MAX_DIGITS or not node.value.isdigit()
+        return short and _WORD.fullmatch(node.value) is not None
+    if isinstance(node, ast.Constant) and isinstance(node.value, int):
+        return bool(abs(node.value) < 10**_MAX_DIGITS)
     return isinstance(node, _EXPRESSIONS)
+
+
+def _exponents(node: ast.AST) -> list[ast.AST | None]:
+    """The exponents of a power or of a shift; None for one that is given in no plain way."""
+    if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Pow | ast.LShift):
+        return [node.right]
+    if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in _POWERS:
+        return [node.args[1] if len(node.args) == 2 else None]
+    return []
+
+
+def _is_small(exponent: ast.AST | None) -> bool:
+    """True for a small number, as 2, -1, Integer(2) or Rational(1, 2)."""
+    if isinstance(exponent, ast.UnaryOp):
+        return _is_small(exponent.operand)
+    if isinstance(exponent, ast.Call) and isinstance(exponent.func, ast.Name):
+        number = exponent.func.id in ("Integer", "Float", "Rational")
+        return number and all(map(_is_small, exponent.args))
+    value = exponent.value if isinstance(exponent, ast.Constant) else None
+    try:
+        return abs(float(value)) <= _MAX_EXPONENT  # type: ignore[arg-type]
+    except (TypeError, ValueError):
+        return False

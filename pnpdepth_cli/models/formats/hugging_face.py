@@ -1,8 +1,8 @@
 """A local Hugging Face folder as a definition: config.json, preprocessor_config.json, safetensors.
 
-Needs `pip install pnpdepth[hf]`. The network is transformers' own class, with code from that
-package only; nothing is downloaded. The picture is prepared by what preprocessor_config.json
-says, on this program's own frame map, so torchvision is not needed.
+Needs `pip install pnpdepth[hf]`. The network is a class of transformers, with code from that
+package only; nothing is downloaded. The image is resized and normalised as preprocessor_config.json
+says, by this program's own code, so torchvision is not needed.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from pnpdepth_cli.completion.interpolation import linear
 from pnpdepth_cli.core.split.user_code import describe
 from pnpdepth_cli.errors import CheckpointError, ModelError
 from pnpdepth_cli.models.definition import (
-    FOREIGN,
+    UNTUNED_DEFAULTS,
     Fixed,
     ModelDefinition,
     Near,
@@ -34,13 +34,20 @@ _WEIGHTS = ("model.safetensors", "model.safetensors.index.json")
 _PICKLED = ("pytorch_model.bin", "pytorch_model.bin.index.json")
 
 
+_MAX_SIDE = 1 << 16  # pixels
+_PLAIN_ATTENTION = ("eager", "sdpa")
+
+
 @dataclass(frozen=True)
 class _Family:
-    """What the classes of one model type give, and the multiple their picture's sides must be."""
+    """What the networks of one model type predict."""
 
     kind: OutputKind
+    """See `ModelDefinition.output_kind`."""
     scale: OutputScale
+    """See `ModelDefinition.output_scale`."""
     of: int = 1
+    """The sides of the image must be multiples of this."""
 
 
 PROMPT_SIZE = (192, 256)
@@ -60,17 +67,27 @@ _FAMILIES = {
 
 
 def hf_definition(folder: Path) -> ModelDefinition:
-    """The definition of a depth network in a folder. ModelError where it cannot be run."""
+    """Returns the definition of a depth network in a Hugging Face folder.
+
+    Args:
+        folder: Has config.json, preprocessor_config.json and model.safetensors, as downloaded.
+
+    Raises:
+        ModelError: A file is missing or wrong, or the type of network is not known.
+        CheckpointError: Its weights are missing, or are pickles.
+    """
     config = _json(folder / "config.json", "it says which network this is")
-    kind = str(config.get("model_type"))
-    if kind not in _FAMILIES:
+    kind = config.get("model_type")
+    if not isinstance(kind, str) or kind not in _FAMILIES:
         raise ModelError(
-            f"{folder}: networks of type {kind!r} are not known; known: {', '.join(_FAMILIES)}"
+            f"{folder}: networks of type {str(kind)[:60]!r} are not known; known:"
+            f" {', '.join(_FAMILIES)}"
         )
+    _refuse_foreign_attention(config, folder)
     family = _FAMILIES[kind]
     if config.get("depth_estimation_type") == "metric":
         family = _Family("depth", "metric", family.of)
-    processing = _json(folder / "preprocessor_config.json", "it says how the picture is prepared")
+    processing = _json(folder / "preprocessor_config.json", "it says how the image is prepared")
     weights, prompted = _weights(folder), kind == "prompt_depth_anything"
     return ModelDefinition(
         name=folder.resolve().name,
@@ -85,12 +102,34 @@ def hf_definition(folder: Path) -> ModelDefinition:
         checkpoint=weights,
         arguments=_with_prompt if prompted else None,
         output=_predicted_depth,
-        defaults=FOREIGN,
+        defaults=UNTUNED_DEFAULTS,
     )
 
 
+def _refuse_foreign_attention(config: Mapping[str, Any], folder: Path) -> None:
+    """ModelError if the settings name an attention that transformers may download and run."""
+    pending: list[Any] = [config]
+    while pending:
+        value = pending.pop()
+        if isinstance(value, list):
+            pending += value
+        if not isinstance(value, Mapping):
+            continue
+        for key, setting in value.items():
+            if "attn_implementation" in key and isinstance(setting, str):
+                if setting not in _PLAIN_ATTENTION:
+                    raise ModelError(
+                        f"{folder / 'config.json'}: {key} {setting[:60]!r} may fetch and run code;"
+                        f" only {' and '.join(_PLAIN_ATTENTION)} are taken, remove the entry"
+                    )
+            elif "attn_implementation" in key and isinstance(setting, Mapping):
+                pending += [{key: one} for one in setting.values()]
+            else:
+                pending.append(setting)
+
+
 def _with_prompt(rgb: Tensor | None, sparse: Tensor | None) -> tuple[Tensor, ...]:
-    """The picture and coarse dense depth (1, 1, 192, 256): the points, joined linearly."""
+    """The image and coarse dense depth (1, 1, 192, 256), interpolated linearly from the points."""
     assert rgb is not None
     assert sparse is not None
     rows, columns = torch.nonzero(sparse[0, 0], as_tuple=True)
@@ -114,12 +153,12 @@ def _json(file: Path, why: str) -> Mapping[str, Any]:
             " from the network's page"
         )
     try:
-        read = json.loads(file.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise ModelError(f"{file} is not JSON: {error}") from None
-    if not isinstance(read, dict):
+        settings = json.loads(file.read_text(encoding="utf-8"))
+    except (ValueError, RecursionError) as error:
+        raise ModelError(f"{file} is not JSON: {describe(error)[:160]}") from None
+    if not isinstance(settings, dict):
         raise ModelError(f"{file} holds no settings")
-    return read
+    return settings
 
 
 def _weights(folder: Path) -> Path:
@@ -136,45 +175,59 @@ def _weights(folder: Path) -> Path:
 
 def _size(processing: Mapping[str, Any], of: int, folder: Path) -> Fixed | Near:
     if not processing.get("do_resize", True) or "size_divisor" in processing:
-        return Near(of=max(of, int(processing.get("size_divisor") or 1)))
+        return Near(of=max(of, _side(processing, "size_divisor", folder)))
     size = processing.get("size")
     if isinstance(size, Mapping):
         height = size.get("height") or size.get("shortest_edge")
         width = size.get("width") or size.get("shortest_edge")
     else:
         height = width = size
-    if not isinstance(height, int) or not isinstance(width, int) or min(height, width) < 1:
+    if not all(isinstance(side, int) and 1 <= side <= _MAX_SIDE for side in (height, width)):
         raise ModelError(
-            f"{folder / 'preprocessor_config.json'}: size {size!r} is no height and width"
+            f"{folder / 'preprocessor_config.json'}: size {str(size)[:60]} is no height and width"
         )
+    assert isinstance(height, int)
+    assert isinstance(width, int)
     if not processing.get("keep_aspect_ratio", False):
         return Fixed(height, width)
     return Near(
-        of=max(of, int(processing.get("ensure_multiple_of") or 1)), height=height, width=width
+        of=max(of, _side(processing, "ensure_multiple_of", folder)), height=height, width=width
     )
 
 
+def _side(processing: Mapping[str, Any], key: str, folder: Path) -> int:
+    """A number of pixels; 1 if there is none."""
+    value = processing.get(key) or 1
+    if not isinstance(value, int) or not 1 <= value <= _MAX_SIDE:
+        raise ModelError(
+            f"{folder / 'preprocessor_config.json'}: {key} {str(value)[:60]!r} is no number of"
+            " pixels"
+        )
+    return value
+
+
 def _normalisation(processing: Mapping[str, Any], folder: Path) -> Normalisation:
-    # A picture in 0…255 where it is not rescaled: 1/255 of the deviation does the same.
-    unit = float(processing.get("rescale_factor", 1 / 255)) * 255
-    unit = unit if processing.get("do_rescale", True) else 255.0
-    if not processing.get("do_normalize", "image_mean" in processing):
-        return Normalisation(std=(1 / unit, 1 / unit, 1 / unit))
+    # An image that is not rescaled is in 0…255: a standard deviation of 1/255 does the same.
+    factor = processing.get("rescale_factor", 1 / 255)
     mean, std = processing.get("image_mean", (0.5,) * 3), processing.get("image_std", (0.5,) * 3)
     try:
+        unit = float(factor) * 255 if processing.get("do_rescale", True) else 255.0
+        if not processing.get("do_normalize", "image_mean" in processing):
+            return Normalisation(std=(1 / unit, 1 / unit, 1 / unit))
         (m0, m1, m2), (s0, s1, s2) = mean, std
         return Normalisation(
             mean=(m0 / unit, m1 / unit, m2 / unit), std=(s0 / unit, s1 / unit, s2 / unit)
         )
-    except (TypeError, ValueError, ModelError):
+    except (TypeError, ValueError, ArithmeticError, ModelError):
         raise ModelError(
-            f"{folder / 'preprocessor_config.json'}: image_mean {mean!r} and image_std {std!r} are"
-            " not three numbers each, the second above 0"
+            f"{folder / 'preprocessor_config.json'}: rescale_factor {str(factor)[:60]}, image_mean"
+            f" {str(mean)[:60]} and image_std {str(std)[:60]} are not a number and three numbers"
+            " each, the factor and image_std above 0"
         ) from None
 
 
 def _build(folder: Path) -> nn.Module:
-    # Read when huggingface_hub is imported; a folder may name a backbone it would look for online.
+    # Read when huggingface_hub is imported; a folder may name a backbone that is looked for online.
     os.environ["HF_HUB_OFFLINE"] = "1"
     try:
         import transformers
@@ -202,5 +255,5 @@ def _build(folder: Path) -> nn.Module:
             f"{folder}: its weights leave {len(missing)} of the network's out or of another shape"
             f" ({', '.join(sorted(missing)[:4])})"
         )
-    made: nn.Module = module.float()
-    return made
+    network: nn.Module = module.float()
+    return network

@@ -17,7 +17,7 @@ from typing import Any
 
 from pnpdepth_cli.core.split.user_code import describe
 from pnpdepth_cli.errors import ModelError, PnpDepthError
-from pnpdepth_cli.models.definition import FOREIGN, ModelDefinition, Multiple
+from pnpdepth_cli.models.definition import UNTUNED_DEFAULTS, ModelDefinition, Multiple
 
 DEFAULT_ATTRIBUTE = "definition"
 
@@ -120,7 +120,7 @@ def _assumed_definition(build: Callable[..., Any], attribute: str, file: Path) -
         output_kind="unknown",
         output_scale="unknown",
         build=build,
-        defaults=FOREIGN,
+        defaults=UNTUNED_DEFAULTS,
         assumed=f"{attribute!r} of {file.name} is no definition; assumed: one rgb image in, sides"
         f" padded to multiples of {_ASSUMED_MULTIPLE}; what its numbers mean is decided from the"
         " points",

@@ -1,6 +1,6 @@
 """A torch.export archive (.pt2) as a definition; the nodes of its graph are the layers.
 
-The archive is checked before torch reads it, and the source code of its guards is never asked for.
+The archive is checked before torch reads it, and the source code of its guards is never run.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ from torch import Tensor, fx, nn
 
 from pnpdepth_cli.core.split.user_code import describe
 from pnpdepth_cli.errors import ModelError
-from pnpdepth_cli.models.definition import FOREIGN, Fixed, ModelDefinition, Multiple
+from pnpdepth_cli.models.definition import UNTUNED_DEFAULTS, Fixed, ModelDefinition, Multiple
 from pnpdepth_cli.models.formats.export_archive import check_archive
 
-_MULTIPLE = 32
+_ASSUMED_MULTIPLE = 32
 
 
 class ExportedOperation(nn.Module):
@@ -29,14 +29,23 @@ class ExportedOperation(nn.Module):
         self._operation = operation
 
     def forward(self, *args: Any, **kwargs: Any) -> Any:
+        """Returns the operation's result."""
         return self._operation(*args, **kwargs)
 
     def extra_repr(self) -> str:
+        """Returns the operation, for `print(network)`."""
         return str(self._operation)
 
 
 def exported_definition(file: Path) -> ModelDefinition:
-    """The definition of a network saved by torch.export.save. ModelError where it cannot be run."""
+    """Returns the definition of a network saved by torch.export.save.
+
+    Args:
+        file: The .pt2 file; it takes one rgb image 1×3×H×W.
+
+    Raises:
+        ModelError: The file cannot be read, would do more than compute, or has other inputs.
+    """
     if not file.is_file():
         raise ModelError(f"exported program {file} does not exist")
     try:
@@ -56,7 +65,7 @@ def exported_definition(file: Path) -> ModelDefinition:
     ]
     if len(shapes) != 1 or len(shapes[0]) != 4 or shapes[0][1] != 3:
         raise ModelError(
-            f"exported program {file} takes inputs {shapes}; one rgb picture 1×3×H×W is expected"
+            f"exported program {file} takes inputs {shapes}; one rgb image 1×3×H×W is expected"
         )
     height, width = shapes[0][2:]
     fixed = isinstance(height, int) and isinstance(width, int)
@@ -64,37 +73,39 @@ def exported_definition(file: Path) -> ModelDefinition:
         name=file.stem,
         summary="torch.export archive",
         input_kind="rgb",
-        size=Fixed(height, width) if fixed else Multiple(_MULTIPLE),
+        size=Fixed(height, width) if fixed else Multiple(_ASSUMED_MULTIPLE),
         normalisation=None,
         output_kind="unknown",
         output_scale="unknown",
         build=lambda: _with_operations_as_modules(graph),
         complete=True,
         checkpoint=file,
-        defaults=FOREIGN,
+        defaults=UNTUNED_DEFAULTS,
     )
 
 
 def _with_operations_as_modules(exported: Any) -> nn.Module:
-    """The same graph, every operation on tensors a submodule under its node's name."""
+    """The same graph, with every operation on tensors as a submodule under its node's name."""
     root, graph = nn.Module(), fx.Graph()
-    kept: dict[fx.Node, Any] = {}
+    copies: dict[fx.Node, Any] = {}
     taken: set[str] = set()
     for node in exported.graph.nodes:
-        made = graph.node_copy(node, lambda n: kept[n])
-        kept[node] = made
+        copy = graph.node_copy(node, lambda n: copies[n])
+        copies[node] = copy
         if node.op == "get_attr":
             name = str(node.target).replace(".", "_")
             if name not in taken:
                 _hold(root, name, _attribute(exported, str(node.target)))
             taken.add(name)
-            made.target = name
+            copy.target = name
         elif _is_layer(node):
             name = node.name
-            while hasattr(root, name):  # every module has a method `to`, and so may a graph
+            while hasattr(
+                root, name
+            ):  # every module has a method `to`; a graph may have such a node
                 name += "_"
             root.add_module(name, ExportedOperation(node.target))
-            made.op, made.target = "call_module", name
+            copy.op, copy.target = "call_module", name
     return fx.GraphModule(root, graph)
 
 
@@ -105,7 +116,7 @@ def _is_layer(node: fx.Node) -> bool:
 
 def _hold(root: nn.Module, name: str, value: Tensor | nn.Module) -> None:
     if isinstance(value, nn.Module):
-        root.add_module(name, value)  # a part that is run as one, such as one without gradients
+        root.add_module(name, value)  # a nested graph, such as one without gradients
     elif value.is_floating_point():
         root.register_parameter(name, nn.Parameter(value.detach(), requires_grad=False))
     else:

@@ -1,8 +1,7 @@
 """Weights from files, without running anything that is in them.
 
 safetensors files hold tensors only, numpy files arrays, TensorFlow checkpoints variables. torch
-files are pickles; they are read with `weights_only=True`, which refuses everything but tensors and
-plain containers. Where more is in them (whole modules, optimisers, arguments), `tensor_pickle`
+files are pickles, often with more in them (whole modules, optimisers, arguments); `tensor_pickle`
 takes the tensors out and runs nothing.
 """
 
@@ -10,7 +9,6 @@ from __future__ import annotations
 
 import functools
 import math
-import pickle
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -18,20 +16,20 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from pnpdepth_cli.core.split.user_code import describe
+from pnpdepth_cli.core.split.user_code import describe, wrap_user_errors
 from pnpdepth_cli.errors import CheckpointError, ModelError
 from pnpdepth_cli.models import registry
 from pnpdepth_cli.models.definition import ModelDefinition
 from pnpdepth_cli.models.weights.numpy_file import SUFFIXES as NUMPY_SUFFIXES
 from pnpdepth_cli.models.weights.numpy_file import read_numpy_file
-from pnpdepth_cli.models.weights.pickle_machine import Instance
+from pnpdepth_cli.models.weights.pickle_reader import StandIn
 from pnpdepth_cli.models.weights.tensor_bundle import SUFFIX as BUNDLE_SUFFIX
 from pnpdepth_cli.models.weights.tensor_bundle import read_tensor_bundle
 from pnpdepth_cli.models.weights.tensor_pickle import (
     is_module,
     module_state,
     read_tensor_file,
-    refuse_compressed,
+    unusual_tensor,
 )
 
 _STATE_KEYS = ("state_dict", "model_state_dict", "model_state", "model", "network", "net", "params")
@@ -40,48 +38,63 @@ WEIGHT_SUFFIXES = (
 )  # fmt: skip
 _COUNTER = "num_batches_tracked"
 _LFS_POINTER = b"version https://git-lfs"
-_TOLD = ("data", "dataset", "arch", "decoder", "modality", "height", "width")
-_SHOWN = 4
-_MOST_PIXELS = 1 << 20  # along a side
-_LONGEST = 60  # characters of a word out of a file
+_TRAINING_ARGUMENTS = ("data", "dataset", "arch", "decoder", "modality", "height", "width")
+_SHOWN_NAMES = 4
+_MAX_SIDE = 1 << 20  # pixels of an image that training may have seen
+_MAX_WORD = 60  # characters of a word out of a file that are shown
+_NOT_WORTH_A_NOTE = (
+    *("torch.", "collections.", "_codecs.encode", "builtins.set", "__builtin__.set"),
+    *("builtins.bytearray", "__builtin__.bytearray", "builtins.complex", "__builtin__.complex"),
+)
 
 
 def read_checkpoint(path: Path) -> dict[str, Tensor]:
-    """The tensors of a checkpoint by name, on the CPU. CheckpointError if that cannot be had.
+    """Returns the tensors of a checkpoint by name, on the CPU.
 
-    In a torch file they may lie in an entry such as "state_dict" beside an epoch or an optimiser.
-    Numpy files hold them as arrays, TensorFlow checkpoints (PREFIX.index) as variables. A folder
-    may hold several files, such as encoder.pth and decoder.pth; then the name of the file, up to
-    its first dot, comes before the names in it.
+    Args:
+        path: A torch, safetensors or numpy file, the PREFIX.index of a TensorFlow checkpoint, or a
+            folder with several of these, such as encoder.pth and decoder.pth; then each name is
+            preceded by the name of its file up to the first dot. In a torch file the tensors may
+            lie in an entry such as "state_dict" beside an epoch or an optimiser.
+
+    Raises:
+        CheckpointError: The file is missing or broken, or holds no named tensors.
     """
     return _read(path)[0]
 
 
 def load_checkpoint(network: nn.Module, definition: ModelDefinition, path: Path) -> list[str]:
-    """The network has the weights of the file; returns notes on what was done to fit them.
+    """Loads the weights of a file into a network; returns notes on what was done to fit them.
 
-    CheckpointError if a key is missing, left over, or of another shape; it names the network of the
-    registry that the file does fit. Or if a weight is not finite. The counters of batch
-    normalisations may be missing, as in files from before PyTorch 0.4.1: they matter in training
-    only.
+    The counters of batch normalisations may be missing, as in files from before PyTorch 0.4.1: they
+    matter in training only.
+
+    Args:
+        network: Built by `definition`; its weights are replaced.
+        definition: Its `read_checkpoint` renames the tensors of a published file.
+        path: See `read_checkpoint`.
+
+    Raises:
+        CheckpointError: A tensor is missing, unexpected, of another shape, or not finite. If the
+            file fits another network that can be named, the message names that.
     """
-    given, notes = _read(path)
+    stored, notes = _read(path)
     own = {n: t for n, t in network.state_dict().items() if isinstance(t, Tensor)}
     if not _all_in_module(own):
-        given, said = _without_module(given, path)
-        notes = [*notes, *said]
+        stored, prefix_notes = _without_module(stored, path)
+        notes = [*notes, *prefix_notes]
     try:
-        state = _fitted(definition, own, given, path)
+        state = _fitted(definition, own, stored, path)
     except CheckpointError:
-        fitting = _networks_it_fits(given, path, definition.name)
+        fitting = _networks_it_fits(stored, path, definition.name)
         if not fitting:
             raise
         raise CheckpointError(
             f"checkpoint {path} does not fit network {definition.name!r}: this is"
             f" {_some(fitting, ' or ')}; use --model {fitting[0]}"
         ) from None
-    learnt = dict(network.named_parameters())
-    broken = [n for n, t in state.items() if n in learnt and not _is_finite(t)]
+    parameters = dict(network.named_parameters())
+    broken = [n for n, t in state.items() if n in parameters and not _is_finite(t)]
     if broken:
         raise CheckpointError(
             f"checkpoint {path}: {len(broken)} of its weights are NaN or infinite"
@@ -97,11 +110,11 @@ def load_checkpoint(network: nn.Module, definition: ModelDefinition, path: Path)
 def _fitted(
     definition: ModelDefinition,
     own: Mapping[str, Tensor],
-    given: Mapping[str, Tensor],
+    stored: Mapping[str, Tensor],
     path: Path,
 ) -> Mapping[str, Tensor]:
-    """The state dict for a network whose own it is to replace. CheckpointError if it is not one."""
-    state = given if definition.read_checkpoint is None else _converted(definition, given, path)
+    """The state dict that replaces the network's own. CheckpointError if it does not fit."""
+    state = stored if definition.read_checkpoint is None else _converted(definition, stored, path)
     problems = [
         *_listed("missing", [n for n in own if n not in state and not n.endswith(_COUNTER)]),
         *_listed("unexpected", [name for name in state if name not in own]),
@@ -119,19 +132,44 @@ def _fitted(
     return state
 
 
-def _networks_it_fits(given: Mapping[str, Tensor], path: Path, asked: str) -> list[str]:
-    """The networks of the registry whose weights these are; those that end as `asked` come first.
+def _networks_it_fits(stored: Mapping[str, Tensor], path: Path, wanted: str) -> list[str]:
+    """The names of the networks whose weights these are; those that end as `wanted` come first.
 
-    Names and shapes decide, so variants for other picture sizes (`-kitti`) fit too.
+    Tensor names and shapes decide, so variants for other image sizes (`-kitti`) fit too.
     """
-    fitting = [name for name in registry.names() if _fits(name, given, path)]
-    ending = asked.rpartition("-")[2]
+    by_class: dict[Any, list[str]] = {}
+    for name in registry.names():
+        build = registry.find_definition(name).build
+        by_class.setdefault(getattr(build, "func", build), []).append(name)
+    fitting = [
+        name
+        for names in by_class.values()
+        if any(_shares_names(name, names[0], stored, path) for name in names)
+        for name in names
+        if _fits(name, stored, path)
+    ]
+    ending = wanted.rpartition("-")[2]
     return sorted(fitting, key=lambda name: name.rpartition("-")[2] != ending)
 
 
-def _fits(name: str, given: Mapping[str, Tensor], path: Path) -> bool:
+def _shares_names(name: str, built: str, stored: Mapping[str, Tensor], path: Path) -> bool:
+    """True if tensors, as the network `name` reads them, have names of the network `built`.
+
+    Building every network would take seconds.
+    """
+    definition = registry.find_definition(name)
     try:
-        _fitted(registry.find_definition(name), _shapes_of(name), given, path)
+        state = (
+            stored if definition.read_checkpoint is None else _converted(definition, stored, path)
+        )
+        return not _shapes_of(built).keys().isdisjoint(state)
+    except ModelError:
+        return False
+
+
+def _fits(name: str, stored: Mapping[str, Tensor], path: Path) -> bool:
+    try:
+        _fitted(registry.find_definition(name), _shapes_of(name), stored, path)
     except ModelError:
         return False
     return True
@@ -139,8 +177,8 @@ def _fits(name: str, given: Mapping[str, Tensor], path: Path) -> bool:
 
 @functools.cache
 def _shapes_of(name: str) -> dict[str, Tensor]:
-    """The state dict of a network of the registry, without its values."""
-    with torch.device("meta"):
+    """The state dict of a network that can be named, without its values."""
+    with wrap_user_errors(f"build of network {name!r}"), torch.device("meta"):
         return registry.find_definition(name).build().state_dict()
 
 
@@ -153,7 +191,7 @@ def _all_in_module(state: Mapping[str, Any]) -> bool:
 
 
 def _without_module(state: dict[str, Tensor], path: Path) -> tuple[dict[str, Tensor], list[str]]:
-    """The tensors by their names without torch's DataParallel, once or more, and what to say."""
+    """The tensors without the prefix of torch's DataParallel, and a note if there was one."""
     notes = []
     while _all_in_module(state):
         state = {name.removeprefix("module."): tensor for name, tensor in state.items()}
@@ -172,22 +210,22 @@ def _listed(what: str, names: list[str]) -> list[str]:
 
 def _some(names: list[str], between: str = ", ") -> str:
     """The first few of the names, and how many more there are."""
-    more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
-    return f"{between.join(map(_short, names[:_SHOWN]))}{more}"
+    more = f" and {len(names) - _SHOWN_NAMES} more" if len(names) > _SHOWN_NAMES else ""
+    return f"{between.join(map(_short, names[:_SHOWN_NAMES]))}{more}"
 
 
 def _short(word: str) -> str:
-    return word if len(word) <= _LONGEST else f"{word[:_LONGEST]}…"
+    return word if len(word) <= _MAX_WORD else f"{word[:_MAX_WORD]}…"
 
 
 def _read(path: Path) -> tuple[dict[str, Tensor], list[str]]:
-    """The named tensors of a file or folder, and what to say of it."""
+    """The named tensors of a file or folder, and notes about it."""
     if path.is_dir():
         return _read_folder(path)
     if not path.is_file():
         index = path.with_name(path.name + BUNDLE_SUFFIX)
-        instead = f"; {index.name} does, name that" if index.is_file() else ""
-        raise CheckpointError(f"checkpoint {path} does not exist{instead}")
+        hint = f"; {index.name} does, name that" if index.is_file() else ""
+        raise CheckpointError(f"checkpoint {path} does not exist{hint}")
     if _is_lfs_pointer(path):
         raise CheckpointError(
             f"checkpoint {path} is a Git LFS pointer, not the file it points to; `git lfs pull`"
@@ -200,7 +238,7 @@ def _read(path: Path) -> tuple[dict[str, Tensor], list[str]]:
     if path.suffix == BUNDLE_SUFFIX:
         return read_tensor_bundle(path), []
     content, notes = _read_torch(path)
-    return _state_in(content, path), notes + _trained_with(content, path)
+    return _state_in(content, path), notes + _training_notes(content, path)
 
 
 def _is_lfs_pointer(path: Path) -> bool:
@@ -217,14 +255,14 @@ def _read_folder(folder: Path) -> tuple[dict[str, Tensor], list[str]]:
         )
     notes = [f"checkpoint {folder.name}: {', '.join(file.name for file in files)}"]
     if len(files) == 1:
-        state, said = _read(files[0])
-        return state, notes + said
+        state, file_notes = _read(files[0])
+        return state, notes + file_notes
     state = {}
     for file in files:
-        part, said = _read(file)
+        part, file_notes = _read(file)
         part, stripped = _without_module(part, file)
         state |= {f"{file.name.partition('.')[0]}.{name}": tensor for name, tensor in part.items()}
-        notes += [*said, *stripped]
+        notes += [*file_notes, *stripped]
     return state, notes
 
 
@@ -241,44 +279,34 @@ def _read_safetensors(path: Path) -> dict[str, Tensor]:
 
 
 def _read_torch(path: Path) -> tuple[Any, list[str]]:
-    """What a torch file holds, and what to say of it."""
-    refuse_compressed(path)
-    try:
-        return torch.load(path, map_location="cpu", weights_only=True), []
-    except pickle.UnpicklingError:
-        read = read_tensor_file(path)
-        foreign = [name for name in read.named if not name.startswith(("torch.", "collections."))]
-        named = _some(foreign) or "classes of torch"
-        note = (
-            f"checkpoint {path.name}: its pickle names {named}; its tensors were taken out,"
-            " nothing of it was run"
-        )
-        return read.content, [note]
-    except Exception as error:  # torch raises a wide choice of types for a broken file
-        reason = describe(error)[:160]
-        if "TorchScript" in reason:
-            reason = "it is a TorchScript archive; save the state_dict() of its module instead"
-        raise CheckpointError(
-            f"checkpoint {path} cannot be read as a torch file ({reason})"
-        ) from None
+    """What a torch file holds, and a note if that is more than tensors."""
+    file = read_tensor_file(path)
+    classes = [name for name in file.named if not name.startswith(_NOT_WORTH_A_NOTE)]
+    if not classes and not file.has_stand_ins:
+        return file.content, []
+    note = (
+        f"checkpoint {path.name}: its pickle names {_some(classes) or 'classes of torch'}; its"
+        " tensors were taken out, nothing of it was run"
+    )
+    return file.content, [note]
 
 
-def _trained_with(content: Any, path: Path) -> list[str]:
-    """What the training's arguments say, where they are kept beside the weights.
+def _training_notes(content: Any, path: Path) -> list[str]:
+    """What the arguments of the training say, if they are stored beside the weights.
 
-    Weights for other data or pictures of another size may fit all the same.
+    Weights for other data, or for images of another size, may fit all the same.
     """
-    given = content.get("args") if isinstance(content, Mapping) else None
-    given = given.state if isinstance(given, Instance) else given
-    if not isinstance(given, Mapping):
+    arguments = content.get("args") if isinstance(content, Mapping) else None
+    arguments = arguments.state if isinstance(arguments, StandIn) else arguments
+    if not isinstance(arguments, Mapping):
         return []
-    told = {key: given.get(key) for key in _TOLD}
-    said = [
+    values = {key: arguments.get(key) for key in _TRAINING_ARGUMENTS}
+    shown = [
         f"{key} {_short(str(value))}"
-        for key, value in told.items()
-        if isinstance(value, str) or (isinstance(value, int) and abs(value) < _MOST_PIXELS)
+        for key, value in values.items()
+        if isinstance(value, str) or (isinstance(value, int) and abs(value) < _MAX_SIDE)
     ]
-    return [f"checkpoint {path.name}: trained with {', '.join(said)}"] if said else []
+    return [f"checkpoint {path.name}: trained with {', '.join(shown)}"] if shown else []
 
 
 def _state_in(content: Any, path: Path) -> dict[str, Tensor]:
@@ -286,20 +314,30 @@ def _state_in(content: Any, path: Path) -> dict[str, Tensor]:
         return module_state(content)
     if not isinstance(content, Mapping):
         raise CheckpointError(f"checkpoint {path} holds a {_kind(content)}, not named tensors")
-    if content and _only_tensors(content):
-        return dict(content)
-    for key in _STATE_KEYS:
-        inner = content.get(key)
-        if is_module(inner):
-            return module_state(inner)
-        if isinstance(inner, Mapping) and inner and _only_tensors(inner):
-            return dict(inner)
+    for mapping in (content, *(content.get(key) for key in _STATE_KEYS)):
+        if is_module(mapping):
+            return module_state(mapping)
+        if isinstance(mapping, Mapping) and mapping:
+            _refuse_unusual_tensors(mapping, path)
+            if _only_tensors(mapping):
+                return dict(mapping)
     names = ", ".join(_short(str(key)) for key in list(content)[:8]) or "nothing"
     raise CheckpointError(f"checkpoint {path} has no state dict; it holds {names}")
 
 
+def _refuse_unusual_tensors(mapping: Mapping[Any, Any], path: Path) -> None:
+    """CheckpointError for a state dict with a tensor that is sparse, quantised or the like."""
+    for name, value in mapping.items():
+        kind = unusual_tensor(value)
+        if kind is not None:
+            raise CheckpointError(
+                f"checkpoint {path}: tensor {_short(str(name))} is {kind}; save its values as a"
+                " dense tensor of floats"
+            )
+
+
 def _kind(content: Any) -> str:
-    return _short(content.path) if isinstance(content, Instance) else type(content).__name__
+    return _short(content.path) if isinstance(content, StandIn) else type(content).__name__
 
 
 def _only_tensors(mapping: Mapping[Any, Any]) -> bool:

@@ -1,8 +1,9 @@
 """The variables of a TensorFlow checkpoint, without TensorFlow.
 
 A checkpoint is PREFIX.index, a sorted table (LevelDB's) from a variable's name to its type, shape
-and place, and PREFIX.data-00000-of-00001 or more, where the values lie one after the other. There
-is nothing in them to run. Memory stays bounded by the size of the files.
+and offset, and PREFIX.data-00000-of-00001 or more, where the values lie one after the other. There
+is nothing in them to run. Memory stays bounded by the size of the files: names are short, no two
+blocks of the table overlap, and the variables are no larger than the files.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ import torch
 from torch import Tensor
 
 from pnpdepth_cli.errors import CheckpointError
-from pnpdepth_cli.models.weights.pickle_machine import Broken
+from pnpdepth_cli.models.weights.pickle_reader import READ_ERRORS, BrokenFileError, brief
 
 SUFFIX = ".index"
 
@@ -35,27 +36,39 @@ _TYPES = {
     19: torch.float16,
 }
 _TEXT = 7  # such as the graph of objects that TensorFlow 2 puts beside the variables
+_MAX_NAME = 1_000  # bytes of a variable's name
+_MAX_AXES = 64
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Place:
+class _Variable:
     """Where the values of one variable lie."""
 
     dtype: int
+    """TensorFlow's number of the type."""
     shape: tuple[int, ...]
+    """Sides."""
     shard: int
+    """Number of the file of values."""
     offset: int
+    """Bytes from the beginning of that file."""
     size: int
+    """Bytes."""
 
 
 def read_tensor_bundle(index: Path) -> dict[str, Tensor]:
-    """The variables by name, "layer/weights" as "layer.weights". CheckpointError if that fails."""
+    """Returns the variables by name, "layer/weights" as "layer.weights".
+
+    Args:
+        index: PREFIX.index; the files of values lie beside it.
+
+    Raises:
+        CheckpointError: A file is missing or broken.
+    """
     try:
         return _Bundle(index).read()
-    except Broken as error:
-        reason: object = error
-    except (OSError, IndexError, RuntimeError, struct.error, UnicodeDecodeError) as error:
-        reason = f"{type(error).__name__}: {' '.join(str(error).split())[:120]}"
+    except (BrokenFileError, OSError, *READ_ERRORS) as error:
+        reason = brief(error)
     raise CheckpointError(
         f"checkpoint {index} cannot be read as a TensorFlow checkpoint ({reason})"
     )
@@ -69,54 +82,60 @@ class _Bundle:
         table = dict(_table(index.read_bytes()))
         header = dict(_fields(table.pop(b"", b"")))
         if header.get(2, 0) != 0:
-            raise Broken("it was written on a big-endian machine")
+            raise BrokenFileError("it was written on a big-endian machine")
         self._shards = _number(header.get(1, 0))
-        self._places = {name.decode(): _place(entry) for name, entry in table.items()}
+        self._variables = {name.decode(): _variable(entry) for name, entry in table.items()}
         self._contents: dict[int, bytes] = {}
 
     def read(self) -> dict[str, Tensor]:
         """Every variable but text."""
-        found: dict[str, Tensor] = {}
+        tensors: dict[str, Tensor] = {}
         left = 0
-        for name, place in self._places.items():
-            if place.dtype == _TEXT:
+        for name, variable in self._variables.items():
+            if variable.dtype == _TEXT:
                 continue
-            if place.shard not in self._contents:
-                self._contents[place.shard] = self._content(place.shard)
-                left += len(self._contents[place.shard])
-            left -= place.size
+            if variable.shard not in self._contents:
+                self._contents[variable.shard] = self._content(variable.shard)
+                left += len(self._contents[variable.shard])
+            left -= variable.size
             if left < 0:
-                raise Broken("its variables are larger than its files")
-            found[name.replace("/", ".")] = _tensor(name, place, self._contents[place.shard])
-        return found
+                raise BrokenFileError("its variables are larger than its files")
+            tensors[name.replace("/", ".")] = _tensor(
+                name, variable, self._contents[variable.shard]
+            )
+        return tensors
 
     def _content(self, shard: int) -> bytes:
         file = f"{self._prefix.name}.data-{shard:05d}-of-{self._shards:05d}"
         path = self._prefix.with_name(file)
         if not path.is_file():
-            raise Broken(f"{file} is not beside it")
+            raise BrokenFileError(f"{file} is not beside it")
         return path.read_bytes()
 
 
-def _tensor(name: str, place: _Place, content: bytes) -> Tensor:
-    dtype = _TYPES.get(place.dtype)
+def _tensor(name: str, variable: _Variable, content: bytes) -> Tensor:
+    dtype = _TYPES.get(variable.dtype)
     if dtype is None:
-        raise Broken(f"{name} is of TensorFlow's type {place.dtype}, not of numbers")
-    count = math.prod(place.shape)
-    if count * dtype.itemsize != place.size or place.offset + place.size > len(content):
-        raise Broken(f"{name} of shape {place.shape} goes beyond its {place.size} bytes")
-    part = bytearray(content[place.offset : place.offset + place.size])
+        raise BrokenFileError(f"{name} is of TensorFlow's type {variable.dtype}, not of numbers")
+    count = math.prod(variable.shape)
+    if count * dtype.itemsize != variable.size or variable.offset + variable.size > len(content):
+        raise BrokenFileError(
+            f"{name} of shape {variable.shape} goes beyond its {variable.size} bytes"
+        )
+    part = bytearray(content[variable.offset : variable.offset + variable.size])
     flat = torch.frombuffer(part, dtype=dtype) if part else torch.empty(0, dtype=dtype)
-    return flat.reshape(place.shape)
+    return flat.reshape(variable.shape)
 
 
-def _place(entry: bytes) -> _Place:
+def _variable(entry: bytes) -> _Variable:
     fields = dict(_fields(entry))
     if 7 in fields:
-        raise Broken("a variable is in slices")
+        raise BrokenFileError("a variable is in slices")
     shape = fields.get(2, b"")
-    sides = _fields(shape) if isinstance(shape, bytes) else ()
-    return _Place(
+    sides = list(_fields(shape)) if isinstance(shape, bytes) else []
+    if len(sides) > _MAX_AXES:
+        raise BrokenFileError(f"a variable of {len(sides)} axes")
+    return _Variable(
         dtype=_number(fields.get(1, 0)),
         shape=tuple(
             _number(dict(_fields(side)).get(1, 0))
@@ -131,7 +150,7 @@ def _place(entry: bytes) -> _Place:
 
 def _number(value: int | bytes) -> int:
     if not isinstance(value, int) or value >= 1 << 63:
-        raise Broken("a size that is none")
+        raise BrokenFileError("a size is not a number")
     return value
 
 
@@ -141,21 +160,26 @@ def _number(value: int | bytes) -> int:
 def _table(data: bytes) -> Iterator[tuple[bytes, bytes]]:
     """Keys and values of all blocks."""
     if len(data) < _FOOTER or struct.unpack("<Q", data[-8:])[0] != _MAGIC:
-        raise Broken("it does not end as an index does")
+        raise BrokenFileError("it does not end as an index does")
     _, at = _varint(data, len(data) - _FOOTER)  # the block of metadata comes first; it is empty
     _, at = _varint(data, at)
+    behind_last = 0
     for _, handle in _block(data, data[at:]):
+        offset, size_at = _varint(handle, 0)
+        if offset < behind_last:
+            raise BrokenFileError("its blocks overlap")
+        behind_last = offset + max(1, _varint(handle, size_at)[0])
         yield from _block(data, handle)
 
 
 def _block(data: bytes, handle: bytes) -> Iterator[tuple[bytes, bytes]]:
-    """Keys and values of the block at (offset, size); each key goes on from the one before."""
+    """Keys and values of the block at (offset, size); each key continues the one before."""
     offset, at = _varint(handle, 0)
     size, _ = _varint(handle, at)
     if offset + size >= len(data) or size < 4:
-        raise Broken("a block goes beyond its end")
+        raise BrokenFileError("a block goes beyond its end")
     if data[offset + size] != 0:
-        raise Broken("its index is compressed, which TensorFlow does not do")
+        raise BrokenFileError("its index is compressed, which TensorFlow does not do")
     (restarts,) = struct.unpack_from("<I", data, offset + size - 4)
     at, end = offset, offset + size - 4 * (restarts + 1)
     key = b""
@@ -164,7 +188,9 @@ def _block(data: bytes, handle: bytes) -> Iterator[tuple[bytes, bytes]]:
         fresh, at = _varint(data, at)
         length, at = _varint(data, at)
         if at + fresh + length > end or shared > len(key):
-            raise Broken("an entry goes beyond its block")
+            raise BrokenFileError("an entry goes beyond its block")
+        if shared + fresh > _MAX_NAME:
+            raise BrokenFileError(f"it has a name of {shared + fresh:,} bytes")
         key = key[:shared] + data[at : at + fresh]
         at += fresh
         yield key, data[at : at + length]
@@ -187,7 +213,7 @@ def _fields(message: bytes) -> Iterator[tuple[int, int | bytes]]:
         elif kind in (1, 5):
             at += 8 if kind == 1 else 4  # checksums
         else:
-            raise Broken("an entry that is no protocol buffer")
+            raise BrokenFileError("an entry that is no protocol buffer")
 
 
 def _varint(data: bytes, at: int) -> tuple[int, int]:
@@ -199,4 +225,4 @@ def _varint(data: bytes, at: int) -> tuple[int, int]:
         value |= (byte & 127) << shift
         if byte < 128:
             return value, at
-    raise Broken("a number without end")
+    raise BrokenFileError("a number without end")

@@ -1,4 +1,4 @@
-"""Which frames a batch has, and what is to be done with each. No torch is needed to know."""
+"""Finds the frames of a batch, and the request, inputs and outputs of each. Imports no torch."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from pnpdepth_cli.errors import InputError, OutputError, UsageError
-from pnpdepth_cli.io.dataset.frame import SCANS, Frame, Source, Unmatched
+from pnpdepth_cli.io.dataset.frame import SCAN_ONLY_SUFFIXES, Frame, Source, Unmatched
 from pnpdepth_cli.io.dataset.frame_names import name_problem
 from pnpdepth_cli.io.file_bytes import one_line
 from pnpdepth_cli.io.layouts import LAYOUTS, find_protocol, list_frames
@@ -17,27 +17,31 @@ from pnpdepth_cli.pipeline.refinement.request import FrameFiles, RefineRequest
 
 @dataclass(frozen=True, kw_only=True)
 class BatchRequest:
-    """What to do with all frames of a folder or a list.
-
-    refine: how; its files, its output and its protocol are set for each frame. layout: its name,
-    None to guess it. protocol: its name, None for the layout's own. workers: threads that read,
-    and as many that write. batch_size: frames of one size that go through the network together,
-    None for as many as alter no result. limit: only the first frames. shard: (i, n), every n-th
-    from the i-th. profile: whether the summary says where the time went.
-    html: the folder for a report, None for no report.
-    """
+    """Which frames to refine, and how."""
 
     source: Path
+    """A folder or a list of frames."""
     output: Path
+    """The folder for the results."""
     refine: RefineRequest
+    """How; its files, its output and its protocol are set for each frame."""
     layout: str | None = None
+    """Name of the data set's layout; None to guess it."""
     protocol: str | None = None
+    """Name of the protocol that crops frames; None for the layout's own."""
     workers: int = 2
+    """Threads that read, and as many that write."""
     batch_size: int | None = None
+    """Frames of one size that go through the network together; None for as many as alter no
+    result."""
     limit: int | None = None
+    """Only the first frames; None for all."""
     shard: tuple[int, int] | None = None
+    """(i, n): every n-th frame from the i-th."""
     profile: bool = False
+    """True to add to the summary where the time went."""
     html: Path | None = None
+    """The folder for a report; None for no report."""
 
     def __post_init__(self) -> None:
         if self.workers < 1:
@@ -55,34 +59,48 @@ class BatchRequest:
 
 @dataclass(frozen=True, kw_only=True)
 class BatchFrames:
-    """frames: all that are there. chosen: those of them to be done in this run."""
+    """The frames of a batch."""
 
     layout: str
+    """Name of the layout."""
     frames: list[Frame]
+    """All frames of the source."""
     chosen: list[Frame]
+    """Those within the limit and the shard."""
     unmatched: tuple[Unmatched, ...]
+    """Files that are in no frame, and why."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Task:
-    """One frame: what to refine, the files that are read for it, by their part, and written."""
+    """One frame to refine."""
 
     name: str
+    """The frame's name."""
     request: RefineRequest
+    """With the frame's files."""
     inputs: dict[str, Path]
+    """The files that are read for it, by their part."""
     outputs: Outputs
+    """The files that are written for it."""
 
 
 def find_frames(request: BatchRequest) -> BatchFrames:
-    """The frames there are. InputError if there is none, UsageError if none has sparse depth."""
+    """Returns the frames of the source.
+
+    Raises:
+        InputError: If there is none.
+        UsageError: If none has sparse depth.
+        OutputError: If the output is a file, or holds the frames.
+    """
     if request.output.exists() and not request.output.is_dir():
         raise OutputError(f"{request.output} is a file; name a folder")
-    if request.source.is_dir() and _is_below(request.source, request.output):
+    if request.source.is_dir() and _is_inside(request.source, request.output):
         raise _holds_the_frames(request.output)
     layout, listing = list_frames(request.source, request.layout)
     frames, unmatched = _own_names(_outside(request.output, listing.frames))
     lost = [*listing.broken, *listing.spare]
-    unmatched += [each for each in lost if not _is_below(each.path, request.output)]
+    unmatched += [each for each in lost if not _is_inside(each.path, request.output)]
     if not frames:
         first = f" ({lost[0]})" if lost else ""
         raise InputError(
@@ -92,7 +110,7 @@ def find_frames(request: BatchRequest) -> BatchFrames:
     if request.refine.files.sample is None and all(frame.sparse is None for frame in frames):
         raise UsageError(
             f"{request.source} looks like {layout!r}, which has no sparse depth; --sample 500"
-            " takes so many points of the ground truth"
+            " draws so many points from the ground truth"
         )
     number, of = request.shard or (1, 1)
     return BatchFrames(
@@ -104,24 +122,24 @@ def find_frames(request: BatchRequest) -> BatchFrames:
 
 
 def task_of(request: BatchRequest, frame: Frame) -> Task:
-    """What is to be done with a frame; what the user said goes before what the data set says."""
-    asked = request.refine.files
-    sparse = frame.sparse if asked.sample is None else None
+    """Returns the frame's task; options of the user go before what the data set states."""
+    base = request.refine.files
+    sparse = frame.sparse if base.sample is None else None
     protocol = frame.protocol if request.protocol is None else find_protocol(request.protocol)
     is_scan = sparse is not None and (
-        asked.scan.calib is not None or sparse.suffix.lower() in SCANS
+        base.scan.calib is not None or sparse.suffix.lower() in SCAN_ONLY_SUFFIXES
     )
-    scan = asked.scan
+    scan = base.scan
     if is_scan:
         camera = frame.camera if scan.camera is None else scan.camera
         scan = replace(scan, calib=scan.calib or frame.calib, camera=camera)
     files = replace(
-        asked,
+        base,
         image=frame.image,
         sparse=sparse,
         gt=frame.gt,
-        sparse_scale=frame.sparse_scale if asked.depth_scale is None else None,
-        gt_scale=asked.gt_scale or asked.depth_scale or frame.gt_scale,
+        sparse_scale=frame.sparse_scale if base.depth_scale is None else None,
+        gt_scale=base.gt_scale or base.depth_scale or frame.gt_scale,
         scan=scan,
         protocol=protocol,
     )
@@ -134,7 +152,7 @@ def task_of(request: BatchRequest, frame: Frame) -> Task:
 
 
 def source_files(frame: Frame) -> list[Path]:
-    """The files that image, sparse depth and truth of the frame are in."""
+    """Returns the files of the frame's image, sparse depth and ground truth."""
     parts = [frame.image, frame.sparse, frame.gt]
     return [part if isinstance(part, Path) else part.path for part in parts if part is not None]
 
@@ -163,26 +181,26 @@ def _holds_the_frames(output: Path) -> OutputError:
 
 
 def _outside(output: Path, frames: list[Frame]) -> tuple[list[Frame], list[Unmatched]]:
-    """The frames without a file in the output folder, and those others."""
+    """The frames without a file in the output folder, and the others as unmatched files."""
     if not output.exists():
         return frames, []
     folder = output.resolve()
-    kept, left = [], []
+    kept, ignored = [], []
     for frame in frames:
         inside = [path for path in source_files(frame) if path.resolve().is_relative_to(folder)]
         if inside:
-            why = "lies in the output folder, from which nothing is taken; move it"
-            left.append(Unmatched(path=inside[0], why=why))
+            why = "lies in the output folder, which is not searched for frames; move it"
+            ignored.append(Unmatched(path=inside[0], why=why))
         else:
             kept.append(frame)
     if frames and not kept:
         raise _holds_the_frames(output)
-    return kept, left
+    return kept, ignored
 
 
-def _own_names(found: tuple[list[Frame], list[Unmatched]]) -> tuple[list[Frame], list[Unmatched]]:
-    """The frames whose name is theirs alone, and fit for their results; and the others."""
-    frames, left = found
+def _own_names(listed: tuple[list[Frame], list[Unmatched]]) -> tuple[list[Frame], list[Unmatched]]:
+    """The frames with a unique name that is fit for their results, and the others as unmatched."""
+    frames, ignored = listed
     kept: dict[str, Frame] = {}
     for frame in frames:
         why = f"is a second frame {frame.name!r}; rename it" if frame.name in kept else None
@@ -196,9 +214,9 @@ def _own_names(found: tuple[list[Frame], list[Unmatched]]) -> tuple[list[Frame],
         else:
             source = frame.image or frame.sparse
             path = source if isinstance(source, Path) else Path(str(source))
-            left.append(Unmatched(path=path, why=why))
-    return list(kept.values()), left
+            ignored.append(Unmatched(path=path, why=why))
+    return list(kept.values()), ignored
 
 
-def _is_below(path: Path, folder: Path) -> bool:
+def _is_inside(path: Path, folder: Path) -> bool:
     return path.resolve().is_relative_to(folder.resolve())

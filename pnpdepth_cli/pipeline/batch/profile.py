@@ -1,4 +1,4 @@
-"""Where the time of a batch goes."""
+"""Measures where the time of a batch goes."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ READING, WRITING = "reading", "writing"
 
 
 class BatchProfile:
-    """`with profile(NETWORK):` adds the seconds of the block, in whatever thread it runs.
+    """`with profile(NETWORK):` adds the seconds of the block, in any thread.
 
-    Network and waiting are times of the one thread that runs the network, and what is left of the
-    wall time is Python in that thread. Reading and writing run beside it, in several threads, so
-    the seconds of these are no share of the wall time.
+    Network and waiting are times of the one thread that runs the network; the rest of the wall time
+    is Python in that thread. Reading and writing run in parallel in other threads, so their seconds
+    do not add up to the wall time.
     """
 
     def __init__(self) -> None:
@@ -29,6 +29,7 @@ class BatchProfile:
 
     @contextmanager
     def __call__(self, stage: str) -> Iterator[None]:
+        """Adds the time spent inside to the stage."""
         start = time.perf_counter()
         try:
             yield
@@ -37,13 +38,13 @@ class BatchProfile:
                 self._seconds[stage] += time.perf_counter() - start
 
     def count(self) -> None:
-        """One more frame is written."""
+        """Counts one more written frame."""
         with self._adding:
             self.frames += 1
 
     @contextmanager
     def wall(self) -> Iterator[None]:
-        """The block is the whole of it."""
+        """Measures the block as the wall time."""
         start = time.perf_counter()
         try:
             yield
@@ -51,7 +52,7 @@ class BatchProfile:
             self._wall += time.perf_counter() - start
 
     def summary(self) -> dict[str, Any]:
-        """{"frames": 24, "seconds": {"network": …, …, "wall": …}, "frames_per_second": …, …}."""
+        """Returns {"frames": 24, "seconds": {"network": …, "wall": …}, …}."""
         wall = self._wall
         return {
             "frames": self.frames,

@@ -1,8 +1,7 @@
-"""Frames read ahead, refined one after the other or a few together, and written behind.
+"""Runs a batch: threads read frames in advance, the network refines, other threads write.
 
-The network runs in the thread that calls, and in no other: it is patched while it is cut. Readers
-and writers are threads of their own, and queues between them are bounded, so memory does not grow
-with the number of frames and the network waits for no file.
+The network runs only in the calling thread, as it is patched while it is cut. The queues between
+the threads are bounded, so memory does not grow with the number of frames.
 """
 
 from __future__ import annotations
@@ -25,6 +24,7 @@ from pnpdepth_cli.errors import (
     StorageError,
     UsageError,
 )
+from pnpdepth_cli.frames.frame import RefinedFrame
 from pnpdepth_cli.io.fingerprint import Fingerprint
 from pnpdepth_cli.pipeline.batch.frames import Task
 from pnpdepth_cli.pipeline.batch.groups import FrameGroups
@@ -36,9 +36,9 @@ from pnpdepth_cli.pipeline.batch.profile import (
     WRITING,
     BatchProfile,
 )
-from pnpdepth_cli.pipeline.batch.state import BatchState, known_inputs
+from pnpdepth_cli.pipeline.batch.run import BatchRun
+from pnpdepth_cli.pipeline.batch.state import BatchState, Status, input_fingerprints
 from pnpdepth_cli.pipeline.batch.summary import failed_row, row_of
-from pnpdepth_cli.pipeline.refinement.frame import RefinedFrame
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs, read_inputs
 from pnpdepth_cli.pipeline.refinement.refine import Refiner, load_refiner, write_refined
 from pnpdepth_cli.pipeline.stopwatch import Stopwatch
@@ -48,25 +48,33 @@ Row = dict[str, Any]
 
 @dataclass(frozen=True, kw_only=True)
 class ReadFrame:
-    """A frame in memory, what its files were known by when it was read, and what reading took."""
+    """A frame in memory."""
 
     inputs: Inputs
-    known: dict[str, Fingerprint]
+    """Its contents."""
+    fingerprints: dict[str, Fingerprint]
+    """Of its files when they were read, by part."""
     watch: Stopwatch
+    """With the seconds of reading."""
 
 
-def settle_refiner(tasks: Iterable[Task], say: Callable[[str], None]) -> Refiner | None:
-    """The network, with what it leaves open settled on the first frame that can be read.
+def resolve_refiner(tasks: Iterable[Task], say: Callable[[str], None]) -> Refiner | None:
+    """Returns the network with its definition resolved on the first frame that can be read.
 
-    tasks: of all frames, also of those that are done or another shard's, so that every run decides
-    the same. None if no frame can be read.
+    Args:
+        tasks: Of all frames, also those that are done or of another shard, so that every run
+            decides the same.
+        say: Receives what was decided.
+
+    Returns:
+        None if no frame can be read.
     """
     for task in tasks:
         try:
             first = read_inputs(task.request)
         except UsageError:
             raise
-        except Exception:  # whatever it is, the frame will be read again, and its error told
+        except Exception:  # the frame is read again later, which reports its error
             continue
         for note in first.notes:
             say(f"{task.name}: {note}")
@@ -74,7 +82,7 @@ def settle_refiner(tasks: Iterable[Task], say: Callable[[str], None]) -> Refiner
         for note in refiner.network.notes:
             say(note)
         if task.request.hold_out.auto:
-            return _with_ways(refiner, list(tasks), first, say)
+            return _with_shortlist(refiner, list(tasks), first, say)
         s = refiner.settings
         say(
             f"network: {refiner.network.definition.name} cut at {refiner.layer}, {s.iterations}"
@@ -84,40 +92,38 @@ def settle_refiner(tasks: Iterable[Task], say: Callable[[str], None]) -> Refiner
     return None
 
 
-def _with_ways(
+def _with_shortlist(
     refiner: Refiner, others: Sequence[Task], first: Inputs, say: Callable[[str], None]
 ) -> Refiner:
-    """The refiner with the ways that are best on the first frame and on a few of the others."""
+    """The refiner with the candidates that are best on a few of the frames."""
     frames = [first]
     for number in sorted({len(others) // 2, len(others) - 1}) if others else ():
-        with contextlib.suppress(PnpDepthError):  # it will be read again, and its error told
+        with contextlib.suppress(PnpDepthError):  # it is read again later, which reports its error
             frames.append(read_inputs(others[number].request))
-    refiner = refiner.with_ways_of(frames)
-    assert refiner.ways is not None
-    found = "; ".join(str(way) for way in refiner.ways)
-    say(f"auto: best on {len(frames)} frames, and to be checked on each: {found}")
+    refiner = refiner.with_shortlist_of(frames)
+    assert refiner.shortlist is not None
+    names = "; ".join(str(candidate) for candidate in refiner.shortlist)
+    say(f"auto: best on {len(frames)} frames, and to be checked on each: {names}")
     return refiner
 
 
 def run_tasks(
-    tasks: Iterable[Task],
-    refiner: Refiner | None,
-    state: BatchState,
-    *,
-    workers: int,
-    batch_size: int | None,
-    proven: bool,
-    stopped: Callable[[], bool],
-    say: Callable[[str], None],
-    profile: BatchProfile,
+    tasks: Iterable[Task], refiner: Refiner | None, run: BatchRun, *, proven: bool
 ) -> Generator[Row, None, None]:
-    """Each task is done and recorded; a row for each, in their order.
+    """Refines and records each task; yields a row for each, in their order.
 
-    A frame that cannot be done has a row that says why. batch_size: see `FrameGroups`. proven: some
-    frame went through with these settings before. stopped(): no further frame is begun. Raises
-    StorageError when nothing more can be written, and an error of network or settings that shows
-    before any frame went through.
+    Args:
+        tasks: The frames to refine.
+        refiner: The network; None if no frame could be read.
+        run: What the frames share.
+        proven: True if a frame was refined with these settings before.
+
+    Raises:
+        StorageError: When nothing more can be written.
+        ModelError: For an error of the network before any frame was refined.
+        UsageError: For an error of the settings before any frame was refined.
     """
+    profile, workers = run.profile, run.workers
     writing: deque[Future[Row]] = deque()
 
     def written() -> Row:
@@ -132,31 +138,31 @@ def run_tasks(
     ):
         groups = None
         if refiner is not None and split is not None:
-            groups = FrameGroups(refiner, split, batch_size, say)
+            groups = FrameGroups(refiner, split, run.batch_size, run.say)
         reading = _read_ahead(tasks, readers, workers, groups, profile)
         try:
             for group in _gathered(reading, groups, profile):
-                if stopped():
+                if run.stopped():
                     break
-                for task, read, made in _refined(groups, group, profile):
-                    if isinstance(made, Exception):
-                        if not proven and isinstance(made, ModelError | UsageError):
-                            raise made
-                        writing.append(writers.submit(_failed, state, task, made))
+                for task, read, result in _refined(groups, group, profile):
+                    if isinstance(result, Exception):
+                        if not proven and isinstance(result, ModelError | UsageError):
+                            raise result
+                        writing.append(writers.submit(_failed, run.state, task, result))
                     else:
                         proven = True
                         assert read is not None
                         assert refiner is not None
-                        given = (state, task, read, refiner, made, profile)
-                        writing.append(writers.submit(_write, *given))
-                # What is refined but not written is lost if the process is killed; so it is little.
+                        arguments = (run, task, read, refiner, result)
+                        writing.append(writers.submit(_write, *arguments))
+                # frames not yet written are lost if the process is killed, so there are few
                 while writing and (writing[0].done() or len(writing) >= workers + len(group)):
                     yield written()
             while writing:
                 yield written()
         finally:
             reading.close()
-            for future in writing:  # after a full disk they would only fail as well
+            for future in writing:  # after a full disk they would fail too
                 future.cancel()
 
 
@@ -185,9 +191,9 @@ def _gathered(
     groups: FrameGroups | None,
     profile: BatchProfile,
 ) -> Generator[list[tuple[Task, ReadFrame | Exception]], None, None]:
-    """The frames in their order, so many of one size at once as go together.
+    """The frames in their order, in groups of one size that go together.
 
-    One that could not be read is passed on in its place, and counts for nothing.
+    One that could not be read keeps its position and does not count.
     """
     group: list[tuple[Task, ReadFrame | Exception]] = []
     size: tuple[int, int] | None = None
@@ -220,7 +226,7 @@ def _refined(
     group: Sequence[tuple[Task, ReadFrame | Exception]],
     profile: BatchProfile,
 ) -> Iterator[tuple[Task, ReadFrame | None, RefinedFrame | Exception]]:
-    """Each frame with what was read and what was made of it; or None, and why it was not read."""
+    """Each frame with its inputs and its result or error; or None, and why it was not read."""
     frames = [read for _, read in group if isinstance(read, ReadFrame)]
     results: list[RefinedFrame | Exception] = []
     if groups is None:
@@ -233,10 +239,10 @@ def _refined(
             for frame in frames:
                 frame.watch.add("refine", (time.perf_counter() - start) / len(frames))
             groups.try_out()
-    made = iter(results)
+    of_frames = iter(results)
     for task, read in group:
         if isinstance(read, ReadFrame):
-            yield task, read, next(made)
+            yield task, read, next(of_frames)
         else:
             yield task, None, read
 
@@ -244,21 +250,17 @@ def _refined(
 def _read(task: Task, profile: BatchProfile) -> ReadFrame:
     watch = Stopwatch()
     with watch("read"), profile(READING):
-        known = known_inputs(task)
+        fingerprints = input_fingerprints(task)
         inputs = read_inputs(task.request)
-    return ReadFrame(inputs=inputs, known=known, watch=watch)
+    return ReadFrame(inputs=inputs, fingerprints=fingerprints, watch=watch)
 
 
 def _write(
-    state: BatchState,
-    task: Task,
-    read: ReadFrame,
-    refiner: Refiner,
-    frame: RefinedFrame,
-    profile: BatchProfile,
+    run: BatchRun, task: Task, read: ReadFrame, refiner: Refiner, frame: RefinedFrame
 ) -> Row:
+    state = run.state
     try:
-        with profile(WRITING):
+        with run.profile(WRITING):
             state.begin(task)
             outcome = write_refined(task.outputs, refiner, read.inputs, frame, read.watch)
             written = {
@@ -266,12 +268,13 @@ def _write(
                 for kind, path in task.outputs.by_kind().items()
             }
             row = row_of(task.name, _paths(task), outcome.record, written)
-            state.finish(task, "diverged" if outcome.diverged else "done", row, read.known)
+            status: Status = "diverged" if outcome.diverged else "done"
+            state.finish(task, status, row, read.fingerprints)
     except StorageError:
         raise
     except Exception as error:
         return _failed(state, task, error)
-    profile.count()
+    run.profile.count()
     return row
 
 
@@ -288,8 +291,8 @@ def _paths(task: Task) -> dict[str, str]:
 def _message(error: Exception) -> str:
     if isinstance(error, PnpDepthError):
         return str(error)
-    place = traceback.extract_tb(error.__traceback__)[-1]
+    line = traceback.extract_tb(error.__traceback__)[-1]
     return (
-        f"a bug of pnpdepth: {type(error).__name__}: {error} ({Path(place.filename).name}, line"
-        f" {place.lineno})"
+        f"a bug of pnpdepth: {type(error).__name__}: {error} ({Path(line.filename).name}, line"
+        f" {line.lineno})"
     )

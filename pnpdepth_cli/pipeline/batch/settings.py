@@ -1,4 +1,4 @@
-"""With which settings a frame is refined, as one digest: equal where the results would be."""
+"""Reduces the settings of a frame to one digest, equal where the results would be equal."""
 
 from __future__ import annotations
 
@@ -17,33 +17,33 @@ def settings_of(request: RefineRequest, model: dict[str, Any], *groups: str) -> 
     """Returns all that decides the result except the frame's own files, in JSON's own types.
 
     Args:
-        request: What is asked for.
-        model: What `model_identity` returns.
+        request: How the frame is refined.
+        model: The `model_identity` of the request.
         *groups: Names of the request's groups. None: all of them.
     """
-    asked = request.settings(*groups)
-    if "device" in asked:  # two devices of a kind give the same, so shards may have one each
-        asked["device"] = asked["device"].split(":")[0]
-    if "scan" in asked:
-        asked["scan"] = asdict(asked["scan"])
-        del asked["scan"]["calib"]
+    fields = request.settings(*groups)
+    if "device" in fields:  # devices of one kind give equal results, so shards may use one each
+        fields["device"] = fields["device"].split(":")[0]
+    if "scan" in fields:
+        fields["scan"] = asdict(fields["scan"])
+        del fields["scan"]["calib"]
     for name in ("sample", "protocol"):
-        if asked.get(name) is not None:
-            asked[name] = asdict(asked[name])
-    settings: dict[str, Any] = plain(asked | model)
+        if fields.get(name) is not None:
+            fields[name] = asdict(fields[name])
+    settings: dict[str, Any] = plain(fields | model)
     return settings
 
 
 def settings_digest(request: RefineRequest, model: dict[str, Any]) -> str:
-    """The digest of `settings_of`."""
+    """Returns the SHA-256 of `settings_of`."""
     text = json.dumps(settings_of(request, model), sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()
 
 
 def model_identity(request: RefineRequest) -> dict[str, Any]:
-    """The program's version, which decides a named network, and the digests of a network's files.
+    """Returns the program's version and the digests of the network's files.
 
-    A file's name, which may have an :ATTRIBUTE or :OUTPUT behind it, counts; its folder does not.
+    A file's name with its :ATTRIBUTE or :OUTPUT counts; its folder does not.
     """
     spec, checkpoint = request.network.model, request.network.checkpoint
     path, colon, choice = Path(spec), "", ""

@@ -1,9 +1,9 @@
-"""What was done before, and whether it still holds: the run manifests of an output folder.
+"""The run manifests of an output folder: which frames are done, and whether they are up to date.
 
-`batch.jsonl`, or `batch.2of8.jsonl` of a shard, grows by a line before a frame's files are written
-("begun") and by one after ("done", "diverged" or "failed"). A line holds the digest of the
-settings, and size, time and digest of every file that was read and written; so a re-run knows what
-is missing or was made otherwise, and a run that is killed at any moment is seen as such.
+`batch.jsonl`, or `batch.2of8.jsonl` of a shard, gets a line before a frame's files are written
+("begun") and one after ("done", "diverged" or "failed"). A line holds the digest of the settings,
+and size, time and digest of every file that was read and written. So a later run recognises what is
+missing, outdated or interrupted.
 """
 
 from __future__ import annotations
@@ -29,9 +29,12 @@ _MANIFEST = re.compile(r"batch(\.\d+of\d+)?\.jsonl")
 
 
 class BatchState:
-    """The run manifests of an output folder; this run writes its own, and reads all of them.
+    """The run manifests of an output folder; this run writes its own and reads all of them.
 
-    model: the network's identity, as `model_identity` says it. fresh: no batch was there before.
+    Args:
+        output: The folder.
+        shard: (i, n) of this run; None for all frames.
+        model: The network's `model_identity`.
     """
 
     def __init__(self, output: Path, shard: tuple[int, int] | None, model: dict[str, Any]) -> None:
@@ -39,13 +42,14 @@ class BatchState:
         self.model = model
         part = "" if shard is None else f".{shard[0]}of{shard[1]}"
         own = output / f"batch{part}.jsonl"
-        made_before = own.exists()
+        existed = own.exists()
         self._own = Journal(own, "frame")
         self.read_others()
-        self.fresh = not made_before and not self._others
+        self.fresh = not existed and not self._others
+        """True if no batch wrote to the folder before."""
 
     def read_others(self) -> None:
-        """What the other shards have done up to now is known."""
+        """Reads what the other shards have done up to now."""
         paths = sorted(self.output.iterdir()) if self.output.is_dir() else []
         self._others = [
             Journal(path, "frame")
@@ -54,18 +58,18 @@ class BatchState:
         ]
 
     def notes(self) -> list[str]:
-        """What is to be said of the manifests."""
+        """Returns a warning for each damaged manifest."""
         return [
-            f"warning: {journal.lost} lines of {journal.path} mean nothing; what they said is done"
+            f"warning: {journal.lost} lines of {journal.path} are damaged; their frames are refined"
             " again"
             for journal in (self._own, *self._others)
             if journal.lost
         ]
 
     def why_to_do(self, task: Task) -> str | None:
-        """Why the frame is to be done; None if it has been, with these settings and files.
+        """Returns why the frame is to be done; None if it is done with these settings and files.
 
-        A word or two, and details behind a colon.
+        The reason is a word or two, with details after a colon.
         """
         lines = self._lines(task.name)
         if not lines:
@@ -75,29 +79,29 @@ class BatchState:
         return None if None in reasons else reasons[0]
 
     def result_of(self, task: Task) -> dict[str, Any] | None:
-        """What became of the frame with these settings, in this run or before; None if nothing."""
+        """Returns the frame's line with these settings, of this run or before; None without one."""
         digest = self._settings(task)
-        found = [line for line in self._lines(task.name) if line.get("settings") == digest]
-        found.sort(key=lambda line: line["state"] == "failed")
-        return found[0] if found else None
+        lines = [line for line in self._lines(task.name) if line.get("settings") == digest]
+        lines.sort(key=lambda line: line["state"] == "failed")
+        return lines[0] if lines else None
 
     def check_foreign(self, paths: Iterable[Path]) -> None:
-        """OutputError if one of the files that a batch would write is there, not from a batch."""
+        """Raises OutputError if one of the files exists, and no batch wrote it."""
         for path in paths:
             if path.exists():
                 raise OutputError(
-                    f"{path} exists, and no batch made it; --overwrite replaces such files, -o"
+                    f"{path} exists, and no batch wrote it; --overwrite replaces such files, -o"
                     " names another folder"
                 )
 
     def begin(self, task: Task) -> None:
-        """It is known that files of this frame may be there from now on."""
+        """Records that files of this frame may exist from now on."""
         self._own.append({"frame": task.name, "state": "begun"})
 
     def finish(
         self, task: Task, status: Status, row: dict[str, Any], read: dict[str, Fingerprint]
     ) -> None:
-        """It is known that the frame is done, and which files it was made of and into."""
+        """Records that the frame is done, with the fingerprints of its inputs and outputs."""
         written = {path: fingerprint(path) for path in task.outputs.paths()}
         self._own.append(
             {
@@ -114,7 +118,7 @@ class BatchState:
         )
 
     def fail(self, task: Task, row: dict[str, Any]) -> None:
-        """It is known that the frame cannot be done, and why; it is tried again by the next run."""
+        """Records why the frame failed; the next run tries it again."""
         self._own.append(
             {
                 "frame": task.name,
@@ -144,7 +148,7 @@ class BatchState:
                 for kind in ("inputs", "outputs")
             )
         except (KeyError, TypeError, AttributeError):
-            return "recorded in a way that is not understood"
+            return "unreadable record"
         if read.keys() != task.inputs.keys():
             return "other input files"
         for part, path in task.inputs.items():
@@ -157,13 +161,13 @@ class BatchState:
         return None
 
 
-def known_inputs(task: Task) -> dict[str, Fingerprint]:
-    """What the files are known by that are read for the frame. InputError if one is not there."""
+def input_fingerprints(task: Task) -> dict[str, Fingerprint]:
+    """Returns the fingerprints of the frame's files. Raises InputError if one is missing."""
     return {part: fingerprint(path) for part, path in task.inputs.items()}
 
 
 def remove_all_leftovers(output: Path) -> int:
-    """No file that a killed run left half-written is below the folder; returns how many were."""
+    """Removes the half-written files of a killed run below the folder; returns how many."""
     folders = [Path(folder) for folder, _, _ in os.walk(output)]
     try:
         return sum(remove_leftovers(folder) for folder in folders)

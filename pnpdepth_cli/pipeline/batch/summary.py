@@ -1,11 +1,12 @@
-"""What became of a batch: `summary.json` and `summary.csv`, written frame by frame."""
+"""Writes the results of a batch, `summary.json` and `summary.csv`, frame by frame."""
 
 from __future__ import annotations
 
 import csv
 import json
+import math
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -26,15 +27,20 @@ _MEASURED = {
     "scores": _SCORES,
 }
 _STAGES = ("before", "after")
+BASELINE_MEASURES = ("held_out_mae", "mae", "rmse")
 _EFFECTIVE = ("layer", "iterations", "lr", "step", "loss", "update", "align")
 
 
 def row_of(
     name: str, inputs: Mapping[str, str], record: Mapping[str, Any], outputs: Mapping[str, str]
 ) -> dict[str, Any]:
-    """What is kept of a refined frame's record, its inputs by part and its outputs by kind.
+    """Returns the summary's row of a refined frame.
 
-    Outputs are paths in the output folder.
+    Args:
+        name: The frame's name.
+        inputs: Its files by part.
+        record: The refinement's record.
+        outputs: Its results by kind, as paths in the output folder.
     """
     return {
         "name": name,
@@ -48,13 +54,14 @@ def row_of(
         "loss": [record["loss"][0], record["loss"][-1]],
         "improved_share": record["improved_share"],
         **{kind: record[kind] for kind in _MEASURED},
+        "baselines": record.get("baselines"),
         "warnings": [note for note in record["notes"] if note.startswith("warning")],
         "seconds": record["seconds"],
     }
 
 
 def failed_row(name: str, inputs: Mapping[str, str], message: str) -> dict[str, Any]:
-    """The same of a frame that could not be refined."""
+    """Returns the summary's row of a frame that could not be refined."""
     return {
         "name": name,
         "status": "failed",
@@ -62,48 +69,79 @@ def failed_row(name: str, inputs: Mapping[str, str], message: str) -> dict[str, 
         "inputs": dict(inputs),
         "outputs": {},
         **dict.fromkeys(_MEASURED),
+        "baselines": None,
     }
 
 
 class Tally:
-    """Counts and means over rows, which are not kept."""
+    """Counts rows and adds up their scores; the rows are not kept."""
 
     def __init__(self) -> None:
         self.counts: Counter[str] = Counter({"done": 0, "diverged": 0, "failed": 0})
         self.warned = 0
         self._sums: dict[tuple[str, str, str], tuple[int, float]] = {}
+        self._baselines: dict[tuple[str, str], tuple[int, float]] = {}
 
     def add(self, row: Mapping[str, Any]) -> None:
-        """One more row."""
+        """Adds one row."""
         self.counts[row["status"]] += 1
         self.warned += bool(row.get("warnings"))
-        for place, value in _measures(row):
-            if value is not None:
-                count, total = self._sums.get(place, (0, 0.0))
-                self._sums[place] = (count + 1, total + value)
+        for key, value in _measures(row):
+            _add(self._sums, key, value)
+        for name, entry in (row.get("baselines") or {}).items():
+            for measure, value in _baseline_measures(entry).items():
+                _add(self._baselines, (name, measure), value)
+
+    @property
+    def baseline_names(self) -> list[str]:
+        """The baselines of any row, in the order of the records."""
+        return list(dict.fromkeys(name for name, _ in self._baselines))
 
     def mean(self) -> dict[str, Any]:
-        """{"scores": {"frames": 9, "before": {"rmse": …}, "after": …}, …}; None where no frame."""
+        """Returns {"scores": {"frames": 9, "before": {"rmse": …}, …}, …}; None without frames."""
         means: dict[str, Any] = {
             kind: {"frames": 0, **{stage: {} for stage in _STAGES}} for kind in _MEASURED
         }
         for (kind, stage, measure), (count, total) in self._sums.items():
             means[kind]["frames"] = max(means[kind]["frames"], count)
-            means[kind][stage][measure] = total / count
-        return {kind: found if found["frames"] else None for kind, found in means.items()}
+            means[kind][stage][measure] = total / count if count else None
+        return {kind: mean if mean["frames"] else None for kind, mean in means.items()}
+
+    def mean_baselines(self) -> dict[str, dict[str, Any]] | None:
+        """Returns {"linear": {"frames": 9, "held_out_mae": …, "mae": …, "rmse": …}, …}."""
+        means: dict[str, dict[str, Any]] = {
+            name: {"frames": 0, **dict.fromkeys(BASELINE_MEASURES)} for name in self.baseline_names
+        }
+        for (name, measure), (count, total) in self._baselines.items():
+            means[name]["frames"] = max(means[name]["frames"], count)
+            means[name][measure] = total / count if count else None
+        return means or None
 
 
 def _measures(row: Mapping[str, Any]) -> Iterator[tuple[tuple[str, str, str], float | None]]:
     for kind, measures in _MEASURED.items():
-        found = row.get(kind)
-        if found:
+        scores = row.get(kind)
+        if scores:
             for stage in _STAGES:
                 for measure in measures:
-                    yield (kind, stage, measure), found[stage].get(measure)
+                    yield (kind, stage, measure), (scores[stage] or {}).get(measure)
+
+
+def _baseline_measures(entry: Mapping[str, Any]) -> dict[str, float | None]:
+    scores = entry.get("scores") or {}
+    measured = {"held_out_mae": entry.get("held_out_mae")}
+    return measured | {measure: scores.get(measure) for measure in ("mae", "rmse")}
+
+
+def _add(sums: dict[Any, tuple[int, float]], key: Any, value: float | None) -> None:
+    """Adds a value to a count and a sum; one that is None or NaN makes only the entry."""
+    count, total = sums.setdefault(key, (0, 0.0))
+    if value is not None and not math.isnan(value):
+        sums[key] = (count + 1, total + value)
 
 
 def write_summary(path: Path, head: Mapping[str, Any], rows: Iterable[Mapping[str, Any]]) -> None:
-    """`path` holds the head as JSON, and the rows as its list `frames`, a line each."""
+    """Writes the head as JSON, with the rows as its list `frames`, a line each."""
     text = json.dumps(plain(head), indent=2, ensure_ascii=False, allow_nan=False)
     with atomic_path(path) as temporary, _text_file(temporary) as file:
         file.write(text.removesuffix("\n}") + ',\n  "frames": [')
@@ -113,8 +151,16 @@ def write_summary(path: Path, head: Mapping[str, Any], rows: Iterable[Mapping[st
         file.write("\n  ]\n}\n")
 
 
-def write_table(path: Path, rows: Iterable[Mapping[str, Any]]) -> None:
-    """`path` holds a line for each row as CSV: its status, its errors, its seconds."""
+def write_table(
+    path: Path, rows: Iterable[Mapping[str, Any]], baselines: Sequence[str] = ()
+) -> None:
+    """Writes a CSV line for each row: its status, its errors, its seconds.
+
+    Args:
+        path: The file.
+        rows: The rows.
+        baselines: Names of baselines, whose errors make the last columns.
+    """
     header = [
         *("name", "status", "message", "points", "held_out_points", "improved_share"),
         *(
@@ -124,6 +170,7 @@ def write_table(path: Path, rows: Iterable[Mapping[str, Any]]) -> None:
             for measure in measures
         ),
         *("warnings", "seconds_read", "seconds_refine", "seconds_write"),
+        *(f"baseline_{name}_{measure}" for name in baselines for measure in BASELINE_MEASURES),
     ]
     with atomic_path(path) as temporary, _text_file(temporary) as file:
         writer = csv.writer(file, lineterminator="\n")
@@ -131,6 +178,10 @@ def write_table(path: Path, rows: Iterable[Mapping[str, Any]]) -> None:
         for row in rows:
             points, seconds = row.get("points") or {}, row.get("seconds") or {}
             measured = dict(_measures(row))
+            of_baselines = {
+                name: _baseline_measures(entry)
+                for name, entry in (row.get("baselines") or {}).items()
+            }
             writer.writerow(
                 [
                     *(text_cell(row["name"]), row["status"], text_cell(row["message"] or "")),
@@ -143,10 +194,15 @@ def write_table(path: Path, rows: Iterable[Mapping[str, Any]]) -> None:
                     ),
                     text_cell("; ".join(row.get("warnings") or ())),
                     *(seconds.get(stage) for stage in ("read", "refine", "write")),
+                    *(
+                        of_baselines.get(name, {}).get(measure)
+                        for name in baselines
+                        for measure in BASELINE_MEASURES
+                    ),
                 ]
             )
 
 
 def _text_file(path: Path) -> Any:
-    # A file name that is no UTF-8 has characters that are none; JSON spells them so.
+    # a file name that is no UTF-8 has surrogates; JSON escapes them so
     return path.open("w", encoding="utf-8", errors="backslashreplace", newline="")

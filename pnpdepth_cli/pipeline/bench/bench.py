@@ -1,11 +1,11 @@
-"""`pnpdepth bench`: what a refinement and everything around it takes, beside one forward pass."""
+"""`pnpdepth bench`: time and memory of a refinement and its parts, relative to a forward pass."""
 
 from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,14 +21,14 @@ from pnpdepth_cli.completion.propagation import propagate
 from pnpdepth_cli.core.refine import RefineSettings, refine
 from pnpdepth_cli.core.split import Split, gradient_at
 from pnpdepth_cli.errors import NoPointsError, PnpDepthError, UsageError
+from pnpdepth_cli.frames.frame import Frame
+from pnpdepth_cli.frames.prepare import PreparedFrame, prepare
+from pnpdepth_cli.frames.refine import refine_frame
 from pnpdepth_cli.io.depth import write_depth
-from pnpdepth_cli.models.aligned import AlignedDepth
 from pnpdepth_cli.models.definition import Fixed
-from pnpdepth_cli.models.frame import FrameMap
 from pnpdepth_cli.models.made_up import made_up_frame
 from pnpdepth_cli.models.network import Network, load_network, out_of_memory_is_a_device_error
-from pnpdepth_cli.pipeline.bench.timing import Spread, Timed, in_turn, peak_mb
-from pnpdepth_cli.pipeline.refinement.frame import FrameToRefine, refine_frame
+from pnpdepth_cli.pipeline.bench.timing import Quartiles, Timed, in_turn, peak_mb
 from pnpdepth_cli.pipeline.refinement.inputs import read_inputs
 from pnpdepth_cli.pipeline.refinement.output_files import plan_outputs
 from pnpdepth_cli.pipeline.refinement.outputs import write_outputs
@@ -46,85 +46,109 @@ from pnpdepth_cli.points import SparsePoints
 DEFAULT_SIZE = (480, 640)
 FIRST_FRAME, FULL = "refinement, first frame", "refinement, fp32"
 _WITH_PEAK = ("forward", "refinement", FIRST_FRAME, FULL)
-_CODES = 1000.0  # per metre, of the made-up sparse depth
+_CODES_PER_METRE = 1000.0  # of the synthetic sparse depth
 
 
 @dataclass(frozen=True, kw_only=True)
 class BenchRequest:
-    """What is to be measured; None is the network's own default.
-
-    size: (H, W) of the made-up frame. repeats: runs that count, after one that does not. files:
-    whether reading, writing and the work on a whole frame are measured too.
-    """
+    """What to measure; None is the network's own default."""
 
     model: str = "compact"
+    """A network, as `--model` names it."""
     checkpoint: Path | None = None
+    """Its weights; None for its own, or random ones."""
     layer: str | None = None
+    """Where it is cut."""
     size: tuple[int, int] | None = None
+    """(H, W) of the synthetic frame."""
     points: int = 500
+    """Sparse points of the frame."""
     iterations: int | None = None
+    """Updates of z."""
     precision: str = "fp32"
+    """Of convolutions and matrix products."""
     device: str = "cpu"
+    """Torch's name of the device."""
     repeats: int = 10
+    """Measured runs, after one warm-up."""
     files: bool = True
+    """True to measure reading, writing, alignment and propagation too."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class BenchPart:
-    """A thing that was timed: `forwards` is its median in forward passes.
-
-    peak_mb: memory beyond what lay there before, 10^6 bytes; None where it was not measured.
-    """
+    """One timed part."""
 
     name: str
-    seconds: Spread
+    """What was timed."""
+    seconds: Quartiles
+    """Of its runs."""
     forwards: float
+    """Its median in forward passes."""
     peak_mb: float | None
+    """Peak memory beyond what was in use before, 10^6 bytes; None if not measured."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Bench:
-    """What was measured, and with what.
+    """The result of `run_bench`.
 
-    limit_by_flops, limit_measured: (front + (2K + 1)·rear) / (front + rear), what a refinement by K
-    updates costs at least, in forward passes; from counts of operations (None where none can be
-    counted) and from the times of the parts.
-    depth_change: mean |d − d'| / d' of the depth refined in fp32, d', where another precision is
-    measured.
+    The limit, (front + (2K + 1)·rear) / (front + rear) forward passes, is what K updates cost at
+    least.
     """
 
     model: str
+    """The network, as `--model` names it."""
     checkpoint: str | None
+    """Its weights; None for random ones."""
     layer: str
+    """Where it is cut."""
     size: tuple[int, int]
+    """(H, W) of the image."""
     network_size: tuple[int, int]
+    """(H, W) of the network's input."""
     points: int
+    """Sparse points inside the network's crop."""
     iterations: int
+    """Updates of z, K."""
     precision: str
+    """Of convolutions and matrix products."""
     device: str
+    """Torch's name of the device."""
     threads: int
+    """Of torch on the CPU."""
     versions: dict[str, str]
+    """Of the program and its libraries."""
     parts: tuple[BenchPart, ...]
+    """What was timed."""
     limit_by_flops: float | None
+    """The limit by counts of operations; None if none can be counted."""
     limit_measured: float
+    """The limit by the times of front and rear."""
     depth_change: float | None
+    """Mean |d − d'| / d', d' refined in fp32; None if the precision is fp32."""
     notes: tuple[str, ...]
+    """What was assumed; one line each."""
 
     def part(self, name: str) -> BenchPart:
-        """The part of that name."""
+        """Returns the part of that name."""
         return next(part for part in self.parts if part.name == name)
 
     def record(self) -> dict[str, Any]:
-        """All of it in JSON's own types."""
+        """Returns the result in JSON's own types."""
         return asdict(self)
 
 
 def run_bench(
     request: BenchRequest, *, on_round: Callable[[int, int], None] = lambda done, of: None
 ) -> Bench:
-    """Everything measured on a made-up frame; a network without weights gets random ones.
+    """Returns the times and memory of all parts on a synthetic frame.
 
-    on_round(done, of) is called after every round, in which each part is run once.
+    A network without weights gets random ones.
+
+    Args:
+        request: What to measure.
+        on_round: Called with (done, of) after every round, in which each part runs once.
     """
     if request.repeats < 1 or request.points < 1:
         raise UsageError(
@@ -138,17 +162,14 @@ def run_bench(
 
 @dataclass(frozen=True, kw_only=True)
 class _Subject:
-    """A network and a made-up frame for it; `asked` names the frame's files."""
+    """A network and a synthetic frame for it; `files_request` names the frame's files."""
 
     request: BenchRequest
-    asked: RefineRequest
+    files_request: RefineRequest
     network: Network
     layer: str
     settings: RefineSettings
-    frame: FrameMap
-    rgb: Tensor
-    points: SparsePoints
-    arguments: tuple[Tensor, ...]
+    prepared: PreparedFrame
 
     @classmethod
     def load(cls, request: BenchRequest, folder: Path) -> _Subject:
@@ -157,43 +178,39 @@ class _Subject:
         policy = definition.size
         own = (policy.height, policy.width) if isinstance(policy, Fixed) else DEFAULT_SIZE
         rgb, points = made_up_frame(request.size or own, request.points)
-        asked = RefineRequest(
+        refine_request = RefineRequest(
             files=FrameFiles(image=folder / "rgb.png", sparse=folder / "sparse.png"),
             network=NetworkChoice(model=request.model),
             method=MethodOptions(
                 layer=request.layer,
                 iterations=request.iterations,
-                # What random weights give has nothing to do with the points.
+                # the output of random weights has no relation to the points
                 align=None if network.checkpoint or definition.complete else "none",
             ),
             outputs=OutputOptions(output=folder / "out", overwrite=True),
         )
-        _write_frame(asked.files, rgb, points)
-        frame = FrameMap.fit(definition.size, *points.size)
-        at = frame.points_to_network(points).to(network.device)
-        if not len(at):
+        _write_frame(refine_request.files, rgb, points)
+        prepared = prepare(network, Frame(rgb=rgb[0], points=points))
+        if not len(prepared.points):
             raise NoPointsError(
                 f"none of {len(points)} points lies in the network's view; take more"
             )
         return cls(
             request=request,
-            asked=asked,
+            files_request=refine_request,
             network=network,
             layer=resolve_layer(definition, request.layer),
-            settings=resolve_settings(definition, asked.method),
-            frame=frame,
-            rgb=rgb,
-            points=at,
-            arguments=network.arguments(frame, rgb, at),
+            settings=resolve_settings(definition, refine_request.method),
+            prepared=prepared,
         )
 
     def measured(self, stack: ExitStack, on_round: Callable[[int, int], None]) -> Bench:
-        """All parts in turn."""
+        """Measures all parts in turn."""
         device, notes = self.network.device, list(self.network.notes)
         opened = _network(self.request, self.request.precision)
         split = stack.enter_context(opened.cut_at(self.layer))
         with torch.no_grad():
-            z = split.front(*self.arguments)
+            z = split.front(*self.prepared.arguments)
             output = split.rear(z)
             limit = _limit(*self._operations(split, z), self.settings.iterations)
         todo = self._engine_parts(split, z)
@@ -207,7 +224,7 @@ class _Subject:
             todo |= self._fitting_parts(output, notes) | self._file_parts()
         spent = in_turn(todo, self.request.repeats, device, on_round=on_round)
         peaks = {name: peak_mb(_once(todo[name]), device) for name in _WITH_PEAK if name in todo}
-        seconds = {name: Spread.of(each) for name, each in spent.items()}
+        seconds = {name: Quartiles.of(each) for name, each in spent.items()}
         front, rear = seconds["front"].median, seconds["rear"].median
         measured = _limit(front, rear, self.settings.iterations)
         assert measured is not None
@@ -215,9 +232,9 @@ class _Subject:
             model=self.request.model,
             checkpoint=str(self.network.checkpoint) if self.network.checkpoint else None,
             layer=self.layer,
-            size=self.frame.image,
-            network_size=self.frame.network,
-            points=len(self.points),
+            size=self.prepared.map.image,
+            network_size=self.prepared.map.network,
+            points=len(self.prepared.points),
             iterations=self.settings.iterations,
             precision=self.request.precision,
             device=str(device),
@@ -239,7 +256,7 @@ class _Subject:
         )
 
     def _engine_parts(self, split: Split, z: Tensor) -> dict[str, Timed]:
-        """The network, the two halves of it, and the refinement; tensors in, tensors out."""
+        """The network, its front and rear, and the refinement; tensors in, tensors out."""
         no_grad, module = torch.no_grad(), self.network.module
         loss_of = LOSSES[self.settings.loss]
 
@@ -247,15 +264,15 @@ class _Subject:
             leaf = z.clone().requires_grad_(True)
             with torch.enable_grad():
                 depth = self.network.depth_of(split.rear(leaf))
-                return leaf, loss_of(self.points.sample(depth), self.points.depth)
+                return leaf, loss_of(self.prepared.points.sample(depth), self.prepared.points.depth)
 
         def first_frame(_: object) -> None:
             with self.network.cut_at(self.layer) as fresh:
                 self._refined(fresh, self.network)
 
         return {
-            "forward": Timed(run=no_grad(lambda _: module(*self.arguments))),
-            "front": Timed(run=no_grad(lambda _: split.front(*self.arguments))),
+            "forward": Timed(run=no_grad(lambda _: module(*self.prepared.arguments))),
+            "front": Timed(run=no_grad(lambda _: split.front(*self.prepared.arguments))),
             "rear": Timed(run=no_grad(lambda _: split.rear(z))),
             "rear backward": Timed(run=lambda prepared: gradient_at(*prepared), prepare=loss),
             "refinement": Timed(run=lambda _: self._refined(split, self.network)),
@@ -263,46 +280,52 @@ class _Subject:
         }
 
     def _refined(self, split: Split, network: Network) -> Tensor:
-        read = AlignedDepth(
-            network, self.points, self.settings.align, every=self.settings.align_every
-        )
-        return refine(split, self.arguments, self.points, self.settings, depth_of=read).after
+        prepared = replace(self.prepared, network=network)
+        return refine(
+            split,
+            prepared.arguments,
+            prepared.points,
+            self.settings,
+            depth_of=prepared.depth_reader(self.settings),
+        ).after
 
     def _fitting_parts(self, output: Any, notes: list[str]) -> dict[str, Timed]:
-        """What else may be done to a prediction."""
+        """Alignment and propagation."""
         stated = self.network.definition.output_kind
         spaces = (stated,) if stated in SPACES else ("depth", "inverse")
-        at_points = self.points.sample(self.network.raw_of(output))
+        at = self.prepared.points
+        at_points = at.sample(self.network.raw_of(output))
         depth = self.network.depth_of(output)
-        points = self.points.resized(*depth.shape[-2:])
-        rgb = F.interpolate(self.rgb, points.size, mode="bilinear")[0]
+        points = at.resized(*depth.shape[-2:])
+        image = self.prepared.frame.rgb
+        assert image is not None
+        rgb = F.interpolate(image[None], points.size, mode="bilinear")[0]
         todo = {
-            "alignment": Timed(run=lambda _: align(at_points, self.points, spaces, "auto")),
+            "alignment": Timed(run=lambda _: align(at_points, at, spaces, "auto")),
             "propagation": Timed(run=lambda _: propagate(depth[0, 0], points, rgb, kind="gp")),
         }
         for name in list(todo):
             try:
                 todo[name].run(None)
-            except PnpDepthError as error:  # random weights may give the same everywhere
-                notes.append(f"{name} is not measured: {error}")
+            except PnpDepthError as error:  # random weights may give a constant
+                notes.append(f"{name} was not measured: {error}")
                 del todo[name]
         return todo
 
     def _file_parts(self) -> dict[str, Timed]:
-        """From files and to files, as `pnpdepth refine` does it."""
-        inputs, outputs = read_inputs(self.asked), plan_outputs(self.asked)
+        """Reading and writing of files, as `pnpdepth refine` does it."""
+        inputs, outputs = read_inputs(self.files_request), plan_outputs(self.files_request)
         with self.network.cut_at(self.layer) as split:
-            task = FrameToRefine.with_points(inputs, inputs.points)
-            frame = refine_frame(self.network, split, self.settings, task)
+            frame = refine_frame(self.network, split, self.settings, inputs.frame())
         return {
-            "reading": Timed(run=lambda _: read_inputs(self.asked)),
+            "reading": Timed(run=lambda _: read_inputs(self.files_request)),
             "writing": Timed(run=lambda _: write_outputs(outputs, inputs, frame)),
         }
 
     def _operations(self, split: Split, z: Tensor) -> tuple[float, float]:
         """Floating-point operations of the front and of the rear."""
         with FlopCounterMode(display=False) as whole:
-            self.network.module(*self.arguments)
+            self.network.module(*self.prepared.arguments)
         with FlopCounterMode(display=False) as behind:
             split.rear(z)
         rear = behind.get_total_flops()
@@ -310,7 +333,7 @@ class _Subject:
 
 
 def _network(request: BenchRequest, precision: str) -> Network:
-    """The network of the request, the same each time also where its weights are random."""
+    """The network of the request, with the same random weights each time if it has none."""
     torch.manual_seed(0)
     return load_network(
         request.model,
@@ -325,7 +348,7 @@ def _write_frame(files: FrameFiles, rgb: Tensor, points: SparsePoints) -> None:
     assert isinstance(files.image, Path)
     assert files.sparse is not None
     cv2.imwrite(str(files.image), (255 * rgb[0].permute(1, 2, 0)).round().byte().numpy())
-    write_depth(files.sparse, points.scatter()[0, 0].numpy(), scale=_CODES)
+    write_depth(files.sparse, points.scatter()[0, 0].numpy(), scale=_CODES_PER_METRE)
 
 
 def _limit(front: float, rear: float, iterations: int) -> float | None:

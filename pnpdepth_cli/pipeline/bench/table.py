@@ -1,4 +1,4 @@
-"""The paper's Table V, the time of a refinement with K = 5, measured again for its networks."""
+"""Measures the paper's table of times (Table IV) for its networks, K = 5."""
 
 from __future__ import annotations
 
@@ -11,18 +11,20 @@ from pnpdepth_cli.pipeline.bench.bench import Bench, BenchRequest, run_bench
 
 @dataclass(frozen=True, kw_only=True)
 class PaperTime:
-    """A network of the paper, our name for it, and the size (H, W) of its frames.
-
-    before, after: seconds that the paper prints for the network and with refinement, on a GPU that
-    it does not name; None where it prints none.
-    """
+    """A network of the paper, and the times that the paper prints."""
 
     name: str
+    """The paper's name of it."""
     model: str
+    """Ours."""
     data: str
+    """The data set."""
     size: tuple[int, int]
+    """(H, W) of its frames."""
     before: float | None = None
+    """Seconds of the network on the paper's GPU, which it does not name; None if not printed."""
     after: float | None = None
+    """Seconds with refinement."""
 
     @property
     def forwards(self) -> float | None:
@@ -52,18 +54,20 @@ PAPER_TIMES = (
         name="Jaritz", model="latefusion", data="NYU", size=(224, 320), before=0.0484, after=0.1593
     ),
 )
-"""Wang et al. (ICRA 2019), Table V, and the three networks that it leaves out."""
+"""Wang et al. (ICRA 2019), Table IV, and the three networks that it leaves out."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class TableRow:
-    """A network of the paper, and what was measured of ours at full size."""
+    """A network of the paper, and our measurement."""
 
     paper: PaperTime
+    """What the paper prints."""
     bench: Bench
+    """Measured at full size."""
 
     def record(self) -> dict[str, Any]:
-        """All of it in JSON's own types."""
+        """Returns the row in JSON's own types."""
         return {"paper": asdict(self.paper), "bench": self.bench.record()}
 
 
@@ -74,9 +78,13 @@ def bench_table(
     device: str,
     on_network: Callable[[int, int, str], None] = lambda done, of, name: None,
 ) -> list[TableRow]:
-    """The paper's networks, full size, with random weights and the paper's settings.
+    """Returns the times of the paper's networks, full size, random weights, K = 5.
 
-    on_network(done, of, name) is called before each.
+    Args:
+        repeats: Measured runs of each part.
+        precision: Of convolutions and matrix products.
+        device: Torch's name of the device.
+        on_network: Called with (done, of, name) before each network.
     """
     rows = []
     for number, paper in enumerate(PAPER_TIMES):

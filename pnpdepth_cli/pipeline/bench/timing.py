@@ -1,4 +1,4 @@
-"""How long things take and how much memory they need, measured so that they can be compared."""
+"""Measures times and peak memory so that they can be compared."""
 
 from __future__ import annotations
 
@@ -14,17 +14,21 @@ import torch
 
 
 @dataclass(frozen=True, kw_only=True)
-class Spread:
-    """Seconds of a number of runs: their median and quartiles."""
+class Quartiles:
+    """Quartiles of the seconds of several runs."""
 
     median: float
+    """Median."""
     lower: float
+    """First quartile."""
     upper: float
+    """Third quartile."""
     runs: int
+    """Number of runs."""
 
     @classmethod
-    def of(cls, seconds: Sequence[float]) -> Spread:
-        """That of at least one run."""
+    def of(cls, seconds: Sequence[float]) -> Quartiles:
+        """Returns the quartiles of at least one run."""
         if len(seconds) == 1:
             return cls(median=seconds[0], lower=seconds[0], upper=seconds[0], runs=1)
         lower, median, upper = statistics.quantiles(seconds, n=4, method="inclusive")
@@ -33,10 +37,12 @@ class Spread:
 
 @dataclass(frozen=True, kw_only=True)
 class Timed:
-    """Something to time: `run` is given what `prepare`, which is not timed, returns."""
+    """A function to time."""
 
     run: Callable[[Any], object]
+    """Takes the result of `prepare`; timed."""
     prepare: Callable[[], Any] = lambda: None
+    """Called before each run; not timed."""
 
 
 def in_turn(
@@ -46,10 +52,15 @@ def in_turn(
     *,
     on_round: Callable[[int, int], None] = lambda done, of: None,
 ) -> dict[str, list[float]]:
-    """Seconds of every run of each thing, after one that does not count.
+    """Returns the seconds of every run of each function, without a first warm-up run.
 
-    One of each in turn, so that what else the machine does slows all of them alike; the device has
-    finished whenever the clock is read. on_round(done, of) is called after each round.
+    The functions run in turn, so that other load on the machine slows all of them alike.
+
+    Args:
+        todo: The functions by name.
+        repeats: Measured runs of each.
+        device: Synchronised whenever the clock is read.
+        on_round: Called with (done, of) after each round.
     """
     spent: dict[str, list[float]] = {name: [] for name in todo}
     for number in range(-1, repeats):
@@ -66,15 +77,15 @@ def in_turn(
 
 
 def synchronise(device: torch.device) -> None:
-    """The device has done all that it was told to."""
+    """Waits until the device has finished its work."""
     if device.type != "cpu":
         torch.get_device_module(device).synchronize()
 
 
 def peak_mb(run: Callable[[], object], device: torch.device) -> float | None:
-    """Memory in 10^6 bytes that `run` needs at its peak, beyond what is in use before.
+    """Returns the peak memory of `run` beyond what is in use before, in 10^6 bytes.
 
-    On a GPU that of its tensors, else that of the process; None where the system does not say.
+    On a GPU of its tensors, else of the process; None where the system does not measure it.
     """
     if device.type == "cuda":
         synchronise(device)
@@ -83,9 +94,9 @@ def peak_mb(run: Callable[[], object], device: torch.device) -> float | None:
         run()
         synchronise(device)
         return (torch.cuda.max_memory_allocated(device) - before) / 1e6
-    _give_back_what_is_free()
+    _release_free_memory()
     try:
-        Path("/proc/self/clear_refs").write_text("5")  # the peak is what is in use now
+        Path("/proc/self/clear_refs").write_text("5")  # resets the peak to what is in use now
         resident = _kilobytes("VmRSS")
         run()
         return max(0.0, (_kilobytes("VmHWM") - resident) * 1024 / 1e6)
@@ -98,8 +109,8 @@ def _kilobytes(name: str) -> int:
     return next(int(line.split()[1]) for line in lines if line.startswith(f"{name}:"))
 
 
-def _give_back_what_is_free() -> None:
-    """Free memory that the C library keeps would hide what is taken of it."""
+def _release_free_memory() -> None:
+    """Returns free memory of the C library to the system, as reuse of it would not be measured."""
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
     if trim is not None:
         trim(0)

@@ -106,4 +106,4 @@ def block_length(series: Floats) -> int:
         return 1
     correlation = min(correlation + (1 + 3 * correlation) / frames, 0.99)
     ratio = math.sqrt(6) * correlation / (1 - correlation**2)
-    return min(frames, math.ceil(ratio ** (2 / 3) * frames ** (1 / 3)))
+    return min(frames, math.ceil(math.pow(ratio, 2 / 3) * math.pow(frames, 1 / 3)))

@@ -61,6 +61,7 @@ def diagnose(
         *_unscored(rows),
         _coverage(scored, protocol),
         _holes(scored),
+        _fits(scored, protocol),
         _scale(scored, kinds),
         _leak(scored, protocol),
     ]
@@ -84,14 +85,16 @@ def _unscored(rows: Sequence[FrameScores]) -> list[str]:
 
 def _coverage(rows: Sequence[FrameScores], protocol: EvalProtocol) -> str | None:
     known = sum(row.known for row in rows)
-    empty = known - sum(row.pixels for row in rows)
+    empty = known - sum(row.predicted for row in rows)
     if not empty:
         return None
-    treatment = (
-        "was filled in from its neighbours before scoring"
-        if protocol.is_devkit
-        else "lowers the coverage and is in no error"
-    )
+    treatment = {
+        "skip": "lowers the coverage and is in no error",
+        "min": f"is scored as {protocol.min_depth:g} m",
+        "max": f"is scored as {protocol.max_depth or 0:g} m",
+    }.get(protocol.missing, "")
+    if protocol.is_devkit:
+        treatment = "was filled in from its neighbours before scoring"
     return (
         f"warning: {empty:,} pixels ({empty / known:.2%}) of the ground truth have no prediction;"
         f" what is missing {treatment}"
@@ -106,6 +109,19 @@ def _holes(rows: Sequence[FrameScores]) -> str | None:
         f"warning: {len(holes):,} predictions have empty rows between filled ones, which the"
         f" development kit sets to −1 m and scores (its logarithmic errors are then NaN):"
         f" {some_names(holes)}"
+    )
+
+
+def _fits(rows: Sequence[FrameScores], protocol: EvalProtocol) -> str | None:
+    """The spread of the factors that predictions were scaled by."""
+    factors = np.array([row.fit.factor for row in rows if row.fit is not None])
+    if not len(factors):
+        return None
+    median = float(np.median(factors))
+    spread = float(np.std(factors / median)) if median else math.nan
+    return (
+        f"scale-by {protocol.scale_by}: factor {median:.4g} (median of {len(factors):,} images),"
+        f" standard deviation / median {spread:.3f}"
     )
 
 

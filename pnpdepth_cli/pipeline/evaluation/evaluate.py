@@ -30,6 +30,7 @@ from pnpdepth_cli.pipeline.evaluation.pairing import FramePair, pair_frames
 from pnpdepth_cli.pipeline.evaluation.protocols import EvalProtocol, choose_protocol
 from pnpdepth_cli.pipeline.evaluation.resampling import studentised_interval
 from pnpdepth_cli.pipeline.evaluation.result import ErrorBin, EvalRequest, Evaluation, Interval
+from pnpdepth_cli.pipeline.evaluation.uncertainty import summarise_uncertainty
 from pnpdepth_cli.pipeline.ordered_pool import in_order
 
 
@@ -55,11 +56,14 @@ def evaluate(
     )
     rows: list[FrameScores] = []
     kinds = FileKinds()
+    uncertainties = []
     by_distance = np.zeros((len(DISTANCE_EDGES_PX) - 1, len(SUMS)))
     by_depth = np.zeros((len(DEPTH_EDGES_M) - 1, len(SUMS)))
     for scored in _scored(pairs.frames, protocol, request, raising=pairs.single):
         rows.append(scored.row)
         kinds.add(scored)
+        if scored.uncertainty is not None:
+            uncertainties.append(scored.uncertainty)
         if scored.by_distance is not None and scored.by_depth is not None:
             by_distance += scored.by_distance
             by_depth += scored.by_depth
@@ -81,6 +85,7 @@ def evaluate(
         mean=_by_key(keys, mean),
         interval=_interval(table, clusters, protocol, request),
         clusters=clusters,
+        uncertainty=summarise_uncertainty(uncertainties),
         by_distance=_bins(by_distance, DISTANCE_EDGES_PX),
         by_depth=_bins(by_depth, DEPTH_EDGES_M),
         notes=(

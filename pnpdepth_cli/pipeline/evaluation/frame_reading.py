@@ -11,15 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import FileFormatError, InputError, SizeError
-from pnpdepth_cli.io.dataset.frame import PICTURES
+from pnpdepth_cli.io.dataset.frame import IMAGE_SUFFIXES
 from pnpdepth_cli.io.depth import DepthImage, read_sparse
 from pnpdepth_cli.io.depth_reading import depth_from_stored, known_metres, load_stored
-from pnpdepth_cli.io.layouts import Hdf5Array, read_frame_truth
+from pnpdepth_cli.io.layouts import Hdf5Array, read_frame_ground_truth
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.pipeline.evaluation.pairing import FramePair
 from pnpdepth_cli.pipeline.evaluation.protocols import EvalProtocol
+from pnpdepth_cli.pipeline.evaluation.scaling import Fit, scaled
+from pnpdepth_cli.pipeline.evaluation.stacks import load_stacked
 from pnpdepth_cli.points import SparsePoints, in_frame
-from pnpdepth_cli.sensors.sparse import as_picture
+from pnpdepth_cli.sensors.sparse import as_depth_image
 
 Depth = NDArray[np.float32]
 Mask = NDArray[np.bool_]
@@ -53,11 +55,17 @@ class LoadedFrame:
     """Depths of one size (H, W) in float32 metres, 0 where unknown."""
 
     prediction: DepthImage | None
-    """None where there is no file."""
+    """As it is scored: scaled, clipped, and filled in as the protocol says; None without a file."""
     ground_truth: DepthImage
     """0 also where the protocol does not score."""
     sparse: Depth | None
     """The points on their pixels; None where no file is known."""
+    predicted: Mask | None = None
+    """(H, W) true where the file has a prediction; None without a file."""
+    fit: Fit | None = None
+    """How the prediction was scaled to the ground truth, if it was."""
+    sigma: Depth | None = None
+    """Standard deviation of the prediction in metres, 0 where unknown, if a file has it."""
     tolerance: float = 0.0
     """Metres that rounding to integer codes can put between equal depths."""
 
@@ -71,14 +79,6 @@ def load_frame(pair: FramePair, protocol: EvalProtocol, scales: Scales) -> Loade
     """
     ground_truth = _read_ground_truth(pair, protocol, scales)
     size = (ground_truth.values.shape[0], ground_truth.values.shape[1])
-    prediction = None
-    if pair.prediction is not None:
-        prediction = _read(pair.prediction, scales.prediction, scales.channel, protocol)
-        prediction = replace(
-            prediction, values=_to_size(pair, prediction.values, size, protocol.resize)
-        )
-        if protocol.clip:
-            prediction = replace(prediction, values=_clipped(prediction.values, protocol))
     sparse, sparse_scale = _known_sparse(pair, protocol, scales, size)
     mask = _scored_mask(pair, ground_truth.values, protocol)
     if protocol.exclude_sparse:
@@ -88,33 +88,83 @@ def load_frame(pair: FramePair, protocol: EvalProtocol, scales: Scales) -> Loade
             )
         mask &= sparse == 0
     half_codes = [0.5 / scale for scale in {ground_truth.scale, sparse_scale} if scale is not None]
-    return LoadedFrame(
-        prediction=prediction,
+    loaded = LoadedFrame(
+        prediction=None,
         ground_truth=replace(
             ground_truth, values=np.where(mask, ground_truth.values, np.float32(0))
         ),
         sparse=sparse,
         tolerance=sum(half_codes),
     )
+    return loaded if pair.prediction is None else _with_prediction(loaded, pair, protocol, scales)
+
+
+def _with_prediction(
+    loaded: LoadedFrame, pair: FramePair, protocol: EvalProtocol, scales: Scales
+) -> LoadedFrame:
+    """The frame with its prediction at the ground truth's size, scaled, clipped and filled in."""
+    assert pair.prediction is not None
+    gt = loaded.ground_truth.values
+    size = (gt.shape[0], gt.shape[1])
+    image = _read(pair.prediction, scales.prediction, scales.channel, protocol, pair.index)
+    values = _to_size(pair, image.values, size, protocol.resize)
+    depth, fit = scaled(values, gt, gt > 0, protocol.prediction_kind, protocol.scale_by)
+    predicted = values > 0
+    if protocol.clip:
+        depth = _clipped(depth, protocol)
+    empty = ~(depth > 0)
+    if protocol.missing == "fail" and (holes := int(np.count_nonzero(empty & (gt > 0)))):
+        raise InputError(
+            f"{pair.prediction} has no depth at {holes:,} pixels of the ground truth, which"
+            " --missing fail refuses"
+        )
+    bounds = {"min": protocol.min_depth, "max": protocol.max_depth}
+    bound = bounds.get(protocol.missing)
+    if bound is not None:
+        depth = np.where(empty, np.float32(bound), depth)
+    return replace(
+        loaded,
+        prediction=replace(image, values=depth),
+        predicted=predicted,
+        fit=fit,
+        sigma=_read_sigma(pair, size, fit, protocol),
+    )
+
+
+def _read_sigma(
+    pair: FramePair, size: tuple[int, int], fit: Fit | None, protocol: EvalProtocol
+) -> Depth | None:
+    """(H, W) the standard deviation in metres, 0 where unknown; None where it is not known."""
+    if pair.sigma is None or fit is not None or protocol.prediction_kind != "depth":
+        return None
+    try:
+        values = depth_from_stored(pair.sigma, load_stored(pair.sigma, None), None).values
+    except InputError:
+        return None
+    return values if values.shape == size else None
 
 
 def _read_ground_truth(pair: FramePair, protocol: EvalProtocol, scales: Scales) -> DepthImage:
     frame = pair.frame
     if isinstance(frame.gt, Hdf5Array):
-        return DepthImage(values=read_frame_truth(frame), source=f"{frame.gt.path.suffix} array",
-                          assumed_scale=False)  # fmt: skip
+        values, source = read_frame_ground_truth(frame), f"{frame.gt.path.suffix} array"
+        return DepthImage(values=values, source=source, assumed_scale=False)
     if frame.gt is None:
         raise InputError(f"frame {pair.name} has no ground truth")
     scale = scales.ground_truth if scales.ground_truth is not None else frame.gt_scale
-    image = _read(frame.gt, scale, scales.channel, protocol)
+    image = _read(frame.gt, scale, scales.channel, protocol, pair.gt_index)
     return replace(image, values=np.ascontiguousarray(frame.protocol.apply(image.values)))
 
 
 def _read(
-    path: Path, scale: float | None, channel: str | None, protocol: EvalProtocol
+    path: Path,
+    scale: float | None,
+    channel: str | None,
+    protocol: EvalProtocol,
+    index: int | None = None,
 ) -> DepthImage:
     """The depth image; codes are metres × the scale, else the file's own, else the protocol's."""
-    stored = load_stored(path, channel)
+    stored = load_stored(path, channel) if index is None else load_stacked(path, index)
     assumed = scale is None and stored.scale is None and stored.values.dtype.kind != "f"
     scale = protocol.scale if assumed else scale
     image = depth_from_stored(path, stored, scale)
@@ -148,13 +198,13 @@ def _read_sparse(
         sparse = read_sparse(pair.sparse, size=size, scale=protocol.scale)
     xy, source_size = sparse.points.xy, sparse.points.size
     if source_size != size:
-        xy = pair.frame.protocol.places(xy, source_size)
+        xy = pair.frame.protocol.in_crop(xy, source_size)
         cut = pair.frame.protocol.apply(np.zeros(source_size, bool)).shape
         if cut != size:
             raise _different(pair, "sparse depth", pair.sparse, source_size, size, advice="")
     inside = in_frame(xy, size)
     points = SparsePoints(xy=xy[inside], depth=sparse.points.depth[inside], size=size)
-    return as_picture(points), sparse.scale
+    return as_depth_image(points), sparse.scale
 
 
 def _scored_mask(pair: FramePair, ground_truth: Depth, protocol: EvalProtocol) -> Mask:
@@ -177,7 +227,7 @@ def _scored_mask(pair: FramePair, ground_truth: Depth, protocol: EvalProtocol) -
 
 def _read_mask(path: Path) -> Mask:
     """(H, W) true where an image has any channel above 0, or an array a number above 0."""
-    if path.suffix.lower() in PICTURES:
+    if path.suffix.lower() in IMAGE_SUFFIXES:
         return np.asarray(read_rgb(path).values.max(axis=2) > 0)
     values = load_stored(path, None).values
     if values.ndim != 2:

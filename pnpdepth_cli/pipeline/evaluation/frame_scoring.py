@@ -17,6 +17,8 @@ from pnpdepth_cli.pipeline.evaluation.frame_reading import Depth, LoadedFrame, S
 from pnpdepth_cli.pipeline.evaluation.kitti_devkit import devkit_errors, fill_background
 from pnpdepth_cli.pipeline.evaluation.pairing import FramePair
 from pnpdepth_cli.pipeline.evaluation.protocols import EvalProtocol
+from pnpdepth_cli.pipeline.evaluation.scaling import Fit
+from pnpdepth_cli.pipeline.evaluation.uncertainty import FrameUncertainty, frame_uncertainty
 
 DISTANCE_EDGES_PX = (0.0, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0, math.inf)
 DEPTH_EDGES_M = (0.0, 1.0, 2.0, 3.0, 5.0, 10.0, 20.0, 40.0, 80.0, math.inf)
@@ -38,6 +40,10 @@ class FrameScores:
     """Scored pixels."""
     known: int = 0
     """Pixels with ground truth that the protocol scores."""
+    predicted: int = 0
+    """Pixels of these with a prediction in the file; the others are empty."""
+    fit: Fit | None = None
+    """How the prediction was scaled to the ground truth, if it was."""
     ratio: float = math.nan
     """Median of prediction / ground truth."""
     leaked: int = 0
@@ -66,7 +72,7 @@ class FrameScores:
     @property
     def coverage(self) -> float:
         """Fraction of the pixels with ground truth that has a prediction."""
-        return self.pixels / self.known if self.known else math.nan
+        return self.predicted / self.known if self.known else math.nan
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,6 +102,8 @@ class ScoredFrame:
     """What kind of file its ground truth is."""
     prediction: FileFacts | None = None
     """What kind of file its prediction is."""
+    uncertainty: FrameUncertainty | None = None
+    """Of the prediction's standard deviation; None without one."""
     by_distance: Sums | None = None
     """By distance to the nearest sparse point; None unless the user named sparse depth."""
     by_depth: Sums | None = None
@@ -123,7 +131,14 @@ def score_pair(pair: FramePair, protocol: EvalProtocol, scales: Scales) -> Score
         return ScoredFrame(row=row, ground_truth=_facts(ground_truth))
     prediction = loaded.prediction
     row = _row(pair, prediction.values, loaded, protocol)
-    scored = ScoredFrame(row=row, prediction=_facts(prediction), ground_truth=_facts(ground_truth))
+    scored = ScoredFrame(
+        row=row,
+        prediction=_facts(prediction),
+        ground_truth=_facts(ground_truth),
+        uncertainty=None
+        if loaded.sigma is None
+        else frame_uncertainty(prediction.values, ground_truth.values, loaded.sigma),
+    )
     if loaded.sparse is None or not row.scored or not pair.sparse_named:
         return scored
     depth = _filled(prediction.values) if protocol.is_devkit else prediction.values
@@ -142,8 +157,17 @@ def _row(pair: FramePair, depth: Depth, loaded: LoadedFrame, protocol: EvalProto
     gt = loaded.ground_truth.values
     sums = error_sums(torch.from_numpy(depth), torch.from_numpy(gt), protocol.thresholds)[0]
     pixels, known = (int(sums[SUMS.index(name)]) for name in ("pixels", "known"))
-    row = FrameScores(pair=pair, values={}, pixels=pixels, known=known, sums=tuple(sums.tolist()))
-    if not (depth > 0).any():
+    filled = loaded.predicted
+    row = FrameScores(
+        pair=pair,
+        values={},
+        pixels=pixels,
+        known=known,
+        predicted=pixels if filled is None else int(np.count_nonzero(filled & (gt > 0))),
+        fit=loaded.fit,
+        sums=tuple(sums.tolist()),
+    )
+    if not ((depth > 0).any() or protocol.is_devkit):
         return replace(row, error=f"{pair.prediction} holds no valid depth")
     if not (pixels or protocol.is_devkit):
         return replace(row, error=f"{pair.prediction} has no depth where the ground truth is known")

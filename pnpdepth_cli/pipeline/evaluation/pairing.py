@@ -10,15 +10,18 @@ from pathlib import Path
 from typing import Any
 
 from pnpdepth_cli.errors import InputError, PnpDepthError, UsageError
-from pnpdepth_cli.io.dataset.frame import DEPTHS, PICTURES
+from pnpdepth_cli.io.dataset.frame import IMAGE_SUFFIXES
+from pnpdepth_cli.io.depth import DEPTH_SUFFIXES
 from pnpdepth_cli.io.file_bytes import one_line
 from pnpdepth_cli.io.layouts import Frame, Source, find_layout, list_frames
 from pnpdepth_cli.io.record import read_json
 from pnpdepth_cli.pipeline.evaluation.dependence import groups_by_name
+from pnpdepth_cli.pipeline.evaluation.stacks import stack_size
 
-_POINTS = (*DEPTHS, ".csv", ".txt")
+_POINTS = (*DEPTH_SUFFIXES, ".csv", ".txt")
 _DEPTH_MARKS = ("_depth", ".depth")
-_COMPANIONS = ("_preview", "_improvement")
+_COMPANIONS = ("_preview", "_improvement", "_sigma", "_valid")
+_SIGMA_SUFFIXES = (".exr", ".npy")
 # KITTI's selection names the kind of file in the middle.
 _KITTI_KIND = re.compile(r"_sync_(image|velodyne_raw|groundtruth_depth)_")
 _LISTED = 5
@@ -40,6 +43,12 @@ class FramePair:
     """The network's sparse input: the user's, the run's record's or the data set's."""
     sparse_named: bool = False
     """True if the user named the sparse input."""
+    sigma: Path | None = None
+    """The standard deviation that a refinement wrote beside its depth."""
+    index: int | None = None
+    """Of the prediction in a file of several frames; None in a file of one."""
+    gt_index: int | None = None
+    """Of the ground truth in a file of several frames."""
     sampled: int = 0
     """Points of the ground truth that were the sparse input, by the run's record."""
     image: Source | None = None
@@ -88,6 +97,9 @@ def pair_frames(
             raise UsageError(
                 f"{ground_truth} is a data set but {prediction} one file; give a folder"
             )
+        frames_in_file = stack_size(prediction)
+        if frames_in_file is not None and ground_truth.is_file():
+            return _stacked_pairs(prediction, ground_truth, frames_in_file)
         name = frame_name(prediction.stem)
         frame = Frame(name=name, gt=ground_truth)
         return _pairs([frame], {name: prediction}, sparse, mask, notes=[], single=True)
@@ -107,6 +119,29 @@ def pair_frames(
     return _pairs(frames, predictions, sparse, mask, notes=notes, single=False)
 
 
+def _stacked_pairs(prediction: Path, ground_truth: Path, count: int) -> Pairs:
+    """A frame for each map of two files of several frames."""
+    others = stack_size(ground_truth)
+    if others != count:
+        stored = "a single map" if others is None else f"{others:,} frames"
+        raise InputError(f"{prediction} holds {count:,} frames but {ground_truth} {stored}")
+    frame = Frame(name="", gt=ground_truth)
+    return Pairs(
+        frames=tuple(
+            FramePair(
+                name=f"{index:04}",
+                prediction=prediction,
+                frame=replace(frame, name=f"{index:04}"),
+                index=index,
+                gt_index=index,
+            )
+            for index in range(count)
+        ),
+        notes=(f"{count:,} frames in each of the two files",),
+        single=False,
+    )
+
+
 def frame_name(stem: str) -> str:
     """Returns the frame of a file with this stem: without `_depth` and KITTI's file kind."""
     name = _KITTI_KIND.sub("_sync_", stem)
@@ -122,9 +157,10 @@ def depth_files(folder: Path) -> tuple[dict[str, Path], list[str]]:
     Raises:
         InputError: If there is none.
     """
-    files, notes = _files(folder, DEPTHS)
+    files, notes = _files(folder, DEPTH_SUFFIXES)
     if not files:
-        raise InputError(f"{folder} holds no depth file ({' '.join(DEPTHS)}); check the path")
+        suffixes = " ".join(DEPTH_SUFFIXES)
+        raise InputError(f"{folder} holds no depth file ({suffixes}); check the path")
     return files, notes
 
 
@@ -195,7 +231,7 @@ def _pairs(
             f" and are not scored: {some_names(extra)}"
         )
     points = _by_frame(sparse, _POINTS, names)
-    masks = _by_frame(mask, (*DEPTHS, *PICTURES), names)
+    masks = _by_frame(mask, (*DEPTH_SUFFIXES, *IMAGE_SUFFIXES), names)
     groups = groups_by_name([frame.name for frame in frames])
     return Pairs(
         frames=tuple(
@@ -226,6 +262,7 @@ def _pair(frame: Frame, prediction: Path | None, sparse: Path | None) -> FramePa
         frame=frame,
         sparse=sparse or _input(record, "sparse") or _depth_file(frame.sparse),
         sparse_named=sparse is not None,
+        sigma=_sigma_of(prediction),
         sampled=_sampled(record),
         image=_input(record, "image") or frame.image,
     )
@@ -241,6 +278,14 @@ def _record_of(prediction: Path | None) -> dict[str, Any]:
         return read_json(record) if record.is_file() else {}
     except PnpDepthError:
         return {}
+
+
+def _sigma_of(prediction: Path | None) -> Path | None:
+    if prediction is None:
+        return None
+    name = _base(prediction.stem, _DEPTH_MARKS) or prediction.stem
+    files = (prediction.with_name(f"{name}_sigma{suffix}") for suffix in _SIGMA_SUFFIXES)
+    return next((file for file in files if file.is_file()), None)
 
 
 def _input(record: dict[str, Any], part: str) -> Path | None:
@@ -268,4 +313,4 @@ def _dict(value: Any) -> dict[str, Any]:
 
 
 def _depth_file(path: Path | None) -> Path | None:
-    return path if path is not None and path.suffix.lower() in DEPTHS else None
+    return path if path is not None and path.suffix.lower() in DEPTH_SUFFIXES else None

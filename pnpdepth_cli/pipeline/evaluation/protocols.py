@@ -7,13 +7,12 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from pnpdepth_cli.choices import AVERAGES, MISSING, PREDICTION_KINDS, RESIZES, SCALINGS
 from pnpdepth_cli.core.metrics import DELTA_THRESHOLDS, MEASURES, Measure
 from pnpdepth_cli.errors import SizeError, UsageError
 from pnpdepth_cli.pipeline.evaluation.kitti_devkit import DEVKIT_MEASURES
 
 KITTI_DEVKIT = "kitti-devkit"
-AVERAGES = ("per-image", "pooled")
-RESIZES = ("nearest", "bilinear")
 
 # (top, bottom, left, right) as fractions of the height and the width, cut to whole pixels.
 # Garg et al. 2016 for KITTI; and what Godard et al. (monodepth, utils/evaluate_kitti.py) found by
@@ -55,6 +54,12 @@ class EvalProtocol:
     """Of δ1, δ2 and δ3."""
     exclude_sparse: bool = False
     """True not to score pixels with a sparse point."""
+    missing: str = "skip"
+    """What becomes of empty predictions: not scored, clamped to a bound and scored, or an error."""
+    prediction_kind: str = "depth"
+    """What predictions are, one of PREDICTION_KINDS."""
+    scale_by: str = "none"
+    """How the prediction of each image is scaled to its ground truth, one of SCALINGS."""
     resize: str | None = None
     """How a prediction of another size is resized to the ground truth's; None refuses it."""
 
@@ -97,7 +102,7 @@ class EvalProtocol:
     def scoring(self) -> dict[str, Any]:
         """Returns what decides the figures; equal for two evaluations that can be compared."""
         rules = asdict(self)
-        for field_of_reading in ("name", "scale", "resize", "mask"):
+        for field_of_reading in ("name", "scale", "resize", "mask", "prediction_kind"):
             rules.pop(field_of_reading)
         return rules | {
             "thresholds": list(self.thresholds),
@@ -109,7 +114,11 @@ class EvalProtocol:
         """Returns one line, such as `eigen: ground truth in 0.001–80 m, crop eigen, …`."""
         published = PROTOCOLS[self.name]
         own = replace(
-            published, mask=self.mask, exclude_sparse=self.exclude_sparse, resize=self.resize
+            published,
+            mask=self.mask,
+            exclude_sparse=self.exclude_sparse,
+            resize=self.resize,
+            prediction_kind=self.prediction_kind,
         )
         return ", ".join(
             (f"{self.name}{'' if self == own else ' (changed)'}: {self._range()}", *self._rest())
@@ -128,6 +137,9 @@ class EvalProtocol:
         parts += [f"mask {self.mask}"] if self.mask else []
         parts += ["without the pixels of sparse points"] if self.exclude_sparse else []
         parts += [f"predictions resized ({self.resize})"] if self.resize else []
+        parts += ["predictions are disparity"] if self.prediction_kind == "disparity" else []
+        parts += [f"each image scaled by {self.scale_by}"] if self.scale_by != "none" else []
+        parts += [_MISSING_TEXTS[self.missing]] if self.missing != "skip" else []
         if self.is_devkit:
             parts.append("missing predictions filled in, errors as its program prints them")
         else:
@@ -142,7 +154,19 @@ _IN_MILLIMETRES = tuple(
     for m in MEASURES
 )
 
-_EIGEN_RANGE: dict[str, Any] = {"min_depth": 1e-3, "max_depth": 80.0, "clip": True}
+_MISSING_TEXTS = {
+    "min": "empty predictions scored as the lower bound",
+    "max": "empty predictions scored as the upper bound",
+    "fail": "no empty predictions",
+}
+# The reference codes (monodepth2's evaluate_depth.py, BTS's eval) clamp predictions with
+# `pred[pred < min_depth] = min_depth`, which scores empty ones (0, NaN) as the lower bound.
+_EIGEN_RANGE: dict[str, Any] = {
+    "min_depth": 1e-3,
+    "max_depth": 80.0,
+    "clip": True,
+    "missing": "min",
+}
 
 PROTOCOLS = {
     protocol.name: protocol
@@ -151,7 +175,13 @@ PROTOCOLS = {
         EvalProtocol(name="paper"),
         # Eigen et al. 2014 with the bounds of later tables (BTS, AdaBins): 0.001 to 10 m.
         EvalProtocol(
-            name="nyu", scale=1000.0, min_depth=1e-3, max_depth=10.0, clip=True, crop="nyu"
+            name="nyu",
+            scale=1000.0,
+            min_depth=1e-3,
+            max_depth=10.0,
+            clip=True,
+            crop="nyu",
+            missing="min",
         ),
         # The completion benchmark's measures in its units, with nothing filled in.
         EvalProtocol(name="kitti"),
@@ -177,11 +207,18 @@ def choose_protocol(name: str, **changes: Any) -> EvalProtocol:
     changed = {field: value for field, value in changes.items() if value is not None}
     published = PROTOCOLS[name]
     if published.is_devkit:
-        for field, option in (("average", "--average"), ("thresholds", "--delta")):
+        for field, option in (
+            ("average", "--average"),
+            ("thresholds", "--delta"),
+            ("missing", "--missing"),
+        ):
             if changed.get(field, getattr(published, field)) != getattr(published, field):
                 raise UsageError(
-                    f"{option} does not apply to {name}: it has no δ and averages over the images"
+                    f"{option} does not apply to {name}: it has no δ, averages over the images, and"
+                    " fills in missing predictions"
                 )
+    if changed.get("min_depth") == 0 and published.missing == "min":
+        changed.setdefault("missing", "skip")  # there is no bound to score empty predictions as
     protocol = replace(published, **changed)
     _check(protocol)
     return protocol
@@ -199,6 +236,17 @@ def _check(protocol: EvalProtocol) -> None:
         raise UsageError(f"resize {protocol.resize!r} is not one of {', '.join(RESIZES)}")
     if not all(math.isfinite(limit) and limit > 1 for limit in protocol.thresholds):
         raise UsageError("--delta must be above 1: δ counts ratios below it")
+    for option, value, names in (
+        ("--missing", protocol.missing, MISSING),
+        ("--scale-by", protocol.scale_by, SCALINGS),
+        ("--pred-kind", protocol.prediction_kind, PREDICTION_KINDS),
+    ):
+        if value not in names:
+            raise UsageError(f"{option} {value!r} is not one of {', '.join(names)}")
+    if protocol.missing == "min" and protocol.min_depth == 0:
+        raise UsageError("--missing min scores empty predictions as --min-depth; set it above 0")
+    if protocol.missing == "max" and protocol.max_depth is None:
+        raise UsageError("--missing max scores empty predictions as --max-depth; set it")
     if protocol.crop not in CROPS:
         _rectangle(protocol.crop)
 

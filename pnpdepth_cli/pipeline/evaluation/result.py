@@ -1,4 +1,4 @@
-"""What `pnpdepth eval` is asked and what it returns; every output is made from the result."""
+"""The request and the result of `pnpdepth eval`; every output is made from the result."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from pnpdepth_cli.pipeline.evaluation.frame_reading import Scales
 from pnpdepth_cli.pipeline.evaluation.frame_scoring import FrameScores
 from pnpdepth_cli.pipeline.evaluation.protocols import EvalProtocol
 from pnpdepth_cli.pipeline.evaluation.resampling import LEVEL
+from pnpdepth_cli.pipeline.evaluation.uncertainty import Uncertainty
 from pnpdepth_cli.pipeline.stopwatch import versions
 
 
@@ -81,7 +82,7 @@ class Evaluation:
     """Scored frames and their means."""
 
     request: EvalRequest
-    """What was asked."""
+    """What was scored."""
     protocol: EvalProtocol
     """The protocol with the user's changes."""
     frames: tuple[FrameScores, ...]
@@ -92,6 +93,8 @@ class Evaluation:
     """Of the means; None with too few independent frames."""
     clusters: Clusters
     """What the bootstrap resamples as a whole."""
+    uncertainty: Uncertainty | None
+    """Whether predicted standard deviations are right; None without any."""
     by_distance: tuple[ErrorBin, ...]
     """By pixels to the nearest sparse point; empty without --sparse."""
     by_depth: tuple[ErrorBin, ...]
@@ -116,9 +119,9 @@ class Evaluation:
 
     @property
     def coverage(self) -> float:
-        """Fraction of all ground truth, of frames without prediction too, that was scored."""
+        """Fraction of all ground truth, of frames without prediction too, that has a prediction."""
         known = sum(frame.known for frame in self.frames)
-        return sum(frame.pixels for frame in self.frames) / known if known else math.nan
+        return sum(frame.predicted for frame in self.frames) / known if known else math.nan
 
     def describe_interval(self) -> str:
         """Returns what the interval is, such as `95 % interval: … over 12 groups of frames`."""
@@ -171,6 +174,7 @@ class Evaluation:
             },
             "mean": self.mean,
             "interval": self._interval_record(),
+            "uncertainty": None if self.uncertainty is None else asdict(self.uncertainty),
             "by_distance_px": [asdict(part) for part in self.by_distance],
             "by_depth_m": [asdict(part) for part in self.by_depth],
             "frames": [frame_record(frame, with_sums=pooled) for frame in self.frames],
@@ -213,6 +217,8 @@ def frame_record(frame: FrameScores, *, with_sums: bool = False) -> dict[str, An
         "coverage": frame.coverage,
         "pixels_given_as_sparse": frame.leaked if frame.has_sparse else None,
         "median_ratio": frame.ratio,
+        "factor": None if frame.fit is None else frame.fit.factor,
+        "shift": None if frame.fit is None else frame.fit.shift,
         "values": frame.values,
         "error": frame.error,
     }

@@ -104,7 +104,8 @@ def _eval_run(text: str, label: str, record: Mapping[str, Any]) -> Run:
         label=label,
         path=text,
         measures=tuple(Measure(**measure) for measure in record["measures"]),
-        scoring=dict(record["protocol"]["scoring"]),
+        # records of earlier versions lack rules that did not exist
+        scoring=PROTOCOLS["paper"].scoring() | record["protocol"]["scoring"],
         frames={
             frame["name"]: RunFrame(
                 values=_numbers(frame["values"]),

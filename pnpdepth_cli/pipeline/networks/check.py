@@ -2,69 +2,117 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor, nn
 
 from pnpdepth_cli.core.split import Split, gradient_at
 from pnpdepth_cli.errors import ModelError
+from pnpdepth_cli.frames.frame import Frame
+from pnpdepth_cli.frames.prepare import prepare
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.models.definition import Fixed
-from pnpdepth_cli.models.frame import FrameMap
-from pnpdepth_cli.models.made_up import made_up_arguments
-from pnpdepth_cli.models.network import load_network, out_of_memory_is_a_device_error
+from pnpdepth_cli.models.made_up import made_up_frame
+from pnpdepth_cli.models.network import Network, load_network, out_of_memory_is_a_device_error
 from pnpdepth_cli.points import SparsePoints
 
 _SIZE = (240, 320)
 
 
+@dataclass(frozen=True, kw_only=True)
+class CheckedModel:
+    """What a network is, what it returned, and how each of its layers can be cut."""
+
+    name: str
+    """Name of its definition."""
+    input: list[int]
+    """Rows and columns of the network's input."""
+    output: list[int]
+    """Rows and columns of its prediction."""
+    output_kind: str
+    """See `ModelDefinition.output_kind`."""
+    output_scale: str
+    """See `ModelDefinition.output_scale`."""
+    range: list[float]
+    """Least and greatest value of the prediction as the network returns it."""
+    parameters: int
+    """Number of its weights."""
+    layers: dict[str, str]
+    """For each layer of the definition "ok", or why the network cannot be cut there."""
+    notes: list[str]
+    """What was assumed, fitted or verified."""
+
+
 def check_model(
     model: str, checkpoint: Path | None, image: Path | None, device: str = "cpu"
-) -> dict[str, Any]:
-    """What the network is, what it gives for the image, and how each of its layers does.
+) -> CheckedModel:
+    """Loads a network, runs it once, and cuts it at every layer of its definition.
 
-    Every listed layer is cut: the cut network must give what the whole one does, to the bit, and
-    a gradient must come back. Raises the errors of loading and of verification.
+    At each layer the cut network must return what the whole one does, bit for bit, and a gradient
+    must come back.
+
+    Args:
+        model: See `pnpdepth_cli.models.registry.find_definition`.
+        checkpoint: Its weights; None takes those of the definition.
+        image: The rgb image to run it on; None runs it on a synthetic frame.
+        device: Name of a torch device.
+
+    Raises:
+        ModelError: The network cannot be run or trusted.
+        CheckpointError: Its weights cannot be loaded.
+        DeviceError: The device is missing or too small.
+        InputError: The image cannot be read.
     """
     network = load_network(model, checkpoint, device)
     definition = network.definition
-    notes = list(network.notes)
     with out_of_memory_is_a_device_error(network.device):
-        if image is None:
-            size = definition.size
-            own = (size.height, size.width) if isinstance(size, Fixed) else _SIZE
-            frame = FrameMap.fit(size, *own)
-            arguments = made_up_arguments(network, frame)
-        else:
-            rgb = torch.from_numpy(read_rgb(image).values).permute(2, 0, 1)[None].contiguous()
-            frame = FrameMap.fit(definition.size, *rgb.shape[-2:])
-            nowhere = SparsePoints(xy=torch.zeros(0, 2), depth=torch.zeros(0), size=frame.network)
-            arguments = network.arguments(frame, rgb, nowhere)
-        notes += network.verified(arguments)
+        prepared = prepare(network, _synthetic(network) if image is None else _read(image))
+        arguments = prepared.arguments
+        notes = [*network.notes, *network.verified(arguments)]
         with torch.no_grad():
             raw = network.raw_of(network.module(*arguments))
         layers = {
-            name: _layer(network.module, name, arguments, network.raw_of, raw)
+            name: _check_layer(network.module, name, arguments, network.raw_of, raw)
             for name in definition.layers
         }
-    return {
-        "name": definition.name,
-        "input": list(frame.network),
-        "output": list(raw.shape[-2:]),
-        "output_kind": definition.output_kind,
-        "output_scale": definition.output_scale,
-        "range": [float(raw.min()), float(raw.max())],
-        "parameters": sum(p.numel() for p in network.module.parameters()),
-        "layers": layers,
-        "notes": notes,
-    }
+    return CheckedModel(
+        name=definition.name,
+        input=list(prepared.map.network),
+        output=list(raw.shape[-2:]),
+        output_kind=definition.output_kind,
+        output_scale=definition.output_scale,
+        range=[float(raw.min()), float(raw.max())],
+        parameters=sum(p.numel() for p in network.module.parameters()),
+        layers=layers,
+        notes=notes,
+    )
 
 
-def _layer(
-    module: torch.nn.Module, name: str, arguments: tuple[Any, ...], raw_of: Any, whole: torch.Tensor
+def _synthetic(network: Network) -> Frame:
+    size = network.definition.size
+    rgb, points = made_up_frame((size.height, size.width) if isinstance(size, Fixed) else _SIZE)
+    return Frame(rgb=rgb[0], points=points)
+
+
+def _read(image: Path) -> Frame:
+    rgb = torch.from_numpy(read_rgb(image).values).permute(2, 0, 1).contiguous()
+    height, width = rgb.shape[-2:]
+    no_points = SparsePoints(xy=torch.zeros(0, 2), depth=torch.zeros(0), size=(height, width))
+    return Frame(rgb=rgb, points=no_points)
+
+
+def _check_layer(
+    module: nn.Module,
+    name: str,
+    arguments: tuple[Tensor, ...],
+    raw_of: Callable[[Any], Tensor],
+    whole: Tensor,
 ) -> str:
-    """ "ok", or why not."""
+    """ "ok", or why the network cannot be cut at the layer."""
     try:
         with Split(module, name) as split:
             with torch.no_grad():

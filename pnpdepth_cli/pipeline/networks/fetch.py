@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 from pnpdepth_cli.errors import ModelError, OutputError, UsageError
 from pnpdepth_cli.io.record import sha256_of, write_json
@@ -17,13 +17,34 @@ _WANTED = [  # never code, never pickles
 RECORD = "fetched.json"
 
 
-def fetch_model(
-    repo: str, revision: str | None = None, output: Path | None = None
-) -> dict[str, Any]:
-    """A Hugging Face repository's settings and safetensors weights are in a folder.
+@dataclass(frozen=True, kw_only=True)
+class FetchedModel:
+    """What was downloaded."""
 
-    Which revision that was, and the files' hashes, are in `fetched.json` there and returned.
-    Raises ModelError where the repository or the network cannot be reached.
+    repository: str
+    """ORG/NAME."""
+    revision: str | None
+    """The commit that was downloaded."""
+    folder: str
+    """Where the files are."""
+    sha256: dict[str, str]
+    """Hash of each file by its name."""
+
+
+def fetch_model(repo: str, revision: str | None = None, output: Path | None = None) -> FetchedModel:
+    """Downloads the settings and safetensors weights of a Hugging Face repository to a folder.
+
+    What was downloaded is returned, and stored as `fetched.json` in the folder.
+
+    Args:
+        repo: ORG/NAME.
+        revision: A branch, tag or commit; None is the main branch.
+        output: The folder, which must be empty or missing; None is NAME.
+
+    Raises:
+        ModelError: The repository cannot be reached.
+        OutputError: The folder holds something.
+        UsageError: `repo` is not of the form ORG/NAME.
     """
     organisation, slash, name = repo.partition("/")
     if not (organisation and slash and name) or "/" in name:
@@ -35,7 +56,7 @@ def fetch_model(
         from huggingface_hub import HfApi, snapshot_download
     except ImportError as error:
         raise ModelError(
-            f"--fetch needs the package {error.name!r}: pip install 'pnpdepth[hf]'"
+            f"fetching needs the package {error.name!r}: pip install 'pnpdepth[hf]'"
         ) from None
     try:
         pinned = HfApi().model_info(repo, revision=revision).sha
@@ -47,11 +68,11 @@ def fetch_model(
             " this machine online, and the name right? A folder copied from elsewhere works too"
         ) from None
     files = sorted(path for path in folder.iterdir() if path.is_file())
-    record = {
-        "repository": repo,
-        "revision": pinned,
-        "folder": str(folder),
-        "sha256": {path.name: sha256_of(path) for path in files},
-    }
-    write_json(folder / RECORD, record)
-    return record
+    fetched = FetchedModel(
+        repository=repo,
+        revision=pinned,
+        folder=str(folder),
+        sha256={path.name: sha256_of(path) for path in files},
+    )
+    write_json(folder / RECORD, asdict(fetched))
+    return fetched

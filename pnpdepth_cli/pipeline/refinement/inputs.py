@@ -1,4 +1,4 @@
-"""What a frame is made of on disk, read and checked against each other."""
+"""The files of a frame, read and checked against each other."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from pnpdepth_cli.errors import InputError, NoPointsError, SizeError, UsageError
+from pnpdepth_cli.frames.frame import Frame
 from pnpdepth_cli.io.dataset.frame import Hdf5Array, Source
 from pnpdepth_cli.io.dataset.hdf5 import depth_of, rgb_of
 from pnpdepth_cli.io.depth import (
@@ -28,60 +28,70 @@ from pnpdepth_cli.pipeline.sparse.scans import read_scan_points
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.sensors import sample_points
 
-Picture = NDArray[np.float32]
+ImageArray = NDArray[np.float32]
+
+_LEAK_FRACTION = 0.5
+"""Of the ground truth's pixels; as much in common with the sparse depth gives a warning."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Inputs:
-    """One frame in memory.
+    """A frame as it was read."""
 
-    rgb: (H, W, 3) float32 in 0..1, or None without an image. points: in the image's frame.
-    gt: (H, W) float32 metres, 0 = unknown, or None. sparse_scale: of an integer sparse file.
-    """
-
-    rgb: Picture | None
+    rgb: ImageArray | None
+    """(H, W, 3) float32 in 0…1. None without an image."""
     points: SparsePoints
-    gt: Picture | None
+    """Sparse depth in the image frame, on the CPU."""
+    gt: ImageArray | None
+    """(H, W) float32 metres, 0 = unknown. None without ground truth."""
     sparse_scale: float | None
+    """Integers per metre of the sparse depth file. None if it holds metres."""
     record: dict[str, Any]
+    """Files and digests, for a record."""
     notes: tuple[str, ...]
+    """What was assumed, and warnings."""
 
     @property
     def size(self) -> tuple[int, int]:
         """(H, W) of the image frame."""
         return self.points.size
 
-    def rgb_tensor(self) -> Tensor | None:
-        """(1, 3, H, W) float32 in 0..1."""
-        picture = self.picture()
-        return None if picture is None else picture[None]
-
-    def picture(self) -> Tensor | None:
-        """(3, H, W) float32 in 0..1."""
-        if self.rgb is None:
-            return None
-        return torch.from_numpy(np.ascontiguousarray(self.rgb.transpose(2, 0, 1)))
+    def frame(self) -> Frame:
+        """Returns the image and all points as tensors."""
+        rgb = self.rgb
+        if rgb is not None:
+            rgb = np.ascontiguousarray(rgb.transpose(2, 0, 1))
+        return Frame(rgb=None if rgb is None else torch.from_numpy(rgb), points=self.points)
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Part:
-    """A picture of the frame and what is said of it. whole: (H, W) before the protocol's cut."""
+    """An image or depth map of the frame."""
 
-    values: Picture
+    values: ImageArray
+    """(H, W) or (H, W, 3), the part that the protocol keeps."""
     whole: tuple[int, int]
+    """(H, W) before the protocol's crop."""
     record: dict[str, Any]
+    """Of its file."""
     notes: tuple[str, ...] = ()
+    """What was assumed."""
     scale: float | None = None
+    """Integers per metre of its file."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Sparse:
-    """Points in the image's frame, the scale of their integer file, and what is said of them."""
+    """The sparse depth of the frame."""
 
     points: SparsePoints
+    """In the image frame."""
     scale: float | None
+    """Integers per metre of its file."""
     record: dict[str, Any]
+    """Of its file."""
     notes: tuple[str, ...]
+    """What was assumed."""
 
 
 def read_inputs(request: RefineRequest) -> Inputs:
@@ -103,16 +113,36 @@ def read_inputs(request: RefineRequest) -> Inputs:
     else:
         sparse = _read_points(files, files.sparse, whole)
     if truth is not None and truth.values.shape != sparse.points.size:
-        raise _of_another_size(files, truth.values.shape, sparse.points.size)
+        raise _size_error(files, truth.values.shape, sparse.points.size)
     parts = {"image": image, "sparse": sparse, "gt": truth}
+    notes = [note for part in parts.values() if part is not None for note in part.notes]
+    if truth is not None and files.sparse is not None:
+        notes += _leak_warning(sparse.points, truth.values)
     return Inputs(
         rgb=None if image is None else image.values,
         points=sparse.points,
         gt=None if truth is None else truth.values,
         sparse_scale=sparse.scale,
         record={name: part.record for name, part in parts.items() if part is not None},
-        notes=tuple(note for part in parts.values() if part is not None for note in part.notes),
+        notes=tuple(notes),
     )
+
+
+def _leak_warning(points: SparsePoints, gt: ImageArray) -> list[str]:
+    """A warning if most of the ground truth is the sparse depth itself.
+
+    KITTI's ground truth holds the points of its own scan by design, which is less than half of it.
+    """
+    known = gt > 0
+    leaked = int((known & (points.scatter()[0, 0].numpy() == gt)).sum())
+    fraction = leaked / int(known.sum())
+    if fraction < _LEAK_FRACTION:
+        return []
+    return [
+        f"warning: {leaked:,} of {int(known.sum()):,} pixels ({fraction:.1%}) of the ground truth"
+        " are the sparse depth itself, so errors against it show nothing; give another --gt, or"
+        " keep points out with --holdout"
+    ]
 
 
 def _read_image(files: FrameFiles, source: Source) -> _Part:
@@ -135,7 +165,7 @@ def _read_truth(files: FrameFiles, source: Source) -> _Part:
     else:
         scale = files.gt_scale or files.depth_scale
         truth = read_depth(source, scale=scale, channel=files.channel)
-    said = describe_range(
+    described = describe_range(
         truth.values,
         truth.source,
         assumed_scale=truth.assumed_scale,
@@ -146,7 +176,7 @@ def _read_truth(files: FrameFiles, source: Source) -> _Part:
         values=np.ascontiguousarray(files.protocol.apply(truth.values)),
         whole=(truth.values.shape[0], truth.values.shape[1]),
         record=_file_record(source) | {"read_as": truth.source},
-        notes=(f"gt: {said}",),
+        notes=(f"gt: {described}",),
         scale=truth.scale,
     )
 
@@ -157,28 +187,28 @@ def _file_record(source: Source) -> dict[str, Any]:
 
 
 def _sampled(files: FrameFiles, image: _Part | None, truth: _Part | None, seed: int) -> _Sparse:
-    """Points of the truth instead of sparse depth."""
+    """Points sampled from the ground truth."""
     if files.sample is None:
         raise InputError(f"{files.image} has no sparse depth; add it, or sample the ground truth")
     if truth is None:
         raise InputError(f"{files.image} has no ground truth to sample points from; add it")
-    picture = None if image is None else image.values
+    rgb = None if image is None else image.values
     try:
-        found = sample_points(truth.values, files.sample, seed, image=picture)
+        points = sample_points(truth.values, files.sample, seed, image=rgb)
     except UsageError as error:  # the pattern itself is good, this frame is too poor for it
         raise InputError(f"{files.gt}: {error}") from error
     source = f"{files.sample.kind} of the ground truth, seed {seed}"
     return _Sparse(
-        points=found.tensors(),
+        points=points.tensors(),
         scale=truth.scale,
         record={"sampled_from": str(files.gt), **asdict(files.sample), "seed": seed},
-        notes=(f"sparse: {describe_range(found.depth, source)}",),
+        notes=(f"sparse: {describe_range(points.depth, source)}",),
     )
 
 
 def _read_scan(files: FrameFiles, path: Path, image_size: tuple[int, int] | None) -> _Sparse:
-    picture = files.image if isinstance(files.image, Path) else None
-    scan = read_scan_points(path, files.scan, image_size, picture)
+    image = files.image if isinstance(files.image, Path) else None
+    scan = read_scan_points(path, files.scan, image_size, image)
     points = _in_protocol(files, path, scan.points.tensors())
     return _Sparse(points=points, scale=None, record=scan.record, notes=scan.notes)
 
@@ -207,13 +237,13 @@ def _read_points(files: FrameFiles, path: Path, image_size: tuple[int, int] | No
 
 
 def _in_protocol(files: FrameFiles, path: Path, points: SparsePoints) -> SparsePoints:
-    """The points, of the whole image, that are in the part of it that the protocol leaves."""
-    # An array of the image's size that takes no memory; the protocol says what is left of it.
-    left = files.protocol.apply(np.broadcast_to(np.False_, points.size))
-    size = (left.shape[0], left.shape[1])
+    """The points in the part of the image that the protocol keeps, in coordinates of that part."""
+    # An array of the image's size that takes no memory, to find the size of that part.
+    kept = files.protocol.apply(np.broadcast_to(np.False_, points.size))
+    size = (kept.shape[0], kept.shape[1])
     if size == points.size:
         return points
-    xy = files.protocol.places(points.xy.numpy(), points.size)
+    xy = files.protocol.in_crop(points.xy.numpy(), points.size)
     return _inside(path, SparsePoints(xy=torch.from_numpy(xy), depth=points.depth, size=size))
 
 
@@ -226,14 +256,12 @@ def _inside(path: Path, points: SparsePoints) -> SparsePoints:
 
 def _check_truth(files: FrameFiles, truth: _Part, image_size: tuple[int, int] | None) -> None:
     if image_size is not None and truth.whole != image_size:
-        raise _of_another_size(files, truth.whole, image_size)
+        raise _size_error(files, truth.whole, image_size)
     if not bool((truth.values > 0).any()):
         raise InputError(f"ground truth {files.gt} has no pixel with known depth")
 
 
-def _of_another_size(
-    files: FrameFiles, size: tuple[int, ...], image_size: tuple[int, int]
-) -> SizeError:
+def _size_error(files: FrameFiles, size: tuple[int, ...], image_size: tuple[int, int]) -> SizeError:
     return SizeError(
         f"ground truth {files.gt} is {size[1]}×{size[0]} but the image is"
         f" {image_size[1]}×{image_size[0]}"

@@ -1,4 +1,4 @@
-"""Which files a refined frame becomes, planned before the work."""
+"""Which files are written for a refined frame, planned before it is computed."""
 
 from __future__ import annotations
 
@@ -7,28 +7,36 @@ from pathlib import Path
 from typing import Any
 
 from pnpdepth_cli.errors import OutputError, UsageError
-from pnpdepth_cli.io.dataset.frame import DEPTHS, PICTURES, SCANS
+from pnpdepth_cli.io.dataset.frame import IMAGE_SUFFIXES, SCAN_ONLY_SUFFIXES
 from pnpdepth_cli.io.depth import DEPTH_SUFFIXES
 from pnpdepth_cli.io.record import write_json
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest
 
-_NO_FOLDERS = {*PICTURES, *DEPTHS, *SCANS, ".hdr", ".bmp", ".mat", ".h5", ".csv", ".json"}
-"""A folder's name may have a dot in it, but who writes these means a file."""
+_FILE_SUFFIXES = {
+    *(*IMAGE_SUFFIXES, *DEPTH_SUFFIXES, *SCAN_ONLY_SUFFIXES),
+    *(".hdr", ".bmp", ".mat", ".h5", ".csv", ".json"),
+}
+"""Suffixes that are taken for those of a file, though a folder's name may have a dot in it."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Outputs:
-    """Where a frame's results go; all but the depth are None when only a depth file is wanted."""
+    """Paths of a frame's results. All but the depth are None when only a depth file is wanted."""
 
     depth: Path
+    """Refined depth."""
     sigma: Path | None = None
+    """Standard deviation of the depth."""
     preview: Path | None = None
+    """Image of the depth before and after."""
     improvement: Path | None = None
+    """Image of what became better and worse."""
     record: Path | None = None
+    """JSON of settings and scores."""
 
     @classmethod
     def in_folder(cls, folder: Path, name: str, request: RefineRequest) -> Outputs:
-        """All that are asked for, in a folder; a name with slashes is a place in folders below."""
+        """Returns all that are asked for, in a folder; a name with slashes goes into subfolders."""
         return cls(
             depth=folder / f"{name}_depth.{request.outputs.format}",
             sigma=folder / f"{name}_sigma.exr" if request.hold_out.uncertainty else None,
@@ -38,7 +46,7 @@ class Outputs:
         )
 
     def by_kind(self) -> dict[str, Path]:
-        """Every file that will be written."""
+        """Returns every file that will be written, by its kind."""
         kinds = {
             "depth": self.depth,
             "sigma": self.sigma,
@@ -49,23 +57,24 @@ class Outputs:
         return {kind: path for kind, path in kinds.items() if path is not None}
 
     def paths(self) -> list[Path]:
-        """The same without saying which is which."""
+        """Returns every file that will be written."""
         return list(self.by_kind().values())
 
     def write_record(self, record: dict[str, Any]) -> None:
-        """The record is on disk, if it is wanted there."""
+        """Writes the record, if it is wanted."""
         if self.record is not None:
             write_json(self.record, record)
 
 
 def plan_outputs(request: RefineRequest) -> Outputs:
-    """Where the results go: `-o FILE.exr` for the depth alone, a folder for all of them.
+    """Returns the paths of the results: `-o FILE.exr` for the depth alone, a folder for all.
 
-    OutputError if one exists already and may not be replaced, or is one of the inputs.
+    Raises:
+        OutputError: One exists and may not be replaced, or is one of the inputs.
     """
     files, asked = request.files, request.outputs
-    given = [files.image, files.sparse, files.gt, files.scan.calib]
-    inputs = [path for path in given if isinstance(path, Path)]
+    sources = [files.image, files.sparse, files.gt, files.scan.calib]
+    inputs = [path for path in sources if isinstance(path, Path)]
     stem = inputs[0].stem
     output = asked.output or Path(f"{stem}_refined")
     if f".{asked.format}" not in DEPTH_SUFFIXES:
@@ -76,7 +85,7 @@ def plan_outputs(request: RefineRequest) -> Outputs:
         )
     if output.suffix.lower() in DEPTH_SUFFIXES:
         outputs = Outputs(depth=output)
-    elif output.suffix.lower() in _NO_FOLDERS and not output.is_dir():
+    elif output.suffix.lower() in _FILE_SUFFIXES and not output.is_dir():
         raise OutputError(
             f"{output}: depth is written as {' '.join(DEPTH_SUFFIXES)}, or into a folder"
         )
@@ -91,5 +100,5 @@ def plan_outputs(request: RefineRequest) -> Outputs:
         if path.resolve() in resolved:
             raise OutputError(f"{path} is one of the inputs; name another output with -o")
         if path.exists() and not asked.overwrite:
-            raise OutputError(f"{path} exists; --overwrite replaces it, -o names another place")
+            raise OutputError(f"{path} exists; --overwrite replaces it, -o names another path")
     return outputs

@@ -1,4 +1,4 @@
-"""A refined frame as files, written whole."""
+"""Writes the files of a refined frame."""
 
 from __future__ import annotations
 
@@ -7,19 +7,19 @@ from typing import Any
 
 import torch
 
+from pnpdepth_cli.frames.frame import RefinedFrame
 from pnpdepth_cli.io.atomic import make_folder
 from pnpdepth_cli.io.depth import write_depth
-from pnpdepth_cli.io.pictures import improvement, improvement_at_points, preview
-from pnpdepth_cli.pipeline.refinement.frame import RefinedFrame
+from pnpdepth_cli.io.visualisation import improvement, improvement_at_points, preview
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs
 from pnpdepth_cli.pipeline.refinement.output_files import Outputs
 
 INTEGER_SCALE = 256.0
-"""KITTI's scale, for integer output where the sparse depth brought none of its own."""
+"""KITTI's scale, for integer output where the sparse depth has none of its own."""
 
 
 def write_outputs(outputs: Outputs, inputs: Inputs, frame: RefinedFrame) -> dict[str, Any]:
-    """The depth and its pictures are on disk; returns what the record says of them."""
+    """Writes the depth and its images. Returns their entries of the record."""
     make_folder(outputs.depth.parent)
     write_depth(outputs.depth, frame.after, scale=inputs.sparse_scale or INTEGER_SCALE)
     if outputs.sigma is not None and frame.sigma is not None:

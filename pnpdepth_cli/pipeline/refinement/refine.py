@@ -11,42 +11,40 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from pnpdepth_cli.auto.candidates import Candidate
 from pnpdepth_cli.core.metrics import Scores, score
 from pnpdepth_cli.core.refine import RefineSettings
 from pnpdepth_cli.core.split import Split
-from pnpdepth_cli.errors import DivergedError, UsageError
+from pnpdepth_cli.errors import DivergedError, PnpDepthError, UsageError
+from pnpdepth_cli.frames.frame import Frame, RefinedFrame
+from pnpdepth_cli.frames.refine import OnIteration, refine_frames
+from pnpdepth_cli.frames.tiles import refine_tiled
 from pnpdepth_cli.io.atomic import all_or_none
 from pnpdepth_cli.io.record import sha256_of
 from pnpdepth_cli.models.network import Network, load_network
-from pnpdepth_cli.pipeline.refinement.frame import (
-    FrameToRefine,
-    PointError,
-    RefinedFrame,
-    point_error,
-    refine_frame,
-    split_points,
-)
-from pnpdepth_cli.pipeline.refinement.held_out import refine_with_folds, ways_of
+from pnpdepth_cli.pipeline.refinement.held_out import best_candidates, refine_with_folds
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs, read_inputs
 from pnpdepth_cli.pipeline.refinement.output_files import Outputs, plan_outputs
 from pnpdepth_cli.pipeline.refinement.outputs import write_outputs
+from pnpdepth_cli.pipeline.refinement.points import PointError, point_error, split_points
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest
 from pnpdepth_cli.pipeline.refinement.resolve import (
     resolve_definition,
     resolve_layer,
     resolve_settings,
 )
-from pnpdepth_cli.pipeline.refinement.tiles import refine_tiled
-from pnpdepth_cli.pipeline.refinement.ways import Way
 from pnpdepth_cli.pipeline.stopwatch import Stopwatch, peak_memory_mb, versions
+from pnpdepth_cli.points import SparsePoints
 
 
 @dataclass(frozen=True, kw_only=True)
 class RefineOutcome:
-    """A refined frame: `record` is what <stem>.json holds; `diverged` says why it stopped early."""
+    """A refined frame on disk."""
 
     record: dict[str, Any]
+    """What <stem>.json holds."""
     diverged: DivergedError | None
+    """Why the refinement stopped early. None if it did not."""
 
 
 def refine_image(
@@ -54,10 +52,14 @@ def refine_image(
     *,
     on_iteration: Callable[[int, int, float], None] = lambda done, of, loss: None,
 ) -> RefineOutcome:
-    """The refined depth and its companions are on disk; what was done is returned.
+    """Refines one frame, writes its depth and companions, and returns what was done.
 
-    on_iteration(done, of, loss) is called after each update of z. Raises the errors of
-    `pnpdepth_cli.errors`; then nothing is written.
+    Args:
+        request: What is asked for.
+        on_iteration: Called with (done, of, loss) after each update of z.
+
+    Raises:
+        PnpDepthError: Any of its kinds; then nothing is written.
     """
     watch = Stopwatch()
     outputs = plan_outputs(request)
@@ -76,19 +78,21 @@ def refine_image(
 
 @dataclass(frozen=True, kw_only=True)
 class Refiner:
-    """A network with nothing left open, the layer to cut it at, and how to refine its frames.
-
-    ways: with --auto, those that were found on other frames; None: each frame finds its own.
-    """
+    """A network with nothing left open, and how to refine its frames."""
 
     request: RefineRequest
+    """What is asked for."""
     network: Network
+    """The network."""
     layer: str
+    """Layer to cut at."""
     settings: RefineSettings
-    ways: tuple[Way, ...] | None = None
+    """How z is updated."""
+    shortlist: tuple[Candidate, ...] | None = None
+    """With `--auto`, the candidates that compete. None: each frame finds its own."""
 
     def split(self) -> Split:
-        """The network cut at the layer, to be opened for as many frames as there are."""
+        """Returns the network cut at the layer, to be opened for all frames."""
         return self.network.cut_at(self.layer)
 
     def refine(
@@ -96,41 +100,86 @@ class Refiner:
         split: Split,
         inputs: Inputs,
         *,
-        on_iteration: Callable[[int, float], None] = lambda done, loss: None,
+        on_iteration: OnIteration = lambda done, loss: None,
     ) -> RefinedFrame:
-        """One frame refined in memory, the same whatever was refined before."""
+        """Returns one frame refined in memory, the same whatever was refined before.
+
+        Raises:
+            PnpDepthError: The frame cannot be refined.
+        """
+        request = self.request
+        torch.manual_seed(request.hold_out.seed)
+        frame, held_out = self._split_frame(inputs)
+        refined: RefinedFrame | PnpDepthError
+        if request.hold_out.needs_folds:
+            refined = refine_with_folds(
+                self.network, self.layer, self.settings, request, frame, inputs.gt, self.shortlist
+            )
+        elif side := request.network.tile:
+            refined = refine_tiled(
+                self.network,
+                split,
+                self.settings,
+                frame,
+                side,
+                propagation=self._propagation,
+                on_iteration=on_iteration,
+            )
+        else:
+            (refined,) = refine_frames(
+                self.network,
+                split,
+                self.settings,
+                (frame,),
+                propagation=self._propagation,
+                on_iteration=on_iteration,
+            )
+        if isinstance(refined, PnpDepthError):
+            raise refined
+        return replace(refined, held_out=held_out)
+
+    def refine_together(
+        self, split: Split, group: Sequence[Inputs], settings: RefineSettings
+    ) -> list[RefinedFrame | PnpDepthError]:
+        """Returns frames of one size refined in one pass; an error in place of a failed frame.
+
+        Args:
+            split: The network cut at the layer, open.
+            group: The frames.
+            settings: How z is updated.
+
+        Raises:
+            BatchError: The network does not take them together.
+        """
         torch.manual_seed(self.request.hold_out.seed)
-        task = self.task(inputs)
-        if self.request.hold_out.needs_folds:
-            return refine_with_folds(
-                self.network, self.layer, self.settings, self.request, task, self.ways
-            )
-        if side := self.request.network.tile:
-            return refine_tiled(
-                self.network, split, self.settings, task, side, on_iteration=on_iteration
-            )
-        return refine_frame(self.network, split, self.settings, task, on_iteration=on_iteration)
+        frames, held_out = zip(*(self._split_frame(inputs) for inputs in group), strict=True)
+        refined = refine_frames(
+            self.network, split, settings, frames, propagation=self._propagation
+        )
+        return [
+            replace(each, held_out=points) if isinstance(each, RefinedFrame) else each
+            for each, points in zip(refined, held_out, strict=True)
+        ]
 
-    def with_ways_of(self, frames: Sequence[Inputs]) -> Refiner:
-        """The same, its ways found on these frames."""
-        tasks = [self.task(inputs) for inputs in frames]
-        ways = ways_of(self.network, self.layer, self.settings, self.request, tasks)
-        return replace(self, ways=ways)
+    def with_shortlist_of(self, group: Sequence[Inputs]) -> Refiner:
+        """Returns the same refiner with the candidates that are best on these frames."""
+        frames = [self._split_frame(inputs)[0] for inputs in group]
+        best = best_candidates(self.network, self.layer, self.settings, self.request, frames)
+        return replace(self, shortlist=best)
 
-    def task(self, inputs: Inputs) -> FrameToRefine:
-        """The frame with its points as the request shares them out."""
+    def _split_frame(self, inputs: Inputs) -> tuple[Frame, SparsePoints]:
+        """The frame with the points to use, and the points held out."""
         asked = self.request.hold_out
         used, held_out = split_points(inputs.points, asked.holdout, asked.seed)
-        return FrameToRefine(
-            inputs=inputs,
-            used=used,
-            held_out=held_out,
-            propagate=self.request.method.propagate or "none",
-        )
+        return inputs.frame().with_points(used), held_out
+
+    @property
+    def _propagation(self) -> str:
+        return self.request.method.propagate or "none"
 
     @functools.cached_property
     def model_record(self) -> dict[str, Any]:
-        """What a record says of the network."""
+        """Entries of the network in a record."""
         checkpoint = self.network.checkpoint
         return {
             "name": self.network.definition.name,
@@ -141,9 +190,11 @@ class Refiner:
 
 
 def load_refiner(request: RefineRequest, first: Inputs) -> Refiner:
-    """The network that is asked for, with what it leaves open settled on this first frame.
+    """Returns the refiner that is asked for; this first frame decides what the network leaves open.
 
-    UsageError if the request asks for what does not go together.
+    Raises:
+        UsageError: The request combines what cannot be combined.
+        ModelError: The network cannot be loaded.
     """
     choice, hold_out = request.network, request.hold_out
     if hold_out.time_budget_s is not None and not hold_out.auto:
@@ -153,7 +204,7 @@ def load_refiner(request: RefineRequest, first: Inputs) -> Refiner:
     network = load_network(
         choice.model, choice.checkpoint, choice.device, precision=choice.precision
     )
-    network = resolve_definition(network, first, choice)
+    network = resolve_definition(network, first.frame(), choice)
     return Refiner(
         request=request,
         network=network,
@@ -165,9 +216,9 @@ def load_refiner(request: RefineRequest, first: Inputs) -> Refiner:
 def write_refined(
     outputs: Outputs, refiner: Refiner, inputs: Inputs, frame: RefinedFrame, watch: Stopwatch
 ) -> RefineOutcome:
-    """The refined frame is scored, and it and its record are on disk.
+    """Scores the refined frame and writes it with its record.
 
-    The record is the same from run to run, but for `seconds` and `peak_memory_mb`.
+    The record is the same from run to run, except `seconds` and `peak_memory_mb`.
     """
     record = _record(refiner, inputs, frame)
     with all_or_none(outputs.paths()):

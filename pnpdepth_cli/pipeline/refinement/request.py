@@ -197,7 +197,7 @@ class MethodOptions:
         None,
         "Propagate the residuals at the points to all pixels: Gaussian process or edge-aware"
         " diffusion.  [default: none; chosen by --auto]",
-        choices=choices.PROPAGATIONS,
+        choices=("none", *choices.PROPAGATIONS),
         axis=Axis(title="propagation of the residual"),
     )
 

@@ -11,6 +11,8 @@ from pnpdepth_cli.choices import SPACES
 from pnpdepth_cli.completion.alignment import align
 from pnpdepth_cli.core.refine import RefineSettings
 from pnpdepth_cli.errors import ModelError, NoPointsError, UsageError
+from pnpdepth_cli.frames.frame import Frame
+from pnpdepth_cli.frames.prepare import prepare
 from pnpdepth_cli.models.definition import (
     IMAGENET_MEAN,
     IMAGENET_STD,
@@ -18,9 +20,7 @@ from pnpdepth_cli.models.definition import (
     Normalisation,
     RefineDefaults,
 )
-from pnpdepth_cli.models.frame import FrameMap
 from pnpdepth_cli.models.network import Network, out_of_memory_is_a_device_error
-from pnpdepth_cli.pipeline.refinement.inputs import Inputs
 from pnpdepth_cli.pipeline.refinement.request import MethodOptions, NetworkChoice
 
 NORMALISATIONS = {
@@ -32,7 +32,7 @@ NORMALISATIONS = {
 """rgb as the network may want it: 0…1, ImageNet's mean and deviation, −1…1, 0…255."""
 
 
-def resolve_definition(network: Network, inputs: Inputs, choice: NetworkChoice) -> Network:
+def resolve_definition(network: Network, frame: Frame, choice: NetworkChoice) -> Network:
     """Returns the network with a definition that leaves nothing open, and notes on the decisions.
 
     The user's choice wins over the definition. An input range that neither states is the one whose
@@ -54,14 +54,11 @@ def resolve_definition(network: Network, inputs: Inputs, choice: NetworkChoice) 
         definition = replace(definition, normalisation=NORMALISATIONS[choice.normalise])
     network = replace(network, definition=definition)
     with out_of_memory_is_a_device_error(network.device):
-        if definition.normalisation is None and inputs.rgb is not None:
-            network, note = _with_best_input_range(network, inputs)
+        if definition.normalisation is None and frame.rgb is not None:
+            network, note = _with_best_input_range(network, frame)
             notes.append(note)
         if definition.verify is not None:
-            frame = FrameMap.fit(definition.size, *inputs.size)
-            points = frame.points_to_network(inputs.points)
-            arguments = network.arguments(frame, inputs.rgb_tensor(), points)
-            notes += network.verified(arguments)
+            notes += network.verified(prepare(network, frame).arguments)
     return replace(network, notes=tuple(notes))
 
 
@@ -126,7 +123,7 @@ def resolve_settings(definition: ModelDefinition, method: MethodOptions) -> Refi
     )
 
 
-def _with_best_input_range(network: Network, inputs: Inputs) -> tuple[Network, str]:
+def _with_best_input_range(network: Network, frame: Frame) -> tuple[Network, str]:
     errors: dict[str, float] = {}
     candidates = {
         name: replace(network, definition=replace(network.definition, normalisation=how))
@@ -134,7 +131,7 @@ def _with_best_input_range(network: Network, inputs: Inputs) -> tuple[Network, s
     }
     for name, candidate in candidates.items():
         try:
-            errors[name] = _alignment_error(candidate, inputs)
+            errors[name] = _alignment_error(candidate, frame)
         except (ModelError, NoPointsError):
             errors[name] = float("inf")
     best = min(errors, key=lambda name: errors[name])
@@ -145,14 +142,13 @@ def _with_best_input_range(network: Network, inputs: Inputs) -> tuple[Network, s
     )
 
 
-def _alignment_error(network: Network, inputs: Inputs) -> float:
+def _alignment_error(network: Network, frame: Frame) -> float:
     """Returns the relative error at the points after the best alignment."""
-    definition = network.definition
-    frame = FrameMap.fit(definition.size, *inputs.size)
-    points = frame.points_to_network(inputs.points)
+    prepared = prepare(network, frame)
+    points = prepared.points.tensors()
     with torch.no_grad():
-        output = network.module(*network.arguments(frame, inputs.rgb_tensor(), points))
+        output = network.module(*prepared.arguments)
     at_points = points.sample(network.raw_of(output).cpu())
-    stated = definition.output_kind
+    stated = network.definition.output_kind
     spaces = (stated,) if stated in SPACES else ("depth", "inverse")
     return align(at_points, points, spaces, "auto").error

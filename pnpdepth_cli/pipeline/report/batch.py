@@ -1,8 +1,8 @@
-"""`pnpdepth batch --html`: each frame before and after refinement, and where it helped.
+"""`pnpdepth batch --html`: each frame before and after refinement, with a map of the change.
 
-Everything comes from the results on disk: figures from the rows of the summary, pictures from the
-panels of the previews and the improvement maps. So a report has the frames of earlier runs too,
-and a picture is named after the files it was made of, so that it is made once.
+Everything is read from the results on disk: scores from the rows of the summary, images from the
+panels of the previews and the improvement maps. So a report also has the frames of earlier runs. An
+image is named after the files it is made of, so that it is made once.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from pnpdepth_cli.errors import InputError, OutputError
 from pnpdepth_cli.io.fingerprint import fingerprint
 from pnpdepth_cli.io.page import SavedPage, open_page
 from pnpdepth_cli.io.report import (
-    PICTURES,
+    IMAGES,
     begin_report,
     check_report_folder,
-    picture_key,
+    image_key,
     write_report,
 )
-from pnpdepth_cli.io.report_pictures import gain_colours, picture_paths, save_pictures
+from pnpdepth_cli.io.report_images import gain_colours, image_paths, save_images
 from pnpdepth_cli.pipeline.evaluation.score_files import column_title, format_value
 from pnpdepth_cli.pipeline.ordered_pool import in_order
 from pnpdepth_cli.pipeline.report.columns import (
@@ -45,82 +45,90 @@ _PANELS = {
     "Image": "image",
     "Sparse depth": "sparse",
 }
-_TRUTH, _HELD_OUT, _USED = "scores", "held_out_error", "sparse_error"
+_GT, _HELD_OUT, _USED = "scores", "held_out_error", "sparse_error"
 _BASES = {
-    _TRUTH: "against the truth",
+    _GT: "against ground truth",
     _HELD_OUT: "at held-out points",
     _USED: "at the points used",
 }
-"""What a frame's errors are of, the best first. At the points used, a gain means nothing."""
+"""What errors are measured on, the best first. A gain at the points used means nothing."""
 _ERRORS = {measure.key: measure for measure in MEASURES if measure.key in ("rmse", "mae")}
 
 
 @dataclass(frozen=True, kw_only=True)
 class BatchReport:
-    """The report `folder` of the results in `output`; workers: threads that draw."""
+    """Writes the report of a batch."""
 
     folder: Path
+    """Where the report is written."""
     output: Path
+    """The folder of the results."""
     workers: int
+    """Threads that draw."""
 
     def check(self, inputs: Sequence[Path], *, overwrite: bool) -> None:
-        """Raises OutputError for a folder that the report cannot, or may not, be written to."""
+        """Raises OutputError for a folder that the report cannot or may not be written to."""
         folder, output = self.folder.resolve(), self.output.resolve()
         if output.is_relative_to(folder):
             raise OutputError(
                 f"{self.folder} holds the results; name a folder of its own for the report, such as"
                 f" {self.output / 'report'}"
             )
-        apart = [path for path in inputs if not _is_about(path, output, folder)]
-        check_report_folder(self.folder, apart, made_of=self._made_of(), overwrite=overwrite)
+        others = [path for path in inputs if not _holds_results(path, output, folder)]
+        check_report_folder(self.folder, others, made_of=self._source(), overwrite=overwrite)
 
     def begin(self) -> None:
-        """The folder is there, and the next run knows it again."""
-        begin_report(self.folder, self._made_of())
+        """Creates the folder, marked so that the next run may replace it."""
+        begin_report(self.folder, self._source())
 
     def drawn(self, row: Row) -> Row:
-        """The pictures of the frame are on disk, if it has results; the row as it is."""
+        """Writes the images of the row's frame, if it has results; returns the row."""
         if row["outputs"]:
-            self._drawn(row)
+            self._draw(row)
         return row
 
     def write(self, summary: Mapping[str, Any], rows: Callable[[], Iterable[Row]]) -> None:
-        """The page is on disk, with all frames that `rows` gives and pictures of them."""
-        found = _Overview.of(rows())
-        measured = any(summary["mean"][basis] for basis in (_TRUTH, _HELD_OUT))
+        """Writes the page.
+
+        Args:
+            summary: The batch's summary without its frames.
+            rows: Gives the summary's rows, each time anew.
+        """
+        overview = _Overview.of(rows())
+        measured = any(summary["mean"][basis] for basis in (_GT, _HELD_OUT))
         columns = _columns(measured)
 
         def entry(row: Row) -> dict[str, Any]:
-            return self._entry(row, columns, measured, mixed=len(found.bases) > 1)
+            return self._entry(row, columns, measured, mixed=len(overview.bases) > 1)
 
         results = (row for row in rows() if row["outputs"])
         entries = in_order(entry, results, self.workers)
-        write_report(self.folder, _head(summary, found, columns, measured), entries)
+        write_report(self.folder, _head(summary, overview, columns, measured), entries)
 
-    def _made_of(self) -> dict[str, Any]:
+    def _source(self) -> dict[str, Any]:
         folder, output = self.folder.resolve(), self.output.resolve()
         return {"command": "batch", "output": os.path.relpath(output, folder)}
 
-    def _drawn(self, row: Row) -> dict[str, Any]:
-        """As `drawn`; what the page says of the pictures."""
+    def _draw(self, row: Row) -> dict[str, Any]:
+        """As `drawn`; returns the page's entry of the images."""
         paths = [self.output / row["outputs"][kind] for kind in ("preview", "improvement")]
         try:
-            key = picture_key(*(fingerprint(path).sha256 for path in paths))
+            key = image_key(*(fingerprint(path).sha256 for path in paths))
             preview, improvement = (open_page(path) for path in paths)
             views = _views(preview, improvement)
-            pictures = self.folder / PICTURES
-            if not all(path.exists() for path in picture_paths(pictures, key, views)):
+            images = self.folder / IMAGES
+            if not all(path.exists() for path in image_paths(images, key, views)):
                 panels = preview.panels() | improvement.panels()
                 named = {_PANELS[title]: panels[title] for title in panels if title in _PANELS}
                 thumb = "image" if "image" in views else "second"
-                save_pictures(pictures, key, named, thumb=thumb)
-        except InputError:  # a result that was there has gone or changed; the next run redoes it
+                save_images(images, key, named, thumb=thumb)
+        except InputError:  # a result has gone or changed; the next run refines it again
             return {"key": None}
         return {
             "key": key,
             "views": views,
-            "scale_m": [preview.said["low_m"], preview.said["high_m"]],
-            "map": {name: improvement.said[name] for name in ("ends", "unknown", "footer")},
+            "scale_m": [preview.content["low_m"], preview.content["high_m"]],
+            "map": {name: improvement.content[name] for name in ("ends", "unknown", "footer")},
         }
 
     def _entry(
@@ -134,17 +142,20 @@ class BatchReport:
             "values": [values.get(column.key) for column in columns],
             "notes": list(_notes(row, basis)),
             "tag": "diverged" if row["status"] == "diverged" else tag,
-            **self._drawn(row),
+            **self._draw(row),
         }
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Overview:
-    """bases: the kinds of error the frames have. first: one with results. failed: all without."""
+    """What all rows together say."""
 
     bases: frozenset[str]
+    """What the frames' errors are measured on, keys of _BASES."""
     first: Row | None
+    """The first row with results."""
     failed: list[dict[str, str]]
+    """Name and reason of each frame without results."""
 
     @classmethod
     def of(cls, rows: Iterable[Row]) -> _Overview:
@@ -158,13 +169,13 @@ class _Overview:
         return cls(bases=frozenset(bases - {""}), first=first, failed=failed)
 
 
-def _is_about(path: Path, output: Path, folder: Path) -> bool:
-    """True for a folder with the results in it, if the report is beside them: both left aside."""
+def _holds_results(path: Path, output: Path, folder: Path) -> bool:
+    """True for a folder that holds the results, if the report is among them too."""
     return folder.is_relative_to(output) and output.is_relative_to(path.resolve())
 
 
 def _views(preview: SavedPage, improvement: SavedPage) -> list[str]:
-    titles = [panel["title"] for page in (preview, improvement) for panel in page.said["panels"]]
+    titles = [panel["title"] for page in (preview, improvement) for panel in page.content["panels"]]
     return [view for title, view in _PANELS.items() if title in titles]
 
 
@@ -173,7 +184,7 @@ def _basis(row: Row) -> str | None:
 
 
 def _columns(measured: bool) -> list[Column]:
-    """Of errors before and after; with gains where any frame has truth or held-out points."""
+    """Errors before and after; with gains if any frame has ground truth or held-out points."""
     columns = []
     for key, measure in _ERRORS.items():
         if measured:
@@ -197,10 +208,10 @@ def _values(row: Row, basis: str | None, measured: bool) -> dict[str, float | No
     if basis is None or (measured and basis == _USED):
         return {}
     values: dict[str, float | None] = {"improved": row["improved_share"]}
-    before, after = row[basis]["before"], row[basis]["after"]
     for key in _ERRORS:
-        values |= {f"{key}_before": before[key], f"{key}_after": after[key]}
-        values[f"{key}_gain"] = _gain(before[key], after[key])
+        before, after = (row[basis][stage].get(key) for stage in ("before", "after"))
+        values |= {f"{key}_before": before, f"{key}_after": after}
+        values[f"{key}_gain"] = _gain(before, after)
     return values
 
 
@@ -212,23 +223,23 @@ def _notes(row: Row, basis: str | None) -> Iterator[str]:
     if row["message"]:
         yield row["message"]
     if basis is not None:
-        of = row[basis]["after"]
-        count = f"{of['pixels']:,} pixels" if basis == _TRUTH else f"{of['points']:,} points"
+        after = row[basis]["after"]
+        count = f"{after['pixels']:,} pixels" if basis == _GT else f"{after['points']:,} points"
         yield f"Errors are {_BASES[basis]}, {count}."
     if basis == _USED:
-        yield "Refinement fitted these points, so its gain there proves nothing."
+        yield "Refinement fits these points, so its gain there proves nothing."
     yield from row["warnings"]
 
 
 def _head(
-    summary: Mapping[str, Any], found: _Overview, columns: list[Column], measured: bool
+    summary: Mapping[str, Any], overview: _Overview, columns: list[Column], measured: bool
 ) -> dict[str, Any]:
     unmatched = len(summary["unmatched"])
     return {
         "kind": "Batch refinement",
         "title": summary["output"],
         "tiles": _tiles(summary, measured),
-        "facts": _facts(summary, found.first),
+        "facts": _facts(summary, overview.first),
         "notes": [f"warning: {unmatched:,} files are in no frame; summary.json has them"]
         if unmatched
         else [],
@@ -237,7 +248,8 @@ def _head(
             for basis in _BASES
             if summary["mean"][basis]
             for each in [_means(basis, summary["mean"][basis])]
-        ],
+        ]
+        + _baselines(summary.get("baselines")),
         "labels": {
             "first": "Before",
             "second": "After",
@@ -246,8 +258,8 @@ def _head(
             "sparse": "Sparse depth",
         },
         "map_colours": gain_colours(),
-        "without_title": f"Not refined: {len(found.failed):,}",
-        "without": found.failed,
+        "without_title": f"Not refined: {len(overview.failed):,}",
+        "without": overview.failed,
         **figures(columns, "rmse_gain" if measured else "rmse_after"),
     }
 
@@ -259,29 +271,29 @@ def _tiles(summary: Mapping[str, Any], measured: bool) -> list[dict[str, str]]:
         f"{counts[kind]:,} {kind}" for kind in ("diverged", "failed", "pending") if counts[kind]
     ]
     tiles = [tile("Frames refined", f"{refined:,} of {counts['frames']:,}", ", ".join(others))]
-    for basis in (_TRUTH, _HELD_OUT) if measured else (_USED,):
+    for basis in (_GT, _HELD_OUT) if measured else (_USED,):
         mean = summary["mean"][basis]
         for key, measure in _ERRORS.items() if mean else ():
-            before, after = (mean[stage][key] for stage in ("before", "after"))
+            before, after = (mean[stage].get(key) for stage in ("before", "after"))
             change = f"{format_value(measure, before)} → {format_value(measure, after)}"
             gain = _gain(before, after)
-            said = ""
+            gain_text = ""
             if gain is not None and basis != _USED:
-                said = f"gain {_signed(100 * gain, 1, '%')} "
-            tiles.append(tile(f"{measure.title} [m]", change, f"{said}{_BASES[basis]}"))
+                gain_text = f"gain {_signed(100 * gain, 1, '%')} "
+            tiles.append(tile(f"{measure.title} [m]", change, f"{gain_text}{_BASES[basis]}"))
     return tiles
 
 
 def _facts(summary: Mapping[str, Any], first: Row | None) -> list[list[str]]:
-    asked = summary["settings"]
+    settings = summary["settings"]
     facts = [
         ["Frames of", f"{summary['source']} (layout {summary['layout']})"],
         ["Results in", summary["output"]],
-        ["Network", str(asked["model"])],
+        ["Network", str(settings["model"])],
     ]
-    if asked["auto"]:
-        found = "each frame by the way that is best at points held out in turns"
-        facts.append(["Refinement", f"{found} (--auto)"])
+    if settings["auto"]:
+        method = "each frame by the candidate with the smallest cross-validation error"
+        facts.append(["Refinement", f"{method} (--auto)"])
     elif first is not None:
         used = first["settings"]
         refined = f"{used['iterations']} updates of z at {used['layer']}"
@@ -289,17 +301,19 @@ def _facts(summary: Mapping[str, Any], first: Row | None) -> list[list[str]]:
             ["Refinement", f"{refined} ({used['update']}, {used['loss']}, step {used['lr']})"]
         )
         facts.append(["Alignment", str(used["align"])])
-    if asked["propagate"]:
-        facts.append(["Propagation", asked["propagate"]])
-    if asked["holdout"]:
-        facts.append(["Held out", f"{asked['holdout']:.0%} of the points, seed {asked['seed']}"])
+    if settings["propagate"]:
+        facts.append(["Propagation", settings["propagate"]])
+    if settings["holdout"]:
+        facts.append(
+            ["Held out", f"{settings['holdout']:.0%} of the points, seed {settings['seed']}"]
+        )
     if summary["counts"]["with_warnings"]:
         facts.append(["Warnings", f"in {frames_text(summary['counts']['with_warnings'])}"])
     return facts
 
 
 def _means(basis: str, mean: Mapping[str, Any]) -> dict[str, Any]:
-    measures: Iterable[Measure] = MEASURES if basis == _TRUTH else _ERRORS.values()
+    measures: Iterable[Measure] = MEASURES if basis == _GT else _ERRORS.values()
     header = ["", "before", "after", *([] if basis == _USED else ["gain"])]
     rows = []
     for measure in measures:
@@ -308,11 +322,33 @@ def _means(basis: str, mean: Mapping[str, Any]) -> dict[str, Any]:
         if basis != _USED:
             row.append(_gain_text(measure, before, after))
         rows.append(row)
-    if basis == _TRUTH:
+    if basis == _GT:
         rows.append(
-            ["coverage", *(f"{mean[stage]['coverage']:.2%}" for stage in ("before", "after")), ""]
+            [
+                "coverage",
+                *(_percent(mean[stage].get("coverage")) for stage in ("before", "after")),
+                "",
+            ]
         )
     return table(f"Means over {frames_text(mean['frames'])}, {_BASES[basis]}", header, rows)
+
+
+def _baselines(mean: Mapping[str, Mapping[str, Any]] | None) -> list[dict[str, Any]]:
+    """A table of the simple baselines, the network and the result; empty without --baselines."""
+    if not mean:
+        return []
+    mae = _ERRORS["mae"]
+    header = ["", "MAE at held-out points [m]", "MAE [m]", "RMSE [m]", "frames"]
+    rows = [
+        [name, *(format_value(mae, row[key]) for key in ("held_out_mae", "mae", "rmse")),
+         f"{row['frames']:,}"]
+        for name, row in mean.items()
+    ]  # fmt: skip
+    return [table("Simple baselines: means over frames", header, rows)]
+
+
+def _percent(value: float | None) -> str:
+    return "–" if value is None else f"{value:.2%}"
 
 
 def _gain_text(measure: Measure, before: float | None, after: float | None) -> str:
@@ -325,7 +361,7 @@ def _gain_text(measure: Measure, before: float | None, after: float | None) -> s
 
 
 def _signed(value: float, decimals: int, unit: str) -> str:
-    """The value with its sign, and with none where nothing but zeros is shown."""
+    """The value with its sign; without one if it is rounded to zero."""
     text = f"{abs(value):.{decimals}f}"
     sign = "" if float(text) == 0 else "+" if value > 0 else "−"
     return f"{sign}{text}{unit}"

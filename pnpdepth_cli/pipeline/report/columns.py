@@ -1,4 +1,4 @@
-"""What a report's page is told of figures: its columns, and text for its head."""
+"""Columns of a report's page, and the tiles and tables of its head."""
 
 from __future__ import annotations
 
@@ -18,25 +18,30 @@ _SWATCHES = 17
 
 @dataclass(frozen=True, kw_only=True)
 class Column:
-    """A figure that every frame has, or has not.
-
-    Shown is value × factor in `unit`, or in per cent. signed: above 0 is better, below 0 worse.
-    listed: it stands in the list of frames too, not only where a frame is looked at.
-    """
+    """A value of each frame, and how the page shows it."""
 
     key: str
+    """Unique name."""
     title: str
+    """Title of the column."""
     unit: str = ""
+    """Unit of value × factor."""
     decimals: int = 4
+    """Digits after the point."""
     factor: float = 1.0
+    """The page shows value × factor."""
     percent: bool = False
+    """True to show the value in per cent."""
     higher_is_better: bool = False
+    """False if lower is better."""
     signed: bool = False
+    """True if values above 0 are better and below 0 worse."""
     listed: bool = True
+    """True to show it in the list of frames, not only in a frame's own view."""
 
 
 def column_of(measure: Measure, *, title: str = "", key: str = "", listed: bool) -> Column:
-    """The column of a measure, under its own title and key or others."""
+    """Returns the column of a measure, with its own title and key or other ones."""
     return Column(
         key=key or measure.key,
         title=title or measure.title,
@@ -50,22 +55,27 @@ def column_of(measure: Measure, *, title: str = "", key: str = "", listed: bool)
 
 
 def frames_text(count: int) -> str:
-    """So many frames, in words."""
+    """Returns text such as `12 frames`."""
     return f"{count:,} frame{'' if count == 1 else 's'}"
 
 
 def tile(label: str, value: str, remark: str = "") -> dict[str, str]:
-    """A figure that is shown large."""
+    """Returns a value that the page shows large."""
     return {"label": label, "value": value, "remark": remark}
 
 
 def table(caption: str, header: Sequence[str], rows: Sequence[Sequence[str]]) -> dict[str, Any]:
-    """A table of text; the first cell of each row is its title."""
+    """Returns a table of text; the first cell of each row is its title."""
     return {"caption": caption, "header": list(header), "rows": [list(row) for row in rows]}
 
 
 def figures(columns: Sequence[Column], sort_by: str) -> dict[str, Any]:
-    """The columns for the page, which of them it sorts by at first, and what never changes."""
+    """Returns the page's columns, the one it is sorted by, and its constants.
+
+    Args:
+        columns: All columns.
+        sort_by: Key of the column that the page is sorted by at first.
+    """
     colours = DepthScale(low_m=1.0, high_m=2.0).paint(np.linspace(1, 2, _SWATCHES)).tolist()
     return {
         "columns": [asdict(column) for column in columns],

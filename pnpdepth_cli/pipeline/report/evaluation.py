@@ -16,11 +16,11 @@ from pnpdepth_cli.io.layouts import Hdf5Array
 from pnpdepth_cli.io.report import (
     begin_report,
     check_report_folder,
-    picture_key,
+    image_key,
     remove_report_leftovers,
     write_report,
 )
-from pnpdepth_cli.io.report_pictures import error_colours, error_map, save_pictures
+from pnpdepth_cli.io.report_images import error_colours, error_map, save_images
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.pipeline.evaluation.frame_reading import Depth, load_frame
 from pnpdepth_cli.pipeline.evaluation.frame_scoring import FrameScores
@@ -114,6 +114,7 @@ def _head(evaluation: Evaluation, columns: list[Column]) -> dict[str, Any]:
         "notes": list(evaluation.notes),
         "tables": [
             _means(evaluation),
+            *_uncertainty(evaluation),
             *_bins("By distance to the nearest sparse point", "px", evaluation.by_distance),
             *_bins("By depth of the ground truth", "m", evaluation.by_depth),
         ],
@@ -167,6 +168,37 @@ def _means(evaluation: Evaluation) -> dict[str, Any]:
     return table(caption, header, rows)
 
 
+def _uncertainty(evaluation: Evaluation) -> list[dict[str, Any]]:
+    """Calibration and sparsification of the predicted standard deviation, if there is one."""
+    uncertainty = evaluation.uncertainty
+    if uncertainty is None:
+        return []
+    calibration = [
+        [f"{expected:.1%}", f"{observed:.1%}"]
+        for expected, observed in zip(uncertainty.expected, uncertainty.observed, strict=True)
+    ]
+    sparsification = [
+        [f"{removed:.0%}", f"{error:.4f}", f"{best:.4f}"]
+        for removed, error, best in zip(
+            uncertainty.removed, uncertainty.sparsification, uncertainty.oracle, strict=True
+        )
+    ]
+    frames = frames_text(uncertainty.frames)
+    return [
+        table(
+            f"Calibration of the standard deviation, {frames}: {uncertainty.within_1_sigma:.1%}"
+            f" within 1σ, {uncertainty.within_2_sigma:.1%} within 2σ",
+            ["normal distribution", "observed"],
+            calibration,
+        ),
+        table(
+            f"Sparsification, {frames}: AUSE {uncertainty.ause:.4f} of the MAE",
+            ["removed", "MAE by σ [m]", "MAE by error [m]"],
+            sparsification,
+        ),
+    ]
+
+
 def _bins(caption: str, unit: str, bins: tuple[ErrorBin, ...]) -> list[dict[str, Any]]:
     if not bins:
         return []
@@ -213,8 +245,8 @@ def _drawn(frame: FrameScores, evaluation: Evaluation, pictures: Path) -> dict[s
     views = {"first": scale.paint(depth), "second": scale.paint(gt), "map": errors.pixels}
     if image is not None:
         views["image"] = np.asarray(np.rint(255 * np.clip(image, 0, 1)), np.uint8)
-    key = picture_key(frame.name)
-    save_pictures(pictures, key, views, thumb="first" if image is None else "image")
+    key = image_key(frame.name)
+    save_images(pictures, key, views, thumb="first" if image is None else "image")
     amount = f"by {errors.strongest_m:.3g} m or more"
     return {
         "key": key,

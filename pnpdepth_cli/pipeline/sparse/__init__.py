@@ -1,0 +1,1 @@
+"""The commands that make sparse depth: project, sample and simulate."""

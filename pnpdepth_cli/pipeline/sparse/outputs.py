@@ -1,4 +1,4 @@
-"""Sparse depth that a command made: planned before the work, written whole after it."""
+"""Output files of the commands that make sparse depth: checked before the work, then written."""
 
 from __future__ import annotations
 
@@ -12,28 +12,40 @@ from numpy.typing import NDArray
 
 from pnpdepth_cli import __version__
 from pnpdepth_cli.errors import OutputError, UsageError
+from pnpdepth_cli.io.atomic import make_folder
 from pnpdepth_cli.io.overlay import overlay
 from pnpdepth_cli.io.record import write_json
 from pnpdepth_cli.io.sparse_writing import SPARSE_SUFFIXES, write_sparse
-from pnpdepth_cli.sensors import Points, as_picture
+from pnpdepth_cli.sensors import Points, as_depth_image
 
 
 @dataclass(frozen=True, kw_only=True)
 class SparseTarget:
-    """Where sparse depth is to go. depth_scale: codes per metre of a PNG."""
+    """Where sparse depth is written."""
 
     output: Path
+    """The sparse depth; its suffix is one of `SPARSE_SUFFIXES`."""
+
     overlay: Path | None = None
+    """A PNG of the points on the image; None for none."""
+
     depth_scale: float = 256.0
+    """Codes per metre of a PNG."""
+
     overwrite: bool = False
+    """Existing files are replaced."""
 
     @property
     def record(self) -> Path:
-        """Beside the output: how it was made."""
+        """The JSON beside the output, with everything it was made from."""
         return self.output.with_suffix(".json")
 
     def check(self, inputs: Iterable[Path | None]) -> None:
-        """Raises OutputError for a place that cannot be used, before any work is done."""
+        """Raises OutputError for files that cannot be written, before any work is done.
+
+        Args:
+            inputs: Files that are read, which must not be replaced.
+        """
         if self.output.suffix.lower() not in SPARSE_SUFFIXES:
             raise OutputError(
                 f"{self.output}: sparse depth is written as one of {', '.join(SPARSE_SUFFIXES)}"
@@ -61,22 +73,36 @@ def write_sparse_outputs(
     notes: Iterable[str],
     rgb: NDArray[np.float32] | None = None,
 ) -> dict[str, Any]:
-    """The sparse depth, its record and the overlay on `rgb` are on disk; returns the record.
+    """Writes the sparse depth, its record and the overlay, and returns the record.
 
-    settings, with the seed among them, also go into the sparse file itself where it is PNG or CSV.
+    Args:
+        target: Where to.
+        points: The sparse depth.
+        command: The command that made it.
+        settings: Its settings, seed included; a PNG or CSV keeps them too.
+        inputs: Its input files, for the record.
+        notes: Lines for a person, for the record.
+        rgb: (H, W, 3) in 0..1, the image of the overlay.
+
+    Raises:
+        OutputError: A file cannot be written.
     """
-    made = {"command": command, "version": __version__, **settings}
+    provenance = {"command": command, "version": __version__, **settings}
     for path in filter(None, (target.output, target.overlay)):
-        _make_folder_of(path)
-    picture = as_picture(points)
+        make_folder(path.parent)
     write_sparse(
-        target.output, points.xy, points.depth, picture, made=made, scale=target.depth_scale
+        target.output,
+        points.xy,
+        points.depth,
+        as_depth_image(points),
+        provenance=provenance,
+        scale=target.depth_scale,
     )
     if target.overlay is not None and rgb is not None:
         overlay(rgb, points.xy, points.depth, target.overlay)
     height, width = points.size
     record = {
-        **made,
+        **provenance,
         "inputs": inputs,
         "points": {
             "count": len(points.depth),
@@ -95,10 +121,3 @@ def write_sparse_outputs(
     }
     write_json(target.record, record)
     return record
-
-
-def _make_folder_of(path: Path) -> None:
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"folder {path.parent} cannot be made: {error.strerror}") from None

@@ -1,4 +1,4 @@
-"""`pnpdepth project`: a LiDAR scan as the sparse depth of a camera's picture."""
+"""`pnpdepth project`: a LiDAR scan as sparse depth of a camera's image."""
 
 from __future__ import annotations
 
@@ -15,19 +15,29 @@ from pnpdepth_cli.pipeline.sparse.scans import ScanOptions, read_scan_points
 
 @dataclass(frozen=True, kw_only=True)
 class ProjectRequest:
-    """What to project. size: (H, W) of the picture, where there is no image to say it."""
+    """What to project, and where to."""
 
     scan: Path
+    """The scan's file."""
+
     options: ScanOptions
+    """Calibration and limits."""
+
     target: SparseTarget
+    """Files to write."""
+
     image: Path | None = None
+    """The camera's image, which gives the size and the ground of an overlay."""
+
     size: tuple[int, int] | None = None
+    """(H, W) of the image, where there is no file of it."""
 
 
 def project_scan(request: ProjectRequest) -> dict[str, Any]:
-    """The scan's points that the camera sees are on disk; what was done is returned.
+    """Writes the scan's points that the camera sees, and returns the record.
 
-    Raises the errors of `pnpdepth_cli.errors`; then nothing is written.
+    Raises:
+        PnpDepthError: An input or output is at fault; then nothing is written.
     """
     target, image = request.target, request.image
     target.check((request.scan, image, request.options.calib))

@@ -1,4 +1,4 @@
-"""`pnpdepth sample`: sparse depth out of dense depth, by a pattern and with a seed."""
+"""`pnpdepth sample`: sparse depth sampled from dense depth by a pattern, with a seed."""
 
 from __future__ import annotations
 
@@ -17,28 +17,47 @@ from pnpdepth_cli.sensors import SampleNoise, SamplePattern, sample_points
 
 @dataclass(frozen=True, kw_only=True)
 class SampleRequest:
-    """What to sample; the fields of the pattern and of the noise are explained there.
-
-    depth_scale: integer depth files hold metres × scale.
-    """
+    """What to sample, and where to."""
 
     depth: Path
+    """The dense depth."""
+
     target: SparseTarget
+    """Files to write."""
+
     pattern: str = "uniform"
+    """One of `choices.PATTERNS`."""
+
     count: int | None = None
+    """Number of points; None with a share."""
+
     share: float | None = None
+    """Fraction of the known pixels; None with a count."""
+
     region: tuple[int, int, int, int] | None = None
+    """x, y, width and height in pixels, for the pattern `region`."""
+
     noise: dict[str, float] = field(default_factory=dict)
+    """Fields of `SampleNoise`."""
+
     seed: int = 0
+    """Of the pattern and the noise."""
+
     image: Path | None = None
+    """The image, for the patterns that need one and for an overlay."""
+
     depth_scale: float | None = None
+    """Codes per metre of an integer depth file; None for the file's own."""
+
     channel: str | None = None
+    """The EXR channel or NPZ array with the depth."""
 
 
 def sample_depth(request: SampleRequest) -> dict[str, Any]:
-    """Points of the depth map are on disk; what was done is returned.
+    """Writes points of the depth map, and returns the record.
 
-    Raises the errors of `pnpdepth_cli.errors`; then nothing is written.
+    Raises:
+        PnpDepthError: An input or output is at fault; then nothing is written.
     """
     request.target.check((request.depth, request.image))
     pattern = SamplePattern(
@@ -53,13 +72,13 @@ def sample_depth(request: SampleRequest) -> dict[str, Any]:
         for name, path in (("depth", request.depth), ("image", request.image))
         if path is not None
     }
-    said = describe_range(
+    depth_range = describe_range(
         dense.values, dense.source, assumed_scale=dense.assumed_scale, noun="pixels"
     )
-    doubt = implausible(dense.values, dense.scale)
+    unlikely = implausible(dense.values, dense.scale)
     wanted = pattern.wanted(int(np.count_nonzero(dense.values)))
-    made, lost = len(points.depth), sum(points.dropped.values())
-    few = request.pattern in ("features", "edges") and made + lost < wanted
+    sampled = len(points.depth) + sum(points.dropped.values())
+    few = request.pattern in ("features", "edges") and sampled < wanted
     return write_sparse_outputs(
         request.target,
         points,
@@ -67,9 +86,9 @@ def sample_depth(request: SampleRequest) -> dict[str, Any]:
         settings={"pattern": asdict(pattern), "noise": asdict(noise), "seed": request.seed},
         inputs=inputs,
         notes=[
-            f"depth: {said}",
-            *([f"warning: {doubt}"] if doubt else []),
-            *([f"warning: the image has {made + lost:,} of the {wanted:,} points asked for"] * few),
+            f"depth: {depth_range}",
+            *([f"warning: {unlikely}"] if unlikely else []),
+            *([f"warning: the image has {sampled:,} of the {wanted:,} points asked for"] * few),
             f"sparse: {describe_range(points.depth, f'{request.pattern}, seed {request.seed}')}",
         ],
         rgb=rgb,

@@ -1,4 +1,4 @@
-"""A LiDAR scan and a calibration, read, checked against the picture, and projected into it."""
+"""A LiDAR scan and a calibration: read, checked against the image, and projected into it."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from pnpdepth_cli.sensors import (
 )
 
 _OFF_CENTRE = 0.15
-"""Share of the picture's side by which a principal point is off without being suspicious."""
+"""Fraction of the image's side by which a principal point may be off centre without warning."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,9 +51,10 @@ class ScanOptions:
     """Float32 numbers of a point in a .bin file; None to tell from the file."""
 
     def describes(self, sparse: Path) -> bool:
-        """True if the sparse depth is a scan: by its suffix, or because of a calibration.
+        """Returns whether the sparse depth is a scan: by its suffix, or because of a calibration.
 
-        UsageError if it is none, and an option asks for what only a scan has.
+        Raises:
+            UsageError: It is not, and an option is given that only a scan has.
         """
         if self.calib is not None or sparse.suffix.lower() in set(SCAN_SUFFIXES) - {".npy"}:
             return True
@@ -67,20 +68,33 @@ class ScanOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class ScanPoints:
-    """A projected scan, what a record says of it, and what a person should be told."""
+    """A projected scan."""
 
     points: ProjectedScan
+    """The points that the camera sees."""
+
     record: dict[str, Any]
+    """What a record keeps of it."""
+
     notes: tuple[str, ...]
+    """Lines for a person."""
 
 
 def read_scan_points(
-    path: Path, options: ScanOptions, size: tuple[int, int] | None, picture: Path | None = None
+    path: Path, options: ScanOptions, size: tuple[int, int] | None, image: Path | None = None
 ) -> ScanPoints:
-    """The points of the scan that a picture of `size` (H, W) shows.
+    """Returns the points of a scan that are visible in an image.
 
-    size None: what the calibration says. picture: its name, for messages. Raises the errors of
-    reading, SizeError if calibration and picture do not fit, NoPointsError if none is in view.
+    Args:
+        path: The scan.
+        options: Calibration and limits.
+        size: (H, W) of the image; None for the calibration's.
+        image: Its file, for messages.
+
+    Raises:
+        InputError: A file cannot be read.
+        SizeError: Calibration and image do not fit together.
+        NoPointsError: No point is visible.
     """
     if options.calib is None:
         raise UsageError(
@@ -88,13 +102,11 @@ def read_scan_points(
         )
     calibration = read_calibration(options.calib, options.camera)
     if not calibration.has_pose:
-        raise UsageError(
-            f"{options.calib} does not say where the scanner stands; add R and t (or Tr)"
-        )
+        raise UsageError(f"{options.calib} has no pose of the scanner; add R and t (or Tr)")
     size = size or calibration.size
     if size is None:
-        raise SizeError(f"{options.calib} does not say the picture's size; give the image too")
-    doubt = check_size(options.calib, calibration, size, picture)
+        raise SizeError(f"{options.calib} does not give the image's size; give the image too")
+    warnings = check_size(options.calib, calibration, size, image)
     scan = read_scan(path, options.point_fields)
     settings = ProjectionSettings(
         euclidean=options.euclidean,
@@ -121,12 +133,12 @@ def read_scan_points(
             "keep_occluded": options.keep_occluded,
             "dropped": dict(points.dropped),
         },
-        notes=(*notes, *doubt),
+        notes=(*notes, *warnings),
     )
 
 
 def camera_of(calibration: Calibration) -> Camera:
-    """The camera and scanner that a calibration describes."""
+    """Returns the camera and the scanner's pose that a calibration describes."""
     return Camera(
         intrinsics=calibration.intrinsics,
         rotation=calibration.rotation,
@@ -136,18 +148,25 @@ def camera_of(calibration: Calibration) -> Camera:
 
 
 def check_size(
-    path: Path, calibration: Calibration, size: tuple[int, int], picture: Path | None = None
+    path: Path, calibration: Calibration, size: tuple[int, int], image: Path | None = None
 ) -> list[str]:
-    """A warning if picture and calibration look like those of two cameras; SizeError if they are.
+    """Returns warnings if image and calibration seem to belong to different cameras.
 
-    size: (H, W) of the picture.
+    Args:
+        path: The calibration's file, for messages.
+        calibration: What is in it.
+        size: (H, W) of the image.
+        image: Its file, for messages.
+
+    Raises:
+        SizeError: They cannot belong together.
     """
-    name = f"{picture} is" if picture else "the picture is"
+    name = f"{image} is" if image else "the image is"
     if calibration.size is not None and calibration.size != size:
         height, width = calibration.size
         raise SizeError(
-            f"{name} {size[1]}×{size[0]} but {path} is of {width}×{height} pictures; give the"
-            " picture as the calibration knows it"
+            f"{name} {size[1]}×{size[0]} but {path} is for images of {width}×{height}; give the"
+            " image at that size"
         )
     x, y = calibration.intrinsics[:2, 2]
     if not (0 <= x < size[1] and 0 <= y < size[0]):
@@ -157,7 +176,7 @@ def check_size(
         )
     if max(abs(x / size[1] - 0.5), abs(y / size[0] - 0.5)) > _OFF_CENTRE:
         return [
-            f"warning: the principal point ({x:.1f}, {y:.1f}) of {path} is far from the middle of"
-            f" a {size[1]}×{size[0]} picture; is this the picture it was made for?"
+            f"warning: the principal point ({x:.1f}, {y:.1f}) of {path} is far from the centre of"
+            f" a {size[1]}×{size[0]} image; does the calibration belong to this image?"
         ]
     return []

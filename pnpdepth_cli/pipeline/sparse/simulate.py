@@ -27,34 +27,62 @@ from pnpdepth_cli.sensors import (
 
 @dataclass(frozen=True, kw_only=True)
 class SimulateRequest:
-    """What to simulate. None leaves a property to the sensor.
-
-    sensor: one of `LIDARS`, or a TOML file. offset: where the scanner stands, metres to the right
-    of, below and in front of the camera. at_scanner: it stands where the calibration has it.
-    """
+    """What to simulate, and where to; None leaves a property to the sensor."""
 
     depth: Path
+    """The dense depth."""
+
     calib: Path
+    """The camera's calibration."""
+
     target: SparseTarget
+    """Files to write."""
+
     sensor: str = "hdl-64e"
+    """One of `LIDARS`, or a TOML file."""
+
     camera: int | None = None
+    """One of KITTI's four, 0 to 3; None for the left colour camera."""
+
     offset: tuple[float, float, float] | None = None
+    """Position of the scanner: metres to the right of, below and in front of the camera."""
+
     at_scanner: bool = False
+    """The scanner has the pose that the calibration gives."""
+
     rotation_noise_deg: float = 0.0
+    """As in `SimulationSettings`."""
+
     angle_noise_deg: float | None = None
+    """As in `SimulationSettings`."""
+
     range_noise: float | None = None
+    """As in `SimulationSettings`."""
+
     dropout: float = 0.0
+    """As in `SimulationSettings`."""
+
     max_range: float | None = None
+    """As in `SimulationSettings`."""
+
     euclidean: bool = False
+    """As in `SimulationSettings`."""
+
     seed: int = 0
+    """Of all noise."""
+
     depth_scale: float | None = None
+    """Codes per metre of an integer depth file; None for the file's own."""
+
     channel: str | None = None
+    """The EXR channel or NPZ array with the depth."""
 
 
 def simulate_scan(request: SimulateRequest) -> dict[str, Any]:
-    """The simulated sensor's points are on disk; what was done is returned.
+    """Writes the simulated sensor's points, and returns the record.
 
-    Raises the errors of `pnpdepth_cli.errors`; then nothing is written.
+    Raises:
+        PnpDepthError: An input or output is at fault; then nothing is written.
     """
     sensor = find_sensor(request.sensor)
     request.target.check((request.depth, request.calib, Path(request.sensor)))
@@ -69,12 +97,12 @@ def simulate_scan(request: SimulateRequest) -> dict[str, Any]:
     dense = read_depth(request.depth, scale=request.depth_scale, channel=request.channel)
     calibration = read_calibration(request.calib, request.camera)
     height, width = dense.values.shape
-    doubts = check_size(request.calib, calibration, (height, width), request.depth)
+    warnings = check_size(request.calib, calibration, (height, width), request.depth)
     unlikely = implausible(dense.values, dense.scale)
-    doubts += [f"warning: {unlikely}"] if unlikely else []
+    warnings += [f"warning: {unlikely}"] if unlikely else []
     camera = _camera(request, calibration)
     points = simulate_lidar(dense.values, camera, sensor, request.seed, settings)
-    said = describe_range(
+    depth_range = describe_range(
         dense.values, dense.source, assumed_scale=dense.assumed_scale, noun="pixels"
     )
     source = f"{sensor.name}, seed {request.seed}"
@@ -93,12 +121,21 @@ def simulate_scan(request: SimulateRequest) -> dict[str, Any]:
             "depth": {"path": str(request.depth), "sha256": sha256_of(request.depth)},
             "calibration": {"path": str(request.calib), "read_as": calibration.source},
         },
-        notes=[f"depth: {said}", *doubts, f"sparse: {describe_range(points.depth, source)}"],
+        notes=[
+            f"depth: {depth_range}",
+            *warnings,
+            f"sparse: {describe_range(points.depth, source)}",
+        ],
     )
 
 
 def find_sensor(spec: str) -> Lidar:
-    """The named sensor, or the one a TOML file describes. UsageError for a name nobody knows."""
+    """Returns the named sensor, or the one that a TOML file describes.
+
+    Raises:
+        UsageError: There is no sensor of this name, or it is described wrongly.
+        InputError: The file cannot be read.
+    """
     if spec in LIDARS:
         return LIDARS[spec]
     if Path(spec).suffix.lower() == ".toml":
@@ -112,13 +149,13 @@ def _finite(value: float) -> float | None:
 
 
 def _camera(request: SimulateRequest, calibration: Calibration) -> Camera:
-    """How the camera sees, with the scanner at the place that is asked for."""
+    """The camera, with the scanner at the position that is asked for."""
     if request.at_scanner and request.offset is not None:
-        raise UsageError("--at-scanner takes the place from the calibration; leave out --offset")
+        raise UsageError("--at-scanner takes the position from the calibration; leave out --offset")
     camera = camera_of(calibration)
     if request.at_scanner:
         if not calibration.has_pose:
-            raise UsageError(f"{request.calib} does not say where the scanner stands; add R and t")
+            raise UsageError(f"{request.calib} has no pose of the scanner; add R and t")
         return camera
-    place = np.array(request.offset or (0.0, 0.0, 0.0))
-    return replace(camera, rotation=FORWARD_LEFT_UP, translation=place)
+    position = np.array(request.offset or (0.0, 0.0, 0.0))
+    return replace(camera, rotation=FORWARD_LEFT_UP, translation=position)

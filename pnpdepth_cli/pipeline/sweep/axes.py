@@ -1,4 +1,4 @@
-"""What a sweep varies: parameters by their name, the values of each, and the cells they make."""
+"""What a sweep varies: named parameters, the values of each, and the cells of a table."""
 
 from __future__ import annotations
 
@@ -17,48 +17,51 @@ from pnpdepth_cli.pipeline.refinement.request import MethodOptions, count_or_sha
 from pnpdepth_cli.pipeline.sweep.points import known_sensor
 
 Cell = Mapping[str, str]
-"""The values of the parameters that are varied, as the user wrote them, by the parameter's name."""
+"""The varied parameters: name to value, as the user wrote it."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Parameter:
-    """What can be varied.
-
-    title: what stands at an axis; of_percent: the same where the values are given in per cent.
-    value: what a text says; it raises ValueError or UsageError if that is nothing. log: whether
-    equal ratios should look equal. of_points: it says something of the points, not of the update.
-    """
+    """A parameter that can be varied."""
 
     title: str
+    """Title of a plot's axis."""
     value: Callable[[str], Any]
+    """Parses a text; raises ValueError or UsageError."""
     of_percent: str = ""
+    """Title where the values are in per cent."""
     log: bool = False
+    """True for a logarithmic axis."""
     of_points: bool = False
+    """True if it concerns the points, not the update."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Axis:
-    """A parameter and the texts of the values it takes, in the order of the user."""
+    """A parameter and its values."""
 
     name: str
+    """Key of PARAMETERS."""
     values: tuple[str, ...]
+    """As the user wrote them, in that order."""
 
     @property
     def parameter(self) -> Parameter:
+        """The parameter that is varied."""
         return PARAMETERS[self.name]
 
     def numbers(self) -> list[float] | None:
-        """The values as places on an axis; None where they are no numbers of one kind."""
-        shares = {value.endswith("%") for value in self.values}
+        """Returns the values as numbers; None if they are no numbers of one unit."""
+        percents = {value.endswith("%") for value in self.values}
         try:
-            return [float(v.removesuffix("%")) for v in self.values] if len(shares) == 1 else None
+            return [float(v.removesuffix("%")) for v in self.values] if len(percents) == 1 else None
         except ValueError:
             return None
 
     def title(self) -> str:
-        """What stands at the axis."""
+        """Returns the title of the plot's axis."""
         if self.numbers() is None:
-            return self.parameter.title.partition(" (")[0]  # what is in brackets is of numbers
+            return self.parameter.title.partition(" (")[0]  # the unit in brackets is of numbers
         return self.parameter.of_percent if self.values[0].endswith("%") else self.parameter.title
 
 
@@ -67,20 +70,22 @@ class Study:
     """One table: every combination of the values of its axes."""
 
     axes: tuple[Axis, ...]
+    """One or two."""
 
     @property
     def name(self) -> str:
+        """The names of the axes, joined."""
         return "_".join(axis.name for axis in self.axes)
 
     def cells(self) -> Iterator[Cell]:
-        """In the order of the table; the last axis changes fastest."""
+        """Yields the cells in the order of the table; the last axis changes fastest."""
         names = [axis.name for axis in self.axes]
         for values in itertools.product(*(axis.values for axis in self.axes)):
             yield dict(zip(names, values, strict=True))
 
 
 def read_axis(text: str) -> Axis:
-    """The axis that a text such as `points=20,100,500` says. UsageError if it says none."""
+    """Returns the axis of a text such as `points=20,100,500`. Raises UsageError for any other."""
     name, equals, listed = text.partition("=")
     name = FORMER_NAMES.get(name, name)
     if name not in PARAMETERS:
@@ -96,7 +101,7 @@ def read_axis(text: str) -> Axis:
 
 
 def read_value(name: str, text: str) -> Any:
-    """What the text says for that parameter. UsageError if that is nothing."""
+    """Returns the parameter's value of a text. Raises UsageError for an invalid one."""
     try:
         return PARAMETERS[name].value(text)
     except (ValueError, UsageError) as error:
@@ -104,7 +109,15 @@ def read_value(name: str, text: str) -> Any:
 
 
 def studies_of(axes: Sequence[Axis], *, one_by_one: bool) -> list[Study]:
-    """A study for each axis, or one of all of them. UsageError where that makes no picture."""
+    """Returns a study for each axis, or one of all of them.
+
+    Args:
+        axes: What is varied.
+        one_by_one: True for a study of each axis.
+
+    Raises:
+        UsageError: Without an axis, with one twice, or for a grid of more than two.
+    """
     if not axes:
         raise UsageError("nothing to vary; say what with --vary, such as --vary points=20,100,500")
     names = [axis.name for axis in axes]
@@ -114,7 +127,7 @@ def studies_of(axes: Sequence[Axis], *, one_by_one: bool) -> list[Study]:
         return [Study(axes=(axis,)) for axis in axes]
     if len(axes) > 2:
         raise UsageError(
-            f"a grid of {len(axes)} parameters is more than a picture shows; --one-by-one varies"
+            f"a grid of {len(axes)} parameters cannot be plotted; --one-by-one varies"
             " each alone, and two --vary make a grid"
         )
     return [Study(axes=tuple(axes))]
@@ -153,9 +166,9 @@ def _one_of(names: Sequence[str]) -> Callable[[str], str]:
 
 
 def _points(text: str) -> str:
-    count, share = count_or_share(text)
-    if (count is not None and count < 1) or (share is not None and not 0 < share <= 1):
-        raise ValueError("give at least one point, or a share above 0 and at most 100 %")
+    count, fraction = count_or_share(text)
+    if (count is not None and count < 1) or (fraction is not None and not 0 < fraction <= 1):
+        raise ValueError("give at least one point, or a fraction above 0 and at most 100 %")
     return text
 
 
@@ -197,16 +210,18 @@ PARAMETERS: Mapping[str, Parameter] = {
     "sensor": Parameter(title="sensor", value=known_sensor, of_points=True),
     "noise": Parameter(title="noise of the points (m)", value=_ANY, of_points=True),
     "relative-noise": Parameter(
-        title="noise of the points (share of depth)", value=_ANY, of_points=True
+        title="noise of the points (fraction of depth)", value=_ANY, of_points=True
     ),
-    "outliers": Parameter(title="wrong points (share)", value=_within(1), of_points=True),
+    "outliers": Parameter(
+        title="outliers among the points (fraction)", value=_within(1), of_points=True
+    ),
     "jitter": Parameter(title="jitter of the points (px)", value=_ANY, of_points=True),
     "rotation-noise": Parameter(
         title="rotation noise of the scanner (°)", value=_within(360), of_points=True
     ),
     **dict(_method_parameters()),
 }
-"""All that can be varied, in the order of the help."""
+"""All parameters that can be varied, in the order of the help."""
 
 FORMER_NAMES = {
     each.option.alias.removeprefix("--"): each.name

@@ -1,4 +1,4 @@
-"""Which runs the cells of a sweep need: each once, however many cells look at it."""
+"""Plans the runs of a sweep: each is computed once, however many cells use it."""
 
 from __future__ import annotations
 
@@ -23,54 +23,63 @@ from pnpdepth_cli.pipeline.sweep.points import Sampling, read_sensor_text
 
 @dataclass(frozen=True, kw_only=True)
 class Method:
-    """How points are made depth: by a refinement at this layer; its `iterations` do not count
-    unless the step falls with them. propagate: how what is left at the points is spread then.
-    """
+    """A refinement and the propagation of its residuals."""
 
     layer: str
+    """Where the network is cut."""
     settings: RefineSettings
+    """Of the refinement; `iterations` is 0 unless the schedule of the step depends on it."""
     propagate: str = "none"
+    """How the residuals at the points are propagated."""
 
     def record(self) -> dict[str, Any]:
-        """All that decides the depth after so many updates."""
+        """Returns all that decides the depth after a number of updates."""
         return {"layer": self.layer, **asdict(self.settings), "propagate": self.propagate}
 
 
 @dataclass(frozen=True, kw_only=True)
-class Place:
-    """Where a cell's figures come from: after so many updates of a method with such points."""
+class Setup:
+    """What one cell is: the points, the method, and the number of updates."""
 
     sampling: Sampling
+    """Where the points come from."""
     method: Method
+    """How they refine the depth."""
     iterations: int
+    """Number of updates."""
 
 
-RunPlace = tuple[str, int, Sampling, "Method | None"]
-"""The frame's name, the seed, and what was done: what tells a sweep's runs apart."""
+RunId = tuple[str, int, Sampling, "Method | None"]
+"""(frame's name, seed, points, method); unique in a sweep."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Run:
-    """One thing to compute for one frame; method None interpolates the points linearly.
-
-    iterations: the numbers of updates after which it is scored. key: what it is known by.
-    """
+    """One computation for one frame."""
 
     task: Task
+    """The frame's files and settings."""
     frame: Frame
+    """The frame."""
     seed: int
+    """Of the drawing of points."""
     sampling: Sampling
+    """Where the points come from."""
     method: Method | None
+    """None interpolates the points linearly."""
     iterations: tuple[int, ...]
+    """Numbers of updates after which the depth is scored."""
     key: str
+    """Digest of all that decides the result."""
 
     @property
-    def place(self) -> RunPlace:
+    def id(self) -> RunId:
+        """What tells the run from the others of its sweep."""
         return self.frame.name, self.seed, self.sampling, self.method
 
 
 class Plan:
-    """What the cells of the studies need, of every frame alike."""
+    """The runs that the cells of the studies need, the same for every frame."""
 
     def __init__(
         self,
@@ -86,22 +95,22 @@ class Plan:
         self._wanted: dict[Sampling, dict[Method, set[int]]] = {}
         for study in studies:
             for cell in study.cells():
-                place = self.place(cell)
-                methods = self._wanted.setdefault(place.sampling, {})
-                methods.setdefault(place.method, set()).add(place.iterations)
+                setup = self.setup(cell)
+                methods = self._wanted.setdefault(setup.sampling, {})
+                methods.setdefault(setup.method, set()).add(setup.iterations)
 
     @property
     def layers(self) -> list[str]:
-        """The layers that are cut at, each once."""
+        """The layers of all methods, each once."""
         methods = (method for methods in self._wanted.values() for method in methods)
         return list(dict.fromkeys(method.layer for method in methods))
 
     def seeds(self, sampling: Sampling) -> Sequence[int]:
-        """Those that are drawn with: one where all would give the same."""
+        """Returns the seeds to draw with: one if all would draw the same points."""
         return self._seeds if sampling.is_random else self._seeds[:1]
 
-    def place(self, cell: Cell) -> Place:
-        """Where the cell's figures come from. UsageError if it makes no sense."""
+    def setup(self, cell: Cell) -> Setup:
+        """Returns what the cell is. Raises UsageError if its parameters contradict each other."""
         of_update = {
             name: read_value(name, text)
             for name, text in cell.items()
@@ -111,9 +120,9 @@ class Plan:
         settings = resolve_settings(self._definition, method)
         settings = replace(settings, lr=_one_spelling(settings.lr))
         iterations = settings.iterations
-        if settings.schedule == "constant":  # then more updates begin like fewer
+        if settings.schedule == "constant":  # more updates then begin as fewer do
             settings = replace(settings, iterations=0)
-        return Place(
+        return Setup(
             sampling=sampling_of(cell, self._sampling),
             method=Method(
                 layer=resolve_layer(self._definition, method.layer),
@@ -124,7 +133,7 @@ class Plan:
         )
 
     def runs(self, task: Task, frame: Frame) -> Iterator[Run]:
-        """Of one frame, those with the same points one after the other."""
+        """Yields the runs of one frame; those with the same points follow each other."""
         read = settings_of(task.request, self._model, "files", "network")
         del read["sample"]  # `sampling` says it
         for sampling, methods in self._wanted.items():
@@ -143,45 +152,45 @@ class Plan:
 
 
 def _one_spelling(lr: float | str) -> float | str:
-    """The step such that equal ones are equal: 0.01 for `1e-2`."""
+    """The step in one spelling, 0.01 for `1e-2`, so that equal steps compare equal."""
     number = float(str(lr).strip().removesuffix("%"))
     return f"{number!r}%" if str(lr).strip().endswith("%") else number
 
 
 def sampling_of(cell: Cell, base: Sampling) -> Sampling:
-    """Where the cell's points come from. UsageError if it makes no sense."""
-    given = {
+    """Returns where the cell's points come from. Raises UsageError for a contradiction."""
+    varied = {
         name.replace("-", "_"): read_value(name, text)
         for name, text in cell.items()
         if PARAMETERS[name].of_points
     }
-    if "sensor" in given:
-        sensor, points = read_sensor_text(given["sensor"])
-        if points is not None and "points" in given:
+    if "sensor" in varied:
+        sensor, points = read_sensor_text(varied["sensor"])
+        if points is not None and "points" in varied:
             raise UsageError(
-                f"sensor {given['sensor']!r} says how many points; leave that out or do not vary"
+                f"sensor {varied['sensor']!r} says how many points; leave that out or do not vary"
                 " the points"
             )
-        given["sensor"] = sensor
+        varied["sensor"] = sensor
         if points is not None:
-            given["points"] = points
-    found = replace(base, **given)
-    if not found.is_pattern and "points" not in given and found.sensor != base.sensor:
-        found = replace(found, points=None)  # what --sample says is of its own pattern
-    if found.is_pattern:
-        found.pattern()
-    return found
+            varied["points"] = points
+    sampling = replace(base, **varied)
+    if not sampling.is_pattern and "points" not in varied and sampling.sensor != base.sensor:
+        sampling = replace(sampling, points=None)  # the number in --sample is of its own pattern
+    if sampling.is_pattern:
+        sampling.pattern()
+    return sampling
 
 
 def run_key(
     name: str, seed: int, sampling: Sampling, method: Method | None, read: dict[str, Any]
 ) -> str:
-    """What a run is known by: equal where the results would be."""
-    said = {
+    """Returns a digest, equal for runs whose results would be equal."""
+    identity = {
         "frame": name,
         "seed": seed,
         "sampling": sampling.record(),
         "method": None if method is None else method.record(),
         "read": read,
     }
-    return hashlib.sha256(json.dumps(plain(said), sort_keys=True).encode()).hexdigest()
+    return hashlib.sha256(json.dumps(plain(identity), sort_keys=True).encode()).hexdigest()

@@ -1,4 +1,4 @@
-"""A sweep's studies as pictures: the error, and the gain over the plain network, as PNG."""
+"""Plots a sweep's studies as PNG: the error, and the gain over the plain network."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ BLUE, VERMILION, GREEN, PURPLE, SKY, ORANGE = (
     *("#0072B2", "#D55E00", "#009E73"),
     *("#CC79A7", "#56B4E9", "#E69F00"),
 )
-"""Told apart by the colour-blind (Okabe and Ito 2008)."""
+"""Distinguishable for the colour-blind (Okabe and Ito 2008)."""
 
 _GREY = "#555555"
 _KINDS = (BLUE, VERMILION, GREEN, PURPLE, SKY, ORANGE)
@@ -36,12 +36,12 @@ _STYLE: dict[Any, Any] = {
     "lines.linewidth": 1.4,
     "legend.frameon": False,
 }
-_LONG = 30
-"""So many letters of values do not fit below an axis without being turned."""
+_MAX_LETTERS = 30
+"""More letters of values below an axis are rotated."""
 
 
 def need_matplotlib() -> None:
-    """UsageError if pictures cannot be drawn."""
+    """Raises UsageError if matplotlib is not installed."""
     if find_spec("matplotlib") is None:
         raise UsageError(
             "plots need matplotlib: pip install 'pnpdepth[plot]'; --no-plots does without"
@@ -49,7 +49,13 @@ def need_matplotlib() -> None:
 
 
 def draw_study(study: Study, cells: Cells, path: Path) -> None:
-    """`path` is a PNG of the cells of one axis or two, in the order of the study's."""
+    """Writes a PNG of the cells of one axis or two.
+
+    Args:
+        study: The axes.
+        cells: The cells in the order of the study.
+        path: The PNG.
+    """
     import matplotlib as mpl
     from matplotlib.figure import Figure
 
@@ -125,11 +131,11 @@ class _Line:
         self, *, colour: Any = _GREY, dashes: str = "-", mark: str = "", aside: float = 0
     ) -> None:
         self.colour, self.dashes, self.mark = colour, dashes, mark
-        self.aside = aside  # of values that are no numbers, so that one does not hide another
+        self.aside = aside  # offset of categories, so that no line hides another
 
 
 def _lines(apart: Axis) -> list[_Line]:
-    """One for each value: from dark to light where values have an order, else of all kinds."""
+    """A line for each value: from dark to light if they are ordered, else of distinct colours."""
     import matplotlib as mpl
 
     many = len(apart.values)
@@ -146,7 +152,7 @@ def _lines(apart: Axis) -> list[_Line]:
 
 
 def _across(first: Axis, second: Axis) -> tuple[Axis, Axis]:
-    """(what goes along the picture, what makes lines): numbers along, and the more values."""
+    """(the x axis, the axis that makes lines): numbers and many values on the x axis."""
     along = max((second, first), key=lambda a: (a.numbers() is not None, len(a.values)))
     return along, first if along is second else second
 
@@ -154,7 +160,7 @@ def _across(first: Axis, second: Axis) -> tuple[Axis, Axis]:
 def _draw(
     axes: Axes, axis: Axis, cells: Cells, key: str, name: str, line: _Line, label: str | None
 ) -> None:
-    """A line through the cells' values; gains have their intervals."""
+    """Draws a line through the cells' values; gains with their intervals."""
     places = axis.numbers()
     x = [n + line.aside for n in range(len(axis.values))] if places is None else places
     order = sorted(range(len(x)), key=lambda n: x[n])
@@ -170,7 +176,7 @@ def _draw(
     drawn = {"color": line.colour, "linestyle": style, "marker": line.mark, "label": label}
     axes.plot(at, values, markersize=12 if line.mark == "_" else 4, **drawn)
     if name != "gain" or all(bound != bound for bound in low):
-        return  # how frames differ in their error would hide how the values do
+        return  # the scatter of frames would hide the differences of values
     if places is None:
         axes.vlines(at, low, high, color=line.colour, linewidth=1)
     else:
@@ -178,9 +184,9 @@ def _draw(
 
 
 def _values(cells: Cells, key: str, name: str) -> list[float]:
-    """The cells' values; not a number where there is none."""
-    found = [((cell["measures"] or {}).get(key) or {}).get(name) for cell in cells]
-    return [float("nan") if value is None else value for value in found]
+    """The cells' values; NaN where there is none."""
+    values = [((cell["measures"] or {}).get(key) or {}).get(name) for cell in cells]
+    return [float("nan") if value is None else value for value in values]
 
 
 def _scale(axes: Axes, axis: Axis) -> None:
@@ -189,7 +195,7 @@ def _scale(axes: Axes, axis: Axis) -> None:
     places = axis.numbers()
     axes.set_xlabel(axis.title())
     if places is None:
-        turned = sum(map(len, axis.values)) > _LONG
+        turned = sum(map(len, axis.values)) > _MAX_LETTERS
         axes.set_xlim(-0.5, len(axis.values) - 0.5)
         axes.set_xticks(
             range(len(axis.values)),

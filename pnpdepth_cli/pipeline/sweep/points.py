@@ -1,4 +1,4 @@
-"""The sparse points of a sweep's runs: a frame's own, drawn from its truth, or a LiDAR's in it."""
+"""The sparse points of a sweep: a frame's own, drawn from its ground truth, or simulated in it."""
 
 from __future__ import annotations
 
@@ -25,45 +25,51 @@ from pnpdepth_cli.sensors import (
     SampleNoise,
     SamplePattern,
     SimulationSettings,
-    disturbed,
     sample_points,
     simulate_lidar,
+    with_noise,
 )
 
 OWN = "own"
-"""The sensor that the frames' own sparse depth is of."""
+"""The name of the frames' own sparse depth as a sensor."""
 
-_REPEATED = ("grid", "lines", "features", OWN)
-"""Sensors that give the same points whatever the seed."""
+_DETERMINISTIC = ("grid", "lines", "features", OWN)
+"""Sensors whose points do not depend on the seed."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Sampling:
-    """Where the points of a run come from.
-
-    sensor: OWN, a pattern of `pnpdepth sample`, or a LiDAR of `pnpdepth simulate`. points: so many
-    or a share (`500`, `5%`) of the known pixels for a pattern, else of the points there are; None
-    for all of those. The others are noise, as `pnpdepth sample` and `simulate` have it.
-    """
+    """Where the points of a run come from."""
 
     sensor: str = OWN
+    """OWN, a pattern of `pnpdepth sample`, or a LiDAR of `pnpdepth simulate`."""
     points: str | None = None
+    """Number or fraction (`500`, `5%`), for a pattern of the known pixels, else of the sensor's
+    points; None for all of these."""
     noise: float = 0.0
+    """Standard deviation of the depth, metres."""
     relative_noise: float = 0.0
+    """Standard deviation as a fraction of the depth."""
     outliers: float = 0.0
+    """Fraction of points with a random depth."""
     jitter: float = 0.0
+    """Standard deviation of the pixel coordinates."""
     rotation_noise: float = 0.0
+    """Standard deviation of the scanner's rotation, degrees."""
 
     @property
     def is_pattern(self) -> bool:
+        """True for a pattern of `pnpdepth sample`."""
         return self.sensor in PATTERNS
 
     @property
     def lidar(self) -> Lidar | None:
+        """The scanner, if the sensor is one."""
         return None if self.is_pattern or self.sensor == OWN else find_sensor(self.sensor)
 
     @property
     def sample_noise(self) -> SampleNoise:
+        """The noise of each point."""
         return SampleNoise(
             metres=self.noise,
             relative=self.relative_noise,
@@ -73,28 +79,28 @@ class Sampling:
 
     @property
     def is_random(self) -> bool:
-        """False if every seed gives the same points."""
+        """True if the points depend on the seed."""
         thinned = self.points is not None and not self.is_pattern
-        return self.sensor not in _REPEATED or thinned or self.sample_noise != SampleNoise()
+        return self.sensor not in _DETERMINISTIC or thinned or self.sample_noise != SampleNoise()
 
     def pattern(self) -> SamplePattern:
-        """Of a sensor that is one. UsageError without a number of points."""
+        """Returns the pattern to draw. Raises UsageError without a number of points."""
         if self.points is None:
             raise UsageError(
                 f"sensor {self.sensor!r} needs a number of points: {self.sensor}:500, or --sample"
                 " 500, or --vary points=100,500"
             )
-        count, share = count_or_share(self.points)
-        return SamplePattern(kind=self.sensor, count=count, share=share)
+        count, fraction = count_or_share(self.points)
+        return SamplePattern(kind=self.sensor, count=count, share=fraction)
 
     def record(self) -> dict[str, Any]:
-        """All that decides the points, but for the frame and the seed."""
+        """Returns all that decides the points except the frame and the seed."""
         lidar = self.lidar
         return asdict(self) | {"sensor": self.sensor if lidar is None else asdict(lidar)}
 
 
 def read_sensor_text(text: str) -> tuple[str, str | None]:
-    """(sensor, points) of `500`, `grid:400`, `grid` or `vlp-16`. UsageError for what is none."""
+    """Returns (sensor, points) of `500`, `grid:400`, `grid` or `vlp-16`, else raises UsageError."""
     if text in (OWN, *PATTERNS, *LIDARS) or text.lower().endswith(".toml"):
         return text, None
     kind, colon, points = text.rpartition(":")
@@ -108,37 +114,45 @@ def read_sensor_text(text: str) -> tuple[str, str | None]:
 
 
 def read_sampling(text: str) -> Sampling:
-    """Points of `500`, `grid:400` or `vlp-16`, without noise. UsageError for what is none."""
+    """Returns the sampling of `500`, `grid:400` or `vlp-16`, without noise."""
     sensor, points = read_sensor_text(known_sensor(text))
     return Sampling(sensor=sensor, points=points)
 
 
 def known_sensor(text: str) -> str:
-    """The text, if it is a sensor's. UsageError for what is none."""
+    """Returns the text if it names a sensor, else raises UsageError."""
     sensor, points = read_sensor_text(text)
     sampling = Sampling(sensor=sensor, points=points)
     if sampling.is_pattern and points is not None:
         sampling.pattern()
     elif sampling.lidar is not None:
-        pass  # it was found, and its file could be read
+        pass  # the sensor exists and its file is readable
     return text
 
 
 def frame_points(
     sampling: Sampling, seed: int, inputs: Inputs, request: RefineRequest, frame: Frame
 ) -> SparsePoints:
-    """The points of one frame. InputError if it cannot have them.
+    """Returns the points of one frame.
 
-    inputs: the frame as read, with its own points if those are wanted. request: how it was read.
+    Args:
+        sampling: Where they come from.
+        seed: Of the drawing.
+        inputs: The frame as read, with its own points if the sensor is OWN.
+        request: How it was read.
+        frame: The frame in its data set.
+
+    Raises:
+        InputError: If the frame cannot have such points.
     """
     try:
-        found = _found(sampling, seed, inputs, request, frame)
-    except UsageError as error:  # the sensor itself is good, this frame is too poor for it
+        points = _points_of(sampling, seed, inputs, request, frame)
+    except UsageError as error:  # the sensor is valid, but not for this frame
         raise InputError(str(error)) from error
-    return found.tensors()
+    return points.tensors()
 
 
-def _found(
+def _points_of(
     sampling: Sampling, seed: int, inputs: Inputs, request: RefineRequest, frame: Frame
 ) -> Points:
     truth, noise = inputs.gt, sampling.sample_noise
@@ -150,11 +164,13 @@ def _found(
     if sampling.lidar is not None:
         points = _scanned(sampling, sampling.lidar, seed, inputs, request, frame)
     elif request.files.sparse is None:
-        raise InputError("there is no sparse depth; --sample 500 takes points of the truth")
+        raise InputError(
+            "there is no sparse depth; --sample 500 draws points from the ground truth"
+        )
     else:
         own = inputs.points
         points = SparsePoints(xy=own.xy.numpy(), depth=own.depth.numpy(), size=own.size)
-    return disturbed(_thinned(points, sampling.points, rng), noise, rng)
+    return with_noise(_thinned(points, sampling.points, rng), noise, rng)
 
 
 def _scanned(
@@ -165,7 +181,7 @@ def _scanned(
     request: RefineRequest,
     frame: Frame,
 ) -> Points:
-    """What the LiDAR, standing in the camera's place, measures in the frame's true depth."""
+    """The points of a LiDAR at the camera's position, simulated in the frame's ground truth."""
     if frame.calib is None:
         raise InputError(
             f"sensor {sampling.sensor!r} needs to know the camera; give --calib, or a list with a"
@@ -174,8 +190,8 @@ def _scanned(
     protocol = request.files.protocol
     if protocol.halved or protocol.crop:
         raise InputError(
-            f"sensor {sampling.sensor!r} needs the picture that the calibration is of, but protocol"
-            f" {protocol.name!r} cuts it; --protocol whole does not"
+            f"sensor {sampling.sensor!r} needs the image that the calibration is of, but protocol"
+            f" {protocol.name!r} crops it; --protocol whole does not"
         )
     calibration = read_calibration(frame.calib, frame.camera)
     check_size(frame.calib, calibration, inputs.size)
@@ -186,7 +202,7 @@ def _scanned(
 
 
 def _thinned(points: Points, wanted: str | None, rng: np.random.Generator) -> Points:
-    """So many of the points, each as likely as any other."""
+    """A uniform random subset of the points."""
     if wanted is None:
         return points
     known = len(points.depth)
@@ -194,14 +210,14 @@ def _thinned(points: Points, wanted: str | None, rng: np.random.Generator) -> Po
     number = max(1, round(share * known)) if share is not None else count or 0
     if number > known:
         raise InputError(
-            f"{number:,} points of {known:,}; ask for fewer, or take them of the truth with"
-            f" --sample {wanted}"
+            f"{number:,} points of {known:,}; ask for fewer, or draw them from the ground truth"
+            f" with --sample {wanted}"
         )
     kept = np.sort(rng.choice(known, number, replace=False))
     return replace(points, xy=points.xy[kept], depth=points.depth[kept])
 
 
 def calibration_file(sampling: Sampling, frame: Frame) -> Path | None:
-    """The calibration that is read for these points as well, if any."""
+    """Returns the calibration file that these points need, if any."""
     path = frame.calib if sampling.lidar is not None else None
     return path if path is not None and path.is_file() else None

@@ -1,4 +1,4 @@
-"""The runs of a sweep: one refinement gives the scores of every number of updates."""
+"""Computes the runs of a sweep: one refinement gives the scores after every number of updates."""
 
 from __future__ import annotations
 
@@ -9,52 +9,59 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from pnpdepth_cli.auto.candidates import SplitCache
 from pnpdepth_cli.completion.interpolation import linear
 from pnpdepth_cli.completion.propagation import propagate
 from pnpdepth_cli.core.metrics import score
 from pnpdepth_cli.core.refine import Refinement, RefineSettings, refine
 from pnpdepth_cli.core.split import Split
-from pnpdepth_cli.errors import DivergedError, NoPointsError
-from pnpdepth_cli.models.aligned import AlignedDepth
+from pnpdepth_cli.errors import DivergedError
+from pnpdepth_cli.frames.prepare import prepare
 from pnpdepth_cli.models.frame import FrameMap
 from pnpdepth_cli.models.network import Network, out_of_memory_is_a_device_error
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs
-from pnpdepth_cli.pipeline.refinement.ways import HeldCut
 from pnpdepth_cli.pipeline.sweep.plan import Method, Run
 
 
 @dataclass(frozen=True, kw_only=True)
 class Curve:
-    """A refinement scored after several numbers of updates.
-
-    plain: of the network alone. scores: by the number of updates. step: α as a number. diverged:
-    why there were no more updates than `made`, None if there were; what was asked of more is
-    scored with the last good depth.
-    """
+    """A refinement scored after several numbers of updates."""
 
     plain: dict[str, Any]
+    """Scores of the network alone."""
     scores: dict[int, dict[str, Any]]
+    """By the number of updates; after a divergence of the last finite depth."""
     step: float
-    made: int
+    """α as a number."""
+    updates: int
+    """Number of updates until the end or a divergence."""
     diverged: str | None
+    """Why it diverged; None if it did not."""
 
 
-def result_of(run: Run, inputs: Inputs, cut: HeldCut) -> dict[str, Any]:
-    """The result of a run of this frame with these points, as the journal has it."""
+def result_of(run: Run, inputs: Inputs, cache: SplitCache) -> dict[str, Any]:
+    """Returns the result of a run as the journal has it.
+
+    Args:
+        run: What to compute.
+        inputs: The frame with the run's points.
+        cache: Keeps the network cut at the last layer.
+    """
     done = {"state": "done", "points": len(inputs.points)}
     if run.method is None:
-        return done | {"scores": {"linear": interpolated(cut.network, inputs)}}
+        return done | {"scores": {"linear": interpolated(cache.network, inputs)}}
     torch.manual_seed(run.seed)
     try:
-        split = cut.at(run.method.layer)
-        curve = refined_curve(cut.network, split, run.method, inputs, run.iterations)
+        split = cache.at(run.method.layer)
+        curve = refined_curve(cache.network, split, run.method, inputs, run.iterations)
     except BaseException:
-        cut.close()
+        cache.close()
         raise
     return done | {
         "plain": curve.plain,
         "scores": {
-            str(k): scores | {"updates": min(k, curve.made)} for k, scores in curve.scores.items()
+            str(k): scores | {"updates": min(k, curve.updates)}
+            for k, scores in curve.scores.items()
         },
         "step": curve.step,
         "diverged": curve.diverged,
@@ -68,53 +75,63 @@ def refined_curve(
     inputs: Inputs,
     wanted: Sequence[int],
 ) -> Curve:
-    """One refinement of as many updates as the most that are wanted, scored after each wanted.
+    """Returns a refinement's scores after each wanted number of updates.
 
-    It is the same as a refinement of each number alone, unless the step falls with their share.
-    split: the network at the method's layer, open.
+    They equal those of a refinement of each number alone if the step is constant.
+
+    Args:
+        network: The network.
+        split: The network cut at the method's layer, open.
+        method: How to refine.
+        inputs: The frame with its points.
+        wanted: Numbers of updates.
     """
-    frame = FrameMap.fit(network.definition.size, *inputs.size)
-    points = frame.points_to_network(inputs.points)
-    if not len(points):
-        raise NoPointsError(f"none of the {len(inputs.points)} points is where the network looks")
-    at = points.tensors(network.device)
+    prepared = prepare(network, inputs.frame())
+    if not len(prepared.points):
+        raise prepared.no_points_error()
     settings = replace(method.settings, iterations=max(wanted))
-    aligned = AlignedDepth(network, at, settings.align, every=settings.align_every)
+    reader = prepared.depth_reader(settings)
     keep = range(settings.iterations + 1) if settings.gives_best else {0, *wanted}
     diverged: DivergedError | None = None
     with out_of_memory_is_a_device_error(network.device):
-        arguments = network.arguments(frame, inputs.rgb_tensor(), points)
         try:
-            result = refine(split, arguments, at, settings, depth_of=aligned, keep_depths=keep)
+            result = refine(
+                split,
+                prepared.arguments,
+                prepared.points,
+                settings,
+                depth_of=reader,
+                keep_depths=keep,
+            )
         except DivergedError as error:
             if not isinstance(error.last_good, Refinement):
                 raise
             diverged, result = error, error.last_good
-        made = len(result.losses) - 1
-        kept = {k: _kept(result.losses, min(k, made), settings) for k in wanted}
-        truth = seen_truth(network, inputs)
+        updates = len(result.losses) - 1
+        kept = {k: _kept(result.losses, min(k, updates), settings) for k in wanted}
+        truth = ground_truth_in_view(network, inputs)
         seen = {**result.depths, result.kept: result.after}
-        depths = {k: frame.depth_to_image(seen[k]).cpu() for k in {0, *kept.values()}}
-        found = {
-            place: asdict(score(_spread(depths[place], inputs, method.propagate), truth))
-            for place in set(kept.values())
+        depths = {k: prepared.map.depth_to_image(seen[k]).cpu() for k in {0, *kept.values()}}
+        scores = {
+            index: asdict(score(_propagated(depths[index], inputs, method.propagate), truth))
+            for index in set(kept.values())
         }
     return Curve(
         plain=asdict(score(depths[0], truth)),
-        scores={k: found[place] for k, place in sorted(kept.items())},
+        scores={k: scores[index] for k, index in sorted(kept.items())},
         step=result.step,
-        made=made,
+        updates=updates,
         diverged=str(diverged) if diverged else None,
     )
 
 
 def interpolated(network: Network, inputs: Inputs) -> dict[str, Any]:
-    """The scores of linear interpolation of the points, on the pixels that the network sees."""
-    return asdict(score(linear(inputs.points), seen_truth(network, inputs)))
+    """Returns the scores of linear interpolation on the pixels inside the network's crop."""
+    return asdict(score(linear(inputs.points), ground_truth_in_view(network, inputs)))
 
 
-def seen_truth(network: Network, inputs: Inputs) -> Tensor:
-    """(H, W) the true depth, unknown where the network does not look."""
+def ground_truth_in_view(network: Network, inputs: Inputs) -> Tensor:
+    """Returns (H, W) the ground truth, 0 outside the network's crop."""
     assert inputs.gt is not None
     top, left, height, width = FrameMap.fit(network.definition.size, *inputs.size).crop
     truth = torch.zeros(inputs.size)
@@ -124,14 +141,14 @@ def seen_truth(network: Network, inputs: Inputs) -> Tensor:
 
 
 def _kept(losses: Sequence[float], updates: int, settings: RefineSettings) -> int:
-    """Which z's depth a refinement of so many updates gives: the last, or that of least loss."""
+    """The index of z that a refinement of so many updates returns: the last, or of least loss."""
     if not settings.gives_best:
         return updates
     return min(range(updates + 1), key=lambda k: (losses[k], -k))
 
 
-def _spread(depth: Tensor, inputs: Inputs, kind: str) -> Tensor:
-    """The depth (H, W) with what is left at the points spread over it."""
+def _propagated(depth: Tensor, inputs: Inputs, kind: str) -> Tensor:
+    """(H, W) the depth with the residuals at the points propagated."""
     if kind == "none":
         return depth
-    return propagate(depth, inputs.points, inputs.picture(), kind=kind).depth
+    return propagate(depth, inputs.points, inputs.frame().rgb, kind=kind).depth

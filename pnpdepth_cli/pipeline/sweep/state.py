@@ -1,4 +1,4 @@
-"""What a sweep has computed before, and whether it still holds."""
+"""Remembers the results of a sweep, and whether they are up to date."""
 
 from __future__ import annotations
 
@@ -16,9 +16,10 @@ RESULTS = ("sweep.json", "sweep.csv", "sweep_frames.csv")
 
 
 class SweepState:
-    """What was computed before: `sweep.jsonl`, a line for each run.
+    """The results in `sweep.jsonl`, a line for each run.
 
-    OutputError if the folder has results that no sweep made.
+    Raises:
+        OutputError: If the folder has results that no sweep wrote.
     """
 
     def __init__(self, output: Path) -> None:
@@ -26,22 +27,22 @@ class SweepState:
         foreign = [name for name in RESULTS if (output / name).exists()]
         if foreign and not path.exists():
             raise OutputError(
-                f"{output / foreign[0]} exists, and no sweep made it; -o names another folder"
+                f"{output / foreign[0]} exists, and no sweep wrote it; -o names another folder"
             )
         self._journal = Journal(path, "run")
 
     def result(self, key: str) -> dict[str, Any] | None:
-        """The run's line; None if it was not done."""
+        """Returns the run's line; None if it was not computed."""
         line = self._journal.newest(key)
         return line if line is not None and line.get("state") == "done" else None
 
     def is_done(self, run: Run) -> bool:
-        """True if it has all the scores that are wanted, of the files as they are now."""
+        """Returns True if all scores of the run exist, of the files as they are now."""
         line = self._still_good(run)
         return line is not None and {str(k) for k in run.iterations} <= line["scores"].keys()
 
     def add(self, run: Run, result: dict[str, Any]) -> None:
-        """The result is on disk, with the scores after other numbers of updates if known."""
+        """Records the result, with known scores after other numbers of updates."""
         before = self._still_good(run)
         if before is not None and "scores" in result:
             result = result | {"scores": before["scores"] | result["scores"]}
@@ -58,7 +59,7 @@ class SweepState:
         )
 
     def fail(self, run: Run, message: str) -> None:
-        """It is known why there is no result; it is tried again by the next sweep."""
+        """Records why the run failed; the next sweep tries it again."""
         self._journal.append(
             {"run": run.key, "frame": run.frame.name, "seed": run.seed, "state": "failed",
              "message": message}

@@ -129,7 +129,8 @@ def _mean_and_interval(
     shape = (len(METHODS) + 2, len(SWEPT))
 
     def statistic(totals: Tensor) -> Tensor:
-        means = frames.means_of(totals).unflatten(-1, table.shape[1:])
+        means = frames.means_of(totals)
+        means = means.reshape(*means.shape[:-1], *table.shape[1:])
         return _with_gains(means).flatten(-2)
 
     mean = _with_gains(torch.from_numpy(table.mean(axis=0)))

@@ -1,4 +1,4 @@
-"""`pnpdepth sweep`: errors against truth while one thing or two are varied."""
+"""`pnpdepth sweep`: errors against ground truth over one or two varied parameters."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any, TypeVar
 
+from pnpdepth_cli.auto.candidates import SplitCache
 from pnpdepth_cli.errors import (
     DeviceError,
     InputError,
@@ -26,9 +27,8 @@ from pnpdepth_cli.pipeline.refinement.inputs import Inputs, read_inputs
 from pnpdepth_cli.pipeline.refinement.refine import Refiner, load_refiner
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest
 from pnpdepth_cli.pipeline.refinement.resolve import resolve_layer, resolve_settings
-from pnpdepth_cli.pipeline.refinement.ways import HeldCut
 from pnpdepth_cli.pipeline.sweep.axes import Study
-from pnpdepth_cli.pipeline.sweep.plan import Place, Plan, Run, RunPlace, sampling_of
+from pnpdepth_cli.pipeline.sweep.plan import Plan, Run, RunId, Setup, sampling_of
 from pnpdepth_cli.pipeline.sweep.plots import draw_study, need_matplotlib
 from pnpdepth_cli.pipeline.sweep.points import OWN, Sampling, frame_points
 from pnpdepth_cli.pipeline.sweep.running import result_of
@@ -37,32 +37,39 @@ from pnpdepth_cli.pipeline.sweep.summary import FrameFigures, summarise, write_f
 from pnpdepth_cli.sensors import SamplePattern
 
 T = TypeVar("T")
-Lines = Mapping[RunPlace, "dict[str, Any] | None"]
-_TRUTH_ALONE = SamplePattern(count=1)
-_TO_SETTLE_ON = 500
-"""Points of the truth; as many as the paper takes indoors."""
+Lines = Mapping[RunId, "dict[str, Any] | None"]
+_GROUND_TRUTH_ONLY = SamplePattern(count=1)
+_RESOLVE_POINTS = 500
+"""Points of the ground truth that the definition is resolved on; the paper uses 500 indoors."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class SweepRequest:
-    """What to vary, over which frames.
-
-    refine: all that is not varied. studies: of `studies_of`. sampling: where points come from
-    unless that is varied, None for the frames' own or, where they have none, the truth. seeds: so
-    many draws of the points, from refine.seed on. layout, protocol, limit: as for a batch.
-    """
+    """What to vary, over which frames."""
 
     source: Path
+    """A folder or a list of frames."""
     output: Path
+    """The folder for the results."""
     refine: RefineRequest
+    """All that is not varied."""
     studies: Sequence[Study]
+    """As `studies_of` returns them."""
     sampling: Sampling | None = None
+    """Where points come from unless that is varied; None for the frames' own, or else the ground
+    truth."""
     seeds: int = 1
+    """Draws of the points, with consecutive seeds."""
     layout: str | None = None
+    """Name of the data set's layout; None to guess it."""
     protocol: str | None = None
+    """Name of the protocol that crops frames; None for the layout's own."""
     limit: int | None = None
+    """Only the first frames; None for all."""
     plots: bool = True
+    """True to write a plot of each study."""
     resamples: int = 2000
+    """Bootstrap samples behind the intervals."""
 
     def __post_init__(self) -> None:
         if self.seeds < 1:
@@ -70,10 +77,13 @@ class SweepRequest:
 
 
 def run_sweep(request: SweepRequest, listener: Listener) -> dict[str, Any]:
-    """Tables and pictures of the studies are in the folder; what sweep.json holds is returned.
+    """Writes tables and plots of the studies; returns the contents of sweep.json.
 
-    Runs that were done before, with these settings and files, are not done again. Raises the
-    errors of `pnpdepth_cli.errors`; what is wrong with one frame is told, and counted.
+    Runs that are done with these settings and files are not computed again. Frames that fail are
+    reported and counted.
+
+    Raises:
+        PnpDepthError: For what concerns all frames.
     """
     if request.plots:
         need_matplotlib()
@@ -81,7 +91,7 @@ def run_sweep(request: SweepRequest, listener: Listener) -> dict[str, Any]:
     make_folder(request.output)
     with locked_folder(request.output, None, lambda: _clean(request.output)):
         state = SweepState(request.output)
-        refiner = _settled(request, tasks, listener)
+        refiner = _resolved(request, tasks, listener)
         plan = Plan(
             request.studies,
             refiner.network.definition,
@@ -92,7 +102,7 @@ def run_sweep(request: SweepRequest, listener: Listener) -> dict[str, Any]:
         )
         for layer in plan.layers:
             with refiner.network.cut_at(layer):
-                pass  # a layer that is not there is told before anything is computed
+                pass  # reports an unknown layer before anything is computed
         runs = [run for task, frame in tasks for run in plan.runs(task, frame)]
         to_do = [run for run in runs if not state.is_done(run)]
         listener.say(
@@ -102,7 +112,7 @@ def run_sweep(request: SweepRequest, listener: Listener) -> dict[str, Any]:
         listener.begin(len(to_do))
         for row in _rows(to_do, refiner, state):
             listener.frame(row)
-        lines = {run.place: state.result(run.key) for run in runs}
+        lines = {run.id: state.result(run.key) for run in runs}
         return _write(request, sampling, refiner, plan, [task.name for task, _ in tasks], lines)
 
 
@@ -111,22 +121,22 @@ def _clean(output: Path) -> None:
 
 
 def _frames(request: SweepRequest, listener: Listener) -> tuple[Sampling, list[tuple[Task, Frame]]]:
-    """Where points come from unless that is varied, and the frames with truth.
+    """Where points come from unless that is varied, and the frames with ground truth.
 
-    InputError if there are none, UsageError if no points can be had.
+    InputError if there are none, UsageError if no points can be drawn.
     """
-    asked = BatchRequest(
+    batch = BatchRequest(
         source=request.source,
         output=request.output,
-        refine=request.refine.with_fields(sample=_TRUTH_ALONE),
+        refine=request.refine.with_fields(sample=_GROUND_TRUTH_ONLY),
         layout=request.layout,
         protocol=request.protocol,
         limit=request.limit,
     )
-    found = find_frames(asked)
-    frames = [frame for frame in found.chosen if frame.gt is not None]
-    without = len(found.chosen) - len(frames)
-    listener.say(f"layout: {found.layout}: {len(frames):,} frames with ground truth")
+    listed = find_frames(batch)
+    frames = [frame for frame in listed.chosen if frame.gt is not None]
+    without = len(listed.chosen) - len(frames)
+    listener.say(f"layout: {listed.layout}: {len(frames):,} frames with ground truth")
     if not frames:
         raise InputError(
             f"{request.source}: none of its {without:,} frames has ground truth, without which"
@@ -138,20 +148,24 @@ def _frames(request: SweepRequest, listener: Listener) -> tuple[Sampling, list[t
     if sampling is None:
         own = any(frame.sparse is not None for frame in frames)
         sampling = Sampling(sensor=OWN if own else "uniform")
-        said = "the frames' own" if own else "uniform of the ground truth, for they have no others"
-        listener.say(f"points: {said}; --sample says otherwise")
+        origin = (
+            "the frames' own" if own else "uniform of the ground truth, as frames have no others"
+        )
+        listener.say(f"points: {origin}; --sample to change")
     samplings = [sampling_of(cell, sampling) for study in request.studies for cell in study.cells()]
     scan = request.refine.files.scan
-    if any(each.lidar for each in samplings):  # then it is the camera's, not of a scan
+    if any(
+        each.lidar for each in samplings
+    ):  # then the calibration is of the camera, not of a scan
         frames = [
             replace(f, calib=scan.calib or f.calib, camera=_given(scan.camera, f.camera))
             for f in frames
         ]
         scan = replace(scan, calib=None, camera=None)
     own_wanted = any(each.sensor == OWN for each in samplings)
-    reading_own = replace(asked, refine=request.refine.with_fields(scan=scan, sample=None))
+    reading_own = replace(batch, refine=request.refine.with_fields(scan=scan, sample=None))
     return sampling, [
-        (task_of(reading_own if own_wanted and frame.sparse else asked, frame), frame)
+        (task_of(reading_own if own_wanted and frame.sparse else batch, frame), frame)
         for frame in frames
     ]
 
@@ -160,19 +174,19 @@ def _given(first: int | None, otherwise: int | None) -> int | None:
     return otherwise if first is None else first
 
 
-def _settled(
+def _resolved(
     request: SweepRequest, tasks: Sequence[tuple[Task, Frame]], listener: Listener
 ) -> Refiner:
-    """The network, with what it leaves open settled on the first frame that can be read.
+    """The network, its definition resolved on the first frame that can be read.
 
-    It is settled on points of the truth, so that it does not depend on what is varied.
+    Points of the ground truth are used, so that it does not depend on what is varied.
     """
     errors = []
     for task, frame in tasks:
         try:
             inputs = read_inputs(task.request)
             known = 0 if inputs.gt is None else int((inputs.gt > 0).sum())
-            some = Sampling(sensor="uniform", points=str(min(_TO_SETTLE_ON, known)))
+            some = Sampling(sensor="uniform", points=str(min(_RESOLVE_POINTS, known)))
             points = frame_points(some, request.refine.hold_out.seed, inputs, task.request, frame)
         except InputError as error:
             errors.append(error)
@@ -196,13 +210,13 @@ def _settled(
 
 
 def _some_layer(request: SweepRequest) -> str | None:
-    """The layer that is asked for, or one that is: a network may have none that it is cut at."""
+    """A layer of the study or of the request, as a network may have no default."""
     axes = [axis for study in request.studies for axis in study.axes if axis.name == "layer"]
     return axes[0].values[0] if axes else request.refine.method.layer
 
 
 def _base(definition: ModelDefinition, request: RefineRequest) -> dict[str, Any]:
-    """What holds where it is not varied."""
+    """The settings that are not varied."""
     settings = resolve_settings(definition, request.method)
     layer = request.method.layer or definition.default_layer
     return {
@@ -213,21 +227,21 @@ def _base(definition: ModelDefinition, request: RefineRequest) -> dict[str, Any]
 
 
 def _rows(runs: Sequence[Run], refiner: Refiner, state: SweepState) -> Iterator[dict[str, Any]]:
-    """Each run is done and recorded; a row for each. Frames are read once, points drawn once."""
-    with HeldCut(refiner.network) as cut:
+    """Computes and records each run; yields a row for each. Frames are read once."""
+    with SplitCache(refiner.network) as cache:
         for _, of_frame in groupby(runs, key=lambda run: run.frame.name):
-            of_one = list(of_frame)
-            inputs = _tried(read_inputs, of_one[0].task.request)
-            for _, of_points in groupby(of_one, key=lambda run: (run.sampling, run.seed)):
-                alike = list(of_points)
+            frame_runs = list(of_frame)
+            inputs = _result_or_error(read_inputs, frame_runs[0].task.request)
+            for _, of_points in groupby(frame_runs, key=lambda run: (run.sampling, run.seed)):
+                same_points = list(of_points)
                 failed = isinstance(inputs, PnpDepthError)
-                drawn = inputs if failed else _tried(_drawn, alike[0], inputs)
-                for run in alike:
-                    yield _done(run, drawn, cut, state)
+                drawn = inputs if failed else _result_or_error(_drawn, same_points[0], inputs)
+                for run in same_points:
+                    yield _done(run, drawn, cache, state)
 
 
-def _tried(read: Callable[..., T], *arguments: Any) -> T | PnpDepthError:
-    """What it gives, or the error of a frame that cannot be used."""
+def _result_or_error(read: Callable[..., T], *arguments: Any) -> T | PnpDepthError:
+    """The result, or the error of a frame that cannot be used."""
     try:
         return read(*arguments)
     except (StorageError, DeviceError):
@@ -243,10 +257,14 @@ def _drawn(run: Run, inputs: Inputs) -> Inputs:
 
 
 def _done(
-    run: Run, inputs: Inputs | PnpDepthError, cut: HeldCut, state: SweepState
+    run: Run, inputs: Inputs | PnpDepthError, cache: SplitCache, state: SweepState
 ) -> dict[str, Any]:
-    """The run's result is recorded; its row for a listener."""
-    result = inputs if isinstance(inputs, PnpDepthError) else _tried(result_of, run, inputs, cut)
+    """Computes and records the run; returns its row for a listener."""
+    result = (
+        inputs
+        if isinstance(inputs, PnpDepthError)
+        else _result_or_error(result_of, run, inputs, cache)
+    )
     row = {"name": run.frame.name, "status": "done", "message": None}
     if isinstance(result, PnpDepthError):
         state.fail(run, str(result))
@@ -265,11 +283,11 @@ def _write(
     names: Sequence[str],
     lines: Lines,
 ) -> dict[str, Any]:
-    """The tables and pictures are on disk; returns what sweep.json holds."""
+    """Writes the tables and plots; returns the contents of sweep.json."""
     studies: list[dict[str, Any]] = []
     rows: list[dict[str, Any]] = []
     for study in request.studies:
-        figures = [_figures(plan.place(cell), plan, names, lines) for cell in study.cells()]
+        figures = [_figures(plan.setup(cell), plan, names, lines) for cell in study.cells()]
         cells = []
         for cell, of_cell in zip(study.cells(), figures, strict=True):
             cells.append({"parameters": dict(cell), **summarise(of_cell, request.resamples)})
@@ -294,16 +312,16 @@ def _write(
     return record
 
 
-def _figures(place: Place, plan: Plan, names: Sequence[str], lines: Lines) -> list[FrameFigures]:
-    """A cell's figures of each frame and seed."""
+def _figures(setup: Setup, plan: Plan, names: Sequence[str], lines: Lines) -> list[FrameFigures]:
+    """A cell's scores of each frame and seed."""
     return [
         FrameFigures.of(
             name,
             seed,
-            place.iterations,
-            linear=lines[name, seed, place.sampling, None],
-            curve=lines[name, seed, place.sampling, place.method],
+            setup.iterations,
+            linear=lines[name, seed, setup.sampling, None],
+            curve=lines[name, seed, setup.sampling, setup.method],
         )
         for name in names
-        for seed in plan.seeds(place.sampling)
+        for seed in plan.seeds(setup.sampling)
     ]

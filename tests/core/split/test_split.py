@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import inspect
 import weakref
+from contextlib import ExitStack
 from typing import Any
 from unittest import mock
 
@@ -120,6 +121,25 @@ def test_torch_transformer_layers_with_their_fast_path_come_out_the_same() -> No
             assert torch.equal(split.rear(split.front(x)), whole)
 
 
+class LooksAtValues(nn.TransformerEncoderLayer):
+    """Scales its output by a number that it reads with numpy."""
+
+    def forward(self, src: Tensor, *args: Any, **kwargs: Any) -> Tensor:
+        return super().forward(src, *args, **kwargs) * float(src.detach().numpy().max())
+
+
+def test_a_value_that_a_users_layer_reads_within_torchs_encoder_is_seen() -> None:
+    torch.manual_seed(0)
+    layer = LooksAtValues(8, 2, 16, batch_first=True)
+    network = nn.Sequential(nn.Linear(4, 8), nn.TransformerEncoder(layer, 2), nn.Linear(8, 1))
+    frames = [torch.rand(1, 6, 4) * scale for scale in (1, 3, 1)]
+    wholes = [plain(network, frame) for frame in frames]
+    with Split(network, "0") as split, torch.no_grad():
+        for frame, whole in zip(frames, wholes, strict=True):
+            assert torch.equal(split.rear(split.front(frame)), whole)
+            assert not split.static_graph
+
+
 def test_a_compiled_network_can_be_cut() -> None:
     network, x = build("unet"), picture()
     whole = plain(network, x)
@@ -174,11 +194,15 @@ def test_further_frames_are_not_watched_and_hold_no_more_memory() -> None:
     network, x = build("unet"), picture()
     whole = plain(network, x)
     held: list[list[int]] = []
-    with Split(network, "bottleneck") as split, torch.no_grad():
+    with Split(network, "bottleneck") as split, torch.no_grad(), ExitStack() as stack:
         for _ in range(2):
             assert torch.equal(split.rear(split.front(x)), whole)
-            held.append([_bytes(call.output) for call in split._calls])
-            split._watching = mock.Mock(side_effect=AssertionError("watched"))  # type: ignore[method-assign]
+            assert split._replay is not None
+            held.append([_bytes(saved.value) for saved in split._replay.outputs if saved])
+            recorder = mock.patch(
+                "pnpdepth_cli.core.split.split.Recorder", side_effect=AssertionError
+            )
+            stack.enter_context(recorder)
     assert held[0] == held[1]
     assert sum(held[0]) > 0
 

@@ -5,13 +5,15 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 
+import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
 from pnpdepth_cli.core.split import Split
-from pnpdepth_cli.core.split.watch import Remembered, Watch
+from pnpdepth_cli.core.split.saved import SavedTensors
+from pnpdepth_cli.core.split.watch import Watch
 from tests.completion.naive import plain
 from tests.core.networks import Branching, Counting, build, conv, picture
 
@@ -42,6 +44,8 @@ DEPENDENT: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
     "written into a part": lambda z, y: y.clone().add_(z[0, 0].detach()),
     "a value": lambda z, y: y * float(z.detach().mean()),
     "numpy": lambda z, y: torch.from_numpy(z.detach().numpy() * 2),
+    "an array": lambda z, y: torch.from_numpy(np.asarray(z.detach()) * 2),
+    "dlpack": lambda z, y: torch.from_numpy(np.from_dlpack(z.detach()) * 2),
     "a list": lambda z, y: torch.tensor(z.detach().tolist()),
     "argmax as a list": lambda z, y: y + z.argmax(1).flatten().tolist()[5],
     "a mask": lambda z, y: y + y[z > 0].sum(),
@@ -120,16 +124,16 @@ def test_a_native_operator_that_reads_z_unseen_runs_again() -> None:
             assert torch.equal(split.rear(z * 3), second)
 
 
-def test_a_remembered_tensor_gets_its_copy_before_it_is_overwritten() -> None:
+def test_a_saved_tensor_gets_its_copy_before_it_is_overwritten() -> None:
     tensor = torch.ones(3)
-    remembered = Remembered([tensor])
-    with Watch([remembered]):
+    saved = SavedTensors([tensor])
+    with Watch([saved]):
         tensor.mul_(5)
-    assert remembered.copied
-    assert torch.equal(remembered.output[0], torch.ones(3))
-    handed = remembered.hand_back()
+    assert saved.copied
+    assert torch.equal(saved.value[0], torch.ones(3))
+    handed = saved.fresh()
     handed[0].mul_(7)
-    assert torch.equal(remembered.output[0], torch.ones(3))
+    assert torch.equal(saved.value[0], torch.ones(3))
 
 
 @pytest.mark.parametrize(
@@ -149,21 +153,21 @@ def test_a_remembered_tensor_gets_its_copy_before_it_is_overwritten() -> None:
 )
 def test_every_form_of_writing_is_seen(write: Callable[[Tensor], object]) -> None:
     tensor = torch.tensor([-1.0, 2.0, 3.0])
-    remembered = Remembered(tensor)
-    with torch.no_grad(), Watch([remembered]):
+    saved = SavedTensors(tensor)
+    with torch.no_grad(), Watch([saved]):
         write(tensor)
-    assert remembered.copied
-    assert torch.equal(remembered.output, torch.tensor([-1.0, 2.0, 3.0]))
+    assert saved.copied
+    assert torch.equal(saved.value, torch.tensor([-1.0, 2.0, 3.0]))
 
 
 def test_reading_makes_no_copy() -> None:
     tensor = torch.ones(3)
-    remembered = Remembered(tensor)
-    with Watch([remembered]):
+    saved = SavedTensors(tensor)
+    with Watch([saved]):
         (tensor + 1).mul_(2)
         tensor.view(3, 1).clone().zero_()
-    assert not remembered.copied
-    assert remembered.hand_back() is tensor
+    assert not saved.copied
+    assert saved.fresh() is tensor
 
 
 def replaceable(call: Callable[[Tensor], object]) -> bool:
@@ -193,6 +197,46 @@ def test_an_output_does_not_stand_for_more() -> None:
     assert not replaceable(lambda t: {"a": t + 1, "b": object()})
     assert not replaceable(lambda t: [(t + 1)] * 2)
     assert not replaceable(lambda t: (t + 1).unbind(0))
+
+
+def test_tensor_methods_are_themselves_in_a_watched_pass() -> None:
+    seen: list[bool] = []
+
+    def look(z: Tensor, y: Tensor) -> Tensor:
+        seen.append((Tensor.numpy, Tensor.tolist) == before and "numpy" not in vars(Tensor))
+        return z
+
+    before = (Tensor.numpy, Tensor.tolist)
+    with Split(Behind(look), "cut") as split, torch.no_grad():
+        split.rear(split.front(picture()))
+    assert seen == [True]
+
+
+def test_two_threads_can_learn_networks_at_the_same_time() -> None:
+    x, way = picture(), DEPENDENT["numpy"]
+    expected: list[Tensor] = []
+
+    def learn(network: nn.Module, results: list[Tensor]) -> None:
+        with torch.no_grad():
+            for _ in range(10):
+                with Split(network, "cut") as split:
+                    z = split.front(x)
+                    results += [split.rear(z), split.rear(-z)]
+
+    torch.manual_seed(0)
+    networks = [Behind(way) for _ in range(3)]
+    learn(networks[0], expected)
+    results: list[list[Tensor]] = [[] for _ in networks]
+    threads = [
+        threading.Thread(target=learn, args=each) for each in zip(networks, results, strict=True)
+    ]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert [len(each) for each in results] == [20, 20, 20]
+    assert all(map(torch.equal, results[0], expected))
+    assert all(torch.equal(each[1], each[3]) for each in results)
 
 
 def test_tensor_methods_are_themselves_again_after_a_watched_pass() -> None:

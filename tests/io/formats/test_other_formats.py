@@ -36,7 +36,6 @@ from pathlib import Path
 import numpy as np
 from pnpdepth_cli.choices import FORMATS
 from pnpdepth_cli.io.depth import DEPTH_SUFFIXES, read_depth, write_depth
-from pnpdepth_cli.io.dataset.frame import DEPTHS
 from pnpdepth_cli.io.sparse_writing import SPARSE_SUFFIXES
 from pnpdepth_cli.cli.refine import refine
 
@@ -47,7 +46,7 @@ image = read_depth(path)
 assert np.array_equal(image.values, depth), image
 assert image.source == "table of metres", image
 assert "metres" in FORMATS
-for suffixes in (DEPTH_SUFFIXES, DEPTHS, SPARSE_SUFFIXES):
+for suffixes in (DEPTH_SUFFIXES, SPARSE_SUFFIXES):
     assert ".metres" in suffixes, suffixes
 option = next(each for each in refine.params if each.name == "format")
 assert "metres" in option.type.choices, option.type.choices

@@ -19,8 +19,8 @@ from pnpdepth_cli.io.layouts import (
     find_layout,
     find_protocol,
     list_frames,
+    read_frame_ground_truth,
     read_frame_image,
-    read_frame_truth,
     read_frames,
 )
 
@@ -220,7 +220,7 @@ def test_synthias_random_set_has_centimetres_in_either_folder(
     assert find_layout(tmp_path) == "synthia"
     (frame,) = read_frames(tmp_path)
     assert (frame.name, frame.gt) == ("0000000", tmp_path / folder / "0000000.png")
-    truth = read_frame_truth(frame)
+    truth = read_frame_ground_truth(frame)
     assert truth[0, 0] == 0
     np.testing.assert_allclose(truth[1:], DEPTH[1:], atol=6e-3)
 
@@ -287,13 +287,13 @@ def test_nyu_frames_come_halved_and_cropped_to_228_by_304(tmp_path: Path) -> Non
     nyu_h5(tmp_path / "h5")
     frame = read_frames(tmp_path / "h5")[1]
     assert read_frame_image(frame).shape == (228, 304, 3)
-    assert read_frame_truth(frame).tolist() == np.full((228, 304), 9.0).tolist()
+    assert read_frame_ground_truth(frame).tolist() == np.full((228, 304), 9.0).tolist()
     nyu_mat(tmp_path / "mat")
     frame = read_frames(tmp_path / "mat")[2]
     np.testing.assert_array_equal(read_frame_image(frame), np.float32(2) / np.float32(255))
     # columns 8 … 311 of every second pixel, 1 3 5 …: column c holds 2 c + 2 metres
     want = 2 * np.arange(8, 312) + 2
-    assert (read_frame_truth(frame) == want).all()
+    assert (read_frame_ground_truth(frame) == want).all()
 
 
 def test_kitti_in_files_of_the_same_kind_is_cut_as_kitti_is(tmp_path: Path) -> None:
@@ -304,7 +304,7 @@ def test_kitti_in_files_of_the_same_kind_is_cut_as_kitti_is(tmp_path: Path) -> N
     (frame,) = read_frames(tmp_path)
     assert frame.protocol.name == "kitti-odometry"
     assert read_frame_image(frame).shape == (228, 912, 3)
-    np.testing.assert_array_equal(read_frame_truth(frame), depth[148:, 164:1076])
+    np.testing.assert_array_equal(read_frame_ground_truth(frame), depth[148:, 164:1076])
 
 
 @pytest.mark.parametrize("kind", ["txt", "mat"])
@@ -330,7 +330,7 @@ def test_an_hdf5_file_that_is_damaged_or_of_another_kind_is_named(tmp_path: Path
     frame = read_frames(tmp_path)[0]
     path.write_bytes(path.read_bytes()[:500])
     with pytest.raises(FileFormatError, match="cannot be read as HDF5"):
-        read_frame_truth(frame)
+        read_frame_ground_truth(frame)
     other = read_frames(tmp_path)[1]
     assert isinstance(other.image, Hdf5Array)
     wrong = Hdf5Array(path=other.image.path, name="infra", axes=(0, 1))
@@ -421,7 +421,7 @@ def test_places_move_as_the_picture_is_cut(name: str) -> None:
     rows, columns = np.indices((480, 1240))
     part = protocol.apply(np.stack([columns, rows], axis=2))
     row, column = 100, 200
-    there = protocol.places(part[row, column][None].astype(np.float32), (480, 1240))
+    there = protocol.in_crop(part[row, column][None].astype(np.float32), (480, 1240))
     # the kept pixel is one quarter of a new one away from its centre where pixels are halved
     np.testing.assert_allclose(there[0], [column, row], atol=0.26)
 
@@ -432,13 +432,13 @@ def test_the_shared_frames_are_recognised(shared_data: Path) -> None:
     completion = read_frames(shared_data / "kitti_dc")
     assert len(completion) == 6
     assert completion[0].calib == shared_data / "kitti_dc"
-    truth = read_frame_truth(completion[0])
+    truth = read_frame_ground_truth(completion[0])
     assert truth.shape == (375, 1242)
     assert 0.15 < np.mean(truth > 0) < 0.25
     scenes = read_frames(shared_data / "7scenes")
     assert len(scenes) == 50
     assert read_frame_image(scenes[0]).shape == (480, 640, 3)
-    assert 0.5 < np.median(read_frame_truth(scenes[0])) < 4
+    assert 0.5 < np.median(read_frame_ground_truth(scenes[0])) < 4
 
 
 def test_a_depth_file_is_read_with_the_scale_of_its_frame(tmp_path: Path) -> None:
@@ -446,10 +446,10 @@ def test_a_depth_file_is_read_with_the_scale_of_its_frame(tmp_path: Path) -> Non
     codes = np.rint(1000 * DEPTH).astype(np.uint16)
     cv2.imwrite(str(tmp_path / "frame-000000.depth.png"), codes)
     (frame,) = read_frames(tmp_path)
-    np.testing.assert_allclose(read_frame_truth(frame), DEPTH, atol=6e-4)
+    np.testing.assert_allclose(read_frame_ground_truth(frame), DEPTH, atol=6e-4)
     write_depth(tmp_path / "g.exr", DEPTH)
     (tmp_path / "m.csv").write_text("image,gt\nframe-000000.color.png,g.exr\n")
-    assert np.array_equal(read_frame_truth(read_frames(tmp_path / "m.csv")[0]), DEPTH)
+    assert np.array_equal(read_frame_ground_truth(read_frames(tmp_path / "m.csv")[0]), DEPTH)
 
 
 def test_a_listing_tells_what_is_in_no_frame(tmp_path: Path) -> None:
@@ -521,3 +521,20 @@ def test_a_folder_that_may_not_be_read_is_an_input_error(
     monkeypatch.setattr(Path, "is_dir", locked)
     with pytest.raises(InputError, match=r"cannot be read \(permission denied\)"):
         list_frames(tmp_path)
+
+
+def test_tum_pairs_long_lists_without_a_matrix_of_all_times(tmp_path: Path) -> None:
+    count = 40_000  # every image with every depth would be 13 GB
+    for name, offset in (("rgb", 0.0), ("depth", 0.005)):
+        lines = (f"{n / 30 + offset:.6f} {name}/{n}.png\n" for n in range(count))
+        (tmp_path / f"{name}.txt").write_text("".join(lines))
+    frames = read_frames(tmp_path)
+    assert len(frames) == count
+    assert all(frame.image.stem == frame.gt.stem for frame in frames)  # type: ignore[union-attr]
+
+
+def test_a_time_of_tum_that_is_no_number_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "rgb.txt").write_text("nan rgb/a.png\n")
+    (tmp_path / "depth.txt").write_text("1 depth/a.png\n")
+    with pytest.raises(FileFormatError, match=r"rgb\.txt, line 1"):
+        read_frames(tmp_path)

@@ -137,6 +137,12 @@ HOSTILE: dict[str, tuple[str, Change, str]] = {
     "a caller of methods": (MODEL, call("_operator.methodcaller"), "it calls"),
     "a size that is a program": (MODEL, size("__import__('os').mkdir('x')"), "no arithmetic"),
     "a size with a program in a text": (MODEL, size("Mul('exit()', 2)"), "no arithmetic"),
+    "a size of many digits": (MODEL, size("9**9**9**9"), "powers without end"),
+    "a size of many digits by a call": (MODEL, size("Pow(9, Pow(9, 99))"), "powers without end"),
+    "a size of many powers": (MODEL, size("((((9**8)**8)**8)**8)**8"), "powers without end"),
+    "a size shifted far": (MODEL, size("LShift(1, 10000000000)"), "powers without end"),
+    "a size shifted far by an operator": (MODEL, size("1 << 10000000000"), "powers without end"),
+    "a size of 3,000 digits": (MODEL, size("9" * 3000), "no arithmetic"),
     "a size that reads an attribute": (MODEL, size("Symbol.__class__"), "no arithmetic"),
     "a name with a default": (MODEL, name("x=__import__('os').mkdir('x')"), "is no name"),
     "pickled weights": (WEIGHTS, PICKLED, "is pickled"),
@@ -170,6 +176,28 @@ def test_no_pickle_in_an_archive_is_run(archive: Path, tmp_path: Path, place: st
     with pytest.raises(Exception):  # noqa: B017
         torch.export.load(hostile)
     assert trap.exists()  # where torch itself reads the file, it is run
+
+
+def test_example_inputs_that_ask_for_memory_are_refused(archive: Path) -> None:
+    class Allocates:
+        def __reduce__(self) -> tuple[Any, ...]:
+            return bytearray, (10**12,)
+
+    greedy = rewritten(archive, INPUTS, lambda _: saved((Allocates(),)))
+    with pytest.raises(ModelError, match=r"example inputs are more than tensors \(__builtin__"):
+        find_definition(str(greedy))
+
+
+def test_a_compressed_archive_is_refused(archive: Path) -> None:
+    target = archive.with_name("packed.pt2")
+    with (
+        zipfile.ZipFile(archive) as plain,
+        zipfile.ZipFile(target, "w", zipfile.ZIP_DEFLATED) as packed,
+    ):
+        for name in plain.namelist():
+            packed.writestr(name, plain.read(name))
+    with pytest.raises(ModelError, match="compressed"):
+        find_definition(str(target))
 
 
 def test_an_archive_with_a_second_one_of_the_older_layout_in_it_is_refused(archive: Path) -> None:

@@ -235,6 +235,69 @@ def test_weights_that_do_not_fit_the_configuration_are_refused(tmp_path: Path) -
         load_network(str(folder), None)
 
 
+def changed(folder: Path, name: str, change: dict[str, Any]) -> Path:
+    settings = json.loads((folder / name).read_text())
+    (folder / name).write_text(json.dumps(settings | change))
+    return folder
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"_attn_implementation": "org/kernel"},
+        {"attn_implementation": {"backbone_config": "org/kernel"}},
+        {"backbone_config": {"_attn_implementation_internal": "flash_attention_2"}},
+    ],
+)
+def test_an_attention_that_may_be_fetched_is_refused(
+    change: dict[str, Any], tmp_path: Path
+) -> None:
+    folder = changed(saved(tmp_path / "net", "glpn"), "config.json", change)
+    with pytest.raises(ModelError, match="may fetch and run code"):
+        hf_definition(folder)
+    changed(folder, "config.json", dict.fromkeys(change, "sdpa"))
+    assert hf_definition(folder).name == "net"
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"size_divisor": "x"},
+        {"size_divisor": [32]},
+        {"size_divisor": 10**12},
+        {"rescale_factor": "x"},
+        {"rescale_factor": None},
+        {"rescale_factor": 0},
+        {"rescale_factor": 10**400},
+        {"do_normalize": True, "image_mean": {"r": 1}},
+        {"do_normalize": True, "image_std": [10**400] * 3},
+    ],
+)
+def test_settings_that_are_no_numbers_are_refused_in_one_line(
+    change: dict[str, Any], tmp_path: Path
+) -> None:
+    folder = changed(saved(tmp_path / "net", "glpn"), "preprocessor_config.json", change)
+    with pytest.raises(ModelError, match=r"preprocessor_config\.json: ") as error:
+        hf_definition(folder)
+    assert "\n" not in str(error.value)
+    assert len(str(error.value)) < 600
+
+
+@pytest.mark.parametrize("size", ["x", [1, 2], {"height": "x", "width": 3}, 10**9, None])
+def test_a_size_that_is_none_is_refused(size: Any, tmp_path: Path) -> None:
+    folder = saved(tmp_path / "net", "dpt")
+    with pytest.raises(ModelError, match="is no height and width"):
+        hf_definition(changed(folder, "preprocessor_config.json", {"size": size}))
+
+
+@pytest.mark.parametrize("name", ["config.json", "preprocessor_config.json"])
+def test_settings_nested_too_deep_are_refused(name: str, tmp_path: Path) -> None:
+    folder = saved(tmp_path / "net", "glpn")
+    (folder / name).write_text('{"a":' + "[" * 100_000 + "]" * 100_000 + "}")
+    with pytest.raises(ModelError, match="is not JSON"):
+        hf_definition(folder)
+
+
 def test_code_in_a_folder_is_never_run(tmp_path: Path) -> None:
     folder = saved(tmp_path / "net", "glpn")
     marker = tmp_path / "ran"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import pickle
 import resource
+import struct
 import sys
 import zipfile
 from pathlib import Path
@@ -227,6 +228,38 @@ def test_an_archive_whose_header_claims_more_than_is_there_is_refused(tmp_path: 
     with zipfile.ZipFile(tmp_path / "x.npz", "w") as archive:
         archive.writestr("a.npy", header.getvalue() + b"\0" * 4)
     assert "does not have its 4 bytes" in refused(tmp_path / "x.npz")
+
+
+def with_directory_size(path: Path, size: int) -> None:
+    """The directory of the archive says that its only entry has this size."""
+    data = bytearray(path.read_bytes())
+    struct.pack_into("<I", data, data.index(b"PK\x01\x02") + 24, size)
+    struct.pack_into("<I", data, data.index(b"PK\x03\x04") + 22, size)
+    path.write_bytes(data)
+
+
+@pytest.mark.parametrize("method", ["STORED", "DEFLATED", "BZIP2", "LZMA"])
+def test_an_archive_whose_directory_says_less_than_it_inflates_to_takes_no_memory(
+    method: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "x.npz"
+    with zipfile.ZipFile(path, "w", getattr(zipfile, f"ZIP_{method}")) as archive:
+        archive.writestr("a.npy", b"\0" * 300_000_000 if method != "STORED" else b"\0" * 1000)
+    with_directory_size(path, 100)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    refused(path)
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 60_000  # kB
+
+
+@pytest.mark.parametrize("method", ["DEFLATED", "BZIP2", "LZMA"])
+def test_a_corrupt_compressed_archive_is_refused(method: str, tmp_path: Path) -> None:
+    path = tmp_path / "x.npz"
+    with zipfile.ZipFile(path, "w", getattr(zipfile, f"ZIP_{method}")) as archive:
+        archive.writestr("a.npy", np.random.default_rng(0).bytes(5000))
+    data = bytearray(path.read_bytes())
+    data[60:200] = b"\xff" * 140
+    path.write_bytes(data)
+    refused(path)
 
 
 @pytest.mark.parametrize("suffix", ["npy", "npz"])

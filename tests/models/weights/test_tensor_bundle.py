@@ -141,7 +141,7 @@ def test_values_that_are_not_beside_it_are_named(tmp_path: Path) -> None:
         ({"a": entry(1, (1,), 2**62, 4)}, "goes beyond its 4 bytes"),
         ({"a": entry(8, (1,), 0, 8)}, "TensorFlow's type 8"),
         ({"a": entry(1, (2,), 0, 8) + b"\x3a\x00"}, "in slices"),
-        ({"a": entry(1, (2**64 - 1,), 0, 8)}, "a size that is none"),
+        ({"a": entry(1, (2**64 - 1,), 0, 8)}, "a size is not a number"),
         ({str(n): entry(1, (2,), 0, 8) for n in range(9)}, "larger than its files"),
     ],
 )
@@ -149,6 +149,35 @@ def test_what_claims_more_or_other_than_is_there_is_refused(
     entries: dict[str, bytes], said: str, tmp_path: Path
 ) -> None:
     assert said in refused(bundle(tmp_path, entries, b"\0" * 8))
+
+
+def shared_keys(count: int) -> bytes:
+    """A block whose every key is the one before and a byte more."""
+    rows = [varint(max(0, n - 1)) + varint(min(1, n)) + varint(0) for n in range(count)]
+    lines = b"".join(row + (b"a" if n else b"") for n, row in enumerate(rows))
+    return lines + struct.pack("<II", 0, 1) + b"\0" + b"\0\0\0\0"
+
+
+def index_of_blocks(data: bytes, handles: list[bytes]) -> bytes:
+    places = []
+    for part in (block([]), block([(b"", handle) for handle in handles])):
+        places.append(varint(len(data)) + varint(len(part) - 5))
+        data += part
+    return data + b"".join(places).ljust(40, b"\0") + struct.pack("<Q", 0xDB4775248B80FB57)
+
+
+def test_names_that_grow_from_one_another_take_no_memory(tmp_path: Path) -> None:
+    data = shared_keys(60_000)
+    handle = varint(0) + varint(len(data) - 5)
+    (tmp_path / "x.index").write_bytes(index_of_blocks(data, [handle]))
+    assert "a name of 1,001 bytes" in refused(tmp_path / "x.index")
+
+
+def test_a_block_that_is_named_again_is_refused(tmp_path: Path) -> None:
+    data = block([(b"%06d" % n, entry(1, (1,), 0, 4)) for n in range(500)])
+    handle = varint(0) + varint(len(data) - 5)
+    (tmp_path / "x.index").write_bytes(index_of_blocks(data, [handle] * 20_000))
+    assert "blocks overlap" in refused(tmp_path / "x.index")
 
 
 def test_an_index_cut_anywhere_is_refused(tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ import resource
 import struct
 import subprocess
 import sys
+import time
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -23,7 +24,8 @@ from hypothesis import strategies as st
 from torch import nn
 
 from pnpdepth_cli.errors import CheckpointError
-from pnpdepth_cli.models.weights.pickle_machine import Instance
+from pnpdepth_cli.models.weights.checkpoint import read_checkpoint
+from pnpdepth_cli.models.weights.pickle_reader import StandIn
 from pnpdepth_cli.models.weights.tensor_pickle import is_module, module_state, read_tensor_file
 
 LAYOUTS = [True, False]
@@ -90,7 +92,7 @@ def test_published_completion_networks_are_read(shared_data: Path) -> None:
         assert sum(t.numel() for n, t in state.items() if "num_batches" not in n) >= 335_000
         assert state["nconv.nconv1.weight_p"].shape == (2, 1, 5, 5)
     whole = read_tensor_file(shared_data / "weights" / "nconv" / "whole_module.pth").content
-    assert isinstance(whole, Instance)
+    assert isinstance(whole, StandIn)
     assert module_state(whole)["nconv7.bias"].shape == (1,)
     path = shared_data / "weights" / "nconv" / "CNN_ep0003.pth.tar"
     ours = read_tensor_file(path).content
@@ -264,12 +266,110 @@ def test_entries_that_share_their_bytes_are_refused(tmp_path: Path) -> None:
 
 
 def test_modules_that_hold_themselves_again_and_again_are_refused() -> None:
-    inner = Instance("a.B", state={"_parameters": {"w": torch.ones(1)}, "_modules": {}})
+    inner = StandIn("a.B", state={"_parameters": {"w": torch.ones(1)}, "_modules": {}})
     for _ in range(40):
-        inner = Instance("a.B", state={"_parameters": {}, "_modules": {"a": inner, "b": inner}})
+        inner = StandIn("a.B", state={"_parameters": {}, "_modules": {"a": inner, "b": inner}})
     with pytest.raises(CheckpointError, match="without end"):
         module_state(inner)
-    ring = Instance("a.B", state={"_parameters": {}, "_modules": {}})
+    ring = StandIn("a.B", state={"_parameters": {}, "_modules": {}})
     ring.state["_modules"]["again"] = ring
     with pytest.raises(CheckpointError, match="without end"):
         module_state(ring)
+
+
+def nested_tuples(depth: int) -> bytes:
+    """Opcodes of a tuple that holds the one inside it twice, and that 1 twice, and so on."""
+    return b"K\x01" + b"2\x86" * depth
+
+
+NESTED = nested_tuples(200)
+HANGS = {
+    "printed": b"\x80\x02" + NESTED + b".",
+    "as a key": b"\x80\x02}" + NESTED + b"K\x01s.",
+    "as a key of a dict call": b"\x80\x02ccollections\nOrderedDict\n]("
+    + NESTED
+    + b"K\x01\x86e\x85R.",
+    "in a set": b"\x80\x04\x8f(" + NESTED + b"\x90.",
+    "in a frozenset": b"\x80\x04(" + NESTED + b"\x91.",
+    "as a storage": b"\x80\x02(X\x07\x00\x00\x00storage" + NESTED * 4 + b"tQ.",
+    "as a dtype": b"\x80\x02cnumpy\ndtype\n" + NESTED + b"\x85R.",
+    "as a name": b"\x80\x04" + NESTED + b"2\x93.",
+}
+
+
+@pytest.mark.parametrize("kind", HANGS)
+def test_a_small_pickle_that_is_large_when_printed_or_hashed_takes_no_time(
+    kind: str, tmp_path: Path
+) -> None:
+    path = archive_of(tmp_path / "x.pt", HANGS[kind])
+    assert path.stat().st_size < 2500
+    start = time.process_time()
+    with pytest.raises(CheckpointError) as error:
+        read_checkpoint(path)
+    assert time.process_time() - start < 5
+    assert len(str(error.value)) < 500 + len(str(path))
+
+
+def test_a_set_of_buffers_that_is_large_when_hashed_takes_no_time(tmp_path: Path) -> None:
+    fleeting = StandIn("builtins.set", ([(), [], "fleeting", pickle.loads(NESTED + b".")],))
+    buffers = {"fleeting": torch.ones(1), "kept": torch.ones(2)}
+    state = {"_buffers": buffers, "_parameters": {}, "_non_persistent_buffers_set": fleeting}
+    start = time.process_time()
+    assert list(module_state(StandIn("a.B", state=state))) == ["kept"]
+    assert time.process_time() - start < 5
+
+
+LONG_NAME = b"X" + struct.pack("<I", 10**6) + b"a" * 10**6
+ALLOCATES = {
+    "a call for memory": b"\x80\x02cbuiltins\nbytearray\n\x8a\x05\x00\xe4\x0b\x54\x02\x85R.",
+    "a dict copied again and again": b"\x80\x02ccollections\nOrderedDict\nq\x00]("
+    + b"K\x01K\x02\x86" * 10**5
+    + b"eq\x01\x85q\x02R("
+    + b"h\x00h\x02R" * 10**5
+    + b"t.",
+    "a long name joined again and again": b"\x80\x04"
+    + LONG_NAME
+    + b"q\x00h\x00\x93("
+    + b"h\x00h\x00\x93" * 10**4
+    + b"t.",
+    "steps without end": b"\x80\x02" + b"]0" * (2 * 10**6) + b"N.",
+}
+
+
+@pytest.mark.parametrize("kind", ALLOCATES)
+def test_a_small_pickle_takes_no_memory(kind: str, tmp_path: Path) -> None:
+    path = archive_of(tmp_path / "x.pt", ALLOCATES[kind])
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    with pytest.raises(CheckpointError):
+        read_checkpoint(path)
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 400_000  # kB
+
+
+def test_integers_too_long_to_print_are_no_names(tmp_path: Path) -> None:
+    torch.save({10**7000: torch.ones(1), "epoch": 1}, tmp_path / "x.pt")
+    with pytest.raises(CheckpointError, match="no state dict; it holds int, epoch"):
+        read_checkpoint(tmp_path / "x.pt")
+
+
+def test_opcodes_that_are_not_on_the_list_are_refused(tmp_path: Path) -> None:
+    for opcode in (
+        b"\x82\x01",
+        b"\x83\x01\x00",
+        b"\x84\x01\x00\x00\x00",
+        b"\x97",
+        b"\x98",
+        b"P1\n",
+        b"\xff",
+    ):
+        path = archive_of(tmp_path / "x.pt", b"\x80\x05" + opcode + b".")
+        with pytest.raises(CheckpointError, match=r"uses the opcode"):
+            read_tensor_file(path)
+
+
+def test_a_tensor_with_attributes_of_its_own_is_a_tensor(tmp_path: Path) -> None:
+    weight = nn.Parameter(torch.ones(2, 3))
+    weight.tag = "kept by torch.save"  # type: ignore[attr-defined]
+    torch.save({"w": weight, "b": torch.ones(2, dtype=torch.uint16)}, tmp_path / "x.pt")
+    state = read_checkpoint(tmp_path / "x.pt")
+    assert torch.equal(state["w"], torch.ones(2, 3))
+    assert state["b"].dtype == torch.uint16

@@ -13,15 +13,17 @@ import cv2
 import numpy as np
 import pytest
 
+from pnpdepth_cli.cli.tables import print_batch
 from pnpdepth_cli.core.metrics import Scores
 from pnpdepth_cli.errors import InputError, LayerError, ModelError, OutputError, UsageError
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.pipeline.batch import running as batch_running
 from pnpdepth_cli.pipeline.batch.batch import plan_batch
 from pnpdepth_cli.pipeline.batch.frames import BatchRequest
-from pnpdepth_cli.pipeline.batch.summary import _SCORES
+from pnpdepth_cli.pipeline.batch.summary import _SCORES, Tally
 from pnpdepth_cli.pipeline.refinement.inputs import read_inputs
 from pnpdepth_cli.pipeline.refinement.refine import Refiner, refine_image
+from pnpdepth_cli.pipeline.report.batch import BatchReport
 from pnpdepth_cli.pipeline.sparse.scans import ScanOptions
 from pnpdepth_cli.sensors import SamplePattern
 from tests.pipeline.batches import (
@@ -35,6 +37,7 @@ from tests.pipeline.batches import (
     results,
     times,
 )
+from tests.pipeline.report_pages import frames_of
 from tests.pipeline.scan_frames import scan_on_disk
 
 
@@ -330,7 +333,7 @@ def test_an_output_folder_that_holds_the_frames_is_refused(root: Path, output: s
 def test_what_no_batch_made_is_not_replaced_unless_asked_for(root: Path) -> None:
     (root / "out").mkdir()
     (root / "out/c.json").write_text("mine")
-    with pytest.raises(OutputError, match=r"c\.json exists, and no batch made it; --overwrite"):
+    with pytest.raises(OutputError, match=r"c\.json exists, and no batch wrote it; --overwrite"):
         batch(root)
     assert [p.name for p in (root / "out").iterdir() if p.suffix != ".lock"] == ["c.json"]
     batch(root, refine={"overwrite": True})
@@ -341,7 +344,7 @@ def test_what_no_batch_made_is_not_replaced_unless_asked_for(root: Path) -> None
 def test_a_summary_that_no_batch_made_is_not_replaced(name: str, root: Path) -> None:
     (root / "out").mkdir()
     (root / "out" / name).write_text("mine")
-    with pytest.raises(OutputError, match="exists, and no batch made it; --overwrite"):
+    with pytest.raises(OutputError, match="exists, and no batch wrote it; --overwrite"):
         batch(root)
     assert (root / "out" / name).read_text() == "mine"
     batch(root, refine={"overwrite": True})
@@ -561,3 +564,50 @@ def test_frames_in_hdf5_files_are_cut_sampled_and_known_by_their_file(
     again = Heard()
     batch(rooms, again, refine=asked)
     assert again.names == []
+
+
+def test_a_plain_prediction_without_scores_ends_no_batch(
+    root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    batch(root, html=tmp_path / "report")
+    summary = json.loads((root / "out" / "summary.json").read_text())
+    tally = Tally()
+    for row in summary["frames"]:
+        # what a record holds where no pixel of the plain prediction can be scored
+        row["scores"]["before"] |= dict.fromkeys(_SCORES) | {"pixels": 0}
+        tally.add(row)
+    mean = tally.mean()
+    assert mean["scores"]["before"]["rmse"] is None
+    assert mean["scores"]["after"]["rmse"] > 0
+    capsys.readouterr()
+    print_batch(summary | {"mean": mean})
+    assert "–" in capsys.readouterr().err
+    report = BatchReport(folder=tmp_path / "report", output=root / "out", workers=1)
+    report.write(summary | {"mean": mean}, lambda: summary["frames"])
+    assert frames_of(tmp_path / "report")["a"]["values"]["rmse_before"] is None
+
+
+def test_baselines_are_in_the_summary_the_table_the_csv_and_the_report(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    root, report = pairs_on_disk(tmp_path / "drive", ("a", "b")), tmp_path / "report"
+    outcome = batch(root, refine={"baselines": True}, html=report)
+    summary = json.loads((root / "out" / "summary.json").read_text())
+    rows = summary["frames"]
+    names = list(rows[0]["baselines"])
+    assert {"linear", "network", "result"} <= set(names)
+    mean = summary["baselines"]["linear"]
+    per_frame = [row["baselines"]["linear"] for row in rows]
+    assert mean["frames"] == 2
+    assert mean["mae"] == pytest.approx(np.mean([each["scores"]["mae"] for each in per_frame]))
+    assert mean["held_out_mae"] == pytest.approx(
+        np.mean([each["held_out_mae"] for each in per_frame])
+    )
+    with (root / "out" / "summary.csv").open() as file:
+        lines = list(csv.DictReader(file))
+    assert [float(line["baseline_linear_mae"]) for line in lines] == [
+        each["scores"]["mae"] for each in per_frame
+    ]
+    print_batch(outcome.summary)
+    assert "against every simple baseline" in capsys.readouterr().err
+    assert "Simple baselines: means over frames" in (report / "index.html").read_text()

@@ -49,13 +49,13 @@ def plain_convolutions() -> Iterator[None]:
 def passes(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """How many frames went together each time, trials included."""
     found: list[int] = []
-    refine_frames = batch_groups.refine_frames
+    refine_together = Refiner.refine_together
 
-    def counted(network: Any, split: Any, settings: Any, tasks: Any) -> Any:
-        found.append(len(tasks))
-        return refine_frames(network, split, settings, tasks)
+    def counted(refiner: Refiner, split: Any, group: Any, settings: Any) -> Any:
+        found.append(len(group))
+        return refine_together(refiner, split, group, settings)
 
-    monkeypatch.setattr(batch_groups, "refine_frames", counted)
+    monkeypatch.setattr(Refiner, "refine_together", counted)
     return found
 
 
@@ -179,7 +179,7 @@ def test_a_batch_stopped_among_groups_goes_on_to_the_same_results(root: Path) ->
 def test_what_auto_does_never_shows_in_the_results(
     root: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(batch_groups, "_MOST", 3)
+    monkeypatch.setattr(batch_groups, "_MAX_FRAMES", 3)
     heard = Heard()
     batch(root, heard, refine={"lr": "5%"})
     assert sum("batch size" in text for text in heard.said) == 1
@@ -196,8 +196,8 @@ def test_auto_takes_frames_together_only_where_that_is_faster(
     faster: float,
     goes_together: bool,
 ) -> None:
-    monkeypatch.setattr(batch_groups, "_MOST", 3)
-    monkeypatch.setattr(batch_groups, "_FASTER", faster)
+    monkeypatch.setattr(batch_groups, "_MAX_FRAMES", 3)
+    monkeypatch.setattr(batch_groups, "_MAX_TIME_RATIO", faster)
     heard = Heard()
     batch(root, heard)
     assert passes == ([3, 3, 3] if goes_together else [3, 3])
@@ -214,7 +214,7 @@ ROUNDS = (FORMULA, f"{FORMULA} + 1e-5 * rgb.mean()")
 def test_where_bits_differ_auto_goes_on_one_at_a_time(
     root: Path, passes: list[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(batch_groups, "_MOST", 3)
+    monkeypatch.setattr(batch_groups, "_MAX_FRAMES", 3)
     paint_in_shades(root)
     change_network(root, ROUNDS)
     heard = Heard()
@@ -252,7 +252,10 @@ CHOOSES = ("        return", "        rgb = rgb / 2 if float(rgb.mean()) > 0.9 e
 @pytest.mark.usefixtures("plain_convolutions")
 @pytest.mark.parametrize(
     ("change", "why"),
-    [(MIXED, "frames that go together change one another"), (CHOOSES, "goes by values")],
+    [
+        (MIXED, "frames that go together influence each other"),
+        (CHOOSES, "control flow depends on image"),
+    ],
 )
 def test_a_network_that_mixes_frames_gets_them_one_at_a_time_whatever_is_asked(
     root: Path, passes: list[int], change: tuple[str, str], why: str
@@ -279,19 +282,19 @@ def test_a_network_for_one_frame_alone_gets_one_at_a_time(root: Path, passes: li
 def test_out_of_memory_halves_the_group_and_goes_on(
     root: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    refine_frames = batch_groups.refine_frames
+    refine_together = Refiner.refine_together
     tried: list[int] = []
     room = 4
 
-    def with_little_room(network: Any, split: Any, settings: Any, tasks: Any) -> Any:
+    def with_little_room(refiner: Refiner, split: Any, group: Any, settings: Any) -> Any:
         nonlocal room
-        tried.append(len(tasks))
+        tried.append(len(group))
         room = 2 if len(tried) == 4 else room  # the memory is needed elsewhere
-        if len(tasks) > room:
+        if len(group) > room:
             raise DeviceError("device 'cpu' is out of memory")
-        return refine_frames(network, split, settings, tasks)
+        return refine_together(refiner, split, group, settings)
 
-    monkeypatch.setattr(batch_groups, "refine_frames", with_little_room)
+    monkeypatch.setattr(Refiner, "refine_together", with_little_room)
     for name in ("i", "j", "k", "l", "m", "n"):
         add_frame(root, name)
     outcome = batch(root, batch_size=8)
@@ -299,7 +302,7 @@ def test_out_of_memory_halves_the_group_and_goes_on(
     assert tried == [8, 4, 4, 4, 2, 2, 2]
     assert outcome.summary["counts"]["done"] == 14
     together = results(root / "out")
-    monkeypatch.setattr(batch_groups, "refine_frames", refine_frames)
+    monkeypatch.setattr(Refiner, "refine_together", refine_together)
     assert together == alone(root)
 
 
@@ -361,4 +364,4 @@ def test_what_is_chosen_for_each_frame_by_itself_is_never_refined_together(
     batch(root, heard, batch_size=2, limit=3, refine={"uncertainty": True})
     assert passes == []
     assert [row["status"] for row in heard.rows] == ["done"] * 3
-    assert any("chosen for each frame alone" in text for text in heard.said)
+    assert any("choose the method for each frame alone" in text for text in heard.said)

@@ -12,7 +12,7 @@ import torch
 from pnpdepth_cli.errors import LayerError, UsageError
 from pnpdepth_cli.pipeline.bench.bench import FIRST_FRAME, FULL, Bench, BenchRequest, run_bench
 from pnpdepth_cli.pipeline.bench.table import PAPER_TIMES
-from pnpdepth_cli.pipeline.bench.timing import Spread, Timed, in_turn
+from pnpdepth_cli.pipeline.bench.timing import Quartiles, Timed, in_turn
 from tests.pipeline.frames import FrameOnDisk, frame_on_disk
 
 CPU = torch.device("cpu")
@@ -121,8 +121,8 @@ def test_what_is_prepared_is_not_timed() -> None:
 
 
 def test_a_spread_is_the_median_and_the_quartiles() -> None:
-    assert Spread.of([5.0, 1.0, 2.0, 4.0, 3.0]) == Spread(median=3, lower=2, upper=4, runs=5)
-    assert Spread.of([2.0]) == Spread(median=2, lower=2, upper=2, runs=1)
+    assert Quartiles.of([5.0, 1.0, 2.0, 4.0, 3.0]) == Quartiles(median=3, lower=2, upper=4, runs=5)
+    assert Quartiles.of([2.0]) == Quartiles(median=2, lower=2, upper=2, runs=1)
 
 
 def test_the_peak_is_what_is_needed_at_once_not_what_is_left() -> None:

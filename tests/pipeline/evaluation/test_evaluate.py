@@ -162,11 +162,16 @@ def test_a_published_protocol_is_what_plain_numpy_makes_of_its_definition(
     root, prediction, truth = random_frames
     inside = np.zeros(truth.shape[1:], bool)
     inside[45:471, 41:601] = True
-    clipped = np.where(prediction > 0, np.clip(prediction, np.float32(1e-3), 10), 0)
-    rows = [
-        brute(p, g, inside & (g > 1e-3) & (g < 10)) for p, g in zip(clipped, truth, strict=True)
-    ]
-    assert scored(root, protocol="nyu").mean == means(rows)
+    clipped = np.clip(prediction, np.float32(1e-3), 10)  # empty predictions too, as BTS does
+
+    def expected(depth: np.ndarray) -> dict[str, Any]:
+        pairs = zip(depth, truth, strict=True)
+        return means([brute(p, g, inside & (g > 1e-3) & (g < 10)) for p, g in pairs])
+
+    assert scored(root, protocol="nyu").mean == expected(clipped)
+    skipped = scored(root, protocol="nyu", missing="skip")
+    assert skipped.mean == expected(np.where(prediction > 0, clipped, 0))
+    assert skipped.coverage == scored(root, protocol="nyu").coverage < 1
 
 
 def test_crop_bounds_and_mask_can_each_be_given_alone(
@@ -207,6 +212,43 @@ def test_the_interval_holds_the_mean_and_is_of_the_seed(
     assert found.interval != scored(root, resamples=500, seed=2).interval
     assert scored(root, resamples=0).interval is None
     assert found.describe_interval().endswith("studentised bootstrap over 6 frames")
+
+
+def test_missing_pixels_are_skipped_clamped_or_refused(two: Path) -> None:
+    bounds = {"min_depth": 0.5, "max_depth": 10.0}
+    skipped = scored(two, **bounds)
+    lowest, highest = (scored(two, missing=name, **bounds) for name in ("min", "max"))
+    assert skipped.frames[1].values["mae"] == 3
+    assert lowest.frames[1].values["mae"] == (3 + 4.5) / 2
+    assert highest.frames[1].values["mae"] == (3 + 5) / 2
+    assert [e.coverage for e in (skipped, lowest, highest)] == [0.75, 0.75, 0.75]
+    assert (lowest.frames[1].pixels, lowest.frames[1].predicted) == (2, 1)
+    assert any("what is missing is scored as 0.5 m" in note for note in lowest.notes)
+    refused = scored(two, missing="fail", **bounds)
+    assert [frame.name for frame in refused.failed] == ["ü b"]
+    assert "--missing fail refuses" in (refused.frames[1].error or "")
+
+
+def test_protocols_of_papers_score_empty_predictions_as_the_lower_bound(tmp_path: Path) -> None:
+    gt = np.full((20, 20), 4, np.float32)
+    prediction = gt.copy()
+    prediction[:, ::2] = 0
+    depth_file(tmp_path / "out" / "a.npy", prediction)
+    depth_file(tmp_path / "gt" / "a.npy", gt)
+    # BTS: pred[pred < min_depth] = min_depth, and all masked ground truth is scored
+    garg = scored(tmp_path, protocol="garg")
+    assert garg.mean["mre"] == pytest.approx(0.5 * (4 - 1e-3) / 4, rel=0.12)
+    assert garg.frames[0].pixels == garg.frames[0].known
+    assert scored(tmp_path, protocol="garg", missing="skip").mean["mre"] == 0
+    assert scored(tmp_path, protocol="garg", min_depth=0.0).mean["mre"] == 0
+
+
+def test_an_empty_frame_counts_in_the_development_kit(tmp_path: Path) -> None:
+    depth_file(tmp_path / "out" / "a.npy", [[0, 0]])
+    depth_file(tmp_path / "gt" / "a.npy", [[2, 4]])
+    found = scored(tmp_path, protocol="kitti-devkit")
+    assert found.mean["mae"] == 4  # against −1 m, as the kit does
+    assert math.isnan(found.mean["log_mae"])
 
 
 def test_few_groups_of_frames_have_no_interval_and_say_so(tmp_path: Path) -> None:

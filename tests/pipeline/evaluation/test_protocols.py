@@ -86,7 +86,8 @@ def test_what_is_not_given_stays_as_published() -> None:
 def test_the_description_says_what_is_scored_and_whether_it_was_changed() -> None:
     assert PROTOCOLS["eigen"].describe() == (
         "eigen: all known ground truth in 0.001–80 m, crop eigen, predictions clipped to the same"
-        " range, δ below 1.25, 1.5625, 1.95312, mean over the images"
+        " range, empty predictions scored as the lower bound, δ below 1.25, 1.5625, 1.95312,"
+        " mean over the images"
     )
     changed = choose_protocol("kitti", average="pooled", mask=Path("m.png"), exclude_sparse=True)
     assert changed.describe() == (

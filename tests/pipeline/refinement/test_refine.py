@@ -53,6 +53,16 @@ def test_refinement_lowers_the_error_at_the_points_and_against_the_truth(
     assert 0 < record["improved_share"] < 1
 
 
+def test_ground_truth_that_is_the_sparse_depth_is_warned_of(frame: FrameOnDisk) -> None:
+    leaked = run(frame, gt=frame.sparse).record["notes"]
+    assert any(
+        "warning: 60 of 60 pixels (100.0%) of the ground truth are the sparse depth" in note
+        for note in leaked
+    )
+    notes = run(frame, gt=frame.gt, overwrite=True).record["notes"]
+    assert not any("sparse depth itself" in note for note in notes)
+
+
 def test_the_scores_of_the_record_are_those_of_the_written_file(frame: FrameOnDisk) -> None:
     record = run(frame, gt=frame.gt, format="npy").record
     written = read_depth(frame.folder / "out" / "img_depth.npy").values
@@ -212,11 +222,11 @@ BAD = [
     ({"lr": "nan"}, UsageError, "not a step size"),
     ({"lr": "0"}, UsageError, "not a step size"),
     ({"lr": "fast"}, UsageError, "not a step size"),
-    ({"holdout": 1.0}, UsageError, "not a share"),
+    ({"holdout": 1.0}, UsageError, "not a fraction"),
     ({"layer": "1.5"}, UsageError, "between 0 and 1"),
     ({"layer": "midle"}, LayerError, "did you mean middle"),
     ({"layer": "unused"}, LayerError, "never runs"),
-    ({"image": None}, PnpDepthError, "looks at a picture"),
+    ({"image": None}, PnpDepthError, "takes an rgb image"),
     ({"device": "cuda:7"}, PnpDepthError, "--device cpu"),
     ({"device": "tpu"}, PnpDepthError, "--device cpu"),
     ({"format": "jpg"}, UsageError, "not one of"),

@@ -81,8 +81,8 @@ def test_the_pictures_are_the_panels_of_the_files_on_disk(root: Path, report: Pa
         shown = np.asarray(Image.open(io.BytesIO(pictures[f"{frame['key']}_{view}.jpg"])))
         scaled = cv2.resize(panel, shown.shape[1::-1], interpolation=cv2.INTER_AREA)
         assert np.abs(shown.astype(int) - scaled).mean() < 6, view
-    assert frame["scale_m"] == [preview.said["low_m"], preview.said["high_m"]]
-    assert frame["map"]["footer"] == improvement.said["footer"]
+    assert frame["scale_m"] == [preview.content["low_m"], preview.content["high_m"]]
+    assert frame["map"]["footer"] == improvement.content["footer"]
 
 
 def test_frames_of_an_earlier_run_without_a_report_are_in_it(root: Path, report: Path) -> None:
@@ -203,7 +203,10 @@ def test_where_only_some_frames_have_truth_the_others_have_no_figures(
     frames = frames_of(report)
     assert frames["a"]["values"]["rmse_gain"] is not None
     assert set(frames["b"]["values"].values()) == {None}
-    assert (frames["a"]["tag"], frames["b"]["tag"]) == ("against the truth", "at the points used")
+    assert (frames["a"]["tag"], frames["b"]["tag"]) == (
+        "against ground truth",
+        "at the points used",
+    )
 
 
 def test_the_shard_that_ends_last_reports_all_frames(root: Path, report: Path) -> None:
@@ -279,7 +282,7 @@ def test_a_disk_that_is_full_while_drawing_ends_the_run_and_the_next_one_goes_on
     root: Path, report: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     drawn: list[str] = []
-    save = report_batch.save_pictures
+    save = report_batch.save_images
 
     def full_at_the_second(folder: Path, key: str, *views: Any, **others: Any) -> None:
         drawn.append(key)
@@ -287,7 +290,7 @@ def test_a_disk_that_is_full_while_drawing_ends_the_run_and_the_next_one_goes_on
             raise StorageError("the disk is full")
         save(folder, key, *views, **others)
 
-    monkeypatch.setattr(report_batch, "save_pictures", full_at_the_second)
+    monkeypatch.setattr(report_batch, "save_images", full_at_the_second)
     with pytest.raises(StorageError):
         batch(root, html=report)
     assert not (report / "index.html").exists()

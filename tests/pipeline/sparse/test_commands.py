@@ -70,7 +70,7 @@ def test_the_overlay_is_written_beside(frame: ScanOnDisk) -> None:
 
 
 def test_the_size_comes_from_image_option_or_calibration(frame: ScanOnDisk) -> None:
-    with pytest.raises(SizeError, match="does not say the picture's size"):
+    with pytest.raises(SizeError, match="does not give the image's size"):
         project_scan(projecting(frame, image=None))
     by_option = project_scan(projecting(frame, image=None, size=(48, 64)))
     frame.calib.write_text(frame.calib.read_text() + "size: [64, 48]\n")
@@ -96,7 +96,7 @@ def test_bad_input_is_refused_in_one_line_and_nothing_is_written(frame: ScanOnDi
     values.tofile(cut)
     refused(frame, FileFormatError, "1 of 150 points", scan=cut)
     refused(frame, FileFormatError, "not a scan", scan=frame.image)
-    refused(frame, FileFormatError, "is not a picture", image=frame.scan)
+    refused(frame, FileFormatError, "is not an image", image=frame.scan)
     refused(frame, UsageError, "needs --calib", options=ScanOptions())
     behind = np.fromfile(frame.scan, "<f4").reshape(-1, 4) * [-1, 1, 1, 1]
     behind.astype("<f4").tofile(cut)
@@ -113,12 +113,12 @@ def test_a_picture_of_another_camera_is_noticed(frame: ScanOnDisk) -> None:
     assert any(note.startswith("warning: the principal point") for note in record["notes"])
     frame.calib.write_text(frame.calib.read_text() + "size: [64, 48]\n")
     target = SparseTarget(output=frame.folder / "b.csv")
-    refused(frame, SizeError, "is of 64×48 pictures", image=wide, target=target)
+    refused(frame, SizeError, "is for images of 64×48", image=wide, target=target)
 
 
 def test_a_calibration_without_a_scanner_is_refused(frame: ScanOnDisk) -> None:
     frame.calib.write_text("60 0 31.5 0 60 23.5 0 0 1")
-    refused(frame, UsageError, "does not say where the scanner stands")
+    refused(frame, UsageError, "has no pose of the scanner")
 
 
 def test_results_are_replaced_only_when_that_is_said(frame: ScanOnDisk) -> None:
@@ -131,7 +131,7 @@ def test_results_are_replaced_only_when_that_is_said(frame: ScanOnDisk) -> None:
     calib.write_text('{"K": [60, 0, 31.5, 0, 60, 23.5, 0, 0, 1]}')
     refused(frame, OutputError, "is an input", target=into, options=ScanOptions(calib=calib))
     below = SparseTarget(output=frame.gt / "s.png")
-    refused(frame, OutputError, "cannot be made", target=below)
+    refused(frame, OutputError, "cannot be written (file exists)", target=below)
     scale = SparseTarget(output=frame.folder / "s.png", depth_scale=0)
     refused(frame, UsageError, "--output-scale", target=scale)
     refused(frame, OutputError, ".jpg", target=SparseTarget(output=frame.folder / "s.jpg"))

@@ -463,7 +463,7 @@ def test_a_folder_that_is_locked_or_holds_other_results_is_refused(root: Path) -
     ):
         sweep(root, "iterations=0,2")
     (out / "sweep.csv").write_text("mine")
-    with pytest.raises(OutputError, match="no sweep made it"):
+    with pytest.raises(OutputError, match="no sweep wrote it"):
         sweep(root, "iterations=0,2")
     assert (out / "sweep.csv").read_text() == "mine"
 

@@ -1,11 +1,13 @@
 """An ONNX graph as a torch module whose submodules are the graph's nodes, under their own names.
 
-What depends on no input is computed once, here. Arithmetic on shapes is done in passing; every
-other node is a submodule, so that the network can be cut at it.
+Nodes that the output does not need are left out. What depends on no input is computed once, when
+the module is made. Arithmetic on shapes is no layer; every other node is a submodule, so that the
+network can be cut at it.
 """
 
 from __future__ import annotations
 
+import heapq
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -15,62 +17,89 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from pnpdepth_cli.core.split.user_code import describe
 from pnpdepth_cli.errors import ModelError
+from pnpdepth_cli.models.formats.onnx.folding import FoldingBudget
 from pnpdepth_cli.models.formats.onnx.operators import OPERATORS, Node, Unsupported
 
 _STANDARD = ("", "ai.onnx")
 _TO_SHAPES = ("Shape", "Size")
 _WHOLE = ("uint16", "uint32", "uint64", "int4", "uint4")
 _HALF = ("float16", "bfloat16")
+_MODULE_ATTRIBUTES = frozenset(vars(nn.Module()))
+"""Such as `training`, which torch itself sets; no submodule can have such a name."""
 
 
 class OnnxNode(nn.Module):
-    """One node with its constant inputs; called with the other inputs, in order."""
+    """One node with its constant inputs; called with the other inputs, in order.
+
+    Args:
+        node: Operator and attributes.
+        inputs: For each input its constant, "" or any text for one that the call gives, or None for
+            one that is left out.
+    """
 
     def __init__(self, node: Node, inputs: Sequence[Tensor | str | None]) -> None:
         super().__init__()
         self.node = node
         self._run = OPERATORS[node.op]
-        self._places: list[str | None] = []  # the constant at each place; "" for what is handed in
-        for place, value in enumerate(inputs):
-            self._places.append(None if value is None else "")
+        # Of each input the name of its buffer, "" if the call gives it, None if it is left out.
+        self._buffer_names: list[str | None] = []
+        for index, value in enumerate(inputs):
+            self._buffer_names.append(None if value is None else "")
             if isinstance(value, Tensor):
-                self._places[-1] = f"input{place}"
+                self._buffer_names[-1] = f"input{index}"
                 if value.is_floating_point():
                     constant = nn.Parameter(value, requires_grad=False)
-                    self.register_parameter(f"input{place}", constant)
+                    self.register_parameter(f"input{index}", constant)
                 else:
-                    self.register_buffer(f"input{place}", value)
+                    self.register_buffer(f"input{index}", value)
 
     def forward(self, *handed_in: Tensor) -> Tensor | tuple[Tensor, ...]:
+        """Returns the node's output, or its outputs."""
         rest = iter(handed_in)
-        given: list[Any] = [
-            None if place is None else getattr(self, place) if place else next(rest)
-            for place in self._places
+        inputs: list[Any] = [
+            None if name is None else getattr(self, name) if name else next(rest)
+            for name in self._buffer_names
         ]
         try:
-            return self._run(self.node, given)
+            return self._run(self.node, inputs)
         except Unsupported as error:
             raise ModelError(f"ONNX node {self.node.name!r}: {_not_covered(self.node, error)}")  # noqa: B904
 
     def extra_repr(self) -> str:
+        """Returns the operator, for `print(network)`."""
         return self.node.op
 
 
 @dataclass(frozen=True)
 class _Step:
+    """One node in the order in which they run."""
+
     run: OnnxNode
     inputs: tuple[str, ...]
+    """Names of the values that it is called with."""
     outputs: tuple[str, ...]
-    done_with: tuple[str, ...]  # values that no later step reads
+    """Names of the values that it returns."""
+    last_read: tuple[str, ...]
+    """Values that no later step reads."""
     on_shapes: bool
+    """True for arithmetic on the shapes of tensors, which stays on the CPU."""
 
 
 class OnnxGraph(nn.Module):
     """An ONNX model as a module: called with the graph's inputs, it returns its outputs.
 
-    One output is a tensor, several are a dict by name. `float32` throughout: half precision
-    weights and inputs are widened. ModelError names every operator that is not covered.
+    One output is a tensor, several are a dict by name. Everything is computed in float32; weights
+    in half precision are widened.
+
+    Args:
+        model: The onnx.ModelProto, without functions of its own.
+        path: Its file, for messages.
+        outputs: Names of the wanted outputs; None takes all of the graph's.
+
+    Raises:
+        ModelError: An operator is not covered; the message names every one.
     """
 
     def __init__(self, model: Any, path: Path, outputs: Sequence[str] | None = None) -> None:
@@ -80,8 +109,11 @@ class OnnxGraph(nn.Module):
         constants = {t.name: _tensor(t, path) for t in graph.initializer}
         self.input_names = tuple(i.name for i in graph.input if i.name not in constants)
         self.output_names = tuple(outputs or (o.name for o in graph.output))
-        _check_operators(graph.node, path)
-        nodes = list(zip(_names(graph.node), graph.node, strict=True))
+        known = {*constants, *self.input_names}
+        order = order_of_nodes(graph.node, known, self.output_names, path)
+        _check_operators([graph.node[n] for n in order], path)
+        names = _names(graph.node)
+        nodes = [(names[n], graph.node[n]) for n in order]
         steps = self._steps_of(nodes, opset, constants, path)
         self._steps = _with_ends(steps, self.output_names)
         self._constants = {n: constants[n] for n in self.output_names if n in constants}
@@ -95,73 +127,85 @@ class OnnxGraph(nn.Module):
     ) -> list[_Step]:
         shapes: set[str] = set()
         steps = []
+        budget = FoldingBudget(sum(constant.numel() for constant in constants.values()))
         for name, proto in nodes:
             attributes = {a.name: _attribute(a, path) for a in proto.attribute}
-            wanted = [output for output in proto.output if output]
+            outputs = [output for output in proto.output if output]
             node = Node(
-                name=name, op=proto.op_type, opset=opset, outputs=len(wanted), attributes=attributes
+                name=name,
+                op=proto.op_type,
+                opset=opset,
+                outputs=len(outputs),
+                attributes=attributes,
             )
             inputs: list[Tensor | str] = [constants.get(n, n) for n in proto.input]
-            made = OnnxNode(node, [None if isinstance(n, str) and not n else n for n in inputs])
+            module = OnnxNode(node, [None if isinstance(n, str) and not n else n for n in inputs])
             handed_in = tuple(n for n in inputs if isinstance(n, str) and n)
-            if node.op == "QuantizeLinear" and handed_in:
-                raise ModelError(f"ONNX file {path}: {_QUANTISED.format(name=name)}")
             if not handed_in:
-                constants.update(_folded(made, proto.output, path))
+                constants.update(_folded(module, proto.output, budget, path))
                 continue
             on_shapes = node.op in _TO_SHAPES or all(n in shapes for n in handed_in)
             if on_shapes:
-                shapes.update(wanted)
-            steps.append(_Step(made, handed_in, tuple(proto.output), (), on_shapes))
+                shapes.update(outputs)
+            steps.append(_Step(module, handed_in, tuple(proto.output), (), on_shapes))
         return steps
 
     def forward(self, *inputs: Tensor) -> Any:
+        """Returns the output, or several outputs by name."""
         values: dict[str, Tensor] = dict(zip(self.input_names, inputs, strict=True))
         device = inputs[0].device
         for step in self._steps:
-            given = [values[name] for name in step.inputs]
+            arguments = [values[name] for name in step.inputs]
             if not step.on_shapes:
-                given = [value.to(device) for value in given]
-            result = step.run(*given)
-            made = result if isinstance(result, tuple) else (result,)
-            values.update(zip(step.outputs, made, strict=False))
-            for name in step.done_with:
+                arguments = [value.to(device) for value in arguments]
+            result = step.run(*arguments)
+            results = result if isinstance(result, tuple) else (result,)
+            values.update(zip(step.outputs, results, strict=False))
+            for name in step.last_read:
                 del values[name]
-        found = {n: values[n] if n in values else self._constants[n] for n in self.output_names}
-        return found if len(found) > 1 else found[self.output_names[0]]
+        outputs = {n: values[n] if n in values else self._constants[n] for n in self.output_names}
+        return outputs if len(outputs) > 1 else outputs[self.output_names[0]]
 
     def every_value(self, *inputs: Tensor) -> Iterable[tuple[str, str, Tensor]]:
-        """(node, value's name, value) of all nodes in the order in which they run."""
+        """Yields (node, value's name, value) of all nodes in the order in which they run."""
         values: dict[str, Tensor] = dict(zip(self.input_names, inputs, strict=True))
         for step in self._steps:
             result = step.run(*(values[name] for name in step.inputs))
-            made = result if isinstance(result, tuple) else (result,)
-            values.update(zip(step.outputs, made, strict=False))
-            for name, value in zip(step.outputs, made, strict=False):
+            results = result if isinstance(result, tuple) else (result,)
+            values.update(zip(step.outputs, results, strict=False))
+            for name, value in zip(step.outputs, results, strict=False):
                 yield step.run.node.name, name, value
 
 
 _QUANTISED = (
-    "node {name!r} (QuantizeLinear) rounds what flows through the network, which has no gradient;"
+    "it quantises activations (QuantizeLinear, {count} ×), and rounding has no gradient;"
     " use the file with float weights, or one where only weights are quantised"
 )
 
 
-def _folded(made: OnnxNode, outputs: Sequence[str], path: Path) -> dict[str, Tensor]:
+def _folded(
+    module: OnnxNode, outputs: Sequence[str], budget: FoldingBudget, path: Path
+) -> dict[str, Tensor]:
+    """The outputs of a node that has only constant inputs."""
     try:
-        with torch.no_grad():
-            result = made()
-    except Unsupported as error:
-        raise ModelError(f"ONNX file {path}: {_not_covered(made.node, error)}") from None
+        with torch.no_grad(), budget:
+            result = module()
+    except ModelError as error:
+        raise ModelError(f"ONNX file {path}: {error}") from None
+    except (RuntimeError, ValueError, TypeError, IndexError, OverflowError) as error:
+        raise ModelError(
+            f"ONNX file {path}: node {module.node.name!r} ({module.node.op}) cannot be computed:"
+            f" {describe(error)[:160]}"
+        ) from None
     return dict(zip(outputs, result if isinstance(result, tuple) else (result,), strict=False))
 
 
 def _with_ends(steps: list[_Step], outputs: Sequence[str]) -> list[_Step]:
-    """The steps that the outputs need, each with the values nobody reads after it."""
+    """The steps that the outputs need, each with the values that no later step reads."""
     needed, kept = set(outputs), []
     for step in reversed(steps):
         if needed.intersection(step.outputs):
-            # Read for the first time from behind: nothing later wants it.
+            # Going backwards, the first step that reads a value is its last reader.
             last = {n for n in step.inputs if n not in needed}
             unread = {n for n in step.outputs if n and n not in needed}
             needed.update(step.inputs)
@@ -170,22 +214,73 @@ def _with_ends(steps: list[_Step], outputs: Sequence[str]) -> list[_Step]:
     return kept[::-1]
 
 
-def _check_operators(nodes: Iterable[Any], path: Path) -> None:
+def _check_operators(nodes: Sequence[Any], path: Path) -> None:
     unknown: Counter[str] = Counter()
     for proto in nodes:
         standard = proto.domain in _STANDARD
         if not standard or proto.op_type not in {*OPERATORS, "QuantizeLinear"}:
             unknown[proto.op_type if standard else f"{proto.domain}.{proto.op_type}"] += 1
     if unknown:
-        named = ", ".join(f"{op} ({count} ×)" for op, count in unknown.items())
+        listed = ", ".join(f"{op} ({count} ×)" for op, count in unknown.items())
         raise ModelError(
-            f"ONNX file {path} uses operators that are not covered: {named}; export the network"
+            f"ONNX file {path} uses operators that are not covered: {listed}; export the network"
             " with others, or bring it as a Python file"
         )
+    quantised = sum(proto.op_type == "QuantizeLinear" for proto in nodes)
+    if quantised:
+        raise ModelError(f"ONNX file {path}: {_QUANTISED.format(count=quantised)}")
+
+
+def order_of_nodes(
+    nodes: Sequence[Any], known: set[str], outputs: Sequence[str], path: Path
+) -> list[int]:
+    """Returns the indices of the nodes that the outputs need, each after those it reads.
+
+    Otherwise the order is that of the file. Files converted to half precision are not in order.
+
+    Args:
+        nodes: The nodes of an onnx.GraphProto.
+        known: Names of the graph's inputs and stored constants.
+        outputs: Names of the wanted values.
+        path: The file, for messages.
+
+    Raises:
+        ModelError: A node reads a value that nothing gives, or nodes read each other in a circle.
+    """
+    producer = {name: n for n, proto in enumerate(nodes) for name in proto.output if name}
+    reads: dict[int, set[int]] = {}
+    pending = [producer[name] for name in outputs if name in producer]
+    while pending:
+        n = pending.pop()
+        if n in reads:
+            continue
+        inputs = {name for name in nodes[n].input if name and name not in known}
+        absent = sorted(inputs - producer.keys())
+        if absent:
+            raise ModelError(f"ONNX file {path}: a node reads {absent[0]!r}, which nothing gives")
+        reads[n] = {producer[name] for name in inputs}
+        pending += reads[n]
+    readers: dict[int, list[int]] = {n: [] for n in reads}
+    for n, before in reads.items():
+        for m in before:
+            readers[m].append(n)
+    waiting = {n: len(before) for n, before in reads.items()}
+    ready = [n for n, count in waiting.items() if not count]
+    heapq.heapify(ready)
+    order = []
+    while ready:
+        order.append(heapq.heappop(ready))
+        for n in readers[order[-1]]:
+            waiting[n] -= 1
+            if not waiting[n]:
+                heapq.heappush(ready, n)
+    if len(order) < len(reads):
+        raise ModelError(f"ONNX file {path}: its nodes read each other in a circle")
+    return order
 
 
 def _names(nodes: Iterable[Any]) -> list[str]:
-    """The nodes' names, fit to be named with --layer; operator and output where a node has none."""
+    """Unique names of the nodes for --layer; a node without a name has operator and output."""
     names: list[str] = []
     taken: Counter[str] = Counter()
     for proto in nodes:
@@ -194,6 +289,7 @@ def _names(nodes: Iterable[Any]) -> list[str]:
         if name.replace(".", "").isdigit():
             name = f"{proto.op_type}_{name}"
         name = name.translate(str.maketrans("#[]", "___"))
+        name = f"{name}_" if name in _MODULE_ATTRIBUTES else name
         taken[name] += 1
         names.append(name if taken[name] == 1 else f"{name}_{taken[name]}")
     return names

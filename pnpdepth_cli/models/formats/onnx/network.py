@@ -1,6 +1,6 @@
-"""An ONNX file as a definition. Its reading by torch is not trusted: onnxruntime checks it.
+"""An ONNX file as a definition. On the first image, onnxruntime checks what torch computes.
 
-`net.onnx`, or `net.onnx:OUTPUT` where the graph has several outputs. Needs `pip install
+`net.onnx`, or `net.onnx:OUTPUT` if the graph has several outputs. Needs `pip install
 pnpdepth[onnx]`.
 """
 
@@ -15,40 +15,52 @@ from torch import Tensor, nn
 
 from pnpdepth_cli.core.split.user_code import describe
 from pnpdepth_cli.errors import ModelError
-from pnpdepth_cli.models.definition import FOREIGN, Fixed, ModelDefinition, Multiple
-from pnpdepth_cli.models.formats.onnx.graph import OnnxGraph
+from pnpdepth_cli.models.definition import UNTUNED_DEFAULTS, Fixed, ModelDefinition, Multiple
+from pnpdepth_cli.models.formats.onnx.functions import inlined
+from pnpdepth_cli.models.formats.onnx.graph import OnnxGraph, order_of_nodes
 
 MISMATCH = 1e-3
 """The largest deviation from onnxruntime's output, relative to that output's range."""
 
 _HALF_MISMATCH = 1e-2  # half precision itself is no better
-_NEWEST = 24
-_MULTIPLE = 32
+_NEWEST_OPSET = 24
+_MAX_BYTES = 1 << 31  # of a protocol buffer; larger weights lie in files beside it
+_ASSUMED_MULTIPLE = 32
 
 
 def onnx_definition(file: Path, output: str | None = None) -> ModelDefinition:
-    """The definition of an ONNX depth network. ModelError where it cannot be run."""
-    model = _inlined(_read(file))
-    picture = _picture_of(model, file)
+    """Returns the definition of an ONNX depth network.
+
+    Args:
+        file: The .onnx file; it takes one rgb image 1×3×H×W or 1×H×W×3.
+        output: Name of the graph's output that is the depth; None if it has only one.
+
+    Raises:
+        ModelError: The file cannot be read, or the network cannot be run.
+    """
+    model = inlined(_read(file), file)
+    input_shape = _image_input_shape(model, file)
     chosen = _chosen_output(model, output, file)
-    channels_last = _channels_last(picture)
-    height, width = picture[1:3] if channels_last else picture[2:4]
+    channels_last = _channels_last(input_shape)
+    height, width = input_shape[1:3] if channels_last else input_shape[2:4]
     fixed = isinstance(height, int) and isinstance(width, int)
     return ModelDefinition(
         name=file.stem,
         input_kind="rgb",
-        size=Fixed(int(height), int(width)) if fixed else Multiple(_patch(model) or _MULTIPLE),
+        size=Fixed(int(height), int(width))
+        if fixed
+        else Multiple(_patch_size(model) or _ASSUMED_MULTIPLE),
         build=lambda: OnnxGraph(model, file, [chosen]),
         complete=True,
         normalisation=None,
-        defaults=FOREIGN,
+        defaults=UNTUNED_DEFAULTS,
         summary=f"ONNX, opset {_opset(model)}, from {model.producer_name or 'an unknown program'}",
         output_kind="unknown",
         output_scale="unknown",
         checkpoint=file,
         arguments=lambda rgb, _: (_as_input(rgb, channels_last),),
         output=_as_map,
-        verify=_FirstPictureCheck(file, chosen),
+        verify=_FirstImageCheck(file, chosen),
     )
 
 
@@ -66,6 +78,8 @@ def _as_map(output: Any) -> Tensor:
 def _read(file: Path) -> Any:
     if not file.is_file():
         raise ModelError(f"ONNX file {file} does not exist")
+    if file.stat().st_size > _MAX_BYTES:
+        raise ModelError(f"ONNX file {file} is larger than 2 GB, which no ONNX file is")
     try:
         import onnx
         import onnxruntime  # noqa: F401
@@ -80,9 +94,10 @@ def _read(file: Path) -> Any:
         raise ModelError(f"ONNX file {file} cannot be read: {describe(error)}") from None
     if not model.graph.node:
         raise ModelError(f"ONNX file {file} cannot be read: it holds no graph")
-    if _opset(model) > _NEWEST:
+    if _opset(model) > _NEWEST_OPSET:
         raise ModelError(
-            f"ONNX file {file} is of opset {_opset(model)}, newer than {_NEWEST}; export an older"
+            f"ONNX file {file} is of opset {_opset(model)}, newer than {_NEWEST_OPSET}; export an"
+            " older one"
         )
     return model
 
@@ -91,31 +106,22 @@ def _opset(model: Any) -> int:
     return max((o.version for o in model.opset_import if o.domain in ("", "ai.onnx")), default=1)
 
 
-def _inlined(model: Any) -> Any:
-    """The model without functions of its own."""
-    if not model.functions:
-        return model
-    from onnx import inliner
-
-    return inliner.inline_local_functions(model)
-
-
-def _picture_of(model: Any, file: Path) -> list[int | str]:
-    """The shape of the only input. ModelError if that is no batch of one rgb picture."""
+def _image_input_shape(model: Any, file: Path) -> list[int | str]:
+    """The shape of the only input. ModelError if that is no batch of one rgb image."""
     constants = {tensor.name for tensor in model.graph.initializer}
     inputs = {i.name: _shape(i) for i in model.graph.input if i.name not in constants}
-    said = ", ".join(f"{name} {'×'.join(map(str, shape))}" for name, shape in inputs.items())
+    listed = ", ".join(f"{name} {'×'.join(map(str, shape))}" for name, shape in inputs.items())
     if len(inputs) != 1:
         raise ModelError(
-            f"ONNX file {file} has {len(inputs)} inputs ({said}); only one, an rgb picture, can be"
-            " handed in"
+            f"ONNX file {file} has {len(inputs)} inputs ({listed}); only networks with one, an rgb"
+            " image, can be run"
         )
     shape = next(iter(inputs.values()))
     channels = shape[-1] if len(shape) == 4 and _channels_last(shape) else shape[1:2] == [3]
     batch = not shape or not isinstance(shape[0], int) or shape[0] == 1
     if len(shape) != 4 or not channels or not batch:
         raise ModelError(
-            f"ONNX file {file} takes {said}; one rgb picture 1×3×H×W or 1×H×W×3 is expected"
+            f"ONNX file {file} takes {listed}; one rgb image 1×3×H×W or 1×H×W×3 is expected"
         )
     return shape
 
@@ -137,13 +143,13 @@ def _chosen_output(model: Any, wanted: str | None, file: Path) -> str:
         return str(wanted)
     listed = ", ".join(f"{n} {'×'.join(map(str, s))}" for n, s in outputs.items())
     first = next(iter(outputs), "OUTPUT")
-    asked = f"no output {wanted!r}" if wanted else f"{len(outputs)} outputs"
+    fact = f"no output {wanted!r}" if wanted else f"{len(outputs)} outputs"
     raise ModelError(
-        f"ONNX file {file} has {asked}; name the depth as --model {file}:{first}; it has {listed}"
+        f"ONNX file {file} has {fact}; name the depth as --model {file}:{first}; it has {listed}"
     )
 
 
-def _patch(model: Any) -> int | None:
+def _patch_size(model: Any) -> int | None:
     """The patch size of a vision transformer: a convolution that steps by its own kernel."""
     for node in model.graph.node:
         if node.op_type == "Conv":
@@ -154,30 +160,32 @@ def _patch(model: Any) -> int | None:
     return None
 
 
-class _FirstPictureCheck:
-    """The network agrees with onnxruntime on the first picture that it is given."""
+class _FirstImageCheck:
+    """Compares the network with onnxruntime on the first image."""
 
     def __init__(self, file: Path, output: str) -> None:
         self._file, self._output, self._note = file, output, ""
 
     def __call__(self, module: nn.Module, arguments: Sequence[Tensor]) -> str:
-        """What to say of the check; it is made once. ModelError if they differ."""
+        """Returns how well they agree; compares only once. ModelError if they differ."""
         if self._note:
             return self._note
         assert isinstance(module, OnnxGraph)
         model = _read(self._file)
+        _remove_nodes_not_needed(model, self._output, self._file)
         inputs = [argument.detach().cpu() for argument in arguments]
-        true = _run(model, [self._output], module.input_names, inputs, self._file)[0]
+        expected = _run(model, [self._output], module.input_names, inputs, self._file)[0]
         with torch.no_grad():
-            ours = module(*arguments).cpu()
+            actual = module(*arguments).cpu()
         limit = _HALF_MISMATCH if _is_half(model) else MISMATCH
-        off = _deviation(ours, true)
-        if not off <= limit:
+        deviation = _deviation(actual, expected)
+        if not deviation <= limit:
+            where = self._first_difference(model, module, inputs)
             raise ModelError(
                 f"ONNX file {self._file}: its reading by torch differs from onnxruntime's by"
-                f" {off:.2g} of the output's range{self._first_difference(model, module, inputs)}"
+                f" {deviation:.2g} of the output's range{where}"
             )
-        self._note = f"ONNX: agrees with onnxruntime on this picture to {off:.1g} of its range"
+        self._note = f"ONNX: agrees with onnxruntime on this image to {deviation:.1g} of its range"
         return self._note
 
     def _first_difference(self, model: Any, module: OnnxGraph, inputs: list[Tensor]) -> str:
@@ -185,15 +193,15 @@ class _FirstPictureCheck:
 
         module = module.cpu()
         with torch.no_grad():
-            ours = [v for v in module.every_value(*inputs) if v[1] and v[2].is_floating_point()]
+            actual = [v for v in module.every_value(*inputs) if v[1] and v[2].is_floating_point()]
         known = {o.name for o in model.graph.output}
         model.graph.output.extend(
-            onnx.ValueInfoProto(name=value) for _, value, _ in ours if value not in known
+            onnx.ValueInfoProto(name=value) for _, value, _ in actual if value not in known
         )
-        names = [value for _, value, _ in ours]
-        theirs = _run(model, names, module.input_names, inputs, self._file)
-        for (node, _, value), true in zip(ours, theirs, strict=True):
-            if not _deviation(value, true) <= MISMATCH:
+        names = [value for _, value, _ in actual]
+        expected = _run(model, names, module.input_names, inputs, self._file)
+        for (node, _, value), reference in zip(actual, expected, strict=True):
+            if not _deviation(value, reference) <= MISMATCH:
                 return f"; the first node that differs is {node!r} ({module._modules[node]})"
         return "; no single node differs by as much"
 
@@ -206,11 +214,16 @@ def _run(
     options = onnxruntime.SessionOptions()
     options.log_severity_level = 4
     options.intra_op_num_threads = torch.get_num_threads()
+    on_disk = _read(file).graph
+    unchanged = (len(model.graph.output), len(model.graph.node)) == (
+        *(len(on_disk.output), len(on_disk.node)),
+    )
     try:
-        # By its path while it is as on disk: weights may lie in files beside it.
-        source = str(file) if len(model.graph.output) == len(_read(file).graph.output) else None
+        # By its path if it is as on disk: weights may lie in files beside it.
         session = onnxruntime.InferenceSession(
-            source or model.SerializeToString(), options, providers=["CPUExecutionProvider"]
+            str(file) if unchanged else model.SerializeToString(),
+            options,
+            providers=["CPUExecutionProvider"],
         )
         halves = {i.name for i in session.get_inputs() if i.type == "tensor(float16)"}
         feed = {
@@ -230,11 +243,27 @@ def _is_half(model: Any) -> bool:
     return any(t.data_type == TensorProto.FLOAT16 for t in model.graph.initializer)
 
 
-def _deviation(ours: Tensor, true: Tensor) -> float:
-    """The largest difference relative to the range of the true values."""
-    if ours.shape != true.shape:
+def _deviation(actual: Tensor, expected: Tensor) -> float:
+    """The largest difference relative to the largest expected value."""
+    if actual.shape != expected.shape:
         return float("inf")
-    if not true.numel():
+    if not expected.numel():
         return 0.0
-    spread = float(true.abs().max())
-    return float((ours.float() - true).abs().max()) / spread if spread else float(ours.abs().max())
+    largest = float(expected.abs().max())
+    difference = float((actual.float() - expected).abs().max())
+    return difference / largest if largest else difference
+
+
+def _remove_nodes_not_needed(model: Any, output: str, file: Path) -> None:
+    """onnxruntime would run every node; a small file may hold one that needs much memory."""
+    graph = model.graph
+    known = {*(t.name for t in graph.initializer), *(i.name for i in graph.input)}
+    needed = order_of_nodes(graph.node, known, [output], file)
+    if len(needed) == len(graph.node):
+        return
+    nodes = [graph.node[n] for n in needed]
+    others = [o for o in graph.output if o.name != output]
+    for other in others:
+        graph.output.remove(other)
+    del graph.node[:]
+    graph.node.extend(nodes)

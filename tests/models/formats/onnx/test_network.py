@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import resource
+import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,7 +16,8 @@ import torch
 pytest.importorskip("onnx", reason="needs the extra [onnx]")
 pytest.importorskip("onnxruntime", reason="needs the extra [onnx]")
 
-from onnx import helper
+import onnx
+from onnx import helper, numpy_helper
 
 from pnpdepth_cli.core.refine import RefineSettings, refine
 from pnpdepth_cli.core.split import Split
@@ -222,3 +227,162 @@ def test_arithmetic_on_shapes_is_no_layer_and_leaves_the_cut_exact(tmp_path: Pat
                     assert torch.equal(split.rear(z), whole), name
     assert network.definition.verify is not None
     network.definition.verify(network.module, (picture(1, 3, 32, 48),))
+
+
+# ------------------------------------------------------------------ half precision, quantised
+
+
+@pytest.mark.parametrize("keep_io_types", [True, False])
+def test_a_network_in_half_precision_is_run_though_its_nodes_are_not_in_order(
+    tmp_path: Path, keep_io_types: bool
+) -> None:
+    from onnxruntime.transformers.float16 import convert_float_to_float16
+
+    whole = onnx.load(write_network(tmp_path / "net.onnx"))
+    half = convert_float_to_float16(whole, keep_io_types=keep_io_types)
+    onnx.save(half, tmp_path / "half.onnx")
+    network = load_network(str(tmp_path / "half.onnx"), None)
+    x = picture(1, 3, 32, 48)
+    assert "agrees with onnxruntime" in network.verified((x,))[0]
+    expected = load_network(str(tmp_path / "net.onnx"), None).module(x)
+    assert torch.allclose(network.module(x), expected, atol=1e-2)
+
+
+def test_quantised_activations_are_refused_by_name(tmp_path: Path) -> None:
+    nodes = (
+        helper.make_node("QuantizeLinear", ["depth", "one"], ["q"]),
+        helper.make_node("DequantizeLinear", ["q", "one"], ["out"]),
+    )
+    path = write_network(tmp_path / "net.onnx", nodes=nodes, outputs=("out",))
+    assert "quantises activations (QuantizeLinear, 1 ×)" in refused(path)
+
+
+# ------------------------------------------------------------------ files that mean harm
+
+
+def edited(path: Path, change: Callable[[Any], object]) -> Path:
+    model = onnx.load(write_network(path))
+    change(model)
+    onnx.save(model, path)
+    return path
+
+
+def test_a_node_may_have_the_name_of_an_attribute_of_modules(tmp_path: Path) -> None:
+    def rename(model: Any) -> None:
+        model.graph.node[0].name = "training"
+
+    network = load_network(str(edited(tmp_path / "net.onnx", rename)), None)
+    assert "training_" in dict(network.module.named_modules())
+    network.module.train()
+    with Split(network.module.eval(), "training_") as split:
+        x = picture(1, 3, 32, 48)
+        assert torch.equal(split.rear(split.front(x)), network.module(x))
+
+
+def test_an_operator_that_the_output_does_not_need_is_not_looked_at(tmp_path: Path) -> None:
+    node = helper.make_node("RandomUniformLike", ["depth"], ["noise"])
+    path = write_network(tmp_path / "net.onnx", nodes=(node,))
+    network = load_network(str(path), None)
+    assert "agrees with onnxruntime" in network.verified((picture(1, 3, 32, 48),))[0]
+
+
+def test_a_value_that_nothing_gives_and_a_circle_are_refused(tmp_path: Path) -> None:
+    def break_off(model: Any) -> None:
+        model.graph.node[0].input[0] = "nowhere"
+
+    def close_a_circle(model: Any) -> None:
+        model.graph.node[0].input[0] = "e"
+
+    assert "'nowhere', which nothing gives" in refused(edited(tmp_path / "a.onnx", break_off))
+    assert "in a circle" in refused(edited(tmp_path / "b.onnx", close_a_circle))
+
+
+def constant(name: str, values: Any) -> Any:
+    tensor = numpy_helper.from_array(np.array(values), f"{name}_value")
+    return helper.make_node("Constant", [], [name], value=tensor)
+
+
+DOUBLING = [helper.make_node("Concat", [f"d{n}"] * 2, [f"d{n + 1}"], axis=0) for n in range(34)]
+BOMBS = {
+    "ConstantOfShape": [
+        constant("n", [100_000, 100_000]),
+        helper.make_node("ConstantOfShape", ["n"], ["big"]),
+    ],
+    "Range": [
+        constant("n", 0), constant("m", 10**9), constant("k", 1),
+        helper.make_node("Range", ["n", "m", "k"], ["big"]),
+    ],
+    "Concat": [
+        constant("d0", [1.0]), *DOUBLING, helper.make_node("Identity", ["d34"], ["big"])
+    ],
+    "MatMul": [
+        constant("n", [100_000, 1]), constant("m", [1, 100_000]),
+        helper.make_node("ConstantOfShape", ["n"], ["a1"]),
+        helper.make_node("ConstantOfShape", ["m"], ["a2"]),
+        helper.make_node("MatMul", ["a1", "a2"], ["big"]),
+    ],
+    "Tile": [
+        constant("a1", [[1.0]]), constant("n", [100_000, 100_000]),
+        helper.make_node("Tile", ["a1", "n"], ["big"]),
+    ],
+    "Pad": [
+        constant("a1", [1.0]), constant("n", [10**10, 0]),
+        helper.make_node("Pad", ["a1", "n"], ["big"]),
+    ],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", BOMBS)
+def test_constants_far_larger_than_the_file_are_refused_before_they_are_made(
+    kind: str, tmp_path: Path
+) -> None:
+    tail = [
+        helper.make_node("ReduceSum", ["big"], ["small"], keepdims=0),
+        helper.make_node("Cast", ["small"], ["number"], to=1),
+        helper.make_node("Mul", ["depth", "number"], ["out"]),
+    ]
+    path = write_network(tmp_path / "x.onnx", nodes=(*BOMBS[kind], *tail), outputs=("out",))
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    start = time.process_time()
+    assert "a constant of" in refused(path)
+    assert time.process_time() - start < 5
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 500_000  # kB
+
+
+def with_functions(path: Path, calls: Callable[[int], list[str]], count: int) -> Path:
+    """A network whose output goes through function 0; each calls those that `calls` names."""
+
+    def function(number: int) -> Any:
+        names = calls(number) or ["Identity"]
+        values = ["x", *(f"v{n}" for n in range(len(names) - 1)), "y"]
+        nodes = [
+            helper.make_node(
+                name, [values[n]], [values[n + 1]], domain="" if name == "Identity" else "own"
+            )
+            for n, name in enumerate(names)
+        ]
+        opsets = [helper.make_opsetid("", 13), helper.make_opsetid("own", 1)]
+        return helper.make_function("own", f"f{number}", ["x"], ["y"], nodes, opsets)
+
+    def add(model: Any) -> None:
+        model.functions.extend(function(number) for number in range(count))
+        model.opset_import.append(helper.make_opsetid("own", 1))
+        model.graph.node.append(helper.make_node("f0", ["depth"], ["out"], domain="own"))
+        model.graph.output[0].name = "out"
+
+    return edited(path, add)
+
+
+def test_functions_are_written_out_but_neither_recursive_nor_exponential_ones(
+    tmp_path: Path,
+) -> None:
+    chain = with_functions(tmp_path / "a.onnx", lambda n: [f"f{n + 1}"] if n < 3 else [], 4)
+    x = picture(1, 3, 32, 48)
+    plain = load_network(str(write_network(tmp_path / "net.onnx")), None)
+    assert torch.equal(load_network(str(chain), None).module(x), plain.module(x))
+    ring = with_functions(tmp_path / "b.onnx", lambda n: [f"f{1 - n}"], 2)
+    assert "calls itself" in refused(ring)
+    doubling = lambda n: [f"f{n + 1}"] * 2 if n < 39 else []  # noqa: E731
+    start = time.process_time()
+    assert "written out" in refused(with_functions(tmp_path / "c.onnx", doubling, 40))
+    assert time.process_time() - start < 5

@@ -1,12 +1,12 @@
-"""The ONNX operators that depth networks use, in torch, each by the standard's own text.
+"""The ONNX operators that depth networks use, in torch, each as the standard defines it.
 
-https://onnx.ai/onnx/operators. Every version of an operator is read directly: what later became an
-input is still taken as the attribute that it was.
+https://onnx.ai/onnx/operators. Every version of an operator is covered: an attribute that later
+became an input is read as either.
 """
 
 from __future__ import annotations
 
-from pnpdepth_cli.models.formats.onnx.operators import (  # noqa: F401  (each fills the table)
+from pnpdepth_cli.models.formats.onnx.operators import (  # noqa: F401  (each registers its operators)
     arithmetic,
     convolution,
     indexing,

@@ -1,4 +1,4 @@
-"""Numbers from numbers: activations, arithmetic, comparison, matrices, reductions."""
+"""Activations, arithmetic, comparison, matrix products and reductions."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from torch import Tensor
 
 from pnpdepth_cli.models.formats.onnx.operators.table import (
     OPERATORS,
-    Given,
+    Inputs,
     Node,
     Unsupported,
-    at,
     operator,
+    optional,
     whole_numbers,
 )
 
@@ -74,16 +74,18 @@ _FOLDED: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
 }
 
 
-def _unary(function: Callable[[Tensor], Tensor]) -> Callable[[Node, Given], Tensor]:
-    return lambda node, given: function(given[0])
+def _unary(function: Callable[[Tensor], Tensor]) -> Callable[[Node, Inputs], Tensor]:
+    return lambda node, inputs: function(inputs[0])
 
 
-def _binary(function: Callable[[Tensor, Tensor], Tensor]) -> Callable[[Node, Given], Tensor]:
-    return lambda node, given: function(given[0], _placed(node, given[0], given[1]))
+def _binary(function: Callable[[Tensor, Tensor], Tensor]) -> Callable[[Node, Inputs], Tensor]:
+    return lambda node, inputs: function(
+        inputs[0], _broadcast_as_before_7(node, inputs[0], inputs[1])
+    )
 
 
-def _folded(function: Callable[[Tensor, Tensor], Tensor]) -> Callable[[Node, Given], Tensor]:
-    return lambda node, given: functools.reduce(function, given)
+def _folded(function: Callable[[Tensor, Tensor], Tensor]) -> Callable[[Node, Inputs], Tensor]:
+    return lambda node, inputs: functools.reduce(function, inputs)
 
 
 OPERATORS.update({name: _unary(f) for name, f in _UNARY.items()})
@@ -91,8 +93,8 @@ OPERATORS.update({name: _binary(f) for name, f in _BINARY.items()})
 OPERATORS.update({name: _folded(f) for name, f in _FOLDED.items()})
 
 
-def _placed(node: Node, a: Tensor, b: Tensor) -> Tensor:
-    """Before opset 7, `axis` said where the dimensions of b start in a."""
+def _broadcast_as_before_7(node: Node, a: Tensor, b: Tensor) -> Tensor:
+    """Before opset 7, `axis` is the dimension of a where those of b start."""
     axis = node.get("axis")
     if node.opset >= 7 or axis is None or not node.get("broadcast"):
         return b
@@ -101,48 +103,48 @@ def _placed(node: Node, a: Tensor, b: Tensor) -> Tensor:
 
 
 @operator("Div")
-def div(node: Node, given: Given) -> Tensor:
-    a, b = given[0], _placed(node, given[0], given[1])
+def div(node: Node, inputs: Inputs) -> Tensor:
+    a, b = inputs[0], _broadcast_as_before_7(node, inputs[0], inputs[1])
     whole = not a.is_floating_point() and not b.is_floating_point()
     return torch.div(a, b, rounding_mode="trunc") if whole else a / b
 
 
 @operator("Mean")
-def mean(node: Node, given: Given) -> Tensor:
-    total: Tensor = functools.reduce(torch.add, given)
-    return total / len(given)
+def mean(node: Node, inputs: Inputs) -> Tensor:
+    total: Tensor = functools.reduce(torch.add, inputs)
+    return total / len(inputs)
 
 
 @operator("Mod")
-def mod(node: Node, given: Given) -> Tensor:
-    return (torch.fmod if node.get("fmod", 0) else torch.remainder)(given[0], given[1])
+def mod(node: Node, inputs: Inputs) -> Tensor:
+    return (torch.fmod if node.get("fmod", 0) else torch.remainder)(inputs[0], inputs[1])
 
 
 @operator("Pow")
-def power(node: Node, given: Given) -> Tensor:
-    base, exponent = given[0], _placed(node, given[0], given[1])
+def power(node: Node, inputs: Inputs) -> Tensor:
+    base, exponent = inputs[0], _broadcast_as_before_7(node, inputs[0], inputs[1])
     return torch.pow(base, exponent).to(base.dtype)
 
 
 @operator("Where")
-def where(node: Node, given: Given) -> Tensor:
-    return torch.where(given[0], given[1], given[2])
+def where(node: Node, inputs: Inputs) -> Tensor:
+    return torch.where(inputs[0], inputs[1], inputs[2])
 
 
 @operator("IsInf")
-def is_infinite(node: Node, given: Given) -> Tensor:
-    found = torch.zeros_like(given[0], dtype=torch.bool)
+def is_infinite(node: Node, inputs: Inputs) -> Tensor:
+    infinite = torch.zeros_like(inputs[0], dtype=torch.bool)
     if node.get("detect_positive", 1):
-        found = found | torch.isposinf(given[0])
-    return found | torch.isneginf(given[0]) if node.get("detect_negative", 1) else found
+        infinite = infinite | torch.isposinf(inputs[0])
+    return infinite | torch.isneginf(inputs[0]) if node.get("detect_negative", 1) else infinite
 
 
 @operator("Clip")
-def clip(node: Node, given: Given) -> Tensor:
-    low = at(given, 1) if node.opset >= 11 else node.get("min")
-    high = at(given, 2) if node.opset >= 11 else node.get("max")
-    x: Tensor = given[0]
-    # Two steps: where low > high the standard gives high, and either may be left out.
+def clip(node: Node, inputs: Inputs) -> Tensor:
+    low = optional(inputs, 1) if node.opset >= 11 else node.get("min")
+    high = optional(inputs, 2) if node.opset >= 11 else node.get("max")
+    x: Tensor = inputs[0]
+    # Two steps: if low > high, the standard's result is high; either may be left out.
     x = x if low is None else torch.maximum(x, torch.as_tensor(low, dtype=x.dtype, device=x.device))
     if high is None:
         return x
@@ -150,53 +152,53 @@ def clip(node: Node, given: Given) -> Tensor:
 
 
 @operator("LeakyRelu")
-def leaky_relu(node: Node, given: Given) -> Tensor:
-    return F.leaky_relu(given[0], node.get("alpha", 0.01))
+def leaky_relu(node: Node, inputs: Inputs) -> Tensor:
+    return F.leaky_relu(inputs[0], node.get("alpha", 0.01))
 
 
 @operator("PRelu")
-def prelu(node: Node, given: Given) -> Tensor:
-    x, slope = given
+def prelu(node: Node, inputs: Inputs) -> Tensor:
+    x, slope = inputs
     if node.opset < 7 and slope.ndim == 1 and len(slope) > 1:
         slope = slope.reshape(-1, *[1] * (x.ndim - 2))
     return torch.where(x < 0, x * slope, x)
 
 
 @operator("Elu")
-def elu(node: Node, given: Given) -> Tensor:
-    return F.elu(given[0], node.get("alpha", 1.0))
+def elu(node: Node, inputs: Inputs) -> Tensor:
+    return F.elu(inputs[0], node.get("alpha", 1.0))
 
 
 @operator("Celu")
-def celu(node: Node, given: Given) -> Tensor:
-    return F.celu(given[0], node.get("alpha", 1.0))
+def celu(node: Node, inputs: Inputs) -> Tensor:
+    return F.celu(inputs[0], node.get("alpha", 1.0))
 
 
 @operator("Selu")
-def selu(node: Node, given: Given) -> Tensor:
+def selu(node: Node, inputs: Inputs) -> Tensor:
     alpha, gamma = node.get("alpha", 1.6732632423543772), node.get("gamma", 1.0507009873554805)
-    return torch.mul(F.elu(given[0], alpha), gamma)
+    return torch.mul(F.elu(inputs[0], alpha), gamma)
 
 
 @operator("ThresholdedRelu")
-def thresholded_relu(node: Node, given: Given) -> Tensor:
-    return F.threshold(given[0], node.get("alpha", 1.0), 0.0)
+def thresholded_relu(node: Node, inputs: Inputs) -> Tensor:
+    return F.threshold(inputs[0], node.get("alpha", 1.0), 0.0)
 
 
 @operator("HardSigmoid")
-def hard_sigmoid(node: Node, given: Given) -> Tensor:
-    line = torch.add(torch.mul(given[0], node.get("alpha", 0.2)), node.get("beta", 0.5))
+def hard_sigmoid(node: Node, inputs: Inputs) -> Tensor:
+    line = torch.add(torch.mul(inputs[0], node.get("alpha", 0.2)), node.get("beta", 0.5))
     return line.clamp(0, 1)
 
 
 @operator("Gelu")
-def gelu(node: Node, given: Given) -> Tensor:
-    return F.gelu(given[0], approximate=node.get("approximate", "none"))
+def gelu(node: Node, inputs: Inputs) -> Tensor:
+    return F.gelu(inputs[0], approximate=node.get("approximate", "none"))
 
 
 @operator("Softmax", "LogSoftmax")
-def softmax(node: Node, given: Given) -> Tensor:
-    x = given[0]
+def softmax(node: Node, inputs: Inputs) -> Tensor:
+    x = inputs[0]
     function = torch.softmax if node.op == "Softmax" else torch.log_softmax
     if node.opset >= 13:
         return function(x, node.get("axis", -1))
@@ -206,13 +208,13 @@ def softmax(node: Node, given: Given) -> Tensor:
 
 
 @operator("MatMul")
-def matmul(node: Node, given: Given) -> Tensor:
-    return torch.matmul(given[0], given[1])
+def matmul(node: Node, inputs: Inputs) -> Tensor:
+    return torch.matmul(inputs[0], inputs[1])
 
 
 @operator("Gemm")
-def gemm(node: Node, given: Given) -> Tensor:
-    a, b, c = given[0], given[1], at(given, 2)
+def gemm(node: Node, inputs: Inputs) -> Tensor:
+    a, b, c = inputs[0], inputs[1], optional(inputs, 2)
     a = a.T if node.get("transA", 0) else a
     b = b.T if node.get("transB", 0) else b
     product: Tensor = node.get("alpha", 1.0) * (a @ b)
@@ -220,13 +222,13 @@ def gemm(node: Node, given: Given) -> Tensor:
 
 
 @operator("Einsum")
-def einsum(node: Node, given: Given) -> Tensor:
-    return torch.einsum(node.get("equation"), *given)
+def einsum(node: Node, inputs: Inputs) -> Tensor:
+    return torch.einsum(node.get("equation"), *inputs)
 
 
 @operator("CumSum")
-def cumsum(node: Node, given: Given) -> Tensor:
-    x, axis = given[0], whole_numbers(given[1])[0]
+def cumsum(node: Node, inputs: Inputs) -> Tensor:
+    x, axis = inputs[0], whole_numbers(inputs[1])[0]
     x = x.flip(axis) if node.get("reverse", 0) else x
     total = x.cumsum(axis, dtype=x.dtype)
     total = total - x if node.get("exclusive", 0) else total
@@ -254,21 +256,21 @@ def _product(x: Tensor, axes: list[int], keep: bool) -> Tensor:
 
 
 @operator(*_REDUCTIONS)
-def reduce(node: Node, given: Given) -> Tensor:
+def reduce(node: Node, inputs: Inputs) -> Tensor:
     axes: Any = node.get("axes")
-    if axes is None and at(given, 1) is not None:
-        axes = whole_numbers(given[1])
+    if axes is None and optional(inputs, 1) is not None:
+        axes = whole_numbers(inputs[1])
     if not axes:
         if node.get("noop_with_empty_axes", 0):
-            # Nothing is summed, but what is done to each element still is.
-            return _REDUCTIONS[node.op](given[0][..., None], [-1], False)
-        axes = list(range(given[0].ndim))
-    return _REDUCTIONS[node.op](given[0], list(axes), bool(node.get("keepdims", 1)))
+            # Nothing is summed, but the function of each element is still applied.
+            return _REDUCTIONS[node.op](inputs[0][..., None], [-1], False)
+        axes = list(range(inputs[0].ndim))
+    return _REDUCTIONS[node.op](inputs[0], list(axes), bool(node.get("keepdims", 1)))
 
 
 @operator("ArgMax", "ArgMin")
-def arg_extreme(node: Node, given: Given) -> Tensor:
+def arg_extreme(node: Node, inputs: Inputs) -> Tensor:
     if node.get("select_last_index", 0):
         raise Unsupported("select_last_index")
     function = torch.argmax if node.op == "ArgMax" else torch.argmin
-    return function(given[0], node.get("axis", 0), keepdim=bool(node.get("keepdims", 1)))
+    return function(inputs[0], node.get("axis", 0), keepdim=bool(node.get("keepdims", 1)))

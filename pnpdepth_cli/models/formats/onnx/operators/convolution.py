@@ -1,4 +1,4 @@
-"""Convolutions and pooling, with the standard's ways to pad."""
+"""Convolutions and pooling, with every padding of the standard."""
 
 from __future__ import annotations
 
@@ -9,7 +9,13 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from pnpdepth_cli.models.formats.onnx.operators.table import Given, Node, Unsupported, at, operator
+from pnpdepth_cli.models.formats.onnx.operators.table import (
+    Inputs,
+    Node,
+    Unsupported,
+    operator,
+    optional,
+)
 
 _CONV = {1: F.conv1d, 2: F.conv2d, 3: F.conv3d}
 _TRANSPOSED = {1: F.conv_transpose1d, 2: F.conv_transpose2d, 3: F.conv_transpose3d}
@@ -19,7 +25,7 @@ Pads = list[tuple[int, int]]
 
 
 def _sides(pads: Pads) -> list[int]:
-    """As F.pad has them: the last axis first."""
+    """The pads in the order of F.pad: the last axis first."""
     return [n for pair in reversed(pads) for n in pair]
 
 
@@ -43,8 +49,8 @@ def _pads(
 
 
 @operator("Conv")
-def conv(node: Node, given: Given) -> Tensor:
-    x, weight, bias = given[0], given[1], at(given, 2)
+def conv(node: Node, inputs: Inputs) -> Tensor:
+    x, weight, bias = inputs[0], inputs[1], optional(inputs, 2)
     rank = x.ndim - 2
     stride, dilation = node.get("strides", [1] * rank), node.get("dilations", [1] * rank)
     pads = _pads(node, x.shape[2:], weight.shape[2:], stride, dilation)
@@ -56,8 +62,8 @@ def conv(node: Node, given: Given) -> Tensor:
 
 
 @operator("ConvTranspose")
-def conv_transpose(node: Node, given: Given) -> Tensor:
-    x, weight, bias = given[0], given[1], at(given, 2)
+def conv_transpose(node: Node, inputs: Inputs) -> Tensor:
+    x, weight, bias = inputs[0], inputs[1], optional(inputs, 2)
     rank = x.ndim - 2
     stride, dilation = node.get("strides", [1] * rank), node.get("dilations", [1] * rank)
     extra = list(node.get("output_padding", [0] * rank))
@@ -91,7 +97,7 @@ def _transposed_pads(node: Node, x: Tensor, stride: Sequence[int], full: Sequenc
 
 
 def _pooled(node: Node, x: Tensor) -> tuple[list[int], list[int], list[int], Pads, Pads]:
-    """Kernel, stride, dilation, pads, and the pads with what ceil_mode adds at the end."""
+    """Kernel, stride, dilation, pads, and the pads with those that ceil_mode adds at the end."""
     rank = x.ndim - 2
     kernel = list(node.get("kernel_shape"))
     stride = list(node.get("strides", [1] * rank))
@@ -103,17 +109,17 @@ def _pooled(node: Node, x: Tensor) -> tuple[list[int], list[int], list[int], Pad
     for n, k, s, d, (begin, end) in zip(x.shape[2:], kernel, stride, dilation, pads, strict=True):
         window = (k - 1) * d + 1
         out = math.ceil((n + begin + end - window) / s) + 1
-        if (out - 1) * s >= n + begin:  # a window may not begin in the padding at the end
+        if (out - 1) * s >= n + begin:  # no window begins in the padding at the end
             out -= 1
         grown.append((begin, max(end, (out - 1) * s + window - n - begin)))
     return kernel, stride, dilation, pads, grown
 
 
 @operator("MaxPool")
-def max_pool(node: Node, given: Given) -> Tensor:
+def max_pool(node: Node, inputs: Inputs) -> Tensor:
     if node.outputs > 1:
         raise Unsupported("its second output, the indices")
-    x = given[0]
+    x = inputs[0]
     kernel, stride, dilation, _, grown = _pooled(node, x)
     if any(n for pair in grown for n in pair):
         x = F.pad(x, _sides(grown), value=-math.inf)
@@ -121,8 +127,8 @@ def max_pool(node: Node, given: Given) -> Tensor:
 
 
 @operator("AveragePool")
-def average_pool(node: Node, given: Given) -> Tensor:
-    x = given[0]
+def average_pool(node: Node, inputs: Inputs) -> Tensor:
+    x = inputs[0]
     kernel, stride, dilation, pads, grown = _pooled(node, x)
     if x.ndim != 4 or any(d != 1 for d in dilation):
         raise Unsupported("other than two spatial axes, or dilations")
@@ -138,10 +144,10 @@ def average_pool(node: Node, given: Given) -> Tensor:
 
 
 @operator("GlobalAveragePool")
-def global_average_pool(node: Node, given: Given) -> Tensor:
-    return given[0].mean(list(range(2, given[0].ndim)), keepdim=True)
+def global_average_pool(node: Node, inputs: Inputs) -> Tensor:
+    return inputs[0].mean(list(range(2, inputs[0].ndim)), keepdim=True)
 
 
 @operator("GlobalMaxPool")
-def global_max_pool(node: Node, given: Given) -> Tensor:
-    return given[0].amax(list(range(2, given[0].ndim)), keepdim=True)
+def global_max_pool(node: Node, inputs: Inputs) -> Tensor:
+    return inputs[0].amax(list(range(2, inputs[0].ndim)), keepdim=True)

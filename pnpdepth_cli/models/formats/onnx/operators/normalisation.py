@@ -1,4 +1,4 @@
-"""Normalisations, and whole numbers read as real ones."""
+"""Normalisations, and the dequantisation of weights."""
 
 from __future__ import annotations
 
@@ -6,42 +6,50 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from pnpdepth_cli.models.formats.onnx.operators.table import Given, Node, Unsupported, at, operator
+from pnpdepth_cli.models.formats.onnx.operators.table import (
+    Inputs,
+    Node,
+    Unsupported,
+    operator,
+    optional,
+)
 
 
 @operator("BatchNormalization")
-def batch_norm(node: Node, given: Given) -> Tensor:
+def batch_norm(node: Node, inputs: Inputs) -> Tensor:
     if node.get("training_mode", 0):
         raise Unsupported("training_mode; export the network in eval mode")
-    x, weight, bias, mean, variance = given[:5]
+    x, weight, bias, mean, variance = inputs[:5]
     return F.batch_norm(x, mean, variance, weight, bias, eps=node.get("epsilon", 1e-5))
 
 
 @operator("InstanceNormalization")
-def instance_norm(node: Node, given: Given) -> Tensor:
-    return F.instance_norm(given[0], weight=given[1], bias=given[2], eps=node.get("epsilon", 1e-5))
+def instance_norm(node: Node, inputs: Inputs) -> Tensor:
+    return F.instance_norm(
+        inputs[0], weight=inputs[1], bias=inputs[2], eps=node.get("epsilon", 1e-5)
+    )
 
 
 @operator("LayerNormalization")
-def layer_norm(node: Node, given: Given) -> Tensor:
+def layer_norm(node: Node, inputs: Inputs) -> Tensor:
     if node.outputs > 1:
         raise Unsupported("its second and third output")
-    x, weight, bias = given[0], given[1], at(given, 2)
+    x, weight, bias = inputs[0], inputs[1], optional(inputs, 2)
     shape = list(x.shape[node.get("axis", -1) % x.ndim :])
     bias = None if bias is None else bias.expand(shape)
     return F.layer_norm(x, shape, weight.expand(shape), bias, node.get("epsilon", 1e-5))
 
 
 @operator("RMSNormalization")
-def rms_norm(node: Node, given: Given) -> Tensor:
-    x, weight = given
+def rms_norm(node: Node, inputs: Inputs) -> Tensor:
+    x, weight = inputs
     shape = list(x.shape[node.get("axis", -1) % x.ndim :])
     return F.rms_norm(x, shape, weight.expand(shape), node.get("epsilon", 1e-5))
 
 
 @operator("GroupNormalization")
-def group_norm(node: Node, given: Given) -> Tensor:
-    x, weight, bias = given
+def group_norm(node: Node, inputs: Inputs) -> Tensor:
+    x, weight, bias = inputs
     groups = node.get("num_groups")
     if node.opset < 21:  # one weight per group
         weight, bias = (v.repeat_interleave(x.shape[1] // groups) for v in (weight, bias))
@@ -49,9 +57,9 @@ def group_norm(node: Node, given: Given) -> Tensor:
 
 
 @operator("LRN")
-def local_response_norm(node: Node, given: Given) -> Tensor:
+def local_response_norm(node: Node, inputs: Inputs) -> Tensor:
     return F.local_response_norm(
-        given[0],
+        inputs[0],
         node.get("size"),
         node.get("alpha", 1e-4),
         node.get("beta", 0.75),
@@ -60,23 +68,23 @@ def local_response_norm(node: Node, given: Given) -> Tensor:
 
 
 @operator("LpNormalization")
-def lp_norm(node: Node, given: Given) -> Tensor:
-    x, axis, p = given[0], node.get("axis", -1), node.get("p", 2)
+def lp_norm(node: Node, inputs: Inputs) -> Tensor:
+    x, axis, p = inputs[0], node.get("axis", -1), node.get("p", 2)
     norm = x.norm(p, dim=axis, keepdim=True)
     return torch.where(norm == 0, torch.zeros_like(x), x / norm)
 
 
 @operator("MeanVarianceNormalization")
-def mean_variance_norm(node: Node, given: Given) -> Tensor:
-    x, axes = given[0], list(node.get("axes", [0, 2, 3]))
+def mean_variance_norm(node: Node, inputs: Inputs) -> Tensor:
+    x, axes = inputs[0], list(node.get("axes", [0, 2, 3]))
     centred = x - x.mean(axes, keepdim=True)
-    spread: Tensor = centred.square().mean(axes, keepdim=True).sqrt()
-    return centred / (spread + 1e-9)
+    std: Tensor = centred.square().mean(axes, keepdim=True).sqrt()
+    return centred / (std + 1e-9)
 
 
 @operator("DequantizeLinear")
-def dequantize(node: Node, given: Given) -> Tensor:
-    x, scale, zero = given[0], given[1], at(given, 2)
+def dequantize(node: Node, inputs: Inputs) -> Tensor:
+    x, scale, zero = inputs[0], inputs[1], optional(inputs, 2)
     if node.get("block_size", 0):
         raise Unsupported("blocks")
     if scale.numel() > 1:

@@ -1,4 +1,4 @@
-"""Resize and Upsample in every mode of the standard, as a weighted sum of picked elements.
+"""Resize and Upsample in every mode of the standard, as a weighted sum of input elements.
 
 Along one axis each output element is Σ_k weight[k]·x[index[k]]: one element for nearest, two for
 linear, four for cubic, more where an antialiasing filter is asked for.
@@ -14,19 +14,19 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from pnpdepth_cli.models.formats.onnx.operators.table import (
-    Given,
+    Inputs,
     Node,
     Unsupported,
-    at,
     operator,
+    optional,
     whole_numbers,
 )
 
 
 @operator("Upsample")
-def upsample(node: Node, given: Given) -> Tensor:
-    x = given[0]
-    scales = node.get("scales") if len(given) < 2 else given[1].tolist()
+def upsample(node: Node, inputs: Inputs) -> Tensor:
+    x = inputs[0]
+    scales = node.get("scales") if len(inputs) < 2 else inputs[1].tolist()
     if scales is None:  # the first version had two attributes
         scales = [1.0, 1.0, node.get("height_scale"), node.get("width_scale")]
     mode = {"bilinear": "linear"}.get(node.get("mode", "nearest"), node.get("mode", "nearest"))
@@ -34,11 +34,11 @@ def upsample(node: Node, given: Given) -> Tensor:
 
 
 @operator("Resize")
-def resize(node: Node, given: Given) -> Tensor:
-    x = given[0]
+def resize(node: Node, inputs: Inputs) -> Tensor:
+    x = inputs[0]
     if node.opset < 11:
         plan = _Plan(node.get("mode", "nearest"), "asymmetric", "simple")
-        return _resized(x, plan, given[1].tolist(), None)
+        return _resized(x, plan, inputs[1].tolist(), None)
     plan = _Plan(
         mode=node.get("mode", "nearest"),
         coordinates=node.get("coordinate_transformation_mode", "half_pixel"),
@@ -49,7 +49,7 @@ def resize(node: Node, given: Given) -> Tensor:
     )
     if plan.coordinates == "tf_crop_and_resize":
         raise Unsupported("coordinate_transformation_mode tf_crop_and_resize")
-    given_scales, given_sizes = at(given, 2), at(given, 3)
+    given_scales, given_sizes = optional(inputs, 2), optional(inputs, 3)
     axes = [a % x.ndim for a in node.get("axes", range(x.ndim))]
     if given_sizes is not None and given_sizes.numel():
         sizes = dict(zip(axes, whole_numbers(given_sizes), strict=True))
@@ -73,7 +73,7 @@ def resize(node: Node, given: Given) -> Tensor:
 
 
 class _Plan:
-    """How coordinates of the output fall on the input, and how values are made there."""
+    """How output coordinates map to the input, and how values are interpolated there."""
 
     def __init__(
         self,
@@ -103,7 +103,7 @@ def _resized(x: Tensor, plan: _Plan, scales: list[float] | None, sizes: list[int
 
 
 def _by_torch(x: Tensor, plan: _Plan, factors: list[float], sizes: list[int]) -> Tensor | None:
-    """torch's own resize where it does the same; None elsewhere."""
+    """The result of torch's own resize if it computes the same; else None."""
     exact = all(n * f == s for n, f, s in zip(x.shape, factors, sizes, strict=True))
     picture = x.ndim == 4 and tuple(x.shape[:2]) == tuple(sizes[:2]) and exact
     if not picture or plan.antialias or not x.is_floating_point():
@@ -133,19 +133,19 @@ def _along(x: Tensor, axis: int, index: Tensor, weight: Tensor) -> Tensor:
 
 def _taps(plan: _Plan, size: int, out: int, factor: float) -> tuple[Tensor, Tensor]:
     """Indices and weights (out, k) along one axis."""
-    place = _coordinates(plan.coordinates, size, out, factor)
+    position = _coordinates(plan.coordinates, size, out, factor)
     if plan.mode == "nearest":
-        index = _ROUNDING[plan.nearest](place, factor).long().clamp(0, size - 1)
+        index = _ROUNDING[plan.nearest](position, factor).long().clamp(0, size - 1)
         return index[:, None], torch.ones(out, 1)
     if plan.mode not in ("linear", "cubic"):
         raise Unsupported(f"mode {plan.mode}")
     linear = plan.mode == "linear"
     if linear and not plan.antialias:
-        place = place.clamp(0, size - 1)
+        position = position.clamp(0, size - 1)
     shrink = min(1.0, factor) if plan.antialias else 1.0
     reach = math.ceil((1 if linear else 2) / shrink)
-    index = place.floor().long()[:, None] + torch.arange(1 - reach, reach + 1)
-    distance = (index - place[:, None]) * shrink
+    index = position.floor().long()[:, None] + torch.arange(1 - reach, reach + 1)
+    distance = (index - position[:, None]) * shrink
     weight = (1 - distance.abs()).clamp_min(0) if linear else _cubic(distance, plan.a)
     outside = (index < 0) | (index > size - 1)
     if plan.exclude_outside:
@@ -156,7 +156,7 @@ def _taps(plan: _Plan, size: int, out: int, factor: float) -> tuple[Tensor, Tens
 
 
 def _coordinates(mode: str, size: int, out: int, factor: float) -> Tensor:
-    """Where the output's elements lie on the input; in float32 as runtimes compute it.
+    """The input coordinates of the output's elements; in float32 as runtimes compute them.
 
     A factor that stands for a ratio of sizes is taken as that, lest a half becomes less than one.
     """

@@ -1,4 +1,4 @@
-"""The same numbers in another shape, type or place."""
+"""Operators that change the shape, type or order of elements, or make constants."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from pnpdepth_cli.models.formats.onnx.operators.table import (
-    Given,
+    Inputs,
     Node,
     Unsupported,
-    at,
     operator,
+    optional,
     whole_numbers,
 )
 
@@ -24,55 +24,55 @@ TYPES = {
 """TensorProto.DataType; half precision is computed in float32."""
 
 
-def _axes(node: Node, given: Given) -> list[int] | None:
+def _axes(node: Node, inputs: Inputs) -> list[int] | None:
     axes = node.get("axes")
-    if axes is None and at(given, 1) is not None:
-        axes = whole_numbers(given[1])
+    if axes is None and optional(inputs, 1) is not None:
+        axes = whole_numbers(inputs[1])
     return None if axes is None else list(axes)
 
 
 @operator("Shape")
-def shape(node: Node, given: Given) -> Tensor:
-    return torch.tensor(given[0].shape[node.get("start", 0) : node.get("end")], dtype=torch.int64)
+def shape(node: Node, inputs: Inputs) -> Tensor:
+    return torch.tensor(inputs[0].shape[node.get("start", 0) : node.get("end")], dtype=torch.int64)
 
 
 @operator("Size")
-def size(node: Node, given: Given) -> Tensor:
-    return torch.tensor(given[0].numel())
+def size(node: Node, inputs: Inputs) -> Tensor:
+    return torch.tensor(inputs[0].numel())
 
 
 @operator("Reshape")
-def reshape(node: Node, given: Given) -> Tensor:
-    x = given[0]
-    wanted = node.get("shape") if len(given) < 2 else whole_numbers(given[1])
+def reshape(node: Node, inputs: Inputs) -> Tensor:
+    x = inputs[0]
+    wanted = node.get("shape") if len(inputs) < 2 else whole_numbers(inputs[1])
     if not node.get("allowzero", 0):
         wanted = [x.shape[i] if n == 0 else n for i, n in enumerate(wanted)]
     return x.reshape(wanted)
 
 
 @operator("Flatten")
-def flatten(node: Node, given: Given) -> Tensor:
-    x = given[0]
+def flatten(node: Node, inputs: Inputs) -> Tensor:
+    x = inputs[0]
     axis = node.get("axis", 1)
     axis = axis + x.ndim if axis < 0 else axis
     return x.reshape(math.prod(x.shape[:axis]), -1)
 
 
 @operator("Transpose")
-def transpose(node: Node, given: Given) -> Tensor:
-    x = given[0]
+def transpose(node: Node, inputs: Inputs) -> Tensor:
+    x = inputs[0]
     return x.permute(node.get("perm", list(range(x.ndim))[::-1]))
 
 
 @operator("Squeeze")
-def squeeze(node: Node, given: Given) -> Tensor:
-    axes = _axes(node, given)
-    return given[0].squeeze() if axes is None else given[0].squeeze(axes)
+def squeeze(node: Node, inputs: Inputs) -> Tensor:
+    axes = _axes(node, inputs)
+    return inputs[0].squeeze() if axes is None else inputs[0].squeeze(axes)
 
 
 @operator("Unsqueeze")
-def unsqueeze(node: Node, given: Given) -> Tensor:
-    x, axes = given[0], _axes(node, given)
+def unsqueeze(node: Node, inputs: Inputs) -> Tensor:
+    x, axes = inputs[0], _axes(node, inputs)
     assert axes is not None
     rank = x.ndim + len(axes)
     for axis in sorted(a % rank for a in axes):
@@ -81,9 +81,9 @@ def unsqueeze(node: Node, given: Given) -> Tensor:
 
 
 @operator("Expand")
-def expand(node: Node, given: Given) -> Tensor:
-    x = given[0]
-    wanted = whole_numbers(given[1])
+def expand(node: Node, inputs: Inputs) -> Tensor:
+    x = inputs[0]
+    wanted = whole_numbers(inputs[1])
     rank = max(x.ndim, len(wanted))
     own = [1] * (rank - x.ndim) + list(x.shape)
     wanted = [1] * (rank - len(wanted)) + wanted
@@ -91,21 +91,21 @@ def expand(node: Node, given: Given) -> Tensor:
 
 
 @operator("Tile")
-def tile(node: Node, given: Given) -> Tensor:
-    return given[0].repeat(whole_numbers(given[1]))
+def tile(node: Node, inputs: Inputs) -> Tensor:
+    return inputs[0].repeat(whole_numbers(inputs[1]))
 
 
 @operator("Concat")
-def concat(node: Node, given: Given) -> Tensor:
-    return torch.cat(given, node.get("axis", 1))
+def concat(node: Node, inputs: Inputs) -> Tensor:
+    return torch.cat(inputs, node.get("axis", 1))
 
 
 @operator("Split")
-def split(node: Node, given: Given) -> tuple[Tensor, ...]:
-    x, axis = given[0], node.get("axis", 0)
+def split(node: Node, inputs: Inputs) -> tuple[Tensor, ...]:
+    x, axis = inputs[0], node.get("axis", 0)
     sizes = node.get("split")
-    if sizes is None and at(given, 1) is not None:
-        sizes = whole_numbers(given[1])
+    if sizes is None and optional(inputs, 1) is not None:
+        sizes = whole_numbers(inputs[1])
     if sizes is None:
         parts, total = node.get("num_outputs", node.outputs), x.shape[axis]
         each = math.ceil(total / parts)
@@ -114,15 +114,15 @@ def split(node: Node, given: Given) -> tuple[Tensor, ...]:
 
 
 @operator("Pad")
-def pad(node: Node, given: Given) -> Tensor:
-    x = given[0]
+def pad(node: Node, inputs: Inputs) -> Tensor:
+    x = inputs[0]
     mode = node.get("mode", "constant")
     flat = node.get("pads", node.get("paddings"))
     value = node.get("value", 0.0)
     if flat is None:
-        flat = whole_numbers(given[1])
-        value = 0.0 if at(given, 2) is None else given[2].item()
-    axes = whole_numbers(given[3]) if at(given, 3) is not None else list(range(x.ndim))
+        flat = whole_numbers(inputs[1])
+        value = 0.0 if optional(inputs, 2) is None else inputs[2].item()
+    axes = whole_numbers(inputs[3]) if optional(inputs, 3) is not None else list(range(x.ndim))
     pairs = list(zip(flat[: len(axes)], flat[len(axes) :], strict=True))
     sides = dict(zip((a % x.ndim for a in axes), pairs, strict=True))
     if mode == "constant":
@@ -130,28 +130,28 @@ def pad(node: Node, given: Given) -> Tensor:
         return F.pad(x, [n for pair in each for n in pair], value=value)
     for axis, (begin, end) in sides.items():
         if begin or end:
-            x = x.index_select(axis, _places(mode, x.shape[axis], begin, end).to(x.device))
+            x = x.index_select(axis, _padded_indices(mode, x.shape[axis], begin, end).to(x.device))
     return x
 
 
-def _places(mode: str, size: int, begin: int, end: int) -> Tensor:
-    """Which element of the axis stands at each place of the padded one."""
-    place = torch.arange(-begin, size + end)
+def _padded_indices(mode: str, size: int, begin: int, end: int) -> Tensor:
+    """The index of the input element for each element of the padded axis."""
+    index = torch.arange(-begin, size + end)
     if mode == "edge":
-        return place.clamp(0, size - 1)
+        return index.clamp(0, size - 1)
     if mode == "wrap":
-        return place.remainder(size)
+        return index.remainder(size)
     if mode != "reflect":
         raise Unsupported(f"mode {mode}")
     if size == 1:
-        return torch.zeros_like(place)
-    around = place.remainder(2 * size - 2)
+        return torch.zeros_like(index)
+    around = index.remainder(2 * size - 2)
     return torch.minimum(around, 2 * size - 2 - around)
 
 
 @operator("DepthToSpace")
-def depth_to_space(node: Node, given: Given) -> Tensor:
-    x, b = given[0], node.get("blocksize")
+def depth_to_space(node: Node, inputs: Inputs) -> Tensor:
+    x, b = inputs[0], node.get("blocksize")
     n, c, h, w = x.shape
     if node.get("mode", "DCR") == "CRD":
         return F.pixel_shuffle(x, b)
@@ -160,33 +160,33 @@ def depth_to_space(node: Node, given: Given) -> Tensor:
 
 
 @operator("SpaceToDepth")
-def space_to_depth(node: Node, given: Given) -> Tensor:
-    x, b = given[0], node.get("blocksize")
+def space_to_depth(node: Node, inputs: Inputs) -> Tensor:
+    x, b = inputs[0], node.get("blocksize")
     n, c, h, w = x.shape
     x = x.reshape(n, c, h // b, b, w // b, b).permute(0, 3, 5, 1, 2, 4)
     return x.reshape(n, c * b * b, h // b, w // b)
 
 
 @operator("Cast")
-def cast(node: Node, given: Given) -> Tensor:
+def cast(node: Node, inputs: Inputs) -> Tensor:
     kind = node.get("to")
     if kind not in TYPES:
         raise Unsupported(f"data type {kind}")
-    return given[0].to(TYPES[kind])
+    return inputs[0].to(TYPES[kind])
 
 
 @operator("CastLike")
-def cast_like(node: Node, given: Given) -> Tensor:
-    return given[0].to(given[1].dtype)
+def cast_like(node: Node, inputs: Inputs) -> Tensor:
+    return inputs[0].to(inputs[1].dtype)
 
 
 @operator("Dropout")
-def dropout(node: Node, given: Given) -> Tensor:
-    return given[0].clone()
+def dropout(node: Node, inputs: Inputs) -> Tensor:
+    return inputs[0].clone()
 
 
 @operator("Constant")
-def constant(node: Node, given: Given) -> Tensor:
+def constant(node: Node, inputs: Inputs) -> Tensor:
     for name in ("value", "value_float", "value_floats", "value_int", "value_ints"):
         if name in node.attributes:
             value = node.attributes[name]
@@ -195,18 +195,18 @@ def constant(node: Node, given: Given) -> Tensor:
 
 
 @operator("ConstantOfShape")
-def constant_of_shape(node: Node, given: Given) -> Tensor:
+def constant_of_shape(node: Node, inputs: Inputs) -> Tensor:
     value: Tensor = node.get("value", torch.zeros(1))
-    return value.reshape(()).expand(whole_numbers(given[0])).clone()
+    return value.reshape(()).expand(whole_numbers(inputs[0])).clone()
 
 
 @operator("Range")
-def number_range(node: Node, given: Given) -> Tensor:
-    start, limit, delta = (v.reshape(()).item() for v in given)
-    return torch.arange(start, limit, delta, dtype=given[0].dtype, device=given[0].device)
+def number_range(node: Node, inputs: Inputs) -> Tensor:
+    start, limit, delta = (v.reshape(()).item() for v in inputs)
+    return torch.arange(start, limit, delta, dtype=inputs[0].dtype, device=inputs[0].device)
 
 
 @operator("Trilu")
-def trilu(node: Node, given: Given) -> Tensor:
-    k = 0 if at(given, 1) is None else whole_numbers(given[1])[0]
-    return (torch.triu if node.get("upper", 1) else torch.tril)(given[0], k)
+def trilu(node: Node, inputs: Inputs) -> Tensor:
+    k = 0 if optional(inputs, 1) is None else whole_numbers(inputs[1])[0]
+    return (torch.triu if node.get("upper", 1) else torch.tril)(inputs[0], k)

@@ -1,4 +1,4 @@
-"""What an operator is given, and the table that operators enter themselves into."""
+"""The table of ONNX operators; each function registers itself with `@operator`."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from typing import Any
 
 from torch import Tensor
 
-Given = list[Tensor]
-"""The inputs of a node in order. Optional ones may be absent or None, so `at` reads those."""
+Inputs = list[Tensor]
+"""The inputs of a node in order; `optional` reads those that may be absent or None."""
 
-Operator = Callable[["Node", Given], "Tensor | tuple[Tensor, ...]"]
+Operator = Callable[["Node", Inputs], "Tensor | tuple[Tensor, ...]"]
 
 OPERATORS: dict[str, Operator] = {}
 
@@ -22,21 +22,26 @@ class Unsupported(Exception):
 
 @dataclass(frozen=True, kw_only=True)
 class Node:
-    """A node of the graph: name, operator, version of the operator set, attributes as Python."""
+    """A node of the graph."""
 
     name: str
+    """Unique in the graph."""
     op: str
+    """Name of the operator."""
     opset: int
+    """Version of the standard's set of operators."""
     outputs: int = 1
+    """Number of outputs that are used."""
     attributes: Mapping[str, Any] = field(default_factory=dict)
+    """Attributes as Python values."""
 
     def get(self, name: str, default: Any = None) -> Any:
-        """An attribute, or the standard's default for it."""
+        """Returns an attribute, or the standard's default for it."""
         return self.attributes.get(name, default)
 
 
 def operator(*names: str) -> Callable[[Operator], Operator]:
-    """The decorated function computes these operators."""
+    """Registers the decorated function for these operators."""
 
     def enter(function: Operator) -> Operator:
         for name in names:
@@ -46,11 +51,11 @@ def operator(*names: str) -> Callable[[Operator], Operator]:
     return enter
 
 
-def at(given: Given, place: int) -> Tensor | None:
-    """The input at a place, None where it is left out."""
-    return given[place] if place < len(given) else None
+def optional(inputs: Inputs, index: int) -> Tensor | None:
+    """Returns an input by its index; None if it is left out."""
+    return inputs[index] if index < len(inputs) else None
 
 
 def whole_numbers(values: Tensor) -> list[int]:
-    """An integer tensor as Python numbers."""
+    """Returns the elements of an integer tensor as Python numbers."""
     return [int(v) for v in values.reshape(-1).tolist()]

@@ -1,0 +1,1 @@
+"""Baselines: each file defines `baseline`, a `Baseline`."""

@@ -1,0 +1,126 @@
+"""Outliers: points whose depth is inconsistent with their neighbours'.
+
+A point on a small object is as alone as an outlier. So points are removed only where the others
+predict each other far better without all that are alone; and points that are alone together are no
+outliers, but something that the network has not seen, such as a corridor behind a door.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from pnpdepth_cli.completion.gaussian_process import leave_one_out, neighbourhoods
+from pnpdepth_cli.completion.interpolation import nearest_points
+from pnpdepth_cli.completion.residual_field import ResidualField, residual_field
+from pnpdepth_cli.points import SparsePoints
+
+ALONE = 10.0
+"""Disagreement with all neighbours, in robust standard deviations, at which a weight is 0."""
+
+_COMPARED = 8  # neighbours that a point is compared with,
+_AGREEING = 2  # of which so many must agree with it
+_MIN_DISAGREEMENT = 0.005  # of log depth; less is none
+_NORMAL_MEDIAN = 1.4826  # standard deviation over median of |x|, normal errors
+
+_PASSES = 3  # without the worst outliers, others stand out
+_MIN_POINTS = 5  # fewer do not predict each other
+_MAX_EXACT = 256  # points up to which all predict each other, instead of neighbourhoods
+_CUTOFFS = (4.0, 4.0, 5.0, 6.0, 8.0)  # times the typical error at which a weight is 0, in turn
+_MIN_ERROR = 1e-3  # of the typical error over its standard deviation; less is none
+_MIN_WEIGHT = 0.05  # points with less weight are suspected
+_AROUND, _MOST_SUSPECTED, _HALF_SUSPECTED = 6, 4, 3
+# neighbours: with a fifth of outliers, 2 % of the points have 4 suspected ones
+_FAR_BETTER = 0.5  # the others' errors without the suspected points must fall to this fraction,
+_FAR_BETTER_MANY = 0.65  # or this one where there are many points, whose errors are well known
+
+
+def outliers(prediction: Tensor, points: SparsePoints, rgb: Tensor | None) -> Tensor:
+    """Returns (N,) bool: which points are outliers; none unless some clearly are.
+
+    Args:
+        prediction: (H, W) metres.
+        points: Sparse depth in the same frame.
+        rgb: (3, H, W) in 0…1, or None.
+
+    Raises:
+        NoPointsError: No point has a prediction.
+    """
+    field = residual_field(prediction, points, rgb)
+    keys = _coordinate_keys(field.points)
+    keys = keys[~torch.isin(keys, _coordinate_keys(without_outliers(field).points))]
+    return torch.isin(_coordinate_keys(points.tensors()), keys).to(points.xy.device)
+
+
+def without_outliers(field: ResidualField) -> ResidualField:
+    """Returns the field with only the points that are inliers."""
+    for _ in range(_PASSES):
+        inliers = inlier_mask(field)
+        if bool(inliers.all()):
+            break
+        field = field.select(inliers)
+    return field
+
+
+def inlier_weights(points: SparsePoints, residual: Tensor) -> Tensor:
+    """Returns (N,) 0…1: how consistent each point is with its neighbours.
+
+    A point that no two of its neighbours agree with is an outlier, or on an object so small that
+    nothing can be learnt from it for others.
+
+    Args:
+        points: Sparse depth.
+        residual: (N,) log measured − log predicted depth.
+    """
+    if len(points) <= _AGREEING:
+        return torch.ones_like(residual)
+    xy = points.xy.double()
+    _, near = nearest_points(points, xy, min(_COMPARED + 1, len(points)))
+    apart = (residual[near[:, 1:]] - residual[:, None]).abs().sort(dim=1).values[:, _AGREEING - 1]
+    typical = max(_NORMAL_MEDIAN * float(apart.median()), _MIN_DISAGREEMENT)
+    return (1 - (apart / (ALONE * typical)).square()).clamp_min(0).square()
+
+
+def inlier_mask(field: ResidualField) -> Tensor:
+    """Returns (N,) bool: the points that are inliers; all of them unless some clearly are not.
+
+    Points are weighted by how well their neighbours predict them: first by `inlier_weights`, then,
+    unless there are very many, by the Gaussian process from the other points as they are weighted.
+    """
+    weight, near = inlier_weights(field.points, field.residual), neighbourhoods(field, _MAX_EXACT)
+    if len(near) == 1 and near.shape[1] >= _MIN_POINTS:
+        for cutoff in _CUTOFFS:
+            error, variance = leave_one_out(field, near, weight)
+            ratio = error[0].abs() / variance[0].sqrt()
+            typical = max(_NORMAL_MEDIAN * float(ratio.median()), _MIN_ERROR)
+            weight = (1 - (ratio / (cutoff * typical)).square()).clamp_min(0).square()
+    inliers = weight > _MIN_WEIGHT
+    inliers = inliers | _suspected_together(field.points, ~inliers)
+    weight = torch.where(inliers, weight.clamp_min(_MIN_WEIGHT), weight)
+    if bool(inliers.all()) or not bool(inliers.any()):
+        return torch.ones_like(inliers)
+    with_all, without = (
+        float((error.abs() * weight[near[:, : error.shape[1]]]).sum())
+        for error, _ in (leave_one_out(field, near), leave_one_out(field, near, weight))
+    )
+    far_better = _FAR_BETTER if len(near) == 1 else _FAR_BETTER_MANY
+    return inliers if without < far_better * with_all else torch.ones_like(inliers)
+
+
+def _suspected_together(points: SparsePoints, suspected: Tensor) -> Tensor:
+    """(N,) bool: suspected points most of whose neighbours are suspected, and those beside them."""
+    if len(points) <= _AROUND or not bool(suspected.any()):
+        return torch.zeros_like(suspected)
+    _, near = nearest_points(points, points.xy.double(), _AROUND + 1)
+    near = near[:, 1:]
+    together = suspected & (suspected[near].sum(dim=1) >= _MOST_SUSPECTED)
+    while True:
+        more = together | (suspected & (together[near].sum(dim=1) >= _HALF_SUSPECTED))
+        if torch.equal(more, together):
+            return together
+        together = more
+
+
+def _coordinate_keys(points: SparsePoints) -> Tensor:
+    """(N,) int64: x and y bit by bit, equal for equal coordinates."""
+    return points.xy.float().contiguous().view(torch.int64).flatten()

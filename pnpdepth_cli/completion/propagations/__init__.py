@@ -1,0 +1,1 @@
+"""Propagations of the residual: each file defines `propagation`, a `Propagation`."""

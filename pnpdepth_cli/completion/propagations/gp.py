@@ -1,0 +1,25 @@
+"""Propagation by a Gaussian process (kriging)."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from pnpdepth_cli.completion.gaussian_process import fit, predict, predict_at, predict_with_sigma
+from pnpdepth_cli.completion.propagation import Propagation
+from pnpdepth_cli.completion.residual_field import ResidualField
+from pnpdepth_cli.points import SparsePoints
+
+
+def _at(field: ResidualField, queries: SparsePoints) -> Tensor:
+    """With many points, each query is predicted from the points nearest to it."""
+    features = torch.stack([queries.sample(one) for one in field.features.unbind(2)], dim=1)
+    return predict_at(fit(field), queries.xy, features)
+
+
+propagation = Propagation(
+    title="Gaussian process",
+    dense=lambda field: predict(fit(field)),
+    at=_at,
+    with_sigma=lambda field: predict_with_sigma(fit(field)),
+)

@@ -1,0 +1,133 @@
+"""The layer where a network is cut: found by name, with the errors of one that cannot be cut."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from pnpdepth_cli.core.split.layer_name import LayerName
+from pnpdepth_cli.core.split.structure import tensors_in
+from pnpdepth_cli.errors import LayerError
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class CutPoint:
+    """The layer to cut at, and the submodules around it."""
+
+    layer: str
+    """The layer as the user named it."""
+    name: LayerName
+    """The name in its parts."""
+    module: nn.Module
+    """The layer's module."""
+    modules: Mapping[str, nn.Module]
+    """All submodules by name; one with several names comes several times."""
+    containers: frozenset[nn.Module]
+    """The submodules that contain the layer, itself included."""
+    around_hooks: frozenset[nn.Module]
+    """The submodules with a hooked submodule, whose hooks would not run if they were cached."""
+
+    @classmethod
+    def find(cls, network: nn.Module, layer: str) -> CutPoint:
+        """Returns the cut point of that name. Raises LayerError if there is no such submodule."""
+        name = LayerName.parse(layer)
+        modules = dict(network.named_modules(remove_duplicate=False))
+        if name.module not in modules or not name.module:
+            raise LayerError(_unknown(name.module, [known for known in modules if known]))
+        return cls(
+            layer=layer,
+            name=name,
+            module=modules[name.module],
+            modules=modules,
+            containers=_containers(modules[name.module], modules),
+            around_hooks=_around_hooks(modules),
+        )
+
+    def choose(self, output: Any) -> tuple[tuple[str, ...], Tensor]:
+        """Returns the path and the tensor of z in the layer's output.
+
+        Raises:
+            LayerError: The output has no such tensor, or several and the name chooses none.
+        """
+        candidates = [
+            (path, tensor)
+            for path, tensor in tensors_in(output)
+            if tensor.is_floating_point() and tensor.layout == torch.strided
+        ]
+        names = ", ".join(self.name.of_output(path) for path, _ in candidates)
+        if self.name.key is None and len(candidates) == 1:
+            return candidates[0][0], candidates[0][1].detach()
+        if self.name.key is None:
+            problem = (
+                f"returns several tensors; say which: {names}"
+                if candidates
+                else "returns no tensor"
+            )
+            raise LayerError(f"layer {self.layer!r} {problem}")
+        for path, tensor in candidates:
+            if path == self.name.key:
+                return path, tensor.detach()
+        raise LayerError(f"layer {self.layer!r} has no such output; it has {names}")
+
+    def never_ran(self, ran: Collection[nn.Module], calls: int) -> LayerError:
+        """Returns the error of a pass that did not reach the cut.
+
+        Args:
+            ran: The submodules that ran.
+            calls: How often the layer itself was called.
+        """
+        if self.module in ran:
+            times = f"{calls} time{'s' if calls > 1 else ''}"
+            return LayerError(f"layer {self.layer!r}: it is called only {times}")
+        inside = [
+            name
+            for name, module in self.modules.items()
+            if name.startswith(self.name.module + ".") and module in ran
+        ]
+        hint = f"cut at a part of it: {', '.join(inside[:4])}" if inside else "choose another layer"
+        return LayerError(f"layer {self.layer!r} never runs in this network's forward; {hint}")
+
+    def several_calls(self, calls: int) -> LayerError:
+        """Returns the error of a layer that is called several times, without a choice of one."""
+        choices = ", ".join(f"{self.layer}#{call}" for call in range(1, calls + 1))
+        return LayerError(
+            f"layer {self.layer!r} is called {calls} times; say which call: {choices}"
+        )
+
+    def aliased(self) -> LayerError:
+        """Returns the error of a z that shares memory with a tensor the network changes."""
+        return LayerError(
+            f"layer {self.layer!r}: its output lies in the memory of an earlier tensor, and"
+            " the network changes one in place and reads the other; cut one layer later"
+        )
+
+
+def _containers(inner: nn.Module, modules: Mapping[str, nn.Module]) -> frozenset[nn.Module]:
+    names = [f"{name}." for name, module in modules.items() if module is inner]
+    return frozenset(
+        module
+        for name, module in modules.items()
+        if not name or any(inside.startswith(f"{name}.") for inside in names)
+    )
+
+
+def _around_hooks(modules: Mapping[str, nn.Module]) -> frozenset[nn.Module]:
+    hooked = [name for name, m in modules.items() if m._forward_hooks or m._forward_pre_hooks]
+    return frozenset(m for part, m in modules.items() for name in hooked if _is_within(name, part))
+
+
+def _is_within(name: str, part: str) -> bool:
+    return name != part and (not part or name.startswith(f"{part}."))
+
+
+def _unknown(name: str, known: list[str]) -> str:
+    near = difflib.get_close_matches(name, known, n=3, cutoff=0.5)
+    hint = (
+        f"did you mean {', '.join(near)}?" if near else "`pnpdepth layers --all` lists all of them"
+    )
+    return f"layer {name!r} is not in this network; {hint}"

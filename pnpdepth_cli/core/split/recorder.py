@@ -1,0 +1,173 @@
+"""The learning passes of a cut network: which calls of submodules can be cached."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from pnpdepth_cli.core.split.cut_point import CutPoint
+from pnpdepth_cli.core.split.recording import RecordedCall, Recording, shapes_of
+from pnpdepth_cli.core.split.replay import CutReached, Replay
+from pnpdepth_cli.core.split.saved import SavedTensors
+from pnpdepth_cli.core.split.structure import tensors_in
+from pnpdepth_cli.core.split.watch import Watch
+
+
+@dataclass(eq=False)
+class _Call:
+    """A call as the recorder goes along; `saved` is None unless it can be cached."""
+
+    module: nn.Module
+    saved: SavedTensors | None = None
+    unread: frozenset[tuple[str, ...]] = field(default_factory=frozenset)
+
+    def recorded(self) -> RecordedCall:
+        return RecordedCall(
+            module=self.module,
+            cached=self.saved is not None,
+            copied=self.saved is not None and self.saved.copied,
+            unread=self.unread,
+        )
+
+
+class Recorder:
+    """Notes the calls of one pass that the replay's recording does not know yet.
+
+    Args:
+        cut: Where the network is cut.
+        watch: Sees the operations of the pass.
+        replay: Handles the pass; gets the longer recording when the pass is over.
+        uncacheable: Submodules that contain something which forbids to cache them as a whole;
+            more are added. Their submodules are then recorded one by one.
+    """
+
+    def __init__(
+        self, cut: CutPoint, watch: Watch, replay: Replay, uncacheable: set[nn.Module]
+    ) -> None:
+        self.watch, self.ran = watch, set[nn.Module]()
+        self._cut, self._replay, self._uncacheable = cut, replay, uncacheable
+        known = zip(replay.recording.calls, replay.outputs, strict=True)
+        self._calls = [_Call(call.module, saved) for call, saved in known]
+        self._known = len(self._calls)
+        self._inside_one = False  # in a submodule that is to be cached as a whole
+
+    def run(self, module: nn.Module, inputs: Any, run: Callable[[], Any]) -> Any:
+        """Runs a submodule, watched."""
+        self.watch.note_reads(inputs)
+        with self.watch.seeing_escapes_of(module):
+            return run()
+
+    def record(self, module: nn.Module, inputs: Any, run: Callable[[], Any]) -> Any:
+        """Runs a call and notes it; it is cached if its output can stand for all that it does."""
+        if self._inside_one and module is not self._cut.module:
+            return run()
+        self.ran.add(module)
+        call, index, since = _Call(module), len(self._calls), self.watch.now()
+        self._calls.append(call)
+        before = list(tensors_in(inputs))
+        outer, self._inside_one = self._inside_one, self._may_be_one(module)
+        try:
+            output = run()
+        finally:
+            tried, self._inside_one = self._inside_one, outer
+        if (
+            self.watch.can_stand_for(since, inputs, output)
+            and module not in self._cut.around_hooks
+            and _same_tensors(before, tensors_in(inputs))
+        ):
+            self._drop_from(index + 1)
+            call.saved = RecordedCall(module=module, cached=True).save(output)
+            self.watch.protect(call.saved)
+        elif tried and next(module.children(), None) is not None:
+            self._uncacheable.add(module)
+        if self._is_cut(module):
+            path, z0 = self._cut.choose(output)
+            self._replay.z0 = z0
+            self._replay.recording = Recording(cut=index, path=path)
+            raise CutReached
+        return output
+
+    def finish_front(self, *, promised_static: bool) -> None:
+        """Gives the replay the recording up to the cut."""
+        self._finish(promised_static or not self.watch.escaped, complete=False)
+
+    def finish_rear(self, output: Any, *, promised_static: bool) -> None:
+        """Gives the replay the whole recording, whose last pass returned `output`.
+
+        Raises:
+            LayerError: The cut is ambiguous, or its output cannot be replaced.
+        """
+        self.watch.note_reads(output)
+        calls = self._replay.calls[self._cut.module]
+        if self._cut.name.call is None and calls > 1:
+            raise self._cut.several_calls(calls)
+        if self.watch.torn:
+            raise self._cut.aliased()
+        if self.watch.data_dependent:  # another z may take another path behind the cut
+            self._drop_from(self._known)
+            for call in self._calls:
+                if call.saved is not None:
+                    call.saved.copied = True
+        else:
+            self._release_unread()
+        static = self._replay.recording.static_graph
+        self._finish(static and (promised_static or not self.watch.escaped), complete=True)
+
+    def abandon(self) -> None:
+        """Forgets what this pass has noted."""
+        self._drop_from(self._known)
+
+    def _finish(self, static_graph: bool, *, complete: bool) -> None:
+        replay = self._replay
+        replay.outputs = [call.saved for call in self._calls]
+        replay.recording = Recording(
+            calls=tuple(call.recorded() for call in self._calls),
+            cut=replay.recording.cut,
+            path=replay.recording.path,
+            shapes=shapes_of(replay.arguments.value),
+            static_graph=static_graph,
+            complete=complete,
+        )
+
+    def _is_cut(self, module: nn.Module) -> bool:
+        reached = self._replay.recording.cut is not None
+        chosen = self._cut.name.call in (None, self._replay.calls[module])
+        return not reached and module is self._cut.module and chosen
+
+    def _may_be_one(self, module: nn.Module) -> bool:
+        """True if it ends before the cut, so that what is inside needs no record."""
+        apart = (self._cut.containers, self._cut.around_hooks, self._uncacheable)
+        return self._replay.recording.cut is None and not any(module in each for each in apart)
+
+    def _release_unread(self) -> None:
+        """Saved outputs that only go into other cached submodules lose their memory.
+
+        An expanded number of the same shape replaces them; every pass reads the same tensors.
+        """
+        for call in self._calls:
+            if call.saved is None or call.saved.copied:  # copies were handed out and may be read
+                continue
+            call.unread = frozenset(
+                path for path, t in tensors_in(call.saved.value) if not _is_read(t, self.watch)
+            )
+            call.saved.value = call.recorded().save(call.saved.value).value
+
+    def _drop_from(self, first: int) -> None:
+        for call in self._calls[first:]:
+            if call.saved is not None:
+                call.saved.value = None  # the watch would hold its tensors
+        del self._calls[first:]
+
+
+def _is_read(tensor: Tensor, watch: Watch) -> bool:
+    """True unless it is known that nobody looks into the tensor's memory."""
+    return watch.was_read(tensor) or tensor.is_inference() or tensor.layout != torch.strided
+
+
+def _same_tensors(one: Iterable[tuple[Any, Tensor]], other: Iterable[tuple[Any, Tensor]]) -> bool:
+    """False where a call has changed the lists or dicts among its inputs."""
+    return [(path, id(tensor)) for path, tensor in one] == [(p, id(t)) for p, t in other]

@@ -1,0 +1,73 @@
+"""From the image frame to the network's frame, and back."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from torch import Tensor
+
+from pnpdepth_cli.core.refine import RefineSettings
+from pnpdepth_cli.errors import NoPointsError
+from pnpdepth_cli.frames.frame import DepthMap, Frame
+from pnpdepth_cli.models.aligned import AlignedDepth
+from pnpdepth_cli.models.frame import FrameMap
+from pnpdepth_cli.models.network import Network
+from pnpdepth_cli.points import SparsePoints
+
+
+@dataclass(frozen=True, kw_only=True)
+class PreparedFrame:
+    """A frame as the network takes it."""
+
+    network: Network
+    """The network."""
+    frame: Frame
+    """The frame in the image frame."""
+    map: FrameMap
+    """From the image frame to the network's frame."""
+    arguments: tuple[Tensor, ...]
+    """Arguments of the network."""
+    points: SparsePoints
+    """The points that the network sees, in its frame and on its device."""
+
+    def depth_reader(self, settings: RefineSettings) -> AlignedDepth:
+        """Returns a new reader of the network's output in metres, (1, 1, h, w)."""
+        every = settings.align_every
+        return AlignedDepth(self.network, self.points, settings.align, every=every)
+
+    def to_image(self, depth: Tensor) -> DepthMap:
+        """Returns depth (1, 1, h, w) of the network's frame as (H, W) of the image frame.
+
+        0 where it is unknown.
+        """
+        image = self.map.depth_to_image(depth).cpu().numpy()
+        known = np.isfinite(image) & (image > 0)
+        return np.where(known, image, 0).astype(np.float32)
+
+    def no_points_error(self) -> NoPointsError:
+        """Returns the error of a frame none of whose points the network sees."""
+        return NoPointsError(
+            f"none of the {len(self.frame.points)} sparse points lies inside the part of the image"
+            f" that network {self.network.definition.name!r} sees (rows and columns"
+            f" {self.map.crop})"
+        )
+
+
+def prepare(network: Network, frame: Frame) -> PreparedFrame:
+    """Returns the frame as the network takes it; `points` may be empty.
+
+    Raises:
+        UsageError: The network needs an image and the frame has none.
+        ModelError: The definition does not make arguments of it.
+    """
+    to_network = FrameMap.fit(network.definition.size, *frame.size)
+    points = to_network.points_to_network(frame.points)
+    rgb = None if frame.rgb is None else frame.rgb[None]
+    return PreparedFrame(
+        network=network,
+        frame=frame,
+        map=to_network,
+        arguments=network.arguments(to_network, rgb, points),
+        points=points.tensors(network.device),
+    )

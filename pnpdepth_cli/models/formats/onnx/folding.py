@@ -1,0 +1,107 @@
+"""Keeps the constants that a small ONNX file makes as small as the constants of a network are.
+
+ConstantOfShape, Range, Expand, Concat of a value with itself and many other operators can turn a
+few bytes into gigabytes. `FoldingBudget` knows the size of every result before it is allocated.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.overrides import TorchFunctionMode
+from torch.utils._pytree import tree_flatten, tree_map_only
+
+from pnpdepth_cli.models.formats.onnx.operators import Unsupported
+
+_ALWAYS_ALLOWED = 1 << 24
+"""Elements of one constant."""
+
+_GROWTH = 4
+"""How many times the elements stored in the file one constant may have."""
+
+_CONSTANTS = 4
+"""How many constants of the largest size there may be."""
+
+_ELEMENTWISE = frozenset(
+    {
+        *("add", "sub", "rsub", "mul", "div", "true_divide", "floor_divide", "pow", "remainder"),
+        *("__add__", "__sub__", "__mul__", "__truediv__", "__pow__", "maximum", "minimum", "where"),
+        *("to", "float", "long", "clone", "contiguous", "clamp", "neg", "abs", "sqrt", "exp"),
+        *("reshape", "view", "permute", "transpose", "squeeze", "unsqueeze", "movedim"),
+    }
+)
+"""Functions whose result has the elements of their tensors broadcast together."""
+
+
+class FoldingBudget(TorchFunctionMode):
+    """Inside, an operation whose result is too large raises Unsupported instead of being run.
+
+    Args:
+        stored: Number of elements that the file itself holds.
+    """
+
+    def __init__(self, stored: int) -> None:
+        super().__init__()
+        self._largest = max(_ALWAYS_ALLOWED, _GROWTH * stored)
+        self._left = _CONSTANTS * self._largest
+
+    def __torch_function__(
+        self, func: Any, types: Any, args: Any = (), kwargs: dict[str, Any] | None = None
+    ) -> Any:
+        """Runs the operation if its result fits; see TorchFunctionMode."""
+        kwargs = kwargs or {}
+        self._refuse(_elements_at_most(func, args, kwargs, self._largest))
+        result = func(*args, **kwargs)
+        elements = sum(part.numel() for part in _tensors_in(result) if part._base is None)
+        self._left -= elements
+        self._refuse(elements)
+        return result
+
+    def _refuse(self, elements: float) -> None:
+        if elements > self._largest or self._left < 0:
+            raise Unsupported(f"a constant of {elements:.3g} elements")
+
+
+def _elements_at_most(func: Any, args: Any, kwargs: dict[str, Any], largest: int) -> float:
+    """Elements of the largest result, or a number that it does not exceed."""
+    name = getattr(func, "__name__", "")
+    leaves = tree_flatten((args, kwargs))[0]
+    sizes = [leaf.shape for leaf in leaves if isinstance(leaf, Tensor)]
+    numbers = [abs(leaf) for leaf in leaves if isinstance(leaf, int | float)]
+    if name in _ELEMENTWISE and sizes:
+        return _broadcast(sizes)
+    bound: float = math.prod(max(2, size.numel()) for size in sizes)
+    bound *= math.prod(2 + number for number in numbers)
+    if bound <= largest and name != "arange":  # whose result is larger the smaller its step
+        return bound
+    return _elements_on_meta(func, args, kwargs)
+
+
+def _broadcast(sizes: list[torch.Size]) -> int:
+    axes = max(map(len, sizes))
+    padded = [(*(1 for _ in range(axes - len(size))), *size) for size in sizes]
+    return math.prod(map(max, *padded)) if len(padded) > 1 else math.prod(padded[0])
+
+
+def _elements_on_meta(func: Any, args: Any, kwargs: dict[str, Any]) -> int:
+    """Elements of the largest result, found on the meta device, where nothing is allocated."""
+    args, kwargs = tree_map_only(Tensor, _without_values, (args, kwargs))
+    if kwargs.get("device") is not None:
+        kwargs = {**kwargs, "device": "meta"}
+    try:
+        with torch.device("meta"):
+            result = func(*args, **kwargs)
+    except (RuntimeError, NotImplementedError):  # its size depends on values; it makes few of them
+        return 0
+    return max((part.numel() for part in _tensors_in(result)), default=0)
+
+
+def _tensors_in(value: Any) -> list[Tensor]:
+    return [leaf for leaf in tree_flatten(value)[0] if isinstance(leaf, Tensor)]
+
+
+def _without_values(tensor: Tensor) -> Tensor:
+    return torch.empty_strided(tensor.shape, tensor.stride(), dtype=tensor.dtype, device="meta")

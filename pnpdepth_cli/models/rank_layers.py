@@ -1,0 +1,163 @@
+"""Ranks the layers a network can be cut at by the spacing of the sparse points.
+
+The paper's rule of thumb: the influential field of a point should be as wide as the gap to the next
+point, so that updates reach all pixels. Of such layers, the one with the least of the network
+behind it is the cheapest.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+from torch.utils.flop_counter import FlopCounterMode
+
+from pnpdepth_cli.core.influence import influential_field
+from pnpdepth_cli.core.split import Split
+from pnpdepth_cli.core.split.layer_name import LayerName
+from pnpdepth_cli.errors import ModelError
+from pnpdepth_cli.models.network import Network
+
+
+@dataclass(frozen=True, kw_only=True)
+class MeasuredLayer:
+    """A layer and what a cut there costs and reaches; all but the name is None with a problem."""
+
+    name: str
+    """What `--layer` takes."""
+    shape: tuple[int, ...] | None = None
+    """Shape of z, the layer's output."""
+    stride: float | None = None
+    """Network pixels per element of z; None if z has no two spatial axes."""
+    cost_behind: float | None = None
+    """Fraction of the network's floating-point operations behind the cut, which every update
+    repeats; None if the network has none that are counted."""
+    seconds_behind: float | None = None
+    """Seconds that one pass of the part behind the cut took here."""
+    parameters: int | None = None
+    """Number of weights of the layer itself."""
+    field_in_z: tuple[int, int] | None = None
+    """Rows and columns of z that one point influences; see `InfluentialField`."""
+    field_in_output: tuple[int, int] | None = None
+    """Rows and columns of the depth map that one point influences."""
+    rank: int | None = None
+    """1 for the layer to cut at for the spacing of the points; None if that is not known."""
+    problem: str | None = None
+    """Why the network cannot be cut here."""
+
+
+def best_layer(
+    network: Network, arguments: tuple[Tensor, ...], size: tuple[int, int], point_count: int
+) -> str | None:
+    """Returns the layer of the definition that is ranked first for so many points in a frame.
+
+    Args:
+        network: Its definition's layers are measured.
+        arguments: The network's arguments for the frame, real or synthetic.
+        size: Rows and columns of the network's input.
+        point_count: Sparse points in the frame, taken to be spread evenly.
+
+    Returns:
+        None if there are no points, or no layer that the network can be cut at.
+    """
+    if not point_count:
+        return None
+    layers = measure_layers(network, network.definition.layers, arguments, size)
+    ranked = rank_layers(layers, point_spacing(size, point_count))
+    return next((layer.name for layer in ranked if layer.rank == 1), None)
+
+
+def point_spacing(size: tuple[int, int], point_count: int) -> float:
+    """Returns the distance, in pixels, between evenly spread points: √(area / number).
+
+    Args:
+        size: Rows and columns of the frame.
+        point_count: Number of points in it, at least 1.
+    """
+    return math.sqrt(size[0] * size[1] / point_count)
+
+
+def rank_layers(layers: Iterable[MeasuredLayer], spacing: float) -> list[MeasuredLayer]:
+    """Returns the layers, in their order, each with its rank for the spacing of the points.
+
+    Layers whose influential field in the depth map is at least as wide as the gap between points
+    come first, the one with the least cost behind the cut before the others. Then come the others,
+    the one with the widest field before the others. Layers with a problem have no rank.
+
+    Args:
+        layers: As measured.
+        spacing: Pixels of the network's frame between neighbouring points; see `point_spacing`.
+    """
+
+    def by_preference(layer: MeasuredLayer) -> tuple[bool, float]:
+        assert layer.field_in_output is not None
+        field = min(layer.field_in_output)
+        reaches = field >= spacing
+        return (not reaches, (layer.cost_behind or 0.0) if reaches else -float(field))
+
+    layers = list(layers)
+    usable = sorted((layer for layer in layers if layer.problem is None), key=by_preference)
+    ranks = {layer.name: rank for rank, layer in enumerate(usable, start=1)}
+    return [replace(layer, rank=ranks.get(layer.name)) for layer in layers]
+
+
+def measure_layers(
+    network: Network,
+    names: Sequence[str],
+    arguments: tuple[Tensor, ...],
+    size: tuple[int, int],
+    on_layer: Callable[[int, int], None] = lambda done, of: None,
+) -> list[MeasuredLayer]:
+    """Returns the layers, each measured by a cut there.
+
+    Args:
+        network: The network.
+        names: The layers, in the order of the result.
+        arguments: The network's arguments for one frame, real or synthetic.
+        size: Rows and columns of the network's input.
+        on_layer: Called after each layer with the number of layers done and of all.
+    """
+    measured = []
+    with torch.no_grad(), FlopCounterMode(display=False) as whole:
+        network.depth_of(network.module(*arguments))
+    for done, name in enumerate(names, start=1):
+        measured.append(_measure(network, name, arguments, size[0], whole.get_total_flops()))
+        on_layer(done, len(names))
+    return measured
+
+
+def _measure(
+    network: Network, name: str, arguments: tuple[Tensor, ...], rows: int, whole_flops: int
+) -> MeasuredLayer:
+    try:
+        with Split(network.module, name) as split, torch.no_grad():
+            z = split.front(*arguments)
+            split.rear(z)
+            with FlopCounterMode(display=False) as behind:
+                split.rear(z)
+            start = time.perf_counter()
+            split.rear(z)
+            seconds = time.perf_counter() - start
+            # On the raw output: where inverse depth is clamped, depth does not change.
+            field = influential_field(split, z, network.raw_of)
+    except ModelError as error:
+        return MeasuredLayer(name=name, problem=str(error))
+    return MeasuredLayer(
+        name=name,
+        shape=tuple(z.shape),
+        stride=rows / z.shape[-2] if z.ndim == 4 else None,
+        cost_behind=behind.get_total_flops() / whole_flops if whole_flops else None,
+        seconds_behind=seconds,
+        parameters=_parameter_count(network, name),
+        field_in_z=field.in_z,
+        field_in_output=field.in_output,
+    )
+
+
+def _parameter_count(network: Network, name: str) -> int:
+    module = dict(network.module.named_modules())[LayerName.parse(name).module]
+    return sum(parameter.numel() for parameter in module.parameters())

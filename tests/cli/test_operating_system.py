@@ -1,0 +1,232 @@
+"""Errors of the operating system are one line and the right exit code, never a traceback."""
+
+from __future__ import annotations
+
+import errno
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+
+import pytest
+
+from pnpdepth_cli.cli import main as main_module
+from pnpdepth_cli.cli.main import _exit_code, run
+
+SAMPLES = Path(__file__).parents[2] / "samples"
+GT = SAMPLES / "indoor" / "gt.png"
+PNPDEPTH = [sys.executable, "-m", "pnpdepth_cli"]
+POSIX = pytest.mark.skipif(os.name != "posix", reason="needs a POSIX shell")
+NO_ROOT = pytest.mark.skipif(
+    getattr(os, "geteuid", lambda: 0)() == 0, reason="root may read and write everything"
+)
+
+
+def shell(line: str, folder: Path) -> subprocess.CompletedProcess[str]:
+    """The finished line of bash, in which `pnpdepth` is this tree's."""
+    script = f'pnpdepth() {{ {sys.executable} -m pnpdepth_cli "$@"; }}\nset -o pipefail\n{line}\n'
+    environment = os.environ | {"PYTHONPATH": str(SAMPLES.parent)}
+    return subprocess.run(
+        ["bash", "-c", script], cwd=folder, env=environment,
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+
+
+def sample_command(output: str) -> str:
+    return f"pnpdepth sample {GT} --count 5 -o {output}"
+
+
+@POSIX
+def test_a_stdout_closed_before_the_start_does_not_disturb_work_that_needs_none(
+    tmp_path: Path,
+) -> None:
+    done = shell(f"{sample_command('a.npy')} >&-", tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "a.npy").read_bytes().startswith(b"\x93NUMPY")
+    assert "Traceback" not in done.stderr
+
+
+@POSIX
+def test_data_for_a_closed_stdout_is_one_line_and_code_2(tmp_path: Path) -> None:
+    done = shell(f"{sample_command('a.npy')} --json >&-", tmp_path)
+    assert done.returncode == 2
+    assert done.stderr == "pnpdepth: stdout cannot be written to: it is closed\n"
+
+
+@POSIX
+@pytest.mark.parametrize("line", ["pnpdepth models --help | true", "pnpdepth --help | head -1"])
+def test_a_reader_that_stops_early_is_no_error(line: str, tmp_path: Path) -> None:
+    done = shell(line, tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+@POSIX
+def test_a_dry_run_cut_off_is_no_error(tmp_path: Path) -> None:
+    manifest = tmp_path / "frames.csv"
+    row = f"{SAMPLES}/indoor/rgb.png,{SAMPLES}/indoor/sparse.png\n"
+    rows = "".join(f"frame-with-a-long-name-{number:05},{row}" for number in range(3000))
+    manifest.write_text("name,image,sparse\n" + rows)
+    done = shell("pnpdepth batch frames.csv -o out --dry-run 2>err | head -1", tmp_path)
+    assert done.returncode == 0, (tmp_path / "err").read_text()
+    assert "Traceback" not in (tmp_path / "err").read_text()
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no device that is always full")
+def test_a_full_stderr_does_not_stop_the_work(tmp_path: Path) -> None:
+    done = shell(f"{sample_command('a.npy')} 2>/dev/full", tmp_path)
+    assert done.returncode == 0
+    assert (tmp_path / "a.npy").exists()
+    assert shell("pnpdepth refin 2>/dev/full", tmp_path).returncode == 2
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code"),
+    [
+        (["sample", "{long}.png", "--count", "5", "-o", "a.png"], 3),
+        (["sample", str(GT), "--count", "5", "-o", "{long}.png"], 2),
+        (["refine", str(GT), "--sparse", "{long}"], 3),
+        (["refine", str(GT), "--sparse", str(GT), "--model", "{long}.onnx", "-o", "a"], 4),
+        (["batch", "{long}", "-o", "out"], 3),
+        (["eval", "{long}", "{long}"], 3),
+    ],
+)
+def test_names_of_5000_characters_are_one_line(
+    arguments: list[str], code: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    monkeypatch.chdir(tmp_path)
+    long = "n" * 5000
+    assert run([word.format(long=long) for word in arguments]) == code
+    last = capsys.readouterr().err.splitlines()[-1]
+    assert last.startswith("pnpdepth: ")
+    assert len(last) < 2100
+
+
+@POSIX
+@NO_ROOT
+@pytest.mark.parametrize(("option", "code"), [("-o", 2), ("--checkpoint", 4), ("--sparse", 3)])
+def test_a_folder_without_permission_is_one_line(option: str, code: int, tmp_path: Path) -> None:
+    closed = tmp_path / "closed"
+    closed.mkdir(mode=0)
+    shutil.copytree(SAMPLES / "indoor", tmp_path / "indoor")
+    given = {"--sparse": "indoor/sparse.png", "-o": "out"} | {option: "closed/x.png"}
+    words = " ".join(f"{name} {value}" for name, value in given.items())
+    done = shell(f"pnpdepth refine indoor/rgb.png {words}", tmp_path)
+    closed.chmod(0o700)
+    assert done.returncode == code, done.stderr
+    assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("path", "number", "code"),
+    [
+        ("in.png", errno.EACCES, 3),
+        ("out/x_depth.png", errno.EACCES, 2),
+        ("net.onnx", errno.EACCES, 4),
+        ("weights/a/b", errno.EACCES, 4),
+        ("table.csv", errno.ENAMETOOLONG, 2),
+        ("in_refined", errno.EACCES, 2),
+        (None, errno.ENOSPC, 2),
+        (None, errno.EIO, 3),
+    ],
+)
+def test_the_code_of_an_error_follows_from_the_option_of_its_file(
+    path: str | None, number: int, code: int
+) -> None:
+    arguments = ["refine", "in.png", "--sparse", "s.png", "-o", "out", "--model", "net.onnx"]
+    arguments += ["--checkpoint=weights", "--csv", "table.csv"]
+    assert _exit_code(OSError(number, os.strerror(number), path), arguments) == code
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "line"),
+    [
+        (MemoryError(), 6, "memory is exhausted"),
+        (RuntimeError("DefaultCPUAllocator: can't allocate memory"), 6, "memory is exhausted"),
+        (ImportError("failed to map segment from shared object"), 6, "memory is exhausted"),
+        (PermissionError(errno.EACCES, "Permission denied", str(GT)), 3, "gt.png: Permission"),
+        (KeyboardInterrupt(), 130, "interrupted"),
+    ],
+)
+def test_an_error_of_the_system_is_one_line(
+    error: BaseException, code: int, line: str,
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    def failing(arguments: list[str]) -> int:
+        raise error
+
+    monkeypatch.setattr(main_module, "_run_command", failing)
+    assert run([]) == code
+    err = capsys.readouterr().err
+    assert err.startswith("pnpdepth: ")
+    assert line in err
+    assert err.count("\n") == 1
+
+
+def test_a_bug_stays_a_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
+    def failing(arguments: list[str]) -> int:
+        raise RuntimeError("a bug")
+
+    monkeypatch.setattr(main_module, "_run_command", failing)
+    with pytest.raises(RuntimeError, match="a bug"):
+        run([])
+
+
+def python(code: str, environment: Mapping[str, str] = {}) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-c", code], env={**os.environ, **environment},
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+
+
+def test_ctrl_c_during_the_first_imports_is_one_line(tmp_path: Path) -> None:
+    (tmp_path / "click.py").write_text("raise KeyboardInterrupt")
+    path = os.pathsep.join([str(tmp_path), str(SAMPLES.parent)])
+    done = python("from pnpdepth_cli.cli.start import main; main()", {"PYTHONPATH": path})
+    assert (done.returncode, done.stderr) == (130, "pnpdepth: interrupted\n")
+
+
+@POSIX
+def test_ctrl_c_at_the_very_end_keeps_the_exit_code() -> None:
+    done = python(
+        "import atexit, os, signal, sys\n"
+        "atexit.register(lambda: os.kill(os.getpid(), signal.SIGINT))\n"
+        "sys.argv = ['pnpdepth', '--version']\n"
+        "from pnpdepth_cli.cli.start import main\nmain()\n"
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    assert signal.SIGINT  # the signal exists here
+
+
+@POSIX
+def test_little_memory_ends_with_code_6_or_works(tmp_path: Path) -> None:
+    line = f"ulimit -v 400000; pnpdepth refine {SAMPLES}/indoor/rgb.png --sparse {GT} -o out"
+    done = shell(line, tmp_path)
+    assert done.returncode == 6, done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_several_outputs_to_one_file_are_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    table = str(tmp_path / "x")
+    other = str(tmp_path / "." / "x")
+    for command in ("eval", "compare"):
+        assert run([command, str(GT), str(GT), "--csv", table, "--markdown", other]) == 2
+        assert "--csv and --markdown are the same file" in capsys.readouterr().err
+        assert run([command, str(GT), str(GT), "--latex", table, "--markdown", other]) == 2
+        assert "--markdown and --latex are the same file" in capsys.readouterr().err
+
+
+def test_a_conversion_into_its_own_source_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    source = tmp_path / "a.safetensors"
+    source.write_bytes(b"kept")
+    for target in (source, tmp_path / "." / "a.safetensors"):
+        assert run(["models", "convert", str(source), str(target), "--overwrite"]) == 2
+        assert "is the checkpoint itself" in capsys.readouterr().err
+        assert source.read_bytes() == b"kept"

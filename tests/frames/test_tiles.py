@@ -1,0 +1,195 @@
+"""Frames refined tile by tile, against the whole frame and against what a seam would be."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from torch import nn
+
+from pnpdepth_cli.core.refine import RefineSettings
+from pnpdepth_cli.core.split import Split
+from pnpdepth_cli.errors import UsageError
+from pnpdepth_cli.frames.frame import Frame, RefinedFrame
+from pnpdepth_cli.frames.refine import refine_frame
+from pnpdepth_cli.frames.tiles import OVERLAP, refine_tiled, tiles_of
+from pnpdepth_cli.models.definition import ModelDefinition, Multiple
+from pnpdepth_cli.models.network import Network, load_network
+from pnpdepth_cli.pipeline.refinement.inputs import read_inputs
+from pnpdepth_cli.pipeline.refinement.refine import load_refiner
+from pnpdepth_cli.pipeline.refinement.request import RefineRequest
+from pnpdepth_cli.points import SparsePoints
+from tests.pipeline.frames import frame_on_disk
+
+CPU = torch.device("cpu")
+PLAIN = RefineSettings(iterations=0)
+SIDE = 64
+
+
+class PixelByPixel(nn.Module):
+    """Metres from the colour of each pixel alone: a tile sees what the whole frame sees."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.features, self.depth = nn.Conv2d(3, 4, 1), nn.Conv2d(4, 1, 1)
+
+    def forward(self, rgb: torch.Tensor) -> torch.Tensor:
+        depth: torch.Tensor = 2.0 + self.depth(torch.tanh(self.features(rgb)))
+        return depth
+
+
+class OneNumber(PixelByPixel):
+    """One depth for all of what it is shown, so that tiles differ as much as they can."""
+
+    def forward(self, rgb: torch.Tensor) -> torch.Tensor:
+        z = self.features(rgb).mean(dim=(2, 3), keepdim=True)
+        return (2.0 + z.sum(dim=1, keepdim=True)).expand(-1, 1, *rgb.shape[-2:])
+
+
+def network(module: nn.Module) -> Network:
+    definition = ModelDefinition(
+        name="toy", input_kind="rgb", size=Multiple(1), build=type(module), layers=("features",)
+    )
+    return Network(definition=definition, module=module.eval(), checkpoint=None, device=CPU)
+
+
+def frame_of(xy: list[tuple[int, int]], depth: list[float], size: tuple[int, int]) -> Frame:
+    points = SparsePoints(
+        xy=torch.tensor(xy, dtype=torch.float32), depth=torch.tensor(depth), size=size
+    )
+    rgb = np.random.default_rng(0).random((*size, 3), dtype=np.float32)
+    return Frame(rgb=torch.from_numpy(rgb).permute(2, 0, 1).contiguous(), points=points)
+
+
+def everywhere(size: tuple[int, int], step: int = 8) -> Frame:
+    xy = [(x, y) for y in range(0, size[0], step) for x in range(0, size[1], step)]
+    return frame_of(xy, [2.0 if x < size[1] // 2 else 2.4 for x, _ in xy], size)
+
+
+def tiled(
+    module: nn.Module, settings: RefineSettings, one: Frame, propagation: str = "none"
+) -> RefinedFrame:
+    with Split(module, "features") as split:
+        return refine_tiled(network(module), split, settings, one, SIDE, propagation=propagation)
+
+
+@given(height=st.integers(1, 300), width=st.integers(1, 300), side=st.integers(16, 128))
+def test_tiles_of_one_size_cover_the_frame_and_overlap_by_a_quarter(
+    height: int, width: int, side: int
+) -> None:
+    tiles = tiles_of((height, width), side)
+    assert {(tile.height, tile.width) for tile in tiles} == {(min(side, height), min(side, width))}
+    covered = np.zeros((height, width), np.float32)
+    for tile in tiles:
+        assert 0 <= tile.top <= height - tile.height
+        assert 0 <= tile.left <= width - tile.width
+        weights = tile.weights((height, width))
+        assert weights.min() > 0
+        assert weights.max() <= 1
+        part = tile.of(covered)
+        part += weights
+    assert covered.min() > 0.2
+    lefts = sorted({tile.left for tile in tiles})
+    assert all(b - a <= side * (1 - OVERLAP) + 1 for a, b in itertools.pairwise(lefts))
+
+
+@given(
+    st.lists(st.tuples(st.floats(-0.5, 149.25), st.floats(-0.5, 99.25)), min_size=1, max_size=30)
+)
+def test_every_point_is_in_a_tile_at_its_place_and_in_no_tile_it_lies_outside_of(
+    places: list[tuple[float, float]],
+) -> None:
+    points = SparsePoints(
+        xy=torch.tensor(places), depth=torch.arange(1.0, len(places) + 1), size=(100, 150)
+    )
+    found = set()
+    for tile in tiles_of((100, 150), SIDE):
+        part = tile.points(points)
+        assert part.size == (tile.height, tile.width)
+        found |= set(part.depth.tolist())
+        back = part.xy + torch.tensor([float(tile.left), float(tile.top)])
+        assert torch.allclose(back, points.xy[part.depth.long() - 1], atol=1e-4)
+        assert bool((part.xy >= -0.5).all() and (part.xy < SIDE - 0.5).all())
+    assert found == set(points.depth.tolist())
+
+
+def test_a_network_that_sees_pixels_alone_gives_the_same_in_tiles_as_in_one_piece() -> None:
+    torch.manual_seed(0)
+    module, one = PixelByPixel(), everywhere((100, 150))
+    with Split(module, "features") as split:
+        whole = refine_frame(network(module), split, PLAIN, one)
+    found = tiled(module, PLAIN, one)
+    np.testing.assert_allclose(found.after, whole.after, rtol=1e-5)
+    np.testing.assert_allclose(found.before, whole.before, rtol=1e-5)
+    assert found.notes[-1].startswith("tiles: 6 of 64×64 pixels")
+
+
+def test_a_frame_no_larger_than_a_tile_is_refined_in_one_piece() -> None:
+    torch.manual_seed(0)
+    module, one = PixelByPixel(), everywhere((60, 64))
+    settings = RefineSettings(iterations=3)
+    with Split(module, "features") as split:
+        whole = refine_frame(network(module), split, settings, one)
+    found = tiled(module, settings, one)
+    assert np.array_equal(found.after, whole.after)
+    assert found.notes == whole.notes
+
+
+def test_the_depths_of_tiles_run_into_each_other_without_a_step() -> None:
+    torch.manual_seed(0)
+    settings = RefineSettings(iterations=60, lr=0.01)
+    after = tiled(OneNumber(), settings, everywhere((64, 400))).after
+    assert after.max() / after.min() > 1.15
+    # where two tiles differ by that much, no two neighbours differ by more than its share
+    overlap = OVERLAP * SIDE
+    steps = np.abs(np.diff(after, axis=1)) / after[:, :-1]
+    assert steps.max() < 1.1 * (after.max() / after.min() - 1) / overlap
+
+
+def test_tiles_with_too_few_points_show_the_depth_of_the_whole_frame_and_it_is_said() -> None:
+    torch.manual_seed(0)
+    module = OneNumber()
+    one = frame_of([(x, 10 + x) for x in range(10)], [3.0] * 10, (64, 300))
+    found = tiled(module, RefineSettings(iterations=200, lr=0.01), one)
+    assert np.unique(found.after[:, 100:]).size <= 3  # one number, to the last bit of a division
+    np.testing.assert_allclose(found.after[:, 100:], found.after[0, 299], rtol=1e-6)
+    assert "of them left as in the whole frame, with fewer than 5 points" in found.notes[-1]
+
+
+def test_propagation_follows_once_over_all_tiles() -> None:
+    torch.manual_seed(0)
+    module, one = PixelByPixel(), everywhere((64, 150))
+    found = tiled(module, PLAIN, one, "gp")
+    at_points = one.points.sample(torch.from_numpy(found.after))
+    assert float((at_points - one.points.depth).abs().mean()) < 0.05
+    assert (
+        float((one.points.sample(torch.from_numpy(found.before)) - one.points.depth).abs().mean())
+        > 0.2
+    )
+
+
+def test_tiles_and_folds_do_not_go_together(tmp_path_factory: pytest.TempPathFactory) -> None:
+    frame = frame_on_disk(tmp_path_factory.mktemp("frame"))
+    request = RefineRequest.from_fields(image=frame.image, sparse=frame.sparse, tile=64, auto=True)
+    with pytest.raises(UsageError, match="--tile goes with none of --auto"):
+        load_refiner(request, read_inputs(request))
+
+
+def test_the_split_is_as_before_for_the_next_frame(
+    tmp_path_factory: pytest.TempPathFactory,
+) -> None:
+    frame = frame_on_disk(tmp_path_factory.mktemp("frame"))
+    loaded, one = load_network(str(frame.model), frame.checkpoint), everywhere((100, 150))
+    settings = RefineSettings(iterations=3)
+    with Split(loaded.module, "middle") as split:
+        first = refine_tiled(loaded, split, settings, one, SIDE)
+        small = refine_frame(loaded, split, settings, everywhere((60, 64)))
+        again = refine_tiled(loaded, split, settings, one, SIDE)
+    assert np.array_equal(first.after, again.after)
+    with Split(loaded.module, "middle") as split:
+        alone = refine_frame(loaded, split, settings, everywhere((60, 64)))
+    assert np.array_equal(small.after, alone.after)

@@ -1,0 +1,204 @@
+"""--auto, --baselines, --uncertainty and --propagate of `pnpdepth refine` and `batch`."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from pnpdepth_cli.auto.auto import Choice, ScoredCandidate, refine_automatically
+from pnpdepth_cli.auto.candidates import (
+    Candidate,
+    RefinementConfig,
+    default_configs,
+)
+from pnpdepth_cli.choices import BASELINES
+from pnpdepth_cli.core.refine import RefineSettings
+from pnpdepth_cli.errors import ModelError, UsageError
+from pnpdepth_cli.frames.frame import Frame
+from pnpdepth_cli.io.depth import read_depth
+from pnpdepth_cli.models.definition import InputKind
+from pnpdepth_cli.models.network import Network, load_network
+from pnpdepth_cli.pipeline.refinement import held_out
+from pnpdepth_cli.pipeline.refinement.request import RefineRequest
+from pnpdepth_cli.points import SparsePoints
+from tests.pipeline.batches import NAMES, Heard, batch, pairs_on_disk, results, times
+from tests.pipeline.frames import FrameOnDisk, frame_on_disk, run
+
+SETTINGS = RefineSettings(iterations=3, lr="5%", update="adam")
+CONFIG = RefinementConfig(layer="middle", settings=SETTINGS)
+
+
+@pytest.fixture
+def frame(tmp_path: Path) -> FrameOnDisk:
+    return frame_on_disk(tmp_path)
+
+
+@pytest.fixture
+def network(frame: FrameOnDisk) -> Network:
+    return load_network(str(frame.model), frame.checkpoint)
+
+
+def in_memory(frame: FrameOnDisk, count: int = 60) -> Frame:
+    rng = np.random.default_rng(1)
+    rows, columns = (rng.integers(0, n, count) for n in frame.depth.shape)
+    points = SparsePoints(
+        xy=torch.from_numpy(np.stack([columns, rows], 1).astype(np.float32)),
+        depth=torch.from_numpy(frame.depth[rows, columns]),
+        size=(frame.depth.shape[0], frame.depth.shape[1]),
+    )
+    rgb = rng.random((*frame.depth.shape, 3), dtype=np.float32)
+    return Frame(rgb=torch.from_numpy(rgb).permute(2, 0, 1).contiguous(), points=points)
+
+
+@pytest.mark.parametrize(
+    ("kind", "network_m", "warned"),
+    [
+        ("rgb+sparse", 0.3, True),
+        ("rgb+sparse", 0.1, False),
+        ("sparse", 0.3, True),
+        ("rgb", 0.3, False),
+    ],
+)
+def test_of_a_network_that_takes_the_points_it_is_said_what_holding_some_out_does_to_it(
+    frame: FrameOnDisk, network: Network, kind: InputKind, network_m: float, warned: bool
+) -> None:
+    scored = [ScoredCandidate(candidate=Candidate(baseline=name), error=0.2) for name in BASELINES]
+    scored.append(ScoredCandidate(candidate=Candidate(config=CONFIG), error=network_m))
+    best = min(scored, key=lambda one: one.error)
+    choice = Choice(
+        candidates=(best.candidate,),
+        weights=(1.0,),
+        error=best.error,
+        network_error=network_m,
+        scored=tuple(scored),
+    )
+    request = RefineRequest.from_fields(image=frame.image, sparse=frame.sparse, auto=True)
+    notes = held_out.auto_notes(choice, request, replace(network.definition, input_kind=kind))
+    assert notes[0].startswith("auto: ")
+    assert any("takes the points itself" in note for note in notes[1:]) == warned
+
+
+def test_the_networks_error_is_that_of_the_network_alone(
+    frame: FrameOnDisk, network: Network
+) -> None:
+    inputs = in_memory(frame)
+    found = refine_automatically(
+        network, default_configs(network.definition, "middle", SETTINGS), inputs
+    )
+    errors = {str(one.candidate): one.error for one in found.choice.scored}
+    assert found.choice.network_error == errors["network"]
+    assert any("network" in name and name != "network" for name in errors)  # none of it alone
+    request = RefineRequest.from_fields(image=frame.image, sparse=frame.sparse, auto=True)
+    note = held_out.auto_notes(found.choice, request, network.definition)[0]
+    assert f"network {errors['network']:.4f} m" in note
+
+
+@pytest.mark.parametrize(
+    ("asked", "tried"), [(None, {"none", "gp", "diffusion"}), ("gp", {"none", "gp"}),
+                         ("none", {"none"})],
+)  # fmt: skip
+def test_with_auto_only_the_propagation_that_is_asked_for_competes(
+    frame: FrameOnDisk, asked: str | None, tried: set[str]
+) -> None:
+    record = run(frame, auto=True, propagate=asked).record
+    assert {each.get("propagate", "none") for each in record["auto"]["tried"]} == tried
+    assert record["settings"]["propagate"] == asked
+
+
+def test_the_record_says_what_was_chosen_and_everything_that_was_tried(frame: FrameOnDisk) -> None:
+    record = run(frame, auto=True, gt=frame.gt).record
+    made = record["auto"]
+    assert abs(sum(each["weight"] for each in made["chosen"]) - 1) < 1e-9
+    errors = [each["held_out_mae"] for each in made["tried"]]
+    assert errors == sorted(errors)
+    assert made["held_out_mae"] <= errors[0] + 1e-6
+    assert made["held_out_points"] == 60
+    assert any(note.startswith("auto: ") for note in record["notes"])
+    saved = json.loads((frame.folder / "out" / "img.json").read_text())
+    assert saved["auto"] == json.loads(json.dumps(made))
+
+
+def test_the_same_request_gives_the_same_bytes(frame: FrameOnDisk) -> None:
+    run(frame, auto=True, uncertainty=True, output=frame.folder / "a")
+    run(frame, auto=True, uncertainty=True, output=frame.folder / "b")
+    for name in ("img_depth.png", "img_sigma.exr"):
+        assert (frame.folder / "a" / name).read_bytes() == (frame.folder / "b" / name).read_bytes()
+
+
+def test_baselines_are_scored_at_held_out_points_and_against_the_truth(frame: FrameOnDisk) -> None:
+    found = run(frame, baselines=True, gt=frame.gt).record["baselines"]
+    assert set(found) == {*BASELINES, "network", "result"}
+    for row in found.values():
+        assert row["held_out_mae"] > 0
+        assert row["scores"]["mae"] > 0
+    plain = run(frame, gt=frame.gt, output=frame.folder / "plain").record["scores"]
+    assert found["result"]["scores"]["mae"] == plain["after"]["mae"]  # nothing else has changed
+    assert found["network"]["scores"]["mae"] == plain["before"]["mae"]
+
+
+def test_the_standard_deviation_is_positive_and_in_a_file_of_its_own(frame: FrameOnDisk) -> None:
+    record = run(frame, uncertainty=True).record
+    sigma = read_depth(Path(record["outputs"]["sigma"])).values
+    assert sigma.shape == frame.depth.shape
+    assert (sigma > 0).all()
+    with pytest.raises(UsageError, match="--uncertainty writes a second file"):
+        run(frame, uncertainty=True, output=frame.folder / "depth.exr")
+
+
+def test_propagation_follows_refinement(frame: FrameOnDisk) -> None:
+    plain = run(frame, format="npy", output=frame.folder / "plain")
+    spread = run(frame, format="npy", output=frame.folder / "gp", propagate="gp")
+    errors = [each.record["sparse_error"]["after"]["mae"] for each in (plain, spread)]
+    assert errors[1] < errors[0]
+
+
+def test_a_batch_finds_its_ways_on_a_few_frames_and_checks_them_on_each(tmp_path: Path) -> None:
+    root = pairs_on_disk(tmp_path / "drive")
+    heard = Heard()
+    batch(root, heard, refine={"auto": True})
+    (said,) = [text for text in heard.said if text.startswith("auto: ")]
+    found = said.partition(": best on ")[2].partition(": ")[2].split("; ")
+    for name in NAMES:
+        made = json.loads((root / "out" / f"{name}.json").read_text())["auto"]
+        tried = {each["way"] for each in made["tried"]}
+        assert set(found) <= tried
+        assert {*BASELINES, "network"} <= tried
+        assert made["held_out_mae"] <= made["tried"][0]["held_out_mae"] + 1e-6
+    before = times(root / "out")
+    batch(root, refine={"auto": True})
+    assert times(root / "out") == before
+
+
+def test_a_frame_that_no_way_can_be_found_on_does_not_stop_a_batch(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    root = pairs_on_disk(tmp_path / "drive")
+    whole, calls = held_out.refine_automatically, []
+
+    def failing_first(*given: Any, **options: Any) -> Any:
+        calls.append(None)
+        if len(calls) == 1:
+            raise ModelError("no way")
+        return whole(*given, **options)
+
+    monkeypatch.setattr(held_out, "refine_automatically", failing_first)
+    batch(root, refine={"auto": True})
+    assert all((root / "out" / f"{name}.json").exists() for name in NAMES)
+
+
+def test_shards_find_the_same_ways(tmp_path: Path) -> None:
+    root = pairs_on_disk(tmp_path / "drive")
+    batch(root, refine={"auto": True})
+    whole = results(root / "out")
+    for number in (1, 2):
+        batch(root, refine={"auto": True}, output=tmp_path / "parts", shard=(number, 2))
+    parts = results(tmp_path / "parts")
+    assert {n: b for n, b in parts.items() if isinstance(b, bytes)} == {
+        n: b for n, b in whole.items() if isinstance(b, bytes)
+    }

@@ -1,0 +1,89 @@
+"""docs/extending.md: the files it shows work from another package, through entry points."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from safetensors.torch import save_file
+
+from pnpdepth_cli.models.registry import find_definition
+
+ROOT = Path(__file__).parent.parent
+PAGE = (ROOT / "docs" / "extending.md").read_text(encoding="utf-8")
+SHOWN = dict(re.findall(r'^```\w+ title="(.*?)"\n(.*?)^```', PAGE, flags=re.DOTALL | re.MULTILINE))
+
+
+@pytest.fixture(scope="module")
+def package(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder that holds the page's files as an installed package, and the samples."""
+    folder = tmp_path_factory.mktemp("extending")
+    (folder / "my_package").mkdir()
+    (folder / "my_package" / "__init__.py").touch()
+    for name, text in SHOWN.items():
+        if name.endswith(".py"):
+            (folder / "my_package" / name).write_text(text)
+    info = folder / "my_package-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: my_package\nVersion: 1.0\n")
+    entries = SHOWN["pyproject.toml"].replace('[project.entry-points."', "[").replace('"]\n', "]\n")
+    (info / "entry_points.txt").write_text(entries.replace('"', ""))
+    shutil.copytree(ROOT / "samples" / "indoor", folder / "indoor")
+    network = find_definition(str(folder / "my_package" / "my_net.py")).build()
+    save_file(network.state_dict(), folder / "my_net.safetensors")
+    return folder
+
+
+def run(arguments: list[str], folder: Path) -> str:
+    done = subprocess.run(
+        [sys.executable, "-m", "pnpdepth_cli", *arguments],
+        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), str(folder)])},
+        capture_output=True,
+        text=True,
+        check=False,
+        cwd=folder,
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_the_files_of_the_page_work_from_another_package(package: Path) -> None:
+    files = ["indoor/rgb.png", "--sparse", "indoor/sparse.png"]
+    network = ["--model", "my-net", "--checkpoint", "my_net.safetensors", "--align", "none"]
+    method = ["--loss", "charbonnier", "--update", "rmsprop", "--lr", "1%"]
+    more = ["--propagate", "median", "--baselines"]
+    output = ["--format", "raw", "-o", "out", "--json"]
+    record = json.loads(run(["refine", *files, *network, *method, *more, *output], package))
+    assert record["model"]["name"] == "my-net"
+    assert record["settings"]["loss"] == "charbonnier"
+    assert record["settings"]["update"] == "rmsprop"
+    assert record["settings"]["propagate"] == "median"
+    assert record["baselines"]["farthest"]["held_out_mae"] > 0
+    assert record["loss"][-1] < record["loss"][0]
+    scores = run(["eval", "out/rgb_depth.raw", "indoor/gt.png", "--json"], package)
+    assert json.loads(scores)
+
+
+def test_the_layout_of_the_page_lists_frames(package: Path) -> None:
+    data = package / "data"
+    data.mkdir()
+    shutil.copy(package / "indoor" / "rgb.png", data / "a_image.png")
+    shutil.copy(package / "indoor" / "sparse.png", data / "a_lidar.png")
+    listed = json.loads(run(["batch", "data", "-o", "planned", "--dry-run", "--json"], package))
+    assert [frame["name"] for frame in listed] == ["a"]
+
+
+def test_with_auto_a_propagation_and_a_baseline_of_another_package_compete(package: Path) -> None:
+    files = ["indoor/rgb.png", "--sparse", "indoor/sparse.png"]
+    network = ["--model", "my-net", "--checkpoint", "my_net.safetensors", "--iterations", "2"]
+    output = ["--auto", "-o", "auto.npy", "--json"]
+    record = json.loads(run(["refine", *files, *network, *output], package))
+    tried = record["auto"]["tried"]
+    assert "median" in {each.get("propagate") for each in tried}
+    assert "farthest" in {each.get("baseline") for each in tried}
