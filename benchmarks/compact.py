@@ -36,9 +36,9 @@ from pnpdepth_cli.completion.interpolation import linear, nearest
 from pnpdepth_cli.core.metrics import score
 from pnpdepth_cli.models.frame import FrameMap
 from pnpdepth_cli.models.network import Network, load_network
-from pnpdepth_cli.pipeline.refinement.inputs import Inputs
 from pnpdepth_cli.pipeline.refinement.request import MethodOptions
 from pnpdepth_cli.pipeline.refinement.resolve import resolve_layer, resolve_settings
+from pnpdepth_cli.points import SparsePoints
 
 CELLS = (
     ("7scenes", 500),
@@ -116,39 +116,46 @@ def measure_fusion(
 ) -> dict[str, tuple[float, float]]:
     """(MAE, RMSE) of the plain prediction with and without priors and wrong points."""
     rows, columns, depth = frame_pixels(frame, count, seed)
-    shape = frame.truth.shape
+    shape = frame.gt.shape
     points = points_on_grid(rows, columns, depth, shape)
-    inputs = frame_inputs(frame.rgb, points, frame.truth)
+    rgb = torch.from_numpy(frame.rgb).permute(2, 0, 1)[None]
     rng = np.random.default_rng(seed)
-    sparse = np.zeros_like(frame.truth)
+    sparse = np.zeros_like(frame.gt)
     sparse[rows, columns] = depth
-    useless = torch.from_numpy(nonsense(rng, shape, frame.truth[::-1, ::-1].copy()))
+    useless = torch.from_numpy(nonsense(rng, shape, frame.gt[::-1, ::-1].copy()))
     wrong = points_on_grid(rows, columns, outliers(rng, sparse, 0.2)[rows, columns], shape)
     depths = {
         "linear": linear(points),
-        "plain": predicted(network, inputs),
-        "useless prior": predicted(network, inputs, aligned(useless, points, kind="median")),
-        "a fifth wrong": predicted(network, frame_inputs(frame.rgb, wrong, frame.truth)),
+        "plain": predicted(network, rgb, points),
+        "useless prior": predicted(network, rgb, points, aligned(useless, points, kind="median")),
+        "a fifth wrong": predicted(network, rgb, wrong),
     }
     if prior is not None:
-        dense = aligned(predicted(prior, inputs), points, kind="median")
-        depths |= {"prior alone": dense, "with prior": predicted(network, inputs, dense)}
-    truth = torch.from_numpy(frame.truth)
+        dense = aligned(predicted(prior, rgb, points), points, kind="median")
+        depths |= {"prior alone": dense, "with prior": predicted(network, rgb, points, dense)}
+    truth = torch.from_numpy(frame.gt)
     scores = {name: score(depth, truth) for name, depth in depths.items()}
     return {name: (s.mae, s.rmse) for name, s in scores.items()}
 
 
 @torch.no_grad()
-def predicted(network: Network, inputs: Inputs, prior: Tensor | None = None) -> Tensor:
-    """The network's prediction (H, W) in metres; prior: a third argument (H, W) in metres."""
-    frame = FrameMap.fit(network.definition.size, *inputs.size)
-    points = frame.points_to_network(inputs.points)
-    arguments = network.arguments(frame, inputs.rgb_tensor(), points)
+def predicted(
+    network: Network, rgb: Tensor, points: SparsePoints, prior: Tensor | None = None
+) -> Tensor:
+    """The network's prediction (H, W) in metres.
+
+    Args:
+        network: The network.
+        rgb: The image (1, 3, H, W) in 0..1.
+        points: Points in the image frame.
+        prior: A third argument (H, W) in metres.
+    """
+    frame = FrameMap.fit(network.definition.size, *points.size)
+    arguments = network.arguments(frame, rgb, frame.points_to_network(points))
     if prior is not None:
         size = arguments[0].shape[-2:]
         arguments += (F.interpolate(prior[None, None], size, mode="bilinear"),)
-    depth = network.depth_of(network.module(*arguments))
-    return frame.depth_to_image(depth)
+    return frame.depth_to_image(network.depth_of(network.module(*arguments)))
 
 
 def print_fusion(
