@@ -3,6 +3,9 @@
 Per set and number of points: nearest and linear interpolation of the points, the network's plain
 prediction, and refinement with the definition's defaults; the same points and the same pixels
 (all with known truth) for each. Mean over frames of the per-frame MAE and RMSE.
+
+With `--fusion` the network's plain prediction is measured in other ways: with the depth of another
+network as prior (`--prior`), with a useless prior, and with a fifth of the points wrong.
 """
 
 from __future__ import annotations
@@ -15,6 +18,8 @@ from pathlib import Path
 
 import numpy as np
 import torch
+import torch.nn.functional as F
+from torch import Tensor
 
 from benchmarks.frames import (
     SETS,
@@ -24,17 +29,24 @@ from benchmarks.frames import (
     points_on_grid,
     refined,
 )
+from model_zoo_defs.training.patterns import outliers
+from model_zoo_defs.training.priors import nonsense
+from pnpdepth_cli.completion.alignment import aligned
 from pnpdepth_cli.completion.interpolation import linear, nearest
 from pnpdepth_cli.core.metrics import score
+from pnpdepth_cli.models.frame import FrameMap
 from pnpdepth_cli.models.network import Network, load_network
+from pnpdepth_cli.pipeline.refinement.inputs import Inputs
 from pnpdepth_cli.pipeline.refinement.request import MethodOptions
 from pnpdepth_cli.pipeline.refinement.resolve import resolve_layer, resolve_settings
 
 CELLS = (
     ("7scenes", 500),
     ("7scenes", 100),
+    ("7scenes", 20),
     ("icl_nuim", 500),
     ("icl_nuim", 100),
+    ("icl_nuim", 20),
     ("kitti_dc", None),
 )
 METHODS = ("nearest", "linear", "plain", "refined")
@@ -99,6 +111,56 @@ def measure_cell(
     return row
 
 
+def measure_fusion(
+    network: Network, prior: Network | None, frame: EvalFrame, count: int | None, seed: int
+) -> dict[str, tuple[float, float]]:
+    """(MAE, RMSE) of the plain prediction with and without priors and wrong points."""
+    rows, columns, depth = frame_pixels(frame, count, seed)
+    shape = frame.truth.shape
+    points = points_on_grid(rows, columns, depth, shape)
+    inputs = frame_inputs(frame.rgb, points, frame.truth)
+    rng = np.random.default_rng(seed)
+    sparse = np.zeros_like(frame.truth)
+    sparse[rows, columns] = depth
+    useless = torch.from_numpy(nonsense(rng, shape, frame.truth[::-1, ::-1].copy()))
+    wrong = points_on_grid(rows, columns, outliers(rng, sparse, 0.2)[rows, columns], shape)
+    depths = {
+        "linear": linear(points),
+        "plain": predicted(network, inputs),
+        "useless prior": predicted(network, inputs, aligned(useless, points, kind="median")),
+        "a fifth wrong": predicted(network, frame_inputs(frame.rgb, wrong, frame.truth)),
+    }
+    if prior is not None:
+        dense = aligned(predicted(prior, inputs), points, kind="median")
+        depths |= {"prior alone": dense, "with prior": predicted(network, inputs, dense)}
+    truth = torch.from_numpy(frame.truth)
+    scores = {name: score(depth, truth) for name, depth in depths.items()}
+    return {name: (s.mae, s.rmse) for name, s in scores.items()}
+
+
+@torch.no_grad()
+def predicted(network: Network, inputs: Inputs, prior: Tensor | None = None) -> Tensor:
+    """The network's prediction (H, W) in metres; prior: a third argument (H, W) in metres."""
+    frame = FrameMap.fit(network.definition.size, *inputs.size)
+    points = frame.points_to_network(inputs.points)
+    arguments = network.arguments(frame, inputs.rgb_tensor(), points)
+    if prior is not None:
+        size = arguments[0].shape[-2:]
+        arguments += (F.interpolate(prior[None, None], size, mode="bilinear"),)
+    depth = network.depth_of(network.module(*arguments))
+    return frame.depth_to_image(depth)
+
+
+def print_fusion(
+    network: Network, prior: Network | None, cell: str, frames: list[EvalFrame], count: int | None
+) -> None:
+    """Lines of a Markdown table, one for each way of a cell."""
+    results = [measure_fusion(network, prior, frame, count, seed=0) for frame in frames]
+    for name in results[0]:
+        mae, rmse = np.array([result[name] for result in results]).mean(0)
+        print(f"| {cell} | {len(frames)} | {name} | {mae:.4f} | {rmse:.4f} |", flush=True)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--data", type=Path, required=True)
@@ -106,6 +168,9 @@ def main() -> None:
     parser.add_argument("--checkpoint", type=Path)
     parser.add_argument("--seeds", type=int, default=1)
     parser.add_argument("--every", type=int, default=1, help="use every n-th frame")
+    parser.add_argument("--first", type=int, default=0, help="number of the first frame")
+    parser.add_argument("--fusion", action="store_true", help="priors and wrong points instead")
+    parser.add_argument("--prior", help="network whose prediction is the prior of --fusion")
     parser.add_argument("--layer")
     parser.add_argument("--iterations", type=int)
     parser.add_argument("--lr")
@@ -114,10 +179,14 @@ def main() -> None:
     args = parser.parse_args()
     network = load_network(args.model, args.checkpoint)
     settings = Settings(args.layer, args.iterations, args.lr, args.update)
+    prior = load_network(args.prior, None) if args.prior else None
     table = {}
     for name, count in CELLS:
-        frames = list(SETS[name](args.data))[:: args.every]
+        frames = list(SETS[name](args.data))[args.first :: args.every]
         cell = f"{name}, {count} points" if count else f"{name}, its LiDAR"
+        if args.fusion:
+            print_fusion(network, prior, cell, frames, count)
+            continue
         table[cell] = measure_cell(network, frames, count, args.seeds, settings)
         if not args.json:
             print_row(cell, table[cell], header=len(table) == 1)

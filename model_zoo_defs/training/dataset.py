@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.utils.data import Dataset, Sampler
 
+from model_zoo_defs.training import priors
 from model_zoo_defs.training.patterns import draw
 from pnpdepth_cli.models.definition import IMAGENET_MEAN, IMAGENET_STD
 
@@ -29,11 +30,12 @@ REFRESH_EVERY = 2000
 
 
 class Sample(NamedTuple):
-    """rgb (3, H, W) normalised; sparse and depth (1, H, W) metres, 0 = unknown."""
+    """rgb (3, H, W) normalised; sparse, depth and prior (1, H, W) metres, 0 = unknown."""
 
     rgb: Tensor
     sparse: Tensor
     depth: Tensor
+    prior: Tensor
 
 
 class Frames:
@@ -89,8 +91,12 @@ def mapped(path: Path) -> dict[str, NDArray[Any]]:
 class Samples(Dataset[Sample]):
     """Endless augmented samples of one size (height, width)."""
 
-    def __init__(self, folders: tuple[Path, ...], size: tuple[int, int], seed: int):
+    def __init__(
+        self, folders: tuple[Path, ...], size: tuple[int, int], seed: int,
+        prior_share: float = priors.SHARE,
+    ):  # fmt: skip
         self.folders, self.size, self.seed = folders, size, seed
+        self.prior_share = prior_share
         self.frames: Frames | None = None
         self._calls = 0
 
@@ -103,7 +109,8 @@ class Samples(Dataset[Sample]):
         rng = np.random.default_rng((self.seed, index))
         while True:
             rgb, depth = self.frames[int(rng.integers(len(self.frames)))]
-            sample = augmented(rng, rgb, depth, self.size)
+            other = self.frames[int(rng.integers(len(self.frames)))][1]
+            sample = augmented(rng, rgb, depth, self.size, other, self.prior_share)
             if bool((sample.depth > 0).any() and (sample.sparse > 0).any()):
                 return sample
 
@@ -128,9 +135,13 @@ def normalised(rgb: Tensor) -> Tensor:
 
 
 def augmented(
-    rng: Generator, rgb: NDArray[np.uint8], depth: NDArray[np.float32], size: tuple[int, int]
-) -> Sample:
-    """A random part of a frame at a random zoom, mirrored half the time, with random points."""
+    rng: Generator, rgb: NDArray[np.uint8], depth: NDArray[np.float32], size: tuple[int, int],
+    other: NDArray[np.float32], prior_share: float = priors.SHARE,
+) -> Sample:  # fmt: skip
+    """A random part of a frame at a random zoom, mirrored half the time, with points and prior.
+
+    other: the depth of an unrelated frame, which a useless prior may show.
+    """
     picture, distance = _zoomed_part(rng, rgb, depth, size)
     if rng.random() < 0.5:
         picture, distance = picture.flip(-1), distance.flip(-1)
@@ -139,8 +150,12 @@ def augmented(
     if rng.random() < 0.15:
         # colour and depth cameras that are not quite registered
         picture = _shifted(picture, int(rng.integers(-2, 3)), int(rng.integers(-3, 4)))
+    grey = picture.mean(0).numpy()
+    prior = priors.draw(rng, distance.numpy(), grey, sparse, other, prior_share)
+    prior = np.zeros_like(sparse) if prior is None else prior
     picture = degraded(rng, misregistered(rng, picture))
-    return Sample(normalised(picture), torch.from_numpy(sparse)[None], distance[None])
+    points, dense = torch.from_numpy(sparse)[None], torch.from_numpy(prior)[None]
+    return Sample(normalised(picture), points, distance[None], dense)
 
 
 def _shifted(picture: Tensor, down: int, right: int) -> Tensor:

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 from safetensors.torch import save_file
@@ -22,6 +23,7 @@ class Schedule:
     """How long a run is and how fast it learns; the first limit that is reached ends it.
 
     averaging: how much of the average of the weights stays at each step.
+    decay: the rate is constant until this many steps before the end; None: it falls all along.
     Without `minutes` the same seed and frames give the same bytes on the same machine.
     """
 
@@ -29,6 +31,8 @@ class Schedule:
     steps: int
     minutes: float | None = None
     averaging: float = 0.999
+    decay: int | None = None
+    warm_up: int = WARM_UP_STEPS
 
     def progress(self, step: int, elapsed_s: float) -> float:
         """How much of the run is done, 0..1, by steps or by the clock, whichever is further."""
@@ -37,8 +41,11 @@ class Schedule:
 
     def rate(self, step: int, elapsed_s: float) -> float:
         """The learning rate: up in a straight line, then down to 0 on a cosine."""
-        factor = min(1.0, (step + 1) / WARM_UP_STEPS)
-        return self.lr * factor * 0.5 * (1.0 + math.cos(math.pi * self.progress(step, elapsed_s)))
+        factor = min(1.0, (step + 1) / self.warm_up)
+        done = self.progress(step, elapsed_s)
+        if self.decay is not None:
+            done = max(0.0, 1.0 - (self.steps - step) / self.decay) if self.decay else 0.0
+        return self.lr * factor * 0.5 * (1.0 + math.cos(math.pi * done))
 
 
 class Learner:
@@ -59,7 +66,7 @@ class Learner:
             _channels_last(one)
         self.learnt = [p for p in self.network.parameters() if p.requires_grad]
         self.optimiser = torch.optim.AdamW(
-            self.learnt, lr=schedule.lr, weight_decay=1e-2, fused=True
+            self.groups(), lr=schedule.lr, weight_decay=1e-2, fused=True
         )
         # On a CPU two halves of a batch on a thread each beat one batch on two threads: they wait
         # for each other once a step, not at every operation.
@@ -68,6 +75,10 @@ class Learner:
         if self.lanes > 1:
             torch.set_num_threads(1)
         self.step, self.elapsed_s = 0, 0.0
+
+    def groups(self) -> list[dict[str, Any]]:
+        """The parameters for the optimiser; `factor` multiplies the learning rate of a group."""
+        return [{"params": self.learnt, "factor": 1.0}]
 
     def loss(self, part: Sequence[Tensor]) -> Tensor:
         """What is to become small, for a part of a batch."""
@@ -82,7 +93,7 @@ class Learner:
         """One step of the optimiser has been made; returns the loss."""
         self.network.train()
         for group in self.optimiser.param_groups:
-            group["lr"] = self.schedule.rate(self.step, self.elapsed_s)
+            group["lr"] = group["factor"] * self.schedule.rate(self.step, self.elapsed_s)
         parts = list(zip(*(tensor.chunk(self.lanes) for tensor in batch), strict=True))
         results = list(self.pool.map(self._loss_and_gradients, parts))
         gradients = zip(*(found for _, found in results), strict=True)

@@ -1,7 +1,7 @@
 """Sparse depth as sensors give it, drawn from dense depth.
 
 `draw` picks one pattern at random, thins it with holes, and adds what real sensors add: noise,
-outliers, and a small shift between depth and picture. All maps are (H, W) float32 metres with
+outliers, and a small shift between depth and image. All maps are (H, W) float32 metres with
 0 = unknown; the same generator state gives the same points.
 """
 
@@ -16,21 +16,71 @@ Mask = NDArray[np.bool_]
 
 
 def draw(rng: Generator, depth: Depth, grey: Depth) -> Depth:
-    """Points of one random pattern with random faults; `grey` (H, W) 0..1 is the picture."""
-    kind = rng.choice(5, p=(0.5, 0.28, 0.07, 0.08, 0.07))
+    """Points of one random pattern with random faults; `grey` (H, W) 0..1 is the image."""
+    kind = rng.choice(6, p=(0.45, 0.25, 0.06, 0.1, 0.05, 0.09))
     if kind == 1:
         sparse = scan_lines(rng, depth)
+    elif kind == 5:
+        sparse = zones(rng, depth)
     else:
         count = int(np.exp(rng.uniform(np.log(5.0), np.log(depth.size / 8))))
         if kind == 4:
             sparse = keep(depth, window(rng, depth.shape) & uniform(rng, depth, 4 * count))
+        elif kind == 3:
+            sparse = triangulated(rng, keep(depth, corners(rng, depth, grey, count)))
         else:
-            pattern = {0: uniform, 2: jittered_grid}.get(int(kind))
-            mask = pattern(rng, depth, count) if pattern else corners(rng, depth, grey, count)
-            sparse = keep(depth, mask)
-    if rng.random() < 0.2:
-        sparse = keep(sparse, ~window(rng, depth.shape))
+            pattern = jittered_grid if kind == 2 else uniform
+            sparse = keep(depth, pattern(rng, depth, count))
+    if rng.random() < 0.25:
+        empty = window if rng.random() < 0.6 else strip
+        sparse = keep(sparse, ~empty(rng, depth.shape))
     return faults(rng, sparse)
+
+
+def strip(rng: Generator, shape: tuple[int, ...]) -> Mask:
+    """The image beyond a random line: a strip of at least 0.1, up to 0.7 of the image."""
+    height, width = shape
+    angle = rng.uniform(0.0, 2.0 * np.pi)
+    rows, columns = np.indices(shape, dtype=np.float32)
+    place = np.cos(angle) * rows / height + np.sin(angle) * columns / width
+    return np.asarray(place < np.quantile(place[::4, ::4], rng.uniform(0.1, 0.7)))
+
+
+def triangulated(rng: Generator, sparse: Depth) -> Depth:
+    """Points with the errors of triangulation: sigma grows with depth, and some are far off."""
+    known = sparse > 0
+    if not known.any():
+        return sparse
+    relative = sparse / np.float32(np.median(sparse[known]))
+    sigma = np.float32(rng.uniform(0.0, 0.03)) * relative
+    inverse = 1.0 + sigma * rng.standard_normal(sparse.shape, dtype=np.float32)
+    wrong = rng.random(sparse.shape) < rng.uniform(0.01, 0.05)
+    factor = np.exp(rng.normal(0.0, 0.6, sparse.shape)).astype(np.float32)
+    inverse = np.where(wrong, factor, np.maximum(inverse, 0.2))
+    return np.where(known, sparse / inverse, np.float32(0.0)).astype(np.float32)
+
+
+def zones(rng: Generator, depth: Depth) -> Depth:
+    """A time-of-flight sensor of few zones: one depth each, holes, mixed depths at edges."""
+    rows, columns = (int(n) for n in rng.integers(6, 33, 2))
+    height, width = depth.shape
+    r = ((np.arange(rows) + 0.5) * height / rows).astype(int)
+    c = ((np.arange(columns) + 0.5) * width / columns).astype(int)
+    at = np.ix_(r, c)
+    reach = np.minimum(int(rng.integers(1, 5)), min(height // rows, width // columns) // 2 + 1)
+    aside = np.ix_(np.clip(r + reach, 0, height - 1), np.clip(c + reach, 0, width - 1))
+    value, second = depth[at], depth[aside]
+    mixed = (rng.random(value.shape) < rng.uniform(0.0, 0.5)) & (second > 0)
+    share = rng.random(value.shape, dtype=np.float32)
+    value = np.where(mixed & (value > 0), share * value + (1.0 - share) * second, value)
+    returned = rng.random(value.shape) >= rng.uniform(0.0, 0.3)
+    if rng.random() < 0.5:
+        known = value[value > 0]
+        limit = np.quantile(known, rng.uniform(0.5, 1.0)) if known.size else 0.0
+        returned &= value <= limit
+    sparse = np.zeros_like(depth)
+    sparse[at] = np.where(returned, value, np.float32(0.0))
+    return sparse
 
 
 def keep(depth: Depth, mask: Mask) -> Depth:
@@ -62,7 +112,7 @@ def jittered_grid(rng: Generator, depth: Depth, count: int) -> Mask:
 
 
 def corners(rng: Generator, depth: Depth, grey: Depth, count: int) -> Mask:
-    """`count` known pixels where the picture has much gradient, as feature points have."""
+    """`count` known pixels where the image has much gradient, as feature points have."""
     dy, dx = np.gradient(grey)
     strength = np.hypot(dy, dx).ravel() + 1e-4
     # the largest of strength^p times a random number (Efraimidis and Spirakis' reservoir keys)
@@ -76,7 +126,7 @@ def corners(rng: Generator, depth: Depth, grey: Depth, count: int) -> Mask:
 
 
 def window(rng: Generator, shape: tuple[int, ...]) -> Mask:
-    """A random rectangle or ellipse of 10 to 80 per cent of the picture's sides."""
+    """A random rectangle or ellipse of 10 to 80 per cent of the image's sides."""
     height, width = shape
     half = rng.uniform(0.05, 0.4, 2) * (height, width)
     centre = rng.uniform(0.1, 0.9, 2) * (height, width)
@@ -94,7 +144,7 @@ def scan_lines(rng: Generator, depth: Depth) -> Depth:
     looks past the edges (`leak`).
     """
     height, width = depth.shape
-    spacing = float(np.exp(rng.uniform(np.log(2.5), np.log(height / 8))))
+    spacing = float(np.exp(rng.uniform(np.log(1.5), np.log(height / 4))))
     # single scanners are dense along the line, also when their lines are far apart
     stride = rng.uniform(1.0, 3.5)
     top = rng.uniform(0.0, 0.45) * height if rng.random() < 0.8 else 0.0
@@ -137,7 +187,7 @@ def leak(rng: Generator, depth: Depth) -> Depth:
 
 
 def faults(rng: Generator, sparse: Depth) -> Depth:
-    """The points with noise, outliers and a shift against the picture, each of them sometimes."""
+    """The points with noise, outliers and a shift against the image, each of them sometimes."""
     mask = sparse > 0
     out = sparse.copy()
     if rng.random() < 0.5:
@@ -146,13 +196,34 @@ def faults(rng: Generator, sparse: Depth) -> Depth:
         # structured light: the error grows with the square of the depth
         share = rng.uniform(0.0, 0.02) / max(float(sparse.max()), 1e-3)
         out += share * sparse**2 * rng.standard_normal(sparse.shape, dtype=np.float32)
-    if rng.random() < 0.3:
-        share = rng.uniform(0.05, 0.2) if rng.random() < 0.1 else rng.uniform(0.0, 0.05)
-        wrong = mask & (rng.random(sparse.shape) < share)
-        out[wrong] *= np.exp(rng.normal(0.0, 0.7, int(wrong.sum()))).astype(np.float32)
+    if rng.random() < 0.4:
+        most = 0.25 if rng.random() < 0.5 else 0.05
+        out = outliers(rng, out, float(rng.uniform(0.0, most)))
     out = np.where(mask, np.maximum(out, np.float32(1e-3)), np.float32(0.0))
     if rng.random() < 0.1:
         out = _shifted(out, int(rng.integers(-2, 3)), int(rng.integers(-2, 3)))
+    return out
+
+
+def outliers(rng: Generator, sparse: Depth, share: float) -> Depth:
+    """The points with a share of them wrong: off by a factor, anywhere in range, or swapped."""
+    rows, columns = np.nonzero(sparse)
+    chosen = rng.random(len(rows)) < share
+    rows, columns = rows[chosen], columns[chosen]
+    if not len(rows):
+        return sparse
+    known, count = sparse[sparse > 0], len(rows)
+    kind = rng.integers(4)
+    if kind == 0:
+        wrong = (sparse[rows, columns] * np.exp(rng.normal(0.0, 0.7, count))).astype(np.float32)
+    elif kind == 1:
+        wrong = rng.uniform(0.5 * known.min(), 1.3 * known.max(), count).astype(np.float32)
+    elif kind == 2:
+        wrong = rng.choice(known, count)
+    else:
+        wrong = sparse[rows, columns] * rng.choice((rng.uniform(0.3, 0.8), rng.uniform(1.3, 3.0)))
+    out = sparse.copy()
+    out[rows, columns] = wrong
     return out
 
 

@@ -11,21 +11,39 @@ from __future__ import annotations
 import argparse
 import math
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
-from torch import Tensor
+import torch.nn.functional as F
+from safetensors.torch import load_file
+from torch import Tensor, nn
 from torch.utils.data import DataLoader
 from tqdm import tqdm
 
 from model_zoo_defs.compact import Compact
+from model_zoo_defs.training import priors
 from model_zoo_defs.training.dataset import Counting, Sample, Samples
 from model_zoo_defs.training.encoder_weights import pretrained_encoder
-from model_zoo_defs.training.learner import Learner, Schedule, append_row
+from model_zoo_defs.training.learner import WARM_UP_STEPS, Learner, Schedule, append_row
 from model_zoo_defs.training.validation import Case, cases, scores
 
+# Layers that the first generation of the network did not have; `upgraded` leaves them as they
+# are initialised, which changes no output without a prior.
+NEW_LAYERS = (
+    "inlier_weights.",
+    "enter_prior.",
+    "weigh_prior.",
+    "enlarge_prior.",
+    "gain_prior",
+    "scale.",
+)
+# a point whose log depth is wrong by less than the first is an inlier, by more than the second not
+INLIER_ERROR, OUTLIER_ERROR = 0.05, 0.2
+SIDE_WEIGHT = 0.1
+NEW_LAYER_FACTOR = 8.0
 # weights of the depths at 1/16, 1/8, 1/4, 1/2 and full size
 LEVEL_WEIGHTS = (0.15, 0.2, 0.3, 0.4, 1.0)
 
@@ -47,6 +65,14 @@ class Settings:
     save_every: int = 500
     val_frames: int = 24
     pretrained: bool = True
+    start: Path | None = None
+    decay: int | None = None
+    warm_up: int = WARM_UP_STEPS
+    averaging: float = 0.999
+    prior_share: float = priors.SHARE
+    only: tuple[str, ...] = ()
+    encoder_rate: float = 0.0
+    encoder_stages: tuple[str, ...] = ("s16", "s32")
     workers: int = 1
     resume: bool = False
 
@@ -61,19 +87,77 @@ class Run(Learner):
         network = Compact()
         if settings.pretrained:
             network.encoder.load_state_dict(pretrained_encoder())
-        # Photographs are what the encoder knows and rendered frames are not: it stays as it is.
+        if settings.start:
+            upgrade(network, load_file(settings.start))
+        # Photographs are what the encoder knows and rendered frames are not: it stays as it is,
+        # or its last stages follow slowly.
+        self.encoder_rate = settings.encoder_rate
         network.encoder.requires_grad_(False)
-        schedule = Schedule(lr=settings.lr, steps=settings.steps, minutes=settings.minutes)
+        if settings.encoder_rate > 0:
+            for stage in settings.encoder_stages:
+                network.encoder.stages[stage].requires_grad_(True)
+        if settings.only:
+            for name, parameter in network.named_parameters():
+                parameter.requires_grad_(any(layer in name for layer in settings.only))
+        schedule = Schedule(
+            lr=settings.lr, steps=settings.steps, minutes=settings.minutes,
+            averaging=settings.averaging, decay=settings.decay, warm_up=settings.warm_up,
+        )  # fmt: skip
         lanes = min(settings.lanes, settings.batch)
         super().__init__(network, schedule, settings.out, "compact", lanes)
+        self.bfloat16 = self.device.type == "cuda" or torch.cpu._is_avx512_bf16_supported()
+
+    def groups(self) -> list[dict[str, Any]]:
+        """The encoder learns slower than the rest, layers of the second generation faster."""
+        groups: dict[float, list[nn.Parameter]] = {}
+        for name, parameter in self.network.named_parameters():
+            if parameter.requires_grad:
+                new = any(layer in name for layer in NEW_LAYERS)
+                slow = name.startswith("encoder.")
+                factor = self.encoder_rate if slow else NEW_LAYER_FACTOR if new else 1.0
+                groups.setdefault(factor, []).append(parameter)
+        return [{"params": some, "factor": factor} for factor, some in groups.items()]
 
     def loss(self, part: Sequence[Tensor]) -> Tensor:
-        """How far the depths of all levels are from the truth."""
-        rgb, sparse, depth = part
+        """How far the depths of all levels are from the truth, and the side outputs from theirs."""
+        rgb, sparse, depth, prior = part
         rgb = rgb.contiguous(memory_format=torch.channels_last)
-        with torch.autocast(self.device.type, torch.bfloat16):
-            depths = self.network.pyramid(rgb, sparse)
-        return pyramid_loss(depths, depth)
+        with torch.autocast(self.device.type, torch.bfloat16, enabled=self.bfloat16):
+            outputs = self.network.outputs(rgb, sparse, prior if bool(prior.any()) else None)
+            sigma = self.network.sigma(outputs)
+        side = inlier_loss(outputs.inlier_logits, sparse, depth)
+        side = side + sigma_loss(sigma, outputs.depths[-1], depth)
+        return pyramid_loss(outputs.depths, depth) + SIDE_WEIGHT * side
+
+
+def upgrade(network: Compact, weights: Mapping[str, Tensor]) -> None:
+    """The network has these weights; layers that are missing in them stay as they are."""
+    own = network.state_dict()
+    missing = sorted(name for name in own.keys() - weights.keys())
+    strange = sorted(weights.keys() - own.keys())
+    unexplained = [name for name in missing if not any(layer in name for layer in NEW_LAYERS)]
+    if strange or unexplained:
+        raise ValueError(f"not weights of compact: {', '.join((strange + unexplained)[:5])}")
+    network.load_state_dict(own | dict(weights))
+
+
+def inlier_loss(logits: Tensor, sparse: Tensor, truth: Tensor) -> Tensor:
+    """Cross entropy of the points' inlier weights; all (B, 1, H, W), 0 in depths = unknown."""
+    at = (sparse > 0) & (truth > 0)
+    error = (torch.log(sparse[at]) - torch.log(truth[at])).abs()
+    inlier = ((OUTLIER_ERROR - error) / (OUTLIER_ERROR - INLIER_ERROR)).clamp(0.0, 1.0)
+    each = F.binary_cross_entropy_with_logits(logits[at], inlier, reduction="none")
+    # every sample counts alike, however many points it has
+    count = at.sum((1, 2, 3), keepdim=True).clamp(min=1).expand_as(at)[at]
+    return (each / count).sum() / len(sparse)
+
+
+def sigma_loss(sigma: Tensor, depth: Tensor, truth: Tensor) -> Tensor:
+    """Negative log likelihood of the error of log depth under a Laplace distribution."""
+    known = truth > 0
+    error = (torch.log(depth.detach()[known]) - torch.log(truth[known])).abs()
+    scale = sigma[known]
+    return (error / scale + torch.log(scale)).mean()
 
 
 def pyramid_loss(depths: list[Tensor], truth: Tensor) -> Tensor:
@@ -107,7 +191,7 @@ def depth_loss(depth: Tensor, truth: Tensor) -> Tensor:
 def _loader(settings: Settings, first_step: int) -> Iterable[Sample]:
     start = first_step * settings.batch
     numbers = Counting(start, (settings.steps - first_step) * settings.batch)
-    data = Samples(settings.data, settings.size, settings.seed)
+    data = Samples(settings.data, settings.size, settings.seed, settings.prior_share)
     return DataLoader(
         data, batch_size=settings.batch, sampler=numbers, num_workers=settings.workers,
         prefetch_factor=4 if settings.workers else None,
@@ -142,9 +226,9 @@ def _report(run: Run, held_out: list[Case], loss: float) -> None:
     out, now = run.out, {"step": float(run.step), "seconds": round(run.elapsed_s)}
     append_row(out / "log.csv", now | {"loss": round(loss, 4)})
     if held_out:
-        found = {k: round(v, 2) for k, v in scores(run.average, held_out, run.device).items()}
-        append_row(out / "val.csv", now | found)
-        tqdm.write(f"step {run.step}: {found}")
+        results = {k: round(v, 2) for k, v in scores(run.average, held_out, run.device).items()}
+        append_row(out / "val.csv", now | results)
+        tqdm.write(f"step {run.step}: {results}")
 
 
 def main() -> None:
@@ -161,8 +245,21 @@ def main() -> None:
     parser.add_argument("--resume", action="store_true", help="go on from RUN_DIR/state.pt")
     parser.add_argument("--batch", type=int, default=Settings.batch)
     parser.add_argument("--lr", type=float, default=Settings.lr)
+    parser.add_argument("--start", type=Path, help="weights to start from")
+    parser.add_argument("--decay", type=int, help="constant rate, falling in the last N steps")
+    parser.add_argument("--warm-up", type=int, default=Settings.warm_up)
+    parser.add_argument("--averaging", type=float, default=Settings.averaging)
+    parser.add_argument("--encoder-rate", type=float, default=0.0, help="times the rate; 0: frozen")
+    parser.add_argument("--only", nargs="+", default=[], help="parts of names of layers to train")
+    parser.add_argument("--prior-share", type=float, default=Settings.prior_share)
+    parser.add_argument("--encoder-stages", nargs="+", default=["s16", "s32"])
+    parser.add_argument("--save-every", type=int, default=Settings.save_every)
+    parser.add_argument("--val-frames", type=int, default=Settings.val_frames)
+    parser.add_argument("--lanes", type=int, default=Settings.lanes)
+    parser.add_argument("--workers", type=int, default=Settings.workers)
     options = parser.parse_args()
-    print(train(Settings(**vars(options) | {"data": tuple(options.data)})))
+    lists = {name: tuple(vars(options)[name]) for name in ("data", "encoder_stages", "only")}
+    print(train(Settings(**vars(options) | lists)))
 
 
 if __name__ == "__main__":

@@ -11,8 +11,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from model_zoo_defs.training import priors
 from model_zoo_defs.training.dataset import Frames, normalised
-from model_zoo_defs.training.patterns import keep, scan_lines, uniform
+from model_zoo_defs.training.patterns import keep, outliers, scan_lines, uniform
 from pnpdepth_cli.completion.interpolation import linear
 from pnpdepth_cli.points import SparsePoints
 
@@ -26,13 +27,17 @@ PATTERNS: dict[str, Callable[[np.random.Generator, Depth], Depth]] = {
 
 
 class Case(NamedTuple):
-    """One frame with points: rgb (1, 3, H, W), sparse (1, 1, H, W), depth and linear (H, W)."""
+    """One frame with points: rgb (1, 3, H, W), sparse (1, 1, H, W), depth and linear (H, W).
+
+    linear: interpolation of the points before any of them was made wrong; prior as `sparse`.
+    """
 
     pattern: str
     rgb: Tensor
     sparse: Tensor
     depth: Depth
     linear: Depth
+    prior: Tensor | None = None
 
 
 def linear_interpolation(sparse: Depth) -> Depth:
@@ -50,7 +55,7 @@ def cases(folder: Path, count: int) -> list[Case]:
     """`count` frames evenly taken from the folder's, each with every pattern."""
     frames = Frames(folder)
     chosen = np.linspace(0, len(frames) - 1, min(count, len(frames))).astype(int)
-    found = []
+    chosen_cases: list[Case] = []
     for index in chosen:
         rgb, depth = frames[int(index)]
         picture = normalised(torch.from_numpy(rgb).permute(2, 0, 1).float() / 255.0)[None]
@@ -58,8 +63,32 @@ def cases(folder: Path, count: int) -> list[Case]:
             sparse = draw(np.random.default_rng(int(index)), depth)
             if np.count_nonzero(sparse) >= 3:
                 at = torch.from_numpy(sparse)[None, None]
-                found.append(Case(pattern, picture, at, depth, linear_interpolation(sparse)))
-    return found
+                case = Case(pattern, picture, at, depth, linear_interpolation(sparse))
+                other = frames[(int(index) + 17) % len(frames)][1]
+                rng = np.random.default_rng((int(index), len(pattern)))
+                chosen_cases += [case, *_variants(rng, case, rgb, other)]
+    return chosen_cases
+
+
+def _variants(
+    rng: np.random.Generator, case: Case, rgb: NDArray[np.uint8], other: Depth
+) -> list[Case]:
+    """The case with a damaged prior, with nonsense as prior, and with a fifth of wrong points."""
+    sparse = case.sparse[0, 0].numpy()
+    grey = (rgb.mean(-1) / 255.0).astype(np.float32)
+
+    def with_prior(kind: str, prior: Depth) -> Case:
+        dense = priors.aligned(prior, sparse, affine=False)
+        return case._replace(
+            pattern=f"{case.pattern}_{kind}", prior=torch.from_numpy(dense)[None, None]
+        )
+
+    variants = [with_prior("prior", priors.damaged(rng, case.depth, grey))]
+    if case.pattern == "uniform500":
+        variants.append(with_prior("nonsense", priors.nonsense(rng, case.depth.shape, other)))
+        wrong = torch.from_numpy(outliers(rng, sparse, 0.2))[None, None]
+        variants.append(case._replace(pattern="uniform500_wrong", sparse=wrong))
+    return variants
 
 
 @torch.no_grad()
@@ -68,7 +97,8 @@ def scores(network: nn.Module, some: list[Case], device: torch.device) -> dict[s
     network.eval()
     ratios: dict[str, list[tuple[float, float]]] = {}
     for case in some:
-        predicted = network(case.rgb.to(device), case.sparse.to(device)).float().cpu()
+        inputs = [case.rgb, case.sparse, *([] if case.prior is None else [case.prior])]
+        predicted = network(*(x.to(device) for x in inputs)).float().cpu()
         known = case.depth > 0
         ours = np.abs(predicted[0, 0].numpy() - case.depth)[known]
         theirs = np.abs(case.linear - case.depth)[known]

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import copy
+
 import pytest
 import torch
 from torch import Tensor
 
-from model_zoo_defs.compact import Compact, definitions
+from model_zoo_defs.compact import Compact, Points, _residual, definitions
 from pnpdepth_cli.core.split import Split
 
 definition = definitions["compact"]
@@ -103,6 +105,136 @@ def test_a_plane_seen_at_some_points_is_continued_as_a_plane(network: Compact) -
     assert float(error.mean()) < 0.03
 
 
+def prior_of(height: int, width: int, seed: int = 3) -> Tensor:
+    """A smooth depth with a window in which it is unknown."""
+    generator = torch.Generator().manual_seed(seed)
+    coarse = 1.0 + 3.0 * torch.rand(1, 1, 4, 5, generator=generator)
+    prior = torch.nn.functional.interpolate(coarse, (height, width), mode="bilinear")
+    prior[..., 10:30, 20:60] = 0.0
+    return prior
+
+
+@pytest.fixture(scope="module")
+def shaken(network: Compact) -> Compact:
+    """A network in which the layers of the prior have weights too."""
+    torch.manual_seed(1)
+    net = copy.deepcopy(network)
+    for name, parameter in net.named_parameters():
+        if "prior" in name or name.startswith(("inlier_weights.", "scale.")):
+            torch.nn.init.normal_(parameter, std=0.05)
+    return net
+
+
+def test_a_prior_that_is_unknown_everywhere_changes_nothing(shaken: Compact) -> None:
+    rgb, sparse = frame(96, 128, 200)
+    with torch.no_grad():
+        torch.testing.assert_close(
+            shaken(rgb, sparse, torch.zeros_like(sparse)), shaken(rgb, sparse), rtol=1e-3, atol=0.0
+        )
+
+
+def test_a_prior_changes_the_depth_and_leaves_it_finite(shaken: Compact) -> None:
+    for count in (0, 1, 300):
+        rgb, sparse = frame(96, 128, count)
+        with torch.no_grad():
+            depth = shaken(rgb, sparse, prior_of(96, 128))
+            assert not torch.equal(depth, shaken(rgb, sparse))
+        assert bool(torch.isfinite(depth).all())
+        assert bool((depth > 0).all())
+
+
+def test_prior_and_points_ten_times_as_far_give_depth_ten_times_as_far(shaken: Compact) -> None:
+    rgb, sparse = frame(96, 128, 300)
+    prior = prior_of(96, 128)
+    with torch.no_grad():
+        expected = shaken(rgb, sparse, prior) * 10.0
+        found = shaken(rgb, sparse * 10.0, prior * 10.0)
+    torch.testing.assert_close(found, expected, rtol=1e-3, atol=0.0)
+
+
+def test_samples_with_and_without_a_prior_share_a_batch(shaken: Compact) -> None:
+    one, other = frame(64, 96, 30, seed=1), frame(64, 96, 700, seed=2)
+    batch = [torch.cat(pair) for pair in zip(one, other, strict=True)]
+    priors = torch.cat([prior_of(64, 96), torch.zeros(1, 1, 64, 96)])
+    with torch.no_grad():
+        together = shaken(*batch, priors)
+        apart = torch.cat([shaken(*one, priors[:1]), shaken(*other)])
+    torch.testing.assert_close(together, apart, rtol=1e-3, atol=1e-4)
+
+
+def test_an_exact_prior_lets_the_untrained_network_know_what_no_point_shows() -> None:
+    """A step between two points is known to the prior alone."""
+    torch.manual_seed(0)
+    untrained = Compact().eval()
+    truth = torch.full((1, 1, 96, 128), 2.0)
+    truth[..., 64:] = 4.0
+    rgb, sparse = torch.zeros(1, 3, 96, 128), torch.zeros(1, 1, 96, 128)
+    sparse[..., 48, 30], sparse[..., 48, 98] = 2.0, 4.0
+    with torch.no_grad():
+        errors = [
+            (torch.log(depth) - torch.log(truth)).abs().mean()
+            for depth in (untrained(rgb, sparse, truth), untrained(rgb, sparse))
+        ]
+    assert errors[0] < 0.7 * errors[1]
+
+
+@pytest.mark.parametrize("with_prior", [False, True])
+@pytest.mark.parametrize("layer", definition.layers)
+def test_rear_of_front_is_the_network_bit_for_bit(
+    shaken: Compact, layer: str, with_prior: bool
+) -> None:
+    inputs = [*frame(96, 128, 200), *([prior_of(96, 128)] if with_prior else [])]
+    with torch.no_grad():
+        expected = shaken(*inputs)
+    with Split(shaken, layer) as split:
+        assert torch.equal(split.rear(split.front(*inputs)), expected)
+
+
+@pytest.mark.parametrize("with_prior", [False, True])
+def test_no_gradient_is_infinite(shaken: Compact, with_prior: bool) -> None:
+    """Cells with one point have no spread, whose square root has no slope."""
+    net = copy.deepcopy(shaken).train()
+    rgb, sparse = frame(64, 96, 40)
+    found = net.outputs(rgb, sparse, prior_of(64, 96) if with_prior else None)
+    loss = sum(depth.log().abs().mean() for depth in found.depths) + net.sigma(found).mean()
+    assert isinstance(loss, Tensor)
+    loss.backward()
+    for name, parameter in net.named_parameters():
+        if parameter.grad is not None:
+            assert bool(torch.isfinite(parameter.grad).all()), name
+
+
+def test_untrained_inlier_weights_are_one() -> None:
+    points = Points(frame(64, 96, 100)[1])
+    weights, _ = Compact().inlier_weights(points, None)
+    assert torch.equal(weights, torch.ones_like(weights))
+
+
+def test_a_point_without_weight_moves_nothing() -> None:
+    sparse = frame(64, 96, 100)[1]
+    wrong = sparse.clone()
+    wrong[..., 32, 48] = 900.0
+    weight = torch.ones_like(sparse)
+    weight[..., 32, 48] = 0.0
+    found = []
+    for depth in (sparse, wrong):
+        points = Points(torch.where(weight > 0, depth, 0.0)) if depth is sparse else Points(depth)
+        points.weigh(weight)
+        moments = points.moments()
+        found.append(_residual(moments, torch.zeros(1, 1, 8, 12) - points.median, 8).mean)
+    torch.testing.assert_close(found[0], found[1], rtol=1e-4, atol=1e-4)
+
+
+def test_sigma_is_positive_and_its_gradient_reaches_no_depth(shaken: Compact) -> None:
+    net = copy.deepcopy(shaken)
+    depth, sigma = net.with_sigma(*frame(64, 96, 50))
+    assert depth.shape == sigma.shape
+    assert bool((sigma > 0).all())
+    sigma.mean().backward()
+    reached = {name.split(".")[0] for name, p in net.named_parameters() if p.grad is not None}
+    assert reached == {"scale"}
+
+
 @pytest.mark.parametrize("layer", definition.layers)
 def test_the_error_at_the_points_reaches_every_layer(network: Compact, layer: str) -> None:
     seen: list[Tensor] = []
@@ -137,6 +269,28 @@ def test_the_shipped_weights_fit_and_are_small() -> None:
     with torch.no_grad():
         depth = network.eval()(*frame(96, 128, 100))
     assert bool(torch.isfinite(depth).all())
+
+
+@pytest.mark.skipif(
+    definition.checkpoint is None or not definition.checkpoint.exists(), reason="not trained yet"
+)
+def test_the_shipped_inlier_weights_tell_outliers_on_a_slope() -> None:
+    safetensors = pytest.importorskip("safetensors.torch")
+    network = definition.build().eval()
+    network.load_state_dict(safetensors.load_file(definition.checkpoint))
+    generator = torch.Generator().manual_seed(5)
+    rows, columns = torch.meshgrid(torch.arange(192.0), torch.arange(256.0), indexing="ij")
+    truth = (2.0 + 0.005 * rows + 0.003 * columns).view(1, 1, 192, 256)
+    known = torch.rand(truth.shape, generator=generator) < 0.01
+    wrong = known & (torch.rand(truth.shape, generator=generator) < 0.2)
+    with torch.no_grad():
+        clean, _ = network.inlier_weights(Points(truth * known), None)
+        mixed, _ = network.inlier_weights(
+            Points(truth * known * torch.where(wrong, 2.0, 1.0)), None
+        )
+    assert float(clean[known].mean()) > 0.98
+    assert float(mixed[known & ~wrong].mean()) > 0.95
+    assert float(mixed[wrong].mean()) < 0.3
 
 
 @pytest.mark.parametrize("layer", ["decoder.s32", "decoder.s8", "decoder.s2"])

@@ -18,11 +18,15 @@ from numpy.typing import NDArray
 from model_zoo_defs.compact import Compact
 from model_zoo_defs.training import patterns
 from model_zoo_defs.training.dataset import Frames, Samples, degraded, mapped
+from model_zoo_defs.training.learner import Schedule
+from model_zoo_defs.training.priors import aligned, damaged, filled, nonsense
+from model_zoo_defs.training.priors import draw as draw_prior
 
 pytest.importorskip("safetensors")
 train = pytest.importorskip("model_zoo_defs.training.train")
 validation = pytest.importorskip("model_zoo_defs.training.validation")
 encoder_weights = pytest.importorskip("model_zoo_defs.training.encoder_weights")
+train_inliers = pytest.importorskip("model_zoo_defs.training.train_inliers")
 
 SHAPE = (48, 64)
 seeds = st.integers(0, 2**32 - 1)
@@ -124,6 +128,108 @@ def test_the_same_state_draws_the_same_points_without_touching_the_depth(seed: i
     assert bool((first >= 0).all())
 
 
+@drawn_often
+@given(seed=seeds)
+def test_a_prior_is_finite_and_the_same_for_the_same_state(seed: int) -> None:
+    depth, other = room(seed), room(seed + 1)
+    sparse = patterns.draw(np.random.default_rng(seed), depth, depth / 5.0)
+    found = [
+        draw_prior(np.random.default_rng(seed), depth, depth / 5.0, sparse, other) for _ in range(2)
+    ]
+    if found[0] is None:
+        assert found[1] is None
+        return
+    assert found[1] is not None
+    assert np.array_equal(found[0], found[1])
+    assert found[0].shape == SHAPE
+    assert found[0].dtype == np.float32
+    assert bool(np.isfinite(found[0]).all())
+    assert bool((found[0] >= 0).all())
+
+
+@drawn_often
+@given(seed=seeds)
+def test_a_damaged_depth_is_known_everywhere_and_nonsense_too(seed: int) -> None:
+    rng, depth = np.random.default_rng(seed), room(seed)
+    for prior in (
+        damaged(rng, depth, depth / 5.0),
+        nonsense(rng, depth.shape, depth),
+    ):
+        assert bool((prior > 0).all())
+        assert bool(np.isfinite(prior).all())
+
+
+def test_damaged_depth_is_nearer_to_the_truth_than_nonsense() -> None:
+    depth = room(3)
+    known = depth > 0
+
+    def error(prior: NDArray[np.float32]) -> float:
+        found = aligned(prior, depth, affine=False)
+        return float(np.abs(np.log(found[known] / depth[known])).mean())
+
+    rng = np.random.default_rng(0)
+    of_damaged = np.mean([error(damaged(rng, depth, depth / 5.0)) for _ in range(20)])
+    of_nonsense = np.mean([error(nonsense(rng, depth.shape, room(4))) for _ in range(20)])
+    assert of_damaged < 0.5 * of_nonsense
+
+
+@pytest.mark.parametrize("affine", [False, True])
+def test_a_prior_off_by_a_scale_or_a_power_is_aligned_despite_wrong_points(affine: bool) -> None:
+    depth = room(2)
+    sparse = patterns.keep(depth, patterns.uniform(np.random.default_rng(0), depth, 200))
+    sparse = patterns.outliers(np.random.default_rng(1), sparse, 0.2)
+    prior = 7.0 * depth ** (0.8 if affine else 1.0)
+    found = aligned(prior.astype(np.float32), sparse, affine=affine)
+    known = depth > 0
+    assert float(np.median(np.abs(np.log(found[known] / depth[known])))) < 0.02
+    assert bool((found[~known] == 0).all())
+
+
+def test_unknown_depth_is_filled_and_known_depth_kept() -> None:
+    depth = room(5)
+    found = filled(depth)[0, 0].numpy()
+    known = depth > 0
+    np.testing.assert_allclose(found[known], np.log(depth[known]), rtol=1e-6)
+    assert bool(np.isfinite(found).all())
+    assert found[~known].max() <= np.log(depth.max()) + 1e-6
+
+
+@drawn_often
+@given(seed=seeds, share=st.floats(0.0, 1.0))
+def test_outliers_change_about_the_share_of_points_and_nothing_else(
+    seed: int, share: float
+) -> None:
+    sparse = patterns.keep(room(seed), patterns.uniform(np.random.default_rng(1), room(seed), 1000))
+    found = patterns.outliers(np.random.default_rng(seed), sparse, share)
+    assert np.array_equal(found > 0, sparse > 0)
+    assert np.count_nonzero(found != sparse) <= 1000 * share + 80
+
+
+@drawn_often
+@given(seed=seeds)
+def test_zones_are_few_and_between_the_depths_of_the_image(seed: int) -> None:
+    depth = room(seed)
+    sparse = patterns.zones(np.random.default_rng(seed), depth)
+    known = sparse > 0
+    assert known.sum() <= 32 * 32
+    assert bool((sparse[known] <= depth.max() * 1.001).all())
+    assert bool((sparse[known] >= depth[depth > 0].min() * 0.999).all())
+
+
+@drawn_often
+@given(seed=seeds)
+def test_a_strip_leaves_a_part_of_the_image(seed: int) -> None:
+    share = patterns.strip(np.random.default_rng(seed), SHAPE).mean()
+    assert 0.05 < share < 0.75
+
+
+def test_triangulated_points_stay_where_they_are() -> None:
+    depth = room(1)
+    found = patterns.triangulated(np.random.default_rng(0), depth)
+    assert np.array_equal(found > 0, depth > 0)
+    assert float(np.median(np.abs(found - depth))) < 0.2
+
+
 def test_a_sample_depends_on_its_number_alone(shards: Path) -> None:
     straight, jumping = Samples((shards,), (32, 64), 3), Samples((shards,), (32, 64), 3)
     straight[0], straight[1]
@@ -215,6 +321,52 @@ def test_the_loss_is_least_for_the_truth_and_blind_to_unknown_depth() -> None:
     assert train.depth_loss(guess, truth) == train.depth_loss(other, truth)
 
 
+def test_inlier_weights_are_taught_by_the_error_of_the_points() -> None:
+    truth = torch.full((1, 1, 4, 4), 2.0)
+    sparse = torch.zeros_like(truth)
+    sparse[..., 0, 0], sparse[..., 1, 1] = 2.02, 5.0
+    right, wrong = torch.zeros_like(truth), torch.zeros_like(truth)
+    right[..., 0, 0], right[..., 1, 1] = 5.0, -5.0
+    wrong[..., 0, 0], wrong[..., 1, 1] = -5.0, 5.0
+    assert train.inlier_loss(right, sparse, truth) < 0.1 < train.inlier_loss(wrong, sparse, truth)
+
+
+def test_the_best_sigma_is_the_mean_absolute_error_of_log_depth() -> None:
+    truth, depth = torch.ones(1, 1, 4, 4), torch.full((1, 1, 4, 4), 1.1)
+    error = float(np.log(1.1))
+    losses = {
+        factor: float(train.sigma_loss(torch.full_like(truth, factor * error), depth, truth))
+        for factor in (0.7, 1.0, 1.4)
+    }
+    assert min(losses, key=lambda factor: losses[factor]) == 1.0
+
+
+def test_weights_of_the_first_generation_give_the_same_depth_in_the_second() -> None:
+    torch.manual_seed(0)
+    old, network = Compact(), Compact()
+    kept = {
+        name: tensor + 0.01
+        for name, tensor in old.state_dict().items()
+        if not any(layer in name for layer in train.NEW_LAYERS)
+    }
+    train.upgrade(network, kept)
+    for name, tensor in network.state_dict().items():
+        if name in kept:
+            assert torch.equal(tensor, kept[name])
+    with pytest.raises(ValueError, match=r"not weights of compact: fit\.far"):
+        train.upgrade(network, {k: v for k, v in kept.items() if not k.startswith("fit.far")})
+    with pytest.raises(ValueError, match="not weights of compact: strange"):
+        train.upgrade(network, kept | {"strange": torch.zeros(1)})
+
+
+def test_a_constant_rate_falls_in_the_last_steps_alone() -> None:
+    schedule = Schedule(lr=1.0, steps=100, decay=20, warm_up=10)
+    rates = [schedule.rate(step, 0.0) for step in (0, 9, 50, 80, 90, 100)]
+    assert rates == pytest.approx([0.1, 1.0, 1.0, 1.0, 0.5, 0.0])
+    endless = Schedule(lr=1.0, steps=100, decay=0, warm_up=10)
+    assert endless.rate(99, 0.0) == 1.0
+
+
 def published_names(state: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
     """A checkpoint with the published names whose normalisation scales by two and adds one."""
     names = {"stem": ("_conv_stem", "_bn0")}
@@ -278,3 +430,17 @@ def stop_at(settings_: train.Settings, step: int) -> None:
         if run.step == step:
             run.save()
             return
+
+
+def test_inlier_weights_learn_which_points_are_wrong(shards: Path) -> None:
+    torch.manual_seed(0)
+    layer = Compact().inlier_weights
+    data = train_inliers.table(layer, Frames(shards), 60, seed=1)
+    loss = train_inliers.fit(
+        layer.first, data.first, torch.zeros_like(data.target), data.target, steps=60
+    )
+    with torch.no_grad():
+        log_odds = layer.first(*data.first)
+    wrong, right = data.target == 0, data.target == 1
+    assert loss < 0.7
+    assert float(log_odds[wrong].mean()) < float(log_odds[right].mean()) - 0.5

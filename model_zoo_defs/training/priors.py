@@ -1,0 +1,206 @@
+"""Dense priors for training: the ground truth damaged as depth networks damage it, and nonsense.
+
+`draw` gives a prior (H, W) in metres, aligned to the points as the program aligns the prediction
+of a network, 0 where it is unknown; None when the sample has no prior. The same generator state
+gives the same prior.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from numpy.random import Generator
+from numpy.typing import NDArray
+from torch import Tensor
+
+from model_zoo_defs.training.patterns import window
+
+Depth = NDArray[np.float32]
+
+SHARE = 0.55
+NONSENSE_SHARE = 0.3
+
+
+def draw(
+    rng: Generator, depth: Depth, grey: Depth, sparse: Depth, other: Depth, share: float = SHARE
+) -> Depth | None:
+    """A prior of a random kind for a `share` of the samples; `other` is an unrelated depth."""
+    if rng.random() >= share:
+        return None
+    useless = rng.random() < NONSENSE_SHARE
+    raw = nonsense(rng, depth.shape, other) if useless else damaged(rng, depth, grey)
+    prior = aligned(raw, sparse, affine=bool(rng.random() < 0.4))
+    if rng.random() < 0.1:
+        prior = np.where(window(rng, depth.shape), np.float32(0.0), prior)
+    return prior
+
+
+def aligned(prior: Depth, sparse: Depth, *, affine: bool) -> Depth:
+    """The prior scaled to the points by the median ratio; affine in log depth on request.
+
+    The affine fit minimises the absolute residuals by reweighting; its slope stays in 0.3..3.
+    """
+    at = (sparse > 0) & (prior > 0)
+    if not at.any():
+        return prior
+    x, y = np.log(prior[at]), np.log(sparse[at])
+    slope, offset = 1.0, float(np.median(y - x))
+    if affine and len(x) >= 5:
+        for _ in range(5):
+            weight = 1.0 / np.maximum(np.abs(slope * x + offset - y), 0.02)
+            weight /= weight.sum()
+            mx, my = float(weight @ x), float(weight @ y)
+            variance = float(weight @ (x - mx) ** 2) + 1e-4
+            slope = float(np.clip(weight @ ((x - mx) * (y - my)) / variance, 0.3, 3.0))
+            offset = my - slope * mx
+    log_prior = np.log(np.where(prior > 0, prior, 1.0))
+    fitted = np.exp(np.clip(slope * log_prior + offset, -12.0, 12.0))
+    return np.where(prior > 0, fitted, 0.0).astype(np.float32)
+
+
+def filled(depth: Depth) -> Tensor:
+    """Log depth (1, 1, H, W) with unknown pixels filled from coarser and coarser means."""
+    known = torch.from_numpy((depth > 0).astype(np.float32))[None, None]
+    value = torch.from_numpy(np.log(np.where(depth > 0, depth, 1.0)).astype(np.float32))[None, None]
+    levels = [(value * known, known)]
+    while min(levels[-1][0].shape[-2:]) > 1:
+        total, share = (F.avg_pool2d(x, 2, ceil_mode=True) for x in levels[-1])
+        levels.append((total, share))
+    result = levels[-1][0] / levels[-1][1].clamp(min=1e-6)
+    for total, share in reversed(levels[:-1]):
+        coarse = _enlarged(result, total.shape[-2:])
+        result = torch.where(share > 0, total / share.clamp(min=1e-6), coarse)
+    return result
+
+
+def damaged(rng: Generator, depth: Depth, grey: Depth) -> Depth:
+    """The ground truth with faults of depth networks, each of them sometimes; metres up to scale.
+
+    One number, the severity, makes some priors nearly exact and others poor in all respects.
+    """
+    severity = float(rng.uniform(0.05, 1.0) ** 1.5)
+    log_depth = filled(depth)
+    chance = 0.25 + 0.5 * severity
+    for fault in FAULTS:
+        if rng.random() < chance:
+            log_depth = fault(rng, log_depth, severity)
+    if rng.random() < 0.4 * chance:
+        texture = torch.from_numpy(grey)[None, None]
+        texture = texture - _smooth(texture, 8)
+        log_depth = log_depth + float(rng.normal(0.0, 0.3 * severity)) * texture
+    return np.asarray(torch.exp(log_depth.clamp(-10.0, 10.0))[0, 0].numpy(), dtype=np.float32)
+
+
+def nonsense(rng: Generator, shape: tuple[int, ...], other: Depth) -> Depth:
+    """A dense depth that has nothing to do with the sample."""
+    kind = rng.integers(4)
+    if kind == 0:
+        return np.ones(shape, np.float32)
+    if kind == 1:
+        grid = rng.normal(0.0, rng.uniform(0.1, 1.0), (1, 1, *rng.integers(3, 40, 2)))
+        noise = _enlarged(torch.from_numpy(grid).float(), shape)
+        return np.asarray(torch.exp(noise)[0, 0].numpy(), dtype=np.float32)
+    if kind == 2:
+        rough = rng.normal(0.0, rng.uniform(0.05, 0.5), shape)
+        return np.asarray(np.exp(rough), dtype=np.float32)
+    strange = torch.exp(filled(other))
+    return np.asarray(_enlarged(strange, shape)[0, 0].numpy(), dtype=np.float32)
+
+
+def _lost_details(rng: Generator, x: Tensor, severity: float) -> Tensor:
+    """Near things thinner than a few pixels are lost, or grow together (opening, closing)."""
+    reach = 2 * int(rng.integers(1, 2 + round(4 * severity))) + 1
+    sign = 1.0 if rng.random() < 0.75 else -1.0
+    grown = F.max_pool2d(sign * x, reach, 1, reach // 2)
+    return sign * -F.max_pool2d(-grown, reach, 1, reach // 2)
+
+
+def _blurred(rng: Generator, x: Tensor, severity: float) -> Tensor:
+    """Depth at 1/2 to 1/16 of the resolution, enlarged again."""
+    factor = 2 ** int(rng.integers(1, 3 + round(2 * severity)))
+    if rng.random() < 0.3:
+        return _enlarged(x[..., factor // 2 :: factor, factor // 2 :: factor], x.shape[-2:])
+    return _smooth(x, factor)
+
+
+def _displaced(rng: Generator, x: Tensor, severity: float) -> Tensor:
+    """Depth moved by a smooth field of a few pixels."""
+    height, width = x.shape[-2:]
+    pixels = float(rng.uniform(0.5, 1.0 + 6.0 * severity))
+    flow = _field(rng, x, int(rng.integers(3, 12)), channels=2)[0] * pixels
+    identity = F.affine_grid(torch.eye(2, 3)[None], [1, 1, height, width], align_corners=False)
+    scaled = torch.stack([flow[0] * 2.0 / width, flow[1] * 2.0 / height], -1)
+    return F.grid_sample(x, identity + scaled, padding_mode="border", align_corners=False)
+
+
+def _scale_field(rng: Generator, x: Tensor, severity: float) -> Tensor:
+    """A smooth error of scale; each part of the image is nearer or farther than it is."""
+    return x + _field(rng, x, int(rng.integers(2, 9))) * float(rng.uniform(0.02, 0.3) * severity)
+
+
+def _contrast(rng: Generator, x: Tensor, severity: float) -> Tensor:
+    """A power of depth."""
+    middle = x.mean()
+    return middle + (x - middle) * float(np.exp(rng.normal(0.0, 0.35 * severity)))
+
+
+def _affine(rng: Generator, x: Tensor, severity: float) -> Tensor:
+    """An offset of depth or of inverse depth, relative to the nearest depth."""
+    sign = 1.0 if rng.random() < 0.5 else -1.0
+    linear = torch.exp(sign * (x - x.median()).clamp(-4.0, 4.0))
+    share = float(rng.uniform(-0.7, 1.0) * severity)
+    return sign * torch.log((linear + share * linear.min()).clamp(min=1e-4)) + x.median()
+
+
+def _flat_range(rng: Generator, x: Tensor, severity: float) -> Tensor:
+    """Depth beyond a random distance is compressed."""
+    limit = torch.quantile(x.flatten(), float(rng.uniform(0.4, 0.95)))
+    return torch.where(x > limit, limit + (x - limit) * float(rng.uniform(0.1, 0.8)), x)
+
+
+def _wrong_planes(rng: Generator, x: Tensor, severity: float) -> Tensor:
+    """Windows with another offset and tilt."""
+    height, width = x.shape[-2:]
+    rows = torch.linspace(-1.0, 1.0, height)[:, None]
+    columns = torch.linspace(-1.0, 1.0, width)[None, :]
+    for _ in range(int(rng.integers(1, 4))):
+        offset, down, right = (rng.normal(0.0, 0.25, 3) * severity).tolist()
+        inside = torch.from_numpy(window(rng, (height, width)))
+        x = torch.where(inside, x + offset + down * rows + right * columns, x)
+    return x
+
+
+def _tiles(rng: Generator, x: Tensor, severity: float) -> Tensor:
+    """Tiles with a scale each, as networks with small inputs leave them."""
+    count = rng.integers(2, 5, 2)
+    offsets = torch.from_numpy(rng.normal(0.0, 0.1 * severity, (1, 1, *count))).float()
+    return x + F.interpolate(offsets, x.shape[-2:], mode="nearest")
+
+
+def _noise(rng: Generator, x: Tensor, severity: float) -> Tensor:
+    """Noise of a random fineness."""
+    cells = int(np.exp(rng.uniform(np.log(8.0), np.log(96.0))))
+    return x + _field(rng, x, cells) * float(rng.uniform(0.005, 0.1) * severity)
+
+
+FAULTS: tuple[Callable[[Generator, Tensor, float], Tensor], ...] = (
+    _lost_details, _displaced, _wrong_planes, _contrast, _affine, _flat_range, _tiles,
+    _scale_field, _blurred, _noise,
+)  # fmt: skip
+
+
+def _field(rng: Generator, like: Tensor, cells: int, channels: int = 1) -> Tensor:
+    """A smooth field (1, channels, H, W) of unit variance at its nodes, `cells` across."""
+    grid = rng.normal(0.0, 1.0, (1, channels, cells, cells))
+    return _enlarged(torch.from_numpy(grid).float(), like.shape[-2:])
+
+
+def _smooth(x: Tensor, factor: int) -> Tensor:
+    return _enlarged(F.avg_pool2d(x, factor, ceil_mode=True), x.shape[-2:])
+
+
+def _enlarged(x: Tensor, size: tuple[int, ...] | torch.Size) -> Tensor:
+    return F.interpolate(x, tuple(size), mode="bilinear", align_corners=False)
