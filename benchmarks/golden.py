@@ -1015,8 +1015,10 @@ def _with_weights(net: Any) -> Any:
     import torch
 
     with torch.no_grad():
-        for parameter in net.parameters():
-            if parameter.ndim > 1:
+        for name, parameter in net.named_parameters():
+            if name.endswith("bias"):
+                parameter.zero_()
+            elif parameter.ndim > 1:
                 count = parameter.numel()
                 waves = torch.sin(torch.arange(count, dtype=torch.float64) * 12.9898) * 43758.5453
                 values = (waves - waves.floor() - 0.5) / math.sqrt(count / len(parameter) / 3)
@@ -1081,9 +1083,9 @@ class Runner:
         seconds: Of the processor, the same way.
     """
 
-    def __init__(self, work: Path, jobs: int) -> None:
+    def __init__(self, work: Path, shared: Path | None, jobs: int) -> None:
         self._work, self._jobs = work, jobs
-        self._norm = Normaliser(work)
+        self._norm = Normaliser(work, shared)
         self.found: dict[str, dict[str, Any]] = {}
         self.seconds: dict[str, float] = {}
 
@@ -1180,10 +1182,10 @@ _MOST_LINES = 120
 class Normaliser:
     """Makes of what a command printed and wrote what is the same in every run."""
 
-    def __init__(self, work: Path) -> None:
+    def __init__(self, work: Path, shared: Path | None) -> None:
         places = [(work / "in", "<in>"), (work / "shared", "<shared>")]
-        if (work / "shared").is_symlink():
-            places.append(((work / "shared").resolve(), "<shared>"))
+        if shared is not None:
+            places.append((shared, "<shared>"))
         self._places = [(str(path), name) for path, name in places]
         self._work = re.compile(re.escape(str(work)) + r"/[\w.-]+")
         self._tree = re.compile(re.escape(str(ROOT)) + r"/(?:[\w.-]+/)*")
@@ -1384,6 +1386,9 @@ def differences(kept: Any, now: Any, *, messages: bool, place: str = "") -> Iter
         if _only_encoded(kept, now):
             yield f"{place}: other bytes, the same values"
             return
+        if "hash" in kept and "hash" in now and kept["hash"] != now["hash"]:
+            yield f"{place}: other values: {_short(_figures(kept))} -> {_short(_figures(now))}"
+            return
         for name in [*kept, *(name for name in now if name not in kept)]:
             where = f"{place}.{name}" if place else name
             if name not in now:
@@ -1409,6 +1414,10 @@ def _is_message(place: str) -> bool:
     if place in ("stdout", "stderr"):
         return False  # looked at below, as data on stdout is no message
     return _MESSAGES.search(place) is not None
+
+
+def _figures(described: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in described.items() if name != "hash"}
 
 
 def _only_encoded(kept: Mapping[str, Any], now: Mapping[str, Any]) -> bool:
@@ -1505,18 +1514,22 @@ def _measure(given: argparse.Namespace) -> Runner:
         sys.exit(f"{given.shared} is no folder")
     _import_libraries()
     wanted = _selected(given.only, shared)
-    with tempfile.TemporaryDirectory(prefix="golden-") as folder:
-        work = Path(folder).resolve()
-        if given.keep is not None:
-            work = Path(given.keep).resolve()
-            work.mkdir(parents=True)
+    if given.keep is None:  # no TemporaryDirectory: forked commands would delete it as they end
+        work = Path(tempfile.mkdtemp(prefix="golden-")).resolve()
+    else:
+        work = Path(given.keep).resolve()
+        work.mkdir(parents=True)
+    runner = Runner(work, shared, given.jobs)
+    try:
         make_inputs(work / "in", shared)
         before = _files_in(work / "in")
-        runner = Runner(work, given.jobs)
         runner.run(wanted)
         for name, state in _files_in(work / "in").items():
             if before.get(name) != state:
                 print(f"note: an input was changed: {name}", file=sys.stderr)
+    finally:
+        if given.keep is None:
+            shutil.rmtree(work)
     if given.slowest:
         print(f"{sum(runner.seconds.values()):6.1f} s of the processor", file=sys.stderr)
     for name in sorted(runner.seconds, key=lambda each: -runner.seconds[each])[: given.slowest]:
