@@ -51,6 +51,8 @@ from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
 Array = NDArray[Any]
+Tell = Callable[[str, Mapping[str, Any]], None]
+"""Told the name of a step that ended, and what it left."""
 
 ROOT = Path(__file__).resolve().parents[1]
 ENVIRONMENT = {
@@ -1083,7 +1085,10 @@ class Runner:
         seconds: Of the processor, the same way.
     """
 
-    def __init__(self, work: Path, shared: Path | None, jobs: int) -> None:
+    def __init__(
+        self, work: Path, shared: Path | None, jobs: int, tell: Tell | None = None
+    ) -> None:
+        self._tell = tell
         self._work, self._jobs = work, jobs
         self._norm = Normaliser(work, shared)
         self.found: dict[str, dict[str, Any]] = {}
@@ -1144,6 +1149,8 @@ class Runner:
             "files": files,
             "gone": sorted(set(each.known) - set(now)),
         }
+        if self._tell is not None:
+            self._tell(step.name, self.found[step.name])
         if step.save is not None:
             (each.folder / step.save).write_text(texts["stdout"], "utf-8")
 
@@ -1508,7 +1515,7 @@ def _steady_environment() -> None:
         os.execve(sys.executable, command, kept | wanted)
 
 
-def _measure(given: argparse.Namespace) -> Runner:
+def _measure(given: argparse.Namespace, tell: Tell | None = None) -> Runner:
     shared = None if given.shared is None else Path(given.shared).resolve()
     if shared is not None and not shared.is_dir():
         sys.exit(f"{given.shared} is no folder")
@@ -1519,7 +1526,7 @@ def _measure(given: argparse.Namespace) -> Runner:
     else:
         work = Path(given.keep).resolve()
         work.mkdir(parents=True)
-    runner = Runner(work, shared, given.jobs)
+    runner = Runner(work, shared, given.jobs, tell)
     try:
         make_inputs(work / "in", shared)
         before = _files_in(work / "in")
@@ -1556,28 +1563,31 @@ def write(given: argparse.Namespace) -> int:
 def check(given: argparse.Namespace) -> int:
     """Runs the commands and prints what is not as it was kept; 1 if something is not."""
     golden = json.loads(Path(given.file).read_text("utf-8"))
-    found = _measure(given).found
     made_with = _made_with()
     if made_with != golden["made_with"]:
         print(f"note: kept with {golden['made_with']}, now {made_with}", file=sys.stderr)
-    kept = golden["steps"]
-    lines = []
-    for name, now in found.items():
-        if name not in kept:
-            lines.append(f"{name}: is not in the file")
-            continue
-        # what went through JSON is compared with what went through JSON
+    kept, differing = golden["steps"], set[str]()
+
+    def tell(name: str, now: Mapping[str, Any]) -> None:
+        if given.only is not None and not fnmatch.fnmatch(name, given.only):
+            return
+        # what was kept went through JSON, so this does too
         again = json.loads(json.dumps(now))
-        differing = compared(kept[name], again, messages=given.messages == "on")
-        lines += [f"{name}: {difference}" for difference in differing]
+        lines = (
+            compared(kept[name], again, messages=given.messages == "on")
+            if name in kept
+            else ["is not in the file"]
+        )
+        for line in lines:
+            print(f"{name}: {line}", flush=True)
+            differing.add(name)
+
+    found = _measure(given, tell).found
     absent = set(kept) - set(found)
     if given.only is None and absent:
         print(f"note: {len(absent)} commands in the file were not run", file=sys.stderr)
-    for line in lines:
-        print(line)
-    differ = len({line.split(": ", 1)[0] for line in lines})
-    print(f"{len(found)} commands, {differ} differ")
-    return 1 if lines else 0
+    print(f"{len(found)} commands, {len(differing)} differ")
+    return 1 if differing else 0
 
 
 def main() -> int:
