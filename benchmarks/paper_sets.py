@@ -121,7 +121,7 @@ def rendered(scenes: Scenes, cache: Path, count: int, workers: int) -> FrameSet:
 
 def _render(scenes: Scenes, folder: Path, count: int, workers: int) -> None:
     try:
-        from model_zoo_defs.training.render import Job, render_all
+        from model_zoo_defs.training.rendering.render import Job, render_all
     except ImportError as error:
         raise UsageError(f"rendering needs {error.name}: pip install 'pnpdepth[train]'") from error
     job = Job(
