@@ -33,7 +33,7 @@ from benchmarks.frames import (
     points_on_grid,
     refined,
 )
-from model_zoo_defs.training.dataset import Frames
+from model_zoo_defs.training.learning.dataset import Frames
 from pnpdepth_cli.auto.auto import refine_automatically
 from pnpdepth_cli.auto.candidates import default_configs
 from pnpdepth_cli.auto.uncertainty import uncertainty

@@ -29,8 +29,8 @@ from benchmarks.frames import (
     points_on_grid,
     refined,
 )
-from model_zoo_defs.training.patterns import outliers
-from model_zoo_defs.training.priors import nonsense
+from model_zoo_defs.training.learning.patterns import outliers
+from model_zoo_defs.training.learning.priors import nonsense
 from pnpdepth_cli.completion.alignment import aligned
 from pnpdepth_cli.completion.interpolation import linear, nearest
 from pnpdepth_cli.core.metrics import score

@@ -51,6 +51,8 @@ from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
 Array = NDArray[Any]
+Tell = Callable[[str, Mapping[str, Any]], None]
+"""Told the name of a step that ended, and what it left."""
 
 ROOT = Path(__file__).resolve().parents[1]
 ENVIRONMENT = {
@@ -1015,8 +1017,10 @@ def _with_weights(net: Any) -> Any:
     import torch
 
     with torch.no_grad():
-        for parameter in net.parameters():
-            if parameter.ndim > 1:
+        for name, parameter in net.named_parameters():
+            if name.endswith("bias"):
+                parameter.zero_()
+            elif parameter.ndim > 1:
                 count = parameter.numel()
                 waves = torch.sin(torch.arange(count, dtype=torch.float64) * 12.9898) * 43758.5453
                 values = (waves - waves.floor() - 0.5) / math.sqrt(count / len(parameter) / 3)
@@ -1081,9 +1085,12 @@ class Runner:
         seconds: Of the processor, the same way.
     """
 
-    def __init__(self, work: Path, jobs: int) -> None:
+    def __init__(
+        self, work: Path, shared: Path | None, jobs: int, tell: Tell | None = None
+    ) -> None:
+        self._tell = tell
         self._work, self._jobs = work, jobs
-        self._norm = Normaliser(work)
+        self._norm = Normaliser(work, shared)
         self.found: dict[str, dict[str, Any]] = {}
         self.seconds: dict[str, float] = {}
 
@@ -1142,6 +1149,8 @@ class Runner:
             "files": files,
             "gone": sorted(set(each.known) - set(now)),
         }
+        if self._tell is not None:
+            self._tell(step.name, self.found[step.name])
         if step.save is not None:
             (each.folder / step.save).write_text(texts["stdout"], "utf-8")
 
@@ -1180,10 +1189,10 @@ _MOST_LINES = 120
 class Normaliser:
     """Makes of what a command printed and wrote what is the same in every run."""
 
-    def __init__(self, work: Path) -> None:
+    def __init__(self, work: Path, shared: Path | None) -> None:
         places = [(work / "in", "<in>"), (work / "shared", "<shared>")]
-        if (work / "shared").is_symlink():
-            places.append(((work / "shared").resolve(), "<shared>"))
+        if shared is not None:
+            places.append((shared, "<shared>"))
         self._places = [(str(path), name) for path, name in places]
         self._work = re.compile(re.escape(str(work)) + r"/[\w.-]+")
         self._tree = re.compile(re.escape(str(ROOT)) + r"/(?:[\w.-]+/)*")
@@ -1232,6 +1241,8 @@ class Normaliser:
             made = {str(name): self.data(each, step, str(name)) for name, each in value.items()}
             if key.endswith(".json"):  # a record, in which times are
                 made |= {name: "#" for name in ("size", "sha256") if name in made}
+            if str(made.get("checkpoint", "")).endswith(".pt2"):
+                made["checkpoint_sha256"] = "#"  # torch.export writes other bytes every time
             return made
         if isinstance(value, list):
             return [self.data(each, step) for each in value]
@@ -1384,6 +1395,9 @@ def differences(kept: Any, now: Any, *, messages: bool, place: str = "") -> Iter
         if _only_encoded(kept, now):
             yield f"{place}: other bytes, the same values"
             return
+        if "hash" in kept and "hash" in now and kept["hash"] != now["hash"]:
+            yield f"{place}: other values: {_short(_figures(kept))} -> {_short(_figures(now))}"
+            return
         for name in [*kept, *(name for name in now if name not in kept)]:
             where = f"{place}.{name}" if place else name
             if name not in now:
@@ -1409,6 +1423,10 @@ def _is_message(place: str) -> bool:
     if place in ("stdout", "stderr"):
         return False  # looked at below, as data on stdout is no message
     return _MESSAGES.search(place) is not None
+
+
+def _figures(described: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in described.items() if name != "hash"}
 
 
 def _only_encoded(kept: Mapping[str, Any], now: Mapping[str, Any]) -> bool:
@@ -1499,24 +1517,28 @@ def _steady_environment() -> None:
         os.execve(sys.executable, command, kept | wanted)
 
 
-def _measure(given: argparse.Namespace) -> Runner:
+def _measure(given: argparse.Namespace, tell: Tell | None = None) -> Runner:
     shared = None if given.shared is None else Path(given.shared).resolve()
     if shared is not None and not shared.is_dir():
         sys.exit(f"{given.shared} is no folder")
     _import_libraries()
     wanted = _selected(given.only, shared)
-    with tempfile.TemporaryDirectory(prefix="golden-") as folder:
-        work = Path(folder).resolve()
-        if given.keep is not None:
-            work = Path(given.keep).resolve()
-            work.mkdir(parents=True)
+    if given.keep is None:  # no TemporaryDirectory: forked commands would delete it as they end
+        work = Path(tempfile.mkdtemp(prefix="golden-")).resolve()
+    else:
+        work = Path(given.keep).resolve()
+        work.mkdir(parents=True)
+    runner = Runner(work, shared, given.jobs, tell)
+    try:
         make_inputs(work / "in", shared)
         before = _files_in(work / "in")
-        runner = Runner(work, given.jobs)
         runner.run(wanted)
         for name, state in _files_in(work / "in").items():
             if before.get(name) != state:
                 print(f"note: an input was changed: {name}", file=sys.stderr)
+    finally:
+        if given.keep is None:
+            shutil.rmtree(work)
     if given.slowest:
         print(f"{sum(runner.seconds.values()):6.1f} s of the processor", file=sys.stderr)
     for name in sorted(runner.seconds, key=lambda each: -runner.seconds[each])[: given.slowest]:
@@ -1543,28 +1565,31 @@ def write(given: argparse.Namespace) -> int:
 def check(given: argparse.Namespace) -> int:
     """Runs the commands and prints what is not as it was kept; 1 if something is not."""
     golden = json.loads(Path(given.file).read_text("utf-8"))
-    found = _measure(given).found
     made_with = _made_with()
     if made_with != golden["made_with"]:
         print(f"note: kept with {golden['made_with']}, now {made_with}", file=sys.stderr)
-    kept = golden["steps"]
-    lines = []
-    for name, now in found.items():
-        if name not in kept:
-            lines.append(f"{name}: is not in the file")
-            continue
-        # what went through JSON is compared with what went through JSON
+    kept, differing = golden["steps"], set[str]()
+
+    def tell(name: str, now: Mapping[str, Any]) -> None:
+        if given.only is not None and not fnmatch.fnmatch(name, given.only):
+            return
+        # what was kept went through JSON, so this does too
         again = json.loads(json.dumps(now))
-        differing = compared(kept[name], again, messages=given.messages == "on")
-        lines += [f"{name}: {difference}" for difference in differing]
+        lines = (
+            compared(kept[name], again, messages=given.messages == "on")
+            if name in kept
+            else ["is not in the file"]
+        )
+        for line in lines:
+            print(f"{name}: {line}", flush=True)
+            differing.add(name)
+
+    found = _measure(given, tell).found
     absent = set(kept) - set(found)
     if given.only is None and absent:
         print(f"note: {len(absent)} commands in the file were not run", file=sys.stderr)
-    for line in lines:
-        print(line)
-    differ = len({line.split(": ", 1)[0] for line in lines})
-    print(f"{len(found)} commands, {differ} differ")
-    return 1 if lines else 0
+    print(f"{len(found)} commands, {len(differing)} differ")
+    return 1 if differing else 0
 
 
 def main() -> int:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TypeVar
@@ -121,7 +121,7 @@ def rendered(scenes: Scenes, cache: Path, count: int, workers: int) -> FrameSet:
 
 def _render(scenes: Scenes, folder: Path, count: int, workers: int) -> None:
     try:
-        from model_zoo_defs.training.render import Job, render_all
+        from model_zoo_defs.training.rendering.render import Job, render_all
     except ImportError as error:
         raise UsageError(f"rendering needs {error.name}: pip install 'pnpdepth[train]'") from error
     job = Job(
@@ -256,9 +256,9 @@ def _data_frame(root: Path, frame: Frame) -> TableFrame:
     if frame.sparse is None:
         gt = read_frame_ground_truth(frame)
         return TableFrame(rgb=read_frame_image(frame), gt=gt, pool=gt)
-    # No output is written; the batch's own reading of scans and scales is wanted.
+    # Nothing is written; this is how `batch` reads scans and scales.
     batch = BatchRequest(source=root, output=root / "out", refine=RefineRequest())
-    inputs = read_inputs(replace(task_of(batch, frame).request, output=None))
+    inputs = read_inputs(task_of(batch, frame).request)
     assert inputs.rgb is not None
     scan = inputs.points.scatter()[0, 0].numpy()
     if inputs.gt is None:

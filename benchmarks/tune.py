@@ -18,8 +18,8 @@ import numpy as np
 import torch
 
 from benchmarks.frames import Depth, frame_inputs, points_on_grid, refined
-from model_zoo_defs.training.dataset import Frames
-from model_zoo_defs.training.patterns import keep, scan_lines, uniform
+from model_zoo_defs.training.learning.dataset import Frames
+from model_zoo_defs.training.learning.patterns import keep, scan_lines, uniform
 from pnpdepth_cli.core.metrics import score
 from pnpdepth_cli.core.refine import RefineSettings
 from pnpdepth_cli.models.network import Network, load_network

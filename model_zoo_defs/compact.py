@@ -441,8 +441,8 @@ class PointFit(nn.Module):
         residual, spread, reliability, support = of_prior
         value, valid = prior.at(16)
         valid = valid * (support > 1e-4)
-        of_prior = PriorFit(value + residual, spread, reliability * valid, valid)
-        return Fit(estimates, distance.unsqueeze(1), of_prior)
+        fit = PriorFit(value + residual, spread, reliability * valid, valid)
+        return Fit(estimates, distance.unsqueeze(1), fit)
 
     @staticmethod
     def _without_points(near: Tensor, prior: Prior | None) -> Fit:

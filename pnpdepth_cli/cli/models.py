@@ -139,6 +139,7 @@ def fetch(repository: str, revision: str | None, output: Path | None, as_json: b
 
 
 def _print(record: Mapping[str, Any], as_json: bool) -> None:
+    """Prints the record to stdout; as text, its `notes` go to stderr."""
     if as_json:
         click.echo(json.dumps(record, indent=2))
         return

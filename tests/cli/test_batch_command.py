@@ -184,7 +184,7 @@ def test_ctrl_c_finishes_the_frame_says_how_to_go_on_and_exits_130(
         running.send_signal(signal.SIGINT)
         _, err = running.communicate(timeout=60)
     assert running.returncode == 130
-    assert "finishing the frame in work" in err
+    assert "finishing the current frame" in err
     assert "of 4 frames; run the same command to continue" in err.splitlines()[-1]
     assert "Traceback" not in err
     states = [json.loads(line)["state"] for line in manifest.read_text().splitlines()]

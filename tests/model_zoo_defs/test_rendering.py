@@ -11,11 +11,12 @@ pytest.importorskip("embreex", reason="embreex is not installed (extra [train])"
 
 from PIL import Image
 
-from model_zoo_defs.training import make_samples, render, scenes, shapes
-from model_zoo_defs.training.materials import Palette
-from model_zoo_defs.training.shading import seen
-from model_zoo_defs.training.shapes import Group
-from model_zoo_defs.training.world import Sky, View, World, looking
+from model_zoo_defs.training.rendering import make_samples, render, shapes
+from model_zoo_defs.training.rendering.materials import Palette
+from model_zoo_defs.training.rendering.shading import seen
+from model_zoo_defs.training.rendering.shapes import Group
+from model_zoo_defs.training.scenes import scenes
+from model_zoo_defs.training.scenes.world import Sky, View, World, looking
 
 HEIGHT, WIDTH = 48, 64
 

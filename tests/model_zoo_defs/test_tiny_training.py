@@ -14,12 +14,12 @@ import pytest
 import torch
 from torch import nn
 
-from model_zoo_defs.training import batches, recipes
-from model_zoo_defs.training.scaffold import scaffolded, without_scaffold
+from model_zoo_defs.training.learning import batches, recipes
+from model_zoo_defs.training.learning.scaffold import scaffolded, without_scaffold
 from pnpdepth_cli.models.definition import ModelDefinition, Multiple
 
 pytest.importorskip("safetensors")
-tiny = pytest.importorskip("model_zoo_defs.training.tiny")
+tiny = pytest.importorskip("model_zoo_defs.training.learning.tiny")
 
 SHAPE = (48, 64)
 WEIGHTS = Path(tiny.__file__).parents[1] / "weights"

@@ -16,17 +16,17 @@ from hypothesis.extra import numpy as hnp
 from numpy.typing import NDArray
 
 from model_zoo_defs.compact import Compact
-from model_zoo_defs.training import patterns
-from model_zoo_defs.training.dataset import Frames, Samples, degraded, mapped
-from model_zoo_defs.training.learner import Schedule
-from model_zoo_defs.training.priors import aligned, damaged, filled, nonsense
-from model_zoo_defs.training.priors import draw as draw_prior
+from model_zoo_defs.training.learning import patterns
+from model_zoo_defs.training.learning.dataset import Frames, Samples, degraded, mapped
+from model_zoo_defs.training.learning.learner import Schedule
+from model_zoo_defs.training.learning.priors import aligned, damaged, filled, nonsense
+from model_zoo_defs.training.learning.priors import draw as draw_prior
 
 pytest.importorskip("safetensors")
-train = pytest.importorskip("model_zoo_defs.training.train")
-validation = pytest.importorskip("model_zoo_defs.training.validation")
-encoder_weights = pytest.importorskip("model_zoo_defs.training.encoder_weights")
-train_inliers = pytest.importorskip("model_zoo_defs.training.train_inliers")
+train = pytest.importorskip("model_zoo_defs.training.learning.train")
+validation = pytest.importorskip("model_zoo_defs.training.learning.validation")
+encoder_weights = pytest.importorskip("model_zoo_defs.training.learning.encoder_weights")
+train_inliers = pytest.importorskip("model_zoo_defs.training.learning.train_inliers")
 
 SHAPE = (48, 64)
 seeds = st.integers(0, 2**32 - 1)

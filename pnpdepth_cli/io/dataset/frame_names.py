@@ -20,15 +20,18 @@ def normalised_name(name: str) -> str:
 
 
 def name_problem(name: str) -> str | None:
-    """Returns why no result can be stored under a frame's name on this system; None if it can."""
+    """Returns why no result can be stored under a frame's name on POSIX; None if it can.
+
+    The reason is a predicate, such as "holds a NUL character".
+    """
     if "\0" in name:
         return "holds a NUL character"
-    place = PurePosixPath(name)
-    if place.is_absolute() or ".." in place.parts:
+    path = PurePosixPath(name)
+    if path.is_absolute() or ".." in path.parts:
         return _LEADS_OUT
-    if not place.parts:
+    if not path.parts:
         return "names no file"
-    if any(len(part.encode("utf-8", "surrogateescape")) > _LONGEST_PART for part in place.parts):
+    if any(len(part.encode("utf-8", "surrogateescape")) > _LONGEST_PART for part in path.parts):
         return f"is longer than {_LONGEST_PART} bytes"
     return None
 

@@ -196,7 +196,8 @@ def _type(dtype: Any) -> str:
 
 
 def _tensor(content: bytes, code: str, shape: tuple[int, ...], fortran: bool, name: str) -> Tensor:
-    if code[:1] not in "<>|=" or code[1:] not in _NUMBERS:
+    """The tensor of an array's bytes, copied to native byte order; `code` is such as "<f4"."""
+    if code[:1] not in ("<", ">", "|", "=") or code[1:] not in _NUMBERS:
         raise BrokenFileError(f"{name} is an array of {code}, not of numbers")
     dtype = np.dtype(code)
     if any(n < 0 for n in shape) or math.prod(shape) * dtype.itemsize != len(content):

@@ -157,7 +157,7 @@ def depth_files(folder: Path) -> tuple[dict[str, Path], list[str]]:
     Raises:
         InputError: If there is none.
     """
-    files, notes = _files(folder, DEPTH_SUFFIXES)
+    files, notes = _depth_files(folder, DEPTH_SUFFIXES)
     if not files:
         suffixes = " ".join(DEPTH_SUFFIXES)
         raise InputError(f"{folder} holds no depth file ({suffixes}); check the path")
@@ -180,7 +180,11 @@ def _layout_of(ground_truth: Path) -> str | None:
         return None
 
 
-def _files(folder: Path, suffixes: Sequence[str]) -> tuple[dict[str, Path], list[str]]:
+def _depth_files(folder: Path, suffixes: Sequence[str]) -> tuple[dict[str, Path], list[str]]:
+    """(one depth file per frame name, warnings) of all depth files below the folder.
+
+    Where `x_depth.png` exists, `x.png` is not depth, and `x_preview.png` and the like belong to it.
+    """
     unreadable: list[OSError] = []
     by_frame: dict[str, Path] = {}
     ignored: list[str] = []
@@ -188,7 +192,7 @@ def _files(folder: Path, suffixes: Sequence[str]) -> tuple[dict[str, Path], list
         folders[:] = sorted(name for name in folders if not name.startswith("."))
         paths = [Path(top, name) for name in sorted(files) if not name.startswith(".")]
         depths = [p for p in paths if p.suffix.lower() in suffixes and p.is_file()]
-        marked = {_base(p.stem, _DEPTH_MARKS) for p in depths} - {None}
+        marked = {_base(p.stem, _DEPTH_MARKS) for p in depths} - {None}  # stems with a _depth file
         inside = Path(top).relative_to(folder)
         for path in depths:
             name = (inside / frame_name(path.stem)).as_posix()
@@ -251,7 +255,7 @@ def _by_frame(path: Path | None, suffixes: Sequence[str], names: Iterable[str]) 
     """The file of each frame: the one for all, or those of the folder."""
     if path is None:
         return {}
-    return _files(path, suffixes)[0] if path.is_dir() else dict.fromkeys(names, path)
+    return _depth_files(path, suffixes)[0] if path.is_dir() else dict.fromkeys(names, path)
 
 
 def _pair(frame: Frame, prediction: Path | None, sparse: Path | None) -> FramePair:

@@ -66,7 +66,12 @@ class FoldingBudget(TorchFunctionMode):
 
 
 def _elements_at_most(func: Any, args: Any, kwargs: dict[str, Any], largest: int) -> float:
-    """Elements of the largest result, or a number that it does not exceed."""
+    """An upper bound on the elements of the result.
+
+    The product of all sizes and numbers bounds most results; each factor is at least 2, so that it
+    bounds sums too, as of concatenation: a + b ≤ a·b for a, b ≥ 2. If it exceeds `largest`, the
+    shape is inferred on the meta device instead.
+    """
     name = getattr(func, "__name__", "")
     leaves = tree_flatten((args, kwargs))[0]
     sizes = [leaf.shape for leaf in leaves if isinstance(leaf, Tensor)]

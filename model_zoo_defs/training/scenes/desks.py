@@ -4,10 +4,18 @@ from __future__ import annotations
 
 import numpy as np
 
-from model_zoo_defs.training import clutter, furniture
-from model_zoo_defs.training.kit import Kit
-from model_zoo_defs.training.shapes import Group, box, lathe, quads, superquadric, surface, tube
-from model_zoo_defs.training.world import Light, Plan, Sky
+from model_zoo_defs.training.rendering.shapes import (
+    Group,
+    box,
+    lathe,
+    quads,
+    superquadric,
+    surface,
+    tube,
+)
+from model_zoo_defs.training.scenes import clutter, furniture
+from model_zoo_defs.training.scenes.kit import Kit
+from model_zoo_defs.training.scenes.world import Light, Plan, Sky
 
 
 def _wild(kit: Kit) -> Group:

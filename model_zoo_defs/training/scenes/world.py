@@ -10,8 +10,8 @@ import numpy.typing as npt
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 
-from model_zoo_defs.training.materials import MaterialTable
-from model_zoo_defs.training.shapes import FloatArray, Group, IntArray, Mesh, rotation
+from model_zoo_defs.training.rendering.materials import MaterialTable
+from model_zoo_defs.training.rendering.shapes import FloatArray, Group, IntArray, Mesh, rotation
 
 
 @dataclass(frozen=True, kw_only=True)

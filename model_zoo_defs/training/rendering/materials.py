@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from model_zoo_defs.training import textures
-from model_zoo_defs.training.textures import SIDE, colour, near
+from model_zoo_defs.training.rendering import textures
+from model_zoo_defs.training.rendering.textures import SIDE, colour, near
 
 FloatArray = npt.NDArray[np.float32]
 

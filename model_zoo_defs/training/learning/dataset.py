@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.utils.data import Dataset, Sampler
 
-from model_zoo_defs.training import priors
-from model_zoo_defs.training.patterns import draw
+from model_zoo_defs.training.learning import priors
+from model_zoo_defs.training.learning.patterns import draw
 from pnpdepth_cli.models.definition import IMAGENET_MEAN, IMAGENET_STD
 
 REFRESH_EVERY = 2000

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from model_zoo_defs.training.materials import Palette
+from model_zoo_defs.training.rendering.materials import Palette
 
 
 @dataclass(frozen=True, kw_only=True)

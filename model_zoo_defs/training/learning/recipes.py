@@ -13,8 +13,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from model_zoo_defs.training.batches import Points, many_points, some_points
-from model_zoo_defs.training.scaffold import scaffolded
+from model_zoo_defs.training.learning.batches import Points, many_points, some_points
+from model_zoo_defs.training.learning.scaffold import scaffolded
 
 NEAREST = 0.1  # metres; below this a logarithm goes on as a straight line
 

@@ -7,9 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from model_zoo_defs.training import clutter, furniture, seating
-from model_zoo_defs.training.kit import Kit
-from model_zoo_defs.training.shapes import (
+from model_zoo_defs.training.rendering.shapes import (
     Group,
     Mesh,
     box,
@@ -17,6 +15,8 @@ from model_zoo_defs.training.shapes import (
     rod,
     surface,
 )
+from model_zoo_defs.training.scenes import clutter, furniture, seating
+from model_zoo_defs.training.scenes.kit import Kit
 
 Hole = tuple[float, float, float, float]
 

@@ -11,9 +11,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from model_zoo_defs.training import priors
-from model_zoo_defs.training.dataset import Frames, normalised
-from model_zoo_defs.training.patterns import keep, outliers, scan_lines, uniform
+from model_zoo_defs.training.learning import priors
+from model_zoo_defs.training.learning.dataset import Frames, normalised
+from model_zoo_defs.training.learning.patterns import keep, outliers, scan_lines, uniform
 from pnpdepth_cli.completion.interpolation import linear
 from pnpdepth_cli.points import SparsePoints
 

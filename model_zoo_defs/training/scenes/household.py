@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from model_zoo_defs.training.kit import Kit
-from model_zoo_defs.training.shapes import (
+from model_zoo_defs.training.rendering.shapes import (
     Group,
     box,
     cylinder,
@@ -15,6 +14,7 @@ from model_zoo_defs.training.shapes import (
     superquadric,
     torus,
 )
+from model_zoo_defs.training.scenes.kit import Kit
 
 
 def mug(kit: Kit) -> Group:

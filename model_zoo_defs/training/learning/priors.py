@@ -16,7 +16,7 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 from torch import Tensor
 
-from model_zoo_defs.training.patterns import window
+from model_zoo_defs.training.learning.patterns import window
 
 Depth = NDArray[np.float32]
 

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image
 
-from model_zoo_defs.training.shapes import FloatArray
+from model_zoo_defs.training.rendering.shapes import FloatArray
 
 
 def photographed(

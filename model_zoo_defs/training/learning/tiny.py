@@ -1,6 +1,6 @@
 """Trains the tiny edition of one of the paper's networks on rendered frames.
 
-    python -m model_zoo_defs.training.tiny --network fcrn-tiny --data DIR ... --val DIR
+    python -m model_zoo_defs.training.learning.tiny --network fcrn-tiny --data DIR ... --val DIR
         --out RUN_DIR --minutes 30 --seed 1
 
 RUN_DIR gets state.pt (everything `--resume` needs), log.csv (loss and, with --val, MAE, RMSE and
@@ -25,11 +25,11 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 from tqdm import tqdm
 
-from model_zoo_defs.training.batches import Batch, Batches
-from model_zoo_defs.training.dataset import Frames
-from model_zoo_defs.training.learner import Learner, Schedule, append_row
-from model_zoo_defs.training.recipes import RECIPES, Recipe, Stage, with_start
-from model_zoo_defs.training.scaffold import without_scaffold
+from model_zoo_defs.training.learning.batches import Batch, Batches
+from model_zoo_defs.training.learning.dataset import Frames
+from model_zoo_defs.training.learning.learner import Learner, Schedule, append_row
+from model_zoo_defs.training.learning.recipes import RECIPES, Recipe, Stage, with_start
+from model_zoo_defs.training.learning.scaffold import without_scaffold
 from pnpdepth_cli.models.definition import ModelDefinition, Multiple
 
 AVERAGING = 0.99  # runs are short, and a stage's weights are of no use to the next one's average

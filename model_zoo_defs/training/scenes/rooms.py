@@ -6,17 +6,17 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from model_zoo_defs.training import clutter, figures, furniture, seating
-from model_zoo_defs.training.kit import Kit
-from model_zoo_defs.training.shapes import (
+from model_zoo_defs.training.rendering.shapes import (
     Group,
     box,
     cylinder,
     quads,
     rod,
 )
-from model_zoo_defs.training.walls import Hole, decorate, opening, openings, wall
-from model_zoo_defs.training.world import Light, Plan, Sky
+from model_zoo_defs.training.scenes import clutter, figures, furniture, seating
+from model_zoo_defs.training.scenes.kit import Kit
+from model_zoo_defs.training.scenes.walls import Hole, decorate, opening, openings, wall
+from model_zoo_defs.training.scenes.world import Light, Plan, Sky
 
 
 def room(kit: Kit) -> Plan:

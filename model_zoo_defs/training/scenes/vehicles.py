@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from model_zoo_defs.training import figures
-from model_zoo_defs.training.kit import Kit
-from model_zoo_defs.training.shapes import (
+from model_zoo_defs.training.rendering.shapes import (
     Group,
     Mesh,
     box,
@@ -18,6 +16,8 @@ from model_zoo_defs.training.shapes import (
     surface,
     torus,
 )  # fmt: skip
+from model_zoo_defs.training.scenes import figures
+from model_zoo_defs.training.scenes.kit import Kit
 
 
 def _loft(stations: list[tuple[float, float, float, float]], power: float) -> Mesh:

@@ -17,8 +17,8 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 from torch import Tensor
 
-from model_zoo_defs.training.dataset import Frames
-from model_zoo_defs.training.patterns import keep, scan_lines, uniform
+from model_zoo_defs.training.learning.dataset import Frames
+from model_zoo_defs.training.learning.patterns import keep, scan_lines, uniform
 
 Depth = NDArray[np.float32]
 Points = Callable[[Generator, Depth], Depth]

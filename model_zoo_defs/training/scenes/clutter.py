@@ -6,7 +6,17 @@ from collections.abc import Callable
 
 import numpy as np
 
-from model_zoo_defs.training.household import (
+from model_zoo_defs.training.rendering.shapes import (
+    Group,
+    box,
+    prism,
+    rod,
+    superquadric,
+    surface,
+    torus,
+    tube,
+)
+from model_zoo_defs.training.scenes.household import (
     books,
     bottle,
     bowl,
@@ -20,17 +30,7 @@ from model_zoo_defs.training.household import (
     pot,
     vase,
 )
-from model_zoo_defs.training.kit import Kit
-from model_zoo_defs.training.shapes import (
-    Group,
-    box,
-    prism,
-    rod,
-    superquadric,
-    surface,
-    torus,
-    tube,
-)
+from model_zoo_defs.training.scenes.kit import Kit
 
 
 def gadget(kit: Kit) -> Group:

@@ -1,6 +1,7 @@
-"""Trains `compact` on rendered frames.
+r"""Trains `compact` on rendered frames.
 
-    python -m model_zoo_defs.training.train --data DIR --val DIR --out RUN_DIR --steps N --seed 1
+    python -m model_zoo_defs.training.learning.train --data DIR --val DIR --out RUN_DIR \
+        --steps N --seed 1
 
 RUN_DIR gets state.pt (everything `--resume` needs), log.csv (losses), val.csv (scores in per cent
 of linear interpolation's) and compact.safetensors (the averaged weights, in half precision).
@@ -24,11 +25,11 @@ from torch.utils.data import DataLoader
 from tqdm import tqdm
 
 from model_zoo_defs.compact import Compact
-from model_zoo_defs.training import priors
-from model_zoo_defs.training.dataset import Counting, Sample, Samples
-from model_zoo_defs.training.encoder_weights import pretrained_encoder
-from model_zoo_defs.training.learner import WARM_UP_STEPS, Learner, Schedule, append_row
-from model_zoo_defs.training.validation import Case, cases, scores
+from model_zoo_defs.training.learning import priors
+from model_zoo_defs.training.learning.dataset import Counting, Sample, Samples
+from model_zoo_defs.training.learning.encoder_weights import pretrained_encoder
+from model_zoo_defs.training.learning.learner import WARM_UP_STEPS, Learner, Schedule, append_row
+from model_zoo_defs.training.learning.validation import Case, cases, scores
 
 # Layers that the first generation of the network did not have; `upgraded` leaves them as they
 # are initialised, which changes no output without a prior.

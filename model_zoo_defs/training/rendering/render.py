@@ -1,4 +1,4 @@
-"""Command that renders training frames: python -m model_zoo_defs.training.render --help."""
+"""Renders training frames: python -m model_zoo_defs.training.rendering.render --help."""
 
 from __future__ import annotations
 
@@ -15,7 +15,13 @@ import numpy.typing as npt
 from PIL import Image
 from tqdm import tqdm
 
-from model_zoo_defs.training.scenes import CAMERAS, KINDS, VIEWS_PER_SCENE, Frame, scene_frames
+from model_zoo_defs.training.scenes.scenes import (
+    CAMERAS,
+    KINDS,
+    VIEWS_PER_SCENE,
+    Frame,
+    scene_frames,
+)
 
 
 @dataclass(frozen=True, kw_only=True)

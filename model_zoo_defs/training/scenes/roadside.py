@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from model_zoo_defs.training.kit import Kit
-from model_zoo_defs.training.shapes import (
+from model_zoo_defs.training.rendering.shapes import (
     Group,
     box,
     cylinder,
@@ -14,6 +13,7 @@ from model_zoo_defs.training.shapes import (
     superquadric,
     tube,
 )
+from model_zoo_defs.training.scenes.kit import Kit
 
 
 def leaves(kit: Kit, centres: np.ndarray, size: float, material: int) -> Group:

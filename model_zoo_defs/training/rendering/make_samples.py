@@ -1,4 +1,4 @@
-"""Command that renders the two frames of samples/: python -m model_zoo_defs.training.make_samples.
+"""Renders the two frames of samples/: python -m model_zoo_defs.training.rendering.make_samples.
 
 One indoor frame with some random sparse points, and one street frame with a laser scan in
 KITTI's formats. Their seeds are set aside: no training frame was made with them.
@@ -17,11 +17,11 @@ import numpy.typing as npt
 from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
-from model_zoo_defs.training.camera_effects import photographed
-from model_zoo_defs.training.scenes import build, generator, pick_view
-from model_zoo_defs.training.shading import seen
-from model_zoo_defs.training.shapes import FloatArray, rotation
-from model_zoo_defs.training.world import View, World, looking
+from model_zoo_defs.training.rendering.camera_effects import photographed
+from model_zoo_defs.training.rendering.shading import seen
+from model_zoo_defs.training.rendering.shapes import FloatArray, rotation
+from model_zoo_defs.training.scenes.scenes import build, generator, pick_view
+from model_zoo_defs.training.scenes.world import View, World, looking
 
 SAMPLE_SEED = 770077
 """Set aside for samples; training uses others."""

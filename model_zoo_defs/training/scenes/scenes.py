@@ -8,15 +8,15 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from model_zoo_defs.training.camera_effects import photographed
-from model_zoo_defs.training.desks import desk_scene
-from model_zoo_defs.training.kit import Kit
-from model_zoo_defs.training.materials import Palette
-from model_zoo_defs.training.rooms import room
-from model_zoo_defs.training.shading import seen
-from model_zoo_defs.training.shapes import FloatArray
-from model_zoo_defs.training.streets import street
-from model_zoo_defs.training.world import Plan, View, World, looking
+from model_zoo_defs.training.rendering.camera_effects import photographed
+from model_zoo_defs.training.rendering.materials import Palette
+from model_zoo_defs.training.rendering.shading import seen
+from model_zoo_defs.training.rendering.shapes import FloatArray
+from model_zoo_defs.training.scenes.desks import desk_scene
+from model_zoo_defs.training.scenes.kit import Kit
+from model_zoo_defs.training.scenes.rooms import room
+from model_zoo_defs.training.scenes.streets import street
+from model_zoo_defs.training.scenes.world import Plan, View, World, looking
 
 KINDS = ("room", "street", "desk")
 """Kinds of scene; a frame stores the index into this."""

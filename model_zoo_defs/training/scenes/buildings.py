@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from model_zoo_defs.training.kit import Kit
-from model_zoo_defs.training.shapes import Group, box, cylinder, prism, quads, rod
-from model_zoo_defs.training.walls import Hole, wall
+from model_zoo_defs.training.rendering.shapes import Group, box, cylinder, prism, quads, rod
+from model_zoo_defs.training.scenes.kit import Kit
+from model_zoo_defs.training.scenes.walls import Hole, wall
 
 
 def building(kit: Kit, width: float) -> Group:

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 
-from model_zoo_defs.training import buildings, clutter, figures, vehicles
-from model_zoo_defs.training.kit import Kit
-from model_zoo_defs.training.roadside import fence, hedge, leaf_green, pole, tree
-from model_zoo_defs.training.shapes import (
+from model_zoo_defs.training.rendering.shapes import (
     Group,
     box,
     rod,
     surface,
 )
-from model_zoo_defs.training.world import Light, Plan, Sky
+from model_zoo_defs.training.scenes import buildings, clutter, figures, vehicles
+from model_zoo_defs.training.scenes.kit import Kit
+from model_zoo_defs.training.scenes.roadside import fence, hedge, leaf_green, pole, tree
+from model_zoo_defs.training.scenes.world import Light, Plan, Sky
 
 _FAR = 110.0
 

@@ -6,9 +6,18 @@ from collections.abc import Callable
 
 import numpy as np
 
-from model_zoo_defs.training.clutter import frame, gadget, scatter
-from model_zoo_defs.training.figures import bicycle
-from model_zoo_defs.training.household import (
+from model_zoo_defs.training.rendering.shapes import (
+    Group,
+    box,
+    cylinder,
+    lathe,
+    rod,
+    superquadric,
+    tube,
+)
+from model_zoo_defs.training.scenes.clutter import frame, gadget, scatter
+from model_zoo_defs.training.scenes.figures import bicycle
+from model_zoo_defs.training.scenes.household import (
     books,
     bottle,
     bowl,
@@ -22,17 +31,8 @@ from model_zoo_defs.training.household import (
     pot,
     vase,
 )
-from model_zoo_defs.training.kit import Kit
-from model_zoo_defs.training.seating import bed, chair, sofa
-from model_zoo_defs.training.shapes import (
-    Group,
-    box,
-    cylinder,
-    lathe,
-    rod,
-    superquadric,
-    tube,
-)
+from model_zoo_defs.training.scenes.kit import Kit
+from model_zoo_defs.training.scenes.seating import bed, chair, sofa
 
 _SHELF_THINGS = (books, carton, vase, gadget, frame, mug, bottle, plant, bowl)
 

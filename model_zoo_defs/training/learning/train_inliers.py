@@ -1,6 +1,7 @@
-"""Trains the inlier weights of `compact` by themselves, before or between runs of `train`.
+r"""Trains the inlier weights of `compact` by themselves, before or between runs of `train`.
 
-    python -m model_zoo_defs.training.train_inliers --data DIR --start WEIGHTS --out WEIGHTS
+    python -m model_zoo_defs.training.learning.train_inliers --data DIR --start WEIGHTS \
+        --out WEIGHTS
 
 The statistics of the points have no parameters, so they are computed once for a few thousand
 samples; what remains is a small network on rows of numbers.
@@ -22,11 +23,11 @@ from torch import Tensor
 from tqdm import tqdm
 
 from model_zoo_defs.compact import Compact, InlierWeights, Points, PointScore, Prior
-from model_zoo_defs.training import priors
-from model_zoo_defs.training.dataset import Frames
-from model_zoo_defs.training.learner import export
-from model_zoo_defs.training.patterns import draw, outliers
-from model_zoo_defs.training.train import INLIER_ERROR, OUTLIER_ERROR, upgrade
+from model_zoo_defs.training.learning import priors
+from model_zoo_defs.training.learning.dataset import Frames
+from model_zoo_defs.training.learning.learner import export
+from model_zoo_defs.training.learning.patterns import draw, outliers
+from model_zoo_defs.training.learning.train import INLIER_ERROR, OUTLIER_ERROR, upgrade
 
 BATCH, RATE, STEPS = 4096, 1e-2, 3000
 POINTS_PER_SAMPLE = 256

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from model_zoo_defs.training.kit import Kit
-from model_zoo_defs.training.shapes import (
+from model_zoo_defs.training.rendering.shapes import (
     Group,
     cylinder,
     rod,
@@ -13,6 +12,7 @@ from model_zoo_defs.training.shapes import (
     torus,
     tube,
 )
+from model_zoo_defs.training.scenes.kit import Kit
 
 
 def person(kit: Kit) -> Group:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from model_zoo_defs.training import textures
-from model_zoo_defs.training.shapes import FloatArray
-from model_zoo_defs.training.world import Hits, View, World
+from model_zoo_defs.training.rendering import textures
+from model_zoo_defs.training.rendering.shapes import FloatArray
+from model_zoo_defs.training.scenes.world import Hits, View, World
 
 
 def seen(
