@@ -327,14 +327,18 @@ class InlierWeights(nn.Module):
         return torch.cat([each, each.mean(0, keepdim=True).expand_as(each)], 1)
 
 
+class ExactLinear(nn.Linear):
+    """A linear layer that stays in float32 at any precision: only plain `nn.Linear` is cast."""
+
+
 class PointScore(nn.Module):
     """Log odds (n,) from the statistics of n points and of their residuals against a prior."""
 
     def __init__(self, statistics: int):
         super().__init__()
-        self.enter = nn.Linear(statistics, 24)
-        self.enter_prior = nn.Linear(statistics + 2, 24, bias=False)
-        self.leave = nn.Linear(24, 1)
+        self.enter = ExactLinear(statistics, 24)
+        self.enter_prior = ExactLinear(statistics + 2, 24, bias=False)
+        self.leave = ExactLinear(24, 1)
         for layer in (self.enter_prior, self.leave):
             nn.init.zeros_(layer.weight)
         nn.init.constant_(self.leave.bias, 0.0)

@@ -22,7 +22,7 @@ pytest.importorskip("safetensors")
 tiny = pytest.importorskip("model_zoo_defs.training.learning.tiny")
 
 SHAPE = (48, 64)
-WEIGHTS = Path(tiny.__file__).parents[1] / "weights"
+WEIGHTS = Path(tiny.__file__).parents[2] / "weights"
 
 
 def slope(seed: int) -> np.ndarray:

@@ -96,7 +96,7 @@ def test_files_that_cannot_grow_stop_it_too(tmp_path: Path) -> None:
 def test_a_second_run_on_the_same_folder_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(lock, "_CLEANING_S", 0.1)
+    monkeypatch.setattr(lock, "_START_S", 0.1)
     root = pairs_on_disk(tmp_path / "drive")
 
     class Twice(Heard):
