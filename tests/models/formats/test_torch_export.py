@@ -100,7 +100,7 @@ def test_a_bare_class_or_factory_is_a_network_and_what_is_assumed_is_said(
     network = load_network(spec, tmp_path / "w.pt")
     assert network.definition.layers[0] == "block"
     assert network.definition.default_alignment == "auto"
-    assert "assumed: one rgb picture in" in network.notes[0]
+    assert "assumed: one rgb image in" in network.notes[0]
 
 
 def test_a_factory_that_needs_arguments_is_refused(tmp_path: Path) -> None:
