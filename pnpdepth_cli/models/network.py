@@ -18,10 +18,10 @@ from pnpdepth_cli.errors import CheckpointError, DeviceError, ModelError, UsageE
 from pnpdepth_cli.models.definition import Fixed, ModelDefinition, Normalisation
 from pnpdepth_cli.models.formats.python_file import importing_beside
 from pnpdepth_cli.models.frame import FrameMap
-from pnpdepth_cli.models.made_up import made_up_arguments
 from pnpdepth_cli.models.precision import dtype_of, lower
 from pnpdepth_cli.models.registry import find_definition
 from pnpdepth_cli.models.suggest_layers import suggest_layers
+from pnpdepth_cli.models.synthetic_frame import synthetic_arguments
 from pnpdepth_cli.models.weights.checkpoint import load_checkpoint
 from pnpdepth_cli.points import SparsePoints
 
@@ -245,7 +245,7 @@ def _with_suggested_layers(network: Network) -> Network:
     else:
         height = width = -(-_SUGGESTION_SIDE // size.of) * size.of
     with out_of_memory_is_a_device_error(network.device):
-        arguments = made_up_arguments(network, FrameMap.fit(size, height, width))
+        arguments = synthetic_arguments(network, FrameMap.fit(size, height, width))
         layers = suggest_layers(network.module, arguments, network.raw_of)
     if not layers:
         return network

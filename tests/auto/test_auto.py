@@ -100,7 +100,7 @@ def test_held_out_points_do_not_tell_the_depth_that_they_score(
     assert torch.equal(again.folds[0].at(way), before)
 
 
-def test_held_out_points_of_which_none_is_believed_count_alike(
+def test_held_out_points_without_any_inlier_weight_count_alike(
     frame: FrameOnDisk, network: Network, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(auto, "inlier_weights", lambda points, residual: torch.zeros_like(residual))
@@ -218,7 +218,7 @@ def test_trials_of_one_layer_share_what_lies_in_front_of_it(
             assert torch.equal(one.after(3), same.after(3))  # type: ignore[union-attr]
 
 
-def test_what_is_needless_after_the_first_is_not_made(frame: FrameOnDisk, network: Network) -> None:
+def test_a_redundant_configuration_is_not_refined(frame: FrameOnDisk, network: Network) -> None:
     inputs = in_memory(frame)
     other = replace(CONFIG, settings=replace(SETTINGS, update="sign"))
     made = refined(

@@ -9,8 +9,8 @@ from pnpdepth_cli.core.refine import RefineSettings, refine
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.models.definition import Fixed, ModelDefinition
 from pnpdepth_cli.models.frame import FrameMap
-from pnpdepth_cli.models.made_up import made_up_arguments
 from pnpdepth_cli.models.network import Network
+from pnpdepth_cli.models.synthetic_frame import synthetic_arguments
 from pnpdepth_cli.points import SparsePoints
 
 
@@ -40,7 +40,7 @@ def size_of(network: Network) -> tuple[int, int]:
 def frame_for(network: Network, size: tuple[int, int] | None = None) -> tuple[Tensor, ...]:
     """Its arguments for a made-up picture, of `size_of` by default."""
     height, width = size or size_of(network)
-    return made_up_arguments(network, FrameMap.fit(Fixed(height, width), height, width))
+    return synthetic_arguments(network, FrameMap.fit(Fixed(height, width), height, width))
 
 
 POINTS = SparsePoints(

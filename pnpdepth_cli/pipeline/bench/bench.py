@@ -26,8 +26,8 @@ from pnpdepth_cli.frames.prepare import PreparedFrame, prepare
 from pnpdepth_cli.frames.refine import refine_frame
 from pnpdepth_cli.io.depth import write_depth
 from pnpdepth_cli.models.definition import Fixed
-from pnpdepth_cli.models.made_up import made_up_frame
 from pnpdepth_cli.models.network import Network, load_network, out_of_memory_is_a_device_error
+from pnpdepth_cli.models.synthetic_frame import synthetic_frame
 from pnpdepth_cli.pipeline.bench.timing import Quartiles, Timed, in_turn, peak_mb
 from pnpdepth_cli.pipeline.refinement.inputs import read_inputs
 from pnpdepth_cli.pipeline.refinement.output_files import plan_outputs
@@ -177,7 +177,7 @@ class _Subject:
         definition = network.definition
         policy = definition.size
         own = (policy.height, policy.width) if isinstance(policy, Fixed) else DEFAULT_SIZE
-        rgb, points = made_up_frame(request.size or own, request.points)
+        rgb, points = synthetic_frame(request.size or own, request.points)
         refine_request = RefineRequest(
             files=FrameFiles(image=folder / "rgb.png", sparse=folder / "sparse.png"),
             network=NetworkChoice(model=request.model),

@@ -16,8 +16,8 @@ from pnpdepth_cli.frames.frame import Frame
 from pnpdepth_cli.frames.prepare import prepare
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.models.definition import Fixed
-from pnpdepth_cli.models.made_up import made_up_frame
 from pnpdepth_cli.models.network import Network, load_network, out_of_memory_is_a_device_error
+from pnpdepth_cli.models.synthetic_frame import synthetic_frame
 from pnpdepth_cli.points import SparsePoints
 
 _SIZE = (240, 320)
@@ -94,7 +94,7 @@ def check_model(
 
 def _synthetic(network: Network) -> Frame:
     size = network.definition.size
-    rgb, points = made_up_frame((size.height, size.width) if isinstance(size, Fixed) else _SIZE)
+    rgb, points = synthetic_frame((size.height, size.width) if isinstance(size, Fixed) else _SIZE)
     return Frame(rgb=rgb[0], points=points)
 
 

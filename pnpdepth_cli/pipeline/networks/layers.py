@@ -11,7 +11,6 @@ from pnpdepth_cli.frames.frame import Frame
 from pnpdepth_cli.frames.prepare import prepare
 from pnpdepth_cli.io.depth import read_sparse
 from pnpdepth_cli.models.definition import Fixed
-from pnpdepth_cli.models.made_up import made_up_frame
 from pnpdepth_cli.models.network import load_network, out_of_memory_is_a_device_error
 from pnpdepth_cli.models.rank_layers import (
     MeasuredLayer,
@@ -19,6 +18,7 @@ from pnpdepth_cli.models.rank_layers import (
     point_spacing,
     rank_layers,
 )
+from pnpdepth_cli.models.synthetic_frame import synthetic_frame
 
 DEFAULT_SIZE = (240, 320)
 """Rows and columns of the synthetic frame where neither a size nor sparse depth is given."""
@@ -76,7 +76,7 @@ def list_layers(
             f"the definition of {network.definition.name!r} lists no layers; --all lists every one"
         )
     with out_of_memory_is_a_device_error(network.device):
-        rgb, synthetic_points = made_up_frame(size or own)
+        rgb, synthetic_points = synthetic_frame(size or own)
         prepared = prepare(network, Frame(rgb=rgb[0], points=synthetic_points))
         rows = measure_layers(network, names, prepared.arguments, prepared.map.network, on_layer)
     spacing = point_spacing(prepared.map.network, count) if count else None

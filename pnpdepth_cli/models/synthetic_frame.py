@@ -1,4 +1,4 @@
-"""A made-up frame, to look at a network without one."""
+"""A synthetic frame, to look at a network without one."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ if TYPE_CHECKING:
 _POINTS = 500
 
 
-def made_up_arguments(network: Network, frame: FrameMap) -> tuple[Tensor, ...]:
-    """The network's arguments for the made-up frame of this size."""
-    rgb, points = made_up_frame(frame.image)
+def synthetic_arguments(network: Network, frame: FrameMap) -> tuple[Tensor, ...]:
+    """The network's arguments for the synthetic frame of this size."""
+    rgb, points = synthetic_frame(frame.image)
     return network.arguments(frame, rgb, frame.points_to_network(points))
 
 
-def made_up_frame(size: tuple[int, int], count: int = _POINTS) -> tuple[Tensor, SparsePoints]:
+def synthetic_frame(size: tuple[int, int], count: int = _POINTS) -> tuple[Tensor, SparsePoints]:
     """A picture (1, 3, H, W) of smooth noise, and points on a slanted plane; the seed is fixed."""
     height, width = size
     generator = torch.Generator().manual_seed(0)
