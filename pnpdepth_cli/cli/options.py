@@ -172,7 +172,7 @@ _SCAN_OPTIONS = (
     click.option(
         "--keep-occluded",
         is_flag=True,
-        help="Keep scan points that are occluded from the camera.",
+        help="Keep LiDAR points that are occluded from the camera.",
     ),
     click.option(
         "--min-range",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +39,7 @@ class ScanOptions:
     """Depth is the distance from the camera's centre instead of z."""
 
     keep_occluded: bool = False
-    """Points stay that the camera sees something nearer in front of."""
+    """Occluded points are kept, those of a scan as those of a depth map that holds one."""
 
     min_range: float = 0.0
     """Metres from the scanner; nearer points are dropped."""
@@ -58,10 +58,10 @@ class ScanOptions:
         """
         if self.calib is not None or sparse.suffix.lower() in set(SCAN_SUFFIXES) - {".npy"}:
             return True
-        if self != ScanOptions():
+        if replace(self, keep_occluded=False) != ScanOptions():
             raise UsageError(
-                f"{sparse} is no scan, so --camera, --range, --keep-occluded, --min-range,"
-                " --max-range and --point-fields do not apply; a scan needs --calib"
+                f"{sparse} is no scan, so --camera, --range, --min-range, --max-range and"
+                " --point-fields do not apply; a scan needs --calib"
             )
         return False
 
