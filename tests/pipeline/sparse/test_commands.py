@@ -24,7 +24,8 @@ from pnpdepth_cli.io.depth import DEPTH_SUFFIXES, read_depth, read_sparse
 from pnpdepth_cli.pipeline.sparse.outputs import SparseTarget
 from pnpdepth_cli.pipeline.sparse.project import ProjectRequest, project_scan
 from pnpdepth_cli.pipeline.sparse.sample import SampleRequest, sample_depth
-from pnpdepth_cli.pipeline.sparse.scans import ScanOptions, camera_of, read_scan_points
+from pnpdepth_cli.pipeline.sparse.scan_options import ScanOptions
+from pnpdepth_cli.pipeline.sparse.scans import camera_of, read_scan_points
 from pnpdepth_cli.pipeline.sparse.simulate import SimulateRequest, find_sensor, simulate_scan
 from tests.pipeline.scan_frames import ScanOnDisk, scan_on_disk
 
