@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from pnpdepth_cli.errors import UsageError
@@ -20,7 +20,7 @@ class ScanOptions:
     )
     camera: int | None = option(None, "KITTI camera number, 0 to 3.  [default: 2]", metavar="N")
     euclidean: bool = option(False, "Depth is the distance from the camera, not z.", flag="--range")
-    keep_occluded: bool = option(False, "Keep scan points that are occluded from the camera.")
+    keep_occluded: bool = option(False, "Keep LiDAR points that are occluded from the camera.")
     min_range: float = option(0.0, "Drop points nearer than M metres.", metavar="M")
     max_range: float | None = option(None, "Drop points farther than M metres.", metavar="M")
     point_fields: int | None = option(
@@ -41,8 +41,9 @@ class ScanOptions:
 
         if self.calib is not None or sparse.suffix.lower() in SCAN_ONLY_SUFFIXES:
             return True
-        if self != ScanOptions():
-            flags = [each.flag for each in options_of(ScanOptions) if each.name != "calib"]
+        if replace(self, keep_occluded=False) != ScanOptions():
+            for_maps = ("calib", "keep_occluded")
+            flags = [each.flag for each in options_of(ScanOptions) if each.name not in for_maps]
             raise UsageError(
                 f"{sparse} is no scan, so {', '.join(flags[:-1])} and {flags[-1]} do not apply; a"
                 " scan needs --calib"

@@ -144,7 +144,8 @@ def test_options_of_a_scan_are_refused_for_anything_else(frame: ScanOnDisk) -> N
     assert ScanOptions(calib=frame.calib).describes(Path("scan.npy"))
     assert not ScanOptions().describes(Path("sparse.npy"))
     with pytest.raises(UsageError, match="is no scan"):
-        ScanOptions(keep_occluded=True).describes(frame.gt)
+        ScanOptions(max_range=9.0).describes(frame.gt)
+    assert not ScanOptions(keep_occluded=True).describes(frame.gt)
 
 
 def sampling(frame: ScanOnDisk, output: str, **more: object) -> SampleRequest:
