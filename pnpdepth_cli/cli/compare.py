@@ -27,6 +27,12 @@ from pnpdepth_cli.cli import options
 @click.option(
     "--no-groups", is_flag=True, help="Treat all frames as independent, also those of a sequence."
 )
+@click.option(
+    "--all",
+    "all_measures",
+    is_flag=True,
+    help="Compare all measures, not only RMSE, MAE, MRE and δ1.",
+)
 @click.option("--csv", type=options.FILE, metavar="FILE|-", help="Write the table as CSV.")
 @click.option(
     "--markdown", type=options.FILE, metavar="FILE|-", help="Write the table as Markdown."
@@ -39,6 +45,7 @@ def compare(
     resamples: int,
     seed: int,
     no_groups: bool,
+    all_measures: bool,
     csv: Path | None,
     markdown: Path | None,
     latex: Path | None,
@@ -67,7 +74,13 @@ def compare(
     score_tables.check_outputs(targets, as_json)
     score_files.check_targets(targets, [Path(run) for run in runs], overwrite=overwrite)
     comparison = compare_runs(
-        CompareRequest(paths=runs, resamples=resamples, seed=seed, grouped=not no_groups)
+        CompareRequest(
+            paths=runs,
+            resamples=resamples,
+            seed=seed,
+            grouped=not no_groups,
+            all_measures=all_measures,
+        )
     )
     score_tables.print_notes(comparison.notes)
     table = score_files.comparison_table(comparison)
