@@ -52,6 +52,8 @@ def click_option(each: OptionField) -> Callable[[Any], Any]:
         details["type"] = _type_of(each)
     if option.show_default:
         details["show_default"] = True
+    if option.hidden:
+        details["hidden"] = True
     if option.alias is not None:
         details |= {"cls": Renamed, "alias": option.alias}
     return click.option(
@@ -95,15 +97,27 @@ def options_of_groups(
     return decorate
 
 
-refinement = options_of_groups(FrameFiles, NetworkChoice, MethodOptions, HoldOut, OutputOptions)
-"""The options of how a frame is refined, named as the fields of a `RefineRequest`."""
+def refinement(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Adds the options of how a frame is refined, named as the fields of a `RefineRequest`."""
+    groups = (FrameFiles, NetworkChoice, MethodOptions, HoldOut, OutputOptions)
+    return models(options_of_groups(*groups, without=["model"])(command))
 
 
 def _only(group: type, name: str) -> Callable[[Any], Any]:
     return click_option(next(each for each in options_of(group) if each.name == name))
 
 
-model = _only(NetworkChoice, "model")
+_MODEL = next(each for each in options_of(NetworkChoice) if each.name == "model")
+model = click_option(_MODEL)
+models = click.option(
+    "--model",
+    "model",
+    multiple=True,
+    default=(_MODEL.default,),
+    show_default=_MODEL.default,
+    metavar=_MODEL.option.metavar,
+    help=f"{_MODEL.option.help} Given several times, all compete and are blended.",
+)
 checkpoint = _only(NetworkChoice, "checkpoint")
 precision = _only(NetworkChoice, "precision")
 device = _only(NetworkChoice, "device")
@@ -221,6 +235,9 @@ def request_of(given: dict[str, Any], **others: Any) -> RefineRequest:
     from pnpdepth_cli.pipeline.sparse.scans import ScanOptions
 
     scan_options, rest = scan_given(given)
+    if isinstance(rest.get("model"), tuple):  # of the commands that take several
+        rest["model"], *more = rest["model"]
+        rest["more_models"] = tuple(more)
     return RefineRequest.from_fields(scan=ScanOptions(**scan_options), **rest, **others)
 
 

@@ -31,7 +31,7 @@ def root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def arguments(*more: str, source: str = "drive") -> list[str]:
     return [
         "batch", source, "-o", "out", "--model", "drive/net/my_net.py",
-        "--checkpoint", "drive/net/my_net.safetensors", *more,
+        "--checkpoint", "drive/net/my_net.safetensors", "--propagate", "none", *more,
     ]  # fmt: skip
 
 

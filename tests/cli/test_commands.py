@@ -26,7 +26,8 @@ def code_of(arguments: list[str]) -> int:
 def refine(frame: FrameOnDisk, *more: str) -> list[str]:
     return [
         "refine", str(frame.image), "--sparse", str(frame.sparse), "-o", str(frame.folder / "out"),
-        "--model", str(frame.model), "--checkpoint", str(frame.checkpoint), *more,
+        "--model", str(frame.model), "--checkpoint", str(frame.checkpoint),
+        "--propagate", "none", *more,
     ]  # fmt: skip
 
 

@@ -225,6 +225,7 @@ def _summarise(
             "with_warnings": tally.warned,
         },
         "mean": tally.mean(),
+        "linear": tally.mean_linear(),
         "baselines": tally.mean_baselines(),
         "unmatched": [str(each) for each in batch.unmatched],
     }

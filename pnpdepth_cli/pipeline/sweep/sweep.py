@@ -8,7 +8,7 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any, TypeVar
 
-from pnpdepth_cli.auto.candidates import SplitCache
+from pnpdepth_cli.auto.predictions import SplitCache
 from pnpdepth_cli.errors import (
     DeviceError,
     InputError,
