@@ -72,7 +72,7 @@ def resolve_method(request: RefineRequest) -> Method:
         return Method(
             chosen=False,
             why=why,
-            options=_with_preset(options, options.preset),
+            options=with_preset(options),
             own_layer=options.preset == PAPER,
         )
     if flags or request.network.tile is not None:
@@ -95,10 +95,15 @@ def _given(options: MethodOptions) -> list[str]:
     ]
 
 
-def _with_preset(options: MethodOptions, preset: str) -> MethodOptions:
-    if preset not in PRESETS:
-        raise UsageError(f"preset {preset!r} is none of {', '.join(PRESETS)}")
-    open_fields = {
-        name: value for name, value in PRESETS[preset].items() if getattr(options, name) is None
-    }
-    return replace(options, **open_fields)
+def with_preset(options: MethodOptions) -> MethodOptions:
+    """Returns the options, and those of the preset that they leave open.
+
+    Raises:
+        UsageError: There is no such preset.
+    """
+    if options.preset is None:
+        return options
+    if options.preset not in PRESETS:
+        raise UsageError(f"preset {options.preset!r} is none of {', '.join(PRESETS)}")
+    values = PRESETS[options.preset].items()
+    return replace(options, **{n: value for n, value in values if getattr(options, n) is None})

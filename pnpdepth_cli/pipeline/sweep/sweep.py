@@ -24,6 +24,7 @@ from pnpdepth_cli.pipeline.batch.batch import Listener
 from pnpdepth_cli.pipeline.batch.frames import BatchRequest, Task, find_frames, task_of
 from pnpdepth_cli.pipeline.batch.settings import model_identity
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs, read_inputs
+from pnpdepth_cli.pipeline.refinement.method import with_preset
 from pnpdepth_cli.pipeline.refinement.refine import Refiner, load_refiner
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest
 from pnpdepth_cli.pipeline.refinement.resolve import resolve_layer, resolve_settings
@@ -217,12 +218,13 @@ def _some_layer(request: SweepRequest) -> str | None:
 
 def _base(definition: ModelDefinition, request: RefineRequest) -> dict[str, Any]:
     """The settings that are not varied."""
-    settings = resolve_settings(definition, request.method)
-    layer = request.method.layer or definition.default_layer
+    method = with_preset(request.method)
+    settings = resolve_settings(definition, method)
+    layer = method.layer or definition.default_layer
     return {
         "layer": None if layer is None else resolve_layer(definition, layer),
         **asdict(settings),
-        "propagate": request.method.propagate or "none",
+        "propagate": method.propagate or "none",
     }
 
 
