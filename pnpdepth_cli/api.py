@@ -74,15 +74,25 @@ def load_network(
 
 
 class RefinerOptions(TypedDict, total=False):
-    """The options of `Refiner`."""
+    """The options of `Refiner`, each by keyword."""
 
     layer: str | None
+    """Layer to cut at. None takes the one that fits the spacing of the points."""
     settings: RefineSettings | None
+    """How z is updated. None takes the network's defaults."""
     propagate: str | None
+    """Propagation of the residuals at the points: "none", "gp" or "diffusion". None is "none", or
+    with `auto` the best at held-out points."""
     auto: bool | None
+    """Take the best candidate at held-out points, for each frame: the network, its refinement,
+    propagation, `compact`, every baseline, and blends. None: only if neither layer, settings,
+    propagate nor tile is given."""
     uncertainty: bool
+    """Also estimate the standard deviation of the depth."""
     tile: int | None
+    """Refine larger frames in tiles of this side length, pixels."""
     seed: int
+    """Of the random choices of `auto` and `uncertainty`."""
 
 
 class Refiner:
@@ -93,42 +103,23 @@ class Refiner:
 
     Args:
         network: From `load_network`.
-        layer: Layer to cut at. None takes the one that fits the spacing of the points.
-        settings: How z is updated. None takes the network's defaults.
-        propagate: Propagation of the residuals at the points: "none", "gp" or "diffusion". None is
-            "none", or with `auto` the best at held-out points.
-        auto: Take the best candidate at held-out points, for each frame: the network, its
-            refinement, propagation, `compact`, every baseline, and blends. None: only if neither
-            layer, settings, propagate nor tile is given.
-        uncertainty: Also estimate the standard deviation of the depth.
-        tile: Refine larger frames in tiles of this side length, pixels.
-        seed: Of the random choices of `auto` and `uncertainty`.
+        **options: See `RefinerOptions`.
+
+    Raises:
+        TypeError: There is no option of this name.
+        UsageError: `tile` is combined with `auto` or `uncertainty`.
     """
 
-    def __init__(
-        self,
-        network: Network,
-        *,
-        layer: str | None = None,
-        settings: RefineSettings | None = None,
-        propagate: str | None = None,
-        auto: bool | None = None,
-        uncertainty: bool = False,
-        tile: int | None = None,
-        seed: int = 0,
-    ) -> None:
-        self._network, self._settings = network, settings
-        if not auto and propagate is None and (settings is not None or auto is False):
-            propagate = "none"  # an option of the method, which fixes it
-        self._request = RefineRequest.from_fields(
-            layer=layer,
-            propagate=propagate,
-            auto=bool(auto),
-            uncertainty=uncertainty,
-            tile=tile,
-            seed=seed,
-        )
-        if tile is not None and needs_folds(self._request):
+    def __init__(self, network: Network, **options: Unpack[RefinerOptions]) -> None:
+        if unknown := options.keys() - RefinerOptions.__annotations__.keys():
+            raise TypeError(f"a Refiner has no options {', '.join(sorted(unknown))}")
+        self._network = network
+        self._settings = options.pop("settings", None)
+        auto = options.pop("auto", None)
+        if not auto and (self._settings is not None or auto is False):
+            options.setdefault("propagate", "none")  # an option of the method fixes it
+        self._request = RefineRequest.from_fields(auto=bool(auto), **options)
+        if options.get("tile") is not None and needs_folds(self._request):
             raise UsageError("tile cannot be combined with auto and uncertainty")
         self._open = ExitStack()
         self._opened: tuple[pipeline.Refiner, pipeline.Opened] | None = None
