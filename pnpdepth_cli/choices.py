@@ -201,6 +201,9 @@ LAYOUTS = Table(
 )
 """Data set layouts, in the order in which they are guessed: `pnpdepth_cli.io.layouts.Layout`."""
 
+COLORS = ("blue-orange", "paper")
+"""Colours of what became better and worse: blue and orange, or the paper's red and green."""
+
 FRAME_PROTOCOLS = ("whole", "nyu", "kitti-odometry", "kitti-depth")
 """What of a frame the paper's experiments use: `pnpdepth_cli.io.dataset.protocols.PROTOCOLS`."""
 

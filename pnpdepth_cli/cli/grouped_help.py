@@ -28,7 +28,10 @@ METHOD = (
     *("--blur", "--parameters", "--proximity", "--line-search", "--keep-best", "--propagate"),
     *("--holdout", "--seed"),
 )
-OUTPUT = ("--output", "--format", "--baselines", "--uncertainty", "--overwrite", "--json")
+OUTPUT = (
+    *("--output", "--format", "--colors", "--baselines", "--uncertainty", "--overwrite"),
+    "--json",
+)
 COMMON = frozenset(
     {
         *("--sparse", "--gt", "--calib", "--output", "--overwrite"),
