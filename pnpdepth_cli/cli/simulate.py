@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import fields
 from typing import Any
 
 import click
@@ -82,12 +81,9 @@ def simulate(as_json: bool, **given: Any) -> None:
     """
     from pnpdepth_cli.cli.tables import print_sparse
     from pnpdepth_cli.pipeline.sparse.simulate import SimulateRequest, simulate_scan
-    from pnpdepth_cli.sensors import SimulationSettings
 
     target = options.sparse_target(given)
-    names = [each.name for each in fields(SimulationSettings)]
-    settings = SimulationSettings(**{name: given.pop(name) for name in names})
-    record = simulate_scan(SimulateRequest(target=target, settings=settings, **given))
+    record = simulate_scan(SimulateRequest.from_fields(target=target, **given))
     if as_json:
         click.echo(json.dumps(record, indent=2))
     else:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -61,6 +61,13 @@ class SimulateRequest:
 
     channel: str | None = None
     """The EXR channel or NPZ array with the depth."""
+
+    @classmethod
+    def from_fields(cls, **values: Any) -> SimulateRequest:
+        """Returns the request with these fields, those of `settings` by their own names."""
+        names = [each.name for each in fields(SimulationSettings) if each.name in values]
+        settings = SimulationSettings(**{name: values.pop(name) for name in names})
+        return cls(settings=settings, **values)
 
 
 def simulate_scan(request: SimulateRequest) -> dict[str, Any]:
