@@ -16,7 +16,13 @@ from pnpdepth_cli.cli.progress import progress_bar
     cls=grouped_help.GroupedCommand,
     common=grouped_help.COMMON,
     groups={
-        "Input": ("--sparse", "--gt", *grouped_help.LIDAR, *grouped_help.FILE_READING),
+        "Input": (
+            "--sparse",
+            "--gt",
+            *grouped_help.LIDAR,
+            *grouped_help.COLMAP,
+            *grouped_help.FILE_READING,
+        ),
         "Network": grouped_help.NETWORK,
         "Method": grouped_help.METHOD,
         "Output": grouped_help.OUTPUT,
@@ -28,7 +34,7 @@ from pnpdepth_cli.cli.progress import progress_bar
     type=options.FILE,
     required=True,
     help="Sparse depth: a map (16-bit PNG, EXR, NPY, NPZ, PFM, TIFF), points x y depth (NPY, CSV),"
-    " or with --calib a LiDAR scan (BIN, NPY, PCD, PLY).",
+    " with --calib a LiDAR scan (BIN, NPY, PCD, PLY), or the folder of a COLMAP model.",
 )
 @options.scan
 @click.option("--gt", type=options.FILE, help="Ground truth depth to score against.")
@@ -48,6 +54,7 @@ def refine(as_json: bool, **given: Any) -> None:
     pnpdepth refine img.png --sparse s.exr --gt gt.png --auto -o out/
     pnpdepth refine img.png --sparse s.npy --model net.onnx --layer Relu_315
     pnpdepth refine 000001.png --sparse 000001.bin --calib 000001.txt
+    pnpdepth refine images/photo.jpg --sparse sparse/0/
 
     Writes <name>_depth.png (16 bit, with its scale), <name>_preview.png, <name>_improvement.png
     (red better, green worse) and <name>.json.

@@ -47,8 +47,12 @@ def print_refinement(record: Mapping[str, Any]) -> None:
     )
     for column in ("", "before", "after", "change"):
         table.add_column(column, justify="left" if not column else "right")
-    _point_rows(table, f"error at {points['used']:,} points used", record["sparse_error"])
-    _point_rows(table, f"error at {points['held_out']:,} held-out points", record["held_out_error"])
+    unit = record["unit"]
+    for title, error in (
+        (f"error at {points['used']:,} points used", record["sparse_error"]),
+        (f"error at {points['held_out']:,} held-out points", record["held_out_error"]),
+    ):
+        _point_rows(table, title, error, unit)
     if record["scores"] is not None:
         after = record["scores"]["after"]
         _score_rows(table, record["scores"])
@@ -58,7 +62,7 @@ def print_refinement(record: Mapping[str, Any]) -> None:
         )
     console.print(table)
     if record["baselines"] is not None:
-        console.print(_baselines(record["baselines"]))
+        console.print(_baselines(record["baselines"], unit))
     if record["improved_share"] is not None:
         where = "pixels with ground truth" if record["scores"] else "points"
         console.print(f"improved: {record['improved_share']:.1%} of the {where}")
@@ -77,7 +81,7 @@ def print_refinement(record: Mapping[str, Any]) -> None:
     console.print("wrote " + escape("  ".join(written)), soft_wrap=True)
 
 
-def _baselines(rows: Mapping[str, Any]) -> Table:
+def _baselines(rows: Mapping[str, Any], unit: str) -> Table:
     """Returns the baselines, the network and the result, best first at the held-out points."""
     with_gt = any(row["scores"] for row in rows.values())
     table = Table(title="against every simple baseline")
@@ -89,10 +93,10 @@ def _baselines(rows: Mapping[str, Any]) -> Table:
     order = sorted(known, key=lambda name: known[name]["held_out_mae"]) or list(rows)
     for name in order:
         row = rows[name]
-        cells = [_metres(row["held_out_mae"])]
+        cells = [_length(row["held_out_mae"], unit)]
         if with_gt:
             scores = row["scores"] or {}
-            cells += [_metres(scores.get(key)) for key in ("mae", "rmse")]
+            cells += [_length(scores.get(key), unit) for key in ("mae", "rmse")]
         table.add_row(name, *cells, style="bold" if name == "result" else None)
     return table
 
@@ -105,8 +109,8 @@ def print_batch(summary: Mapping[str, Any]) -> None:
         table = Table(title="means over frames")
         for column in ("", "before", "after", "change"):
             table.add_column(column, justify="left" if not column else "right")
-        _point_rows(table, "error at points used", mean["sparse_error"])
-        _point_rows(table, "error at held-out points", mean["held_out_error"])
+        _point_rows(table, "error at points used", mean["sparse_error"], summary["unit"])
+        _point_rows(table, "error at held-out points", mean["held_out_error"], summary["unit"])
         if mean["scores"] is not None:
             _score_rows(table, mean["scores"])
             table.caption = f"scored on the ground truth of {mean['scores']['frames']:,} frames"
@@ -116,7 +120,7 @@ def print_batch(summary: Mapping[str, Any]) -> None:
             name: {"held_out_mae": row["held_out_mae"], "scores": row}
             for name, row in summary["baselines"].items()
         }
-        console.print(_baselines(rows))
+        console.print(_baselines(rows, summary["unit"]))
     parts = [f"{counts['done']:,} of {counts['frames']:,} frames done"]
     parts += [
         f"{counts[kind]:,} {kind}" for kind in ("diverged", "failed", "pending") if counts[kind]
@@ -190,14 +194,14 @@ def _print_notes(console: Console, notes: Sequence[str]) -> None:
         console.print(escape(printable(note)), style=style, soft_wrap=True)
 
 
-def _point_rows(table: Table, title: str, error: Mapping[str, Any] | None) -> None:
+def _point_rows(table: Table, title: str, error: Mapping[str, Any] | None, unit: str) -> None:
     if error is not None:
         before, after = error["before"], error["after"]
         for name, key in (("MAE", "mae"), ("RMSE", "rmse")):
             table.add_row(
                 f"{title}, {name}",
-                _metres(before.get(key)),
-                _metres(after.get(key)),
+                _length(before.get(key), unit),
+                _length(after.get(key), unit),
                 _change(key, before.get(key), after.get(key)),
             )
 
@@ -211,8 +215,8 @@ def _score_rows(table: Table, scores: Mapping[str, Any]) -> None:
         table.add_row(title, *cells, _change(key, *values))
 
 
-def _metres(value: float | None) -> str:
-    return "–" if value is None or math.isnan(value) else f"{value:.4f} m"
+def _length(value: float | None, unit: str) -> str:
+    return "–" if value is None or math.isnan(value) else f"{value:.4f} {unit}"
 
 
 def _change(key: str, before: float | None, after: float | None) -> str:

@@ -224,6 +224,7 @@ def _summarise(
             "pending": len(batch.frames) - known,
             "with_warnings": tally.warned,
         },
+        "unit": tally.unit,
         "mean": tally.mean(),
         "baselines": tally.mean_baselines(),
         "unmatched": [str(each) for each in batch.unmatched],

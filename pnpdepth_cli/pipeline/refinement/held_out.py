@@ -146,9 +146,8 @@ def auto_notes(
     network = choice.network_error
     assert network is not None
     note = (
-        f"auto: {choice}; {choice.error:.4f} m off at {choice.held_out:,} held-out points in"
-        f" {choice.folds} folds (network {network:.4f} m, best baseline {best}"
-        f" {errors[best]:.4f} m)"
+        f"auto: {choice}; MAE {choice.error:.4f} at {choice.held_out:,} held-out points in"
+        f" {choice.folds} folds (network {network:.4f}, best baseline {best} {errors[best]:.4f})"
     )
     if definition.input_kind == "rgb" or network <= errors[best]:
         return (note,)

@@ -33,6 +33,7 @@ from pnpdepth_cli.pipeline.refinement.resolve import (
     resolve_layer,
     resolve_settings,
 )
+from pnpdepth_cli.pipeline.sparse.colmap import METRES
 from pnpdepth_cli.pipeline.stopwatch import Stopwatch, peak_memory_mb, versions
 from pnpdepth_cli.points import SparsePoints
 
@@ -209,7 +210,7 @@ def load_refiner(request: RefineRequest, first: Inputs) -> Refiner:
         request=request,
         network=network,
         layer=resolve_layer(network.definition, request.method.layer),
-        settings=resolve_settings(network.definition, request.method),
+        settings=resolve_settings(network.definition, request.method, metric=first.unit == METRES),
     )
 
 
@@ -235,6 +236,7 @@ def _record(refiner: Refiner, inputs: Inputs, frame: RefinedFrame) -> dict[str, 
     hold_out, propagate = request.hold_out, request.method.propagate
     return {
         "versions": versions(),
+        "unit": inputs.unit,
         "inputs": inputs.record,
         "model": refiner.model_record,
         "settings": {

@@ -55,7 +55,8 @@ class FrameFiles:
     image: Source | None = None
     """Input image. None for a network that takes sparse depth alone."""
     sparse: Path | None = None
-    """Sparse depth, or a LiDAR scan. None: `sample` takes points of the ground truth."""
+    """Sparse depth, a LiDAR scan, or a COLMAP model. None: `sample` takes points of the ground
+    truth."""
     gt: Source | None = None
     """Ground truth depth."""
     depth_scale: float | None = option(
@@ -71,6 +72,24 @@ class FrameFiles:
     )
     sparse_size_ok: bool = option(
         False, "Accept a sparse depth map of another size; its points are moved to the image."
+    )
+    unit_scale: float | None = option(
+        None,
+        "Metres per unit of a COLMAP model.  [default: depth is in model units]",
+        metavar="M",
+    )
+    min_track: int = option(
+        3,
+        "Drop points of a COLMAP model that fewer images observe.",
+        metavar="N",
+        least=1,
+        show_default=True,
+    )
+    max_reprojection: float = option(
+        2.0,
+        "Drop points of a COLMAP model with a larger mean reprojection error.",
+        metavar="PIXELS",
+        show_default=True,
     )
     scan: ScanOptions = field(default_factory=_default_scan)
     """How `sparse` is projected where it is a LiDAR scan."""
