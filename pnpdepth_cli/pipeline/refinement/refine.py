@@ -33,7 +33,7 @@ from pnpdepth_cli.pipeline.refinement.resolve import (
     resolve_layer,
     resolve_settings,
 )
-from pnpdepth_cli.pipeline.sparse.colmap import METRES
+from pnpdepth_cli.pipeline.sparse.colmap_options import METRES
 from pnpdepth_cli.pipeline.stopwatch import Stopwatch, peak_memory_mb, versions
 from pnpdepth_cli.points import SparsePoints
 

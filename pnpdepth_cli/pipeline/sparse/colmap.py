@@ -9,41 +9,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pnpdepth_cli.errors import InputError, NoPointsError, SizeError, UsageError
+from pnpdepth_cli.errors import InputError, NoPointsError, SizeError
 from pnpdepth_cli.io.colmap.model import find_model, model_files, name_in_model, read_model
 from pnpdepth_cli.io.colmap.parts import ColmapCamera, ColmapModel
 from pnpdepth_cli.io.depth import describe_range
 from pnpdepth_cli.io.fingerprint import fingerprint
+from pnpdepth_cli.pipeline.sparse.colmap_options import METRES, MODEL_UNITS, ColmapOptions
 from pnpdepth_cli.points import SparsePoints, in_frame
 from pnpdepth_cli.sensors import Camera, Points
 from pnpdepth_cli.sensors.sparse import DropCounter, nearest_in_pixel
-
-METRES, MODEL_UNITS = "m", "model units"
 
 _SIZES_IN_RANGE = 8.0
 """A 16-bit file in model units holds depths up to at least so many times the model's extent."""
 
 _LARGEST_CODE = 65535
-
-
-@dataclass(frozen=True, kw_only=True)
-class ColmapOptions:
-    """Which points of the model are used, and their unit."""
-
-    unit_scale: float | None = None
-    """Metres per unit of the model; None leaves depth in model units."""
-
-    min_track: int = 3
-    """Fewest images that observe a point; no more than the model has."""
-
-    max_reprojection: float = 2.0
-    """Largest mean reprojection error of a point, pixels."""
-
-    def __post_init__(self) -> None:
-        if self.unit_scale is not None and not 0 < self.unit_scale < np.inf:
-            raise UsageError(f"--unit-scale {self.unit_scale:g} is no length; give metres per unit")
-        if self.min_track < 1 or not self.max_reprojection > 0:
-            raise UsageError("--min-track must be 1 or more, and --max-reprojection above 0")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -14,7 +14,8 @@ from pnpdepth_cli.cli.main import main
 from pnpdepth_cli.errors import InputError, NoPointsError, SizeError, UsageError
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.io.layouts import list_frames
-from pnpdepth_cli.pipeline.sparse.colmap import ColmapOptions, read_colmap_points
+from pnpdepth_cli.pipeline.sparse.colmap import read_colmap_points
+from pnpdepth_cli.pipeline.sparse.colmap_options import ColmapOptions
 from tests.colmap_models import HEIGHT, WIDTH, write_text_model
 from tests.pipeline.frames import FrameOnDisk, frame_on_disk, run
 
@@ -93,7 +94,7 @@ def test_depth_is_in_model_units_and_every_output_says_so(tmp_path: Path, projec
 
 
 def test_a_unit_scale_makes_it_metres(tmp_path: Path, project: Path) -> None:
-    record = refine(frame_on_disk(tmp_path), project, unit_scale=0.5)
+    record = refine(frame_on_disk(tmp_path), project, colmap=ColmapOptions(unit_scale=0.5))
     assert record["unit"] == "m"
     assert 1.7 < record["points"]["nearest"] < record["points"]["farthest"] < 2.3
     assert read_depth(tmp_path / "out" / "a_depth.png").scale == 256
@@ -191,5 +192,7 @@ def test_the_largest_of_several_models_is_used(project: Path) -> None:
 def test_a_network_of_metres_is_scaled_to_model_units(tmp_path: Path, project: Path) -> None:
     frame = frame_on_disk(tmp_path)
     assert refine(frame, project)["settings"]["align"] == "scale"
-    record = refine(frame, project, unit_scale=1.0, output=tmp_path / "metres")
+    record = refine(
+        frame, project, colmap=ColmapOptions(unit_scale=1.0), output=tmp_path / "metres"
+    )
     assert record["settings"]["align"] == "none"
