@@ -25,8 +25,9 @@ from pnpdepth_cli.io.fingerprint import fingerprint
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.pipeline.refinement.request import FrameFiles, RefineRequest
 from pnpdepth_cli.pipeline.sparse.colmap import read_colmap_points
-from pnpdepth_cli.pipeline.sparse.colmap_options import METRES
-from pnpdepth_cli.pipeline.sparse.scans import ScanOptions, read_scan_points
+from pnpdepth_cli.pipeline.sparse.colmap_options import METRES, ColmapOptions
+from pnpdepth_cli.pipeline.sparse.scan_options import ScanOptions
+from pnpdepth_cli.pipeline.sparse.scans import read_scan_points
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.sensors import Points, occluded_in_map, sample_points
 
@@ -116,6 +117,11 @@ def read_inputs(request: RefineRequest) -> Inputs:
         sparse = _sampled(files, image, truth, request.hold_out.seed)
     elif files.sparse.is_dir():
         sparse = _read_colmap(files, files.sparse, whole)
+    elif files.colmap != ColmapOptions():
+        raise UsageError(
+            f"{files.sparse} is no COLMAP model, so --unit-scale, --min-track and"
+            " --max-reprojection do not apply"
+        )
     elif files.scan.describes(files.sparse):
         sparse = _read_scan(files, files.sparse, whole)
     else:

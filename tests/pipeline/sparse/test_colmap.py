@@ -196,3 +196,8 @@ def test_a_network_of_metres_is_scaled_to_model_units(tmp_path: Path, project: P
         frame, project, colmap=ColmapOptions(unit_scale=1.0), output=tmp_path / "metres"
     )
     assert record["settings"]["align"] == "none"
+
+
+def test_options_of_a_model_are_refused_for_other_sparse_depth(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match=r"s\.png is no COLMAP model, so --unit-scale"):
+        run(frame_on_disk(tmp_path), colmap=ColmapOptions(unit_scale=1.0))
