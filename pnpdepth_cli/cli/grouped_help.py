@@ -32,7 +32,7 @@ METHOD = (
 OUTPUT = ("--output", "--format", "--baselines", "--uncertainty", "--overwrite", "--json")
 COMMON = frozenset(
     {
-        *("--sparse", "--gt", "--calib", "--unit-scale", "--output", "--overwrite"),
+        *("--sparse", "--gt", "--calib", "--output", "--overwrite"),
         *("--json", "--model", "--checkpoint", "--layer", "--align", "--auto"),
         *("--iterations", "--lr", "--loss", "--update", "--holdout"),
         "--uncertainty",

@@ -54,7 +54,6 @@ def refine(as_json: bool, **given: Any) -> None:
     pnpdepth refine img.png --sparse s.exr --gt gt.png --auto -o out/
     pnpdepth refine img.png --sparse s.npy --model net.onnx --layer Relu_315
     pnpdepth refine 000001.png --sparse 000001.bin --calib 000001.txt
-    pnpdepth refine images/photo.jpg --sparse sparse/0/
 
     Writes <name>_depth.png (16 bit, with its scale), <name>_preview.png, <name>_improvement.png
     (red better, green worse) and <name>.json.
