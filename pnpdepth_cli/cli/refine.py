@@ -33,8 +33,8 @@ from pnpdepth_cli.cli.progress import progress_bar
     "--sparse",
     type=options.FILE,
     required=True,
-    help="Sparse depth: a map (16-bit PNG, EXR, NPY, NPZ, PFM, TIFF), points x y depth (NPY, CSV),"
-    " with --calib a LiDAR scan (BIN, NPY, PCD, PLY), or the folder of a COLMAP model.",
+    help="Sparse depth: a map (16-bit PNG, EXR, NPY, …), points x y depth (NPY, CSV), a LiDAR scan"
+    " with --calib (BIN, NPY, PCD, PLY), or the folder of a COLMAP model.",
 )
 @options.scan
 @click.option("--gt", type=options.FILE, help="Ground truth depth to score against.")
