@@ -216,8 +216,8 @@ LENSES = (
 )
 """Lens distortions: `pnpdepth_cli.sensors.lens`."""
 
-EVAL_PROTOCOLS = ("paper", "nyu", "kitti", "kitti-devkit", "eigen", "garg")
-"""Published ways to score depth: `pnpdepth_cli.pipeline.evaluation.protocols.PROTOCOLS`."""
+EVAL_PROTOCOLS = ("paper", "nyu-eigen", "kitti", "kitti-devkit", "eigen", "garg")
+"""Published protocols of scoring depth: `pnpdepth_cli.pipeline.evaluation.protocols.PROTOCOLS`."""
 
 AVERAGES = ("per-image", "pooled")
 """How errors are averaged: every image or every pixel has equal weight."""
