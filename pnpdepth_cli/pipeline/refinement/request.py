@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 from pnpdepth_cli import choices
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.pipeline.options import Axis, option
+from pnpdepth_cli.pipeline.sparse.colmap_options import ColmapOptions
 from pnpdepth_cli.pipeline.sparse.scan_options import ScanOptions
 
 if TYPE_CHECKING:
@@ -49,7 +50,8 @@ class FrameFiles:
     image: Source | None = None
     """Input image. None for a network that takes sparse depth alone."""
     sparse: Path | None = None
-    """Sparse depth, or a LiDAR scan. None: `sample` takes points of the ground truth."""
+    """Sparse depth, a LiDAR scan, or a COLMAP model. None: `sample` takes points of the ground
+    truth."""
     gt: Source | None = None
     """Ground truth depth."""
     depth_scale: float | None = option(
@@ -66,6 +68,8 @@ class FrameFiles:
     sparse_size_ok: bool = option(
         False, "Accept a sparse depth map of another size; its points are moved to the image."
     )
+    colmap: ColmapOptions = field(default_factory=ColmapOptions)
+    """Which points are used where `sparse` is a COLMAP model."""
     scan: ScanOptions = field(default_factory=ScanOptions)
     """How `sparse` is projected where it is a LiDAR scan."""
     sample: SamplePattern | None = None
