@@ -18,6 +18,7 @@ LIDAR = (
     *("--calib", "--camera", "--range", "--keep-occluded", "--min-range", "--max-range"),
     "--point-fields",
 )
+COLMAP = ("--unit-scale", "--min-track", "--max-reprojection")
 FILE_READING = ("--depth-scale", "--gt-scale", "--channel", "--sparse-size-ok", "--max-pixels")
 NETWORK = (
     *("--model", "--checkpoint", "--layer", "--align", "--align-every", "--output-kind"),

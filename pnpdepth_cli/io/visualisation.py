@@ -46,6 +46,7 @@ def preview(
     before: Depth,
     after: Depth,
     path: Path,
+    unit: str = "m",
 ) -> None:
     """Writes a PNG of image, sparse depth, depth before and after, and what changed.
 
@@ -59,6 +60,7 @@ def preview(
         before: (H, W) metres before refinement.
         after: (H, W) metres after refinement.
         path: The PNG.
+        unit: Of all depths, where it is not the metre.
 
     Raises:
         SizeError: Image and depth differ in size.
@@ -87,7 +89,7 @@ def preview(
         Panel(title="Depth after", pixels=resized(scale.paint(after), factor)),
         *_change_panels(before, after, scale, grey, factor),
     ]
-    save_page(depth_page(panels, columns, scale), path)
+    save_page(depth_page(panels, columns, scale, unit), path)
 
 
 def _change_panels(
@@ -121,7 +123,7 @@ def _change_panels(
         Panel(
             title="Change",
             pixels=shown,
-            remark=f"after - before: teal farther, purple nearer, full at {strongest:.3g} m",
+            remark=f"after - before: teal farther, purple nearer, full at {strongest:.3g}",
         ),
         Panel(title="Zoom", pixels=zoom, remark="before | after, where most changed (frame)"),
     ]
@@ -188,7 +190,7 @@ def improvement(
     return _save_gain(
         panel,
         gain[known],
-        _GainKey(strongest=strongest, swatch=swatch, noun="pixels", colors=colors),
+        _GainKey(amount=f"{strongest:.3g} m or more", swatch=swatch, noun="pixels", colors=colors),
         path,
     )
 
@@ -201,7 +203,7 @@ def improvement_at_points(
     after_at: Depth,
     held_out: bool,
     path: Path,
-    *,
+    unit: str = "m",
     colors: str = "blue-orange",
 ) -> float:
     """Writes a PNG of where the error at sparse points fell and rose, as discs on the grey image.
@@ -214,6 +216,7 @@ def improvement_at_points(
         after_at: (N,) metres after refinement.
         held_out: Whether refinement did not use the points, which the PNG says.
         path: The PNG.
+        unit: Of all depths, where it is not the metre.
         colors: One of `choices.COLORS`.
 
     Returns:
@@ -243,7 +246,8 @@ def improvement_at_points(
     )
     panel = Panel(title="Change of error", pixels=discs, remark=remark)
     noun = "held-out points" if held_out else "points used"
-    key = _GainKey(strongest=strongest, swatch=None, noun=noun, colors=colors)
+    amount = f"{strongest:.3g} {unit} or more"
+    key = _GainKey(amount=amount, swatch=None, noun=noun, colors=colors)
     return _save_gain(panel, gain, key, path)
 
 
@@ -267,8 +271,8 @@ def _strongest(gain: NDArray[np.float64]) -> float:
 class _GainKey:
     """What the colours of a map of gains mean."""
 
-    strongest: float
-    """Metres of full colour."""
+    amount: str
+    """Change of full colour."""
     swatch: tuple[tuple[int, int, int], str] | None
     """A colour outside the bar and its meaning."""
     noun: str
@@ -278,13 +282,13 @@ class _GainKey:
 
 
 def _save_gain(panel: Panel, gain: NDArray[np.float64], key: _GainKey, path: Path) -> float:
+    """Writes the panel with a colour bar and a footer. Returns the fraction with a gain above 0."""
     improved, worse = float((gain > 0).mean()), float((gain < 0).mean())
     strength = np.linspace(-1, 1, 220)
     bar = np.repeat(paint_gain(strength, np.full(220, 0.88), key.colors)[None], 18, axis=0)
-    amount = f"{key.strongest:.3g} m or more"
     counted = f"{gain.size:,} {key.noun}"
     footer = f"{100 * improved:.1f} % of {counted} improved, {100 * worse:.1f} % worse"
-    ends = (f"worse by {amount}", f"better by {amount}")
+    ends = (f"worse by {key.amount}", f"better by {key.amount}")
     save_page(gain_page(panel, bar, ends, key.swatch, footer), path)
     return improved
 

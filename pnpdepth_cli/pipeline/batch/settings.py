@@ -28,7 +28,7 @@ def settings_of(request: RefineRequest, model: dict[str, Any], *groups: str) -> 
     if "scan" in fields:
         fields["scan"] = asdict(fields["scan"])
         del fields["scan"]["calib"]
-    for name in ("sample", "protocol"):
+    for name in ("colmap", "sample", "protocol"):
         if fields.get(name) is not None:
             fields[name] = asdict(fields[name])
     settings: dict[str, Any] = plain(fields | model)
