@@ -262,6 +262,7 @@ def _json_fields(path: Path, text: str) -> dict[str, str]:
 
 
 def _numbers(path: Path, fields: dict[str, str], name: str, counts: Sequence[int]) -> list[float]:
+    """The finite numbers of a field, as many as one of `counts`."""
     if name not in fields:
         raise FileFormatError(
             f"{path} has no {name}; this calibration is incomplete or of another kind"

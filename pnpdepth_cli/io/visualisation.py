@@ -204,6 +204,7 @@ def _save_gain(
     noun: str,
     path: Path,
 ) -> float:
+    """Writes the panel with a colour bar and a footer. Returns the fraction with a gain above 0."""
     improved, worse = float((gain > 0).mean()), float((gain < 0).mean())
     strength = np.linspace(-1, 1, 220)
     bar = np.repeat(paint_gain(strength, np.full(220, 0.88))[None], 18, axis=0)

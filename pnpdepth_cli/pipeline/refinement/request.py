@@ -93,8 +93,8 @@ class NetworkChoice:
     """Further networks, with their own weights; they compete and are blended with the first."""
     checkpoint: Path | None = option(
         None,
-        "Weights: a safetensors, torch, numpy or TensorFlow (.index) file, or a folder of them. No"
-        " code in them is run.",
+        "Weights: a safetensors, torch, numpy or TensorFlow (.index) file, or a folder. No code in"
+        " it is run.",
     )
     output_kind: str | None = option(
         None,
@@ -228,9 +228,7 @@ class HoldOut:
         parse=parse_seconds,
     )
     baselines: bool = option(False, "Also score every baseline, such as linear interpolation.")
-    uncertainty: bool = option(
-        False, "Write <name>_sigma.exr, the standard deviation of the depth."
-    )
+    uncertainty: bool = option(False, "Write <name>_sigma.exr, the depth's standard deviation.")
     holdout: float = option(0.0, "Hold out this fraction of the points to score at.", metavar="F")
     seed: int = option(
         0, "Random seed.", metavar="N", least=0, most=LARGEST_SEED, show_default=True
