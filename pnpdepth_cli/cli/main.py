@@ -57,6 +57,7 @@ COMMANDS = {
     "project": "project:project",
     "sample": "sample:sample",
     "simulate": "simulate:simulate",
+    "cloud": "cloud:cloud",
     "eval": "evaluate:evaluate",
     "compare": "compare:compare",
     "sweep": "sweep:sweep",
