@@ -212,9 +212,8 @@ def _masks(
             " `pnpdepth refine --uncertainty` writes"
         )
     sigma = read_depth(frame.sigma).values
-    if sigma.shape == depth.shape:
-        sigma = sigma <= request.max_sigma * depth
-    yield frame.sigma, sigma.astype(bool)
+    same_size = sigma.shape == depth.shape
+    yield frame.sigma, sigma <= request.max_sigma * depth if same_size else sigma > 0
 
 
 def _camera(
