@@ -15,7 +15,16 @@ OTHER = "Other"
 """Title of the options that no group lists."""
 
 LIDAR = (
-    *("--calib", "--camera", "--range", "--keep-occluded", "--min-range", "--max-range"),
+    *(
+        "--calib",
+        "--extrinsics",
+        "--inverse-extrinsics",
+        "--camera",
+        "--range",
+        "--keep-occluded",
+        "--min-range",
+        "--max-range",
+    ),
     "--point-fields",
 )
 COLMAP = ("--unit-scale", "--min-track", "--max-reprojection")
