@@ -82,6 +82,7 @@ class RefinerOptions(TypedDict, total=False):
 
     layer: str | None
     settings: RefineSettings | None
+    target: str
     propagate: str | None
     auto: bool
     uncertainty: bool
@@ -98,13 +99,14 @@ class Refiner:
     Args:
         network: From `load_network`.
         layer: Layer to cut at. None takes the network's default.
-        settings: How z is updated. None takes the network's defaults.
+        settings: What is updated and how. None takes the network's defaults for the target.
+        target: "given", or "masked" to update weights by points hidden from the network's input.
         propagate: Propagation of the residuals at the points: "none", "gp" or "diffusion". None is
             "none", or with `auto` the best by cross-validation.
         auto: Choose alignment, updates and propagation by cross-validation, for each frame.
         uncertainty: Also estimate the standard deviation of the depth.
         tile: Refine larger frames in tiles of this side length, pixels.
-        seed: Of the random choices of `auto` and `uncertainty`.
+        seed: Of the random choices of `auto`, `uncertainty` and `target`.
     """
 
     def __init__(
@@ -113,6 +115,7 @@ class Refiner:
         *,
         layer: str | None = None,
         settings: RefineSettings | None = None,
+        target: str = "given",
         propagate: str | None = None,
         auto: bool = False,
         uncertainty: bool = False,
@@ -121,6 +124,7 @@ class Refiner:
     ) -> None:
         self._network, self._layer, self._settings = network, layer, settings
         self._request = RefineRequest.from_fields(
+            target=target if settings is None else settings.target,
             propagate=propagate,
             auto=auto,
             uncertainty=uncertainty,
@@ -184,7 +188,8 @@ class Refiner:
             request=self._request,
             network=network,
             layer=resolve_layer(network.definition, self._layer),
-            settings=self._settings or resolve_settings(network.definition, self._request.method),
+            settings=self._settings
+            or resolve_settings(network.definition, self._request.method, self._request.hold_out),
         )
 
 

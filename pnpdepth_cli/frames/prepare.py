@@ -26,10 +26,26 @@ class PreparedFrame:
     """The frame in the image frame."""
     map: FrameMap
     """From the image frame to the network's frame."""
+    image: Tensor | None
+    """The image as the network takes it. None if it takes none."""
     arguments: tuple[Tensor, ...]
     """Arguments of the network."""
     points: SparsePoints
     """The points that the network sees, in its frame and on its device."""
+
+    @property
+    def varying(self) -> tuple[int, ...]:
+        """Positions of the arguments that depend on the points."""
+        fewer = self.arguments_for(self.points)
+        return tuple(
+            index
+            for index, (one, other) in enumerate(zip(self.arguments, fewer, strict=True))
+            if one is not other
+        )
+
+    def arguments_for(self, points: SparsePoints) -> tuple[Tensor, ...]:
+        """Returns the arguments of the network for some of the points; the image is the same."""
+        return self.network.arguments_of(self.image, points)
 
     def depth_reader(self, settings: RefineSettings) -> AlignedDepth:
         """Returns a new reader of the network's output in metres, (1, 1, h, w)."""
@@ -63,11 +79,12 @@ def prepare(network: Network, frame: Frame) -> PreparedFrame:
     """
     to_network = FrameMap.fit(network.definition.size, *frame.size)
     points = to_network.points_to_network(frame.points)
-    rgb = None if frame.rgb is None else frame.rgb[None]
+    image = network.image_of(to_network, None if frame.rgb is None else frame.rgb[None])
     return PreparedFrame(
         network=network,
         frame=frame,
         map=to_network,
-        arguments=network.arguments(to_network, rgb, points),
+        image=image,
+        arguments=network.arguments_of(image, points),
         points=points.tensors(network.device),
     )

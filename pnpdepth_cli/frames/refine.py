@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from pnpdepth_cli.completion.propagation import propagate
-from pnpdepth_cli.core.refine import Refinement, RefineSettings, refine_from
-from pnpdepth_cli.core.split import Split
+from pnpdepth_cli.core.refine import Refinement, RefineSettings, refine_from, refine_weights
+from pnpdepth_cli.core.split import InputSplit, Split
+from pnpdepth_cli.core.weights import MovingWeights
 from pnpdepth_cli.errors import BatchError, DivergedError, PnpDepthError
 from pnpdepth_cli.frames.frame import DepthMap, Frame, RefinedFrame, no_points
 from pnpdepth_cli.frames.prepare import PreparedFrame, prepare
 from pnpdepth_cli.models.aligned import AlignedDepth
 from pnpdepth_cli.models.network import Network, out_of_memory_is_a_device_error
+from pnpdepth_cli.points import SparsePoints
 
 OnIteration = Callable[[int, float], None]
 """Called with (updates made, loss)."""
@@ -72,7 +75,9 @@ def refine_frames(
         seen = [each for each in prepared if len(each.points)]
         readers = [each.depth_reader(settings) for each in seen]
         results: list[Refinement | PnpDepthError] = []
-        if seen:
+        if seen and settings.moves_weights:
+            results = [_refine_weights(split, settings, seen, readers, on_iteration)]
+        elif seen:
             with torch.no_grad():
                 z = split.front(*_stacked([each.arguments for each in seen]))
             results = refine_from(
@@ -88,6 +93,44 @@ def refine_frames(
         for each in zip(seen, readers, results, strict=True)
     )
     return [next(refined) if len(each.points) else each.no_points_error() for each in prepared]
+
+
+def _refine_weights(
+    split: Split,
+    settings: RefineSettings,
+    frames: Sequence[PreparedFrame],
+    readers: Sequence[AlignedDepth],
+    on_iteration: OnIteration,
+) -> Refinement | PnpDepthError:
+    """The result of one frame, whose weights move for it alone."""
+    if len(frames) > 1:
+        raise BatchError("weights move for one frame alone; refine the frames one at a time")
+    (frame,), (reader,) = frames, readers
+    if isinstance(split, InputSplit):
+        output = split.first(*frame.arguments, varying=frame.varying)
+
+        def predict(points: SparsePoints) -> Any:
+            return split.again(*frame.arguments_for(points))
+    else:
+        with torch.no_grad():
+            z0 = split.front(*frame.arguments)
+            output = split.rear(z0)
+
+        def predict(points: SparsePoints) -> Any:
+            return split.rear(z0)
+
+    try:
+        return refine_weights(
+            output,
+            predict,
+            MovingWeights(frame.network.module, settings.parameters, settings.mask.seed),
+            frame.points,
+            settings,
+            depth_of=reader,
+            on_iteration=lambda iteration, loss: on_iteration(iteration + 1, loss),
+        )
+    except PnpDepthError as error:
+        return error
 
 
 def to_refined_frame(

@@ -29,6 +29,7 @@ from pnpdepth_cli.pipeline.refinement.outputs import write_outputs
 from pnpdepth_cli.pipeline.refinement.points import PointError, point_error, split_points
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest
 from pnpdepth_cli.pipeline.refinement.resolve import (
+    moves_weights,
     resolve_definition,
     resolve_layer,
     resolve_settings,
@@ -92,7 +93,9 @@ class Refiner:
     """With `--auto`, the candidates that compete. None: each frame finds its own."""
 
     def split(self) -> Split:
-        """Returns the network cut at the layer, to be opened for all frames."""
+        """Returns the network cut at the layer, or at its sparse depth, to be opened for all."""
+        if self.settings.masked:
+            return self.network.cut_at_points()
         return self.network.cut_at(self.layer)
 
     def refine(
@@ -197,7 +200,7 @@ def load_refiner(request: RefineRequest, first: Inputs) -> Refiner:
         ModelError: The network cannot be loaded.
     """
     choice, hold_out = request.network, request.hold_out
-    if hold_out.time_budget_s is not None and not hold_out.auto:
+    if hold_out.time_budget_s is not None and not (hold_out.auto or moves_weights(request.method)):
         raise UsageError("--time-budget is for the trials of --auto; give that too")
     if choice.tile is not None and hold_out.needs_folds:
         raise UsageError("--tile goes with none of --auto, --baselines and --uncertainty")
@@ -205,11 +208,17 @@ def load_refiner(request: RefineRequest, first: Inputs) -> Refiner:
         choice.model, choice.checkpoint, choice.device, precision=choice.precision
     )
     network = resolve_definition(network, first.frame(), choice)
+    settings = resolve_settings(network.definition, request.method, hold_out)
+    if settings.moves_weights and hold_out.needs_folds:
+        raise UsageError(
+            "weights cannot be updated together with --auto, --baselines or --uncertainty; leave"
+            " out --target and --parameters"
+        )
     return Refiner(
         request=request,
         network=network,
         layer=resolve_layer(network.definition, request.method.layer),
-        settings=resolve_settings(network.definition, request.method),
+        settings=settings,
     )
 
 
@@ -259,6 +268,7 @@ def _record(refiner: Refiner, inputs: Inputs, frame: RefinedFrame) -> dict[str, 
             "farthest": float(inputs.points.depth.max()),
         },
         "loss": list(frame.refinement.losses),
+        "kept": frame.refinement.kept,
         "sparse_error": _before_after(frame, lambda d: point_error(d, frame.used)),
         "held_out_error": _before_after(frame, lambda d: point_error(d, frame.held_out)),
         "scores": _before_after(frame, lambda d: _score(d, inputs.gt)),
