@@ -20,7 +20,7 @@ import torch
 
 from pnpdepth_cli.io.depth import write_depth
 from pnpdepth_cli.pipeline.batch.batch import run_batch
-from pnpdepth_cli.pipeline.batch.frames import BatchRequest
+from pnpdepth_cli.pipeline.batch.request import BatchRequest
 from pnpdepth_cli.pipeline.refinement.request import NetworkChoice, RefineRequest
 from pnpdepth_cli.pipeline.stopwatch import peak_memory_mb
 

@@ -15,7 +15,8 @@ from benchmarks.frames import SETS, Depth, EvalFrame, points_on_grid, sampled
 from pnpdepth_cli.errors import NoPointsError, UsageError
 from pnpdepth_cli.io.dataset.protocols import PROTOCOLS, Protocol
 from pnpdepth_cli.io.layouts import Frame, read_frame_ground_truth, read_frame_image, read_frames
-from pnpdepth_cli.pipeline.batch.frames import BatchRequest, task_of
+from pnpdepth_cli.pipeline.batch.frames import task_of
+from pnpdepth_cli.pipeline.batch.request import BatchRequest
 from pnpdepth_cli.pipeline.refinement.inputs import read_inputs
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest
 from pnpdepth_cli.points import SparsePoints

@@ -1,8 +1,8 @@
 """Evidence for the sensors: python -m benchmarks.sensors DATA, DATA the folder of real frames.
 
 Projection against rendered ground truth (samples/street), the occlusion filter against KITTI's
-accumulated ground truth, the fractions of samples of the paper's LiDARs, and the time of a
-projection. Without DATA, only what the samples can show.
+accumulated ground truth, of scans and of projected maps, the fractions of samples of the paper's
+LiDARs, and the time of a projection. Without DATA, only what the samples can show.
 """
 
 from __future__ import annotations
@@ -13,18 +13,27 @@ import time
 from pathlib import Path
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
+from benchmarks.frames import frame_inputs, frame_pixels, kitti_dc, points_on_grid, refined
+from pnpdepth_cli.completion.interpolation import linear
+from pnpdepth_cli.core.metrics import score
 from pnpdepth_cli.io.calibration import read_calibration
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.io.scans import read_scan
+from pnpdepth_cli.models.network import load_network
+from pnpdepth_cli.pipeline.refinement.request import MethodOptions
+from pnpdepth_cli.pipeline.refinement.resolve import resolve_layer, resolve_settings
 from pnpdepth_cli.pipeline.sparse.scans import camera_of
 from pnpdepth_cli.sensors import (
     FORWARD_LEFT_UP,
     LIDARS,
     Camera,
     OcclusionFilter,
+    Points,
     ProjectionSettings,
+    occluded_in_map,
     project_velodyne,
     simulate_lidar,
 )
@@ -97,6 +106,33 @@ def kitti(data: Path) -> None:
     print(f"  filter: {agreement(*joined)}; {joined[0].mean():.1%} of all removed")
 
 
+def projected_maps(data: Path) -> None:
+    """MAE on KITTI's projected maps as they are and without occluded points, per half of them."""
+    network = load_network("compact", None, "cpu")
+    layer = resolve_layer(network.definition, None)
+    settings = resolve_settings(network.definition, MethodOptions())
+    errors: dict[str, list[list[float]]] = {"even": [], "odd": []}
+    for number, frame in enumerate(kitti_dc(data)):
+        truth = torch.from_numpy(frame.gt)
+        everything = points_on_grid(*frame_pixels(frame, None, 0), frame.gt.shape)
+        hidden = occluded_in_map(
+            Points(xy=everything.xy.numpy(), depth=everything.depth.numpy(), size=everything.size)
+        )
+        assert hidden is not None
+        row = []
+        for points in (everything, everything.select(~torch.from_numpy(hidden))):
+            result = refined(network, layer, settings, frame_inputs(frame.rgb, points, frame.gt))
+            for depth in (linear(points), torch.from_numpy(result.after)):
+                row.append(score(depth, truth).mae)
+        errors["odd" if number % 2 else "even"].append(row)
+    for half, rows in errors.items():
+        means = np.mean(rows, axis=0)
+        print(
+            f"kitti_dc, {len(rows)} {half} frames, MAE in m with all points / without occluded:"
+            f" linear {means[0]:.3f} / {means[2]:.3f}, compact {means[1]:.3f} / {means[3]:.3f}"
+        )
+
+
 def fractions() -> None:
     """The paper's LiDARs in SYNTHIA's view of a scene without holes."""
     depth = np.full(SYNTHIA_SIZE, 10.0)
@@ -136,6 +172,7 @@ def main() -> None:
     fractions()
     if args.data is not None:
         kitti(args.data)
+        projected_maps(args.data)
         speed(args.data, args.runs)
 
 

@@ -78,16 +78,25 @@ def load_network(
 
 
 class RefinerOptions(TypedDict, total=False):
-    """The options of `Refiner`."""
+    """The options of `Refiner`, each by keyword."""
 
     layer: str | None
+    """Layer to cut at. None takes the network's default."""
     settings: RefineSettings | None
+    """What is updated and how. None takes the network's defaults for the target."""
     target: str
+    """"given", or "masked" to update weights by points hidden from the network's input."""
     propagate: str | None
+    """Propagation of the residuals at the points: "none", "gp" or "diffusion". None is "none", or
+    with `auto` the best by cross-validation."""
     auto: bool
+    """Choose alignment, updates and propagation by cross-validation, for each frame."""
     uncertainty: bool
+    """Also estimate the standard deviation of the depth."""
     tile: int | None
+    """Refine larger frames in tiles of this side length, pixels."""
     seed: int
+    """Of the random choices of `auto`, `uncertainty` and the masks."""
 
 
 class Refiner:
@@ -98,40 +107,21 @@ class Refiner:
 
     Args:
         network: From `load_network`.
-        layer: Layer to cut at. None takes the network's default.
-        settings: What is updated and how. None takes the network's defaults for the target.
-        target: "given", or "masked" to update weights by points hidden from the network's input.
-        propagate: Propagation of the residuals at the points: "none", "gp" or "diffusion". None is
-            "none", or with `auto` the best by cross-validation.
-        auto: Choose alignment, updates and propagation by cross-validation, for each frame.
-        uncertainty: Also estimate the standard deviation of the depth.
-        tile: Refine larger frames in tiles of this side length, pixels.
-        seed: Of the random choices of `auto`, `uncertainty` and `target`.
+        **options: See `RefinerOptions`.
+
+    Raises:
+        TypeError: There is no option of this name.
+        UsageError: `tile` is combined with `auto` or `uncertainty`.
     """
 
-    def __init__(
-        self,
-        network: Network,
-        *,
-        layer: str | None = None,
-        settings: RefineSettings | None = None,
-        target: str = "given",
-        propagate: str | None = None,
-        auto: bool = False,
-        uncertainty: bool = False,
-        tile: int | None = None,
-        seed: int = 0,
-    ) -> None:
-        self._network, self._layer, self._settings = network, layer, settings
-        self._request = RefineRequest.from_fields(
-            target=target if settings is None else settings.target,
-            propagate=propagate,
-            auto=auto,
-            uncertainty=uncertainty,
-            tile=tile,
-            seed=seed,
-        )
-        if tile is not None and self._request.hold_out.needs_folds:
+    def __init__(self, network: Network, **options: Unpack[RefinerOptions]) -> None:
+        if unknown := options.keys() - RefinerOptions.__annotations__.keys():
+            raise TypeError(f"a Refiner has no options {', '.join(sorted(unknown))}")
+        self._network = network
+        self._layer = options.pop("layer", None)
+        self._settings = options.pop("settings", None)
+        self._request = RefineRequest.from_fields(**options)
+        if options.get("tile") is not None and self._request.hold_out.needs_folds:
             raise UsageError("tile cannot be combined with auto and uncertainty")
         self._open = ExitStack()
         self._opened: tuple[pipeline.Refiner, Split] | None = None

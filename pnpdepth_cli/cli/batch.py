@@ -10,18 +10,16 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
-from pnpdepth_cli.choices import FRAME_PROTOCOLS, LAYOUTS
 from pnpdepth_cli.cli import grouped_help, options
 from pnpdepth_cli.cli.exit_codes import INTERRUPTED
 from pnpdepth_cli.cli.printable import printable
-from pnpdepth_cli.errors import FramesFailedError, StorageError, UsageError
-
-if TYPE_CHECKING:
-    from pnpdepth_cli.pipeline.batch.frames import BatchRequest
+from pnpdepth_cli.errors import FramesFailedError, StorageError
+from pnpdepth_cli.pipeline.batch.request import BatchRequest
+from pnpdepth_cli.pipeline.refinement.request import sample_pattern
 
 _STOPPING = b"\nfinishing the current frame; press Ctrl-C again to stop at once\n"
 
@@ -47,45 +45,11 @@ _STOPPING = b"\nfinishing the current frame; press Ctrl-C again to stop at once\
 @click.argument("source", type=options.FILE, metavar="FOLDER|LIST")
 @click.option("-o", "--output", type=options.FILE, required=True, help="Output folder.")
 @click.option(
-    "--layout",
-    type=click.Choice(tuple(LAYOUTS)),
-    help="Layout of the folder.  [default: recognised]",
-)
-@click.option(
-    "--protocol",
-    type=click.Choice(FRAME_PROTOCOLS),
-    help="Crop and depth range of the frames.  [default: the layout's own]",
-)
-@click.option(
     "--sample",
     metavar="[PATTERN:]N|P%",
     help="Sample the sparse depth from the ground truth, as `pnpdepth sample` does.",
 )
-@click.option("--limit", type=int, metavar="N", help="Only the first N frames.")
-@click.option("--shard", metavar="I/N", help="Every N-th frame, starting at the I-th.")
-@click.option(
-    "--workers",
-    type=int,
-    default=2,
-    show_default=True,
-    metavar="N",
-    help="Number of threads that read, and of threads that write.",
-)
-@click.option(
-    "--html",
-    type=options.FILE,
-    metavar="FOLDER",
-    help="Write an HTML report: every frame before and after, the worst first.",
-)
-@click.option(
-    "--batch-size",
-    default="auto",
-    show_default=True,
-    metavar="auto|N",
-    help="Number of frames per forward pass. auto: as many as save time without changing a bit of"
-    " the results.",
-)
-@click.option("--profile", is_flag=True, help="Print the time spent in each stage.")
+@options.options_of_groups(BatchRequest)
 @click.option("--dry-run", is_flag=True, help="List the frames that would be refined, and exit.")
 @options.scan
 @options.refinement
@@ -93,15 +57,7 @@ _STOPPING = b"\nfinishing the current frame; press Ctrl-C again to stop at once\
 def batch(
     source: Path,
     output: Path,
-    layout: str | None,
-    protocol: str | None,
     sample: str | None,
-    limit: int | None,
-    shard: str | None,
-    workers: int,
-    batch_size: str,
-    profile: bool,
-    html: Path | None,
     dry_run: bool,
     as_json: bool,
     **given: Any,
@@ -125,23 +81,11 @@ def batch(
     all frames; OUTPUT/batch.jsonl is the journal of the run.
     """
     from pnpdepth_cli.pipeline.batch.batch import plan_batch
-    from pnpdepth_cli.pipeline.batch.frames import BatchRequest
-    from pnpdepth_cli.pipeline.refinement.request import sample_pattern
 
+    own = options.taken(BatchRequest, given)
     pattern = None if sample is None else sample_pattern(*_sample(sample))
-    request = BatchRequest(
-        source=source,
-        output=output,
-        refine=options.request_of(given, sample=pattern),
-        layout=layout,
-        protocol=protocol,
-        workers=workers,
-        batch_size=None if batch_size == "auto" else _batch_size(batch_size),
-        profile=profile,
-        limit=limit,
-        shard=None if shard is None else _shard(shard),
-        html=html,
-    )
+    refine = options.request_of(given, sample=pattern)
+    request = BatchRequest(source=source, output=output, refine=refine, **own)
     if dry_run:
         planned = plan_batch(request, lambda text: click.echo(printable(text), err=True))
         if as_json:
@@ -215,16 +159,3 @@ def _sample(text: str) -> tuple[str, int | None, float | None]:
     """Returns (pattern, count, fraction) from `500`, `5%` or `lines:16`."""
     kind, colon, count = text.rpartition(":")
     return kind if colon else "uniform", *options.count_or_share(count)
-
-
-def _batch_size(text: str) -> int:
-    if not text.isdecimal():
-        raise UsageError(f"batch size {text!r} is neither auto nor a number of frames such as 8")
-    return int(text)
-
-
-def _shard(text: str) -> tuple[int, int]:
-    number, slash, of = text.partition("/")
-    if not (slash and number.isdecimal() and of.isdecimal()):
-        raise UsageError(f"shard {text!r} is not of the form I/N, such as 1/4")
-    return int(number), int(of)

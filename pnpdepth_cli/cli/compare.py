@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -21,29 +22,15 @@ from pnpdepth_cli.cli import options
     metavar="N",
     help="Number of bootstrap resamples and of random permutations.",
 )
-@click.option(
-    "--seed", type=options.SEED, default=0, show_default=True, metavar="N", help="Of --bootstrap."
+@options.bootstrap_seed
+@options.no_groups
+@options.table_files(
+    csv="Write the table as CSV.",
+    markdown="Write the table as Markdown.",
+    latex="Write it as a tabular.",
 )
-@click.option(
-    "--no-groups", is_flag=True, help="Treat all frames as independent, also those of a sequence."
-)
-@click.option("--csv", type=options.FILE, metavar="FILE|-", help="Write the table as CSV.")
-@click.option(
-    "--markdown", type=options.FILE, metavar="FILE|-", help="Write the table as Markdown."
-)
-@click.option("--latex", type=options.FILE, metavar="FILE|-", help="Write it as a tabular.")
-@options.overwrite
-@options.as_json
 def compare(
-    runs: tuple[str, ...],
-    resamples: int,
-    seed: int,
-    no_groups: bool,
-    csv: Path | None,
-    markdown: Path | None,
-    latex: Path | None,
-    overwrite: bool,
-    as_json: bool,
+    runs: tuple[str, ...], resamples: int, seed: int, no_groups: bool, **table_files: Any
 ) -> None:
     """Compare RUNs with the first of them, on the frames that all of them scored.
 
@@ -63,22 +50,20 @@ def compare(
     from pnpdepth_cli.pipeline.evaluation.compare import CompareRequest
     from pnpdepth_cli.pipeline.evaluation.compare import compare as compare_runs
 
-    targets = (csv, markdown, latex)
-    score_tables.check_outputs(targets, as_json)
-    score_files.check_targets(targets, [Path(run) for run in runs], overwrite=overwrite)
+    tables = score_tables.TableFiles(**table_files)
+    tables.check([Path(run) for run in runs])
     comparison = compare_runs(
         CompareRequest(paths=runs, resamples=resamples, seed=seed, grouped=not no_groups)
     )
     score_tables.print_notes(comparison.notes)
     table = score_files.comparison_table(comparison)
     caption = score_files.comparison_caption(comparison)
-    texts = (
-        (csv, score_files.csv_text(*table)),
-        (markdown, score_files.markdown_text(*table, caption)),
-        (latex, score_files.latex_text(*table, caption)),
+    to_stdout = tables.write(
+        score_files.csv_text(*table),
+        score_files.markdown_text(*table, caption),
+        score_files.latex_text(*table, caption),
     )
-    to_stdout = score_tables.write_texts(texts)
-    if as_json:
+    if tables.as_json:
         click.echo(json.dumps(comparison.as_record(), indent=2))
     elif not to_stdout:
         score_tables.print_comparison(comparison)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,7 +23,17 @@ from pnpdepth_cli.cli.progress import progress_bar
 from pnpdepth_cli.errors import FramesFailedError, UsageError
 
 if TYPE_CHECKING:
-    from pnpdepth_cli.pipeline.evaluation.result import Evaluation
+    from pnpdepth_cli.pipeline.evaluation.result import EvalRequest
+
+_REQUEST_OPTIONS = ("sparse", "protocol", "resamples", "seed", "workers")
+"""Options that are fields of `EvalRequest`."""
+_SCALE_OPTIONS = {
+    "prediction": "pred_scale",
+    "ground_truth": "gt_scale",
+    "sparse": "sparse_scale",
+    "channel": "channel",
+}
+"""Options by the field of `Scales` that they set."""
 
 
 @click.command(
@@ -120,9 +131,7 @@ if TYPE_CHECKING:
     metavar="N",
     help="Number of bootstrap resamples for the intervals; 0 prints none.",
 )
-@click.option(
-    "--seed", type=options.SEED, default=0, show_default=True, metavar="N", help="Of --bootstrap."
-)
+@options.bootstrap_seed
 @click.option(
     "--workers",
     type=int,
@@ -131,31 +140,19 @@ if TYPE_CHECKING:
     metavar="N",
     help="Number of frames read at once.",
 )
-@click.option(
-    "--no-groups", is_flag=True, help="Treat all frames as independent, also those of a sequence."
+@options.no_groups
+@options.table_files(
+    csv="Write a row per frame.",
+    markdown="Write a table of the means.",
+    latex="Write a tabular of the means.",
 )
-@click.option("--csv", type=options.FILE, metavar="FILE|-", help="Write a row per frame.")
-@click.option("--markdown", type=options.FILE, metavar="FILE|-", help="Write a table of the means.")
-@click.option("--latex", type=options.FILE, metavar="FILE|-", help="Write a tabular of the means.")
 @click.option(
     "--html",
     type=options.FILE,
     metavar="FOLDER",
     help="Write an HTML report: every frame beside its ground truth, the worst first.",
 )
-@options.overwrite
-@options.as_json
-def evaluate(
-    prediction: Path,
-    truth: Path,
-    csv: Path | None,
-    markdown: Path | None,
-    latex: Path | None,
-    html: Path | None,
-    overwrite: bool,
-    as_json: bool,
-    **given: Any,
-) -> None:
+def evaluate(prediction: Path, truth: Path, html: Path | None, **given: Any) -> None:
     """Score the depth in PRED against the ground truth in GT: two files, or two folders.
 
     \b
@@ -177,26 +174,28 @@ def evaluate(
     """
     from pnpdepth_cli.cli import score_tables
     from pnpdepth_cli.pipeline.evaluation import score_files
+    from pnpdepth_cli.pipeline.evaluation.evaluate import evaluate as run_evaluation
     from pnpdepth_cli.pipeline.report import evaluation as report_eval
 
-    targets = (csv, markdown, latex)
-    score_tables.check_outputs(targets, as_json)
-    score_files.check_targets(targets, (prediction, truth), overwrite=overwrite)
+    names = [each.name for each in fields(score_tables.TableFiles)]
+    tables = score_tables.TableFiles(**{name: given.pop(name) for name in names})
+    tables.check((prediction, truth))
     if html is not None:
         inputs = [p for p in (prediction, truth, given["sparse"], given["mask"]) if p is not None]
-        report_eval.check_eval_report(html, inputs, overwrite=overwrite)
-    evaluation = _evaluate(prediction, truth, **given)
+        report_eval.check_eval_report(html, inputs, overwrite=tables.overwrite)
+    request = _request(prediction, truth, given)
+    with progress_bar("eval", "frame") as show:
+        evaluation = run_evaluation(request, on_frame=show)
     protocol = evaluation.protocol.describe()
     score_tables.print_notes([f"protocol {protocol}", *evaluation.notes])
     name = prediction.stem if prediction.is_file() else prediction.resolve().name
     table = score_files.means_table(evaluation, name)
-    texts = (
-        (csv, score_files.frames_csv(evaluation)),
-        (markdown, score_files.markdown_text(*table, protocol)),
-        (latex, score_files.latex_text(*table, protocol)),
+    to_stdout = tables.write(
+        score_files.frames_csv(evaluation),
+        score_files.markdown_text(*table, protocol),
+        score_files.latex_text(*table, protocol),
     )
-    to_stdout = score_tables.write_texts(texts)
-    if as_json:
+    if tables.as_json:
         click.echo(json.dumps(evaluation.as_record(), indent=2))
     elif not to_stdout:
         score_tables.print_evaluation(evaluation)
@@ -209,46 +208,26 @@ def evaluate(
         raise FramesFailedError(unscored)
 
 
-def _evaluate(
-    prediction: Path,
-    truth: Path,
-    *,
-    sparse: Path | None,
-    protocol: str,
-    pred_scale: float | None,
-    gt_scale: float | None,
-    sparse_scale: float | None,
-    channel: str | None,
-    resamples: int,
-    seed: int,
-    workers: int,
-    delta: str | None,
-    exclude_sparse: bool,
-    no_groups: bool,
-    **changes: Any,
-) -> Evaluation:
-    """Runs the evaluation with a progress bar."""
-    from pnpdepth_cli.pipeline.evaluation.evaluate import evaluate
+def _request(prediction: Path, truth: Path, given: dict[str, Any]) -> EvalRequest:
+    """Returns the request of the other options; those without an own field change the protocol."""
     from pnpdepth_cli.pipeline.evaluation.frame_reading import Scales
     from pnpdepth_cli.pipeline.evaluation.result import EvalRequest
 
-    changes |= {"thresholds": _thresholds(delta), "exclude_sparse": exclude_sparse or None}
-    request = EvalRequest(
+    own = {name: given.pop(name) for name in _REQUEST_OPTIONS}
+    scales = {field: given.pop(name) for field, name in _SCALE_OPTIONS.items()}
+    grouped = not given.pop("no_groups")
+    derived = {
+        "thresholds": _thresholds(given.pop("delta")),
+        "exclude_sparse": given.pop("exclude_sparse") or None,
+    }
+    return EvalRequest(
         prediction=prediction,
         ground_truth=truth,
-        sparse=sparse,
-        protocol=protocol,
-        changes=changes,
-        scales=Scales(
-            prediction=pred_scale, ground_truth=gt_scale, sparse=sparse_scale, channel=channel
-        ),
-        resamples=resamples,
-        seed=seed,
-        grouped=not no_groups,
-        workers=workers,
+        grouped=grouped,
+        scales=Scales(**scales),
+        changes=given | derived,
+        **own,
     )
-    with progress_bar("eval", "frame") as show:
-        return evaluate(request, on_frame=show)
 
 
 def _thresholds(text: str | None) -> tuple[float, float, float] | None:

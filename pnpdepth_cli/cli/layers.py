@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
 import click
 
 from pnpdepth_cli.cli import options
 from pnpdepth_cli.cli.progress import progress_bar
+from pnpdepth_cli.pipeline.refinement.request import NetworkChoice
 
 
 @click.command(short_help="List the layers a network can be cut at.")
@@ -26,7 +28,7 @@ from pnpdepth_cli.cli.progress import progress_bar
 )
 @options.device
 @options.as_json
-def layers(model: str, size: str | None, as_json: bool, **given: Any) -> None:
+def layers(size: str | None, every: bool, sparse: Path | None, as_json: bool, **given: Any) -> None:
     """List the layers a network can be cut at.
 
     For each layer: shape and stride of z, the fraction of the network's cost behind the cut (which
@@ -34,14 +36,13 @@ def layers(model: str, size: str | None, as_json: bool, **given: Any) -> None:
     """
     from pnpdepth_cli.pipeline.networks.layers import list_layers
 
+    choice = NetworkChoice(**given)
     with progress_bar("layers", "layer") as show:
         result = list_layers(
-            model,
-            given["checkpoint"],
-            given["device"],
-            every=given["every"],
+            choice,
+            every=every,
             size=options.height_and_width(size) if size else None,
-            sparse=given["sparse"],
+            sparse=sparse,
             on_layer=show,
         )
     if as_json:
@@ -51,7 +52,7 @@ def layers(model: str, size: str | None, as_json: bool, **given: Any) -> None:
 
     spacing = "" if result.spacing is None else f", points {result.spacing:.3g} pixels apart"
     print_rows(
-        f"layers of {model}{spacing}",
+        f"layers of {choice.model}{spacing}",
         (
             "layer",
             "z",

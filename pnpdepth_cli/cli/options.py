@@ -21,6 +21,7 @@ from pnpdepth_cli.pipeline.refinement.request import (
     OutputOptions,
     RefineRequest,
 )
+from pnpdepth_cli.pipeline.sparse.scan_options import ScanOptions
 
 if TYPE_CHECKING:
     from pnpdepth_cli.pipeline.sparse.outputs import SparseTarget
@@ -112,6 +113,9 @@ depth_scale = _only(FrameFiles, "depth_scale")
 channel = _only(FrameFiles, "channel")
 seed = _only(HoldOut, "seed")
 overwrite = _only(OutputOptions, "overwrite")
+camera = _only(ScanOptions, "camera")
+euclidean = _only(ScanOptions, "euclidean")
+max_range = _only(ScanOptions, "max_range")
 as_json = click.option("--json", "as_json", is_flag=True, help="Print the result as JSON.")
 
 
@@ -137,6 +141,13 @@ output_scale = click.option(
     metavar="S",
     help="A written PNG holds metres × S.",
 )
+
+
+def scan(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Adds the options of a LiDAR scan, and `--max-pixels`."""
+    return options_of_groups(ScanOptions)(max_pixels(command))
+
+
 sparse_output = click.option(
     "-o",
     "--output",
@@ -144,71 +155,38 @@ sparse_output = click.option(
     required=True,
     help="Sparse depth file: PNG, EXR, NPY, NPZ, PFM or TIFF map, or CSV rows x y depth.",
 )
-camera = click.option(
-    "--camera", type=int, metavar="N", help="KITTI camera number, 0 to 3.  [default: 2]"
-)
-euclidean = click.option(
-    "--range",
-    "euclidean",
-    is_flag=True,
-    help="Depth is the distance from the camera, not z.",
-)
-max_range = click.option(
-    "--max-range",
-    type=float,
-    metavar="M",
-    help="Drop points farther than M metres.",
-)
 
-_SCAN_OPTIONS = (
-    click.option(
-        "--calib",
-        type=FILE,
-        metavar="FILE|FOLDER",
-        help="Calibration of a LiDAR scan: a KITTI file or raw folder, or a file with K, R, t.",
-    ),
-    camera,
-    euclidean,
-    click.option(
-        "--keep-occluded",
-        is_flag=True,
-        help="Keep scan points that are occluded from the camera.",
-    ),
-    click.option(
-        "--min-range",
-        type=float,
-        default=0.0,
-        metavar="M",
-        help="Drop points nearer than M metres.",
-    ),
-    max_range,
-    click.option(
-        "--point-fields",
-        type=click.IntRange(3, 64),
-        metavar="N",
-        help="Float32 numbers of a point in a .bin: KITTI 4, nuScenes 5.  [default: recognised]",
-    ),
-    max_pixels,
+
+def table_files(*, csv: str, markdown: str, latex: str) -> Callable[[Any], Any]:
+    """Returns a decorator that adds the options of `score_tables.TableFiles`.
+
+    Args:
+        csv: Help text of `--csv`.
+        markdown: Help text of `--markdown`.
+        latex: Help text of `--latex`.
+    """
+
+    def decorate(command: Any) -> Any:
+        command = overwrite(as_json(command))
+        for name, text in (("--latex", latex), ("--markdown", markdown), ("--csv", csv)):
+            command = click.option(name, type=FILE, metavar="FILE|-", help=text)(command)
+        return command
+
+    return decorate
+
+
+bootstrap_seed = click.option(
+    "--seed", type=SEED, default=0, show_default=True, metavar="N", help="Of --bootstrap."
+)
+no_groups = click.option(
+    "--no-groups", is_flag=True, help="Treat all frames as independent, also those of a sequence."
 )
 
 
-def scan(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Adds the options of a LiDAR scan; `scan_given` separates them from the others."""
-    for option in reversed(_SCAN_OPTIONS):
-        command = option(command)
-    return command
-
-
-def scan_given(given: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Returns (the options of a LiDAR scan, the others)."""
-    names = (
-        *("calib", "camera", "euclidean", "keep_occluded", "min_range", "max_range"),
-        "point_fields",
-    )
-    return (
-        {name: given[name] for name in names},
-        {name: value for name, value in given.items() if name not in names},
-    )
+def taken(group: type, given: dict[str, Any]) -> dict[str, Any]:
+    """Returns the options of this group by name; they are taken out of `given`."""
+    names = [each.name for each in options_of(group)]
+    return {name: given.pop(name) for name in names if name in given}
 
 
 def request_of(given: dict[str, Any], **others: Any) -> RefineRequest:
@@ -218,10 +196,8 @@ def request_of(given: dict[str, Any], **others: Any) -> RefineRequest:
         given: Values of the options of `scan` and `options_of_groups`, by their names.
         **others: Other fields of the request.
     """
-    from pnpdepth_cli.pipeline.sparse.scans import ScanOptions
-
-    scan_options, rest = scan_given(given)
-    return RefineRequest.from_fields(scan=ScanOptions(**scan_options), **rest, **others)
+    scan_options = ScanOptions(**taken(ScanOptions, given))
+    return RefineRequest.from_fields(scan=scan_options, **given, **others)
 
 
 def sparse_target(given: dict[str, Any]) -> SparseTarget:

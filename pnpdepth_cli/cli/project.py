@@ -9,6 +9,7 @@ from typing import Any
 import click
 
 from pnpdepth_cli.cli import options
+from pnpdepth_cli.pipeline.sparse.scan_options import ScanOptions
 
 
 @click.command(short_help="Project a LiDAR scan into a camera image.")
@@ -33,14 +34,12 @@ def project(scan: Path, image: Path | None, size: str | None, as_json: bool, **g
     """
     from pnpdepth_cli.cli.tables import print_sparse
     from pnpdepth_cli.pipeline.sparse.project import ProjectRequest, project_scan
-    from pnpdepth_cli.pipeline.sparse.scans import ScanOptions
 
     target = options.sparse_target(given)
-    scan_options, _ = options.scan_given(given)
     record = project_scan(
         ProjectRequest(
             scan=scan,
-            options=ScanOptions(**scan_options),
+            options=ScanOptions(**given),
             target=target,
             image=image,
             size=options.height_and_width(size) if size else None,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,6 +18,7 @@ from pnpdepth_cli.cli.printable import printable
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.pipeline.evaluation.score_files import (
     bin_rows,
+    check_targets,
     format_value,
     interval_text,
     unit_of,
@@ -42,28 +44,57 @@ def print_notes(notes: Sequence[str]) -> None:
         console.print(escape(printable(note)), style=style, soft_wrap=True)
 
 
-def check_outputs(targets: Sequence[Path | None], as_json: bool) -> None:
-    """Raises UsageError if two of --csv, --markdown, --latex and --json go to one place."""
-    if sum(str(path) == "-" for path in targets) + as_json > 1:
-        raise UsageError("only one of --json, --csv -, --markdown - and --latex - can go to stdout")
-    options: dict[Path, str] = {}
-    for option, path in zip(("--csv", "--markdown", "--latex"), targets, strict=True):
-        if path is not None and str(path) != "-":
-            first = options.setdefault(path.resolve(), option)
-            if first != option:
-                raise UsageError(f"{first} and {option} are the same file {path}; name two files")
+@dataclass(frozen=True, kw_only=True)
+class TableFiles:
+    """Where the tables of a command are written; `-` is stdout."""
 
+    csv: Path | None
+    """Target of the CSV text."""
+    markdown: Path | None
+    """Target of the Markdown text."""
+    latex: Path | None
+    """Target of the LaTeX text."""
+    overwrite: bool
+    """Whether existing files are replaced."""
+    as_json: bool
+    """Whether the result goes to stdout as JSON."""
 
-def write_texts(texts: Sequence[tuple[Path | None, str]]) -> bool:
-    """The texts are in their files, if any; True if one went to stdout, as `-` says."""
-    for path, text in texts:
-        # a file name that is no UTF-8 has characters that are none
-        data = text.encode("utf-8", "backslashreplace")
-        if str(path) == "-":
-            click.echo(data, nl=False)
-        elif path is not None:
-            write_bytes(path, data)
-    return any(str(path) == "-" for path, _ in texts)
+    @property
+    def targets(self) -> tuple[Path | None, Path | None, Path | None]:
+        """CSV, Markdown and LaTeX."""
+        return self.csv, self.markdown, self.latex
+
+    def check(self, inputs: Sequence[Path]) -> None:
+        """Checks the files before the work.
+
+        Raises:
+            UsageError: Two outputs go to one file or to stdout.
+            OutputError: A file is an input, or exists and is not to be replaced.
+        """
+        if sum(str(path) == "-" for path in self.targets) + self.as_json > 1:
+            raise UsageError(
+                "only one of --json, --csv -, --markdown - and --latex - can go to stdout"
+            )
+        options: dict[Path, str] = {}
+        for option, path in zip(("--csv", "--markdown", "--latex"), self.targets, strict=True):
+            if path is not None and str(path) != "-":
+                first = options.setdefault(path.resolve(), option)
+                if first != option:
+                    raise UsageError(
+                        f"{first} and {option} are the same file {path}; name two files"
+                    )
+        check_targets(self.targets, inputs, overwrite=self.overwrite)
+
+    def write(self, csv: str, markdown: str, latex: str) -> bool:
+        """Writes the files that were named. Returns whether a text went to stdout."""
+        for path, text in zip(self.targets, (csv, markdown, latex), strict=True):
+            # a file name that is not UTF-8 has characters that cannot be encoded
+            data = text.encode("utf-8", "backslashreplace")
+            if str(path) == "-":
+                click.echo(data, nl=False)
+            elif path is not None:
+                write_bytes(path, data)
+        return any(str(path) == "-" for path in self.targets)
 
 
 def print_evaluation(evaluation: Evaluation) -> None:

@@ -9,11 +9,11 @@ from typing import Any
 
 import click
 
-from pnpdepth_cli.choices import FRAME_PROTOCOLS, LAYOUTS
 from pnpdepth_cli.cli import grouped_help, options
 from pnpdepth_cli.cli.exit_codes import INTERRUPTED
 from pnpdepth_cli.cli.progress import BatchProgress
 from pnpdepth_cli.errors import FramesFailedError, StorageError
+from pnpdepth_cli.pipeline.batch.request import FrameSelection
 from pnpdepth_cli.pipeline.refinement.request import FrameFiles, MethodOptions, NetworkChoice
 
 
@@ -62,17 +62,7 @@ from pnpdepth_cli.pipeline.refinement.request import FrameFiles, MethodOptions, 
     metavar="N",
     help="Number of random draws of the points; the first uses --seed.",
 )
-@click.option(
-    "--layout",
-    type=click.Choice(tuple(LAYOUTS)),
-    help="Layout of the folder.  [default: recognised]",
-)
-@click.option(
-    "--protocol",
-    type=click.Choice(FRAME_PROTOCOLS),
-    help="Crop and depth range of the frames.  [default: the layout's own]",
-)
-@click.option("--limit", type=int, metavar="N", help="Only the first N frames.")
+@options.options_of_groups(FrameSelection)
 @click.option("--plots/--no-plots", default=True, help="Draw plots, or write tables only.")
 @options.scan
 @options.options_of_groups(FrameFiles, NetworkChoice, MethodOptions, without=["tile"])
@@ -84,11 +74,6 @@ def sweep(
     vary: tuple[str, ...],
     one_by_one: bool,
     sample: str | None,
-    seeds: int,
-    layout: str | None,
-    protocol: str | None,
-    limit: int | None,
-    plots: bool,
     as_json: bool,
     **given: Any,
 ) -> None:
@@ -129,17 +114,16 @@ def sweep(
     from pnpdepth_cli.pipeline.sweep.points import read_sampling
     from pnpdepth_cli.pipeline.sweep.sweep import SweepRequest, run_sweep
 
+    own = options.taken(FrameSelection, given)
     request = SweepRequest(
         source=source,
         output=output,
-        refine=options.request_of(given),
         studies=studies_of([read_axis(text) for text in vary], one_by_one=one_by_one),
         sampling=None if sample is None else read_sampling(sample),
-        seeds=seeds,
-        layout=layout,
-        protocol=protocol,
-        limit=limit,
-        plots=plots,
+        seeds=given.pop("seeds"),
+        plots=given.pop("plots"),
+        refine=options.request_of(given),
+        **own,
     )
     with _Progress() as progress:
         try:

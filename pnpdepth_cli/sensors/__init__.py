@@ -11,6 +11,7 @@ from __future__ import annotations
 from pnpdepth_cli.sensors.camera import Camera
 from pnpdepth_cli.sensors.lidar import FORWARD_LEFT_UP, LIDARS, Lidar
 from pnpdepth_cli.sensors.occlusion import OcclusionFilter
+from pnpdepth_cli.sensors.projected_map import occluded_in_map
 from pnpdepth_cli.sensors.samplers import (
     PATTERNS,
     SampleNoise,
@@ -36,6 +37,7 @@ __all__ = [
     "SamplePattern",
     "SimulationSettings",
     "as_depth_image",
+    "occluded_in_map",
     "project_velodyne",
     "sample_points",
     "simulate_lidar",

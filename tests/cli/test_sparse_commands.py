@@ -113,7 +113,7 @@ def test_refine_takes_a_scan_with_its_calibration(
     arguments.append("--overwrite")
     assert code_of(arguments) == 2
     assert "needs --calib" in capsys.readouterr().err
-    assert code_of([*arguments[:3], str(scan.gt), *arguments[4:], "--keep-occluded"]) == 2
+    assert code_of([*arguments[:3], str(scan.gt), *arguments[4:], "--max-range", "9"]) == 2
     assert "is no scan" in capsys.readouterr().err
 
 

@@ -8,7 +8,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from model_zoo_defs.compact import Compact, Points, _residual, definitions
+from model_zoo_defs._compact.points import Points, residual_of
+from model_zoo_defs.compact import Compact, definitions
 from pnpdepth_cli.core.split import Split
 
 definition = definitions["compact"]
@@ -221,7 +222,7 @@ def test_a_point_without_weight_moves_nothing() -> None:
         points = Points(torch.where(weight > 0, depth, 0.0)) if depth is sparse else Points(depth)
         points.weigh(weight)
         moments = points.moments()
-        found.append(_residual(moments, torch.zeros(1, 1, 8, 12) - points.median, 8).mean)
+        found.append(residual_of(moments, torch.zeros(1, 1, 8, 12) - points.median, 8).mean)
     torch.testing.assert_close(found[0], found[1], rtol=1e-4, atol=1e-4)
 
 

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from pnpdepth_cli.pipeline.batch.batch import BatchOutcome, run_batch
-from pnpdepth_cli.pipeline.batch.frames import BatchRequest
+from pnpdepth_cli.pipeline.batch.request import BatchRequest
 from pnpdepth_cli.pipeline.refinement.refine import refine_image
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest
 from tests.pipeline.frames import frame_on_disk

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from model_zoo_defs.compact import STAGES
+from model_zoo_defs._compact.encoder import STAGES
 
 EPSILON = 1e-3
 

@@ -22,7 +22,9 @@ from safetensors.torch import load_file
 from torch import Tensor
 from tqdm import tqdm
 
-from model_zoo_defs.compact import Compact, InlierWeights, Points, PointScore, Prior
+from model_zoo_defs._compact.inliers import InlierWeights, PointScore
+from model_zoo_defs._compact.points import Points, Prior
+from model_zoo_defs.compact import Compact
 from model_zoo_defs.training.learning import priors
 from model_zoo_defs.training.learning.dataset import Frames
 from model_zoo_defs.training.learning.learner import export

@@ -28,8 +28,10 @@ from pnpdepth_cli.models.definition import (
     Near,
     Normalisation,
 )
+from pnpdepth_cli.models.weights.file_size import size_problem
 from pnpdepth_cli.points import SparsePoints
 
+_MOST_JSON_BYTES = 1 << 24
 _WEIGHTS = ("model.safetensors", "model.safetensors.index.json")
 _PICKLED = ("pytorch_model.bin", "pytorch_model.bin.index.json")
 
@@ -152,6 +154,8 @@ def _json(file: Path, why: str) -> Mapping[str, Any]:
             f"{file.parent} is no Hugging Face folder: it has no {file.name}, and {why}; take it"
             " from the network's page"
         )
+    if problem := size_problem(file, _MOST_JSON_BYTES):
+        raise ModelError(f"{file} {problem}")
     try:
         settings = json.loads(file.read_text(encoding="utf-8"))
     except (ValueError, RecursionError) as error:

@@ -5,8 +5,10 @@ The archive is checked before torch reads it, and the source code of its guards 
 
 from __future__ import annotations
 
+import contextlib
+import logging
 import operator
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +19,7 @@ from pnpdepth_cli.core.split.user_code import describe
 from pnpdepth_cli.errors import ModelError
 from pnpdepth_cli.models.definition import UNTUNED_DEFAULTS, Fixed, ModelDefinition, Multiple
 from pnpdepth_cli.models.formats.export_archive import check_archive
+from pnpdepth_cli.models.weights.file_size import size_problem
 
 _ASSUMED_MULTIPLE = 32
 
@@ -48,9 +51,12 @@ def exported_definition(file: Path) -> ModelDefinition:
     """
     if not file.is_file():
         raise ModelError(f"exported program {file} does not exist")
+    if problem := size_problem(file):
+        raise ModelError(f"exported program {file} {problem}")
     try:
         check_archive(file)
-        graph = torch.export.load(file).module(check_guards=False)
+        with _without_logs_of_torch():
+            graph = torch.export.load(file).module(check_guards=False)
     except ModelError:
         raise
     except Exception as error:  # every part of torch.export has its own way to fail
@@ -82,6 +88,17 @@ def exported_definition(file: Path) -> ModelDefinition:
         checkpoint=file,
         defaults=UNTUNED_DEFAULTS,
     )
+
+
+@contextlib.contextmanager
+def _without_logs_of_torch() -> Iterator[None]:
+    """torch.export logs the traceback of each attempt to read a damaged file; the error says it."""
+    before = logging.root.manager.disable
+    logging.disable(logging.CRITICAL)
+    try:
+        yield
+    finally:
+        logging.disable(before)
 
 
 def _with_operations_as_modules(exported: Any) -> nn.Module:

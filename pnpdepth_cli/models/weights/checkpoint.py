@@ -20,6 +20,7 @@ from pnpdepth_cli.core.split.user_code import describe, wrap_user_errors
 from pnpdepth_cli.errors import CheckpointError, ModelError
 from pnpdepth_cli.models import registry
 from pnpdepth_cli.models.definition import ModelDefinition
+from pnpdepth_cli.models.weights.file_size import size_problem
 from pnpdepth_cli.models.weights.numpy_file import SUFFIXES as NUMPY_SUFFIXES
 from pnpdepth_cli.models.weights.numpy_file import read_numpy_file
 from pnpdepth_cli.models.weights.pickle_reader import StandIn
@@ -231,6 +232,8 @@ def _read(path: Path) -> tuple[dict[str, Tensor], list[str]]:
             f"checkpoint {path} is a Git LFS pointer, not the file it points to; `git lfs pull`"
             " fetches that"
         )
+    if problem := size_problem(path):
+        raise CheckpointError(f"checkpoint {path} {problem}")
     if path.suffix == ".safetensors":
         return _read_safetensors(path), []
     if path.suffix in NUMPY_SUFFIXES:

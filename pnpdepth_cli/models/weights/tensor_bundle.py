@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from pnpdepth_cli.errors import CheckpointError
+from pnpdepth_cli.models.weights.file_size import size_problem
 from pnpdepth_cli.models.weights.pickle_reader import READ_ERRORS, BrokenFileError, brief
 
 SUFFIX = ".index"
@@ -110,6 +111,8 @@ class _Bundle:
         path = self._prefix.with_name(file)
         if not path.is_file():
             raise BrokenFileError(f"{file} is not beside it")
+        if problem := size_problem(path):
+            raise BrokenFileError(f"{file} {problem}")
         return path.read_bytes()
 
 

@@ -14,12 +14,12 @@ from pnpdepth_cli.io.lock import in_turn, locked_folder
 from pnpdepth_cli.io.report import remove_report_leftovers
 from pnpdepth_cli.pipeline.batch.frames import (
     BatchFrames,
-    BatchRequest,
     find_frames,
     source_files,
     task_of,
 )
 from pnpdepth_cli.pipeline.batch.profile import BatchProfile
+from pnpdepth_cli.pipeline.batch.request import BatchRequest
 from pnpdepth_cli.pipeline.batch.run import BatchRun
 from pnpdepth_cli.pipeline.batch.settings import model_identity, settings_of
 from pnpdepth_cli.pipeline.batch.state import NEW, BatchState, remove_all_leftovers

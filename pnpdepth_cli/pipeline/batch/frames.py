@@ -11,50 +11,9 @@ from pnpdepth_cli.io.dataset.frame import SCAN_ONLY_SUFFIXES, Frame, Source, Unm
 from pnpdepth_cli.io.dataset.frame_names import name_problem
 from pnpdepth_cli.io.file_bytes import one_line
 from pnpdepth_cli.io.layouts import LAYOUTS, find_protocol, list_frames
+from pnpdepth_cli.pipeline.batch.request import BatchRequest
 from pnpdepth_cli.pipeline.refinement.output_files import Outputs
 from pnpdepth_cli.pipeline.refinement.request import FrameFiles, RefineRequest
-
-
-@dataclass(frozen=True, kw_only=True)
-class BatchRequest:
-    """Which frames to refine, and how."""
-
-    source: Path
-    """A folder or a list of frames."""
-    output: Path
-    """The folder for the results."""
-    refine: RefineRequest
-    """How; its files, its output and its protocol are set for each frame."""
-    layout: str | None = None
-    """Name of the data set's layout; None to guess it."""
-    protocol: str | None = None
-    """Name of the protocol that crops frames; None for the layout's own."""
-    workers: int = 2
-    """Threads that read, and as many that write."""
-    batch_size: int | None = None
-    """Frames of one size that go through the network together; None for as many as alter no
-    result."""
-    limit: int | None = None
-    """Only the first frames; None for all."""
-    shard: tuple[int, int] | None = None
-    """(i, n): every n-th frame from the i-th."""
-    profile: bool = False
-    """True to add to the summary where the time went."""
-    html: Path | None = None
-    """The folder for a report; None for no report."""
-
-    def __post_init__(self) -> None:
-        if self.workers < 1:
-            raise UsageError(f"workers {self.workers}: at least one thread has to read")
-        if self.batch_size is not None and self.batch_size < 1:
-            raise UsageError(f"batch size {self.batch_size}: give 1 or more frames, or auto")
-        if self.limit is not None and self.limit < 1:
-            raise UsageError(f"limit {self.limit}: give the number of frames to do, 1 or more")
-        if self.shard is not None and not 1 <= self.shard[0] <= self.shard[1]:
-            number, of = self.shard
-            raise UsageError(f"shard {number}/{of}: give I/N with I from 1 to N, such as 1/4")
-        if self.protocol is not None:
-            find_protocol(self.protocol)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -19,6 +19,7 @@ from pnpdepth_cli.models.rank_layers import (
     rank_layers,
 )
 from pnpdepth_cli.models.synthetic_frame import synthetic_frame
+from pnpdepth_cli.pipeline.refinement.request import NetworkChoice
 
 DEFAULT_SIZE = (240, 320)
 """Rows and columns of the synthetic frame where neither a size nor sparse depth is given."""
@@ -37,9 +38,7 @@ class LayerList:
 
 
 def list_layers(
-    model: str,
-    checkpoint: Path | None,
-    device: str,
+    choice: NetworkChoice,
     *,
     every: bool,
     size: tuple[int, int] | None = None,
@@ -49,9 +48,7 @@ def list_layers(
     """Returns the layers that a network can be cut at, measured on a synthetic frame.
 
     Args:
-        model: See `pnpdepth_cli.models.registry.find_definition`.
-        checkpoint: Its weights; None takes those of the definition.
-        device: Name of a torch device.
+        choice: The network, its weights and device.
         every: Whether all submodules are listed, not only the layers of the definition.
         size: Rows and columns of the frame; None takes those of `sparse`, or the network's own, or
             `DEFAULT_SIZE`.
@@ -62,7 +59,7 @@ def list_layers(
         UsageError: The definition lists no layers.
         ModelError, CheckpointError, DeviceError, InputError: As in loading and reading.
     """
-    network = load_network(model, checkpoint, device)
+    network = load_network(choice.model, choice.checkpoint, choice.device)
     policy, count = network.definition.size, None
     own = (policy.height, policy.width) if isinstance(policy, Fixed) else DEFAULT_SIZE
     if sparse is not None:

@@ -26,7 +26,7 @@ from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.pipeline.refinement.request import FrameFiles, RefineRequest
 from pnpdepth_cli.pipeline.sparse.scans import read_scan_points
 from pnpdepth_cli.points import SparsePoints
-from pnpdepth_cli.sensors import sample_points
+from pnpdepth_cli.sensors import Points, occluded_in_map, sample_points
 
 ImageArray = NDArray[np.float32]
 
@@ -223,17 +223,32 @@ def _read_points(files: FrameFiles, path: Path, image_size: tuple[int, int] | No
             f"{path} is {sparse_size[1]}×{sparse_size[0]} but {files.image} is"
             f" {size[1]}×{size[0]}; --sparse-size-ok maps the points if both show the same view"
         )
-    points = _inside(path, sparse.points.tensors().resized(*size))
-    notes = [f"sparse: {describe_range(depth, sparse.source, assumed_scale=sparse.assumed_scale)}"]
-    if len(points) < len(depth):
-        notes.append(f"sparse: {len(depth) - len(points):,} points outside the image")
+    visible, record, notes = _visible(sparse.points, files.scan.keep_occluded)
+    points = _inside(path, visible.tensors().resized(*size))
+    described = describe_range(depth, sparse.source, assumed_scale=sparse.assumed_scale)
+    notes = [f"sparse: {described}", *notes]
+    if len(points) < len(visible):
+        notes.append(f"sparse: {len(visible) - len(points):,} points outside the image")
     notes += [f"warning: {text}" for text in [implausible(depth, sparse.scale)] if text]
     return _Sparse(
         points=_in_protocol(files, path, points),
         scale=sparse.scale,
-        record=_file_record(path) | {"read_as": sparse.source},
+        record=_file_record(path) | {"read_as": sparse.source} | record,
         notes=tuple(notes),
     )
+
+
+def _visible(points: Points, keep_occluded: bool) -> tuple[Points, dict[str, Any], list[str]]:
+    """The points without occluded ones, and entries of the record and notes on these."""
+    hidden = None if keep_occluded else occluded_in_map(points)
+    if hidden is None or not hidden.any():
+        return points, {}, []
+    count = int(hidden.sum())
+    note = (
+        f"sparse: a projected LiDAR scan; dropped {count:,} points occluded from the camera by"
+        " nearer ones; --keep-occluded keeps them"
+    )
+    return points.select(~hidden), {"dropped": {"hidden by foreground": count}}, [note]
 
 
 def _in_protocol(files: FrameFiles, path: Path, points: SparsePoints) -> SparsePoints:

@@ -208,17 +208,11 @@ def load_refiner(request: RefineRequest, first: Inputs) -> Refiner:
         choice.model, choice.checkpoint, choice.device, precision=choice.precision
     )
     network = resolve_definition(network, first.frame(), choice)
-    settings = resolve_settings(network.definition, request.method, hold_out)
-    if settings.moves_weights and hold_out.needs_folds:
-        raise UsageError(
-            "weights cannot be updated together with --auto, --baselines or --uncertainty; leave"
-            " out --target and --parameters"
-        )
     return Refiner(
         request=request,
         network=network,
         layer=resolve_layer(network.definition, request.method.layer),
-        settings=settings,
+        settings=resolve_settings(network.definition, request.method, hold_out),
     )
 
 

@@ -14,20 +14,14 @@ from typing import TYPE_CHECKING, Any
 from pnpdepth_cli import choices
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.pipeline.options import Axis, option
+from pnpdepth_cli.pipeline.sparse.scan_options import ScanOptions
 
 if TYPE_CHECKING:
     from pnpdepth_cli.io.dataset.frame import Source
     from pnpdepth_cli.io.dataset.protocols import Protocol
-    from pnpdepth_cli.pipeline.sparse.scans import ScanOptions
     from pnpdepth_cli.sensors import SamplePattern
 
 LARGEST_SEED = 2**32 - 1
-
-
-def _default_scan() -> ScanOptions:
-    from pnpdepth_cli.pipeline.sparse.scans import ScanOptions
-
-    return ScanOptions()
 
 
 def _whole_frame() -> Protocol:
@@ -72,7 +66,7 @@ class FrameFiles:
     sparse_size_ok: bool = option(
         False, "Accept a sparse depth map of another size; its points are moved to the image."
     )
-    scan: ScanOptions = field(default_factory=_default_scan)
+    scan: ScanOptions = field(default_factory=ScanOptions)
     """How `sparse` is projected where it is a LiDAR scan."""
     sample: SamplePattern | None = None
     """Which pixels of the ground truth serve as sparse depth."""

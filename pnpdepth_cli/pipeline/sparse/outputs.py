@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -63,31 +63,42 @@ class SparseTarget:
             taken.add(path.resolve())
 
 
+@dataclass(frozen=True, kw_only=True)
+class Provenance:
+    """What sparse depth was made from, for its record."""
+
+    command: str
+    """The command that made it."""
+
+    settings: dict[str, Any]
+    """Its settings, seed included; a PNG or CSV keeps them too."""
+
+    inputs: dict[str, Any]
+    """Its input files."""
+
+    notes: Sequence[str]
+    """What was assumed, and warnings."""
+
+
 def write_sparse_outputs(
     target: SparseTarget,
     points: Points,
+    made_from: Provenance,
     *,
-    command: str,
-    settings: dict[str, Any],
-    inputs: dict[str, Any],
-    notes: Iterable[str],
     rgb: NDArray[np.float32] | None = None,
 ) -> dict[str, Any]:
     """Writes the sparse depth, its record and the overlay, and returns the record.
 
     Args:
-        target: Where to.
+        target: The files.
         points: The sparse depth.
-        command: The command that made it.
-        settings: Its settings, seed included; a PNG or CSV keeps them too.
-        inputs: Its input files, for the record.
-        notes: Lines for a person, for the record.
+        made_from: Goes into the record.
         rgb: (H, W, 3) in 0..1, the image of the overlay.
 
     Raises:
         OutputError: A file cannot be written.
     """
-    provenance = {"command": command, "version": __version__, **settings}
+    provenance = {"command": made_from.command, "version": __version__, **made_from.settings}
     for path in filter(None, (target.output, target.overlay)):
         make_folder(path.parent)
     write_sparse(
@@ -103,7 +114,7 @@ def write_sparse_outputs(
     height, width = points.size
     record = {
         **provenance,
-        "inputs": inputs,
+        "inputs": made_from.inputs,
         "points": {
             "count": len(points.depth),
             "share_of_pixels": len(points.depth) / (height * width),
@@ -112,7 +123,7 @@ def write_sparse_outputs(
             "dropped": dict(points.dropped),
         },
         "size": [width, height],
-        "notes": list(notes),
+        "notes": list(made_from.notes),
         "outputs": {
             "sparse": str(target.output),
             "overlay": str(target.overlay) if target.overlay else None,

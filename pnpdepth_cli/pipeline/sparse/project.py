@@ -9,8 +9,9 @@ from typing import Any
 from pnpdepth_cli.errors import SizeError, UsageError
 from pnpdepth_cli.io.record import sha256_of
 from pnpdepth_cli.io.rgb import read_rgb
-from pnpdepth_cli.pipeline.sparse.outputs import SparseTarget, write_sparse_outputs
-from pnpdepth_cli.pipeline.sparse.scans import ScanOptions, read_scan_points
+from pnpdepth_cli.pipeline.sparse.outputs import Provenance, SparseTarget, write_sparse_outputs
+from pnpdepth_cli.pipeline.sparse.scan_options import ScanOptions
+from pnpdepth_cli.pipeline.sparse.scans import read_scan_points
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,9 +60,11 @@ def project_scan(request: ProjectRequest) -> dict[str, Any]:
     return write_sparse_outputs(
         target,
         scan.points,
-        command="project",
-        settings=settings,
-        inputs=inputs | {"scan": scan.record},
-        notes=scan.notes,
+        Provenance(
+            command="project",
+            settings=settings,
+            inputs=inputs | {"scan": scan.record},
+            notes=scan.notes,
+        ),
         rgb=rgb,
     )

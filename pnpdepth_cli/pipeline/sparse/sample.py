@@ -11,7 +11,7 @@ import numpy as np
 from pnpdepth_cli.io.depth import describe_range, implausible, read_depth
 from pnpdepth_cli.io.record import sha256_of
 from pnpdepth_cli.io.rgb import read_rgb
-from pnpdepth_cli.pipeline.sparse.outputs import SparseTarget, write_sparse_outputs
+from pnpdepth_cli.pipeline.sparse.outputs import Provenance, SparseTarget, write_sparse_outputs
 from pnpdepth_cli.sensors import SampleNoise, SamplePattern, sample_points
 
 
@@ -79,17 +79,20 @@ def sample_depth(request: SampleRequest) -> dict[str, Any]:
     wanted = pattern.wanted(int(np.count_nonzero(dense.values)))
     sampled = len(points.depth) + sum(points.dropped.values())
     few = request.pattern in ("features", "edges") and sampled < wanted
+    source = f"{request.pattern}, seed {request.seed}"
     return write_sparse_outputs(
         request.target,
         points,
-        command="sample",
-        settings={"pattern": asdict(pattern), "noise": asdict(noise), "seed": request.seed},
-        inputs=inputs,
-        notes=[
-            f"depth: {depth_range}",
-            *([f"warning: {unlikely}"] if unlikely else []),
-            *([f"warning: the image has {sampled:,} of the {wanted:,} points asked for"] * few),
-            f"sparse: {describe_range(points.depth, f'{request.pattern}, seed {request.seed}')}",
-        ],
+        Provenance(
+            command="sample",
+            settings={"pattern": asdict(pattern), "noise": asdict(noise), "seed": request.seed},
+            inputs=inputs,
+            notes=[
+                f"depth: {depth_range}",
+                *([f"warning: {unlikely}"] if unlikely else []),
+                *([f"warning: the image has {sampled:,} of the {wanted:,} points asked for"] * few),
+                f"sparse: {describe_range(points.depth, source)}",
+            ],
+        ),
         rgb=rgb,
     )

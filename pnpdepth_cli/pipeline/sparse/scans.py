@@ -12,7 +12,8 @@ from pnpdepth_cli.errors import SizeError, UsageError
 from pnpdepth_cli.io.calibration import Calibration, read_calibration
 from pnpdepth_cli.io.depth import describe_range
 from pnpdepth_cli.io.record import sha256_of
-from pnpdepth_cli.io.scans import SCAN_SUFFIXES, read_scan
+from pnpdepth_cli.io.scans import read_scan
+from pnpdepth_cli.pipeline.sparse.scan_options import ScanOptions
 from pnpdepth_cli.sensors import (
     Camera,
     OcclusionFilter,
@@ -23,47 +24,6 @@ from pnpdepth_cli.sensors import (
 
 _OFF_CENTRE = 0.15
 """Fraction of the image's side by which a principal point may be off centre without warning."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class ScanOptions:
-    """How a scan becomes sparse depth of an image."""
-
-    calib: Path | None = None
-    """A calibration file, or the folder of KITTI's raw calibration."""
-
-    camera: int | None = None
-    """One of KITTI's four, 0 to 3; None for the left colour camera."""
-
-    euclidean: bool = False
-    """Depth is the distance from the camera's centre instead of z."""
-
-    keep_occluded: bool = False
-    """Points stay that the camera sees something nearer in front of."""
-
-    min_range: float = 0.0
-    """Metres from the scanner; nearer points are dropped."""
-
-    max_range: float | None = None
-    """Metres from the scanner; farther points are dropped."""
-
-    point_fields: int | None = None
-    """Float32 numbers of a point in a .bin file; None to tell from the file."""
-
-    def describes(self, sparse: Path) -> bool:
-        """Returns whether the sparse depth is a scan: by its suffix, or because of a calibration.
-
-        Raises:
-            UsageError: It is not, and an option is given that only a scan has.
-        """
-        if self.calib is not None or sparse.suffix.lower() in set(SCAN_SUFFIXES) - {".npy"}:
-            return True
-        if self != ScanOptions():
-            raise UsageError(
-                f"{sparse} is no scan, so --camera, --range, --keep-occluded, --min-range,"
-                " --max-range and --point-fields do not apply; a scan needs --calib"
-            )
-        return False
 
 
 @dataclass(frozen=True, kw_only=True)

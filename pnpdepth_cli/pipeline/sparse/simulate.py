@@ -13,7 +13,7 @@ from pnpdepth_cli.io.calibration import Calibration, read_calibration
 from pnpdepth_cli.io.depth import describe_range, implausible, read_depth
 from pnpdepth_cli.io.record import sha256_of
 from pnpdepth_cli.io.sensor_file import read_sensor
-from pnpdepth_cli.pipeline.sparse.outputs import SparseTarget, write_sparse_outputs
+from pnpdepth_cli.pipeline.sparse.outputs import Provenance, SparseTarget, write_sparse_outputs
 from pnpdepth_cli.pipeline.sparse.scans import camera_of, check_size
 from pnpdepth_cli.sensors import (
     FORWARD_LEFT_UP,
@@ -109,23 +109,25 @@ def simulate_scan(request: SimulateRequest) -> dict[str, Any]:
     return write_sparse_outputs(
         request.target,
         points,
-        command="simulate",
-        settings={
-            "sensor": asdict(sensor) | {"max_range": _finite(sensor.max_range)},
-            **asdict(settings),
-            "rotation": camera.rotation.tolist(),
-            "translation": camera.translation.tolist(),
-            "seed": request.seed,
-        },
-        inputs={
-            "depth": {"path": str(request.depth), "sha256": sha256_of(request.depth)},
-            "calibration": {"path": str(request.calib), "read_as": calibration.source},
-        },
-        notes=[
-            f"depth: {depth_range}",
-            *warnings,
-            f"sparse: {describe_range(points.depth, source)}",
-        ],
+        Provenance(
+            command="simulate",
+            settings={
+                "sensor": asdict(sensor) | {"max_range": _finite(sensor.max_range)},
+                **asdict(settings),
+                "rotation": camera.rotation.tolist(),
+                "translation": camera.translation.tolist(),
+                "seed": request.seed,
+            },
+            inputs={
+                "depth": {"path": str(request.depth), "sha256": sha256_of(request.depth)},
+                "calibration": {"path": str(request.calib), "read_as": calibration.source},
+            },
+            notes=[
+                f"depth: {depth_range}",
+                *warnings,
+                f"sparse: {describe_range(points.depth, source)}",
+            ],
+        ),
     )
 
 

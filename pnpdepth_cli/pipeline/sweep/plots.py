@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -83,13 +84,14 @@ def _draw_one(axis: Axis, cells: Cells, error: Axes, gain: Axes) -> None:
         ("linear", ORANGE, ":", "linear interpolation"),
         ("refined", BLUE, "-", "refined"),
     ):
-        line = _Line(colour=colour, dashes=dashes, mark="o" if method == "refined" else "")
-        _draw(error, axis, cells, "mae", method, line, label)
-    for key, title, line in (
-        ("mae", "MAE", _Line(colour=BLUE, mark="o", aside=-0.08)),
-        ("rmse", "RMSE", _Line(colour=VERMILION, mark="s", aside=0.08)),
-    ):
-        _draw(gain, axis, cells, key, "gain", line, title)
+        line = _Line(
+            colour=colour, dashes=dashes, mark="o" if method == "refined" else "", label=label
+        )
+        _draw(error, axis, cells, "mae", method, line)
+    mae = _Line(colour=BLUE, mark="o", aside=-0.08, label="MAE")
+    rmse = _Line(colour=VERMILION, mark="s", aside=0.08, label="RMSE")
+    _draw(gain, axis, cells, "mae", "gain", mae)
+    _draw(gain, axis, cells, "rmse", "gain", rmse)
     gain.set_ylabel("gain over the plain network (%)")
     for axes in (error, gain):
         _scale(axes, axis)
@@ -102,19 +104,20 @@ def _draw_two(study: Study, cells: Cells, error: Axes, gain: Axes) -> None:
         [cell for cell in cells if cell["parameters"][apart.name] == value]
         for value in apart.values
     ]
-    for value, group, line in zip(apart.values, groups, _lines(apart), strict=True):
-        _draw(error, across, group, "mae", "refined", line, value)
-        _draw(gain, across, group, "mae", "gain", line, value)
+    for group, line in zip(groups, _lines(apart), strict=True):
+        _draw(error, across, group, "mae", "refined", line)
+        _draw(gain, across, group, "mae", "gain", line)
     for method, dashes, label in (
         ("plain", "--", "plain network"),
         ("linear", ":", "linear interpolation"),
     ):
         if all(_values(g, "mae", method) == _values(groups[0], "mae", method) for g in groups):
-            _draw(error, across, groups[0], "mae", method, _Line(dashes=dashes), label)
+            line = _Line(dashes=dashes, label=label)
+            _draw(error, across, groups[0], "mae", method, line)
         elif method == "linear":
             for group, line in zip(groups, _lines(apart), strict=True):
                 same = _Line(colour=line.colour, dashes=dashes, aside=line.aside)
-                _draw(error, across, group, "mae", method, same, None)
+                _draw(error, across, group, "mae", method, same)
             error.plot([], [], color=_GREY, linestyle=dashes, label=label)
     handles, labels = error.get_legend_handles_labels()
     kept = [pair for pair in zip(handles, labels, strict=True) if pair[1] not in apart.values]
@@ -124,14 +127,20 @@ def _draw_two(study: Study, cells: Cells, error: Axes, gain: Axes) -> None:
         _scale(axes, across)
 
 
+@dataclass(frozen=True, kw_only=True)
 class _Line:
     """How a line looks."""
 
-    def __init__(
-        self, *, colour: Any = _GREY, dashes: str = "-", mark: str = "", aside: float = 0
-    ) -> None:
-        self.colour, self.dashes, self.mark = colour, dashes, mark
-        self.aside = aside  # offset of categories, so that no line hides another
+    colour: Any = _GREY
+    """Colour of matplotlib."""
+    dashes: str = "-"
+    """Line style of matplotlib."""
+    mark: str = ""
+    """Marker of matplotlib."""
+    aside: float = 0
+    """Offset of categories, so that no line hides another."""
+    label: str | None = None
+    """Text of the legend; None for no entry."""
 
 
 def _lines(apart: Axis) -> list[_Line]:
@@ -146,7 +155,12 @@ def _lines(apart: Axis) -> list[_Line]:
     else:
         colours = list(_KINDS[:many])
     return [
-        _Line(colour=c, mark=_MARKS[n % len(_MARKS)], aside=0.6 * ((n + 0.5) / many - 0.5))
+        _Line(
+            colour=c,
+            mark=_MARKS[n % len(_MARKS)],
+            aside=0.6 * ((n + 0.5) / many - 0.5),
+            label=apart.values[n],
+        )
         for n, c in enumerate(colours)
     ]
 
@@ -157,9 +171,7 @@ def _across(first: Axis, second: Axis) -> tuple[Axis, Axis]:
     return along, first if along is second else second
 
 
-def _draw(
-    axes: Axes, axis: Axis, cells: Cells, key: str, name: str, line: _Line, label: str | None
-) -> None:
+def _draw(axes: Axes, axis: Axis, cells: Cells, key: str, name: str, line: _Line) -> None:
     """Draws a line through the cells' values; gains with their intervals."""
     places = axis.numbers()
     x = [n + line.aside for n in range(len(axis.values))] if places is None else places
@@ -172,8 +184,8 @@ def _draw(
     style = line.dashes if linked else ""
     if places is None and name in ("plain", "linear") and len(set(values)) > 1:
         mark = "_" if name == "plain" else "x"
-        style, line = "", _Line(colour=line.colour, mark=mark, aside=line.aside)
-    drawn = {"color": line.colour, "linestyle": style, "marker": line.mark, "label": label}
+        style, line = "", replace(line, mark=mark)
+    drawn = {"color": line.colour, "linestyle": style, "marker": line.mark, "label": line.label}
     axes.plot(at, values, markersize=12 if line.mark == "_" else 4, **drawn)
     if name != "gain" or all(bound != bound for bound in low):
         return  # the scatter of frames would hide the differences of values

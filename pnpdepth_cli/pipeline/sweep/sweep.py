@@ -21,7 +21,8 @@ from pnpdepth_cli.io.dataset.frame import Frame
 from pnpdepth_cli.io.lock import locked_folder
 from pnpdepth_cli.models.definition import ModelDefinition
 from pnpdepth_cli.pipeline.batch.batch import Listener
-from pnpdepth_cli.pipeline.batch.frames import BatchRequest, Task, find_frames, task_of
+from pnpdepth_cli.pipeline.batch.frames import Task, find_frames, task_of
+from pnpdepth_cli.pipeline.batch.request import BatchRequest, FrameSelection
 from pnpdepth_cli.pipeline.batch.settings import model_identity
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs, read_inputs
 from pnpdepth_cli.pipeline.refinement.refine import Refiner, load_refiner
@@ -44,15 +45,9 @@ _RESOLVE_POINTS = 500
 
 
 @dataclass(frozen=True, kw_only=True)
-class SweepRequest:
+class SweepRequest(FrameSelection):
     """What to vary, over which frames."""
 
-    source: Path
-    """A folder or a list of frames."""
-    output: Path
-    """The folder for the results."""
-    refine: RefineRequest
-    """All that is not varied."""
     studies: Sequence[Study]
     """As `studies_of` returns them."""
     sampling: Sampling | None = None
@@ -60,12 +55,6 @@ class SweepRequest:
     truth."""
     seeds: int = 1
     """Draws of the points, with consecutive seeds."""
-    layout: str | None = None
-    """Name of the data set's layout; None to guess it."""
-    protocol: str | None = None
-    """Name of the protocol that crops frames; None for the layout's own."""
-    limit: int | None = None
-    """Only the first frames; None for all."""
     plots: bool = True
     """True to write a plot of each study."""
     resamples: int = 2000

@@ -19,12 +19,12 @@ from pnpdepth_cli.errors import InputError, LayerError, ModelError, OutputError,
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.pipeline.batch import running as batch_running
 from pnpdepth_cli.pipeline.batch.batch import plan_batch
-from pnpdepth_cli.pipeline.batch.frames import BatchRequest
+from pnpdepth_cli.pipeline.batch.request import BatchRequest
 from pnpdepth_cli.pipeline.batch.summary import _SCORES, Tally
 from pnpdepth_cli.pipeline.refinement.inputs import read_inputs
 from pnpdepth_cli.pipeline.refinement.refine import Refiner, refine_image
 from pnpdepth_cli.pipeline.report.batch import BatchReport
-from pnpdepth_cli.pipeline.sparse.scans import ScanOptions
+from pnpdepth_cli.pipeline.sparse.scan_options import ScanOptions
 from pnpdepth_cli.sensors import SamplePattern
 from tests.pipeline.batches import (
     NAMES,

@@ -16,7 +16,7 @@ from pnpdepth_cli.errors import OutputError, StorageError
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.io.page import open_page
 from pnpdepth_cli.pipeline.batch.batch import plan_batch
-from pnpdepth_cli.pipeline.batch.frames import BatchRequest
+from pnpdepth_cli.pipeline.batch.request import BatchRequest
 from pnpdepth_cli.pipeline.report import batch as report_batch
 from tests.pipeline.batches import NAMES, Heard, add_frame, batch, pairs_on_disk, refinement
 from tests.pipeline.report_pages import frames_of, page_data, pictures_of

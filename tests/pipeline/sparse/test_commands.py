@@ -24,7 +24,8 @@ from pnpdepth_cli.io.depth import DEPTH_SUFFIXES, read_depth, read_sparse
 from pnpdepth_cli.pipeline.sparse.outputs import SparseTarget
 from pnpdepth_cli.pipeline.sparse.project import ProjectRequest, project_scan
 from pnpdepth_cli.pipeline.sparse.sample import SampleRequest, sample_depth
-from pnpdepth_cli.pipeline.sparse.scans import ScanOptions, camera_of, read_scan_points
+from pnpdepth_cli.pipeline.sparse.scan_options import ScanOptions
+from pnpdepth_cli.pipeline.sparse.scans import camera_of, read_scan_points
 from pnpdepth_cli.pipeline.sparse.simulate import SimulateRequest, find_sensor, simulate_scan
 from tests.pipeline.scan_frames import ScanOnDisk, scan_on_disk
 
@@ -143,7 +144,8 @@ def test_options_of_a_scan_are_refused_for_anything_else(frame: ScanOnDisk) -> N
     assert ScanOptions(calib=frame.calib).describes(Path("scan.npy"))
     assert not ScanOptions().describes(Path("sparse.npy"))
     with pytest.raises(UsageError, match="is no scan"):
-        ScanOptions(keep_occluded=True).describes(frame.gt)
+        ScanOptions(max_range=9.0).describes(frame.gt)
+    assert not ScanOptions(keep_occluded=True).describes(frame.gt)
 
 
 def sampling(frame: ScanOnDisk, output: str, **more: object) -> SampleRequest:

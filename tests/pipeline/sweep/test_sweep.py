@@ -29,7 +29,7 @@ from pnpdepth_cli.pipeline.refinement import refine as refining
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs, read_inputs
 from pnpdepth_cli.pipeline.refinement.refine import load_refiner, refine_image
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest
-from pnpdepth_cli.pipeline.sparse.scans import ScanOptions
+from pnpdepth_cli.pipeline.sparse.scan_options import ScanOptions
 from pnpdepth_cli.pipeline.sweep import plots as sweep_plots
 from pnpdepth_cli.pipeline.sweep.axes import PARAMETERS, read_axis, studies_of
 from pnpdepth_cli.pipeline.sweep.plan import Method

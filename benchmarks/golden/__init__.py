@@ -1,0 +1,1 @@
+"""Golden output of the command line: see `python -m benchmarks.golden --help`."""

@@ -1,0 +1,188 @@
+"""Weighted local planes through the points at 1/16."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from model_zoo_defs._compact.encoder import ENCODER_CHANNELS
+from model_zoo_defs._compact.points import MASKED, Points, Prior, resize
+
+FIT_HEADS = 4
+FIT_KEY = 16
+FIT_CHUNK = 1024
+
+
+def _cell_grid(height: int, width: int, like: Tensor) -> Tensor:
+    """Row and column of every cell's centre, (2, height, width), in cells."""
+    rows = torch.arange(height, device=like.device, dtype=torch.float32) + 0.5
+    columns = torch.arange(width, device=like.device, dtype=torch.float32) + 0.5
+    return torch.stack(torch.meshgrid(rows, columns, indexing="ij"))
+
+
+class PriorFit(NamedTuple):
+    """Fits of the points' residuals against the prior, each (B, heads, h, w).
+
+    estimates: prior plus fitted residual; reliability: log of the std of the points' values
+    over the std of their residuals, both near the cell, positive where the prior explains
+    the points.
+    """
+
+    estimates: Tensor
+    std: Tensor
+    reliability: Tensor
+    valid: Tensor
+
+
+class Fit(NamedTuple):
+    """Fits at 1/16: estimates (B, heads, h, w), log distance in cells to the nearest points.
+
+    of_prior: None without a prior.
+    """
+
+    estimates: Tensor
+    distance: Tensor
+    of_prior: PriorFit | None = None
+
+
+class PointFit(nn.Module):
+    """Weighted local planes through the points, one estimate per head, at 1/16.
+
+    The weight of a cell with points is exp(query . key) / distance^(2 p) times the mean weight of
+    its points; p, the ridge of the plane's slope (relative to the std of the points) and the
+    projections are learnt. The residuals against a prior are fitted with the same weights.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.near = nn.Conv2d(ENCODER_CHANNELS["s16"], 64, 1)
+        self.far = nn.Conv2d(ENCODER_CHANNELS["s32"], 64, 1)
+        self.query = nn.Conv2d(64, FIT_HEADS * FIT_KEY, 1)
+        self.key = nn.Conv2d(64, FIT_HEADS * FIT_KEY, 1)
+        self.power = nn.Parameter(torch.tensor([2.0, 3.0, 4.0, 6.0]).log())
+        self.ridge = nn.Parameter(torch.tensor([0.05, 0.1, 0.3, 1.0]).log())
+        self.floor = nn.Parameter(torch.tensor(0.3).log())
+
+    def forward(self, near: Tensor, far: Tensor, points: Points, prior: Prior | None = None) -> Fit:
+        """The fits at 1/16 through the points and, with a prior, through residuals against it."""
+        height, width = near.shape[-2:]
+        features = F.relu(self.near(near) + resize(self.far(far), near.shape[-2:]))
+        queries = self._per_head(self.query(features))
+        keys = self._per_head(self.key(features))
+        cells = self._cells(points, prior, height, width)
+        seen = cells[-1].any(0)
+        if not bool(seen.any()):
+            return self._without_points(near, prior)
+        keys, cells = keys[:, :, seen], [x[..., seen] for x in cells]
+        centres = _cell_grid(height, width, near).flatten(1)
+        middle = centres.mean(1, keepdim=True)  # small numbers keep the moments exact
+        centres, cells[0] = centres - middle, cells[0] - middle
+        # The moments are small differences of large sums, which bfloat16 would leave nothing of.
+        with torch.autocast(near.device.type, enabled=False):
+            parts = [
+                self._fit(queries[:, :, i : i + FIT_CHUNK], centres[:, i : i + FIT_CHUNK], keys,
+                          *cells)
+                for i in range(0, height * width, FIT_CHUNK)
+            ]  # fmt: skip
+        rows = (torch.cat(part, dim=-1) for part in zip(*parts, strict=True))
+        estimates, distance, *of_prior = (x.reshape(*x.shape[:-1], height, width) for x in rows)
+        if prior is None:
+            return Fit(estimates, distance.unsqueeze(1))
+        residual, std, reliability, support = of_prior
+        value, valid = prior.at(16)
+        valid = valid * (support > 1e-4)
+        fit = PriorFit(value + residual, std, reliability * valid, valid)
+        return Fit(estimates, distance.unsqueeze(1), fit)
+
+    @staticmethod
+    def _without_points(near: Tensor, prior: Prior | None) -> Fit:
+        """The prior as it is; 0, the median, without a prior."""
+        zeros = torch.zeros_like(near[:, :FIT_HEADS], dtype=torch.float32)
+        distance = zeros[:, :1] + 5.0
+        if prior is None:
+            return Fit(zeros, distance)
+        value, valid = prior.at(16)
+        return Fit(zeros, distance, PriorFit(value + zeros, zeros + 1.0, zeros, valid + zeros))
+
+    @staticmethod
+    def _per_head(x: Tensor) -> Tensor:
+        """(B, heads, cells, key) in float32."""
+        return x.float().reshape(len(x), FIT_HEADS, FIT_KEY, -1).transpose(2, 3)
+
+    @staticmethod
+    def _cells(points: Points, prior: Prior | None, height: int, width: int) -> list[Tensor]:
+        """Of the points of each cell, weighted, (B, cells) but for the place (B, 2, cells).
+
+        Place, value, log weight, the same of the residual against the prior where there is one
+        (value, fraction of points where the prior is known), and if there is any point.
+        """
+        weight = points.weight
+        pixel = (_cell_grid(weight.shape[-2], weight.shape[-1], weight) / 16.0).unsqueeze(0)
+        maps = [points.mask, weight, points.value * weight, pixel * weight.detach()]
+        count, density, value, at = (F.avg_pool2d(x, 16) for x in maps)
+        safe = density.clamp(min=1e-6)
+        reliability = torch.log((density / count.clamp(min=1e-6)).clamp(min=1e-6))
+        cells = [(at / safe.detach()).flatten(2), (value / safe).flatten(1), reliability.flatten(1)]
+        if prior is not None:
+            maps = [prior.weight, prior.weight * prior.residual]
+            both, residual = (F.avg_pool2d(x, 16) for x in maps)
+            cells += [(residual / both.clamp(min=1e-6)).flatten(1), (both / safe).flatten(1)]
+        return [*cells, (count > 0).flatten(1)]
+
+    def _fit(
+        self, queries: Tensor, centres: Tensor, keys: Tensor, at: Tensor, value: Tensor,
+        reliability: Tensor, *more: Tensor,
+    ) -> tuple[Tensor, ...]:  # fmt: skip
+        """Estimates (B, heads, cells) and log distance (B, cells) for some of the cells.
+
+        With a prior also the fit of the residuals against it, the std of the residuals, the
+        reliability and the fraction of the weights on cells where the prior is known, each
+        (B, heads, cells).
+        """
+        *of_prior, known = more
+        square = torch.cdist(centres.t().expand(at.shape[0], -1, -1), at.transpose(1, 2)).square()
+        absent = ~known.unsqueeze(1)
+        far = torch.log(square + self.floor.exp()).masked_fill(absent, -MASKED)
+        alike = queries @ keys.transpose(2, 3) / FIT_KEY**0.5
+        alike = alike + reliability.view(len(at), 1, 1, -1)
+        weight = (alike - self.power.exp().view(1, -1, 1, 1) * far.unsqueeze(1)).softmax(-1)
+        y, x = at.unbind(1)
+        products = torch.stack([y, x, value, y * y, x * x, x * y, y * value, x * value], -1)
+        nearest = square.masked_fill(absent, 1e6).amin(-1)
+        distance = 0.5 * torch.log(nearest + 0.1)
+        if not of_prior:
+            return self._plane(centres, weight @ products.unsqueeze(1)), distance
+        residual, support_at = of_prior
+        products = torch.cat([products, value.square().unsqueeze(-1)], -1)
+        more_products = torch.stack(
+            [torch.ones_like(y), y, x, residual, y * y, x * x, x * y, y * residual, x * residual,
+             residual * residual], -1,
+        ) * support_at.unsqueeze(-1)  # fmt: skip
+        moments = weight @ torch.cat([products, more_products], -1).unsqueeze(1)
+        estimate = self._plane(centres, moments[..., :8])
+        support = moments[..., 9]
+        rest = moments[..., 10:] / support.unsqueeze(-1).clamp(min=1e-4)
+        shifted = self._plane(centres, rest[..., :8])
+        std = torch.sqrt((rest[..., 8] - rest[..., 2].square()).clamp(min=0.0) + 1e-4)
+        plain = torch.sqrt((moments[..., 8] - moments[..., 2].square()).clamp(min=0.0) + 1e-4)
+        reliability = torch.log(plain / std).clamp(-3.0, 3.0)
+        return estimate, distance, shifted, std, reliability, support
+
+    def _plane(self, centres: Tensor, moments: Tensor) -> Tensor:
+        """Returns the value (B, heads, cells) at the centres of the plane with these moments.
+
+        moments (B, heads, cells, 8): weighted means of y, x, z, yy, xx, xy, yz and xz.
+        """
+        my, mx, mz, yy, xx, xy, yz, xz = moments.unbind(-1)
+        yy, xx = (yy - my * my).clamp(min=0.0), (xx - mx * mx).clamp(min=0.0)
+        xy, yz, xz = xy - mx * my, yz - my * mz, xz - mx * mz
+        damping = self.ridge.exp().view(1, -1, 1) * (yy + xx) + 1e-2
+        yy, xx = yy + damping, xx + damping
+        determinant = (yy * xx - xy * xy).clamp(min=1e-4)
+        slope_y, slope_x = (xx * yz - xy * xz) / determinant, (yy * xz - xy * yz) / determinant
+        tilt = slope_y * (centres[0] - my) + slope_x * (centres[1] - mx)
+        # far outside the points a plane runs away: half a unit of log depth is as far as it may go
+        return mz + 0.5 * torch.tanh(tilt / 0.5)

@@ -1,0 +1,112 @@
+"""Sparse depth and a prior as log depth, and the residuals of the points."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+# a prior further than this from the median, in log depth, is clamped
+PRIOR_RANGE = 4.0
+MASKED = -1e4
+
+
+class Points:
+    """The sparse depth of a batch: log depth minus its median, and where it is known.
+
+    value, mask, weight: (B, 1, H, W); median: (B, 1, 1, 1), 0 for a sample without any point.
+    The weight of a point is 1 until `weigh` is called.
+    """
+
+    def __init__(self, sparse: Tensor):
+        self.mask = (sparse > 0).to(torch.float32)
+        log_depth = torch.log(torch.where(sparse > 0, sparse, 1.0).to(torch.float32))
+        rows = zip(log_depth.flatten(1), self.mask.flatten(1) > 0, strict=True)
+        known = (row[seen] for row, seen in rows)
+        medians = [row.median() if row.numel() else row.new_zeros(()) for row in known]
+        self.median = torch.stack(medians).view(-1, 1, 1, 1)
+        self.value = (log_depth - self.median) * self.mask
+        self.weight = self.mask
+
+    def weigh(self, weight: Tensor) -> None:
+        """Residuals and fits use these weights (B, 1, H, W), 0..1, at the points."""
+        self.weight = self.mask * weight
+
+    def moments(self) -> Tensor:
+        """Share of known pixels, weight, weighted value and square (B, 4, H / 2, W / 2).
+
+        Sums over 2 x 2 pixels are all the residuals need; finer positions change them by less
+        than half a pixel's slope.
+        """
+        weighted = self.weight * self.value
+        parts = [self.mask, self.weight, weighted, weighted * self.value]
+        return F.avg_pool2d(torch.cat(parts, dim=1), 2)
+
+
+class Residual(NamedTuple):
+    """Weighted residuals of the points against a depth, per cell, each (B, 1, h, w).
+
+    std: standard deviation of the residuals; density: weighted fraction of known pixels;
+    reliability: log of the mean weight of the cell's points, MASKED where there is none.
+    """
+
+    mean: Tensor
+    std: Tensor
+    density: Tensor
+    reliability: Tensor
+
+
+def residual_of(moments: Tensor, depth: Tensor, stride: int) -> Residual:
+    """The residuals of `Points.moments` against `depth`, per cell of `stride` pixels."""
+    count, density, value, square = moments.chunk(4, dim=1)
+    dense = resize(depth, density.shape[-2:]) if stride > 2 else depth
+    difference = value - dense * density
+    squared = square - dense * (2.0 * value - dense * density)
+    sums = F.avg_pool2d(torch.cat([count, density, difference, squared], dim=1), stride // 2)
+    count, density, difference, squared = sums.chunk(4, dim=1)
+    known = density.clamp(min=1e-6)
+    mean = difference / known
+    std = torch.sqrt((squared / known - mean * mean).clamp(min=0.0) + 1e-6)
+    weight = torch.log((density / count.clamp(min=1e-6)).clamp(min=1e-6))
+    return Residual(mean, std, density, torch.where(count > 0, weight, MASKED))
+
+
+class Prior:
+    """A dense depth in the units of `Points`, 0 where unknown, and where it is known.
+
+    value, valid: (B, 1, H, W).
+    """
+
+    def __init__(self, depth: Tensor, points: Points):
+        valid = (depth > 0) & torch.isfinite(depth)
+        self.valid = valid.to(torch.float32)
+        value = torch.log(torch.where(valid, depth, 1.0).to(torch.float32)) - points.median
+        self.value = value.clamp(-PRIOR_RANGE, PRIOR_RANGE) * self.valid
+        # residuals of the points against the prior, on the pixels where both are known
+        self.weight = points.weight * self.valid
+        self.residual = (points.value - self.value) * self.valid * points.mask
+        weighted = self.weight * self.residual
+        parts = [points.mask * self.valid, self.weight, weighted, weighted * self.residual]
+        self.moments = F.avg_pool2d(torch.cat(parts, dim=1), 2)
+
+    def at(self, stride: int) -> tuple[Tensor, Tensor]:
+        """Value and validity at the centre pixels of the cells of `stride` pixels."""
+        start = stride // 2
+        part = (..., slice(start, None, stride), slice(start, None, stride))
+        return self.value[part], self.valid[part]
+
+    def hints(self, before: Tensor, stride: int) -> Tensor:
+        """Value relative to `before`, validity, residual and std (B, 4, h, w) of a level."""
+        value, valid = self.at(stride)
+        sums = F.avg_pool2d(self.moments, stride // 2) if stride > 2 else self.moments
+        _, density, mean, square = sums.chunk(4, dim=1)
+        known = density.clamp(min=1e-6)
+        mean = mean / known
+        std = torch.sqrt((square / known - mean * mean).clamp(min=0.0) + 1e-6)
+        return torch.cat([(value - before) * valid, valid, mean, std], dim=1)
+
+
+def resize(x: Tensor, size: torch.Size | tuple[int, int]) -> Tensor:
+    return F.interpolate(x, size=tuple(size), mode="bilinear", align_corners=False)

@@ -1,0 +1,51 @@
+"""Options of a LiDAR scan. Imports neither numpy nor torch."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from pnpdepth_cli.errors import UsageError
+from pnpdepth_cli.pipeline.options import option, options_of
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScanOptions:
+    """How a scan is projected to sparse depth of an image."""
+
+    calib: Path | None = option(
+        None,
+        "Calibration of a LiDAR scan: a KITTI file or raw folder, or a file with K, R, t.",
+        metavar="FILE|FOLDER",
+    )
+    camera: int | None = option(None, "KITTI camera number, 0 to 3.  [default: 2]", metavar="N")
+    euclidean: bool = option(False, "Depth is the distance from the camera, not z.", flag="--range")
+    keep_occluded: bool = option(False, "Keep LiDAR points that are occluded from the camera.")
+    min_range: float = option(0.0, "Drop points nearer than M metres.", metavar="M")
+    max_range: float | None = option(None, "Drop points farther than M metres.", metavar="M")
+    point_fields: int | None = option(
+        None,
+        "Float32 numbers of a point in a .bin: KITTI 4, nuScenes 5.  [default: recognised]",
+        metavar="N",
+        least=3,
+        most=64,
+    )
+
+    def describes(self, sparse: Path) -> bool:
+        """Returns whether the sparse depth is a scan: by its suffix, or because of a calibration.
+
+        Raises:
+            UsageError: It is not, and an option is given that only a scan has.
+        """
+        from pnpdepth_cli.io.dataset.frame import SCAN_ONLY_SUFFIXES
+
+        if self.calib is not None or sparse.suffix.lower() in SCAN_ONLY_SUFFIXES:
+            return True
+        if replace(self, keep_occluded=False) != ScanOptions():
+            for_maps = ("calib", "keep_occluded")
+            flags = [each.flag for each in options_of(ScanOptions) if each.name not in for_maps]
+            raise UsageError(
+                f"{sparse} is no scan, so {', '.join(flags[:-1])} and {flags[-1]} do not apply; a"
+                " scan needs --calib"
+            )
+        return False

@@ -1,0 +1,35 @@
+"""Damaged files of every kind end in one line and an exit code, in bounded time and memory.
+
+PNPDEPTH_FUZZ_INPUTS and PNPDEPTH_FUZZ_SEED ask for more than the few hundred inputs of a test run.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.fuzz.fuzzing import fuzz
+from tests.fuzz.mutations import mutated
+
+pytest.importorskip("resource")  # peak memory; not on Windows
+
+INPUTS = int(os.environ.get("PNPDEPTH_FUZZ_INPUTS", "600"))
+SEED = int(os.environ.get("PNPDEPTH_FUZZ_SEED", "0"))
+
+
+def test_no_damaged_file_causes_a_traceback_a_hang_or_much_memory(tmp_path: Path) -> None:
+    result = fuzz(tmp_path, SEED, 0, INPUTS)
+    assert [str(finding) for finding in result.findings] == []
+    assert result.inputs == INPUTS
+    assert min(result.codes[0], result.codes[3]) > 0  # some inputs stay valid, most do not
+
+
+def test_the_same_seed_and_number_give_the_same_bytes() -> None:
+    data = Path(__file__).read_bytes()
+    first, second, other = (
+        mutated(data, np.random.default_rng((3, number))) for number in (7, 7, 8)
+    )
+    assert first == second != other

@@ -1,0 +1,133 @@
+"""Projected scans in depth maps: recognised by their pattern, and their occluded points."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from pnpdepth_cli.io.calibration import read_calibration
+from pnpdepth_cli.io.depth import read_depth, write_depth
+from pnpdepth_cli.io.scans import read_scan
+from pnpdepth_cli.pipeline.refinement.inputs import read_inputs
+from pnpdepth_cli.pipeline.refinement.request import FrameFiles, RefineRequest
+from pnpdepth_cli.pipeline.sparse.scan_options import ScanOptions
+from pnpdepth_cli.pipeline.sparse.scans import camera_of
+from pnpdepth_cli.sensors import (
+    FORWARD_LEFT_UP,
+    Camera,
+    OcclusionFilter,
+    Points,
+    ProjectionSettings,
+    SamplePattern,
+    as_depth_image,
+    occluded_in_map,
+    project_velodyne,
+    sample_points,
+)
+from pnpdepth_cli.sensors.projected_map import interleaved, scan_pattern
+
+SIZE = (240, 640)
+INTRINSICS = np.array([[700.0, 0, 320], [0, 700, 120], [0, 0, 1]])
+
+
+def points_of(depth: NDArray[np.floating]) -> Points:
+    rows, columns = np.nonzero(depth)
+    return Points(
+        xy=np.column_stack([columns, rows]).astype(np.float32),
+        depth=depth[rows, columns].astype(np.float32),
+        size=depth.shape,
+    )
+
+
+def boards_before_a_wall(occlusion: OcclusionFilter | None) -> Points:
+    """A map of boards at 5 m and a wall at 20 m, seen by a scanner above and beside the camera."""
+    elevation, azimuth = np.meshgrid(
+        np.radians(np.arange(-9, 9, 0.4)), np.radians(np.arange(-24, 24, 0.2)), indexing="ij"
+    )
+    y, z = np.tan(azimuth).ravel(), (np.tan(elevation) / np.cos(azimuth)).ravel()
+    on_board = (np.floor(5 * y / 0.25) % 2 == 0) & (np.abs(5 * z) < 0.4)
+    x = np.where(on_board, 5.0, 20.0)
+    camera = Camera(
+        intrinsics=INTRINSICS,
+        rotation=FORWARD_LEFT_UP,
+        translation=np.array([0.06, -0.08, -0.27]),
+    )
+    scan = project_velodyne(
+        np.column_stack([x, x * y, x * z]), camera, SIZE, ProjectionSettings(occlusion=occlusion)
+    )
+    return points_of(as_depth_image(scan))
+
+
+def test_points_of_the_wall_within_the_boards_are_occluded() -> None:
+    points = boards_before_a_wall(None)
+    hidden = occluded_in_map(points)
+    assert hidden is not None
+    assert points.depth[hidden].min() > 19  # the foreground itself stays
+    between = interleaved(as_depth_image(points), 0.08)
+    column, row = points.xy.astype(int).T
+    assert hidden[between[row, column]].mean() > 0.8
+    assert hidden.mean() < 2.5 * between.sum() / len(points)
+
+
+def test_a_map_without_its_occluded_points_is_left_alone() -> None:
+    assert occluded_in_map(boards_before_a_wall(OcclusionFilter())) is None
+
+
+@pytest.mark.parametrize("kind", ["uniform", "grid"])
+def test_sampled_points_are_no_projected_scan(kind: str) -> None:
+    depth = np.where(np.arange(640) // 40 % 2 == 0, 2.0, 8.0) * np.ones((480, 1))
+    samples = sample_points(depth.astype(np.float32), SamplePattern(kind=kind, count=9000), 0)
+    assert occluded_in_map(points_of(as_depth_image(samples))) is None
+
+
+def test_points_between_pixels_and_a_few_points_are_left_alone() -> None:
+    points = boards_before_a_wall(None)
+    off_grid = Points(xy=points.xy + np.float32(0.25), depth=points.depth, size=points.size)
+    assert occluded_in_map(off_grid) is None
+    assert occluded_in_map(points.select(np.arange(len(points)) < 900)) is None
+
+
+def test_spacings_are_those_to_the_next_point_in_a_row_or_beside_it() -> None:
+    known = np.zeros((40, 60), bool)
+    known[::5, ::3] = True
+    pattern = scan_pattern(known)
+    assert (pattern.along_px, pattern.across_px) == (3.0, 5.0)
+    assert pattern.has_scan_lines
+    assert not scan_pattern(known.T).has_scan_lines
+    assert scan_pattern(np.zeros((4, 5), bool)).along_px == np.inf
+
+
+def test_a_frame_is_read_without_occluded_points_unless_they_are_kept(tmp_path: Path) -> None:
+    points = boards_before_a_wall(None)
+    write_depth(tmp_path / "sparse.png", as_depth_image(points), scale=256)
+    files = FrameFiles(sparse=tmp_path / "sparse.png")
+    read = read_inputs(RefineRequest(files=files))
+    count = read.record["sparse"]["dropped"]["hidden by foreground"]
+    assert len(read.points) == len(points) - count < len(points)
+    assert sum("--keep-occluded" in note for note in read.notes) == 1
+    kept = read_inputs(RefineRequest(files=replace(files, scan=ScanOptions(keep_occluded=True))))
+    assert len(kept.points) == len(points)
+    assert not any("occluded" in note for note in kept.notes)
+
+
+def test_kittis_maps_are_recognised_and_its_filtered_scans_are_not(shared_data: Path) -> None:
+    for path in sorted((shared_data / "kitti_dc" / "velodyne_raw").glob("*.png")):
+        raw = read_depth(path).values
+        truth = read_depth(path.parents[1] / "groundtruth" / path.name).values
+        points = points_of(raw)
+        hidden = occluded_in_map(points)
+        assert hidden is not None
+        true_depth = truth[tuple(points.xy.astype(int).T[::-1])]
+        agrees = np.abs(points.depth - true_depth) <= 0.1 * true_depth
+        known = true_depth > 0
+        assert (~hidden[known & agrees]).mean() > 0.985
+        assert hidden[known & ~agrees].mean() > 0.4
+    folder = shared_data / "kitti_object"
+    camera = camera_of(read_calibration(folder / "calib" / "000001.txt"))
+    scan = read_scan(folder / "velodyne" / "000001.bin").points
+    filtered = project_velodyne(scan, camera, (375, 1242))
+    assert occluded_in_map(points_of(as_depth_image(filtered))) is None
