@@ -25,8 +25,8 @@ NETWORK = (
 )
 METHOD = (
     *("--auto", "--time-budget", "--iterations", "--lr", "--loss", "--update", "--schedule"),
-    *("--blur", "--target", "--parameters", "--mask", "--mask-fraction", "--proximity"),
-    *("--line-search", "--keep-best", "--propagate"),
+    *("--blur", "--target", "--parameters", "--mask", "--mask-fraction", "--mask-scale"),
+    *("--proximity", "--line-search", "--keep-best", "--propagate"),
     *("--holdout", "--seed"),
 )
 OUTPUT = ("--output", "--format", "--baselines", "--uncertainty", "--overwrite", "--json")

@@ -34,7 +34,7 @@ from pnpdepth_cli.core.refinement import DepthOf, FrameRefinement, Refinement, R
 from pnpdepth_cli.core.split import Split, gradient_at
 from pnpdepth_cli.core.split.user_code import wrap_user_errors
 from pnpdepth_cli.core.weights import MovingWeights
-from pnpdepth_cli.core.weights_refinement import Predict, WeightsRefinement
+from pnpdepth_cli.core.weights_refinement import FrameOfPoints, WeightsRefinement
 from pnpdepth_cli.errors import LayerError, PnpDepthError
 from pnpdepth_cli.points import SparsePoints
 
@@ -165,24 +165,18 @@ def refine_from(
 
 
 def refine_weights(
-    output: Any,
-    predict: Predict,
+    frame: FrameOfPoints,
     weights: MovingWeights,
-    points: SparsePoints,
     settings: RefineSettings,
     *,
-    depth_of: DepthOf,
     on_iteration: Callable[[int, float], None] = lambda iteration, loss: None,
 ) -> Refinement:
     """Returns the depth of one frame after moving weights, which are back in place afterwards.
 
     Args:
-        output: What the network returns for all points.
-        predict: Returns what the network returns for some of the points, differentiably.
+        frame: The frame, and how the network predicts it.
         weights: The weights that move, θ_0.
-        points: As of `refine`.
         settings: What is updated and how.
-        depth_of: As of `refine`.
         on_iteration: Called after each step k with k and L(θ_k).
 
     Raises:
@@ -190,24 +184,23 @@ def refine_weights(
         ModelError: As of `refine`.
         LayerError: The depth depends on no weight behind the cut.
     """
-    frame = WeightsRefinement(settings, weights, points, depth_of)
-    before = frame.begin(output, predict)
-    for iteration in range(frame.iterations):
-        given, asked = frame.mask()
+    state = WeightsRefinement(frame, weights, settings)
+    state.begin()
+    for iteration in range(state.iterations):
+        given, asked = state.mask()
         with torch.enable_grad(), weights.in_place(requires_grad=True) as theta:
-            loss = frame.loss(predict(given), asked)
+            loss = state.loss(frame.predict_in_steps(given), asked)
             gradients = _gradients(loss, theta)
-        frame.update(loss, gradients)
-        if frame.error is not None:
+        state.update(loss, gradients)
+        if state.error is not None:
             break
-        on_iteration(iteration, frame.losses[-1])
-        if frame.finished(predict):
+        on_iteration(iteration, state.losses[-1])
+        if state.finished():
             break
-    result = frame.result(before, predict)
-    if frame.error is not None:
-        frame.error.last_good = result
-        raise frame.error
-    return result
+    if state.error is not None:
+        state.error.last_good = state.result()
+        raise state.error
+    return state.result()
 
 
 def _gradients(loss: Tensor, theta: Sequence[Tensor]) -> list[Tensor | None]:

@@ -30,6 +30,8 @@ class MaskSettings:
     """Fraction hidden at every step."""
     set_aside: float = 0.1
     """Fraction never shown during the steps; the step that is best there is taken."""
+    scale: float = 1.0
+    """Side of the image during the steps, as a fraction of the side that the network takes."""
     seed: int = 0
     """Of the masks, and of the random start of low-rank weights."""
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -19,7 +20,7 @@ from pnpdepth_cli.core.weights import MovingWeights
 from pnpdepth_cli.errors import DivergedError, LayerError
 from pnpdepth_cli.points import SparsePoints
 
-CHECKS = 4
+CHECKS = 3
 """How often the points set aside are looked at, besides before the first step."""
 PATIENCE = 2
 """The steps end after so many checks in a row that are worse than the best."""
@@ -28,36 +29,50 @@ Predict = Callable[[SparsePoints], Any]
 """Returns what the network returns for a frame when it is given these of its points."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class FrameOfPoints:
+    """A frame whose depth the network predicts from any of its points."""
+
+    points: SparsePoints
+    """All points, on the network's grid."""
+    inliers: SparsePoints
+    """Those that the steps are made with."""
+    output: Any
+    """What the network returns for all points."""
+    predict: Predict
+    """Returns what the network returns for some of them, differentiably."""
+    predict_in_steps: Predict
+    """The same for the steps, perhaps from a smaller image of the same field of view."""
+    depth_of: DepthOf
+    """Turns that into depth (1, 1, h, w) in metres, differentiably."""
+
+
 class WeightsRefinement:
     """The state of a refinement by moving weights: masks, losses, and the best weights.
 
     Args:
-        settings: What is updated and how.
+        frame: The frame.
         weights: The weights that move.
-        points: The frame's sparse depth, on the network's grid.
-        depth_of: Turns the network's output into depth.
+        settings: What is updated and how.
     """
 
     def __init__(
-        self,
-        settings: RefineSettings,
-        weights: MovingWeights,
-        points: SparsePoints,
-        depth_of: DepthOf,
+        self, frame: FrameOfPoints, weights: MovingWeights, settings: RefineSettings
     ) -> None:
-        self._settings, self._weights, self._depth_of = settings, weights, depth_of
-        self._points = points
+        self._frame, self._weights, self._settings = frame, weights, settings
         self._loss: Loss = LOSSES[settings.loss]
         generator = torch.Generator().manual_seed(settings.mask.seed)
         masked = settings.masked
-        aside = set_aside(points, settings.mask.set_aside if masked else 0.0, generator)
-        self._shown, self._aside = points.select(~aside), points.select(aside)
+        fraction = settings.mask.set_aside if masked else 0.0
+        aside = set_aside(frame.inliers, fraction, generator)
+        self._shown, self._aside = frame.inliers.select(~aside), frame.inliers.select(aside)
         self._masks = Masks(self._shown, settings.mask, generator)
         self._rules: list[Update] = []
         self._steps: list[float] = []
         self._checks: dict[int, float] = {}
         self._best = list(weights.theta), 0
-        self._started, self._slowest = time.monotonic(), 0.0
+        self._started = time.monotonic()
+        self._before = torch.empty(0)
         self.losses: list[float] = []
         self.error: DivergedError | None = None
 
@@ -67,14 +82,13 @@ class WeightsRefinement:
         enough = len(self._shown) > 1 or not self._settings.masked
         return self._settings.iterations if enough else 0
 
-    def begin(self, output: Any, predict: Predict) -> Tensor:
-        """Returns the depth before any step. Raises ModelError where it is not finite."""
-        before = self._depth_of(output).detach()
-        at_points = self._points.sample(before)
+    def begin(self) -> None:
+        """Predicts the depth before any step. Raises ModelError where it is not finite."""
+        self._before = self._frame.depth_of(self._frame.output).detach()
+        at_points = self._frame.points.sample(self._before)
         if not bool(at_points.isfinite().all()):
             raise bad_prediction(at_points)
-        self._check(predict, 0)
-        return before
+        self._check(0)
 
     def mask(self) -> tuple[SparsePoints, SparsePoints]:
         """Returns the points that the network is given, and those that L is taken at."""
@@ -85,7 +99,7 @@ class WeightsRefinement:
 
     def loss(self, output: Any, asked: SparsePoints) -> Tensor:
         """Returns L of the network's output at these points."""
-        return self._loss(asked.sample(self._depth_of(output)), asked.depth)
+        return self._loss(asked.sample(self._frame.depth_of(output)), asked.depth)
 
     def update(self, loss: Tensor, gradients: Sequence[Tensor | None]) -> None:
         """Moves the weights: θ_{k+1} = θ_k − α·U(∂L/∂θ_k). Sets `error` where that diverges."""
@@ -106,39 +120,38 @@ class WeightsRefinement:
             )
         ]
 
-    def finished(self, predict: Predict) -> bool:
+    def finished(self) -> bool:
         """Whether no further step is worth its time, by the points set aside and the budget."""
         made, of = len(self.losses), self._settings.iterations
         if made == of or made * CHECKS // of > (made - 1) * CHECKS // of:
-            self._check(predict, made)
+            self._check(made)
         return self._out_of_time() or self._getting_worse()
 
-    def result(self, before: Tensor, predict: Predict) -> Refinement:
+    def result(self) -> Refinement:
         """Returns the refinement with the best weights, given all points."""
         self._weights.theta, kept = self._best
-        after = self._depth_of(self._predicted(predict, self._points)).detach() if kept else before
         return Refinement(
-            before=before,
-            after=after,
+            before=self._before,
+            after=self._predicted(self._frame.points) if kept else self._before,
             losses=tuple(self.losses),
             step=self._steps[0] if self._steps else 0.0,
             kept=kept,
         )
 
-    def _check(self, predict: Predict, made: int) -> None:
+    def _check(self, made: int) -> None:
         """Notes the loss at the points set aside; without any, the last weights are the best."""
         if not len(self._aside):
             self._best = list(self._weights.theta), made
             return
-        depth = self._depth_of(self._predicted(predict, self._shown))
-        loss = float(self._loss(self._aside.sample(depth), self._aside.depth))
+        at_points = self._aside.sample(self._predicted(self._shown))
+        loss = float(self._loss(at_points, self._aside.depth))
         if made == 0 or loss < min(self._checks.values()):
             self._best = list(self._weights.theta), made
         self._checks[made] = loss
 
-    def _predicted(self, predict: Predict, points: SparsePoints) -> Any:
+    def _predicted(self, points: SparsePoints) -> Tensor:
         with torch.no_grad(), self._weights.in_place():
-            return predict(points)
+            return self._frame.depth_of(self._frame.predict(points)).detach()
 
     def _getting_worse(self) -> bool:
         later = sum(made > self._best[1] for made in self._checks)

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+import torch.nn.functional as F
 from torch import Tensor
 
 from pnpdepth_cli.core.refine import RefineSettings
 from pnpdepth_cli.errors import NoPointsError
 from pnpdepth_cli.frames.frame import DepthMap, Frame
 from pnpdepth_cli.models.aligned import AlignedDepth
+from pnpdepth_cli.models.definition import Fixed
 from pnpdepth_cli.models.frame import FrameMap
 from pnpdepth_cli.models.network import Network
 from pnpdepth_cli.points import SparsePoints
@@ -46,6 +48,24 @@ class PreparedFrame:
     def arguments_for(self, points: SparsePoints) -> tuple[Tensor, ...]:
         """Returns the arguments of the network for some of the points; the image is the same."""
         return self.network.arguments_of(self.image, points)
+
+    def reduced(self, scale: float) -> PreparedFrame | None:
+        """Returns the frame with sides of about this fraction, in the same field of view.
+
+        None where the network takes one size only, or where the size stays the same.
+        """
+        policy, (height, width) = self.network.definition.size, self.map.network
+        if isinstance(policy, Fixed):
+            return None
+        size = [max(1, round(side * scale / policy.of)) * policy.of for side in (height, width)]
+        if size == [height, width]:
+            return None
+        image = self.image
+        if image is not None:
+            image = F.interpolate(image, size, mode="bilinear", align_corners=False, antialias=True)
+        points = self.points.resized(*size)
+        arguments = self.network.arguments_of(image, points)
+        return replace(self, image=image, points=points, arguments=arguments)
 
     def depth_reader(self, settings: RefineSettings) -> AlignedDepth:
         """Returns a new reader of the network's output in metres, (1, 1, h, w)."""

@@ -142,6 +142,8 @@ class RefineDefaults:
     """What is hidden as a whole where the loss is taken at hidden points."""
     mask_fraction: float = 0.5
     """Fraction of the points hidden there at every update, between 0 and 1."""
+    mask_scale: float = 1.0
+    """Side of the image there during the updates, as a fraction, 1 at most."""
     align: Align | None = None
     """How the output is fitted to the points; None is "none" for metric networks, else "auto"."""
     spread: float | None = None
@@ -163,6 +165,7 @@ class RefineDefaults:
         validity.instance(self, "parameters", str, "the name of what is updated")
         validity.one_of(self, "mask", choices.MASKS)
         validity.fraction(self, "mask_fraction")
+        validity.fraction(self, "mask_scale", most=True)
         if self.align is not None:
             validity.one_of(self, "align", choices.ALIGNMENTS)
 

@@ -16,6 +16,7 @@ from pnpdepth_cli.core.refine import Refinement, RefineSettings, refine_weights
 from pnpdepth_cli.core.refinement import MaskSettings
 from pnpdepth_cli.core.split import InputSplit, Split
 from pnpdepth_cli.core.weights import MovingWeights, rank_of
+from pnpdepth_cli.core.weights_refinement import FrameOfPoints
 from pnpdepth_cli.errors import DivergedError, LayerError, UsageError
 from pnpdepth_cli.points import SparsePoints
 from tests.completion.naive import plain
@@ -55,14 +56,16 @@ def refined(
 ) -> Refinement:
     at, rgb = at or points(), picture()
     with InputSplit(network) as split:
-        return refine_weights(
-            split.first(rgb, at.scatter(), varying=(1,)),
-            lambda shown: split.again(rgb, shown.scatter()),
-            MovingWeights(network, settings.parameters, settings.mask.seed),
-            at,
-            settings,
+        frame = FrameOfPoints(
+            points=at,
+            inliers=at,
+            output=split.first(rgb, at.scatter(), varying=(1,)),
+            predict=lambda shown: split.again(rgb, shown.scatter()),
+            predict_in_steps=lambda shown: split.again(rgb, shown.scatter()),
             depth_of=lambda output: output,
         )
+        weights = MovingWeights(network, settings.parameters, settings.mask.seed)
+        return refine_weights(frame, weights, settings)
 
 
 def naive(network: nn.Module, at: SparsePoints) -> Tensor:
@@ -167,14 +170,15 @@ def test_with_target_given_the_loss_at_all_points_falls() -> None:
     settings = replace(SETTINGS, target="given", update="adam", lr=0.01)
     with Split(network, "enter") as split:
         z = split.front(picture(), at.scatter())
-        result = refine_weights(
-            split.rear(z),
-            lambda _: split.rear(z),
-            MovingWeights(network, "weights"),
-            at,
-            settings,
+        frame = FrameOfPoints(
+            points=at,
+            inliers=at,
+            output=split.rear(z),
+            predict=lambda _: split.rear(z),
+            predict_in_steps=lambda _: split.rear(z),
             depth_of=lambda output: output,
         )
+        result = refine_weights(frame, MovingWeights(network, "weights"), settings)
     assert result.losses == tuple(sorted(result.losses, reverse=True))
     assert result.kept == settings.iterations
 

@@ -191,6 +191,13 @@ class MethodOptions:
         metavar="F",
         axis=Axis(title="hidden fraction of the points"),
     )
+    mask_scale: float | None = option(
+        None,
+        "With --target masked: reduce the image to this fraction of its sides during the updates;"
+        " 0.5 takes a third of the time.",
+        metavar="F",
+        axis=Axis(title="scale of the image during the updates"),
+    )
     proximity: float = option(
         0.0,
         "Add W times the mean squared change of log depth to the loss.",

@@ -151,7 +151,7 @@ def moves_weights(method: MethodOptions) -> bool:
 
 
 def _resolve_mask(defaults: RefineDefaults, method: MethodOptions, seed: int) -> MaskSettings:
-    for name in ("mask", "mask_fraction"):
+    for name in ("mask", "mask_fraction", "mask_scale"):
         if method.target != "masked" and getattr(method, name) is not None:
             flag = "--" + name.replace("_", "-")
             raise UsageError(f"{flag} is for points hidden from the input; add --target masked")
@@ -160,7 +160,12 @@ def _resolve_mask(defaults: RefineDefaults, method: MethodOptions, seed: int) ->
     fraction = defaults.mask_fraction if method.mask_fraction is None else method.mask_fraction
     if not 0 < fraction < 1:
         raise UsageError(f"mask fraction {fraction} is not between 0 and 1, such as 0.5")
-    return MaskSettings(kind=method.mask or defaults.mask, fraction=fraction, seed=seed)
+    scale = defaults.mask_scale if method.mask_scale is None else method.mask_scale
+    if not 0 < scale <= 1:
+        raise UsageError(f"mask scale {scale} is not above 0 and 1 at most, such as 0.5")
+    return MaskSettings(
+        kind=method.mask or defaults.mask, fraction=fraction, scale=scale, seed=seed
+    )
 
 
 def _check_weights(

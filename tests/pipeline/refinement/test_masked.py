@@ -32,7 +32,9 @@ def test_masked_points_change_the_depth_and_the_record_says_how(frame: FrameOnDi
     record = run(frame, gt=frame.gt, **MASKED).record
     settings = record["settings"]
     assert (settings["target"], settings["parameters"]) == ("masked", "weights")
-    assert settings["mask"] == {"kind": "points", "fraction": 0.5, "set_aside": 0.1, "seed": 0}
+    assert settings["mask"] == {
+        "kind": "points", "fraction": 0.5, "set_aside": 0.1, "scale": 0.5, "seed": 0
+    }  # fmt: skip
     assert (settings["iterations"], settings["update"]) == (3, MASKED_DEFAULTS.update)
     assert len(record["loss"]) == 3
     assert record["scores"]["before"] != record["scores"]["after"]
@@ -45,6 +47,11 @@ def test_the_same_seed_gives_the_same_bytes(frame: FrameOnDisk) -> None:
         results.append(depth_bytes(frame))
     assert results[0] == results[1]
     assert losses[0] == losses[1] != losses[2]
+
+
+def test_the_steps_may_see_a_reduced_image(frame: FrameOnDisk) -> None:
+    losses = [run(frame, mask_scale=s, overwrite=True, **MASKED).record["loss"] for s in (0.5, 1.0)]
+    assert losses[0] != losses[1]
 
 
 def test_no_iterations_give_the_plain_depth(frame: FrameOnDisk) -> None:
@@ -82,6 +89,7 @@ def test_a_network_is_as_before_after_the_refiner_closes(frame: FrameOnDisk) -> 
         ({"layer": "decoder.s8"}, "--layer is where z is"),
         ({"line_search": True}, "--line-search is for updates of z"),
         ({"mask_fraction": 1.0}, "not between 0 and 1"),
+        ({"mask_scale": 1.5}, "not above 0 and 1 at most"),
         ({"target": "given", "mask": "lines"}, "--mask is for points hidden"),
     ],
 )
