@@ -67,6 +67,9 @@ class DepthFormat:
     write: Callable[[Path, NDArray[np.float32], WriteOptions], None]
     """(H, W) metres, 0 where unknown, into an existing empty file. Raises OutputError."""
 
+    integer: bool = False
+    """Whether files hold 16-bit integer codes, not float32 metres."""
+
 
 def depth_formats() -> list[DepthFormat]:
     """All formats, in the order of `choices.FORMATS`."""

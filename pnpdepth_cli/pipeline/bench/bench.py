@@ -31,6 +31,7 @@ from pnpdepth_cli.models.synthetic_frame import synthetic_frame
 from pnpdepth_cli.pipeline.bench.timing import Quartiles, Timed, in_turn, peak_mb
 from pnpdepth_cli.pipeline.refinement.inputs import read_inputs
 from pnpdepth_cli.pipeline.refinement.output_files import plan_outputs
+from pnpdepth_cli.pipeline.refinement.output_range import within_range
 from pnpdepth_cli.pipeline.refinement.outputs import write_outputs
 from pnpdepth_cli.pipeline.refinement.request import (
     FrameFiles,
@@ -317,6 +318,7 @@ class _Subject:
         inputs, outputs = read_inputs(self.files_request), plan_outputs(self.files_request)
         with self.network.cut_at(self.layer) as split:
             frame = refine_frame(self.network, split, self.settings, inputs.frame())
+        frame = within_range(outputs.depth, inputs, frame)
         return {
             "reading": Timed(run=lambda _: read_inputs(self.files_request)),
             "writing": Timed(run=lambda _: write_outputs(outputs, inputs, frame)),

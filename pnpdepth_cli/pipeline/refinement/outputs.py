@@ -13,17 +13,15 @@ from pnpdepth_cli.io.depth import write_depth
 from pnpdepth_cli.io.visualisation import improvement, improvement_at_points, preview
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs
 from pnpdepth_cli.pipeline.refinement.output_files import Outputs
-
-INTEGER_SCALE = 256.0
-"""KITTI's scale, for integer output where the sparse depth has none of its own."""
+from pnpdepth_cli.pipeline.refinement.output_range import output_scale
 
 
 def write_outputs(outputs: Outputs, inputs: Inputs, frame: RefinedFrame) -> dict[str, Any]:
     """Writes the depth and its images. Returns their entries of the record."""
     make_folder(outputs.depth.parent)
-    write_depth(outputs.depth, frame.after, scale=inputs.sparse_scale or INTEGER_SCALE)
+    write_depth(outputs.depth, frame.after, scale=output_scale(inputs))
     if outputs.sigma is not None and frame.sigma is not None:
-        write_depth(outputs.sigma, frame.sigma, scale=INTEGER_SCALE)
+        write_depth(outputs.sigma, frame.sigma)
     record: dict[str, Any] = {"improved_share": None}
     if outputs.preview is not None:
         preview(

@@ -25,6 +25,7 @@ from pnpdepth_cli.models.network import Network, load_network
 from pnpdepth_cli.pipeline.refinement.held_out import best_candidates, refine_with_folds
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs, read_inputs
 from pnpdepth_cli.pipeline.refinement.output_files import Outputs, plan_outputs
+from pnpdepth_cli.pipeline.refinement.output_range import within_range
 from pnpdepth_cli.pipeline.refinement.outputs import write_outputs
 from pnpdepth_cli.pipeline.refinement.points import PointError, point_error, split_points
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest
@@ -223,6 +224,7 @@ def write_refined(
 
     The record is the same from run to run, except `seconds` and `peak_memory_mb`.
     """
+    frame = within_range(outputs.depth, inputs, frame)
     record = _record(refiner, inputs, frame)
     with all_or_none(outputs.paths()):
         with watch("write"):

@@ -80,6 +80,13 @@ def test_a_network_without_weights_gets_random_ones_and_says_so(frame: FrameOnDi
     assert any("weights: random" in note for note in found.notes)
 
 
+def test_depths_that_a_png_cannot_hold_end_no_bench(tmp_path: Path) -> None:
+    frame = frame_on_disk(tmp_path)
+    frame.model.write_text(frame.model.read_text().replace("2 + 3 *", "1e-9 +"))
+    measured = run_bench(request(frame, checkpoint=None))
+    assert measured.part("writing").seconds.median > 0
+
+
 def test_nothing_is_left_behind(frame: FrameOnDisk, tmp_path: Path, monkeypatch) -> None:  # type: ignore[no-untyped-def]
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     run_bench(request(frame))
