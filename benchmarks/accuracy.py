@@ -34,15 +34,17 @@ from benchmarks.frames import (
     refined,
 )
 from model_zoo_defs.training.learning.dataset import Frames
-from pnpdepth_cli.auto.auto import refine_automatically
-from pnpdepth_cli.auto.candidates import default_configs
+from pnpdepth_cli.auto.auto import AutoRefined, refine_automatically
+from pnpdepth_cli.auto.predictions import OpenNetworks
 from pnpdepth_cli.auto.uncertainty import uncertainty
 from pnpdepth_cli.choices import BASELINES
 from pnpdepth_cli.core.metrics import score
 from pnpdepth_cli.core.refine import RefineSettings
 from pnpdepth_cli.models.definition import Normalisation
 from pnpdepth_cli.models.network import Network, load_network
-from pnpdepth_cli.pipeline.refinement.request import MethodOptions
+from pnpdepth_cli.pipeline.refinement.inputs import Inputs
+from pnpdepth_cli.pipeline.refinement.refine import refiner_of
+from pnpdepth_cli.pipeline.refinement.request import MethodOptions, RefineRequest
 from pnpdepth_cli.pipeline.refinement.resolve import resolve_layer, resolve_settings
 from pnpdepth_cli.points import SparsePoints
 
@@ -140,15 +142,14 @@ def measure(
         "tuned": torch.from_numpy(refined(network, layer, settings, inputs).after),
     }
     depths |= {name: made.depth(points, prediction) for name, made in BASELINES.items()}
-    configs = default_configs(network.definition, layer, settings)
     start = time.perf_counter()
-    auto = refine_automatically(network, configs, inputs.frame())
+    auto = chosen(network, inputs)
     auto_s = time.perf_counter() - start
     depths["auto"] = torch.from_numpy(auto.frame.after)
     if bool(outlier.any()):
         right = points.select(~outlier)
         of_right = frame_inputs(frame.rgb, right, frame.gt)
-        inliers_only = refine_automatically(network, configs, of_right.frame())
+        inliers_only = chosen(network, of_right)
         depths[INLIERS_ONLY] = torch.from_numpy(inliers_only.frame.after)
     within = {}
     if with_sigma:
@@ -162,6 +163,14 @@ def measure(
         "plain_s": plain_s,
         "auto_s": auto_s,
     }
+
+
+def chosen(network: Network, inputs: Inputs) -> AutoRefined:
+    """The frame as `pnpdepth refine` gives it by default."""
+    refiner = refiner_of(RefineRequest(), [network], inputs)
+    assert refiner.competition is not None
+    with OpenNetworks(refiner.networks) as opened:
+        return refine_automatically(opened, refiner.competition, inputs.frame())
 
 
 def errors_of(depths: dict[str, torch.Tensor], gt: torch.Tensor) -> Errors:

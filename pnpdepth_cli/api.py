@@ -15,18 +15,14 @@ from numpy.typing import ArrayLike, NDArray
 from pnpdepth_cli.core.metrics import DELTA_THRESHOLDS, Scores
 from pnpdepth_cli.core.metrics import score as score_tensors
 from pnpdepth_cli.core.refine import RefineSettings
-from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.errors import DivergedError, InputError, NoPointsError, SizeError, UsageError
 from pnpdepth_cli.models import network as networks
 from pnpdepth_cli.models.network import Network
 from pnpdepth_cli.pipeline.refinement import refine as pipeline
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs
+from pnpdepth_cli.pipeline.refinement.method import needs_folds
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest
-from pnpdepth_cli.pipeline.refinement.resolve import (
-    resolve_definition,
-    resolve_layer,
-    resolve_settings,
-)
+from pnpdepth_cli.pipeline.refinement.resolve import resolve_definition
 from pnpdepth_cli.points import SparsePoints
 
 if TYPE_CHECKING:
@@ -81,16 +77,18 @@ class RefinerOptions(TypedDict, total=False):
     """The options of `Refiner`, each by keyword."""
 
     layer: str | None
-    """Layer to cut at. None takes the network's default."""
+    """Layer to cut at. None takes the one that fits the spacing of the points."""
     settings: RefineSettings | None
     """What is updated and how. None takes the network's defaults for the target."""
     target: str
     """"given", or "masked" to update weights by points hidden from the network's input."""
     propagate: str | None
     """Propagation of the residuals at the points: "none", "gp" or "diffusion". None is "none", or
-    with `auto` the best by cross-validation."""
-    auto: bool
-    """Choose alignment, updates and propagation by cross-validation, for each frame."""
+    with `auto` the best at held-out points."""
+    auto: bool | None
+    """Take the best candidate at held-out points, for each frame: the network, its refinement,
+    propagation, `compact`, every baseline, and blends. None: only if neither layer, settings,
+    propagate nor tile is given."""
     uncertainty: bool
     """Also estimate the standard deviation of the depth."""
     tile: int | None
@@ -118,13 +116,15 @@ class Refiner:
         if unknown := options.keys() - RefinerOptions.__annotations__.keys():
             raise TypeError(f"a Refiner has no options {', '.join(sorted(unknown))}")
         self._network = network
-        self._layer = options.pop("layer", None)
         self._settings = options.pop("settings", None)
-        self._request = RefineRequest.from_fields(**options)
-        if options.get("tile") is not None and self._request.hold_out.needs_folds:
+        auto = options.pop("auto", None)
+        if not auto and (self._settings is not None or auto is False):
+            options.setdefault("propagate", "none")  # an option of the method fixes it
+        self._request = RefineRequest.from_fields(auto=bool(auto), **options)
+        if options.get("tile") is not None and needs_folds(self._request):
             raise UsageError("tile cannot be combined with auto and uncertainty")
         self._open = ExitStack()
-        self._opened: tuple[pipeline.Refiner, Split] | None = None
+        self._opened: tuple[pipeline.Refiner, pipeline.Opened] | None = None
 
     def __enter__(self) -> Refiner:
         return self
@@ -158,9 +158,11 @@ class Refiner:
         inputs = _inputs(image, sparse)
         if self._opened is None:
             refiner = self._resolve(inputs)
-            self._opened = refiner, self._open.enter_context(refiner.split())
-        refiner, split = self._opened
-        frame = refiner.refine(split, inputs)
+            opened = refiner.opened()
+            self._open.enter_context(opened)
+            self._opened = refiner, opened
+        refiner, opened = self._opened
+        frame = refiner.refine(opened, inputs)
         refined = Refined(
             depth=frame.after,
             before=frame.before,
@@ -174,13 +176,7 @@ class Refiner:
 
     def _resolve(self, inputs: Inputs) -> pipeline.Refiner:
         network = resolve_definition(self._network, inputs.frame(), self._request.network)
-        return pipeline.Refiner(
-            request=self._request,
-            network=network,
-            layer=resolve_layer(network.definition, self._layer),
-            settings=self._settings
-            or resolve_settings(network.definition, self._request.method, self._request.hold_out),
-        )
+        return pipeline.refiner_of(self._request, [network], inputs, settings=self._settings)
 
 
 def refine(

@@ -128,6 +128,9 @@ Align = Literal["none", "median", "scale", "affine", "auto"]
 ALIGNMENTS: tuple[Align, ...] = get_args(Align)
 """How the network's output is fitted to the sparse points."""
 
+PRESETS = ("paper", "fast")
+"""Methods by one name: `pnpdepth_cli.pipeline.refinement.method.PRESETS`."""
+
 Space = Literal["depth", "inverse", "log"]
 SPACES: tuple[Space, ...] = get_args(Space)
 """The quantities in which depth is predicted, fitted or interpolated."""

@@ -61,7 +61,6 @@ def test_arrays_are_refined_as_the_command_refines_files(
         main(["refine", *files, "-o", str(tmp_path / "depth.npy")])
     assert ended.value.code in (None, 0)
     assert np.array_equal(refined.depth, np.load(tmp_path / "depth.npy"))
-    assert refined.losses[-1] < refined.losses[0]
     truth = read_depth(SAMPLE / "gt.png").values
     assert pnp.score(refined.depth, truth).mae < pnp.score(refined.before, truth).mae
 

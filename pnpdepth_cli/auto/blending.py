@@ -1,15 +1,16 @@
 """Which of several candidates, or which mean of a few, is nearest to held-out points.
 
 Of candidates scored on few points, the best one is best partly by chance, and a mean of two good
-ones is mostly better than either (stacked generalisation, Wolpert 1992; Breiman 1996). So means of
-the best few compete as well, with round weights. Anything but the default candidate has to be
-better than it by more than chance: by the standard error of the mean difference over the points.
+ones is mostly better than either (stacked generalisation, Wolpert 1992; Breiman 1996). So
+arithmetic and geometric means of the best few compete as well, with round weights. Anything but
+the default candidate has to be better than it by more than chance: by the standard error of the
+mean difference over the points.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -33,8 +34,29 @@ class Blend:
     """Numbers of the candidates."""
     weights: tuple[float, ...]
     """Their weights, with a sum of 1."""
+    geometric: bool
+    """Whether the mean is that of log depth."""
     error: float
     """Mean absolute error of the weighted mean, metres."""
+
+
+def weighted_mean(depths: Tensor, weights: Sequence[float], *, geometric: bool) -> Tensor:
+    """Returns the weighted mean (…) of depths (C, …) where they are known; 0 where none is.
+
+    Args:
+        depths: Metres of C candidates; not positive is unknown.
+        weights: C weights above 0.
+        geometric: Whether it is the mean of log depth.
+    """
+    if len(weights) == 1:
+        return depths[0]
+    weight = torch.tensor(weights, dtype=depths.dtype).reshape(-1, *[1] * (depths.ndim - 1))
+    known = depths > 0
+    weight = torch.where(known, weight, 0.0)
+    values = torch.where(known, depths, 1.0)
+    total = weight.sum(dim=0)
+    mean = ((values.log() if geometric else values) * weight).sum(dim=0) / total
+    return torch.where(total > 0, mean.exp() if geometric else mean, 0.0)
 
 
 def held_out_error(predicted: Tensor, depth: Tensor, weights: Tensor) -> Tensor:
@@ -56,7 +78,8 @@ def best_blend(
     weights: Tensor,
     *,
     default: int,
-    baselines: Sequence[int] = (),
+    baselines: Collection[int] = (),
+    bounds: Collection[int] = (),
 ) -> Blend:
     """Returns the candidate, or mean of a few, that is best beyond chance at held-out points.
 
@@ -66,29 +89,39 @@ def best_blend(
         weights: (M,) 0…1 of each point.
         default: The candidate to take where no other is better by more than chance.
         baselines: Candidates that the result is never worse than.
+        bounds: Those of them that are taken only where everything else is worse than they are.
     """
     errors = held_out_error(predicted, depth, weights)
-    bound = min((float(errors[one]) for one in baselines), default=math.inf)
+    limit = min((float(errors[one]) for one in baselines), default=math.inf)
     default_errors = (predicted[default] - depth).abs()
+    competing = [one for one in range(len(errors)) if one not in bounds]
     blends = []
-    for members, parts in _means(errors, default):
-        mean = (torch.tensor(parts)[:, None] * predicted[list(members)]).sum(dim=0)
+    for members, parts, geometric in _means(errors, competing, default):
+        mean = weighted_mean(predicted[list(members)], parts, geometric=geometric)
         error = float(held_out_error(mean, depth, weights))
         margin = _standard_error((mean - depth).abs() - default_errors, weights)
-        if error <= bound * (1 + _ROUNDING):
-            blends.append((error + CAUTION * margin, Blend(members, parts, error)))
+        if error <= limit * (1 + _ROUNDING):
+            blends.append((error + CAUTION * margin, Blend(members, parts, geometric, error)))
+    if not blends:
+        best = min(baselines, key=lambda one: float(errors[one]))
+        return Blend((best,), (1.0,), False, float(errors[best]))
     return min(blends, key=lambda one: one[0])[1]
 
 
-def _means(errors: Tensor, default: int) -> Iterator[tuple[tuple[int, ...], tuple[float, ...]]]:
-    """Members and weights of all blends that compete, every candidate alone among them."""
-    yield from (((one,), (1.0,)) for one in range(len(errors)))
-    order = [int(i) for i in errors.argsort(stable=True)[:BLENDED]]
+def _means(
+    errors: Tensor, competing: Sequence[int], default: int
+) -> Iterator[tuple[tuple[int, ...], tuple[float, ...], bool]]:
+    """Members, weights and kind of all blends, every candidate alone among them."""
+    yield from (((one,), (1.0,), False) for one in competing)
+    order = sorted(competing, key=lambda one: float(errors[one]))[:BLENDED]
     paired = order if default in order else [*order, default]
-    for pair in combinations(paired, 2):
-        yield from ((pair, (weight, 1 - weight)) for weight in PAIR_WEIGHTS)
-    for count in range(3, len(order) + 1):
-        yield from ((some, (1 / count,) * count) for some in combinations(order, count))
+    for geometric in (True, False):
+        for pair in combinations(paired, 2):
+            yield from ((pair, (weight, 1 - weight), geometric) for weight in PAIR_WEIGHTS)
+        for count in range(3, len(order) + 1):
+            yield from (
+                (some, (1 / count,) * count, geometric) for some in combinations(order, count)
+            )
 
 
 def _standard_error(difference: Tensor, weights: Tensor) -> float:

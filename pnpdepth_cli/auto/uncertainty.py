@@ -34,9 +34,7 @@ def uncertainty(result: AutoRefined, depth: DepthMap) -> tuple[DepthMap, str]:
         return (relative.numpy() * depth).astype(np.float32), note
     per_fold = []
     for fold in result.folds:
-        parts = zip(result.choice.weights, result.choice.candidates, strict=True)
-        predicted = sum(weight * fold.at(each) for weight, each in parts)
-        assert isinstance(predicted, Tensor)
+        predicted = fold.predicted(result.choice)
         sigma = fold.held_out.sample(fold.depths.relative_sigma())
         good = (fold.inlier_weights > MIN_INLIER_WEIGHT) & (predicted > 0) & (sigma > 0)
         residual = fold.held_out.depth[good].log() - predicted[good].log()

@@ -30,7 +30,7 @@ _STOPPING = b"\nfinishing the current frame; press Ctrl-C again to stop at once\
     common=frozenset(
         {
             *("--layout", "--sample", "--limit", "--shard", "--calib", "--model", "--checkpoint"),
-            *("--auto", "--output", "--html", "--overwrite", "--json", "--workers", "--dry-run"),
+            *("--preset", "--output", "--html", "--overwrite", "--json", "--workers", "--dry-run"),
         }
     ),
     groups={

@@ -24,7 +24,7 @@ NETWORK = (
     *("--normalise", "--precision", "--device", "--tile"),
 )
 METHOD = (
-    *("--auto", "--time-budget", "--iterations", "--lr", "--loss", "--update", "--schedule"),
+    *("--preset", "--time-budget", "--iterations", "--lr", "--loss", "--update", "--schedule"),
     *("--blur", "--target", "--parameters", "--mask", "--mask-fraction", "--mask-scale"),
     *("--proximity", "--line-search", "--keep-best", "--propagate"),
     *("--holdout", "--seed"),
@@ -33,7 +33,7 @@ OUTPUT = ("--output", "--format", "--baselines", "--uncertainty", "--overwrite",
 COMMON = frozenset(
     {
         *("--sparse", "--gt", "--calib", "--output", "--overwrite"),
-        *("--json", "--model", "--checkpoint", "--layer", "--align", "--auto"),
+        *("--json", "--model", "--checkpoint", "--layer", "--align", "--preset"),
         *("--iterations", "--lr", "--loss", "--update", "--holdout"),
         "--uncertainty",
     }

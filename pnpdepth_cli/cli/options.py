@@ -53,6 +53,8 @@ def click_option(each: OptionField) -> Callable[[Any], Any]:
         details["type"] = _type_of(each)
     if option.show_default:
         details["show_default"] = True
+    if option.hidden:
+        details["hidden"] = True
     if option.alias is not None:
         details |= {"cls": Renamed, "alias": option.alias}
     return click.option(
@@ -96,15 +98,27 @@ def options_of_groups(
     return decorate
 
 
-refinement = options_of_groups(FrameFiles, NetworkChoice, MethodOptions, HoldOut, OutputOptions)
-"""The options of how a frame is refined, named as the fields of a `RefineRequest`."""
+def refinement(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Adds the options of how a frame is refined, named as the fields of a `RefineRequest`."""
+    groups = (FrameFiles, NetworkChoice, MethodOptions, HoldOut, OutputOptions)
+    return models(options_of_groups(*groups, without=["model"])(command))
 
 
 def _only(group: type, name: str) -> Callable[[Any], Any]:
     return click_option(next(each for each in options_of(group) if each.name == name))
 
 
-model = _only(NetworkChoice, "model")
+_MODEL = next(each for each in options_of(NetworkChoice) if each.name == "model")
+model = click_option(_MODEL)
+models = click.option(
+    "--model",
+    "model",
+    multiple=True,
+    default=(_MODEL.default,),
+    show_default=_MODEL.default,
+    metavar=_MODEL.option.metavar,
+    help=f"{_MODEL.option.help} Given several times, all compete and are blended.",
+)
 checkpoint = _only(NetworkChoice, "checkpoint")
 precision = _only(NetworkChoice, "precision")
 device = _only(NetworkChoice, "device")
@@ -197,6 +211,10 @@ def request_of(given: dict[str, Any], **others: Any) -> RefineRequest:
         **others: Other fields of the request.
     """
     scan_options = ScanOptions(**taken(ScanOptions, given))
+    if isinstance(given.get("model"), tuple):  # of the commands that take several
+        first, *more = given["model"]
+        others |= {"model": first, "more_models": tuple(more)}
+        given = {name: value for name, value in given.items() if name != "model"}
     return RefineRequest.from_fields(scan=scan_options, **given, **others)
 
 

@@ -34,29 +34,35 @@ _STAGES = {
 }
 
 
+_COLUMNS = ("", "before", "after", "change", "linear", "against linear")
+
+
 def print_refinement(record: Mapping[str, Any]) -> None:
     """Prints the end of `pnpdepth refine`: notes, errors before and after, files, times."""
     console = Console(stderr=True, highlight=False)
     _print_notes(console, record["notes"])
     settings, points = record["settings"], record["points"]
-    name = record["model"]["name"]
-    table = Table(
-        title=escape(f"{name} cut at {settings['layer']}")
-        if record["auto"] is None
-        else f"{escape(name)}, best candidates at held-out points"
-    )
-    for column in ("", "before", "after", "change"):
+    beside = record["linear"]
+    table = Table(title=escape(_title(record)))
+    for column in _COLUMNS:
         table.add_column(column, justify="left" if not column else "right")
     _point_rows(table, f"error at {points['used']:,} points used", record["sparse_error"])
-    _point_rows(table, f"error at {points['held_out']:,} held-out points", record["held_out_error"])
+    held_out = f"error at {points['held_out']:,} held-out points"
+    _point_rows(table, held_out, record["held_out_error"], beside["held_out_error"])
     if record["scores"] is not None:
         after = record["scores"]["after"]
-        _score_rows(table, record["scores"])
+        _score_rows(table, record["scores"], beside["scores"])
         table.caption = (
             f"scored on {after['pixels']:,} pixels of ground truth"
             f" ({after['coverage']:.1%} of those known)"
         )
+    elif (folds := beside["folds"]) is not None:
+        _fold_row(table, f"error at {folds['points']:,} points in turn held out, MAE", folds)
     console.print(table)
+    if beside["worse"]:
+        console.print(
+            "[yellow]warning: this depth is worse than linear interpolation of the points[/]"
+        )
     if record["baselines"] is not None:
         console.print(_baselines(record["baselines"]))
     if record["improved_share"] is not None:
@@ -75,6 +81,16 @@ def print_refinement(record: Mapping[str, Any]) -> None:
     )
     written = [path for path in record["outputs"].values() if path]
     console.print("wrote " + escape("  ".join(written)), soft_wrap=True)
+
+
+def _title(record: Mapping[str, Any]) -> str:
+    """What the depth comes from."""
+    name, choice = record["model"]["name"], record["auto"]
+    if choice is None:
+        return f"{name} cut at {record['settings']['layer']}"
+    if not choice["uses_network"]:
+        return f"best candidate at held-out points, without {name}"
+    return f"{name}, best candidate at held-out points"
 
 
 def _baselines(rows: Mapping[str, Any]) -> Table:
@@ -103,12 +119,15 @@ def print_batch(summary: Mapping[str, Any]) -> None:
     mean, counts = summary["mean"], summary["counts"]
     if any(mean.values()):
         table = Table(title="means over frames")
-        for column in ("", "before", "after", "change"):
+        for column in _COLUMNS:
             table.add_column(column, justify="left" if not column else "right")
+        beside = summary["linear"]
         _point_rows(table, "error at points used", mean["sparse_error"])
-        _point_rows(table, "error at held-out points", mean["held_out_error"])
+        _point_rows(
+            table, "error at held-out points", mean["held_out_error"], beside["held_out_error"]
+        )
         if mean["scores"] is not None:
-            _score_rows(table, mean["scores"])
+            _score_rows(table, mean["scores"], beside["scores"])
             table.caption = f"scored on the ground truth of {mean['scores']['frames']:,} frames"
         console.print(table)
     if summary["baselines"]:
@@ -122,6 +141,10 @@ def print_batch(summary: Mapping[str, Any]) -> None:
         f"{counts[kind]:,} {kind}" for kind in ("diverged", "failed", "pending") if counts[kind]
     ]
     parts += [f"{counts['with_warnings']:,} with warnings"] if counts["with_warnings"] else []
+    if (compared := summary["linear"])["frames"]:
+        parts += [
+            f"{compared['worse']:,} of {compared['frames']:,} worse than linear interpolation"
+        ]
     console.print(", ".join(parts))
     output = summary["output"]
     console.print("wrote " + escape(f"{output}/summary.json  {output}/summary.csv"), soft_wrap=True)
@@ -190,25 +213,41 @@ def _print_notes(console: Console, notes: Sequence[str]) -> None:
         console.print(escape(printable(note)), style=style, soft_wrap=True)
 
 
-def _point_rows(table: Table, title: str, error: Mapping[str, Any] | None) -> None:
+def _point_rows(
+    table: Table,
+    title: str,
+    error: Mapping[str, Any] | None,
+    linear: Mapping[str, Any] | None = None,
+) -> None:
     if error is not None:
         before, after = error["before"], error["after"]
         for name, key in (("MAE", "mae"), ("RMSE", "rmse")):
-            table.add_row(
-                f"{title}, {name}",
-                _metres(before.get(key)),
-                _metres(after.get(key)),
-                _change(key, before.get(key), after.get(key)),
-            )
+            values = before.get(key), after.get(key), (linear or {}).get(key)
+            table.add_row(f"{title}, {name}", *_cells(key, _metres, values))
 
 
-def _score_rows(table: Table, scores: Mapping[str, Any]) -> None:
+def _score_rows(table: Table, scores: Mapping[str, Any], linear: Mapping[str, Any] | None) -> None:
     before, after = scores["before"], scores["after"]
     table.add_section()
     for title, key, show in _SCORES:
-        values = (before.get(key), after.get(key))
-        cells = ["–" if value is None or math.isnan(value) else show(value) for value in values]
-        table.add_row(title, *cells, _change(key, *values))
+        values = before.get(key), after.get(key), (linear or {}).get(key)
+        table.add_row(title, *_cells(key, show, values))
+
+
+def _fold_row(table: Table, title: str, errors: Mapping[str, float]) -> None:
+    values = errors["before"], errors["after"], errors["linear"]
+    table.add_row(title, *_cells("mae", _metres, values))
+
+
+def _cells(
+    key: str,
+    show: Callable[[float], str],
+    values: tuple[float | None, float | None, float | None],
+) -> list[str]:
+    """Before, after, change, linear interpolation, and the change against it."""
+    before, after, linear = values
+    shown = ["–" if v is None or math.isnan(v) else show(v) for v in values]
+    return [*shown[:2], _change(key, before, after), shown[2], _change(key, linear, after)]
 
 
 def _metres(value: float | None) -> str:

@@ -65,6 +65,28 @@ def linear(points: SparsePoints, xy: Tensor | None = None, *, space: str = "dept
     return _shaped(dense, points, xy)
 
 
+def in_hull(points: SparsePoints, xy: Tensor | None = None) -> Tensor:
+    """Returns bool (H, W), or (M,), whether each pixel lies in the convex hull of the points.
+
+    Args:
+        points: Sparse depth.
+        xy: (M, 2) pixel coordinates. None: every pixel.
+    """
+    from scipy.spatial import ConvexHull, QhullError
+
+    pixels = _queries(points, xy)
+    inside = torch.zeros(len(pixels), dtype=torch.bool)
+    if len(points) >= 3:
+        try:
+            planes = torch.from_numpy(ConvexHull(points.xy.double().cpu().numpy()).equations)
+            inside = torch.ones_like(inside)
+            for x, y, offset in planes.tolist():
+                inside &= x * pixels[:, 0] + y * pixels[:, 1] + offset <= _AT_A_POINT
+        except QhullError:  # all points on one line
+            pass
+    return inside.reshape(points.size if xy is None else (len(xy),)).to(points.depth.device)
+
+
 def inverse_distance(
     points: SparsePoints,
     xy: Tensor | None = None,

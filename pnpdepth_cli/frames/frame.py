@@ -61,6 +61,9 @@ class RefinedFrame:
     """(H, W) metres, standard deviation of `after`. None if it was not asked for."""
     choice: dict[str, Any] | None = None
     """What was chosen by held-out points, for a record."""
+    interpolation: dict[str, Any] | None = None
+    """Mean absolute errors in metres of the network (before), of linear interpolation and of the
+    result (after) at points that were held out in turns, for a record."""
     baselines: dict[str, dict[str, Any]] | None = None
     """Scores of the baselines, for a record."""
 

@@ -20,7 +20,9 @@ from pnpdepth_cli.core.influence import influential_field
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.core.split.layer_name import LayerName
 from pnpdepth_cli.errors import ModelError
-from pnpdepth_cli.models.network import Network
+from pnpdepth_cli.models.frame import FrameMap
+from pnpdepth_cli.models.network import Network, out_of_memory_is_a_device_error
+from pnpdepth_cli.models.synthetic_frame import synthetic_arguments
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,9 +68,36 @@ def best_layer(
     """
     if not point_count:
         return None
-    layers = measure_layers(network, network.definition.layers, arguments, size)
-    ranked = rank_layers(layers, point_spacing(size, point_count))
-    return next((layer.name for layer in ranked if layer.rank == 1), None)
+    spacing = point_spacing(size, point_count)
+    measured: list[MeasuredLayer] = []
+    # From the last layer on, each has more of the network behind it: the first that reaches far
+    # enough is the one of least cost, and those before it need not be measured.
+    for name in reversed(network.definition.layers):
+        layer = _measure(network, name, arguments, size[0], None)
+        measured.insert(0, layer)
+        if layer.field_in_output is not None and min(layer.field_in_output) >= spacing:
+            return name
+    return next((layer.name for layer in rank_layers(measured, spacing) if layer.rank == 1), None)
+
+
+def default_layer(network: Network, size: tuple[int, int], point_count: int) -> str | None:
+    """Returns the layer to cut at where no option names one.
+
+    It is the one that the definition names, else the one that is ranked first for the spacing of
+    the points, measured on a synthetic frame.
+
+    Args:
+        network: The network.
+        size: Rows and columns of the image frame.
+        point_count: Sparse points in the frame.
+    """
+    definition = network.definition
+    if definition.defaults.layer is not None or len(definition.layers) < 2:
+        return definition.default_layer
+    frame = FrameMap.fit(definition.size, *size)
+    with out_of_memory_is_a_device_error(network.device):
+        arguments = synthetic_arguments(network, frame)
+        return best_layer(network, arguments, frame.network, point_count) or definition.layers[0]
 
 
 def point_spacing(size: tuple[int, int], point_count: int) -> float:
@@ -85,8 +114,9 @@ def rank_layers(layers: Iterable[MeasuredLayer], spacing: float) -> list[Measure
     """Returns the layers, in their order, each with its rank for the spacing of the points.
 
     Layers whose influential field in the depth map is at least as wide as the gap between points
-    come first, the one with the least cost behind the cut before the others. Then come the others,
-    the one with the widest field before the others. Layers with a problem have no rank.
+    come first, the one with the least cost behind the cut before the others; of equal ones the
+    last. Then come the others, the one with the widest field before the others. Layers with a
+    problem have no rank.
 
     Args:
         layers: As measured.
@@ -100,7 +130,8 @@ def rank_layers(layers: Iterable[MeasuredLayer], spacing: float) -> list[Measure
         return (not reaches, (layer.cost_behind or 0.0) if reaches else -float(field))
 
     layers = list(layers)
-    usable = sorted((layer for layer in layers if layer.problem is None), key=by_preference)
+    usable = [layer for layer in reversed(layers) if layer.problem is None]
+    usable.sort(key=by_preference)
     ranks = {layer.name: rank for rank, layer in enumerate(usable, start=1)}
     return [replace(layer, rank=ranks.get(layer.name)) for layer in layers]
 
@@ -131,17 +162,16 @@ def measure_layers(
 
 
 def _measure(
-    network: Network, name: str, arguments: tuple[Tensor, ...], rows: int, whole_flops: int
+    network: Network, name: str, arguments: tuple[Tensor, ...], rows: int, whole_flops: int | None
 ) -> MeasuredLayer:
+    """The layer, its field alone without the operations of the whole network."""
     try:
         with Split(network.module, name) as split, torch.no_grad():
             z = split.front(*arguments)
             split.rear(z)
-            with FlopCounterMode(display=False) as behind:
-                split.rear(z)
-            start = time.perf_counter()
-            split.rear(z)
-            seconds = time.perf_counter() - start
+            cost, seconds = None, None
+            if whole_flops is not None:
+                cost, seconds = _cost_behind(split, z, whole_flops)
             # On the raw output: where inverse depth is clamped, depth does not change.
             field = influential_field(split, z, network.raw_of)
     except ModelError as error:
@@ -150,12 +180,22 @@ def _measure(
         name=name,
         shape=tuple(z.shape),
         stride=rows / z.shape[-2] if z.ndim == 4 else None,
-        cost_behind=behind.get_total_flops() / whole_flops if whole_flops else None,
+        cost_behind=cost,
         seconds_behind=seconds,
         parameters=_parameter_count(network, name),
         field_in_z=field.in_z,
         field_in_output=field.in_output,
     )
+
+
+def _cost_behind(split: Split, z: Tensor, whole_flops: int) -> tuple[float | None, float]:
+    """Fraction of the operations behind the cut, and the seconds that one pass of them takes."""
+    with FlopCounterMode(display=False) as behind:
+        split.rear(z)
+    start = time.perf_counter()
+    split.rear(z)
+    seconds = time.perf_counter() - start
+    return (behind.get_total_flops() / whole_flops if whole_flops else None), seconds
 
 
 def _parameter_count(network: Network, name: str) -> int:

@@ -47,6 +47,8 @@ class Option:
     """Converts the text of the command line. None: by the field's type."""
     show_default: bool = False
     """Whether the help shows the default."""
+    hidden: bool = False
+    """Whether the help does not show the option."""
     axis: Axis | None = None
     """How a sweep shows the field. None: a sweep does not vary it."""
 

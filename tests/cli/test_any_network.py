@@ -24,7 +24,8 @@ def test_an_unaligned_network_is_aligned_and_recorded(
     wrong = frame.folder / "wrong.py"
     wrong.write_text(source.replace("return 2 + 3 *", "return -50 * (2 + 3 *").replace(
         "(self.encode(rgb))))", "(self.encode(rgb)))))"))  # fmt: skip
-    plain = [*refine(frame), "--model", str(wrong), "--json", "--iterations", "0", "--overwrite"]
+    options = ("--json", "--iterations", "0", "--overwrite")
+    plain = refine(frame, "--model", str(wrong), *options)
     assert code_of(plain) == 0
     record = json.loads(capsys.readouterr().out)
     assert record["alignment"] is None

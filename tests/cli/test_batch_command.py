@@ -29,9 +29,10 @@ def root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def arguments(*more: str, source: str = "drive") -> list[str]:
+    model = [] if "--model" in more else ["--model", "drive/net/my_net.py"]
     return [
-        "batch", source, "-o", "out", "--model", "drive/net/my_net.py",
-        "--checkpoint", "drive/net/my_net.safetensors", *more,
+        "batch", source, "-o", "out", *model,
+        "--checkpoint", "drive/net/my_net.safetensors", "--propagate", "none", *more,
     ]  # fmt: skip
 
 

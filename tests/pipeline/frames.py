@@ -77,12 +77,16 @@ def frame_on_disk(folder: Path, height: int = 46, width: int = 62) -> FrameOnDis
 
 
 def run(frame: FrameOnDisk, **changes: Any) -> RefineOutcome:
-    """What `pnpdepth refine` gives of the frame, with these changes of the request."""
+    """What `pnpdepth refine` gives of the frame, with these changes of the request.
+
+    The method is the network's own refinement; `propagate=None` leaves it to the choice.
+    """
     request: dict[str, Any] = {
         "image": frame.image,
         "sparse": frame.sparse,
         "output": frame.folder / "out",
         "model": str(frame.model),
         "checkpoint": frame.checkpoint,
+        "propagate": None if {"preset", "auto"} & changes.keys() else "none",
     }
     return refine_image(RefineRequest.from_fields(**(request | changes)))

@@ -25,6 +25,7 @@ from pnpdepth_cli.pipeline.batch.settings import model_identity, settings_of
 from pnpdepth_cli.pipeline.batch.state import NEW, BatchState, remove_all_leftovers
 from pnpdepth_cli.pipeline.batch.summary import CSV, JSON, Tally, write_summary, write_table
 from pnpdepth_cli.pipeline.ordered_pool import in_order
+from pnpdepth_cli.pipeline.refinement.method import resolve_method
 
 if TYPE_CHECKING:
     from pnpdepth_cli.pipeline.report.batch import BatchReport
@@ -211,12 +212,13 @@ def _summarise(
     for row in rows():
         tally.add(row)
     write_table(request.output / CSV, rows(), tally.baseline_names)
-    known = sum(tally.counts.values())
+    known, method = sum(tally.counts.values()), resolve_method(request.refine)
     summary = {
         "command": "batch",
         "source": str(request.source),
         "output": str(request.output),
         "layout": batch.layout,
+        "method": {"kind": "chosen" if method.chosen else "fixed", "why": method.why},
         "settings": settings_of(request.refine, state.model),
         "counts": {
             "frames": len(batch.frames),
@@ -225,6 +227,7 @@ def _summarise(
             "with_warnings": tally.warned,
         },
         "mean": tally.mean(),
+        "linear": tally.mean_linear(),
         "baselines": tally.mean_baselines(),
         "unmatched": [str(each) for each in batch.unmatched],
     }

@@ -22,7 +22,8 @@ from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.errors import DeviceError, NoPointsError, PnpDepthError, UsageError
 from pnpdepth_cli.frames.frame import RefinedFrame
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs
-from pnpdepth_cli.pipeline.refinement.refine import Refiner
+from pnpdepth_cli.pipeline.refinement.method import needs_folds
+from pnpdepth_cli.pipeline.refinement.refine import Opened, Refiner
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest
 from pnpdepth_cli.pipeline.refinement.resolve import moves_weights
 
@@ -53,20 +54,20 @@ class FrameGroups:
 
     Args:
         refiner: The network and its settings.
-        split: The refiner's network, cut and open.
+        opened: The refiner's networks, open.
         wanted: How many frames go together; None for as many as give equal bits in less time.
         say: Receives what was decided.
     """
 
     def __init__(
-        self, refiner: Refiner, split: Split, wanted: int | None, say: Callable[[str], None]
+        self, refiner: Refiner, opened: Opened, wanted: int | None, say: Callable[[str], None]
     ) -> None:
         why_alone = _why_alone(refiner.request)
         if why_alone is not None:
             if wanted not in (None, 1):
                 say(f"batch size: 1; {why_alone}")
             wanted = 1
-        self._refiner, self._split = refiner, split
+        self._refiner, self._opened = refiner, opened
         self._wanted, self._say = wanted, say
         self._count: dict[tuple[int, int], int] = {}  # by size, how many go together
         self._limit: dict[tuple[int, int], int] = {}  # by size, how many fit into memory
@@ -108,7 +109,7 @@ class FrameGroups:
     def _refined_alone(self, inputs: Inputs) -> RefinedFrame | Exception:
         start = time.perf_counter()
         try:
-            frame = self._refiner.refine(self._split, inputs)
+            frame = self._refiner.refine(self._opened, inputs)
         except Exception as error:  # concerns this frame only
             return error
         seconds = time.perf_counter() - start
@@ -145,7 +146,8 @@ class FrameGroups:
     def _pass(
         self, group: Sequence[Inputs], settings: RefineSettings
     ) -> list[RefinedFrame | PnpDepthError]:
-        return self._refiner.refine_together(self._split, group, settings)
+        assert isinstance(self._opened, Split)
+        return self._refiner.refine_together(self._opened, group, settings)
 
     def _tried(self, size: tuple[int, int], alone: Sequence[_Alone]) -> int:
         """How many frames of the size are to go together from now on."""
@@ -163,7 +165,8 @@ class FrameGroups:
     def _may_go_together(self, size: tuple[int, int], alone: Sequence[_Alone]) -> bool:
         group = [each.inputs for each in alone]
         plain = self._pass(group, replace(self._refiner.settings, iterations=0))
-        if not self._split.static_graph:
+        assert isinstance(self._opened, Split)
+        if not self._opened.static_graph:
             self._say(
                 f"batch size: 1 for {_name(size)}; the network's control flow depends on image"
                 " values, which differ between the frames of a batch"
@@ -215,7 +218,7 @@ class FrameGroups:
 
 def _why_alone(request: RefineRequest) -> str | None:
     """Why each frame has to be refined by itself; None if it need not."""
-    if request.hold_out.needs_folds:
+    if needs_folds(request):
         return "held-out points choose the method for each frame alone"
     if request.network.tile is not None:
         return "tiles go through the network one by one"

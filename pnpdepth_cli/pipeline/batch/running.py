@@ -81,7 +81,7 @@ def resolve_refiner(tasks: Iterable[Task], say: Callable[[str], None]) -> Refine
         refiner = load_refiner(task.request, first)
         for note in refiner.network.notes:
             say(note)
-        if task.request.hold_out.auto:
+        if refiner.method.chosen:
             return _with_shortlist(refiner, list(tasks), first, say)
         s = refiner.settings
         say(
@@ -101,9 +101,9 @@ def _with_shortlist(
         with contextlib.suppress(PnpDepthError):  # it is read again later, which reports its error
             frames.append(read_inputs(others[number].request))
     refiner = refiner.with_shortlist_of(frames)
-    assert refiner.shortlist is not None
-    names = "; ".join(str(candidate) for candidate in refiner.shortlist)
-    say(f"auto: best on {len(frames)} frames, and to be checked on each: {names}")
+    assert refiner.competition is not None
+    names = "; ".join(str(candidate) for candidate in refiner.competition.shortlist or ())
+    say(f"choice: best on {len(frames)} frames, and to be checked on each: {names}")
     return refiner
 
 
@@ -132,13 +132,13 @@ def run_tasks(
 
     with (
         profile.wall(),
-        refiner.split() if refiner is not None else nullcontext() as split,
+        refiner.opened() if refiner is not None else nullcontext() as opened,
         ThreadPoolExecutor(workers) as readers,
         ThreadPoolExecutor(workers) as writers,
     ):
         groups = None
-        if refiner is not None and split is not None:
-            groups = FrameGroups(refiner, split, run.batch_size, run.say)
+        if refiner is not None and opened is not None:
+            groups = FrameGroups(refiner, opened, run.batch_size, run.say)
         reading = _read_ahead(tasks, readers, workers, groups, profile)
         try:
             for group in _gathered(reading, groups, profile):

@@ -22,6 +22,7 @@ def settings_of(request: RefineRequest, model: dict[str, Any], *groups: str) -> 
         *groups: Names of the request's groups. None: all of them.
     """
     fields = request.settings(*groups)
+    fields.pop("more_models", None)  # the identity of the network has their files
     if "device" in fields:  # devices of one kind give equal results, so shards may use one each
         fields["device"] = fields["device"].split(":")[0]
     if "scan" in fields:
@@ -45,15 +46,23 @@ def model_identity(request: RefineRequest) -> dict[str, Any]:
 
     A file's name with its :ATTRIBUTE or :OUTPUT counts; its folder does not.
     """
-    spec, checkpoint = request.network.model, request.network.checkpoint
+    checkpoint = request.network.checkpoint
+    identity = {
+        "version": __version__,
+        **_identity(request.network.model),
+        "checkpoint": None if checkpoint is None else sha256_of(checkpoint),
+    }
+    more = [_identity(spec) for spec in request.network.more_models]
+    return identity | ({"more_models": more} if more else {})
+
+
+def _identity(spec: str) -> dict[str, Any]:
     path, colon, choice = Path(spec), "", ""
     if not path.exists() and ":" in spec:
         start, colon, choice = spec.rpartition(":")
         path = Path(start)
     files = [path] if path.is_file() else sorted(p for p in path.glob("*") if p.is_file())
     return {
-        "version": __version__,
         "model": f"{path.name}{colon}{choice}" if files else spec,
         "model_files": {p.name: sha256_of(p) for p in files},
-        "checkpoint": None if checkpoint is None else sha256_of(checkpoint),
     }

@@ -54,6 +54,7 @@ def row_of(
         "loss": [record["loss"][0], record["loss"][-1]],
         "improved_share": record["improved_share"],
         **{kind: record[kind] for kind in _MEASURED},
+        "linear": record.get("linear"),
         "baselines": record.get("baselines"),
         "warnings": [note for note in record["notes"] if note.startswith("warning")],
         "seconds": record["seconds"],
@@ -69,6 +70,7 @@ def failed_row(name: str, inputs: Mapping[str, str], message: str) -> dict[str, 
         "inputs": dict(inputs),
         "outputs": {},
         **dict.fromkeys(_MEASURED),
+        "linear": None,
         "baselines": None,
     }
 
@@ -79,6 +81,8 @@ class Tally:
     def __init__(self) -> None:
         self.counts: Counter[str] = Counter({"done": 0, "diverged": 0, "failed": 0})
         self.warned = 0
+        self._compared, self._worse = 0, 0
+        self._linear: dict[tuple[str, str], tuple[int, float]] = {}
         self._sums: dict[tuple[str, str, str], tuple[int, float]] = {}
         self._baselines: dict[tuple[str, str], tuple[int, float]] = {}
 
@@ -88,6 +92,13 @@ class Tally:
         self.warned += bool(row.get("warnings"))
         for key, value in _measures(row):
             _add(self._sums, key, value)
+        linear = row.get("linear") or {}
+        if linear.get("worse") is not None:
+            self._compared += 1
+            self._worse += linear["worse"]
+        for kind in ("scores", "held_out_error"):
+            for measure in _MEASURED[kind]:
+                _add(self._linear, (kind, measure), (linear.get(kind) or {}).get(measure))
         for name, entry in (row.get("baselines") or {}).items():
             for measure, value in _baseline_measures(entry).items():
                 _add(self._baselines, (name, measure), value)
@@ -106,6 +117,18 @@ class Tally:
             means[kind]["frames"] = max(means[kind]["frames"], count)
             means[kind][stage][measure] = total / count if count else None
         return {kind: mean if mean["frames"] else None for kind, mean in means.items()}
+
+    def mean_linear(self) -> dict[str, Any]:
+        """Returns the means of linear interpolation's scores, and how many frames are worse."""
+        means: dict[str, Any] = {
+            kind: {
+                measure: total / count if count else None
+                for (of, measure), (count, total) in self._linear.items()
+                if of == kind
+            }
+            for kind in ("scores", "held_out_error")
+        }
+        return means | {"frames": self._compared, "worse": self._worse}
 
     def mean_baselines(self) -> dict[str, dict[str, Any]] | None:
         """Returns {"linear": {"frames": 9, "held_out_mae": …, "mae": …, "rmse": …}, …}."""

@@ -1,8 +1,8 @@
-"""A frame refined with held-out points: `--auto`, `--baselines` and `--uncertainty`."""
+"""A frame refined with held-out points: the default choice, `--baselines` and `--uncertainty`."""
 
 from __future__ import annotations
 
-import math
+import time
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 from typing import Any
@@ -10,13 +10,16 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from pnpdepth_cli.auto.auto import (
-    MIN_POINTS,
-    AutoRefined,
-    Choice,
-    refine_automatically,
+from pnpdepth_cli.auto.auto import MIN_POINTS, AutoRefined, refine_automatically
+from pnpdepth_cli.auto.candidates import (
+    FUSED_ITERATIONS,
+    Candidate,
+    RefinementConfig,
+    default_config,
+    more_configs,
 )
-from pnpdepth_cli.auto.candidates import Candidate, RefinementConfig, default_configs
+from pnpdepth_cli.auto.choice import Choice, Competition
+from pnpdepth_cli.auto.predictions import OpenNetworks
 from pnpdepth_cli.auto.uncertainty import uncertainty
 from pnpdepth_cli.choices import BASELINES, PROPAGATIONS
 from pnpdepth_cli.core.metrics import score
@@ -25,60 +28,87 @@ from pnpdepth_cli.errors import PnpDepthError
 from pnpdepth_cli.frames.frame import DepthMap, Frame, RefinedFrame
 from pnpdepth_cli.models.definition import ModelDefinition
 from pnpdepth_cli.models.network import Network
+from pnpdepth_cli.pipeline.refinement.method import Method
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest
+
+LINEAR = Candidate(baseline="linear")
+"""The interpolation that every result is compared with."""
+
+
+def competition_of(
+    method: Method, networks: Sequence[tuple[str, Network, str, RefineSettings]], *, timed: bool
+) -> Competition:
+    """Returns which candidates compete for a request.
+
+    Args:
+        method: Of the request.
+        networks: Name, network, layer and settings of each network, the user's first.
+        timed: Whether further refinements are tried while time is left.
+    """
+    options = method.options
+    if not method.chosen:
+        name, _, layer, settings = networks[0]
+        config = RefinementConfig(network=name, layer=layer, settings=settings)
+        fixed = Candidate(
+            config=config,
+            iterations=settings.iterations,
+            propagate=options.propagate or "none",
+        )
+        return Competition(configs=(config,), propagations=(), fixed=fixed)
+    configs, more = [], []
+    for name, network, layer, settings in networks:
+        own = default_config(network.definition, layer, settings, network=name)
+        if options.iterations is None and options.lr is None:
+            count = min(FUSED_ITERATIONS, own.settings.iterations)
+            if network.definition.input_kind != "rgb":
+                count = 0
+            first = replace(own, settings=replace(own.settings, iterations=count))
+        else:
+            first = own
+        configs.append(first)
+        if timed:
+            own = own if own == first else replace(own)
+            more += [*([own] if own != first else []), *more_configs(network.definition, own)]
+    return Competition(
+        configs=tuple(configs),
+        more_configs=tuple(more),
+        propagations=_competing_propagations(options.propagate),
+    )
 
 
 def refine_with_folds(
-    network: Network,
-    layer: str,
-    settings: RefineSettings,
+    opened: OpenNetworks,
+    competition: Competition,
     request: RefineRequest,
     frame: Frame,
     gt: DepthMap | None,
-    shortlist: Sequence[Candidate] | None = None,
 ) -> RefinedFrame:
-    """Returns the frame refined by its best candidate with `--auto`, else as the settings say.
+    """Returns the frame refined by its best candidate, or by the fixed one.
 
     Args:
-        network: The network.
-        layer: The layer to cut at.
-        settings: How z is updated.
+        opened: The networks.
+        competition: Which candidates compete.
         request: What was asked for.
         frame: The frame with all points that may be used.
         gt: (H, W) metres, ground truth to score the baselines at.
-        shortlist: With `--auto`, the candidates that were best on other frames; only they compete.
     """
     hold_out = request.hold_out
-    asked = RefinementConfig(layer=layer, settings=settings)
-    fixed = Candidate(
-        config=asked, iterations=settings.iterations, propagate=request.method.propagate or "none"
-    )
-    configs, budget_s = [asked], hold_out.time_budget_s
-    if hold_out.auto and shortlist is None:
-        configs = default_configs(network.definition, layer, settings)
-    elif shortlist is not None:
-        first = default_configs(network.definition, layer, settings)[0]
-        configs = [first, *(each.config for each in shortlist if each.config)]
-        budget_s = math.inf
-    result = refine_automatically(
-        network,
-        list(dict.fromkeys(configs)),
-        frame,
-        shortlist=shortlist,
-        fixed=None if hold_out.auto else fixed,
-        propagations=_competing_propagations(request),
-        budget_s=budget_s,
-        seed=hold_out.seed,
-    )
+    if hold_out.time_budget_s is not None:
+        competition = replace(competition, deadline=time.monotonic() + hold_out.time_budget_s)
+    result = refine_automatically(opened, competition, frame, seed=hold_out.seed)
     refined = replace(
         result.frame,
-        choice=_record(result.choice) if hold_out.auto else None,
-        notes=(
-            *result.frame.notes,
-            *result.notes,
-            *auto_notes(result.choice, request, network.definition),
-        ),
+        notes=(*result.frame.notes, *result.notes),
+        interpolation=_against_linear(result.choice),
     )
+    if competition.fixed is None:
+        user = competition.configs[0].network
+        definition = opened.networks[user].definition
+        refined = replace(
+            refined,
+            choice=_record(result.choice, user),
+            notes=(*refined.notes, *choice_notes(result.choice, definition)),
+        )
     if hold_out.baselines:
         refined = replace(refined, baselines=baseline_scores(result, gt))
     if hold_out.uncertainty:
@@ -88,82 +118,77 @@ def refine_with_folds(
 
 
 def best_candidates(
-    network: Network,
-    layer: str,
-    settings: RefineSettings,
-    request: RefineRequest,
-    frames: Sequence[Frame],
+    opened: OpenNetworks, competition: Competition, seed: int, frames: Sequence[Frame]
 ) -> tuple[Candidate, ...]:
-    """Returns the candidates that are best on these frames, one or a few of each.
+    """Returns the default candidate and those that are best on these frames.
 
-    Arguments as of `refine_with_folds`. A frame that fails is left out.
+    A frame that fails is left out.
 
     Raises:
         PnpDepthError: All frames fail; the error is the first one's.
     """
-    configs = default_configs(network.definition, layer, settings)
-    best: dict[Candidate, None] = {}
+    best: dict[Candidate, None] = {competition.default: None}
     errors: list[PnpDepthError] = []
     for frame in frames:
         try:
-            result = refine_automatically(
-                network,
-                configs,
-                frame,
-                propagations=_competing_propagations(request),
-                budget_s=request.hold_out.time_budget_s,
-                seed=request.hold_out.seed,
-            )
+            result = refine_automatically(opened, competition, frame, seed=seed)
         except PnpDepthError as error:
             errors.append(error)
         else:
             best |= dict.fromkeys(result.choice.candidates)
-    if errors and not best:
+    if len(errors) == len(frames):
         raise errors[0]
     return tuple(best)
 
 
-def _competing_propagations(request: RefineRequest) -> tuple[str, ...]:
+def _competing_propagations(asked: str | None) -> tuple[str, ...]:
     """The propagation that was asked for, or all."""
-    kind = request.method.propagate
-    if kind is None:
+    if asked is None:
         return tuple(PROPAGATIONS)
-    return () if kind == "none" else (kind,)
+    return () if asked == "none" else (asked,)
 
 
-def auto_notes(
-    choice: Choice, request: RefineRequest, definition: ModelDefinition
-) -> tuple[str, ...]:
-    """Returns what the user is told of the choice; nothing without `--auto`."""
-    if not request.hold_out.auto:
-        return ()
+def _against_linear(choice: Choice) -> dict[str, Any] | None:
+    """Errors of network, linear interpolation and result at the held-out points of the folds."""
+    linear = choice.error_of(LINEAR)
+    if linear is None or choice.error is None:
+        return None
+    return {
+        "points": choice.held_out,
+        "before": choice.network_error,
+        "linear": linear,
+        "after": choice.error,
+    }
+
+
+def choice_notes(choice: Choice, definition: ModelDefinition) -> tuple[str, ...]:
+    """Returns what the user is told of the choice."""
     if choice.error is None:
-        return (
-            f"auto: with fewer than {MIN_POINTS} points none can be held out; taken is {choice}",
-        )
+        return (f"choice: {choice}; with fewer than {MIN_POINTS} points none can be held out",)
     errors = {str(one.candidate): one.error for one in choice.scored}
     best = min((name for name in BASELINES if name in errors), key=lambda name: errors[name])
     network = choice.network_error
     assert network is not None
     note = (
-        f"auto: {choice}; {choice.error:.4f} m off at {choice.held_out:,} held-out points in"
-        f" {choice.folds} folds (network {network:.4f} m, best baseline {best}"
-        f" {errors[best]:.4f} m)"
+        f"choice: {choice}; {choice.error:.4f} m off at {choice.held_out:,} held-out points"
+        f" (network {network:.4f} m, best baseline {best} {errors[best]:.4f} m)"
     )
     if definition.input_kind == "rgb" or network <= errors[best]:
         return (note,)
     return (
         note,
-        f"auto: {definition.name} takes the points itself, and was scored with gaps where some were"
-        " held out; if it is trained for points like these, see what it gives without --auto",
+        f"choice: {definition.name} takes the points itself, and was scored with gaps where some"
+        " were held out; if it is trained for points like these, see what --preset fast gives",
     )
 
 
-def _record(choice: Choice) -> dict[str, Any]:
+def _record(choice: Choice, user: str) -> dict[str, Any]:
     """The choice in JSON's own types."""
     parts = zip(choice.weights, choice.candidates, strict=True)
     return {
         "chosen": [{"weight": weight, **_candidate(each)} for weight, each in parts],
+        "mean": "geometric" if choice.geometric else "arithmetic",
+        "uses_network": choice.uses(user),
         "held_out_mae": choice.error,
         "held_out_points": choice.held_out,
         "folds": choice.folds,
@@ -174,11 +199,18 @@ def _record(choice: Choice) -> dict[str, Any]:
 
 
 def _candidate(candidate: Candidate) -> dict[str, Any]:
+    way = {"way": str(candidate)}
     if candidate.baseline is not None:
-        return {"way": str(candidate), "baseline": candidate.baseline}
+        return way | {"baseline": candidate.baseline}
+    if candidate.fused:
+        parts = zip(candidate.weights, candidate.fused, strict=True)
+        return way | {
+            "fused": [{"weight": weight, **_candidate(each)} for weight, each in parts],
+            "propagate": candidate.propagate,
+        }
     assert candidate.config is not None
-    return {
-        "way": str(candidate),
+    return way | {
+        "network": candidate.config.network,
         "layer": candidate.config.layer,
         **asdict(candidate.config.settings),
         "iterations": candidate.iterations,

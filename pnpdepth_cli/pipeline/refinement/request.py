@@ -85,6 +85,8 @@ class NetworkChoice:
         metavar="NETWORK",
         show_default=True,
     )
+    more_models: tuple[str, ...] = ()
+    """Further networks, with their own weights; they compete and are blended with the first."""
     checkpoint: Path | None = option(
         None,
         "Weights: a safetensors, torch, numpy or TensorFlow (.index) file, or a folder of them. No"
@@ -117,8 +119,17 @@ class NetworkChoice:
 
 @dataclass(frozen=True, kw_only=True)
 class MethodOptions:
-    """Where the network is cut, how z is updated, and what follows. These decide the method."""
+    """Where the network is cut, how z is updated, and what follows.
 
+    Without any of these, the method is chosen by held-out points; see `method.resolve_method`.
+    """
+
+    preset: str | None = option(
+        None,
+        "paper: the paper's setting and nothing else; fast: one refinement and propagation."
+        "  [default: the best candidate at held-out points]",
+        choices=choices.PRESETS,
+    )
     layer: str | None = option(
         None,
         "Layer to cut at: the name of a submodule (NAME#2: its second call, NAME[KEY]: one of its"
@@ -218,7 +229,7 @@ class MethodOptions:
     propagate: str | None = option(
         None,
         "Propagate the residuals at the points to all pixels: Gaussian process or edge-aware"
-        " diffusion.  [default: none; chosen by --auto]",
+        " diffusion.  [default: none, with other options of the method]",
         choices=("none", *choices.PROPAGATIONS),
         axis=Axis(title="propagation of the residual"),
     )
@@ -230,12 +241,13 @@ class HoldOut:
 
     auto: bool = option(
         False,
-        "Choose alignment, updates and propagation by cross-validation over the points.",
+        "Choose by held-out points also where options of the method are given.",
+        hidden=True,
     )
     time_budget_s: float | None = option(
         None,
-        "With --auto: also try other layers and step sizes for this long, such as 5s. Where weights"
-        " are updated: begin no update after it.",
+        "Cap on the time of the choice, such as 5s; what is left tries other layers and steps."
+        " Where weights are updated, no update begins that would not end in time.",
         flag="--time-budget",
         metavar="SECONDS",
         parse=parse_seconds,
@@ -248,11 +260,6 @@ class HoldOut:
     seed: int = option(
         0, "Random seed.", metavar="N", least=0, most=LARGEST_SEED, show_default=True
     )
-
-    @property
-    def needs_folds(self) -> bool:
-        """Whether points are held out in turns, to choose, to compare or to calibrate."""
-        return self.auto or self.baselines or self.uncertainty
 
 
 @dataclass(frozen=True, kw_only=True)

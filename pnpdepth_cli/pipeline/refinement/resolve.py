@@ -137,11 +137,6 @@ def resolve_settings(
     )
     if of_weights:
         _check_weights(definition, method, settings)
-        if hold_out.needs_folds:
-            raise UsageError(
-                "weights cannot be updated together with --auto, --baselines or --uncertainty;"
-                " leave out --target and --parameters"
-            )
     return settings
 
 

@@ -291,9 +291,8 @@ def _facts(summary: Mapping[str, Any], first: Row | None) -> list[list[str]]:
         ["Results in", summary["output"]],
         ["Network", str(settings["model"])],
     ]
-    if settings["auto"]:
-        method = "each frame by the candidate with the smallest cross-validation error"
-        facts.append(["Refinement", f"{method} (--auto)"])
+    if summary["method"]["kind"] == "chosen":
+        facts.append(["Refinement", "each frame by its best candidate at held-out points"])
     elif first is not None:
         used = first["settings"]
         refined = f"{used['iterations']} updates of z at {used['layer']}"

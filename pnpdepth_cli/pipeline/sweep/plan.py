@@ -15,6 +15,7 @@ from pnpdepth_cli.io.record import plain
 from pnpdepth_cli.models.definition import ModelDefinition
 from pnpdepth_cli.pipeline.batch.frames import Task
 from pnpdepth_cli.pipeline.batch.settings import settings_of
+from pnpdepth_cli.pipeline.refinement.method import with_preset
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest
 from pnpdepth_cli.pipeline.refinement.resolve import resolve_layer, resolve_settings
 from pnpdepth_cli.pipeline.sweep.axes import PARAMETERS, Cell, Study, read_value
@@ -116,7 +117,7 @@ class Plan:
             for name, text in cell.items()
             if not PARAMETERS[name].of_points
         }
-        method = replace(self._base.method, **of_update)
+        method = with_preset(replace(self._base.method, **of_update))
         settings = resolve_settings(self._definition, method)
         settings = replace(settings, lr=_one_spelling(settings.lr))
         iterations = settings.iterations

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from pnpdepth_cli.auto.candidates import SplitCache
+from pnpdepth_cli.auto.predictions import SplitCache
 from pnpdepth_cli.completion.interpolation import linear
 from pnpdepth_cli.completion.propagation import propagate
 from pnpdepth_cli.core.metrics import score

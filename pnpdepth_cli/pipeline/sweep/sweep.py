@@ -8,7 +8,7 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any, TypeVar
 
-from pnpdepth_cli.auto.candidates import SplitCache
+from pnpdepth_cli.auto.predictions import SplitCache
 from pnpdepth_cli.errors import (
     DeviceError,
     InputError,
@@ -25,6 +25,7 @@ from pnpdepth_cli.pipeline.batch.frames import Task, find_frames, task_of
 from pnpdepth_cli.pipeline.batch.request import BatchRequest, FrameSelection
 from pnpdepth_cli.pipeline.batch.settings import model_identity
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs, read_inputs
+from pnpdepth_cli.pipeline.refinement.method import with_preset
 from pnpdepth_cli.pipeline.refinement.refine import Refiner, load_refiner
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest
 from pnpdepth_cli.pipeline.refinement.resolve import resolve_layer, resolve_settings
@@ -206,12 +207,13 @@ def _some_layer(request: SweepRequest) -> str | None:
 
 def _base(definition: ModelDefinition, request: RefineRequest) -> dict[str, Any]:
     """The settings that are not varied."""
-    settings = resolve_settings(definition, request.method)
-    layer = request.method.layer or definition.default_layer
+    method = with_preset(request.method)
+    settings = resolve_settings(definition, method)
+    layer = method.layer or definition.default_layer
     return {
         "layer": None if layer is None else resolve_layer(definition, layer),
         **asdict(settings),
-        "propagate": request.method.propagate or "none",
+        "propagate": method.propagate or "none",
     }
 
 

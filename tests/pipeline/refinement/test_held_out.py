@@ -7,31 +7,21 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
-import torch
 
-from pnpdepth_cli.auto.auto import Choice, ScoredCandidate, refine_automatically
-from pnpdepth_cli.auto.candidates import (
-    Candidate,
-    RefinementConfig,
-    default_configs,
-)
+from pnpdepth_cli.auto.candidates import Candidate, RefinementConfig
+from pnpdepth_cli.auto.choice import Choice, ScoredCandidate
 from pnpdepth_cli.choices import BASELINES
 from pnpdepth_cli.core.refine import RefineSettings
 from pnpdepth_cli.errors import ModelError, UsageError
-from pnpdepth_cli.frames.frame import Frame
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.models.definition import InputKind
 from pnpdepth_cli.models.network import Network, load_network
 from pnpdepth_cli.pipeline.refinement import held_out
-from pnpdepth_cli.pipeline.refinement.request import RefineRequest
-from pnpdepth_cli.points import SparsePoints
 from tests.pipeline.batches import NAMES, Heard, batch, pairs_on_disk, results, times
 from tests.pipeline.frames import FrameOnDisk, frame_on_disk, run
 
-SETTINGS = RefineSettings(iterations=3, lr="5%", update="adam")
-CONFIG = RefinementConfig(layer="middle", settings=SETTINGS)
+CONFIG = RefinementConfig(layer="middle", settings=RefineSettings(iterations=3))
 
 
 @pytest.fixture
@@ -42,18 +32,6 @@ def frame(tmp_path: Path) -> FrameOnDisk:
 @pytest.fixture
 def network(frame: FrameOnDisk) -> Network:
     return load_network(str(frame.model), frame.checkpoint)
-
-
-def in_memory(frame: FrameOnDisk, count: int = 60) -> Frame:
-    rng = np.random.default_rng(1)
-    rows, columns = (rng.integers(0, n, count) for n in frame.depth.shape)
-    points = SparsePoints(
-        xy=torch.from_numpy(np.stack([columns, rows], 1).astype(np.float32)),
-        depth=torch.from_numpy(frame.depth[rows, columns]),
-        size=(frame.depth.shape[0], frame.depth.shape[1]),
-    )
-    rgb = rng.random((*frame.depth.shape, 3), dtype=np.float32)
-    return Frame(rgb=torch.from_numpy(rgb).permute(2, 0, 1).contiguous(), points=points)
 
 
 @pytest.mark.parametrize(
@@ -78,25 +56,21 @@ def test_of_a_network_that_takes_the_points_it_is_said_what_holding_some_out_doe
         network_error=network_m,
         scored=tuple(scored),
     )
-    request = RefineRequest.from_fields(image=frame.image, sparse=frame.sparse, auto=True)
-    notes = held_out.auto_notes(choice, request, replace(network.definition, input_kind=kind))
-    assert notes[0].startswith("auto: ")
+    notes = held_out.choice_notes(choice, replace(network.definition, input_kind=kind))
+    assert notes[0].startswith("choice: ")
     assert any("takes the points itself" in note for note in notes[1:]) == warned
 
 
-def test_the_networks_error_is_that_of_the_network_alone(
-    frame: FrameOnDisk, network: Network
-) -> None:
-    inputs = in_memory(frame)
-    found = refine_automatically(
-        network, default_configs(network.definition, "middle", SETTINGS), inputs
-    )
-    errors = {str(one.candidate): one.error for one in found.choice.scored}
-    assert found.choice.network_error == errors["network"]
-    assert any("network" in name and name != "network" for name in errors)  # none of it alone
-    request = RefineRequest.from_fields(image=frame.image, sparse=frame.sparse, auto=True)
-    note = held_out.auto_notes(found.choice, request, network.definition)[0]
-    assert f"network {errors['network']:.4f} m" in note
+def test_the_networks_error_is_that_of_the_network_alone(frame: FrameOnDisk) -> None:
+    record = run(frame, auto=True).record
+    (error,) = [
+        each["held_out_mae"]
+        for each in record["auto"]["tried"]
+        if each.get("network") == "tiny" and not each["iterations"] and each["propagate"] == "none"
+    ]
+    assert record["linear"]["folds"]["before"] == error
+    (note,) = [note for note in record["notes"] if note.startswith("choice: ")]
+    assert f"network {error:.4f} m" in note
 
 
 @pytest.mark.parametrize(
@@ -117,11 +91,84 @@ def test_the_record_says_what_was_chosen_and_everything_that_was_tried(frame: Fr
     assert abs(sum(each["weight"] for each in made["chosen"]) - 1) < 1e-9
     errors = [each["held_out_mae"] for each in made["tried"]]
     assert errors == sorted(errors)
-    assert made["held_out_mae"] <= errors[0] + 1e-6
+    limit = min(each["held_out_mae"] for each in made["tried"] if "baseline" in each)
+    assert made["held_out_mae"] <= limit + 1e-6
     assert made["held_out_points"] == 60
-    assert any(note.startswith("auto: ") for note in record["notes"])
+    assert any(note.startswith("choice: ") for note in record["notes"])
     saved = json.loads((frame.folder / "out" / "img.json").read_text())
     assert saved["auto"] == json.loads(json.dumps(made))
+
+
+def test_without_options_of_the_method_it_is_chosen_by_held_out_points(
+    frame: FrameOnDisk,
+) -> None:
+    record = run(frame, propagate=None).record
+    assert record["method"] == {
+        "kind": "chosen",
+        "why": "default",
+        "networks": ["tiny", "compact"],
+    }
+    assert record["auto"]["folds"] > 0
+
+
+@pytest.mark.parametrize(
+    ("asked", "why"),
+    [
+        ({"iterations": 2}, "--iterations"),
+        ({"layer": "encode"}, "--layer"),
+        ({"preset": "fast"}, "--preset fast"),
+        ({"preset": "paper", "iterations": 2}, "--preset paper --iterations"),
+    ],
+)
+def test_an_option_of_the_method_fixes_it(
+    frame: FrameOnDisk, asked: dict[str, Any], why: str
+) -> None:
+    record = run(frame, **({"propagate": None} | asked)).record
+    assert record["method"] == {"kind": "fixed", "why": why, "networks": ["tiny"]}
+    assert record["auto"] is None
+    settings = record["settings"]
+    assert {name: settings[name] for name in asked if name != "preset"} == {
+        name: value for name, value in asked.items() if name != "preset"
+    }
+
+
+def test_the_papers_preset_is_the_papers_setting_bit_for_bit(frame: FrameOnDisk) -> None:
+    paper = {
+        "layer": "middle", "update": "sign", "lr": "0.01", "iterations": 5, "loss": "l1",
+        "schedule": "constant", "blur": 0.0, "align": "none", "propagate": "none",
+    }  # fmt: skip
+    one = run(frame, preset="paper", format="npy", output=frame.folder / "preset")
+    other = run(frame, **paper, format="npy", output=frame.folder / "options")
+    depths = [
+        (frame.folder / name / "img_depth.npy").read_bytes() for name in ("preset", "options")
+    ]
+    assert depths[0] == depths[1]
+    assert one.record["settings"] == other.record["settings"]
+    assert one.record["loss"] == other.record["loss"]
+
+
+def test_networks_that_are_given_compete(frame: FrameOnDisk) -> None:
+    second = frame.folder / "second.py"
+    text = frame.model.read_text().replace('name="tiny"', 'name="second", complete=True')
+    second.write_text(text)
+    record = run(frame, propagate=None, more_models=(str(second),)).record
+    assert record["method"]["networks"] == ["tiny", "second", "compact"]
+    tried = {each.get("network") for each in record["auto"]["tried"]}
+    assert {"tiny", "second", "compact"} <= tried
+
+
+def test_linear_interpolation_is_beside_every_result(frame: FrameOnDisk) -> None:
+    compared = run(frame, gt=frame.gt).record["linear"]
+    assert compared["scores"]["mae"] < 0.05
+    assert compared["worse"] is True
+    compared = run(frame, output=frame.folder / "b").record["linear"]
+    assert compared["scores"] is None
+    assert compared["folds"]["after"] > compared["folds"]["linear"] > 0
+    assert compared["worse"] is True
+    compared = run(frame, output=frame.folder / "c", holdout=0.2).record["linear"]
+    assert compared["held_out_error"]["mae"] > 0
+    compared = run(frame, output=frame.folder / "d", propagate=None, gt=frame.gt).record["linear"]
+    assert compared["worse"] is False
 
 
 def test_the_same_request_gives_the_same_bytes(frame: FrameOnDisk) -> None:
@@ -162,14 +209,13 @@ def test_a_batch_finds_its_ways_on_a_few_frames_and_checks_them_on_each(tmp_path
     root = pairs_on_disk(tmp_path / "drive")
     heard = Heard()
     batch(root, heard, refine={"auto": True})
-    (said,) = [text for text in heard.said if text.startswith("auto: ")]
+    (said,) = [text for text in heard.said if text.startswith("choice: ")]
     found = said.partition(": best on ")[2].partition(": ")[2].split("; ")
     for name in NAMES:
         made = json.loads((root / "out" / f"{name}.json").read_text())["auto"]
         tried = {each["way"] for each in made["tried"]}
         assert set(found) <= tried
-        assert {*BASELINES, "network"} <= tried
-        assert made["held_out_mae"] <= made["tried"][0]["held_out_mae"] + 1e-6
+        assert {*BASELINES, "tiny aligned (auto)"} <= tried
     before = times(root / "out")
     batch(root, refine={"auto": True})
     assert times(root / "out") == before

@@ -231,7 +231,7 @@ BAD = [
     ({"device": "tpu"}, PnpDepthError, "--device cpu"),
     ({"format": "jpg"}, UsageError, "not one of"),
     ({"depth_scale": -1.0}, UsageError, "scale"),
-    ({"time_budget_s": 5.0}, UsageError, "trials of --auto"),
+    ({"time_budget_s": 5.0}, UsageError, "--propagate fixes the method"),
 ]
 
 

@@ -164,7 +164,7 @@ def test_the_page_says_how_frames_were_refined_and_that_each_may_have_its_own_wa
     assert (facts["Alignment"], facts["Propagation"]) == ("none", "gp")
     batch(root, output=root / "auto", html=tmp_path / "auto", refine={"auto": True})
     facts = dict(page_data(tmp_path / "auto")["facts"])
-    assert facts["Refinement"].endswith("(--auto)")
+    assert facts["Refinement"].endswith("best candidate at held-out points")
     assert "Alignment" not in facts
 
 

@@ -1,0 +1,252 @@
+"""The depth that each candidate predicts for a frame, with nothing computed twice.
+
+A network that takes only the image runs its front once for a frame, whatever points it is refined
+with. One refinement gives the depth after every number of updates that competes. Everything else
+is computed when a candidate first needs it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from pnpdepth_cli.auto.blending import weighted_mean
+from pnpdepth_cli.auto.candidates import Candidate, RefinementConfig
+from pnpdepth_cli.choices import BASELINES
+from pnpdepth_cli.completion.interpolation import in_hull
+from pnpdepth_cli.completion.propagation import propagate, propagate_at
+from pnpdepth_cli.core.refine import refine_from
+from pnpdepth_cli.core.split import Split
+from pnpdepth_cli.errors import PnpDepthError
+from pnpdepth_cli.frames.frame import Frame, RefinedFrame
+from pnpdepth_cli.frames.prepare import PreparedFrame, prepare
+from pnpdepth_cli.frames.refine import to_refined_frame
+from pnpdepth_cli.models.network import Network, out_of_memory_is_a_device_error
+from pnpdepth_cli.points import SparsePoints
+
+
+@dataclass(frozen=True, kw_only=True)
+class Trajectory:
+    """A refinement and the depths on its way."""
+
+    depths: dict[int, Tensor]
+    """(H, W) metres in the image frame, 0 = unknown, by the number of updates."""
+    frame: RefinedFrame
+    """The refined frame at the end."""
+
+    def after(self, iterations: int) -> Tensor:
+        """Returns the depth (H, W) after so many updates, or the last before a divergence."""
+        return self.depths[max(updates for updates in self.depths if updates <= iterations)]
+
+
+class SplitCache:
+    """Keeps the network cut while the layer stays the same, so that it is recorded once."""
+
+    def __init__(self, network: Network) -> None:
+        self.network, self._open = network, ExitStack()
+        self._split: Split | None = None
+
+    def __enter__(self) -> SplitCache:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Restores the whole network until it is cut again."""
+        self._open.close()
+        self._split = None
+
+    def at(self, layer: str) -> Split:
+        """Returns the network cut at the layer, open."""
+        if self._split is None or self._split.layer != layer:
+            self.close()
+            self._split = self._open.enter_context(self.network.cut_at(layer))
+        return self._split
+
+
+class OpenNetworks:
+    """Networks that stay cut from frame to frame, as a context manager.
+
+    Args:
+        networks: By name. The first is the user's.
+    """
+
+    def __init__(self, networks: Mapping[str, Network]) -> None:
+        self.networks = dict(networks)
+        self._caches = {name: SplitCache(network) for name, network in self.networks.items()}
+        self._stack = ExitStack()
+
+    def __enter__(self) -> OpenNetworks:
+        for cache in self._caches.values():
+            self._stack.enter_context(cache)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stack.close()
+
+    def split(self, config: RefinementConfig) -> Split:
+        """Returns the configuration's network cut at its layer, open."""
+        return self._caches[config.network].at(config.layer)
+
+
+class FramePasses:
+    """Passes of the networks over one image, for several sets of points.
+
+    Args:
+        opened: The networks.
+        frame: The image; its own points are not used.
+    """
+
+    def __init__(self, opened: OpenNetworks, frame: Frame) -> None:
+        self._opened, self._frame = opened, frame
+        self._z0: dict[tuple[str, str], Tensor] = {}
+
+    def trajectory(self, config: RefinementConfig, points: SparsePoints) -> Trajectory:
+        """Returns the refinement of the frame with these points.
+
+        Raises:
+            PnpDepthError: The refinement fails.
+        """
+        network = self._opened.networks[config.network]
+        with out_of_memory_is_a_device_error(network.device):
+            prepared = prepare(network, self._frame.with_points(points))
+            if not len(prepared.points):
+                raise prepared.no_points_error()
+            split = self._opened.split(config)
+            key = (config.network, config.layer)
+            z0 = self._z0.get(key)
+            if z0 is None:
+                with torch.no_grad():
+                    z0 = split.front(*prepared.arguments)
+                if network.definition.input_kind == "rgb":
+                    # the cut holds the outputs of one layer's front at a time
+                    self._z0 = {k: z for k, z in self._z0.items() if k[0] != key[0]} | {key: z0}
+            refined = _trajectory(split, z0, prepared, config)
+        if isinstance(refined, PnpDepthError):
+            raise refined
+        return refined
+
+
+def _trajectory(
+    split: Split, z0: Tensor, prepared: PreparedFrame, config: RefinementConfig
+) -> Trajectory | PnpDepthError:
+    reader = prepared.depth_reader(config.settings)
+    (result,) = refine_from(
+        split,
+        z0,
+        (prepared.points,),
+        config.settings,
+        depth_of=(reader,),
+        keep_depths={0, *config.competing_iterations},
+    )
+    refined = to_refined_frame(prepared, reader, result)
+    if isinstance(refined, PnpDepthError):
+        return refined
+    depths = {
+        updates: torch.from_numpy(prepared.to_image(depth))
+        for updates, depth in refined.refinement.depths.items()
+        if updates == 0 or bool(depth.isfinite().all())
+    }
+    refinement = replace(refined.refinement, depths={})
+    return Trajectory(depths=depths, frame=replace(refined, refinement=refinement))
+
+
+class CandidateDepths:
+    """Depth of one frame by many candidates, from one set of points.
+
+    Args:
+        passes: The networks' passes over the frame's image.
+        frame: The frame with the points that candidates may use.
+        reference: The refinement whose start is the prediction of baselines that need one.
+        default: The candidate that continues baselines outside the hull of the points.
+    """
+
+    def __init__(
+        self,
+        passes: FramePasses,
+        frame: Frame,
+        reference: RefinementConfig,
+        default: Candidate,
+    ) -> None:
+        self._passes, self._frame = passes, frame
+        self._reference, self._default = reference, default
+        self._trajectories: dict[RefinementConfig, Trajectory | PnpDepthError] = {}
+
+    def trajectory(self, config: RefinementConfig) -> Trajectory:
+        """Returns the refinement; raises its PnpDepthError, computed or remembered."""
+        if config not in self._trajectories:
+            try:
+                made = self._passes.trajectory(config, self._frame.points)
+            except PnpDepthError as error:
+                self._trajectories[config] = error
+                raise
+            self._trajectories[config] = made
+        known = self._trajectories[config]
+        if isinstance(known, PnpDepthError):
+            raise known
+        return known
+
+    @property
+    def prediction(self) -> Tensor:
+        """(H, W) metres of the reference network, aligned with the points."""
+        return self.trajectory(self._reference).after(0)
+
+    def dense(self, candidate: Candidate) -> Tensor:
+        """Returns the candidate's depth (H, W) metres, 0 = unknown."""
+        frame = self._frame
+        if candidate.within_hull:
+            inside = in_hull(frame.points)
+            baseline = self.dense(replace(candidate, within_hull=False))
+            return torch.where(inside, baseline, self.dense(self._default))
+        depth = self._start(candidate)
+        if candidate.propagate == "none":
+            return depth
+        return propagate(depth, frame.points, frame.rgb, kind=candidate.propagate).depth
+
+    def at(self, xy: Tensor, candidate: Candidate) -> Tensor:
+        """Returns the candidate's depth (M,) metres at pixel coordinates (M, 2)."""
+        frame, name = self._frame, candidate.baseline
+        if candidate.within_hull:
+            inside = in_hull(frame.points, xy)
+            baseline = self.at(xy, replace(candidate, within_hull=False))
+            return torch.where(inside, baseline, self.at(xy, self._default))
+        if candidate.propagate != "none":
+            start = self._start(candidate)
+            return propagate_at(start, frame.points, frame.rgb, xy, kind=candidate.propagate)
+        if name is None:
+            queries = SparsePoints(xy=xy, depth=xy.new_ones(len(xy)), size=frame.size)
+            return queries.sample(self._start(candidate))
+        depth: Tensor = BASELINES[name].at(xy, frame.points, self._prediction_for(name))
+        return depth
+
+    def relative_sigma(self) -> Tensor:
+        """Returns the uncalibrated standard deviation (H, W) of log depth.
+
+        It is that of the network's residual: a candidate that goes through the points leaves none.
+        """
+        frame = self._frame
+        result = propagate(self.prediction, frame.points, frame.rgb, sigma=True)
+        assert result.sigma is not None
+        return torch.where(result.depth > 0, result.sigma / result.depth, 0.0)
+
+    def _start(self, candidate: Candidate) -> Tensor:
+        """(H, W): the candidate's depth before propagation."""
+        if candidate.fused:
+            members = torch.stack([self.dense(each) for each in candidate.fused])
+            return weighted_mean(members, candidate.weights, geometric=True)
+        if candidate.baseline is not None:
+            name = candidate.baseline
+            made: Any = BASELINES[name].depth(self._frame.points, self._prediction_for(name))
+            depth: Tensor = made
+            return depth
+        config = candidate.config or self._reference
+        return self.trajectory(config).after(candidate.iterations)
+
+    def _prediction_for(self, baseline: str) -> Tensor | None:
+        return self.prediction if BASELINES[baseline].needs_prediction else None
