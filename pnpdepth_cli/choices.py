@@ -219,7 +219,7 @@ SENSORS = ("vlp-16", "vlp-32c", "hdl-32e", "hdl-64e")
 """LiDARs by data sheet; `pnpdepth_cli.sensors.LIDARS` has the paper's of each as "paper-<name>"."""
 
 EVAL_PROTOCOLS = ("paper", "nyu", "kitti", "kitti-devkit", "eigen", "garg")
-"""Published ways to score depth: `pnpdepth_cli.pipeline.evaluation.protocols.PROTOCOLS`."""
+"""Published protocols of scoring depth: `pnpdepth_cli.pipeline.evaluation.protocols.PROTOCOLS`."""
 
 AVERAGES = ("per-image", "pooled")
 """How errors are averaged: every image or every pixel has equal weight."""
