@@ -35,7 +35,7 @@ _STOPPING = b"\nfinishing the current frame; press Ctrl-C again to stop at once\
     ),
     groups={
         "Frames": ("--layout", "--protocol", "--sample", "--limit", "--shard"),
-        "Input": (*grouped_help.LIDAR, *grouped_help.FILE_READING),
+        "Input": (*grouped_help.LIDAR, *grouped_help.COLMAP, *grouped_help.FILE_READING),
         "Network": grouped_help.NETWORK,
         "Method": grouped_help.METHOD,
         "Output": (*grouped_help.OUTPUT, "--html"),
