@@ -15,7 +15,16 @@ OTHER = "Other"
 """Title of the options that no group lists."""
 
 LIDAR = (
-    *("--calib", "--camera", "--range", "--keep-occluded", "--min-range", "--max-range"),
+    *(
+        "--calib",
+        "--extrinsics",
+        "--inverse-extrinsics",
+        "--camera",
+        "--range",
+        "--keep-occluded",
+        "--min-range",
+        "--max-range",
+    ),
     "--point-fields",
 )
 COLMAP = ("--unit-scale", "--min-track", "--max-reprojection")
@@ -26,7 +35,8 @@ NETWORK = (
 )
 METHOD = (
     *("--preset", "--time-budget", "--iterations", "--lr", "--loss", "--update", "--schedule"),
-    *("--blur", "--parameters", "--proximity", "--line-search", "--keep-best", "--propagate"),
+    *("--blur", "--target", "--parameters", "--mask", "--mask-fraction", "--mask-scale"),
+    *("--proximity", "--line-search", "--keep-best", "--propagate"),
     *("--holdout", "--seed"),
 )
 OUTPUT = ("--output", "--format", "--baselines", "--uncertainty", "--overwrite", "--json")

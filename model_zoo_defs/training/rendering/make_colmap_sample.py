@@ -56,7 +56,7 @@ def make_photos(folder: Path) -> float:
     """Writes images/*.jpg and gt/*.png of a camera in a room; returns its focal length, pixels."""
     world, plan = build("room", generator(SAMPLE_SEED, SCENE, 0))
     rng = generator(SAMPLE_SEED, SCENE, 1 + VIEW)
-    first = pick_view(world, plan, "room", rng, height=HEIGHT, width=WIDTH)
+    first = pick_view(world, plan, "room", rng, size=(HEIGHT, WIDTH))
     for name in ("images", "gt"):
         (folder / name).mkdir(parents=True, exist_ok=True)
     for number in range(PHOTOS):

@@ -131,7 +131,9 @@ def _input_files(files: FrameFiles, *, is_scan: bool) -> Iterator[tuple[str, Pat
             yield from ((f"sparse {file.name}", file) for file in model_files(path))
         else:
             yield part, path
-    calib = files.scan.calib
+    calib, extrinsics = files.scan.calib, files.scan.extrinsics
+    if is_scan and extrinsics is not None:
+        yield "extrinsics", extrinsics
     if is_scan and calib is not None:
         if calib.is_dir():
             yield from ((f"calib {p.name}", p) for p in sorted(calib.glob("calib_*.txt")))
