@@ -60,7 +60,7 @@ class MeasureGroup:
     """True if `previous` is used."""
 
 
-def mean_of(values: NDArray[np.generic], weights: NDArray[np.generic] | None = None) -> float:
+def mean_of(values: NDArray[np.generic], weights: Floats | None = None) -> float:
     """Returns the mean, weighted or not; NaN of nothing."""
     if not values.size:
         return math.nan
