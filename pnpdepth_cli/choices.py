@@ -230,6 +230,14 @@ LENSES = (
 EVAL_PROTOCOLS = ("paper", "nyu-eigen", "kitti", "kitti-devkit", "eigen", "garg")
 """Published protocols of scoring depth: `pnpdepth_cli.pipeline.evaluation.protocols.PROTOCOLS`."""
 
+MEASURE_GROUPS = Table(
+    "pipeline/evaluation/measures",
+    "GROUP",
+    group="measures",
+    noun="group of measures",
+)
+"""Measures that `eval` computes only on request."""
+
 AVERAGES = ("per-image", "pooled")
 """How errors are averaged: every image or every pixel has equal weight."""
 
