@@ -218,8 +218,8 @@ PATTERNS = ("uniform", "bernoulli", "grid", "lines", "features", "edges", "regio
 SENSORS = ("vlp-16", "vlp-32c", "hdl-32e", "hdl-64e")
 """LiDARs by data sheet; `pnpdepth_cli.sensors.LIDARS` has the paper's of each as "paper-<name>"."""
 
-EVAL_PROTOCOLS = ("paper", "nyu", "kitti", "kitti-devkit", "eigen", "garg")
-"""Published ways to score depth: `pnpdepth_cli.pipeline.evaluation.protocols.PROTOCOLS`."""
+EVAL_PROTOCOLS = ("paper", "nyu-eigen", "kitti", "kitti-devkit", "eigen", "garg")
+"""Published protocols of scoring depth: `pnpdepth_cli.pipeline.evaluation.protocols.PROTOCOLS`."""
 
 AVERAGES = ("per-image", "pooled")
 """How errors are averaged: every image or every pixel has equal weight."""

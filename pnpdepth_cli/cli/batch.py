@@ -158,4 +158,4 @@ def _finishing_on_interrupt() -> Iterator[Callable[[], bool]]:
 def _sample(text: str) -> tuple[str, int | None, float | None]:
     """Returns (pattern, count, fraction) from `500`, `5%` or `lines:16`."""
     kind, colon, count = text.rpartition(":")
-    return kind if colon else "uniform", *options.count_or_share(count)
+    return kind if colon else "uniform", *options.count_or_fraction(count)

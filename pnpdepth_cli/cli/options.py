@@ -239,6 +239,6 @@ def height_and_width(text: str) -> tuple[int, int]:
     return int(height), int(width)
 
 
-def count_or_share(text: str | None) -> tuple[int | None, float | None]:
+def count_or_fraction(text: str | None) -> tuple[int | None, float | None]:
     """Returns (count, None) for `500`, (None, fraction) for `5%`. Raises UsageError otherwise."""
-    return (None, None) if text is None else request.count_or_share(text)
+    return (None, None) if text is None else request.count_or_fraction(text)

@@ -65,9 +65,9 @@ def print_refinement(record: Mapping[str, Any]) -> None:
         )
     if record["baselines"] is not None:
         console.print(_baselines(record["baselines"]))
-    if record["improved_share"] is not None:
+    if record["improved_fraction"] is not None:
         where = "pixels with ground truth" if record["scores"] else "points"
-        console.print(f"improved: {record['improved_share']:.1%} of the {where}")
+        console.print(f"improved: {record['improved_fraction']:.1%} of the {where}")
     seconds = record["seconds"]
     updates = (
         f"{settings['iterations']} updates ({settings['update']}, {settings['loss']}, step"
@@ -185,7 +185,7 @@ def print_sparse(record: Mapping[str, Any]) -> None:
     points, (width, height) = record["points"], record["size"]
     written = [path for path in record["outputs"].values() if path]
     console.print(
-        f"wrote {points['count']:,} points, {points['share_of_pixels']:.2%} of {width}×{height}"
+        f"wrote {points['count']:,} points, {points['fraction_of_pixels']:.2%} of {width}×{height}"
         f" pixels: {escape('  '.join(written))}",
         soft_wrap=True,
     )

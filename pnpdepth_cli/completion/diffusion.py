@@ -84,7 +84,7 @@ def _readings(field: ResidualField, rows: int, columns: int) -> Any:
             bottom * columns + right,
         ]
     )
-    shares = torch.stack([(1 - fx) * (1 - fy), fx * (1 - fy), (1 - fx) * fy, fx * fy])
+    weights = torch.stack([(1 - fx) * (1 - fy), fx * (1 - fy), (1 - fx) * fy, fx * fy])
     which = torch.arange(len(xy)).repeat(4, 1)
-    values = (shares.flatten().numpy(), (which.flatten().numpy(), places.long().flatten().numpy()))
+    values = (weights.flatten().numpy(), (which.flatten().numpy(), places.long().flatten().numpy()))
     return coo_array(values, shape=(len(xy), rows * columns)).tocsr()

@@ -45,7 +45,7 @@ lengths and the least and most noise are there for frames unlike those."""
 NEIGHBOURS = 48
 """Points that predict a block, or a single pixel, where there are many points."""
 MIN_POINTS = 5
-"""Fewer points cannot tell which length scales are best."""
+"""Fewer points do not determine the length scales."""
 DEFAULT_SCALE = 0.2
 """Standard deviation of f with fewer points: typical relative errors of networks."""
 

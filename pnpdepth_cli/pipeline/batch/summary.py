@@ -52,7 +52,7 @@ def row_of(
         "points": record["points"],
         "settings": {name: record["settings"][name] for name in _EFFECTIVE},
         "loss": [record["loss"][0], record["loss"][-1]],
-        "improved_share": record["improved_share"],
+        "improved_fraction": record["improved_fraction"],
         **{kind: record[kind] for kind in _MEASURED},
         "linear": record.get("linear"),
         "baselines": record.get("baselines"),
@@ -185,7 +185,7 @@ def write_table(
         baselines: Names of baselines, whose errors make the last columns.
     """
     header = [
-        *("name", "status", "message", "points", "held_out_points", "improved_share"),
+        *("name", "status", "message", "points", "held_out_points", "improved_fraction"),
         *(
             f"{kind}_{measure}_{stage}" if kind != "scores" else f"{measure}_{stage}"
             for kind, measures in _MEASURED.items()
@@ -208,7 +208,7 @@ def write_table(
             writer.writerow(
                 [
                     *(text_cell(row["name"]), row["status"], text_cell(row["message"] or "")),
-                    *(points.get("used"), points.get("held_out"), row.get("improved_share")),
+                    *(points.get("used"), points.get("held_out"), row.get("improved_fraction")),
                     *(
                         measured.get((kind, stage, measure))
                         for kind, measures in _MEASURED.items()

@@ -22,7 +22,7 @@ def write_outputs(outputs: Outputs, inputs: Inputs, frame: RefinedFrame) -> dict
     write_depth(outputs.depth, frame.after, scale=output_scale(inputs))
     if outputs.sigma is not None and frame.sigma is not None:
         write_depth(outputs.sigma, frame.sigma)
-    record: dict[str, Any] = {"improved_share": None}
+    record: dict[str, Any] = {"improved_fraction": None}
     if outputs.preview is not None:
         preview(
             inputs.rgb,
@@ -33,7 +33,7 @@ def write_outputs(outputs: Outputs, inputs: Inputs, frame: RefinedFrame) -> dict
             outputs.preview,
         )
     if outputs.improvement is not None:
-        record["improved_share"] = _write_improvement(outputs.improvement, inputs, frame)
+        record["improved_fraction"] = _write_improvement(outputs.improvement, inputs, frame)
     record["outputs"] = {
         kind: None if path is None else str(path)
         for kind, path in (

@@ -331,7 +331,7 @@ def _wanted(name: str, names: Collection[str]) -> bool:
     return not names or name in names
 
 
-def count_or_share(text: str) -> tuple[int | None, float | None]:
+def count_or_fraction(text: str) -> tuple[int | None, float | None]:
     """Returns (points, fraction) of `500` or `5%`; the other is None. Raises UsageError."""
     try:
         if text.strip().endswith("%"):
@@ -341,8 +341,8 @@ def count_or_share(text: str) -> tuple[int | None, float | None]:
         raise UsageError(f"count {text!r} is neither a number such as 500 nor 5%") from None
 
 
-def sample_pattern(kind: str, count: int | None, share: float | None) -> SamplePattern:
+def sample_pattern(kind: str, count: int | None, fraction: float | None) -> SamplePattern:
     """Returns the pattern of so many points, or this fraction of the known pixels."""
     from pnpdepth_cli.sensors import SamplePattern
 
-    return SamplePattern(kind=kind, count=count, share=share)
+    return SamplePattern(kind=kind, count=count, fraction=fraction)

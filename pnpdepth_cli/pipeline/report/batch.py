@@ -207,7 +207,9 @@ def _columns(measured: bool) -> list[Column]:
 def _values(row: Row, basis: str | None, measured: bool) -> dict[str, float | None]:
     if basis is None or (measured and basis == _USED):
         return {}
-    values: dict[str, float | None] = {"improved": row["improved_share"]}
+    values: dict[str, float | None] = {
+        "improved": row.get("improved_fraction", row.get("improved_share"))
+    }
     for key in _ERRORS:
         before, after = (row[basis][stage].get(key) for stage in ("before", "after"))
         values |= {f"{key}_before": before, f"{key}_after": after}

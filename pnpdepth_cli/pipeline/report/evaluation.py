@@ -68,14 +68,14 @@ def write_eval_report(
     Raises:
         OutputError: If the report cannot be written.
     """
-    pictures = begin_report(folder, _SOURCE)
+    images = begin_report(folder, _SOURCE)
     remove_report_leftovers(folder)
     columns = _columns(evaluation)
     scored = evaluation.scored
 
     def entries() -> Iterator[dict[str, Any]]:
         drawn = in_order(
-            lambda frame: _entry(frame, evaluation, columns, pictures),
+            lambda frame: _entry(frame, evaluation, columns, images),
             scored,
             evaluation.request.workers,
         )
@@ -207,7 +207,7 @@ def _bins(caption: str, unit: str, bins: tuple[ErrorBin, ...]) -> list[dict[str,
 
 
 def _entry(
-    frame: FrameScores, evaluation: Evaluation, columns: list[Column], pictures: Path
+    frame: FrameScores, evaluation: Evaluation, columns: list[Column], images: Path
 ) -> dict[str, Any]:
     values = frame.values | {"coverage": frame.coverage}
     notes = [f"Scored: {frame.pixels:,} of {frame.known:,} pixels of the ground truth."]
@@ -216,7 +216,7 @@ def _entry(
     notes.append(f"Prediction: {frame.pair.prediction}")
     notes.append(f"Ground truth: {frame.pair.frame.gt}")
     try:
-        drawn = _drawn(frame, evaluation, pictures)
+        drawn = _drawn(frame, evaluation, images)
     except InputError as error:  # the file has changed since it was scored
         notes.append(str(error))
         drawn = {"key": None}
@@ -229,7 +229,7 @@ def _entry(
     }
 
 
-def _drawn(frame: FrameScores, evaluation: Evaluation, pictures: Path) -> dict[str, Any]:
+def _drawn(frame: FrameScores, evaluation: Evaluation, images: Path) -> dict[str, Any]:
     """Writes the images of a frame and returns the page's entry of them."""
     protocol = evaluation.protocol
     loaded = load_frame(frame.pair, protocol, evaluation.request.scales)
@@ -246,7 +246,7 @@ def _drawn(frame: FrameScores, evaluation: Evaluation, pictures: Path) -> dict[s
     if image is not None:
         views["image"] = np.asarray(np.rint(255 * np.clip(image, 0, 1)), np.uint8)
     key = image_key(frame.name)
-    save_images(pictures, key, views, thumb="first" if image is None else "image")
+    save_images(images, key, views, thumb="first" if image is None else "image")
     amount = f"by {errors.strongest_m:.3g} m or more"
     return {
         "key": key,
