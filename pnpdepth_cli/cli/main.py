@@ -55,6 +55,7 @@ COMMANDS = {
     "models": "models:models",
     "layers": "layers:layers",
     "project": "project:project",
+    "frames": "frames:frames",
     "sample": "sample:sample",
     "simulate": "simulate:simulate",
     "eval": "evaluate:evaluate",

@@ -24,6 +24,9 @@ from pnpdepth_cli.io.depth import (
 from pnpdepth_cli.io.fingerprint import fingerprint
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.pipeline.refinement.request import FrameFiles, RefineRequest
+from pnpdepth_cli.pipeline.sparse.colmap import read_colmap_points
+from pnpdepth_cli.pipeline.sparse.colmap_options import METRES, ColmapOptions
+from pnpdepth_cli.pipeline.sparse.scan_options import ScanOptions
 from pnpdepth_cli.pipeline.sparse.scans import read_scan_points
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.sensors import Points, occluded_in_map, sample_points
@@ -50,6 +53,8 @@ class Inputs:
     """Files and digests, for a record."""
     notes: tuple[str, ...]
     """What was assumed, and warnings."""
+    unit: str = METRES
+    """Of all depths: "m", or "model units" of a COLMAP model without scale."""
 
     @property
     def size(self) -> tuple[int, int]:
@@ -92,6 +97,8 @@ class _Sparse:
     """Of its file."""
     notes: tuple[str, ...]
     """What was assumed."""
+    unit: str = METRES
+    """Of the depth."""
 
 
 def read_inputs(request: RefineRequest) -> Inputs:
@@ -108,10 +115,22 @@ def read_inputs(request: RefineRequest) -> Inputs:
         _check_ground_truth(files, ground_truth, whole)
     if files.sparse is None:
         sparse = _sampled(files, image, ground_truth, request.hold_out.seed)
+    elif files.sparse.is_dir():
+        sparse = _read_colmap(files, files.sparse, whole)
+    elif files.colmap != ColmapOptions():
+        raise UsageError(
+            f"{files.sparse} is no COLMAP model, so --unit-scale, --min-track and"
+            " --max-reprojection do not apply"
+        )
     elif files.scan.describes(files.sparse):
         sparse = _read_scan(files, files.sparse, whole)
     else:
         sparse = _read_points(files, files.sparse, whole)
+    if ground_truth is not None and sparse.unit != METRES:
+        raise UsageError(
+            f"the ground truth {files.gt} is in metres but the sparse depth in {sparse.unit}; give"
+            " --unit-scale, or leave out --gt"
+        )
     if ground_truth is not None and ground_truth.values.shape != sparse.points.size:
         raise _size_error(files, ground_truth.values.shape, sparse.points.size)
     parts = {"image": image, "sparse": sparse, "gt": ground_truth}
@@ -125,6 +144,7 @@ def read_inputs(request: RefineRequest) -> Inputs:
         sparse_scale=sparse.scale,
         record={name: part.record for name, part in parts.items() if part is not None},
         notes=tuple(notes),
+        unit=sparse.unit,
     )
 
 
@@ -213,6 +233,23 @@ def _read_scan(files: FrameFiles, path: Path, image_size: tuple[int, int] | None
     scan = read_scan_points(path, files.scan, image_size, image)
     points = _in_protocol(files, path, scan.points.tensors())
     return _Sparse(points=points, scale=None, record=scan.record, notes=scan.notes)
+
+
+def _read_colmap(files: FrameFiles, path: Path, image_size: tuple[int, int] | None) -> _Sparse:
+    if image_size is None or not isinstance(files.image, Path):
+        raise UsageError(f"{path} is a folder, taken for a COLMAP model, which needs the image")
+    if files.scan != ScanOptions():
+        raise UsageError(f"{path} is a COLMAP model, so the options of a LiDAR scan do not apply")
+    observed = read_colmap_points(
+        path, files.colmap, files.image, image_size, any_size=files.sparse_size_ok
+    )
+    return _Sparse(
+        points=_in_protocol(files, path, observed.points.tensors()),
+        scale=observed.scale,
+        record=observed.record,
+        notes=observed.notes,
+        unit=observed.unit,
+    )
 
 
 def _read_points(files: FrameFiles, path: Path, image_size: tuple[int, int] | None) -> _Sparse:

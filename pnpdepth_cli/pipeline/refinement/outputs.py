@@ -31,6 +31,7 @@ def write_outputs(outputs: Outputs, inputs: Inputs, frame: RefinedFrame) -> dict
             frame.before,
             frame.after,
             outputs.preview,
+            inputs.unit,
         )
     if outputs.improvement is not None:
         record["improved_fraction"] = _write_improvement(outputs.improvement, inputs, frame)
@@ -58,4 +59,5 @@ def _write_improvement(path: Path, inputs: Inputs, frame: RefinedFrame) -> float
         points.sample(torch.from_numpy(frame.after)).numpy(),
         held_out=bool(len(frame.held_out)),
         path=path,
+        unit=inputs.unit,
     )

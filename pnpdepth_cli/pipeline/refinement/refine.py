@@ -45,6 +45,7 @@ from pnpdepth_cli.pipeline.refinement.resolve import (
     resolve_layer,
     resolve_settings,
 )
+from pnpdepth_cli.pipeline.sparse.colmap_options import METRES
 from pnpdepth_cli.pipeline.stopwatch import Stopwatch, peak_memory_mb, versions
 from pnpdepth_cli.points import SparsePoints
 
@@ -294,7 +295,7 @@ def refiner_of(
         layer = options.layer
         if layer is None and not method.own_layer and options.target != "masked":
             layer = default_layer(network, first.size, len(first.points))
-        own = resolve_settings(definition, options, request.hold_out)
+        own = resolve_settings(definition, options, request.hold_out, metric=first.unit == METRES)
         if number == 0 and settings is not None:
             own = settings
         plans.append((_name(networks, number), network, resolve_layer(definition, layer), own))
@@ -362,6 +363,7 @@ def _record(refiner: Refiner, inputs: Inputs, frame: RefinedFrame) -> dict[str, 
     propagate = method.options.propagate
     return {
         "versions": versions(),
+        "unit": inputs.unit,
         "inputs": inputs.record,
         "model": refiner.model_record,
         "method": {

@@ -251,7 +251,7 @@ def _head(
             if summary["mean"][basis]
             for each in [_means(basis, summary["mean"][basis])]
         ]
-        + _baselines(summary.get("baselines")),
+        + _baselines(summary.get("baselines"), summary["unit"]),
         "labels": {
             "first": "Before",
             "second": "After",
@@ -282,7 +282,9 @@ def _tiles(summary: Mapping[str, Any], measured: bool) -> list[dict[str, str]]:
             gain_text = ""
             if gain is not None and basis != _USED:
                 gain_text = f"gain {_signed(100 * gain, 1, '%')} "
-            tiles.append(tile(f"{measure.title} [m]", change, f"{gain_text}{_BASES[basis]}"))
+            tiles.append(
+                tile(f"{measure.title} [{summary['unit']}]", change, f"{gain_text}{_BASES[basis]}")
+            )
     return tiles
 
 
@@ -334,12 +336,12 @@ def _means(basis: str, mean: Mapping[str, Any]) -> dict[str, Any]:
     return table(f"Means over {frames_text(mean['frames'])}, {_BASES[basis]}", header, rows)
 
 
-def _baselines(mean: Mapping[str, Mapping[str, Any]] | None) -> list[dict[str, Any]]:
+def _baselines(mean: Mapping[str, Mapping[str, Any]] | None, unit: str) -> list[dict[str, Any]]:
     """A table of the simple baselines, the network and the result; empty without --baselines."""
     if not mean:
         return []
     mae = _ERRORS["mae"]
-    header = ["", "MAE at held-out points [m]", "MAE [m]", "RMSE [m]", "frames"]
+    header = ["", f"MAE at held-out points [{unit}]", "MAE [m]", "RMSE [m]", "frames"]
     rows = [
         [name, *(format_value(mae, row[key]) for key in ("held_out_mae", "mae", "rmse")),
          f"{row['frames']:,}"]

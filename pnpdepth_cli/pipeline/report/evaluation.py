@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -118,6 +118,7 @@ def _head(evaluation: Evaluation, columns: list[Column]) -> dict[str, Any]:
             *_bins("By distance to the nearest sparse point", "px", evaluation.by_distance),
             *_bins("By depth of the ground truth", "m", evaluation.by_depth),
         ],
+        "charts": _charts(evaluation),
         "labels": {
             "first": f"Prediction{filled}", "second": "Ground truth", "map": "Error",
             "image": "Image",
@@ -197,6 +198,55 @@ def _uncertainty(evaluation: Evaluation) -> list[dict[str, Any]]:
             sparsification,
         ),
     ]
+
+
+def _charts(evaluation: Evaluation) -> list[dict[str, Any]]:
+    """The calibration plot and the sparsification curve of the predicted standard deviation."""
+    uncertainty = evaluation.uncertainty
+    if uncertainty is None:
+        return []
+    frames = frames_text(uncertainty.frames)
+    observed = _line("observed", uncertainty.expected, uncertainty.observed)
+    charts = [
+        _chart(
+            f"Calibration, {frames}",
+            ("errors within the interval if normal", "observed"),
+            [observed, _line("normal", (0, 1), (0, 1), dashed=True)],
+        )
+    ]
+    whole = uncertainty.sparsification[0]
+    if whole:
+        curves = (
+            [value / whole for value in curve]
+            for curve in (uncertainty.sparsification, uncertainty.oracle)
+        )
+        by_sigma, by_error = curves
+        charts.append(
+            _chart(
+                f"Sparsification, {frames}: AUSE {uncertainty.ause:.4f}",
+                ("pixels removed", "MAE of the others"),
+                [
+                    _line("by σ", uncertainty.removed, by_sigma),
+                    _line("by error (oracle)", uncertainty.removed, by_error, dashed=True),
+                ],
+            )
+        )
+    return charts
+
+
+def _chart(caption: str, titles: tuple[str, str], lines: list[dict[str, Any]]) -> dict[str, Any]:
+    """Lines over fractions from 0 to 1, upwards to 1 or to the highest value."""
+    top = max(1.0, *(y for line in lines for _, y in line["points"]))
+    x_title, y_title = titles
+    return {
+        "caption": caption, "x_title": x_title, "y_title": y_title, "top": top, "lines": lines,
+    }  # fmt: skip
+
+
+def _line(
+    label: str, x: Sequence[float], y: Sequence[float], *, dashed: bool = False
+) -> dict[str, Any]:
+    return {"label": label, "points": list(zip(x, y, strict=True)), "dashed": dashed}
 
 
 def _bins(caption: str, unit: str, bins: tuple[ErrorBin, ...]) -> list[dict[str, Any]]:
