@@ -58,6 +58,7 @@ COMMANDS = {
     "frames": "frames:frames",
     "sample": "sample:sample",
     "simulate": "simulate:simulate",
+    "cloud": "cloud:cloud",
     "eval": "evaluate:evaluate",
     "compare": "compare:compare",
     "sweep": "sweep:sweep",
