@@ -192,7 +192,8 @@ def _score_all(board: _Scoreboard, competition: Competition) -> None:
         start = time.monotonic()
         if competition.deadline is None or start + longest > competition.deadline:
             break
-        board.score(_updates(config))
+        seconds = (competition.deadline - start) / (len(board.folds) + 1)
+        board.score(_updates(config.within(seconds)))
         longest = max(longest, time.monotonic() - start)
     of_networks = [each for config in competition.configs for each in _updates(config)]
     board.score(of_networks)

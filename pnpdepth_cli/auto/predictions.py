@@ -21,11 +21,11 @@ from pnpdepth_cli.choices import BASELINES
 from pnpdepth_cli.completion.interpolation import in_hull
 from pnpdepth_cli.completion.propagation import propagate, propagate_at
 from pnpdepth_cli.core.refine import refine_from
-from pnpdepth_cli.core.split import Split
+from pnpdepth_cli.core.split import InputSplit, Split
 from pnpdepth_cli.errors import PnpDepthError
 from pnpdepth_cli.frames.frame import Frame, RefinedFrame
 from pnpdepth_cli.frames.prepare import PreparedFrame, prepare
-from pnpdepth_cli.frames.refine import to_refined_frame
+from pnpdepth_cli.frames.refine import refine_frame_weights, to_refined_frame
 from pnpdepth_cli.models.network import Network, out_of_memory_is_a_device_error
 from pnpdepth_cli.points import SparsePoints
 
@@ -62,6 +62,14 @@ class SplitCache:
         self._open.close()
         self._split = None
 
+    def at_points(self) -> InputSplit:
+        """Returns the network cut at its sparse depth, open."""
+        if not isinstance(self._split, InputSplit):
+            self.close()
+            self._split = self._open.enter_context(self.network.cut_at_points())
+        assert isinstance(self._split, InputSplit)
+        return self._split
+
     def at(self, layer: str) -> Split:
         """Returns the network cut at the layer, open."""
         if self._split is None or self._split.layer != layer:
@@ -91,8 +99,9 @@ class OpenNetworks:
         self._stack.close()
 
     def split(self, config: RefinementConfig) -> Split:
-        """Returns the configuration's network cut at its layer, open."""
-        return self._caches[config.network].at(config.layer)
+        """Returns the configuration's network cut at its layer or its sparse depth, open."""
+        cache = self._caches[config.network]
+        return cache.at_points() if config.settings.masked else cache.at(config.layer)
 
 
 class FramePasses:
@@ -119,6 +128,8 @@ class FramePasses:
             if not len(prepared.points):
                 raise prepared.no_points_error()
             split = self._opened.split(config)
+            if config.settings.moves_weights:
+                return _of_weights(split, prepared, config)
             key = (config.network, config.layer)
             z0 = self._z0.get(key)
             if z0 is None:
@@ -155,6 +166,17 @@ def _trajectory(
     }
     refinement = replace(refined.refinement, depths={})
     return Trajectory(depths=depths, frame=replace(refined, refinement=refinement))
+
+
+def _of_weights(split: Split, prepared: PreparedFrame, config: RefinementConfig) -> Trajectory:
+    """The plain depth and that of the best weights."""
+    reader = prepared.depth_reader(config.settings)
+    result = refine_frame_weights(split, config.settings, prepared, reader)
+    refined = to_refined_frame(prepared, reader, result)
+    if isinstance(refined, PnpDepthError):
+        raise refined
+    plain, best = (torch.from_numpy(depth) for depth in (refined.before, refined.after))
+    return Trajectory(depths={0: plain, config.settings.iterations: best}, frame=refined)
 
 
 class CandidateDepths:
