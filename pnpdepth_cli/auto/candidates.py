@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from pnpdepth_cli.core.refine import RefineSettings
 from pnpdepth_cli.models.definition import ModelDefinition
 
-ITERATIONS = (1, 2, 3, 5, 10, 20)
+ITERATIONS = (5, 10)
 """Numbers of updates of z that compete, besides a configuration's own."""
 FUSED_ITERATIONS = 5
 """Updates of z before propagation. More fit what propagation fits anyway."""
