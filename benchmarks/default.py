@@ -41,6 +41,8 @@ from pnpdepth_cli.models.network import Network
 from pnpdepth_cli.pipeline.refinement.refine import refiner_of
 from pnpdepth_cli.pipeline.refinement.request import MethodOptions, RefineRequest
 from pnpdepth_cli.pipeline.refinement.resolve import resolve_settings
+from pnpdepth_cli.points import SparsePoints
+from pnpdepth_cli.sensors import occluded_in_map
 
 ROOMS = ("7scenes", "icl_nuim")
 COUNTS = (20, 100, 500)
@@ -73,6 +75,10 @@ def measure(network: Network, frame: EvalFrame, count: int | None, seed: int) ->
     """MAE and RMSE of every column on one frame, the choice, and its time."""
     rows, columns, depth = frame_pixels(frame, count, seed)
     points = points_on_grid(rows, columns, depth, frame.gt.shape)
+    if count is None:  # as the commands read a projected scan
+        arrays = SparsePoints(xy=points.xy.numpy(), depth=points.depth.numpy(), size=points.size)
+        hidden = occluded_in_map(arrays)
+        points = points if hidden is None else points.select(torch.from_numpy(~hidden))
     inputs = frame_inputs(frame.rgb, points, frame.gt)
     refiner = refiner_of(RefineRequest(), [network], inputs)
     assert refiner.competition is not None

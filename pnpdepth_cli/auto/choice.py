@@ -133,7 +133,7 @@ class Competition:
     @property
     def fusion(self) -> Candidate:
         """All networks fused; it also continues baselines outside the hull of the points."""
-        return fusion(self.members, [1.0] * len(self.members), self._propagate)
+        return fusion(self.members, [each.weight for each in self.configs], self._propagate)
 
     @property
     def members(self) -> list[Candidate]:

@@ -57,6 +57,7 @@ _NEIGHBOURHOODS = 24  # in which the length scales are tried, when there are man
 _INNER = 16  # and points of each that are left out: the middle ones
 _IN_BLOCK = 3  # a block contains at most 1/3 of the points that predict it,
 _MIN_BLOCK = 8  # pixels, a block's side
+_WORTH_A_GRID = 1 << 16  # pixels; for fewer, every pixel is predicted
 _NODES_BETWEEN = 6  # nodes of the grid between two points,
 _MAX_STEP = 4  # and most pixels between two nodes: on real frames as good as every pixel
 _CROWDED = 0.05  # except for this fraction of all points
@@ -169,6 +170,8 @@ def _predict(field: ResidualField, *, sigma: bool) -> Tensor:
 
 def _step(points: SparsePoints) -> int:
     """Pixels between the nodes of the grid on which the residual is predicted."""
+    if points.size[0] * points.size[1] < _WORTH_A_GRID:
+        return 1
     spacing = math.sqrt(points.size[0] * points.size[1] / len(points))
     return min(_MAX_STEP, max(1, int(spacing / _NODES_BETWEEN)))
 
