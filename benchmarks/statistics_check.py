@@ -1,51 +1,67 @@
 """Simulates the type-1 error of `compare` and the coverage of the intervals of `eval`.
 
-    python -m benchmarks.statistics_check --trials 1000
+    python -m benchmarks.statistics_check --trials 10000
 
 Type-1 error: two runs are equally good, and p < 0.05 should come in 5 % of the trials. The errors
 of a run are independent, skewed, or autocorrelated within each sequence, AR(1). Coverage: the 95 %
-interval of a mean should hold the true mean in 95 % of the trials.
+interval of a mean should hold the true mean in 95 % of the trials. Trials are columns of the tables
+that `compare` and `eval` resample, so that thousands are tested in one call.
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Sequence
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from pnpdepth_cli.pipeline.evaluation.averages import FrameTable
-from pnpdepth_cli.pipeline.evaluation.dependence import find_clusters
+from pnpdepth_cli.pipeline.evaluation.dependence import find_clusters, independent_frames
 from pnpdepth_cli.pipeline.evaluation.resampling import sign_flip_p_values, studentised_interval
 
 Floats = NDArray[np.float64]
 Draw = Callable[[np.random.Generator, int, int], Floats]
 
 ALPHA = 0.05
-SIGMA = 0.5
-"""Standard deviation of the logarithm of lognormal errors."""
+SWAPS = 4999
+"""Random swaps of a test; up to 12 clusters are tested exactly."""
+_TEST_COLUMNS, _INTERVAL_COLUMNS = 250, 20
+"""Trials that share their random numbers."""
 
 
-def normal(rng: np.random.Generator, groups: int, frames: int) -> Floats:
-    """Returns (groups, frames) independent normal errors."""
-    return rng.normal(size=(groups, frames))
+def normal(rng: np.random.Generator, sequences: int, frames: int) -> Floats:
+    """Returns (sequences, frames) independent normal errors of mean 0."""
+    return rng.normal(size=(sequences, frames))
 
 
-def skewed(rng: np.random.Generator, groups: int, frames: int) -> Floats:
-    """Returns (groups, frames) independent lognormal errors."""
-    return rng.lognormal(0, SIGMA, (groups, frames))
+def lognormal(sigma: float) -> Draw:
+    """Returns a function that draws independent errors of mean 1 whose logarithm deviates sigma."""
+
+    def draw(rng: np.random.Generator, sequences: int, frames: int) -> Floats:
+        return rng.lognormal(-(sigma**2) / 2, sigma, (sequences, frames))
+
+    return draw
+
+
+skewed = lognormal(0.5)
 
 
 def autoregression(correlation: float) -> Draw:
     """Returns a function that draws errors with this lag-1 autocorrelation in each sequence."""
 
-    def draw(rng: np.random.Generator, groups: int, frames: int) -> Floats:
-        noise = rng.normal(size=(groups, frames + 100))
+    def draw(rng: np.random.Generator, sequences: int, frames: int) -> Floats:
+        noise = rng.normal(size=(sequences, frames + 100))
         return np.asarray(lfilter([1.0], [1.0, -correlation], noise, axis=1)[:, 100:])
 
     return draw
+
+
+def drifting(rng: np.random.Generator, sequences: int, frames: int) -> Floats:
+    """Returns (sequences, frames) errors of a slow drift under independent noise."""
+    return autoregression(0.9)(rng, sequences, frames) + 1.5 * normal(rng, sequences, frames)
 
 
 ERRORS: dict[str, Draw] = {
@@ -53,13 +69,18 @@ ERRORS: dict[str, Draw] = {
     "lognormal": skewed,
     "AR(1) 0.5": autoregression(0.5),
     "AR(1) 0.9": autoregression(0.9),
+    "drift + noise": drifting,
 }
+SIZES = ((8, 12), (12, 12), (20, 10), (100, 1), (1, 30), (1, 100), (1, 400), (1, 1000))
+"""(groups, frames of each)."""
 
 
 def type_1_error(
-    draw: Draw, groups: int, frames: int, *, trials: int, grouped: bool, seed: int = 0
-) -> float:
-    """Returns the fraction of trials with p < ALPHA for two equally good runs.
+    draw: Draw, groups: int, frames: int, *, trials: int, grouped: bool = True, seed: int = 0
+) -> tuple[float, float]:
+    """Returns the fraction of equally good pairs of runs with p < ALPHA, and of testable ones.
+
+    A trial is testable if its clusters are enough for p < ALPHA.
 
     Args:
         draw: Draws the errors of a run.
@@ -71,52 +92,89 @@ def type_1_error(
     """
     rng = np.random.default_rng(seed)
     names = [f"{group}" for group in range(groups) for _ in range(frames)]
-    rejected = 0
-    for trial in range(trials):
-        change = (draw(rng, groups, frames) - draw(rng, groups, frames)).reshape(-1, 1)
-        ids = find_clusters(names, change).ids if grouped else np.arange(len(change))
-        sums = FrameTable(rows=change).cluster_totals(ids)[:, :1]
+    runs = [draw(rng, trials * groups, frames).reshape(trials, -1) for _ in range(2)]
+    changes = runs[1] - runs[0]
+    rejected = testable = 0
+    for part, (ids, columns) in enumerate(_by_clusters(changes, names, grouped=grouped)):
+        totals = FrameTable(rows=changes[columns].T).cluster_totals(ids)[:, :-1]
+        p_values, _ = sign_flip_p_values(
+            lambda flips, totals=totals: (1 - 2 * flips) @ totals, len(totals), SWAPS, seed=part
+        )
+        rejected += int((p_values < ALPHA).sum())
+        testable += len(columns) * (2.0 ** (1 - len(totals)) < ALPHA)
+    return rejected / trials, testable / trials
 
-        def difference(flips: Floats, sums: Floats = sums) -> Floats:
-            return (1 - 2 * flips) @ sums
 
-        (p_value,), _ = sign_flip_p_values(difference, len(sums), 999, seed=trial)
-        rejected += p_value < ALPHA
-    return rejected / trials
+def _by_clusters(
+    changes: Floats, names: Sequence[str], *, grouped: bool
+) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
+    """(clusters of the frames, a few trials that have these)."""
+    by_count: dict[int, list[int]] = defaultdict(list)
+    ids_of = {}
+    for trial, change in enumerate(changes):
+        if not grouped:
+            clusters = independent_frames(len(names))
+        elif trial == 0 or len(set(names)) == 1:
+            clusters = find_clusters(names, change[:, None])
+        by_count[clusters.count].append(trial)
+        ids_of[clusters.count] = clusters.ids
+    for count, members in by_count.items():
+        for start in range(0, len(members), _TEST_COLUMNS):
+            yield ids_of[count], np.array(members[start : start + _TEST_COLUMNS])
 
 
-def interval_coverage(frames: int, *, trials: int, resamples: int = 1000, seed: int = 0) -> float:
-    """Returns the fraction of 95 % intervals of lognormal errors that hold the true mean."""
+def interval_coverage(
+    draw: Draw, frames: int, *, trials: int, resamples: int = 1000, mean: float = 1.0, seed: int = 0
+) -> float:
+    """Returns the fraction of 95 % intervals of independent frames that hold the true mean.
+
+    Args:
+        draw: Draws the errors.
+        frames: Of each trial.
+        trials: How many intervals.
+        resamples: Bootstrap samples behind each.
+        mean: The true mean of the errors.
+        seed: Of the trials.
+    """
     rng = np.random.default_rng(seed)
-    mean = np.exp(SIGMA**2 / 2)
     covered = 0
-    for trial in range(trials):
-        table = FrameTable(rows=rng.lognormal(0, SIGMA, (frames, 1)))
+    for start in range(0, trials, _INTERVAL_COLUMNS):
+        columns = min(_INTERVAL_COLUMNS, trials - start)
+        table = FrameTable(rows=draw(rng, columns, frames).T)
         totals = table.cluster_totals(np.arange(frames))
-        low, high = studentised_interval(table.means_of, totals, resamples, seed=trial)
-        covered += bool(low[0] <= mean <= high[0])
+        low, high = studentised_interval(table.means_of, totals, resamples, seed=start)
+        covered += int(((low <= mean) & (mean <= high)).sum())
     return covered / trials
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Prints both tables."""
+    """Prints both tables as Markdown."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--trials", type=int, default=1000)
+    parser.add_argument("--trials", type=int, default=10_000)
     trials = parser.parse_args(arguments).trials
     error = (0.05 * 0.95 / trials) ** 0.5
-    print(f"{trials:,} trials; standard error of a fraction of 5 %: {error:.1%}\n")
-    print("type-1 error at p < 0.05     groups × frames   by group   frames as independent")
+    print(f"{trials:,} trials; standard error of a fraction of 5 %: {error:.2%}\n")
+    print("| errors |" + "".join(f" {g} × {n} |" for g, n in SIZES) + " 20 × 10, no groups |")
+    print("|---" * (len(SIZES) + 2) + "|")
     for name, draw in ERRORS.items():
-        for groups, frames in ((8, 12), (20, 10), (100, 1), (1, 100)):
-            by_group, independent = (
-                type_1_error(draw, groups, frames, trials=trials, grouped=grouped)
-                for grouped in (True, False)
-            )
-            size = f"{groups} × {frames}"
-            print(f"{name:<28} {size:>15} {by_group:>10.1%} {independent:>23.1%}")
-    print(f"\n95 % interval of lognormal errors (σ {SIGMA})   coverage")
-    for frames in (5, 8, 12, 20, 50, 100):
-        print(f"{frames:>3} frames {interval_coverage(frames, trials=trials):>40.1%}")
+        cells = [_cell(*type_1_error(draw, *size, trials=trials)) for size in SIZES]
+        cells.append(_cell(*type_1_error(draw, 20, 10, trials=trials, grouped=False)))
+        print(f"| {name} | {' | '.join(cells)} |", flush=True)
+    frames = (5, 6, 8, 10, 12, 20, 50, 100)
+    print("\n| errors |" + "".join(f" {n} frames |" for n in frames))
+    print("|---" * (len(frames) + 1) + "|")
+    for name, draw, mean in (
+        ("normal", normal, 0.0),
+        ("lognormal, σ 0.5", skewed, 1.0),
+        ("lognormal, σ 1", lognormal(1.0), 1.0),
+    ):
+        cells = [f"{interval_coverage(draw, n, trials=trials, mean=mean):.1%}" for n in frames]
+        print(f"| {name} | {' | '.join(cells)} |", flush=True)
+
+
+def _cell(rejected: float, testable: float) -> str:
+    """The type-1 error, and where not all trials could be tested, how many could."""
+    return f"{rejected:.1%}" + ("" if testable == 1 else f" ({testable:.0%} testable)")
 
 
 if __name__ == "__main__":

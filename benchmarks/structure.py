@@ -4,7 +4,7 @@
     python -m benchmarks.structure OLD . --markdown
 
 Trees are folders with `pnpdepth_cli` and `model_zoo_defs`. Hops are the functions of the package on
-the stack from the command `refine` to the loop of equation 3, without the cut, on the sample frame.
+the stack from `refine` (`--preset paper`) to equation 3, without the cut, on the sample frame.
 """
 
 from __future__ import annotations
@@ -138,10 +138,14 @@ def hops_of(tree: Path) -> list[str]:
     """Returns the functions on the stack from the command to the gradient, outermost first."""
     sample = tree / "samples" / "indoor"
     command = ["refine", str(sample / "rgb.png"), "--sparse", str(sample / "sparse.png")]
+    choices = tree / "pnpdepth_cli" / "choices.py"
+    if choices.is_file() and "PRESETS" in choices.read_text(encoding="utf-8"):
+        command += ["--preset", "paper"]
     with tempfile.TemporaryDirectory() as folder:
         done = subprocess.run(
             [sys.executable, "-c", _HOPS, *command, "-o", f"{folder}/depth.npy"],
             env={**os.environ, "PYTHONPATH": str(tree)},
+            cwd=folder,
             capture_output=True,
             text=True,
             check=False,

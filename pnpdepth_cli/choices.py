@@ -196,7 +196,7 @@ LAYOUTS = Table(
     noun="layout",
     first=(
         *("manifest", "nyu-mat", "kitti-odometry", "kitti-object", "kitti-depth", "tum"),
-        *("7scenes", "synthia", "pairs", "nyu-h5"),
+        *("7scenes", "synthia", "colmap", "pairs", "nyu-h5"),
     ),
 )
 """Data set layouts, in the order in which they are guessed: `pnpdepth_cli.io.layouts.Layout`."""
@@ -210,8 +210,14 @@ PATTERNS = ("uniform", "bernoulli", "grid", "lines", "features", "edges", "regio
 SENSORS = ("vlp-16", "vlp-32c", "hdl-32e", "hdl-64e")
 """LiDARs by data sheet; `pnpdepth_cli.sensors.LIDARS` has the paper's of each as "paper-<name>"."""
 
-EVAL_PROTOCOLS = ("paper", "nyu", "kitti", "kitti-devkit", "eigen", "garg")
-"""Published ways to score depth: `pnpdepth_cli.pipeline.evaluation.protocols.PROTOCOLS`."""
+LENSES = (
+    *("radial-tangential", "fisheye", "fov", "thin-prism-fisheye", "rad-tan-thin-prism-fisheye"),
+    *("division", "eucm"),
+)
+"""Lens distortions: `pnpdepth_cli.sensors.lens`."""
+
+EVAL_PROTOCOLS = ("paper", "nyu-eigen", "kitti", "kitti-devkit", "eigen", "garg")
+"""Published protocols of scoring depth: `pnpdepth_cli.pipeline.evaluation.protocols.PROTOCOLS`."""
 
 AVERAGES = ("per-image", "pooled")
 """How errors are averaged: every image or every pixel has equal weight."""

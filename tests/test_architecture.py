@@ -13,12 +13,13 @@ from pnpdepth_cli.cli.main import COMMANDS
 
 ROOT = Path(__file__).parent.parent
 PACKAGE = ROOT / "pnpdepth_cli"
-GROUND_FLOOR = {"errors", "choices", "points", "budget"}
+GROUND_FLOOR = {"errors", "choices", "points", "budget", "scan_pattern"}
 MAY_IMPORT = {
     "errors": set(),
     "choices": {"errors"},
     "budget": {"errors"},
     "points": {"errors"},
+    "scan_pattern": {"errors"},
     "core": GROUND_FLOOR,
     "sensors": GROUND_FLOOR,
     "io": GROUND_FLOOR,

@@ -25,7 +25,7 @@ CAUTION = 1.5
 """Standard errors by which anything but the default has to be better. 1 to 2 were alike on the even
 frames of ICL-NUIM, 7-Scenes and KITTI, 0 was worse."""
 ENOUGH_FOR_BOUND = 60
-"""From so many held-out points on, the result is never worse than a baseline at them. Fewer say less
+"""From so many held-out points on, the result is never worse than a baseline there. Fewer say less
 of a baseline than one standard error: with 20 points a strict bound cost up to 20 % of the MAE."""
 _ROUNDING = 1e-6
 

@@ -3,8 +3,9 @@
 A held-out point must be as far from the remaining points as an ordinary pixel is from all points,
 or the score is that of something else than the image's depth. Points at random pixels are so by
 themselves. LiDAR points lie close together along a scan line and far apart across; held out one by
-one, each would be predicted from its neighbour on the line. There whole cells of a grid are held
-out (blocked cross-validation, Roberts et al. 2017), as large as makes the distances agree.
+one, each would be predicted from its neighbour on the line. There whole scan lines are held out.
+Of other clustered points whole cells of a grid are held out (blocked cross-validation, Roberts et
+al. 2017), as large as makes the distances agree.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from torch import Tensor
 
 from pnpdepth_cli.completion.interpolation import nearest_points
 from pnpdepth_cli.points import SparsePoints
+from pnpdepth_cli.scan_pattern import scan_lines
 
 _GROWTH = 1.5  # of a cell's side from trial to trial
 _MAX_SIDE = 0.25  # of a cell, as a fraction of the image's shorter side
@@ -26,7 +28,8 @@ _SLACK = 1.15  # a cell need not be larger for the last few per cent of distance
 def spatial_folds(points: SparsePoints, folds: int, *, seed: int = 0) -> Tensor:
     """Returns (N,) int64, the fold 0 … folds − 1 of each point; folds are about equally large.
 
-    With fewer points than folds every point has a fold of its own.
+    With fewer points than folds every point has a fold of its own. Neighbouring scan lines of a
+    LiDAR are in different folds.
 
     Args:
         points: Sparse depth.
@@ -34,6 +37,10 @@ def spatial_folds(points: SparsePoints, folds: int, *, seed: int = 0) -> Tensor:
         seed: Of the random division.
     """
     generator = torch.Generator().manual_seed(seed)
+    line = scan_lines(points.xy.cpu().numpy(), points.size)
+    if line is not None:
+        first = torch.randint(folds, (1,), generator=generator)
+        return (torch.from_numpy(line) + first) % folds
     target = _distance_of_pixels(points, generator)
     side, best = 0.0, _folds_of_cells(points, 0.0, folds, generator)
     while _distance_held_out(points, best, generator) * _SLACK < target:

@@ -35,7 +35,7 @@ _STOPPING = b"\nfinishing the current frame; press Ctrl-C again to stop at once\
     ),
     groups={
         "Frames": ("--layout", "--protocol", "--sample", "--limit", "--shard"),
-        "Input": (*grouped_help.LIDAR, *grouped_help.FILE_READING),
+        "Input": (*grouped_help.LIDAR, *grouped_help.COLMAP, *grouped_help.FILE_READING),
         "Network": grouped_help.NETWORK,
         "Method": grouped_help.METHOD,
         "Output": (*grouped_help.OUTPUT, "--html"),
@@ -158,4 +158,4 @@ def _finishing_on_interrupt() -> Iterator[Callable[[], bool]]:
 def _sample(text: str) -> tuple[str, int | None, float | None]:
     """Returns (pattern, count, fraction) from `500`, `5%` or `lines:16`."""
     kind, colon, count = text.rpartition(":")
-    return kind if colon else "uniform", *options.count_or_share(count)
+    return kind if colon else "uniform", *options.count_or_fraction(count)

@@ -29,8 +29,19 @@ from pnpdepth_cli.cli import options
     markdown="Write the table as Markdown.",
     latex="Write it as a tabular.",
 )
+@click.option(
+    "--all",
+    "all_measures",
+    is_flag=True,
+    help="Compare all measures, not only RMSE, MAE, MRE and δ1.",
+)
 def compare(
-    runs: tuple[str, ...], resamples: int, seed: int, no_groups: bool, **table_files: Any
+    runs: tuple[str, ...],
+    resamples: int,
+    seed: int,
+    no_groups: bool,
+    all_measures: bool,
+    **table_files: Any,
 ) -> None:
     """Compare RUNs with the first of them, on the frames that all of them scored.
 
@@ -53,7 +64,13 @@ def compare(
     tables = score_tables.TableFiles(**table_files)
     tables.check([Path(run) for run in runs])
     comparison = compare_runs(
-        CompareRequest(paths=runs, resamples=resamples, seed=seed, grouped=not no_groups)
+        CompareRequest(
+            paths=runs,
+            resamples=resamples,
+            seed=seed,
+            grouped=not no_groups,
+            all_measures=all_measures,
+        )
     )
     score_tables.print_notes(comparison.notes)
     table = score_files.comparison_table(comparison)

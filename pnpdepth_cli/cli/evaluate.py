@@ -12,6 +12,7 @@ import click
 from pnpdepth_cli.choices import (
     AVERAGES,
     EVAL_PROTOCOLS,
+    FRAME_PROTOCOLS,
     MISSING,
     PREDICTION_KINDS,
     RESIZES,
@@ -23,9 +24,12 @@ from pnpdepth_cli.cli.progress import progress_bar
 from pnpdepth_cli.errors import FramesFailedError, UsageError
 
 if TYPE_CHECKING:
+    _Choice = click.Choice[str]
     from pnpdepth_cli.pipeline.evaluation.result import EvalRequest
+else:
+    _Choice = click.Choice  # not generic before click 8.2
 
-_REQUEST_OPTIONS = ("sparse", "protocol", "resamples", "seed", "workers")
+_REQUEST_OPTIONS = ("sparse", "protocol", "layout_protocol", "resamples", "seed", "workers")
 """Options that are fields of `EvalRequest`."""
 _SCALE_OPTIONS = {
     "prediction": "pred_scale",
@@ -34,6 +38,13 @@ _SCALE_OPTIONS = {
     "channel": "channel",
 }
 """Options by the field of `Scales` that they set."""
+
+
+class _ProtocolName(_Choice):
+    """A protocol; `nyu`, the former name of `nyu-eigen`, is accepted."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
+        return super().convert("nyu-eigen" if value == "nyu" else value, param, ctx)
 
 
 @click.command(
@@ -49,8 +60,15 @@ _SCALE_OPTIONS = {
     ),
     groups={
         "Input": (
-            *("--pred-scale", "--gt-scale", "--pred-kind", "--channel", "--resize", "--mask"),
-            *("--sparse", "--sparse-scale", "--workers", "--max-pixels"),
+            *("--pred-scale", "--gt-scale", "--pred-kind", "--channel", "--resize", "--pred-crop"),
+            *(
+                "--mask",
+                "--layout-protocol",
+                "--sparse",
+                "--sparse-scale",
+                "--workers",
+                "--max-pixels",
+            ),
         ),
         "Protocol": (
             *("--protocol", "--min-depth", "--max-depth", "--clip", "--crop", "--average"),
@@ -64,7 +82,7 @@ _SCALE_OPTIONS = {
 @click.argument("truth", type=options.FILE, metavar="GT")
 @click.option(
     "--protocol",
-    type=click.Choice(EVAL_PROTOCOLS),
+    type=_ProtocolName(EVAL_PROTOCOLS),
     default="paper",
     show_default=True,
     help="Preset of the options below.",
@@ -110,6 +128,17 @@ _SCALE_OPTIONS = {
     "--resize",
     type=click.Choice(RESIZES),
     help="Resize predictions to the size of the ground truth.",
+)
+@click.option(
+    "--pred-crop",
+    "prediction_crop",
+    metavar="kb|X,Y,W,H",
+    help="Part of the frame that predictions show, such as the 1216×352 of KITTI's benchmark.",
+)
+@click.option(
+    "--layout-protocol",
+    type=click.Choice(FRAME_PROTOCOLS),
+    help="Crop of the frames of a data set GT, as in batch.  [default: the layout's own]",
 )
 @click.option(
     "--sparse",
@@ -167,7 +196,7 @@ def evaluate(prediction: Path, truth: Path, html: Path | None, **given: Any) -> 
 
     \b
     paper         all known ground truth; mean over images
-    nyu           0.001–10 m, predictions clipped to it, Eigen's crop of 640×480
+    nyu-eigen     0.001–10 m, predictions clipped to it, Eigen's crop of 640×480
     kitti         measures and units of the KITTI depth completion benchmark
     kitti-devkit  figures of KITTI's development kit: missing depth filled in, metres, 1/m
     eigen, garg   0.001–80 m, predictions clipped to it, Eigen's or Garg's crop

@@ -15,9 +15,19 @@ OTHER = "Other"
 """Title of the options that no group lists."""
 
 LIDAR = (
-    *("--calib", "--camera", "--range", "--keep-occluded", "--min-range", "--max-range"),
+    *(
+        "--calib",
+        "--extrinsics",
+        "--inverse-extrinsics",
+        "--camera",
+        "--range",
+        "--keep-occluded",
+        "--min-range",
+        "--max-range",
+    ),
     "--point-fields",
 )
+COLMAP = ("--unit-scale", "--min-track", "--max-reprojection")
 FILE_READING = ("--depth-scale", "--gt-scale", "--channel", "--sparse-size-ok", "--max-pixels")
 NETWORK = (
     *("--model", "--checkpoint", "--layer", "--align", "--align-every", "--output-kind"),

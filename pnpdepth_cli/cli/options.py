@@ -21,6 +21,7 @@ from pnpdepth_cli.pipeline.refinement.request import (
     OutputOptions,
     RefineRequest,
 )
+from pnpdepth_cli.pipeline.sparse.colmap_options import ColmapOptions
 from pnpdepth_cli.pipeline.sparse.scan_options import ScanOptions
 
 if TYPE_CHECKING:
@@ -100,7 +101,7 @@ def options_of_groups(
 
 def refinement(command: Callable[..., Any]) -> Callable[..., Any]:
     """Adds the options of how a frame is refined, named as the fields of a `RefineRequest`."""
-    groups = (FrameFiles, NetworkChoice, MethodOptions, HoldOut, OutputOptions)
+    groups = (FrameFiles, ColmapOptions, NetworkChoice, MethodOptions, HoldOut, OutputOptions)
     return models(options_of_groups(*groups, without=["model"])(command))
 
 
@@ -211,6 +212,7 @@ def request_of(given: dict[str, Any], **others: Any) -> RefineRequest:
         **others: Other fields of the request.
     """
     scan_options = ScanOptions(**taken(ScanOptions, given))
+    others |= {"colmap": ColmapOptions(**taken(ColmapOptions, given))}
     if isinstance(given.get("model"), tuple):  # of the commands that take several
         first, *more = given["model"]
         others |= {"model": first, "more_models": tuple(more)}
@@ -238,6 +240,6 @@ def height_and_width(text: str) -> tuple[int, int]:
     return int(height), int(width)
 
 
-def count_or_share(text: str | None) -> tuple[int | None, float | None]:
+def count_or_fraction(text: str | None) -> tuple[int | None, float | None]:
     """Returns (count, None) for `500`, (None, fraction) for `5%`. Raises UsageError otherwise."""
-    return (None, None) if text is None else request.count_or_share(text)
+    return (None, None) if text is None else request.count_or_fraction(text)

@@ -16,7 +16,13 @@ from pnpdepth_cli.cli.progress import progress_bar
     cls=grouped_help.GroupedCommand,
     common=grouped_help.COMMON,
     groups={
-        "Input": ("--sparse", "--gt", *grouped_help.LIDAR, *grouped_help.FILE_READING),
+        "Input": (
+            "--sparse",
+            "--gt",
+            *grouped_help.LIDAR,
+            *grouped_help.COLMAP,
+            *grouped_help.FILE_READING,
+        ),
         "Network": grouped_help.NETWORK,
         "Method": grouped_help.METHOD,
         "Output": grouped_help.OUTPUT,
@@ -27,8 +33,8 @@ from pnpdepth_cli.cli.progress import progress_bar
     "--sparse",
     type=options.FILE,
     required=True,
-    help="Sparse depth: a map (16-bit PNG, EXR, NPY, NPZ, PFM, TIFF), points x y depth (NPY, CSV),"
-    " or with --calib a LiDAR scan (BIN, NPY, PCD, PLY).",
+    help="Sparse depth: a map (16-bit PNG, EXR, NPY, …), points x y depth (NPY, CSV), a LiDAR scan"
+    " with --calib (BIN, NPY, PCD, PLY), or the folder of a COLMAP model.",
 )
 @options.scan
 @click.option("--gt", type=options.FILE, help="Ground truth depth to score against.")

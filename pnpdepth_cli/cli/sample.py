@@ -79,14 +79,14 @@ def sample(count: str | None, region: str | None, as_json: bool, **given: Any) -
     from pnpdepth_cli.cli.tables import print_sparse
     from pnpdepth_cli.pipeline.sparse.sample import SampleRequest, sample_depth
 
-    points, fraction = options.count_or_share(count)
+    points, fraction = options.count_or_fraction(count)
     target = options.sparse_target(given)
     noise = {key: given.pop(name) for key, name in _NOISE.items()}
     record = sample_depth(
         SampleRequest(
             target=target,
             count=points,
-            share=fraction,
+            fraction=fraction,
             region=_region(region) if region else None,
             noise=noise,
             **given,

@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 _ALL_FRAMES_SHOWN = 12
 _WORST_SHOWN = 5
 _FRAME_COLUMNS = 6
+_LABEL_LETTERS = 36
 
 
 def print_notes(notes: Sequence[str]) -> None:
@@ -121,24 +122,23 @@ def print_comparison(comparison: Comparison) -> None:
     base, *others = comparison.runs
     frames = len(comparison.names)
     table = _table(f"the {f'{frames:,} frames' if frames > 1 else 'frame'} that all runs have")
-    table.add_column("")
-    table.add_column(_one_line(base.label), justify="right")
-    for run in others:
-        table.add_column(_one_line(run.label), justify="right")
-        for title in ("gain", "95 % of the gain", "p"):
-            table.add_column(title, justify="right")
+    for title in ("", "run", "mean", "gain", "95 % of the gain", "p"):
+        table.add_column(title, justify="left" if title in ("", "run") else "right")
     for measure in comparison.measures:
         unit = f" [dim]{unit_of(measure)}[/]" if unit_of(measure) else ""
-        cells = [f"{measure.title}{unit}", format_value(measure, base.mean[measure.key])]
+        first = format_value(measure, base.mean[measure.key])
+        table.add_row(f"{measure.title}{unit}", _short(base.label), first, *["–"] * 3)
         for run, gains in zip(others, comparison.gains, strict=True):
             gain = gains[measure.key]
-            cells += [
+            table.add_row(
+                "",
+                _short(run.label),
                 format_value(measure, run.mean[measure.key]),
                 _coloured(gain.percent, significant=gain.p_adjusted < 0.05),
                 _range(gain.low_percent, gain.high_percent),
                 _p_value(gain.p_adjusted),
-            ]
-        table.add_row(*cells)
+            )
+        table.add_section()
     how = "all swaps" if comparison.exact else f"{comparison.resamples:,} random swaps"
     _print(console, table)
     caption = (
@@ -147,6 +147,12 @@ def print_comparison(comparison: Comparison) -> None:
         " (Holm)"
     )
     console.print(_one_line(caption), style="dim", soft_wrap=True)
+
+
+def _short(label: str) -> str:
+    """The run's label on one line, with its end if it is long."""
+    text = printable(label)
+    return escape(text if len(text) <= _LABEL_LETTERS else f"…{text[1 - _LABEL_LETTERS :]}")
 
 
 def _means(evaluation: Evaluation) -> Table:

@@ -83,7 +83,7 @@ def simulate(as_json: bool, **given: Any) -> None:
     from pnpdepth_cli.pipeline.sparse.simulate import SimulateRequest, simulate_scan
 
     target = options.sparse_target(given)
-    record = simulate_scan(SimulateRequest(target=target, **given))
+    record = simulate_scan(SimulateRequest.from_fields(target=target, **given))
     if as_json:
         click.echo(json.dumps(record, indent=2))
     else:

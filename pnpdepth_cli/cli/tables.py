@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 from rich.box import SIMPLE_HEAD
@@ -46,9 +47,11 @@ def print_refinement(record: Mapping[str, Any]) -> None:
     table = Table(title=escape(_title(record)))
     for column in _COLUMNS:
         table.add_column(column, justify="left" if not column else "right")
-    _point_rows(table, f"error at {points['used']:,} points used", record["sparse_error"])
+    unit = record["unit"]
+    used = f"error at {points['used']:,} points used"
+    _point_rows(table, used, record["sparse_error"], unit=unit)
     held_out = f"error at {points['held_out']:,} held-out points"
-    _point_rows(table, held_out, record["held_out_error"], beside["held_out_error"])
+    _point_rows(table, held_out, record["held_out_error"], beside["held_out_error"], unit=unit)
     if record["scores"] is not None:
         after = record["scores"]["after"]
         _score_rows(table, record["scores"], beside["scores"])
@@ -57,17 +60,17 @@ def print_refinement(record: Mapping[str, Any]) -> None:
             f" ({after['coverage']:.1%} of those known)"
         )
     elif (folds := beside["folds"]) is not None:
-        _fold_row(table, f"error at {folds['points']:,} points in turn held out, MAE", folds)
+        _fold_row(table, f"error at {folds['points']:,} points in turn held out, MAE", folds, unit)
     console.print(table)
     if beside["worse"]:
         console.print(
             "[yellow]warning: this depth is worse than linear interpolation of the points[/]"
         )
     if record["baselines"] is not None:
-        console.print(_baselines(record["baselines"]))
-    if record["improved_share"] is not None:
+        console.print(_baselines(record["baselines"], unit))
+    if record["improved_fraction"] is not None:
         where = "pixels with ground truth" if record["scores"] else "points"
-        console.print(f"improved: {record['improved_share']:.1%} of the {where}")
+        console.print(f"improved: {record['improved_fraction']:.1%} of the {where}")
     seconds = record["seconds"]
     updates = (
         f"{settings['iterations']} updates ({settings['update']}, {settings['loss']}, step"
@@ -93,7 +96,7 @@ def _title(record: Mapping[str, Any]) -> str:
     return f"{name}, best candidate at held-out points"
 
 
-def _baselines(rows: Mapping[str, Any]) -> Table:
+def _baselines(rows: Mapping[str, Any], unit: str) -> Table:
     """Returns the baselines, the network and the result, best first at the held-out points."""
     with_gt = any(row["scores"] for row in rows.values())
     table = Table(title="against every simple baseline")
@@ -105,10 +108,10 @@ def _baselines(rows: Mapping[str, Any]) -> Table:
     order = sorted(known, key=lambda name: known[name]["held_out_mae"]) or list(rows)
     for name in order:
         row = rows[name]
-        cells = [_metres(row["held_out_mae"])]
+        cells = [_length(row["held_out_mae"], unit)]
         if with_gt:
             scores = row["scores"] or {}
-            cells += [_metres(scores.get(key)) for key in ("mae", "rmse")]
+            cells += [_length(scores.get(key), unit) for key in ("mae", "rmse")]
         table.add_row(name, *cells, style="bold" if name == "result" else None)
     return table
 
@@ -116,15 +119,19 @@ def _baselines(rows: Mapping[str, Any]) -> Table:
 def print_batch(summary: Mapping[str, Any]) -> None:
     """Prints the end of `pnpdepth batch`: mean errors before and after, counts, files."""
     console = Console(stderr=True, highlight=False)
-    mean, counts = summary["mean"], summary["counts"]
+    mean, counts, unit = summary["mean"], summary["counts"], summary["unit"]
     if any(mean.values()):
         table = Table(title="means over frames")
         for column in _COLUMNS:
             table.add_column(column, justify="left" if not column else "right")
         beside = summary["linear"]
-        _point_rows(table, "error at points used", mean["sparse_error"])
+        _point_rows(table, "error at points used", mean["sparse_error"], unit=unit)
         _point_rows(
-            table, "error at held-out points", mean["held_out_error"], beside["held_out_error"]
+            table,
+            "error at held-out points",
+            mean["held_out_error"],
+            beside["held_out_error"],
+            unit=unit,
         )
         if mean["scores"] is not None:
             _score_rows(table, mean["scores"], beside["scores"])
@@ -135,7 +142,7 @@ def print_batch(summary: Mapping[str, Any]) -> None:
             name: {"held_out_mae": row["held_out_mae"], "scores": row}
             for name, row in summary["baselines"].items()
         }
-        console.print(_baselines(rows))
+        console.print(_baselines(rows, unit))
     parts = [f"{counts['done']:,} of {counts['frames']:,} frames done"]
     parts += [
         f"{counts[kind]:,} {kind}" for kind in ("diverged", "failed", "pending") if counts[kind]
@@ -185,7 +192,7 @@ def print_sparse(record: Mapping[str, Any]) -> None:
     points, (width, height) = record["points"], record["size"]
     written = [path for path in record["outputs"].values() if path]
     console.print(
-        f"wrote {points['count']:,} points, {points['share_of_pixels']:.2%} of {width}×{height}"
+        f"wrote {points['count']:,} points, {points['fraction_of_pixels']:.2%} of {width}×{height}"
         f" pixels: {escape('  '.join(written))}",
         soft_wrap=True,
     )
@@ -218,12 +225,14 @@ def _point_rows(
     title: str,
     error: Mapping[str, Any] | None,
     linear: Mapping[str, Any] | None = None,
+    *,
+    unit: str,
 ) -> None:
     if error is not None:
         before, after = error["before"], error["after"]
         for name, key in (("MAE", "mae"), ("RMSE", "rmse")):
             values = before.get(key), after.get(key), (linear or {}).get(key)
-            table.add_row(f"{title}, {name}", *_cells(key, _metres, values))
+            table.add_row(f"{title}, {name}", *_cells(key, partial(_length, unit=unit), values))
 
 
 def _score_rows(table: Table, scores: Mapping[str, Any], linear: Mapping[str, Any] | None) -> None:
@@ -234,9 +243,9 @@ def _score_rows(table: Table, scores: Mapping[str, Any], linear: Mapping[str, An
         table.add_row(title, *_cells(key, show, values))
 
 
-def _fold_row(table: Table, title: str, errors: Mapping[str, float]) -> None:
+def _fold_row(table: Table, title: str, errors: Mapping[str, float], unit: str) -> None:
     values = errors["before"], errors["after"], errors["linear"]
-    table.add_row(title, *_cells("mae", _metres, values))
+    table.add_row(title, *_cells("mae", partial(_length, unit=unit), values))
 
 
 def _cells(
@@ -250,8 +259,8 @@ def _cells(
     return [*shown[:2], _change(key, before, after), shown[2], _change(key, linear, after)]
 
 
-def _metres(value: float | None) -> str:
-    return "–" if value is None or math.isnan(value) else f"{value:.4f} m"
+def _length(value: float | None, unit: str) -> str:
+    return "–" if value is None or math.isnan(value) else f"{value:.4f} {unit}"
 
 
 def _change(key: str, before: float | None, after: float | None) -> str:

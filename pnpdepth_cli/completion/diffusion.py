@@ -44,8 +44,8 @@ def diffuse(field: ResidualField) -> Tensor:
     number = torch.arange(rows * columns).reshape(rows, columns)
     first = torch.cat([number[:, :-1].flatten(), number[:-1].flatten()])
     second = torch.cat([number[:, 1:].flatten(), number[1:].flatten()])
-    looks = nodes.flatten(1).t().double()
-    step = looks[first] - looks[second]
+    node_features = nodes.flatten(1).t().double()
+    step = node_features[first] - node_features[second]
     apart = (step[:, 2] / EDGE_DEPTH).square()
     apart = apart + (step[:, 3:] / EDGE_COLOUR).square().sum(dim=1)
     weight = STIFFNESS / (1 + apart)
@@ -56,14 +56,16 @@ def diffuse(field: ResidualField) -> Tensor:
     middle = float(field.residual.median())
     system = reads.T @ reads + laplacian(adjacent) + _REGULARISATION * eye_array(total)
     right = reads.T @ (field.residual - middle).numpy()
-    # positive definite: its own diagonal will do for pivots, and others would fill the factors
-    found = splu(
+    # The matrix is positive definite: diagonal pivots are stable, and keep the factors sparse.
+    factors = splu(
         csc_array(system),
         permc_spec="MMD_AT_PLUS_A",
         diag_pivot_thresh=0.0,
         options={"SymmetricMode": True},
     )
-    correction = torch.from_numpy(found.solve(right)).float().reshape(1, 1, rows, columns) + middle
+    correction = (
+        torch.from_numpy(factors.solve(right)).float().reshape(1, 1, rows, columns) + middle
+    )
     return F.interpolate(correction, (height, width), mode="bilinear", align_corners=False)[0, 0]
 
 
@@ -84,7 +86,7 @@ def _readings(field: ResidualField, rows: int, columns: int) -> Any:
             bottom * columns + right,
         ]
     )
-    shares = torch.stack([(1 - fx) * (1 - fy), fx * (1 - fy), (1 - fx) * fy, fx * fy])
+    weights = torch.stack([(1 - fx) * (1 - fy), fx * (1 - fy), (1 - fx) * fy, fx * fy])
     which = torch.arange(len(xy)).repeat(4, 1)
-    values = (shares.flatten().numpy(), (which.flatten().numpy(), places.long().flatten().numpy()))
+    values = (weights.flatten().numpy(), (which.flatten().numpy(), places.long().flatten().numpy()))
     return coo_array(values, shape=(len(xy), rows * columns)).tocsr()

@@ -45,7 +45,7 @@ lengths and the least and most noise are there for frames unlike those."""
 NEIGHBOURS = 48
 """Points that predict a block, or a single pixel, where there are many points."""
 MIN_POINTS = 5
-"""Fewer points cannot tell which length scales are best."""
+"""Fewer points do not determine the length scales."""
 DEFAULT_SCALE = 0.2
 """Standard deviation of f with fewer points: typical relative errors of networks."""
 
@@ -109,9 +109,9 @@ def predict_at(field: ResidualField, xy: Tensor, features: Tensor) -> Tensor:
         features: (M, 3 or 6), the features there.
     """
     if _is_exact(field) or len(field.points) <= NEIGHBOURS:
-        return _solve(field, _all_points(field), features[None], False)[0, 0]
+        return _solve(field, _all_points(field), features[None])[0, 0]
     _, near = nearest_points(field.points, xy.double(), NEIGHBOURS)
-    return _solve(field, near, features[:, None], False)[0, :, 0]
+    return _solve(field, near, features[:, None])[0, :, 0]
 
 
 def leave_one_out(
@@ -189,7 +189,7 @@ def _predict_grid(field: ResidualField, *, sigma: bool) -> Tensor:
     return blended.sum(dim=0)
 
 
-def _solve(field: ResidualField, near: Tensor, queries: Tensor, sigma: bool) -> Tensor:
+def _solve(field: ResidualField, near: Tensor, queries: Tensor, sigma: bool = False) -> Tensor:
     """(1 or 2, B, Q) float32: mean and variance at B × Q features, from points near (B, k)."""
     (blocks, count), per_block = near.shape, queries.shape[1]
     result = queries.new_empty(1 + sigma, blocks, per_block)

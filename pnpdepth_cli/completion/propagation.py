@@ -28,7 +28,7 @@ NONE = "none"
 
 @dataclass(frozen=True, kw_only=True)
 class Propagation:
-    """A way to predict the residual away from the points."""
+    """A method that predicts the residual away from the points."""
 
     title: str
     """What it does, in a few words."""

@@ -1,4 +1,4 @@
-"""The residual at the sparse points, and what every pixel looks like.
+"""The residual at the sparse points, and the features of every pixel.
 
 The residual is r = log measured depth − log predicted depth. A propagation predicts it at every
 pixel from the points, by features of the pixels: position, predicted depth and colour.

@@ -116,17 +116,17 @@ class Scores:
 
 def score(
     predicted: Tensor,
-    truth: Tensor,
+    ground_truth: Tensor,
     thresholds: tuple[float, float, float] = DELTA_THRESHOLDS,
 ) -> Scores:
     """Returns the scores of a prediction against the ground truth.
 
     Args:
         predicted: Depth in metres, of any shape; 0, negative or not finite where missing.
-        truth: Ground truth depth of the same shape, likewise.
+        ground_truth: Ground truth depth of the same shape, likewise.
         thresholds: Of δ1 to δ3.
     """
-    (sums,) = error_sums(predicted, truth, thresholds)
+    (sums,) = error_sums(predicted, ground_truth, thresholds)
     values = measures_of(sums).tolist()
     pixels, known = int(sums[SUMS.index("pixels")]), int(sums[SUMS.index("known")])
     return Scores(
@@ -138,7 +138,7 @@ def score(
 
 def error_sums(
     predicted: Tensor,
-    truth: Tensor,
+    ground_truth: Tensor,
     thresholds: tuple[float, float, float] = DELTA_THRESHOLDS,
     part: Tensor | None = None,
     parts: int = 1,
@@ -147,22 +147,22 @@ def error_sums(
 
     Args:
         predicted: Depth as for `score`.
-        truth: Ground truth as for `score`.
+        ground_truth: Ground truth as for `score`.
         thresholds: Of δ1 to δ3.
         part: Number, 0 to parts − 1, of the part that each pixel belongs to, of the image's shape.
             None: the image is one part.
         parts: Number of parts.
     """
-    if predicted.shape != truth.shape:
+    if predicted.shape != ground_truth.shape:
         raise ValueError(
-            f"prediction is {tuple(predicted.shape)}, ground truth {tuple(truth.shape)}"
+            f"prediction is {tuple(predicted.shape)}, ground truth {tuple(ground_truth.shape)}"
         )
-    sums = torch.zeros(parts, len(SUMS), dtype=torch.float64, device=truth.device)
-    predicted, truth = predicted.reshape(-1), truth.reshape(-1)
+    sums = torch.zeros(parts, len(SUMS), dtype=torch.float64, device=ground_truth.device)
+    predicted, ground_truth = predicted.reshape(-1), ground_truth.reshape(-1)
     labels = None if part is None else part.reshape(-1)
-    for start in range(0, truth.numel(), _CHUNK):
+    for start in range(0, ground_truth.numel(), _CHUNK):
         piece = slice(start, start + _CHUNK)
-        p, g = predicted[piece].double(), truth[piece].double()
+        p, g = predicted[piece].double(), ground_truth[piece].double()
         known = g.isfinite() & (g > 0)
         scored = known & p.isfinite() & (p > 0)
         terms = _terms(p[scored], g[scored], thresholds)

@@ -1,4 +1,4 @@
-"""Camera intrinsics and the pose of a scanner: KITTI's calibration files, and plain ones.
+"""Camera intrinsics and the pose of a scanner: of KITTI, OpenCV, ROS, Kalibr, and plain files.
 
 A plain file is JSON, or lines of `name: numbers` in which brackets, commas and list dashes only
 separate, and a value may continue over several lines:
@@ -6,7 +6,8 @@ separate, and a value may continue over several lines:
     K: [721.5, 0, 609.6,  0, 721.5, 172.9,  0, 0, 1]
     R: [[0, -1, 0], [0, 0, -1], [1, 0, 0]]     # x_camera = R · x_scanner + t
     t: [0.06, -0.08, -0.27]
-    distortion: []                             # OpenCV: k1 k2 p1 p2 [k3 [k4 k5 k6]]
+    distortion: []                             # OpenCV: k1 k2 p1 p2 [k3 [k4 k5 k6 …]]
+    lens: radial-tangential                    # or fisheye: OpenCV's k1 k2 k3 k4
     size: [1242, 375]                          # optional: width and height
 
 Nine bare numbers are K alone.
@@ -26,12 +27,15 @@ from numpy.typing import NDArray
 from pnpdepth_cli.errors import FileFormatError, InputError, UsageError
 from pnpdepth_cli.io.file_bytes import check_pixel_count, one_line, read_bytes
 from pnpdepth_cli.io.file_kind import kind_of
+from pnpdepth_cli.io.robot_calibration import camera_in_yaml, is_robot_calibration
+from pnpdepth_cli.io.yaml_file import parse_yaml
 
 CAMERA = 2
 """KITTI's left colour camera, whose images the benchmarks have."""
 
 _RAW_FILES = ("calib_cam_to_cam.txt", "calib_velo_to_cam.txt")
-_PLAIN = {"K": (9,), "R": (9,), "t": (3,), "distortion": (0, 4, 5, 8), "size": (2,)}
+_COEFFICIENTS = {"radial-tangential": (0, 4, 5, 8, 12, 14), "fisheye": (4,)}
+_PLAIN = ("K", "R", "t", "distortion", "lens", "size")
 _SEPARATORS = re.compile(r"[\[\](),;\s]+")
 _FIELD = re.compile(r"^\s*([A-Za-z_]\w*)\s*:(.*)$")
 _ROTATION_TOLERANCE = 1e-3
@@ -55,7 +59,7 @@ class Calibration:
     """(3,) metres, the scanner's origin in the camera's frame."""
 
     distortion: tuple[float, ...]
-    """OpenCV's coefficients, or none."""
+    """Coefficients of the lens, or none."""
 
     size: tuple[int, int] | None
     """(H, W) of the images; None if the file does not give it."""
@@ -66,13 +70,17 @@ class Calibration:
     source: str
     """What was read, for a person."""
 
+    lens: str = "radial-tangential"
+    """One of `choices.LENSES`."""
+
 
 def read_calibration(path: Path, camera: int | None = None) -> Calibration:
     """Returns the calibration in a file, or in a folder of KITTI's raw data.
 
     Args:
         path: File or folder.
-        camera: 0 to 3 of KITTI's; None for 2, the left colour camera.
+        camera: 0 to 3 of KITTI's, None for 2, the left colour camera; or the number of a camera of
+            Kalibr's, None for cam0.
 
     Raises:
         FileFormatError: A matrix is missing, or is not made of numbers that a camera can have.
@@ -82,6 +90,8 @@ def read_calibration(path: Path, camera: int | None = None) -> Calibration:
     if path.is_dir() or path.name in _RAW_FILES:
         return _kitti_raw(path if path.is_dir() else path.parent, camera)
     text = _text(path)
+    if is_robot_calibration(text):
+        return _robot(path, text, camera)
     if text.lstrip().startswith("{"):
         return _plain(path, _json_fields(path, text), camera)
     if not re.search(r"[A-Za-z_]\w*\s*:", text):
@@ -90,6 +100,23 @@ def read_calibration(path: Path, camera: int | None = None) -> Calibration:
     if any(re.fullmatch(r"P\d", name) for name in fields):
         return _kitti(path, fields, camera)
     return _plain(path, fields, camera)
+
+
+def _robot(path: Path, text: str, camera: int | None) -> Calibration:
+    """OpenCV's, ROS's or Kalibr's."""
+    found = camera_in_yaml(path, parse_yaml(path, text), camera)
+    _check_intrinsics(path, found.intrinsics)
+    rotation, translation = found.pose or (np.eye(3), np.zeros(3))
+    return Calibration(
+        intrinsics=found.intrinsics,
+        rotation=rotation,
+        translation=translation,
+        distortion=found.distortion,
+        size=found.size,
+        has_pose=found.pose is not None,
+        source=found.source,
+        lens=found.lens,
+    )
 
 
 def _kitti(path: Path, fields: dict[str, str], camera: int | None) -> Calibration:
@@ -169,14 +196,19 @@ def _plain(path: Path, fields: dict[str, str], camera: int | None) -> Calibratio
     has_pose = "R" in fields
     rotation = _matrix(path, fields, "R", (3, 3)) if has_pose else np.eye(3)
     _check_rotation(path, "R", rotation)
-    lens = (
-        _numbers(path, fields, "distortion", _PLAIN["distortion"]) if "distortion" in fields else []
-    )
+    lens = fields.get("lens", "radial-tangential").strip(" \"'")
+    if lens not in _COEFFICIENTS:
+        raise FileFormatError(
+            f"{path}: lens {one_line(lens)[:40]!r} is not one of {', '.join(_COEFFICIENTS)}"
+        )
+    counts = _COEFFICIENTS[lens]
+    distortion = _numbers(path, fields, "distortion", counts) if "distortion" in fields else []
     return Calibration(
         intrinsics=intrinsics,
         rotation=rotation,
         translation=_matrix(path, fields, "t", (3,)) if has_pose else np.zeros(3),
-        distortion=tuple(lens),
+        distortion=tuple(distortion),
+        lens=lens,
         size=_height_width(path, _numbers(path, fields, "size", (2,)))
         if "size" in fields
         else None,
@@ -230,6 +262,7 @@ def _json_fields(path: Path, text: str) -> dict[str, str]:
 
 
 def _numbers(path: Path, fields: dict[str, str], name: str, counts: Sequence[int]) -> list[float]:
+    """The finite numbers of a field, as many as one of `counts`."""
     if name not in fields:
         raise FileFormatError(
             f"{path} has no {name}; this calibration is incomplete or of another kind"

@@ -20,6 +20,7 @@ def describe_range(
     assumed_scale: bool = False,
     noun: str = "points",
     option: str = "--depth-scale",
+    unit: str = "m",
 ) -> str:
     """Returns a line such as `1,842 points, 2.1–63.4 m (16-bit PNG ÷ 256)`.
 
@@ -29,6 +30,7 @@ def describe_range(
         assumed_scale: Name the option that changes the scale.
         noun: What is counted, in the plural.
         option: That option.
+        unit: Of the depth.
     """
     known = _known(depth)
     hint = f"; {option} to change" if assumed_scale else ""
@@ -37,7 +39,7 @@ def describe_range(
     count = f"{known.size:,} {noun[:-1] if known.size == 1 else noun}"
     low, high = metres(float(known.min())), metres(float(known.max()))
     extent = low if low == high else f"{low}–{high}"
-    return f"{count}, {extent} m ({source}{hint})"
+    return f"{count}, {extent} {unit} ({source}{hint})"
 
 
 def implausible(depth: NDArray[Any], scale: float | None = None) -> str | None:

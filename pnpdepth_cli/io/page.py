@@ -116,13 +116,17 @@ def draw_discs(
     return canvas
 
 
-def depth_page(panels: list[Panel], columns: int, scale: DepthScale) -> PIL.Image.Image:
+def depth_page(
+    panels: list[Panel], columns: int, scale: DepthScale, unit: str = "m"
+) -> PIL.Image.Image:
     """Returns a page of panels, `columns` to a row, with a bar of depth colours to their right."""
     page, draw = _lay_out(panels, columns, legend_width=_LEGEND_WIDTH)
     page.info[_CONTENT_KEY] |= {"low_m": scale.low_m, "high_m": scale.high_m}
     left = page.width - MARGIN - _LEGEND_WIDTH + GAP
     top, bottom = MARGIN + _TITLE_HEIGHT, page.height - MARGIN
-    draw.text((left, MARGIN + 5), "metres", font=_font(_FONT_SIZE), fill=_INK)
+    draw.text(
+        (left, MARGIN + 5), "metres" if unit == "m" else unit, font=_font(_FONT_SIZE), fill=_INK
+    )
     # Far at the top, as on an axis.
     depths = np.linspace(1, 0, bottom - top)
     if scale.logarithmic:

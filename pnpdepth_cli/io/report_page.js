@@ -52,6 +52,7 @@ function fillHead() {
       make("dd", { class: "remark", text: tile.remark })));
   }
   for (const table of data.tables) byId("summary").append(summaryTable(table));
+  for (const chart of data.charts ?? []) byId("summary").append(lineChart(chart));
   for (const [label, text] of data.facts) {
     byId("facts").append(make("dt", { text: label }), make("dd", { text: visible(text) }));
   }
@@ -87,6 +88,33 @@ function svg(tag, attributes, text) {
   if (text !== undefined) element.textContent = text;
   return element;
 }
+
+// Lines from (0, 0) up to (1, top), with their names at the right.
+function lineChart({ caption, x_title: xTitle, y_title: yTitle, top, lines }) {
+  const [W, H, left, right, above, below] = [480, 250, 44, 120, 12, 40];
+  const x = (value) => left + value * (W - left - right);
+  const y = (value) => H - below - (value / top) * (H - above - below);
+  const chart = svg("svg", { viewBox: `0 0 ${W} ${H}`, role: "img", "aria-label": caption });
+  for (let n = 0; n <= 4; n += 1) {
+    const part = n / 4;
+    chart.append(
+      svg("line", { x1: left, x2: W - right, y1: y(part * top), y2: y(part * top), class: "grid" }),
+      svg("text", { x: left - 8, y: y(part * top) + 4, class: "left" }, percent(part * top)),
+      svg("text", { x: x(part), y: H - below + 17 }, percent(part)));
+  }
+  lines.forEach(({ label, points, dashed }, i) => {
+    const path = points.map(([a, b]) => `${x(a).toFixed(1)},${y(b).toFixed(1)}`).join(" ");
+    const kind = dashed ? "line reference" : "line";
+    const at = above + 6 + 18 * i;
+    chart.append(svg("polyline", { points: path, class: kind }),
+      svg("line", { x1: W - right + 8, x2: W - right + 28, y1: at, y2: at, class: kind }),
+      svg("text", { x: W - right + 34, y: at + 4, class: "right" }, label));
+  });
+  chart.append(svg("text", { x: (left + W - right) / 2, y: H - 3 }, `${xTitle}; upwards: ${yTitle}`));
+  return make("figure", { class: "lines" }, chart, make("figcaption", { text: caption }));
+}
+
+const percent = (fraction) => `${Math.round(100 * fraction)} %`;
 
 function roundStep(rough) {
   const power = 10 ** Math.floor(Math.log10(rough));

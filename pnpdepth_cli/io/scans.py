@@ -42,7 +42,7 @@ def read_scan(path: Path, point_fields: int | None = None) -> ScanFile:
 
     Args:
         path: The file; its suffix says the format.
-        point_fields: Float32 numbers of a point in a .bin; None to tell from name and content.
+        point_fields: Float32 numbers of a point in a .bin; None: recognised from name and content.
 
     Raises:
         FileFormatError: The file is damaged, ambiguous, or holds points that are no numbers.
@@ -70,7 +70,7 @@ def read_scan(path: Path, point_fields: int | None = None) -> ScanFile:
     if np.abs(points).max() > _FARTHEST_M:
         raise FileFormatError(
             f"{path}: a coordinate of {np.abs(points).max():.3g} m is none of a scan; its numbers"
-            " are probably stored in another way than the format says"
+            " are probably not stored as the format says"
         )
     return ScanFile(points=points, source=source)
 

@@ -35,6 +35,7 @@ def preview(
     before: Depth,
     after: Depth,
     path: Path,
+    unit: str = "m",
 ) -> None:
     """Writes a PNG of image, sparse depth, depth before and after, in colours of one scale.
 
@@ -45,6 +46,7 @@ def preview(
         before: (H, W) metres before refinement.
         after: (H, W) metres after refinement.
         path: The PNG.
+        unit: Of all depths, where it is not the metre.
 
     Raises:
         SizeError: Image and depth differ in size.
@@ -72,7 +74,7 @@ def preview(
         Panel(title="Depth before", pixels=resized(scale.paint(before), factor)),
         Panel(title="Depth after", pixels=resized(scale.paint(after), factor)),
     ]
-    save_page(depth_page(panels, columns, scale), path)
+    save_page(depth_page(panels, columns, scale, unit), path)
 
 
 def improvement(
@@ -115,7 +117,12 @@ def improvement(
     swatch = None if known.all() else ((52, 52, 52), "no ground truth")
     panel = Panel(title="Change of error", pixels=resized(pixels, factor), remark=_GAIN)
     return _save_gain(
-        panel, gain[known], strongest=strongest, swatch=swatch, noun="pixels", path=path
+        panel,
+        gain[known],
+        amount=f"{strongest:.3g} m or more",
+        swatch=swatch,
+        noun="pixels",
+        path=path,
     )
 
 
@@ -127,6 +134,7 @@ def improvement_at_points(
     after_at: Depth,
     held_out: bool,
     path: Path,
+    unit: str = "m",
 ) -> float:
     """Writes a PNG of where the error at sparse points fell and rose, as discs on the grey image.
 
@@ -138,6 +146,7 @@ def improvement_at_points(
         after_at: (N,) metres after refinement.
         held_out: Whether refinement did not use the points, which the PNG says.
         path: The PNG.
+        unit: Of all depths, where it is not the metre.
 
     Returns:
         The fraction of points whose error fell.
@@ -166,7 +175,8 @@ def improvement_at_points(
     )
     panel = Panel(title="Change of error", pixels=discs, remark=remark)
     noun = "held-out points" if held_out else "points used"
-    return _save_gain(panel, gain, strongest=strongest, swatch=None, noun=noun, path=path)
+    amount = f"{strongest:.3g} {unit} or more"
+    return _save_gain(panel, gain, amount=amount, swatch=None, noun=noun, path=path)
 
 
 def _gain(before: Depth, after: Depth, gt: Depth) -> NDArray[np.float64]:
@@ -189,15 +199,15 @@ def _save_gain(
     panel: Panel,
     gain: NDArray[np.float64],
     *,
-    strongest: float,
+    amount: str,
     swatch: tuple[tuple[int, int, int], str] | None,
     noun: str,
     path: Path,
 ) -> float:
+    """Writes the panel with a colour bar and a footer. Returns the fraction with a gain above 0."""
     improved, worse = float((gain > 0).mean()), float((gain < 0).mean())
     strength = np.linspace(-1, 1, 220)
     bar = np.repeat(paint_gain(strength, np.full(220, 0.88))[None], 18, axis=0)
-    amount = f"{strongest:.3g} m or more"
     footer = f"{100 * improved:.1f} % of {gain.size:,} {noun} improved, {100 * worse:.1f} % worse"
     ends = (f"worse by {amount}", f"better by {amount}")
     save_page(gain_page(panel, bar, ends, swatch, footer), path)

@@ -59,7 +59,7 @@ class AlignedDepth:
         if beyond > 0:
             near, far = made.bounds
             notes.append(
-                f"alignment: {beyond:.2%} of the picture came out nearer than {near:.3g} m or"
+                f"alignment: {beyond:.2%} of the image came out nearer than {near:.3g} m or"
                 f" farther than {far:.3g} m, or at no depth at all, and reads as these bounds"
             )
         stated = self._network.definition.output_kind in SPACES

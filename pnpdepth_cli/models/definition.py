@@ -232,7 +232,7 @@ class ModelDefinition:
     is the tensor itself, or the only tensor in it."""
     verify: Callable[[nn.Module, tuple[Tensor, ...]], str | None] | None = None
     """Called with the network and its arguments for the first frame; returns a note or None, or
-    raises ModelError if the network cannot be trusted."""
+    raises ModelError if the network cannot be verified."""
     assumed: str = ""
     """What was assumed where no definition was given; it is printed."""
 

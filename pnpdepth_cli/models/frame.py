@@ -13,7 +13,7 @@ from pnpdepth_cli.points import SparsePoints
 
 @dataclass(frozen=True, kw_only=True)
 class FrameMap:
-    """How a picture gets into a network: crop a box, resize it, pad right and bottom.
+    """How an image gets into a network: crop a box, resize it, pad right and bottom.
 
     image: (H, W). crop: (top, left, height, width) in the image. resized: what the crop becomes.
     network: (h, w), the resized crop with padding.
@@ -47,15 +47,13 @@ class FrameMap:
     def rgb_to_network(self, rgb: Tensor) -> Tensor:
         """(1, 3, H, W) → (1, 3, h, w); antialiased when shrinking, edge pixels in the padding."""
         top, left, height, width = self.crop
-        picture = rgb[..., top : top + height, left : left + width]
+        image = rgb[..., top : top + height, left : left + width]
         if (height, width) != self.resized:
-            picture = F.interpolate(
-                picture, self.resized, mode="bilinear", align_corners=False, antialias=True
+            image = F.interpolate(
+                image, self.resized, mode="bilinear", align_corners=False, antialias=True
             )
         bottom, right = (self.network[0] - self.resized[0], self.network[1] - self.resized[1])
-        return (
-            F.pad(picture, (0, right, 0, bottom), mode="replicate") if bottom or right else picture
-        )
+        return F.pad(image, (0, right, 0, bottom), mode="replicate") if bottom or right else image
 
     def points_to_network(self, points: SparsePoints) -> SparsePoints:
         """The points inside the crop, at their places in the network's frame."""

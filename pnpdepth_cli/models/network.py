@@ -94,7 +94,7 @@ class Network:
         """Returns the notes of the definition's `verify` on the network's arguments for a frame.
 
         Raises:
-            ModelError: The network cannot be trusted, or `verify` itself raises.
+            ModelError: The network cannot be verified, or `verify` itself raises.
         """
         if self.definition.verify is None:
             return ()

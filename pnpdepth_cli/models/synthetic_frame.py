@@ -24,7 +24,7 @@ def synthetic_arguments(network: Network, frame: FrameMap) -> tuple[Tensor, ...]
 
 
 def synthetic_frame(size: tuple[int, int], count: int = _POINTS) -> tuple[Tensor, SparsePoints]:
-    """A picture (1, 3, H, W) of smooth noise, and points on a slanted plane; the seed is fixed."""
+    """A smooth random rgb image (1, 3, H, W), and points on a slanted plane; the seed is fixed."""
     height, width = size
     generator = torch.Generator().manual_seed(0)
     coarse = torch.rand(1, 3, max(2, height // 8), max(2, width // 8), generator=generator)

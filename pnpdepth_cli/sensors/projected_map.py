@@ -8,11 +8,10 @@ surface.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
+from pnpdepth_cli.scan_pattern import scan_pattern
 from pnpdepth_cli.sensors.occlusion import OcclusionFilter, hidden_points
 from pnpdepth_cli.sensors.sparse import Mask, Points, as_depth_image
 
@@ -23,27 +22,9 @@ MARGIN_IN_LINES = 0.57
 """Radius of the filter over the spacing of scan lines, chosen on three KITTI frames."""
 
 _LINE_SPACING_PX = (3.0, 8.0)  # farther apart, lines say little of what is between them
-_ACROSS_OVER_ALONG = 1.5  # at least: spacing across over spacing along scan lines
 _INTERLEAVED = 0.003  # least fraction of points that lie between points of a nearer surface
 _INTERLEAVED_REACH = (4, 2)  # pixels to each side, and half the width, of the area compared
 _AT_CAMERA = np.zeros(3)  # no parallax is known; the margin stands for it
-
-
-@dataclass(frozen=True, kw_only=True)
-class ScanPattern:
-    """Spacing of the points of a projected scan."""
-
-    along_px: float
-    """Median distance to the next point along a row."""
-    across_px: float
-    """Median distance to the next point along a column."""
-
-    @property
-    def has_scan_lines(self) -> bool:
-        """Whether points are much denser along rows than along columns, and lines are close."""
-        low, high = _LINE_SPACING_PX
-        dense_along = self.across_px >= _ACROSS_OVER_ALONG * self.along_px
-        return dense_along and low <= self.across_px <= high
 
 
 def occluded_in_map(points: Points) -> Mask | None:
@@ -62,8 +43,9 @@ def occluded_in_map(points: Points) -> Mask | None:
     if len(points) < MIN_POINTS or bool((points.xy != np.floor(points.xy)).any()):
         return None
     depth = as_depth_image(points)
-    pattern = scan_pattern(depth > 0)
-    if not pattern.has_scan_lines:
+    pattern = scan_pattern(points.xy, points.size)
+    low, high = _LINE_SPACING_PX
+    if not (pattern.has_scan_lines and low <= pattern.across_px <= high):
         return None
     settings = OcclusionFilter()
     if interleaved(depth, settings.nearer).sum() < _INTERLEAVED * len(points):
@@ -77,11 +59,6 @@ def occluded_in_map(points: Points) -> Mask | None:
         scanner=_AT_CAMERA,
         settings=settings,
     )
-
-
-def scan_pattern(known: Mask) -> ScanPattern:
-    """Returns the spacing of the known pixels (H, W) along rows and along columns."""
-    return ScanPattern(along_px=_median_gap(known), across_px=_median_gap(known.T))
 
 
 def interleaved(depth: NDArray[np.float32], nearer: float) -> Mask:
@@ -110,16 +87,3 @@ def _nearest_above(depth: NDArray[np.float32]) -> NDArray[np.float32]:
     for below in range(1, reach):
         nearest = np.minimum(nearest, row[below : below + height])
     return nearest
-
-
-def _median_gap(known: Mask) -> float:
-    """The median distance in pixels from a point to the next in its row or a row beside it."""
-    band = known.copy()
-    band[1:] |= known[:-1]
-    band[:-1] |= known[1:]
-    width = known.shape[1]
-    column = np.where(band, np.arange(width), 2 * width)
-    next_column = np.minimum.accumulate(column[:, ::-1], axis=1)[:, ::-1]
-    next_column = np.pad(next_column[:, 1:], ((0, 0), (0, 1)), constant_values=2 * width)
-    gaps = next_column[known] - np.nonzero(known)[1]
-    return float(np.median(gaps)) if len(gaps) else np.inf

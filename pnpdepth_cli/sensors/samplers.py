@@ -25,9 +25,9 @@ class SamplePattern:
     """One of `choices.PATTERNS`."""
 
     count: int | None = None
-    """Number of points, or of lines for `lines`; None with a share."""
+    """Number of points, or of lines for `lines`; None with a fraction."""
 
-    share: float | None = None
+    fraction: float | None = None
     """Fraction of the known pixels, 0 to 1; None with a count."""
 
     region: tuple[int, int, int, int] | None = None
@@ -36,14 +36,14 @@ class SamplePattern:
     def __post_init__(self) -> None:
         if self.kind not in PATTERNS:
             raise UsageError(f"pattern {self.kind!r} is not one of {', '.join(PATTERNS)}")
-        if self.count is not None and self.share is not None:
+        if self.count is not None and self.fraction is not None:
             raise UsageError("give a number of points or a fraction of the pixels, not both")
         too_few = self.count is not None and self.count < 1
-        if too_few or (self.share is not None and not 0 < self.share <= 1):
+        if too_few or (self.fraction is not None and not 0 < self.fraction <= 1):
             raise UsageError("give at least one point, or a fraction above 0 and at most 100 %")
         if self.kind == "lines" and self.count is None:
             raise UsageError("pattern 'lines' needs the number of lines as its count")
-        if self.kind not in ("lines", "region") and self.count is None and self.share is None:
+        if self.kind not in ("lines", "region") and self.count is None and self.fraction is None:
             raise UsageError(f"pattern {self.kind!r} needs a count, N or N %")
         if (self.region is None) == (self.kind == "region"):
             raise UsageError(
@@ -52,8 +52,8 @@ class SamplePattern:
 
     def wanted(self, known: int) -> int:
         """Returns the number of points to sample from `known` pixels."""
-        if self.share is not None:
-            return max(1, round(self.share * known))
+        if self.fraction is not None:
+            return max(1, round(self.fraction * known))
         return known if self.count is None else self.count
 
 
@@ -157,8 +157,8 @@ def _grid(
 ) -> Pixels:
     """Known pixels of a square grid whose spacing gives a full map the wanted count."""
     height, width = depth.shape
-    if pattern.share is not None:
-        spacing = pattern.share**-0.5
+    if pattern.fraction is not None:
+        spacing = pattern.fraction**-0.5
     else:
         spacing = max(1.0, (height * width / pattern.wanted(known.size)) ** 0.5)
     rows, columns = (
@@ -295,7 +295,7 @@ def with_noise(points: Points, noise: SampleNoise, rng: np.random.Generator) -> 
         xy, values = xy[near], values[near]
     positive = drops.keep(values.astype(np.float32) > 0, "noise left no depth")
     xy, values = xy[positive], values[positive]
-    inside = drops.keep(in_frame(xy, (height, width)), "outside the picture")
+    inside = drops.keep(in_frame(xy, (height, width)), "outside the image")
     if not inside.any():
         raise NoPointsError(f"noise leaves no point ({drops}); make it smaller")
     return SparsePoints(

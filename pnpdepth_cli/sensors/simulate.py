@@ -101,7 +101,7 @@ def simulate_lidar(
     if not near.all():
         points = points[drops.keep(near, "noise put it too far")]
     xy = camera.pixels_of(points)
-    inside = drops.keep(in_frame(xy, size), "outside the picture")
+    inside = drops.keep(in_frame(xy, size), "outside the image")
     points, xy = points[inside], xy[inside]
     front = drops.keep(nearest_in_pixel(xy, points[:, 2], size), "behind another in their pixel")
     points, xy = points[front], xy[front]

@@ -71,7 +71,7 @@ def project_velodyne(
     seen = camera.from_scanner(xyz[drops.keep(in_range, "out of range")])
     seen = seen[drops.keep(seen[:, 2] > 0, "behind the camera")]
     xy = camera.pixels_of(seen)
-    inside = drops.keep(in_frame(xy, size), "outside the picture")
+    inside = drops.keep(in_frame(xy, size), "outside the image")
     seen, xy = seen[inside], xy[inside]
     front = drops.keep(nearest_in_pixel(xy, seen[:, 2], size), "behind another in their pixel")
     seen, xy = seen[front], xy[front]

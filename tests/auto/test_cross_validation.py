@@ -52,6 +52,15 @@ def test_points_on_lines_are_held_out_as_far_off_as_pixels_are(gap: int) -> None
     assert float(alone.median()) == 1.0  # which is what a neighbour on the line would tell
 
 
+def test_neighbouring_scan_lines_are_in_different_folds() -> None:
+    y, x = torch.meshgrid(torch.arange(10, 150, 5), torch.arange(0, 300, 2), indexing="ij")
+    points = points_at(torch.stack([x.flatten(), y.flatten()], dim=1), (160, 300))
+    fold = spatial_folds(points, 4, seed=3).reshape(y.shape)
+    assert bool((fold == fold[:, :1]).all())
+    assert bool((fold[1:, 0] != fold[:-1, 0]).all())
+    assert len(fold[:, 0].unique()) == 4
+
+
 def test_points_at_one_place_are_shared_out_too() -> None:
     fold = spatial_folds(points_at(torch.zeros(12, 2), (20, 20)), 3)
     assert torch.equal(torch.bincount(fold), torch.tensor([4, 4, 4]))

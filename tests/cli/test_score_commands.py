@@ -186,16 +186,35 @@ def test_runs_are_compared_as_a_table_as_json_and_as_files(
         Path(f"{name}.json").write_text(capsys.readouterr().out)
     assert code_of("compare", "out.json", "better.json", "--csv", "c.csv", "--latex", "c.tex") == 0
     out, err = capsys.readouterr()
-    assert err == ""
-    for word in ("the 6 frames that all runs have", "+50.00 %", "0.375", "from all swaps"):
+    assert err.startswith("warning: 6 frames are too few independent ones")
+    for word in ("the 6 frames that all runs have", "+50.00 %", "0.125", "from all swaps"):
         assert word in out, word
-    (rmse, *_) = csv.DictReader(io.StringIO(Path("c.csv").read_text()))
-    assert rmse["gain [%]"] == "+50.00"
+    rows = list(csv.DictReader(io.StringIO(Path("c.csv").read_text())))
+    assert [(row["measure"], row["run"]) for row in rows[:2]] == [
+        ("RMSE [m] ↓", "out"),
+        ("RMSE [m] ↓", "better"),
+    ]
+    assert [row["gain [%]"] for row in rows[:2]] == ["–", "+50.00"]
+    assert len(rows) == 2 * 4
     assert r"\toprule" in Path("c.tex").read_text()
     assert code_of("compare", "out.json", "better.json", "--json") == 0
     record = json.loads(capsys.readouterr().out)
     assert record["gains"][0]["mre"]["percent"] == pytest.approx(50, rel=1e-4)
     assert record["exact_p_values"] is True
+
+
+def test_four_runs_fit_into_120_columns(frames: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert code_of("eval", "out", "gt", "--json") == 0
+    text = capsys.readouterr().out
+    runs = [f"{kind} run of a network with a long name at K = 20.json" for kind in "abcd"]
+    for name in runs:
+        Path(name).write_text(text)
+    for options in ([], ["--all"]):
+        assert code_of("compare", *runs, *options) == 0
+        out = capsys.readouterr().out
+        table = out[: out.index("gain: in per cent")].splitlines()
+        assert max(map(len, table)) <= 120
+        assert sum("long name at K = 20" in line for line in table) == 4 * (12 if options else 4)
 
 
 def test_a_refinement_scores_the_same_when_its_files_are_evaluated(

@@ -43,7 +43,7 @@ def plain_world(mesh: shapes.Mesh) -> World:
 
 def tiny_view(yaw: float = 0.0, pitch: float = 0.0) -> View:
     return looking(
-        (0.3, -0.2, 1.5), yaw, pitch, 0.05, fov_deg=70, height=HEIGHT, width=WIDTH, shift=(0.1, 0)
+        (0.3, -0.2, 1.5), (yaw, pitch, 0.05), fov_deg=70, shift=(0.1, 0), size=(HEIGHT, WIDTH)
     )
 
 
@@ -64,7 +64,7 @@ def job(out: Path, **changes: object) -> render.Job:
 
 def test_the_depth_of_an_upright_plane_is_its_distance_along_the_axis() -> None:
     square = [(-40, 4, -40), (40, 4, -40), (40, 4, 40), (-40, 4, 40)]
-    view = looking((0, 0, 0), 0, 0, 0, fov_deg=80, height=HEIGHT, width=WIDTH)
+    view = looking((0, 0, 0), (0, 0, 0), fov_deg=80, size=(HEIGHT, WIDTH))
     _, depth = seen(plain_world(shapes.quads([square])), view, np.random.default_rng(0))
     np.testing.assert_allclose(depth, 4.0, rtol=1e-6)
 
@@ -94,7 +94,7 @@ def test_points_of_a_sphere_lie_at_its_radius() -> None:
 def test_unprojected_pixels_lie_on_the_triangles_they_show() -> None:
     world, plan = scenes.build("room", scenes.generator(3, 0, 0))
     rng = scenes.generator(3, 0, 1)
-    view = scenes.pick_view(world, plan, "room", rng, height=HEIGHT, width=WIDTH)
+    view = scenes.pick_view(world, plan, "room", rng, size=(HEIGHT, WIDTH))
     hits = world.cast(*view.grid())
     points = points_of(view, hits.t.reshape(HEIGHT, WIDTH)).reshape(-1, 3)[hits.met]
     corners = world.mesh.vertices[world.mesh.faces[hits.face[hits.met]]].astype(float)
@@ -167,7 +167,7 @@ def test_a_surface_of_revolution_has_normals_across_its_skin() -> None:
 def test_the_street_samples_scan_lands_on_the_depth_the_camera_sees() -> None:
     square = [(-60, 20, -60), (60, 20, -60), (60, 20, 60), (-60, 20, 60)]
     world = plain_world(shapes.quads([square]))
-    view = looking((0, 0, 1.65), 0, 0, 0, fov_deg=80, height=375, width=1242)
+    view = looking((0, 0, 1.65), (0, 0, 0), fov_deg=80, size=(375, 1242))
     rng = np.random.default_rng(0)
     turn = make_samples.laser_axes()
     scan = make_samples.laser_scan(world, view, turn, rng)

@@ -28,7 +28,7 @@ from pnpdepth_cli.sensors import (
     project_velodyne,
     sample_points,
 )
-from pnpdepth_cli.sensors.projected_map import interleaved, scan_pattern
+from pnpdepth_cli.sensors.projected_map import interleaved
 
 SIZE = (240, 640)
 INTRINSICS = np.array([[700.0, 0, 320], [0, 700, 120], [0, 0, 1]])
@@ -89,16 +89,6 @@ def test_points_between_pixels_and_a_few_points_are_left_alone() -> None:
     off_grid = Points(xy=points.xy + np.float32(0.25), depth=points.depth, size=points.size)
     assert occluded_in_map(off_grid) is None
     assert occluded_in_map(points.select(np.arange(len(points)) < 900)) is None
-
-
-def test_spacings_are_those_to_the_next_point_in_a_row_or_beside_it() -> None:
-    known = np.zeros((40, 60), bool)
-    known[::5, ::3] = True
-    pattern = scan_pattern(known)
-    assert (pattern.along_px, pattern.across_px) == (3.0, 5.0)
-    assert pattern.has_scan_lines
-    assert not scan_pattern(known.T).has_scan_lines
-    assert scan_pattern(np.zeros((4, 5), bool)).along_px == np.inf
 
 
 def test_a_frame_is_read_without_occluded_points_unless_they_are_kept(tmp_path: Path) -> None:

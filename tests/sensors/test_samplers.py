@@ -52,7 +52,7 @@ def test_uniform_gives_exactly_the_number_asked_for(count: int, seed: int) -> No
 
 def test_uniform_of_a_share_is_of_the_known_pixels() -> None:
     known = np.count_nonzero(HOLES)
-    assert len(sample_points(HOLES, SamplePattern(share=0.05), 0).depth) == round(0.05 * known)
+    assert len(sample_points(HOLES, SamplePattern(fraction=0.05), 0).depth) == round(0.05 * known)
 
 
 def test_bernoulli_gives_the_number_on_average_but_not_exactly() -> None:
@@ -120,7 +120,7 @@ def test_noise_has_the_size_asked_for() -> None:
 def test_jitter_moves_places_and_leaves_depths() -> None:
     clean = sample_points(DEPTH, SamplePattern(count=500), 3)
     moved = sample_points(DEPTH, SamplePattern(count=500), 3, noise=SampleNoise(jitter_px=0.7))
-    lost = moved.dropped.get("outside the picture", 0)
+    lost = moved.dropped.get("outside the image", 0)
     assert len(moved.depth) == 500 - lost
     assert np.isin(moved.depth, clean.depth).all()
     if not lost:
@@ -132,9 +132,9 @@ def test_jitter_moves_places_and_leaves_depths() -> None:
     [
         ({"kind": "spiral", "count": 3}, "spiral"),
         ({"count": 0}, "at least one"),
-        ({"share": 1.5}, "100 %"),
-        ({"share": 0.0}, "above 0"),
-        ({"count": 3, "share": 0.1}, "not both"),
+        ({"fraction": 1.5}, "100 %"),
+        ({"fraction": 0.0}, "above 0"),
+        ({"count": 3, "fraction": 0.1}, "not both"),
         ({}, "needs a count"),
         ({"kind": "lines"}, "number of lines"),
         ({"kind": "region", "count": 3}, "region"),

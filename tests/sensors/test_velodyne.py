@@ -53,7 +53,7 @@ def test_a_scan_projects_as_computed_by_hand() -> None:
     assert got.dropped == {
         "out of range": 0,
         "behind the camera": 1,
-        "outside the picture": 1,
+        "outside the image": 1,
         "behind another in their pixel": 0,
     }
 
@@ -90,7 +90,7 @@ def test_an_empty_range_is_a_mistake_of_the_user() -> None:
 
 def test_a_scan_that_the_camera_does_not_see_says_where_its_points_are() -> None:
     scan = np.array([[-5.0, 0, 0], [1.0, 50, 0], [1.0, 40, 0]])
-    with pytest.raises(NoPointsError, match=r"1 behind the camera, 2 outside the picture") as error:
+    with pytest.raises(NoPointsError, match=r"1 behind the camera, 2 outside the image") as error:
         project_velodyne(scan, camera(), SIZE)
     assert "\n" not in str(error.value)
 

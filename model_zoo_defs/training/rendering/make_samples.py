@@ -51,7 +51,7 @@ def make_indoor(folder: Path) -> None:
     """Writes rgb.png, sparse.png and gt.png of an indoor frame."""
     world, plan = build("room", generator(SAMPLE_SEED, INDOOR_SCENE, 0))
     rng = generator(SAMPLE_SEED, INDOOR_SCENE, 1 + INDOOR_VIEW)
-    view = pick_view(world, plan, "room", rng, height=480, width=640)
+    view = pick_view(world, plan, "room", rng, size=(480, 640))
     depth = _write_picture(world, view, rng, folder, INDOOR_SCALE)
     v, u = np.nonzero(depth)
     keep = np.sort(rng.choice(len(v), SPARSE_POINTS, replace=False))
@@ -66,7 +66,7 @@ def make_street(folder: Path) -> None:
     world, plan = build("street", rng)
     lane = float(plan.high[0]) * 0.55
     view = replace(
-        looking((lane, 0.0, 1.65), 0.02, -0.01, 0.0, fov_deg=80, height=375, width=1242),
+        looking((lane, 0.0, 1.65), (0.02, -0.01, 0.0), fov_deg=80, size=(375, 1242)),
         fx=_FOCAL_PX, fy=_FOCAL_PX, cx=_CX, cy=_CY,
     )  # fmt: skip
     _write_picture(world, view, rng, folder, STREET_SCALE)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 
@@ -175,25 +176,35 @@ THINGS: tuple[Callable[[Kit], Group], ...] = (
 )  # fmt: skip
 
 
+class Rectangle(NamedTuple):
+    """A horizontal rectangle that things stand on, in metres."""
+
+    low: tuple[float, float]
+    """Least x and y."""
+    high: tuple[float, float]
+    """Greatest x and y."""
+    z: float
+    """Height."""
+
+
 def scatter(
     kit: Kit,
     group: Group,
     *,
-    low: tuple[float, float],
-    high: tuple[float, float],
-    z: float,
+    area: Rectangle,
     count: int,
     tallest: float = 0.6,
     things: tuple[Callable[[Kit], Group], ...] = THINGS,
 ) -> None:
-    """Puts about `count` things onto the rectangle at height z, overlapping at times."""
+    """Puts about `count` things onto the rectangle, overlapping at times."""
+    low, high = area.low, area.high
     for _ in range(count):
         item = things[int(kit.rng.integers(len(things)))](kit)
         lower, upper = item.bounds()
         scale = min(
             1.0, tallest / float(upper[2]), (high[1] - low[1]) * 1.2 / float(upper[1] - lower[1])
         )
-        at = (kit.size(low[0], high[0]), kit.size(low[1], high[1]), z)
+        at = (kit.size(low[0], high[0]), kit.size(low[1], high[1]), area.z)
         group.place(
             item, at, yaw=kit.size(-0.6, 0.6) if kit.chance(0.6) else kit.size(0, 6.3), scale=scale
         )

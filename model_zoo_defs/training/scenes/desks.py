@@ -109,7 +109,9 @@ def desk_scene(kit: Kit) -> Plan:
         targets.append((x, y, z + kit.size(0, 0.15)))
         low = (max(-half[0], x - spread), max(-half[1], y - spread))
         high = (min(half[0], x + spread), min(half[1], y + spread))
-        clutter.scatter(kit, group, low=low, high=high, z=z, count=int(kit.rng.integers(4, 14)))
+        clutter.scatter(
+            kit, group, area=clutter.Rectangle(low, high, z), count=int(kit.rng.integers(4, 14))
+        )
         for _ in range(int(kit.rng.integers(0, 4))):
             group.place(
                 _wild(kit),

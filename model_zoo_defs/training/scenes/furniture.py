@@ -15,7 +15,7 @@ from model_zoo_defs.training.rendering.shapes import (
     superquadric,
     tube,
 )
-from model_zoo_defs.training.scenes.clutter import frame, gadget, scatter
+from model_zoo_defs.training.scenes.clutter import Rectangle, frame, gadget, scatter
 from model_zoo_defs.training.scenes.figures import bicycle
 from model_zoo_defs.training.scenes.household import (
     books,
@@ -64,8 +64,14 @@ def table(kit: Kit, *, width: float = 0.0) -> Group:
                 group.add(leg, legs, at)
         if kit.chance(0.5):
             group.add(box(w * 0.9, d * 0.85, 0.08), wood, (0, y, h - thick - 0.08))
-    scatter(kit, group, low=(-w * 0.42, -d * 0.9), high=(w * 0.42, -d * 0.1), z=h,
-            count=int(kit.rng.integers(0, 9)), tallest=0.45, things=_TABLE_THINGS)  # fmt: skip
+    scatter(
+        kit,
+        group,
+        area=Rectangle((-w * 0.42, -d * 0.9), (w * 0.42, -d * 0.1), h),
+        count=int(kit.rng.integers(0, 9)),
+        tallest=0.45,
+        things=_TABLE_THINGS,
+    )
     return group
 
 
@@ -87,9 +93,7 @@ def desk(kit: Kit) -> Group:
         scatter(
             kit,
             group,
-            low=(-w * 0.45, -0.62),
-            high=(w * 0.45, -0.15),
-            z=top,
+            area=Rectangle((-w * 0.45, -0.62), (w * 0.45, -0.15), top),
             count=int(kit.rng.integers(1, 7)),
             tallest=0.4,
         )
@@ -112,13 +116,15 @@ def bookshelf(kit: Kit) -> Group:
     for z in shelves:
         group.add(box(w, d, t), wood, (0, -d / 2, float(z)))
         if z < shelves[-1]:
-            _fill_shelf(kit, group, w - 2 * t, d, float(z) + t, gap - t, covers)
+            _fill_shelf(kit, group, (w - 2 * t, d, gap - t), float(z) + t, covers)
     return group
 
 
 def _fill_shelf(
-    kit: Kit, group: Group, w: float, d: float, z: float, gap: float, covers: list[int]
+    kit: Kit, group: Group, size: tuple[float, float, float], z: float, covers: list[int]
 ) -> None:
+    """Adds books and things to a shelf of this width, depth and height, whose board is at z."""
+    w, d, gap = size
     x = -w / 2
     while x < w / 2 - 0.06:
         if kit.chance(0.8):
@@ -142,9 +148,7 @@ def _fill_shelf(
                 scatter(
                     kit,
                     group,
-                    low=((x + end) / 2, -d * 0.7),
-                    high=((x + end) / 2 + 0.01, -d * 0.4),
-                    z=z,
+                    area=Rectangle(((x + end) / 2, -d * 0.7), ((x + end) / 2 + 0.01, -d * 0.4), z),
                     count=1,
                     tallest=gap * 0.9,
                     things=_SHELF_THINGS,
@@ -164,21 +168,21 @@ def cupboard(kit: Kit, *, hang: float = 0.0) -> Group:
     if hang:
         d, h = 0.35, kit.size(0.5, 0.8)
     group.add(box(w, d, h), front, (0, -d / 2, hang))
-    _doors(kit, group, w, d, h, hang, front)
+    _doors(kit, group, (w, d, h), hang, front)
     if h < 1.3 and not hang:
         scatter(
             kit,
             group,
-            low=(-w * 0.42, -d * 0.85),
-            high=(w * 0.42, -d * 0.2),
-            z=h,
+            area=Rectangle((-w * 0.42, -d * 0.85), (w * 0.42, -d * 0.2), h),
             count=int(kit.rng.integers(0, 7)),
             tallest=0.7,
         )
     return group
 
 
-def _doors(kit: Kit, group: Group, w: float, d: float, h: float, z: float, front: int) -> None:
+def _doors(kit: Kit, group: Group, size: tuple[float, float, float], z: float, front: int) -> None:
+    """Adds doors with handles to the front of a body of this width, depth and height at z."""
+    w, d, h = size
     steel = kit.metal()
     columns, rows = (
         max(1, round(w / kit.size(0.4, 0.6))),
@@ -221,7 +225,7 @@ def kitchen(kit: Kit) -> Group:
     top = kit.surface("marble", "speckle", "plain", "wood", tile_m=0.8)
     group.add(box(w, d - 0.05, h - 0.1), front, (0, -d / 2, 0.1))
     group.add(box(w, d - 0.12, 0.1), kit.dark(), (0, -d / 2 + 0.03, 0))
-    _doors(kit, group, w, d - 0.03, h - 0.1, 0.08, front)
+    _doors(kit, group, (w, d - 0.03, h - 0.1), 0.08, front)
     group.add(box(w + 0.02, d + 0.03, 0.04), top, (0, -d / 2, h - 0.04))
     group.add(
         box(w, 0.012, 0.55), kit.surface("tiles", "brick", "plain", tile_m=0.5), (0, -0.006, h)
@@ -237,9 +241,7 @@ def kitchen(kit: Kit) -> Group:
     scatter(
         kit,
         group,
-        low=(-w * 0.47, -d * 0.9),
-        high=(w * 0.47, -0.1),
-        z=h,
+        area=Rectangle((-w * 0.47, -d * 0.9), (w * 0.47, -0.1), h),
         count=int(kit.rng.integers(4, 18)),
         tallest=0.45,
         things=_KITCHEN_THINGS,

@@ -88,7 +88,10 @@ def room(kit: Kit) -> Plan:
         )
         group.add(thing, paint, (kit.size(0.3, 0.7) * w, kit.size(0.3, 0.7) * d, 0))
     clutter.scatter(
-        kit, group, low=(0.4, 0.4), high=(w - 0.4, d - 0.4), z=0.0, count=int(rng.integers(0, 10))
+        kit,
+        group,
+        area=clutter.Rectangle((0.4, 0.4), (w - 0.4, d - 0.4), 0.0),
+        count=int(rng.integers(0, 10)),
     )
     _outside(kit, group, w, d)
     for _ in range(16):

@@ -101,11 +101,11 @@ def pick_view(
     kind: str,
     rng: np.random.Generator,
     *,
-    height: int,
-    width: int,
+    size: tuple[int, int],
     rig: Rig | None = None,
 ) -> View:
-    """Returns a view that shows much of the scene; the best of some tries."""
+    """Returns a view (rows, columns) that shows much of the scene; the best of some tries."""
+    height, width = size
     best, best_score = None, -1.0
     for _ in range(24):
         view = _street_view(plan, rng, height, width, rig) if kind == "street" else _indoor_view(
@@ -135,7 +135,7 @@ def _street_view(
         place[2] = rng.uniform(*rig.height)
         yaw, roll = np.radians(rng.normal(0, rig.roll_deg, 2))
         fov, shift = rig.fov_deg, rig.shift
-    return looking(place, yaw, pitch, roll, fov_deg=fov, height=height, width=width, shift=shift)
+    return looking(place, (yaw, pitch, roll), fov_deg=fov, shift=shift, size=(height, width))
 
 
 def _indoor_view(
@@ -159,7 +159,7 @@ def _indoor_view(
         roll, fov = np.radians(rng.normal(0, rig.roll_deg)), rig.fov_deg
         if rig.pitch_deg is not None:
             pitch = np.radians(rng.normal(*rig.pitch_deg))
-    return looking(place, yaw, pitch, roll, fov_deg=fov, height=height, width=width)
+    return looking(place, (yaw, pitch, roll), fov_deg=fov, size=(height, width))
 
 
 def _score(world: World, view: View, closest: float) -> float:
@@ -195,7 +195,7 @@ def scene_frames(
     frames = []
     for number in range(VIEWS_PER_SCENE):
         own = generator(seed, scene, 1 + number)
-        view = pick_view(world, plan, kind, own, height=height, width=width, rig=rig)
+        view = pick_view(world, plan, kind, own, rig=rig, size=(height, width))
         colour, depth = seen(world, view, own)
         frames.append(
             Frame(

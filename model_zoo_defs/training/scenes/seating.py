@@ -22,13 +22,11 @@ def cushion(
     size: tuple[float, float, float],
     at: tuple[float, float, float],
     material: int,
-    *,
-    pitch: float = 0.0,
-    yaw: float = 0.0,
+    **turn: float,
 ) -> None:
-    """Adds a padded block whose middle is at `at`."""
+    """Adds a padded block whose middle is at `at`; turn: `pitch` and `yaw` in radians."""
     body = superquadric(size, vertical=kit.size(0.25, 0.5), around=kit.size(0.2, 0.4))
-    group.add(body, material, at, pitch=pitch, yaw=yaw)
+    group.add(body, material, at, **turn)
 
 
 def chair(kit: Kit) -> Group:

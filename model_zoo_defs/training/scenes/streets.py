@@ -188,9 +188,7 @@ def street(kit: Kit) -> Plan:
     clutter.scatter(
         kit,
         group,
-        low=(-half - 2, 4),
-        high=(half + 2, 20),
-        z=0.0,
+        area=clutter.Rectangle((-half - 2, 4), (half + 2, 20), 0.0),
         count=int(kit.rng.integers(0, 4)),
     )
     targets += [(kit.size(-9, 9), kit.size(10, 60), kit.size(0.3, 4)) for _ in range(12)]

@@ -87,9 +87,7 @@ def opening(kit: Kit, side: Group, hole: Hole, paint: int) -> None:
         clutter.scatter(
             kit,
             side,
-            low=(u0 + 0.1, -0.02),
-            high=(u1 - 0.1, 0.04),
-            z=scatter_z,
+            area=clutter.Rectangle((u0 + 0.1, -0.02), (u1 - 0.1, 0.04), scatter_z),
             count=3,
             tallest=0.4,
         )
@@ -145,9 +143,7 @@ def decorate(kit: Kit, side: Group, length: float, height: float, holes: Sequenc
             clutter.scatter(
                 kit,
                 side,
-                low=(u - w / 2, -0.15),
-                high=(u + w / 2, -0.06),
-                z=z + 0.025,
+                area=clutter.Rectangle((u - w / 2, -0.15), (u + w / 2, -0.06), z + 0.025),
                 count=4,
                 tallest=0.3,
             )

@@ -70,17 +70,23 @@ class View:
 
 def looking(
     place: npt.ArrayLike,
-    yaw: float,
-    pitch: float,
-    roll: float,
+    angles: tuple[float, float, float],
     *,
     fov_deg: float,
-    height: int,
-    width: int,
+    size: tuple[int, int],
     shift: tuple[float, float] = (0.0, 0.0),
 ) -> View:
-    """Returns a view along +y turned by yaw (left), pitch (up) and roll, all in radians."""
-    right_forward_up = rotation(yaw, pitch, roll)
+    """Returns a view along +y turned by yaw (left), pitch (up) and roll, all in radians.
+
+    Args:
+        place: (3,) position of the camera, metres.
+        angles: Yaw, pitch and roll.
+        fov_deg: Horizontal field of view.
+        size: Rows and columns of the image.
+        shift: Of the principal point, as fractions of width and height.
+    """
+    height, width = size
+    right_forward_up = rotation(*angles)
     axes = np.stack(
         [right_forward_up[:, 0], -right_forward_up[:, 2], right_forward_up[:, 1]], axis=1
     )

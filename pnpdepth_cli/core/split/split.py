@@ -19,7 +19,6 @@ reached Python, where the network could branch on it. Then further frames are on
 from __future__ import annotations
 
 from collections.abc import Sequence
-from types import TracebackType
 from typing import Any
 
 import torch
@@ -73,16 +72,11 @@ class Split:
             self._network.eval()
             self._state.freeze()
         except BaseException:
-            self.__exit__(None, None, None)
+            self.__exit__()
             raise
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         if self._interception is not None:
             self._interception.close()
         self._state.close()

@@ -42,7 +42,7 @@ def parse_npz(path: Path, data: bytes, key: str | None) -> tuple[str, NDArray[An
             name = _choose(path, list(members), key)
             if members[name].compress_type not in _COMPRESSIONS:
                 raise FileFormatError(
-                    f"{path}: array {name} is compressed in a way that numpy does not write;"
+                    f"{path}: array {name} has a compression that numpy does not write;"
                     " save it with numpy.savez_compressed"
                 )
             with archive.open(members[name]) as member:

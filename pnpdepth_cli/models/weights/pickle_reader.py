@@ -7,6 +7,8 @@ is an error. Names are never imported. Calls give tensors, plain containers or a
 
 Time and memory are bounded: a pickle has at most `MAX_STEPS` opcodes, where an opcode that copies n
 values counts as n, and no opcode reads more bytes than the file has.
+
+One file holds all code that a hostile pickle reaches, so that it can be reviewed in one reading.
 """
 
 from __future__ import annotations

@@ -226,6 +226,7 @@ def _summarise(
             "pending": len(batch.frames) - known,
             "with_warnings": tally.warned,
         },
+        "unit": tally.unit,
         "mean": tally.mean(),
         "linear": tally.mean_linear(),
         "baselines": tally.mean_baselines(),

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from pnpdepth_cli.errors import InputError, OutputError, UsageError
+from pnpdepth_cli.io.colmap.model import model_files
 from pnpdepth_cli.io.dataset.frame import SCAN_ONLY_SUFFIXES, Frame, Source, Unmatched
 from pnpdepth_cli.io.dataset.frame_names import name_problem
 from pnpdepth_cli.io.file_bytes import one_line
@@ -123,9 +124,16 @@ def _input_files(files: FrameFiles, *, is_scan: bool) -> Iterator[tuple[str, Pat
         "gt": files.gt,
     }
     for part, source in parts.items():
-        if source is not None:
-            yield part, source if isinstance(source, Path) else source.path
-    calib = files.scan.calib
+        if source is None:
+            continue
+        path = source if isinstance(source, Path) else source.path
+        if part == "sparse" and path.is_dir():  # a COLMAP model
+            yield from ((f"sparse {file.name}", file) for file in model_files(path))
+        else:
+            yield part, path
+    calib, extrinsics = files.scan.calib, files.scan.extrinsics
+    if is_scan and extrinsics is not None:
+        yield "extrinsics", extrinsics
     if is_scan and calib is not None:
         if calib.is_dir():
             yield from ((f"calib {p.name}", p) for p in sorted(calib.glob("calib_*.txt")))

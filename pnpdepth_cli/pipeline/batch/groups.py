@@ -162,6 +162,7 @@ class FrameGroups:
         return 1
 
     def _may_go_together(self, size: tuple[int, int], alone: Sequence[_Alone]) -> bool:
+        """Whether frames refined together, in less time, have the same results as alone."""
         group = [each.inputs for each in alone]
         plain = self._pass(group, replace(self._refiner.settings, iterations=0))
         assert isinstance(self._opened, Split)

@@ -27,8 +27,8 @@ def settings_of(request: RefineRequest, model: dict[str, Any], *groups: str) -> 
         fields["device"] = fields["device"].split(":")[0]
     if "scan" in fields:
         fields["scan"] = asdict(fields["scan"])
-        del fields["scan"]["calib"]
-    for name in ("sample", "protocol"):
+        del fields["scan"]["calib"], fields["scan"]["extrinsics"]
+    for name in ("colmap", "sample", "protocol"):
         if fields.get(name) is not None:
             fields[name] = asdict(fields[name])
     settings: dict[str, Any] = plain(fields | model)

@@ -49,10 +49,11 @@ def row_of(
         "inputs": dict(inputs),
         "outputs": dict(outputs),
         "size": record["size"],
+        "unit": record["unit"],
         "points": record["points"],
         "settings": {name: record["settings"][name] for name in _EFFECTIVE},
         "loss": [record["loss"][0], record["loss"][-1]],
-        "improved_share": record["improved_share"],
+        "improved_fraction": record["improved_fraction"],
         **{kind: record[kind] for kind in _MEASURED},
         "linear": record.get("linear"),
         "baselines": record.get("baselines"),
@@ -81,6 +82,7 @@ class Tally:
     def __init__(self) -> None:
         self.counts: Counter[str] = Counter({"done": 0, "diverged": 0, "failed": 0})
         self.warned = 0
+        self._units: set[str] = set()
         self._compared, self._worse = 0, 0
         self._linear: dict[tuple[str, str], tuple[int, float]] = {}
         self._sums: dict[tuple[str, str, str], tuple[int, float]] = {}
@@ -90,6 +92,7 @@ class Tally:
         """Adds one row."""
         self.counts[row["status"]] += 1
         self.warned += bool(row.get("warnings"))
+        self._units |= {row["unit"]} if "unit" in row else set()
         for key, value in _measures(row):
             _add(self._sums, key, value)
         linear = row.get("linear") or {}
@@ -102,6 +105,11 @@ class Tally:
         for name, entry in (row.get("baselines") or {}).items():
             for measure, value in _baseline_measures(entry).items():
                 _add(self._baselines, (name, measure), value)
+
+    @property
+    def unit(self) -> str:
+        """The unit of all depths."""
+        return " and ".join(sorted(self._units)) or "m"
 
     @property
     def baseline_names(self) -> list[str]:
@@ -185,7 +193,7 @@ def write_table(
         baselines: Names of baselines, whose errors make the last columns.
     """
     header = [
-        *("name", "status", "message", "points", "held_out_points", "improved_share"),
+        *("name", "status", "message", "points", "held_out_points", "improved_fraction"),
         *(
             f"{kind}_{measure}_{stage}" if kind != "scores" else f"{measure}_{stage}"
             for kind, measures in _MEASURED.items()
@@ -208,7 +216,7 @@ def write_table(
             writer.writerow(
                 [
                     *(text_cell(row["name"]), row["status"], text_cell(row["message"] or "")),
-                    *(points.get("used"), points.get("held_out"), row.get("improved_share")),
+                    *(points.get("used"), points.get("held_out"), row.get("improved_fraction")),
                     *(
                         measured.get((kind, stage, measure))
                         for kind, measures in _MEASURED.items()

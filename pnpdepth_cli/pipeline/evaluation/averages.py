@@ -22,13 +22,13 @@ class FrameTable:
     """(N, M) measures of each frame; where pixels are pooled, (N, len(SUMS)) sums over pixels."""
     pooled: bool = False
     """True if the mean is over the pixels of all frames."""
+    kept: tuple[int, ...] | None = None
+    """Of a pooled table: which of core.metrics.MEASURES the means are; None for all."""
 
     def mean(self) -> Floats:
         """Returns (M,) the means over all frames."""
-        totals = self.rows.sum(axis=0)
-        if self.pooled:
-            return np.asarray(measures_of(torch.from_numpy(totals)).numpy())
-        return np.asarray(totals / len(self.rows))
+        totals = np.append(self.rows.sum(axis=0), len(self.rows))
+        return np.asarray(self.means_of(torch.from_numpy(totals)).numpy())
 
     def cluster_totals(self, clusters: NDArray[np.int64]) -> Floats:
         """Returns (G, C) the sums of the rows of each cluster, and in the last column its frames.
@@ -44,5 +44,6 @@ class FrameTable:
     def means_of(self, totals: Tensor) -> Tensor:
         """Returns (…, M) the means of frames whose `cluster_totals` add up to (…, C)."""
         if self.pooled:
-            return measures_of(totals[..., :-1])
+            means = measures_of(totals[..., :-1])
+            return means if self.kept is None else means[..., list(self.kept)]
         return totals[..., :-1] / totals[..., -1:]

@@ -5,13 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
+from pathlib import PurePath
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from pnpdepth_cli.core.metrics import Measure
+from pnpdepth_cli.core.metrics import MEASURES, Measure
 from pnpdepth_cli.errors import InputError, UsageError
 from pnpdepth_cli.io.record import plain
 from pnpdepth_cli.pipeline.evaluation.averages import Floats, FrameTable
@@ -31,6 +32,8 @@ from pnpdepth_cli.pipeline.evaluation.resampling import (
 from pnpdepth_cli.pipeline.evaluation.runs import Run, read_run
 
 ALPHA = 0.05
+MAIN_MEASURES = ("rmse", "mae", "mre", "delta1", "inverse_rmse", "inverse_mae")
+"""Keys of the measures that are compared unless all are asked for; the last two are the kit's."""
 _LEAST_COVERAGE_DIFFERENCE = 0.001
 """Runs whose scored fractions of the ground truth differ by more are not ranked silently."""
 
@@ -77,7 +80,7 @@ class Comparison:
     names: tuple[str, ...]
     """The shared frames."""
     measures: tuple[Measure, ...]
-    """Those that all runs have."""
+    """Those compared; p-values are adjusted for their number."""
     scoring: dict[str, Any]
     """The rules by which all runs were scored."""
     runs: tuple[RunMean, ...]
@@ -127,6 +130,8 @@ class CompareRequest:
     """Of both."""
     grouped: bool = True
     """False if every frame counts as independent."""
+    all_measures: bool = False
+    """True to compare by every measure that all runs have, not only by MAIN_MEASURES."""
 
 
 def compare(request: CompareRequest) -> Comparison:
@@ -148,7 +153,9 @@ def compare(request: CompareRequest) -> Comparison:
         first, other = (some_names(run.frames) or "none" for run in (runs[0], runs[-1]))
         raise InputError(f"the runs have no scored frame in common: {first}; and {other}")
     shared = set.intersection(*({m.key for m in run.measures} for run in runs))
-    measures = tuple(measure for measure in runs[0].measures if measure.key in shared)
+    common = [measure for measure in runs[0].measures if measure.key in shared]
+    main = [measure for measure in common if measure.key in MAIN_MEASURES]
+    measures = tuple(common if request.all_measures or not main else main)
     keys = [measure.key for measure in measures]
     tables = [_table(run, names, keys) for run in runs]
     clusters = _clusters(runs, names, keys, grouped=request.grouped)
@@ -171,7 +178,7 @@ def compare(request: CompareRequest) -> Comparison:
         exact=all(exact for _, exact in tests),
         resamples=request.resamples,
         seed=request.seed,
-        notes=(*_notes(runs, names), *_cluster_notes(clusters, len(names))),
+        notes=(*_notes(runs, names), *_cluster_notes(clusters, len(names), len(measures))),
     )
 
 
@@ -197,7 +204,9 @@ def _values(run: Run, names: Sequence[str], keys: Sequence[str]) -> Floats:
 
 def _table(run: Run, names: Sequence[str], keys: Sequence[str]) -> FrameTable:
     if run.pooled:
-        return FrameTable(rows=np.array([run.frames[name].sums for name in names]), pooled=True)
+        kept = tuple(n for n, measure in enumerate(MEASURES) if measure.key in keys)
+        sums = np.array([run.frames[name].sums for name in names])
+        return FrameTable(rows=sums, pooled=True, kept=kept)
     return FrameTable(rows=_values(run, names, keys))
 
 
@@ -264,9 +273,13 @@ def _coverage(run: Run, names: Sequence[str]) -> float | None:
 
 
 def _labels(runs: Sequence[Run]) -> list[str]:
-    """Short names, or the whole paths where short ones come twice."""
-    names = [run.label for run in runs]
-    return names if len(set(names)) == len(names) else [run.path for run in runs]
+    """The shortest ends of the paths that tell the runs apart."""
+    paths = [PurePath(run.path).with_name(run.label).parts for run in runs]
+    for length in range(1, max(map(len, paths)) + 1):
+        names = ["/".join(parts[-length:]) for parts in paths]
+        if len(set(names)) == len(names):
+            return names
+    return [run.path for run in runs]
 
 
 def _notes(runs: Sequence[Run], names: Sequence[str]) -> list[str]:
@@ -311,13 +324,14 @@ def _coverage_warning(runs: Sequence[Run], names: Sequence[str]) -> str:
     )
 
 
-def _cluster_notes(clusters: Clusters, frames: int) -> list[str]:
+def _cluster_notes(clusters: Clusters, frames: int, measures: int) -> list[str]:
     """A warning where the frames are too dependent, or too few, to conclude anything."""
     smallest = 2.0 ** (1 - clusters.count)
-    if frames == 1 or smallest < ALPHA:
+    if frames == 1 or measures * smallest < ALPHA:
         return []
+    adjusted = min(1.0, measures * smallest)
     return [
-        f"warning: {clusters.describe()} are too few to conclude anything: the smallest possible p"
-        f" is {smallest:.2g}" + ("" if clusters.count >= MIN_CLUSTERS else ", and there is no"
-        f" interval below {MIN_CLUSTERS}")
-    ]  # fmt: skip
+        f"warning: {clusters.describe()} are too few independent ones to conclude anything from"
+        f" {measures} measures: the smallest possible p is {smallest:.2g}, adjusted {adjusted:.2g}"
+        + ("" if clusters.count >= MIN_CLUSTERS else f"; there is no interval below {MIN_CLUSTERS}")
+    ]

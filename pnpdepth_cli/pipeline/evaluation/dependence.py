@@ -20,9 +20,14 @@ from pnpdepth_cli.pipeline.evaluation.averages import Floats
 MIN_CLUSTERS = 5
 """Fewer give no interval: with lognormal errors (σ 0.5) even a studentised one misses too often."""
 
+BLOCK_BIAS = 0.1
+"""Fraction of the variance of a mean that blocks of a single sequence may miss."""
+
+MAX_BLOCKS = 10
+"""Most blocks of a single sequence. Few long blocks stay independent also where the correlation is
+not that of a first-order autoregression, at a small loss of power (Ibragimov and Müller 2010)."""
+
 _FRAME_NUMBER = re.compile(r"(?:^|[_\-/])\d+(?:_image_\d+)?$")
-_SIGNIFICANT = 1.645
-"""One-sided 5 % point of the normal distribution."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,7 +62,7 @@ def groups_by_name(names: Sequence[str]) -> list[str]:
 
 
 def find_clusters(groups: Sequence[str], series: Floats) -> Clusters:
-    """Returns the groups; inside a single group, blocks as long as its errors are correlated.
+    """Returns the groups; for a single group with correlated errors, blocks of it.
 
     Args:
         groups: The sequence of each of N frames.
@@ -72,10 +77,11 @@ def find_clusters(groups: Sequence[str], series: Floats) -> Clusters:
     length = block_length(series)
     if length == 1:
         return independent_frames(frames)
-    blocks = max(1, frames // length)
+    blocks = max(1, min(MAX_BLOCKS, frames // length))
     return Clusters(
-        ids=np.minimum(np.arange(frames) // length, blocks - 1),
-        unit=f"blocks of {length} consecutive frames, as their errors are correlated",
+        ids=np.arange(frames) * blocks // frames,
+        unit=f"blocks of about {round(frames / blocks):,} consecutive frames of one sequence,"
+        " as their errors are correlated",
     )
 
 
@@ -85,11 +91,12 @@ def independent_frames(frames: int) -> Clusters:
 
 
 def block_length(series: Floats) -> int:
-    """Returns the length of blocks that makes the mean's block bootstrap most accurate; 1 if none.
+    """Returns the length of blocks whose means are nearly independent; 1 if frames already are.
 
-    The optimum for a first-order autoregression (Carlstein 1986; Politis and White 2004), with the
-    median lag-1 autocorrelation of the columns, corrected for its bias (Kendall 1954). A series
-    without significant autocorrelation counts as independent.
+    Blocks of length L of a first-order autoregression with lag-1 correlation ρ understate the
+    variance of the mean by the fraction 2ρ/(1 − ρ²)/L for large L, which is kept at BLOCK_BIAS.
+    ρ is the median over the columns, corrected for its bias (Kendall 1954); a correlation below its
+    standard error counts as none.
 
     Args:
         series: (N, M) in order of time.
@@ -102,8 +109,7 @@ def block_length(series: Floats) -> int:
         warnings.simplefilter("ignore", RuntimeWarning)
         lag_one = (centred[1:] * centred[:-1]).sum(axis=0) / (centred**2).sum(axis=0)
         correlation = float(np.nanmedian(lag_one))
-    if math.isnan(correlation) or correlation <= _SIGNIFICANT / math.sqrt(frames):
+    if math.isnan(correlation) or correlation <= 1 / math.sqrt(frames):
         return 1
     correlation = min(correlation + (1 + 3 * correlation) / frames, 0.99)
-    ratio = math.sqrt(6) * correlation / (1 - correlation**2)
-    return min(frames, math.ceil(math.pow(ratio, 2 / 3) * math.pow(frames, 1 / 3)))
+    return min(frames, math.ceil(2 * correlation / (1 - correlation**2) / BLOCK_BIAS))

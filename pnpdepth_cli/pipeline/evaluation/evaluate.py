@@ -52,7 +52,11 @@ def evaluate(
     protocol = choose_protocol(request.protocol, **request.changes)
     _check(request)
     pairs = pair_frames(
-        request.prediction, request.ground_truth, sparse=request.sparse, mask=protocol.mask
+        request.prediction,
+        request.ground_truth,
+        sparse=request.sparse,
+        mask=protocol.mask,
+        layout_protocol=request.layout_protocol,
     )
     rows: list[FrameScores] = []
     kinds = FileKinds()

@@ -107,7 +107,7 @@ def _with_prediction(
     gt = loaded.ground_truth.values
     size = (gt.shape[0], gt.shape[1])
     image = _read(pair.prediction, scales.prediction, scales.channel, protocol, pair.index)
-    values = _to_size(pair, image.values, size, protocol.resize)
+    values = _to_size(pair, image.values, size, protocol)
     depth, fit = scaled(values, gt, gt > 0, protocol.prediction_kind, protocol.scale_by)
     predicted = values > 0
     if protocol.clip:
@@ -141,7 +141,12 @@ def _read_sigma(
         values = depth_from_stored(pair.sigma, load_stored(pair.sigma, None), None).values
     except InputError:
         return None
-    return values if values.shape == size else None
+    top, bottom, left, right = protocol.prediction_window(size)
+    if values.shape != (bottom - top, right - left):
+        return None
+    placed = np.zeros(size, np.float32)
+    placed[top:bottom, left:right] = values
+    return placed
 
 
 def _read_ground_truth(pair: FramePair, protocol: EvalProtocol, scales: Scales) -> DepthImage:
@@ -235,15 +240,26 @@ def _read_mask(path: Path) -> Mask:
     return np.asarray(values > 0)
 
 
-def _to_size(pair: FramePair, depth: Depth, size: tuple[int, int], method: str | None) -> Depth:
-    """The depth map at the ground truth's size: as it is, or resized as the protocol allows."""
-    if depth.shape == size:
+def _to_size(pair: FramePair, depth: Depth, size: tuple[int, int], protocol: EvalProtocol) -> Depth:
+    """The depth map at the ground truth's size: as it is, in its crop, or resized if allowed."""
+    top, bottom, left, right = protocol.prediction_window(size)
+    view = (bottom - top, right - left)
+    if depth.shape != view:
+        if protocol.resize is None:
+            raise _different(
+                pair, "prediction", pair.prediction, depth.shape, view,
+                advice="; --resize nearest or bilinear scales predictions if both show the same"
+                " view, --pred-crop kb puts those of KITTI's benchmark crop in their place",
+            )  # fmt: skip
+        depth = _resized(depth, view, protocol.resize)
+    if view == size:
         return depth
-    if method is None:
-        raise _different(
-            pair, "prediction", pair.prediction, depth.shape, size,
-            advice="; --resize nearest or bilinear scales predictions if both show the same view",
-        )  # fmt: skip
+    placed = np.zeros(size, np.float32)
+    placed[top:bottom, left:right] = depth
+    return placed
+
+
+def _resized(depth: Depth, size: tuple[int, int], method: str) -> Depth:
     height, width = size
     if method == "nearest":
         resized = cv2.resize(depth, (width, height), interpolation=cv2.INTER_NEAREST_EXACT)

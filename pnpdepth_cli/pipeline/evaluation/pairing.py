@@ -13,7 +13,7 @@ from pnpdepth_cli.errors import InputError, PnpDepthError, UsageError
 from pnpdepth_cli.io.dataset.frame import IMAGE_SUFFIXES
 from pnpdepth_cli.io.depth import DEPTH_SUFFIXES
 from pnpdepth_cli.io.file_bytes import one_line
-from pnpdepth_cli.io.layouts import Frame, Source, find_layout, list_frames
+from pnpdepth_cli.io.layouts import Frame, Source, find_layout, find_protocol, list_frames
 from pnpdepth_cli.io.record import read_json
 from pnpdepth_cli.pipeline.evaluation.dependence import groups_by_name
 from pnpdepth_cli.pipeline.evaluation.stacks import stack_size
@@ -70,7 +70,12 @@ class Pairs:
 
 
 def pair_frames(
-    prediction: Path, ground_truth: Path, *, sparse: Path | None = None, mask: Path | None = None
+    prediction: Path,
+    ground_truth: Path,
+    *,
+    sparse: Path | None = None,
+    mask: Path | None = None,
+    layout_protocol: str | None = None,
 ) -> Pairs:
     """Returns the frames of two files, or of two folders by name.
 
@@ -79,15 +84,22 @@ def pair_frames(
         ground_truth: The same, or a data set of a known layout, or a manifest.
         sparse: A file, or a folder with the same names.
         mask: A file, or a folder with the same names.
+        layout_protocol: One of choices.FRAME_PROTOCOLS, by which the frames of a data set are cut;
+            None for the layout's own.
 
     Raises:
-        UsageError: For a file and a folder.
+        UsageError: For a file and a folder, or a layout protocol without a data set.
         InputError: For a missing path, or folders without a common name.
     """
     for path in (prediction, ground_truth, *(p for p in (sparse, mask) if p)):
         if not path.exists():
             raise InputError(f"{path}: no such file or folder; check the path")
     layout = _layout_of(ground_truth)
+    if layout is None and layout_protocol is not None:
+        raise UsageError(
+            f"--layout-protocol {layout_protocol} is for data sets, and {ground_truth} is in no"
+            " known layout; leave it out"
+        )
     if layout is None and prediction.is_dir() != ground_truth.is_dir():
         both = (prediction, ground_truth)
         folder, file = both if prediction.is_dir() else reversed(both)
@@ -111,7 +123,14 @@ def pair_frames(
     else:
         listed = list_frames(ground_truth, layout)[1].frames
         frames = [frame for frame in listed if frame.gt is not None]
-        notes.append(f"gt: layout {layout}; frames with ground truth: {len(frames):,}")
+        if layout_protocol is not None:
+            cut = find_protocol(layout_protocol)
+            frames = [replace(frame, protocol=cut) for frame in frames]
+        cuts = ", ".join(sorted({frame.protocol.name for frame in frames} - {"whole"}))
+        notes.append(
+            f"gt: layout {layout}; frames with ground truth: {len(frames):,}"
+            + (f", cut by layout protocol {cuts}; --layout-protocol to change" if cuts else "")
+        )
         if not frames:
             raise InputError(
                 f"{ground_truth} looks like {layout!r}, and no frame in it has ground truth"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,9 @@ from pnpdepth_cli.pipeline.evaluation.kitti_devkit import DEVKIT_MEASURES
 
 KITTI_DEVKIT = "kitti-devkit"
 
+FORMER_NAMES = {"nyu": "nyu-eigen"}
+"""Present names of protocols by former ones, which are still accepted."""
+
 # (top, bottom, left, right) as fractions of the height and the width, cut to whole pixels.
 # Garg et al. 2016 for KITTI; and what Godard et al. (monodepth, utils/evaluate_kitti.py) found by
 # trial to reproduce Eigen et al. 2014. Nearly all later evaluations use these two.
@@ -24,6 +28,9 @@ _CROP_FRACTIONS = {
 # Eigen et al. 2014 for NYU Depth v2: rows 45 to 470, columns 41 to 600 of 480x640 pixels.
 _NYU_SIZE = (480, 640)
 _NYU_WINDOW = (45, 471, 41, 601)
+# What networks for KITTI's benchmark see of a frame: 352x1216 pixels at the bottom, centred (BTS,
+# Lee et al. 2019, `do_kb_crop`).
+_KB_SIZE = (352, 1216)
 CROPS = ("none", "nyu", *_CROP_FRACTIONS)
 
 Window = tuple[int, int, int, int]
@@ -60,6 +67,9 @@ class EvalProtocol:
     """What predictions are, one of PREDICTION_KINDS."""
     scale_by: str = "none"
     """How the prediction of each image is scaled to its ground truth, one of SCALINGS."""
+    prediction_crop: str | None = None
+    """Part of the ground truth's frame that predictions show: "kb", or X,Y,WIDTH,HEIGHT; None for
+    all of it. The rest counts as empty."""
     resize: str | None = None
     """How a prediction of another size is resized to the ground truth's; None refuses it."""
 
@@ -99,10 +109,30 @@ class EvalProtocol:
             raise SizeError(f"crop {self.crop} does not lie in a frame of {width}×{height}")
         return y, y + h, x, x + w
 
+    def prediction_window(self, size: tuple[int, int]) -> Window:
+        """Returns the rows and columns of a frame of `size` (H, W) pixels that predictions show.
+
+        Raises:
+            SizeError: If the crop does not fit the frame.
+        """
+        height, width = size
+        if self.prediction_crop is None:
+            return 0, height, 0, width
+        if self.prediction_crop == "kb":
+            h, w = _KB_SIZE
+            x, y = (width - w) // 2, height - h
+        else:
+            x, y, w, h = _rectangle(self.prediction_crop)
+        if min(x, y) < 0 or x + w > width or y + h > height:
+            raise SizeError(
+                f"--pred-crop {self.prediction_crop} does not lie in a frame of {width}×{height}"
+            )
+        return y, y + h, x, x + w
+
     def scoring(self) -> dict[str, Any]:
         """Returns what decides the figures; equal for two evaluations that can be compared."""
         rules = asdict(self)
-        for field_of_reading in ("name", "scale", "resize", "mask", "prediction_kind"):
+        for field_of_reading in _OF_READING:
             rules.pop(field_of_reading)
         return rules | {
             "thresholds": list(self.thresholds),
@@ -118,6 +148,7 @@ class EvalProtocol:
             mask=self.mask,
             exclude_sparse=self.exclude_sparse,
             resize=self.resize,
+            prediction_crop=self.prediction_crop,
             prediction_kind=self.prediction_kind,
         )
         return ", ".join(
@@ -137,6 +168,7 @@ class EvalProtocol:
         parts += [f"mask {self.mask}"] if self.mask else []
         parts += ["without the pixels of sparse points"] if self.exclude_sparse else []
         parts += [f"predictions resized ({self.resize})"] if self.resize else []
+        parts += [f"predictions of crop {self.prediction_crop}"] if self.prediction_crop else []
         parts += ["predictions are disparity"] if self.prediction_kind == "disparity" else []
         parts += [f"each image scaled by {self.scale_by}"] if self.scale_by != "none" else []
         parts += [_MISSING_TEXTS[self.missing]] if self.missing != "skip" else []
@@ -153,6 +185,9 @@ _IN_MILLIMETRES = tuple(
     replace(m, shown_unit="mm", shown_factor=1000.0, decimals=1) if m.key in ("rmse", "mae") else m
     for m in MEASURES
 )
+
+_OF_READING = ("name", "scale", "resize", "mask", "prediction_kind", "prediction_crop")
+"""Fields that say how files are read, not how they are scored."""
 
 _MISSING_TEXTS = {
     "min": "empty predictions scored as the lower bound",
@@ -175,7 +210,7 @@ PROTOCOLS = {
         EvalProtocol(name="paper"),
         # Eigen et al. 2014 with the bounds of later tables (BTS, AdaBins): 0.001 to 10 m.
         EvalProtocol(
-            name="nyu",
+            name="nyu-eigen",
             scale=1000.0,
             min_depth=1e-3,
             max_depth=10.0,
@@ -202,6 +237,7 @@ def choose_protocol(name: str, **changes: Any) -> EvalProtocol:
     Raises:
         UsageError: For an unknown name or a setting out of its range.
     """
+    name = FORMER_NAMES.get(name, name)
     if name not in PROTOCOLS:
         raise UsageError(f"no protocol {name!r}; there are {', '.join(PROTOCOLS)}")
     changed = {field: value for field, value in changes.items() if value is not None}
@@ -249,13 +285,15 @@ def _check(protocol: EvalProtocol) -> None:
         raise UsageError("--missing max scores empty predictions as --max-depth; set it")
     if protocol.crop not in CROPS:
         _rectangle(protocol.crop)
+    if protocol.prediction_crop not in (None, "kb"):
+        _rectangle(protocol.prediction_crop, names=("kb",))
 
 
-def _rectangle(text: str) -> tuple[int, int, int, int]:
+def _rectangle(text: str, names: Sequence[str] = CROPS) -> tuple[int, int, int, int]:
     try:
         x, y, width, height = (int(word) for word in text.split(","))
     except ValueError:
         x, y, width, height = -1, -1, 0, 0
     if min(x, y) < 0 or min(width, height) < 1:
-        raise UsageError(f"crop {text!r} is neither X,Y,WIDTH,HEIGHT nor one of {', '.join(CROPS)}")
+        raise UsageError(f"crop {text!r} is neither X,Y,WIDTH,HEIGHT nor one of {', '.join(names)}")
     return x, y, width, height

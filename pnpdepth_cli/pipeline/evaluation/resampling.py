@@ -12,6 +12,8 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
+from scipy import stats
 from torch import Tensor
 
 from pnpdepth_cli.pipeline.evaluation.averages import Floats
@@ -26,10 +28,12 @@ _CELLS = 1 << 21
 def studentised_interval(
     statistic: Callable[[Tensor], Tensor], totals: Floats, resamples: int, seed: int
 ) -> tuple[Floats, Floats]:
-    """Returns (M,), (M,): the ends of the bootstrap-t interval of statistic(totals.sum(0)).
+    """Returns (M,), (M,): the ends of the 95 % interval of statistic(totals.sum(0)).
 
-    Efron and Tibshirani 1993, section 12.5, with standard errors linearised in the totals
-    (infinitesimal jackknife). NaN where the statistic is NaN.
+    Each end is that of the bootstrap-t (Efron and Tibshirani 1993, section 12.5) or of Student's t,
+    whichever is farther out: the first follows the skewness of the errors, the second the error of
+    a standard error from few clusters. Standard errors are linearised in the totals (infinitesimal
+    jackknife). NaN where the statistic is NaN.
 
     Args:
         statistic: From totals (…, C) to (…, M); differentiable, and unchanged where the totals are
@@ -39,42 +43,72 @@ def studentised_interval(
         seed: Of the drawing.
     """
     clusters = len(totals)
-    columns = torch.from_numpy(totals)
+    moments = _Moments(statistic, totals)
     generator = np.random.default_rng(seed)
-    fractions = np.full(clusters, 1 / clusters)
-    value, error = (row[0] for row in _linearised(statistic, np.ones((1, clusters)), columns))
+    value, error = (row[0] for row in moments.linearised(np.ones((1, clusters))))
     ratios = []
     for size in _batches(resamples, clusters):
-        weights = generator.multinomial(clusters, fractions, size=size).astype(np.float64)
-        values, errors = _linearised(statistic, weights, columns)
+        drawn = generator.integers(0, clusters, (size, clusters), dtype=np.int32)
+        values, errors = moments.linearised(_counts(drawn))
         with np.errstate(divide="ignore", invalid="ignore"):
             # a resample without variance says nothing of the ratio's distribution
-            ratios.append(np.where(errors > 1e-9 * error, (values - value) / errors, np.nan))
+            ratios.append(np.where(errors > 1e-6 * error, (values - value) / errors, np.nan))
     tail = (1 - LEVEL) / 2
     all_ratios = np.concatenate(ratios)
     none = np.isnan(all_ratios).all(axis=0)  # all clusters are alike: nothing varies
     all_ratios[:, none] = 0.0
     low_ratio, high_ratio = np.nanquantile(all_ratios, [tail, 1 - tail], axis=0)
-    return value - high_ratio * error, value - low_ratio * error
+    student = stats.t.ppf(1 - tail, clusters - 1) * math.sqrt(clusters / (clusters - 1))
+    low, high = np.minimum(low_ratio, -student), np.maximum(high_ratio, student)
+    return value - high * error, value - low * error
 
 
-def _linearised(
-    statistic: Callable[[Tensor], Tensor], weights: Floats, totals: Tensor
-) -> tuple[Floats, Floats]:
-    """(B, M) the statistic where clusters count as weights (B, G), and (B, M) standard errors."""
-    counts = torch.from_numpy(weights)
-    resampled = counts @ totals
-    values = statistic(resampled)
-    # central differences: a backward pass would carry the NaN of one measure into the others
-    steps = torch.diag(_STEP * totals.abs().mean(dim=0).clamp_min(1e-300))
-    ahead, behind = (statistic(resampled[:, None] + sign * steps) for sign in (1, -1))
-    slopes = ((ahead - behind) / (2 * steps.diagonal()[:, None])).transpose(-1, -2)
-    variances = [
-        (counts * (slopes[:, measure] @ totals.T).square()).sum(dim=-1)
-        for measure in range(values.shape[-1])
-    ]
-    errors = torch.stack(variances, dim=-1).nan_to_num(0.0).sqrt()
-    return values.numpy(), errors.numpy()
+class _Moments:
+    """The statistic and its standard error, from first and second moments of the clusters."""
+
+    def __init__(self, statistic: Callable[[Tensor], Tensor], totals: Floats) -> None:
+        self._statistic = statistic
+        self._totals = totals
+        # centred, so that little cancels in the second moments
+        self._centred = totals - totals.mean(axis=0)
+        columns = totals.shape[1]
+        self._upper = np.triu_indices(columns)
+        self._products = self._centred[:, self._upper[0]] * self._centred[:, self._upper[1]]
+        # central differences: a backward pass would carry the NaN of one measure into the others
+        self._steps = torch.diag(
+            _STEP * torch.from_numpy(totals).abs().mean(dim=0).clamp_min(1e-300)
+        )
+
+    def linearised(self, counts: Floats) -> tuple[Floats, Floats]:
+        """Returns (B, M) the statistic where clusters count as (B, G), and (B, M) its errors."""
+        resampled = torch.from_numpy(counts @ self._totals)
+        values = self._statistic(resampled)
+        ahead, behind = (
+            self._statistic(resampled[:, None] + sign * self._steps) for sign in (1, -1)
+        )
+        slopes = ((ahead - behind) / (2 * self._steps.diagonal()[:, None])).transpose(-1, -2)
+        variances = torch.einsum(
+            "bmc,bcd,bmd->bm", slopes, torch.from_numpy(self._covariances(counts)), slopes
+        )
+        return values.numpy(), variances.nan_to_num(0.0).clamp_min(0).sqrt().numpy()
+
+    def _covariances(self, counts: Floats) -> Floats:
+        """(B, C, C) sums over the clusters of products of totals, centred in each resample."""
+        rows, columns = self._upper
+        sums = counts @ self._centred
+        centred = counts @ self._products - sums[:, rows] * sums[:, columns] / len(self._totals)
+        covariances = np.empty((len(counts), sums.shape[1], sums.shape[1]))
+        covariances[:, rows, columns] = centred
+        covariances[:, columns, rows] = centred
+        return covariances
+
+
+def _counts(drawn: NDArray[np.int32]) -> Floats:
+    """(B, G) how often each of G clusters is among (B, G) drawn ones."""
+    batch, clusters = drawn.shape
+    drawn += np.arange(0, batch * clusters, clusters, dtype=np.int32)[:, None]
+    counts = np.bincount(drawn.ravel(), minlength=batch * clusters)
+    return counts.reshape(batch, clusters).astype(np.float64)
 
 
 def sign_flip_p_values(

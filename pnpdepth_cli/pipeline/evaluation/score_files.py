@@ -118,23 +118,23 @@ def bin_rows(bins: Sequence[ErrorBin]) -> list[list[str]]:
 
 
 def comparison_table(comparison: Comparison) -> tuple[list[str], list[list[str]]]:
-    """Returns (header, a row for each measure): the runs, each but the first with gain and p."""
+    """Returns (header, a row for each measure and run); all runs but the first have gain and p."""
     base, *others = comparison.runs
-    header = ["", base.label]
-    for run in others:
-        header += [run.label, "gain [%]", "low", "high", "p"]
+    header = ["measure", "run", "mean", "gain [%]", "low", "high", "p"]
     rows = []
     for measure in comparison.measures:
-        row = [column_title(measure), format_value(measure, base.mean[measure.key])]
+        title, mean = column_title(measure), format_value(measure, base.mean[measure.key])
+        rows.append([title, base.label, mean, *["–"] * 4])
         for run, gains in zip(others, comparison.gains, strict=True):
             gain = gains[measure.key]
             bounds = (gain.percent, gain.low_percent, gain.high_percent)
-            row += [
+            rows.append([
+                title,
+                run.label,
                 format_value(measure, run.mean[measure.key]),
                 *("–" if math.isnan(value) else f"{value:+.2f}" for value in bounds),
                 "–" if math.isnan(gain.p_adjusted) else f"{gain.p_adjusted:.4f}",
-            ]
-        rows.append(row)
+            ])  # fmt: skip
     return header, rows
 
 

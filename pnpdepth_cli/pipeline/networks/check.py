@@ -1,4 +1,4 @@
-"""`pnpdepth models check`: can this network be run, trusted, cut and refined?"""
+"""`pnpdepth models check`: can this network be run, verified, cut and refined?"""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def check_model(
         device: Name of a torch device.
 
     Raises:
-        ModelError: The network cannot be run or trusted.
+        ModelError: The network cannot be run or verified.
         CheckpointError: Its weights cannot be loaded.
         DeviceError: The device is missing or too small.
         InputError: The image cannot be read.

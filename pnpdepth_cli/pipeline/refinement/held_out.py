@@ -170,8 +170,8 @@ def choice_notes(choice: Choice, definition: ModelDefinition) -> tuple[str, ...]
     network = choice.network_error
     assert network is not None
     note = (
-        f"choice: {choice}; {choice.error:.4f} m off at {choice.held_out:,} held-out points"
-        f" (network {network:.4f} m, best baseline {best} {errors[best]:.4f} m)"
+        f"choice: {choice}; MAE {choice.error:.4f} at {choice.held_out:,} held-out points"
+        f" (network {network:.4f}, best baseline {best} {errors[best]:.4f})"
     )
     if definition.input_kind == "rgb" or network <= errors[best]:
         return (note,)

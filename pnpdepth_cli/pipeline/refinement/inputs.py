@@ -24,6 +24,9 @@ from pnpdepth_cli.io.depth import (
 from pnpdepth_cli.io.fingerprint import fingerprint
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.pipeline.refinement.request import FrameFiles, RefineRequest
+from pnpdepth_cli.pipeline.sparse.colmap import read_colmap_points
+from pnpdepth_cli.pipeline.sparse.colmap_options import METRES, ColmapOptions
+from pnpdepth_cli.pipeline.sparse.scan_options import ScanOptions
 from pnpdepth_cli.pipeline.sparse.scans import read_scan_points
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.sensors import Points, occluded_in_map, sample_points
@@ -50,6 +53,8 @@ class Inputs:
     """Files and digests, for a record."""
     notes: tuple[str, ...]
     """What was assumed, and warnings."""
+    unit: str = METRES
+    """Of all depths: "m", or "model units" of a COLMAP model without scale."""
 
     @property
     def size(self) -> tuple[int, int]:
@@ -92,6 +97,8 @@ class _Sparse:
     """Of its file."""
     notes: tuple[str, ...]
     """What was assumed."""
+    unit: str = METRES
+    """Of the depth."""
 
 
 def read_inputs(request: RefineRequest) -> Inputs:
@@ -102,29 +109,42 @@ def read_inputs(request: RefineRequest) -> Inputs:
     """
     files = request.files
     image = None if files.image is None else _read_image(files, files.image)
-    truth = None if files.gt is None else _read_truth(files, files.gt)
+    ground_truth = None if files.gt is None else _read_ground_truth(files, files.gt)
     whole = None if image is None else image.whole
-    if truth is not None:
-        _check_truth(files, truth, whole)
+    if ground_truth is not None:
+        _check_ground_truth(files, ground_truth, whole)
     if files.sparse is None:
-        sparse = _sampled(files, image, truth, request.hold_out.seed)
+        sparse = _sampled(files, image, ground_truth, request.hold_out.seed)
+    elif files.sparse.is_dir():
+        sparse = _read_colmap(files, files.sparse, whole)
+    elif files.colmap != ColmapOptions():
+        raise UsageError(
+            f"{files.sparse} is no COLMAP model, so --unit-scale, --min-track and"
+            " --max-reprojection do not apply"
+        )
     elif files.scan.describes(files.sparse):
         sparse = _read_scan(files, files.sparse, whole)
     else:
         sparse = _read_points(files, files.sparse, whole)
-    if truth is not None and truth.values.shape != sparse.points.size:
-        raise _size_error(files, truth.values.shape, sparse.points.size)
-    parts = {"image": image, "sparse": sparse, "gt": truth}
+    if ground_truth is not None and sparse.unit != METRES:
+        raise UsageError(
+            f"the ground truth {files.gt} is in metres but the sparse depth in {sparse.unit}; give"
+            " --unit-scale, or leave out --gt"
+        )
+    if ground_truth is not None and ground_truth.values.shape != sparse.points.size:
+        raise _size_error(files, ground_truth.values.shape, sparse.points.size)
+    parts = {"image": image, "sparse": sparse, "gt": ground_truth}
     notes = [note for part in parts.values() if part is not None for note in part.notes]
-    if truth is not None and files.sparse is not None:
-        notes += _leak_warning(sparse.points, truth.values)
+    if ground_truth is not None and files.sparse is not None:
+        notes += _leak_warning(sparse.points, ground_truth.values)
     return Inputs(
         rgb=None if image is None else image.values,
         points=sparse.points,
-        gt=None if truth is None else truth.values,
+        gt=None if ground_truth is None else ground_truth.values,
         sparse_scale=sparse.scale,
         record={name: part.record for name, part in parts.items() if part is not None},
         notes=tuple(notes),
+        unit=sparse.unit,
     )
 
 
@@ -159,25 +179,25 @@ def _read_image(files: FrameFiles, source: Source) -> _Part:
     )
 
 
-def _read_truth(files: FrameFiles, source: Source) -> _Part:
+def _read_ground_truth(files: FrameFiles, source: Source) -> _Part:
     if isinstance(source, Hdf5Array):
-        truth = DepthImage(values=depth_of(source), source="HDF5", assumed_scale=False)
+        ground_truth = DepthImage(values=depth_of(source), source="HDF5", assumed_scale=False)
     else:
         scale = files.gt_scale or files.depth_scale
-        truth = read_depth(source, scale=scale, channel=files.channel)
+        ground_truth = read_depth(source, scale=scale, channel=files.channel)
     described = describe_range(
-        truth.values,
-        truth.source,
-        assumed_scale=truth.assumed_scale,
+        ground_truth.values,
+        ground_truth.source,
+        assumed_scale=ground_truth.assumed_scale,
         noun="pixels",
         option="--gt-scale",
     )
     return _Part(
-        values=np.ascontiguousarray(files.protocol.apply(truth.values)),
-        whole=(truth.values.shape[0], truth.values.shape[1]),
-        record=_file_record(source) | {"read_as": truth.source},
+        values=np.ascontiguousarray(files.protocol.apply(ground_truth.values)),
+        whole=(ground_truth.values.shape[0], ground_truth.values.shape[1]),
+        record=_file_record(source) | {"read_as": ground_truth.source},
         notes=(f"gt: {described}",),
-        scale=truth.scale,
+        scale=ground_truth.scale,
     )
 
 
@@ -186,21 +206,23 @@ def _file_record(source: Source) -> dict[str, Any]:
     return {"path": str(source), "sha256": fingerprint(path).sha256}
 
 
-def _sampled(files: FrameFiles, image: _Part | None, truth: _Part | None, seed: int) -> _Sparse:
+def _sampled(
+    files: FrameFiles, image: _Part | None, ground_truth: _Part | None, seed: int
+) -> _Sparse:
     """Points sampled from the ground truth."""
     if files.sample is None:
         raise InputError(f"{files.image} has no sparse depth; add it, or sample the ground truth")
-    if truth is None:
+    if ground_truth is None:
         raise InputError(f"{files.image} has no ground truth to sample points from; add it")
     rgb = None if image is None else image.values
     try:
-        points = sample_points(truth.values, files.sample, seed, image=rgb)
+        points = sample_points(ground_truth.values, files.sample, seed, image=rgb)
     except UsageError as error:  # the pattern itself is good, this frame is too poor for it
         raise InputError(f"{files.gt}: {error}") from error
     source = f"{files.sample.kind} of the ground truth, seed {seed}"
     return _Sparse(
         points=points.tensors(),
-        scale=truth.scale,
+        scale=ground_truth.scale,
         record={"sampled_from": str(files.gt), **asdict(files.sample), "seed": seed},
         notes=(f"sparse: {describe_range(points.depth, source)}",),
     )
@@ -211,6 +233,23 @@ def _read_scan(files: FrameFiles, path: Path, image_size: tuple[int, int] | None
     scan = read_scan_points(path, files.scan, image_size, image)
     points = _in_protocol(files, path, scan.points.tensors())
     return _Sparse(points=points, scale=None, record=scan.record, notes=scan.notes)
+
+
+def _read_colmap(files: FrameFiles, path: Path, image_size: tuple[int, int] | None) -> _Sparse:
+    if image_size is None or not isinstance(files.image, Path):
+        raise UsageError(f"{path} is a folder, taken for a COLMAP model, which needs the image")
+    if files.scan != ScanOptions():
+        raise UsageError(f"{path} is a COLMAP model, so the options of a LiDAR scan do not apply")
+    observed = read_colmap_points(
+        path, files.colmap, files.image, image_size, any_size=files.sparse_size_ok
+    )
+    return _Sparse(
+        points=_in_protocol(files, path, observed.points.tensors()),
+        scale=observed.scale,
+        record=observed.record,
+        notes=observed.notes,
+        unit=observed.unit,
+    )
 
 
 def _read_points(files: FrameFiles, path: Path, image_size: tuple[int, int] | None) -> _Sparse:
@@ -269,10 +308,12 @@ def _inside(path: Path, points: SparsePoints) -> SparsePoints:
     return inside
 
 
-def _check_truth(files: FrameFiles, truth: _Part, image_size: tuple[int, int] | None) -> None:
-    if image_size is not None and truth.whole != image_size:
-        raise _size_error(files, truth.whole, image_size)
-    if not bool((truth.values > 0).any()):
+def _check_ground_truth(
+    files: FrameFiles, ground_truth: _Part, image_size: tuple[int, int] | None
+) -> None:
+    if image_size is not None and ground_truth.whole != image_size:
+        raise _size_error(files, ground_truth.whole, image_size)
+    if not bool((ground_truth.values > 0).any()):
         raise InputError(f"ground truth {files.gt} has no pixel with known depth")
 
 

@@ -22,7 +22,7 @@ def write_outputs(outputs: Outputs, inputs: Inputs, frame: RefinedFrame) -> dict
     write_depth(outputs.depth, frame.after, scale=output_scale(inputs))
     if outputs.sigma is not None and frame.sigma is not None:
         write_depth(outputs.sigma, frame.sigma)
-    record: dict[str, Any] = {"improved_share": None}
+    record: dict[str, Any] = {"improved_fraction": None}
     if outputs.preview is not None:
         preview(
             inputs.rgb,
@@ -31,9 +31,10 @@ def write_outputs(outputs: Outputs, inputs: Inputs, frame: RefinedFrame) -> dict
             frame.before,
             frame.after,
             outputs.preview,
+            inputs.unit,
         )
     if outputs.improvement is not None:
-        record["improved_share"] = _write_improvement(outputs.improvement, inputs, frame)
+        record["improved_fraction"] = _write_improvement(outputs.improvement, inputs, frame)
     record["outputs"] = {
         kind: None if path is None else str(path)
         for kind, path in (
@@ -58,4 +59,5 @@ def _write_improvement(path: Path, inputs: Inputs, frame: RefinedFrame) -> float
         points.sample(torch.from_numpy(frame.after)).numpy(),
         held_out=bool(len(frame.held_out)),
         path=path,
+        unit=inputs.unit,
     )

@@ -44,6 +44,7 @@ from pnpdepth_cli.pipeline.refinement.resolve import (
     resolve_layer,
     resolve_settings,
 )
+from pnpdepth_cli.pipeline.sparse.colmap_options import METRES
 from pnpdepth_cli.pipeline.stopwatch import Stopwatch, peak_memory_mb, versions
 from pnpdepth_cli.points import SparsePoints
 
@@ -290,7 +291,7 @@ def refiner_of(
         if layer is None and not method.own_layer:
             layer = default_layer(network, first.size, len(first.points))
         options = method.options if number == 0 else MethodOptions()
-        own = resolve_settings(definition, options)
+        own = resolve_settings(definition, options, metric=first.unit == METRES)
         if number == 0 and settings is not None:
             own = settings
         plans.append((_name(networks, number), network, resolve_layer(definition, layer), own))
@@ -353,6 +354,7 @@ def _record(refiner: Refiner, inputs: Inputs, frame: RefinedFrame) -> dict[str, 
     propagate = method.options.propagate
     return {
         "versions": versions(),
+        "unit": inputs.unit,
         "inputs": inputs.record,
         "model": refiner.model_record,
         "method": {

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 from pnpdepth_cli import choices
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.pipeline.options import Axis, option
+from pnpdepth_cli.pipeline.sparse.colmap_options import ColmapOptions
 from pnpdepth_cli.pipeline.sparse.scan_options import ScanOptions
 
 if TYPE_CHECKING:
@@ -49,7 +50,8 @@ class FrameFiles:
     image: Source | None = None
     """Input image. None for a network that takes sparse depth alone."""
     sparse: Path | None = None
-    """Sparse depth, or a LiDAR scan. None: `sample` takes points of the ground truth."""
+    """Sparse depth, a LiDAR scan, or a COLMAP model. None: `sample` takes points of the ground
+    truth."""
     gt: Source | None = None
     """Ground truth depth."""
     depth_scale: float | None = option(
@@ -66,6 +68,8 @@ class FrameFiles:
     sparse_size_ok: bool = option(
         False, "Accept a sparse depth map of another size; its points are moved to the image."
     )
+    colmap: ColmapOptions = field(default_factory=ColmapOptions)
+    """Which points are used where `sparse` is a COLMAP model."""
     scan: ScanOptions = field(default_factory=ScanOptions)
     """How `sparse` is projected where it is a LiDAR scan."""
     sample: SamplePattern | None = None
@@ -89,8 +93,8 @@ class NetworkChoice:
     """Further networks, with their own weights; they compete and are blended with the first."""
     checkpoint: Path | None = option(
         None,
-        "Weights: a safetensors, torch, numpy or TensorFlow (.index) file, or a folder of them. No"
-        " code in them is run.",
+        "Weights: a safetensors, torch, numpy or TensorFlow (.index) file, or a folder. No code in"
+        " it is run.",
     )
     output_kind: str | None = option(
         None,
@@ -224,9 +228,7 @@ class HoldOut:
         parse=parse_seconds,
     )
     baselines: bool = option(False, "Also score every baseline, such as linear interpolation.")
-    uncertainty: bool = option(
-        False, "Write <name>_sigma.exr, the standard deviation of the depth."
-    )
+    uncertainty: bool = option(False, "Write <name>_sigma.exr, the depth's standard deviation.")
     holdout: float = option(0.0, "Hold out this fraction of the points to score at.", metavar="F")
     seed: int = option(
         0, "Random seed.", metavar="N", least=0, most=LARGEST_SEED, show_default=True
@@ -302,7 +304,7 @@ def _wanted(name: str, names: Collection[str]) -> bool:
     return not names or name in names
 
 
-def count_or_share(text: str) -> tuple[int | None, float | None]:
+def count_or_fraction(text: str) -> tuple[int | None, float | None]:
     """Returns (points, fraction) of `500` or `5%`; the other is None. Raises UsageError."""
     try:
         if text.strip().endswith("%"):
@@ -312,8 +314,8 @@ def count_or_share(text: str) -> tuple[int | None, float | None]:
         raise UsageError(f"count {text!r} is neither a number such as 500 nor 5%") from None
 
 
-def sample_pattern(kind: str, count: int | None, share: float | None) -> SamplePattern:
+def sample_pattern(kind: str, count: int | None, fraction: float | None) -> SamplePattern:
     """Returns the pattern of so many points, or this fraction of the known pixels."""
     from pnpdepth_cli.sensors import SamplePattern
 
-    return SamplePattern(kind=kind, count=count, share=share)
+    return SamplePattern(kind=kind, count=count, fraction=fraction)

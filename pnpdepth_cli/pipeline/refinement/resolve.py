@@ -87,11 +87,19 @@ def resolve_layer(definition: ModelDefinition, layer: str | None) -> str:
     return definition.layers[round(fraction * (len(definition.layers) - 1))]
 
 
-def resolve_settings(definition: ModelDefinition, method: MethodOptions) -> RefineSettings:
+def resolve_settings(
+    definition: ModelDefinition, method: MethodOptions, *, metric: bool = True
+) -> RefineSettings:
     """Returns the settings of refinement: the user's, else the network's defaults.
 
     Another update rule than the network's default starts from the paper's step size, schedule and
-    blur, because those of the network were tuned for its own rule.
+    blur, because those of the network were tuned for its own rule. The output of a network of
+    metres from an image alone is scaled to points in another unit.
+
+    Args:
+        definition: Of the network.
+        method: What the user chose.
+        metric: Whether the points are in metres.
 
     Raises:
         UsageError: A value is out of range.
@@ -107,6 +115,9 @@ def resolve_settings(definition: ModelDefinition, method: MethodOptions) -> Refi
         raise UsageError(f"blur {blur} is no distance; give 0 or more spacings of the points")
     if not 0 <= method.proximity < math.inf:
         raise UsageError(f"proximity {method.proximity} is no weight; give 0 or more")
+    alignment = definition.default_alignment
+    if not metric and alignment == "none" and definition.input_kind == "rgb":
+        alignment = "scale"
     return RefineSettings(
         iterations=iterations,
         lr=steps.lr if method.lr is None else method.lr,
@@ -118,7 +129,7 @@ def resolve_settings(definition: ModelDefinition, method: MethodOptions) -> Refi
         proximity=method.proximity,
         line_search=method.line_search,
         keep_best=method.keep_best,
-        align=method.align or definition.default_alignment,
+        align=method.align or alignment,
         align_every=method.align_every,
     )
 

@@ -207,7 +207,9 @@ def _columns(measured: bool) -> list[Column]:
 def _values(row: Row, basis: str | None, measured: bool) -> dict[str, float | None]:
     if basis is None or (measured and basis == _USED):
         return {}
-    values: dict[str, float | None] = {"improved": row["improved_share"]}
+    values: dict[str, float | None] = {
+        "improved": row.get("improved_fraction", row.get("improved_share"))
+    }
     for key in _ERRORS:
         before, after = (row[basis][stage].get(key) for stage in ("before", "after"))
         values |= {f"{key}_before": before, f"{key}_after": after}
@@ -249,7 +251,7 @@ def _head(
             if summary["mean"][basis]
             for each in [_means(basis, summary["mean"][basis])]
         ]
-        + _baselines(summary.get("baselines")),
+        + _baselines(summary.get("baselines"), summary["unit"]),
         "labels": {
             "first": "Before",
             "second": "After",
@@ -280,7 +282,9 @@ def _tiles(summary: Mapping[str, Any], measured: bool) -> list[dict[str, str]]:
             gain_text = ""
             if gain is not None and basis != _USED:
                 gain_text = f"gain {_signed(100 * gain, 1, '%')} "
-            tiles.append(tile(f"{measure.title} [m]", change, f"{gain_text}{_BASES[basis]}"))
+            tiles.append(
+                tile(f"{measure.title} [{summary['unit']}]", change, f"{gain_text}{_BASES[basis]}")
+            )
     return tiles
 
 
@@ -332,12 +336,12 @@ def _means(basis: str, mean: Mapping[str, Any]) -> dict[str, Any]:
     return table(f"Means over {frames_text(mean['frames'])}, {_BASES[basis]}", header, rows)
 
 
-def _baselines(mean: Mapping[str, Mapping[str, Any]] | None) -> list[dict[str, Any]]:
+def _baselines(mean: Mapping[str, Mapping[str, Any]] | None, unit: str) -> list[dict[str, Any]]:
     """A table of the simple baselines, the network and the result; empty without --baselines."""
     if not mean:
         return []
     mae = _ERRORS["mae"]
-    header = ["", "MAE at held-out points [m]", "MAE [m]", "RMSE [m]", "frames"]
+    header = ["", f"MAE at held-out points [{unit}]", "MAE [m]", "RMSE [m]", "frames"]
     rows = [
         [name, *(format_value(mae, row[key]) for key in ("held_out_mae", "mae", "rmse")),
          f"{row['frames']:,}"]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -68,14 +68,14 @@ def write_eval_report(
     Raises:
         OutputError: If the report cannot be written.
     """
-    pictures = begin_report(folder, _SOURCE)
+    images = begin_report(folder, _SOURCE)
     remove_report_leftovers(folder)
     columns = _columns(evaluation)
     scored = evaluation.scored
 
     def entries() -> Iterator[dict[str, Any]]:
         drawn = in_order(
-            lambda frame: _entry(frame, evaluation, columns, pictures),
+            lambda frame: _entry(frame, evaluation, columns, images),
             scored,
             evaluation.request.workers,
         )
@@ -118,6 +118,7 @@ def _head(evaluation: Evaluation, columns: list[Column]) -> dict[str, Any]:
             *_bins("By distance to the nearest sparse point", "px", evaluation.by_distance),
             *_bins("By depth of the ground truth", "m", evaluation.by_depth),
         ],
+        "charts": _charts(evaluation),
         "labels": {
             "first": f"Prediction{filled}", "second": "Ground truth", "map": "Error",
             "image": "Image",
@@ -199,6 +200,55 @@ def _uncertainty(evaluation: Evaluation) -> list[dict[str, Any]]:
     ]
 
 
+def _charts(evaluation: Evaluation) -> list[dict[str, Any]]:
+    """The calibration plot and the sparsification curve of the predicted standard deviation."""
+    uncertainty = evaluation.uncertainty
+    if uncertainty is None:
+        return []
+    frames = frames_text(uncertainty.frames)
+    observed = _line("observed", uncertainty.expected, uncertainty.observed)
+    charts = [
+        _chart(
+            f"Calibration, {frames}",
+            ("errors within the interval if normal", "observed"),
+            [observed, _line("normal", (0, 1), (0, 1), dashed=True)],
+        )
+    ]
+    whole = uncertainty.sparsification[0]
+    if whole:
+        curves = (
+            [value / whole for value in curve]
+            for curve in (uncertainty.sparsification, uncertainty.oracle)
+        )
+        by_sigma, by_error = curves
+        charts.append(
+            _chart(
+                f"Sparsification, {frames}: AUSE {uncertainty.ause:.4f}",
+                ("pixels removed", "MAE of the others"),
+                [
+                    _line("by σ", uncertainty.removed, by_sigma),
+                    _line("by error (oracle)", uncertainty.removed, by_error, dashed=True),
+                ],
+            )
+        )
+    return charts
+
+
+def _chart(caption: str, titles: tuple[str, str], lines: list[dict[str, Any]]) -> dict[str, Any]:
+    """Lines over fractions from 0 to 1, upwards to 1 or to the highest value."""
+    top = max(1.0, *(y for line in lines for _, y in line["points"]))
+    x_title, y_title = titles
+    return {
+        "caption": caption, "x_title": x_title, "y_title": y_title, "top": top, "lines": lines,
+    }  # fmt: skip
+
+
+def _line(
+    label: str, x: Sequence[float], y: Sequence[float], *, dashed: bool = False
+) -> dict[str, Any]:
+    return {"label": label, "points": list(zip(x, y, strict=True)), "dashed": dashed}
+
+
 def _bins(caption: str, unit: str, bins: tuple[ErrorBin, ...]) -> list[dict[str, Any]]:
     if not bins:
         return []
@@ -207,7 +257,7 @@ def _bins(caption: str, unit: str, bins: tuple[ErrorBin, ...]) -> list[dict[str,
 
 
 def _entry(
-    frame: FrameScores, evaluation: Evaluation, columns: list[Column], pictures: Path
+    frame: FrameScores, evaluation: Evaluation, columns: list[Column], images: Path
 ) -> dict[str, Any]:
     values = frame.values | {"coverage": frame.coverage}
     notes = [f"Scored: {frame.pixels:,} of {frame.known:,} pixels of the ground truth."]
@@ -216,7 +266,7 @@ def _entry(
     notes.append(f"Prediction: {frame.pair.prediction}")
     notes.append(f"Ground truth: {frame.pair.frame.gt}")
     try:
-        drawn = _drawn(frame, evaluation, pictures)
+        drawn = _drawn(frame, evaluation, images)
     except InputError as error:  # the file has changed since it was scored
         notes.append(str(error))
         drawn = {"key": None}
@@ -229,7 +279,7 @@ def _entry(
     }
 
 
-def _drawn(frame: FrameScores, evaluation: Evaluation, pictures: Path) -> dict[str, Any]:
+def _drawn(frame: FrameScores, evaluation: Evaluation, images: Path) -> dict[str, Any]:
     """Writes the images of a frame and returns the page's entry of them."""
     protocol = evaluation.protocol
     loaded = load_frame(frame.pair, protocol, evaluation.request.scales)
@@ -246,7 +296,7 @@ def _drawn(frame: FrameScores, evaluation: Evaluation, pictures: Path) -> dict[s
     if image is not None:
         views["image"] = np.asarray(np.rint(255 * np.clip(image, 0, 1)), np.uint8)
     key = image_key(frame.name)
-    save_images(pictures, key, views, thumb="first" if image is None else "image")
+    save_images(images, key, views, thumb="first" if image is None else "image")
     amount = f"by {errors.strongest_m:.3g} m or more"
     return {
         "key": key,

@@ -117,7 +117,7 @@ def write_sparse_outputs(
         "inputs": made_from.inputs,
         "points": {
             "count": len(points.depth),
-            "share_of_pixels": len(points.depth) / (height * width),
+            "fraction_of_pixels": len(points.depth) / (height * width),
             "nearest": float(points.depth.min()),
             "farthest": float(points.depth.max()),
             "dropped": dict(points.dropped),

@@ -29,9 +29,9 @@ class SampleRequest:
     """One of `choices.PATTERNS`."""
 
     count: int | None = None
-    """Number of points; None with a share."""
+    """Number of points; None with a fraction."""
 
-    share: float | None = None
+    fraction: float | None = None
     """Fraction of the known pixels; None with a count."""
 
     region: tuple[int, int, int, int] | None = None
@@ -61,7 +61,7 @@ def sample_depth(request: SampleRequest) -> dict[str, Any]:
     """
     request.target.check((request.depth, request.image))
     pattern = SamplePattern(
-        kind=request.pattern, count=request.count, share=request.share, region=request.region
+        kind=request.pattern, count=request.count, fraction=request.fraction, region=request.region
     )
     noise = SampleNoise(**request.noise)
     dense = read_depth(request.depth, scale=request.depth_scale, channel=request.channel)

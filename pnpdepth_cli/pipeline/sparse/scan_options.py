@@ -15,10 +15,18 @@ class ScanOptions:
 
     calib: Path | None = option(
         None,
-        "Calibration of a LiDAR scan: a KITTI file or raw folder, or a file with K, R, t.",
+        "Calibration of a LiDAR scan: KITTI, OpenCV, ROS, Kalibr, or a file with K, R, t.",
         metavar="FILE|FOLDER",
     )
-    camera: int | None = option(None, "KITTI camera number, 0 to 3.  [default: 2]", metavar="N")
+    extrinsics: Path | None = option(
+        None,
+        "Pose of the scanner in the camera's frame: matrix, quaternion or tf.",
+        metavar="FILE",
+    )
+    inverse_extrinsics: bool = option(False, "The pose maps the camera to the scanner.")
+    camera: int | None = option(
+        None, "Camera number of KITTI (0 to 3) or Kalibr.  [default: 2; 0]", metavar="N"
+    )
     euclidean: bool = option(False, "Depth is the distance from the camera, not z.", flag="--range")
     keep_occluded: bool = option(False, "Keep LiDAR points that are occluded from the camera.")
     min_range: float = option(0.0, "Drop points nearer than M metres.", metavar="M")

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import SizeError, UsageError
 from pnpdepth_cli.io.calibration import Calibration, read_calibration
 from pnpdepth_cli.io.depth import describe_range
+from pnpdepth_cli.io.extrinsics import inverse, read_extrinsics
 from pnpdepth_cli.io.record import sha256_of
 from pnpdepth_cli.io.scans import read_scan
 from pnpdepth_cli.pipeline.sparse.scan_options import ScanOptions
+from pnpdepth_cli.points import in_frame
 from pnpdepth_cli.sensors import (
     Camera,
     OcclusionFilter,
@@ -21,6 +24,12 @@ from pnpdepth_cli.sensors import (
     ProjectionSettings,
     project_velodyne,
 )
+
+_MORE_IF_INVERTED = 3.0
+"""Times as many points in the image with inverted extrinsics that give a warning."""
+
+_NEXT_TO_NONE = 0.05
+"""Fraction of them; fewer points with the extrinsics themselves are an error."""
 
 _OFF_CENTRE = 0.15
 """Fraction of the image's side by which a principal point may be off centre without warning."""
@@ -60,9 +69,12 @@ def read_scan_points(
         raise UsageError(
             f"{path} is a scan, which needs --calib: a calibration file, or KITTI's raw folder"
         )
-    calibration = read_calibration(options.calib, options.camera)
+    calibration = with_extrinsics(read_calibration(options.calib, options.camera), options)
     if not calibration.has_pose:
-        raise UsageError(f"{options.calib} has no pose of the scanner; add R and t (or Tr)")
+        raise UsageError(
+            f"{options.calib} has no pose of the scanner; add it (R and t, Tr, T_camera_lidar), or"
+            " give --extrinsics"
+        )
     size = size or calibration.size
     if size is None:
         raise SizeError(f"{options.calib} does not give the image's size; give the image too")
@@ -74,7 +86,10 @@ def read_scan_points(
         max_range=np.inf if options.max_range is None else options.max_range,
         occlusion=None if options.keep_occluded else OcclusionFilter(),
     )
-    points = project_velodyne(scan.points, camera_of(calibration), size, settings)
+    camera = camera_of(calibration)
+    if not calibration.source.startswith("KITTI"):  # whose files have one direction
+        warnings += check_direction(scan.points, camera, size)
+    points = project_velodyne(scan.points, camera, size, settings)
     source = f"{scan.source} of {len(scan.points):,} points, {calibration.source}"
     lost = ", ".join(f"{count:,} {why}" for why, count in points.dropped.items() if count)
     notes = [f"sparse: {describe_range(points.depth, source)}"]
@@ -87,6 +102,8 @@ def read_scan_points(
             "read_as": source,
             "calibration": str(options.calib),
             "camera": options.camera,
+            "extrinsics": None if options.extrinsics is None else str(options.extrinsics),
+            "inverse_extrinsics": options.inverse_extrinsics,
             "depth_is": "range" if options.euclidean else "z",
             "min_range": options.min_range,
             "max_range": options.max_range,
@@ -97,6 +114,52 @@ def read_scan_points(
     )
 
 
+def with_extrinsics(calibration: Calibration, options: ScanOptions) -> Calibration:
+    """Returns the calibration with the pose of the scanner that the options name, if any."""
+    rotation, translation = calibration.rotation, calibration.translation
+    if options.extrinsics is not None:
+        rotation, translation = read_extrinsics(options.extrinsics)
+    if options.inverse_extrinsics:
+        rotation, translation = inverse((rotation, translation))
+    return replace(
+        calibration,
+        rotation=rotation,
+        translation=translation,
+        has_pose=calibration.has_pose or options.extrinsics is not None,
+    )
+
+
+def check_direction(scan: NDArray[np.floating], camera: Camera, size: tuple[int, int]) -> list[str]:
+    """Returns a warning if the inverse of the scanner's pose puts far more points into the image.
+
+    Args:
+        scan: (N, 3) metres in the scanner's frame.
+        camera: With the pose.
+        size: (H, W) of the image.
+
+    Raises:
+        UsageError: The pose puts next to none of the points into the image.
+    """
+    rotation, translation = inverse((camera.rotation, camera.translation))
+    turned = replace(camera, rotation=rotation, translation=translation)
+    inside, inverted = (_count_inside(scan, each, size) for each in (camera, turned))
+    if inverted < _MORE_IF_INVERTED * max(inside, 1):
+        return []
+    text = (
+        f"the extrinsics put {inside:,} of {len(scan):,} scan points into the image, their inverse"
+        f" {inverted:,}; if they map the camera to the scanner, add --inverse-extrinsics"
+    )
+    if inside < _NEXT_TO_NONE * inverted:
+        raise UsageError(text)
+    return [f"warning: {text}"]
+
+
+def _count_inside(scan: NDArray[np.floating], camera: Camera, size: tuple[int, int]) -> int:
+    seen = camera.from_scanner(scan)
+    xy = camera.pixels_of(seen[seen[:, 2] > 0])
+    return int(np.count_nonzero(in_frame(xy, size)))
+
+
 def camera_of(calibration: Calibration) -> Camera:
     """Returns the camera and the scanner's pose that a calibration describes."""
     return Camera(
@@ -104,6 +167,7 @@ def camera_of(calibration: Calibration) -> Camera:
         rotation=calibration.rotation,
         translation=calibration.translation,
         distortion=calibration.distortion,
+        lens=calibration.lens,
     )
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -50,23 +50,8 @@ class SimulateRequest:
     at_scanner: bool = False
     """The scanner has the pose that the calibration gives."""
 
-    rotation_noise_deg: float = 0.0
-    """As in `SimulationSettings`."""
-
-    angle_noise_deg: float | None = None
-    """As in `SimulationSettings`."""
-
-    range_noise: float | None = None
-    """As in `SimulationSettings`."""
-
-    dropout: float = 0.0
-    """As in `SimulationSettings`."""
-
-    max_range: float | None = None
-    """As in `SimulationSettings`."""
-
-    euclidean: bool = False
-    """As in `SimulationSettings`."""
+    settings: SimulationSettings = field(default_factory=SimulationSettings)
+    """Noise and limits."""
 
     seed: int = 0
     """Of all noise."""
@@ -77,6 +62,13 @@ class SimulateRequest:
     channel: str | None = None
     """The EXR channel or NPZ array with the depth."""
 
+    @classmethod
+    def from_fields(cls, **values: Any) -> SimulateRequest:
+        """Returns the request with these fields, those of `settings` by their own names."""
+        names = [each.name for each in fields(SimulationSettings) if each.name in values]
+        settings = SimulationSettings(**{name: values.pop(name) for name in names})
+        return cls(settings=settings, **values)
+
 
 def simulate_scan(request: SimulateRequest) -> dict[str, Any]:
     """Writes the simulated sensor's points, and returns the record.
@@ -86,14 +78,6 @@ def simulate_scan(request: SimulateRequest) -> dict[str, Any]:
     """
     sensor = find_sensor(request.sensor)
     request.target.check((request.depth, request.calib, Path(request.sensor)))
-    settings = SimulationSettings(
-        rotation_noise_deg=request.rotation_noise_deg,
-        angle_noise_deg=request.angle_noise_deg,
-        range_noise=request.range_noise,
-        dropout=request.dropout,
-        max_range=request.max_range,
-        euclidean=request.euclidean,
-    )
     dense = read_depth(request.depth, scale=request.depth_scale, channel=request.channel)
     calibration = read_calibration(request.calib, request.camera)
     height, width = dense.values.shape
@@ -101,7 +85,7 @@ def simulate_scan(request: SimulateRequest) -> dict[str, Any]:
     unlikely = implausible(dense.values, dense.scale)
     warnings += [f"warning: {unlikely}"] if unlikely else []
     camera = _camera(request, calibration)
-    points = simulate_lidar(dense.values, camera, sensor, request.seed, settings)
+    points = simulate_lidar(dense.values, camera, sensor, request.seed, request.settings)
     depth_range = describe_range(
         dense.values, dense.source, assumed_scale=dense.assumed_scale, noun="pixels"
     )
@@ -113,7 +97,7 @@ def simulate_scan(request: SimulateRequest) -> dict[str, Any]:
             command="simulate",
             settings={
                 "sensor": asdict(sensor) | {"max_range": _finite(sensor.max_range)},
-                **asdict(settings),
+                **asdict(request.settings),
                 "rotation": camera.rotation.tolist(),
                 "translation": camera.translation.tolist(),
                 "seed": request.seed,

@@ -13,7 +13,7 @@ import torch
 from pnpdepth_cli.core.step_sizes import step_size
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.pipeline.options import options_of
-from pnpdepth_cli.pipeline.refinement.request import MethodOptions, count_or_share
+from pnpdepth_cli.pipeline.refinement.request import MethodOptions, count_or_fraction
 from pnpdepth_cli.pipeline.sweep.points import known_sensor
 
 Cell = Mapping[str, str]
@@ -166,7 +166,7 @@ def _one_of(names: Sequence[str]) -> Callable[[str], str]:
 
 
 def _points(text: str) -> str:
-    count, fraction = count_or_share(text)
+    count, fraction = count_or_fraction(text)
     if (count is not None and count < 1) or (fraction is not None and not 0 < fraction <= 1):
         raise ValueError("give at least one point, or a fraction above 0 and at most 100 %")
     return text

@@ -75,7 +75,7 @@ class Run:
 
     @property
     def id(self) -> RunId:
-        """What tells the run from the others of its sweep."""
+        """What distinguishes the run from the others of its sweep."""
         return self.frame.name, self.seed, self.sampling, self.method
 
 

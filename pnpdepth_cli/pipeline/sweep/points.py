@@ -12,7 +12,7 @@ from pnpdepth_cli.errors import InputError, UsageError
 from pnpdepth_cli.io.calibration import read_calibration
 from pnpdepth_cli.io.dataset.frame import Frame
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs
-from pnpdepth_cli.pipeline.refinement.request import RefineRequest, count_or_share
+from pnpdepth_cli.pipeline.refinement.request import RefineRequest, count_or_fraction
 from pnpdepth_cli.pipeline.sparse.scans import camera_of, check_size
 from pnpdepth_cli.pipeline.sparse.simulate import find_sensor
 from pnpdepth_cli.points import SparsePoints
@@ -90,8 +90,8 @@ class Sampling:
                 f"sensor {self.sensor!r} needs a number of points: {self.sensor}:500, or --sample"
                 " 500, or --vary points=100,500"
             )
-        count, fraction = count_or_share(self.points)
-        return SamplePattern(kind=self.sensor, count=count, share=fraction)
+        count, fraction = count_or_fraction(self.points)
+        return SamplePattern(kind=self.sensor, count=count, fraction=fraction)
 
     def record(self) -> dict[str, Any]:
         """Returns all that decides the points except the frame and the seed."""
@@ -109,7 +109,7 @@ def read_sensor_text(text: str) -> tuple[str, str | None]:
             f"no sensor {text!r}; it is {OWN}, a pattern such as grid:500 ({', '.join(PATTERNS)}),"
             f" a TOML file, or a LiDAR ({', '.join(LIDARS)})"
         )
-    count_or_share(points)
+    count_or_fraction(points)
     return kind or "uniform", points
 
 
@@ -155,11 +155,11 @@ def frame_points(
 def _points_of(
     sampling: Sampling, seed: int, inputs: Inputs, request: RefineRequest, frame: Frame
 ) -> Points:
-    truth, noise = inputs.gt, sampling.sample_noise
-    if truth is None:
+    ground_truth, noise = inputs.gt, sampling.sample_noise
+    if ground_truth is None:
         raise InputError("there is no ground truth")
     if sampling.is_pattern:
-        return sample_points(truth, sampling.pattern(), seed, image=inputs.rgb, noise=noise)
+        return sample_points(ground_truth, sampling.pattern(), seed, image=inputs.rgb, noise=noise)
     rng = np.random.default_rng(seed)
     if sampling.lidar is not None:
         points = _scanned(sampling, sampling.lidar, seed, inputs, request, frame)
@@ -206,8 +206,8 @@ def _thinned(points: Points, wanted: str | None, rng: np.random.Generator) -> Po
     if wanted is None:
         return points
     known = len(points.depth)
-    count, share = count_or_share(wanted)
-    number = max(1, round(share * known)) if share is not None else count or 0
+    count, fraction = count_or_fraction(wanted)
+    number = max(1, round(fraction * known)) if fraction is not None else count or 0
     if number > known:
         raise InputError(
             f"{number:,} points of {known:,}; ask for fewer, or draw them from the ground truth"

@@ -109,15 +109,15 @@ def refined_curve(
             diverged, result = error, error.last_good
         updates = len(result.losses) - 1
         kept = {k: _kept(result.losses, min(k, updates), settings) for k in wanted}
-        truth = ground_truth_in_view(network, inputs)
+        ground_truth = ground_truth_in_view(network, inputs)
         seen = {**result.depths, result.kept: result.after}
         depths = {k: prepared.map.depth_to_image(seen[k]).cpu() for k in {0, *kept.values()}}
         scores = {
-            index: asdict(score(_propagated(depths[index], inputs, method.propagate), truth))
+            index: asdict(score(_propagated(depths[index], inputs, method.propagate), ground_truth))
             for index in set(kept.values())
         }
     return Curve(
-        plain=asdict(score(depths[0], truth)),
+        plain=asdict(score(depths[0], ground_truth)),
         scores={k: scores[index] for k, index in sorted(kept.items())},
         step=result.step,
         updates=updates,
@@ -134,10 +134,10 @@ def ground_truth_in_view(network: Network, inputs: Inputs) -> Tensor:
     """Returns (H, W) the ground truth, 0 outside the network's crop."""
     assert inputs.gt is not None
     top, left, height, width = FrameMap.fit(network.definition.size, *inputs.size).crop
-    truth = torch.zeros(inputs.size)
+    ground_truth = torch.zeros(inputs.size)
     here = (slice(top, top + height), slice(left, left + width))
-    truth[here] = torch.from_numpy(inputs.gt)[here]
-    return truth
+    ground_truth[here] = torch.from_numpy(inputs.gt)[here]
+    return ground_truth
 
 
 def _kept(losses: Sequence[float], updates: int, settings: RefineSettings) -> int:

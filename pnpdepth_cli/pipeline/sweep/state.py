@@ -24,10 +24,10 @@ class SweepState:
 
     def __init__(self, output: Path) -> None:
         path = output / "sweep.jsonl"
-        foreign = [name for name in RESULTS if (output / name).exists()]
-        if foreign and not path.exists():
+        unowned = [name for name in RESULTS if (output / name).exists()]
+        if unowned and not path.exists():
             raise OutputError(
-                f"{output / foreign[0]} exists, and no sweep wrote it; -o names another folder"
+                f"{output / unowned[0]} exists, and no sweep wrote it; -o names another folder"
             )
         self._journal = Journal(path, "run")
 

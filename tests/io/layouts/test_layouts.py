@@ -23,6 +23,7 @@ from pnpdepth_cli.io.layouts import (
     read_frame_image,
     read_frames,
 )
+from tests.colmap_models import write_text_model
 
 DEPTH = np.random.default_rng(0).uniform(1, 9, (12, 16)).astype(np.float32)
 
@@ -89,6 +90,11 @@ def synthia(root: Path) -> None:
     touch(root / "CameraParams/intrinsics.txt")
 
 
+def colmap(root: Path) -> None:
+    write_text_model(root / "sparse" / "0", names=("left/a.png", "b.png"))
+    touch(root / "images/left/a.png", root / "images/b.png")
+
+
 def nyu_h5(root: Path) -> None:
     h5py = pytest.importorskip("h5py")
     (root / "official").mkdir(parents=True)
@@ -117,6 +123,7 @@ MAKERS = {
     "tum": (tum, ["1.000", "1.033"]),
     "7scenes": (seven_scenes, ["seq-01_frame-000000", "seq-02_frame-000000"]),
     "synthia": (synthia, ["Stereo_Left_Omni_F_000000", "Stereo_Right_Omni_B_000000"]),
+    "colmap": (colmap, ["b", "left/a"]),
     "nyu-h5": (nyu_h5, ["official_00001", "official_00009"]),
     "nyu-mat": (nyu_mat, ["0001", "0002", "0003", "0004"]),
 }

@@ -48,20 +48,36 @@ def test_groups_are_clusters_in_the_order_of_the_frames() -> None:
 
 def test_one_sequence_of_independent_frames_has_a_cluster_for_each() -> None:
     lengths = [block_length(autoregression(0.0, 100, seed)) for seed in range(40)]
-    assert np.mean([length == 1 for length in lengths]) >= 0.9
+    assert np.mean([length == 1 for length in lengths]) >= 0.7  # 84 % in the long run
     assert find_clusters([""] * 6, np.arange(6.0)[:, None] % 2).describe() == "6 frames"
 
 
-def test_one_correlated_sequence_is_cut_into_blocks() -> None:
+def test_one_correlated_sequence_is_cut_into_a_few_long_blocks() -> None:
     series = autoregression(0.5, 1000, 0)
-    # Politis and White 2004 for an AR(1): (sqrt(6) 0.5 / 0.75)^(2/3) 1000^(1/3) = 13.9
+    # 2ρ/(1 − ρ²)/L of the variance is missing: 1.33/L, a tenth at 13.3
     assert block_length(series) == pytest.approx(14, abs=3)
     clusters = find_clusters(["drive"] * 1000, series)
-    sizes = np.bincount(clusters.ids)
     assert (np.diff(clusters.ids) >= 0).all()
-    assert set(sizes[:-1]) == {block_length(series)}
-    assert sizes[-1] >= sizes[0]
-    assert "consecutive frames" in clusters.describe()
+    assert np.bincount(clusters.ids).tolist() == [100] * 10
+    assert "blocks of about 100 consecutive frames" in clusters.describe()
+    short = find_clusters(["drive"] * 60, autoregression(0.5, 60, 0))
+    assert short.count == 60 // block_length(autoregression(0.5, 60, 0)) < 6
+
+
+def test_long_blocks_hold_also_for_a_slow_drift_under_noise() -> None:
+    rng = np.random.default_rng(0)
+
+    def drift(frames: int) -> np.ndarray:
+        steps = lfilter([1.0], [1.0, -0.9], rng.normal(size=(frames + 200, 1)), axis=0)[200:]
+        return np.asarray(steps + 1.5 * rng.normal(size=(frames, 1)))
+
+    block_means = []
+    for _ in range(200):
+        series = drift(400)
+        clusters = find_clusters([""] * 400, series)
+        block_means.append(np.bincount(clusters.ids, series[:, 0]) / np.bincount(clusters.ids))
+    neighbours = np.concatenate([np.column_stack([m[:-1], m[1:]]) for m in block_means])
+    assert np.corrcoef(neighbours.T)[0, 1] < 0.25  # frames: 0.6
 
 
 def test_columns_without_a_number_do_not_decide_the_blocks() -> None:

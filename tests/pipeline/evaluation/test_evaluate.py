@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +30,7 @@ def scored(root: Path, **given: Any) -> Evaluation:
     changes = {
         name: given.pop(name)
         for name in list(given)
-        if name not in ("protocol", "sparse", "scales", "resamples", "seed", "grouped", "workers")
+        if name not in {each.name for each in fields(EvalRequest)}
     }
     return evaluate(
         EvalRequest(prediction=root / "out", ground_truth=root / "gt", changes=changes, **given)
@@ -467,6 +468,58 @@ def test_the_truth_of_a_data_set_is_cut_as_its_layout_says(tmp_path: Path) -> No
     depth_file(tmp_path / "out" / "00001_depth.npy", cut)
     found = scored(tmp_path)
     assert (found.mean["rmse"], found.frames[0].pixels) == (0, 228 * 304)
+
+
+def test_nyus_own_file_is_scored_at_its_whole_size_with_eigens_crop(tmp_path: Path) -> None:
+    h5py = pytest.importorskip("h5py")
+    rng = np.random.default_rng(0)
+    depths = rng.uniform(1, 4, (2, 480, 640)).astype(np.float32)
+    mat = tmp_path / "gt" / "nyu_depth_v2_labeled.mat"
+    mat.parent.mkdir()
+    with h5py.File(mat, "w") as file:
+        file["depths"] = depths.transpose(0, 2, 1)
+        file["images"] = np.zeros((2, 3, 640, 480), np.uint8)
+    predictions = depths * rng.uniform(0.9, 1.1, depths.shape).astype(np.float32)
+    for number, prediction in enumerate(predictions, start=1):
+        depth_file(tmp_path / "out" / f"{number:04}_depth.npy", prediction)
+    found = scored(tmp_path, protocol="nyu-eigen", layout_protocol="whole")
+    error = (predictions - depths)[:, 45:471, 41:601].astype(np.float64)
+    expected = np.sqrt((error**2).mean(axis=(1, 2))).mean()
+    assert found.mean["rmse"] == pytest.approx(expected, rel=1e-6)
+    assert scored(tmp_path, protocol="nyu", layout_protocol="whole").mean == found.mean
+    with pytest.raises(InputError, match=r"no frame could be scored; the first: .*304×228"):
+        scored(tmp_path, protocol="nyu-eigen")
+
+
+def test_a_layout_protocol_without_a_data_set_is_refused(two: Path) -> None:
+    with pytest.raises(UsageError, match="--layout-protocol whole is for data sets"):
+        scored(two, layout_protocol="whole")
+
+
+def test_predictions_of_kittis_benchmark_crop_are_put_in_their_place(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    truth = rng.uniform(2, 60, (375, 1242)).astype(np.float32)
+    prediction = rng.uniform(2, 60, (352, 1216)).astype(np.float32)
+    depth_file(tmp_path / "gt" / "a.npy", truth)
+    depth_file(tmp_path / "out" / "a.npy", prediction)
+    with pytest.raises(InputError, match="--pred-crop kb puts"):
+        scored(tmp_path)
+    skipped = scored(tmp_path, prediction_crop="kb")
+    error = prediction.astype(np.float64) - truth[375 - 352 :, 13 : 13 + 1216]
+    assert skipped.mean["rmse"] == pytest.approx(np.sqrt((error**2).mean()), rel=1e-6)
+    assert skipped.coverage == pytest.approx(352 * 1216 / (375 * 1242))
+    # BTS and AdaBins paste the crop into zeros, clip, and score inside Garg's crop
+    whole = np.zeros((375, 1242), np.float32)
+    whole[23:, 13:1229] = prediction
+    inside = (slice(153, 371), slice(44, 1197))
+    clipped = np.clip(whole, 1e-3, 80)[inside].astype(np.float64)
+    expected = np.sqrt(((clipped - truth[inside]) ** 2).mean())
+    garg = scored(tmp_path, protocol="garg", prediction_crop="kb")
+    assert garg.mean["rmse"] == pytest.approx(expected, rel=1e-6)
+    same = scored(tmp_path, prediction_crop="13,23,1216,352")
+    assert same.mean == skipped.mean
+    with pytest.raises(UsageError, match="neither X,Y,WIDTH,HEIGHT nor one of kb"):
+        scored(tmp_path, prediction_crop="kitti")
 
 
 REFUSED = [

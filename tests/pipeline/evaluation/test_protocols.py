@@ -14,7 +14,7 @@ from pnpdepth_cli.pipeline.evaluation.protocols import PROTOCOLS, choose_protoco
 # (protocol, frame, (top, bottom, left, right)) as the published evaluations cut them
 WINDOWS = [
     ("paper", (228, 304), (0, 228, 0, 304)),
-    ("nyu", (480, 640), (45, 471, 41, 601)),
+    ("nyu-eigen", (480, 640), (45, 471, 41, 601)),
     ("garg", (375, 1242), (153, 371, 44, 1197)),
     ("garg", (370, 1224), (151, 366, 43, 1180)),
     ("eigen", (375, 1242), (124, 342, 44, 1197)),
@@ -34,7 +34,7 @@ def test_the_bounds_are_the_published_ones() -> None:
     bounds = {p.name: (p.min_depth, p.max_depth, p.clip) for p in PROTOCOLS.values()}
     assert bounds == {
         "paper": (0.0, None, False),
-        "nyu": (1e-3, 10.0, True),
+        "nyu-eigen": (1e-3, 10.0, True),
         "kitti": (0.0, None, False),
         "kitti-devkit": (0.0, None, False),
         "eigen": (1e-3, 80.0, True),
@@ -52,7 +52,7 @@ def test_a_rectangle_is_cut_where_it_is_and_refused_where_it_is_not_inside() -> 
 
 def test_the_nyu_crop_is_of_640_by_480_only() -> None:
     with pytest.raises(SizeError, match=r"640×480 but this one is 304×228; --crop none"):
-        PROTOCOLS["nyu"].window((228, 304))
+        PROTOCOLS["nyu-eigen"].window((228, 304))
 
 
 REFUSED: list[tuple[str, dict[str, Any], str]] = [
@@ -99,6 +99,6 @@ def test_the_description_says_what_is_scored_and_whether_it_was_changed() -> Non
 def test_rules_that_score_alike_are_equal_whatever_they_are_called() -> None:
     assert PROTOCOLS["paper"].scoring() == PROTOCOLS["kitti"].scoring()
     assert PROTOCOLS["paper"].scoring() == choose_protocol("paper", resize="nearest").scoring()
-    kinds = ("paper", "nyu", "kitti-devkit", "eigen", "garg")
+    kinds = ("paper", "nyu-eigen", "kitti-devkit", "eigen", "garg")
     rules = [PROTOCOLS[name].scoring() for name in kinds]
     assert all(a != b for i, a in enumerate(rules) for b in rules[:i])

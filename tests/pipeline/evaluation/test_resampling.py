@@ -10,6 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
+from benchmarks.statistics_check import interval_coverage, skewed
+from pnpdepth_cli.core.metrics import SUMS
 from pnpdepth_cli.pipeline.evaluation.averages import FrameTable
 from pnpdepth_cli.pipeline.evaluation.resampling import (
     holm,
@@ -34,17 +36,30 @@ def test_the_interval_is_the_textbooks_for_many_frames() -> None:
     assert high[0] == pytest.approx(rows.mean() + 1.96 * standard_error, abs=0.1 * standard_error)
 
 
-def test_the_interval_is_the_bootstrap_t_of_the_mean() -> None:
+def test_each_end_is_the_farther_one_of_bootstrap_t_and_students_t() -> None:
     values = np.random.default_rng(2).lognormal(0, 0.5, 9)
-    weights = np.random.default_rng(7).multinomial(9, np.full(9, 1 / 9), size=3000)
-    means = weights @ values / 9
-    errors = np.sqrt(((weights @ values**2) / 9 - means**2) / 9)
-    ratios = (means - values.mean()) / np.where(errors > 1e-9, errors, np.nan)
-    low, high = np.nanquantile(ratios, [0.025, 0.975])
+    drawn = values[np.random.default_rng(7).integers(0, 9, (3000, 9), dtype=np.int32)]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratios = (drawn.mean(axis=1) - values.mean()) / (drawn.std(axis=1) / 3)
+    ratios = ratios[drawn.std(axis=1) > 1e-6]
+    low, high = np.quantile(ratios, [0.025, 0.975])
     own = values.std() / 3
-    expected = (values.mean() - high * own, values.mean() - low * own)
+    bootstrap = (values.mean() - high * own, values.mean() - low * own)
+    student = stats.t.interval(0.95, 8, loc=values.mean(), scale=stats.sem(values))
+    expected = (min(bootstrap[0], student[0]), max(bootstrap[1], student[1]))
+    assert expected == pytest.approx((student[0], bootstrap[1]))  # the errors are skewed
     found = interval(values[:, None], 3000, seed=7)
     assert np.ravel(found) == pytest.approx(expected, rel=1e-9)
+
+
+def test_the_standard_error_of_a_pooled_measure_is_the_delta_methods() -> None:
+    sums = np.random.default_rng(3).uniform(1, 2, (300, len(SUMS)))
+    table = FrameTable(rows=sums, pooled=True)
+    low, high = studentised_interval(table.means_of, table.cluster_totals(np.arange(300)), 4000, 0)
+    squared, pixels = sums[:, SUMS.index("squared")], sums[:, SUMS.index("pixels")]
+    mean = squared.sum() / pixels.sum()
+    error = np.sqrt(((squared - mean * pixels) ** 2).sum()) / pixels.sum() / (2 * np.sqrt(mean))
+    assert (high[0] - low[0]) / 2 == pytest.approx(1.96 * error, rel=0.05)
 
 
 def test_clusters_of_equal_frames_are_as_sure_as_one_frame_each() -> None:
@@ -57,11 +72,8 @@ def test_clusters_of_equal_frames_are_as_sure_as_one_frame_each() -> None:
 
 
 def test_lognormal_errors_of_eight_frames_are_covered() -> None:
-    generator = np.random.default_rng(0)
-    mean = np.exp(0.125)
-    ends = [interval(generator.lognormal(0, 0.5, (8, 1)), 400, seed) for seed in range(400)]
-    covered = np.mean([low[0] <= mean <= high[0] for low, high in ends])
-    assert covered >= 0.91  # 93 % in the long run; three standard errors of 400 trials are 4 %
+    covered = interval_coverage(skewed, 8, trials=600, resamples=500)
+    assert covered >= 0.93 - 3 * np.sqrt(0.93 * 0.07 / 600)
 
 
 def test_the_interval_is_of_the_seed_and_the_same_in_any_batches(

@@ -50,7 +50,7 @@ def test_refinement_lowers_the_error_at_the_points_and_against_the_truth(
         assert record[measured]["after"]["mae"] < 0.8 * record[measured]["before"]["mae"]
     assert len(record["loss"]) == 41
     assert record["loss"][-1] < record["loss"][0]
-    assert 0 < record["improved_share"] < 1
+    assert 0 < record["improved_fraction"] < 1
 
 
 def test_ground_truth_that_is_the_sparse_depth_is_warned_of(frame: FrameOnDisk) -> None:

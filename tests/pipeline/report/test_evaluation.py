@@ -130,6 +130,34 @@ def test_with_sparse_points_the_errors_by_distance_and_depth_are_on_the_page(roo
     ]
 
 
+def test_a_standard_deviation_has_a_calibration_plot_and_a_sparsification_curve(
+    root: Path,
+) -> None:
+    rng = np.random.default_rng(1)
+    for name in NAMES:
+        truth = np.load(root / "gt" / f"{name}.npy")
+        sigma = rng.uniform(0.05, 0.5, truth.shape).astype(np.float32)
+        (root / "out" / f"{name}.npy").unlink()
+        depth = truth + sigma * rng.normal(size=truth.shape)
+        write_depth(root / "out" / f"{name}_depth.npy", np.maximum(depth, 0.1).astype(np.float32))
+        np.save(root / "out" / f"{name}_sigma.npy", sigma)
+    found = reported(root)
+    assert found.uncertainty is not None
+    calibration, sparsification = page_data(root / "report")["charts"]
+    observed = calibration["lines"][0]["points"]
+    assert observed == [[x, pytest.approx(x, abs=0.02)] for x, _ in observed]
+    by_sigma, by_error = (dict(line["points"]) for line in sparsification["lines"])
+    assert by_sigma[0] == by_error[0] == 1
+    assert 1 > by_sigma[0.5] > by_error[0.5] > 0
+    area = np.trapezoid([by_sigma[x] - by_error[x] for x in by_sigma], list(by_sigma))
+    assert area == pytest.approx(found.uncertainty.ause)
+
+
+def test_an_evaluation_without_a_standard_deviation_has_no_charts(root: Path) -> None:
+    reported(root)
+    assert page_data(root / "report")["charts"] == []
+
+
 def test_what_the_development_kit_fills_in_is_shown_filled(root: Path) -> None:
     depth = np.full((60, 80), 4, np.float32)
     write_depth(root / "gt/a.npy", depth)

@@ -165,7 +165,7 @@ def test_the_seed_is_in_the_png_and_in_the_record(frame: ScanOnDisk) -> None:
 
 def test_the_same_seed_gives_the_same_bytes(frame: ScanOnDisk) -> None:
     for name in ("a", "b"):
-        sample_depth(sampling(frame, f"{name}.png", share=0.1, noise={"metres": 0.1}, seed=2))
+        sample_depth(sampling(frame, f"{name}.png", fraction=0.1, noise={"metres": 0.1}, seed=2))
     assert (frame.folder / "a.png").read_bytes() == (frame.folder / "b.png").read_bytes()
 
 
@@ -222,7 +222,7 @@ def test_kittis_frames_project_to_the_density_of_the_data_sets_own(
                 image=image,
             )
         )
-        assert 0.033 < record["points"]["share_of_pixels"] < 0.045
+        assert 0.033 < record["points"]["fraction_of_pixels"] < 0.045
 
 
 def test_kittis_own_projected_scan_comes_back_from_the_scanners_frame(

@@ -105,14 +105,14 @@ def _pooled(node: Node, x: Tensor) -> tuple[list[int], list[int], list[int], Pad
     pads = _pads(node, x.shape[2:], kernel, stride, dilation)
     if not node.get("ceil_mode", 0):
         return kernel, stride, dilation, pads, pads
-    grown = []
+    padded = []
     for n, k, s, d, (begin, end) in zip(x.shape[2:], kernel, stride, dilation, pads, strict=True):
         window = (k - 1) * d + 1
         out = math.ceil((n + begin + end - window) / s) + 1
         if (out - 1) * s >= n + begin:  # no window begins in the padding at the end
             out -= 1
-        grown.append((begin, max(end, (out - 1) * s + window - n - begin)))
-    return kernel, stride, dilation, pads, grown
+        padded.append((begin, max(end, (out - 1) * s + window - n - begin)))
+    return kernel, stride, dilation, pads, padded
 
 
 @operator("MaxPool")
@@ -120,27 +120,27 @@ def max_pool(node: Node, inputs: Inputs) -> Tensor:
     if node.outputs > 1:
         raise Unsupported("its second output, the indices")
     x = inputs[0]
-    kernel, stride, dilation, _, grown = _pooled(node, x)
-    if any(n for pair in grown for n in pair):
-        x = F.pad(x, _sides(grown), value=-math.inf)
+    kernel, stride, dilation, _, padded = _pooled(node, x)
+    if any(n for pair in padded for n in pair):
+        x = F.pad(x, _sides(padded), value=-math.inf)
     return _MAX_POOL[x.ndim - 2](x, kernel, stride, 0, dilation)
 
 
 @operator("AveragePool")
 def average_pool(node: Node, inputs: Inputs) -> Tensor:
     x = inputs[0]
-    kernel, stride, dilation, pads, grown = _pooled(node, x)
+    kernel, stride, dilation, pads, padded = _pooled(node, x)
     if x.ndim != 4 or any(d != 1 for d in dilation):
         raise Unsupported("other than two spatial axes, or dilations")
-    if not any(n for pair in grown for n in pair):
+    if not any(n for pair in padded for n in pair):
         return F.avg_pool2d(x, kernel, stride)
     area = math.prod(kernel)
-    total = F.avg_pool2d(F.pad(x, _sides(grown)), kernel, stride) * area
+    total = F.avg_pool2d(F.pad(x, _sides(padded)), kernel, stride) * area
     inside = torch.ones_like(x[:1, :1])
     if node.get("count_include_pad", 0):
         inside = F.pad(inside, _sides(pads), value=1.0)
-        grown = [(0, g[1] - p[1]) for g, p in zip(grown, pads, strict=True)]
-    return total / (F.avg_pool2d(F.pad(inside, _sides(grown)), kernel, stride) * area)
+        padded = [(0, g[1] - p[1]) for g, p in zip(padded, pads, strict=True)]
+    return total / (F.avg_pool2d(F.pad(inside, _sides(padded)), kernel, stride) * area)
 
 
 @operator("GlobalAveragePool")

@@ -105,8 +105,8 @@ def _resized(x: Tensor, plan: _Plan, scales: list[float] | None, sizes: list[int
 def _by_torch(x: Tensor, plan: _Plan, factors: list[float], sizes: list[int]) -> Tensor | None:
     """The result of torch's own resize if it computes the same; else None."""
     exact = all(n * f == s for n, f, s in zip(x.shape, factors, sizes, strict=True))
-    picture = x.ndim == 4 and tuple(x.shape[:2]) == tuple(sizes[:2]) and exact
-    if not picture or plan.antialias or not x.is_floating_point():
+    is_image = x.ndim == 4 and tuple(x.shape[:2]) == tuple(sizes[:2]) and exact
+    if not is_image or plan.antialias or not x.is_floating_point():
         return None
     size = (sizes[2], sizes[3])
     whole = all(f >= 1 and f == int(f) for f in factors)

@@ -1,0 +1,77 @@
+"""`colmap`: a COLMAP project, images/ and sparse/0/, or sparse/, or a model beside images/.
+
+The images of dense/, which COLMAP undistorts, are a project of their own: dense/images/ and
+dense/sparse/. Of several models, sparse/0 to sparse/N, the one with the most images is used.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from pnpdepth_cli.io.colmap.model import model_files, read_model
+from pnpdepth_cli.io.colmap.parts import ColmapImage
+from pnpdepth_cli.io.dataset.find_files import find_files
+from pnpdepth_cli.io.dataset.frame import IMAGE_SUFFIXES, Frame, Listing, Pose, Unmatched
+from pnpdepth_cli.io.layouts import Layout
+
+
+def matches(root: Path) -> bool:
+    """Returns whether there is images/ and a sparse model."""
+    return (root / "images").is_dir() and bool(_models(root))
+
+
+def listing(root: Path) -> Listing:
+    """Returns one frame for each registered image that exists.
+
+    Raises:
+        FileFormatError: The model is damaged.
+    """
+    models = [read_model(folder) for folder in _models(root)]
+    model = max(models, key=lambda each: len(each.images))
+    photos = root / "images"
+    files, unreadable = find_files(photos, IMAGE_SUFFIXES)
+    spare = [
+        Unmatched(path=path, why=f"is not registered in {model.folder}")
+        for path in files.values()
+        if path.relative_to(photos).as_posix() not in model.images
+    ]
+    for other in models:
+        if other is not model:
+            why = f"is another model, of {len(other.images):,} images, in a unit of its own"
+            spare.append(Unmatched(path=other.folder, why=why))
+    frames, broken = [], list(unreadable)
+    for name, image in sorted(model.images.items()):
+        path = photos / name
+        if path.is_file():
+            frames.append(
+                Frame(
+                    name=Path(name).with_suffix("").as_posix(),
+                    image=path,
+                    sparse=model.folder,
+                    pose=_pose(image),
+                )
+            )
+        else:
+            why = f"is missing, but registered in {model.folder}; add it"
+            broken.append(Unmatched(path=path, why=why))
+    return Listing(frames=frames, broken=tuple(broken), spare=tuple(spare))
+
+
+def _models(root: Path) -> list[Path]:
+    """The folders of models, sparse/0 first."""
+    sparse = root / "sparse"
+    inside = [p for p in sparse.iterdir() if p.name.isdigit()] if sparse.is_dir() else []
+    numbered = sorted(inside, key=lambda p: int(p.name))
+    return [folder for folder in (*numbered, sparse, root) if model_files(folder)]
+
+
+def _pose(image: ColmapImage) -> Pose:
+    """Camera to model: the inverse of COLMAP's."""
+    rotation = image.rotation.T
+    rows = np.column_stack([rotation, -rotation @ image.translation])
+    return tuple(tuple(float(value) for value in row) for row in rows)
+
+
+LAYOUT = Layout(matches=matches, listing=listing)

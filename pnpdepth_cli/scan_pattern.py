@@ -1,0 +1,107 @@
+"""Scan lines in the pattern of sparse points: recognised by spacing, and each point's line.
+
+The points of a rotating LiDAR are close together along a scan line and farther apart across.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+MIN_LINES = 12
+"""With fewer scan lines, leaving some out is another task than filling in between them."""
+
+_MIN_POINTS = 500
+_ACROSS_OVER_ALONG = 1.5  # at least: spacing across over spacing along scan lines
+_ALONG, _ACROSS = 3.0, 0.35  # spacings to the next point of a line, at most
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScanPattern:
+    """Spacing of sparse points."""
+
+    points: int
+    """Number of points."""
+    along_px: float
+    """Median distance to the next point along a row."""
+    across_px: float
+    """Median distance to the next point along a column."""
+
+    @property
+    def has_scan_lines(self) -> bool:
+        """Whether points are much denser along rows than along columns."""
+        return (
+            self.points >= _MIN_POINTS
+            and _ACROSS_OVER_ALONG * self.along_px <= self.across_px < float("inf")
+        )
+
+
+def scan_pattern(xy: NDArray[np.floating], size: tuple[int, int]) -> ScanPattern:
+    """Returns the spacing of points along rows and along columns.
+
+    Args:
+        xy: (N, 2) pixel coordinates inside the image.
+        size: (H, W) of the image.
+    """
+    import numpy as np
+
+    known = np.zeros(size, bool)
+    column, row = np.floor(np.asarray(xy, np.float64) + 0.5).astype(np.intp).T
+    known[row.clip(0, size[0] - 1), column.clip(0, size[1] - 1)] = True
+    return ScanPattern(points=len(xy), along_px=_median_gap(known), across_px=_median_gap(known.T))
+
+
+def scan_lines(xy: NDArray[np.floating], size: tuple[int, int]) -> NDArray[np.intp] | None:
+    """Returns (N,) the number of each point's scan line, from the top; None without scan lines.
+
+    Each point is linked with the next one to the right in nearly the same row; a line that is
+    interrupted, as by the sky, is several.
+
+    Args:
+        xy: (N, 2) pixel coordinates inside the image.
+        size: (H, W) of the image.
+    """
+    import numpy as np
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+    from scipy.spatial import cKDTree
+
+    pattern = scan_pattern(xy, size)
+    if not pattern.has_scan_lines:
+        return None
+    xy = np.asarray(xy, np.float64)
+    reach = np.array([_ALONG * pattern.along_px, max(1.0, _ACROSS * pattern.across_px)])
+    first, second = cKDTree(xy / reach).query_pairs(1.0, p=np.inf, output_type="ndarray").T
+    left = np.where(xy[first, 0] <= xy[second, 0], first, second)
+    right = first + second - left
+    offset = np.abs(xy[right] - xy[left])
+    ahead = offset[:, 0] > 0
+    left, right, offset = left[ahead], right[ahead], offset[ahead]
+    order = np.lexsort((offset @ (1 / reach), left))
+    nearest = order[np.diff(left[order], prepend=-1) > 0]
+    links = coo_matrix((np.ones(len(nearest)), (left[nearest], right[nearest])), (len(xy),) * 2)
+    count, line = connected_components(links, directed=False)
+    if count < MIN_LINES:
+        return None
+    height = np.bincount(line, xy[:, 1]) / np.bincount(line)
+    number: NDArray[np.intp] = np.argsort(np.argsort(height, kind="stable"))[line]
+    return number
+
+
+def _median_gap(known: NDArray[np.bool_]) -> float:
+    """The median distance in pixels from a point to the next in its row or a row beside it."""
+    import numpy as np
+
+    band = known.copy()
+    band[1:] |= known[:-1]
+    band[:-1] |= known[1:]
+    width = known.shape[1]
+    column = np.where(band, np.arange(width), np.inf)
+    next_column = np.minimum.accumulate(column[:, ::-1], axis=1)[:, ::-1]
+    next_column = np.pad(next_column[:, 1:], ((0, 0), (0, 1)), constant_values=np.inf)
+    gaps = next_column[known] - np.nonzero(known)[1]
+    return float(np.median(gaps)) if len(gaps) else float("inf")

@@ -1,0 +1,63 @@
+"""Small sparse models of COLMAP as text, for tests of every camera model."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from pnpdepth_cli.io.colmap.cameras import MODELS
+
+WIDTH, HEIGHT = 64, 48
+_COEFFICIENTS = {
+    "SIMPLE_RADIAL": "-0.1",
+    "RADIAL": "-0.1 0.02",
+    "OPENCV": "-0.1 0.02 0.001 -0.002",
+    "OPENCV_FISHEYE": "-0.02 0.01 -0.003 0.001",
+    "FULL_OPENCV": "-0.1 0.02 0.001 -0.002 0.01 0.02 -0.01 0.003",
+    "FOV": "0.9",
+    "SIMPLE_RADIAL_FISHEYE": "-0.03",
+    "RADIAL_FISHEYE": "-0.03 0.01",
+    "THIN_PRISM_FISHEYE": "-0.02 0.01 0.001 -0.002 -0.003 0.001 0.002 -0.001",
+    "RAD_TAN_THIN_PRISM_FISHEYE": "-0.02 0.01 -0.003 0.001 0.002 -0.001 0.001 -0.002"
+    " 0.002 0.001 -0.001 0.001",
+    "SIMPLE_DIVISION": "-0.15",
+    "DIVISION": "-0.15",
+    "EUCM": "0.6 1.1",
+}
+CAMERAS = {
+    name: f"{'50' if model.focals == 1 else '50 52'} 32.5 23 {_COEFFICIENTS.get(name, '')}".strip()
+    for name, model in MODELS.items()
+}
+"""Parameters by the name of the camera model."""
+
+
+def write_text_model(
+    folder: Path,
+    *,
+    camera: str = "PINHOLE",
+    names: tuple[str, ...] = ("a.png", "b.png", "c.png"),
+    points: int = 40,
+) -> None:
+    """A wall 4 units away that cameras side by side see; each observes all points."""
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "cameras.txt").write_text(
+        f"# comment\n1 {camera} {WIDTH} {HEIGHT} {CAMERAS[camera]}\n"
+    )
+    rng = np.random.default_rng(0)
+    xyz = np.column_stack([rng.uniform(-1.2, 1.2, (points, 2)), rng.uniform(3.5, 4.5, points)])
+    keypoints = " ".join(f"0 0 {number + 1}" for number in range(points))
+    (folder / "images.txt").write_text(
+        "# comment\n"
+        + "".join(
+            f"{number + 1} 1 0 0 0 {0.1 * number} 0 0 1 {name}\n{keypoints} 5 5 -1\n"
+            for number, name in enumerate(names)
+        )
+    )
+    tracks = [" ".join(f"{i + 1} {p}" for i in range(len(names))) for p in range(points)]
+    (folder / "points3D.txt").write_text(
+        "".join(
+            f"{number + 1} {x} {y} {z} 9 9 9 0.5 {tracks[number]}\n"
+            for number, (x, y, z) in enumerate(xyz)
+        )
+    )

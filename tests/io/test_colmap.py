@@ -1,0 +1,160 @@
+"""Sparse models of COLMAP in text and binary, whole, damaged and lying."""
+
+from __future__ import annotations
+
+import contextlib
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pnpdepth_cli.errors import FileFormatError, InputError, PnpDepthError
+from pnpdepth_cli.io.colmap.cameras import MODELS
+from pnpdepth_cli.io.colmap.model import name_in_model, read_model
+from tests.colmap_models import CAMERAS, write_text_model
+
+PARTS = ("cameras", "images", "points3D")
+
+
+def write_binary_model(folder: Path) -> None:
+    """Two images of one point each, and one point that both observe."""
+    folder.mkdir(parents=True, exist_ok=True)
+    camera = struct.pack("<IiQQ4d", 1, 2, 64, 48, 50.0, 32.0, 24.0, 0.1)
+    images = b"".join(
+        struct.pack("<I7dI", number, 1, 0, 0, 0, 0.1 * number, 0, 0, 1)
+        + f"dir/{number}.png".encode()
+        + b"\0"
+        + struct.pack("<Q", 2)
+        + struct.pack("<ddq", 10, 11, 7)
+        + struct.pack("<ddq", 12, 13, -1)
+        for number in (1, 2)
+    )
+    point = struct.pack("<Q3d3BdQ", 7, 0.5, -0.25, 4.0, 1, 2, 3, 0.75, 2)
+    track = struct.pack("<4I", 1, 0, 2, 0)
+    (folder / "cameras.bin").write_bytes(struct.pack("<Q", 1) + camera)
+    (folder / "images.bin").write_bytes(struct.pack("<Q", 2) + images)
+    (folder / "points3D.bin").write_bytes(struct.pack("<Q", 1) + point + track)
+
+
+def test_a_binary_model_is_read_as_written(tmp_path: Path) -> None:
+    write_binary_model(tmp_path)
+    model = read_model(tmp_path)
+    camera = model.cameras[1]
+    assert (camera.model, camera.size, camera.lens) == (
+        "SIMPLE_RADIAL",
+        (48, 64),
+        "radial-tangential",
+    )
+    assert camera.intrinsics.tolist() == [[50, 0, 31.5], [0, 50, 23.5], [0, 0, 1]]
+    assert camera.distortion == (0.1, 0, 0, 0)
+    assert list(model.images) == ["dir/1.png", "dir/2.png"]
+    assert model.images["dir/2.png"].translation.tolist() == [0.2, 0, 0]
+    assert model.images["dir/2.png"].points.tolist() == [7]
+    points = model.points
+    assert points.xyz.tolist() == [[0.5, -0.25, 4.0]]
+    assert (points.error.tolist(), points.track.tolist()) == ([0.75], [2])
+
+
+def test_a_model_is_found_in_the_folders_above_it(tmp_path: Path) -> None:
+    write_binary_model(tmp_path / "sparse" / "0")
+    for above in (tmp_path, tmp_path / "sparse", tmp_path / "sparse" / "0"):
+        assert read_model(above).folder == tmp_path / "sparse" / "0"
+    (tmp_path / "other").mkdir()
+    with pytest.raises(InputError, match="without a COLMAP model; give the one with cameras"):
+        read_model(tmp_path / "other")
+
+
+@pytest.mark.parametrize("part", PARTS)
+def test_a_binary_file_that_is_cut_short_is_one_line(part: str, tmp_path: Path) -> None:
+    write_binary_model(tmp_path)
+    file = tmp_path / f"{part}.bin"
+    whole = file.read_bytes()
+    for end in range(1, len(whole)):
+        file.write_bytes(whole[:end])
+        with pytest.raises(FileFormatError) as caught:
+            read_model(tmp_path)
+        assert "\n" not in str(caught.value)
+        assert str(file) in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("part", "offset"), [(p, 0) for p in PARTS] + [("images", 82), ("points3D", 51)]
+)
+def test_a_count_that_lies_allocates_nothing(part: str, offset: int, tmp_path: Path) -> None:
+    write_binary_model(tmp_path)
+    file = tmp_path / f"{part}.bin"
+    data = bytearray(file.read_bytes())
+    struct.pack_into("<Q", data, offset, 2**40)
+    file.write_bytes(data)
+    with pytest.raises(FileFormatError, match="cut short"):
+        read_model(tmp_path)
+
+
+@settings(max_examples=150)
+@given(data=st.data())
+def test_a_damaged_model_raises_only_our_errors(
+    data: st.DataObject, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    folder = tmp_path_factory.mktemp("model")
+    text = data.draw(st.booleans())
+    (write_text_model if text else write_binary_model)(folder)
+    file = folder / f"{data.draw(st.sampled_from(PARTS))}{'.txt' if text else '.bin'}"
+    content = bytearray(file.read_bytes())
+    for _ in range(data.draw(st.integers(1, 4))):
+        content[data.draw(st.integers(0, len(content) - 1))] = data.draw(st.integers(0, 255))
+    file.write_bytes(content)
+    with contextlib.suppress(PnpDepthError):
+        read_model(folder)
+
+
+def test_every_camera_model_of_pycolmap_but_panoramas_is_known() -> None:
+    pycolmap = pytest.importorskip("pycolmap")
+    theirs = {n: int(m) for n, m in pycolmap.CameraModelId.__members__.items() if n != "INVALID"}
+    assert {name: model.number for name, model in MODELS.items()} == {
+        name: number for name, number in theirs.items() if name != "EQUIRECTANGULAR"
+    }
+
+
+@pytest.mark.parametrize("name", CAMERAS)
+def test_points_project_as_in_pycolmap_for_every_camera_model(name: str, tmp_path: Path) -> None:
+    pycolmap = pytest.importorskip("pycolmap")
+    from pnpdepth_cli.sensors import Camera
+
+    write_text_model(tmp_path, camera=name)
+    ours = read_model(tmp_path).cameras[1]
+    theirs = pycolmap.Reconstruction(str(tmp_path)).cameras[1]
+    assert theirs.model.name == name
+    rng = np.random.default_rng(0)
+    points = np.column_stack([rng.uniform(-0.6, 0.6, (200, 2)), np.ones(200)]) * 3
+    eye = Camera(intrinsics=ours.intrinsics, distortion=ours.distortion, lens=ours.lens)
+    expected = theirs.img_from_cam(points) - 0.5  # pixel centres are at .5 in COLMAP
+    np.testing.assert_allclose(eye.pixels_of(points), expected, atol=1e-6)
+
+
+def test_a_photo_is_found_by_the_longest_name_that_ends_its_path(tmp_path: Path) -> None:
+    write_text_model(tmp_path, names=("left/1.png", "right/1.png", "2.png"))
+    model = read_model(tmp_path)
+    assert name_in_model(model, Path("/photos/right/1.png")) == "right/1.png"
+    assert name_in_model(model, Path("anywhere/2.png")) == "2.png"
+    with pytest.raises(InputError, match=r"could be any of left/1\.png, right/1\.png"):
+        name_in_model(model, Path("/photos/1.png"))
+    with pytest.raises(InputError, match=r"not among the 3 images .* did not register it"):
+        name_in_model(model, Path("/photos/9.png"))
+
+
+def test_panoramas_are_refused_in_one_line(tmp_path: Path) -> None:
+    write_text_model(tmp_path)
+    (tmp_path / "cameras.txt").write_text("1 EQUIRECTANGULAR 64 32 64 32\n")
+    with pytest.raises(FileFormatError, match="has no z axis; render perspective views"):
+        read_model(tmp_path)
+
+
+def test_an_image_whose_camera_is_missing_is_named(tmp_path: Path) -> None:
+    write_text_model(tmp_path)
+    cameras = tmp_path / "cameras.txt"
+    cameras.write_text(cameras.read_text().replace("1 PINHOLE", "5 PINHOLE"))
+    with pytest.raises(FileFormatError, match=r"has camera 1, which cameras\.txt lacks"):
+        read_model(tmp_path)

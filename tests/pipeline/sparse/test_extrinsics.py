@@ -1,0 +1,58 @@
+"""A scan with extrinsics from a file, and extrinsics of the wrong direction."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pnpdepth_cli.errors import UsageError
+from pnpdepth_cli.pipeline.sparse.scan_options import ScanOptions
+from pnpdepth_cli.pipeline.sparse.scans import read_scan_points
+from tests.pipeline.scan_frames import CALIBRATION, HEIGHT, WIDTH, ScanOnDisk, scan_on_disk
+
+TURN = np.array([[0, -1, 0], [0, 0, -1], [1, 0, 0]])
+SHIFT = np.array([0.1, -0.05, -0.2])
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> ScanOnDisk:
+    """A scan whose calibration lacks the pose, and the pose in a file of its own."""
+    scene = scan_on_disk(tmp_path)
+    scene.calib.write_text(CALIBRATION.splitlines()[0])
+    np.savetxt(tmp_path / "pose.txt", np.column_stack([TURN, SHIFT]))
+    np.savetxt(tmp_path / "inverse.txt", np.column_stack([TURN.T, -TURN.T @ SHIFT]))
+    return scene
+
+
+def test_extrinsics_of_a_file_complete_a_calibration(scene: ScanOnDisk) -> None:
+    options = ScanOptions(calib=scene.calib)
+    with pytest.raises(UsageError, match=r"has no pose of the scanner; .* or give --extrinsics"):
+        read_scan_points(scene.scan, options, (HEIGHT, WIDTH))
+    options = ScanOptions(calib=scene.calib, extrinsics=scene.folder / "pose.txt")
+    read = read_scan_points(scene.scan, options, (HEIGHT, WIDTH))
+    np.testing.assert_allclose(read.points.xy, scene.places[read.points.index], atol=1e-3)
+
+
+def test_extrinsics_of_the_wrong_direction_are_recognised(scene: ScanOnDisk) -> None:
+    wrong = ScanOptions(calib=scene.calib, extrinsics=scene.folder / "inverse.txt")
+    with pytest.raises(UsageError, match=r"put 0 of 150 scan .* add --inverse-extrinsics"):
+        read_scan_points(scene.scan, wrong, (HEIGHT, WIDTH))
+    right = ScanOptions(
+        calib=scene.calib, extrinsics=scene.folder / "inverse.txt", inverse_extrinsics=True
+    )
+    read = read_scan_points(scene.scan, right, (HEIGHT, WIDTH))
+    np.testing.assert_allclose(read.points.xy, scene.places[read.points.index], atol=1e-3)
+    assert not [note for note in read.notes if "extrinsics" in note]
+
+
+def test_a_fisheye_lens_of_a_plain_calibration_is_applied(scene: ScanOnDisk) -> None:
+    plain = scene.calib.read_text()
+    moved = []
+    for lens in ("", "\ndistortion: [0.1, 0, 0, 0]\nlens: fisheye\n"):
+        scene.calib.write_text(plain + lens)
+        options = ScanOptions(calib=scene.calib, extrinsics=scene.folder / "pose.txt")
+        points = read_scan_points(scene.scan, options, (HEIGHT, WIDTH)).points
+        moved.append(points.xy[:5])
+    assert np.abs(moved[0] - moved[1]).max() > 0.01

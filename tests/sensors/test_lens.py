@@ -1,0 +1,83 @@
+"""Lens distortion is that of OpenCV and of COLMAP, and undoing it gives the direction back."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from pnpdepth_cli.choices import LENSES
+from pnpdepth_cli.sensors import lens as lenses
+from pnpdepth_cli.sensors.camera import Camera
+from pnpdepth_cli.sensors.lens import distort, largest_radius, undistort
+
+K = np.array([[420.0, 0, 320], [0, 410, 240], [0, 0, 1]])
+small = st.floats(-0.05, 0.05)
+EXAMPLES: dict[str, tuple[float, ...]] = {
+    "radial-tangential": (-0.2, 0.05, 0.001, -0.002, 0.01),
+    "fisheye": (-0.02, 0.01, -0.003, 0.001),
+    "fov": (0.9,),
+    "thin-prism-fisheye": (-0.02, 0.01, 0.001, -0.002, -0.003, 0.001, 0.002, -0.001),
+    "rad-tan-thin-prism-fisheye": (
+        *(-0.02, 0.01, -0.003, 0.001, 0.0, 0.0, 0.001, -0.002, 0.002, 0.0, -0.001, 0.001),
+    ),
+    "division": (-0.15,),
+    "eucm": (0.6, 1.1),
+}
+
+
+def directions(seed: int, widest: float = 0.9) -> NDArray[np.float64]:
+    return np.random.default_rng(seed).uniform(-widest, widest, (60, 2))
+
+
+def test_every_lens_of_the_list_is_implemented() -> None:
+    assert tuple(lenses._LENSES) == LENSES == tuple(EXAMPLES)
+
+
+@settings(max_examples=60)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    coefficients=st.tuples(*[small] * 14).flatmap(
+        lambda c: st.sampled_from([c[:4], c[:5], c[:8], c[:12], c])
+    ),
+)
+def test_radial_tangential_is_opencvs(seed: int, coefficients: tuple[float, ...]) -> None:
+    points = np.column_stack([directions(seed, 0.6), np.ones(60)])
+    camera = Camera(intrinsics=K, distortion=coefficients)
+    theirs, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), K, np.array(coefficients))
+    np.testing.assert_allclose(camera.pixels_of(points), theirs[:, 0], atol=1e-6)
+
+
+@settings(max_examples=60)
+@given(seed=st.integers(0, 2**32 - 1), coefficients=st.tuples(*[small] * 4))
+def test_fisheye_is_opencvs(seed: int, coefficients: tuple[float, ...]) -> None:
+    points = np.column_stack([directions(seed), np.ones(60)])
+    camera = Camera(intrinsics=K, distortion=coefficients, lens="fisheye")
+    theirs, _ = cv2.fisheye.projectPoints(
+        points[:, None], np.zeros(3), np.zeros(3), K, np.array(coefficients)
+    )
+    np.testing.assert_allclose(camera.pixels_of(points), theirs[:, 0], atol=1e-6)
+
+
+@pytest.mark.parametrize("lens", LENSES)
+def test_undoing_a_lens_gives_the_directions_back(lens: str) -> None:
+    plane = directions(0, 0.7)
+    shown = distort(plane, lens, EXAMPLES[lens])
+    assert np.abs(shown - plane).max() > 1e-3
+    np.testing.assert_allclose(undistort(shown, lens, EXAMPLES[lens]), plane, atol=1e-9)
+
+
+@pytest.mark.parametrize("lens", LENSES)
+def test_the_axis_stays_where_it_is(lens: str) -> None:
+    assert distort(np.zeros((1, 2)), lens, EXAMPLES[lens]).tolist() == [[0, 0]]
+
+
+def test_a_fisheye_that_turns_back_shows_nothing_beyond() -> None:
+    turns_back = (-0.2, 0.0, 0.0, 0.0)  # angle − 0.2 angle³ has its maximum at 1.29 radians
+    assert largest_radius("fisheye", turns_back) == pytest.approx(np.tan(1.29), rel=0.01)
+    beyond = distort(np.array([[4.0, 0.0], [1.0, 0.0]]), "fisheye", turns_back)
+    assert np.isnan(beyond[0]).all()
+    assert np.isfinite(beyond[1]).all()
