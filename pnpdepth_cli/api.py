@@ -78,7 +78,9 @@ class RefinerOptions(TypedDict, total=False):
     layer: str | None
     """Layer to cut at. None takes the one that fits the spacing of the points."""
     settings: RefineSettings | None
-    """How z is updated. None takes the network's defaults."""
+    """What is updated and how. None takes the network's defaults for the target."""
+    target: str
+    """"given", or "masked" to update weights by points hidden from the network's input."""
     propagate: str | None
     """Propagation of the residuals at the points: "none", "gp" or "diffusion". None is "none", or
     with `auto` the best at held-out points."""
@@ -91,7 +93,7 @@ class RefinerOptions(TypedDict, total=False):
     tile: int | None
     """Refine larger frames in tiles of this side length, pixels."""
     seed: int
-    """Of the random choices of `auto` and `uncertainty`."""
+    """Of the random choices of `auto`, `uncertainty` and the masks."""
 
 
 class Refiner:

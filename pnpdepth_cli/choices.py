@@ -104,13 +104,21 @@ UPDATES = Table(
 )
 """U: each entry creates a rule that turns gradients into directions of z."""
 
-Schedule = Literal["constant", "linear"]
+Schedule = Literal["constant", "linear", "cosine"]
 SCHEDULES: tuple[Schedule, ...] = get_args(Schedule)
 """How the step size changes over the updates of z."""
 
 Parameters = Literal["elements", "channels"]
 PARAMETERS: tuple[Parameters, ...] = get_args(Parameters)
-"""What is updated: every element of z, or a scale and a shift of each channel of z."""
+"""What is updated of z: every element, or a scale and a shift of each channel."""
+
+Target = Literal["given", "masked"]
+TARGETS: tuple[Target, ...] = get_args(Target)
+"""Which points the loss is taken at: those the network was given, or points hidden from it."""
+
+Mask = Literal["points", "blocks", "lines"]
+MASKS: tuple[Mask, ...] = get_args(Mask)
+"""What is hidden as a whole: single points, blocks of the frame, or scan lines."""
 
 Precision = Literal["fp32", "bf16", "fp16"]
 PRECISIONS: tuple[Precision, ...] = get_args(Precision)

@@ -18,7 +18,7 @@ from pnpdepth_cli.models.registry import find_definition
 ROOT = Path(__file__).parent.parent
 README = ROOT / "README.md"
 PAGES = [README, *sorted((ROOT / "docs").rglob("*.md"))]
-WRITES_FILES = ("refine", "project", "sample", "simulate")
+WRITES_FILES = ("refine", "project", "sample", "simulate", "cloud")
 
 
 def blocks(page: Path, language: str) -> list[str]:

@@ -20,6 +20,7 @@ from pnpdepth_cli.cli.printable import printable
 from pnpdepth_cli.errors import FramesFailedError, StorageError
 from pnpdepth_cli.pipeline.batch.request import BatchRequest
 from pnpdepth_cli.pipeline.refinement.request import sample_pattern
+from pnpdepth_cli.pipeline.sparse.bag_options import BagOptions
 
 _STOPPING = b"\nfinishing the current frame; press Ctrl-C again to stop at once\n"
 
@@ -34,7 +35,10 @@ _STOPPING = b"\nfinishing the current frame; press Ctrl-C again to stop at once\
         }
     ),
     groups={
-        "Frames": ("--layout", "--protocol", "--sample", "--limit", "--shard"),
+        "Frames": (
+            *("--layout", "--protocol", "--sample", "--limit", "--shard"),
+            *("--image-topic", "--points-topic", "--tolerance"),
+        ),
         "Input": (*grouped_help.LIDAR, *grouped_help.COLMAP, *grouped_help.FILE_READING),
         "Network": grouped_help.NETWORK,
         "Method": grouped_help.METHOD,
@@ -42,14 +46,14 @@ _STOPPING = b"\nfinishing the current frame; press Ctrl-C again to stop at once\
         "Run": ("--workers", "--batch-size", "--profile", "--dry-run"),
     },
 )
-@click.argument("source", type=options.FILE, metavar="FOLDER|LIST")
+@click.argument("source", type=options.FILE, metavar="FOLDER|LIST|BAG")
 @click.option("-o", "--output", type=options.FILE, required=True, help="Output folder.")
 @click.option(
     "--sample",
     metavar="[PATTERN:]N|P%",
     help="Sample the sparse depth from the ground truth, as `pnpdepth sample` does.",
 )
-@options.options_of_groups(BatchRequest)
+@options.options_of_groups(BatchRequest, BagOptions)
 @click.option("--dry-run", is_flag=True, help="List the frames that would be refined, and exit.")
 @options.scan
 @options.refinement
@@ -62,7 +66,7 @@ def batch(
     as_json: bool,
     **given: Any,
 ) -> None:
-    """Refine all frames of FOLDER, or of a LIST of them (CSV or JSON lines).
+    """Refine all frames of FOLDER, of a LIST of them (CSV or JSON lines), or of a ROS BAG.
 
     \b
     pnpdepth batch drive_0001/ -o out/
@@ -80,12 +84,20 @@ def batch(
     missing or whose settings or files have changed. OUTPUT/summary.json and OUTPUT/summary.csv list
     all frames; OUTPUT/batch.jsonl is the journal of the run.
     """
+    from pnpdepth_cli.pipeline.batch.bags import unpacked
     from pnpdepth_cli.pipeline.batch.batch import plan_batch
 
     own = options.taken(BatchRequest, given)
+    bag_options = BagOptions(**options.taken(BagOptions, given))
     pattern = None if sample is None else sample_pattern(*_sample(sample))
     refine = options.request_of(given, sample=pattern)
     request = BatchRequest(source=source, output=output, refine=refine, **own)
+    request = unpacked(
+        request,
+        bag_options,
+        lambda text: click.echo(printable(text), err=True),
+        may_write=not dry_run,
+    )
     if dry_run:
         planned = plan_batch(request, lambda text: click.echo(printable(text), err=True))
         if as_json:

@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     "--points", type=int, default=500, show_default=True, metavar="N", help="Number of points."
 )
 @click.option("--iterations", type=int, metavar="K", help="Number of updates of z.")
+@options.target
 @options.precision
 @options.device
 @click.option(
@@ -66,6 +67,8 @@ def bench(size: str | None, repeats: int, table: bool, as_json: bool, **given: A
     if repeats < 1:
         raise UsageError(f"repeats {repeats}: there must be at least one")
     if table:
+        if given["target"] != "given":
+            raise UsageError("--table measures the paper's updates and not --target masked")
         refused = {"--size": size} | {
             f"--{name}": given[name] for name in ("checkpoint", "layer", "iterations")
         }

@@ -35,7 +35,8 @@ NETWORK = (
 )
 METHOD = (
     *("--preset", "--time-budget", "--iterations", "--lr", "--loss", "--update", "--schedule"),
-    *("--blur", "--parameters", "--proximity", "--line-search", "--keep-best", "--propagate"),
+    *("--blur", "--target", "--parameters", "--mask", "--mask-fraction", "--mask-scale"),
+    *("--proximity", "--line-search", "--keep-best", "--propagate"),
     *("--holdout", "--seed"),
 )
 OUTPUT = ("--output", "--format", "--baselines", "--uncertainty", "--overwrite", "--json")

@@ -9,6 +9,16 @@ equations 2 and 3:
 
 `refine_from` is that loop. L and D_s are those of `core.losses` and `points`, U one of
 `core.update_rules`, α and its schedule those of `core.step_sizes`.
+
+A network that is given the points as an input fits them before the first update, so that L says
+little. `refine_weights` hides some points m_k ⊂ D_s from the input and takes L at these, a new
+random m_k at every step, and moves the weights θ instead of z:
+
+    θ_{k+1} = θ_k − α·U(∂L(f_θ(x, D_s ∖ m_k), m_k) / ∂θ_k)
+    depth   = f_θ*(x, D_s)
+
+θ* is the θ_k that is best at points never shown; k = 0 is among them. With target "given" nothing
+is hidden, and L is taken at all points, as in equation 3.
 """
 
 from __future__ import annotations
@@ -22,10 +32,21 @@ from torch import Tensor
 from pnpdepth_cli.core.batch import frame_parts
 from pnpdepth_cli.core.refinement import DepthOf, FrameRefinement, Refinement, RefineSettings
 from pnpdepth_cli.core.split import Split, gradient_at
+from pnpdepth_cli.core.split.user_code import wrap_user_errors
+from pnpdepth_cli.core.weights import MovingWeights
+from pnpdepth_cli.core.weights_refinement import FrameOfPoints, WeightsRefinement
 from pnpdepth_cli.errors import LayerError, PnpDepthError
 from pnpdepth_cli.points import SparsePoints
 
-__all__ = ["DepthOf", "RefineSettings", "Refinement", "refine", "refine_batch", "refine_from"]
+__all__ = [
+    "DepthOf",
+    "RefineSettings",
+    "Refinement",
+    "refine",
+    "refine_batch",
+    "refine_from",
+    "refine_weights",
+]
 
 _LOSS_SCALE = 1024.0
 """Factor on the loss where float16 is involved, whose smallest number exceeds many gradients."""
@@ -141,6 +162,53 @@ def refine_from(
         with torch.no_grad():
             _losses(frames, split.rear(z))
     return [frame.result() if frame.error is None else frame.error for frame in frames]
+
+
+def refine_weights(
+    frame: FrameOfPoints,
+    weights: MovingWeights,
+    settings: RefineSettings,
+    *,
+    on_iteration: Callable[[int, float], None] = lambda iteration, loss: None,
+) -> Refinement:
+    """Returns the depth of one frame after moving weights, which are back in place afterwards.
+
+    Args:
+        frame: The frame, and how the network predicts it.
+        weights: The weights that move, θ_0.
+        settings: What is updated and how.
+        on_iteration: Called after each step k with k and L(θ_k).
+
+    Raises:
+        DivergedError: As of `refine`.
+        ModelError: As of `refine`.
+        LayerError: The depth depends on no weight behind the cut.
+    """
+    state = WeightsRefinement(frame, weights, settings)
+    state.begin()
+    for iteration in range(state.iterations):
+        given, asked = state.mask()
+        with torch.enable_grad(), weights.in_place(requires_grad=True) as theta:
+            loss = state.loss(frame.predict_in_steps(given), asked)
+            gradients = _gradients(loss, theta)
+        state.update(loss, gradients)
+        if state.error is not None:
+            break
+        on_iteration(iteration, state.losses[-1])
+        if state.finished():
+            break
+    if state.error is not None:
+        state.error.last_good = state.result()
+        raise state.error
+    return state.result()
+
+
+def _gradients(loss: Tensor, theta: Sequence[Tensor]) -> list[Tensor | None]:
+    """∂L/∂θ_k; None for what L does not depend on."""
+    if loss.requires_grad:
+        with wrap_user_errors("the gradient of the network"):
+            loss.backward()  # type: ignore[no-untyped-call]
+    return [value.grad for value in theta]
 
 
 def _losses(frames: Sequence[FrameRefinement], output: Any) -> list[Tensor]:

@@ -8,7 +8,7 @@ from typing import Any
 
 from torch import Tensor
 
-from pnpdepth_cli.choices import LOSSES, UPDATES
+from pnpdepth_cli.choices import LOSSES, PARAMETERS, UPDATES
 from pnpdepth_cli.core.losses import Loss
 from pnpdepth_cli.core.proximity import proximity_loss
 from pnpdepth_cli.core.step_sizes import SCHEDULES, Channels, blurred, step_size
@@ -21,11 +21,27 @@ DepthOf = Callable[[Any], Tensor]
 
 
 @dataclass(frozen=True, kw_only=True)
+class MaskSettings:
+    """Which points are hidden from the network's input, and which decide how many steps count."""
+
+    kind: str = "points"
+    """What is hidden as a whole, one of `choices.MASKS`."""
+    fraction: float = 0.5
+    """Fraction hidden at every step."""
+    set_aside: float = 0.1
+    """Fraction never shown during the steps; the step that is best there is taken."""
+    scale: float = 1.0
+    """Side of the image during the steps, as a fraction of the side that the network takes."""
+    seed: int = 0
+    """Of the masks, and of the random start of low-rank weights."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class RefineSettings:
-    """How z is updated; the defaults are the paper's."""
+    """What is updated and how; the defaults are the paper's."""
 
     iterations: int = 5
-    """Number of updates of z; 0 gives the plain prediction."""
+    """Number of updates; 0 gives the plain prediction."""
     lr: float | str = 0.01
     """Step size α: a number, or a text such as "3%" of the standard deviation of z_0."""
     loss: str = "l1"
@@ -37,7 +53,13 @@ class RefineSettings:
     blur: float = 0.0
     """Standard deviation of the blur of the gradient, in mean spacings of the points."""
     parameters: str = "elements"
-    """What is updated, one of `choices.PARAMETERS`."""
+    """What is updated: "elements" or "channels" of z, "weights", or "lora:R"."""
+    target: str = "given"
+    """Which points L is taken at, one of `choices.TARGETS`."""
+    mask: MaskSettings = MaskSettings()
+    """With target "masked": which points are hidden from the input."""
+    time_budget_s: float | None = None
+    """Seconds after which no update of weights begins; None sets no limit."""
     proximity: float = 0.0
     """Weight of the proximity loss in L."""
     line_search: bool = False
@@ -48,6 +70,16 @@ class RefineSettings:
     """How `depth_of` fits the network's output to the points, one of `choices.ALIGNMENTS`."""
     align_every: bool = False
     """Whether `depth_of` repeats that fit at every update."""
+
+    @property
+    def moves_weights(self) -> bool:
+        """Whether weights of the network are updated instead of z."""
+        return self.parameters not in PARAMETERS
+
+    @property
+    def masked(self) -> bool:
+        """Whether L is taken at points hidden from the network's input."""
+        return self.target == "masked"
 
     @property
     def gives_best(self) -> bool:
@@ -120,7 +152,7 @@ class FrameRefinement:
         if self._settings.iterations and not bool(loss.isfinite()):
             self.error = self._diverged("loss", len(self.losses))
             if not self.losses and not bool(at_points.isfinite().all()):
-                self.error = _bad_prediction(at_points)
+                self.error = bad_prediction(at_points)
             return None
         self._record(loss, depth.detach())
         return loss
@@ -178,7 +210,8 @@ class FrameRefinement:
         )
 
 
-def _bad_prediction(at_points: Tensor) -> ModelError:
+def bad_prediction(at_points: Tensor) -> ModelError:
+    """Returns the error of a plain prediction (N,) at the points that is not finite."""
     return ModelError(
         f"the network's prediction is not finite at {int((~at_points.isfinite()).sum()):,} of"
         f" {len(at_points):,} sparse points, before any update of z; are its weights, its input"

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+import torch.nn.functional as F
 from torch import Tensor
 
 from pnpdepth_cli.core.refine import RefineSettings
 from pnpdepth_cli.errors import NoPointsError
 from pnpdepth_cli.frames.frame import DepthMap, Frame
 from pnpdepth_cli.models.aligned import AlignedDepth
+from pnpdepth_cli.models.definition import Fixed
 from pnpdepth_cli.models.frame import FrameMap
 from pnpdepth_cli.models.network import Network
 from pnpdepth_cli.points import SparsePoints
@@ -26,10 +28,44 @@ class PreparedFrame:
     """The frame in the image frame."""
     map: FrameMap
     """From the image frame to the network's frame."""
+    image: Tensor | None
+    """The image as the network takes it. None if it takes none."""
     arguments: tuple[Tensor, ...]
     """Arguments of the network."""
     points: SparsePoints
     """The points that the network sees, in its frame and on its device."""
+
+    @property
+    def varying(self) -> tuple[int, ...]:
+        """Positions of the arguments that depend on the points."""
+        fewer = self.arguments_for(self.points)
+        return tuple(
+            index
+            for index, (one, other) in enumerate(zip(self.arguments, fewer, strict=True))
+            if one is not other
+        )
+
+    def arguments_for(self, points: SparsePoints) -> tuple[Tensor, ...]:
+        """Returns the arguments of the network for some of the points; the image is the same."""
+        return self.network.arguments_of(self.image, points)
+
+    def reduced(self, scale: float) -> PreparedFrame | None:
+        """Returns the frame with sides of about this fraction, in the same field of view.
+
+        None where the network takes one size only, or where the size stays the same.
+        """
+        policy, (height, width) = self.network.definition.size, self.map.network
+        if isinstance(policy, Fixed):
+            return None
+        size = [max(1, round(side * scale / policy.of)) * policy.of for side in (height, width)]
+        if size == [height, width]:
+            return None
+        image = self.image
+        if image is not None:
+            image = F.interpolate(image, size, mode="bilinear", align_corners=False, antialias=True)
+        points = self.points.resized(*size)
+        arguments = self.network.arguments_of(image, points)
+        return replace(self, image=image, points=points, arguments=arguments)
 
     def depth_reader(self, settings: RefineSettings) -> AlignedDepth:
         """Returns a new reader of the network's output in metres, (1, 1, h, w)."""
@@ -63,11 +99,12 @@ def prepare(network: Network, frame: Frame) -> PreparedFrame:
     """
     to_network = FrameMap.fit(network.definition.size, *frame.size)
     points = to_network.points_to_network(frame.points)
-    rgb = None if frame.rgb is None else frame.rgb[None]
+    image = network.image_of(to_network, None if frame.rgb is None else frame.rgb[None])
     return PreparedFrame(
         network=network,
         frame=frame,
         map=to_network,
-        arguments=network.arguments(to_network, rgb, points),
+        image=image,
+        arguments=network.arguments_of(image, points),
         points=points.tensors(network.device),
     )

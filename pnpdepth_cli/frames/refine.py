@@ -2,19 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
 
 import torch
 from torch import Tensor
 
+from pnpdepth_cli.completion.outliers import outliers
 from pnpdepth_cli.completion.propagation import propagate
-from pnpdepth_cli.core.refine import Refinement, RefineSettings, refine_from
-from pnpdepth_cli.core.split import Split
+from pnpdepth_cli.core.refine import Refinement, RefineSettings, refine_from, refine_weights
+from pnpdepth_cli.core.split import InputSplit, Split
+from pnpdepth_cli.core.weights import MovingWeights
+from pnpdepth_cli.core.weights_refinement import FrameOfPoints, Predict
 from pnpdepth_cli.errors import BatchError, DivergedError, PnpDepthError
 from pnpdepth_cli.frames.frame import DepthMap, Frame, RefinedFrame, no_points
 from pnpdepth_cli.frames.prepare import PreparedFrame, prepare
 from pnpdepth_cli.models.aligned import AlignedDepth
 from pnpdepth_cli.models.network import Network, out_of_memory_is_a_device_error
+from pnpdepth_cli.points import SparsePoints
+
+MIN_POINTS_FOR_OUTLIERS = 50
+"""Of fewer points, one inconsistent with the others may be all that is seen of an object."""
 
 OnIteration = Callable[[int, float], None]
 """Called with (updates made, loss)."""
@@ -72,7 +81,9 @@ def refine_frames(
         seen = [each for each in prepared if len(each.points)]
         readers = [each.depth_reader(settings) for each in seen]
         results: list[Refinement | PnpDepthError] = []
-        if seen:
+        if seen and settings.moves_weights:
+            results = [_refine_weights(split, settings, seen, readers, on_iteration)]
+        elif seen:
             with torch.no_grad():
                 z = split.front(*_stacked([each.arguments for each in seen]))
             results = refine_from(
@@ -88,6 +99,87 @@ def refine_frames(
         for each in zip(seen, readers, results, strict=True)
     )
     return [next(refined) if len(each.points) else each.no_points_error() for each in prepared]
+
+
+def _refine_weights(
+    split: Split,
+    settings: RefineSettings,
+    frames: Sequence[PreparedFrame],
+    readers: Sequence[AlignedDepth],
+    on_iteration: OnIteration,
+) -> Refinement | PnpDepthError:
+    """The result of one frame, whose weights move for it alone."""
+    if len(frames) > 1:
+        raise BatchError("weights move for one frame alone; refine the frames one at a time")
+    (frame,), (reader,) = frames, readers
+    weights = MovingWeights(frame.network.module, settings.parameters, settings.mask.seed)
+    try:
+        with _opened(split, frame, reader, settings.mask.scale) as seen:
+            return refine_weights(
+                seen,
+                weights,
+                settings,
+                on_iteration=lambda iteration, loss: on_iteration(iteration + 1, loss),
+            )
+    except PnpDepthError as error:
+        return error
+
+
+@contextmanager
+def _opened(
+    split: Split, frame: PreparedFrame, reader: AlignedDepth, scale: float
+) -> Iterator[FrameOfPoints]:
+    """The frame as the network predicts it from any of its points, after one plain pass.
+
+    A split at a layer stays at z_0. One at the points predicts the steps from a reduced image.
+    """
+    if not isinstance(split, InputSplit):
+        with torch.no_grad():
+            z0 = split.front(*frame.arguments)
+            output = split.rear(z0)
+
+        def from_z(points: SparsePoints) -> Any:
+            return split.rear(z0)
+
+        yield _frame_of_points(frame, reader, output, from_z, from_z)
+        return
+    output = split.first(*frame.arguments, varying=frame.varying)
+
+    def predict(points: SparsePoints) -> Any:
+        return split.again(*frame.arguments_for(points))
+
+    reduced = frame.reduced(scale)
+    if reduced is None:
+        yield _frame_of_points(frame, reader, output, predict, predict)
+        return
+    with frame.network.cut_at_points() as small:
+        small.first(*reduced.arguments, varying=reduced.varying)
+
+        def predict_reduced(points: SparsePoints) -> Any:
+            return small.again(*reduced.arguments_for(points.resized(*reduced.points.size)))
+
+        yield _frame_of_points(frame, reader, output, predict, predict_reduced)
+
+
+def _frame_of_points(
+    frame: PreparedFrame, reader: AlignedDepth, output: Any, predict: Predict, in_steps: Predict
+) -> FrameOfPoints:
+    return FrameOfPoints(
+        points=frame.points,
+        inliers=_inliers(frame.points),
+        output=output,
+        predict=predict,
+        predict_in_steps=in_steps,
+        depth_of=reader,
+    )
+
+
+def _inliers(points: SparsePoints) -> SparsePoints:
+    """The points without those inconsistent with the others; of a few, none is."""
+    if len(points) < MIN_POINTS_FOR_OUTLIERS:
+        return points
+    on_cpu = points.tensors()
+    return points.select(~outliers(torch.ones(points.size), on_cpu, None).to(points.xy.device))
 
 
 def to_refined_frame(

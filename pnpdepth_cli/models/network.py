@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from pnpdepth_cli.core.split import Split
+from pnpdepth_cli.core.split import InputSplit, Split
 from pnpdepth_cli.core.split.structure import tensors_in
 from pnpdepth_cli.core.split.user_code import is_out_of_memory, wrap_user_errors
 from pnpdepth_cli.errors import CheckpointError, DeviceError, ModelError, UsageError
@@ -54,6 +54,19 @@ class Network:
         """
         return Split(self.module, layer, static_graph=self.definition.static_graph)
 
+    def cut_at_points(self) -> InputSplit:
+        """Returns the network cut at its sparse depth, to be opened by `with`.
+
+        Raises:
+            UsageError: The network takes no sparse depth.
+        """
+        if "sparse" not in self.definition.input_kind:
+            raise UsageError(
+                f"network {self.definition.name!r} takes no sparse depth, so no points can be"
+                " hidden from it; take --target given"
+            )
+        return InputSplit(self.module, static_graph=self.definition.static_graph)
+
     def arguments(
         self, frame: FrameMap, rgb: Tensor | None, points: SparsePoints
     ) -> tuple[Tensor, ...]:
@@ -68,19 +81,41 @@ class Network:
             UsageError: The network takes an rgb image and there is none.
             ModelError: The definition's `arguments` raises or does not return a tuple.
         """
-        kind = self.definition.input_kind
-        image = sparse = None
-        if "rgb" in kind:
-            if rgb is None:
-                raise UsageError(
-                    f"network {self.definition.name!r} takes an rgb image; name one before --sparse"
-                )
-            normalise = self.definition.normalisation or Normalisation()
-            mean = rgb.new_tensor(normalise.mean).reshape(1, 3, 1, 1)
-            std = rgb.new_tensor(normalise.std).reshape(1, 3, 1, 1)
-            image = ((frame.rgb_to_network(rgb) - mean) / std).to(self.device)
-        if "sparse" in kind:
-            sparse = points.scatter().to(self.device)
+        return self.arguments_of(self.image_of(frame, rgb), points)
+
+    def image_of(self, frame: FrameMap, rgb: Tensor | None) -> Tensor | None:
+        """Returns the image as the network takes it, (1, 3, h, w); None if it takes none.
+
+        Args:
+            frame: As of `arguments`.
+            rgb: As of `arguments`.
+
+        Raises:
+            UsageError: As of `arguments`.
+        """
+        if "rgb" not in self.definition.input_kind:
+            return None
+        if rgb is None:
+            raise UsageError(
+                f"network {self.definition.name!r} takes an rgb image; name one before --sparse"
+            )
+        normalise = self.definition.normalisation or Normalisation()
+        mean = rgb.new_tensor(normalise.mean).reshape(1, 3, 1, 1)
+        std = rgb.new_tensor(normalise.std).reshape(1, 3, 1, 1)
+        return ((frame.rgb_to_network(rgb) - mean) / std).to(self.device)
+
+    def arguments_of(self, image: Tensor | None, points: SparsePoints) -> tuple[Tensor, ...]:
+        """Returns the positional arguments of the network's forward.
+
+        Args:
+            image: From `image_of`.
+            points: As of `arguments`.
+
+        Raises:
+            ModelError: As of `arguments`.
+        """
+        takes_points = "sparse" in self.definition.input_kind
+        sparse = points.scatter().to(self.device) if takes_points else None
         with wrap_user_errors(f"arguments of network {self.definition.name!r}"):
             arguments = self.definition.call_arguments(image, sparse)
         if not isinstance(arguments, tuple):

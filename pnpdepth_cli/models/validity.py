@@ -44,6 +44,13 @@ def at_least_zero(owner: object, field: str) -> None:
         refuse(owner, field, "is not a number of at least 0")
 
 
+def fraction(owner: object, field: str, *, most: bool = False) -> None:
+    """Checks that the field is a number above 0 and below 1, or 1 at most."""
+    value = getattr(owner, field)
+    if not _is_number(value) or not (0 < value < 1 or (most and value == 1)):
+        refuse(owner, field, "is not a fraction between 0 and 1")
+
+
 def step(owner: object, field: str) -> None:
     """Checks that the field is a positive number, or a text such as "0.5" or "3%"."""
     value = getattr(owner, field)

@@ -107,7 +107,8 @@ class Recorder:
             raise self._cut.several_calls(calls)
         if self.watch.torn:
             raise self._cut.aliased()
-        if self.watch.data_dependent:  # another z may take another path behind the cut
+        # Another z may take another path behind the cut, unless the definition says otherwise.
+        if self.watch.data_dependent and not promised_static:
             self._drop_from(self._known)
             for call in self._calls:
                 if call.saved is not None:

@@ -19,7 +19,7 @@ reached Python, where the network could branch on it. Then further frames are on
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor, nn
@@ -32,6 +32,9 @@ from pnpdepth_cli.core.split.state import NetworkState
 from pnpdepth_cli.core.split.user_code import wrap_user_errors
 from pnpdepth_cli.core.split.watch import Watch
 from pnpdepth_cli.errors import LayerError
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
 
 _LOW_PRECISION = (torch.float16, torch.bfloat16)
 
@@ -60,12 +63,15 @@ class Split:
     def __init__(self, network: nn.Module, layer: str, *, static_graph: bool = False) -> None:
         self.layer = layer
         self._network, self._promised_static = network, static_graph
-        self._cut = CutPoint.find(network, layer)
+        self._cut = self._find_cut()
         self._uncacheable: set[nn.Module] = set()
         self._interception: Interception | None = None
         self._replay: Replay | None = None
 
-    def __enter__(self) -> Split:
+    def _find_cut(self) -> CutPoint:
+        return CutPoint.find(self._network, self.layer)
+
+    def __enter__(self) -> Self:
         self._state = NetworkState(self._network)
         try:
             self._interception = Interception(dict.fromkeys(self._cut.modules.values()))
@@ -145,10 +151,13 @@ class Split:
                 return replay
             raise self._never_ran(replay, recorder.ran)
 
-    def _record_rear(self, replay: Replay) -> Any:
+    def _record_rear(self, replay: Replay, varying: Sequence[Tensor] = ()) -> Any:
+        """A watched pass; what depends on z, or on these tensors, is not cached."""
         assert self._interception is not None
         saved = [output for output in replay.outputs if output is not None]
         watch = Watch((replay.arguments, *saved, *self._state.tensors), reads=True)
+        for tensor in varying:
+            watch.touch(tensor)
         recorder = Recorder(self._cut, watch, replay, self._uncacheable)
         try:
             output = self._run(replay, recorder)

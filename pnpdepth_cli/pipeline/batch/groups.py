@@ -25,6 +25,7 @@ from pnpdepth_cli.pipeline.refinement.inputs import Inputs
 from pnpdepth_cli.pipeline.refinement.method import needs_folds
 from pnpdepth_cli.pipeline.refinement.refine import Opened, Refiner
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest
+from pnpdepth_cli.pipeline.refinement.resolve import moves_weights
 
 _MAX_FRAMES = 16
 _MAX_PIXELS = {"cpu": 2**18}
@@ -222,6 +223,8 @@ def _why_alone(request: RefineRequest) -> str | None:
         return "held-out points choose the method for each frame alone"
     if request.network.tile is not None:
         return "tiles go through the network one by one"
+    if moves_weights(request.method):
+        return "weights are updated for each frame alone"
     return None
 
 

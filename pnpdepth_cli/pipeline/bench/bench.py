@@ -46,7 +46,8 @@ from pnpdepth_cli.points import SparsePoints
 
 DEFAULT_SIZE = (480, 640)
 FIRST_FRAME, FULL = "refinement, first frame", "refinement, fp32"
-_WITH_PEAK = ("forward", "refinement", FIRST_FRAME, FULL)
+MASKED = "refinement, hidden points"
+_WITH_PEAK = ("forward", "refinement", FIRST_FRAME, FULL, MASKED)
 _CODES_PER_METRE = 1000.0  # of the synthetic sparse depth
 
 
@@ -66,6 +67,8 @@ class BenchRequest:
     """Sparse points of the frame."""
     iterations: int | None = None
     """Updates of z."""
+    target: str = "given"
+    """"masked" times refinement by hidden points as well, with the network's defaults."""
     precision: str = "fp32"
     """Of convolutions and matrix products."""
     device: str = "cpu"
@@ -221,6 +224,8 @@ class _Subject:
             full_split = stack.enter_context(full.cut_at(self.layer))
             todo[FULL] = Timed(run=lambda _: self._refined(full_split, full))
             change = _change(self._refined(split, self.network), self._refined(full_split, full))
+        if self.request.target == "masked":
+            todo[MASKED] = self._masked_part()
         if self.request.files:
             todo |= self._fitting_parts(output, notes) | self._file_parts()
         spent = in_turn(todo, self.request.repeats, device, on_round=on_round)
@@ -279,6 +284,17 @@ class _Subject:
             "refinement": Timed(run=lambda _: self._refined(split, self.network)),
             FIRST_FRAME: Timed(run=first_frame),
         }
+
+    def _masked_part(self) -> Timed:
+        """A refinement by hidden points, the cut included."""
+        method = replace(self.files_request.method, target="masked", layer=None, iterations=None)
+        settings = resolve_settings(self.network.definition, method)
+
+        def run(_: object) -> None:
+            with self.network.cut_at_points() as split:
+                refine_frame(self.network, split, settings, self.prepared.frame)
+
+        return Timed(run=run)
 
     def _refined(self, split: Split, network: Network) -> Tensor:
         prepared = replace(self.prepared, network=network)

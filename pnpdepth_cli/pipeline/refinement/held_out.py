@@ -199,17 +199,17 @@ def _record(choice: Choice, user: str) -> dict[str, Any]:
 
 
 def _candidate(candidate: Candidate) -> dict[str, Any]:
-    way = {"way": str(candidate)}
+    entry = {"candidate": str(candidate)}
     if candidate.baseline is not None:
-        return way | {"baseline": candidate.baseline}
+        return entry | {"baseline": candidate.baseline}
     if candidate.fused:
         parts = zip(candidate.weights, candidate.fused, strict=True)
-        return way | {
+        return entry | {
             "fused": [{"weight": weight, **_candidate(each)} for weight, each in parts],
             "propagate": candidate.propagate,
         }
     assert candidate.config is not None
-    return way | {
+    return entry | {
         "network": candidate.config.network,
         "layer": candidate.config.layer,
         **asdict(candidate.config.settings),

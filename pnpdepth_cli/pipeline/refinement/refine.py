@@ -40,6 +40,7 @@ from pnpdepth_cli.pipeline.refinement.outputs import write_outputs
 from pnpdepth_cli.pipeline.refinement.points import PointError, point_error, split_points
 from pnpdepth_cli.pipeline.refinement.request import MethodOptions, NetworkChoice, RefineRequest
 from pnpdepth_cli.pipeline.refinement.resolve import (
+    moves_weights,
     resolve_definition,
     resolve_layer,
     resolve_settings,
@@ -124,6 +125,8 @@ class Refiner:
         """Returns the networks, to be opened by `with` for all frames."""
         if self.competition is not None:
             return OpenNetworks(self.networks)
+        if self.settings.masked:
+            return self.network.cut_at_points()
         return self.network.cut_at(self.layer)
 
     def refine(
@@ -253,7 +256,8 @@ def load_refiner(request: RefineRequest, first: Inputs) -> Refiner:
         ModelError: The network cannot be loaded.
     """
     choice, hold_out, method = request.network, request.hold_out, resolve_method(request)
-    if hold_out.time_budget_s is not None and not method.chosen:
+    timed = method.chosen or moves_weights(method.options)
+    if hold_out.time_budget_s is not None and not timed:
         raise UsageError(f"--time-budget caps the choice, but {method.why} fixes the method")
     if choice.more_models and not method.chosen:
         raise UsageError(f"several --model compete in the choice, but {method.why} fixes a method")
@@ -287,16 +291,21 @@ def refiner_of(
         networks = _with_companion(networks, request.network, first.frame())
     for number, network in enumerate(networks):
         definition = network.definition
-        layer = method.options.layer if number == 0 else None
-        if layer is None and not method.own_layer:
-            layer = default_layer(network, first.size, len(first.points))
         options = method.options if number == 0 else MethodOptions()
-        own = resolve_settings(definition, options, metric=first.unit == METRES)
+        layer = options.layer
+        if layer is None and not method.own_layer and options.target != "masked":
+            layer = default_layer(network, first.size, len(first.points))
+        own = resolve_settings(definition, options, request.hold_out, metric=first.unit == METRES)
         if number == 0 and settings is not None:
             own = settings
         plans.append((_name(networks, number), network, resolve_layer(definition, layer), own))
     _, network, cut_at, own = plans[0]
     folds = needs_folds(request)
+    if folds and own.moves_weights:
+        raise UsageError(
+            "weights cannot be updated together with --auto, --baselines or --uncertainty; leave"
+            " out --target and --parameters"
+        )
     timed = request.hold_out.time_budget_s is not None
     return Refiner(
         request=request,
@@ -384,6 +393,7 @@ def _record(refiner: Refiner, inputs: Inputs, frame: RefinedFrame) -> dict[str, 
             "farthest": float(inputs.points.depth.max()),
         },
         "loss": list(frame.refinement.losses),
+        "kept": frame.refinement.kept,
         "sparse_error": _before_after(frame, lambda d: point_error(d, frame.used)),
         "held_out_error": _before_after(frame, lambda d: point_error(d, frame.held_out)),
         "scores": _before_after(frame, lambda d: _score(d, inputs.gt)),

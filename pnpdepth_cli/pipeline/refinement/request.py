@@ -143,9 +143,9 @@ class MethodOptions:
     )
     iterations: int | None = option(
         None,
-        "Number of updates of z; 0 is no refinement.",
+        "Number of updates; 0 is no refinement.",
         metavar="K",
-        axis=Axis(title="updates of z"),
+        axis=Axis(title="updates"),
     )
     lr: str | None = option(
         None,
@@ -167,7 +167,7 @@ class MethodOptions:
     )
     schedule: str | None = option(
         None,
-        "Step size over the updates; linear decays to 0.",
+        "Step size over the updates; linear and cosine decay to 0.",
         choices=choices.SCHEDULES,
         axis=Axis(title="schedule of the step"),
     )
@@ -178,12 +178,40 @@ class MethodOptions:
         metavar="S",
         axis=Axis(title="blur of the gradient (spacings of the points)"),
     )
-    parameters: str = option(
-        "elements",
-        "Update every element of z, or a scale and a shift of each channel.",
-        choices=choices.PARAMETERS,
+    target: str = option(
+        "given",
+        "Take the loss at the points that the network was given, or at points hidden from its"
+        " input, others at every step.",
+        choices=choices.TARGETS,
         show_default=True,
+        axis=Axis(title="points of the loss"),
+    )
+    parameters: str | None = option(
+        None,
+        "What is updated: elements of z, a scale and a shift of its channels, the weights behind"
+        " the cut, or low-rank additions to them, lora:R.  [default: elements; weights with"
+        " --target masked]",
+        metavar="|".join((*choices.PARAMETERS, "weights", "lora:R")),
         axis=Axis(title="what is updated"),
+    )
+    mask: str | None = option(
+        None,
+        "With --target masked: hide single points, blocks of the frame, or scan lines.",
+        choices=choices.MASKS,
+        axis=Axis(title="what is hidden"),
+    )
+    mask_fraction: float | None = option(
+        None,
+        "With --target masked: the fraction of the points hidden at every step.",
+        metavar="F",
+        axis=Axis(title="hidden fraction of the points"),
+    )
+    mask_scale: float | None = option(
+        None,
+        "With --target masked: reduce the image to this fraction of its sides during the updates;"
+        " 0.5 takes a third of the time.",
+        metavar="F",
+        axis=Axis(title="scale of the image during the updates"),
     )
     proximity: float = option(
         0.0,
@@ -222,7 +250,8 @@ class HoldOut:
     )
     time_budget_s: float | None = option(
         None,
-        "Cap on the time of the choice, such as 5s; what is left tries other layers and steps.",
+        "Cap on the time of the choice, such as 5s; what is left tries other layers and steps."
+        " Where weights are updated, no update begins that would not end in time.",
         flag="--time-budget",
         metavar="SECONDS",
         parse=parse_seconds,

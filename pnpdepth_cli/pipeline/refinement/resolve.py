@@ -7,9 +7,11 @@ from dataclasses import replace
 
 import torch
 
-from pnpdepth_cli.choices import SPACES
+from pnpdepth_cli.choices import PARAMETERS, SPACES
 from pnpdepth_cli.completion.alignment import align
 from pnpdepth_cli.core.refine import RefineSettings
+from pnpdepth_cli.core.refinement import MaskSettings
+from pnpdepth_cli.core.weights import rank_of
 from pnpdepth_cli.errors import ModelError, NoPointsError, UsageError
 from pnpdepth_cli.frames.frame import Frame
 from pnpdepth_cli.frames.prepare import prepare
@@ -21,7 +23,7 @@ from pnpdepth_cli.models.definition import (
     RefineDefaults,
 )
 from pnpdepth_cli.models.network import Network, out_of_memory_is_a_device_error
-from pnpdepth_cli.pipeline.refinement.request import MethodOptions, NetworkChoice
+from pnpdepth_cli.pipeline.refinement.request import HoldOut, MethodOptions, NetworkChoice
 
 NORMALISATIONS = {
     "unit": Normalisation(),
@@ -88,7 +90,11 @@ def resolve_layer(definition: ModelDefinition, layer: str | None) -> str:
 
 
 def resolve_settings(
-    definition: ModelDefinition, method: MethodOptions, *, metric: bool = True
+    definition: ModelDefinition,
+    method: MethodOptions,
+    hold_out: HoldOut | None = None,
+    *,
+    metric: bool = True,
 ) -> RefineSettings:
     """Returns the settings of refinement: the user's, else the network's defaults.
 
@@ -99,12 +105,15 @@ def resolve_settings(
     Args:
         definition: Of the network.
         method: What the user chose.
+        hold_out: For the seed and the time budget; None takes their defaults.
         metric: Whether the points are in metres.
 
     Raises:
-        UsageError: A value is out of range.
+        UsageError: A value is out of range, or goes with another target.
     """
-    defaults = definition.defaults
+    hold_out = hold_out or HoldOut()
+    of_weights = moves_weights(method)
+    defaults = definition.masked if of_weights else definition.defaults
     iterations = defaults.iterations if method.iterations is None else method.iterations
     if iterations < 0:
         raise UsageError(f"iterations {iterations} is negative; 0 gives the plain prediction")
@@ -118,20 +127,74 @@ def resolve_settings(
     alignment = definition.default_alignment
     if not metric and alignment == "none" and definition.input_kind == "rgb":
         alignment = "scale"
-    return RefineSettings(
+    settings = RefineSettings(
         iterations=iterations,
         lr=steps.lr if method.lr is None else method.lr,
         loss=method.loss or defaults.loss,
         update=update,
         schedule=method.schedule or steps.schedule,
         blur=blur,
-        parameters=method.parameters,
+        parameters=method.parameters or defaults.parameters,
+        target=method.target,
+        mask=_resolve_mask(defaults, method, hold_out.seed),
         proximity=method.proximity,
         line_search=method.line_search,
         keep_best=method.keep_best,
         align=method.align or alignment,
         align_every=method.align_every,
+        time_budget_s=hold_out.time_budget_s if of_weights else None,
     )
+    if of_weights:
+        _check_weights(definition, method, settings)
+    return settings
+
+
+def moves_weights(method: MethodOptions) -> bool:
+    """Whether weights are updated instead of z."""
+    return method.target == "masked" or method.parameters not in (None, *PARAMETERS)
+
+
+def _resolve_mask(defaults: RefineDefaults, method: MethodOptions, seed: int) -> MaskSettings:
+    for name in ("mask", "mask_fraction", "mask_scale"):
+        if method.target != "masked" and getattr(method, name) is not None:
+            flag = "--" + name.replace("_", "-")
+            raise UsageError(f"{flag} is for points hidden from the input; add --target masked")
+    if method.target != "masked":
+        return MaskSettings()
+    fraction = defaults.mask_fraction if method.mask_fraction is None else method.mask_fraction
+    if not 0 < fraction < 1:
+        raise UsageError(f"mask fraction {fraction} is not between 0 and 1, such as 0.5")
+    scale = defaults.mask_scale if method.mask_scale is None else method.mask_scale
+    if not 0 < scale <= 1:
+        raise UsageError(f"mask scale {scale} is not above 0 and 1 at most, such as 0.5")
+    return MaskSettings(
+        kind=method.mask or defaults.mask, fraction=fraction, scale=scale, seed=seed
+    )
+
+
+def _check_weights(
+    definition: ModelDefinition, method: MethodOptions, settings: RefineSettings
+) -> None:
+    """Raises UsageError where weights move and an option concerns z."""
+    if not settings.moves_weights:
+        raise UsageError(
+            f"--target masked updates weights, not {settings.parameters} of z; take --parameters"
+            " weights or lora:8"
+        )
+    rank_of(settings.parameters)
+    if method.target == "masked" and "sparse" not in definition.input_kind:
+        raise UsageError(
+            f"network {definition.name!r} takes no sparse depth, so no points can be hidden from"
+            " it; take --target given"
+        )
+    if method.target == "masked" and method.layer is not None:
+        raise UsageError(
+            "--layer is where z is; with --target masked the network is cut at its sparse depth"
+        )
+    concern_z = ("blur", "proximity", "line_search", "keep_best", "align_every")
+    if wrong := [name for name in concern_z if getattr(method, name)]:
+        flag = "--" + wrong[0].replace("_", "-")
+        raise UsageError(f"{flag} is for updates of z; weights are updated here")
 
 
 def _with_best_input_range(network: Network, frame: Frame) -> tuple[Network, str]:

@@ -173,23 +173,23 @@ def _across(first: Axis, second: Axis) -> tuple[Axis, Axis]:
 
 def _draw(axes: Axes, axis: Axis, cells: Cells, key: str, name: str, line: _Line) -> None:
     """Draws a line through the cells' values; gains with their intervals."""
-    places = axis.numbers()
-    x = [n + line.aside for n in range(len(axis.values))] if places is None else places
+    positions = axis.numbers()
+    x = [n + line.aside for n in range(len(axis.values))] if positions is None else positions
     order = sorted(range(len(x)), key=lambda n: x[n])
     values, low, high = (
         [_values(cells, key, name + end)[n] for n in order] for end in ("", "_low", "_high")
     )
     at = [x[n] for n in order]
-    linked = places is not None or name in ("plain", "linear")
+    linked = positions is not None or name in ("plain", "linear")
     style = line.dashes if linked else ""
-    if places is None and name in ("plain", "linear") and len(set(values)) > 1:
+    if positions is None and name in ("plain", "linear") and len(set(values)) > 1:
         mark = "_" if name == "plain" else "x"
         style, line = "", replace(line, mark=mark)
     drawn = {"color": line.colour, "linestyle": style, "marker": line.mark, "label": line.label}
     axes.plot(at, values, markersize=12 if line.mark == "_" else 4, **drawn)
     if name != "gain" or all(bound != bound for bound in low):
         return  # the scatter of frames would hide the differences of values
-    if places is None:
+    if positions is None:
         axes.vlines(at, low, high, color=line.colour, linewidth=1)
     else:
         axes.fill_between(at, low, high, color=line.colour, alpha=0.15, linewidth=0)
@@ -204,9 +204,9 @@ def _values(cells: Cells, key: str, name: str) -> list[float]:
 def _scale(axes: Axes, axis: Axis) -> None:
     from matplotlib.ticker import FixedFormatter, FixedLocator, NullLocator
 
-    places = axis.numbers()
+    positions = axis.numbers()
     axes.set_xlabel(axis.title())
-    if places is None:
+    if positions is None:
         turned = sum(map(len, axis.values)) > _MAX_LETTERS
         axes.set_xlim(-0.5, len(axis.values) - 0.5)
         axes.set_xticks(
@@ -216,8 +216,8 @@ def _scale(axes: Axes, axis: Axis) -> None:
             ha="right" if turned else "center",
         )
         axes.grid(visible=False, axis="x")
-    elif axis.parameter.log and min(places) > 0:
+    elif axis.parameter.log and min(positions) > 0:
         axes.set_xscale("log")
-        axes.xaxis.set_major_locator(FixedLocator(places))
+        axes.xaxis.set_major_locator(FixedLocator(positions))
         axes.xaxis.set_major_formatter(FixedFormatter([v.removesuffix("%") for v in axis.values]))
         axes.xaxis.set_minor_locator(NullLocator())

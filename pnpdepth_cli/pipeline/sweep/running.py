@@ -16,7 +16,9 @@ from pnpdepth_cli.core.metrics import score
 from pnpdepth_cli.core.refine import Refinement, RefineSettings, refine
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.errors import DivergedError
+from pnpdepth_cli.frames.frame import RefinedFrame
 from pnpdepth_cli.frames.prepare import prepare
+from pnpdepth_cli.frames.refine import refine_frame
 from pnpdepth_cli.models.frame import FrameMap
 from pnpdepth_cli.models.network import Network, out_of_memory_is_a_device_error
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs
@@ -52,8 +54,14 @@ def result_of(run: Run, inputs: Inputs, cache: SplitCache) -> dict[str, Any]:
         return done | {"scores": {"linear": interpolated(cache.network, inputs)}}
     torch.manual_seed(run.seed)
     try:
-        split = cache.at(run.method.layer)
-        curve = refined_curve(cache.network, split, run.method, inputs, run.iterations)
+        if run.method.settings.moves_weights:
+            cache.close()
+            curve = weights_curve(
+                cache.network, _seeded(run.method, run.seed), inputs, run.iterations
+            )
+        else:
+            split = cache.at(run.method.layer)
+            curve = refined_curve(cache.network, split, run.method, inputs, run.iterations)
     except BaseException:
         cache.close()
         raise
@@ -122,6 +130,34 @@ def refined_curve(
         step=result.step,
         updates=updates,
         diverged=str(diverged) if diverged else None,
+    )
+
+
+def _seeded(method: Method, seed: int) -> Method:
+    settings = method.settings
+    return replace(method, settings=replace(settings, mask=replace(settings.mask, seed=seed)))
+
+
+def weights_curve(network: Network, method: Method, inputs: Inputs, wanted: Sequence[int]) -> Curve:
+    """Returns the same where weights move; each number of updates is refined for itself."""
+    truth, frame = ground_truth_in_view(network, inputs), inputs.frame()
+    refined: dict[int, RefinedFrame] = {}
+    cut = network.cut_at_points() if method.settings.masked else network.cut_at(method.layer)
+    with cut as split:
+        for k in wanted:
+            settings = replace(method.settings, iterations=k)
+            refined[k] = refine_frame(network, split, settings, frame, propagation=method.propagate)
+    last = refined[max(wanted)]
+    before = _propagated(torch.from_numpy(last.before), inputs, method.propagate)
+    return Curve(
+        plain=asdict(score(torch.from_numpy(last.before), truth)),
+        scores={
+            k: asdict(score(torch.from_numpy(each.after) if k else before, truth))
+            for k, each in sorted(refined.items())
+        },
+        step=last.refinement.step,
+        updates=len(last.refinement.losses),
+        diverged=str(last.diverged) if last.diverged else None,
     )
 
 

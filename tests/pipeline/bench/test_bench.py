@@ -4,13 +4,21 @@ import json
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 
 from pnpdepth_cli.errors import LayerError, UsageError
-from pnpdepth_cli.pipeline.bench.bench import FIRST_FRAME, FULL, Bench, BenchRequest, run_bench
+from pnpdepth_cli.pipeline.bench.bench import (
+    FIRST_FRAME,
+    FULL,
+    MASKED,
+    Bench,
+    BenchRequest,
+    run_bench,
+)
 from pnpdepth_cli.pipeline.bench.table import PAPER_TIMES
 from pnpdepth_cli.pipeline.bench.timing import Quartiles, Timed, in_turn
 from tests.pipeline.frames import FrameOnDisk, frame_on_disk
@@ -72,6 +80,13 @@ def test_the_record_is_json_and_says_what_was_measured(found: Bench) -> None:
     assert (record["points"], record["iterations"], record["layer"]) == (80, 5, "middle")
     assert record["threads"] == torch.get_num_threads()
     assert record["versions"]["torch"] == torch.__version__
+
+
+def test_refinement_by_hidden_points_is_timed_where_asked_for() -> None:
+    request = BenchRequest(size=(32, 32), points=40, repeats=1, files=False, target="masked")
+    assert run_bench(request).part(MASKED).forwards > 1
+    with pytest.raises(UsageError, match="takes no sparse depth"):
+        run_bench(replace(request, model="fcrn-tiny"))
 
 
 def test_a_network_without_weights_gets_random_ones_and_says_so(frame: FrameOnDisk) -> None:

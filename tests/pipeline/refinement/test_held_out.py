@@ -213,7 +213,7 @@ def test_a_batch_finds_its_ways_on_a_few_frames_and_checks_them_on_each(tmp_path
     found = said.partition(": best on ")[2].partition(": ")[2].split("; ")
     for name in NAMES:
         made = json.loads((root / "out" / f"{name}.json").read_text())["auto"]
-        tried = {each["way"] for each in made["tried"]}
+        tried = {each["candidate"] for each in made["tried"]}
         assert set(found) <= tried
         assert {*BASELINES, "tiny aligned (auto)"} <= tried
     before = times(root / "out")

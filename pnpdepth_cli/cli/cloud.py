@@ -1,0 +1,73 @@
+"""`pnpdepth cloud`."""
+
+from __future__ import annotations
+
+import json
+import math
+from typing import Any
+
+import click
+
+from pnpdepth_cli.cli import options
+
+
+@click.command(short_help="Write depth as a coloured point cloud.")
+@click.argument("depth", type=options.FILE)
+@click.option("--image", type=options.FILE, help="Image with the colours.  [default: the record's]")
+@click.option(
+    "--calib",
+    type=options.FILE,
+    metavar="FILE|FOLDER",
+    help="Calibration of the camera: a file with K, or a KITTI file or raw folder.",
+)
+@click.option("--camera", type=int, metavar="N", help="KITTI camera number, 0 to 3.  [default: 2]")
+@click.option(
+    "--fov", "fov_deg", type=float, metavar="DEG", help="Horizontal field of view, without --calib."
+)
+@click.option(
+    "--poses",
+    type=options.FILE,
+    help="Camera poses of a folder's files in their order (KITTI or TUM rows).",
+)
+@click.option("--depth-scale", type=float, metavar="S", help="Integer depth files hold metres × S.")
+@click.option("--min-depth", type=float, default=0.0, metavar="M", help="Drop nearer pixels.")
+@click.option("--max-depth", type=float, default=math.inf, metavar="M", help="Drop farther pixels.")
+@click.option(
+    "--max-sigma",
+    type=float,
+    metavar="F",
+    help="Drop pixels whose standard deviation is above this fraction of their depth.",
+)
+@click.option(
+    "--edge",
+    type=float,
+    default=0.05,
+    metavar="F",
+    show_default=True,
+    help="Cut where depth jumps by this fraction; 0 never cuts.",
+)
+@click.option("--voxel", type=float, metavar="M", help="Merge the points in cubes of this side.")
+@click.option("-o", "--output", type=options.FILE, required=True, help="PLY, GLB or LAZ file.")
+@options.overwrite
+@options.as_json
+def cloud(as_json: bool, **values: Any) -> None:
+    """Write DEPTH, a depth file or the results of a batch, as a coloured point cloud.
+
+    \b
+    pnpdepth cloud out/img_depth.png --calib camera.txt -o img.ply
+    pnpdepth cloud out/ --calib calib.txt --poses poses.txt --voxel 0.05 -o drive.ply
+    pnpdepth cloud depth.exr --image img.png --fov 60 -o img.glb
+
+    The cloud is in the camera's frame (x right, y down, z forward), with poses in the world's.
+    Pixels that NAME_valid.png beside NAME_depth excludes are left out.
+    """
+    from pnpdepth_cli.pipeline.cloud import CloudRequest, write_depth_cloud
+
+    record = write_depth_cloud(CloudRequest(**values))
+    if as_json:
+        click.echo(json.dumps(record, indent=2))
+        return
+    for note in record["notes"]:
+        click.echo(note, err=True)
+    colours = "coloured" if record["coloured"] else "without colours (no image is known)"
+    click.echo(f"wrote {record['points']:,} points, {colours}: {record['output']}")

@@ -1,0 +1,182 @@
+"""The refinement of one frame by moving weights: its state between steps, and its result."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from pnpdepth_cli.choices import LOSSES, UPDATES
+from pnpdepth_cli.core.losses import Loss
+from pnpdepth_cli.core.masks import Masks, set_aside
+from pnpdepth_cli.core.refinement import DepthOf, Refinement, RefineSettings, bad_prediction
+from pnpdepth_cli.core.step_sizes import SCHEDULES, step_size
+from pnpdepth_cli.core.update_rules import Update
+from pnpdepth_cli.core.weights import MovingWeights
+from pnpdepth_cli.errors import DivergedError, LayerError
+from pnpdepth_cli.points import SparsePoints
+
+CHECKS = 3
+"""How often the points set aside are looked at, besides before the first step."""
+PATIENCE = 2
+"""The steps end after so many checks in a row that are worse than the best."""
+
+Predict = Callable[[SparsePoints], Any]
+"""Returns what the network returns for a frame when it is given these of its points."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrameOfPoints:
+    """A frame whose depth the network predicts from any of its points."""
+
+    points: SparsePoints
+    """All points, on the network's grid."""
+    inliers: SparsePoints
+    """Those that the steps are made with."""
+    output: Any
+    """What the network returns for all points."""
+    predict: Predict
+    """Returns what the network returns for some of them, differentiably."""
+    predict_in_steps: Predict
+    """The same for the steps, perhaps from a smaller image of the same field of view."""
+    depth_of: DepthOf
+    """Turns that into depth (1, 1, h, w) in metres, differentiably."""
+
+
+class WeightsRefinement:
+    """The state of a refinement by moving weights: masks, losses, and the best weights.
+
+    Args:
+        frame: The frame.
+        weights: The weights that move.
+        settings: What is updated and how.
+    """
+
+    def __init__(
+        self, frame: FrameOfPoints, weights: MovingWeights, settings: RefineSettings
+    ) -> None:
+        self._frame, self._weights, self._settings = frame, weights, settings
+        self._loss: Loss = LOSSES[settings.loss]
+        generator = torch.Generator().manual_seed(settings.mask.seed)
+        masked = settings.masked
+        fraction = settings.mask.set_aside if masked else 0.0
+        aside = set_aside(frame.inliers, fraction, generator)
+        self._shown, self._aside = frame.inliers.select(~aside), frame.inliers.select(aside)
+        self._masks = Masks(self._shown, settings.mask, generator)
+        self._rules: list[Update] = []
+        self._steps: list[float] = []
+        self._checks: dict[int, float] = {}
+        self._best = list(weights.theta), 0
+        self._started = time.monotonic()
+        self._before = torch.empty(0)
+        self.losses: list[float] = []
+        self.error: DivergedError | None = None
+
+    @property
+    def iterations(self) -> int:
+        """Number of steps at most; a single point cannot be both hidden and shown."""
+        enough = len(self._shown) > 1 or not self._settings.masked
+        return self._settings.iterations if enough else 0
+
+    def begin(self) -> None:
+        """Predicts the depth before any step. Raises ModelError where it is not finite."""
+        self._before = self._frame.depth_of(self._frame.output).detach()
+        at_points = self._frame.points.sample(self._before)
+        if not bool(at_points.isfinite().all()):
+            raise bad_prediction(at_points)
+        self._check(0)
+
+    def mask(self) -> tuple[SparsePoints, SparsePoints]:
+        """Returns the points that the network is given, and those that L is taken at."""
+        if not self._settings.masked:
+            return self._shown, self._shown
+        away = self._masks.next()
+        return self._shown.select(~away), self._shown.select(away)
+
+    def loss(self, output: Any, asked: SparsePoints) -> Tensor:
+        """Returns L of the network's output at these points."""
+        return self._loss(asked.sample(self._frame.depth_of(output)), asked.depth)
+
+    def update(self, loss: Tensor, gradients: Sequence[Tensor | None]) -> None:
+        """Moves the weights: θ_{k+1} = θ_k − α·U(∂L/∂θ_k). Sets `error` where that diverges."""
+        done = len(self.losses)
+        if not done:
+            self._start_rules(gradients)
+        known = [gradient for gradient in gradients if gradient is not None]
+        finite = loss.isfinite().all() & torch.stack([g.isfinite().all() for g in known]).all()
+        if not bool(finite):
+            self.error = self._diverged(done)
+            return
+        self.losses.append(float(loss.detach()))
+        factor = SCHEDULES[self._settings.schedule](done / self._settings.iterations)
+        self._weights.theta = [
+            value - factor * alpha * rule(gradient)
+            for value, alpha, rule, gradient in zip(
+                self._weights.theta, self._steps, self._rules, known, strict=True
+            )
+        ]
+
+    def finished(self) -> bool:
+        """Whether no further step is worth its time, by the points set aside and the budget."""
+        made, of = len(self.losses), self._settings.iterations
+        if made == of or made * CHECKS // of > (made - 1) * CHECKS // of:
+            self._check(made)
+        return self._out_of_time() or self._getting_worse()
+
+    def result(self) -> Refinement:
+        """Returns the refinement with the best weights, given all points."""
+        self._weights.theta, kept = self._best
+        return Refinement(
+            before=self._before,
+            after=self._predicted(self._frame.points) if kept else self._before,
+            losses=tuple(self.losses),
+            step=self._steps[0] if self._steps else 0.0,
+            kept=kept,
+        )
+
+    def _check(self, made: int) -> None:
+        """Notes the loss at the points set aside; without any, the last weights are the best."""
+        if not len(self._aside):
+            self._best = list(self._weights.theta), made
+            return
+        at_points = self._aside.sample(self._predicted(self._shown))
+        loss = float(self._loss(at_points, self._aside.depth))
+        if made == 0 or loss < min(self._checks.values()):
+            self._best = list(self._weights.theta), made
+        self._checks[made] = loss
+
+    def _predicted(self, points: SparsePoints) -> Tensor:
+        with torch.no_grad(), self._weights.in_place():
+            return self._frame.depth_of(self._frame.predict(points)).detach()
+
+    def _getting_worse(self) -> bool:
+        later = sum(made > self._best[1] for made in self._checks)
+        return later >= PATIENCE
+
+    def _out_of_time(self) -> bool:
+        budget, spent = self._settings.time_budget_s, time.monotonic() - self._started
+        # A step and the last prediction must still fit.
+        return budget is not None and spent + 2 * spent / max(1, len(self.losses)) > budget
+
+    def _start_rules(self, gradients: Sequence[Tensor | None]) -> None:
+        """Begins with those weights that a gradient reaches."""
+        self._weights.keep([gradient is not None for gradient in gradients])
+        if not self._weights.theta:
+            raise LayerError(
+                "no weight can move: the prediction depends on no parameter behind the cut; take"
+                " --parameters elements, or cut at an earlier layer"
+            )
+        self._best = list(self._weights.theta), 0
+        lr, update = self._settings.lr, self._settings.update
+        self._rules = [UPDATES[update]() for _ in self._weights.theta]
+        self._steps = [step_size(lr, parameter) for parameter in self._weights.parameters()]
+
+    def _diverged(self, made: int) -> DivergedError:
+        return DivergedError(
+            f"the loss or its gradient is not finite after {made} steps of the weights; try a"
+            " smaller --lr"
+        )

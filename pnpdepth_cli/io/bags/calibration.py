@@ -1,0 +1,90 @@
+"""The calibration that a bag holds: camera_info of a camera, and static transforms."""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import Any
+
+import numpy as np
+
+from pnpdepth_cli.io.bags.bag import CAMERAS, TRANSFORMS, Bag
+from pnpdepth_cli.io.calibration import Calibration
+from pnpdepth_cli.io.extrinsics import Extrinsics, inverse, pose_of_quaternion
+from pnpdepth_cli.io.robot_calibration import camera_in_yaml
+
+_STATIC = "/tf_static"
+
+
+def camera_info_topic(bag: Bag, image_topic: str) -> str | None:
+    """Returns the topic of the camera's intrinsics: beside the image's, or the only one."""
+    topics = bag.topics(CAMERAS)
+    parts = image_topic.removesuffix("/compressed").split("/")[:-1]
+    beside = "/".join([*parts, "camera_info"])
+    if beside in topics:
+        return beside
+    return next(iter(topics)) if len(topics) == 1 else None
+
+
+def camera_of_bag(bag: Bag, topic: str) -> tuple[Calibration, str] | None:
+    """Returns the camera of the first message of a camera_info topic, and its frame's name."""
+    for _, _, message in bag.messages([topic]):
+        matrix, distortion = (getattr(message, n, getattr(message, n.upper(), ())) for n in "kd")
+        if not np.any(matrix):
+            return None  # an uncalibrated camera
+        content = {
+            "camera_matrix": [float(value) for value in matrix],
+            "distortion_coefficients": [float(value) for value in distortion],
+            "distortion_model": str(message.distortion_model) if len(distortion) else "none",
+            "width": int(message.width),
+            "height": int(message.height),
+        }
+        camera = camera_in_yaml(bag.path, content, None)
+        calibration = Calibration(
+            intrinsics=camera.intrinsics,
+            rotation=np.eye(3),
+            translation=np.zeros(3),
+            distortion=camera.distortion,
+            size=camera.size,
+            has_pose=False,
+            source=topic,
+            lens=camera.lens,
+        )
+        return calibration, frame_of(message)
+    return None
+
+
+def frame_of(message: Any) -> str:
+    """Returns the name of the frame in a message's header, without ROS 1's leading slash."""
+    return str(message.header.frame_id).lstrip("/")
+
+
+def static_pose(bag: Bag, camera: str, scanner: str) -> Extrinsics | None:
+    """Returns the pose of the scanner's frame in the camera's, by /tf_static; None without one."""
+    if camera == scanner:
+        return np.eye(3), np.zeros(3)
+    links: dict[str, dict[str, Extrinsics]] = {}
+    topics = [name for name in bag.topics(TRANSFORMS) if name.endswith(_STATIC)]
+    for _, _, message in bag.messages(topics):
+        for each in message.transforms:
+            parent, child = frame_of(each), str(each.child_frame_id).lstrip("/")
+            shift, turn = each.transform.translation, each.transform.rotation
+            pose = pose_of_quaternion(
+                bag.path, [shift.x, shift.y, shift.z], [turn.x, turn.y, turn.z, turn.w]
+            )
+            links.setdefault(parent, {})[child] = pose
+            links.setdefault(child, {})[parent] = inverse(pose)
+    return _chained(links, camera, scanner)
+
+
+def _chained(links: dict[str, dict[str, Extrinsics]], start: str, end: str) -> Extrinsics | None:
+    """x_start = pose · x_end along the shortest chain of transforms."""
+    poses: dict[str, Extrinsics] = {start: (np.eye(3), np.zeros(3))}
+    waiting = deque([start])
+    while waiting and end not in poses:
+        frame = waiting.popleft()
+        rotation, translation = poses[frame]
+        for other, (turn, shift) in links.get(frame, {}).items():
+            if other not in poses:
+                poses[other] = rotation @ turn, rotation @ shift + translation
+                waiting.append(other)
+    return poses.get(end)

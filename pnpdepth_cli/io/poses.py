@@ -1,0 +1,65 @@
+"""Camera poses in files: the matrix rows of KITTI odometry, and the rows of TUM RGB-D."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from pnpdepth_cli.errors import FileFormatError
+from pnpdepth_cli.io.file_bytes import read_bytes
+
+_KITTI_COLUMNS, _TUM_COLUMNS = 12, 8
+_ROTATION_TOLERANCE = 1e-3
+
+
+def read_poses(path: Path) -> NDArray[np.float64]:
+    """Returns the poses (N, 3, 4) from each camera's frame to the world's, in file order.
+
+    Args:
+        path: Rows of 12 numbers, a 3×4 matrix (KITTI odometry), or of 8 numbers, time, position
+            and quaternion x y z w (TUM RGB-D benchmark); `#` begins a comment.
+
+    Raises:
+        FileFormatError: A row has other numbers, or its rotation is none.
+        InputError: The file cannot be read.
+    """
+    poses = []
+    for number, line in enumerate(read_bytes(path).decode("utf-8", "replace").splitlines(), 1):
+        words = line.partition("#")[0].split()
+        if words:
+            poses.append(_pose(path, number, words))
+    if not poses:
+        raise FileFormatError(f"{path} has no poses")
+    return np.stack(poses)
+
+
+def _pose(path: Path, number: int, words: list[str]) -> NDArray[np.float64]:
+    try:
+        values = np.array(words, np.float64)
+    except ValueError:
+        raise FileFormatError(f"{path}: line {number} is not made of numbers") from None
+    if len(values) == _KITTI_COLUMNS:
+        pose = values.reshape(3, 4)
+    elif len(values) == _TUM_COLUMNS:
+        pose = np.column_stack([_rotation(path, number, values[4:]), values[1:4]])
+    else:
+        raise FileFormatError(
+            f"{path}: line {number} has {len(values)} numbers; a pose has 12 (KITTI) or 8 (TUM)"
+        )
+    rotation = pose[:, :3]
+    is_rotation = np.allclose(rotation @ rotation.T, np.eye(3), atol=_ROTATION_TOLERANCE)
+    if not (np.isfinite(pose).all() and is_rotation and np.linalg.det(rotation) > 0):
+        raise FileFormatError(f"{path}: line {number} holds no rotation")
+    return pose
+
+
+def _rotation(path: Path, number: int, quaternion: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The rotation matrix (3, 3) of a quaternion x y z w of any length but 0."""
+    try:
+        matrix: NDArray[np.float64] = Rotation.from_quat(quaternion).as_matrix()
+    except ValueError as error:
+        raise FileFormatError(f"{path}: line {number}: {error}") from None
+    return matrix

@@ -1,0 +1,211 @@
+"""`pnpdepth frames`: a bag as a folder of images, scans and their calibration."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pnpdepth_cli.errors import InputError, OutputError
+from pnpdepth_cli.io.atomic import atomic_path, make_folder
+from pnpdepth_cli.io.bags.bag import CLOUDS, IMAGES, Bag, open_bag, topic_of
+from pnpdepth_cli.io.bags.calibration import (
+    camera_info_topic,
+    camera_of_bag,
+    frame_of,
+    static_pose,
+)
+from pnpdepth_cli.io.bags.messages import cloud_points, image_file, seconds_of
+from pnpdepth_cli.io.bags.pairing import Stamped, nearest_pairs
+from pnpdepth_cli.io.calibration import Calibration
+from pnpdepth_cli.io.record import plain, read_json, write_json
+from pnpdepth_cli.pipeline.sparse.bag_options import BagOptions
+
+RECORD = "frames.json"
+_FOLDERS = ("rgb", "sparse")
+
+
+@dataclass(frozen=True, kw_only=True)
+class FramesRequest:
+    """Which bag to write as files, and where."""
+
+    bag: Path
+    """A file or a folder."""
+
+    output: Path
+    """The folder for rgb/, sparse/, calib.txt and frames.json."""
+
+    options: BagOptions = field(default_factory=BagOptions)
+    """Which messages make a frame."""
+
+    limit: int | None = None
+    """Only the first frames; None for all."""
+
+    overwrite: bool = False
+    """Existing files are replaced."""
+
+
+def write_frames(request: FramesRequest, say: Callable[[str], None]) -> dict[str, Any]:
+    """Writes the frames of a bag in the layout `pairs`, one at a time, and returns the record.
+
+    Args:
+        request: What to write.
+        say: Receives what was guessed, and warnings.
+
+    Raises:
+        InputError: The bag cannot be read, or has no frame.
+        UsageError: Topics are ambiguous.
+        OutputError: The folder holds files that may not be replaced.
+    """
+    _check_output(request)
+    with open_bag(request.bag) as bag:
+        options = request.options
+        topics = (
+            topic_of(bag, options.image_topic, IMAGES, "--image-topic"),
+            topic_of(bag, options.points_topic, CLOUDS, "--points-topic"),
+        )
+        say(f"topics: images of {topics[0]}, points of {topics[1]}")
+        _clear(request)
+        lost, frames, calibrated = 0, 0, False
+        pairs = nearest_pairs(_stream(bag, *topics), options.tolerance)
+        for image, scan in pairs:
+            if scan is None:
+                lost += 1
+                continue
+            if not calibrated:
+                calibrated = True
+                _write_calibration(request.output, bag, topics[0], image, scan, say)
+            _write_frame(request.output, topics, image, scan)
+            frames += 1
+            if frames == request.limit:
+                break
+    if lost:
+        say(f"warning: {lost:,} images have no scan within {options.tolerance:g} s")
+    if not frames:
+        raise InputError(
+            f"{request.bag}: no image of {topics[0]} has a scan of {topics[1]} within"
+            f" {options.tolerance:g} s; check the clocks, or give a larger --tolerance"
+        )
+    record = _identity(request) | {
+        "image_topic": topics[0],
+        "points_topic": topics[1],
+        "complete": True,
+        "frames": frames,
+        "images_without_scan": lost,
+    }
+    write_json(request.output / RECORD, record)
+    return record
+
+
+def written_before(request: FramesRequest) -> bool:
+    """Returns whether the folder holds the frames of this bag with these options."""
+    path = request.output / RECORD
+    if not path.is_file():
+        return False
+    record = read_json(path)
+    identity = plain(_identity(request) | {"complete": True})
+    return all(record.get(name) == value for name, value in identity.items())
+
+
+def _check_output(request: FramesRequest) -> None:
+    folder = request.output
+    ours = (folder / RECORD).is_file()
+    if ours and not request.overwrite:
+        raise OutputError(f"{folder} holds the frames of a bag; --overwrite replaces them")
+    if folder.is_file() or (not ours and folder.is_dir() and any(folder.iterdir())):
+        raise OutputError(f"{folder} exists, and holds no frames of a bag; name another with -o")
+
+
+def _clear(request: FramesRequest) -> None:
+    """Removes the frames that were written before, and records that these are incomplete."""
+    for name in _FOLDERS:
+        make_folder(request.output / name)
+        for path in (request.output / name).iterdir():
+            path.unlink()
+    (request.output / "calib.txt").unlink(missing_ok=True)
+    write_json(request.output / RECORD, _identity(request) | {"complete": False})
+
+
+def _identity(request: FramesRequest) -> dict[str, Any]:
+    paths = sorted(request.bag.iterdir()) if request.bag.is_dir() else [request.bag]
+    files = {path.name: [path.stat().st_size, path.stat().st_mtime_ns] for path in paths}
+    return {
+        "command": "frames",
+        "bag": str(request.bag),
+        "bag_files": files,
+        "options": asdict(request.options),
+        "limit": request.limit,
+    }
+
+
+def _stream(bag: Bag, images: str, points: str) -> Iterator[tuple[bool, Stamped]]:
+    for topic, logged_ns, message in bag.messages([images, points]):
+        time_s = seconds_of(message, logged_ns)
+        yield topic == images, Stamped(time_s=time_s, message=message)
+
+
+def _write_frame(folder: Path, topics: tuple[str, str], image: Stamped, scan: Stamped) -> None:
+    """Writes rgb/NAME.png and sparse/NAME.ply; the name is the image's time."""
+    name = f"{image.time_s:.6f}".replace(".", "_")
+    suffix, data = image_file(image.message, topics[0])
+    with atomic_path(folder / "rgb" / f"{name}{suffix}") as temporary:
+        temporary.write_bytes(data)
+    with atomic_path(folder / "sparse" / f"{name}.ply") as temporary:
+        temporary.write_bytes(_ply(cloud_points(scan.message, topics[1])))
+
+
+def _ply(points: NDArray[np.float32]) -> bytes:
+    header = (
+        f"ply\nformat binary_little_endian 1.0\nelement vertex {len(points)}\n"
+        "property float x\nproperty float y\nproperty float z\nend_header\n"
+    )
+    return header.encode() + points.astype("<f4").tobytes()
+
+
+def _write_calibration(
+    folder: Path,
+    bag: Bag,
+    image_topic: str,
+    image: Stamped,
+    scan: Stamped,
+    say: Callable[[str], None],
+) -> None:
+    """Writes calib.txt as far as the bag holds a calibration; says what is missing."""
+    topic = camera_info_topic(bag, image_topic)
+    camera = None if topic is None else camera_of_bag(bag, topic)
+    if camera is None:
+        say(f"warning: {bag.path} has no camera_info of {image_topic}; refine with --calib")
+        return
+    calibration, frame = camera
+    names = frame or frame_of(image.message), frame_of(scan.message)
+    pose = static_pose(bag, *names)
+    if pose is None:
+        say(
+            f"warning: {bag.path} has no static transform from {names[0]} to {names[1]}; refine"
+            " with --extrinsics"
+        )
+    else:
+        say(f"calibration: {topic}, and /tf_static from {names[0]} to {names[1]}")
+        calibration = replace(calibration, rotation=pose[0], translation=pose[1], has_pose=True)
+    with atomic_path(folder / "calib.txt") as temporary:
+        temporary.write_text(_calibration_text(calibration))
+
+
+def _calibration_text(calibration: Calibration) -> str:
+    fields: dict[str, Any] = {"K": calibration.intrinsics.ravel().tolist()}
+    if calibration.has_pose:
+        fields |= {
+            "R": calibration.rotation.ravel().tolist(),
+            "t": calibration.translation.tolist(),
+        }
+    if calibration.distortion:
+        fields["distortion"] = list(calibration.distortion)
+    if calibration.size is not None:
+        fields["size"] = [calibration.size[1], calibration.size[0]]
+    lines = [f"{name}: {json.dumps(value)}\n" for name, value in fields.items()]
+    return "".join([*lines, f"lens: {calibration.lens}\n"])

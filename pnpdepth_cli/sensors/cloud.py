@@ -1,0 +1,173 @@
+"""Dense depth as a coloured point cloud with normals, cut where depth jumps."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pnpdepth_cli.sensors.camera import Camera
+
+Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+EDGE = 0.05
+"""Default of `EdgeCut.jump`: of depth maps of indoor and street scenes, it cuts silhouettes and
+keeps floors down to a grazing angle of about 5 degrees."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PointCloud:
+    """N points with colours and normals."""
+
+    xyz: NDArray[np.float32]
+    """(N, 3) in the unit of the depth, in the camera's or the world's frame."""
+    rgb: NDArray[np.uint8] | None
+    """(N, 3) colours 0…255. None: without colours."""
+    normals: NDArray[np.float32]
+    """(N, 3) unit vectors towards the camera; 0 where a point has no two neighbours."""
+
+    def __len__(self) -> int:
+        return len(self.xyz)
+
+    def transformed(self, pose: Floats) -> PointCloud:
+        """Returns the cloud in another frame.
+
+        Args:
+            pose: (3, 4) or (4, 4), from the cloud's frame to the other; its rotation has no scale.
+        """
+        rotation, translation = pose[:3, :3], pose[:3, 3]
+        return PointCloud(
+            xyz=(self.xyz @ rotation.T + translation).astype(np.float32),
+            rgb=self.rgb,
+            normals=(self.normals @ rotation.T).astype(np.float32),
+        )
+
+
+def cloud_from_depth(
+    depth: NDArray[np.float32],
+    camera: Camera,
+    *,
+    rgb: NDArray[np.float32] | None = None,
+    keep: Mask | None = None,
+    edge: float = EDGE,
+) -> PointCloud:
+    """Returns the points of a depth map in the camera's frame.
+
+    Args:
+        depth: (H, W), 0 = unknown.
+        camera: Intrinsics and distortion of the image that the depth belongs to.
+        rgb: (H, W, 3) 0…1.
+        keep: (H, W) false for pixels that are left out.
+        edge: A pixel is left out if the depth of one of its four neighbours differs by more than
+            this fraction from what continues its own surface. 0 keeps all pixels.
+    """
+    known = (depth > 0) & np.isfinite(depth)
+    if keep is not None:
+        known &= keep
+    if edge:
+        known &= ~depth_edges(np.where(known, depth, 0), edge)
+    rows, columns = np.nonzero(known)
+    points = np.zeros((*depth.shape, 3))
+    points[known] = camera.unproject(np.column_stack([columns, rows]), depth[known])
+    return PointCloud(
+        xyz=points[known].astype(np.float32),
+        rgb=None if rgb is None else np.rint(np.clip(rgb[known], 0, 1) * 255).astype(np.uint8),
+        normals=_normals(points, known)[known].astype(np.float32),
+    )
+
+
+def depth_edges(depth: NDArray[np.float32], edge: float) -> Mask:
+    """Returns (H, W) true for pixels beside a jump of depth, on both of its sides.
+
+    A jump is a second difference of inverse depth of more than `edge` of the inverse depth. A
+    plane has none, whatever its slope: inverse depth is linear in the pixel coordinates.
+
+    Args:
+        depth: (H, W), 0 = unknown.
+        edge: Fraction of the inverse depth.
+    """
+    known = depth > 0
+    inverse = np.where(known, 1 / np.where(known, depth, 1), np.nan)
+    result = np.zeros(depth.shape, bool)
+    for axis in (0, 1):
+        values = np.moveaxis(inverse, axis, 0)
+        middle = values[1:-1]
+        bend = np.abs(values[2:] - 2 * middle + values[:-2])
+        jump = bend > edge * middle  # false beside unknown pixels
+        np.moveaxis(result, axis, 0)[1:-1] |= jump
+    return result
+
+
+def _normals(points: Floats, known: Mask) -> Floats:
+    """Unit normals (H, W, 3) towards the camera from the differences of neighbours."""
+    across, has_across = _difference(points, known, 1)
+    down, has_down = _difference(points, known, 0)
+    normals = np.cross(down, across)
+    length = np.linalg.norm(normals, axis=2)
+    valid = known & has_across & has_down & (length > 0)
+    normals = np.where(valid[..., None], normals / np.where(valid, length, 1)[..., None], 0)
+    away = (normals * points).sum(axis=2) > 0
+    return np.where(away[..., None], -normals, normals)
+
+
+def _difference(points: Floats, known: Mask, axis: int) -> tuple[Floats, Mask]:
+    """Difference (H, W, 3) of the neighbours along an axis, and where at least one is known."""
+    points, known = np.moveaxis(points, axis, 0), np.moveaxis(known, axis, 0)
+    before, after = points.copy(), points.copy()
+    valid = np.zeros(known.shape, bool)
+    has_before, has_after = known[1:] & known[:-1], known[:-1] & known[1:]
+    before[1:][has_before] = points[:-1][has_before]
+    after[:-1][has_after] = points[1:][has_after]
+    valid[1:] |= has_before
+    valid[:-1] |= has_after
+    return np.moveaxis(after - before, 0, axis), np.moveaxis(valid, 0, axis)
+
+
+class VoxelGrid:
+    """Merges clouds: one point per occupied cube, the mean of all points in it.
+
+    Args:
+        side: Of a cube, in the unit of the clouds.
+    """
+
+    def __init__(self, side: float) -> None:
+        self._side = side
+        self._cells = np.zeros((0, 3), np.int64)
+        self._sums = np.zeros((0, 10))  # xyz, rgb, normal, count
+
+    def add(self, cloud: PointCloud) -> None:
+        """Adds the points of a cloud in the grid's frame."""
+        cells = np.floor(cloud.xyz / self._side).astype(np.int64)
+        rgb = np.zeros((len(cloud), 3)) if cloud.rgb is None else cloud.rgb
+        ones = np.ones((len(cloud), 1))
+        values = np.concatenate([cloud.xyz, rgb, cloud.normals, ones], axis=1)
+        cells = np.concatenate([self._cells, cells])
+        values = np.concatenate([self._sums, values])
+        self._cells, inverse = np.unique(cells, axis=0, return_inverse=True)
+        self._sums = np.zeros((len(self._cells), values.shape[1]))
+        np.add.at(self._sums, inverse.reshape(-1), values)
+
+    def cloud(self, *, coloured: bool) -> PointCloud:
+        """Returns the merged cloud, sorted by cell."""
+        mean = self._sums[:, :9] / self._sums[:, 9:]
+        length = np.linalg.norm(mean[:, 6:], axis=1, keepdims=True)
+        normals = np.where(length > 0, mean[:, 6:] / np.where(length > 0, length, 1), 0)
+        return PointCloud(
+            xyz=mean[:, :3].astype(np.float32),
+            rgb=np.rint(mean[:, 3:6]).astype(np.uint8) if coloured else None,
+            normals=normals.astype(np.float32),
+        )
+
+
+def concatenated(clouds: Iterable[PointCloud]) -> PointCloud:
+    """Returns all points of the clouds, one after another; all or none have colours."""
+    clouds = list(clouds)
+    colours = [cloud.rgb for cloud in clouds if cloud.rgb is not None]
+    return PointCloud(
+        xyz=np.concatenate([cloud.xyz for cloud in clouds]),
+        rgb=np.concatenate(colours) if len(colours) == len(clouds) else None,
+        normals=np.concatenate([cloud.normals for cloud in clouds]),
+    )

@@ -1,0 +1,273 @@
+"""Moving weights by hidden points, against a loop that runs the whole network every time."""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from pnpdepth_cli.core.masks import Masks, set_aside
+from pnpdepth_cli.core.refine import Refinement, RefineSettings, refine_weights
+from pnpdepth_cli.core.refinement import MaskSettings
+from pnpdepth_cli.core.split import InputSplit, Split
+from pnpdepth_cli.core.weights import MovingWeights, rank_of
+from pnpdepth_cli.core.weights_refinement import FrameOfPoints
+from pnpdepth_cli.errors import DivergedError, LayerError, UsageError
+from pnpdepth_cli.points import SparsePoints
+from tests.completion.naive import plain
+from tests.core.networks import build, conv, depth_of, picture
+from tests.core.split.test_split import Failing, same, state_of
+
+SETTINGS = RefineSettings(
+    iterations=4, lr=0.01, loss="log", update="sgd", parameters="weights", target="masked"
+)
+
+
+class TwoInputs(nn.Module):
+    """An image encoder and points that enter behind it, as in late fusion."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        torch.manual_seed(0)
+        self.encoder = nn.Sequential(conv(3, 8), nn.BatchNorm2d(8), nn.ReLU(inplace=True))
+        self.enter, self.head = conv(9, 8), conv(8, 1)
+        self.runs = 0
+
+    def forward(self, rgb: Tensor, sparse: Tensor) -> Tensor:
+        features = self.encoder(rgb)
+        return F.softplus(self.head(F.relu(self.enter(torch.cat([features, sparse], 1))))) + 1
+
+
+def points(count: int = 40, seed: int = 0) -> SparsePoints:
+    generator = torch.Generator().manual_seed(seed)
+    cells = torch.randperm(256, generator=generator)[:count]
+    xy = torch.stack([cells % 16, cells // 16], 1).float()
+    depth = 2 + torch.rand(count, generator=generator)
+    return SparsePoints(xy=xy, depth=depth, size=(16, 16))
+
+
+def refined(
+    network: nn.Module, settings: RefineSettings = SETTINGS, at: SparsePoints | None = None
+) -> Refinement:
+    at, rgb = at or points(), picture()
+    with InputSplit(network) as split:
+        frame = FrameOfPoints(
+            points=at,
+            inliers=at,
+            output=split.first(rgb, at.scatter(), varying=(1,)),
+            predict=lambda shown: split.again(rgb, shown.scatter()),
+            predict_in_steps=lambda shown: split.again(rgb, shown.scatter()),
+            depth_of=lambda output: output,
+        )
+        weights = MovingWeights(network, settings.parameters, settings.mask.seed)
+        return refine_weights(frame, weights, settings)
+
+
+def naive(network: nn.Module, at: SparsePoints) -> Tensor:
+    """The last step's depth by plain gradient descent on a copy of the network."""
+    network, generator = copy.deepcopy(network).eval(), torch.Generator().manual_seed(0)
+    shown = at.select(~set_aside(at, 0.1, generator))
+    masks = Masks(shown, SETTINGS.mask, generator)
+    moved = [*network.enter.parameters(), *network.head.parameters()]
+    network.encoder.requires_grad_(False)
+    for _ in range(SETTINGS.iterations):
+        away = masks.next()
+        asked = shown.select(away)
+        depth = network(picture(), shown.select(~away).scatter())
+        loss = (asked.sample(depth).log() - asked.depth.log()).abs().mean()
+        gradients = torch.autograd.grad(loss, moved)
+        with torch.no_grad():
+            for parameter, gradient in zip(moved, gradients, strict=True):
+                parameter -= SETTINGS.lr * gradient
+    depth = network(picture(), at.scatter())
+    return depth.detach()
+
+
+# ------------------------------------------------------------------ the cut at the points
+
+
+def test_what_does_not_depend_on_the_points_runs_once_and_nothing_changes() -> None:
+    network, rgb = TwoInputs().eval(), picture()
+    calls: list[int] = []
+    network.encoder[0].forward = _counted(network.encoder[0].forward, calls)  # type: ignore
+    frames = [points(40, seed).scatter() for seed in range(3)]
+    with torch.no_grad():
+        whole = [network(rgb, sparse) for sparse in frames]
+    calls.clear()
+    with InputSplit(network) as split, torch.no_grad():
+        first = split.first(rgb, frames[0], varying=(1,))
+        again = [split.again(rgb, sparse) for sparse in frames]
+        assert len(calls) == 1
+        other = split.first(rgb * 0.5, frames[0], varying=(1,))
+        assert len(calls) == 2
+        assert split.static_graph
+    assert torch.equal(first, whole[0])
+    assert all(torch.equal(one, other) for one, other in zip(again, whole, strict=True))
+    with torch.no_grad():
+        assert torch.equal(other, network(rgb * 0.5, frames[0]))
+
+
+@pytest.mark.parametrize("name", ["resnet", "unet", "in place", "branching", "updating"])
+def test_a_network_whose_only_input_varies_runs_as_a_whole(name: str) -> None:
+    network, x = build(name), picture()
+    wholes = [depth_of(plain(network, frame)) for frame in (x, x * 0.7)]
+    with InputSplit(network) as split, torch.no_grad():
+        assert torch.equal(depth_of(split.first(x, varying=(0,))), wholes[0])
+        assert torch.equal(depth_of(split.again(x * 0.7)), wholes[1])
+
+
+def _counted(forward: Any, calls: list[int]) -> Any:
+    def counted(*args: Any) -> Any:
+        calls.append(1)
+        return forward(*args)
+
+    return counted
+
+
+# ------------------------------------------------------------------ the equation
+
+
+def test_the_steps_are_those_of_running_the_whole_network_every_time() -> None:
+    network = TwoInputs()
+    result = refined(network)
+    assert result.kept == SETTINGS.iterations
+    assert torch.allclose(result.after, naive(network, points()), rtol=1e-6, atol=0)
+    assert len(result.losses) == SETTINGS.iterations
+
+
+def test_the_same_seed_gives_the_same_bytes_and_another_seed_others() -> None:
+    results = [refined(TwoInputs(), _seeded(seed)).after for seed in (3, 3, 4)]
+    assert torch.equal(results[0], results[1])
+    assert not torch.equal(results[0], results[2])
+
+
+def _seeded(seed: int) -> RefineSettings:
+    return replace(SETTINGS, mask=MaskSettings(seed=seed))
+
+
+def test_a_step_that_makes_held_out_points_worse_is_not_taken() -> None:
+    result = refined(TwoInputs(), replace(SETTINGS, update="sign", lr=3.0))
+    assert result.kept == 0
+    assert torch.equal(result.after, result.before)
+    assert len(result.losses) < SETTINGS.iterations
+
+
+def test_low_rank_weights_start_as_the_network_and_move() -> None:
+    settings = replace(SETTINGS, parameters="lora:2", update="adam")
+    result = refined(TwoInputs(), settings)
+    assert torch.equal(result.before, refined(TwoInputs(), replace(settings, iterations=0)).after)
+    assert result.kept > 0
+    assert not torch.equal(result.after, result.before)
+
+
+def test_with_target_given_the_loss_at_all_points_falls() -> None:
+    network, at = TwoInputs(), points()
+    settings = replace(SETTINGS, target="given", update="adam", lr=0.01)
+    with Split(network, "enter") as split:
+        z = split.front(picture(), at.scatter())
+        frame = FrameOfPoints(
+            points=at,
+            inliers=at,
+            output=split.rear(z),
+            predict=lambda _: split.rear(z),
+            predict_in_steps=lambda _: split.rear(z),
+            depth_of=lambda output: output,
+        )
+        result = refine_weights(frame, MovingWeights(network, "weights"), settings)
+    assert result.losses == tuple(sorted(result.losses, reverse=True))
+    assert result.kept == settings.iterations
+
+
+def test_a_budget_ends_the_steps() -> None:
+    assert len(refined(TwoInputs(), replace(SETTINGS, time_budget_s=1e-9)).losses) == 1
+
+
+# ------------------------------------------------------------------ leaving no trace
+
+
+@pytest.mark.parametrize("parameters", ["weights", "lora:2"])
+def test_the_network_is_as_before(parameters: str) -> None:
+    network = TwoInputs()
+    before = state_of(network)
+    refined(network, replace(SETTINGS, parameters=parameters))
+    assert same(before, state_of(network))
+
+
+@pytest.mark.parametrize("kind", [RuntimeError, KeyboardInterrupt])
+@pytest.mark.parametrize("call", [1, 2, 3, 4, 6])
+def test_the_network_is_as_before_after_an_exception(kind: type[BaseException], call: int) -> None:
+    network = TwoInputs()
+    network.head = Failing(network.head, call, kind)
+    before = state_of(network)
+    with pytest.raises(Exception if kind is RuntimeError else kind):
+        refined(network)
+    assert same(before, state_of(network))
+
+
+def test_a_divergence_gives_what_was_reached() -> None:
+    with pytest.raises(DivergedError, match="try a smaller --lr") as caught:
+        refined(TwoInputs(), replace(SETTINGS, lr=1e30))
+    assert isinstance(caught.value.last_good, Refinement)
+
+
+def test_a_network_without_weights_behind_the_points_is_refused() -> None:
+    class Interpolates(nn.Module):
+        def forward(self, rgb: Tensor, sparse: Tensor) -> Tensor:
+            return sparse.mean() + 0 * rgb[:, :1]
+
+    with pytest.raises(LayerError, match="no weight can move"):
+        refined(Interpolates())
+
+
+@pytest.mark.parametrize("text", ["lora", "lora:0", "lora:x", "heads"])
+def test_what_cannot_move_is_refused(text: str) -> None:
+    with pytest.raises(UsageError, match="none of elements, channels, weights"):
+        rank_of(text)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_a_few_points_are_enough_or_leave_the_plain_depth(count: int) -> None:
+    result = refined(TwoInputs(), at=points(count))
+    assert len(result.losses) == (0 if count == 1 else SETTINGS.iterations)
+    assert result.after.isfinite().all()
+
+
+# ------------------------------------------------------------------ masks
+
+
+@pytest.mark.parametrize("kind", ["points", "blocks", "lines"])
+@pytest.mark.parametrize("fraction", [0.1, 0.3, 0.5, 0.8])
+@pytest.mark.parametrize("count", [2, 5, 40])
+def test_a_mask_hides_some_and_shows_some(kind: str, fraction: float, count: int) -> None:
+    masks = _masks(points(count), kind, fraction)
+    for _ in range(7):
+        assert 0 < int(masks.next().sum()) < count
+
+
+@pytest.mark.parametrize(("fraction", "parts"), [(0.5, 2), (0.34, 3), (0.25, 4)])
+def test_every_point_is_hidden_once_before_any_is_hidden_again(fraction: float, parts: int) -> None:
+    masks = _masks(points(40), "points", fraction)
+    for _ in range(2):
+        hidden = sum(masks.next().int() for _ in range(parts))
+        assert torch.equal(hidden, torch.ones(40, dtype=torch.int))  # type: ignore[arg-type]
+
+
+def test_of_a_single_point_nothing_is_hidden() -> None:
+    assert not _masks(points(1), "points", 0.5).next().any()
+
+
+def _masks(at: SparsePoints, kind: str, fraction: float) -> Masks:
+    mask = MaskSettings(kind=kind, fraction=fraction)
+    return Masks(at, mask, torch.Generator().manual_seed(0))
+
+
+def test_points_set_aside_are_a_tenth_but_at_least_a_few() -> None:
+    generator = torch.Generator()
+    counts = [int(set_aside(points(count), 0.1, generator).sum()) for count in (2, 8, 40, 200)]
+    assert counts == [0, 2, 4, 20]
+    assert not set_aside(points(40), 0.0, generator).any()

@@ -1,0 +1,114 @@
+"""Updates of weights by points hidden from the network's input, through files and options."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from pnpdepth_cli import Refiner, load_network
+from pnpdepth_cli.errors import UsageError
+from pnpdepth_cli.io.depth import read_depth
+from pnpdepth_cli.models.definition import MASKED_DEFAULTS
+from pnpdepth_cli.pipeline.refinement.request import HoldOut, MethodOptions
+from pnpdepth_cli.pipeline.refinement.resolve import resolve_settings
+from tests.core.split.test_split import same, state_of
+from tests.pipeline.frames import FrameOnDisk, frame_on_disk, run
+
+MASKED = {"model": "compact", "checkpoint": None, "target": "masked", "iterations": 3}
+
+
+@pytest.fixture
+def frame(tmp_path: Path) -> FrameOnDisk:
+    return frame_on_disk(tmp_path)
+
+
+def depth_bytes(frame: FrameOnDisk) -> bytes:
+    return (frame.folder / "out" / "img_depth.png").read_bytes()
+
+
+def test_masked_points_change_the_depth_and_the_record_says_how(frame: FrameOnDisk) -> None:
+    record = run(frame, gt=frame.gt, **MASKED).record
+    settings = record["settings"]
+    assert (settings["target"], settings["parameters"]) == ("masked", "weights")
+    assert settings["mask"] == {
+        "kind": "points", "fraction": 0.5, "set_aside": 0.1, "scale": 0.5, "seed": 0
+    }  # fmt: skip
+    assert (settings["iterations"], settings["update"]) == (3, MASKED_DEFAULTS.update)
+    assert len(record["loss"]) == 3
+    assert record["scores"]["before"] != record["scores"]["after"]
+
+
+def test_the_same_seed_gives_the_same_bytes(frame: FrameOnDisk) -> None:
+    results, losses = [], []
+    for seed in (1, 1, 2):
+        losses.append(run(frame, seed=seed, overwrite=True, **MASKED).record["loss"])
+        results.append(depth_bytes(frame))
+    assert results[0] == results[1]
+    assert losses[0] == losses[1] != losses[2]
+
+
+def test_the_steps_may_see_a_reduced_image(frame: FrameOnDisk) -> None:
+    losses = [run(frame, mask_scale=s, overwrite=True, **MASKED).record["loss"] for s in (0.5, 1.0)]
+    assert losses[0] != losses[1]
+
+
+def test_no_iterations_give_the_plain_depth(frame: FrameOnDisk) -> None:
+    run(frame, **MASKED | {"iterations": 0})
+    masked = depth_bytes(frame)
+    run(frame, overwrite=True, model="compact", checkpoint=None, iterations=0)
+    assert masked == depth_bytes(frame)
+
+
+@pytest.mark.parametrize("parameters", ["weights", "lora:2"])
+def test_a_network_of_images_moves_weights_behind_the_cut_by_all_points(
+    frame: FrameOnDisk, parameters: str
+) -> None:
+    record = run(frame, parameters=parameters, lr="0.01").record
+    assert record["settings"]["layer"] == "middle"
+    assert record["loss"][-1] < record["loss"][0]
+    assert len(record["loss"]) == MASKED_DEFAULTS.iterations
+
+
+def test_a_network_is_as_before_after_the_refiner_closes(frame: FrameOnDisk) -> None:
+    network = load_network("compact")
+    before = state_of(network.module)
+    rgb, sparse = torch.rand(46, 62, 3).numpy(), read_depth(frame.sparse).values
+    with Refiner(network, target="masked") as refiner:
+        refined = refiner.refine(rgb, sparse)
+    assert same(before, state_of(network.module))
+    assert 0 < len(refined.losses) <= MASKED_DEFAULTS.iterations
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"parameters": "channels"}, "--target masked updates weights"),
+        ({"parameters": "lora:0"}, "none of elements, channels, weights"),
+        ({"layer": "decoder.s8"}, "--layer is where z is"),
+        ({"line_search": True}, "--line-search is for updates of z"),
+        ({"mask_fraction": 1.0}, "not between 0 and 1"),
+        ({"mask_scale": 1.5}, "not above 0 and 1 at most"),
+        ({"target": "given", "mask": "lines"}, "--mask is for points hidden"),
+    ],
+)
+def test_what_does_not_go_together_is_refused(
+    frame: FrameOnDisk, wrong: dict[str, object], message: str
+) -> None:
+    with pytest.raises(UsageError, match=message):
+        run(frame, **MASKED | wrong)
+
+
+def test_points_cannot_be_hidden_from_a_network_of_images(frame: FrameOnDisk) -> None:
+    with pytest.raises(UsageError, match="takes no sparse depth"):
+        run(frame, target="masked")
+
+
+def test_seed_and_budget_reach_the_settings() -> None:
+    definition = load_network("compact").definition
+    settings = resolve_settings(
+        definition, MethodOptions(target="masked"), HoldOut(seed=5, time_budget_s=2.0)
+    )
+    assert (settings.mask.seed, settings.time_budget_s) == (5, 2.0)
+    assert resolve_settings(definition, MethodOptions()).time_budget_s is None
