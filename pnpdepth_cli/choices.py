@@ -203,8 +203,8 @@ LAYOUTS = Table(
     group="layouts",
     noun="layout",
     first=(
-        *("manifest", "nyu-mat", "kitti-odometry", "kitti-object", "kitti-depth", "tum"),
-        *("7scenes", "synthia", "colmap", "pairs", "nyu-h5"),
+        *("manifest", "nyu-mat", "kitti-odometry", "kitti-object", "kitti-depth", "kitti-raw"),
+        *("tum", "7scenes", "synthia", "colmap", "pairs", "nyu-h5"),
     ),
 )
 """Data set layouts, in the order in which they are guessed: `pnpdepth_cli.io.layouts.Layout`."""
