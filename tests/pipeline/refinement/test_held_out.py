@@ -70,7 +70,7 @@ def test_the_networks_error_is_that_of_the_network_alone(frame: FrameOnDisk) -> 
     ]
     assert record["linear"]["folds"]["before"] == error
     (note,) = [note for note in record["notes"] if note.startswith("choice: ")]
-    assert f"network {error:.4f} m" in note
+    assert f"network {error:.4f}" in note
 
 
 @pytest.mark.parametrize(
