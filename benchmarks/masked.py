@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -20,7 +20,7 @@ import torch
 
 from benchmarks.frames import SETS, frame_inputs, frame_pixels, points_on_grid
 from pnpdepth_cli.core.metrics import score
-from pnpdepth_cli.frames.refine import refine_frame
+from pnpdepth_cli.frames.refine import refine_frame, with_propagation
 from pnpdepth_cli.models.network import Network, load_network
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs
 from pnpdepth_cli.pipeline.refinement.request import HoldOut, MethodOptions
@@ -68,25 +68,30 @@ def measured(network: Network, method: MethodOptions, inputs: Inputs, seed: int)
     layer = resolve_layer(definition, method.layer)
     start = time.process_time()
     with network.cut_at_points() if settings.masked else network.cut_at(layer) as split:
-        propagation = method.propagate or "none"
-        frame = refine_frame(network, split, settings, inputs.frame(), propagation=propagation)
+        frame = refine_frame(network, split, settings, inputs.frame())
     seconds = time.process_time() - start
-    before, after = (score(torch.from_numpy(d), gt) for d in (frame.before, frame.after))
+    propagated = with_propagation(inputs.frame(), frame.after, "gp")
+    seconds_propagated = time.process_time() - start
+    plain, after, last = (
+        score(torch.from_numpy(depth), gt) for depth in (frame.before, frame.after, propagated)
+    )
     kept = frame.refinement.kept
     return (
-        Row(mae=before.mae, rmse=before.rmse, seconds=0.0, kept=0),
+        Row(mae=plain.mae, rmse=plain.rmse, seconds=0.0, kept=0),
         Row(mae=after.mae, rmse=after.rmse, seconds=seconds, kept=kept),
+        Row(mae=last.mae, rmse=last.rmse, seconds=seconds_propagated, kept=kept),
     )
 
 
-def methods(steps: list[int]) -> dict[str, MethodOptions]:
+def methods(
+    steps: list[int], lr: str | None = None, scale: float | None = None
+) -> dict[str, MethodOptions]:
     """Returns what is compared, by the name in the table."""
-    masked = MethodOptions(target="masked")
+    masked = MethodOptions(target="masked", lr=lr, mask_scale=scale)
     return {
         "paper's update": MethodOptions(),
         **{f"masked, {k} steps": replace(masked, iterations=k) for k in steps},
         "masked": masked,
-        "masked + gp": replace(masked, propagate="gp"),
     }
 
 
@@ -100,6 +105,8 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=100, help="Of each set, at most.")
     parser.add_argument("--model", default="compact")
     parser.add_argument("--steps", nargs="*", type=int, default=[12, 40])
+    parser.add_argument("--lr", help="Step size of the hidden points.")
+    parser.add_argument("--scale", type=float, help="Of the image during their steps.")
     parser.add_argument("--only", nargs="*", help="Names of methods.")
     parser.add_argument("--wrong", type=float, default=0.0, help="Fraction of wrong points.")
     args = parser.parse_args()
@@ -119,18 +126,19 @@ def _measure_set(args: argparse.Namespace, network: Network, name: str, count: i
     ]
     label = f"{name}, {count or 'LiDAR'}"
     shown_plain = False
-    for title, method in methods(args.steps).items():
+    for title, method in methods(args.steps, args.lr, args.scale).items():
         if args.only and title not in args.only:
             continue
         rows = [measured(network, method, inputs, seed) for inputs, seed in cases]
-        plain, refined = ([pair[index] for pair in rows] for index in (0, 1))
+        plain, refined, propagated = zip(*rows, strict=True)
         if not shown_plain:
             print(_line(label, "plain", plain, plain), flush=True)
             shown_plain = True
         print(_line(label, title, refined, plain), flush=True)
+        print(_line(label, f"{title} + gp", propagated, plain), flush=True)
 
 
-def _line(label: str, title: str, rows: list[Row], plain: list[Row]) -> str:
+def _line(label: str, title: str, rows: Sequence[Row], plain: Sequence[Row]) -> str:
     mean = {
         name: float(np.mean([getattr(row, name) for row in rows]))
         for name in ("mae", "rmse", "seconds", "kept")

@@ -22,7 +22,6 @@ is what refinement moves.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple, cast
 
@@ -51,7 +50,6 @@ from model_zoo_defs._compact.points import Points, Prior, residual_of, resize
 from pnpdepth_cli.models.definition import (
     IMAGENET_MEAN,
     IMAGENET_STD,
-    MASKED_DEFAULTS,
     ModelDefinition,
     Multiple,
     Normalisation,
@@ -209,7 +207,6 @@ definitions = {
         output_kind="depth",
         layers=("decoder.s32", "decoder.s16", "decoder.s8", "decoder.s4", "decoder.s2"),
         defaults=RefineDefaults(layer="decoder.s8", lr="3%"),
-        masked=replace(MASKED_DEFAULTS, mask_scale=0.5),
         build=Compact,
         checkpoint=Path(__file__).parent / "weights" / "compact.safetensors",
     ),

@@ -38,13 +38,23 @@ class RefinementConfig:
     def __str__(self) -> str:
         s = self.settings
         aligned = "" if s.align == "none" else f", aligned ({s.align})"
+        if s.masked:
+            return f"{self.network}, hidden points, {s.update}, step {s.lr}{aligned}"
         return f"{self.network} cut at {self.layer}, {s.update}, step {s.lr}{aligned}"
 
     @property
     def competing_iterations(self) -> tuple[int, ...]:
-        """Numbers of updates of z above 0 that compete, ascending."""
+        """Numbers of updates above 0 that compete, ascending; of weights, the best is taken."""
         most = self.settings.iterations
+        if self.settings.moves_weights:
+            return (most,)
         return tuple(sorted({*(k for k in ITERATIONS if k < most), most} - {0}))
+
+    def within(self, seconds: float) -> RefinementConfig:
+        """Returns the refinement with a cap on the time of its updates, where these are costly."""
+        if not self.settings.moves_weights:
+            return self
+        return replace(self, settings=replace(self.settings, time_budget_s=seconds))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,7 +89,8 @@ class Candidate:
         if self.config is None:
             return "network"
         if self.iterations:
-            return f"{self.iterations} updates of z ({self.config})"
+            moved = "weights" if self.config.settings.moves_weights else "z"
+            return f"{self.iterations} updates of {moved} ({self.config})"
         network, align = self.config.network, self.config.settings.align
         return network if align == "none" else f"{network} aligned ({align})"
 

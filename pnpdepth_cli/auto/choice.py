@@ -188,8 +188,10 @@ def _score_all(board: _Scoreboard, competition: Competition) -> None:
     """Scores the candidates, and further refinements, while the deadline allows."""
     board.deadline = competition.deadline
     board.score(competition.candidates())
-    more = competition.more_configs if competition.deadline is not None else ()
-    board.score(each for config in more for each in _updates(config))
+    for config in competition.more_configs if competition.deadline is not None else ():
+        left_s = competition.deadline - time.monotonic()
+        if left_s > 0:
+            board.score(_updates(config.within(left_s / (len(board.folds) + 1))))
     board.score(each for config in competition.configs for each in _updates(config))
     errors = board.errors()
     starts = [each for each in errors if each.config is not None and each.propagate == "none"]

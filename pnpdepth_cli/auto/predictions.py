@@ -21,12 +21,12 @@ from pnpdepth_cli.choices import BASELINES, LOSSES
 from pnpdepth_cli.completion.interpolation import in_hull
 from pnpdepth_cli.completion.propagation import propagate, propagate_at
 from pnpdepth_cli.core.refine import Refinement, refine_from
-from pnpdepth_cli.core.split import Split
+from pnpdepth_cli.core.split import InputSplit, Split
 from pnpdepth_cli.core.split.user_code import wrap_user_errors
 from pnpdepth_cli.errors import PnpDepthError
 from pnpdepth_cli.frames.frame import Frame, RefinedFrame
 from pnpdepth_cli.frames.prepare import PreparedFrame, prepare
-from pnpdepth_cli.frames.refine import to_refined_frame
+from pnpdepth_cli.frames.refine import refine_frame_weights, to_refined_frame
 from pnpdepth_cli.models.aligned import AlignedDepth
 from pnpdepth_cli.models.network import Network, out_of_memory_is_a_device_error
 from pnpdepth_cli.points import SparsePoints
@@ -64,6 +64,14 @@ class SplitCache:
         self._open.close()
         self._split = None
 
+    def at_points(self) -> InputSplit:
+        """Returns the network cut at its sparse depth, open."""
+        if not isinstance(self._split, InputSplit):
+            self.close()
+            self._split = self._open.enter_context(self.network.cut_at_points())
+        assert isinstance(self._split, InputSplit)
+        return self._split
+
     def at(self, layer: str) -> Split:
         """Returns the network cut at the layer, open."""
         if self._split is None or self._split.layer != layer:
@@ -93,8 +101,9 @@ class OpenNetworks:
         self._stack.close()
 
     def split(self, config: RefinementConfig) -> Split:
-        """Returns the configuration's network cut at its layer, open."""
-        return self._caches[config.network].at(config.layer)
+        """Returns the configuration's network cut at its layer or its sparse depth, open."""
+        cache = self._caches[config.network]
+        return cache.at_points() if config.settings.masked else cache.at(config.layer)
 
 
 class FramePasses:
@@ -123,10 +132,13 @@ class FramePasses:
             if not len(prepared.points):
                 raise prepared.no_points_error()
             reader = prepared.depth_reader(config.settings)
-            if config.settings.iterations:
-                result = self._refined(config, prepared, reader)
-            else:
+            if not config.settings.iterations:
                 result = self._plain(config, prepared, reader)
+            elif config.settings.moves_weights:
+                self._z0.pop(config.network, None)
+                return _of_weights(self._opened.split(config), prepared, config)
+            else:
+                result = self._refined(config, prepared, reader)
             refined = to_refined_frame(prepared, reader, result)
         if isinstance(refined, PnpDepthError):
             raise refined
@@ -209,6 +221,17 @@ def _trajectory(prepared: PreparedFrame, refined: RefinedFrame) -> Trajectory:
     }
     refinement = replace(refined.refinement, depths={})
     return Trajectory(depths=depths, frame=replace(refined, refinement=refinement))
+
+
+def _of_weights(split: Split, prepared: PreparedFrame, config: RefinementConfig) -> Trajectory:
+    """The plain depth and that of the best weights."""
+    reader = prepared.depth_reader(config.settings)
+    result = refine_frame_weights(split, config.settings, prepared, reader)
+    refined = to_refined_frame(prepared, reader, result)
+    if isinstance(refined, PnpDepthError):
+        raise refined
+    plain, best = (torch.from_numpy(depth) for depth in (refined.before, refined.after))
+    return Trajectory(depths={0: plain, config.settings.iterations: best}, frame=refined)
 
 
 class CandidateDepths:

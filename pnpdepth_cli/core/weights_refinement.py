@@ -20,6 +20,8 @@ from pnpdepth_cli.core.weights import MovingWeights
 from pnpdepth_cli.errors import DivergedError, LayerError
 from pnpdepth_cli.points import SparsePoints
 
+MIN_POINTS = 30
+"""With fewer points no step is made: what a few hidden points ask does not hold for a frame."""
 CHECKS = 3
 """How often the points set aside are looked at, besides before the first step."""
 PATIENCE = 2
@@ -78,8 +80,8 @@ class WeightsRefinement:
 
     @property
     def iterations(self) -> int:
-        """Number of steps at most; a single point cannot be both hidden and shown."""
-        enough = len(self._shown) > 1 or not self._settings.masked
+        """Number of steps at most."""
+        enough = len(self._frame.inliers) >= MIN_POINTS or not self._settings.masked
         return self._settings.iterations if enough else 0
 
     def begin(self) -> None:

@@ -82,7 +82,9 @@ def refine_frames(
         readers = [each.depth_reader(settings) for each in seen]
         results: list[Refinement | PnpDepthError] = []
         if seen and settings.moves_weights:
-            results = [_refine_weights(split, settings, seen, readers, on_iteration)]
+            if len(seen) > 1:
+                raise BatchError("weights are updated for one frame alone; refine one at a time")
+            results = [refine_frame_weights(split, settings, seen[0], readers[0], on_iteration)]
         elif seen:
             with torch.no_grad():
                 z = split.front(*_stacked([each.arguments for each in seen]))
@@ -101,17 +103,22 @@ def refine_frames(
     return [next(refined) if len(each.points) else each.no_points_error() for each in prepared]
 
 
-def _refine_weights(
+def refine_frame_weights(
     split: Split,
     settings: RefineSettings,
-    frames: Sequence[PreparedFrame],
-    readers: Sequence[AlignedDepth],
-    on_iteration: OnIteration,
+    frame: PreparedFrame,
+    reader: AlignedDepth,
+    on_iteration: OnIteration = lambda done, loss: None,
 ) -> Refinement | PnpDepthError:
-    """The result of one frame, whose weights move for it alone."""
-    if len(frames) > 1:
-        raise BatchError("weights move for one frame alone; refine the frames one at a time")
-    (frame,), (reader,) = frames, readers
+    """Returns the refinement of one frame by updates of weights, or its error.
+
+    Args:
+        split: The network cut at its sparse depth, or at a layer; open.
+        settings: What is updated and how.
+        frame: The frame, with at least one point.
+        reader: Reads depth from the network's output.
+        on_iteration: As of `refine_frame`.
+    """
     weights = MovingWeights(frame.network.module, settings.parameters, settings.mask.seed)
     try:
         with _opened(split, frame, reader, settings.mask.scale) as seen:

@@ -29,7 +29,8 @@ from pnpdepth_cli.frames.frame import DepthMap, Frame, RefinedFrame
 from pnpdepth_cli.models.definition import ModelDefinition
 from pnpdepth_cli.models.network import Network
 from pnpdepth_cli.pipeline.refinement.method import Method
-from pnpdepth_cli.pipeline.refinement.request import RefineRequest
+from pnpdepth_cli.pipeline.refinement.request import MethodOptions, RefineRequest
+from pnpdepth_cli.pipeline.refinement.resolve import resolve_settings
 
 LINEAR = Candidate(baseline="linear")
 """The interpolation that every result is compared with."""
@@ -66,6 +67,8 @@ def competition_of(
         else:
             first = own
         configs.append(first)
+        if timed and "sparse" in network.definition.input_kind:
+            more.append(replace(own, settings=_masked_settings(network.definition)))
         if timed:
             own = own if own == first else replace(own)
             more += [*([own] if own != first else []), *more_configs(network.definition, own)]
@@ -74,6 +77,11 @@ def competition_of(
         more_configs=tuple(more),
         propagations=_competing_propagations(options.propagate, timed=timed),
     )
+
+
+def _masked_settings(definition: ModelDefinition) -> RefineSettings:
+    """The settings by which points hidden from a network's input refine it."""
+    return resolve_settings(definition, MethodOptions(target="masked"))
 
 
 def refine_with_folds(

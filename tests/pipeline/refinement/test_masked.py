@@ -33,7 +33,7 @@ def test_masked_points_change_the_depth_and_the_record_says_how(frame: FrameOnDi
     settings = record["settings"]
     assert (settings["target"], settings["parameters"]) == ("masked", "weights")
     assert settings["mask"] == {
-        "kind": "points", "fraction": 0.5, "set_aside": 0.1, "scale": 0.5, "seed": 0
+        "kind": "points", "fraction": 0.5, "set_aside": 0.1, "scale": 1.0, "seed": 0
     }  # fmt: skip
     assert (settings["iterations"], settings["update"]) == (3, MASKED_DEFAULTS.update)
     assert len(record["loss"]) == 3

@@ -573,3 +573,16 @@ def test_without_matplotlib_it_is_said_at_once_which_extra_is_missing(
         sweep(root, "iterations=0,2", plots=True)
     assert not (root / "out").exists()
     assert sweep(root, "iterations=0,2")["studies"][0]["plot"] is None
+
+
+def test_a_sweep_over_what_moves_refines_each_for_itself(root: Path) -> None:
+    record = sweep(root, "parameters=elements,weights", refine={"lr": "0.001", "iterations": 3})
+    gains = [cell["measures"]["mae"]["gain"] for cell in record["studies"][0]["cells"]]
+    assert gains[0] != gains[1] != 0
+    weights = alone(root, lr="0.001", iterations=3, parameters="weights")
+    (line,) = [
+        each
+        for each in lines(root / "out/sweep_frames.csv")
+        if (each["parameters"], each["frame"]) == ("weights", "a")
+    ]
+    assert float(line["mae_refined"]) == weights["after"]["mae"]
