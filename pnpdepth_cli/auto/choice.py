@@ -188,8 +188,8 @@ def _score_all(board: _Scoreboard, competition: Competition) -> None:
     """Scores the candidates, and further refinements, while the deadline allows."""
     board.deadline = competition.deadline
     board.score(competition.candidates())
-    for config in competition.more_configs if competition.deadline is not None else ():
-        left_s = competition.deadline - time.monotonic()
+    for config in competition.more_configs:
+        left_s = (competition.deadline or 0.0) - time.monotonic()
         if left_s > 0:
             board.score(_updates(config.within(left_s / (len(board.folds) + 1))))
     board.score(each for config in competition.configs for each in _updates(config))

@@ -132,6 +132,7 @@ class FramePasses:
             if not len(prepared.points):
                 raise prepared.no_points_error()
             reader = prepared.depth_reader(config.settings)
+            result: Refinement | PnpDepthError
             if not config.settings.iterations:
                 result = self._plain(config, prepared, reader)
             elif config.settings.moves_weights:
