@@ -74,7 +74,7 @@ def test_the_networks_error_is_that_of_the_network_alone(frame: FrameOnDisk) -> 
 
 
 @pytest.mark.parametrize(
-    ("asked", "tried"), [(None, {"none", "gp", "diffusion"}), ("gp", {"none", "gp"}),
+    ("asked", "tried"), [(None, {"none", "gp"}), ("gp", {"none", "gp"}),
                          ("none", {"none"})],
 )  # fmt: skip
 def test_with_auto_only_the_propagation_that_is_asked_for_competes(
