@@ -63,6 +63,24 @@ def test_ground_truth_that_is_the_sparse_depth_is_warned_of(frame: FrameOnDisk) 
     assert not any("sparse depth itself" in note for note in notes)
 
 
+def test_a_wrong_scale_of_the_ground_truth_is_warned_of(frame: FrameOnDisk) -> None:
+    notes = run(frame, gt=frame.gt, gt_scale=256.0, iterations=0).record["notes"]
+    assert any("the ground truth is 3.91 times the sparse depth" in note for note in notes)
+    notes = run(frame, gt=frame.gt, iterations=0, overwrite=True).record["notes"]
+    assert not any("times the sparse depth" in note for note in notes)
+
+
+def test_a_point_beyond_everything_is_dropped_with_a_note(frame: FrameOnDisk) -> None:
+    depth = read_depth(frame.sparse).values.copy()
+    rows, columns = np.nonzero(depth)
+    depth[rows[0], columns[0]] = 1e30
+    write_depth(frame.folder / "far.npy", depth)
+    record = run(frame, sparse=frame.folder / "far.npy", iterations=0).record
+    assert record["points"]["used"] == len(rows) - 1
+    assert record["points"]["farthest"] < 10
+    assert any("dropped 1 of 60 points more than 1,000 times" in note for note in record["notes"])
+
+
 def test_the_scores_of_the_record_are_those_of_the_written_file(frame: FrameOnDisk) -> None:
     record = run(frame, gt=frame.gt, format="npy").record
     written = read_depth(frame.folder / "out" / "img_depth.npy").values
