@@ -182,6 +182,10 @@ def _check_weights(
             " weights or lora:8"
         )
     rank_of(settings.parameters)
+    if method.preset is not None:
+        raise UsageError(
+            f"--preset {method.preset} updates z; leave out --target and --parameters, or the preset"
+        )
     if method.target == "masked" and "sparse" not in definition.input_kind:
         raise UsageError(
             f"network {definition.name!r} takes no sparse depth, so no points can be hidden from"

@@ -87,6 +87,7 @@ def test_a_network_is_as_before_after_the_refiner_closes(frame: FrameOnDisk) -> 
         ({"parameters": "channels"}, "--target masked updates weights"),
         ({"parameters": "lora:0"}, "none of elements, channels, weights"),
         ({"layer": "decoder.s8"}, "--layer is where z is"),
+        ({"preset": "paper"}, "--preset paper updates z"),
         ({"line_search": True}, "--line-search is for updates of z"),
         ({"mask_fraction": 1.0}, "not between 0 and 1"),
         ({"mask_scale": 1.5}, "not above 0 and 1 at most"),
