@@ -203,11 +203,14 @@ LAYOUTS = Table(
     group="layouts",
     noun="layout",
     first=(
-        *("manifest", "nyu-mat", "kitti-odometry", "kitti-object", "kitti-depth", "tum"),
-        *("7scenes", "synthia", "colmap", "pairs", "nyu-h5"),
+        *("manifest", "nyu-mat", "kitti-odometry", "kitti-object", "kitti-depth", "kitti-raw"),
+        *("tum", "7scenes", "synthia", "colmap", "pairs", "nyu-h5"),
     ),
 )
 """Data set layouts, in the order in which they are guessed: `pnpdepth_cli.io.layouts.Layout`."""
+
+COLORS = ("blue-orange", "paper")
+"""Colours of what became better and worse: blue and orange, or the paper's red and green."""
 
 FRAME_PROTOCOLS = ("whole", "nyu", "kitti-odometry", "kitti-depth")
 """What of a frame the paper's experiments use: `pnpdepth_cli.io.dataset.protocols.PROTOCOLS`."""
@@ -226,6 +229,14 @@ LENSES = (
 
 EVAL_PROTOCOLS = ("paper", "nyu-eigen", "kitti", "kitti-devkit", "eigen", "garg")
 """Published protocols of scoring depth: `pnpdepth_cli.pipeline.evaluation.protocols.PROTOCOLS`."""
+
+MEASURE_GROUPS = Table(
+    "pipeline/evaluation/measures",
+    "GROUP",
+    group="measures",
+    noun="group of measures",
+)
+"""Measures that `eval` computes only on request."""
 
 AVERAGES = ("per-image", "pooled")
 """How errors are averaged: every image or every pixel has equal weight."""

@@ -13,6 +13,7 @@ from pnpdepth_cli.choices import (
     AVERAGES,
     EVAL_PROTOCOLS,
     FRAME_PROTOCOLS,
+    MEASURE_GROUPS,
     MISSING,
     PREDICTION_KINDS,
     RESIZES,
@@ -29,7 +30,15 @@ if TYPE_CHECKING:
 else:
     _Choice = click.Choice  # not generic before click 8.2
 
-_REQUEST_OPTIONS = ("sparse", "protocol", "layout_protocol", "resamples", "seed", "workers")
+_REQUEST_OPTIONS = (
+    "sparse",
+    "protocol",
+    "layout_protocol",
+    "calib",
+    "resamples",
+    "seed",
+    "workers",
+)
 """Options that are fields of `EvalRequest`."""
 _SCALE_OPTIONS = {
     "prediction": "pred_scale",
@@ -63,6 +72,7 @@ class _ProtocolName(_Choice):
             *("--pred-scale", "--gt-scale", "--pred-kind", "--channel", "--resize", "--pred-crop"),
             *(
                 "--mask",
+                "--calib",
                 "--layout-protocol",
                 "--sparse",
                 "--sparse-scale",
@@ -73,7 +83,7 @@ class _ProtocolName(_Choice):
         "Protocol": (
             *("--protocol", "--min-depth", "--max-depth", "--clip", "--crop", "--average"),
             *("--delta", "--exclude-sparse", "--missing", "--scale-by", "--bootstrap"),
-            *("--no-groups", "--seed"),
+            *("--no-groups", "--seed", "--measures"),
         ),
         "Output": ("--csv", "--markdown", "--latex", "--html", "--overwrite", "--json"),
     },
@@ -119,6 +129,17 @@ class _ProtocolName(_Choice):
     "prediction_kind",
     type=click.Choice(PREDICTION_KINDS),
     help="What predictions are.  [default: depth]",
+)
+@click.option(
+    "--measures",
+    metavar="GROUP,…",
+    help=f"Additional measures: {', '.join(MEASURE_GROUPS)}.",
+)
+@click.option(
+    "--calib",
+    type=options.FILE,
+    help="Calibration or K of all frames, for --measures normals and cloud.  [default: the data"
+    " set's]",
 )
 @click.option("--pred-scale", type=float, metavar="S", help="Integer predictions hold metres × S.")
 @click.option("--gt-scale", type=float, metavar="S", help="Integer ground truth holds metres × S.")
@@ -245,7 +266,9 @@ def _request(prediction: Path, truth: Path, given: dict[str, Any]) -> EvalReques
     own = {name: given.pop(name) for name in _REQUEST_OPTIONS}
     scales = {field: given.pop(name) for field, name in _SCALE_OPTIONS.items()}
     grouped = not given.pop("no_groups")
+    groups = given.pop("measures")
     derived = {
+        "groups": None if groups is None else tuple(dict.fromkeys(groups.split(","))),
         "thresholds": _thresholds(given.pop("delta")),
         "exclude_sparse": given.pop("exclude_sparse") or None,
     }

@@ -39,7 +39,10 @@ METHOD = (
     *("--proximity", "--line-search", "--keep-best", "--propagate"),
     *("--holdout", "--seed"),
 )
-OUTPUT = ("--output", "--format", "--baselines", "--uncertainty", "--overwrite", "--json")
+OUTPUT = (
+    *("--output", "--format", "--colors", "--baselines", "--uncertainty", "--overwrite"),
+    "--json",
+)
 COMMON = frozenset(
     {
         *("--sparse", "--gt", "--calib", "--output", "--overwrite"),

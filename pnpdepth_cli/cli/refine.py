@@ -56,7 +56,7 @@ def refine(as_json: bool, **given: Any) -> None:
     pnpdepth refine 000001.png --sparse 000001.bin --calib 000001.txt
 
     Writes <name>_depth.png (16 bit, with its scale), <name>_preview.png, <name>_improvement.png
-    (red better, green worse) and <name>.json.
+    (blue better, orange worse) and <name>.json.
     """
     from pnpdepth_cli.cli.tables import print_refinement
     from pnpdepth_cli.pipeline.refinement.refine import refine_image

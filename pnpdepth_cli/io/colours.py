@@ -18,6 +18,11 @@ _RED = np.array([214, 26, 30], dtype=np.float32)
 _GREEN = np.array([16, 140, 52], dtype=np.float32)
 _BLUE = np.array([25, 90, 190], dtype=np.float32)
 _ORANGE = np.array([220, 105, 0], dtype=np.float32)
+_PURPLE = np.array([118, 42, 131], dtype=np.float32)
+_TEAL = np.array([1, 102, 94], dtype=np.float32)
+_GAIN_COLOURS = {"blue-orange": (_BLUE, _ORANGE), "paper": (_RED, _GREEN)}
+"""(better, worse) by the names of `choices.COLORS`."""
+
 LOGARITHMIC_FROM = 8.0
 """Ratio of far to near from which the scale is logarithmic.
 
@@ -100,9 +105,23 @@ def dimmed(grey: NDArray[np.float32]) -> Pixels:
     return np.repeat(levels[:, :, None], 3, axis=2)
 
 
-def paint_gain(strength: NDArray[np.floating], light: NDArray[np.floating]) -> Pixels:
-    """Returns (..., 3) colours: red at strength 1 (better), green at -1 (worse), `light` at 0."""
-    return _between(strength, light, _RED, _GREEN)
+def paint_gain(
+    strength: NDArray[np.floating], light: NDArray[np.floating], colors: str = "blue-orange"
+) -> Pixels:
+    """Returns (..., 3) colours of a gain: `light` at strength 0.
+
+    Args:
+        strength: 1 for better, -1 for worse; by default blue and orange, which colour-blind eyes
+            tell apart.
+        light: Grey level 0..1 at strength 0, of the same shape.
+        colors: One of `choices.COLORS`.
+    """
+    return _between(strength, light, *_GAIN_COLOURS[colors])
+
+
+def paint_change(strength: NDArray[np.floating], light: NDArray[np.floating]) -> Pixels:
+    """Returns (..., 3) colours: teal at 1 (farther), purple at -1 (nearer), `light` at 0."""
+    return _between(strength, light, _TEAL, _PURPLE)
 
 
 def paint_error(strength: NDArray[np.floating], light: NDArray[np.floating]) -> Pixels:

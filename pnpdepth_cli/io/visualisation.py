@@ -2,14 +2,23 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import InputError, NoPointsError, SizeError
-from pnpdepth_cli.io.colours import depth_scale, dimmed, grey_of, paint_gain
+from pnpdepth_cli.io.colours import (
+    DepthScale,
+    depth_scale,
+    dimmed,
+    grey_of,
+    paint_change,
+    paint_gain,
+)
 from pnpdepth_cli.io.page import (
     Panel,
     depth_page,
@@ -25,6 +34,8 @@ Depth = NDArray[np.float32]
 # Wider images than this (KITTI is 3.3 : 1) are stacked; two in a row would be too small.
 _WIDE = 2.0
 _STRONGEST_PERCENTILE = 95.0
+_ZOOM = 4  # the zoom shows this fraction of the image's sides
+_FRAME = (230, 30, 30)
 _GAIN = "|before - ground truth| - |after - ground truth|"
 
 
@@ -37,7 +48,10 @@ def preview(
     path: Path,
     unit: str = "m",
 ) -> None:
-    """Writes a PNG of image, sparse depth, depth before and after, in colours of one scale.
+    """Writes a PNG of image, sparse depth, depth before and after, and what changed.
+
+    Depths have colours of one scale. The last two panels show the signed change in metres, and the
+    depth before and after where most changed.
 
     Args:
         rgb: (H, W, 3) in 0..1; None for a network without image.
@@ -73,8 +87,62 @@ def preview(
         Panel(title="Sparse depth", pixels=discs, remark=count),
         Panel(title="Depth before", pixels=resized(scale.paint(before), factor)),
         Panel(title="Depth after", pixels=resized(scale.paint(after), factor)),
+        *_change_panels(before, after, scale, grey, factor),
     ]
     save_page(depth_page(panels, columns, scale, unit), path)
+
+
+def _change_panels(
+    before: Depth, after: Depth, scale: DepthScale, grey: NDArray[np.float32], factor: float
+) -> list[Panel]:
+    """The signed change in metres, and before and after side by side where most changed."""
+    both = (before > 0) & (after > 0) & np.isfinite(before) & np.isfinite(after)
+    change = np.where(both, np.nan_to_num(after) - np.nan_to_num(before), 0).astype(np.float64)
+    strongest = _strongest(change[both])
+    pixels = dimmed(0.6 * grey)
+    pixels[both] = paint_change(change[both] / strongest, 0.66 + 0.3 * grey[both])
+    relative = np.abs(change) / np.where(both, after, 1)
+    top, left, height, width = _most_changed(relative)
+    shown = resized(pixels, factor)
+    low = (round(left * factor), round(top * factor))
+    high = (round((left + width) * factor) - 1, round((top + height) * factor) - 1)
+    cv2.rectangle(shown, low, high, _FRAME, 2)
+    area = np.s_[top : top + height, left : left + width]
+    size = (shown.shape[1] // 2, shown.shape[0])
+    halves = [
+        cv2.resize(scale.paint(depth[area]), size, interpolation=cv2.INTER_NEAREST)
+        if min(size) > 0
+        else shown[:, :0]
+        for depth in (before, after)
+    ]
+    zoom = np.full_like(shown, 255)
+    zoom[:, : size[0]] = halves[0]
+    zoom[:, shown.shape[1] - size[0] :] = halves[1]
+    zoom[:, size[0] - 1 : shown.shape[1] - size[0] + 1] = 255
+    return [
+        Panel(
+            title="Change",
+            pixels=shown,
+            remark=f"after - before: teal farther, purple nearer, full at {strongest:.3g}",
+        ),
+        Panel(title="Zoom", pixels=zoom, remark="before | after, where most changed (frame)"),
+    ]
+
+
+def _most_changed(relative: NDArray[np.float64]) -> tuple[int, int, int, int]:
+    """Top, left, height and width of the window with the largest mean relative change.
+
+    Its width is halved, because two windows stand side by side.
+    """
+    rows, columns = relative.shape
+    height, width = max(1, rows // _ZOOM), max(1, columns // (2 * _ZOOM))
+    bounded = np.minimum(relative, _strongest(relative))
+    total = cv2.integral(bounded)
+    window = (total[height:, width:] - total[:-height, width:] - total[height:, :-width]) + total[
+        :-height, :-width
+    ]
+    top, left = np.unravel_index(int(window.argmax()), window.shape)
+    return int(top), int(left), height, width
 
 
 def improvement(
@@ -82,9 +150,11 @@ def improvement(
     after: Depth,
     gt: Depth,
     path: Path,
+    *,
     rgb: NDArray[np.float32] | None = None,
+    colors: str = "blue-orange",
 ) -> float:
-    """Writes a PNG of where |depth - gt| fell (red) and rose (green), as figure 4(d) of the paper.
+    """Writes a PNG of where |depth - gt| fell and rose, as figure 4(d) of the paper.
 
     Only pixels with known ground truth count; equal errors are neither better nor worse.
 
@@ -94,6 +164,7 @@ def improvement(
         gt: (H, W) metres of ground truth, 0 where unknown.
         path: The PNG.
         rgb: (H, W, 3) in 0..1, the ground of the map; None for grey.
+        colors: One of `choices.COLORS`: blue better and orange worse, or red and green.
 
     Returns:
         The fraction of pixels whose error fell.
@@ -112,17 +183,15 @@ def improvement(
     grey = grey_of(rgb) if rgb is not None else np.full(gt.shape, 0.3, dtype=np.float32)
     strongest = _strongest(gain[known])
     pixels = dimmed(0.6 * grey)
-    pixels[known] = paint_gain(gain[known] / strongest, 0.66 + 0.3 * grey[known])
+    pixels[known] = paint_gain(gain[known] / strongest, 0.66 + 0.3 * grey[known], colors)
     factor = magnification(gt.shape, columns=1, legend=False)
     swatch = None if known.all() else ((52, 52, 52), "no ground truth")
     panel = Panel(title="Change of error", pixels=resized(pixels, factor), remark=_GAIN)
     return _save_gain(
         panel,
         gain[known],
-        amount=f"{strongest:.3g} m or more",
-        swatch=swatch,
-        noun="pixels",
-        path=path,
+        _GainKey(amount=f"{strongest:.3g} m or more", swatch=swatch, noun="pixels", colors=colors),
+        path,
     )
 
 
@@ -135,6 +204,7 @@ def improvement_at_points(
     held_out: bool,
     path: Path,
     unit: str = "m",
+    colors: str = "blue-orange",
 ) -> float:
     """Writes a PNG of where the error at sparse points fell and rose, as discs on the grey image.
 
@@ -147,6 +217,7 @@ def improvement_at_points(
         held_out: Whether refinement did not use the points, which the PNG says.
         path: The PNG.
         unit: Of all depths, where it is not the metre.
+        colors: One of `choices.COLORS`.
 
     Returns:
         The fraction of points whose error fell.
@@ -165,7 +236,7 @@ def improvement_at_points(
     grey = grey_of(rgb_or_grey)
     factor = magnification(grey.shape, columns=1, legend=False)
     ground = resized(dimmed(0.8 * grey), factor, smooth=True)
-    colours = paint_gain(gain / strongest, np.full(len(gain), 0.92))
+    colours = paint_gain(gain / strongest, np.full(len(gain), 0.92), colors)
     weakest_first = np.argsort(np.abs(gain), kind="stable")
     discs = draw_discs(ground, xy, colours, factor, weakest_first)
     remark = (
@@ -176,7 +247,8 @@ def improvement_at_points(
     panel = Panel(title="Change of error", pixels=discs, remark=remark)
     noun = "held-out points" if held_out else "points used"
     amount = f"{strongest:.3g} {unit} or more"
-    return _save_gain(panel, gain, amount=amount, swatch=None, noun=noun, path=path)
+    key = _GainKey(amount=amount, swatch=None, noun=noun, colors=colors)
+    return _save_gain(panel, gain, key, path)
 
 
 def _gain(before: Depth, after: Depth, gt: Depth) -> NDArray[np.float64]:
@@ -195,22 +267,29 @@ def _strongest(gain: NDArray[np.float64]) -> float:
     return float(np.percentile(changed, _STRONGEST_PERCENTILE)) if changed.size else 1.0
 
 
-def _save_gain(
-    panel: Panel,
-    gain: NDArray[np.float64],
-    *,
-    amount: str,
-    swatch: tuple[tuple[int, int, int], str] | None,
-    noun: str,
-    path: Path,
-) -> float:
+@dataclass(frozen=True, kw_only=True)
+class _GainKey:
+    """What the colours of a map of gains mean."""
+
+    amount: str
+    """Change of full colour."""
+    swatch: tuple[tuple[int, int, int], str] | None
+    """A colour outside the bar and its meaning."""
+    noun: str
+    """What is counted."""
+    colors: str
+    """One of `choices.COLORS`."""
+
+
+def _save_gain(panel: Panel, gain: NDArray[np.float64], key: _GainKey, path: Path) -> float:
     """Writes the panel with a colour bar and a footer. Returns the fraction with a gain above 0."""
     improved, worse = float((gain > 0).mean()), float((gain < 0).mean())
     strength = np.linspace(-1, 1, 220)
-    bar = np.repeat(paint_gain(strength, np.full(220, 0.88))[None], 18, axis=0)
-    footer = f"{100 * improved:.1f} % of {gain.size:,} {noun} improved, {100 * worse:.1f} % worse"
-    ends = (f"worse by {amount}", f"better by {amount}")
-    save_page(gain_page(panel, bar, ends, swatch, footer), path)
+    bar = np.repeat(paint_gain(strength, np.full(220, 0.88), key.colors)[None], 18, axis=0)
+    counted = f"{gain.size:,} {key.noun}"
+    footer = f"{100 * improved:.1f} % of {counted} improved, {100 * worse:.1f} % worse"
+    ends = (f"worse by {key.amount}", f"better by {key.amount}")
+    save_page(gain_page(panel, bar, ends, key.swatch, footer), path)
     return improved
 
 

@@ -84,7 +84,8 @@ def test_a_saved_page_can_be_taken_apart_again(tmp_path: Path) -> None:
     page = open_page(tmp_path / "p.png")
     assert (page.content["low_m"], page.content["high_m"]) == pytest.approx((2, 7), abs=0.2)
     panels = page.panels()
-    assert list(panels) == ["Image", "Sparse depth", "Depth before", "Depth after"]
+    titles = ["Image", "Sparse depth", "Depth before", "Depth after", "Change", "Zoom"]
+    assert list(panels) == titles
     assert np.array_equal(panels["Image"], np.rint(255 * rgb).astype(np.uint8))
     assert panels["Depth before"].shape == (480, 640, 3)
     improvement(depth, depth + 1, depth, tmp_path / "i.png")

@@ -17,11 +17,12 @@ from pnpdepth_cli.io.colours import (
     round_steps,
 )
 from pnpdepth_cli.io.depth import read_depth, read_sparse
-from pnpdepth_cli.io.page import draw_discs, magnification
+from pnpdepth_cli.io.page import draw_discs, magnification, open_page
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.io.visualisation import improvement, improvement_at_points, preview
 
 RED, GREEN = [214, 26, 30], [16, 140, 52]
+BLUE, ORANGE = [25, 90, 190], [220, 105, 0]
 
 
 def pixels_of(path: Path) -> np.ndarray:
@@ -66,7 +67,7 @@ def test_wide_images_are_stacked_and_others_are_two_by_two(tmp_path: Path) -> No
         preview(rgb, xy, at(depth, xy), depth, depth, tmp_path / "p.png")
         shape = pixels_of(tmp_path / "p.png").shape
         assert shape[1] // width == columns
-        assert shape[0] // height == 4 // columns
+        assert shape[0] // height == 6 // columns
 
 
 def test_the_image_stands_in_the_preview_as_it_is(tmp_path: Path) -> None:
@@ -83,7 +84,8 @@ def test_equal_depths_have_equal_panels_and_other_depths_other_ones(tmp_path: Pa
 
     def lower_panels(after: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         preview(rgb, xy, sparse, depth, after, tmp_path / "p.png")
-        row = pixels_of(tmp_path / "p.png")[-(24 + 480) : -24]
+        below = 24 + 480 + 10 + 34  # of the margin and the row of the change
+        row = pixels_of(tmp_path / "p.png")[-(below + 480) : -below]
         return row[:, 24 : 24 + 640], row[:, 24 + 640 + 20 : 24 + 2 * 640 + 20]
 
     assert np.array_equal(*lower_panels(depth))
@@ -111,7 +113,7 @@ def test_parts_of_different_size_are_refused(tmp_path: Path) -> None:
     with pytest.raises(SizeError, match=r"depth and after differ in size \(8x6 and 6x8\)"):
         preview(rgb, xy, at(depth, xy), depth, depth.T, tmp_path / "p.png")
     with pytest.raises(SizeError, match="depth and image differ"):
-        improvement(depth, depth, depth, tmp_path / "p.png", rgb[:3])
+        improvement(depth, depth, depth, tmp_path / "p.png", rgb=rgb[:3])
     with pytest.raises(SizeError, match="differ in number"):
         improvement_at_points(rgb, xy, at(depth, xy), depth[0, :3], depth[0, :3], True, tmp_path)
 
@@ -129,7 +131,7 @@ def panel(path: Path, height: int, width: int, factor: int) -> np.ndarray:
     return page[factor // 2 :: factor, factor // 2 :: factor]
 
 
-def test_red_is_better_green_is_worse_and_equal_is_neither(tmp_path: Path) -> None:
+def test_blue_is_better_orange_is_worse_and_equal_is_neither(tmp_path: Path) -> None:
     gt = np.array([[5, 5, 5, 0]], dtype=np.float32)
     before = np.array([[6, 5, 6, 6]], dtype=np.float32)
     after = np.array([[5, 6, 4, 5]], dtype=np.float32)  # |6 - 5| = |4 - 5|: unchanged
@@ -137,11 +139,37 @@ def test_red_is_better_green_is_worse_and_equal_is_neither(tmp_path: Path) -> No
     assert share == 1 / 3
     factor = int(magnification(gt.shape, columns=1, legend=False))
     colours = panel(tmp_path / "i.png", 1, 4, factor)[0]
-    assert colours[0].tolist() == RED
-    assert colours[1].tolist() == GREEN
+    assert colours[0].tolist() == BLUE
+    assert colours[1].tolist() == ORANGE
     assert np.ptp(colours[2].astype(int)) == 0
     assert np.ptp(colours[3].astype(int)) == 0
     assert colours[3, 0] < 80 < 150 < colours[2, 0]
+
+
+def test_the_papers_colours_are_red_and_green(tmp_path: Path) -> None:
+    gt = np.array([[5, 5]], dtype=np.float32)
+    before, after = np.array([[6, 5]], np.float32), np.array([[5, 6]], np.float32)
+    improvement(before, after, gt, tmp_path / "i.png", colors="paper")
+    factor = int(magnification(gt.shape, columns=1, legend=False))
+    assert panel(tmp_path / "i.png", 1, 2, factor)[0].tolist() == [RED, GREEN]
+
+
+def test_the_preview_shows_the_signed_change_and_zooms_to_it(tmp_path: Path) -> None:
+    before = np.full((80, 120), 4, np.float32)
+    after = before.copy()
+    after[60:70, 90:100] = 5
+    no_xy, no_depth = np.zeros((0, 2), np.float32), np.zeros(0, np.float32)
+    preview(None, no_xy, no_depth, before, after, tmp_path / "p.png")
+    panels = open_page(tmp_path / "p.png").panels()
+    assert list(panels)[4:] == ["Change", "Zoom"]
+    change, zoom = panels["Change"], panels["Zoom"]
+    factor = change.shape[0] // 80
+    farther, unchanged = change[65 * factor, 95 * factor], change[10 * factor, 10 * factor]
+    assert farther.tolist() == [1, 102, 94]
+    assert np.ptp(unchanged.astype(int)) == 0
+    half = zoom.shape[1] // 2
+    assert len(np.unique(zoom[:, : half - 2].reshape(-1, 3), axis=0)) == 1
+    assert len(np.unique(zoom[:, half + 2 :].reshape(-1, 3), axis=0)) == 2
 
 
 def test_nothing_changed_is_nothing_improved(tmp_path: Path) -> None:
@@ -184,8 +212,8 @@ def test_points_are_coloured_discs_where_they_lie(
     assert share == 0.5
     factor = int(magnification((30, 40), columns=1, legend=False))
     colours = panel(tmp_path / "i.png", 30, 40, factor)
-    assert colours[5, 5].tolist() == RED
-    assert colours[20, 30].tolist() == GREEN
+    assert colours[5, 5].tolist() == BLUE
+    assert colours[20, 30].tolist() == ORANGE
     assert np.ptp(colours[12, 17].astype(int)) == 0
 
 
@@ -245,8 +273,8 @@ def test_a_few_wild_depths_do_not_stretch_the_scale() -> None:
 
 def test_stronger_change_is_stronger_colour() -> None:
     colours = paint_gain(np.array([0, 0.3, 1, 7, -0.3, -1]), np.full(6, 0.9)).astype(int)
-    assert colours[2].tolist() == colours[3].tolist() == RED
-    assert colours[5].tolist() == GREEN
+    assert colours[2].tolist() == colours[3].tolist() == BLUE
+    assert colours[5].tolist() == ORANGE
     spread = np.ptp(colours, axis=1)
     assert spread[0] == 0 < spread[1] < spread[2]
 
@@ -265,6 +293,6 @@ def test_pictures_of_real_frames_are_written(shared_data: Path, tmp_path: Path, 
         gt = read_depth(depth, scale=1000).values
     dense = np.where(gt > 0, gt, np.float32(np.median(gt[gt > 0])))
     preview(rgb, sparse.xy[::40], sparse.depth[::40], dense * 1.2, dense, tmp_path / "p.png")
-    assert improvement(dense * 1.2, dense, gt, tmp_path / "i.png", rgb) == 1
+    assert improvement(dense * 1.2, dense, gt, tmp_path / "i.png", rgb=rgb) == 1
     assert pixels_of(tmp_path / "p.png").shape[1] <= 1600
     assert pixels_of(tmp_path / "i.png").shape[1] <= 1600

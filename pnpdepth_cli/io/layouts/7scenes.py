@@ -43,4 +43,4 @@ def _images(root: Path) -> list[Path]:
     return sorted(p for p in paths if p.suffix.lower() in IMAGE_SUFFIXES)
 
 
-LAYOUT = Layout(matches=matches, listing=listing)
+LAYOUT = Layout(matches=matches, listing=listing, needs=("frame-*.color.*",))

@@ -10,7 +10,8 @@ holds a `Layout` called `LAYOUT`.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from pnpdepth_cli.choices import LAYOUTS
@@ -48,6 +49,9 @@ class Layout:
     listing: Callable[[Path], Listing]
     """The frames of a folder or file that matches, and what is in no frame."""
 
+    needs: tuple[str, ...] = ()
+    """Patterns of what the folder holds, for the message of an unknown folder."""
+
 
 def find_layout(root: Path, name: str | None = None) -> str:
     """Returns the name of the layout that a folder or file is of.
@@ -67,8 +71,29 @@ def find_layout(root: Path, name: str | None = None) -> str:
     for each in LAYOUTS if name is None else (name,):
         if LAYOUTS[each].matches(root):
             return each
-    looks = f"like {name!r}" if name else f"like any layout ({', '.join(LAYOUTS)})"
-    raise InputError(f"{root} does not look {looks}; check the folder, or name its layout")
+    if name is not None:
+        needed = ", ".join(LAYOUTS[name].needs)
+        raise InputError(
+            f"{root} does not look like {name!r}" + (f", which needs {needed}" if needed else "")
+        )
+    raise InputError(f"{root} does not look like any layout; {_nearest(root)}")
+
+
+def _nearest(root: Path) -> str:
+    """What the nearest layout lacks, and what the others need."""
+    needs = {each: LAYOUTS[each].needs for each in LAYOUTS if LAYOUTS[each].needs}
+    present = {
+        each: [pattern for pattern in patterns if next(root.glob(pattern), None)]
+        for each, patterns in needs.items()
+    }
+    best = max(needs, key=lambda each: len(present[each]) / len(needs[each]))
+    text = "layouts need: "
+    if present[best]:
+        lacking = [pattern for pattern in needs[best] if pattern not in present[best]]
+        fact = f" and lacks {', '.join(lacking)}" if lacking else ""
+        text = f"nearest is {best!r}, which needs {', '.join(needs[best])}{fact}; others need: "
+    others = (each for each in needs if each != best or not present[best])
+    return text + "; ".join(f"{each} {', '.join(needs[each])}" for each in others)
 
 
 def list_frames(root: Path, name: str | None = None) -> tuple[str, Listing]:
@@ -82,11 +107,48 @@ def list_frames(root: Path, name: str | None = None) -> tuple[str, Listing]:
         InputError: The folder matches no layout, or cannot be read.
     """
     try:
-        layout = find_layout(root, name)
-        return layout, LAYOUTS[layout].listing(root)
+        parts = _data_sets(root, name)
+        layout = parts[0][1]
+        if parts[0][0] == root:
+            return layout, LAYOUTS[layout].listing(root)
+        listings = [(folder.name, LAYOUTS[layout].listing(folder)) for folder, _ in parts]
     except OSError as error:
         reason = (error.strerror or str(error)).lower()
         raise InputError(f"{error.filename or root} cannot be read ({reason}); check it") from error
+    return layout, Listing(
+        frames=[
+            replace(frame, name=f"{prefix}/{frame.name}")
+            for prefix, part in listings
+            for frame in part.frames
+        ],
+        broken=tuple(each for _, part in listings for each in part.broken),
+        spare=tuple(each for _, part in listings for each in part.spare),
+    )
+
+
+def _data_sets(root: Path, name: str | None) -> list[tuple[Path, str]]:
+    """The folder, or those in it that are of one layout, with that layout.
+
+    Raises:
+        InputError: Neither is, or the folders in it are of several layouts.
+    """
+    try:
+        return [(root, find_layout(root, name))]
+    except InputError as error:
+        found = []
+        for folder in sorted(root.iterdir()) if root.is_dir() else []:
+            if folder.is_dir() and not folder.name.startswith("."):
+                with suppress(InputError):
+                    found.append((folder, find_layout(folder, name)))
+        layouts = sorted({layout for _, layout in found})
+        if len(layouts) > 1:
+            raise InputError(
+                f"{root} holds folders of several layouts ({', '.join(layouts)}); give one of"
+                " them, or name the layout"
+            ) from error
+        if not found:
+            raise
+        return found
 
 
 def read_frames(root: Path, name: str | None = None) -> list[Frame]:

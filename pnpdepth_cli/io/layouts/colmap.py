@@ -74,4 +74,4 @@ def _pose(image: ColmapImage) -> Pose:
     return tuple(tuple(float(value) for value in row) for row in rows)
 
 
-LAYOUT = Layout(matches=matches, listing=listing)
+LAYOUT = Layout(matches=matches, listing=listing, needs=("images", "sparse/*/cameras.*"))

@@ -3,7 +3,8 @@
 The selection (and the anonymous test set) has image/ velodyne_raw/ [groundtruth_depth/]
 [intrinsics/]. The tree has <drive>/proj_depth/{velodyne_raw,groundtruth}/image_0{2,3}/; the images
 come from the raw data, whose <drive>/image_0{2,3}/data/ is searched in the same drive's folder, in
-<date>/ and in raw/<date>/.
+<date>/, in raw/<date>/ and in kitti_raw/<date>/. As downloaded, scans and ground truth lie apart in
+data_depth_velodyne/{train,val}/ and data_depth_annotated/{train,val}/.
 """
 
 from __future__ import annotations
@@ -81,7 +82,8 @@ def _by_frame(folder: Path, suffixes: tuple[str, ...]) -> dict[str, Path]:
 
 
 def _cameras(root: Path) -> list[Path]:
-    return sorted(p for start in ("", "*/", "*/*/") for p in root.glob(start + _RAW) if p.is_dir())
+    starts = ("", "*/", "*/*/", "data_depth_velodyne/*/*/")
+    return sorted({p for start in starts for p in root.glob(start + _RAW) if p.is_dir()})
 
 
 def _drives(root: Path) -> Listing:
@@ -94,7 +96,7 @@ def _drives(root: Path) -> Listing:
         if images is None:
             broken.append(_without_images(root, drive, camera))
             continue
-        ground_truth = by_stem(drive / "proj_depth" / "groundtruth" / camera, _PNG)
+        ground_truth = by_stem(_annotated(drive) / "proj_depth" / "groundtruth" / camera, _PNG)
         rgb, scans = by_stem(images, IMAGE_SUFFIXES), by_stem(folder, _PNG)
         frames += [
             Frame(
@@ -117,10 +119,20 @@ def _drives(root: Path) -> Listing:
     return Listing(frames=frames, broken=tuple(broken), spare=tuple(spare))
 
 
+def _annotated(drive: Path) -> Path:
+    """The drive with ground truth: the same, or that in data_depth_annotated/, as downloaded."""
+    base = drive.parents[1]
+    if base.name == "data_depth_velodyne":
+        return base.with_name("data_depth_annotated") / drive.parent.name / drive.name
+    return drive
+
+
 def _images_of(root: Path, drive: Path, camera: str) -> tuple[Path | None, Path | None]:
     """The folders of a drive's images and of its calibration; None for one that is missing."""
     date = drive.name[:10]
-    for parent in (drive, root / date / drive.name, root / "raw" / date / drive.name):
+    above = [drive.parents[2]] if drive.parents[1].name == "data_depth_velodyne" else []
+    folders = [base / raw for base in (root, *above) for raw in ("", "raw", "kitti_raw")]
+    for parent in (drive, *(folder / date / drive.name for folder in folders)):
         images = parent / camera / "data"
         if images.is_dir():
             calib = next(
@@ -139,4 +151,8 @@ def _without_images(root: Path, drive: Path, camera: str) -> Unmatched:
     )
 
 
-LAYOUT = Layout(matches=matches, listing=listing)
+LAYOUT = Layout(
+    matches=matches,
+    listing=listing,
+    needs=("*/proj_depth/velodyne_raw/image_0[23]", "*/image_0[23]/data"),
+)

@@ -53,4 +53,4 @@ def _parts(root: Path) -> list[Path]:
     return [p for p in candidates if all((p / name).is_dir() for name in needed)]
 
 
-LAYOUT = Layout(matches=matches, listing=listing)
+LAYOUT = Layout(matches=matches, listing=listing, needs=("image_2", "velodyne", "calib"))

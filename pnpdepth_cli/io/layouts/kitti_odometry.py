@@ -1,6 +1,7 @@
 """`kitti-odometry`: sequences/NN/ with image_2/, velodyne/ and calib.txt, or one such sequence.
 
-The ground truth of its experiments is the scan itself. The training sequences, 00 to 10, have the
+The ground truth of the paper's experiments is the scan itself: `batch --sample 500` projects it and
+draws 500 of its points. The training sequences, 00 to 10, have the
 poses of camera 0 in poses/NN.txt beside sequences/, a row of 12 numbers per frame.
 """
 
@@ -104,4 +105,8 @@ def _pose(path: Path, number: int, line: str) -> Pose:
     return tuple(tuple(values[start : start + 4]) for start in (0, 4, 8))
 
 
-LAYOUT = Layout(matches=matches, listing=listing)
+LAYOUT = Layout(
+    matches=matches,
+    listing=listing,
+    needs=("sequences/*/image_2", "sequences/*/velodyne", "sequences/*/calib.txt"),
+)

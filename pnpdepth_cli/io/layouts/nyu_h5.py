@@ -52,4 +52,4 @@ def _protocol_of(files: list[Path]) -> Protocol:
     return PROTOCOLS["nyu"]
 
 
-LAYOUT = Layout(matches=matches, listing=listing)
+LAYOUT = Layout(matches=matches, listing=listing, needs=("*.h5",))

@@ -74,4 +74,4 @@ def _test_numbers(path: Path) -> Any:
         raise FileFormatError(f"{path} has no testNdxs ({one_line(error)})") from error
 
 
-LAYOUT = Layout(matches=matches, listing=listing)
+LAYOUT = Layout(matches=matches, listing=listing, needs=("nyu_depth_v2_labeled.mat",))

@@ -63,4 +63,4 @@ def listing(root: Path) -> Listing:
     )
 
 
-LAYOUT = Layout(matches=matches, listing=listing)
+LAYOUT = Layout(matches=matches, listing=listing, needs=("rgb", "sparse"))

@@ -77,4 +77,4 @@ def _cameras(root: Path) -> Iterator[tuple[list[str], Path, Path]]:
             yield prefix, rgb, depth / "Depth" if (depth / "Depth").is_dir() else depth
 
 
-LAYOUT = Layout(matches=matches, listing=listing)
+LAYOUT = Layout(matches=matches, listing=listing, needs=("RGB", "Depth"))

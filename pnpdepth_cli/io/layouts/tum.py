@@ -1,4 +1,8 @@
-"""`tum`: TUM RGB-D, rgb.txt and depth.txt with a time and a path per line, paired by time."""
+"""`tum`: TUM RGB-D, rgb.txt and depth.txt with a time and a path per line, paired by time.
+
+An associations.txt (of TUM's associate.py, or of ICL-NUIM) pairs them itself: a time and a path
+twice per line.
+"""
 
 from __future__ import annotations
 
@@ -13,17 +17,21 @@ from pnpdepth_cli.io.file_bytes import check_value_count, one_line, read_bytes
 from pnpdepth_cli.io.layouts import Layout
 
 _SCALE = 5000.0
+_ASSOCIATIONS = "associations.txt"
 _LONGEST_GAP_S = 0.02
 """As the data set's own tool associates them."""
 
 
 def matches(root: Path) -> bool:
-    """Returns whether the folder has rgb.txt and depth.txt."""
-    return (root / "rgb.txt").is_file() and (root / "depth.txt").is_file()
+    """Returns whether the folder has rgb.txt and depth.txt, or associations.txt."""
+    names = ("rgb.txt", "depth.txt")
+    return (root / _ASSOCIATIONS).is_file() or all((root / name).is_file() for name in names)
 
 
 def listing(root: Path) -> Listing:
     """Returns one frame for each image with a depth image within 0.02 s; each is used once."""
+    if (root / _ASSOCIATIONS).is_file():
+        return Listing(frames=_associated(root / _ASSOCIATIONS))
     images, depths = _listed(root / "rgb.txt"), _listed(root / "depth.txt")
     partner_of: dict[int, int] = {}
     taken: set[int] = set()
@@ -54,6 +62,25 @@ def listing(root: Path) -> Listing:
         ),
     ]
     return Listing(frames=frames, spare=tuple(spare))
+
+
+def _associated(path: Path) -> list[Frame]:
+    """The frames of a file of pairs, whichever of the two comes first."""
+    frames = []
+    for number, line in enumerate(read_bytes(path).decode("utf-8", "replace").splitlines(), 1):
+        words = line.split("#", 1)[0].split()
+        if not words:
+            continue
+        files = [path.parent / word for word in words[1::2]]
+        depths = [file for file in files if "depth" in file.parts[-2:][0].lower()]
+        if len(words) != 4 or len(depths) != 1:
+            raise FileFormatError(
+                f"{path}, line {number}: {one_line(line)[:60]!r} is not a time and a path of rgb,"
+                " and a time and a path of depth"
+            )
+        (image,) = (file for file in files if file not in depths)
+        frames.append(Frame(name=image.stem, image=image, gt=depths[0], gt_scale=_SCALE))
+    return frames
 
 
 def _close_pairs(
@@ -89,4 +116,4 @@ def _listed(path: Path) -> list[tuple[float, Path]]:
     return sorted(entries)
 
 
-LAYOUT = Layout(matches=matches, listing=listing)
+LAYOUT = Layout(matches=matches, listing=listing, needs=("rgb.txt", "depth.txt"))

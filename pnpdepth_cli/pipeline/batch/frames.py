@@ -86,8 +86,11 @@ def task_of(request: BatchRequest, frame: Frame) -> Task:
     base = request.refine.files
     sparse = frame.sparse if base.sample is None else None
     protocol = frame.protocol if request.protocol is None else find_protocol(request.protocol)
-    is_scan = sparse is not None and (
-        base.scan.calib is not None or sparse.suffix.lower() in SCAN_ONLY_SUFFIXES
+    gt = frame.gt
+    if base.sample is not None and gt is None and _is_scan_file(frame.sparse):
+        gt = frame.sparse  # points are sampled from the projected scan
+    is_scan = _is_scan_file(gt) or (
+        sparse is not None and (base.scan.calib is not None or _is_scan_file(sparse))
     )
     scan = base.scan
     if is_scan:
@@ -97,7 +100,7 @@ def task_of(request: BatchRequest, frame: Frame) -> Task:
         base,
         image=frame.image,
         sparse=sparse,
-        gt=frame.gt,
+        gt=gt,
         sparse_scale=frame.sparse_scale if base.depth_scale is None else None,
         gt_scale=base.gt_scale or base.depth_scale or frame.gt_scale,
         scan=scan,
@@ -109,6 +112,10 @@ def task_of(request: BatchRequest, frame: Frame) -> Task:
         inputs=dict(_input_files(files, is_scan=is_scan)),
         outputs=Outputs.in_folder(request.output, frame.name, request.refine),
     )
+
+
+def _is_scan_file(source: Source | None) -> bool:
+    return isinstance(source, Path) and source.suffix.lower() in SCAN_ONLY_SUFFIXES
 
 
 def source_files(frame: Frame) -> list[Path]:

@@ -22,21 +22,29 @@ class FrameTable:
     """(N, M) measures of each frame; where pixels are pooled, (N, len(SUMS)) sums over pixels."""
     pooled: bool = False
     """True if the mean is over the pixels of all frames."""
+    gaps: bool = False
+    """True if a frame may lack a measure (NaN), which then is in no mean of this measure."""
     kept: tuple[int, ...] | None = None
     """Of a pooled table: which of core.metrics.MEASURES the means are; None for all."""
 
     def mean(self) -> Floats:
         """Returns (M,) the means over all frames."""
-        totals = np.append(self.rows.sum(axis=0), len(self.rows))
+        totals = self.cluster_totals(np.zeros(len(self.rows), np.int64))[0]
         return np.asarray(self.means_of(torch.from_numpy(totals)).numpy())
 
     def cluster_totals(self, clusters: NDArray[np.int64]) -> Floats:
         """Returns (G, C) the sums of the rows of each cluster, and in the last column its frames.
 
+        With gaps, the last M columns are the frames that have each measure.
+
         Args:
             clusters: (N,) the cluster of each frame, from 0 to G − 1.
         """
-        rows = np.column_stack([self.rows, np.ones(len(self.rows))])
+        if self.gaps:
+            known = ~np.isnan(self.rows)
+            rows = np.column_stack([np.where(known, self.rows, 0), known])
+        else:
+            rows = np.column_stack([self.rows, np.ones(len(self.rows))])
         totals = np.zeros((int(clusters.max()) + 1, rows.shape[1]))
         np.add.at(totals, clusters, rows)
         return totals
@@ -46,4 +54,5 @@ class FrameTable:
         if self.pooled:
             means = measures_of(totals[..., :-1])
             return means if self.kept is None else means[..., list(self.kept)]
-        return totals[..., :-1] / totals[..., -1:]
+        measures = self.rows.shape[1] if self.gaps else -1
+        return totals[..., :measures] / totals[..., measures:]

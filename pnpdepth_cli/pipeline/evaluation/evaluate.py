@@ -26,7 +26,7 @@ from pnpdepth_cli.pipeline.evaluation.frame_scoring import (
     score_pair,
 )
 from pnpdepth_cli.pipeline.evaluation.kitti_devkit import devkit_mean
-from pnpdepth_cli.pipeline.evaluation.pairing import FramePair, pair_frames
+from pnpdepth_cli.pipeline.evaluation.pairing import FramePair, in_sequences, pair_frames
 from pnpdepth_cli.pipeline.evaluation.protocols import EvalProtocol, choose_protocol
 from pnpdepth_cli.pipeline.evaluation.resampling import studentised_interval
 from pnpdepth_cli.pipeline.evaluation.result import ErrorBin, EvalRequest, Evaluation, Interval
@@ -57,13 +57,17 @@ def evaluate(
         sparse=request.sparse,
         mask=protocol.mask,
         layout_protocol=request.layout_protocol,
+        calib=request.calib,
     )
     rows: list[FrameScores] = []
     kinds = FileKinds()
     uncertainties = []
     by_distance = np.zeros((len(DISTANCE_EDGES_PX) - 1, len(SUMS)))
     by_depth = np.zeros((len(DEPTH_EDGES_M) - 1, len(SUMS)))
-    for scored in _scored(pairs.frames, protocol, request, raising=pairs.single):
+    frames = pairs.frames
+    if any(group.in_sequences for group in protocol.measure_groups):
+        frames = in_sequences(frames)
+    for scored in _scored(frames, protocol, request, raising=pairs.single):
         rows.append(scored.row)
         kinds.add(scored)
         if scored.uncertainty is not None:
@@ -77,7 +81,7 @@ def evaluate(
         raise InputError(f"no frame could be scored; the first: {rows[0].error}")
     keys = [measure.key for measure in protocol.measures]
     values = np.array([[row.values[key] for key in keys] for row in scored_rows])
-    table = FrameTable(rows=values)
+    table = FrameTable(rows=values, gaps=bool(protocol.groups))
     if protocol.average == "pooled":
         table = FrameTable(rows=np.array([row.sums for row in scored_rows]), pooled=True)
     mean = devkit_mean(values) if protocol.is_devkit else table.mean()

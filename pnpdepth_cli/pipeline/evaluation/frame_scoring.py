@@ -10,11 +10,13 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from pnpdepth_cli.core.metrics import SUMS, error_sums, measures_of
+from pnpdepth_cli.core.metrics import MEASURES, SUMS, error_sums, measures_of
 from pnpdepth_cli.errors import InputError
+from pnpdepth_cli.io.calibration import read_calibration
 from pnpdepth_cli.io.depth import DepthImage
 from pnpdepth_cli.pipeline.evaluation.frame_reading import Depth, LoadedFrame, Scales, load_frame
 from pnpdepth_cli.pipeline.evaluation.kitti_devkit import devkit_errors, fill_background
+from pnpdepth_cli.pipeline.evaluation.measured_frame import MeasuredFrame
 from pnpdepth_cli.pipeline.evaluation.pairing import FramePair
 from pnpdepth_cli.pipeline.evaluation.protocols import EvalProtocol
 from pnpdepth_cli.pipeline.evaluation.scaling import Fit
@@ -131,6 +133,8 @@ def score_pair(pair: FramePair, protocol: EvalProtocol, scales: Scales) -> Score
         return ScoredFrame(row=row, ground_truth=_facts(ground_truth))
     prediction = loaded.prediction
     row = _row(pair, prediction.values, loaded, protocol)
+    if row.scored and protocol.groups:
+        row = replace(row, values=row.values | _additional(pair, loaded, protocol, scales))
     scored = ScoredFrame(
         row=row,
         prediction=_facts(prediction),
@@ -177,7 +181,7 @@ def _row(pair: FramePair, depth: Depth, loaded: LoadedFrame, protocol: EvalProto
         values = devkit_errors(depth, gt)
         holes = int(np.count_nonzero((fill_background(depth) < 0) & (gt > 0)))
     else:
-        keys = (measure.key for measure in protocol.measures)
+        keys = (measure.key for measure in MEASURES)
         values, holes = dict(zip(keys, measures_of(sums).tolist(), strict=True)), 0
     leaked = min(pair.sampled, pixels)
     if loaded.sparse is not None:
@@ -191,6 +195,48 @@ def _row(pair: FramePair, depth: Depth, loaded: LoadedFrame, protocol: EvalProto
         leaked=leaked,
         has_sparse=loaded.sparse is not None or bool(leaked),
         holes=holes,
+    )
+
+
+def _additional(
+    pair: FramePair, loaded: LoadedFrame, protocol: EvalProtocol, scales: Scales
+) -> dict[str, float]:
+    """The measures of the protocol's additional groups."""
+    frame = _measured(pair, loaded)
+    values: dict[str, float] = {}
+    for name, group in zip(protocol.groups, protocol.measure_groups, strict=True):
+        if group.needs == "intrinsics" and frame.intrinsics is None:
+            raise InputError(
+                f"--measures {name} needs the intrinsics of frame {pair.name}; give --calib"
+            )
+        if group.needs == "sparse" and frame.sparse is None:
+            raise InputError(
+                f"--measures {name} needs the sparse depth of frame {pair.name}; give --sparse"
+            )
+        if group.in_sequences and pair.previous is not None:
+            before = load_frame(pair.previous, protocol, scales)
+            if before.prediction is not None:
+                frame = replace(frame, previous=_measured(pair.previous, before))
+        values |= group.values(frame)
+    return values
+
+
+def _measured(pair: FramePair, loaded: LoadedFrame) -> MeasuredFrame:
+    assert loaded.prediction is not None
+    intrinsics = None
+    if pair.frame.calib is not None:
+        cut = pair.frame.protocol
+        if cut.halved or cut.crop is not None:
+            raise InputError(
+                f"the calibration of frame {pair.name} is of the whole image, but layout protocol"
+                f" {cut.name} cuts it; --layout-protocol whole does not"
+            )
+        intrinsics = read_calibration(pair.frame.calib, pair.frame.camera).intrinsics
+    return MeasuredFrame(
+        depth=loaded.prediction.values,
+        gt=loaded.ground_truth.values,
+        sparse=loaded.sparse,
+        intrinsics=intrinsics,
     )
 
 

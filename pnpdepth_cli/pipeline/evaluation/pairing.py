@@ -49,6 +49,8 @@ class FramePair:
     """Of the prediction in a file of several frames; None in a file of one."""
     gt_index: int | None = None
     """Of the ground truth in a file of several frames."""
+    previous: FramePair | None = None
+    """The frame before in the same sequence, without its own previous one."""
     sampled: int = 0
     """Points of the ground truth that were the sparse input, by the run's record."""
     image: Source | None = None
@@ -76,6 +78,7 @@ def pair_frames(
     sparse: Path | None = None,
     mask: Path | None = None,
     layout_protocol: str | None = None,
+    calib: Path | None = None,
 ) -> Pairs:
     """Returns the frames of two files, or of two folders by name.
 
@@ -86,14 +89,30 @@ def pair_frames(
         mask: A file, or a folder with the same names.
         layout_protocol: One of choices.FRAME_PROTOCOLS, by which the frames of a data set are cut;
             None for the layout's own.
+        calib: Calibration of all frames; None for the data set's own.
 
     Raises:
         UsageError: For a file and a folder, or a layout protocol without a data set.
         InputError: For a missing path, or folders without a common name.
     """
-    for path in (prediction, ground_truth, *(p for p in (sparse, mask) if p)):
+    for path in (prediction, ground_truth, *(p for p in (sparse, mask, calib) if p)):
         if not path.exists():
             raise InputError(f"{path}: no such file or folder; check the path")
+    pairs = _found_pairs(prediction, ground_truth, sparse, mask, layout_protocol)
+    if calib is None:
+        return pairs
+    frames = (replace(each, frame=replace(each.frame, calib=calib)) for each in pairs.frames)
+    return replace(pairs, frames=tuple(frames))
+
+
+def _found_pairs(
+    prediction: Path,
+    ground_truth: Path,
+    sparse: Path | None,
+    mask: Path | None,
+    layout_protocol: str | None,
+) -> Pairs:
+    """`pair_frames` of paths that exist."""
     layout = _layout_of(ground_truth)
     if layout is None and layout_protocol is not None:
         raise UsageError(
@@ -159,6 +178,16 @@ def _stacked_pairs(prediction: Path, ground_truth: Path, count: int) -> Pairs:
         notes=(f"{count:,} frames in each of the two files",),
         single=False,
     )
+
+
+def in_sequences(frames: Sequence[FramePair]) -> tuple[FramePair, ...]:
+    """Returns the frames, each with the one before in its sequence."""
+    last: dict[str, FramePair] = {}
+    linked = []
+    for frame in frames:
+        linked.append(replace(frame, previous=last.get(frame.group)))
+        last[frame.group] = frame
+    return tuple(linked)
 
 
 def frame_name(stem: str) -> str:

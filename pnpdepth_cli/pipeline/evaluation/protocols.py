@@ -8,10 +8,18 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from pnpdepth_cli.choices import AVERAGES, MISSING, PREDICTION_KINDS, RESIZES, SCALINGS
+from pnpdepth_cli.choices import (
+    AVERAGES,
+    MEASURE_GROUPS,
+    MISSING,
+    PREDICTION_KINDS,
+    RESIZES,
+    SCALINGS,
+)
 from pnpdepth_cli.core.metrics import DELTA_THRESHOLDS, MEASURES, Measure
 from pnpdepth_cli.errors import SizeError, UsageError
 from pnpdepth_cli.pipeline.evaluation.kitti_devkit import DEVKIT_MEASURES
+from pnpdepth_cli.pipeline.evaluation.measured_frame import MeasureGroup
 
 KITTI_DEVKIT = "kitti-devkit"
 
@@ -70,6 +78,8 @@ class EvalProtocol:
     prediction_crop: str | None = None
     """Part of the ground truth's frame that predictions show: "kb", or X,Y,WIDTH,HEIGHT; None for
     all of it. The rest counts as empty."""
+    groups: tuple[str, ...] = ()
+    """Additional measures, names of MEASURE_GROUPS."""
     resize: str | None = None
     """How a prediction of another size is resized to the ground truth's; None refuses it."""
 
@@ -83,7 +93,13 @@ class EvalProtocol:
         """The measures in order, and how tables show them."""
         if self.is_devkit:
             return DEVKIT_MEASURES
-        return _IN_MILLIMETRES if self.name == "kitti" else MEASURES
+        usual = _IN_MILLIMETRES if self.name == "kitti" else MEASURES
+        return (*usual, *(measure for group in self.measure_groups for measure in group.measures))
+
+    @property
+    def measure_groups(self) -> tuple[MeasureGroup, ...]:
+        """The groups of additional measures."""
+        return tuple(MEASURE_GROUPS[name] for name in self.groups)
 
     def window(self, size: tuple[int, int]) -> Window:
         """Returns the rows and columns that are scored of a frame of `size` (H, W) pixels.
@@ -149,6 +165,7 @@ class EvalProtocol:
             exclude_sparse=self.exclude_sparse,
             resize=self.resize,
             prediction_crop=self.prediction_crop,
+            groups=self.groups,
             prediction_kind=self.prediction_kind,
         )
         return ", ".join(
@@ -186,7 +203,7 @@ _IN_MILLIMETRES = tuple(
     for m in MEASURES
 )
 
-_OF_READING = ("name", "scale", "resize", "mask", "prediction_kind", "prediction_crop")
+_OF_READING = ("name", "scale", "resize", "mask", "prediction_kind", "prediction_crop", "groups")
 """Fields that say how files are read, not how they are scored."""
 
 _MISSING_TEXTS = {
@@ -247,11 +264,12 @@ def choose_protocol(name: str, **changes: Any) -> EvalProtocol:
             ("average", "--average"),
             ("thresholds", "--delta"),
             ("missing", "--missing"),
+            ("groups", "--measures"),
         ):
             if changed.get(field, getattr(published, field)) != getattr(published, field):
                 raise UsageError(
-                    f"{option} does not apply to {name}: it has no δ, averages over the images, and"
-                    " fills in missing predictions"
+                    f"{option} does not apply to {name}: it has its own measures, no δ, averages"
+                    " over the images, and fills in missing predictions"
                 )
     if changed.get("min_depth") == 0 and published.missing == "min":
         changed.setdefault("missing", "skip")  # there is no bound to score empty predictions as
@@ -272,6 +290,10 @@ def _check(protocol: EvalProtocol) -> None:
         raise UsageError(f"resize {protocol.resize!r} is not one of {', '.join(RESIZES)}")
     if not all(math.isfinite(limit) and limit > 1 for limit in protocol.thresholds):
         raise UsageError("--delta must be above 1: δ counts ratios below it")
+    for name in protocol.groups:
+        _ = MEASURE_GROUPS[name]
+    if protocol.groups and protocol.average == "pooled":
+        raise UsageError("--measures are of each image; --average pooled does not apply to them")
     for option, value, names in (
         ("--missing", protocol.missing, MISSING),
         ("--scale-by", protocol.scale_by, SCALINGS),

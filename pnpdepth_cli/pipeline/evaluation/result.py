@@ -29,6 +29,8 @@ class EvalRequest:
     """The networks' sparse input: a file, or a folder of them."""
     protocol: str = "paper"
     """Name of the protocol."""
+    calib: Path | None = None
+    """Calibration of all frames, for measures that need the intrinsics; None for the data set's."""
     layout_protocol: str | None = None
     """How frames of a data set are cut, one of FRAME_PROTOCOLS; None for the layout's own."""
     changes: dict[str, Any] = field(default_factory=dict)
@@ -157,6 +159,7 @@ class Evaluation:
                 "prediction": str(request.prediction),
                 "truth": str(request.ground_truth),
                 "sparse": str(request.sparse) if request.sparse else None,
+                "calib": str(request.calib) if request.calib else None,
                 "layout_protocol": request.layout_protocol,
                 "scales": request.scales.as_record(),
             },

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import InputError, NoPointsError, SizeError, UsageError
 from pnpdepth_cli.frames.frame import Frame
-from pnpdepth_cli.io.dataset.frame import Hdf5Array, Source
+from pnpdepth_cli.io.dataset.frame import SCAN_ONLY_SUFFIXES, Hdf5Array, Source
 from pnpdepth_cli.io.dataset.hdf5 import depth_of, rgb_of
 from pnpdepth_cli.io.depth import (
     DepthImage,
@@ -29,7 +29,7 @@ from pnpdepth_cli.pipeline.sparse.colmap_options import METRES, ColmapOptions
 from pnpdepth_cli.pipeline.sparse.scan_options import ScanOptions
 from pnpdepth_cli.pipeline.sparse.scans import read_scan_points
 from pnpdepth_cli.points import SparsePoints
-from pnpdepth_cli.sensors import Points, occluded_in_map, sample_points
+from pnpdepth_cli.sensors import Points, as_depth_image, occluded_in_map, sample_points
 
 ImageArray = NDArray[np.float32]
 
@@ -109,8 +109,8 @@ def read_inputs(request: RefineRequest) -> Inputs:
     """
     files = request.files
     image = None if files.image is None else _read_image(files, files.image)
-    ground_truth = None if files.gt is None else _read_ground_truth(files, files.gt)
     whole = None if image is None else image.whole
+    ground_truth = None if files.gt is None else _read_ground_truth(files, files.gt, whole)
     if ground_truth is not None:
         _check_ground_truth(files, ground_truth, whole)
     if files.sparse is None:
@@ -179,7 +179,18 @@ def _read_image(files: FrameFiles, source: Source) -> _Part:
     )
 
 
-def _read_ground_truth(files: FrameFiles, source: Source) -> _Part:
+def _read_ground_truth(
+    files: FrameFiles, source: Source, image_size: tuple[int, int] | None
+) -> _Part:
+    if isinstance(source, Path) and source.suffix.lower() in SCAN_ONLY_SUFFIXES:
+        image = files.image if isinstance(files.image, Path) else None
+        scan = read_scan_points(source, files.scan, image_size, image)
+        return _Part(
+            values=np.ascontiguousarray(files.protocol.apply(as_depth_image(scan.points))),
+            whole=scan.points.size,
+            record=scan.record,
+            notes=tuple(note.replace("sparse:", "gt:", 1) for note in scan.notes),
+        )
     if isinstance(source, Hdf5Array):
         ground_truth = DepthImage(values=depth_of(source), source="HDF5", assumed_scale=False)
     else:

@@ -33,6 +33,8 @@ class Outputs:
     """Image of what became better and worse."""
     record: Path | None = None
     """JSON of settings and scores."""
+    colors: str = "blue-orange"
+    """Colours of better and worse, one of `choices.COLORS`."""
 
     @classmethod
     def in_folder(cls, folder: Path, name: str, request: RefineRequest) -> Outputs:
@@ -43,6 +45,7 @@ class Outputs:
             preview=folder / f"{name}_preview.png",
             improvement=folder / f"{name}_improvement.png",
             record=folder / f"{name}.json",
+            colors=request.outputs.colors,
         )
 
     def by_kind(self) -> dict[str, Path]:

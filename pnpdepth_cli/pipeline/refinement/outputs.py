@@ -34,7 +34,9 @@ def write_outputs(outputs: Outputs, inputs: Inputs, frame: RefinedFrame) -> dict
             inputs.unit,
         )
     if outputs.improvement is not None:
-        record["improved_fraction"] = _write_improvement(outputs.improvement, inputs, frame)
+        record["improved_fraction"] = _write_improvement(
+            outputs.improvement, inputs, frame, outputs.colors
+        )
     record["outputs"] = {
         kind: None if path is None else str(path)
         for kind, path in (
@@ -47,9 +49,11 @@ def write_outputs(outputs: Outputs, inputs: Inputs, frame: RefinedFrame) -> dict
     return record
 
 
-def _write_improvement(path: Path, inputs: Inputs, frame: RefinedFrame) -> float:
+def _write_improvement(path: Path, inputs: Inputs, frame: RefinedFrame, colors: str) -> float:
     if inputs.gt is not None:
-        return improvement(frame.before, frame.after, inputs.gt, path, rgb=inputs.rgb)
+        return improvement(
+            frame.before, frame.after, inputs.gt, path, rgb=inputs.rgb, colors=colors
+        )
     points = frame.held_out if len(frame.held_out) else frame.used
     return improvement_at_points(
         inputs.rgb if inputs.rgb is not None else frame.before,
@@ -60,4 +64,5 @@ def _write_improvement(path: Path, inputs: Inputs, frame: RefinedFrame) -> float
         held_out=bool(len(frame.held_out)),
         path=path,
         unit=inputs.unit,
+        colors=colors,
     )

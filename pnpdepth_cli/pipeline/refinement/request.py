@@ -276,6 +276,12 @@ class OutputOptions:
         choices=choices.FORMATS,
         show_default=True,
     )
+    colors: str = option(
+        "blue-orange",
+        "Colours of better and worse: blue and orange, or the paper's red and green.",
+        choices=choices.COLORS,
+        show_default=True,
+    )
     overwrite: bool = option(False, "Replace existing results.")
 
 

@@ -564,3 +564,46 @@ def test_real_frames_of_kitti_score_as_plain_numpy_does(shared_data: Path) -> No
         )
         expected = brute(p, g, np.ones(g.shape, bool))
         assert frame.values == pytest.approx(expected, rel=1e-6)
+
+
+@pytest.fixture
+def sequences(tmp_path: Path) -> Path:
+    """Two sequences of two frames, and the intrinsics."""
+    rng = np.random.default_rng(0)
+    for name in ("a/0", "a/1", "b/0", "b/1"):
+        truth = rng.uniform(2, 9, (20, 30))
+        depth_file(tmp_path / "gt" / f"{name}.npy", truth)
+        depth_file(tmp_path / "out" / f"{name}.npy", truth * rng.uniform(0.9, 1.1, truth.shape))
+    (tmp_path / "K.txt").write_text("K: 50 0 15 0 50 10 0 0 1\n")
+    return tmp_path
+
+
+def test_additional_measures_follow_the_usual_ones(sequences: Path) -> None:
+    usual, more = scored(sequences), scored(sequences, groups=("area", "flicker"))
+    assert list(more.mean)[: len(usual.mean)] == list(usual.mean)
+    assert usual.mean.items() <= more.mean.items()
+    assert more.protocol.scoring() == usual.protocol.scoring()
+    first, second, third, fourth = (frame.values["flicker"] for frame in more.frames)
+    assert math.isnan(first)
+    assert math.isnan(third)
+    assert more.mean["flicker"] == pytest.approx((second + fourth) / 2)  # over those that have it
+    assert math.isnan(more.mean["mae_40_80"])
+
+
+def test_measures_of_the_scene_need_intrinsics(sequences: Path) -> None:
+    with pytest.raises(InputError, match="--measures cloud needs the intrinsics of frame a/0"):
+        scored(sequences, groups=("cloud",))
+    found = scored(sequences, groups=("cloud", "normals"), calib=sequences / "K.txt")
+    assert found.mean["f_score"] > 0
+    assert found.mean["normal_angle"] > 0
+    with pytest.raises(InputError, match="--measures distance needs the sparse depth of frame"):
+        scored(sequences, groups=("distance",))
+
+
+def test_unknown_and_unfitting_measures_are_refused(two: Path) -> None:
+    with pytest.raises(UsageError, match="unknown group of measures 'edge'; did you mean 'edges'"):
+        scored(two, groups=("edge",))
+    with pytest.raises(UsageError, match="--average pooled does not apply"):
+        scored(two, groups=("area",), average="pooled")
+    with pytest.raises(UsageError, match="--measures does not apply to kitti-devkit"):
+        scored(two, groups=("area",), protocol="kitti-devkit")
