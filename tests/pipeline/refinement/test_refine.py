@@ -272,13 +272,3 @@ def test_a_truth_of_another_size_or_without_depth_is_refused(frame: FrameOnDisk)
         run(frame, gt=small)
     with pytest.raises(InputError, match="no pixel with known depth"):
         run(frame, gt=empty)
-
-
-def test_depth_that_does_not_fit_the_output_format_is_refused_by_name(frame: FrameOnDisk) -> None:
-    far = frame.folder / "far.csv"
-    far.write_text("30 20 2.0\n")
-    model = frame.folder / "far.py"
-    model.write_text(frame.model.read_text().replace("2 + 3", "400 + 3"))
-    with pytest.raises(OutputError, match="exr"):
-        run(frame, model=str(model), sparse=far, iterations=0)
-    assert not (frame.folder / "out").exists() or not files(frame.folder / "out")
