@@ -230,6 +230,9 @@ LENSES = (
 EVAL_PROTOCOLS = ("paper", "nyu-eigen", "kitti", "kitti-devkit", "eigen", "garg")
 """Published protocols of scoring depth: `pnpdepth_cli.pipeline.evaluation.protocols.PROTOCOLS`."""
 
+PLOT_FORMATS = ("png", "svg", "pdf")
+"""Files that `sweep` plots to."""
+
 MEASURE_GROUPS = Table(
     "pipeline/evaluation/measures",
     "GROUP",
