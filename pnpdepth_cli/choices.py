@@ -204,7 +204,8 @@ LAYOUTS = Table(
     noun="layout",
     first=(
         *("manifest", "nyu-mat", "kitti-odometry", "kitti-object", "kitti-depth", "kitti-raw"),
-        *("tum", "7scenes", "synthia", "colmap", "pairs", "nyu-h5"),
+        *("tum", "7scenes", "synthia", "colmap", "void", "diode", "ibims", "scannet"),
+        *("arkitscenes", "hypersim", "pairs", "nyu-h5"),
     ),
 )
 """Data set layouts, in the order in which they are guessed: `pnpdepth_cli.io.layouts.Layout`."""

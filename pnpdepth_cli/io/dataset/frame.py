@@ -23,6 +23,10 @@ class Hdf5Array:
     name: str
     """The array's name in the file."""
 
+    focal_px: float | None = None
+    """For depth that is the distance from the camera's centre: the focal length, with the principal
+    point in the middle, to get z. None for z itself."""
+
     axes: tuple[int, ...]
     """Order of the axes that makes the array, without its indexed axis, (H, W) or (H, W, 3)."""
 
@@ -72,6 +76,15 @@ class Frame:
 
     pose: Pose | None = None
     """x_world = pose · (x, 1) for points of KITTI's camera 0, whichever camera took the image."""
+
+    masks: tuple[Path, ...] = ()
+    """Images or arrays of the ground truth's size; where one is 0, the ground truth is unknown."""
+
+    gt_other_size: bool = False
+    """Whether the ground truth may have another size than the image, of the same view."""
+
+    sparse_other_size: bool = False
+    """The same for the sparse depth."""
 
     group: str | None = None
     """The sequence it belongs to; None derives it from the name."""

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from pnpdepth_cli.errors import InputError
 from pnpdepth_cli.io.dataset.frame import Frame, Hdf5Array
 from pnpdepth_cli.io.dataset.hdf5 import depth_of, rgb_of
+from pnpdepth_cli.io.dataset.masks import masked
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.io.rgb import read_rgb
 
@@ -29,4 +30,5 @@ def read_frame_ground_truth(frame: Frame) -> NDArray[np.float32]:
         depth = depth_of(frame.gt)
     else:
         depth = read_depth(frame.gt, scale=frame.gt_scale).values
+    depth = masked(depth, frame.masks)
     return np.ascontiguousarray(frame.protocol.apply(depth))

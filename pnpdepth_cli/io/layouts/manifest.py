@@ -1,9 +1,10 @@
 """`manifest`: a CSV with a header line, or JSON lines, of frames whose files lie anywhere.
 
-Columns or keys: image, sparse, gt, calib, camera, sparse_scale, gt_scale, name, group, protocol;
-all may be left out or empty but one of image and sparse. Paths are relative to the manifest. A
-frame without a name is called by its image's stem; if stems come twice, by its path below the
-folder that all of the images are in. Frames of one group are of one sequence.
+Columns or keys: image, sparse, gt, calib, mask, camera, sparse_scale, gt_scale, gt_size_ok, name,
+group, protocol; all may be left out or empty but one of image and sparse. Paths are relative to the
+manifest. Where the mask is 0, the ground truth is unknown; with gt_size_ok, it may have another
+size than the image. A frame without a name is called by its image's stem; if stems come twice, by
+its path below the folder that all of the images are in. Frames of one group are of one sequence.
 """
 
 from __future__ import annotations
@@ -23,9 +24,10 @@ from pnpdepth_cli.io.dataset.protocols import WHOLE, find_protocol
 from pnpdepth_cli.io.file_bytes import one_line, read_bytes
 from pnpdepth_cli.io.layouts import Layout
 
-_PATHS = ("image", "sparse", "gt", "calib")
+_PATHS = ("image", "sparse", "gt", "calib", "mask")
 _NUMBERS = {"camera": int, "sparse_scale": float, "gt_scale": float}
-_KEYS = (*_PATHS, *_NUMBERS, "name", "group", "protocol")
+_FLAGS = {"1": True, "true": True, "yes": True, "0": False, "false": False, "no": False}
+_KEYS = (*_PATHS, *_NUMBERS, "gt_size_ok", "name", "group", "protocol")
 
 
 def matches(root: Path) -> bool:
@@ -56,7 +58,9 @@ def listing(root: Path) -> Listing:
                 f"{root}, line {number}: a second frame {one_line(name)!r}{alike}; name it"
             )
         taken[name.casefold()] = name
-        frames.append(Frame(**values | {"name": name}))
+        masks = (values["mask"],) if "mask" in values else ()
+        fields = {key: value for key, value in values.items() if key != "mask"}
+        frames.append(Frame(**fields | {"name": name, "masks": masks}))
         lost = [file for file in _files(values) if not file.exists()]
         why = f"does not exist; correct line {number} of {root}"
         broken += [Unmatched(path=file, why=why) for file in lost]
@@ -124,7 +128,19 @@ def _parts(path: Path, number: int, row: dict[str, Any]) -> dict[str, Any]:
         raise FileFormatError(f"{where}: {one_line(error)}") from error
     protocol = find_protocol(values["protocol"]) if "protocol" in values else WHOLE
     group = {"group": values["group"]} if "group" in values else {}
-    return {"protocol": protocol, **_given_name(where, values), **group, **files, **numbers}
+    if values.get("gt_size_ok", "0").lower() not in _FLAGS:
+        raise FileFormatError(
+            f"{where}: gt_size_ok is {values['gt_size_ok'][:20]!r}, not true or false"
+        )
+    other_size = _FLAGS[values.get("gt_size_ok", "0").lower()]
+    return {
+        "protocol": protocol,
+        **_given_name(where, values),
+        **group,
+        **files,
+        **numbers,
+        "gt_other_size": other_size,
+    }
 
 
 def _given_name(where: str, values: dict[str, str]) -> dict[str, str]:

@@ -101,6 +101,9 @@ def task_of(request: BatchRequest, frame: Frame) -> Task:
         image=frame.image,
         sparse=sparse,
         gt=gt,
+        gt_masks=frame.masks,
+        gt_size_ok=frame.gt_other_size,
+        sparse_size_ok=base.sparse_size_ok or frame.sparse_other_size,
         sparse_scale=frame.sparse_scale if base.depth_scale is None else None,
         gt_scale=base.gt_scale or base.depth_scale or frame.gt_scale,
         scan=scan,
@@ -138,6 +141,8 @@ def _input_files(files: FrameFiles, *, is_scan: bool) -> Iterator[tuple[str, Pat
             yield from ((f"sparse {file.name}", file) for file in model_files(path))
         else:
             yield part, path
+    if files.gt is not None:
+        yield from ((f"mask {number}", path) for number, path in enumerate(files.gt_masks))
     calib, extrinsics = files.scan.calib, files.scan.extrinsics
     if is_scan and extrinsics is not None:
         yield "extrinsics", extrinsics

@@ -10,12 +10,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pnpdepth_cli.errors import FileFormatError, InputError, SizeError
-from pnpdepth_cli.io.dataset.frame import IMAGE_SUFFIXES
+from pnpdepth_cli.errors import InputError, SizeError
+from pnpdepth_cli.io.dataset.masks import masked, read_mask
 from pnpdepth_cli.io.depth import DepthImage, read_sparse
 from pnpdepth_cli.io.depth_reading import depth_from_stored, known_metres, load_stored
 from pnpdepth_cli.io.layouts import Hdf5Array, read_frame_ground_truth
-from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.pipeline.evaluation.pairing import FramePair
 from pnpdepth_cli.pipeline.evaluation.protocols import EvalProtocol
 from pnpdepth_cli.pipeline.evaluation.scaling import Fit, scaled
@@ -158,7 +157,8 @@ def _read_ground_truth(pair: FramePair, protocol: EvalProtocol, scales: Scales) 
         raise InputError(f"frame {pair.name} has no ground truth")
     scale = scales.ground_truth if scales.ground_truth is not None else frame.gt_scale
     image = _read(frame.gt, scale, scales.channel, protocol, pair.gt_index)
-    return replace(image, values=np.ascontiguousarray(frame.protocol.apply(image.values)))
+    values = masked(image.values, frame.masks)
+    return replace(image, values=np.ascontiguousarray(frame.protocol.apply(values)))
 
 
 def _read(
@@ -221,23 +221,13 @@ def _scored_mask(pair: FramePair, ground_truth: Depth, protocol: EvalProtocol) -
     if protocol.max_depth is not None:
         scored &= ground_truth < protocol.max_depth
     if pair.mask is not None:
-        mask = _read_mask(pair.mask)
+        mask = read_mask(pair.mask)
         if mask.shape != ground_truth.shape:
             raise _different(pair, "mask", pair.mask, mask.shape, ground_truth.shape, advice="")
         scored &= mask
     elif protocol.mask is not None:
         raise InputError(f"frame {pair.name} has no mask in {protocol.mask}; add it")
     return scored
-
-
-def _read_mask(path: Path) -> Mask:
-    """(H, W) true where an image has any channel above 0, or an array a number above 0."""
-    if path.suffix.lower() in IMAGE_SUFFIXES:
-        return np.asarray(read_rgb(path).values.max(axis=2) > 0)
-    values = load_stored(path, None).values
-    if values.ndim != 2:
-        raise FileFormatError(f"{path}: a mask is (H, W), not of shape {values.shape}")
-    return np.asarray(values > 0)
 
 
 def _to_size(pair: FramePair, depth: Depth, size: tuple[int, int], protocol: EvalProtocol) -> Depth:

@@ -14,6 +14,7 @@ from pnpdepth_cli.errors import InputError, NoPointsError, SizeError, UsageError
 from pnpdepth_cli.frames.frame import Frame
 from pnpdepth_cli.io.dataset.frame import SCAN_ONLY_SUFFIXES, Hdf5Array, Source
 from pnpdepth_cli.io.dataset.hdf5 import depth_of, rgb_of
+from pnpdepth_cli.io.dataset.masks import masked, moved_to
 from pnpdepth_cli.io.depth import (
     DepthImage,
     describe_range,
@@ -196,16 +197,21 @@ def _read_ground_truth(
     else:
         scale = files.gt_scale or files.depth_scale
         ground_truth = read_depth(source, scale=scale, channel=files.channel)
+    values = masked(ground_truth.values, files.gt_masks)
+    if files.gt_size_ok and image_size not in (None, values.shape):
+        assert image_size is not None
+        path = source.path if isinstance(source, Hdf5Array) else source
+        values = moved_to(path, values, image_size)
     described = describe_range(
-        ground_truth.values,
+        values,
         ground_truth.source,
         assumed_scale=ground_truth.assumed_scale,
         noun="pixels",
         option="--gt-scale",
     )
     return _Part(
-        values=np.ascontiguousarray(files.protocol.apply(ground_truth.values)),
-        whole=(ground_truth.values.shape[0], ground_truth.values.shape[1]),
+        values=np.ascontiguousarray(files.protocol.apply(values)),
+        whole=(values.shape[0], values.shape[1]),
         record=_file_record(source) | {"read_as": ground_truth.source},
         notes=(f"gt: {described}",),
         scale=ground_truth.scale,

@@ -72,6 +72,10 @@ class FrameFiles:
     """Which points are used where `sparse` is a COLMAP model."""
     scan: ScanOptions = field(default_factory=ScanOptions)
     """How `sparse` is projected where it is a LiDAR scan."""
+    gt_masks: tuple[Path, ...] = ()
+    """Where one of these is 0, the ground truth is unknown."""
+    gt_size_ok: bool = False
+    """Accept ground truth of another size; its known pixels are moved to the image."""
     sample: SamplePattern | None = None
     """Which pixels of the ground truth serve as sparse depth."""
     protocol: Protocol = field(default_factory=_whole_frame)
@@ -285,7 +289,7 @@ class OutputOptions:
     overwrite: bool = option(False, "Replace existing results.")
 
 
-_PLACES = {"image", "sparse", "gt", "model", "checkpoint", "output", "overwrite"}
+_PLACES = {"image", "sparse", "gt", "gt_masks", "model", "checkpoint", "output", "overwrite"}
 """Fields that say where something lies. A cache key has digests of what lies there instead."""
 
 
