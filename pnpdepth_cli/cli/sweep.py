@@ -108,7 +108,8 @@ def sweep(
                 noise of the points, as in `pnpdepth sample`
     rotation-noise
                 rotation of a LiDAR, degrees
-    iterations, layer, lr, loss, update, schedule, blur, parameters, proximity, align, propagate
+    iterations, layer, lr, loss, update, schedule, blur, parameters, proximity, align, propagate,
+    target, mask, mask-scale, mask-fraction
                 the options of the same names
     preset, model
                 presets of the method; networks, as NETWORK or NETWORK@WEIGHTS

@@ -190,7 +190,7 @@ def _method_parameters() -> Iterator[tuple[str, Parameter]]:
             continue
         value = _VALUES[each.type] if names is None else _one_of(tuple(names))
         yield (
-            each.name,
+            each.name.replace("_", "-"),
             Parameter(
                 title=axis.title,
                 of_percent=axis.title_percent,

@@ -114,7 +114,7 @@ class Plan:
     def setup(self, cell: Cell) -> Setup:
         """Returns what the cell is. Raises UsageError if its parameters contradict each other."""
         of_update = {
-            name: read_value(name, text)
+            name.replace("-", "_"): read_value(name, text)
             for name, text in cell.items()
             if not PARAMETERS[name].of_points and name not in _NOT_OF_UPDATE
         }
