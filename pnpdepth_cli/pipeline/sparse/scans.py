@@ -28,6 +28,9 @@ from pnpdepth_cli.sensors import (
 _MORE_IF_INVERTED = 3.0
 """Times as many points in the image with inverted extrinsics that give a warning."""
 
+_THIN = 0.5
+"""Largest variance of a scan's rays along its thin direction, as a fraction of the next."""
+
 _NEXT_TO_NONE = 0.05
 """Fraction of them; fewer points with the extrinsics themselves are an error."""
 
@@ -130,7 +133,10 @@ def with_extrinsics(calibration: Calibration, options: ScanOptions) -> Calibrati
 
 
 def check_direction(scan: NDArray[np.floating], camera: Camera, size: tuple[int, int]) -> list[str]:
-    """Returns a warning if the inverse of the scanner's pose puts far more points into the image.
+    """Returns a warning if the inverse of the scanner's pose fits the image better.
+
+    That is: it puts far more points into the image, or more points and the camera upright in the
+    scan, which is flatter than it is wide.
 
     Args:
         scan: (N, 3) metres in the scanner's frame.
@@ -143,7 +149,9 @@ def check_direction(scan: NDArray[np.floating], camera: Camera, size: tuple[int,
     rotation, translation = inverse((camera.rotation, camera.translation))
     turned = replace(camera, rotation=rotation, translation=translation)
     inside, inverted = (_count_inside(scan, each, size) for each in (camera, turned))
-    if inverted < _MORE_IF_INVERTED * max(inside, 1):
+    upright, upright_inverted = _is_upright(scan, camera), _is_upright(scan, turned)
+    far_more = inverted >= _MORE_IF_INVERTED * max(inside, 1) and upright is not True
+    if not far_more and not (inverted > inside and upright is False and upright_inverted):
         return []
     text = (
         f"the extrinsics put {inside:,} of {len(scan):,} scan points into the image, their inverse"
@@ -152,6 +160,15 @@ def check_direction(scan: NDArray[np.floating], camera: Camera, size: tuple[int,
     if inside < _NEXT_TO_NONE * inverted:
         raise UsageError(text)
     return [f"warning: {text}"]
+
+
+def _is_upright(scan: NDArray[np.floating], camera: Camera) -> bool | None:
+    """Whether the thin direction of the scan is the camera's y; None for a scan without one."""
+    rays = scan / np.maximum(np.linalg.norm(scan, axis=1, keepdims=True), 1e-9)
+    variances, axes = np.linalg.eigh(rays.T @ rays / len(rays))
+    if variances[0] > _THIN * variances[1]:
+        return None
+    return bool(np.argmax(np.abs(camera.rotation @ axes[:, 0])) == 1)
 
 
 def _count_inside(scan: NDArray[np.floating], camera: Camera, size: tuple[int, int]) -> int:

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from pnpdepth_cli.errors import UsageError
+from pnpdepth_cli.io.calibration import read_calibration
+from pnpdepth_cli.io.extrinsics import inverse
+from pnpdepth_cli.io.scans import read_scan
 from pnpdepth_cli.pipeline.sparse.scan_options import ScanOptions
-from pnpdepth_cli.pipeline.sparse.scans import read_scan_points
+from pnpdepth_cli.pipeline.sparse.scans import camera_of, check_direction, read_scan_points
 from tests.pipeline.scan_frames import CALIBRATION, HEIGHT, WIDTH, ScanOnDisk, scan_on_disk
 
 TURN = np.array([[0, -1, 0], [0, 0, -1], [1, 0, 0]])
@@ -56,3 +60,17 @@ def test_a_fisheye_lens_of_a_plain_calibration_is_applied(scene: ScanOnDisk) -> 
         points = read_scan_points(scene.scan, options, (HEIGHT, WIDTH)).points
         moved.append(points.xy[:5])
     assert np.abs(moved[0] - moved[1]).max() > 0.01
+
+
+def test_the_wrong_direction_of_a_real_scan_is_recognised(shared_data: Path) -> None:
+    folder = shared_data / "kitti_object"
+    for path in sorted((folder / "calib").glob("*.txt")):
+        scan = read_scan(folder / "velodyne" / f"{path.stem}.bin").points
+        right = camera_of(read_calibration(path))
+        turn, shift = inverse((right.rotation, right.translation))
+        wrong = replace(right, rotation=turn, translation=shift)
+        portrait = replace(right, intrinsics=np.array([[700.0, 0, 180], [0, 700, 600], [0, 0, 1]]))
+        assert check_direction(scan, right, (375, 1242)) == []
+        assert check_direction(scan, portrait, (1242, 375)) == []
+        (warning,) = check_direction(scan, wrong, (375, 1242))
+        assert "if they map the camera to the scanner, add --inverse-extrinsics" in warning
