@@ -202,6 +202,7 @@ definitions = {
         input_kind="rgb+sparse",
         size=Multiple(32, longest=1280),
         static_graph=True,
+        image_encoder="encoder",
         normalisation=Normalisation(mean=IMAGENET_MEAN, std=IMAGENET_STD),
         output_kind="depth",
         layers=("decoder.s32", "decoder.s16", "decoder.s8", "decoder.s4", "decoder.s2"),

@@ -82,7 +82,7 @@ def test_the_layout_of_the_page_lists_frames(package: Path) -> None:
 def test_with_auto_a_propagation_and_a_baseline_of_another_package_compete(package: Path) -> None:
     files = ["indoor/rgb.png", "--sparse", "indoor/sparse.png"]
     network = ["--model", "my-net", "--checkpoint", "my_net.safetensors", "--iterations", "2"]
-    output = ["--auto", "-o", "auto.npy", "--json"]
+    output = ["--auto", "--time-budget", "60s", "-o", "auto.npy", "--json"]
     record = json.loads(run(["refine", *files, *network, *output], package))
     tried = record["auto"]["tried"]
     assert "median" in {each.get("propagate") for each in tried}

@@ -13,8 +13,11 @@ from dataclasses import dataclass, replace
 from pnpdepth_cli.core.refine import RefineSettings
 from pnpdepth_cli.models.definition import ModelDefinition
 
-ITERATIONS = (1, 2, 3, 5, 10, 20)
+ITERATIONS = (5, 10)
 """Numbers of updates of z that compete, besides a configuration's own."""
+WEIGHT_WITH_POINTS = 3.0
+"""Weight in the fusion of a network that takes the points, against 1 of one that does not. On even
+frames of ICL-NUIM, 7-Scenes and KITTI 1 : 3 was better than 1 : 1 in the mean."""
 FUSED_ITERATIONS = 5
 """Updates of z before propagation. More fit what propagation fits anyway."""
 
@@ -29,6 +32,8 @@ class RefinementConfig:
     """Layer to cut at."""
     settings: RefineSettings
     """How z is updated, `settings.iterations` times at most."""
+    weight: float = 1.0
+    """Weight of the network in the fusion of all."""
 
     def __str__(self) -> str:
         s = self.settings
@@ -135,7 +140,9 @@ def default_config(
     align = settings.align
     if align == "none" and definition.input_kind == "rgb":
         align = "auto"
-    return RefinementConfig(network=network, layer=layer, settings=replace(settings, align=align))
+    weight = 1.0 if definition.input_kind == "rgb" else WEIGHT_WITH_POINTS
+    settings = replace(settings, align=align)
+    return RefinementConfig(network=network, layer=layer, settings=settings, weight=weight)
 
 
 def more_configs(definition: ModelDefinition, first: RefinementConfig) -> list[RefinementConfig]:

@@ -7,7 +7,7 @@ another one is better beyond chance. What is taken is never worse than any basel
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 
@@ -133,7 +133,7 @@ class Competition:
     @property
     def fusion(self) -> Candidate:
         """All networks fused; it also continues baselines outside the hull of the points."""
-        return fusion(self.members, [1.0] * len(self.members), self._propagate)
+        return fusion(self.members, [each.weight for each in self.configs], self._propagate)
 
     @property
     def members(self) -> list[Candidate]:
@@ -146,7 +146,7 @@ class Competition:
     def candidates(self) -> Iterator[Candidate]:
         """Yields the candidates of the networks that compete, besides refinements alone."""
         for config, member in zip(self.configs, self.members, strict=True):
-            yield Candidate(config=config, propagate=self._propagate)
+            yield Candidate(config=config)
             yield replace(member, propagate=self._propagate)
         for pair in combinations(self.members[:FUSED_NETWORKS], 2):
             for weight in (*FUSION_WEIGHTS, 0.5):
@@ -185,18 +185,14 @@ def choose(folds: Sequence[Fold], competition: Competition) -> Choice:
 
 
 def _score_all(board: _Scoreboard, competition: Competition) -> None:
-    """Scores all candidates; refinements that are left out without the time only while it lasts."""
+    """Scores the candidates, and further refinements, while the deadline allows."""
+    board.deadline = competition.deadline
     board.score(competition.candidates())
-    longest = 0.0
     for config in competition.more_configs:
-        start = time.monotonic()
-        if competition.deadline is None or start + longest > competition.deadline:
-            break
-        seconds = (competition.deadline - start) / (len(board.folds) + 1)
-        board.score(_updates(config.within(seconds)))
-        longest = max(longest, time.monotonic() - start)
-    of_networks = [each for config in competition.configs for each in _updates(config)]
-    board.score(of_networks)
+        left_s = (competition.deadline or 0.0) - time.monotonic()
+        if left_s > 0:
+            board.score(_updates(config.within(left_s / (len(board.folds) + 1))))
+    board.score(each for config in competition.configs for each in _updates(config))
     errors = board.errors()
     starts = [each for each in errors if each.config is not None and each.propagate == "none"]
     if starts:
@@ -219,20 +215,29 @@ class _Scoreboard:
         # Without any weight the network sees nothing at these points.
         self.weights = weights if bool(weights.any()) else torch.ones_like(weights)
         self.predicted: dict[Candidate, Tensor] = {}
+        self.deadline: float | None = None
+        self._longest = 0.0  # seconds that a candidate took, refined with all sets of points
 
-    def score(self, candidates: Iterator[Candidate] | Sequence[Candidate]) -> None:
-        """Adds candidates; those that fail on this frame do not compete."""
+    def score(self, candidates: Iterable[Candidate]) -> None:
+        """Adds candidates; those that fail on this frame or have no time left do not compete."""
         for candidate in candidates:
             if candidate in self.predicted:
                 continue
-            try:
-                self.predicted[candidate] = torch.cat([fold.at(candidate) for fold in self.folds])
-            except ModelError:
-                # No line fits points that are all equally far: such a baseline does not compete.
-                continue
-            except PnpDepthError:
-                if candidate.baseline is not None:
-                    raise
+            start = time.monotonic()
+            if self.deadline is not None and start + self._longest > self.deadline:
+                return
+            self._add(candidate)
+            self._longest = max(self._longest, time.monotonic() - start)
+
+    def _add(self, candidate: Candidate) -> None:
+        try:
+            self.predicted[candidate] = torch.cat([fold.at(candidate) for fold in self.folds])
+        except ModelError:
+            # No line fits points that are all equally far: such a baseline does not compete.
+            return
+        except PnpDepthError:
+            if candidate.baseline is not None:
+                raise
 
     def errors(self) -> dict[Candidate, float]:
         """Returns the error in metres of every candidate that competes."""

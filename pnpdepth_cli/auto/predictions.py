@@ -7,8 +7,8 @@ is computed when a candidate first needs it.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from contextlib import ExitStack
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -17,15 +17,17 @@ from torch import Tensor
 
 from pnpdepth_cli.auto.blending import weighted_mean
 from pnpdepth_cli.auto.candidates import Candidate, RefinementConfig
-from pnpdepth_cli.choices import BASELINES
+from pnpdepth_cli.choices import BASELINES, LOSSES
 from pnpdepth_cli.completion.interpolation import in_hull
 from pnpdepth_cli.completion.propagation import propagate, propagate_at
-from pnpdepth_cli.core.refine import refine_from
+from pnpdepth_cli.core.refine import Refinement, refine_from
 from pnpdepth_cli.core.split import InputSplit, Split
+from pnpdepth_cli.core.split.user_code import wrap_user_errors
 from pnpdepth_cli.errors import PnpDepthError
 from pnpdepth_cli.frames.frame import Frame, RefinedFrame
 from pnpdepth_cli.frames.prepare import PreparedFrame, prepare
 from pnpdepth_cli.frames.refine import refine_frame_weights, to_refined_frame
+from pnpdepth_cli.models.aligned import AlignedDepth
 from pnpdepth_cli.models.network import Network, out_of_memory_is_a_device_error
 from pnpdepth_cli.points import SparsePoints
 
@@ -114,7 +116,9 @@ class FramePasses:
 
     def __init__(self, opened: OpenNetworks, frame: Frame) -> None:
         self._opened, self._frame = opened, frame
-        self._z0: dict[tuple[str, str], Tensor] = {}
+        self._z0: dict[str, tuple[str, Tensor]] = {}  # layer and z_0 by network
+        self._outputs: dict[str, Any] = {}  # of networks that take only the image
+        self._encoded: dict[str, Any] = {}  # what encoders of the image returned, by network
 
     def trajectory(self, config: RefinementConfig, points: SparsePoints) -> Trajectory:
         """Returns the refinement of the frame with these points.
@@ -127,38 +131,90 @@ class FramePasses:
             prepared = prepare(network, self._frame.with_points(points))
             if not len(prepared.points):
                 raise prepared.no_points_error()
-            split = self._opened.split(config)
-            if config.settings.moves_weights:
-                return _of_weights(split, prepared, config)
-            key = (config.network, config.layer)
-            z0 = self._z0.get(key)
-            if z0 is None:
-                with torch.no_grad():
-                    z0 = split.front(*prepared.arguments)
-                if network.definition.input_kind == "rgb":
-                    # the cut holds the outputs of one layer's front at a time
-                    self._z0 = {k: z for k, z in self._z0.items() if k[0] != key[0]} | {key: z0}
-            refined = _trajectory(split, z0, prepared, config)
+            reader = prepared.depth_reader(config.settings)
+            result: Refinement | PnpDepthError
+            if not config.settings.iterations:
+                result = self._plain(config, prepared, reader)
+            elif config.settings.moves_weights:
+                self._z0.pop(config.network, None)
+                return _of_weights(self._opened.split(config), prepared, config)
+            else:
+                result = self._refined(config, prepared, reader)
+            refined = to_refined_frame(prepared, reader, result)
         if isinstance(refined, PnpDepthError):
             raise refined
-        return refined
+        return _trajectory(prepared, refined)
+
+    def _refined(
+        self, config: RefinementConfig, prepared: PreparedFrame, reader: AlignedDepth
+    ) -> Refinement | PnpDepthError:
+        split = self._opened.split(config)
+        layer, z0 = self._z0.pop(config.network, (None, None))
+        if z0 is None or layer != config.layer:
+            with torch.no_grad():
+                z0 = split.front(*prepared.arguments)
+        if prepared.network.definition.input_kind == "rgb":
+            # the cut keeps what the front of its last layer gave
+            self._z0[config.network] = config.layer, z0
+        (result,) = refine_from(
+            split,
+            z0,
+            (prepared.points,),
+            config.settings,
+            depth_of=(reader,),
+            keep_depths={0, *config.competing_iterations},
+        )
+        return result
+
+    def _plain(
+        self, config: RefinementConfig, prepared: PreparedFrame, reader: AlignedDepth
+    ) -> Refinement:
+        """The same without updates: a pass of the whole network, which need not be cut."""
+        definition, name = prepared.network.definition, config.network
+        output = self._outputs.get(name)
+        if output is None:
+            with (
+                torch.no_grad(),
+                self._encoder_runs_once(prepared.network, name),
+                wrap_user_errors("the network's forward"),
+            ):
+                output = prepared.network.module(*prepared.arguments)
+        if definition.input_kind == "rgb":
+            self._outputs[name] = output
+        depth = reader(output).detach()
+        loss: Tensor = LOSSES[config.settings.loss](
+            prepared.points.sample(depth), prepared.points.depth
+        )
+        return Refinement(
+            before=depth, after=depth, losses=(float(loss),), step=0.0, kept=0, depths={0: depth}
+        )
+
+    @contextmanager
+    def _encoder_runs_once(self, network: Network, name: str) -> Iterator[None]:
+        """Inside, the encoder of the image gives what it gave for this image before."""
+        if network.definition.image_encoder is None:
+            yield
+            return
+        encoder = network.module.get_submodule(network.definition.image_encoder)
+        run, own = encoder.forward, encoder.__dict__.get("forward")
+
+        def forward(*inputs: Any, **options: Any) -> Any:
+            if name not in self._encoded:
+                self._encoded[name] = run(*inputs, **options)
+            return self._encoded[name]
+
+        encoder.__dict__["forward"] = forward
+        try:
+            yield
+        finally:
+            if own is None:
+                del encoder.__dict__["forward"]
+            else:
+                encoder.__dict__["forward"] = own
 
 
-def _trajectory(
-    split: Split, z0: Tensor, prepared: PreparedFrame, config: RefinementConfig
-) -> Trajectory | PnpDepthError:
-    reader = prepared.depth_reader(config.settings)
-    (result,) = refine_from(
-        split,
-        z0,
-        (prepared.points,),
-        config.settings,
-        depth_of=(reader,),
-        keep_depths={0, *config.competing_iterations},
-    )
-    refined = to_refined_frame(prepared, reader, result)
-    if isinstance(refined, PnpDepthError):
-        return refined
+def _trajectory(prepared: PreparedFrame, refined: RefinedFrame) -> Trajectory:
+    """The refined frame with the depths on its way in the image frame."""
     depths = {
         updates: torch.from_numpy(prepared.to_image(depth))
         for updates, depth in refined.refinement.depths.items()
@@ -215,6 +271,11 @@ class CandidateDepths:
         return known
 
     @property
+    def points(self) -> SparsePoints:
+        """The points that candidates may use."""
+        return self._frame.points
+
+    @property
     def prediction(self) -> Tensor:
         """(H, W) metres of the reference network, aligned with the points."""
         return self.trajectory(self._reference).after(0)
@@ -246,16 +307,6 @@ class CandidateDepths:
             return queries.sample(self._start(candidate))
         depth: Tensor = BASELINES[name].at(xy, frame.points, self._prediction_for(name))
         return depth
-
-    def relative_sigma(self) -> Tensor:
-        """Returns the uncalibrated standard deviation (H, W) of log depth.
-
-        It is that of the network's residual: a candidate that goes through the points leaves none.
-        """
-        frame = self._frame
-        result = propagate(self.prediction, frame.points, frame.rgb, sigma=True)
-        assert result.sigma is not None
-        return torch.where(result.depth > 0, result.sigma / result.depth, 0.0)
 
     def _start(self, candidate: Candidate) -> Tensor:
         """(H, W): the candidate's depth before propagation."""

@@ -51,7 +51,7 @@ def refine(as_json: bool, **given: Any) -> None:
 
     \b
     pnpdepth refine img.png --sparse s.png
-    pnpdepth refine img.png --sparse s.exr --gt gt.png --auto -o out/
+    pnpdepth refine img.png --sparse s.exr --gt gt.png -o out/
     pnpdepth refine img.png --sparse s.npy --model net.onnx --layer Relu_315
     pnpdepth refine 000001.png --sparse 000001.bin --calib 000001.txt
 

@@ -57,6 +57,9 @@ _NEIGHBOURHOODS = 24  # in which the length scales are tried, when there are man
 _INNER = 16  # and points of each that are left out: the middle ones
 _IN_BLOCK = 3  # a block contains at most 1/3 of the points that predict it,
 _MIN_BLOCK = 8  # pixels, a block's side
+_WORTH_A_GRID = 1 << 16  # pixels; for fewer, every pixel is predicted
+_NODES_BETWEEN = 6  # nodes of the grid between two points,
+_MAX_STEP = 4  # and most pixels between two nodes: on real frames as good as every pixel
 _CROWDED = 0.05  # except for this fraction of all points
 _MIN_SCORED_WEIGHT = 1e-6  # the weight of a point that predicts nothing
 _WITHIN = 0.68  # fraction within ± one standard deviation
@@ -148,7 +151,33 @@ def neighbourhoods(field: ResidualField, max_exact: int) -> Tensor:
 
 
 def _predict(field: ResidualField, *, sigma: bool) -> Tensor:
-    """(1 or 2, H, W): mean and, if wanted, variance in units of the scale."""
+    """(1 or 2, H, W): mean and, if wanted, variance in units of the scale.
+
+    The residual is smooth where the prediction is not, so that it is predicted on a coarser grid.
+    """
+    size = field.points.size
+    step = _step(field.points)
+    if step == 1:
+        return _predict_grid(field, sigma=sigma)
+    coarse = (max(1, round(size[0] / step)), max(1, round(size[1] / step)))
+    features = F.interpolate(field.features.permute(2, 0, 1)[None], coarse, mode="area")
+    grid = replace(
+        field, features=features[0].permute(1, 2, 0), points=field.points.resized(*coarse)
+    )
+    values = _predict_grid(grid, sigma=sigma)[None]
+    return F.interpolate(values, size, mode="bilinear", align_corners=False)[0]
+
+
+def _step(points: SparsePoints) -> int:
+    """Pixels between the nodes of the grid on which the residual is predicted."""
+    if points.size[0] * points.size[1] < _WORTH_A_GRID:
+        return 1
+    spacing = math.sqrt(points.size[0] * points.size[1] / len(points))
+    return min(_MAX_STEP, max(1, int(spacing / _NODES_BETWEEN)))
+
+
+def _predict_grid(field: ResidualField, *, sigma: bool) -> Tensor:
+    """The same, predicted at every pixel of the field's features."""
     height, width = field.points.size
     if _is_exact(field):
         queries = field.features.reshape(1, height * width, -1)

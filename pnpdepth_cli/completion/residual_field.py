@@ -6,6 +6,7 @@ pixel from the points, by features of the pixels: position, predicted depth and 
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass, replace
 
 import torch
@@ -108,10 +109,19 @@ def features_of(log_depth: Tensor, rgb: Tensor | None) -> Tensor:
     u = (log_depth - known.mean()) / (known.std(correction=0) + _FLAT_DEPTH)
     maps = [position, u.nan_to_num(0.0)[..., None]]
     if rgb is not None:
-        lab = cielab(rgb)
-        lab = lab - lab.mean(dim=(0, 1))
-        maps.append(lab / (lab.square().sum(dim=-1).mean().sqrt() + _FLAT_COLOUR))
+        maps.append(_colour(rgb))
     return torch.cat(maps, dim=-1).float()
+
+
+@functools.lru_cache(maxsize=1)
+def _colour(rgb: Tensor) -> Tensor:
+    """CIELAB (H, W, 3), its mean 0 and its standard deviation over the image about 1.
+
+    Remembered for the last image, whose residuals are propagated several times.
+    """
+    lab = cielab(rgb)
+    lab = lab - lab.mean(dim=(0, 1))
+    return lab / (lab.square().sum(dim=-1).mean().sqrt() + _FLAT_COLOUR)
 
 
 def cielab(rgb: Tensor) -> Tensor:

@@ -237,6 +237,9 @@ class ModelDefinition:
     complete: bool = False
     """True if `build` returns the network with its weights; `checkpoint` then only says where they
     are."""
+    image_encoder: str | None = None
+    """Name of a submodule whose output depends on the image alone. It runs once for several sets of
+    points of one image."""
     static_graph: bool = False
     """True if the network runs the same submodules in the same order for all images of one size,
     even where values of tensors reach Python code. Then the cut is learned only once."""
@@ -276,6 +279,8 @@ class ModelDefinition:
         validity.names(self, "layers")
         for settings in ("defaults", "masked"):
             validity.instance(self, settings, RefineDefaults, "RefineDefaults(…)")
+        if self.image_encoder is not None:
+            validity.instance(self, "image_encoder", str, "the name of a submodule")
         if self.checkpoint is not None:
             validity.instance(self, "checkpoint", Path, "a pathlib.Path")
         for hook in ("read_checkpoint", "arguments", "output", "verify"):

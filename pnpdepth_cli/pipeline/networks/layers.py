@@ -17,6 +17,7 @@ from pnpdepth_cli.models.rank_layers import (
     measure_layers,
     point_spacing,
     rank_layers,
+    wanted_field,
 )
 from pnpdepth_cli.models.synthetic_frame import synthetic_frame
 from pnpdepth_cli.pipeline.refinement.request import NetworkChoice
@@ -76,7 +77,14 @@ def list_layers(
         rgb, synthetic_points = synthetic_frame(size or own)
         prepared = prepare(network, Frame(rgb=rgb[0], points=synthetic_points))
         rows = measure_layers(network, names, prepared.arguments, prepared.map.network, on_layer)
-    spacing = point_spacing(prepared.map.network, count) if count else None
-    return LayerList(
-        rows=rank_layers(rows, spacing) if spacing else rows, spacing=spacing, notes=network.notes
-    )
+    spacing, notes = None, network.notes
+    if count:
+        spacing = point_spacing(prepared.map.network, count)
+        rows = rank_layers(rows, wanted_field(prepared.map.network, spacing))
+        if network.definition.defaults.layer is not None:
+            notes = (
+                *notes,
+                f"layers: {network.definition.name!r} is cut at {network.definition.defaults.layer}"
+                " by default, as its definition says",
+            )
+    return LayerList(rows=rows, spacing=spacing, notes=notes)

@@ -75,7 +75,7 @@ def competition_of(
     return Competition(
         configs=tuple(configs),
         more_configs=tuple(more),
-        propagations=_competing_propagations(options.propagate),
+        propagations=_competing_propagations(options.propagate, timed=timed),
     )
 
 
@@ -120,8 +120,13 @@ def refine_with_folds(
     if hold_out.baselines:
         refined = replace(refined, baselines=baseline_scores(result, gt))
     if hold_out.uncertainty:
-        sigma, note = uncertainty(result, refined.after)
-        refined = replace(refined, sigma=sigma, notes=(*refined.notes, note))
+        estimate = uncertainty(result, refined.after)
+        refined = replace(
+            refined,
+            sigma=estimate.sigma,
+            valid=estimate.valid,
+            notes=(*refined.notes, estimate.note),
+        )
     return refined
 
 
@@ -149,10 +154,10 @@ def best_candidates(
     return tuple(best)
 
 
-def _competing_propagations(asked: str | None) -> tuple[str, ...]:
-    """The propagation that was asked for, or all."""
+def _competing_propagations(asked: str | None, *, timed: bool) -> tuple[str, ...]:
+    """The propagation that was asked for, or all; without a time budget the fast ones."""
     if asked is None:
-        return tuple(PROPAGATIONS)
+        return tuple(name for name in PROPAGATIONS if timed or PROPAGATIONS[name].at is not None)
     return () if asked == "none" else (asked,)
 
 

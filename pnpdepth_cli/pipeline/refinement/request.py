@@ -264,7 +264,9 @@ class HoldOut:
         parse=parse_seconds,
     )
     baselines: bool = option(False, "Also score every baseline, such as linear interpolation.")
-    uncertainty: bool = option(False, "Write <name>_sigma.exr, the depth's standard deviation.")
+    uncertainty: bool = option(
+        False, "Write the depth's standard deviation and a mask of valid depth."
+    )
     holdout: float = option(0.0, "Hold out this fraction of the points to score at.", metavar="F")
     seed: int = option(
         0, "Random seed.", metavar="N", least=0, most=LARGEST_SEED, show_default=True
