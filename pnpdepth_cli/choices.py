@@ -205,7 +205,7 @@ LAYOUTS = Table(
     first=(
         *("manifest", "nyu-mat", "kitti-odometry", "kitti-object", "kitti-depth", "kitti-raw"),
         *("tum", "7scenes", "synthia", "colmap", "void", "diode", "ibims", "scannet"),
-        *("arkitscenes", "hypersim", "pairs", "nyu-h5"),
+        *("arkitscenes", "hypersim", "nuscenes", "pairs", "nyu-h5"),
     ),
 )
 """Data set layouts, in the order in which they are guessed: `pnpdepth_cli.io.layouts.Layout`."""
