@@ -219,15 +219,16 @@ def _read_sparse(
 
 def _sampled_again(pair: FramePair, sampling: dict[str, Any], ground_truth: Depth) -> Depth:
     """(H, W) the points that a run sampled from this ground truth, drawn again by its record."""
-    pattern = {each.name: sampling.get(each.name) for each in fields(SamplePattern)}
+    pattern: dict[str, Any] = {each.name: sampling.get(each.name) for each in fields(SamplePattern)}
     image = None
     if isinstance(pair.image, Path):
         rgb = read_rgb(pair.image).values
         rgb = rgb if rgb.shape[:2] == ground_truth.shape else pair.frame.protocol.apply(rgb)
         image = rgb if rgb.shape[:2] == ground_truth.shape else None
     try:
-        region = pattern["region"] and tuple(pattern["region"])
-        drawn = SamplePattern(**{**pattern, "region": region})
+        if pattern["region"] is not None:
+            pattern["region"] = tuple(pattern["region"])
+        drawn = SamplePattern(**pattern)
         points = sample_points(ground_truth, drawn, int(sampling["seed"]), image=image)
     except (KeyError, TypeError, ValueError, UsageError) as error:
         raise InputError(
