@@ -379,7 +379,9 @@ def test_the_record_beside_a_prediction_is_enough_to_find_the_leak(two: Path) ->
     sampled = {"inputs": {"sparse": {"sampled_from": "gt"}}, "points": {"used": 2}}
     (two / "out" / "a.json").write_text(json.dumps(sampled))
     assert scored(two).frames[0].leaked == 2
-    with pytest.raises(InputError, match="no sparse depth file to exclude; give it with --sparse"):
+    with pytest.raises(
+        InputError, match=r"cannot be sampled again as its record says .*; give them with --sparse"
+    ):
         scored(two, exclude_sparse=True)
 
 
