@@ -153,7 +153,7 @@ def measure(
         depths[INLIERS_ONLY] = torch.from_numpy(inliers_only.frame.after)
     within = {}
     if with_sigma:
-        sigma, _ = uncertainty(auto, auto.frame.after)
+        sigma = uncertainty(auto, auto.frame.after).sigma
         known = (frame.gt > 0) & (auto.frame.after > 0)
         inside = np.abs(frame.gt - auto.frame.after)[known] <= sigma[known]
         within = {"within_sigma": float(inside.mean())}

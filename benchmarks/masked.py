@@ -24,7 +24,9 @@ from pnpdepth_cli.frames.refine import refine_frame, with_propagation
 from pnpdepth_cli.models.network import Network, load_network
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs
 from pnpdepth_cli.pipeline.refinement.request import HoldOut, MethodOptions
-from pnpdepth_cli.pipeline.refinement.resolve import resolve_layer, resolve_settings
+from pnpdepth_cli.pipeline.refinement.resolve import is_dense, resolve_layer, resolve_settings
+from pnpdepth_cli.points import SparsePoints
+from pnpdepth_cli.sensors import occluded_in_map
 
 _WRONG_FACTORS = (0.3, 3.0)
 """Range of the factor on the depth of wrong points."""
@@ -57,6 +59,10 @@ def inputs_of(
         factors = np.exp(rng.uniform(*np.log(_WRONG_FACTORS), len(depth)))
         depth = np.where(bad, depth * factors, depth).astype(np.float32)
         points = points_on_grid(rows, columns, depth, frame.gt.shape)
+        if count is None:  # as the program does with a projected scan
+            xy, depth = points.xy.numpy(), points.depth.numpy()
+            occluded = occluded_in_map(SparsePoints(xy=xy, depth=depth, size=points.size))
+            points = points if occluded is None else points.select(torch.from_numpy(~occluded))
         yield frame_inputs(frame.rgb, points, frame.gt)
 
 
@@ -64,7 +70,9 @@ def measured(network: Network, method: MethodOptions, inputs: Inputs, seed: int)
     """Returns the plain prediction's row and that of the refinement."""
     assert inputs.gt is not None
     gt, definition = torch.from_numpy(inputs.gt), network.definition
-    settings = resolve_settings(definition, method, HoldOut(seed=seed))
+    settings = resolve_settings(
+        definition, method, HoldOut(seed=seed), dense=is_dense(inputs.points)
+    )
     layer = resolve_layer(definition, method.layer)
     start = time.process_time()
     with network.cut_at_points() if settings.masked else network.cut_at(layer) as split:

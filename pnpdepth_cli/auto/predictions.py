@@ -271,6 +271,11 @@ class CandidateDepths:
         return known
 
     @property
+    def points(self) -> SparsePoints:
+        """The points that candidates may use."""
+        return self._frame.points
+
+    @property
     def prediction(self) -> Tensor:
         """(H, W) metres of the reference network, aligned with the points."""
         return self.trajectory(self._reference).after(0)
@@ -302,16 +307,6 @@ class CandidateDepths:
             return queries.sample(self._start(candidate))
         depth: Tensor = BASELINES[name].at(xy, frame.points, self._prediction_for(name))
         return depth
-
-    def relative_sigma(self) -> Tensor:
-        """Returns the uncalibrated standard deviation (H, W) of log depth.
-
-        It is that of the network's residual: a candidate that goes through the points leaves none.
-        """
-        frame = self._frame
-        result = propagate(self.prediction, frame.points, frame.rgb, sigma=True)
-        assert result.sigma is not None
-        return torch.where(result.depth > 0, result.sigma / result.depth, 0.0)
 
     def _start(self, candidate: Candidate) -> Tensor:
         """(H, W): the candidate's depth before propagation."""

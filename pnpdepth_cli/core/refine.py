@@ -17,8 +17,8 @@ random m_k at every step, and moves the weights θ instead of z:
     θ_{k+1} = θ_k − α·U(∂L(f_θ(x, D_s ∖ m_k), m_k) / ∂θ_k)
     depth   = f_θ*(x, D_s)
 
-θ* is the θ_k that is best at points never shown; k = 0 is among them. With target "given" nothing
-is hidden, and L is taken at all points, as in equation 3.
+θ* is the last θ_k, unless another is better beyond chance at points never shown; k = 0 is among
+them. With target "given" nothing is hidden, and L is taken at all points, as in equation 3.
 """
 
 from __future__ import annotations

@@ -25,7 +25,7 @@ MIN_POINTS = 30
 CHECKS = 3
 """How often the points set aside are looked at, besides before the first step."""
 PATIENCE = 2
-"""The steps end after so many checks in a row that are worse than the best."""
+"""The steps end after so many checks in a row that are worse than the best beyond chance."""
 
 Predict = Callable[[SparsePoints], Any]
 """Returns what the network returns for a frame when it is given these of its points."""
@@ -71,8 +71,8 @@ class WeightsRefinement:
         self._masks = Masks(self._shown, settings.mask, generator)
         self._rules: list[Update] = []
         self._steps: list[float] = []
-        self._checks: dict[int, float] = {}
-        self._best = list(weights.theta), 0
+        self._errors: dict[int, float] = {}
+        self._checked: dict[int, list[Tensor]] = {0: list(weights.theta)}
         self._started = time.monotonic()
         self._before = torch.empty(0)
         self.losses: list[float] = []
@@ -131,7 +131,8 @@ class WeightsRefinement:
 
     def result(self) -> Refinement:
         """Returns the refinement with the best weights, given all points."""
-        self._weights.theta, kept = self._best
+        kept = self._kept()
+        self._weights.theta = self._checked[kept]
         return Refinement(
             before=self._before,
             after=self._predicted(self._frame.points) if kept else self._before,
@@ -141,23 +142,39 @@ class WeightsRefinement:
         )
 
     def _check(self, made: int) -> None:
-        """Notes the loss at the points set aside; without any, the last weights are the best."""
-        if not len(self._aside):
-            self._best = list(self._weights.theta), made
-            return
-        at_points = self._aside.sample(self._predicted(self._shown))
-        loss = float(self._loss(at_points, self._aside.depth))
-        if made == 0 or loss < min(self._checks.values()):
-            self._best = list(self._weights.theta), made
-        self._checks[made] = loss
+        """Notes the loss at the points set aside; without any, that the last weights count."""
+        self._checked[made] = list(self._weights.theta)
+        if len(self._aside):
+            at_points = self._aside.sample(self._predicted(self._shown))
+            self._errors[made] = float(self._loss(at_points, self._aside.depth))
+
+    def _kept(self) -> int:
+        """The step that counts: the last, unless another is better beyond chance."""
+        last = max(self._checked)
+        if not self._errors:
+            return last
+        best = min(self._errors, key=lambda made: self._errors[made])
+        return best if self._beyond_chance(best, last) else last
+
+    def _beyond_chance(self, better: int, worse: int) -> bool:
+        """Whether one check is better than another by more than a mean over so few points varies.
+
+        A mean of m absolute errors varies by about 1/√m of itself; two checks at the same points
+        share much of that, so that half of it counts. A check that is not finite is always worse.
+        """
+        margin = 1 - 0.5 * len(self._aside) ** -0.5
+        return not self._errors[better] >= margin * self._errors[worse]
 
     def _predicted(self, points: SparsePoints) -> Tensor:
         with torch.no_grad(), self._weights.in_place():
             return self._frame.depth_of(self._frame.predict(points)).detach()
 
     def _getting_worse(self) -> bool:
-        later = sum(made > self._best[1] for made in self._checks)
-        return later >= PATIENCE
+        if not self._errors:
+            return False
+        best = min(self._errors, key=lambda made: self._errors[made])
+        later = [made for made in self._errors if made > best]
+        return sum(self._beyond_chance(best, made) for made in later) >= PATIENCE
 
     def _out_of_time(self) -> bool:
         budget, spent = self._settings.time_budget_s, time.monotonic() - self._started
@@ -172,7 +189,7 @@ class WeightsRefinement:
                 "no weight can move: the prediction depends on no parameter behind the cut; take"
                 " --parameters elements, or cut at an earlier layer"
             )
-        self._best = list(self._weights.theta), 0
+        self._checked = {0: list(self._weights.theta)}
         lr, update = self._settings.lr, self._settings.update
         self._rules = [UPDATES[update]() for _ in self._weights.theta]
         self._steps = [step_size(lr, parameter) for parameter in self._weights.parameters()]

@@ -59,6 +59,8 @@ class RefinedFrame:
     """What a person should know."""
     sigma: DepthMap | None = None
     """(H, W) metres, standard deviation of `after`. None if it was not asked for."""
+    valid: NDArray[np.bool_] | None = None
+    """(H, W), where points support `after`. None without `sigma`."""
     choice: dict[str, Any] | None = None
     """What was chosen by held-out points, for a record."""
     interpolation: dict[str, Any] | None = None

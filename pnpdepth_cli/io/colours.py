@@ -40,6 +40,9 @@ class DepthScale:
     high_m: float
     """Far end, metres."""
 
+    warm_is_far: bool = False
+    """Whether the warm end is the far one, as for a standard deviation."""
+
     @property
     def logarithmic(self) -> bool:
         """True if the colours follow log depth."""
@@ -55,7 +58,8 @@ class DepthScale:
     def paint(self, depth: NDArray[np.floating]) -> Pixels:
         """Returns (..., 3) colours of depths of any shape; `UNKNOWN` where there is none."""
         known = np.isfinite(depth) & (depth > 0)
-        pixels = _turbo(1 - self.position(np.where(known, depth, self.low_m)))
+        position = self.position(np.where(known, depth, self.low_m))
+        pixels = _turbo(position if self.warm_is_far else 1 - position)
         pixels[~known] = UNKNOWN
         return pixels
 

@@ -28,6 +28,7 @@ from pnpdepth_cli.io.page import (
     resized,
     save_page,
 )
+from pnpdepth_cli.io.uncertainty_images import hatched
 
 Depth = NDArray[np.float32]
 
@@ -35,6 +36,7 @@ Depth = NDArray[np.float32]
 _WIDE = 2.0
 _STRONGEST_PERCENTILE = 95.0
 _ZOOM = 4  # the zoom shows this fraction of the image's sides
+_FEW = 20  # points
 _FRAME = (230, 30, 30)
 _GAIN = "|before - ground truth| - |after - ground truth|"
 
@@ -47,6 +49,8 @@ def preview(
     after: Depth,
     path: Path,
     unit: str = "m",
+    *,
+    valid: NDArray[np.bool_] | None = None,
 ) -> None:
     """Writes a PNG of image, sparse depth, depth before and after, and what changed.
 
@@ -61,12 +65,13 @@ def preview(
         after: (H, W) metres after refinement.
         path: The PNG.
         unit: Of all depths, where it is not the metre.
+        valid: (H, W); the depth after is hatched where false. None: all is valid.
 
     Raises:
         SizeError: Image and depth differ in size.
         OutputError: The file cannot be written.
     """
-    _check_same_size(before, after=after, image=rgb)
+    _check_same_size(before, after=after, image=rgb, mask=valid)
     height, width = before.shape
     columns = 1 if width > _WIDE * height else 2
     factor = magnification(before.shape, columns=columns, legend=True)
@@ -86,22 +91,37 @@ def preview(
         ),
         Panel(title="Sparse depth", pixels=discs, remark=count),
         Panel(title="Depth before", pixels=resized(scale.paint(before), factor)),
-        Panel(title="Depth after", pixels=resized(scale.paint(after), factor)),
-        *_change_panels(before, after, scale, grey, factor),
+        Panel(
+            title="Depth after",
+            pixels=hatched(resized(scale.paint(after), factor), valid),
+            remark="" if valid is None or valid.all() else "hatched: not valid",
+        ),
+        *_change_panels(before, after, scale, grey, _area(sparse_xy)),
     ]
     save_page(depth_page(panels, columns, scale, unit), path)
 
 
 def _change_panels(
-    before: Depth, after: Depth, scale: DepthScale, grey: NDArray[np.float32], factor: float
+    before: Depth,
+    after: Depth,
+    scale: DepthScale,
+    grey: NDArray[np.float32],
+    of_points: tuple[slice, slice],
 ) -> list[Panel]:
-    """The signed change in metres, and before and after side by side where most changed."""
+    """The signed change in metres, and before and after side by side where most changed.
+
+    Only the rows and columns with points count for the zoom: elsewhere, such as in the sky, the
+    depth has nothing to follow.
+    """
+    columns = 1 if before.shape[1] > _WIDE * before.shape[0] else 2
+    factor = magnification(before.shape, columns=columns, legend=True)
     both = (before > 0) & (after > 0) & np.isfinite(before) & np.isfinite(after)
     change = np.where(both, np.nan_to_num(after) - np.nan_to_num(before), 0).astype(np.float64)
     strongest = _strongest(change[both])
     pixels = dimmed(0.6 * grey)
     pixels[both] = paint_change(change[both] / strongest, 0.66 + 0.3 * grey[both])
-    relative = np.abs(change) / np.where(both, after, 1)
+    relative = np.zeros_like(change)
+    relative[of_points] = (np.abs(change) / np.where(both, after, 1))[of_points]
     top, left, height, width = _most_changed(relative)
     shown = resized(pixels, factor)
     low = (round(left * factor), round(top * factor))
@@ -127,6 +147,14 @@ def _change_panels(
         ),
         Panel(title="Zoom", pixels=zoom, remark="before | after, where most changed (frame)"),
     ]
+
+
+def _area(xy: NDArray[np.float32]) -> tuple[slice, slice]:
+    """Rows and columns with points, without the outermost per cent; all for a few points."""
+    if len(xy) < _FEW:
+        return slice(None), slice(None)
+    (left, top), (right, bottom) = np.percentile(xy, (1, 99), axis=0).astype(int)
+    return slice(max(top, 0), bottom + 1), slice(max(left, 0), right + 1)
 
 
 def _most_changed(relative: NDArray[np.float64]) -> tuple[int, int, int, int]:

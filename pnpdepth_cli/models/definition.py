@@ -31,7 +31,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -188,6 +188,12 @@ MASKED_DEFAULTS = RefineDefaults(
 )
 """For updates of weights, with points hidden from the input or without."""
 
+DENSE_SPACING = 10.0
+"""Mean spacing of the points in pixels below which they are dense, as those of a LiDAR are."""
+
+MASKED_DENSE_DEFAULTS = replace(MASKED_DEFAULTS, iterations=8, lr=2e-4, mask_scale=0.5)
+"""The same for dense points, of which half a frame's tell more: more steps follow their noise."""
+
 
 def _inputs_in_order(
     input_kind: InputKind, rgb: Tensor | None, sparse: Tensor | None
@@ -232,6 +238,8 @@ class ModelDefinition:
     """Its settings of refinement where no option sets them."""
     masked: RefineDefaults = MASKED_DEFAULTS
     """The same where weights are updated, as with points hidden from the input."""
+    masked_dense: RefineDefaults = MASKED_DENSE_DEFAULTS
+    """The same for points that lie closer than `DENSE_SPACING`."""
     checkpoint: Path | None = None
     """The weights that come with the definition; None if the user names them."""
     complete: bool = False
@@ -277,7 +285,7 @@ class ModelDefinition:
         validity.one_of(self, "output_kind", choices.OUTPUT_KINDS)
         validity.one_of(self, "output_scale", choices.OUTPUT_SCALES)
         validity.names(self, "layers")
-        for settings in ("defaults", "masked"):
+        for settings in ("defaults", "masked", "masked_dense"):
             validity.instance(self, settings, RefineDefaults, "RefineDefaults(…)")
         if self.image_encoder is not None:
             validity.instance(self, "image_encoder", str, "the name of a submodule")

@@ -1,15 +1,50 @@
-"""The calibration of a standard deviation by held-out residuals."""
+"""The calibration of a standard deviation by held-out residuals, and the validity mask."""
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
 
-from pnpdepth_cli.auto.uncertainty import calibration
+from pnpdepth_cli.auto.uncertainty import calibration, valid_depth
+from pnpdepth_cli.points import SparsePoints
 
 
-def test_calibration_brings_two_thirds_of_the_residuals_within_sigma() -> None:
-    residual = torch.randn(2000, generator=torch.Generator().manual_seed(0)) * 3
-    factor = calibration(residual, torch.ones(2000))
-    assert float((residual.abs() <= factor).double().mean()) == pytest.approx(0.68, abs=1e-3)
+def test_normal_residuals_are_calibrated_to_their_standard_deviation() -> None:
+    residual = torch.randn(20000, generator=torch.Generator().manual_seed(0)) * 3
+    factor = calibration(residual, torch.ones(20000))
+    assert factor == pytest.approx(3, rel=0.03)
+    assert calibration(2 * residual, torch.ones(20000)) == pytest.approx(2 * factor)
     assert calibration(residual[:0], residual[:0]) == 1.0
+
+
+def test_heavy_tails_are_between_the_factors_of_one_and_of_two_sigma() -> None:
+    generator = torch.Generator().manual_seed(0)
+    residual = torch.randn(20000, generator=generator) / torch.rand(20000, generator=generator)
+    factor = calibration(residual, torch.ones(20000))
+    within_one = float((residual.abs() <= factor).double().mean())
+    within_two = float((residual.abs() <= 2 * factor).double().mean())
+    assert 0.68 < within_one < 0.95
+    assert 0.68 < within_two < 0.95
+
+
+def lidar_points() -> SparsePoints:
+    """Scan lines in the lower half of an image of 60 × 100 pixels, 5 to 20 m away."""
+    y, x = torch.meshgrid(torch.arange(30, 60, 4), torch.arange(0, 100, 2), indexing="ij")
+    xy = torch.stack([x.flatten(), y.flatten()], dim=1).float()
+    return SparsePoints(xy=xy, depth=torch.linspace(20, 5, len(xy)), size=(60, 100))
+
+
+def test_the_sky_above_scan_lines_is_not_valid() -> None:
+    depth = np.full((60, 100), 10, np.float32)
+    valid = valid_depth(lidar_points(), depth, np.full_like(depth, 0.1))
+    assert not valid[:20].any()
+    assert valid[30:59].all()
+
+
+def test_depth_beyond_the_points_or_too_uncertain_is_not_valid() -> None:
+    depth = np.full((60, 100), 10, np.float32)
+    sigma = np.full_like(depth, 0.1)
+    depth[40, 10], depth[40, 11], sigma[40, 12] = 0, 31, 2.6
+    valid = valid_depth(lidar_points(), depth, sigma)
+    assert valid[40, 9:14].tolist() == [True, False, False, False, True]

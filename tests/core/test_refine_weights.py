@@ -151,7 +151,7 @@ def _seeded(seed: int) -> RefineSettings:
 
 
 def test_a_step_that_makes_held_out_points_worse_is_not_taken() -> None:
-    result = refined(TwoInputs(), replace(SETTINGS, update="sign", lr=3.0))
+    result = refined(TwoInputs(), replace(SETTINGS, update="sign", lr=1e3))
     assert result.kept == 0
     assert torch.equal(result.after, result.before)
     assert len(result.losses) < SETTINGS.iterations

@@ -19,7 +19,12 @@ from pnpdepth_cli.io.colours import (
 from pnpdepth_cli.io.depth import read_depth, read_sparse
 from pnpdepth_cli.io.page import draw_discs, magnification, open_page
 from pnpdepth_cli.io.rgb import read_rgb
-from pnpdepth_cli.io.visualisation import improvement, improvement_at_points, preview
+from pnpdepth_cli.io.uncertainty_images import sigma_preview
+from pnpdepth_cli.io.visualisation import (
+    improvement,
+    improvement_at_points,
+    preview,
+)
 
 RED, GREEN = [214, 26, 30], [16, 140, 52]
 BLUE, ORANGE = [25, 90, 190], [220, 105, 0]
@@ -170,6 +175,20 @@ def test_the_preview_shows_the_signed_change_and_zooms_to_it(tmp_path: Path) -> 
     half = zoom.shape[1] // 2
     assert len(np.unique(zoom[:, : half - 2].reshape(-1, 3), axis=0)) == 1
     assert len(np.unique(zoom[:, half + 2 :].reshape(-1, 3), axis=0)) == 2
+
+
+def test_depth_that_is_not_valid_is_hatched(tmp_path: Path) -> None:
+    rgb, depth, xy = scene(60, 80)
+    valid = np.ones((60, 80), bool)
+    valid[:20] = False
+    preview(rgb, xy, at(depth, xy), depth, depth, tmp_path / "p.png", valid=valid)
+    panels = open_page(tmp_path / "p.png").panels()
+    before, after = panels["Depth before"], panels["Depth after"]
+    factor = before.shape[0] // 60
+    assert np.array_equal(before[20 * factor :], after[20 * factor :])
+    assert (after[: 20 * factor].astype(int) > before[: 20 * factor]).any(axis=2).all()
+    sigma_preview(0.1 * depth, valid, tmp_path / "s.png")
+    assert list(open_page(tmp_path / "s.png").panels()) == ["Standard deviation"]
 
 
 def test_nothing_changed_is_nothing_improved(tmp_path: Path) -> None:

@@ -120,8 +120,13 @@ def refine_with_folds(
     if hold_out.baselines:
         refined = replace(refined, baselines=baseline_scores(result, gt))
     if hold_out.uncertainty:
-        sigma, note = uncertainty(result, refined.after)
-        refined = replace(refined, sigma=sigma, notes=(*refined.notes, note))
+        estimate = uncertainty(result, refined.after)
+        refined = replace(
+            refined,
+            sigma=estimate.sigma,
+            valid=estimate.valid,
+            notes=(*refined.notes, estimate.note),
+        )
     return refined
 
 

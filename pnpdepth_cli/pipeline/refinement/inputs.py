@@ -185,7 +185,7 @@ def _read_ground_truth(
 ) -> _Part:
     if isinstance(source, Path) and source.suffix.lower() in SCAN_ONLY_SUFFIXES:
         image = files.image if isinstance(files.image, Path) else None
-        scan = read_scan_points(source, files.scan, image_size, image)
+        scan = read_scan_points(source, files.scan, image_size, image, files.calibration)
         return _Part(
             values=np.ascontiguousarray(files.protocol.apply(as_depth_image(scan.points))),
             whole=scan.points.size,
@@ -247,7 +247,7 @@ def _sampled(
 
 def _read_scan(files: FrameFiles, path: Path, image_size: tuple[int, int] | None) -> _Sparse:
     image = files.image if isinstance(files.image, Path) else None
-    scan = read_scan_points(path, files.scan, image_size, image)
+    scan = read_scan_points(path, files.scan, image_size, image, files.calibration)
     points = _in_protocol(files, path, scan.points.tensors())
     return _Sparse(points=points, scale=None, record=scan.record, notes=scan.notes)
 

@@ -27,6 +27,10 @@ class Outputs:
     """Refined depth."""
     sigma: Path | None = None
     """Standard deviation of the depth."""
+    sigma_preview: Path | None = None
+    """Image of the standard deviation."""
+    valid: Path | None = None
+    """Mask of the pixels whose depth is valid."""
     preview: Path | None = None
     """Image of the depth before and after."""
     improvement: Path | None = None
@@ -39,9 +43,16 @@ class Outputs:
     @classmethod
     def in_folder(cls, folder: Path, name: str, request: RefineRequest) -> Outputs:
         """Returns all that are asked for, in a folder; a name with slashes goes into subfolders."""
+        of_sigma = {}
+        if request.hold_out.uncertainty:
+            of_sigma = {
+                "sigma": folder / f"{name}_sigma.exr",
+                "sigma_preview": folder / f"{name}_sigma_preview.png",
+                "valid": folder / f"{name}_valid.png",
+            }
         return cls(
             depth=folder / f"{name}_depth.{request.outputs.format}",
-            sigma=folder / f"{name}_sigma.exr" if request.hold_out.uncertainty else None,
+            **of_sigma,
             preview=folder / f"{name}_preview.png",
             improvement=folder / f"{name}_improvement.png",
             record=folder / f"{name}.json",
@@ -53,6 +64,8 @@ class Outputs:
         kinds = {
             "depth": self.depth,
             "sigma": self.sigma,
+            "sigma_preview": self.sigma_preview,
+            "valid": self.valid,
             "preview": self.preview,
             "improvement": self.improvement,
             "record": self.record,

@@ -10,6 +10,7 @@ import torch
 from pnpdepth_cli.frames.frame import RefinedFrame
 from pnpdepth_cli.io.atomic import make_folder
 from pnpdepth_cli.io.depth import write_depth
+from pnpdepth_cli.io.uncertainty_images import sigma_preview, write_mask
 from pnpdepth_cli.io.visualisation import improvement, improvement_at_points, preview
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs
 from pnpdepth_cli.pipeline.refinement.output_files import Outputs
@@ -22,6 +23,10 @@ def write_outputs(outputs: Outputs, inputs: Inputs, frame: RefinedFrame) -> dict
     write_depth(outputs.depth, frame.after, scale=output_scale(inputs))
     if outputs.sigma is not None and frame.sigma is not None:
         write_depth(outputs.sigma, frame.sigma)
+    if outputs.sigma_preview is not None and frame.sigma is not None:
+        sigma_preview(frame.sigma, frame.valid, outputs.sigma_preview, inputs.unit)
+    if outputs.valid is not None and frame.valid is not None:
+        write_mask(outputs.valid, frame.valid)
     record: dict[str, Any] = {"improved_fraction": None}
     if outputs.preview is not None:
         preview(
@@ -32,6 +37,7 @@ def write_outputs(outputs: Outputs, inputs: Inputs, frame: RefinedFrame) -> dict
             frame.after,
             outputs.preview,
             inputs.unit,
+            valid=frame.valid,
         )
     if outputs.improvement is not None:
         record["improved_fraction"] = _write_improvement(
@@ -42,6 +48,7 @@ def write_outputs(outputs: Outputs, inputs: Inputs, frame: RefinedFrame) -> dict
         for kind, path in (
             ("depth", outputs.depth),
             ("sigma", outputs.sigma),
+            ("valid", outputs.valid),
             ("preview", outputs.preview),
             ("improvement", outputs.improvement),
         )

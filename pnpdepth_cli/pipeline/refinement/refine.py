@@ -40,6 +40,7 @@ from pnpdepth_cli.pipeline.refinement.outputs import write_outputs
 from pnpdepth_cli.pipeline.refinement.points import PointError, point_error, split_points
 from pnpdepth_cli.pipeline.refinement.request import MethodOptions, NetworkChoice, RefineRequest
 from pnpdepth_cli.pipeline.refinement.resolve import (
+    is_dense,
     moves_weights,
     resolve_definition,
     resolve_layer,
@@ -295,7 +296,13 @@ def refiner_of(
         layer = options.layer
         if layer is None and not method.own_layer and options.target != "masked":
             layer = default_layer(network, first.size, len(first.points))
-        own = resolve_settings(definition, options, request.hold_out, metric=first.unit == METRES)
+        own = resolve_settings(
+            definition,
+            options,
+            request.hold_out,
+            metric=first.unit == METRES,
+            dense=is_dense(first.points),
+        )
         if number == 0 and settings is not None:
             own = settings
         plans.append((_name(networks, number), network, resolve_layer(definition, layer), own))

@@ -16,6 +16,7 @@ from pnpdepth_cli.errors import ModelError, NoPointsError, UsageError
 from pnpdepth_cli.frames.frame import Frame
 from pnpdepth_cli.frames.prepare import prepare
 from pnpdepth_cli.models.definition import (
+    DENSE_SPACING,
     IMAGENET_MEAN,
     IMAGENET_STD,
     ModelDefinition,
@@ -24,6 +25,7 @@ from pnpdepth_cli.models.definition import (
 )
 from pnpdepth_cli.models.network import Network, out_of_memory_is_a_device_error
 from pnpdepth_cli.pipeline.refinement.request import HoldOut, MethodOptions, NetworkChoice
+from pnpdepth_cli.points import SparsePoints
 
 NORMALISATIONS = {
     "unit": Normalisation(),
@@ -95,6 +97,7 @@ def resolve_settings(
     hold_out: HoldOut | None = None,
     *,
     metric: bool = True,
+    dense: bool = False,
 ) -> RefineSettings:
     """Returns the settings of refinement: the user's, else the network's defaults.
 
@@ -107,13 +110,16 @@ def resolve_settings(
         method: What the user chose.
         hold_out: For the seed and the time budget; None takes their defaults.
         metric: Whether the points are in metres.
+        dense: Whether the points lie as close as a LiDAR's; see `is_dense`.
 
     Raises:
         UsageError: A value is out of range, or goes with another target.
     """
     hold_out = hold_out or HoldOut()
     of_weights = moves_weights(method)
-    defaults = definition.masked if of_weights else definition.defaults
+    defaults = definition.masked_dense if dense else definition.masked
+    if not of_weights:
+        defaults = definition.defaults
     iterations = defaults.iterations if method.iterations is None else method.iterations
     if iterations < 0:
         raise UsageError(f"iterations {iterations} is negative; 0 gives the plain prediction")
@@ -149,6 +155,12 @@ def resolve_settings(
     return settings
 
 
+def is_dense(points: SparsePoints) -> bool:
+    """Whether the mean spacing of the points is below `DENSE_SPACING` pixels."""
+    height, width = points.size
+    return height * width < DENSE_SPACING**2 * len(points)
+
+
 def moves_weights(method: MethodOptions) -> bool:
     """Whether weights are updated instead of z."""
     return method.target == "masked" or method.parameters not in (None, *PARAMETERS)
@@ -182,6 +194,10 @@ def _check_weights(
             " weights or lora:8"
         )
     rank_of(settings.parameters)
+    if method.preset is not None:
+        raise UsageError(
+            f"--preset {method.preset} updates z; it goes with neither --target masked nor weights"
+        )
     if method.target == "masked" and "sparse" not in definition.input_kind:
         raise UsageError(
             f"network {definition.name!r} takes no sparse depth, so no points can be hidden from"

@@ -7,6 +7,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import cv2
+import numpy as np
 import pytest
 
 from pnpdepth_cli.auto.candidates import Candidate, RefinementConfig
@@ -194,6 +196,10 @@ def test_the_standard_deviation_is_positive_and_in_a_file_of_its_own(frame: Fram
     sigma = read_depth(Path(record["outputs"]["sigma"])).values
     assert sigma.shape == frame.depth.shape
     assert (sigma > 0).all()
+    valid = cv2.imread(record["outputs"]["valid"], cv2.IMREAD_UNCHANGED)
+    assert valid.shape == frame.depth.shape
+    assert set(np.unique(valid)) <= {0, 255}
+    assert (frame.folder / "out" / "img_sigma_preview.png").is_file()
     with pytest.raises(UsageError, match="--uncertainty writes a second file"):
         run(frame, uncertainty=True, output=frame.folder / "depth.exr")
 

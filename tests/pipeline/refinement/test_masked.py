@@ -10,7 +10,7 @@ import torch
 from pnpdepth_cli import Refiner, load_network
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.io.depth import read_depth
-from pnpdepth_cli.models.definition import MASKED_DEFAULTS
+from pnpdepth_cli.models.definition import MASKED_DEFAULTS, MASKED_DENSE_DEFAULTS
 from pnpdepth_cli.pipeline.refinement.request import HoldOut, MethodOptions
 from pnpdepth_cli.pipeline.refinement.resolve import resolve_settings
 from tests.core.split.test_split import same, state_of
@@ -33,7 +33,7 @@ def test_masked_points_change_the_depth_and_the_record_says_how(frame: FrameOnDi
     settings = record["settings"]
     assert (settings["target"], settings["parameters"]) == ("masked", "weights")
     assert settings["mask"] == {
-        "kind": "points", "fraction": 0.5, "set_aside": 0.1, "scale": 1.0, "seed": 0
+        "kind": "points", "fraction": 0.5, "set_aside": 0.1, "scale": 0.5, "seed": 0
     }  # fmt: skip
     assert (settings["iterations"], settings["update"]) == (3, MASKED_DEFAULTS.update)
     assert len(record["loss"]) == 3
@@ -68,7 +68,7 @@ def test_a_network_of_images_moves_weights_behind_the_cut_by_all_points(
     record = run(frame, parameters=parameters, lr="0.01").record
     assert record["settings"]["layer"] == "middle"
     assert record["loss"][-1] < record["loss"][0]
-    assert len(record["loss"]) == MASKED_DEFAULTS.iterations
+    assert len(record["loss"]) == MASKED_DENSE_DEFAULTS.iterations
 
 
 def test_a_network_is_as_before_after_the_refiner_closes(frame: FrameOnDisk) -> None:
@@ -87,6 +87,7 @@ def test_a_network_is_as_before_after_the_refiner_closes(frame: FrameOnDisk) -> 
         ({"parameters": "channels"}, "--target masked updates weights"),
         ({"parameters": "lora:0"}, "none of elements, channels, weights"),
         ({"layer": "decoder.s8"}, "--layer is where z is"),
+        ({"preset": "paper"}, "--preset paper updates z"),
         ({"line_search": True}, "--line-search is for updates of z"),
         ({"mask_fraction": 1.0}, "not between 0 and 1"),
         ({"mask_scale": 1.5}, "not above 0 and 1 at most"),
@@ -103,6 +104,14 @@ def test_what_does_not_go_together_is_refused(
 def test_points_cannot_be_hidden_from_a_network_of_images(frame: FrameOnDisk) -> None:
     with pytest.raises(UsageError, match="takes no sparse depth"):
         run(frame, target="masked")
+
+
+def test_dense_points_have_defaults_of_their_own(frame: FrameOnDisk) -> None:
+    definition = load_network("compact").definition
+    method = MethodOptions(target="masked")
+    settings = resolve_settings(definition, method, dense=True)
+    assert (settings.iterations, settings.lr, settings.mask.scale) == (8, 2e-4, 0.5)
+    assert run(frame, **MASKED | {"iterations": None}).record["settings"]["lr"] == 2e-4
 
 
 def test_seed_and_budget_reach_the_settings() -> None:
