@@ -205,7 +205,7 @@ LAYOUTS = Table(
     first=(
         *("manifest", "nyu-mat", "kitti-odometry", "kitti-object", "kitti-depth", "kitti-raw"),
         *("tum", "7scenes", "synthia", "colmap", "void", "diode", "ibims", "scannet"),
-        *("arkitscenes", "hypersim", "pairs", "nyu-h5"),
+        *("arkitscenes", "hypersim", "nuscenes", "pairs", "nyu-h5"),
     ),
 )
 """Data set layouts, in the order in which they are guessed: `pnpdepth_cli.io.layouts.Layout`."""
@@ -230,6 +230,9 @@ LENSES = (
 
 EVAL_PROTOCOLS = ("paper", "nyu-eigen", "kitti", "kitti-devkit", "eigen", "garg")
 """Published protocols of scoring depth: `pnpdepth_cli.pipeline.evaluation.protocols.PROTOCOLS`."""
+
+PLOT_FORMATS = ("png", "svg", "pdf")
+"""Files that `sweep` plots to."""
 
 MEASURE_GROUPS = Table(
     "pipeline/evaluation/measures",

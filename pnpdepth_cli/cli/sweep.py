@@ -9,6 +9,7 @@ from typing import Any
 
 import click
 
+from pnpdepth_cli.choices import PLOT_FORMATS
 from pnpdepth_cli.cli import grouped_help, options
 from pnpdepth_cli.cli.exit_codes import INTERRUPTED
 from pnpdepth_cli.cli.progress import BatchProgress
@@ -32,7 +33,7 @@ from pnpdepth_cli.pipeline.refinement.request import FrameFiles, MethodOptions, 
         "Input": (*grouped_help.LIDAR, *grouped_help.FILE_READING),
         "Network": grouped_help.NETWORK,
         "Method": tuple(name for name in grouped_help.METHOD if name != "--seed"),
-        "Output": ("--output", "--plots", "--json"),
+        "Output": ("--output", "--plots", "--plot-format", "--cost", "--json"),
     },
 )
 @click.argument("source", type=options.FILE, metavar="FOLDER|LIST")
@@ -64,6 +65,16 @@ from pnpdepth_cli.pipeline.refinement.request import FrameFiles, MethodOptions, 
 )
 @options.options_of_groups(FrameSelection)
 @click.option("--plots/--no-plots", default=True, help="Draw plots, or write tables only.")
+@click.option(
+    "--plot-format",
+    type=click.Choice(PLOT_FORMATS),
+    default="png",
+    show_default=True,
+    help="File format of the plots.",
+)
+@click.option(
+    "--cost", is_flag=True, help="Add the time of the refinement to tables, and a plot over it."
+)
 @options.scan
 @options.options_of_groups(FrameFiles, NetworkChoice, MethodOptions, without=["tile"])
 @options.seed
@@ -97,8 +108,12 @@ def sweep(
                 noise of the points, as in `pnpdepth sample`
     rotation-noise
                 rotation of a LiDAR, degrees
-    iterations, layer, lr, loss, update, schedule, blur, parameters, proximity, align, propagate
+    iterations, layer, lr, loss, update, schedule, blur, parameters, proximity, align, propagate,
+    target, mask, mask-scale, mask-fraction
                 the options of the same names
+    preset, model
+                presets of the method; networks, as NETWORK or NETWORK@WEIGHTS
+    seed        of the draw of the points, in place of --seeds
 
     One --vary gives one table and one plot; two give a table and a plot of their grid; with
     --one-by-one every --vary gives its own. Tables compare the refined depth with the network's
@@ -106,9 +121,9 @@ def sweep(
     mean over seeds; 95 % intervals are over frames. Gains are in per cent, positive if refinement
     is better.
 
-    OUTPUT gets sweep.csv and sweep.json (means), sweep_frames.csv (every frame), a PNG per plot,
-    and sweep.jsonl (the journal). Run again, also with other values, only missing values are
-    computed. Plots need the extra pnpdepth[plot].
+    OUTPUT gets sweep.csv, sweep.json and sweep.tex (means), sweep_frames.csv (every frame), a plot
+    per table, and sweep.jsonl (the journal). Run again, also with other values, only missing values
+    are computed. Plots need the extra pnpdepth[plot].
     """
     from pnpdepth_cli.pipeline.sweep.axes import read_axis, studies_of
     from pnpdepth_cli.pipeline.sweep.points import read_sampling
@@ -122,6 +137,8 @@ def sweep(
         sampling=None if sample is None else read_sampling(sample),
         seeds=given.pop("seeds"),
         plots=given.pop("plots"),
+        plot_format=given.pop("plot_format"),
+        cost=given.pop("cost"),
         refine=options.request_of(given),
         **own,
     )
@@ -165,22 +182,24 @@ def _print(record: Mapping[str, Any]) -> None:
 
     for study in record["studies"]:
         names = list(study["parameters"])
+        cost = any("time_s" in cell for cell in study["cells"])
         print_rows(
             f"{' × '.join(names)}: means over frames, MAE in metres, gains over plain in %",
             [*names, "points used", "frames", "linear", "plain", "refined", "±", "gain", "95 %",
-             "RMSE gain", "MRE gain", "δ1 gain"],
+             "RMSE gain", "MRE gain", "δ1 gain", *(["time [s]"] if cost else [])],
             [_cells(names, cell) for cell in study["cells"]],
         )  # fmt: skip
     folder = record["output"]
-    files = ["sweep.csv", "sweep.json", "sweep_frames.csv"]
+    files = ["sweep.csv", "sweep.json", "sweep.tex", "sweep_frames.csv"]
     files += [study["plot"] for study in record["studies"] if study["plot"]]
     click.echo("wrote " + "  ".join(f"{folder}/{name}" for name in files), err=True)
 
 
 def _cells(names: list[str], cell: Mapping[str, Any]) -> list[str]:
     start = [cell["parameters"][name] for name in names]
+    time = [] if "time_s" not in cell else [_seconds(cell["time_s"])]
     if cell["measures"] is None:
-        return [*start, "–", "0", *["–"] * 9]
+        return [*start, "–", "0", *["–"] * 9, *time]
     mae = cell["measures"]["mae"]
     low, high = mae["refined_low"], mae["refined_high"]
     return [
@@ -192,7 +211,12 @@ def _cells(names: list[str], cell: Mapping[str, Any]) -> list[str]:
         _percent(mae["gain"]),
         "–" if low is None else f"{_percent(mae['gain_low'])} … {_percent(mae['gain_high'])}",
         *(_percent(cell["measures"][key]["gain"]) for key in ("rmse", "mre", "delta1")),
+        *time,
     ]
+
+
+def _seconds(value: float | None) -> str:
+    return "–" if value is None else f"{value:.3g}"
 
 
 def _percent(value: float | None) -> str:

@@ -85,11 +85,12 @@ class Alignment:
         return (self.scale < 0) != (self.space == "inverse")
 
     def __str__(self) -> str:
-        reads = {"depth": "depth", "inverse": "1/depth", "log": "log depth"}[self.space]
-        sign, shift = ("−" if self.shift < 0 else "+"), abs(self.shift)
-        line = f"{self.scale:.4g}·output" + (f" {sign} {shift:.4g}" if shift else "")
+        read_as = {"depth": "depth", "inverse": "inverse depth", "log": "log depth"}[self.space]
         sense = "nearer" if self.falling else "farther"
-        return f"{self.kind}: {reads} = {line}, larger is {sense}"
+        fitted = {"none": "not fitted", "affine": "fitted by scale and shift"}.get(
+            self.kind, f"fitted by {self.kind}"
+        )
+        return f"the network's output is read as {read_as} (larger is {sense}), {fitted}"
 
 
 def align(x: Tensor, points: SparsePoints, spaces: tuple[str, ...], kind: str) -> Alignment:

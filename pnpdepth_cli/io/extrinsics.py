@@ -29,7 +29,7 @@ Extrinsics = tuple[Floats, Floats]
 
 _SEPARATORS = re.compile(r"[\[\](),;\s]+")
 _ROTATION_TOLERANCE = 1e-3
-_FARTHEST_M = 1e4
+_FARTHEST_M = 1e6
 
 
 def read_extrinsics(path: Path) -> Extrinsics:

@@ -161,5 +161,5 @@ def test_what_cannot_be_aligned_is_said() -> None:
 def test_the_decision_reads_as_a_sentence() -> None:
     d = scene(20)
     assert str(align(5 / d, points_of(d), ("inverse",), "scale")) == (
-        "scale: 1/depth = 0.2·output, larger is nearer"
+        "the network's output is read as inverse depth (larger is nearer), fitted by scale"
     )

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pnpdepth_cli.errors import InputError
+from pnpdepth_cli.io.calibration import Calibration
 from pnpdepth_cli.io.dataset.protocols import WHOLE, Protocol
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".exr")
@@ -64,6 +65,9 @@ class Frame:
 
     camera: int | None = None
     """Which camera of the calibration."""
+
+    calibration: Calibration | None = None
+    """The calibration itself, of a data set that has one for each frame and no file of it."""
 
     sparse_scale: float | None = None
     """Codes per metre of integer sparse depth."""

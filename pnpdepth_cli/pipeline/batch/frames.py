@@ -101,6 +101,7 @@ def task_of(request: BatchRequest, frame: Frame) -> Task:
         image=frame.image,
         sparse=sparse,
         gt=gt,
+        calibration=frame.calibration,
         gt_masks=frame.masks,
         gt_size_ok=frame.gt_other_size,
         sparse_size_ok=base.sparse_size_ok or frame.sparse_other_size,

@@ -28,6 +28,9 @@ def settings_of(request: RefineRequest, model: dict[str, Any], *groups: str) -> 
     if "scan" in fields:
         fields["scan"] = asdict(fields["scan"])
         del fields["scan"]["calib"], fields["scan"]["extrinsics"]
+    calibration = fields.pop("calibration", None)
+    if calibration is not None:
+        fields["calibration"] = asdict(calibration)
     for name in ("colmap", "sample", "protocol"):
         if fields.get(name) is not None:
             fields[name] = asdict(fields[name])

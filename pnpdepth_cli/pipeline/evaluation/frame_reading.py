@@ -3,23 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pnpdepth_cli.errors import InputError, SizeError
+from pnpdepth_cli.errors import InputError, SizeError, UsageError
 from pnpdepth_cli.io.dataset.masks import masked, read_mask
 from pnpdepth_cli.io.depth import DepthImage, read_sparse
 from pnpdepth_cli.io.depth_reading import depth_from_stored, known_metres, load_stored
 from pnpdepth_cli.io.layouts import Hdf5Array, read_frame_ground_truth
+from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.pipeline.evaluation.pairing import FramePair
 from pnpdepth_cli.pipeline.evaluation.protocols import EvalProtocol
 from pnpdepth_cli.pipeline.evaluation.scaling import Fit, scaled
 from pnpdepth_cli.pipeline.evaluation.stacks import load_stacked
 from pnpdepth_cli.points import SparsePoints, in_frame
+from pnpdepth_cli.sensors import SamplePattern, sample_points
 from pnpdepth_cli.sensors.sparse import as_depth_image
 
 Depth = NDArray[np.float32]
@@ -81,6 +84,8 @@ def load_frame(pair: FramePair, protocol: EvalProtocol, scales: Scales) -> Loade
     sparse, sparse_scale = _known_sparse(pair, protocol, scales, size)
     mask = _scored_mask(pair, ground_truth.values, protocol)
     if protocol.exclude_sparse:
+        if sparse is None and pair.sampling is not None:
+            sparse = _sampled_again(pair, pair.sampling, ground_truth.values)
         if sparse is None:
             raise InputError(
                 f"frame {pair.name} has no sparse depth file to exclude; give it with --sparse"
@@ -210,6 +215,32 @@ def _read_sparse(
     inside = in_frame(xy, size)
     points = SparsePoints(xy=xy[inside], depth=sparse.points.depth[inside], size=size)
     return as_depth_image(points), sparse.scale
+
+
+def _sampled_again(pair: FramePair, sampling: dict[str, Any], ground_truth: Depth) -> Depth:
+    """(H, W) the points that a run sampled from this ground truth, drawn again by its record."""
+    pattern: dict[str, Any] = {each.name: sampling.get(each.name) for each in fields(SamplePattern)}
+    image = None
+    if isinstance(pair.image, Path):
+        rgb = read_rgb(pair.image).values
+        rgb = rgb if rgb.shape[:2] == ground_truth.shape else pair.frame.protocol.apply(rgb)
+        image = rgb if rgb.shape[:2] == ground_truth.shape else None
+    try:
+        if pattern["region"] is not None:
+            pattern["region"] = tuple(pattern["region"])
+        drawn = SamplePattern(**pattern)
+        points = sample_points(ground_truth, drawn, int(sampling["seed"]), image=image)
+    except (KeyError, TypeError, ValueError, UsageError) as error:
+        raise InputError(
+            f"the points of frame {pair.name} cannot be sampled again as its record says"
+            f" ({error}); give them with --sparse"
+        ) from error
+    if len(points.depth) < pair.sampled:
+        raise InputError(
+            f"the record of frame {pair.name} has {pair.sampled:,} points, but sampling again gives"
+            f" {len(points.depth):,}: it is of another ground truth; give them with --sparse"
+        )
+    return as_depth_image(points)
 
 
 def _scored_mask(pair: FramePair, ground_truth: Depth, protocol: EvalProtocol) -> Mask:

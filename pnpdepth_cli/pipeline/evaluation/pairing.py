@@ -51,6 +51,8 @@ class FramePair:
     """Of the ground truth in a file of several frames."""
     previous: FramePair | None = None
     """The frame before in the same sequence, without its own previous one."""
+    sampling: dict[str, Any] | None = None
+    """How the sparse input was sampled from the ground truth, by the run's record."""
     sampled: int = 0
     """Points of the ground truth that were the sparse input, by the run's record."""
     image: Source | None = None
@@ -315,6 +317,7 @@ def _pair(frame: Frame, prediction: Path | None, sparse: Path | None) -> FramePa
         sparse=sparse or _input(record, "sparse") or _depth_file(frame.sparse),
         sparse_named=sparse is not None,
         sigma=_sigma_of(prediction),
+        sampling=_sampling(record),
         sampled=_sampled(record),
         image=_input(record, "image") or frame.image,
     )
@@ -352,9 +355,15 @@ def _input(record: dict[str, Any], part: str) -> Path | None:
     return Path(path)
 
 
+def _sampling(record: dict[str, Any]) -> dict[str, Any] | None:
+    """How points were sampled from the ground truth; None if they were not."""
+    entry = _dict(_dict(record.get("inputs")).get("sparse"))
+    return entry if "sampled_from" in entry else None
+
+
 def _sampled(record: dict[str, Any]) -> int:
     """How many points of the ground truth were the sparse depth."""
-    if "sampled_from" not in _dict(_dict(record.get("inputs")).get("sparse")):
+    if _sampling(record) is None:
         return 0
     used = _dict(record.get("points")).get("used")
     return used if isinstance(used, int) else 0

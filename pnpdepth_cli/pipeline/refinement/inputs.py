@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,7 @@ from pnpdepth_cli.io.depth import (
     read_depth,
     read_sparse,
 )
+from pnpdepth_cli.io.depth_range import metres
 from pnpdepth_cli.io.fingerprint import fingerprint
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.pipeline.refinement.request import FrameFiles, RefineRequest
@@ -36,6 +37,16 @@ ImageArray = NDArray[np.float32]
 
 _LEAK_FRACTION = 0.5
 """Of the ground truth's pixels; as much in common with the sparse depth gives a warning."""
+
+
+_FAR = 1000.0
+"""Times the median depth; no point of an image is farther."""
+
+_OTHER_SCALE = 1.5
+"""Ratio of ground truth to sparse depth that no noise explains."""
+
+_MIN_COMPARED = 10
+"""Fewer points decide nothing."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -127,6 +138,7 @@ def read_inputs(request: RefineRequest) -> Inputs:
         sparse = _read_scan(files, files.sparse, whole)
     else:
         sparse = _read_points(files, files.sparse, whole)
+    sparse = _without_far_points(sparse)
     if ground_truth is not None and sparse.unit != METRES:
         raise UsageError(
             f"the ground truth {files.gt} is in metres but the sparse depth in {sparse.unit}; give"
@@ -138,6 +150,7 @@ def read_inputs(request: RefineRequest) -> Inputs:
     notes = [note for part in parts.values() if part is not None for note in part.notes]
     if ground_truth is not None and files.sparse is not None:
         notes += _leak_warning(sparse.points, ground_truth.values)
+        notes += _scale_warning(sparse.points, ground_truth.values)
     return Inputs(
         rgb=None if image is None else image.values,
         points=sparse.points,
@@ -147,6 +160,38 @@ def read_inputs(request: RefineRequest) -> Inputs:
         notes=tuple(notes),
         unit=sparse.unit,
     )
+
+
+def _without_far_points(sparse: _Sparse) -> _Sparse:
+    """The sparse depth without points farther than anything in one image can be, with a note."""
+    depth = sparse.points.depth
+    median = float(depth.median())
+    far = depth > _FAR * median
+    count = int(far.sum())
+    if not count or len(depth) < _MIN_COMPARED:
+        return sparse
+    note = (
+        f"sparse: dropped {count:,} of {len(depth):,} points more than {_FAR:,.0f} times as far as"
+        f" the median of {metres(median)} {sparse.unit}; the farthest was at"
+        f" {metres(float(depth.max()))} {sparse.unit}"
+    )
+    return replace(sparse, points=sparse.points.select(~far), notes=(*sparse.notes, note))
+
+
+def _scale_warning(points: SparsePoints, gt: ImageArray) -> list[str]:
+    """A warning if ground truth and sparse depth differ by a factor where both are known."""
+    depth = points.scatter()[0, 0].numpy()
+    both = (depth > 0) & (gt > 0)
+    if int(both.sum()) < _MIN_COMPARED:
+        return []
+    ratio = float(np.median(gt[both] / depth[both]))
+    if 1 / _OTHER_SCALE <= ratio <= _OTHER_SCALE:
+        return []
+    return [
+        f"warning: the ground truth is {ratio:.3g} times the sparse depth where both are known"
+        f" (median of {int(both.sum()):,} pixels), so one of their scales is wrong; give --gt-scale"
+        " or --depth-scale"
+    ]
 
 
 def _leak_warning(points: SparsePoints, gt: ImageArray) -> list[str]:
@@ -185,7 +230,7 @@ def _read_ground_truth(
 ) -> _Part:
     if isinstance(source, Path) and source.suffix.lower() in SCAN_ONLY_SUFFIXES:
         image = files.image if isinstance(files.image, Path) else None
-        scan = read_scan_points(source, files.scan, image_size, image)
+        scan = read_scan_points(source, files.scan, image_size, image, files.calibration)
         return _Part(
             values=np.ascontiguousarray(files.protocol.apply(as_depth_image(scan.points))),
             whole=scan.points.size,
@@ -247,7 +292,7 @@ def _sampled(
 
 def _read_scan(files: FrameFiles, path: Path, image_size: tuple[int, int] | None) -> _Sparse:
     image = files.image if isinstance(files.image, Path) else None
-    scan = read_scan_points(path, files.scan, image_size, image)
+    scan = read_scan_points(path, files.scan, image_size, image, files.calibration)
     points = _in_protocol(files, path, scan.points.tensors())
     return _Sparse(points=points, scale=None, record=scan.record, notes=scan.notes)
 

@@ -18,6 +18,7 @@ from pnpdepth_cli.pipeline.sparse.colmap_options import ColmapOptions
 from pnpdepth_cli.pipeline.sparse.scan_options import ScanOptions
 
 if TYPE_CHECKING:
+    from pnpdepth_cli.io.calibration import Calibration
     from pnpdepth_cli.io.dataset.frame import Source
     from pnpdepth_cli.io.dataset.protocols import Protocol
     from pnpdepth_cli.sensors import SamplePattern
@@ -72,6 +73,8 @@ class FrameFiles:
     """Which points are used where `sparse` is a COLMAP model."""
     scan: ScanOptions = field(default_factory=ScanOptions)
     """How `sparse` is projected where it is a LiDAR scan."""
+    calibration: Calibration | None = None
+    """Of a LiDAR scan, where the data set gives it instead of a file."""
     gt_masks: tuple[Path, ...] = ()
     """Where one of these is 0, the ground truth is unknown."""
     gt_size_ok: bool = False

@@ -53,7 +53,11 @@ class ScanPoints:
 
 
 def read_scan_points(
-    path: Path, options: ScanOptions, size: tuple[int, int] | None, image: Path | None = None
+    path: Path,
+    options: ScanOptions,
+    size: tuple[int, int] | None,
+    image: Path | None = None,
+    calibration: Calibration | None = None,
 ) -> ScanPoints:
     """Returns the points of a scan that are visible in an image.
 
@@ -62,26 +66,30 @@ def read_scan_points(
         options: Calibration and limits.
         size: (H, W) of the image; None for the calibration's.
         image: Its file, for messages.
+        calibration: Of the frame, where the options name no file.
 
     Raises:
         InputError: A file cannot be read.
         SizeError: Calibration and image do not fit together.
         NoPointsError: No point is visible.
     """
-    if options.calib is None:
+    if options.calib is not None:
+        calibration = read_calibration(options.calib, options.camera)
+    if calibration is None:
         raise UsageError(
             f"{path} is a scan, which needs --calib: a calibration file, or KITTI's raw folder"
         )
-    calibration = with_extrinsics(read_calibration(options.calib, options.camera), options)
+    named = options.calib or Path(calibration.source)
+    calibration = with_extrinsics(calibration, options)
     if not calibration.has_pose:
         raise UsageError(
-            f"{options.calib} has no pose of the scanner; add it (R and t, Tr, T_camera_lidar), or"
+            f"{named} has no pose of the scanner; add it (R and t, Tr, T_camera_lidar), or"
             " give --extrinsics"
         )
     size = size or calibration.size
     if size is None:
-        raise SizeError(f"{options.calib} does not give the image's size; give the image too")
-    warnings = check_size(options.calib, calibration, size, image)
+        raise SizeError(f"{named} does not give the image's size; give the image too")
+    warnings = check_size(named, calibration, size, image)
     scan = read_scan(path, options.point_fields)
     settings = ProjectionSettings(
         euclidean=options.euclidean,
@@ -90,7 +98,7 @@ def read_scan_points(
         occlusion=None if options.keep_occluded else OcclusionFilter(),
     )
     camera = camera_of(calibration)
-    if not calibration.source.startswith("KITTI"):  # whose files have one direction
+    if not calibration.source.startswith(("KITTI", "nuScenes")):  # whose files have one direction
         warnings += check_direction(scan.points, camera, size)
     points = project_velodyne(scan.points, camera, size, settings)
     source = f"{scan.source} of {len(scan.points):,} points, {calibration.source}"
@@ -103,7 +111,7 @@ def read_scan_points(
             "path": str(path),
             "sha256": sha256_of(path),
             "read_as": source,
-            "calibration": str(options.calib),
+            "calibration": str(named),
             "camera": options.camera,
             "extrinsics": None if options.extrinsics is None else str(options.extrinsics),
             "inverse_extrinsics": options.inverse_extrinsics,

@@ -10,6 +10,7 @@ from typing import Any
 
 import torch
 
+from pnpdepth_cli.choices import PRESETS
 from pnpdepth_cli.core.step_sizes import step_size
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.pipeline.options import options_of
@@ -189,7 +190,7 @@ def _method_parameters() -> Iterator[tuple[str, Parameter]]:
             continue
         value = _VALUES[each.type] if names is None else _one_of(tuple(names))
         yield (
-            each.name,
+            each.name.replace("_", "-"),
             Parameter(
                 title=axis.title,
                 of_percent=axis.title_percent,
@@ -197,6 +198,13 @@ def _method_parameters() -> Iterator[tuple[str, Parameter]]:
                 log=axis.log,
             ),
         )
+
+
+def _seed(text: str) -> int:
+    number = _whole(text)
+    if number >= 2**63:
+        raise ValueError(f"{number} is no seed; give one below 2^63")
+    return number
 
 
 PARAMETERS: Mapping[str, Parameter] = {
@@ -220,6 +228,9 @@ PARAMETERS: Mapping[str, Parameter] = {
         title="rotation noise of the scanner (°)", value=_within(360), of_points=True
     ),
     **dict(_method_parameters()),
+    "preset": Parameter(title="preset", value=_one_of(tuple(PRESETS))),
+    "model": Parameter(title="network", value=str),
+    "seed": Parameter(title="seed of the points", value=_seed),
 }
 """All parameters that can be varied, in the order of the help."""
 

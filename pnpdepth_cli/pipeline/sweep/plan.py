@@ -18,8 +18,11 @@ from pnpdepth_cli.pipeline.batch.settings import settings_of
 from pnpdepth_cli.pipeline.refinement.method import with_preset
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest
 from pnpdepth_cli.pipeline.refinement.resolve import resolve_layer, resolve_settings
-from pnpdepth_cli.pipeline.sweep.axes import PARAMETERS, Cell, Study, read_value
+from pnpdepth_cli.pipeline.sweep.axes import PARAMETERS, Cell, read_value
 from pnpdepth_cli.pipeline.sweep.points import Sampling, read_sensor_text
+
+_NOT_OF_UPDATE = ("model", "seed")
+"""Parameters that neither the update nor the points have."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,6 +51,8 @@ class Setup:
     """How they refine the depth."""
     iterations: int
     """Number of updates."""
+    seeds: tuple[int, ...]
+    """Of the draws of the points."""
 
 
 RunId = tuple[str, int, Sampling, "Method | None"]
@@ -80,11 +85,11 @@ class Run:
 
 
 class Plan:
-    """The runs that the cells of the studies need, the same for every frame."""
+    """The runs that the cells of one network need, the same for every frame."""
 
     def __init__(
         self,
-        studies: Sequence[Study],
+        cells: Sequence[Cell],
         definition: ModelDefinition,
         base: RefineRequest,
         sampling: Sampling,
@@ -93,11 +98,11 @@ class Plan:
     ) -> None:
         self._definition, self._base, self._sampling = definition, base, sampling
         self._seeds, self._model = range(base.hold_out.seed, base.hold_out.seed + seeds), model
-        self._wanted: dict[Sampling, dict[Method, set[int]]] = {}
-        for study in studies:
-            for cell in study.cells():
-                setup = self.setup(cell)
-                methods = self._wanted.setdefault(setup.sampling, {})
+        self._wanted: dict[tuple[Sampling, int], dict[Method, set[int]]] = {}
+        for cell in cells:
+            setup = self.setup(cell)
+            for seed in setup.seeds:
+                methods = self._wanted.setdefault((setup.sampling, seed), {})
                 methods.setdefault(setup.method, set()).add(setup.iterations)
 
     @property
@@ -106,16 +111,12 @@ class Plan:
         methods = (method for methods in self._wanted.values() for method in methods)
         return list(dict.fromkeys(method.layer for method in methods))
 
-    def seeds(self, sampling: Sampling) -> Sequence[int]:
-        """Returns the seeds to draw with: one if all would draw the same points."""
-        return self._seeds if sampling.is_random else self._seeds[:1]
-
     def setup(self, cell: Cell) -> Setup:
         """Returns what the cell is. Raises UsageError if its parameters contradict each other."""
         of_update = {
-            name: read_value(name, text)
+            name.replace("-", "_"): read_value(name, text)
             for name, text in cell.items()
-            if not PARAMETERS[name].of_points
+            if not PARAMETERS[name].of_points and name not in _NOT_OF_UPDATE
         }
         method = with_preset(replace(self._base.method, **of_update))
         settings = resolve_settings(self._definition, method)
@@ -123,8 +124,13 @@ class Plan:
         iterations = settings.iterations
         if settings.schedule == "constant":  # more updates then begin as fewer do
             settings = replace(settings, iterations=0)
+        sampling = sampling_of(cell, self._sampling)
+        seeds = tuple(self._seeds)
+        if "seed" in cell:
+            seeds = (read_value("seed", cell["seed"]),)
         return Setup(
-            sampling=sampling_of(cell, self._sampling),
+            sampling=sampling,
+            seeds=seeds if sampling.is_random else seeds[:1],
             method=Method(
                 layer=resolve_layer(self._definition, method.layer),
                 settings=settings,
@@ -137,19 +143,18 @@ class Plan:
         """Yields the runs of one frame; those with the same points follow each other."""
         read = settings_of(task.request, self._model, "files", "network")
         del read["sample"]  # `sampling` says it
-        for sampling, methods in self._wanted.items():
-            for seed in self.seeds(sampling):
-                none: set[int] = set()
-                for method, wanted in ((None, none), *methods.items()):
-                    yield Run(
-                        task=task,
-                        frame=frame,
-                        seed=seed,
-                        sampling=sampling,
-                        method=method,
-                        iterations=tuple(sorted(wanted)),
-                        key=run_key(frame.name, seed, sampling, method, read),
-                    )
+        for (sampling, seed), methods in self._wanted.items():
+            none: set[int] = set()
+            for method, wanted in ((None, none), *methods.items()):
+                yield Run(
+                    task=task,
+                    frame=frame,
+                    seed=seed,
+                    sampling=sampling,
+                    method=method,
+                    iterations=tuple(sorted(wanted)),
+                    key=run_key(frame.name, seed, sampling, method, read),
+                )
 
 
 def _one_spelling(lr: float | str) -> float | str:

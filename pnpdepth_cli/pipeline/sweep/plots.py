@@ -1,4 +1,4 @@
-"""Plots a sweep's studies as PNG: the error, and the gain over the plain network."""
+"""Plots a sweep's studies: the error, the gain over the plain network, and the error over time."""
 
 from __future__ import annotations
 
@@ -27,6 +27,7 @@ _GREY = "#555555"
 _KINDS = (BLUE, VERMILION, GREEN, PURPLE, SKY, ORANGE)
 _MARKS = "osD^vP"
 _STYLE: dict[Any, Any] = {
+    "svg.hashsalt": "pnpdepth",
     "font.size": 8,
     "axes.spines.top": False,
     "axes.spines.right": False,
@@ -37,6 +38,12 @@ _STYLE: dict[Any, Any] = {
     "lines.linewidth": 1.4,
     "legend.frameon": False,
 }
+_METADATA: dict[str, dict[str, Any]] = {
+    "png": {"Software": None},
+    "svg": {"Date": None},
+    "pdf": {"CreationDate": None},
+}
+"""Without the program's version and the date, so that the same sweep gives the same bytes."""
 _MAX_LETTERS = 30
 """More letters of values below an axis are rotated."""
 
@@ -50,19 +57,20 @@ def need_matplotlib() -> None:
 
 
 def draw_study(study: Study, cells: Cells, path: Path) -> None:
-    """Writes a PNG of the cells of one axis or two.
+    """Writes a plot of the cells of one axis or two, with a third panel where times are known.
 
     Args:
         study: The axes.
         cells: The cells in the order of the study.
-        path: The PNG.
+        path: The file, of one of PLOT_FORMATS.
     """
     import matplotlib as mpl
     from matplotlib.figure import Figure
 
     with mpl.rc_context(_STYLE):
-        figure = Figure(figsize=(7.2, 2.9), dpi=200, layout="constrained")
-        error, gain = figure.subplots(1, 2)
+        timed = any(cell.get("time_s") is not None for cell in cells)
+        figure = Figure(figsize=(10.4 if timed else 7.2, 2.9), dpi=200, layout="constrained")
+        error, gain, *cost = figure.subplots(1, 3 if timed else 2)
         if len(study.axes) == 1:
             _draw_one(study.axes[0], cells, error, gain)
         else:
@@ -73,9 +81,30 @@ def draw_study(study: Study, cells: Cells, path: Path) -> None:
             )
         error.set_ylabel("MAE (m)")
         gain.axhline(0, color=_GREY, linewidth=0.8, zorder=1)
+        for axes in cost:
+            _draw_cost(axes, cells)
+        kind = path.suffix.removeprefix(".")
         with atomic_path(path) as temporary:
-            # without the program's version and the date, so the same sweep gives the same bytes
-            figure.savefig(temporary, format="png", metadata={"Software": None})
+            figure.savefig(temporary, format=kind, metadata=_METADATA[kind])
+
+
+def _draw_cost(axes: Axes, cells: Cells) -> None:
+    """The error of each cell over the time of its refinement, with its values."""
+    for cell in cells:
+        (error,) = _values([cell], "mae", "refined")
+        if cell.get("time_s") is None or error != error:
+            continue
+        axes.plot(cell["time_s"], error, "o", color=BLUE, markersize=4)
+        axes.annotate(
+            ", ".join(cell["parameters"].values()),
+            (cell["time_s"], error),
+            textcoords="offset points",
+            xytext=(4, 3),
+            fontsize=6,
+            color=_GREY,
+        )
+    axes.set_xlabel("time of the refinement (s)")
+    axes.set_ylabel("MAE (m)")
 
 
 def _draw_one(axis: Axis, cells: Cells, error: Axes, gain: Axes) -> None:

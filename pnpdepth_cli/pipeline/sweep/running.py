@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
@@ -35,6 +36,8 @@ class Curve:
     """By the number of updates; after a divergence of the last finite depth."""
     step: float
     """α as a number."""
+    times_s: dict[int, float]
+    """By the number of updates: seconds until the depth after it."""
     updates: int
     """Number of updates until the end or a divergence."""
     diverged: str | None
@@ -68,7 +71,7 @@ def result_of(run: Run, inputs: Inputs, cache: SplitCache) -> dict[str, Any]:
     return done | {
         "plain": curve.plain,
         "scores": {
-            str(k): scores | {"updates": min(k, curve.updates)}
+            str(k): scores | {"updates": min(k, curve.updates), "time_s": curve.times_s[k]}
             for k, scores in curve.scores.items()
         },
         "step": curve.step,
@@ -101,6 +104,7 @@ def refined_curve(
     reader = prepared.depth_reader(settings)
     keep = range(settings.iterations + 1) if settings.gives_best else {0, *wanted}
     diverged: DivergedError | None = None
+    clock = _Clock()
     with out_of_memory_is_a_device_error(network.device):
         try:
             result = refine(
@@ -110,11 +114,13 @@ def refined_curve(
                 settings,
                 depth_of=reader,
                 keep_depths=keep,
+                on_iteration=clock.on_iteration,
             )
         except DivergedError as error:
             if not isinstance(error.last_good, Refinement):
                 raise
             diverged, result = error, error.last_good
+        clock.stop()
         updates = len(result.losses) - 1
         kept = {k: _kept(result.losses, min(k, updates), settings) for k in wanted}
         ground_truth = ground_truth_in_view(network, inputs)
@@ -127,6 +133,7 @@ def refined_curve(
     return Curve(
         plain=asdict(score(depths[0], ground_truth)),
         scores={k: scores[index] for k, index in sorted(kept.items())},
+        times_s={k: clock.until(min(k, updates)) for k in kept},
         step=result.step,
         updates=updates,
         diverged=str(diverged) if diverged else None,
@@ -142,11 +149,14 @@ def weights_curve(network: Network, method: Method, inputs: Inputs, wanted: Sequ
     """Returns the same where weights move; each number of updates is refined for itself."""
     truth, frame = ground_truth_in_view(network, inputs), inputs.frame()
     refined: dict[int, RefinedFrame] = {}
+    times: dict[int, float] = {}
     cut = network.cut_at_points() if method.settings.masked else network.cut_at(method.layer)
     with cut as split:
         for k in wanted:
             settings = replace(method.settings, iterations=k)
+            began = time.perf_counter()
             refined[k] = refine_frame(network, split, settings, frame, propagation=method.propagate)
+            times[k] = time.perf_counter() - began
     last = refined[max(wanted)]
     before = _propagated(torch.from_numpy(last.before), inputs, method.propagate)
     return Curve(
@@ -155,10 +165,38 @@ def weights_curve(network: Network, method: Method, inputs: Inputs, wanted: Sequ
             k: asdict(score(torch.from_numpy(each.after) if k else before, truth))
             for k, each in sorted(refined.items())
         },
+        times_s=times,
         step=last.refinement.step,
         updates=len(last.refinement.losses),
         diverged=str(last.diverged) if last.diverged else None,
     )
+
+
+class _Clock:
+    """Times a refinement, and from it the shorter ones that it includes."""
+
+    def __init__(self) -> None:
+        self._began = time.perf_counter()
+        self._updates: list[float] = []
+        self._last_pass = 0.0
+
+    def on_iteration(self, iteration: int, loss: float) -> None:
+        """Notes that an update is done."""
+        self._updates.append(time.perf_counter() - self._began)
+
+    def stop(self) -> None:
+        """Notes that the pass after the last update is done."""
+        done = time.perf_counter() - self._began
+        self._last_pass = done - (self._updates[-1] if self._updates else 0.0)
+
+    def until(self, updates: int) -> float:
+        """Returns seconds until the depth after so many updates; after none, by extrapolation."""
+        if not self._updates:
+            return self._last_pass
+        if updates > 0:
+            return self._updates[min(updates, len(self._updates)) - 1] + self._last_pass
+        apart = (self._updates[-1] - self._updates[0]) / max(1, len(self._updates) - 1)
+        return max(0.0, self._updates[0] - apart) + self._last_pass
 
 
 def interpolated(network: Network, inputs: Inputs) -> dict[str, Any]:

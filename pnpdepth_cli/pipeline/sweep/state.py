@@ -12,7 +12,7 @@ from pnpdepth_cli.io.journal import Journal
 from pnpdepth_cli.pipeline.sweep.plan import Run
 from pnpdepth_cli.pipeline.sweep.points import OWN, calibration_file
 
-RESULTS = ("sweep.json", "sweep.csv", "sweep_frames.csv")
+RESULTS = ("sweep.json", "sweep.csv", "sweep_frames.csv", "sweep.tex")
 
 
 class SweepState:

@@ -24,6 +24,7 @@ from pnpdepth_cli.pipeline.evaluation.dependence import (
     groups_by_name,
 )
 from pnpdepth_cli.pipeline.evaluation.resampling import studentised_interval
+from pnpdepth_cli.pipeline.evaluation.score_files import latex_text
 
 METHODS = ("plain", "linear", "refined")
 SWEPT = tuple(m for m in MEASURES if m.key in ("mae", "rmse", "mre", "delta1"))
@@ -48,6 +49,8 @@ class FrameFigures:
     """(methods, measures); None if something failed."""
     points: int = 0
     """How many points were drawn."""
+    time_s: float | None = None
+    """Seconds of the refinement; None if they were not recorded."""
     diverged: bool = False
     """True if the refinement made fewer updates than it should."""
 
@@ -83,11 +86,14 @@ class FrameFigures:
             seed=seed,
             values=np.array(rows, np.float64),  # null in JSON becomes NaN
             points=curve["points"],
+            time_s=by_method["refined"].get("time_s"),
             diverged=by_method["refined"]["updates"] < iterations,
         )
 
 
-def summarise(figures: Sequence[FrameFigures], resamples: int) -> dict[str, Any]:
+def summarise(
+    figures: Sequence[FrameFigures], resamples: int, *, cost: bool = False
+) -> dict[str, Any]:
     """Returns a cell's means over frames, of each frame's mean over its draws.
 
     Frames of which a draw failed are left out. Gains are in per cent, positive where the refinement
@@ -97,16 +103,20 @@ def summarise(figures: Sequence[FrameFigures], resamples: int) -> dict[str, Any]
         figures: All draws of all frames of the cell.
         resamples: Bootstrap samples behind the intervals, which are studentised and over sequences
             of frames; there are none with fewer than MIN_CLUSTERS of these.
+        cost: True to add the mean time of a refinement.
     """
     by_frame: dict[str, list[FrameFigures]] = {}
     for each in figures:
         by_frame.setdefault(each.name, []).append(each)
     whole = [of for of in by_frame.values() if all(each.values is not None for each in of)]
-    counts = {
+    counts: dict[str, Any] = {
         "frames": len(whole),
         "failed": len(by_frame) - len(whole),
         "diverged": sum(each.diverged for each in figures),
     }
+    if cost:
+        times = [each.time_s for of in whole for each in of if each.time_s is not None]
+        counts |= {"time_s": float(np.mean(times)) if times else None}
     if not whole:
         return counts | {"points": None, "measures": None}
     table = np.stack(
@@ -170,8 +180,11 @@ def _by_measure(mean: Floats, low: Floats, high: Floats) -> dict[str, dict[str, 
 def write_sweep(folder: Path, record: Mapping[str, Any]) -> None:
     """Writes the record to sweep.json, and a line for each of its cells to sweep.csv."""
     write_json(folder / "sweep.json", record)
+    tables = (_latex(study, record) for study in record["studies"])
+    _write_text(folder / "sweep.tex", "\n".join(tables))
     names = _parameters(record["studies"])
-    header = ["study", *names, "frames", "failed", "diverged", "points_used"]
+    cost = ["time_s"] * any("time_s" in c for study in record["studies"] for c in study["cells"])
+    header = ["study", *names, "frames", "failed", "diverged", "points_used", *cost]
     header += [f"{measure.key}_{name}" for measure in SWEPT for name in _MEASURE_COLUMNS]
 
     def rows() -> Iterator[list[Any]]:
@@ -181,7 +194,7 @@ def write_sweep(folder: Path, record: Mapping[str, Any]) -> None:
                 yield [
                     study["name"],
                     *(cell["parameters"].get(name) for name in names),
-                    *(cell[name] for name in ("frames", "failed", "diverged", "points")),
+                    *(cell[name] for name in ("frames", "failed", "diverged", "points", *cost)),
                     *(
                         measures.get(measure.key, {}).get(name)
                         for measure in SWEPT
@@ -190,6 +203,27 @@ def write_sweep(folder: Path, record: Mapping[str, Any]) -> None:
                 ]
 
     _write_csv(folder / "sweep.csv", header, rows())
+
+
+def _latex(study: Mapping[str, Any], record: Mapping[str, Any]) -> str:
+    """A tabular of a study: MAE and RMSE of each method, the gain in MAE and its interval."""
+    names = list(study["parameters"])
+    header = [*names, *(f"{m} {what} [m]" for m in ("MAE", "RMSE") for what in METHODS)]
+    header += ["gain [%]", "low", "high"]
+    rows = []
+    for cell in study["cells"]:
+        measures = cell["measures"] or {}
+        mae = measures.get("mae", {})
+        values = [measures.get(key, {}).get(name) for key in ("mae", "rmse") for name in METHODS]
+        row = ["–" if value is None else f"{value:.4f}" for value in values]
+        gains = [mae.get(name) for name in ("gain", "gain_low", "gain_high")]
+        row += ["–" if value is None else f"{value:+.1f}" for value in gains]
+        rows.append([*(cell["parameters"][name] for name in names), *row])
+    caption = (
+        f"means over {len(record['frames']):,} frames, {record['seeds']} draws of the points each;"
+        " gain: in per cent of the plain network's MAE; interval: 95 %, over sequences of frames"
+    )
+    return latex_text(header, rows, caption)
 
 
 def write_frames(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
@@ -226,6 +260,10 @@ def _write_csv(path: Path, header: Sequence[str], rows: Iterator[list[Any]]) -> 
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(header)
     writer.writerows(rows)
+    _write_text(path, text.getvalue())
+
+
+def _write_text(path: Path, text: str) -> None:
     with atomic_path(path) as temporary:
         # a file name that is no UTF-8 has surrogates
-        temporary.write_bytes(text.getvalue().encode("utf-8", "backslashreplace"))
+        temporary.write_bytes(text.encode("utf-8", "backslashreplace"))

@@ -29,7 +29,7 @@ from pnpdepth_cli.pipeline.refinement.method import with_preset
 from pnpdepth_cli.pipeline.refinement.refine import Refiner, load_refiner
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest
 from pnpdepth_cli.pipeline.refinement.resolve import resolve_layer, resolve_settings
-from pnpdepth_cli.pipeline.sweep.axes import Study
+from pnpdepth_cli.pipeline.sweep.axes import Cell, Study
 from pnpdepth_cli.pipeline.sweep.plan import Plan, Run, RunId, Setup, sampling_of
 from pnpdepth_cli.pipeline.sweep.plots import draw_study, need_matplotlib
 from pnpdepth_cli.pipeline.sweep.points import OWN, Sampling, frame_points
@@ -40,6 +40,8 @@ from pnpdepth_cli.sensors import SamplePattern
 
 T = TypeVar("T")
 Lines = Mapping[RunId, "dict[str, Any] | None"]
+Model = tuple[str, "Path | None"]
+"""A network and its weights, as the user names them."""
 _GROUND_TRUTH_ONLY = SamplePattern(count=1)
 _RESOLVE_POINTS = 500
 """Points of the ground truth that the definition is resolved on; the paper uses 500 indoors."""
@@ -58,6 +60,10 @@ class SweepRequest(FrameSelection):
     """Draws of the points, with consecutive seeds."""
     plots: bool = True
     """True to write a plot of each study."""
+    plot_format: str = "png"
+    """One of PLOT_FORMATS."""
+    cost: bool = False
+    """True to report the time of the refinement beside its error."""
     resamples: int = 2000
     """Bootstrap samples behind the intervals."""
 
@@ -81,29 +87,86 @@ def run_sweep(request: SweepRequest, listener: Listener) -> dict[str, Any]:
     make_folder(request.output)
     with locked_folder(request.output, None, lambda: _clean(request.output)):
         state = SweepState(request.output)
-        refiner = _resolved(request, tasks, listener)
-        plan = Plan(
-            request.studies,
-            refiner.network.definition,
-            request.refine,
-            sampling,
-            request.seeds,
-            model_identity(request.refine),
-        )
-        for layer in plan.layers:
-            with refiner.network.cut_at(layer):
-                pass  # reports an unknown layer before anything is computed
-        runs = [run for task, frame in tasks for run in plan.runs(task, frame)]
-        to_do = [run for run in runs if not state.is_done(run)]
+        networks = {
+            model: _network(model, request, sampling, tasks, listener) for model in _models(request)
+        }
+        runs = [(each, run) for each in networks.values() for run in each.runs]
+        to_do = [(each, run) for each, run in runs if not state.is_done(run)]
         listener.say(
             f"{len(tasks):,} frames, {len(runs):,} runs: {len(runs) - len(to_do):,} done already,"
             f" {len(to_do):,} to do"
         )
         listener.begin(len(to_do))
-        for row in _rows(to_do, refiner, state):
-            listener.frame(row)
-        lines = {run.id: state.result(run.key) for run in runs}
-        return _write(request, sampling, refiner, plan, [task.name for task, _ in tasks], lines)
+        for each in networks.values():
+            own = [run for owner, run in to_do if owner is each]
+            for row in _rows(own, each.refiner, state):
+                listener.frame(row)
+        return _write(request, sampling, networks, [task.name for task, _ in tasks], state)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Network:
+    """A network of the sweep and its runs."""
+
+    refiner: Refiner
+    """The network, loaded."""
+    base: dict[str, Any]
+    """The settings that are not varied."""
+    plan: Plan
+    """What its cells need."""
+    runs: tuple[Run, ...]
+    """Of all frames."""
+
+
+def _models(request: SweepRequest) -> list[Model]:
+    """The networks of the cells, each once; one in most sweeps."""
+    cells = [cell for study in request.studies for cell in study.cells()]
+    return list(dict.fromkeys(_model_of(cell, request) for cell in cells))
+
+
+def _model_of(cell: Cell, request: SweepRequest) -> Model:
+    """The network of a cell, varied as `NETWORK` or `NETWORK@WEIGHTS`, and its weights."""
+    network = request.refine.network
+    if "model" not in cell:
+        return network.model, network.checkpoint
+    spec, at, weights = cell["model"].partition("@")
+    if not at and network.checkpoint is not None:
+        raise UsageError("--checkpoint is of one network; vary model=NETWORK@WEIGHTS instead")
+    return spec, Path(weights) if at else None
+
+
+def _network(
+    model: Model,
+    request: SweepRequest,
+    sampling: Sampling,
+    tasks: Sequence[tuple[Task, Frame]],
+    listener: Listener,
+) -> _Network:
+    """The network, loaded, and the runs of its cells."""
+    spec, checkpoint = model
+    cells = [
+        cell
+        for study in request.studies
+        for cell in study.cells()
+        if _model_of(cell, request) == model
+    ]
+    refine = request.refine.with_fields(model=spec, checkpoint=checkpoint)
+    tasks = [
+        (replace(task, request=task.request.with_fields(model=spec, checkpoint=checkpoint)), frame)
+        for task, frame in tasks
+    ]
+    refiner = _resolved(replace(request, refine=refine), tasks, listener)
+    definition = refiner.network.definition
+    plan = Plan(cells, definition, refine, sampling, request.seeds, model_identity(refine))
+    for layer in plan.layers:
+        with refiner.network.cut_at(layer):
+            pass  # reports an unknown layer before anything is computed
+    return _Network(
+        refiner=refiner,
+        base=_base(definition, refine),
+        plan=plan,
+        runs=tuple(run for task, frame in tasks for run in plan.runs(task, frame)),
+    )
 
 
 def _clean(output: Path) -> None:
@@ -269,33 +332,41 @@ def _done(
 def _write(
     request: SweepRequest,
     sampling: Sampling,
-    refiner: Refiner,
-    plan: Plan,
+    networks: Mapping[Model, _Network],
     names: Sequence[str],
-    lines: Lines,
+    state: SweepState,
 ) -> dict[str, Any]:
     """Writes the tables and plots; returns the contents of sweep.json."""
+    lines: dict[Model, Lines] = {
+        model: {run.id: state.result(run.key) for run in each.runs}
+        for model, each in networks.items()
+    }
     studies: list[dict[str, Any]] = []
     rows: list[dict[str, Any]] = []
     for study in request.studies:
-        figures = [_figures(plan.setup(cell), plan, names, lines) for cell in study.cells()]
         cells = []
-        for cell, of_cell in zip(study.cells(), figures, strict=True):
-            cells.append({"parameters": dict(cell), **summarise(of_cell, request.resamples)})
-            rows += [{"study": study.name, "parameters": cell, "figures": f} for f in of_cell]
-        plot = f"sweep_{study.name}.png" if request.plots else None
+        for cell in study.cells():
+            model = _model_of(cell, request)
+            plan = networks[model].plan
+            figures = _figures(plan.setup(cell), names, lines[model])
+            summary = summarise(figures, request.resamples, cost=request.cost)
+            cells.append({"parameters": dict(cell), **summary})
+            rows += [{"study": study.name, "parameters": cell, "figures": f} for f in figures]
+        plot = f"sweep_{study.name}.{request.plot_format}" if request.plots else None
         if plot is not None:
             draw_study(study, cells, request.output / plot)
         values = {axis.name: list(axis.values) for axis in study.axes}
         studies.append({"name": study.name, "parameters": values, "plot": plot, "cells": cells})
+    first, *others = networks.values()
     record = {
         "command": "sweep",
         "source": str(request.source),
         "output": str(request.output),
-        "model": refiner.model_record,
+        "model": first.refiner.model_record,
+        **({"more_models": [each.refiner.model_record for each in others]} if others else {}),
         "frames": list(names),
         "seeds": request.seeds,
-        "base": _base(refiner.network.definition, request.refine) | asdict(sampling),
+        "base": first.base | asdict(sampling),
         "studies": studies,
     }
     write_sweep(request.output, record)
@@ -303,7 +374,7 @@ def _write(
     return record
 
 
-def _figures(setup: Setup, plan: Plan, names: Sequence[str], lines: Lines) -> list[FrameFigures]:
+def _figures(setup: Setup, names: Sequence[str], lines: Lines) -> list[FrameFigures]:
     """A cell's scores of each frame and seed."""
     return [
         FrameFigures.of(
@@ -314,5 +385,5 @@ def _figures(setup: Setup, plan: Plan, names: Sequence[str], lines: Lines) -> li
             curve=lines[name, seed, setup.sampling, setup.method],
         )
         for name in names
-        for seed in plan.seeds(setup.sampling)
+        for seed in setup.seeds
     ]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import fields
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ from pnpdepth_cli.io.layouts import PROTOCOLS as LAYOUT_PROTOCOLS
 from pnpdepth_cli.pipeline.evaluation.evaluate import evaluate
 from pnpdepth_cli.pipeline.evaluation.frame_reading import Scales
 from pnpdepth_cli.pipeline.evaluation.result import EvalRequest, Evaluation
+from pnpdepth_cli.sensors import SamplePattern, sample_points
 
 
 def depth_file(path: Path, rows: Any, scale: float = 1000) -> Path:
@@ -378,7 +379,9 @@ def test_the_record_beside_a_prediction_is_enough_to_find_the_leak(two: Path) ->
     sampled = {"inputs": {"sparse": {"sampled_from": "gt"}}, "points": {"used": 2}}
     (two / "out" / "a.json").write_text(json.dumps(sampled))
     assert scored(two).frames[0].leaked == 2
-    with pytest.raises(InputError, match="no sparse depth file to exclude; give it with --sparse"):
+    with pytest.raises(
+        InputError, match=r"cannot be sampled again as its record says .*; give them with --sparse"
+    ):
         scored(two, exclude_sparse=True)
 
 
@@ -607,3 +610,26 @@ def test_unknown_and_unfitting_measures_are_refused(two: Path) -> None:
         scored(two, groups=("area",), average="pooled")
     with pytest.raises(UsageError, match="--measures does not apply to kitti-devkit"):
         scored(two, groups=("area",), protocol="kitti-devkit")
+
+
+def test_points_sampled_from_the_ground_truth_are_excluded_as_they_were_drawn(
+    tmp_path: Path,
+) -> None:
+    truth = np.random.default_rng(0).uniform(2, 9, (20, 30)).astype(np.float32)
+    points = sample_points(truth, SamplePattern(count=50), seed=7)
+    x, y = np.rint(points.xy).astype(int).T
+    depth = truth + 1
+    depth[y, x] = truth[y, x]  # copies the points
+    depth_file(tmp_path / "gt" / "a.npy", truth)
+    depth_file(tmp_path / "out" / "a_depth.npy", depth)
+    sampling = {"sampled_from": "gt/a.npy", **asdict(SamplePattern(count=50)), "seed": 7}
+    record = {"inputs": {"sparse": sampling}, "points": {"used": 50}}
+    (tmp_path / "out" / "a.json").write_text(json.dumps(record))
+    assert scored(tmp_path).mean["mae"] == pytest.approx(1 - 50 / 600, rel=1e-5)
+    found = scored(tmp_path, exclude_sparse=True)
+    assert found.frames[0].pixels == 550
+    assert found.mean["mae"] == pytest.approx(1, rel=1e-5)
+    record["points"]["used"] = 51
+    (tmp_path / "out" / "a.json").write_text(json.dumps(record))
+    with pytest.raises(InputError, match="it is of another ground truth; give them with --sparse"):
+        scored(tmp_path, exclude_sparse=True)

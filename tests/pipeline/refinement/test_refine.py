@@ -63,6 +63,24 @@ def test_ground_truth_that_is_the_sparse_depth_is_warned_of(frame: FrameOnDisk) 
     assert not any("sparse depth itself" in note for note in notes)
 
 
+def test_a_wrong_scale_of_the_ground_truth_is_warned_of(frame: FrameOnDisk) -> None:
+    notes = run(frame, gt=frame.gt, gt_scale=256.0, iterations=0).record["notes"]
+    assert any("the ground truth is 3.91 times the sparse depth" in note for note in notes)
+    notes = run(frame, gt=frame.gt, iterations=0, overwrite=True).record["notes"]
+    assert not any("times the sparse depth" in note for note in notes)
+
+
+def test_a_point_beyond_everything_is_dropped_with_a_note(frame: FrameOnDisk) -> None:
+    depth = read_depth(frame.sparse).values.copy()
+    rows, columns = np.nonzero(depth)
+    depth[rows[0], columns[0]] = 1e30
+    write_depth(frame.folder / "far.npy", depth)
+    record = run(frame, sparse=frame.folder / "far.npy", iterations=0).record
+    assert record["points"]["used"] == len(rows) - 1
+    assert record["points"]["farthest"] < 10
+    assert any("dropped 1 of 60 points more than 1,000 times" in note for note in record["notes"])
+
+
 def test_the_scores_of_the_record_are_those_of_the_written_file(frame: FrameOnDisk) -> None:
     record = run(frame, gt=frame.gt, format="npy").record
     written = read_depth(frame.folder / "out" / "img_depth.npy").values
@@ -254,13 +272,3 @@ def test_a_truth_of_another_size_or_without_depth_is_refused(frame: FrameOnDisk)
         run(frame, gt=small)
     with pytest.raises(InputError, match="no pixel with known depth"):
         run(frame, gt=empty)
-
-
-def test_depth_that_does_not_fit_the_output_format_is_refused_by_name(frame: FrameOnDisk) -> None:
-    far = frame.folder / "far.csv"
-    far.write_text("30 20 2.0\n")
-    model = frame.folder / "far.py"
-    model.write_text(frame.model.read_text().replace("2 + 3", "400 + 3"))
-    with pytest.raises(OutputError, match="exr"):
-        run(frame, model=str(model), sparse=far, iterations=0)
-    assert not (frame.folder / "out").exists() or not files(frame.folder / "out")

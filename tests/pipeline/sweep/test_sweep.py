@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from safetensors.torch import load_file, save_file
 
 from pnpdepth_cli.completion.interpolation import linear
 from pnpdepth_cli.core.metrics import score
@@ -586,3 +587,88 @@ def test_a_sweep_over_what_moves_refines_each_for_itself(root: Path) -> None:
         if (each["parameters"], each["frame"]) == ("weights", "a")
     ]
     assert float(line["mae_refined"]) == weights["after"]["mae"]
+
+
+def test_each_network_has_its_own_cells(root: Path) -> None:
+    net, weights = root / "net" / "my_net.py", root / "net" / "my_net.safetensors"
+    other = root / "net" / "other.safetensors"
+    state = {name: 1.1 * value for name, value in load_file(weights).items()}
+    save_file(state, other)
+    models = [f"{net}@{weights}", f"{net}@{other}"]
+    found = sweep(root, f"model={','.join(models)}", "points=20,60", refine={"checkpoint": None})
+    cells = found["studies"][0]["cells"]
+    assert [cell["parameters"]["model"] for cell in cells] == [m for m in models for _ in range(2)]
+    for model, checkpoint in zip(models, (weights, other), strict=True):
+        alone = sweep(
+            root, "points=20,60", refine={"checkpoint": checkpoint}, output=root / checkpoint.stem
+        )
+        own = [cell["measures"] for cell in cells if cell["parameters"]["model"] == model]
+        assert own == [cell["measures"] for cell in alone["studies"][0]["cells"]]
+    assert cells[0]["measures"] != cells[2]["measures"]
+    assert [found["model"]["checkpoint"], found["more_models"][0]["checkpoint"]] == [
+        str(weights),
+        str(other),
+    ]
+    with pytest.raises(UsageError, match="vary model=NETWORK@WEIGHTS"):
+        sweep(root, f"model={net}")
+
+
+def test_each_seed_is_a_draw_of_the_points(root: Path) -> None:
+    found = sweep(root, "seed=0,3", sampling=read_sampling("40"))
+    drawn = [cell["measures"]["mae"]["refined"] for cell in found["studies"][0]["cells"]]
+    both = sweep(root, "points=40", seeds=4, sampling=read_sampling("40"), output=root / "both")
+    assert both["frames"] == found["frames"]
+    with (root / "both" / "sweep_frames.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    for seed, value in zip((0, 3), drawn, strict=True):
+        own = [float(row["mae_refined"]) for row in rows if row["seed"] == str(seed)]
+        assert value == pytest.approx(np.mean(own))
+
+
+def test_presets_are_varied(root: Path) -> None:
+    found = sweep(root, "preset=paper,fast", refine={"propagate": None})
+    paper, fast = (cell["measures"]["mae"]["refined"] for cell in found["studies"][0]["cells"])
+    alone = sweep(
+        root, "iterations=5", refine={"preset": "paper", "propagate": None}, output=root / "alone"
+    )
+    assert paper == alone["studies"][0]["cells"][0]["measures"]["mae"]["refined"]
+    assert fast != paper
+
+
+def test_the_cost_stands_beside_the_error_where_it_is_asked_for(root: Path) -> None:
+    found = sweep(root, "iterations=0,1,4", cost=True)
+    times = [cell["time_s"] for cell in found["studies"][0]["cells"]]
+    assert 0 < times[0] <= times[1] < times[2]
+    with (root / "out" / "sweep.csv").open(newline="") as file:
+        assert [float(row["time_s"]) for row in csv.DictReader(file)] == times
+    assert "time_s" not in sweep(root, "iterations=0,1,4")["studies"][0]["cells"][0]
+
+
+def test_a_column_of_the_csv_has_a_name_of_its_own(root: Path) -> None:
+    sweep(root, "points=20,60", cost=True)
+    with (root / "out" / "sweep.csv").open(newline="") as file:
+        header = next(csv.reader(file))
+    assert len(set(header)) == len(header)
+
+
+def test_tables_are_written_as_latex(root: Path) -> None:
+    found = sweep(root, "points=20,60", "iterations=0,5")
+    lines = (root / "out" / "sweep.tex").read_text().splitlines()
+    (mae,) = {f"{found['studies'][0]['cells'][0]['measures']['mae']['refined']:.4f}"}
+    first = lines[lines.index(r"\midrule") + 1]
+    assert first.startswith("20 & 0 & ")
+    assert first.split(" & ")[4] == mae
+    assert sum(line.endswith(r"\\") for line in lines) == 5
+
+
+@pytest.mark.parametrize(("kind", "start"), [("svg", b"<?xml"), ("pdf", b"%PDF")])
+def test_plots_can_be_vector_graphics_of_the_same_bytes(
+    root: Path, kind: str, start: bytes
+) -> None:
+    plot = root / "out" / f"sweep_iterations.{kind}"
+    written = []
+    for _ in range(2):
+        sweep(root, "iterations=0,1", plots=True, plot_format=kind, cost=True)
+        written.append(plot.read_bytes())
+    assert written[0].startswith(start)
+    assert written[0] == written[1]
