@@ -35,7 +35,7 @@ _STAGES = {
 }
 
 
-_COLUMNS = ("", "before", "after", "change", "linear", "against linear")
+_COLUMNS = ("", "before", "after", "change", "linear", "vs linear")
 
 
 def print_refinement(record: Mapping[str, Any]) -> None:

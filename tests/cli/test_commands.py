@@ -9,6 +9,9 @@ from pathlib import Path
 import pytest
 
 from pnpdepth_cli.cli.main import main
+from pnpdepth_cli.cli.options import request_of
+from pnpdepth_cli.cli.refine import refine as refine_command
+from pnpdepth_cli.cli.tables import print_refinement
 from tests.pipeline.frames import FrameOnDisk, frame_on_disk
 
 
@@ -252,3 +255,28 @@ def test_idle_threads_sleep_soon_unless_the_user_says_how_they_wait(
         [sys.executable, "-c", code], env=others | said, capture_output=True, text=True, check=True
     )
     assert done.stdout.splitlines()[-1] == spins
+
+
+def test_a_depth_worse_than_linear_interpolation_is_named_so(
+    frame: FrameOnDisk, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert code_of(refine(frame, "--gt", str(frame.gt))) == 0
+    assert "this depth is worse than linear interpolation" in capsys.readouterr().err
+
+
+def test_the_title_says_when_the_network_is_not_used(
+    frame: FrameOnDisk, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert code_of([*refine(frame, "--auto", "--json")]) == 0
+    record = json.loads(capsys.readouterr().out)
+    print_refinement(record | {"auto": record["auto"] | {"uses_network": False}})
+    assert "without tiny" in " ".join(capsys.readouterr().err.split())
+
+
+def test_several_models_are_the_first_and_more() -> None:
+    context = refine_command.make_context(
+        "refine", ["a.png", "--sparse", "s.png", "--model", "fcrn-tiny", "--model", "eigen-tiny"]
+    )
+    given = {name: value for name, value in context.params.items() if name != "as_json"}
+    network = request_of(given).network
+    assert (network.model, network.more_models) == ("fcrn-tiny", ("eigen-tiny",))

@@ -93,7 +93,9 @@ def _nearest(root: Path) -> str:
         fact = f" and lacks {', '.join(lacking)}" if lacking else ""
         text = f"nearest is {best!r}, which needs {', '.join(needs[best])}{fact}; others need: "
     others = (each for each in needs if each != best or not present[best])
-    return text + "; ".join(f"{each} {', '.join(needs[each])}" for each in others)
+    without = [each for each in LAYOUTS if each not in needs]
+    more = f"; without a fixed folder: {', '.join(without)}" if without else ""
+    return text + "; ".join(f"{each} {', '.join(needs[each])}" for each in others) + more
 
 
 def list_frames(root: Path, name: str | None = None) -> tuple[str, Listing]:

@@ -473,7 +473,9 @@ def test_a_protocol_cuts_image_points_and_truth_alike(root: Path) -> None:
 
 
 def test_an_empty_folder_says_which_layouts_there_are(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"layout \(manifest, .*pairs"):
+    with pytest.raises(
+        InputError, match=r"any layout; layouts need: nyu-mat .*; pairs rgb, sparse"
+    ):
         batch(tmp_path)
     for part in ("rgb", "sparse"):
         (tmp_path / part).mkdir()
