@@ -13,7 +13,7 @@ from pnpdepth_cli.io.calibration import read_calibration
 from pnpdepth_cli.io.depth import read_depth, write_depth
 from pnpdepth_cli.io.scans import read_scan
 from pnpdepth_cli.pipeline.refinement.inputs import read_inputs
-from pnpdepth_cli.pipeline.refinement.request import FrameFiles, RefineRequest
+from pnpdepth_cli.pipeline.refinement.request import FrameFiles, MethodOptions, RefineRequest
 from pnpdepth_cli.pipeline.sparse.scan_options import ScanOptions
 from pnpdepth_cli.pipeline.sparse.scans import camera_of
 from pnpdepth_cli.sensors import (
@@ -102,6 +102,8 @@ def test_a_frame_is_read_without_occluded_points_unless_they_are_kept(tmp_path: 
     kept = read_inputs(RefineRequest(files=replace(files, scan=ScanOptions(keep_occluded=True))))
     assert len(kept.points) == len(points)
     assert not any("occluded" in note for note in kept.notes)
+    paper = RefineRequest(files=files, method=MethodOptions(preset="paper"))
+    assert len(read_inputs(paper).points) == len(points)
 
 
 def test_kittis_maps_are_recognised_and_its_filtered_scans_are_not(shared_data: Path) -> None:

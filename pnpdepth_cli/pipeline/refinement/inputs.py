@@ -25,6 +25,7 @@ from pnpdepth_cli.io.depth import (
 from pnpdepth_cli.io.depth_range import metres
 from pnpdepth_cli.io.fingerprint import fingerprint
 from pnpdepth_cli.io.rgb import read_rgb
+from pnpdepth_cli.pipeline.refinement.method import PAPER
 from pnpdepth_cli.pipeline.refinement.request import FrameFiles, RefineRequest
 from pnpdepth_cli.pipeline.sparse.colmap import read_colmap_points
 from pnpdepth_cli.pipeline.sparse.colmap_options import METRES, ColmapOptions
@@ -137,7 +138,8 @@ def read_inputs(request: RefineRequest) -> Inputs:
     elif files.scan.describes(files.sparse):
         sparse = _read_scan(files, files.sparse, whole)
     else:
-        sparse = _read_points(files, files.sparse, whole)
+        keep = files.scan.keep_occluded or request.method.preset == PAPER
+        sparse = _read_points(files, files.sparse, whole, keep_occluded=keep)
     sparse = _without_far_points(sparse)
     if ground_truth is not None and sparse.unit != METRES:
         raise UsageError(
@@ -314,7 +316,9 @@ def _read_colmap(files: FrameFiles, path: Path, image_size: tuple[int, int] | No
     )
 
 
-def _read_points(files: FrameFiles, path: Path, image_size: tuple[int, int] | None) -> _Sparse:
+def _read_points(
+    files: FrameFiles, path: Path, image_size: tuple[int, int] | None, *, keep_occluded: bool
+) -> _Sparse:
     scale = files.sparse_scale or files.depth_scale
     sparse = read_sparse(path, size=image_size, scale=scale, channel=files.channel)
     sparse_size, depth = sparse.points.size, sparse.points.depth
@@ -324,7 +328,7 @@ def _read_points(files: FrameFiles, path: Path, image_size: tuple[int, int] | No
             f"{path} is {sparse_size[1]}×{sparse_size[0]} but {files.image} is"
             f" {size[1]}×{size[0]}; --sparse-size-ok maps the points if both show the same view"
         )
-    visible, record, notes = _visible(sparse.points, files.scan.keep_occluded)
+    visible, record, notes = _visible(sparse.points, keep_occluded)
     points = _inside(path, visible.tensors().resized(*size))
     described = describe_range(depth, sparse.source, assumed_scale=sparse.assumed_scale)
     notes = [f"sparse: {described}", *notes]
