@@ -36,9 +36,9 @@ class Budget:
     """Bytes that one file's decoded content may take, such as the tensors of a checkpoint."""
 
     def max_values_from(self, file_bytes: int) -> int:
-        """Values that so many stored bytes can hold without lying about it, at most max_pixels.
+        """Returns the most values that a file of this size may claim, at most max_pixels.
 
-        Small files may decode to 2²⁵ values whatever their size, as an image of one colour does.
+        Any file may claim 2²⁵ values: an image of one colour takes almost no bytes.
         """
         return min(self.max_pixels, max(_UNBACKED_VALUES, _VALUES_PER_BYTE * file_bytes))
 

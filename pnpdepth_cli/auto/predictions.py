@@ -285,8 +285,8 @@ class CandidateDepths:
         frame = self._frame
         if candidate.within_hull:
             inside = in_hull(frame.points)
-            baseline = self.dense(replace(candidate, within_hull=False))
-            return torch.where(inside, baseline, self.dense(self._default))
+            unlimited = self.dense(replace(candidate, within_hull=False))
+            return torch.where(inside, unlimited, self.dense(self._default))
         depth = self._start(candidate)
         if candidate.propagate == "none":
             return depth

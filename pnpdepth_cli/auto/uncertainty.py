@@ -158,8 +158,8 @@ def valid_depth(points: SparsePoints, depth: DepthMap, sigma: DepthMap) -> NDArr
     """Returns (H, W) true where the depth map is supported by the points.
 
     False where depth is unknown or far beyond the farthest point, where σ is above a quarter of the
-    depth, and outside the hull of the points, such as in the sky above a LiDAR's scan lines, unless
-    a point is as near as the points are to pixels inside.
+    depth, and outside the hull of the points, such as in the sky above a LiDAR's scan lines, except
+    at pixels about as near to a point as the pixels inside the hull are.
 
     Args:
         points: Sparse depth in the image frame.

@@ -92,10 +92,11 @@ def refine_tiled(
     propagation: str = "none",
     on_iteration: OnIteration = lambda done, loss: None,
 ) -> RefinedFrame:
-    """Returns the frame refined in tiles of at most side × side pixels; a small one in one piece.
+    """Returns the frame refined in tiles of at most side × side pixels.
 
-    Losses, step size and alignment are those of the whole frame at reduced size, for which
-    `on_iteration` is called too. Other arguments and errors as of `refine_frame`.
+    A frame of one tile is refined as it is. For others, the whole frame is refined at reduced size
+    too: it fills tiles with few points, and the result reports its losses, step size and alignment.
+    Other arguments and errors are those of `refine_frame`.
     """
     tiles = tiles_of(frame.size, side)
     if len(tiles) == 1:

@@ -81,6 +81,10 @@ class Replay:
         return self._output_with_z(run) if in_backward and is_cut else run()
 
     def _saved_output(self, index: int, run: Callable[[], Any]) -> Any:
+        """The saved output of a recorded call. A call that may be saved runs once, others always.
+
+        Calls inside the one that runs are not replayed meanwhile (`_fills`).
+        """
         saved, call = self.outputs[index], self.recording.calls[index]
         if saved is not None:
             return saved.fresh()

@@ -70,19 +70,19 @@ class Watch(TorchDispatchMode):
         return False
 
     def __init__(self, saved: Iterable[SavedTensors], *, reads: bool = False) -> None:
+        """Begins with all counts at 0; sets and keys below are numbers of storages."""
         super().__init__()  # type: ignore[no-untyped-call]
+        self.data_dependent = self.escaped = self.torn = False
+        self._operations = self._touches = 0
         self._reads: set[int] | None = set() if reads else None
-        self.data_dependent = self.escaped = False
-        self._operations = 0
-        self._touches = 0
-        self._writes: list[int] = []  # operation that created the changed storage; 0: none
-        self._created: dict[int, int] = {}
-        self._marked: set[int] = set()
+        self._writes: list[int] = []  # per change in place, the storage's creator; 0: none
+        self._created: dict[int, int] = {}  # operation that created a storage
+        self._marked: set[int] = set()  # storages that depend on z
         self._protected: dict[int, list[SavedTensors]] = {}
-        self._twins: tuple[Tensor, ...] = ()
-        self._stale: set[int] = set()  # storages of a twin whose other was changed
-        self.torn = False
-        self._function_mode, self._sees_escapes = _EscapeMode(self), False
+        self._twins: tuple[Tensor, ...] = ()  # z, and the tensor of the network it stands for
+        self._stale: set[int] = set()  # the storage of one twin after the other was changed
+        self._function_mode = _EscapeMode(self)
+        self._sees_escapes = False
         for each in saved:
             self.protect(each)
 

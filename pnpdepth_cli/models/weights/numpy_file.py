@@ -142,17 +142,17 @@ class _Arrays:
         return dict(self._walk(content, "", _MAX_DEPTH))
 
     def _walk(
-        self, content: Mapping[Any, Any], prefix: str, deeper: int
+        self, content: Mapping[Any, Any], prefix: str, levels_left: int
     ) -> Iterator[tuple[str, Tensor]]:
         for key, value in content.items():
             name = f"{prefix}{key}"
             self._entries -= 1
-            if self._entries < 0 or (isinstance(value, Mapping) and deeper == 1):
+            if self._entries < 0 or (isinstance(value, Mapping) and levels_left == 1):
                 raise BrokenFileError(
-                    "its dicts hold more, or deeper, than the layers of a network"
+                    "its dicts are larger or nested deeper than the layers of any network"
                 )
             if isinstance(value, Mapping):
-                yield from self._walk(value, f"{name}.", deeper - 1)
+                yield from self._walk(value, f"{name}.", levels_left - 1)
             else:
                 yield name, self._array(value, name)
 

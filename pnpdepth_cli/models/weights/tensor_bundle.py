@@ -110,7 +110,7 @@ class _Bundle:
         file = f"{self._prefix.name}.data-{shard:05d}-of-{self._shards:05d}"
         path = self._prefix.with_name(file)
         if not path.is_file():
-            raise BrokenFileError(f"{file} is not beside it")
+            raise BrokenFileError(f"{file} is not beside the index")
         if problem := size_problem(path):
             raise BrokenFileError(f"{file} {problem}")
         return path.read_bytes()

@@ -14,7 +14,10 @@ from pnpdepth_cli.pipeline.refinement.request import RefineRequest
 
 
 def settings_of(request: RefineRequest, model: dict[str, Any], *groups: str) -> dict[str, Any]:
-    """Returns all that decides the result except the frame's own files, in JSON's own types.
+    """Returns the settings that decide a frame's result, in JSON's own types.
+
+    A frame is refined again if its record has other settings. The files of the frame, its
+    calibration among them, are compared by their content elsewhere.
 
     Args:
         request: How the frame is refined.
@@ -22,7 +25,7 @@ def settings_of(request: RefineRequest, model: dict[str, Any], *groups: str) -> 
         *groups: Names of the request's groups. None: all of them.
     """
     fields = request.settings(*groups)
-    fields.pop("more_models", None)  # the identity of the network has their files
+    fields.pop("more_models", None)  # `model` has the digests of all networks
     if "device" in fields:  # devices of one kind give equal results, so shards may use one each
         fields["device"] = fields["device"].split(":")[0]
     if "scan" in fields:

@@ -42,7 +42,7 @@ class Outputs:
 
     @classmethod
     def in_folder(cls, folder: Path, name: str, request: RefineRequest) -> Outputs:
-        """Returns all that are asked for, in a folder; a name with slashes goes into subfolders."""
+        """Returns the paths in a folder, those of σ if wanted; slashes in names are subfolders."""
         of_sigma = {}
         if request.hold_out.uncertainty:
             of_sigma = {

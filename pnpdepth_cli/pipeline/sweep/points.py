@@ -205,15 +205,15 @@ def _thinned(points: Points, wanted: str | None, rng: np.random.Generator) -> Po
     """A uniform random subset of the points."""
     if wanted is None:
         return points
-    known = len(points.depth)
+    available = len(points.depth)
     count, fraction = count_or_fraction(wanted)
-    number = max(1, round(fraction * known)) if fraction is not None else count or 0
-    if number > known:
+    number = max(1, round(fraction * available)) if fraction is not None else count or 0
+    if number > available:
         raise InputError(
-            f"{number:,} points of {known:,}; ask for fewer, or draw them from the ground truth"
+            f"{number:,} points of {available:,}; ask for fewer, or draw them from the ground truth"
             f" with --sample {wanted}"
         )
-    kept = np.sort(rng.choice(known, number, replace=False))
+    kept = np.sort(rng.choice(available, number, replace=False))
     return replace(points, xy=points.xy[kept], depth=points.depth[kept])
 
 

@@ -117,7 +117,7 @@ def test_an_array_named_twice_is_one_and_no_array_is_made_twice(tmp_path: Path) 
         ({"a": np.array(["x", "y"])}, "a is an array of"),
         ({"a": np.array([1 + 2j])}, "a is an array of <c16, not of numbers"),
         ({"a": np.array([{}, 1], dtype=object)}, "a holds objects"),
-        ({"a": {"b": {"c": {"d": np.ones(1)}}}}, "deeper, than the layers"),
+        ({"a": {"b": {"c": {"d": np.ones(1)}}}}, "nested deeper than the layers"),
         ({"a": torch.nn.Identity()}, "a is no array but a torch.nn"),
     ],
 )

@@ -128,7 +128,7 @@ def test_the_prefix_alone_says_what_to_name(tmp_path: Path) -> None:
 def test_values_that_are_not_beside_it_are_named(tmp_path: Path) -> None:
     index = written(tmp_path)
     index.with_name("x.ckpt.data-00000-of-00001").unlink()
-    assert "x.ckpt.data-00000-of-00001 is not beside it" in refused(index)
+    assert "x.ckpt.data-00000-of-00001 is not beside the index" in refused(index)
 
 
 @pytest.mark.parametrize(

@@ -36,7 +36,7 @@ def surface_errors(frame: MeasuredFrame) -> dict[str, float]:
     angles = _angles_deg(normals[known], gt_normals[known])
     planes = [
         (spread, _angles_deg(normal[None], gt_normal[None])[0])
-        for tile in _tiles(frame.both)
+        for tile in _tiles(frame.both.shape)
         if (fitted := _planes(predicted[tile], true[tile], frame.both[tile])) is not None
         for spread, normal, gt_normal in (fitted,)
     ]
@@ -86,8 +86,9 @@ def _plane(points: Floats) -> tuple[float, Floats]:
     return math.sqrt(max(0.0, float(variances[0]))), axes[:, 0]
 
 
-def _tiles(known: Mask) -> list[tuple[slice, slice]]:
-    height, width = known.shape
+def _tiles(size: tuple[int, ...]) -> list[tuple[slice, slice]]:
+    """All whole tiles of an image (H, W); the rest at its right and lower border is left out."""
+    height, width = size
     return [
         (slice(y, y + TILE_PX), slice(x, x + TILE_PX))
         for y in range(0, height - TILE_PX + 1, TILE_PX)
