@@ -116,9 +116,8 @@ models = click.option(
     "model",
     multiple=True,
     default=(_MODEL.default,),
-    show_default=_MODEL.default,
     metavar=_MODEL.option.metavar,
-    help=f"{_MODEL.option.help} Given several times, all compete and are blended.",
+    help=f"{_MODEL.option.help} Given several times, all compete.  [default: {_MODEL.default}]",
 )
 checkpoint = _only(NetworkChoice, "checkpoint")
 precision = _only(NetworkChoice, "precision")
