@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import FileFormatError
 from pnpdepth_cli.io.file_bytes import one_line, read_bytes
+from pnpdepth_cli.io.rotation import rotation_of
 from pnpdepth_cli.io.yaml_file import parse_yaml
 
 Floats = NDArray[np.float64]
@@ -69,15 +70,7 @@ def pose_of_quaternion(path: Path, translation: list[float], xyzw: list[float]) 
     if len(translation) != 3:
         raise FileFormatError(f"{path}: a translation has 3 numbers, not {len(translation)}")
     _check_translation(path, np.array(translation))
-    x, y, z, w = np.array(xyzw) / length
-    rotation = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
-    return rotation, np.array(translation)
+    return rotation_of(np.roll(xyzw, 1)), np.array(translation)
 
 
 def inverse(pose: Extrinsics) -> Extrinsics:

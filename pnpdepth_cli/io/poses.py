@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from pnpdepth_cli.errors import FileFormatError
 from pnpdepth_cli.io.file_bytes import read_bytes
+from pnpdepth_cli.io.rotation import rotation_of
 
 _KITTI_COLUMNS, _TUM_COLUMNS = 12, 8
 _ROTATION_TOLERANCE = 1e-3
@@ -44,7 +44,7 @@ def _pose(path: Path, number: int, words: list[str]) -> NDArray[np.float64]:
     if len(values) == _KITTI_COLUMNS:
         pose = values.reshape(3, 4)
     elif len(values) == _TUM_COLUMNS:
-        pose = np.column_stack([_rotation(path, number, values[4:]), values[1:4]])
+        pose = np.column_stack([rotation_of(np.roll(values[4:], 1)), values[1:4]])
     else:
         raise FileFormatError(
             f"{path}: line {number} has {len(values)} numbers; a pose has 12 (KITTI) or 8 (TUM)"
@@ -54,12 +54,3 @@ def _pose(path: Path, number: int, words: list[str]) -> NDArray[np.float64]:
     if not (np.isfinite(pose).all() and is_rotation and np.linalg.det(rotation) > 0):
         raise FileFormatError(f"{path}: line {number} holds no rotation")
     return pose
-
-
-def _rotation(path: Path, number: int, quaternion: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The rotation matrix (3, 3) of a quaternion x y z w of any length but 0."""
-    try:
-        matrix: NDArray[np.float64] = Rotation.from_quat(quaternion).as_matrix()
-    except ValueError as error:
-        raise FileFormatError(f"{path}: line {number}: {error}") from None
-    return matrix

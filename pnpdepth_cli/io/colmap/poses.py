@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from pnpdepth_cli.errors import FileFormatError
 from pnpdepth_cli.io.colmap.parts import ColmapImage, ColmapPoints, Floats
 from pnpdepth_cli.io.file_bytes import one_line
+from pnpdepth_cli.io.rotation import rotation_of
 
 _NO_POINT = -1
 
@@ -39,21 +40,9 @@ def image_of(
         )
     return ColmapImage(
         camera=camera,
-        rotation=rotation_of(values[:4] / length),
+        rotation=rotation_of(values[:4]),
         translation=values[4:],
         points=np.unique(points[points != _NO_POINT]),
-    )
-
-
-def rotation_of(quaternion: Floats) -> Floats:
-    """Returns the (3, 3) rotation of a unit quaternion w x y z."""
-    w, x, y, z = quaternion
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
     )
 
 
