@@ -17,14 +17,13 @@ import argparse
 import json
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from benchmarks.accuracy import opened
+from benchmarks.accuracy import Case, Errors, errors_of, opened
 from benchmarks.frames import (
     SETS,
     EvalFrame,
@@ -36,7 +35,6 @@ from benchmarks.frames import (
 from pnpdepth_cli.auto.auto import AutoRefined, refine_automatically
 from pnpdepth_cli.auto.candidates import Candidate
 from pnpdepth_cli.auto.predictions import OpenNetworks
-from pnpdepth_cli.core.metrics import score
 from pnpdepth_cli.models.network import Network
 from pnpdepth_cli.pipeline.refinement.refine import refiner_of
 from pnpdepth_cli.pipeline.refinement.request import MethodOptions, RefineRequest
@@ -51,24 +49,13 @@ OF_STREETS = ("fastdepth", "compact", "sparse2dense-tiny-kitti", "sfmlearner-tin
 BASELINES = ("linear", "linear-log", "idw", "local")
 """Baselines among the single candidates; the others were nowhere the best."""
 
-Errors = dict[str, tuple[float, float]]
 
-
-@dataclass(frozen=True)
-class Cell:
-    """A network on a set of frames with so many points, None for the set's LiDAR."""
-
-    network: str
-    frames: str
-    points: int | None
-
-
-def cells() -> Iterator[Cell]:
+def cells() -> Iterator[Case]:
     """All that is measured."""
     for frames in ROOMS:
         for points in COUNTS:
-            yield from (Cell(network, frames, points) for network in OF_ROOMS)
-    yield from (Cell(network, "kitti_dc", None) for network in OF_STREETS)
+            yield from (Case(network, frames, points) for network in OF_ROOMS)
+    yield from (Case(network, "kitti_dc", None) for network in OF_STREETS)
 
 
 def measure(network: Network, frame: EvalFrame, count: int | None, seed: int) -> dict[str, object]:
@@ -109,14 +96,6 @@ def single_candidates(auto: AutoRefined) -> Iterator[tuple[str, Tensor]]:
             yield str(candidate), auto.depths.dense(candidate)
 
 
-def errors_of(depths: dict[str, Tensor], gt: Tensor) -> Errors:
-    """(MAE, RMSE) over the pixels with ground truth where all are known."""
-    seen = torch.stack([depth > 0 for depth in depths.values()]).all(dim=0)
-    gt = torch.where(seen, gt, 0.0)
-    scores = {name: score(depth, gt) for name, depth in depths.items()}
-    return {name: (s.mae, s.rmse) for name, s in scores.items()}
-
-
 def summary(rows: list[dict[str, object]]) -> dict[str, object]:
     """Means over the frames of a cell."""
     errors: list[Errors] = [row["errors"] for row in rows]  # type: ignore[misc]
@@ -140,7 +119,7 @@ HEAD = (
 )  # fmt: skip
 
 
-def table_row(cell: Cell, measured: dict[str, object]) -> str:
+def table_row(cell: Case, measured: dict[str, object]) -> str:
     """A line of the table."""
     mean: dict[str, tuple[float, float]] = measured["mean"]  # type: ignore[assignment]
     best = str(measured["best"])

@@ -297,8 +297,8 @@ class CandidateDepths:
         frame, name = self._frame, candidate.baseline
         if candidate.within_hull:
             inside = in_hull(frame.points, xy)
-            baseline = self.at(xy, replace(candidate, within_hull=False))
-            return torch.where(inside, baseline, self.at(xy, self._default))
+            unlimited = self.at(xy, replace(candidate, within_hull=False))
+            return torch.where(inside, unlimited, self.at(xy, self._default))
         if candidate.propagate != "none":
             start = self._start(candidate)
             return propagate_at(start, frame.points, frame.rgb, xy, kind=candidate.propagate)
