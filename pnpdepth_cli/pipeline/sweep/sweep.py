@@ -87,6 +87,8 @@ def run_sweep(request: SweepRequest, listener: Listener) -> dict[str, Any]:
     make_folder(request.output)
     with locked_folder(request.output, None, lambda: _clean(request.output)):
         state = SweepState(request.output)
+        for note in state.notes():
+            listener.say(note)
         networks = {
             model: _network(model, request, sampling, tasks, listener) for model in _models(request)
         }
