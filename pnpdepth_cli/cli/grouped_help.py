@@ -40,7 +40,16 @@ METHOD = (
     *("--holdout", "--seed"),
 )
 OUTPUT = (
-    *("--output", "--format", "--colors", "--baselines", "--uncertainty", "--overwrite"),
+    *(
+        "--output",
+        "--format",
+        "--ply",
+        "--fov",
+        "--colors",
+        "--baselines",
+        "--uncertainty",
+        "--overwrite",
+    ),
     "--json",
 )
 COMMON = frozenset(
@@ -48,7 +57,7 @@ COMMON = frozenset(
         *("--sparse", "--gt", "--calib", "--output", "--overwrite"),
         *("--json", "--model", "--checkpoint", "--layer", "--align", "--preset"),
         *("--iterations", "--lr", "--loss", "--update", "--holdout"),
-        "--uncertainty",
+        *("--uncertainty", "--ply"),
     }
 )
 """The options of a refinement that `--help` shows."""
