@@ -25,7 +25,8 @@ LARGE_STEP = 0.1  # of z's spread, by one step
 def markdown(table: Table) -> str:
     """A set's table with the paper's figures beside ours, the δ at 1.01^k, and the steps."""
     rows, beside = table["rows"], table["beside_paper"]
-    parts = [f"## {heading(table)}\n", f"{_sample_line(table)}\n", _measures(rows, table["street"], beside=beside)]
+    title = f"## {heading(table)}\n\n{_sample_line(table)}\n"
+    parts = [title, _measures(rows, table["street"], beside=beside)]
     if any(row["fine"] for row in rows):
         parts.append(_fine(rows, beside=beside))
     notes = [*table["notes"], *remarks(rows)]
