@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import bz2
 import functools
+import importlib
 import sqlite3
 from collections.abc import Callable, Mapping
 from io import BytesIO
@@ -19,7 +20,7 @@ from pnpdepth_cli.errors import FileFormatError
 from pnpdepth_cli.io.file_bytes import one_line, read_bytes, size_of_regular_file
 from pnpdepth_cli.io.yaml_file import parse_yaml
 
-_METADATA = "metadata.yaml"
+_METADATA, _INFORMATION = "metadata.yaml", "rosbag2_bagfile_information"
 _CHUNK_BYTES = 1 << 28
 """Chunks are closed at 768 KiB by default, and a message of a sensor is far below this."""
 
@@ -50,8 +51,8 @@ def check_bag(path: Path) -> None:
 
 def _check_metadata(path: Path) -> None:
     content = parse_yaml(path, read_bytes(path).decode("utf-8", "replace"))
-    information = content.get("rosbag2_bagfile_information") if _is_mapping(content) else None
-    if not _is_mapping(information):
+    information = content.get(_INFORMATION) if isinstance(content, Mapping) else None
+    if not isinstance(information, Mapping):
         raise FileFormatError(f"{path} is not the metadata of a bag; repair it: ros2 bag reindex")
     mode = str(information.get("compression_mode") or "none").lower()
     if mode != "none":
@@ -59,10 +60,6 @@ def _check_metadata(path: Path) -> None:
             f"{path}: bags of compression_mode {one_line(mode)[:20]!r} are not read; convert it"
             " with `ros2 bag convert`, to MCAP with compressed chunks if it must be small"
         )
-
-
-def _is_mapping(value: Any) -> bool:
-    return isinstance(value, Mapping)
 
 
 def _check_database(path: Path) -> None:
@@ -82,9 +79,9 @@ def _check_database(path: Path) -> None:
 def bound_decompression() -> None:
     """Makes rosbags decompress chunks within `budget()`, in the whole process."""
     import lz4.frame
-    from rosbags.rosbag1 import reader as rosbag1
-    from rosbags.rosbag2 import storage_mcap as mcap
 
+    rosbag1: Any = importlib.import_module("rosbags.rosbag1.reader")
+    mcap: Any = importlib.import_module("rosbags.rosbag2.storage_mcap")
     rosbag1.decompressors.update(bz2=_bounded(bz2.open), lz4=_bounded(lz4.frame.open))
     mcap.DECOMPRESSORS.update(lz4=_bounded(lz4.frame.open), zstd=_bounded(mcap.zstd.open))
 
