@@ -6,19 +6,26 @@ import base64
 import hashlib
 import json
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 from pnpdepth_cli.errors import FileFormatError, InputError, OutputError
-from pnpdepth_cli.io.atomic import atomic_path, cannot_write, make_folder, remove_leftovers
+from pnpdepth_cli.io.atomic import (
+    atomic_folder,
+    atomic_path,
+    cannot_write,
+    make_folder,
+    remove_leftovers,
+)
 from pnpdepth_cli.io.record import plain, read_json, write_json
 
 PAGE = "index.html"
 IMAGES = "pictures"
 _MADE_OF = "report.json"
-_IMAGE = re.compile(r"([0-9a-f]{20})_[a-z_]+\.jpg")
+_IMAGE = re.compile(r"[0-9a-f]{20}_[a-z_]+\.jpg")
 
 
 def check_report_folder(
@@ -69,8 +76,23 @@ def begin_report(folder: Path, made_of: Mapping[str, Any]) -> Path:
     return images
 
 
+@contextmanager
+def whole_report(folder: Path) -> Iterator[Path]:
+    """Yields a folder for a report that replaces the one in `folder`; if it fails, that one stays.
+
+    Raises:
+        OutputError: The folder cannot be written to.
+    """
+    remove_report_leftovers(folder)
+    images: set[str] = set()
+    with atomic_folder(folder) as temporary:
+        yield temporary
+        images = {path.name for path in (temporary / IMAGES).iterdir()}
+    _remove_images(folder, lambda name: name not in images)
+
+
 def remove_report_leftovers(folder: Path) -> int:
-    """Removes temporary files of killed writers and returns how many there were.
+    """Removes what killed writers left and returns how many there were.
 
     To be called only while nobody writes to the report.
     """
@@ -115,12 +137,16 @@ def write_report(folder: Path, head: Mapping[str, Any], frames: Iterable[Mapping
             keys.add(frame["key"])
         file.write("\n]}")
         file.write(end)
+    _remove_images(folder, lambda name: name.partition("_")[0] not in keys)
+    return page.stat().st_size
+
+
+def _remove_images(folder: Path, unused: Callable[[str], bool]) -> None:
+    """Removes images of a report, and no other file, by their names."""
     try:
         for path in (folder / IMAGES).iterdir():
-            name = _IMAGE.fullmatch(path.name)
-            if name is not None and name[1] not in keys:
+            if _IMAGE.fullmatch(path.name) and unused(path.name):
                 path.unlink(missing_ok=True)
-        return page.stat().st_size
     except OSError as error:
         raise cannot_write(folder, error) from error
 

@@ -617,3 +617,10 @@ def test_baselines_are_in_the_summary_the_table_the_csv_and_the_report(
     print_batch(outcome.summary)
     assert "against every simple baseline" in capsys.readouterr().err
     assert "Simple baselines: means over frames" in (report / "index.html").read_text()
+
+
+def test_a_formula_as_a_name_is_text_in_the_summary(tmp_path: Path) -> None:
+    root = pairs_on_disk(tmp_path / "drive", ("=1+1", "@b"))
+    batch(root)
+    with (root / "out/summary.csv").open(newline="") as file:
+        assert [row["name"] for row in csv.DictReader(file)] == ["'=1+1", "'@b"]
