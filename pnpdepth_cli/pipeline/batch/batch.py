@@ -164,12 +164,18 @@ def _rows(
 ) -> Generator[dict[str, Any], None, None]:
     """A row for each frame as it is done; the network is loaded before the first is taken."""
     # these import torch, which a run with nothing to do does not need
-    from pnpdepth_cli.pipeline.batch.running import resolve_refiner, run_tasks
+    from pnpdepth_cli.pipeline.batch.resolving import opened_groups, resolve_refiner
+    from pnpdepth_cli.pipeline.batch.running import run_tasks
 
     refiner = resolve_refiner((task_of(request, frame) for frame in batch.frames), run.say)
     proven = len(to_do) < len(batch.chosen)
     tasks = (task_of(request, frame) for frame in to_do)
-    return run_tasks(tasks, refiner, run, proven=proven)
+
+    def rows() -> Generator[dict[str, Any], None, None]:
+        with opened_groups(refiner, run.batch_size, run.say) as groups:
+            yield from run_tasks(tasks, groups, run, proven=proven)
+
+    return rows()
 
 
 def _report_of(request: BatchRequest, batch: BatchFrames) -> BatchReport | None:
