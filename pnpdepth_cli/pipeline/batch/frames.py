@@ -118,6 +118,11 @@ def task_of(request: BatchRequest, frame: Frame) -> Task:
     )
 
 
+def compared(count: int) -> list[int]:
+    """Returns which of the frames behind the first candidates are compared on."""
+    return sorted({count // 2, count - 1}) if count else []
+
+
 def _is_scan_file(source: Source | None) -> bool:
     return isinstance(source, Path) and source.suffix.lower() in SCAN_ONLY_SUFFIXES
 

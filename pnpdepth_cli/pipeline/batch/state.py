@@ -33,10 +33,13 @@ _MANIFEST = re.compile(r"batch(\.\d+of\d+)?\.jsonl")
 class FrameRecorder(Protocol):
     """Records what is done, in the manifest or for it."""
 
-    output: Path
-    """The output folder."""
-    model: dict[str, Any]
-    """The network's `model_identity`."""
+    @property
+    def output(self) -> Path:
+        """The output folder."""
+
+    @property
+    def model(self) -> dict[str, Any]:
+        """The network's `model_identity`."""
 
     def begin(self, task: Task) -> None:
         """Records that files of this frame may exist from now on."""
