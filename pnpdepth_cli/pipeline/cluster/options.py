@@ -80,9 +80,13 @@ def spread_of(device: str, options: ClusterOptions) -> Spread | None:
     """
     names = device.split(",")
     if options.ray is None and len(names) == 1 and device != ALL_DEVICES:
+        if options != ClusterOptions():
+            raise UsageError(
+                "--ray-workers, --cpus-per-worker and --retries are of Ray workers; add --ray"
+            )
         return None
-    kinds = {name.partition(":")[0] for name in names}
-    kind = "cuda" if device == ALL_DEVICES else kinds.pop()
+    kinds = {"cuda" if name == ALL_DEVICES else name.partition(":")[0] for name in names}
+    kind = kinds.pop()
     if kinds or kind not in ("cpu", "cuda"):
         raise UsageError(f"device {device!r}: workers run on cpu, cuda, cuda:0,cuda:1 or all")
     indices = tuple(int(name[5:]) for name in names if name[5:].isdecimal() and kind == "cuda")

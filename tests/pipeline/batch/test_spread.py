@@ -103,7 +103,8 @@ def test_a_killed_driver_is_resumed(cluster: Any, root: Path) -> None:
         "from pnpdepth_cli.pipeline.cluster.options import ClusterOptions\n"
         "class Telling(Heard):\n"
         "    def frame(self, row): print(row['name'], flush=True)\n"
-        "batch(Path(sys.argv[1]), Telling(), cluster=ClusterOptions(ray=sys.argv[2], ray_workers=1))\n"
+        "options = ClusterOptions(ray=sys.argv[2], ray_workers=1)\n"
+        "batch(Path(sys.argv[1]), Telling(), cluster=options)\n"
     )
     driver = subprocess.Popen(
         [sys.executable, "-c", program, str(root), cluster.address],

@@ -68,6 +68,8 @@ def test_addresses_of_clusters(text: str) -> None:
 
 def test_one_device_needs_no_cluster() -> None:
     assert spread_of("cuda:1", ClusterOptions()) is None
+    with pytest.raises(UsageError, match="are of Ray workers; add --ray"):
+        spread_of("cuda:1", ClusterOptions(ray_workers=2))
 
 
 def test_several_devices_are_a_local_cluster() -> None:
