@@ -32,7 +32,16 @@ _STOPPING = b"\nfinishing the current frame; press Ctrl-C again to stop at once\
     common=frozenset(
         {
             *("--layout", "--sample", "--limit", "--shard", "--calib", "--model", "--checkpoint"),
-            *("--preset", "--output", "--html", "--overwrite", "--json", "--workers", "--dry-run"),
+            *(
+                "--preset",
+                "--output",
+                "--ply",
+                "--html",
+                "--overwrite",
+                "--json",
+                "--workers",
+                "--dry-run",
+            ),
         }
     ),
     groups={

@@ -18,7 +18,8 @@ from pnpdepth_cli.cli import options
     "--calib",
     type=options.FILE,
     metavar="FILE|FOLDER",
-    help="Calibration of the camera: a file with K, or a KITTI file or raw folder.",
+    help="Calibration of the camera: a file with K, or a KITTI file or raw folder.  [default: the"
+    " record's, else EXIF]",
 )
 @click.option("--camera", type=int, metavar="N", help="KITTI camera number, 0 to 3.  [default: 2]")
 @click.option(
@@ -27,7 +28,8 @@ from pnpdepth_cli.cli import options
 @click.option(
     "--poses",
     type=options.FILE,
-    help="Camera poses of a folder's files in their order (KITTI or TUM rows).",
+    help="Camera poses of a folder's files in their order (KITTI or TUM rows).  [default: the"
+    " records']",
 )
 @click.option("--depth-scale", type=float, metavar="S", help="Integer depth files hold metres × S.")
 @click.option("--min-depth", type=float, default=0.0, metavar="M", help="Drop nearer pixels.")
@@ -54,7 +56,7 @@ def cloud(as_json: bool, **values: Any) -> None:
     """Write DEPTH, a depth file or the results of a batch, as a coloured point cloud.
 
     \b
-    pnpdepth cloud out/img_depth.png --calib camera.txt -o img.ply
+    pnpdepth cloud out/img_depth.png -o img.ply
     pnpdepth cloud out/ --calib calib.txt --poses poses.txt --voxel 0.05 -o drive.ply
     pnpdepth cloud depth.exr --image img.png --fov 60 -o img.glb
 

@@ -40,7 +40,16 @@ METHOD = (
     *("--holdout", "--seed"),
 )
 OUTPUT = (
-    *("--output", "--format", "--colors", "--baselines", "--uncertainty", "--overwrite"),
+    *(
+        "--output",
+        "--format",
+        "--ply",
+        "--fov",
+        "--colors",
+        "--baselines",
+        "--uncertainty",
+        "--overwrite",
+    ),
     "--json",
 )
 CLUSTER = ("--ray", "--ray-workers", "--cpus-per-worker", "--retries")
@@ -49,7 +58,7 @@ COMMON = frozenset(
         *("--sparse", "--gt", "--calib", "--output", "--overwrite"),
         *("--json", "--model", "--checkpoint", "--layer", "--align", "--preset"),
         *("--iterations", "--lr", "--loss", "--update", "--holdout"),
-        "--uncertainty",
+        *("--uncertainty", "--ply"),
     }
 )
 """The options of a refinement that `--help` shows."""

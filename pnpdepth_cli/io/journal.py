@@ -1,7 +1,8 @@
 """An append-only file with a JSON object per line, of which the newest of each key counts.
 
 A process that is killed while it writes leaves an incomplete last line. It is cut off before the
-next line is written, and lines that are not JSON objects are skipped, so all others stay valid.
+next line is written. Each line begins with the CRC-32 of the rest of it; lines that are damaged or
+edited are skipped, so all others stay valid.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from __future__ import annotations
 import json
 import os
 import threading
+import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -16,6 +18,9 @@ from typing import Any
 from pnpdepth_cli.errors import InputError
 from pnpdepth_cli.io.atomic import cannot_write
 from pnpdepth_cli.io.record import plain
+
+_CHECKSUM = b'{"crc32": "%08x", '
+_CHECKSUM_BYTES = len(_CHECKSUM % 0)
 
 
 class Journal:
@@ -28,7 +33,7 @@ class Journal:
         key: The field of a line that identifies it.
 
     Attributes:
-        lost: Number of lines that are not JSON objects.
+        lost: Number of lines that are damaged or edited.
     """
 
     def __init__(self, path: Path, key: str) -> None:
@@ -60,9 +65,7 @@ class Journal:
         Raises:
             StorageError: The disk is full or gone; at most an incomplete line was written.
         """
-        texts = [
-            (json.dumps(plain(line), allow_nan=False) + "\n").encode("ascii") for line in lines
-        ]
+        texts = [_line(line) for line in lines]
         with self._writing:
             try:
                 self._write(b"".join(texts))
@@ -104,12 +107,18 @@ class Journal:
         return offset
 
 
+def _line(content: Mapping[str, Any]) -> bytes:
+    rest = json.dumps(plain(content), allow_nan=False).encode("ascii")[1:]
+    return _CHECKSUM % zlib.crc32(rest) + rest + b"\n"
+
+
 def _object(data: bytes) -> dict[str, Any] | None:
-    try:
-        line = json.loads(data)
-    except (ValueError, RecursionError):
+    """The content of a whole line; None if its checksum is wrong or missing."""
+    rest = data.removesuffix(b"\n")[_CHECKSUM_BYTES:]
+    if not data.startswith(_CHECKSUM % zlib.crc32(rest)):
         return None
-    return line if isinstance(line, dict) else None
+    content: dict[str, Any] = json.loads(b"{" + rest)
+    return content
 
 
 def _cannot_read(path: Path, error: OSError) -> InputError:

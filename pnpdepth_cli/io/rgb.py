@@ -81,7 +81,7 @@ def _decode_8_bit(
     from PIL import Image
 
     try:
-        with _QUIET_PILLOW, Image.open(io.BytesIO(data), formats=[kind]) as image:
+        with QUIET_PILLOW, Image.open(io.BytesIO(data), formats=[kind]) as image:
             check_pixel_count(path, *image.size, file_bytes=len(data))
             image.load()
             frames = getattr(image, "n_frames", 1)
@@ -113,7 +113,7 @@ def _decode_16_bit(path: Path, data: bytes, kind: str) -> tuple[NDArray[np.float
         return values, 1
     from PIL import Image
 
-    with _QUIET_PILLOW, Image.open(io.BytesIO(data), formats=["PNG"]) as image:
+    with QUIET_PILLOW, Image.open(io.BytesIO(data), formats=["PNG"]) as image:
         return values, _orientation(image)
 
 
@@ -138,7 +138,8 @@ def _quiet_pillow() -> Iterator[None]:
         Image.MAX_IMAGE_PIXELS = limit
 
 
-_QUIET_PILLOW = SharedContext(_quiet_pillow)
+QUIET_PILLOW = SharedContext(_quiet_pillow)
+"""While it is open, in any number of threads, Pillow does not warn."""
 
 
 def _turn_upright(values: NDArray[np.float32], orientation: int) -> NDArray[np.float32]:

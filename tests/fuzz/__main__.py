@@ -27,7 +27,8 @@ def main() -> int:
         print(finding)
         if options.findings is not None:
             options.findings.mkdir(parents=True, exist_ok=True)
-            path = options.findings / f"{options.seed}-{finding.number}-{finding.file}"
+            file = finding.file.replace("/", "_")
+            path = options.findings / f"{options.seed}-{finding.number}-{file}"
             path.write_bytes(finding.data)
     codes = ", ".join(f"{code}: {count:,}" for code, count in sorted(result.codes.items()))
     print(f"{result.inputs:,} inputs, {len(result.findings)} findings; exit codes {codes}")

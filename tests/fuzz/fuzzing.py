@@ -62,12 +62,13 @@ def fuzz(folder: Path, seed: int, first: int, count: int) -> FuzzResult:
     """Runs inputs FIRST to FIRST + COUNT - 1 and returns what they showed.
 
     Args:
-        folder: Working folder of the worker; it writes the valid files there.
+        folder: An existing folder; the worker writes the valid files into files/ of it.
         seed: Of the mutations.
         first: Number of the first input.
         count: Number of inputs.
     """
     result = FuzzResult()
+    folder = folder / "files"
     end = first + count
     while first < end:
         started: dict[str, Any] | None = None

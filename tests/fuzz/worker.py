@@ -2,6 +2,7 @@
 
     python -m tests.fuzz.worker FOLDER SEED FIRST COUNT
 
+FOLDER is made anew.
 Input number I is the I-th seed, cyclically, damaged by the generator of (SEED, I). A line
 {"start": I} goes out before an input and {"end": I, ...} after it.
 """
@@ -75,7 +76,7 @@ def run_input(seed: Seed, data: bytes) -> dict[str, Any]:
         err.write(traceback.format_exc())
     finally:
         file.write_bytes(original)
-        for name in (*seed.scratch, "batch"):
+        for name in seed.scratch:
             path = Path(name)
             shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
     return {
@@ -91,7 +92,8 @@ def main() -> None:
     folder, seed, first, count = Path(sys.argv[1]), *map(int, sys.argv[2:5])
     report = os.fdopen(os.dup(1), "w")
     warnings.simplefilter("ignore")
-    folder.mkdir(parents=True, exist_ok=True)
+    shutil.rmtree(folder, ignore_errors=True)  # of a worker that died
+    folder.mkdir(parents=True)
     os.chdir(folder)
     seeds = write_seeds(Path())
     for each in seeds:  # imports and caches are nobody's cost

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import json
 import threading
+import zlib
 from pathlib import Path
 
 import pytest
@@ -55,11 +56,40 @@ def test_lines_without_meaning_are_counted_and_passed_over(
     tmp_path_factory: pytest.TempPathFactory, noise: bytes
 ) -> None:
     path = tmp_path_factory.mktemp("journal") / "j.jsonl"
-    path.write_bytes(b'{"frame": "a"}\n' + noise.replace(b"\n", b"") + b'|\n{"frame": "b"}\n')
+    written = Journal(path, "frame")
+    written.append({"frame": "a"})
+    with path.open("ab") as file:
+        file.write(noise.replace(b"\n", b"") + b"|\n")
+    Journal(path, "frame").append({"frame": "b"})
     journal = Journal(path, "frame")
     assert journal.keys() == ["a", "b"]
     assert journal.lost == 1
     assert journal.newest("b") == {"frame": "b"}
+
+
+@given(data=st.data())
+def test_a_line_with_a_changed_byte_is_passed_over(
+    tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
+) -> None:
+    path = tmp_path_factory.mktemp("journal") / "j.jsonl"
+    journal = Journal(path, "frame")
+    for name in "ab":
+        journal.append({"frame": name, "scores": {"rmse": 0.25}})
+    content = bytearray(path.read_bytes())
+    at = data.draw(st.integers(0, content.index(b"\n") - 1))
+    content[at] = data.draw(st.sampled_from(sorted({*range(32, 127)} - {content[at]})))
+    path.write_bytes(content)
+    damaged = Journal(path, "frame")
+    assert damaged.keys() == ["b"]
+    assert damaged.lost == 1
+
+
+def test_a_line_is_json_and_begins_with_the_checksum_of_its_rest(tmp_path: Path) -> None:
+    path = tmp_path / "j.jsonl"
+    Journal(path, "frame").append({"frame": "a", "n": 1})
+    line = path.read_text()
+    assert line == '{"crc32": "78f709b6", "frame": "a", "n": 1}\n'
+    assert int(json.loads(line)["crc32"], 16) == zlib.crc32(b'"frame": "a", "n": 1}')
 
 
 def test_names_that_are_no_utf_8_come_back(tmp_path: Path) -> None:
@@ -77,7 +107,7 @@ def test_a_full_disk_is_said_and_what_was_there_stays(tmp_path: Path) -> None:
     assert Journal(path, "frame").keys() == ["a"]
     journal.append({"frame": "c"})
     assert Journal(path, "frame").keys() == ["a", "c"]
-    assert path.read_text() == '{"frame": "a"}\n{"frame": "c"}\n'
+    assert [json.loads(line)["frame"] for line in path.read_text().splitlines()] == ["a", "c"]
 
 
 def test_threads_may_append_at_once(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
-from pnpdepth_cli.errors import InputError, OutputError, SizeError, UsageError
+from pnpdepth_cli.errors import FileFormatError, InputError, OutputError, SizeError, UsageError
 from pnpdepth_cli.io.depth_writing import write_depth
 from pnpdepth_cli.io.scans import read_scan
 from pnpdepth_cli.pipeline.cloud import CloudRequest, write_depth_cloud
@@ -62,6 +62,50 @@ def test_a_calibration_file_gives_the_camera(tmp_path: Path) -> None:
     assert points[0] == pytest.approx([-WIDTH / 2 / 15, -HEIGHT / 2 / 15, 2], rel=1e-5)
 
 
+def with_camera(path: Path, pose: list[list[float]] | None) -> Path:
+    """The depth file, with a camera in its record."""
+    record = path.with_name(path.name.replace("_depth.png", ".json"))
+    camera = {
+        "intrinsics": [[20, 0, 0], [0, 20, 0], [0, 0, 1]], "lens": "radial-tangential",
+        "distortion": [], "source": "made up", "pose": pose,
+    }  # fmt: skip
+    entries = {"camera": camera, "size": [WIDTH, HEIGHT], "unit": "model units"}
+    record.write_text(json.dumps(json.loads(record.read_text()) | entries))
+    return path
+
+
+def test_the_camera_and_the_pose_come_from_the_record(tmp_path: Path) -> None:
+    pose = [[1.0, 0, 0, 5], [0, 1, 0, 0], [0, 0, 1, 0]]
+    path = with_camera(frame(tmp_path, "a"), pose)
+    record = written(path, tmp_path / "a.ply", fov_deg=None)
+    assert (record["frame"], record["unit"]) == ("world", "model units")
+    assert record["notes"] == ["camera: made up (from the record)"]
+    assert points_of(tmp_path / "a.ply")[-1] == pytest.approx(
+        [5 + 2 * (WIDTH - 1) / 20, 2 * (HEIGHT - 1) / 20, 2]
+    )
+
+
+def test_frames_with_and_without_a_pose_are_not_mixed(tmp_path: Path) -> None:
+    with_camera(frame(tmp_path / "out", "a"), [[1.0, 0, 0, 5], [0, 1, 0, 0], [0, 0, 1, 0]])
+    with_camera(frame(tmp_path / "out", "b"), None)
+    with pytest.raises(InputError, match=r"b_depth\.png has no pose in its record"):
+        written(tmp_path / "out", tmp_path / "o.ply", fov_deg=None)
+
+
+def test_a_depth_of_another_size_than_its_record_needs_its_own_camera(tmp_path: Path) -> None:
+    path = with_camera(frame(tmp_path, "a"), None)
+    write_depth(path, np.ones((HEIGHT // 2, WIDTH // 2), np.float32))
+    with pytest.raises(SizeError, match="unlike its record"):
+        written(path, tmp_path / "o.ply", fov_deg=None)
+
+
+def test_a_damaged_camera_in_a_record_is_one_line(tmp_path: Path) -> None:
+    path = frame(tmp_path, "a")
+    (tmp_path / "a.json").write_text('{"camera": {"intrinsics": [1, 2], "pose": null}}')
+    with pytest.raises(FileFormatError, match="the camera in the record beside it is damaged"):
+        written(path, tmp_path / "o.ply", fov_deg=None)
+
+
 def test_pixels_beyond_the_limits_are_left_out(tmp_path: Path) -> None:
     depth = np.linspace(1, 5, HEIGHT * WIDTH).reshape(HEIGHT, WIDTH).astype(np.float32)
     write_depth(tmp_path / "d.exr", depth)
@@ -108,8 +152,8 @@ def test_voxels_merge_what_two_frames_see(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("values", "error", "message"),
     [
-        ({"fov_deg": None}, UsageError, "one of --calib and --fov"),
-        ({"calib": Path("k.txt")}, UsageError, "one of --calib and --fov"),
+        ({"fov_deg": None}, UsageError, "give --calib or --fov"),
+        ({"calib": Path("k.txt")}, UsageError, "--calib and --fov both"),
         ({"fov_deg": 0.0}, UsageError, "--fov is 0"),
         ({"voxel": 0.0}, UsageError, "--voxel"),
         ({"edge": math.inf}, UsageError, "--edge"),

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from pnpdepth_cli.errors import InputError
+from pnpdepth_cli.errors import FileFormatError, InputError
 from pnpdepth_cli.io.calibration import Calibration
 from pnpdepth_cli.io.dataset.protocols import WHOLE, Protocol
 
@@ -93,6 +93,10 @@ class Frame:
     group: str | None = None
     """The sequence it belongs to; None derives it from the name."""
 
+    def __post_init__(self) -> None:
+        for source in (self.image, self.sparse, self.gt, self.calib, *self.masks):
+            _check_no_nul(source.path if isinstance(source, Hdf5Array) else source)
+
 
 @dataclass(frozen=True, kw_only=True)
 class Unmatched:
@@ -103,6 +107,9 @@ class Unmatched:
 
     why: str
     """The reason, as the end of a sentence that begins with the path."""
+
+    def __post_init__(self) -> None:
+        _check_no_nul(self.path)
 
     def __str__(self) -> str:
         return f"{self.path} {self.why}"
@@ -120,6 +127,13 @@ class Listing:
 
     spare: tuple[Unmatched, ...] = ()
     """Other files beside them."""
+
+
+def _check_no_nul(path: Path | None) -> None:
+    """Raises FileFormatError for a path that no file can have: an index file may hold any text."""
+    if path is not None and "\0" in str(path):
+        name = str(path).replace("\0", "\\0")
+        raise FileFormatError(f"{name}: a file name holds a NUL character; correct the file's list")
 
 
 def by_stem(folder: Path, suffixes: Iterable[str]) -> dict[str, Path]:

@@ -45,6 +45,18 @@ class Protocol:
         moved = (np.asarray(xy, np.float64) + 0.5) / 2 - 0.5 if self.halved else xy
         return np.asarray(moved - np.array([left, top]), np.float32)
 
+    def intrinsics_in_crop(
+        self, intrinsics: NDArray[np.float64], size: tuple[int, int]
+    ) -> NDArray[np.float64]:
+        """Returns the (3, 3) intrinsics of that part, from those of the whole image of (H, W)."""
+        top, left, _, _ = self._window(size)
+        result = np.array(intrinsics, np.float64)
+        if self.halved:  # x becomes (x + 0.5) / 2 - 0.5
+            result[:2] /= 2
+            result[:2, 2] -= 0.25
+        result[:2, 2] -= (left, top)
+        return result
+
     def _window(self, size: tuple[int, int]) -> tuple[int, int, int, int]:
         """(top, left, height, width) after halving."""
         height, width = (side // 2 for side in size) if self.halved else size

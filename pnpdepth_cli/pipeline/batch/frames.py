@@ -89,9 +89,7 @@ def task_of(request: BatchRequest, frame: Frame) -> Task:
     gt = frame.gt
     if base.sample is not None and gt is None and _is_scan_file(frame.sparse):
         gt = frame.sparse  # points are sampled from the projected scan
-    is_scan = _is_scan_file(gt) or (
-        sparse is not None and (base.scan.calib is not None or _is_scan_file(sparse))
-    )
+    is_scan = _is_scan_file(gt) or (sparse is not None and _is_scan(base, sparse))
     scan = base.scan
     if is_scan:
         camera = frame.camera if scan.camera is None else scan.camera
@@ -102,6 +100,8 @@ def task_of(request: BatchRequest, frame: Frame) -> Task:
         sparse=sparse,
         gt=gt,
         calibration=frame.calibration,
+        camera_file=None if is_scan or not request.refine.outputs.needs_camera else frame.calib,
+        camera_number=frame.camera if scan.camera is None else scan.camera,
         gt_masks=frame.masks,
         gt_size_ok=frame.gt_other_size,
         sparse_size_ok=base.sparse_size_ok or frame.sparse_other_size,
@@ -121,6 +121,11 @@ def task_of(request: BatchRequest, frame: Frame) -> Task:
 def compared(count: int) -> list[int]:
     """Returns which of the frames behind the first candidates are compared on."""
     return sorted({count // 2, count - 1}) if count else []
+
+
+def _is_scan(base: FrameFiles, sparse: Path) -> bool:
+    suffix = sparse.suffix.lower()
+    return suffix in SCAN_ONLY_SUFFIXES or (suffix == ".npy" and base.scan.calib is not None)
 
 
 def _is_scan_file(source: Source | None) -> bool:
@@ -149,10 +154,10 @@ def _input_files(files: FrameFiles, *, is_scan: bool) -> Iterator[tuple[str, Pat
             yield part, path
     if files.gt is not None:
         yield from ((f"mask {number}", path) for number, path in enumerate(files.gt_masks))
-    calib, extrinsics = files.scan.calib, files.scan.extrinsics
+    calib, extrinsics = files.scan.calib or files.camera_file, files.scan.extrinsics
     if is_scan and extrinsics is not None:
         yield "extrinsics", extrinsics
-    if is_scan and calib is not None:
+    if calib is not None:
         if calib.is_dir():
             yield from ((f"calib {p.name}", p) for p in sorted(calib.glob("calib_*.txt")))
         else:

@@ -142,7 +142,7 @@ class BatchState:
 
     def _lines(self, name: str) -> list[dict[str, Any]]:
         lines = [journal.newest(name) for journal in (self._own, *self._others)]
-        return [line for line in lines if line is not None and "state" in line]
+        return [line for line in lines if line is not None]
 
     def _why_not(self, line: dict[str, Any], task: Task, digest: str) -> str | None:
         if line["state"] == "begun":
@@ -151,13 +151,10 @@ class BatchState:
             return "failed before"
         if line.get("settings") != digest:
             return "other settings"
-        try:
-            read, written = (
-                {name: Fingerprint(**known) for name, known in line[kind].items()}
-                for kind in ("inputs", "outputs")
-            )
-        except (KeyError, TypeError, AttributeError):
-            return "unreadable record"
+        read, written = (
+            {name: Fingerprint(**known) for name, known in line[kind].items()}
+            for kind in ("inputs", "outputs")
+        )
         if read.keys() != task.inputs.keys():
             return "other input files"
         for part, path in task.inputs.items():

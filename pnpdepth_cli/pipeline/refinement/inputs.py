@@ -25,6 +25,7 @@ from pnpdepth_cli.io.depth import (
 from pnpdepth_cli.io.depth_range import metres
 from pnpdepth_cli.io.fingerprint import fingerprint
 from pnpdepth_cli.io.rgb import read_rgb
+from pnpdepth_cli.pipeline.refinement.frame_camera import FrameCamera, camera_of_frame
 from pnpdepth_cli.pipeline.refinement.method import PAPER
 from pnpdepth_cli.pipeline.refinement.request import FrameFiles, RefineRequest
 from pnpdepth_cli.pipeline.sparse.colmap import read_colmap_points
@@ -68,6 +69,8 @@ class Inputs:
     """What was assumed, and warnings."""
     unit: str = METRES
     """Of all depths: "m", or "model units" of a COLMAP model without scale."""
+    camera: FrameCamera | None = None
+    """The camera in pixels of the image frame. None: unknown."""
 
     @property
     def size(self) -> tuple[int, int]:
@@ -112,6 +115,8 @@ class _Sparse:
     """What was assumed."""
     unit: str = METRES
     """Of the depth."""
+    camera: FrameCamera | None = None
+    """The camera of the whole image, where it came with the points."""
 
 
 def read_inputs(request: RefineRequest) -> Inputs:
@@ -148,11 +153,14 @@ def read_inputs(request: RefineRequest) -> Inputs:
         )
     if ground_truth is not None and ground_truth.values.shape != sparse.points.size:
         raise _size_error(files, ground_truth.values.shape, sparse.points.size)
+    size = whole or (None if ground_truth is None else ground_truth.whole) or sparse.points.size
+    camera = camera_of_frame(request, sparse.camera, size)
     parts = {"image": image, "sparse": sparse, "gt": ground_truth}
     notes = [note for part in parts.values() if part is not None for note in part.notes]
     if ground_truth is not None and files.sparse is not None:
         notes += _leak_warning(sparse.points, ground_truth.values)
         notes += _scale_warning(sparse.points, ground_truth.values)
+    notes += () if camera is None else camera.notes
     return Inputs(
         rgb=None if image is None else image.values,
         points=sparse.points,
@@ -161,6 +169,7 @@ def read_inputs(request: RefineRequest) -> Inputs:
         record={name: part.record for name, part in parts.items() if part is not None},
         notes=tuple(notes),
         unit=sparse.unit,
+        camera=camera,
     )
 
 
@@ -296,7 +305,13 @@ def _read_scan(files: FrameFiles, path: Path, image_size: tuple[int, int] | None
     image = files.image if isinstance(files.image, Path) else None
     scan = read_scan_points(path, files.scan, image_size, image, files.calibration)
     points = _in_protocol(files, path, scan.points.tensors())
-    return _Sparse(points=points, scale=None, record=scan.record, notes=scan.notes)
+    return _Sparse(
+        points=points,
+        scale=None,
+        record=scan.record,
+        notes=scan.notes,
+        camera=FrameCamera(camera=scan.camera, source=f"calibration of {path.name}"),
+    )
 
 
 def _read_colmap(files: FrameFiles, path: Path, image_size: tuple[int, int] | None) -> _Sparse:
@@ -313,6 +328,9 @@ def _read_colmap(files: FrameFiles, path: Path, image_size: tuple[int, int] | No
         record=observed.record,
         notes=observed.notes,
         unit=observed.unit,
+        camera=FrameCamera(
+            camera=observed.camera, source=f"COLMAP model {path}", pose=observed.pose
+        ),
     )
 
 

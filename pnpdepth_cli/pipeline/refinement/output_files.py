@@ -35,6 +35,8 @@ class Outputs:
     """Image of the depth before and after."""
     improvement: Path | None = None
     """Image of what became better and worse."""
+    cloud: Path | None = None
+    """Point cloud of the depth."""
     record: Path | None = None
     """JSON of settings and scores."""
     colors: str = "blue-orange"
@@ -55,6 +57,7 @@ class Outputs:
             **of_sigma,
             preview=folder / f"{name}_preview.png",
             improvement=folder / f"{name}_improvement.png",
+            cloud=folder / f"{name}.ply" if request.outputs.ply else None,
             record=folder / f"{name}.json",
             colors=request.outputs.colors,
         )
@@ -68,6 +71,7 @@ class Outputs:
             "valid": self.valid,
             "preview": self.preview,
             "improvement": self.improvement,
+            "cloud": self.cloud,
             "record": self.record,
         }
         return {kind: path for kind, path in kinds.items() if path is not None}
@@ -95,10 +99,10 @@ def plan_outputs(request: RefineRequest) -> Outputs:
     output = asked.output or Path(f"{stem}_refined")
     if f".{asked.format}" not in DEPTH_SUFFIXES:
         raise UsageError(f"format {asked.format!r} is not one of {' '.join(DEPTH_SUFFIXES)}")
-    if output.suffix.lower() in DEPTH_SUFFIXES and request.hold_out.uncertainty:
-        raise UsageError(
-            f"--uncertainty writes a second file; name a folder, not {output}, with -o"
-        )
+    added = {"--uncertainty": request.hold_out.uncertainty, "--ply": asked.ply}
+    if output.suffix.lower() in DEPTH_SUFFIXES and any(added.values()):
+        flag = next(flag for flag, given in added.items() if given)
+        raise UsageError(f"{flag} writes a second file; name a folder, not {output}, with -o")
     if output.suffix.lower() in DEPTH_SUFFIXES:
         outputs = Outputs(depth=output)
     elif output.suffix.lower() in _FILE_SUFFIXES and not output.is_dir():

@@ -9,12 +9,14 @@ import torch
 
 from pnpdepth_cli.frames.frame import RefinedFrame
 from pnpdepth_cli.io.atomic import make_folder
+from pnpdepth_cli.io.cloud_files import write_cloud
 from pnpdepth_cli.io.depth import write_depth
 from pnpdepth_cli.io.uncertainty_images import sigma_preview, write_mask
 from pnpdepth_cli.io.visualisation import improvement, improvement_at_points, preview
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs
 from pnpdepth_cli.pipeline.refinement.output_files import Outputs
 from pnpdepth_cli.pipeline.refinement.output_range import output_scale
+from pnpdepth_cli.sensors.cloud import cloud_from_depth
 
 
 def write_outputs(outputs: Outputs, inputs: Inputs, frame: RefinedFrame) -> dict[str, Any]:
@@ -43,6 +45,8 @@ def write_outputs(outputs: Outputs, inputs: Inputs, frame: RefinedFrame) -> dict
         record["improved_fraction"] = _write_improvement(
             outputs.improvement, inputs, frame, outputs.colors
         )
+    if outputs.cloud is not None:
+        record["cloud"] = _write_cloud(outputs.cloud, inputs, frame)
     record["outputs"] = {
         kind: None if path is None else str(path)
         for kind, path in (
@@ -51,9 +55,20 @@ def write_outputs(outputs: Outputs, inputs: Inputs, frame: RefinedFrame) -> dict
             ("valid", outputs.valid),
             ("preview", outputs.preview),
             ("improvement", outputs.improvement),
+            ("cloud", outputs.cloud),
         )
     }
     return record
+
+
+def _write_cloud(path: Path, inputs: Inputs, frame: RefinedFrame) -> dict[str, Any]:
+    """Writes the cloud of the refined depth, in the world's frame if the pose is known."""
+    assert inputs.camera is not None
+    cloud = cloud_from_depth(frame.after, inputs.camera.camera, rgb=inputs.rgb, keep=frame.valid)
+    pose = inputs.camera.pose
+    cloud = cloud if pose is None else cloud.transformed(pose)
+    write_cloud(path, cloud.xyz, cloud.normals, cloud.rgb)
+    return {"points": len(cloud), "frame": "camera" if pose is None else "world"}
 
 
 def _write_improvement(path: Path, inputs: Inputs, frame: RefinedFrame, colors: str) -> float:

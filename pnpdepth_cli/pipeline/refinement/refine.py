@@ -372,6 +372,7 @@ def _record(refiner: Refiner, inputs: Inputs, frame: RefinedFrame) -> dict[str, 
         "versions": versions(),
         "unit": inputs.unit,
         "inputs": inputs.record,
+        "camera": None if inputs.camera is None else inputs.camera.record(),
         "model": refiner.model_record,
         "method": {
             "kind": "chosen" if method.chosen else "fixed",

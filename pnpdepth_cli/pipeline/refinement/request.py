@@ -75,6 +75,10 @@ class FrameFiles:
     """How `sparse` is projected where it is a LiDAR scan."""
     calibration: Calibration | None = None
     """Of a LiDAR scan, where the data set gives it instead of a file."""
+    camera_file: Path | None = None
+    """Calibration of the camera, where `sparse` is no LiDAR scan and an output needs the camera."""
+    camera_number: int | None = None
+    """Which camera of `camera_file`."""
     gt_masks: tuple[Path, ...] = ()
     """Where one of these is 0, the ground truth is unknown."""
     gt_size_ok: bool = False
@@ -290,6 +294,13 @@ class OutputOptions:
         choices=choices.FORMATS,
         show_default=True,
     )
+    ply: bool = option(False, "Also write a coloured point cloud, NAME.ply.")
+    fov_deg: float | None = option(
+        None,
+        "Horizontal field of view, for --ply without --calib, COLMAP model or EXIF.",
+        flag="--fov",
+        metavar="DEG",
+    )
     colors: str = option(
         "blue-orange",
         "Colours of better and worse: blue and orange, or the paper's red and green.",
@@ -298,9 +309,20 @@ class OutputOptions:
     )
     overwrite: bool = option(False, "Replace existing results.")
 
+    @property
+    def needs_camera(self) -> bool:
+        """Whether an output cannot be written without the camera."""
+        return self.ply
 
-_PLACES = {"image", "sparse", "gt", "gt_masks", "model", "checkpoint", "output", "overwrite"}
+
+_PLACES = {"image", "sparse", "gt", "gt_masks", "model", "checkpoint", "output", "overwrite"} | {
+    "camera_file",
+    "camera_number",
+}
 """Fields that say where something lies. A cache key has digests of what lies there instead."""
+
+_ADDED = {"ply"}
+"""Fields that add a file and change no other. A cache key does without: the file exists or not."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -345,7 +367,7 @@ class RefineRequest:
             each.name: getattr(group, each.name)
             for group in chosen
             for each in fields(group)
-            if each.name not in _PLACES
+            if each.name not in _PLACES | _ADDED
         }
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import InputError, NoPointsError, SizeError
 from pnpdepth_cli.io.colmap.model import find_model, model_files, name_in_model, read_model
-from pnpdepth_cli.io.colmap.parts import ColmapCamera, ColmapModel
+from pnpdepth_cli.io.colmap.parts import ColmapCamera, ColmapImage, ColmapModel
 from pnpdepth_cli.io.depth import describe_range
 from pnpdepth_cli.io.fingerprint import fingerprint
 from pnpdepth_cli.pipeline.sparse.colmap_options import METRES, MODEL_UNITS, ColmapOptions
@@ -31,6 +31,12 @@ class ColmapPointsOfImage:
 
     points: Points
     """In the frame of the image, depth in `unit`."""
+
+    camera: Camera
+    """In pixels of the image."""
+
+    pose: NDArray[np.float64]
+    """(3, 4) from the camera's frame to the model's, in `unit`."""
 
     unit: str
     """METRES or MODEL_UNITS."""
@@ -85,6 +91,8 @@ def read_colmap_points(
         notes.append("unit: depth is in model units; --unit-scale gives metres per unit")
     return ColmapPointsOfImage(
         points=points.resized(*size),
+        camera=_resized(_eye(camera), camera.size, size),
+        pose=_pose(model.images[name], options.unit_scale or 1.0),
         unit=unit,
         scale=_output_scale(model) if unit == MODEL_UNITS else None,
         record={
@@ -154,6 +162,22 @@ def _points(
 
 def _eye(camera: ColmapCamera) -> Camera:
     return Camera(intrinsics=camera.intrinsics, distortion=camera.distortion, lens=camera.lens)
+
+
+def _resized(camera: Camera, old: tuple[int, int], new: tuple[int, int]) -> Camera:
+    """The camera for another size of the image, (H, W); pixel centres are at whole numbers."""
+    scale = np.array([[new[1] / old[1]], [new[0] / old[0]]])
+    intrinsics = camera.intrinsics.copy()
+    intrinsics[:2, 2] += 0.5
+    intrinsics[:2] *= scale
+    intrinsics[:2, 2] -= 0.5
+    return replace(camera, intrinsics=intrinsics)
+
+
+def _pose(image: ColmapImage, unit: float) -> NDArray[np.float64]:
+    """(3, 4) from the camera's frame to the model's, of which a unit is so long."""
+    rotation = image.rotation.T
+    return np.column_stack([rotation, -rotation @ image.translation * unit])
 
 
 def _output_scale(model: ColmapModel) -> float:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from pnpdepth_cli.errors import SizeError, UsageError
-from pnpdepth_cli.io.record import sha256_of
+from pnpdepth_cli.io.record import plain, sha256_of
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.pipeline.sparse.outputs import Provenance, SparseTarget, write_sparse_outputs
 from pnpdepth_cli.pipeline.sparse.scan_options import ScanOptions
@@ -41,7 +41,7 @@ def project_scan(request: ProjectRequest) -> dict[str, Any]:
         PnpDepthError: An input or output is at fault; then nothing is written.
     """
     target, image = request.target, request.image
-    target.check((request.scan, image, request.options.calib))
+    target.check((request.scan, image, request.options.calib, request.options.extrinsics))
     if target.overlay is not None and image is None:
         raise UsageError("an overlay needs the image; give --image")
     rgb = None
@@ -54,7 +54,7 @@ def project_scan(request: ProjectRequest) -> dict[str, Any]:
         size = (rgb.shape[0], rgb.shape[1])
         inputs["image"] = {"path": str(image), "sha256": sha256_of(image)}
     scan = read_scan_points(request.scan, request.options, size, image)
-    settings = asdict(request.options) | {"calib": str(request.options.calib)}
+    settings = plain(asdict(request.options))
     if request.options.point_fields is None:
         del settings["point_fields"]
     return write_sparse_outputs(

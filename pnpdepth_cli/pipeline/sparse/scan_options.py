@@ -40,16 +40,20 @@ class ScanOptions:
     )
 
     def describes(self, sparse: Path) -> bool:
-        """Returns whether the sparse depth is a scan: by its suffix, or because of a calibration.
+        """Returns whether the sparse depth is a scan: by its suffix, or a .npy with a calibration.
+
+        A calibration of other sparse depth is that of the camera.
 
         Raises:
             UsageError: It is not, and an option is given that only a scan has.
         """
         from pnpdepth_cli.io.dataset.frame import SCAN_ONLY_SUFFIXES
 
-        if self.calib is not None or sparse.suffix.lower() in SCAN_ONLY_SUFFIXES:
+        suffix = sparse.suffix.lower()
+        if suffix in SCAN_ONLY_SUFFIXES or (suffix == ".npy" and self.calib is not None):
             return True
-        if replace(self, keep_occluded=False) != ScanOptions():
+        camera = self.camera if self.calib is None else None
+        if replace(self, calib=None, camera=camera, keep_occluded=False) != ScanOptions():
             for_maps = ("calib", "keep_occluded")
             flags = [each.flag for each in options_of(ScanOptions) if each.name not in for_maps]
             raise UsageError(

@@ -45,6 +45,9 @@ class ScanPoints:
     points: ProjectedScan
     """The points that the camera sees."""
 
+    camera: Camera
+    """The camera, with the pose of the scanner."""
+
     record: dict[str, Any]
     """What a record keeps of it."""
 
@@ -107,6 +110,7 @@ def read_scan_points(
     notes += [f"sparse: dropped {lost}"] if lost else []
     return ScanPoints(
         points=points,
+        camera=camera,
         record={
             "path": str(path),
             "sha256": sha256_of(path),

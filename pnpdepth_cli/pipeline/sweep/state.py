@@ -31,6 +31,12 @@ class SweepState:
             )
         self._journal = Journal(path, "run")
 
+    def notes(self) -> list[str]:
+        """Returns a warning if the journal is damaged."""
+        lost = self._journal.lost
+        text = f"warning: {lost} lines of {self._journal.path} are damaged; their runs are repeated"
+        return [text] if lost else []
+
     def result(self, key: str) -> dict[str, Any] | None:
         """Returns the run's line; None if it was not computed."""
         line = self._journal.newest(key)

@@ -34,6 +34,7 @@ from pnpdepth_cli.pipeline.sweep.plan import Plan, Run, RunId, Setup, sampling_o
 from pnpdepth_cli.pipeline.sweep.plots import draw_study, need_matplotlib
 from pnpdepth_cli.pipeline.sweep.points import OWN, Sampling, frame_points
 from pnpdepth_cli.pipeline.sweep.running import result_of
+from pnpdepth_cli.pipeline.sweep.seeds import over_seeds
 from pnpdepth_cli.pipeline.sweep.state import SweepState
 from pnpdepth_cli.pipeline.sweep.summary import FrameFigures, summarise, write_frames, write_sweep
 from pnpdepth_cli.sensors import SamplePattern
@@ -87,6 +88,8 @@ def run_sweep(request: SweepRequest, listener: Listener) -> dict[str, Any]:
     make_folder(request.output)
     with locked_folder(request.output, None, lambda: _clean(request.output)):
         state = SweepState(request.output)
+        for note in state.notes():
+            listener.say(note)
         networks = {
             model: _network(model, request, sampling, tasks, listener) for model in _models(request)
         }
@@ -356,7 +359,15 @@ def _write(
         if plot is not None:
             draw_study(study, cells, request.output / plot)
         values = {axis.name: list(axis.values) for axis in study.axes}
-        studies.append({"name": study.name, "parameters": values, "plot": plot, "cells": cells})
+        studies.append(
+            {
+                "name": study.name,
+                "parameters": values,
+                "plot": plot,
+                "cells": cells,
+                "over_seeds": over_seeds(cells),
+            }
+        )
     first, *others = networks.values()
     record = {
         "command": "sweep",

@@ -68,6 +68,14 @@ def test_a_nul_in_a_path_of_a_manifest_is_named(tmp_path: Path) -> None:
         read_frames(tmp_path / "m.jsonl")
 
 
+@pytest.mark.parametrize("line", ["1.0 rgb/a\0.png", "9.0 rgb/a\0.png"])
+def test_a_nul_in_a_path_of_any_other_list_is_one_line(tmp_path: Path, line: str) -> None:
+    (tmp_path / "rgb.txt").write_text(f"{line}\n2.0 rgb/b.png\n")
+    (tmp_path / "depth.txt").write_text("1.0 depth/a.png\n2.0 depth/b.png\n")
+    with pytest.raises(FileFormatError, match=r"rgb/a\\0\.png: a file name holds a NUL"):
+        read_frames(tmp_path)
+
+
 def test_a_field_beyond_what_csv_takes_is_named(tmp_path: Path) -> None:
     (tmp_path / "m.csv").write_text("image\n" + "x" * 200_000 + "\n")
     with pytest.raises(FileFormatError, match="field larger than field limit"):

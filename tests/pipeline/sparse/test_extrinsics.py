@@ -8,10 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pnpdepth_cli.errors import UsageError
+from pnpdepth_cli.errors import OutputError, UsageError
 from pnpdepth_cli.io.calibration import read_calibration
 from pnpdepth_cli.io.extrinsics import inverse
+from pnpdepth_cli.io.record import read_json
 from pnpdepth_cli.io.scans import read_scan
+from pnpdepth_cli.pipeline.sparse.outputs import SparseTarget
+from pnpdepth_cli.pipeline.sparse.project import ProjectRequest, project_scan
 from pnpdepth_cli.pipeline.sparse.scan_options import ScanOptions
 from pnpdepth_cli.pipeline.sparse.scans import camera_of, check_direction, read_scan_points
 from tests.pipeline.scan_frames import CALIBRATION, HEIGHT, WIDTH, ScanOnDisk, scan_on_disk
@@ -37,6 +40,34 @@ def test_extrinsics_of_a_file_complete_a_calibration(scene: ScanOnDisk) -> None:
     options = ScanOptions(calib=scene.calib, extrinsics=scene.folder / "pose.txt")
     read = read_scan_points(scene.scan, options, (HEIGHT, WIDTH))
     np.testing.assert_allclose(read.points.xy, scene.places[read.points.index], atol=1e-3)
+
+
+def test_projecting_with_extrinsics_records_their_path(scene: ScanOnDisk) -> None:
+    options = ScanOptions(calib=scene.calib, extrinsics=scene.folder / "pose.txt")
+    for name in ("out.png", "out.csv"):
+        record = project_scan(
+            ProjectRequest(
+                scan=scene.scan,
+                options=options,
+                target=SparseTarget(output=scene.folder / name, overwrite=True),
+                size=(HEIGHT, WIDTH),
+            )
+        )
+        assert record["extrinsics"] == str(options.extrinsics)
+        assert read_json(scene.folder / "out.json") == record
+
+
+def test_the_extrinsics_are_not_replaced_by_the_output(scene: ScanOnDisk) -> None:
+    pose = scene.folder / "pose.json"
+    pose.write_text((scene.folder / "pose.txt").read_text())
+    request = ProjectRequest(
+        scan=scene.scan,
+        options=ScanOptions(calib=scene.calib, extrinsics=pose),
+        target=SparseTarget(output=scene.folder / "pose.png", overwrite=True),
+        size=(HEIGHT, WIDTH),
+    )
+    with pytest.raises(OutputError, match=r"pose\.json is an input"):
+        project_scan(request)
 
 
 def test_extrinsics_of_the_wrong_direction_are_recognised(scene: ScanOnDisk) -> None:

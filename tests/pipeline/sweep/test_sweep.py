@@ -280,6 +280,17 @@ def test_a_sweep_that_was_killed_goes_on_and_ends_the_same(root: Path, after: in
     assert resumed["studies"] == sweep(root, *vary, output=root / "other")["studies"]
 
 
+def test_an_edited_line_of_the_journal_is_computed_again(root: Path) -> None:
+    undisturbed = sweep(root, "iterations=0,2")
+    path = root / "out/sweep.jsonl"
+    path.write_text(path.read_text().replace('"rmse"', '"other"', 1))
+    heard = Heard()
+    resumed = sweep(root, "iterations=0,2", heard=heard)
+    assert heard.to_do == 1
+    assert any("1 lines of" in text and "are damaged" in text for text in heard.said)
+    assert resumed["studies"] == undisturbed["studies"]
+
+
 def test_what_was_made_of_a_file_that_changed_is_computed_again(root: Path) -> None:
     sweep(root, "iterations=0,2")
     cv2.imwrite(str(root / "rgb/b.png"), np.zeros((46, 62, 3), np.uint8))

@@ -1,0 +1,52 @@
+"""Depth, points, stacks and images."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from pnpdepth_cli.io.depth_writing import write_depth
+from tests.fuzz.seeds.seed import HEIGHT, OUT, WIDTH, Seed
+
+
+def write_seeds(folder: Path, depth: np.ndarray, rng: np.random.Generator) -> list[Seed]:
+    """Returns depth in every format, sparse points, stacks, and images."""
+    return [*_depths(folder, depth, rng), *_images(folder, rng)]
+
+
+def _depths(folder: Path, depth: np.ndarray, rng: np.random.Generator) -> list[Seed]:
+    names = [f"depth.{suffix}" for suffix in ("png", "exr", "npy", "npz", "pfm", "tif")]
+    for name in names:
+        write_depth(folder / name, depth)
+    cv2.imwrite(str(folder / "double.tif"), depth.astype(np.float64))
+    points = np.column_stack([rng.uniform(0, 20, (30, 2)), rng.uniform(1, 9, 30)])
+    np.savetxt(folder / "points.csv", points, delimiter=",", header="x,y,depth", comments="")
+    np.save(folder / "points.npy", points)
+    np.save(folder / "stack.npy", np.stack([depth, depth]))
+    np.savez(folder / "gt_depths.npz", data=np.stack([depth, depth]))
+    return [
+        *(
+            Seed(file=name, command=("sample", name, "--count", "20", *OUT))
+            for name in (*names, "double.tif")
+        ),
+        *(
+            Seed(file=name, command=("eval", "gt.npy", "gt.npy", "--sparse", name))
+            for name in ("points.csv", "points.npy")
+        ),
+        Seed(file="stack.npy", command=("eval", "stack.npy", "stack.npy")),
+        Seed(file="gt_depths.npz", command=("eval", "stack.npy", "gt_depths.npz")),
+    ]
+
+
+def _images(folder: Path, rng: np.random.Generator) -> list[Seed]:
+    image = rng.integers(0, 255, (HEIGHT, WIDTH, 3), dtype=np.uint8)
+    names = [f"image.{suffix}" for suffix in ("png", "jpg", "webp", "tif")]
+    for name in names:
+        cv2.imwrite(str(folder / name), image)
+    features = ("--pattern", "features", "--count", "5")
+    return [
+        Seed(file=name, command=("sample", "gt.npy", *features, "--image", name, *OUT))
+        for name in names
+    ]

@@ -1,0 +1,27 @@
+"""A valid file, and the command line that reads it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+HEIGHT, WIDTH = 24, 32
+SIZE = ("--size", f"{HEIGHT}x{WIDTH}")
+OUT = ("-o", "out.png", "--overwrite")
+DRY_RUN = ("-o", "batch", "--dry-run")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Seed:
+    """A valid file, and a command that reads it."""
+
+    file: str
+    """The file that is damaged, relative to the working folder."""
+    command: tuple[str, ...]
+    """Arguments of `pnpdepth`."""
+    scratch: tuple[str, ...] = field(
+        default=(
+            *("out.png", "out.png.json", "out.json", "out.safetensors", "out.ply", "out.ply.json"),
+            *("batch", "frames", "refined"),
+        )
+    )
+    """Files and folders that the command may write."""
