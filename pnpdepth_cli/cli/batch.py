@@ -52,7 +52,7 @@ _STOPPING = b"\nfinishing the current frame; press Ctrl-C again to stop at once\
         "Input": (*grouped_help.LIDAR, *grouped_help.COLMAP, *grouped_help.FILE_READING),
         "Network": grouped_help.NETWORK,
         "Method": grouped_help.METHOD,
-        "Output": (*grouped_help.OUTPUT, "--html"),
+        "Output": (*grouped_help.OUTPUT, "--html", "--html-3d"),
         "Run": ("--workers", "--batch-size", "--profile", "--dry-run"),
         "Cluster": grouped_help.CLUSTER,
     },

@@ -190,7 +190,12 @@ def _report_of(request: BatchRequest, batch: BatchFrames) -> BatchReport | None:
         return None
     from pnpdepth_cli.pipeline.report.batch import BatchReport
 
-    report = BatchReport(folder=request.html, output=request.output, workers=request.workers)
+    report = BatchReport(
+        folder=request.html,
+        output=request.output,
+        workers=request.workers,
+        view_3d=request.html_3d,
+    )
     files = (path for frame in batch.frames for path in source_files(frame))
     inputs = [request.source, *(files if request.html.exists() else ())]
     report.check(inputs, overwrite=request.refine.outputs.overwrite)

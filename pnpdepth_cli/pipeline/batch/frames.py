@@ -83,6 +83,7 @@ def find_frames(request: BatchRequest) -> BatchFrames:
 
 def task_of(request: BatchRequest, frame: Frame) -> Task:
     """Returns the frame's task; options of the user go before what the data set states."""
+    request = replace(request, refine=request.refine.with_fields(view_3d=request.html_3d))
     base = request.refine.files
     sparse = frame.sparse if base.sample is None else None
     protocol = frame.protocol if request.protocol is None else find_protocol(request.protocol)

@@ -301,6 +301,8 @@ class OutputOptions:
         flag="--fov",
         metavar="DEG",
     )
+    view_3d: bool = False
+    """Whether the 3D view of the frame is written, which the report of a batch shows."""
     colors: str = option(
         "blue-orange",
         "Colours of better and worse: blue and orange, or the paper's red and green.",
@@ -312,7 +314,7 @@ class OutputOptions:
     @property
     def needs_camera(self) -> bool:
         """Whether an output cannot be written without the camera."""
-        return self.ply
+        return self.ply or self.view_3d
 
 
 _PLACES = {"image", "sparse", "gt", "gt_masks", "model", "checkpoint", "output", "overwrite"} | {
@@ -321,7 +323,7 @@ _PLACES = {"image", "sparse", "gt", "gt_masks", "model", "checkpoint", "output",
 }
 """Fields that say where something lies. A cache key has digests of what lies there instead."""
 
-_ADDED = {"ply"}
+_ADDED = {"ply", "view_3d"}
 """Fields that add a file and change no other. A cache key does without: the file exists or not."""
 
 
