@@ -43,6 +43,7 @@ OUTPUT = (
     *("--output", "--format", "--output-scale", "--ply", "--fov", "--colors", "--baselines"),
     *("--uncertainty", "--overwrite", "--json"),
 )
+CLUSTER = ("--ray", "--ray-workers", "--cpus-per-worker", "--retries")
 COMMON = frozenset(
     {
         *("--sparse", "--gt", "--calib", "--output", "--overwrite"),

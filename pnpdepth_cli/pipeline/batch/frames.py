@@ -119,6 +119,11 @@ def task_of(request: BatchRequest, frame: Frame) -> Task:
     )
 
 
+def compared(count: int) -> list[int]:
+    """Returns which of the frames behind the first candidates are compared on."""
+    return sorted({count // 2, count - 1}) if count else []
+
+
 def _is_scan(base: FrameFiles, sparse: Path) -> bool:
     suffix = sparse.suffix.lower()
     return suffix in SCAN_ONLY_SUFFIXES or (suffix == ".npy" and base.scan.calib is not None)

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from pnpdepth_cli.choices import FRAME_PROTOCOLS, LAYOUTS
 from pnpdepth_cli.errors import UsageError
+from pnpdepth_cli.pipeline.cluster.options import ClusterOptions
 from pnpdepth_cli.pipeline.options import option
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest
 
@@ -78,6 +79,8 @@ class BatchRequest(FrameSelection):
         None, "Every N-th frame, starting at the I-th.", metavar="I/N", parse=parse_shard
     )
     profile: bool = option(False, "Print the time spent in each stage.")
+    cluster: ClusterOptions = field(default_factory=ClusterOptions)
+    """The Ray workers, if any."""
 
     def __post_init__(self) -> None:
         from pnpdepth_cli.io.dataset.protocols import find_protocol

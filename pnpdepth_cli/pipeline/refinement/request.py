@@ -140,7 +140,12 @@ class NetworkChoice:
         choices=choices.PRECISIONS,
         show_default=True,
     )
-    device: str = option("cpu", "cpu, cuda, cuda:1, mps, …", metavar="NAME", show_default=True)
+    device: str = option(
+        "cpu",
+        "cpu, cuda, cuda:1, mps, …; batch, eval and sweep also take cuda:0,cuda:1 and all.",
+        metavar="NAME",
+        show_default=True,
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
