@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from pnpdepth_cli.choices import FRAME_PROTOCOLS, LAYOUTS
 from pnpdepth_cli.errors import UsageError
+from pnpdepth_cli.pipeline.batch.sequence_options import SequenceOptions
 from pnpdepth_cli.pipeline.options import option
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest
 
@@ -72,6 +73,8 @@ class BatchRequest(FrameSelection):
     shard: tuple[int, int] | None = option(
         None, "Every N-th frame, starting at the I-th.", metavar="I/N", parse=parse_shard
     )
+    sequence: SequenceOptions = field(default_factory=SequenceOptions)
+    """What a frame takes over from its neighbours."""
     profile: bool = option(False, "Print the time spent in each stage.")
 
     def __post_init__(self) -> None:

@@ -158,7 +158,7 @@ class Refiner:
         held = spatial_folds(points, _CHECK_FOLDS, seed=self.request.hold_out.seed) == 0
         kept, left = points.select(~held), points.select(held)
         try:
-            again = self._refined(opened, inputs.frame().with_points(kept), None)
+            again = self._refined(opened, inputs.frame(kept), None)
         except PnpDepthError:
             return frame
         before, after = point_error(again.before, left), point_error(again.after, left)
@@ -231,7 +231,7 @@ class Refiner:
         """The frame with the points to use, and the points held out."""
         asked = self.request.hold_out
         used, held_out = split_points(inputs.points, asked.holdout, asked.seed)
-        return inputs.frame().with_points(used), held_out
+        return inputs.frame(used), held_out
 
     @property
     def _propagation(self) -> str:
@@ -399,6 +399,7 @@ def _record(refiner: Refiner, inputs: Inputs, frame: RefinedFrame) -> dict[str, 
             "held_out": len(frame.held_out),
             "nearest": float(inputs.points.depth.min()),
             "farthest": float(inputs.points.depth.max()),
+            **_moved_points(inputs, frame),
         },
         "loss": list(frame.refinement.losses),
         "kept": frame.refinement.kept,
@@ -411,6 +412,13 @@ def _record(refiner: Refiner, inputs: Inputs, frame: RefinedFrame) -> dict[str, 
         "diverged": str(frame.diverged) if frame.diverged else None,
         "notes": [note for note in (*inputs.notes, *_notes(refiner), *frame.notes) if note],
     }
+
+
+def _moved_points(inputs: Inputs, frame: RefinedFrame) -> dict[str, int]:
+    """The number of used points that are neighbours', for a frame with neighbours."""
+    if not inputs.neighbours:
+        return {}
+    return {"moved": len(frame.used) - (len(inputs.points) - len(frame.held_out))}
 
 
 def _notes(refiner: Refiner) -> list[str]:
