@@ -151,4 +151,4 @@ def test_a_frame_without_calibration_fails_with_the_reason(tmp_path: Path) -> No
     (root / "calib").rmdir()
     heard = Heard()
     accumulating(root, heard=heard)
-    assert ["needs the camera" in row["error"] for row in heard.rows] == [True, True]
+    assert ["needs the camera" in row["message"] for row in heard.rows] == [True, True]
