@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from pnpdepth_cli.completion.interpolation import linear
 from pnpdepth_cli.sensors import Camera, NeighbourScan, Points, accumulated
 from pnpdepth_cli.sensors.registration import registered, surface_of
 
@@ -71,6 +72,22 @@ def test_points_of_a_moved_object_are_dropped() -> None:
     assert (later.depth == 4).sum() > 100
     assert not (depth[on_old_box] < 4.5).any()
     assert both.dropped["moved, occluded or seen through"] > 100
+
+
+def test_depth_around_a_moved_object_is_about_as_good_as_without_neighbours() -> None:
+    alone: list[float] = []
+    more: list[float] = []
+    for seed in range(6):
+        own, later = room((0, 0, 0), -0.2, seed), room((0, 0, 0), 0.3, seed + 10)
+        held = np.random.default_rng(seed).random(len(own)) < 0.2
+        at = CAMERA.unproject(own.xy, np.full(len(own), 4.0))
+        around = held & (np.abs(at[:, 0]) < 0.9) & (np.abs(at[:, 1]) < 0.6)
+        used, scored = own.select(~held), own.select(around).tensors()
+        both = accumulated(used, [NeighbourScan(points=later, motion=STILL, apart=1)], CAMERA)
+        for errors, points in ((alone, used), (more, both)):
+            depth = linear(points.tensors(), scored.xy)
+            errors.append(float((depth - scored.depth).abs().mean()))
+    assert np.mean(more) < 1.06 * np.mean(alone)
 
 
 def test_a_scan_farther_in_time_gives_way_to_a_nearer_one() -> None:
