@@ -25,7 +25,8 @@ LARGE_STEP = 0.1  # of z's spread, by one step
 def markdown(table: Table) -> str:
     """A set's table with the paper's figures beside ours, the δ at 1.01^k, and the steps."""
     rows, beside = table["rows"], table["beside_paper"]
-    parts = [f"## {heading(table)}\n", _measures(rows, table["street"], beside=beside)]
+    title = f"## {heading(table)}\n\n{_sample_line(table)}\n"
+    parts = [title, _measures(rows, table["street"], beside=beside)]
     if any(row["fine"] for row in rows):
         parts.append(_fine(rows, beside=beside))
     notes = [*table["notes"], *remarks(rows)]
@@ -37,6 +38,13 @@ def heading(table: Table) -> str:
     """Which of the paper's tables a set's is, on what."""
     name = f"Table {'II' if table['street'] else 'I'}"
     return f"{name} on {table['set']}"
+
+
+def _sample_line(table: Table) -> str:
+    """What the means are over; the interval needs several groups of frames."""
+    rendered = table["set"].startswith("rendered")
+    groups = "each its own group" if rendered else "of one sequence, one group"
+    return f"Means over frames (n in the table), {groups}; one draw of the points, no interval."
 
 
 def paper_row(row: Result, street: bool) -> PaperRow:

@@ -27,8 +27,8 @@ from pnpdepth_cli.pipeline.batch.frames import task_of
 from pnpdepth_cli.pipeline.batch.request import BatchRequest
 from pnpdepth_cli.pipeline.batch.sequence import with_neighbours
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs, read_inputs
+from pnpdepth_cli.pipeline.refinement.load_refiner import load_refiner
 from pnpdepth_cli.pipeline.refinement.points import split_points
-from pnpdepth_cli.pipeline.refinement.refine import load_refiner
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.scan_pattern import scan_lines

@@ -16,15 +16,25 @@ IMAGES, POINTS = "/front/image_raw", "/lidar/points"
 
 
 def write_bag(
-    path: Path, *, frames: int = 3, compressed: bool = False, static: bool = True, info: bool = True
+    path: Path,
+    *,
+    frames: int = 3,
+    compressed: bool = False,
+    static: bool = True,
+    info: bool = True,
+    compression: Any = None,
 ) -> Path:
     """A bag of ROS 1 (.bag), ROS 2 with MCAP (.mcap) or SQLite (a folder), by the path's suffix.
 
     Images have 30 ms between them, and each a scan 4 ms later; the scans are of a wall 5 m ahead.
+    `compression` is rosbags' of the chunks.
     """
     ros1 = path.suffix == ".bag"
     store = message_types(ros1=ros1)
-    with _writer(path) as writer:
+    opened = _writer(path)
+    if compression is not None:
+        opened.set_compression(compression)
+    with opened as writer:
         connections: dict[str, Any] = {}
         messages = _messages(store.types, ros1, frames, compressed, static, info)
         for topic, time_ns, message in messages:

@@ -52,6 +52,7 @@ OUTPUT = (
     ),
     "--json",
 )
+CLUSTER = ("--ray", "--ray-workers", "--cpus-per-worker", "--retries")
 COMMON = frozenset(
     {
         *("--sparse", "--gt", "--calib", "--output", "--overwrite"),

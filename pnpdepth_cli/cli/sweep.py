@@ -113,7 +113,8 @@ def sweep(
                 the options of the same names
     preset, model
                 presets of the method; networks, as NETWORK or NETWORK@WEIGHTS
-    seed        of the draw of the points, in place of --seeds
+    seed        of the draw of the points, in place of --seeds; from 3 on, a second table has the
+                means over seeds with their intervals
 
     One --vary gives one table and one plot; two give a table and a plot of their grid; with
     --one-by-one every --vary gives its own. Tables compare the refined depth with the network's
@@ -189,10 +190,43 @@ def _print(record: Mapping[str, Any]) -> None:
              "RMSE gain", "MRE gain", "δ1 gain", *(["time [s]"] if cost else [])],
             [_cells(names, cell) for cell in study["cells"]],
         )  # fmt: skip
+        _print_over_seeds(study)
     folder = record["output"]
     files = ["sweep.csv", "sweep.json", "sweep.tex", "sweep_frames.csv"]
     files += [study["plot"] for study in record["studies"] if study["plot"]]
     click.echo("wrote " + "  ".join(f"{folder}/{name}" for name in files), err=True)
+
+
+def _print_over_seeds(study: Mapping[str, Any]) -> None:
+    """Prints the means over the draws of the points, where seeds were varied."""
+    from pnpdepth_cli.cli.tables import print_rows
+
+    rows = study["over_seeds"]
+    if not rows:
+        return
+    others = list(rows[0]["parameters"])
+    print_rows(
+        "over seeds of the points: mean MAE in metres with its 95 % interval over draws, gain in %",
+        [*others, "seeds", "linear", "plain", "refined", "gain"],
+        [
+            [
+                *(row["parameters"][name] for name in others),
+                str(row["seeds"]),
+                *(
+                    _with_interval(row["mae"][name], ".4f")
+                    for name in ("linear", "plain", "refined")
+                ),
+                _with_interval(row["mae"]["gain"], "+.1f"),
+            ]
+            for row in rows
+        ],
+    )
+
+
+def _with_interval(value: Mapping[str, float | None], form: str) -> str:
+    if value["mean"] is None:
+        return "–"
+    return f"{value['mean']:{form}} [{value['low']:{form}}, {value['high']:{form}}]"
 
 
 def _cells(names: list[str], cell: Mapping[str, Any]) -> list[str]:

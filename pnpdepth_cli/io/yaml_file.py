@@ -9,8 +9,8 @@ from typing import Any
 from pnpdepth_cli.errors import FileFormatError, UsageError
 from pnpdepth_cli.io.file_bytes import one_line
 
-_LONGEST = 1 << 18
-"""Characters; a calibration has a few thousand."""
+_LONGEST = 1 << 17
+"""Characters, parsed in 2 s at most; a calibration has a few thousand, a bag a line per topic."""
 
 _OPENCV_HEADER = re.compile(r"\A\s*%YAML:1\.\d\s*$", re.MULTILINE)
 """OpenCV's first line, which YAML itself does not allow."""

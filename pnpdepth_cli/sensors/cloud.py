@@ -64,11 +64,7 @@ def cloud_from_depth(
         edge: A pixel is left out if the depth of one of its four neighbours differs by more than
             this fraction from what continues its own surface. 0 keeps all pixels.
     """
-    known = (depth > 0) & np.isfinite(depth)
-    if keep is not None:
-        known &= keep
-    if edge:
-        known &= ~depth_edges(np.where(known, depth, 0), edge)
+    known = kept_pixels(depth, keep, edge)
     rows, columns = np.nonzero(known)
     points = np.zeros((*depth.shape, 3))
     points[known] = camera.unproject(np.column_stack([columns, rows]), depth[known])
@@ -77,6 +73,16 @@ def cloud_from_depth(
         rgb=None if rgb is None else np.rint(np.clip(rgb[known], 0, 1) * 255).astype(np.uint8),
         normals=_normals(points, known)[known].astype(np.float32),
     )
+
+
+def kept_pixels(depth: NDArray[np.float32], keep: Mask | None = None, edge: float = EDGE) -> Mask:
+    """Returns (H, W) true for the pixels that become points; arguments as of `cloud_from_depth`."""
+    known: Mask = (depth > 0) & np.isfinite(depth)
+    if keep is not None:
+        known &= keep
+    if edge:
+        known &= ~depth_edges(np.where(known, depth, 0), edge)
+    return known
 
 
 def depth_edges(depth: NDArray[np.float32], edge: float) -> Mask:

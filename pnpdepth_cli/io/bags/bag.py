@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from pnpdepth_cli.errors import FileFormatError, InputError, PnpDepthError, UsageError
+from pnpdepth_cli.io.bags.bounds import bound_decompression, check_bag
 from pnpdepth_cli.io.file_bytes import one_line
 
 BAG_SUFFIXES = (".bag", ".mcap", ".db3")
@@ -75,7 +76,9 @@ def open_bag(path: Path) -> Iterator[Bag]:
     if not path.exists():
         raise InputError(f"{path}: no such file; check the path")
     ros1 = path.suffix.lower() == ".bag"
+    bound_decompression()
     with _as_our_errors(path):
+        check_bag(path)
         reader: Any = Reader1(path) if ros1 else Reader2(path)
         reader.open()
     try:

@@ -13,10 +13,15 @@ from pnpdepth_cli.errors import FileFormatError
 from pnpdepth_cli.io.dataset.frame import Frame, Hdf5Array, Listing
 from pnpdepth_cli.io.dataset.hdf5 import shape_of
 from pnpdepth_cli.io.dataset.protocols import PROTOCOLS
-from pnpdepth_cli.io.file_bytes import one_line, read_bytes
+from pnpdepth_cli.io.file_bytes import one_line, read_bytes, size_of_regular_file
 from pnpdepth_cli.io.layouts import Layout
 
 _LABELED = "nyu_depth_v2_labeled.mat"
+_MOST_FRAMES = 100_000
+"""The official file has 1,449."""
+
+_MOST_SPLIT_BYTES = 1 << 16
+"""splits.mat has 2.6 kB; scipy decompresses all of it."""
 
 
 def matches(root: Path) -> bool:
@@ -28,6 +33,8 @@ def listing(root: Path) -> Listing:
     """Returns the frames of the test set, or all without a split; numbered from 1."""
     path = _labeled(root)
     count = shape_of(path, "depths")[0]
+    if count > _MOST_FRAMES:
+        raise FileFormatError(f"{path} claims {count:,} frames; the official file has 1,449")
     frames = [
         Frame(
             name=f"{number:04}",
@@ -68,8 +75,11 @@ def _split(folder: Path, count: int) -> list[int]:
 def _test_numbers(path: Path) -> Any:
     from scipy.io import loadmat
 
+    size = size_of_regular_file(path)
+    if size > _MOST_SPLIT_BYTES:
+        raise FileFormatError(f"{path} has {size:,} bytes; the official file has 2.6 kB")
     try:
-        return loadmat(path, variable_names=["testNdxs"])["testNdxs"].ravel().tolist()
+        return loadmat(path, variable_names=["testNdxs"])["testNdxs"].ravel()[:_MOST_FRAMES]
     except Exception as error:  # scipy raises many kinds for a damaged file
         raise FileFormatError(f"{path} has no testNdxs ({one_line(error)})") from error
 

@@ -86,6 +86,7 @@ def find_frames(request: BatchRequest) -> BatchFrames:
 
 def task_of(request: BatchRequest, frame: Frame) -> Task:
     """Returns the frame's task; options of the user go before what the data set states."""
+    request = replace(request, refine=request.refine.with_fields(view_3d=request.html_3d))
     base = request.refine.files
     sparse = frame.sparse if base.sample is None else None
     protocol = frame.protocol if request.protocol is None else find_protocol(request.protocol)
@@ -120,6 +121,11 @@ def task_of(request: BatchRequest, frame: Frame) -> Task:
         inputs=dict(_input_files(files, is_scan=is_scan)),
         outputs=Outputs.in_folder(request.output, frame.name, request.refine),
     )
+
+
+def compared(count: int) -> list[int]:
+    """Returns which of the frames behind the first candidates are compared on."""
+    return sorted({count // 2, count - 1}) if count else []
 
 
 def _is_scan(base: FrameFiles, sparse: Path) -> bool:

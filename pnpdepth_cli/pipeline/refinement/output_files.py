@@ -37,6 +37,8 @@ class Outputs:
     """Image of what became better and worse."""
     cloud: Path | None = None
     """Point cloud of the depth."""
+    view: Path | None = None
+    """3D view for a report."""
     record: Path | None = None
     """JSON of settings and scores."""
     colors: str = "blue-orange"
@@ -58,6 +60,7 @@ class Outputs:
             preview=folder / f"{name}_preview.png",
             improvement=folder / f"{name}_improvement.png",
             cloud=folder / f"{name}.ply" if request.outputs.ply else None,
+            view=folder / f"{name}_view.json" if request.outputs.view_3d else None,
             record=folder / f"{name}.json",
             colors=request.outputs.colors,
         )
@@ -72,6 +75,7 @@ class Outputs:
             "preview": self.preview,
             "improvement": self.improvement,
             "cloud": self.cloud,
+            "view": self.view,
             "record": self.record,
         }
         return {kind: path for kind, path in kinds.items() if path is not None}

@@ -16,6 +16,7 @@ from pnpdepth_cli.io.visualisation import improvement, improvement_at_points, pr
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs
 from pnpdepth_cli.pipeline.refinement.output_files import Outputs
 from pnpdepth_cli.pipeline.refinement.output_range import output_scale
+from pnpdepth_cli.pipeline.refinement.view_3d import write_view
 from pnpdepth_cli.sensors.cloud import cloud_from_depth
 
 
@@ -47,6 +48,8 @@ def write_outputs(outputs: Outputs, inputs: Inputs, frame: RefinedFrame) -> dict
         )
     if outputs.cloud is not None:
         record["cloud"] = _write_cloud(outputs.cloud, inputs, frame)
+    if outputs.view is not None:
+        write_view(outputs.view, inputs, frame)
     record["outputs"] = {
         kind: None if path is None else str(path)
         for kind, path in (
@@ -56,6 +59,7 @@ def write_outputs(outputs: Outputs, inputs: Inputs, frame: RefinedFrame) -> dict
             ("preview", outputs.preview),
             ("improvement", outputs.improvement),
             ("cloud", outputs.cloud),
+            ("view", outputs.view),
         )
     }
     return record

@@ -131,7 +131,12 @@ class NetworkChoice:
         choices=choices.PRECISIONS,
         show_default=True,
     )
-    device: str = option("cpu", "cpu, cuda, cuda:1, mps, …", metavar="NAME", show_default=True)
+    device: str = option(
+        "cpu",
+        "cpu, cuda, cuda:1, mps, …; batch, eval and sweep also take cuda:0,cuda:1 and all.",
+        metavar="NAME",
+        show_default=True,
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -298,6 +303,8 @@ class OutputOptions:
         flag="--fov",
         metavar="DEG",
     )
+    view_3d: bool = False
+    """Whether the 3D view of the frame is written, which the report of a batch shows."""
     colors: str = option(
         "blue-orange",
         "Colours of better and worse: blue and orange, or the paper's red and green.",
@@ -309,7 +316,7 @@ class OutputOptions:
     @property
     def needs_camera(self) -> bool:
         """Whether an output cannot be written without the camera."""
-        return self.ply
+        return self.ply or self.view_3d
 
 
 _PLACES = {"image", "sparse", "gt", "gt_masks", "model", "checkpoint", "output", "overwrite"} | {
@@ -318,7 +325,7 @@ _PLACES = {"image", "sparse", "gt", "gt_masks", "model", "checkpoint", "output",
 }
 """Fields that say where something lies. A cache key has digests of what lies there instead."""
 
-_ADDED = {"ply"}
+_ADDED = {"ply", "view_3d"}
 """Fields that add a file and change no other. A cache key does without: the file exists or not."""
 
 

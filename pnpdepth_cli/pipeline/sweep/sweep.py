@@ -25,8 +25,9 @@ from pnpdepth_cli.pipeline.batch.frames import Task, find_frames, task_of
 from pnpdepth_cli.pipeline.batch.request import BatchRequest, FrameSelection
 from pnpdepth_cli.pipeline.batch.settings import model_identity
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs, read_inputs
+from pnpdepth_cli.pipeline.refinement.load_refiner import load_refiner
 from pnpdepth_cli.pipeline.refinement.method import with_preset
-from pnpdepth_cli.pipeline.refinement.refine import Refiner, load_refiner
+from pnpdepth_cli.pipeline.refinement.refiner import Refiner
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest
 from pnpdepth_cli.pipeline.refinement.resolve import resolve_layer, resolve_settings
 from pnpdepth_cli.pipeline.sweep.axes import Cell, Study
@@ -34,6 +35,7 @@ from pnpdepth_cli.pipeline.sweep.plan import Plan, Run, RunId, Setup, sampling_o
 from pnpdepth_cli.pipeline.sweep.plots import draw_study, need_matplotlib
 from pnpdepth_cli.pipeline.sweep.points import OWN, Sampling, frame_points
 from pnpdepth_cli.pipeline.sweep.running import result_of
+from pnpdepth_cli.pipeline.sweep.seeds import over_seeds
 from pnpdepth_cli.pipeline.sweep.state import SweepState
 from pnpdepth_cli.pipeline.sweep.summary import FrameFigures, summarise, write_frames, write_sweep
 from pnpdepth_cli.sensors import SamplePattern
@@ -358,7 +360,15 @@ def _write(
         if plot is not None:
             draw_study(study, cells, request.output / plot)
         values = {axis.name: list(axis.values) for axis in study.axes}
-        studies.append({"name": study.name, "parameters": values, "plot": plot, "cells": cells})
+        studies.append(
+            {
+                "name": study.name,
+                "parameters": values,
+                "plot": plot,
+                "cells": cells,
+                "over_seeds": over_seeds(cells),
+            }
+        )
     first, *others = networks.values()
     record = {
         "command": "sweep",
