@@ -67,6 +67,11 @@ def set_max_pixels(max_pixels: int | None) -> None:
     )
 
 
+def chosen_max_pixels() -> int | None:
+    """What `set_max_pixels` was given; None for the default."""
+    return None if _chosen is None else _chosen.max_pixels
+
+
 _chosen: Budget | None = None
 
 

@@ -14,6 +14,7 @@
     │   └── CheckpointError      4  the weights cannot be used
     ├── DivergedError            5  refinement produced non-finite numbers
     ├── DeviceError              6  the device is absent or out of memory
+    │   └── ClusterError         6  the Ray cluster cannot be used
     └── FramesFailedError        7  a batch finished, but some of its frames failed
 
 A message names the object, the fact and the remedy, on one line.
@@ -94,6 +95,10 @@ class DeviceError(PnpDepthError):
     """The device is absent or out of memory."""
 
     exit_code = 6
+
+
+class ClusterError(DeviceError):
+    """The Ray cluster cannot be used."""
 
 
 class FramesFailedError(PnpDepthError):

@@ -19,6 +19,8 @@ from pnpdepth_cli.cli.exit_codes import INTERRUPTED
 from pnpdepth_cli.cli.printable import printable
 from pnpdepth_cli.errors import FramesFailedError, StorageError
 from pnpdepth_cli.pipeline.batch.request import BatchRequest
+from pnpdepth_cli.pipeline.batch.sequence_options import SequenceOptions
+from pnpdepth_cli.pipeline.cluster.options import ClusterOptions
 from pnpdepth_cli.pipeline.refinement.request import sample_pattern
 from pnpdepth_cli.pipeline.sparse.bag_options import BagOptions
 
@@ -48,11 +50,13 @@ _STOPPING = b"\nfinishing the current frame; press Ctrl-C again to stop at once\
             *("--layout", "--protocol", "--sample", "--limit", "--shard"),
             *("--image-topic", "--points-topic", "--tolerance"),
         ),
+        "Sequences": ("--accumulate", "--poses"),
         "Input": (*grouped_help.LIDAR, *grouped_help.COLMAP, *grouped_help.FILE_READING),
         "Network": grouped_help.NETWORK,
         "Method": grouped_help.METHOD,
-        "Output": (*grouped_help.OUTPUT, "--html"),
+        "Output": (*grouped_help.OUTPUT, "--html", "--html-3d"),
         "Run": ("--workers", "--batch-size", "--profile", "--dry-run"),
+        "Cluster": grouped_help.CLUSTER,
     },
 )
 @click.argument("source", type=options.FILE, metavar="FOLDER|LIST|BAG")
@@ -62,7 +66,7 @@ _STOPPING = b"\nfinishing the current frame; press Ctrl-C again to stop at once\
     metavar="[PATTERN:]N|P%",
     help="Sample the sparse depth from the ground truth, as `pnpdepth sample` does.",
 )
-@options.options_of_groups(BatchRequest, BagOptions)
+@options.options_of_groups(BatchRequest, SequenceOptions, ClusterOptions, BagOptions)
 @click.option("--dry-run", is_flag=True, help="List the frames that would be refined, and exit.")
 @options.scan
 @options.refinement
@@ -82,6 +86,7 @@ def batch(
     pnpdepth batch frames.csv -o out/ --workers 4 --model net.onnx
     pnpdepth batch kitchen/ -o out/ --sample 500          # sparse depth from the ground truth
     pnpdepth batch drive_0001/ -o out/ --shard 1/4        # one of four processes
+    pnpdepth batch drive_0001/ -o out/ --ray              # all devices of this machine
     pnpdepth batch drive_0001/ -o out/ --html report/     # then open report/index.html
 
     The layout of a folder is recognised from its content. The simplest layout has files of the same
@@ -97,7 +102,9 @@ def batch(
     from pnpdepth_cli.pipeline.batch.batch import plan_batch
 
     own = options.taken(BatchRequest, given)
+    own["cluster"] = ClusterOptions(**options.taken(ClusterOptions, given))
     bag_options = BagOptions(**options.taken(BagOptions, given))
+    own["sequence"] = SequenceOptions(**options.taken(SequenceOptions, given))
     pattern = None if sample is None else sample_pattern(*_sample(sample))
     refine = options.request_of(given, sample=pattern)
     request = BatchRequest(source=source, output=output, refine=refine, **own)

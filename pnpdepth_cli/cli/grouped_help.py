@@ -40,18 +40,10 @@ METHOD = (
     *("--holdout", "--seed"),
 )
 OUTPUT = (
-    *(
-        "--output",
-        "--format",
-        "--ply",
-        "--fov",
-        "--colors",
-        "--baselines",
-        "--uncertainty",
-        "--overwrite",
-    ),
-    "--json",
+    *("--output", "--format", "--output-scale", "--ply", "--fov", "--colors", "--baselines"),
+    *("--uncertainty", "--overwrite", "--json"),
 )
+CLUSTER = ("--ray", "--ray-workers", "--cpus-per-worker", "--retries")
 COMMON = frozenset(
     {
         *("--sparse", "--gt", "--calib", "--output", "--overwrite"),

@@ -52,6 +52,8 @@ def click_option(each: OptionField) -> Callable[[Any], Any]:
         details["is_flag"] = True
     else:
         details["type"] = _type_of(each)
+    if option.value_if_bare is not None:
+        details |= {"is_flag": False, "flag_value": option.value_if_bare}
     if option.show_default:
         details["show_default"] = True
     if option.hidden:

@@ -59,21 +59,22 @@ class Journal:
         except OSError as error:
             raise _cannot_read(self.path, error) from error
 
-    def append(self, line: Mapping[str, Any]) -> None:
-        """Appends a line.
+    def append(self, *lines: Mapping[str, Any]) -> None:
+        """Appends lines, all in one write.
 
         Raises:
             StorageError: The disk is full or gone; at most an incomplete line was written.
         """
-        data = _line(line)
+        texts = [_line(line) for line in lines]
         with self._writing:
             try:
-                self._write(data)
+                self._write(b"".join(texts))
             except OSError as error:
                 raise cannot_write(self.path, error) from error
-            if isinstance(line.get(self._key), str):
-                self._offsets[line[self._key]] = self._end
-            self._end += len(data)
+            for line, data in zip(lines, texts, strict=True):
+                if isinstance(line.get(self._key), str):
+                    self._offsets[line[self._key]] = self._end
+                self._end += len(data)
 
     def _write(self, data: bytes) -> None:
         flags = os.O_RDWR | os.O_CREAT | getattr(os, "O_BINARY", 0)

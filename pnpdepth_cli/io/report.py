@@ -21,11 +21,12 @@ from pnpdepth_cli.io.atomic import (
     remove_leftovers,
 )
 from pnpdepth_cli.io.record import plain, read_json, write_json
+from pnpdepth_cli.io.report_view import VIEWER, save_viewer
 
 PAGE = "index.html"
 IMAGES = "pictures"
 _MADE_OF = "report.json"
-_IMAGE = re.compile(r"[0-9a-f]{20}_[a-z_]+\.jpg")
+_IMAGE = re.compile(r"[0-9a-f]{20}_[a-z_]+\.(?:jpg|js)")
 
 
 def check_report_folder(
@@ -84,10 +85,12 @@ def whole_report(folder: Path) -> Iterator[Path]:
         OutputError: The folder cannot be written to.
     """
     remove_report_leftovers(folder)
-    images: set[str] = set()
     with atomic_folder(folder) as temporary:
         yield temporary
         images = {path.name for path in (temporary / IMAGES).iterdir()}
+        viewer = (temporary / VIEWER).exists()
+    if not viewer:
+        _remove_viewer(folder)
     _remove_images(folder, lambda name: name not in images)
 
 
@@ -109,13 +112,20 @@ def image_key(*parts: str) -> str:
     return hashlib.sha256(text.encode("utf-8", "surrogateescape")).hexdigest()[:20]
 
 
-def write_report(folder: Path, head: Mapping[str, Any], frames: Iterable[Mapping[str, Any]]) -> int:
+def write_report(
+    folder: Path,
+    head: Mapping[str, Any],
+    frames: Iterable[Mapping[str, Any]],
+    *,
+    viewer: bool = False,
+) -> int:
     """Writes the page, removes images of frames that it does not have, and returns its size.
 
     Args:
         folder: The report's folder.
         head: What report_page.js shows of all frames.
         frames: A mapping per frame, taken one by one; its `key` is that of its images, or None.
+        viewer: Whether frames have 3D views, so that the page may run scripts of its folder.
 
     Returns:
         Bytes of the page.
@@ -124,7 +134,7 @@ def write_report(folder: Path, head: Mapping[str, Any], frames: Iterable[Mapping
         OutputError: The page cannot be written.
     """
     keys: set[str] = set()
-    start, end = _page().split("@DATA@")
+    start, end = _page(viewer=viewer).split("@DATA@")
     page = folder / PAGE
     with (
         atomic_path(page) as temporary,
@@ -137,8 +147,19 @@ def write_report(folder: Path, head: Mapping[str, Any], frames: Iterable[Mapping
             keys.add(frame["key"])
         file.write("\n]}")
         file.write(end)
+    if viewer:
+        save_viewer(folder)
+    else:
+        _remove_viewer(folder)
     _remove_images(folder, lambda name: name.partition("_")[0] not in keys)
     return page.stat().st_size
+
+
+def _remove_viewer(folder: Path) -> None:
+    try:
+        (folder / VIEWER).unlink(missing_ok=True)
+    except OSError as error:
+        raise cannot_write(folder, error) from error
 
 
 def _remove_images(folder: Path, unused: Callable[[str], bool]) -> None:
@@ -158,12 +179,15 @@ def _is_of(folder: Path, made_of: Mapping[str, Any] | None) -> bool:
         return False
 
 
-def _page() -> str:
-    """The page with style and script in it; its policy allows no other script and no request."""
+def _page(*, viewer: bool) -> str:
+    """The page with style and script in it; its policy allows no request beyond its folder.
+
+    It allows no other script either, but for a report with 3D views those beside it.
+    """
     html, style, script = (_template(kind) for kind in ("html", "css", "js"))
     policy = (
         f"default-src 'none'; img-src 'self' file: data:; style-src {_digest(style)};"
-        f" script-src {_digest(script)}"
+        f" script-src {_digest(script)}{' file:' if viewer else ''}"
     )
     parts = {"@POLICY@": policy, "@STYLE@": style, "@SCRIPT@": script}
     for mark, text in parts.items():

@@ -355,6 +355,7 @@ function viewsOf(frame) {
   for (const view of ["image", "sparse"]) {
     if (frame.views.includes(view)) views.push(plainView(frame, view));
   }
+  if (frame.view_mb) views.push(spaceView(frame));
   return views;
 }
 
@@ -407,6 +408,80 @@ function plainView(frame, view) {
     make("span", { class: "label left", text: data.labels[view], "aria-hidden": "true" })));
 }
 
+// ---- the 3D view, whose scripts are loaded when it is first opened ----
+
+const space = { open: false, frame: null };
+
+function spaceView(frame) {
+  const stage = make("div", { class: "stage space" });
+  const figure = make("figure", { class: "wide" }, stage);
+  const open = make("button", { type: "button", class: "load",
+    text: `Open the 3D view (${frame.view_mb} MB)` });
+  open.addEventListener("click", () => { space.open = true; loadSpace(frame, figure, stage); });
+  stage.append(open);
+  if (space.open) loadSpace(frame, figure, stage);
+  return figure;
+}
+
+function loadScript(source) {
+  return new Promise((resolve, reject) => {
+    const script = make("script", { src: source });
+    script.addEventListener("load", () => { script.remove(); resolve(); });
+    script.addEventListener("error", () => { script.remove(); reject(new Error(source)); });
+    document.head.append(script);
+  });
+}
+
+async function loadSpace(frame, figure, stage) {
+  space.frame = frame;
+  stage.replaceChildren(make("p", { class: "load", role: "status", text: "Loading …" }));
+  let content;
+  window.pnpdepthView = (given) => { content = given; };
+  try {
+    if (!space.loaded) await loadScript("viewer.js");
+    space.loaded = true;
+    await loadScript(`pictures/${frame.key}_view.js`);
+    if (space.frame !== frame) return; // another frame was opened meanwhile
+    fillSpace(frame, figure, stage, content);
+  } catch (error) {
+    const why = `The 3D view cannot be shown: ${error.message}`;
+    stage.replaceChildren(make("p", { class: "load", text: why }));
+  }
+}
+
+function fillSpace(frame, figure, stage, content) {
+  const canvas = pnpdepthViewer.show(content);
+  const names = { before: data.labels.first, after: data.labels.second, gt: data.labels.gt };
+  const count = make("span", { class: "count", role: "status" });
+  const choose = (name) => {
+    const label = `${names[name]} in 3D, ${visible(frame.name)}`;
+    const points = pnpdepthViewer.choose(name, label);
+    count.textContent = `${points.toLocaleString("en")} points`;
+    space.shown = name;
+  };
+  const shown = space.shown in content.depths ? space.shown : "after";
+  const choices = Object.keys(content.depths).map((name) => {
+    const input = make("input", { type: "radio", name: "cloud", value: name,
+      checked: name === shown });
+    input.addEventListener("change", () => choose(name));
+    return make("label", {}, input, make("span", { text: names[name] }));
+  });
+  const reset = make("button", { type: "button", text: "Reset view" });
+  reset.addEventListener("click", () => pnpdepthViewer.reset());
+  stage.replaceChildren(canvas);
+  figure.replaceChildren(stage,
+    make("div", { class: "switch", role: "radiogroup", "aria-label": "Cloud" }, ...choices, reset,
+      count),
+    make("figcaption", { text: "Drag to rotate, wheel or pinch to zoom, drag with the right button" +
+      " or two fingers to move." }));
+  choose(shown);
+}
+
+function closeSpace() {
+  if (space.loaded) pnpdepthViewer.clear();
+  space.frame = null;
+}
+
 function listenToFrame() {
   const dialog = byId("frame");
   const step = (by) => {
@@ -417,7 +492,7 @@ function listenToFrame() {
   byId("next").addEventListener("click", () => step(1));
   byId("close").addEventListener("click", () => dialog.close());
   dialog.addEventListener("click", (event) => { if (event.target === dialog) dialog.close(); });
-  dialog.addEventListener("close", () => moveTo(list.at));
+  dialog.addEventListener("close", () => { closeSpace(); moveTo(list.at); });
   dialog.addEventListener("keydown", (event) => {
     if (event.ctrlKey || event.altKey || event.metaKey) return;
     const by = { n: 1, p: -1 }[event.key.toLowerCase()];

@@ -45,6 +45,8 @@ class Option:
     """Largest value of an integer."""
     parse: Callable[[str], Any] | None = None
     """Converts the text of the command line. None: by the field's type."""
+    value_if_bare: str | None = None
+    """Value of the option where none follows. None: one has to."""
     show_default: bool = False
     """Whether the help shows the default."""
     hidden: bool = False

@@ -88,6 +88,9 @@ EXITS: list[tuple[list[str], int, str]] = [
     (["--layer", "encod"], 4, "encode"),
     (["--model", "compakt"], 4, "compact"),
     (["--device", "cuda:9"], 6, "--device cpu"),
+    (["--device", "cpu,cuda"], 2, "workers run on cpu, cuda"),
+    (["--ray", "frames"], 2, "is no address of a Ray cluster"),
+    (["--ray", "127.0.0.1:1"], 6, "cannot be reached (connection refused)"),
 ]
 
 
@@ -99,6 +102,14 @@ def test_the_exit_code_says_whose_mistake_it_was(
     err = capsys.readouterr().err
     assert said in err.splitlines()[-1]
     assert "Traceback" not in err
+
+
+def test_ray_without_an_address_is_this_machine(
+    root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "ray", None)  # it would be imported only to run
+    assert code_of(arguments("--dry-run", "--ray")) == 0
+    assert code_of(arguments("--ray", "--workers", "1")) == 2
 
 
 def test_an_empty_folder_is_an_input_error_that_names_the_layouts(

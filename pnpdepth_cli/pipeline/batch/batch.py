@@ -22,6 +22,7 @@ from pnpdepth_cli.pipeline.batch.profile import BatchProfile
 from pnpdepth_cli.pipeline.batch.request import BatchRequest
 from pnpdepth_cli.pipeline.batch.run import BatchRun
 from pnpdepth_cli.pipeline.batch.settings import model_identity, settings_of
+from pnpdepth_cli.pipeline.batch.spread import spread_request, spread_rows
 from pnpdepth_cli.pipeline.batch.state import NEW, BatchState, remove_all_leftovers
 from pnpdepth_cli.pipeline.batch.summary import CSV, JSON, Tally, write_summary, write_table
 from pnpdepth_cli.pipeline.ordered_pool import in_order
@@ -81,6 +82,7 @@ def run_batch(
         PnpDepthError: For what concerns all frames, such as a network that cannot be loaded, or a
             full disk.
     """
+    request, spread = spread_request(request)
     batch = find_frames(request)
     report = _report_of(request, batch)
     for note in _notes_of(request, batch):
@@ -108,7 +110,10 @@ def run_batch(
                 state=state, profile=profile, say=listener.say, stopped=stopped,
                 workers=request.workers, batch_size=request.batch_size,
             )  # fmt: skip
-            refined = _rows(request, batch, to_do, run)
+            if spread is None:
+                refined = _rows(request, batch, to_do, run)
+            else:
+                refined = spread_rows(request, spread, batch.frames, to_do, run)
             with closing(refined if report is None else _drawn(report, refined)) as rows:
                 listener.begin(len(to_do))
                 for row in rows:
@@ -122,6 +127,7 @@ def run_batch(
 
 def plan_batch(request: BatchRequest, say: Callable[[str], None]) -> list[Planned]:
     """Returns the frames that `run_batch` would do, and why; nothing is written."""
+    request, _ = spread_request(request)
     batch = find_frames(request)
     _report_of(request, batch)
     for note in _notes_of(request, batch):
@@ -164,12 +170,18 @@ def _rows(
 ) -> Generator[dict[str, Any], None, None]:
     """A row for each frame as it is done; the network is loaded before the first is taken."""
     # these import torch, which a run with nothing to do does not need
-    from pnpdepth_cli.pipeline.batch.running import resolve_refiner, run_tasks
+    from pnpdepth_cli.pipeline.batch.resolving import opened_groups, resolve_refiner
+    from pnpdepth_cli.pipeline.batch.running import run_tasks
 
     refiner = resolve_refiner((task_of(request, frame) for frame in batch.frames), run.say)
     proven = len(to_do) < len(batch.chosen)
     tasks = (task_of(request, frame) for frame in to_do)
-    return run_tasks(tasks, refiner, run, proven=proven)
+
+    def rows() -> Generator[dict[str, Any], None, None]:
+        with opened_groups(refiner, run.batch_size, run.say) as groups:
+            yield from run_tasks(tasks, groups, run, proven=proven)
+
+    return rows()
 
 
 def _report_of(request: BatchRequest, batch: BatchFrames) -> BatchReport | None:
@@ -178,7 +190,12 @@ def _report_of(request: BatchRequest, batch: BatchFrames) -> BatchReport | None:
         return None
     from pnpdepth_cli.pipeline.report.batch import BatchReport
 
-    report = BatchReport(folder=request.html, output=request.output, workers=request.workers)
+    report = BatchReport(
+        folder=request.html,
+        output=request.output,
+        workers=request.workers,
+        view_3d=request.html_3d,
+    )
     files = (path for frame in batch.frames for path in source_files(frame))
     inputs = [request.source, *(files if request.html.exists() else ())]
     report.check(inputs, overwrite=request.refine.outputs.overwrite)

@@ -23,7 +23,7 @@ from pnpdepth_cli.errors import DeviceError, NoPointsError, PnpDepthError, Usage
 from pnpdepth_cli.frames.frame import RefinedFrame
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs
 from pnpdepth_cli.pipeline.refinement.method import needs_folds
-from pnpdepth_cli.pipeline.refinement.refine import Opened, Refiner
+from pnpdepth_cli.pipeline.refinement.refiner import Opened, Refiner
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest
 from pnpdepth_cli.pipeline.refinement.resolve import moves_weights
 
@@ -67,7 +67,7 @@ class FrameGroups:
             if wanted not in (None, 1):
                 say(f"batch size: 1; {why_alone}")
             wanted = 1
-        self._refiner, self._opened = refiner, opened
+        self.refiner, self._opened = refiner, opened
         self._wanted, self._say = wanted, say
         self._count: dict[tuple[int, int], int] = {}  # by size, how many go together
         self._limit: dict[tuple[int, int], int] = {}  # by size, how many fit into memory
@@ -102,14 +102,14 @@ class FrameGroups:
             self._count[size] = self._tried(size, tried)
 
     def _to_try(self, size: tuple[int, int]) -> int:
-        pixels = _MAX_PIXELS.get(self._refiner.network.device.type, _MAX_PIXELS_GPU)
+        pixels = _MAX_PIXELS.get(self.refiner.network.device.type, _MAX_PIXELS_GPU)
         wanted = self._wanted or min(_MAX_FRAMES, pixels // (size[0] * size[1]))
         return max(1, min(wanted, self._limit.get(size, wanted)))
 
     def _refined_alone(self, inputs: Inputs) -> RefinedFrame | Exception:
         start = time.perf_counter()
         try:
-            frame = self._refiner.refine(self._opened, inputs)
+            frame = self.refiner.refine(self._opened, inputs)
         except Exception as error:  # concerns this frame only
             return error
         seconds = time.perf_counter() - start
@@ -123,7 +123,7 @@ class FrameGroups:
         """The frames refined in one pass; None if they are to be refined one at a time."""
         size = group[0].size
         try:
-            frames = self._pass(group, self._refiner.settings)
+            frames = self._pass(group, self.refiner.settings)
         except DeviceError:  # out of memory
             self._limit[size] = len(group) // 2
             del self._count[size]
@@ -147,7 +147,7 @@ class FrameGroups:
         self, group: Sequence[Inputs], settings: RefineSettings
     ) -> list[RefinedFrame | PnpDepthError]:
         assert isinstance(self._opened, Split)
-        return self._refiner.refine_together(self._opened, group, settings)
+        return self.refiner.refine_together(self._opened, group, settings)
 
     def _tried(self, size: tuple[int, int], alone: Sequence[_Alone]) -> int:
         """How many frames of the size are to go together from now on."""
@@ -165,7 +165,7 @@ class FrameGroups:
     def _may_go_together(self, size: tuple[int, int], alone: Sequence[_Alone]) -> bool:
         """Whether frames refined together, in less time, have the same results as alone."""
         group = [each.inputs for each in alone]
-        plain = self._pass(group, replace(self._refiner.settings, iterations=0))
+        plain = self._pass(group, replace(self.refiner.settings, iterations=0))
         assert isinstance(self._opened, Split)
         if not self._opened.static_graph:
             self._say(
@@ -182,7 +182,7 @@ class FrameGroups:
         spent_s = expected_s = 0.0
         if exact:
             start = time.perf_counter()
-            frames = self._pass(group, self._refiner.settings)
+            frames = self._pass(group, self.refiner.settings)
             spent_s = time.perf_counter() - start
             expected_s = len(alone) * statistics.median(each.seconds for each in alone)
             exact = len(list(_frames(frames, alone))) == len(alone) and all(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -25,6 +25,7 @@ class BatchProfile:
         self._stages = (WAITING_TO_READ, NETWORK, WAITING_TO_WRITE, READING, WRITING)
         self._seconds = dict.fromkeys(self._stages, 0.0)
         self._wall = 0.0
+        self._workers: list[dict[str, Any]] = []
         self._adding = threading.Lock()
 
     @contextmanager
@@ -51,13 +52,22 @@ class BatchProfile:
         finally:
             self._wall += time.perf_counter() - start
 
+    def add_workers(self, figures: Sequence[dict[str, Any]]) -> None:
+        """Adds what `summary` gave in each worker of a cluster."""
+        for each in figures:
+            self.frames += each.get("frames", 0)
+            for stage in self._stages:
+                self._seconds[stage] += each.get("seconds", {}).get(stage, 0.0)
+        self._workers = list(figures)
+
     def summary(self) -> dict[str, Any]:
         """Returns {"frames": 24, "seconds": {"network": …, "wall": …}, …}."""
-        wall = self._wall
+        wall, devices = self._wall, max(1, len(self._workers))
         return {
             "frames": self.frames,
             "seconds": {stage: round(s, 4) for stage, s in self._seconds.items()}
             | {"wall": round(wall, 4)},
             "frames_per_second": round(self.frames / wall, 4) if wall else None,
-            "network_busy": round(self._seconds[NETWORK] / wall, 4) if wall else None,
+            "network_busy": round(self._seconds[NETWORK] / wall / devices, 4) if wall else None,
+            **({"workers": self._workers} if self._workers else {}),
         }

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from pnpdepth_cli.choices import FRAME_PROTOCOLS, LAYOUTS
 from pnpdepth_cli.errors import UsageError
+from pnpdepth_cli.pipeline.batch.sequence_options import SequenceOptions
+from pnpdepth_cli.pipeline.cluster.options import ClusterOptions
 from pnpdepth_cli.pipeline.options import option
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest
 
@@ -62,6 +64,11 @@ class BatchRequest(FrameSelection):
         "Write an HTML report: every frame before and after, the worst first.",
         metavar="FOLDER",
     )
+    html_3d: bool = option(
+        False,
+        "With --html: also show every frame as a point cloud, before, after and ground truth; adds"
+        " up to 2.5 MB a frame.",
+    )
     batch_size: int | None = option(
         None,
         "Number of frames per forward pass. auto: as many as save time without changing a bit of"
@@ -72,11 +79,17 @@ class BatchRequest(FrameSelection):
     shard: tuple[int, int] | None = option(
         None, "Every N-th frame, starting at the I-th.", metavar="I/N", parse=parse_shard
     )
+    sequence: SequenceOptions = field(default_factory=SequenceOptions)
+    """What a frame takes over from its neighbours."""
     profile: bool = option(False, "Print the time spent in each stage.")
+    cluster: ClusterOptions = field(default_factory=ClusterOptions)
+    """The Ray workers, if any."""
 
     def __post_init__(self) -> None:
         from pnpdepth_cli.io.dataset.protocols import find_protocol
 
+        if self.html_3d and self.html is None:
+            raise UsageError("--html-3d adds to the report; name its folder with --html")
         if self.workers < 1:
             raise UsageError(f"workers {self.workers}: at least one thread has to read")
         if self.batch_size is not None and self.batch_size < 1:

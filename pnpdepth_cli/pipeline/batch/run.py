@@ -6,14 +6,14 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from pnpdepth_cli.pipeline.batch.profile import BatchProfile
-from pnpdepth_cli.pipeline.batch.state import BatchState
+from pnpdepth_cli.pipeline.batch.state import FrameRecorder
 
 
 @dataclass(frozen=True, kw_only=True)
 class BatchRun:
     """How frames are refined, and where their progress goes."""
 
-    state: BatchState
+    state: FrameRecorder
     """Records what is done."""
     profile: BatchProfile
     """Adds up where the time goes."""

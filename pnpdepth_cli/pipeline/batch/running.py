@@ -6,13 +6,11 @@ the threads are bounded, so memory does not grow with the number of frames.
 
 from __future__ import annotations
 
-import contextlib
 import time
 import traceback
 from collections import deque
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from collections.abc import Generator, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -37,10 +35,11 @@ from pnpdepth_cli.pipeline.batch.profile import (
     BatchProfile,
 )
 from pnpdepth_cli.pipeline.batch.run import BatchRun
-from pnpdepth_cli.pipeline.batch.state import BatchState, Status, input_fingerprints
+from pnpdepth_cli.pipeline.batch.state import FrameRecorder, Status, input_fingerprints
 from pnpdepth_cli.pipeline.batch.summary import failed_row, row_of
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs, read_inputs
-from pnpdepth_cli.pipeline.refinement.refine import Refiner, load_refiner, write_refined
+from pnpdepth_cli.pipeline.refinement.refine import write_refined
+from pnpdepth_cli.pipeline.refinement.refiner import Refiner
 from pnpdepth_cli.pipeline.stopwatch import Stopwatch
 
 Row = dict[str, Any]
@@ -58,63 +57,14 @@ class ReadFrame:
     """With the seconds of reading."""
 
 
-def resolve_refiner(tasks: Iterable[Task], say: Callable[[str], None]) -> Refiner | None:
-    """Returns the network with its definition resolved on the first frame that can be read.
-
-    Args:
-        tasks: Of all frames, also those that are done or of another shard, so that every run
-            decides the same.
-        say: Receives what was decided.
-
-    Returns:
-        None if no frame can be read.
-    """
-    for task in tasks:
-        try:
-            first = read_inputs(task.request)
-        except UsageError:
-            raise
-        except Exception:  # the frame is read again later, which reports its error
-            continue
-        for note in first.notes:
-            say(f"{task.name}: {note}")
-        refiner = load_refiner(task.request, first)
-        for note in refiner.network.notes:
-            say(note)
-        if refiner.method.chosen:
-            return _with_shortlist(refiner, list(tasks), first, say)
-        s = refiner.settings
-        say(
-            f"network: {refiner.network.definition.name} cut at {refiner.layer}, {s.iterations}"
-            f" updates of z ({s.update}, {s.loss}, step {s.lr})"
-        )
-        return refiner
-    return None
-
-
-def _with_shortlist(
-    refiner: Refiner, others: Sequence[Task], first: Inputs, say: Callable[[str], None]
-) -> Refiner:
-    """The refiner with the candidates that are best on a few of the frames."""
-    frames = [first]
-    for number in sorted({len(others) // 2, len(others) - 1}) if others else ():
-        with contextlib.suppress(PnpDepthError):  # it is read again later, which reports its error
-            frames.append(read_inputs(others[number].request))
-    refiner = refiner.with_shortlist_of(frames)
-    assert refiner.competition is not None
-    names = "; ".join(str(candidate) for candidate in refiner.competition.shortlist or ())
-    say(f"choice: best on {len(frames)} frames, and to be checked on each: {names}")
-    return refiner
-
-
 def run_tasks(
-    tasks: Iterable[Task], refiner: Refiner | None, run: BatchRun, *, proven: bool
+    tasks: Iterable[Task], groups: FrameGroups | None, run: BatchRun, *, proven: bool
 ) -> Generator[Row, None, None]:
     """Refines and records each task; yields a row for each, in their order.
 
     Args:
         tasks: The frames to refine.
-        refiner: The network; None if no frame could be read.
+        groups: The network, open; None if no frame could be read.
         run: What the frames share.
         proven: True if a frame was refined with these settings before.
 
@@ -132,13 +82,9 @@ def run_tasks(
 
     with (
         profile.wall(),
-        refiner.opened() if refiner is not None else nullcontext() as opened,
         ThreadPoolExecutor(workers) as readers,
         ThreadPoolExecutor(workers) as writers,
     ):
-        groups = None
-        if refiner is not None and opened is not None:
-            groups = FrameGroups(refiner, opened, run.batch_size, run.say)
         reading = _read_ahead(tasks, readers, workers, groups, profile)
         try:
             for group in _gathered(reading, groups, profile):
@@ -152,8 +98,8 @@ def run_tasks(
                     else:
                         proven = True
                         assert read is not None
-                        assert refiner is not None
-                        arguments = (run, task, read, refiner, result)
+                        assert groups is not None
+                        arguments = (run, task, read, groups.refiner, result)
                         writing.append(writers.submit(_write, *arguments))
                 # frames not yet written are lost if the process is killed, so there are few
                 while writing and (writing[0].done() or len(writing) >= workers + len(group)):
@@ -278,7 +224,7 @@ def _write(
     return row
 
 
-def _failed(state: BatchState, task: Task, error: Exception) -> Row:
+def _failed(state: FrameRecorder, task: Task, error: Exception) -> Row:
     row = failed_row(task.name, _paths(task), _message(error))
     state.fail(task, row)
     return row

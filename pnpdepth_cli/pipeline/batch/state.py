@@ -13,7 +13,7 @@ import re
 from collections.abc import Iterable
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, Protocol
 
 from pnpdepth_cli.errors import OutputError
 from pnpdepth_cli.io.atomic import cannot_write, remove_leftovers
@@ -24,8 +24,33 @@ from pnpdepth_cli.pipeline.batch.settings import settings_digest
 
 Status = Literal["done", "diverged", "failed"]
 
+Line = dict[str, Any]
+"""A line of a run manifest."""
 NEW = "new"
 _MANIFEST = re.compile(r"batch(\.\d+of\d+)?\.jsonl")
+
+
+class FrameRecorder(Protocol):
+    """Records what is done, in the manifest or for it."""
+
+    @property
+    def output(self) -> Path:
+        """The output folder."""
+
+    @property
+    def model(self) -> dict[str, Any]:
+        """The network's `model_identity`."""
+
+    def begin(self, task: Task) -> None:
+        """Records that files of this frame may exist from now on."""
+
+    def finish(
+        self, task: Task, status: Status, row: dict[str, Any], read: dict[str, Fingerprint]
+    ) -> None:
+        """Records that the frame is done, with the fingerprints of its inputs."""
+
+    def fail(self, task: Task, row: dict[str, Any]) -> None:
+        """Records why the frame failed."""
 
 
 class BatchState:
@@ -96,37 +121,21 @@ class BatchState:
 
     def begin(self, task: Task) -> None:
         """Records that files of this frame may exist from now on."""
-        self._own.append({"frame": task.name, "state": "begun"})
+        self.record(begun_line(task.name))
 
     def finish(
         self, task: Task, status: Status, row: dict[str, Any], read: dict[str, Fingerprint]
     ) -> None:
         """Records that the frame is done, with the fingerprints of its inputs and outputs."""
-        written = {path: fingerprint(path) for path in task.outputs.paths()}
-        self._own.append(
-            {
-                "frame": task.name,
-                "state": status,
-                "settings": self._settings(task),
-                "inputs": {part: asdict(known) for part, known in read.items()},
-                "outputs": {
-                    path.relative_to(self.output).as_posix(): asdict(known)
-                    for path, known in written.items()
-                },
-                "row": row,
-            }
-        )
+        self.record(finished_line(self, task, status, row, read))
 
     def fail(self, task: Task, row: dict[str, Any]) -> None:
         """Records why the frame failed; the next run tries it again."""
-        self._own.append(
-            {
-                "frame": task.name,
-                "state": "failed",
-                "settings": self._settings(task),
-                "row": row,
-            }
-        )
+        self.record(failed_line(self, task, row))
+
+    def record(self, *lines: dict[str, Any]) -> None:
+        """Appends lines to the manifest of this run."""
+        self._own.append(*lines)
 
     def _settings(self, task: Task) -> str:
         return settings_digest(task.request, self.model)
@@ -156,6 +165,39 @@ class BatchState:
             if known is None or not is_unchanged(path, known):
                 return f"result {'changed' if path.exists() else 'missing'}: {path.name}"
         return None
+
+
+def begun_line(name: str) -> Line:
+    """Returns the line before the files of a frame are written."""
+    return {"frame": name, "state": "begun"}
+
+
+def finished_line(
+    recorder: FrameRecorder,
+    task: Task,
+    status: Status,
+    row: dict[str, Any],
+    read: dict[str, Fingerprint],
+) -> Line:
+    """Returns the line of a frame whose files are written."""
+    written = {path: fingerprint(path) for path in task.outputs.paths()}
+    return {
+        "frame": task.name,
+        "state": status,
+        "settings": settings_digest(task.request, recorder.model),
+        "inputs": {part: asdict(known) for part, known in read.items()},
+        "outputs": {
+            path.relative_to(recorder.output).as_posix(): asdict(known)
+            for path, known in written.items()
+        },
+        "row": row,
+    }
+
+
+def failed_line(recorder: FrameRecorder, task: Task, row: dict[str, Any]) -> Line:
+    """Returns the line of a frame that could not be refined."""
+    digest = settings_digest(task.request, recorder.model)
+    return {"frame": task.name, "state": "failed", "settings": digest, "row": row}
 
 
 def input_fingerprints(task: Task) -> dict[str, Fingerprint]:

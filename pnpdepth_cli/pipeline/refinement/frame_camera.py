@@ -92,9 +92,10 @@ def camera_of_frame(
         image = files.image if isinstance(files.image, Path) else None
         known = None if image is None else camera_of_exif(image, size)
         if known is None:
+            flag, named = "--ply" if asked.ply else "--html-3d", image or files.sparse
             raise UsageError(
-                f"--ply needs the camera, and {image or files.sparse} has neither a calibration"
-                " nor a focal length in EXIF; give --calib or --fov"
+                f"{flag} needs the camera, and {named} has neither a calibration nor a focal length"
+                " in EXIF; give --calib or --fov"
             )
     return None if known is None else known.in_part(files.protocol, size)
 

@@ -37,8 +37,12 @@ class Outputs:
     """Image of what became better and worse."""
     cloud: Path | None = None
     """Point cloud of the depth."""
+    view: Path | None = None
+    """3D view for a report."""
     record: Path | None = None
     """JSON of settings and scores."""
+    scale: float | None = None
+    """Codes per metre of an integer depth file. None: what suits the frame."""
     colors: str = "blue-orange"
     """Colours of better and worse, one of `choices.COLORS`."""
 
@@ -58,7 +62,9 @@ class Outputs:
             preview=folder / f"{name}_preview.png",
             improvement=folder / f"{name}_improvement.png",
             cloud=folder / f"{name}.ply" if request.outputs.ply else None,
+            view=folder / f"{name}_view.json" if request.outputs.view_3d else None,
             record=folder / f"{name}.json",
+            scale=request.outputs.output_scale,
             colors=request.outputs.colors,
         )
 
@@ -72,6 +78,7 @@ class Outputs:
             "preview": self.preview,
             "improvement": self.improvement,
             "cloud": self.cloud,
+            "view": self.view,
             "record": self.record,
         }
         return {kind: path for kind, path in kinds.items() if path is not None}
@@ -104,7 +111,7 @@ def plan_outputs(request: RefineRequest) -> Outputs:
         flag = next(flag for flag, given in added.items() if given)
         raise UsageError(f"{flag} writes a second file; name a folder, not {output}, with -o")
     if output.suffix.lower() in DEPTH_SUFFIXES:
-        outputs = Outputs(depth=output)
+        outputs = Outputs(depth=output, scale=asked.output_scale)
     elif output.suffix.lower() in _FILE_SUFFIXES and not output.is_dir():
         raise OutputError(
             f"{output}: depth is written as {' '.join(DEPTH_SUFFIXES)}, or into a folder"

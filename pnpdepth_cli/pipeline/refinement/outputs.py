@@ -16,13 +16,14 @@ from pnpdepth_cli.io.visualisation import improvement, improvement_at_points, pr
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs
 from pnpdepth_cli.pipeline.refinement.output_files import Outputs
 from pnpdepth_cli.pipeline.refinement.output_range import output_scale
+from pnpdepth_cli.pipeline.refinement.view_3d import write_view
 from pnpdepth_cli.sensors.cloud import cloud_from_depth
 
 
 def write_outputs(outputs: Outputs, inputs: Inputs, frame: RefinedFrame) -> dict[str, Any]:
     """Writes the depth and its images. Returns their entries of the record."""
     make_folder(outputs.depth.parent)
-    write_depth(outputs.depth, frame.after, scale=output_scale(inputs))
+    write_depth(outputs.depth, frame.after, scale=output_scale(outputs, inputs))
     if outputs.sigma is not None and frame.sigma is not None:
         write_depth(outputs.sigma, frame.sigma)
     if outputs.sigma_preview is not None and frame.sigma is not None:
@@ -47,6 +48,8 @@ def write_outputs(outputs: Outputs, inputs: Inputs, frame: RefinedFrame) -> dict
         )
     if outputs.cloud is not None:
         record["cloud"] = _write_cloud(outputs.cloud, inputs, frame)
+    if outputs.view is not None:
+        write_view(outputs.view, inputs, frame)
     record["outputs"] = {
         kind: None if path is None else str(path)
         for kind, path in (
@@ -56,6 +59,7 @@ def write_outputs(outputs: Outputs, inputs: Inputs, frame: RefinedFrame) -> dict
             ("preview", outputs.preview),
             ("improvement", outputs.improvement),
             ("cloud", outputs.cloud),
+            ("view", outputs.view),
         )
     }
     return record

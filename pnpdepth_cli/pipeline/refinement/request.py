@@ -19,7 +19,7 @@ from pnpdepth_cli.pipeline.sparse.scan_options import ScanOptions
 
 if TYPE_CHECKING:
     from pnpdepth_cli.io.calibration import Calibration
-    from pnpdepth_cli.io.dataset.frame import Source
+    from pnpdepth_cli.io.dataset.frame import Neighbour, Source
     from pnpdepth_cli.io.dataset.protocols import Protocol
     from pnpdepth_cli.sensors import SamplePattern
 
@@ -42,6 +42,17 @@ def parse_seconds(text: str) -> float:
     if not 0 < seconds < float("inf"):
         raise UsageError(f"time budget {text!r} is not a duration; give seconds, such as 5s")
     return seconds
+
+
+def parse_codes_per_metre(text: str) -> float:
+    """Returns the codes per metre of `256` or `mm`. Raises UsageError for any other text."""
+    try:
+        scale = 1000.0 if text == "mm" else float(text)
+    except ValueError:
+        scale = -1.0
+    if not 0 < scale < float("inf"):
+        raise UsageError(f"--output-scale {text!r} is neither mm nor codes per metre such as 256")
+    return scale
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,6 +90,8 @@ class FrameFiles:
     """Calibration of the camera, where `sparse` is no LiDAR scan and an output needs the camera."""
     camera_number: int | None = None
     """Which camera of `camera_file`."""
+    neighbours: tuple[Neighbour, ...] = ()
+    """Other frames of the sequence, whose points are moved into this one."""
     gt_masks: tuple[Path, ...] = ()
     """Where one of these is 0, the ground truth is unknown."""
     gt_size_ok: bool = False
@@ -129,7 +142,12 @@ class NetworkChoice:
         choices=choices.PRECISIONS,
         show_default=True,
     )
-    device: str = option("cpu", "cpu, cuda, cuda:1, mps, …", metavar="NAME", show_default=True)
+    device: str = option(
+        "cpu",
+        "cpu, cuda, cuda:1, mps, …; batch, eval and sweep also take cuda:0,cuda:1 and all.",
+        metavar="NAME",
+        show_default=True,
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -289,6 +307,13 @@ class OutputOptions:
         choices=choices.FORMATS,
         show_default=True,
     )
+    output_scale: float | None = option(
+        None,
+        "Codes per metre of a 16-bit PNG; mm is 1000.  [default: as the sparse depth file, else 256"
+        " or what fits]",
+        metavar="mm|S",
+        parse=parse_codes_per_metre,
+    )
     ply: bool = option(False, "Also write a coloured point cloud, NAME.ply.")
     fov_deg: float | None = option(
         None,
@@ -296,6 +321,8 @@ class OutputOptions:
         flag="--fov",
         metavar="DEG",
     )
+    view_3d: bool = False
+    """Whether the 3D view of the frame is written, which the report of a batch shows."""
     colors: str = option(
         "blue-orange",
         "Colours of better and worse: blue and orange, or the paper's red and green.",
@@ -307,7 +334,7 @@ class OutputOptions:
     @property
     def needs_camera(self) -> bool:
         """Whether an output cannot be written without the camera."""
-        return self.ply
+        return self.ply or self.view_3d
 
 
 _PLACES = {"image", "sparse", "gt", "gt_masks", "model", "checkpoint", "output", "overwrite"} | {
@@ -316,7 +343,7 @@ _PLACES = {"image", "sparse", "gt", "gt_masks", "model", "checkpoint", "output",
 }
 """Fields that say where something lies. A cache key has digests of what lies there instead."""
 
-_ADDED = {"ply"}
+_ADDED = {"ply", "view_3d"}
 """Fields that add a file and change no other. A cache key does without: the file exists or not."""
 
 

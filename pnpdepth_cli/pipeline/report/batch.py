@@ -25,6 +25,7 @@ from pnpdepth_cli.io.report import (
     write_report,
 )
 from pnpdepth_cli.io.report_images import gain_colours, image_paths, save_images
+from pnpdepth_cli.io.report_view import megabytes, save_view, view_path
 from pnpdepth_cli.pipeline.evaluation.score_files import column_title, format_value
 from pnpdepth_cli.pipeline.ordered_pool import in_order
 from pnpdepth_cli.pipeline.report.columns import (
@@ -65,6 +66,8 @@ class BatchReport:
     """The folder of the results."""
     workers: int
     """Threads that draw."""
+    view_3d: bool = False
+    """Whether the frames have 3D views."""
 
     def check(self, inputs: Sequence[Path], *, overwrite: bool) -> None:
         """Raises OutputError for a folder that the report cannot or may not be written to."""
@@ -103,7 +106,8 @@ class BatchReport:
 
         results = (row for row in rows() if row["outputs"])
         entries = in_order(entry, results, self.workers)
-        write_report(self.folder, _head(summary, overview, columns, measured), entries)
+        head = _head(summary, overview, columns, measured)
+        write_report(self.folder, head, entries, viewer=self.view_3d)
 
     def _source(self) -> dict[str, Any]:
         folder, output = self.folder.resolve(), self.output.resolve()
@@ -113,7 +117,9 @@ class BatchReport:
         """As `drawn`; returns the page's entry of the images."""
         paths = [self.output / row["outputs"][kind] for kind in ("preview", "improvement")]
         try:
-            key = image_key(*(fingerprint(path).sha256 for path in paths))
+            view = self._view_of(row)
+            made_of = [*paths, *([] if view is None else [view])]
+            key = image_key(*(fingerprint(path).sha256 for path in made_of))
             preview, improvement = (open_page(path) for path in paths)
             views = _views(preview, improvement)
             images = self.folder / IMAGES
@@ -122,14 +128,23 @@ class BatchReport:
                 named = {_PANELS[title]: panels[title] for title in panels if title in _PANELS}
                 thumb = "image" if "image" in views else "second"
                 save_images(images, key, named, thumb=thumb)
+            script = view_path(images, key)
+            if view is not None and not script.exists():
+                save_view(view, script)
         except InputError:  # a result has gone or changed; the next run refines it again
             return {"key": None}
         return {
             "key": key,
             "views": views,
+            "view_mb": None if view is None else megabytes(script),
             "scale_m": [preview.content["low_m"], preview.content["high_m"]],
             "map": {name: improvement.content[name] for name in ("ends", "unknown", "footer")},
         }
+
+    def _view_of(self, row: Row) -> Path | None:
+        """The 3D view of the row's frame."""
+        name = row["outputs"].get("view") if self.view_3d else None
+        return None if name is None else self.output / name
 
     def _entry(
         self, row: Row, columns: list[Column], measured: bool, *, mixed: bool
@@ -258,6 +273,7 @@ def _head(
             "map": "Change of error",
             "image": "Image",
             "sparse": "Sparse depth",
+            "gt": "Ground truth",
         },
         "map_colours": gain_colours(),
         "without_title": f"Not refined: {len(overview.failed):,}",

@@ -15,8 +15,8 @@ import torch
 
 from pnpdepth_cli.errors import DeviceError, StorageError
 from pnpdepth_cli.pipeline.batch import groups as batch_groups
-from pnpdepth_cli.pipeline.batch import running as batch_running
-from pnpdepth_cli.pipeline.refinement.refine import Refiner
+from pnpdepth_cli.pipeline.batch import resolving
+from pnpdepth_cli.pipeline.refinement.refiner import Refiner
 from tests.pipeline.batches import (
     Heard,
     add_frame,
@@ -311,7 +311,7 @@ def test_afterwards_the_network_is_as_before(
     root: Path, monkeypatch: pytest.MonkeyPatch, how: str
 ) -> None:
     refiners: list[Refiner] = []
-    load = batch_running.load_refiner
+    load = resolving.load_refiner
 
     def loaded(*given: Any) -> Refiner:
         refiner = load(*given)
@@ -326,7 +326,7 @@ def test_afterwards_the_network_is_as_before(
             if how == "full disk" and len(self.rows) == 2:
                 raise StorageError("full")
 
-    monkeypatch.setattr(batch_running, "load_refiner", loaded)
+    monkeypatch.setattr(resolving, "load_refiner", loaded)
     asked = iter([False, False, how == "stop", *[False] * 9])
     heard = Stops()
     if how == "full disk":

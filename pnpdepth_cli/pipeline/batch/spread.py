@@ -1,0 +1,200 @@
+"""A batch on a Ray cluster: workers read, refine and write; the driver keeps the manifest."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pnpdepth_cli.io.dataset.frame import Frame
+from pnpdepth_cli.io.fingerprint import Fingerprint
+from pnpdepth_cli.pipeline.batch.frames import Task, compared, task_of
+from pnpdepth_cli.pipeline.batch.profile import BatchProfile
+from pnpdepth_cli.pipeline.batch.request import BatchRequest
+from pnpdepth_cli.pipeline.batch.run import BatchRun
+from pnpdepth_cli.pipeline.batch.state import (
+    BatchState,
+    Line,
+    Status,
+    begun_line,
+    failed_line,
+    finished_line,
+)
+from pnpdepth_cli.pipeline.batch.summary import failed_row
+from pnpdepth_cli.pipeline.cluster.options import Spread, spread_of
+from pnpdepth_cli.pipeline.cluster.pool import Lost, WorkerPool, worker_pool
+from pnpdepth_cli.pipeline.cluster.worker import Done
+
+if TYPE_CHECKING:
+    from pnpdepth_cli.pipeline.batch.groups import FrameGroups
+
+_SEARCHED = 64
+"""Frames that one call looks through for the first that can be read."""
+
+
+def spread_request(request: BatchRequest) -> tuple[BatchRequest, Spread | None]:
+    """Returns the request of each worker, and the workers; None for this process alone.
+
+    Raises:
+        UsageError: The devices cannot be spread over.
+    """
+    spread = spread_of(request.refine.network.device, request.cluster)
+    if spread is None:
+        return request, None
+    refine = request.refine.with_fields(device=spread.device)
+    return replace(request, refine=refine), spread
+
+
+def spread_rows(
+    request: BatchRequest,
+    spread: Spread,
+    frames: Sequence[Frame],
+    to_do: Sequence[Frame],
+    run: BatchRun,
+) -> Generator[dict[str, Any], None, None]:
+    """Refines and records each frame on the workers; yields the rows as they are done.
+
+    Args:
+        request: As `spread_request` returns it.
+        spread: The workers.
+        frames: All frames, the first of which decide what the network leaves open.
+        to_do: The frames to refine.
+        run: What the frames share.
+
+    Raises:
+        PnpDepthError: As of `run_tasks`.
+        ClusterError: The cluster cannot be used.
+    """
+    state = run.state
+    assert isinstance(state, BatchState)
+    with worker_pool(spread, state.output, run.say) as pool, run.profile.wall():
+        deciding = _deciding(request, frames, pool)
+        job = RefineJob(request=request, model=state.model, deciding=deciding)
+        for part in pool.results(
+            job,
+            to_do,
+            begin=lambda begun: state.record(*(begun_line(frame.name) for frame in begun)),
+            stopped=run.stopped,
+        ):
+            lines = [
+                _lost_line(state, request, frame, result) if isinstance(result, Lost) else result
+                for frame, result in part
+            ]
+            state.record(*lines)
+            yield from (line["row"] for line in lines)
+        run.profile.add_workers(pool.figures())
+
+
+def _deciding(
+    request: BatchRequest, frames: Sequence[Frame], pool: WorkerPool
+) -> tuple[Frame, ...]:
+    """The frames that a run in one process resolves its network on; none if none can be read."""
+    for start in range(0, len(frames), _SEARCHED):
+        found = pool.call(first_readable, request, frames[start : start + _SEARCHED])
+        if found is not None:
+            first = start + found
+            others = range(first + 1, len(frames))
+            return (frames[first], *(frames[others[i]] for i in compared(len(others))))
+    return ()
+
+
+def _lost_line(state: BatchState, request: BatchRequest, frame: Frame, lost: Lost) -> Line:
+    task = task_of(request, frame)
+    paths = {part: str(path) for part, path in task.inputs.items()}
+    return failed_line(state, task, failed_row(task.name, paths, lost.message))
+
+
+def first_readable(request: BatchRequest, frames: Sequence[Frame]) -> int | None:
+    """Returns which frame is the first that can be read; to be called on a worker."""
+    from pnpdepth_cli.pipeline.batch.resolving import readable
+
+    found = (i for i, frame in enumerate(frames) if readable(task_of(request, frame)) is not None)
+    return next(found, None)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RefineJob:
+    """Refines frames on a worker; its results are lines of the manifest."""
+
+    request: BatchRequest
+    """How, on one device."""
+    model: dict[str, Any]
+    """The network's `model_identity`."""
+    deciding: tuple[Frame, ...]
+    """The first frame that can be read, and others that candidates are compared on."""
+
+    @contextmanager
+    def opened(self) -> Iterator[Callable[[Sequence[Frame], bool], Done]]:
+        """Yields a function that refines frames; the network is loaded and cut once."""
+        from pnpdepth_cli.pipeline.batch.resolving import opened_groups, readable, refiner_on
+
+        notes: list[str] = []
+        refiner = None
+        if self.deciding:
+            first, *others = (task_of(self.request, frame) for frame in self.deciding)
+            inputs = readable(first)
+            if inputs is not None:
+                refiner = refiner_on(first, inputs, others, notes.append)
+        collector = LineCollector(output=self.request.output, model=self.model)
+        run = BatchRun(
+            state=collector, profile=BatchProfile(), say=notes.append, stopped=lambda: False,
+            workers=self.request.workers, batch_size=self.request.batch_size,
+        )  # fmt: skip
+        with opened_groups(refiner, run.batch_size, run.say) as groups:
+
+            def refine(frames: Sequence[Frame], proven: bool) -> Done:
+                done = refined_lines(self.request, frames, groups, run, proven=proven)
+                said = tuple(notes)
+                notes.clear()
+                return replace(done, notes=said)
+
+            yield refine
+
+
+def refined_lines(
+    request: BatchRequest,
+    frames: Sequence[Frame],
+    groups: FrameGroups | None,
+    run: BatchRun,
+    *,
+    proven: bool,
+) -> Done:
+    """Returns the lines of these frames, refined and written."""
+    from pnpdepth_cli.pipeline.batch.running import run_tasks
+
+    assert isinstance(run.state, LineCollector)
+    tasks = (task_of(request, frame) for frame in frames)
+    rows = list(run_tasks(tasks, groups, run, proven=proven))
+    return Done(
+        results=[run.state.lines.pop(frame.name) for frame in frames],
+        proves=any(row["status"] != "failed" for row in rows),
+        multiple=groups.largest if groups else 1,
+        figures=run.profile.summary(),
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class LineCollector:
+    """Keeps the lines of a manifest until the driver takes them."""
+
+    output: Path
+    """The output folder."""
+    model: dict[str, Any]
+    """The network's `model_identity`."""
+    lines: dict[str, Line] = field(default_factory=dict)
+    """By the name of the frame."""
+
+    def begin(self, task: Task) -> None:
+        """Does nothing: the driver has recorded it."""
+
+    def finish(
+        self, task: Task, status: Status, row: dict[str, Any], read: dict[str, Fingerprint]
+    ) -> None:
+        """Keeps the line of a frame that is done."""
+        self.lines[task.name] = finished_line(self, task, status, row, read)
+
+    def fail(self, task: Task, row: dict[str, Any]) -> None:
+        """Keeps the line of a frame that failed."""
+        self.lines[task.name] = failed_line(self, task, row)

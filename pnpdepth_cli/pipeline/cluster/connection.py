@@ -1,0 +1,131 @@
+"""Connects to a Ray cluster, or starts one of this machine's devices."""
+
+from __future__ import annotations
+
+import os
+import socket
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from types import ModuleType
+from typing import Any
+
+from pnpdepth_cli.errors import ClusterError, UsageError
+from pnpdepth_cli.io.file_bytes import one_line
+from pnpdepth_cli.pipeline.cluster.options import LOCAL, Spread
+
+_CONNECT_S = 5.0
+_OBJECT_STORE_BYTES = 100 * 2**20
+"""Of a local cluster: only rows of frames go through it."""
+_HTTP2_PREFACE = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + bytes(3) + b"\x04" + bytes(5)
+"""How a gRPC client begins, with empty settings: RFC 9113, section 3.4."""
+_SETTINGS_FRAME = 4
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cluster:
+    """A connection to a cluster."""
+
+    ray: ModuleType
+    """Ray, connected."""
+    workers: int
+    """Number of workers to start."""
+    resources: dict[str, Any]
+    """Of each worker, as Ray's options."""
+
+
+@contextmanager
+def connected(spread: Spread) -> Iterator[Cluster]:
+    """Yields a connection to the cluster; a local one ends with it.
+
+    Raises:
+        UsageError: Ray is not installed.
+        ClusterError: The cluster cannot be reached, or has fewer devices than asked for.
+    """
+    os.environ["RAY_USAGE_STATS_ENABLED"] = "0"  # read when Ray is imported and by its processes
+    try:
+        import ray
+    except ImportError:
+        raise UsageError("--ray needs Ray: pip install 'pnpdepth[ray]'") from None
+    ours = not ray.is_initialized()
+    if ours:
+        _connect(ray, spread)
+    try:
+        yield _planned(ray, spread)
+    finally:
+        if ours:
+            ray.shutdown()
+
+
+def _connect(ray: ModuleType, spread: Spread) -> None:
+    quiet = {"log_to_driver": False, "logging_level": "ERROR"}
+    if spread.address == LOCAL:
+        _choose_gpus(spread.indices)
+        ray.init(
+            address=LOCAL,
+            num_cpus=os.cpu_count(),
+            include_dashboard=False,
+            object_store_memory=_OBJECT_STORE_BYTES,
+            **quiet,
+        )
+        return
+    if spread.address != "auto":
+        _check_answers(spread.address)
+    try:
+        ray.init(address=spread.address, **quiet)
+    except (Exception, SystemExit) as error:
+        reason = one_line(str(error)).split(". ")[0][:200]
+        raise ClusterError(
+            f"Ray cluster {spread.address!r} cannot be used: {reason}; start it with `ray start"
+            " --head`, or leave the address out"
+        ) from None
+
+
+def _check_answers(address: str) -> None:
+    """Raises ClusterError if no gRPC server answers there, which Ray takes minutes to find out."""
+    host, _, port = address.removeprefix("ray://").rpartition(":")
+    try:
+        with socket.create_connection((host, int(port)), timeout=_CONNECT_S) as server:
+            server.sendall(_HTTP2_PREFACE)
+            frame = server.recv(9)
+    except (OSError, OverflowError) as error:
+        reason = one_line(getattr(error, "strerror", None) or error).lower()
+        raise ClusterError(
+            f"Ray cluster {address!r} cannot be reached ({reason}); check the address and that the"
+            " head node runs"
+        ) from None
+    if len(frame) < 9 or frame[3] != _SETTINGS_FRAME:
+        raise ClusterError(
+            f"{address!r} is another server than a Ray cluster; the head node prints its address"
+            " when it starts"
+        )
+
+
+def _choose_gpus(indices: tuple[int, ...]) -> None:
+    """Makes these GPUs of the machine the cluster's."""
+    if indices:
+        given = os.environ.get("CUDA_VISIBLE_DEVICES")
+        names = [] if given is None else given.split(",")
+        chosen = [names[i] if i < len(names) else str(i) for i in indices]
+        os.environ["CUDA_VISIBLE_DEVICES"] = ",".join(chosen)
+
+
+def _planned(ray: ModuleType, spread: Spread) -> Cluster:
+    """The workers that the devices of the cluster allow."""
+    options, cpus = spread.options, spread.options.cpus_per_worker
+    if spread.device == "cuda":
+        there = int(ray.cluster_resources().get("GPU", 0))
+        resources = {"num_gpus": 1, "num_cpus": cpus}
+    else:
+        nodes = [node["Resources"].get("CPU", 0) for node in ray.nodes() if node["Alive"]]
+        there = sum(int(count) // cpus for count in nodes)
+        resources = {"num_cpus": cpus}
+    wanted = options.ray_workers or len(spread.indices) or there
+    if wanted > there or not there:
+        where = "this machine" if spread.address == LOCAL else f"Ray cluster {spread.address!r}"
+        each = "a GPU" if spread.device == "cuda" else f"{cpus} CPU cores"
+        raise ClusterError(
+            f"{where} has devices for {there} workers of {each} each, and {max(1, wanted)} are"
+            " asked for; change --device, --ray-workers or --cpus-per-worker"
+        )
+    return Cluster(ray=ray, workers=wanted, resources=resources)

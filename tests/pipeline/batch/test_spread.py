@@ -1,0 +1,157 @@
+"""A batch on a real Ray cluster of three nodes."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pnpdepth_cli.errors import ClusterError
+from pnpdepth_cli.pipeline.cluster import pool
+from pnpdepth_cli.pipeline.cluster.options import ClusterOptions
+from tests.pipeline.batches import Heard, add_frame, batch, pairs_on_disk, results
+from tests.pipeline.cluster.nodes import three_nodes
+
+pytest.importorskip("ray")
+NAMES = tuple(f"f{number:02}" for number in range(12))
+DEADLY = "        if float(rgb.mean()) > 0.99:\n            import os\n            os._exit(1)\n"
+
+
+@pytest.fixture(scope="module")
+def cluster() -> Iterator[Any]:
+    with three_nodes() as nodes:
+        yield nodes
+
+
+@pytest.fixture(scope="module")
+def frames(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Frames of which one kills its worker, where the network is `deadly`."""
+    root = pairs_on_disk(tmp_path_factory.mktemp("frames") / "drive", NAMES)
+    batch(root)
+    (root / "out").rename(root / "plain")
+    return root
+
+
+@pytest.fixture
+def root(frames: Path) -> Iterator[Path]:
+    yield frames
+    shutil.rmtree(frames / "out", ignore_errors=True)
+
+
+class Doing(Heard):
+    """Does something at a row."""
+
+    def __init__(self, number: int, what: Callable[[], Any]) -> None:
+        super().__init__()
+        self._number, self._what = number, what
+
+    def frame(self, row: dict[str, Any]) -> None:
+        super().frame(row)
+        if len(self.rows) == self._number:
+            self._what()
+
+
+def states(output: Path) -> dict[str, str]:
+    """The newest state of each frame in the manifest."""
+    lines = [json.loads(line) for line in (output / "batch.jsonl").read_text().splitlines()]
+    return {line["frame"]: line["state"] for line in lines}
+
+
+def test_results_equal_those_of_one_process_when_a_node_is_lost(cluster: Any, root: Path) -> None:
+    lost = cluster.worker_nodes.copy().pop()
+    heard = Doing(2, lambda: cluster.remove_node(lost, allow_graceful=False))
+    outcome = batch(root, heard, cluster=ClusterOptions(ray=cluster.address), profile=True)
+    cluster.add_node(num_cpus=1, node_ip_address="127.0.0.5")
+    assert sorted(heard.names) == list(NAMES)
+    assert results(root / "out") == results(root / "plain")
+    assert set(states(root / "out").values()) == {"done"}
+    assert outcome.summary["counts"]["done"] == len(NAMES)
+    assert sum(each["items"] for each in outcome.summary["profile"]["workers"]) <= len(NAMES)
+
+
+def test_a_frame_that_kills_its_worker_is_named_and_the_others_are_done(
+    cluster: Any, tmp_path: Path
+) -> None:
+    root = pairs_on_disk(tmp_path / "drive", NAMES[:5])
+    add_frame(root, "bad", np.full((46, 62, 3), 255, np.uint8))
+    model = root / "net" / "my_net.py"
+    start = "    def forward(self, rgb):\n"
+    model.write_text(model.read_text().replace(start, start + DEADLY))
+    heard = Heard()
+    batch(root, heard, cluster=ClusterOptions(ray=cluster.address, ray_workers=2, retries=1))
+    rows = {row["name"]: row for row in heard.rows}
+    assert len(rows) == len(heard.rows) == 6
+    assert rows["bad"]["status"] == "failed"
+    assert rows["bad"]["message"].startswith("its worker died 2 times")
+    assert {row["status"] for name, row in rows.items() if name != "bad"} == {"done"}
+
+
+def test_a_killed_driver_is_resumed(cluster: Any, root: Path) -> None:
+    program = (
+        "import sys; from pathlib import Path\n"
+        "from tests.pipeline.batches import Heard, batch\n"
+        "from pnpdepth_cli.pipeline.cluster.options import ClusterOptions\n"
+        "class Telling(Heard):\n"
+        "    def frame(self, row): print(row['name'], flush=True)\n"
+        "options = ClusterOptions(ray=sys.argv[2], ray_workers=1)\n"
+        "batch(Path(sys.argv[1]), Telling(), cluster=options)\n"
+    )
+    driver = subprocess.Popen(
+        [sys.executable, "-c", program, str(root), cluster.address],
+        stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True,
+    )  # fmt: skip
+    assert driver.stdout is not None
+    first = driver.stdout.readline().strip()
+    os.kill(driver.pid, signal.SIGKILL)
+    driver.wait()
+    driver.stdout.close()
+    assert states(root / "out")[first] == "done"
+    heard = Heard()
+    batch(root, heard)
+    assert first not in heard.names
+    assert results(root / "out") == results(root / "plain")
+
+
+def test_what_is_wrong_with_a_cluster_is_an_error(
+    cluster: Any, root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    options = ClusterOptions(ray=cluster.address)
+    one = replace(options, ray_workers=1)
+    with pytest.raises(ClusterError, match="devices for 3 workers of 1 CPU cores each, and 9 are"):
+        batch(root, cluster=replace(options, ray_workers=9))
+    with pytest.raises(ClusterError, match="devices for 0 workers of a GPU each, and 1 are"):
+        batch(root, cluster=options, refine={"device": "cuda"})
+    with monkeypatch.context() as changed:
+        changed.setattr(pool, "software", lambda: {"torch": "1.0"})
+        with pytest.raises(ClusterError, match=r"has torch .* and here it is 1\.0; install the"):
+            batch(root, cluster=one)
+    with monkeypatch.context() as changed:
+        changed.setattr(Path, "touch", lambda path: None)  # as on a disk of the driver alone
+        with pytest.raises(ClusterError, match="does not see the output folder; name a folder"):
+            batch(root, cluster=one)
+    assert not results(root / "out")
+
+
+def test_a_stopped_batch_ends_with_the_pieces_that_are_begun(cluster: Any, root: Path) -> None:
+    heard = Heard()
+    outcome = batch(
+        root,
+        heard,
+        stopped=lambda: bool(heard.rows),
+        cluster=ClusterOptions(ray=cluster.address, ray_workers=1),
+    )
+    assert outcome.stopped
+    assert 1 <= len(heard.rows) < len(NAMES)
+    begun = states(root / "out")
+    assert set(begun) == set(heard.names)
+    assert set(begun.values()) == {"done"}

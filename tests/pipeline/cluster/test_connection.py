@@ -1,0 +1,94 @@
+from __future__ import annotations
+
+import socket
+import sys
+import threading
+
+import pytest
+
+from pnpdepth_cli.errors import ClusterError, UsageError
+from pnpdepth_cli.pipeline.cluster.connection import connected
+from pnpdepth_cli.pipeline.cluster.options import (
+    LOCAL,
+    ClusterOptions,
+    parse_address,
+    spread_of,
+)
+
+
+def connect(address: str) -> None:
+    spread = spread_of("cpu", ClusterOptions(ray=address))
+    assert spread is not None
+    with connected(spread):
+        raise AssertionError("there is no cluster")
+
+
+def test_without_ray_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "ray", None)
+    with pytest.raises(UsageError, match=r"--ray needs Ray: pip install 'pnpdepth\[ray\]'"):
+        connect(LOCAL)
+
+
+@pytest.mark.parametrize("scheme", ["", "ray://"])
+def test_an_address_where_nothing_answers_is_an_error_at_once(scheme: str) -> None:
+    pytest.importorskip("ray")
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+        with pytest.raises(ClusterError, match=r"cannot be reached \(connection refused\)"):
+            connect(f"{scheme}127.0.0.1:{port}")
+
+
+@pytest.mark.parametrize("answer", [b"HTTP/1.1 400 Bad Request\r\n\r\n", b""])
+def test_another_server_is_not_taken_for_a_cluster(answer: bytes) -> None:
+    pytest.importorskip("ray")
+    with socket.create_server(("127.0.0.1", 0)) as server:
+
+        def serve() -> None:
+            client, _ = server.accept()
+            with client:
+                client.recv(100)
+                client.sendall(answer)
+
+        threading.Thread(target=serve, daemon=True).start()
+        with pytest.raises(ClusterError, match="is another server than a Ray cluster"):
+            connect(f"127.0.0.1:{server.getsockname()[1]}")
+
+
+@pytest.mark.parametrize("text", ["frames/", "out", "host", "ray://host", "a/b:1"])
+def test_a_folder_after_ray_is_not_taken_for_an_address(text: str) -> None:
+    with pytest.raises(UsageError, match="is no address of a Ray cluster"):
+        parse_address(text)
+
+
+@pytest.mark.parametrize("text", ["auto", "local", "host:6379", "ray://host:10001", "[::1]:6379"])
+def test_addresses_of_clusters(text: str) -> None:
+    assert parse_address(text) == text
+
+
+def test_one_device_needs_no_cluster() -> None:
+    assert spread_of("cuda:1", ClusterOptions()) is None
+    with pytest.raises(UsageError, match="are of Ray workers; add --ray"):
+        spread_of("cuda:1", ClusterOptions(ray_workers=2))
+
+
+def test_several_devices_are_a_local_cluster() -> None:
+    spread = spread_of("cuda:0,cuda:2", ClusterOptions())
+    assert spread is not None
+    assert (spread.address, spread.device, spread.indices) == (LOCAL, "cuda", (0, 2))
+    spread = spread_of("all", ClusterOptions())
+    assert spread is not None
+    assert (spread.address, spread.device, spread.indices) == (LOCAL, "cuda", ())
+
+
+@pytest.mark.parametrize(
+    "device", ["cuda:0,cuda:0", "cpu,cuda:0", "cpu,cpu", "mps,mps", "cuda,cuda"]
+)
+def test_devices_that_cannot_be_spread_over_are_refused(device: str) -> None:
+    with pytest.raises(UsageError, match=f"device '{device}'"):
+        spread_of(device, ClusterOptions())
+
+
+def test_gpus_of_a_cluster_have_no_numbers() -> None:
+    with pytest.raises(UsageError, match="take --device cuda, and --ray-workers 2"):
+        spread_of("cuda:0,cuda:1", ClusterOptions(ray="auto"))
