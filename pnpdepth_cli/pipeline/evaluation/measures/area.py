@@ -1,6 +1,6 @@
 """Errors weighted by the surface that a pixel covers, and by bands of range.
 
-A pixel at depth g covers a surface proportional to g² if it faces the camera, so that usual means
+A pixel at depth g covers a surface proportional to g² if it faces the camera, so that means over pixels
 are of the image and weighted ones of the scene.
 """
 
