@@ -94,7 +94,10 @@ class EvalProtocol:
         if self.is_devkit:
             return DEVKIT_MEASURES
         standard = _IN_MILLIMETRES if self.name == "kitti" else MEASURES
-        return (*standard, *(measure for group in self.measure_groups for measure in group.measures))
+        return (
+            *standard,
+            *(measure for group in self.measure_groups for measure in group.measures),
+        )
 
     @property
     def measure_groups(self) -> tuple[MeasureGroup, ...]:
