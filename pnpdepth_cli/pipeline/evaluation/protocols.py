@@ -93,9 +93,9 @@ class EvalProtocol:
         """The measures in order, and how tables show them."""
         if self.is_devkit:
             return DEVKIT_MEASURES
-        standard = _IN_MILLIMETRES if self.name == "kitti" else MEASURES
+        base = _IN_MILLIMETRES if self.name == "kitti" else MEASURES
         return (
-            *standard,
+            *base,
             *(measure for group in self.measure_groups for measure in group.measures),
         )
 

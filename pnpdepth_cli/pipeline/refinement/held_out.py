@@ -162,7 +162,7 @@ def _competing_propagations(asked: str | None, *, timed: bool) -> tuple[str, ...
 
 
 def _against_linear(choice: Choice) -> dict[str, Any] | None:
-    """MAE in metres of network, linear interpolation and result at held-out points; None without."""
+    """MAE in metres at held-out points of network, linear interpolation and result, if measured."""
     linear = choice.error_of(LINEAR)
     if linear is None or choice.error is None:
         return None
