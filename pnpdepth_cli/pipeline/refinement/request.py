@@ -19,7 +19,7 @@ from pnpdepth_cli.pipeline.sparse.scan_options import ScanOptions
 
 if TYPE_CHECKING:
     from pnpdepth_cli.io.calibration import Calibration
-    from pnpdepth_cli.io.dataset.frame import Source
+    from pnpdepth_cli.io.dataset.frame import Neighbour, Source
     from pnpdepth_cli.io.dataset.protocols import Protocol
     from pnpdepth_cli.sensors import SamplePattern
 
@@ -79,6 +79,8 @@ class FrameFiles:
     """Calibration of the camera, where `sparse` is no LiDAR scan and an output needs the camera."""
     camera_number: int | None = None
     """Which camera of `camera_file`."""
+    neighbours: tuple[Neighbour, ...] = ()
+    """Other frames of the sequence, whose points are moved into this one."""
     gt_masks: tuple[Path, ...] = ()
     """Where one of these is 0, the ground truth is unknown."""
     gt_size_ok: bool = False
