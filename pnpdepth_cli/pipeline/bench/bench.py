@@ -334,7 +334,7 @@ class _Subject:
         inputs, outputs = read_inputs(self.files_request), plan_outputs(self.files_request)
         with self.network.cut_at(self.layer) as split:
             frame = refine_frame(self.network, split, self.settings, inputs.frame())
-        frame = within_range(outputs.depth, inputs, frame)
+        frame = within_range(outputs, inputs, frame)
         return {
             "reading": Timed(run=lambda _: read_inputs(self.files_request)),
             "writing": Timed(run=lambda _: write_outputs(outputs, inputs, frame)),
