@@ -3,11 +3,18 @@
 `python -m benchmarks.cluster entries --count 1000000` makes a list of so many frames and a manifest
 that says they are done, with a hard link for each result, and prints CPU seconds and peak memory of
 planning, of a run that has nothing to do, and of its summary.
+
+`… overhead FOLDER --frames 60` refines frames of a data set with and without a Ray worker, compares
+the results, and prints the CPU seconds of all processes between the first frame and the last.
+
+`… scaling --workers 16` gives 1 and 16 workers frames whose stand-in network only waits, and prints
+frames a second, and the driver's CPU time with the manifest's lines of such frames written.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import os
 import shutil
@@ -15,9 +22,12 @@ import subprocess
 import sys
 import tempfile
 import time
-from dataclasses import asdict
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
+
+import psutil
 
 from benchmarks.batch import make_frames
 from pnpdepth_cli.io.fingerprint import fingerprint
@@ -26,7 +36,11 @@ from pnpdepth_cli.pipeline.batch.batch import run_batch
 from pnpdepth_cli.pipeline.batch.frames import find_frames, task_of
 from pnpdepth_cli.pipeline.batch.request import BatchRequest
 from pnpdepth_cli.pipeline.batch.settings import model_identity, settings_digest
+from pnpdepth_cli.pipeline.cluster.options import LOCAL, ClusterOptions, spread_of
+from pnpdepth_cli.pipeline.cluster.pool import worker_pool
+from pnpdepth_cli.pipeline.cluster.worker import Done
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest
+from pnpdepth_cli.sensors import SamplePattern
 
 LINKS = 50_000
 """Hard links of a file; ext4 allows 65,000."""
@@ -160,14 +174,179 @@ def entries(count: int, folder: Path | None) -> dict[str, Any]:
         }
 
 
+class Clock(Quiet):
+    """CPU seconds of this process and those it started, at the first frame and at the last."""
+
+    def __init__(self) -> None:
+        self.moments: list[tuple[float, float]] = []
+        self.to_do = 0
+
+    def begin(self, to_do: int) -> None:
+        """The frames begin."""
+        self.to_do = to_do
+
+    def frame(self, row: dict[str, Any]) -> None:
+        """One more."""
+        self.moments.append((cpu_seconds(), time.perf_counter()))
+
+    def between(self) -> dict[str, float]:
+        """What the frames between the first row and the last took."""
+        (cpu, wall), (cpu_end, wall_end) = self.moments[0], self.moments[-1]
+        frames = len(self.moments) - 1
+        return {
+            "cpu_s_a_frame": round((cpu_end - cpu) / frames, 4),
+            "wall_s_a_frame": round((wall_end - wall) / frames, 4),
+        }
+
+
+def cpu_seconds() -> float:
+    """Of this process and all its living descendants."""
+    own = psutil.Process()
+    total = 0.0
+    for process in (own, *own.children(recursive=True)):
+        with contextlib.suppress(psutil.Error):
+            times = process.cpu_times()
+            total += times.user + times.system
+    return total
+
+
+def overhead(source: Path, frames: int, model: str) -> dict[str, Any]:
+    with tempfile.TemporaryDirectory() as temporary:
+        found: dict[str, Any] = {"frames": frames}
+        for name, cluster in (
+            ("one process", ClusterOptions()),
+            ("one Ray worker", ClusterOptions(ray=LOCAL, ray_workers=1)),
+        ):
+            clock = Clock()
+            request = BatchRequest(
+                source=source,
+                output=Path(temporary) / name,
+                limit=frames,
+                refine=RefineRequest.from_fields(
+                    model=model, preset="paper", sample=SamplePattern(count=500)
+                ),
+                cluster=cluster,
+            )
+            run_batch(request, clock)
+            found[name] = clock.between()
+        plain, ray = (contents(Path(temporary) / name) for name in list(found)[1:])
+        one, other = (found[name]["cpu_s_a_frame"] for name in list(found)[1:])
+        return found | {"overhead": round(other / one - 1, 3), "equal": plain == ray,
+                        "files": len(plain)}  # fmt: skip
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    """The results below a folder by name; of records, without times and memory."""
+    found = {}
+    for path in sorted(folder.rglob("*")):
+        name = path.relative_to(folder).as_posix()
+        if path.is_dir() or name.startswith(("summary.", "batch.", ".")):
+            continue
+        found[name] = path.read_bytes()
+        if path.suffix == ".json":
+            record = json.loads(found[name])
+            del record["seconds"], record["peak_memory_mb"]
+            found[name] = json.dumps(record).encode()
+    return found
+
+
+@dataclass(frozen=True, kw_only=True)
+class WaitingJob:
+    """Waits as if for a GPU, and returns a line of a manifest for each frame."""
+
+    line: dict[str, Any]
+    """Of a frame that was refined."""
+    wait_s: float
+    """For each frame."""
+
+    @contextlib.contextmanager
+    def opened(self) -> Iterator[Callable[[Sequence[str], bool], Done]]:
+        """Yields the function of a piece."""
+
+        def work(names: Sequence[str], checked: bool) -> Done:
+            time.sleep(self.wait_s * len(names))
+            return Done(results=[self.line | {"frame": name} for name in names])
+
+        yield work
+
+
+def scaling(workers: int, rate: float, seconds: float) -> dict[str, Any]:
+    os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
+    import ray
+
+    with tempfile.TemporaryDirectory() as temporary:
+        root = Path(temporary)
+        line = one_line_of(root)
+        wait_s = workers / rate
+        ray.init(num_cpus=workers, include_dashboard=False, log_to_driver=False)
+        found = {
+            f"{count} workers": waited(root, count, WaitingJob(line=line, wait_s=wait_s), seconds)
+            for count in (1, workers)
+        }
+        ray.shutdown()
+    one, many = (each["frames_a_second"] for each in found.values())
+    return {"wait_s": wait_s, **found, "speedup": round(many / one, 2)}
+
+
+def waited(root: Path, workers: int, job: WaitingJob, seconds: float) -> dict[str, float]:
+    """Frames a second and the driver's CPU time, once all workers have begun."""
+    spread = spread_of("cpu", ClusterOptions(ray=LOCAL, ray_workers=workers))
+    assert spread is not None
+    journal = Journal(root / f"{workers}.jsonl", "frame")
+    names = [f"f{number:07}" for number in range(int(seconds * workers / job.wait_s))]
+
+    def begin(begun: Sequence[str]) -> None:
+        journal.append(*({"frame": name, "state": "begun"} for name in begun))
+
+    with worker_pool(spread, root, lambda text: None) as pool:
+        while sum(1 for _ in pool.figures()) < workers:
+            pool.call(time.sleep, 0.1)
+            list(pool.results(job, names[:1]))
+        start, cpu = time.perf_counter(), time.process_time()
+        for part in pool.results(job, names, begin=begin):
+            journal.append(*(line for _, line in part))
+        wall = time.perf_counter() - start
+    return {
+        "frames": len(names),
+        "frames_a_second": round(len(names) / wall, 2),
+        "driver_cpu": round((time.process_time() - cpu) / wall, 4),
+    }
+
+
+def one_line_of(root: Path) -> dict[str, Any]:
+    """A line of the manifest of a frame that was refined."""
+    make_frames(root, 1, 48, 64)
+    request = BatchRequest(
+        source=root, output=root / "out", refine=RefineRequest.from_fields(preset="fast")
+    )
+    run_batch(request, Quiet())
+    line = Journal(root / "out" / "batch.jsonl", "frame").newest("000000")
+    assert line is not None
+    return line
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     commands = parser.add_subparsers(dest="command", required=True)
     of_entries = commands.add_parser("entries")
     of_entries.add_argument("--count", type=int, default=1_000_000)
     of_entries.add_argument("--folder", type=Path, help="where the files are made")
+    of_overhead = commands.add_parser("overhead")
+    of_overhead.add_argument("source", type=Path)
+    of_overhead.add_argument("--frames", type=int, default=60)
+    of_overhead.add_argument("--model", default="compact")
+    of_scaling = commands.add_parser("scaling")
+    of_scaling.add_argument("--workers", type=int, default=16)
+    of_scaling.add_argument("--rate", type=float, default=200.0, help="frames a second of all")
+    of_scaling.add_argument("--seconds", type=float, default=30.0)
     args = parser.parse_args()
-    print(json.dumps(entries(args.count, args.folder), indent=2))
+    if args.command == "entries":
+        result = entries(args.count, args.folder)
+    elif args.command == "overhead":
+        result = overhead(args.source, args.frames, args.model)
+    else:
+        result = scaling(args.workers, args.rate, args.seconds)
+    print(json.dumps(result, indent=2))
 
 
 if __name__ == "__main__":

@@ -36,7 +36,7 @@ from pnpdepth_cli.auto.auto import AutoRefined, refine_automatically
 from pnpdepth_cli.auto.candidates import Candidate
 from pnpdepth_cli.auto.predictions import OpenNetworks
 from pnpdepth_cli.models.network import Network
-from pnpdepth_cli.pipeline.refinement.refine import refiner_of
+from pnpdepth_cli.pipeline.refinement.load_refiner import refiner_of
 from pnpdepth_cli.pipeline.refinement.request import MethodOptions, RefineRequest
 from pnpdepth_cli.pipeline.refinement.resolve import resolve_settings
 from pnpdepth_cli.points import SparsePoints

@@ -19,7 +19,7 @@ from pnpdepth_cli.auto.auto import refine_automatically
 from pnpdepth_cli.auto.predictions import OpenNetworks
 from pnpdepth_cli.auto.uncertainty import uncertainty
 from pnpdepth_cli.models.network import Network
-from pnpdepth_cli.pipeline.refinement.refine import refiner_of
+from pnpdepth_cli.pipeline.refinement.load_refiner import refiner_of
 from pnpdepth_cli.pipeline.refinement.request import HoldOut, MethodOptions, RefineRequest
 
 FRAMES = {"kitti_dc": (1, 3, 5), "7scenes": (5, 25, 45), "icl_nuim": (1, 9, 17)}

@@ -17,9 +17,11 @@ from pnpdepth_cli.core.refine import RefineSettings
 from pnpdepth_cli.errors import DivergedError, InputError, NoPointsError, SizeError, UsageError
 from pnpdepth_cli.models import network as networks
 from pnpdepth_cli.models.network import Network
-from pnpdepth_cli.pipeline.refinement import refine as pipeline
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs
+from pnpdepth_cli.pipeline.refinement.load_refiner import refiner_of
 from pnpdepth_cli.pipeline.refinement.method import needs_folds
+from pnpdepth_cli.pipeline.refinement.refiner import Opened
+from pnpdepth_cli.pipeline.refinement.refiner import Refiner as FrameRefiner
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest
 from pnpdepth_cli.pipeline.refinement.resolve import resolve_definition
 from pnpdepth_cli.points import SparsePoints
@@ -123,7 +125,7 @@ class Refiner:
         if options.get("tile") is not None and needs_folds(self._request):
             raise UsageError("tile cannot be combined with auto and uncertainty")
         self._open = ExitStack()
-        self._opened: tuple[pipeline.Refiner, pipeline.Opened] | None = None
+        self._opened: tuple[FrameRefiner, Opened] | None = None
 
     def __enter__(self) -> Refiner:
         return self
@@ -168,9 +170,9 @@ class Refiner:
             raise DivergedError(str(frame.diverged), refined)
         return refined
 
-    def _resolve(self, inputs: Inputs) -> pipeline.Refiner:
+    def _resolve(self, inputs: Inputs) -> FrameRefiner:
         network = resolve_definition(self._network, inputs.frame(), self._request.network)
-        return pipeline.refiner_of(self._request, [network], inputs, settings=self._settings)
+        return refiner_of(self._request, [network], inputs, settings=self._settings)
 
 
 def refine(

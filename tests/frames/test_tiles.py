@@ -20,7 +20,7 @@ from pnpdepth_cli.frames.tiles import OVERLAP, refine_tiled, tiles_of
 from pnpdepth_cli.models.definition import ModelDefinition, Multiple
 from pnpdepth_cli.models.network import Network, load_network
 from pnpdepth_cli.pipeline.refinement.inputs import read_inputs
-from pnpdepth_cli.pipeline.refinement.refine import load_refiner
+from pnpdepth_cli.pipeline.refinement.load_refiner import load_refiner
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest
 from pnpdepth_cli.points import SparsePoints
 from tests.pipeline.frames import frame_on_disk

@@ -23,7 +23,7 @@ from pnpdepth_cli.errors import DeviceError, NoPointsError, PnpDepthError, Usage
 from pnpdepth_cli.frames.frame import RefinedFrame
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs
 from pnpdepth_cli.pipeline.refinement.method import needs_folds
-from pnpdepth_cli.pipeline.refinement.refine import Opened, Refiner
+from pnpdepth_cli.pipeline.refinement.refiner import Opened, Refiner
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest
 from pnpdepth_cli.pipeline.refinement.resolve import moves_weights
 

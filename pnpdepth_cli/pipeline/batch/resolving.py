@@ -9,8 +9,9 @@ from pnpdepth_cli.errors import PnpDepthError, UsageError
 from pnpdepth_cli.pipeline.batch.frames import Task, compared
 from pnpdepth_cli.pipeline.batch.groups import FrameGroups
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs, read_inputs
+from pnpdepth_cli.pipeline.refinement.load_refiner import load_refiner
 from pnpdepth_cli.pipeline.refinement.method import resolve_method
-from pnpdepth_cli.pipeline.refinement.refine import Refiner, load_refiner
+from pnpdepth_cli.pipeline.refinement.refiner import Refiner
 
 
 @contextlib.contextmanager

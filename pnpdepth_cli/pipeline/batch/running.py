@@ -38,7 +38,8 @@ from pnpdepth_cli.pipeline.batch.run import BatchRun
 from pnpdepth_cli.pipeline.batch.state import FrameRecorder, Status, input_fingerprints
 from pnpdepth_cli.pipeline.batch.summary import failed_row, row_of
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs, read_inputs
-from pnpdepth_cli.pipeline.refinement.refine import Refiner, write_refined
+from pnpdepth_cli.pipeline.refinement.refine import write_refined
+from pnpdepth_cli.pipeline.refinement.refiner import Refiner
 from pnpdepth_cli.pipeline.stopwatch import Stopwatch
 
 Row = dict[str, Any]

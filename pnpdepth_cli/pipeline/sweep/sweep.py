@@ -25,8 +25,9 @@ from pnpdepth_cli.pipeline.batch.frames import Task, find_frames, task_of
 from pnpdepth_cli.pipeline.batch.request import BatchRequest, FrameSelection
 from pnpdepth_cli.pipeline.batch.settings import model_identity
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs, read_inputs
+from pnpdepth_cli.pipeline.refinement.load_refiner import load_refiner
 from pnpdepth_cli.pipeline.refinement.method import with_preset
-from pnpdepth_cli.pipeline.refinement.refine import Refiner, load_refiner
+from pnpdepth_cli.pipeline.refinement.refiner import Refiner
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest
 from pnpdepth_cli.pipeline.refinement.resolve import resolve_layer, resolve_settings
 from pnpdepth_cli.pipeline.sweep.axes import Cell, Study

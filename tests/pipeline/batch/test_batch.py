@@ -23,7 +23,8 @@ from pnpdepth_cli.pipeline.batch.request import BatchRequest
 from pnpdepth_cli.pipeline.batch.settings import SettingsDigests, settings_digest
 from pnpdepth_cli.pipeline.batch.summary import _SCORES, Tally
 from pnpdepth_cli.pipeline.refinement.inputs import read_inputs
-from pnpdepth_cli.pipeline.refinement.refine import Refiner, refine_image
+from pnpdepth_cli.pipeline.refinement.refine import refine_image
+from pnpdepth_cli.pipeline.refinement.refiner import Refiner
 from pnpdepth_cli.pipeline.report.batch import BatchReport
 from pnpdepth_cli.pipeline.sparse.scan_options import ScanOptions
 from pnpdepth_cli.sensors import SamplePattern

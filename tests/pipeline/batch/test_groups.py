@@ -16,7 +16,7 @@ import torch
 from pnpdepth_cli.errors import DeviceError, StorageError
 from pnpdepth_cli.pipeline.batch import groups as batch_groups
 from pnpdepth_cli.pipeline.batch import resolving
-from pnpdepth_cli.pipeline.refinement.refine import Refiner
+from pnpdepth_cli.pipeline.refinement.refiner import Refiner
 from tests.pipeline.batches import (
     Heard,
     add_frame,
