@@ -64,7 +64,7 @@ class SettingsDigests:
     def of(self, request: RefineRequest) -> str:
         """Returns the digest of a frame's request."""
         files = request.files
-        if files.calibration is not None:  # its arrays cannot be compared by ==
+        if files.calibration is not None or files.neighbours:  # of arrays, and of each frame alone
             return settings_digest(request, self._model)
         scan = replace(files.scan, calib=None, extrinsics=None)
         alike = replace(
