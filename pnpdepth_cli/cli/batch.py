@@ -19,6 +19,7 @@ from pnpdepth_cli.cli.exit_codes import INTERRUPTED
 from pnpdepth_cli.cli.printable import printable
 from pnpdepth_cli.errors import FramesFailedError, StorageError
 from pnpdepth_cli.pipeline.batch.request import BatchRequest
+from pnpdepth_cli.pipeline.batch.sequence_options import SequenceOptions
 from pnpdepth_cli.pipeline.cluster.options import ClusterOptions
 from pnpdepth_cli.pipeline.refinement.request import sample_pattern
 from pnpdepth_cli.pipeline.sparse.bag_options import BagOptions
@@ -49,6 +50,7 @@ _STOPPING = b"\nfinishing the current frame; press Ctrl-C again to stop at once\
             *("--layout", "--protocol", "--sample", "--limit", "--shard"),
             *("--image-topic", "--points-topic", "--tolerance"),
         ),
+        "Sequences": ("--accumulate", "--poses"),
         "Input": (*grouped_help.LIDAR, *grouped_help.COLMAP, *grouped_help.FILE_READING),
         "Network": grouped_help.NETWORK,
         "Method": grouped_help.METHOD,
@@ -64,7 +66,7 @@ _STOPPING = b"\nfinishing the current frame; press Ctrl-C again to stop at once\
     metavar="[PATTERN:]N|P%",
     help="Sample the sparse depth from the ground truth, as `pnpdepth sample` does.",
 )
-@options.options_of_groups(BatchRequest, ClusterOptions, BagOptions)
+@options.options_of_groups(BatchRequest, SequenceOptions, ClusterOptions, BagOptions)
 @click.option("--dry-run", is_flag=True, help="List the frames that would be refined, and exit.")
 @options.scan
 @options.refinement
@@ -102,6 +104,7 @@ def batch(
     own = options.taken(BatchRequest, given)
     own["cluster"] = ClusterOptions(**options.taken(ClusterOptions, given))
     bag_options = BagOptions(**options.taken(BagOptions, given))
+    own["sequence"] = SequenceOptions(**options.taken(SequenceOptions, given))
     pattern = None if sample is None else sample_pattern(*_sample(sample))
     refine = options.request_of(given, sample=pattern)
     request = BatchRequest(source=source, output=output, refine=refine, **own)

@@ -102,6 +102,19 @@ def read_calibration(path: Path, camera: int | None = None) -> Calibration:
     return _plain(path, fields, camera)
 
 
+def read_rigid_motion(path: Path) -> tuple[Floats, Floats]:
+    """Returns (rotation (3, 3), translation (3,) metres) of KITTI's raw files with R and T.
+
+    Raises:
+        FileFormatError: One is missing, or the rotation is none.
+        InputError: The file cannot be read.
+    """
+    fields = _fields(path, _text(path))
+    rotation = _matrix(path, fields, "R", (3, 3))
+    _check_rotation(path, "R", rotation)
+    return rotation, _matrix(path, fields, "T", (3,))
+
+
 def _robot(path: Path, text: str, camera: int | None) -> Calibration:
     """OpenCV's, ROS's or Kalibr's."""
     found = camera_in_yaml(path, parse_yaml(path, text), camera)

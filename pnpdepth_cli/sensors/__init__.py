@@ -8,6 +8,7 @@ x right, y down, whole numbers at pixel centres. numpy only; nothing here reads 
 
 from __future__ import annotations
 
+from pnpdepth_cli.sensors.accumulation import NeighbourScan, accumulated
 from pnpdepth_cli.sensors.camera import Camera
 from pnpdepth_cli.sensors.lidar import FORWARD_LEFT_UP, LIDARS, Lidar
 from pnpdepth_cli.sensors.occlusion import OcclusionFilter
@@ -29,6 +30,7 @@ __all__ = [
     "PATTERNS",
     "Camera",
     "Lidar",
+    "NeighbourScan",
     "OcclusionFilter",
     "Points",
     "ProjectedScan",
@@ -36,6 +38,7 @@ __all__ = [
     "SampleNoise",
     "SamplePattern",
     "SimulationSettings",
+    "accumulated",
     "as_depth_image",
     "occluded_in_map",
     "project_velodyne",

@@ -45,6 +45,20 @@ Pose = tuple[tuple[float, ...], ...]
 
 
 @dataclass(frozen=True, kw_only=True)
+class Neighbour:
+    """Another frame of the same sequence, whose points are moved into this one."""
+
+    sparse: Path
+    """Its sparse depth."""
+
+    motion: Pose
+    """(3, 4) from the other camera's frame to this one's, metres."""
+
+    apart: int
+    """Frames between the two, at least 1."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Frame:
     """One frame; parts that it does not have are None."""
 
@@ -79,7 +93,13 @@ class Frame:
     """The part of the frame that is used."""
 
     pose: Pose | None = None
-    """x_world = pose · (x, 1) for points of KITTI's camera 0, whichever camera took the image."""
+    """x_world = pose · (x, 1) for points in the camera's frame; of KITTI odometry camera 0's."""
+
+    oxts: Path | None = None
+    """The packet of KITTI's inertial system that gives the pose."""
+
+    neighbours: tuple[Neighbour, ...] = ()
+    """Other frames whose points are moved into this one."""
 
     masks: tuple[Path, ...] = ()
     """Images or arrays of the ground truth's size; where one is 0, the ground truth is unknown."""

@@ -18,6 +18,7 @@ from pnpdepth_cli.io.dataset.frame import (
     without_partner,
 )
 from pnpdepth_cli.io.layouts import Layout
+from pnpdepth_cli.io.oxts import PACKETS
 
 _SCANS = "velodyne_points/data"
 _CAMERAS = ("image_02", "image_03")
@@ -43,6 +44,7 @@ def listing(root: Path) -> Listing:
             broken.append(Unmatched(path=drive, why=why))
             continue
         scans = by_stem(drive / _SCANS, (".bin",))
+        packets = by_stem(drive / PACKETS, (".txt",))
         for camera in _CAMERAS:
             images = by_stem(drive / camera / "data", IMAGE_SUFFIXES)
             annotated = _annotated(root, drive, camera)
@@ -55,6 +57,7 @@ def listing(root: Path) -> Listing:
                     gt_scale=_SCALE,
                     calib=calib,
                     camera=int(camera[-1]),
+                    oxts=packets.get(stem),
                 )
                 for stem, image in images.items()
                 if stem in scans

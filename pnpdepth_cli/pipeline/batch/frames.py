@@ -13,6 +13,7 @@ from pnpdepth_cli.io.dataset.frame_names import name_problem
 from pnpdepth_cli.io.file_bytes import one_line
 from pnpdepth_cli.io.layouts import LAYOUTS, find_protocol, list_frames
 from pnpdepth_cli.pipeline.batch.request import BatchRequest
+from pnpdepth_cli.pipeline.batch.sequence import with_neighbours
 from pnpdepth_cli.pipeline.refinement.output_files import Outputs
 from pnpdepth_cli.pipeline.refinement.request import FrameFiles, RefineRequest
 
@@ -72,6 +73,8 @@ def find_frames(request: BatchRequest) -> BatchFrames:
             f"{request.source} looks like {layout!r}, which has no sparse depth; --sample 500"
             " draws so many points from the ground truth"
         )
+    sequence = request.sequence
+    frames = with_neighbours(frames, sequence.accumulate, sequence.poses)
     number, of = request.shard or (1, 1)
     return BatchFrames(
         layout=layout,
@@ -91,7 +94,7 @@ def task_of(request: BatchRequest, frame: Frame) -> Task:
     if base.sample is not None and gt is None and _is_scan_file(frame.sparse):
         gt = frame.sparse  # points are sampled from the projected scan
     is_scan = _is_scan_file(gt) or (sparse is not None and _is_scan(base, sparse))
-    scan = base.scan
+    scan, needs_camera = base.scan, request.refine.outputs.needs_camera or frame.neighbours
     if is_scan:
         camera = frame.camera if scan.camera is None else scan.camera
         scan = replace(scan, calib=scan.calib or frame.calib, camera=camera)
@@ -101,8 +104,9 @@ def task_of(request: BatchRequest, frame: Frame) -> Task:
         sparse=sparse,
         gt=gt,
         calibration=frame.calibration,
-        camera_file=None if is_scan or not request.refine.outputs.needs_camera else frame.calib,
+        camera_file=frame.calib if needs_camera and not is_scan else None,
         camera_number=frame.camera if scan.camera is None else scan.camera,
+        neighbours=frame.neighbours,
         gt_masks=frame.masks,
         gt_size_ok=frame.gt_other_size,
         sparse_size_ok=base.sparse_size_ok or frame.sparse_other_size,
@@ -153,6 +157,7 @@ def _input_files(files: FrameFiles, *, is_scan: bool) -> Iterator[tuple[str, Pat
             yield from ((f"sparse {file.name}", file) for file in model_files(path))
         else:
             yield part, path
+    yield from ((f"sparse of {each.sparse.stem}", each.sparse) for each in files.neighbours)
     if files.gt is not None:
         yield from ((f"mask {number}", path) for number, path in enumerate(files.gt_masks))
     calib, extrinsics = files.scan.calib or files.camera_file, files.scan.extrinsics

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from pnpdepth_cli.choices import FRAME_PROTOCOLS, LAYOUTS
 from pnpdepth_cli.errors import UsageError
+from pnpdepth_cli.pipeline.batch.sequence_options import SequenceOptions
 from pnpdepth_cli.pipeline.cluster.options import ClusterOptions
 from pnpdepth_cli.pipeline.options import option
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest
@@ -78,6 +79,8 @@ class BatchRequest(FrameSelection):
     shard: tuple[int, int] | None = option(
         None, "Every N-th frame, starting at the I-th.", metavar="I/N", parse=parse_shard
     )
+    sequence: SequenceOptions = field(default_factory=SequenceOptions)
+    """What a frame takes over from its neighbours."""
     profile: bool = option(False, "Print the time spent in each stage.")
     cluster: ClusterOptions = field(default_factory=ClusterOptions)
     """The Ray workers, if any."""

@@ -31,6 +31,9 @@ def settings_of(request: RefineRequest, model: dict[str, Any], *groups: str) -> 
     if "scan" in fields:
         fields["scan"] = asdict(fields["scan"])
         del fields["scan"]["calib"], fields["scan"]["extrinsics"]
+    neighbours = fields.pop("neighbours", ())
+    if neighbours:
+        fields["neighbours"] = [(each.motion, each.apart) for each in neighbours]
     calibration = fields.pop("calibration", None)
     if calibration is not None:
         fields["calibration"] = asdict(calibration)

@@ -139,9 +139,10 @@ def comparison_table(comparison: Comparison) -> tuple[list[str], list[list[str]]
 
 
 def comparison_caption(comparison: Comparison) -> str:
-    """Returns what the table shows, in one line."""
+    """Returns the caption of the table of a comparison, one line."""
     return (
-        f"{len(comparison.names):,} shared frames; gains in per cent of {comparison.runs[0].label};"
+        f"{len(comparison.names):,} shared frames; gains in per cent of the error of"
+        f" {comparison.runs[0].label};"
         f" intervals (95 %) and p-values over {comparison.clusters.describe()}, p adjusted for"
         f" {len(comparison.measures)} measures (Holm)"
     )

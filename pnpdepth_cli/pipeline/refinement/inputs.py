@@ -27,13 +27,24 @@ from pnpdepth_cli.io.fingerprint import fingerprint
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.pipeline.refinement.frame_camera import FrameCamera, camera_of_frame
 from pnpdepth_cli.pipeline.refinement.method import PAPER
+from pnpdepth_cli.pipeline.refinement.neighbours import (
+    read_neighbours,
+    record_of_neighbours,
+    with_moved_points,
+)
 from pnpdepth_cli.pipeline.refinement.request import FrameFiles, RefineRequest
 from pnpdepth_cli.pipeline.sparse.colmap import read_colmap_points
 from pnpdepth_cli.pipeline.sparse.colmap_options import METRES, ColmapOptions
 from pnpdepth_cli.pipeline.sparse.scan_options import ScanOptions
 from pnpdepth_cli.pipeline.sparse.scans import read_scan_points
 from pnpdepth_cli.points import SparsePoints
-from pnpdepth_cli.sensors import Points, as_depth_image, occluded_in_map, sample_points
+from pnpdepth_cli.sensors import (
+    NeighbourScan,
+    Points,
+    as_depth_image,
+    occluded_in_map,
+    sample_points,
+)
 
 ImageArray = NDArray[np.float32]
 
@@ -71,18 +82,23 @@ class Inputs:
     """Of all depths: "m", or "model units" of a COLMAP model without scale."""
     camera: FrameCamera | None = None
     """The camera in pixels of the image frame. None: unknown."""
+    neighbours: tuple[NeighbourScan, ...] = ()
+    """Points of other frames of the sequence; then the camera is known."""
 
     @property
     def size(self) -> tuple[int, int]:
         """(H, W) of the image frame."""
         return self.points.size
 
-    def frame(self) -> Frame:
-        """Returns the image and all points as tensors."""
+    def frame(self, points: SparsePoints | None = None) -> Frame:
+        """Returns the image, and points (None: all) with those of the neighbours, as tensors."""
+        points = self.points if points is None else points
+        if self.neighbours and self.camera is not None:
+            points = with_moved_points(points, self.neighbours, self.camera.camera)
         rgb = self.rgb
         if rgb is not None:
             rgb = np.ascontiguousarray(rgb.transpose(2, 0, 1))
-        return Frame(rgb=None if rgb is None else torch.from_numpy(rgb), points=self.points)
+        return Frame(rgb=None if rgb is None else torch.from_numpy(rgb), points=points)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -133,18 +149,8 @@ def read_inputs(request: RefineRequest) -> Inputs:
         _check_ground_truth(files, ground_truth, whole)
     if files.sparse is None:
         sparse = _sampled(files, image, ground_truth, request.hold_out.seed)
-    elif files.sparse.is_dir():
-        sparse = _read_colmap(files, files.sparse, whole)
-    elif files.colmap != ColmapOptions():
-        raise UsageError(
-            f"{files.sparse} is no COLMAP model, so --unit-scale, --min-track and"
-            " --max-reprojection do not apply"
-        )
-    elif files.scan.describes(files.sparse):
-        sparse = _read_scan(files, files.sparse, whole)
     else:
-        keep = files.scan.keep_occluded or request.method.preset == PAPER
-        sparse = _read_points(files, files.sparse, whole, keep_occluded=keep)
+        sparse = _read_sparse(request, files.sparse, whole)
     sparse = _without_far_points(sparse)
     if ground_truth is not None and sparse.unit != METRES:
         raise UsageError(
@@ -155,6 +161,9 @@ def read_inputs(request: RefineRequest) -> Inputs:
         raise _size_error(files, ground_truth.values.shape, sparse.points.size)
     size = whole or (None if ground_truth is None else ground_truth.whole) or sparse.points.size
     camera = camera_of_frame(request, sparse.camera, size)
+    neighbours = read_neighbours(
+        files, camera, lambda path: _read_sparse(request, path, size).points
+    )
     parts = {"image": image, "sparse": sparse, "gt": ground_truth}
     notes = [note for part in parts.values() if part is not None for note in part.notes]
     if ground_truth is not None and files.sparse is not None:
@@ -166,11 +175,29 @@ def read_inputs(request: RefineRequest) -> Inputs:
         points=sparse.points,
         gt=None if ground_truth is None else ground_truth.values,
         sparse_scale=sparse.scale,
-        record={name: part.record for name, part in parts.items() if part is not None},
+        record={name: part.record for name, part in parts.items() if part is not None}
+        | ({"neighbours": record_of_neighbours(files)} if neighbours else {}),
         notes=tuple(notes),
         unit=sparse.unit,
         camera=camera,
+        neighbours=neighbours,
     )
+
+
+def _read_sparse(request: RefineRequest, path: Path, size: tuple[int, int] | None) -> _Sparse:
+    """The sparse depth of one file for an image of (H, W)."""
+    files = request.files
+    if path.is_dir():
+        return _read_colmap(files, path, size)
+    if files.colmap != ColmapOptions():
+        raise UsageError(
+            f"{path} is no COLMAP model, so --unit-scale, --min-track and --max-reprojection do not"
+            " apply"
+        )
+    if files.scan.describes(path):
+        return _read_scan(files, path, size)
+    keep = files.scan.keep_occluded or request.method.preset == PAPER
+    return _read_points(files, path, size, keep_occluded=keep)
 
 
 def _without_far_points(sparse: _Sparse) -> _Sparse:

@@ -55,6 +55,7 @@ def record_of(refiner: Refiner, inputs: Inputs, frame: RefinedFrame) -> dict[str
             "held_out": len(frame.held_out),
             "nearest": float(inputs.points.depth.min()),
             "farthest": float(inputs.points.depth.max()),
+            **_moved_points(inputs, frame),
         },
         "loss": list(frame.refinement.losses),
         "kept": frame.refinement.kept,
@@ -67,6 +68,13 @@ def record_of(refiner: Refiner, inputs: Inputs, frame: RefinedFrame) -> dict[str
         "diverged": str(frame.diverged) if frame.diverged else None,
         "notes": [note for note in (*inputs.notes, *_notes(refiner), *frame.notes) if note],
     }
+
+
+def _moved_points(inputs: Inputs, frame: RefinedFrame) -> dict[str, int]:
+    """The number of used points that are neighbours', for a frame with neighbours."""
+    if not inputs.neighbours:
+        return {}
+    return {"moved": len(frame.used) - (len(inputs.points) - len(frame.held_out))}
 
 
 def _notes(refiner: Refiner) -> list[str]:

@@ -158,7 +158,7 @@ class Refiner:
         """The frame with the points to use, and the points held out."""
         asked = self.request.hold_out
         used, held_out = split_points(inputs.points, asked.holdout, asked.seed)
-        return inputs.frame().with_points(used), held_out
+        return inputs.frame(used), held_out
 
     @property
     def _propagation(self) -> str:

@@ -19,7 +19,7 @@ from pnpdepth_cli.pipeline.sparse.scan_options import ScanOptions
 
 if TYPE_CHECKING:
     from pnpdepth_cli.io.calibration import Calibration
-    from pnpdepth_cli.io.dataset.frame import Source
+    from pnpdepth_cli.io.dataset.frame import Neighbour, Source
     from pnpdepth_cli.io.dataset.protocols import Protocol
     from pnpdepth_cli.sensors import SamplePattern
 
@@ -42,6 +42,17 @@ def parse_seconds(text: str) -> float:
     if not 0 < seconds < float("inf"):
         raise UsageError(f"time budget {text!r} is not a duration; give seconds, such as 5s")
     return seconds
+
+
+def parse_codes_per_metre(text: str) -> float:
+    """Returns the codes per metre of `256` or `mm`. Raises UsageError for any other text."""
+    try:
+        scale = 1000.0 if text == "mm" else float(text)
+    except ValueError:
+        scale = -1.0
+    if not 0 < scale < float("inf"):
+        raise UsageError(f"--output-scale {text!r} is neither mm nor codes per metre such as 256")
+    return scale
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,6 +90,8 @@ class FrameFiles:
     """Calibration of the camera, where `sparse` is no LiDAR scan and an output needs the camera."""
     camera_number: int | None = None
     """Which camera of `camera_file`."""
+    neighbours: tuple[Neighbour, ...] = ()
+    """Other frames of the sequence, whose points are moved into this one."""
     gt_masks: tuple[Path, ...] = ()
     """Where one of these is 0, the ground truth is unknown."""
     gt_size_ok: bool = False
@@ -293,6 +306,13 @@ class OutputOptions:
         "Format of the depth file in an output folder.",
         choices=choices.FORMATS,
         show_default=True,
+    )
+    output_scale: float | None = option(
+        None,
+        "Codes per metre of a 16-bit PNG; mm is 1000.  [default: as the sparse depth file, else 256"
+        " or what fits]",
+        metavar="mm|S",
+        parse=parse_codes_per_metre,
     )
     ply: bool = option(False, "Also write a coloured point cloud, NAME.ply.")
     fov_deg: float | None = option(

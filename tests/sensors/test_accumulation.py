@@ -1,0 +1,117 @@
+"""Points of neighbouring scans: kept on what stands still, dropped on what moved."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pnpdepth_cli.completion.interpolation import linear
+from pnpdepth_cli.sensors import Camera, NeighbourScan, Points, accumulated
+from pnpdepth_cli.sensors.registration import registered, surface_of
+
+SIZE = (120, 160)
+CAMERA = Camera(intrinsics=np.array([[150.0, 0, 79.5], [0, 150.0, 59.5], [0, 0, 1]]))
+STILL = np.column_stack([np.eye(3), np.zeros(3)])
+
+
+def room(
+    position: tuple[float, float, float], box_x: float | None, seed: int, count: int = 3000
+) -> Points:
+    """What a camera at a position sees: two walls, a floor, and a box 4 m away, if any."""
+    rng = np.random.default_rng(seed)
+    pixels = rng.permutation(SIZE[0] * SIZE[1])[:count]
+    xy = np.column_stack([pixels % SIZE[1], pixels // SIZE[1]]).astype(np.float32)
+    rays = CAMERA.unproject(xy, np.ones(count))
+    shift = np.array(position)
+    depth = depth_of_walls(rays, shift)
+    if box_x is not None:
+        at = rays[:, :2] * (4 - shift[2]) + shift[:2]
+        on_box = (np.abs(at[:, 0] - box_x) < 0.5) & (np.abs(at[:, 1]) < 0.5)
+        depth = np.where(on_box, 4 - shift[2], depth)
+    return Points(xy=xy, depth=depth.astype(np.float32), size=SIZE)
+
+
+def depth_of_walls(rays: NDArray[np.float64], shift: NDArray[np.float64]) -> NDArray[np.float64]:
+    """A wall 8 m ahead, one 2 m to the left, and a floor 1.5 m below the origin."""
+    with np.errstate(divide="ignore"):
+        left = np.where(rays[:, 0] < 0, (-2 - shift[0]) / rays[:, 0], np.inf)
+        floor = np.where(rays[:, 1] > 0, (1.5 - shift[1]) / rays[:, 1], np.inf)
+    return np.minimum(np.minimum(left, floor), 8 - shift[2])
+
+
+def from_ahead(metres: float) -> NDArray[np.float64]:
+    """The motion from a camera that is so far ahead to this one."""
+    motion = STILL.copy()
+    motion[2, 3] = metres
+    return motion
+
+
+def test_moved_points_lie_on_the_surfaces_of_the_frame() -> None:
+    own, ahead = room((0, 0, 0), None, 0), room((0, 0, 0.5), None, 1)
+    both = accumulated(own, [NeighbourScan(points=ahead, motion=from_ahead(0.5), apart=1)], CAMERA)
+    moved = both.xy[len(own) :]
+    expected = depth_of_walls(CAMERA.unproject(moved, np.ones(len(moved))), np.zeros(3))
+    assert len(moved) > 1000
+    assert np.median(np.abs(both.depth[len(own) :] / expected - 1)) < 1e-3
+
+
+def test_the_frames_own_points_come_first_and_unchanged() -> None:
+    own, ahead = room((0, 0, 0), None, 0), room((0, 0, 0.5), None, 1)
+    both = accumulated(own, [NeighbourScan(points=ahead, motion=from_ahead(0.5), apart=1)], CAMERA)
+    assert both.xy[: len(own)].tobytes() == own.xy.tobytes()
+    assert both.depth[: len(own)].tobytes() == own.depth.tobytes()
+
+
+def test_points_of_a_moved_object_are_dropped() -> None:
+    own, later = room((0, 0, 0), -1.0, 0), room((0, 0, 0), 1.0, 1)
+    both = accumulated(own, [NeighbourScan(points=later, motion=STILL, apart=1)], CAMERA)
+    moved, depth = both.xy[len(own) :], both.depth[len(own) :]
+    on_old_box = (np.abs((moved[:, 0] - 79.5) / 150 * 4 - 1) < 0.4) & (
+        np.abs((moved[:, 1] - 59.5) / 150 * 4) < 0.4
+    )
+    assert (later.depth == 4).sum() > 100
+    assert not (depth[on_old_box] < 4.5).any()
+    assert both.dropped["moved, occluded or seen through"] > 100
+
+
+def test_depth_around_a_moved_object_is_about_as_good_as_without_neighbours() -> None:
+    alone: list[float] = []
+    more: list[float] = []
+    for seed in range(6):
+        own, later = room((0, 0, 0), -0.2, seed), room((0, 0, 0), 0.3, seed + 10)
+        held = np.random.default_rng(seed).random(len(own)) < 0.2
+        at = CAMERA.unproject(own.xy, np.full(len(own), 4.0))
+        around = held & (np.abs(at[:, 0]) < 0.9) & (np.abs(at[:, 1]) < 0.6)
+        used, scored = own.select(~held), own.select(around).tensors()
+        both = accumulated(used, [NeighbourScan(points=later, motion=STILL, apart=1)], CAMERA)
+        for errors, points in ((alone, used), (more, both)):
+            depth = linear(points.tensors(), scored.xy)
+            errors.append(float((depth - scored.depth).abs().mean()))
+    assert np.mean(more) < 1.06 * np.mean(alone)
+
+
+def test_a_scan_farther_in_time_gives_way_to_a_nearer_one() -> None:
+    own, one, two = (room((0, 0, 0), None, seed) for seed in range(3))
+    near = NeighbourScan(points=one, motion=STILL, apart=1)
+    far = NeighbourScan(points=two, motion=STILL, apart=2)
+    with_near, with_both = (accumulated(own, each, CAMERA) for each in ([near], [far, near]))
+    kept = with_both.xy[: len(with_near)]
+    assert kept.tobytes() == with_near.xy.tobytes()
+    more = with_both.xy[len(with_near) :]
+    distance = np.linalg.norm(more[:, None] - with_near.xy[None], axis=2).min(axis=1)
+    assert distance.min() >= 2
+
+
+def test_a_wrong_motion_is_corrected_by_the_surfaces() -> None:
+    own, ahead = room((0, 0, 0), -1.0, 0), room((0, 0, 0.5), -1.0, 1)
+    xyz = CAMERA.unproject(ahead.xy, ahead.depth)
+    motion = registered(surface_of(own, CAMERA), xyz, from_ahead(0.6), CAMERA)
+    np.testing.assert_allclose(motion[:, :3], np.eye(3), atol=2e-3)
+    assert abs(motion[2, 3] - 0.5) < 0.01
+
+
+def test_a_motion_is_kept_where_few_points_have_a_plane() -> None:
+    own, ahead = room((0, 0, 0), None, 0, count=60), room((0, 0, 0.5), None, 1, count=60)
+    xyz = CAMERA.unproject(ahead.xy, ahead.depth)
+    motion = registered(surface_of(own, CAMERA), xyz, from_ahead(0.6), CAMERA)
+    assert motion.tobytes() == from_ahead(0.6).tobytes()
