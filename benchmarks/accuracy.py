@@ -6,7 +6,7 @@ every baseline of `pnpdepth_cli.choices.BASELINES`, and `--auto`. The same netwo
 pixels for all: those with known ground truth in the network's crop. `wins` counts frames where
 `--auto` is not above the aligned network, and at most 3 per cent above the frame's best baseline.
 `--outliers 0.2` gives that fraction of the points random depths; the last column is `--auto` on the
-inliers alone, as if the outliers were known. `--sigma` adds the fraction of the ground truth that lies
+inliers alone, as if the outliers were known. `--sigma` adds the fraction of the ground truth
 within ± one standard deviation of `--uncertainty`, which should be 68 %. `--render FOLDER` takes
 frames rendered by this project instead. Nothing was tuned on the real frames.
 """
