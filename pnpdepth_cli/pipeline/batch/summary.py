@@ -172,12 +172,12 @@ def _add(sums: dict[Any, tuple[int, float]], key: Any, value: float | None) -> N
 
 
 def write_summary(path: Path, head: Mapping[str, Any], rows: Iterable[Mapping[str, Any]]) -> None:
-    """Writes the head as JSON, with the rows as its list `frames`, a line each."""
+    """Writes the head as JSON, with the rows, of JSON's own types, as its list `frames`."""
     text = json.dumps(plain(head), indent=2, ensure_ascii=False, allow_nan=False)
     with atomic_path(path) as temporary, _text_file(temporary) as file:
         file.write(text.removesuffix("\n}") + ',\n  "frames": [')
         for number, row in enumerate(rows):
-            line = json.dumps(plain(row), ensure_ascii=False, allow_nan=False)
+            line = json.dumps(row, ensure_ascii=False, allow_nan=False)
             file.write(f"{',' if number else ''}\n    {line}")
         file.write("\n  ]\n}\n")
 

@@ -126,6 +126,7 @@ class WorkerPool:
         *,
         begin: Callable[[Sequence[Any]], None] = lambda items: None,
         stopped: Callable[[], bool] = lambda: False,
+        proven: bool = False,
     ) -> Iterator[list[tuple[Any, Any]]]:
         """Yields the items of each piece with their results, or Lost, as pieces are done.
 
@@ -134,6 +135,7 @@ class WorkerPool:
             items: Sent to the workers.
             begin: Called with items before they are handed out.
             stopped: True if nothing more is to be handed out.
+            proven: Whether an item succeeded before, so that errors are of single items.
 
         Raises:
             PnpDepthError: What concerns all items.
@@ -146,7 +148,7 @@ class WorkerPool:
                 self._open(hand)
         pieces = Pieces(items, self._retries)
         self._unproven: list[tuple[Piece, PnpDepthError]] = []
-        self._proven = False
+        self._proven = proven
         try:
             while True:
                 if stopped():
