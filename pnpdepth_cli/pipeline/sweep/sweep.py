@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
-from itertools import groupby
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from pnpdepth_cli.auto.predictions import SplitCache
 from pnpdepth_cli.errors import (
-    DeviceError,
     InputError,
     PnpDepthError,
-    StorageError,
     UsageError,
 )
 from pnpdepth_cli.io.atomic import make_folder, remove_leftovers
@@ -24,29 +22,32 @@ from pnpdepth_cli.pipeline.batch.batch import Listener
 from pnpdepth_cli.pipeline.batch.frames import Task, find_frames, task_of
 from pnpdepth_cli.pipeline.batch.request import BatchRequest, FrameSelection
 from pnpdepth_cli.pipeline.batch.settings import model_identity
-from pnpdepth_cli.pipeline.refinement.inputs import Inputs, read_inputs
-from pnpdepth_cli.pipeline.refinement.load_refiner import load_refiner
+from pnpdepth_cli.pipeline.cluster.options import ClusterOptions, Spread, spread_of
+from pnpdepth_cli.pipeline.cluster.pool import WorkerPool, worker_pool
 from pnpdepth_cli.pipeline.refinement.method import with_preset
 from pnpdepth_cli.pipeline.refinement.refiner import Refiner
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest
 from pnpdepth_cli.pipeline.refinement.resolve import resolve_layer, resolve_settings
 from pnpdepth_cli.pipeline.sweep.axes import Cell, Study
+from pnpdepth_cli.pipeline.sweep.computing import (
+    FirstFrame,
+    Result,
+    by_frame,
+    results_of_frame,
+    spread_results,
+)
 from pnpdepth_cli.pipeline.sweep.plan import Plan, Run, RunId, Setup, sampling_of
 from pnpdepth_cli.pipeline.sweep.plots import draw_study, need_matplotlib
-from pnpdepth_cli.pipeline.sweep.points import OWN, Sampling, frame_points
-from pnpdepth_cli.pipeline.sweep.running import result_of
+from pnpdepth_cli.pipeline.sweep.points import OWN, Sampling
 from pnpdepth_cli.pipeline.sweep.seeds import over_seeds
 from pnpdepth_cli.pipeline.sweep.state import SweepState
 from pnpdepth_cli.pipeline.sweep.summary import FrameFigures, summarise, write_frames, write_sweep
 from pnpdepth_cli.sensors import SamplePattern
 
-T = TypeVar("T")
 Lines = Mapping[RunId, "dict[str, Any] | None"]
 Model = tuple[str, "Path | None"]
 """A network and its weights, as the user names them."""
 _GROUND_TRUTH_ONLY = SamplePattern(count=1)
-_RESOLVE_POINTS = 500
-"""Points of the ground truth that the definition is resolved on; the paper uses 500 indoors."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,6 +69,8 @@ class SweepRequest(FrameSelection):
     """True to report the time of the refinement beside its error."""
     resamples: int = 2000
     """Bootstrap samples behind the intervals."""
+    cluster: ClusterOptions = field(default_factory=ClusterOptions)
+    """The Ray workers, if any."""
 
     def __post_init__(self) -> None:
         if self.seeds < 1:
@@ -85,6 +88,13 @@ def run_sweep(request: SweepRequest, listener: Listener) -> dict[str, Any]:
     """
     if request.plots:
         need_matplotlib()
+    spread = spread_of(request.refine.network.device, request.cluster)
+    if spread is not None:
+        request = replace(
+            request,
+            refine=request.refine.with_fields(device=spread.device),
+            cluster=replace(request.cluster, ray=spread.address),
+        )
     sampling, tasks = _frames(request, listener)
     make_folder(request.output)
     with locked_folder(request.output, None, lambda: _clean(request.output)):
@@ -101,11 +111,24 @@ def run_sweep(request: SweepRequest, listener: Listener) -> dict[str, Any]:
             f" {len(to_do):,} to do"
         )
         listener.begin(len(to_do))
-        for each in networks.values():
-            own = [run for owner, run in to_do if owner is each]
-            for row in _rows(own, each.refiner, state):
-                listener.frame(row)
+        with _workers(spread if to_do else None, request, listener) as pool:
+            for each in networks.values():
+                own = [run for owner, run in to_do if owner is each]
+                for row in _rows(each, own, state, pool):
+                    listener.frame(row)
         return _write(request, sampling, networks, [task.name for task, _ in tasks], state)
+
+
+@contextmanager
+def _workers(
+    spread: Spread | None, request: SweepRequest, listener: Listener
+) -> Iterator[WorkerPool | None]:
+    """The workers that are asked for; None for this process alone."""
+    if spread is None:
+        yield None
+        return
+    with worker_pool(spread, listener.say, inputs=[request.source]) as pool:
+        yield pool
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -114,6 +137,8 @@ class _Network:
 
     refiner: Refiner
     """The network, loaded."""
+    first: FirstFrame
+    """The frame that its definition was resolved on."""
     base: dict[str, Any]
     """The settings that are not varied."""
     plan: Plan
@@ -159,7 +184,7 @@ def _network(
         (replace(task, request=task.request.with_fields(model=spec, checkpoint=checkpoint)), frame)
         for task, frame in tasks
     ]
-    refiner = _resolved(replace(request, refine=refine), tasks, listener)
+    first, refiner = _resolved(replace(request, refine=refine), tasks, listener)
     definition = refiner.network.definition
     plan = Plan(cells, definition, refine, sampling, request.seeds, model_identity(refine))
     for layer in plan.layers:
@@ -167,6 +192,7 @@ def _network(
             pass  # reports an unknown layer before anything is computed
     return _Network(
         refiner=refiner,
+        first=first,
         base=_base(definition, refine),
         plan=plan,
         runs=tuple(run for task, frame in tasks for run in plan.runs(task, frame)),
@@ -233,24 +259,25 @@ def _given(first: int | None, otherwise: int | None) -> int | None:
 
 def _resolved(
     request: SweepRequest, tasks: Sequence[tuple[Task, Frame]], listener: Listener
-) -> Refiner:
-    """The network, its definition resolved on the first frame that can be read.
+) -> tuple[FirstFrame, Refiner]:
+    """The network, its definition resolved on the first frame that can be read, and that frame.
 
-    Points of the ground truth are used, so that it does not depend on what is varied.
+    Where workers compute, it is loaded here on the CPU, to plan.
     """
     errors = []
     for task, frame in tasks:
+        first = FirstFrame(
+            task=task,
+            frame=frame,
+            seed=request.refine.hold_out.seed,
+            layer=_some_layer(request),
+        )
         try:
-            inputs = read_inputs(task.request)
-            known = 0 if inputs.gt is None else int((inputs.gt > 0).sum())
-            some = Sampling(sensor="uniform", points=str(min(_RESOLVE_POINTS, known)))
-            points = frame_points(some, request.refine.hold_out.seed, inputs, task.request, frame)
+            inputs = first.read()
         except InputError as error:
             errors.append(error)
             continue
-        refiner = load_refiner(
-            task.request.with_fields(layer=_some_layer(request)), replace(inputs, points=points)
-        )
+        refiner = first.load(inputs, device=None if request.cluster.ray is None else "cpu")
         for note in inputs.notes:
             if task.request.files.sample is None or not note.startswith("sparse"):
                 listener.say(f"{task.name}: {note}")
@@ -262,7 +289,7 @@ def _resolved(
             f" {base['iterations']} updates of z ({base['update']}, {base['loss']}, step"
             f" {base['lr']})"
         )
-        return refiner
+        return first, refiner
     raise errors[0]
 
 
@@ -284,45 +311,22 @@ def _base(definition: ModelDefinition, request: RefineRequest) -> dict[str, Any]
     }
 
 
-def _rows(runs: Sequence[Run], refiner: Refiner, state: SweepState) -> Iterator[dict[str, Any]]:
-    """Computes and records each run; yields a row for each. Frames are read once."""
-    with SplitCache(refiner.network) as cache:
-        for _, of_frame in groupby(runs, key=lambda run: run.frame.name):
-            frame_runs = list(of_frame)
-            inputs = _result_or_error(read_inputs, frame_runs[0].task.request)
-            for _, of_points in groupby(frame_runs, key=lambda run: (run.sampling, run.seed)):
-                same_points = list(of_points)
-                failed = isinstance(inputs, PnpDepthError)
-                drawn = inputs if failed else _result_or_error(_drawn, same_points[0], inputs)
-                for run in same_points:
-                    yield _done(run, drawn, cache, state)
+def _rows(
+    each: _Network, runs: Sequence[Run], state: SweepState, pool: WorkerPool | None
+) -> Iterator[dict[str, Any]]:
+    """Computes and records each run; yields a row for each."""
+    if pool is not None:
+        for run, result in spread_results(runs, each.first, pool):
+            yield _recorded(run, result, state)
+        return
+    with SplitCache(each.refiner.network) as cache:
+        for frame_runs in by_frame(runs):
+            for run, result in results_of_frame(frame_runs, cache):
+                yield _recorded(run, result, state)
 
 
-def _result_or_error(read: Callable[..., T], *arguments: Any) -> T | PnpDepthError:
-    """The result, or the error of a frame that cannot be used."""
-    try:
-        return read(*arguments)
-    except (StorageError, DeviceError):
-        raise
-    except PnpDepthError as error:
-        return error
-
-
-def _drawn(run: Run, inputs: Inputs) -> Inputs:
-    """The frame with the run's points."""
-    points = frame_points(run.sampling, run.seed, inputs, run.task.request, run.frame)
-    return replace(inputs, points=points)
-
-
-def _done(
-    run: Run, inputs: Inputs | PnpDepthError, cache: SplitCache, state: SweepState
-) -> dict[str, Any]:
-    """Computes and records the run; returns its row for a listener."""
-    result = (
-        inputs
-        if isinstance(inputs, PnpDepthError)
-        else _result_or_error(result_of, run, inputs, cache)
-    )
+def _recorded(run: Run, result: Result, state: SweepState) -> dict[str, Any]:
+    """Records the run; returns its row for a listener."""
     row = {"name": run.frame.name, "status": "done", "message": None}
     if isinstance(result, PnpDepthError):
         state.fail(run, str(result))
