@@ -130,7 +130,8 @@ def sweep(
     """
     from pnpdepth_cli.pipeline.sweep.axes import read_axis, studies_of
     from pnpdepth_cli.pipeline.sweep.points import read_sampling
-    from pnpdepth_cli.pipeline.sweep.sweep import SweepRequest, run_sweep
+    from pnpdepth_cli.pipeline.sweep.request import SweepRequest
+    from pnpdepth_cli.pipeline.sweep.sweep import run_sweep
 
     own = options.taken(FrameSelection, given)
     request = SweepRequest(

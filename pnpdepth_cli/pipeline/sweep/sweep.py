@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,69 +12,39 @@ from pnpdepth_cli.auto.predictions import SplitCache
 from pnpdepth_cli.errors import (
     InputError,
     PnpDepthError,
-    UsageError,
 )
 from pnpdepth_cli.io.atomic import make_folder, remove_leftovers
 from pnpdepth_cli.io.dataset.frame import Frame
 from pnpdepth_cli.io.lock import locked_folder
-from pnpdepth_cli.models.definition import ModelDefinition
 from pnpdepth_cli.pipeline.batch.batch import Listener
 from pnpdepth_cli.pipeline.batch.frames import Task, find_frames, task_of
-from pnpdepth_cli.pipeline.batch.request import BatchRequest, FrameSelection
-from pnpdepth_cli.pipeline.batch.settings import model_identity
-from pnpdepth_cli.pipeline.cluster.options import ClusterOptions, Spread, spread_of
+from pnpdepth_cli.pipeline.batch.request import BatchRequest
+from pnpdepth_cli.pipeline.cluster.options import Spread, spread_of
 from pnpdepth_cli.pipeline.cluster.pool import WorkerPool, worker_pool
-from pnpdepth_cli.pipeline.refinement.method import with_preset
-from pnpdepth_cli.pipeline.refinement.refiner import Refiner
-from pnpdepth_cli.pipeline.refinement.request import RefineRequest
-from pnpdepth_cli.pipeline.refinement.resolve import resolve_layer, resolve_settings
-from pnpdepth_cli.pipeline.sweep.axes import Cell, Study
 from pnpdepth_cli.pipeline.sweep.computing import (
-    FirstFrame,
     Result,
     by_frame,
     results_of_frame,
     spread_results,
 )
-from pnpdepth_cli.pipeline.sweep.plan import Plan, Run, RunId, Setup, sampling_of
+from pnpdepth_cli.pipeline.sweep.networks import (
+    Model,
+    SweptNetwork,
+    model_of,
+    models_of,
+    swept_network,
+)
+from pnpdepth_cli.pipeline.sweep.plan import Run, RunId, Setup, sampling_of
 from pnpdepth_cli.pipeline.sweep.plots import draw_study, need_matplotlib
 from pnpdepth_cli.pipeline.sweep.points import OWN, Sampling
+from pnpdepth_cli.pipeline.sweep.request import SweepRequest
 from pnpdepth_cli.pipeline.sweep.seeds import over_seeds
 from pnpdepth_cli.pipeline.sweep.state import SweepState
 from pnpdepth_cli.pipeline.sweep.summary import FrameFigures, summarise, write_frames, write_sweep
 from pnpdepth_cli.sensors import SamplePattern
 
 Lines = Mapping[RunId, "dict[str, Any] | None"]
-Model = tuple[str, "Path | None"]
-"""A network and its weights, as the user names them."""
 _GROUND_TRUTH_ONLY = SamplePattern(count=1)
-
-
-@dataclass(frozen=True, kw_only=True)
-class SweepRequest(FrameSelection):
-    """What to vary, over which frames."""
-
-    studies: Sequence[Study]
-    """As `studies_of` returns them."""
-    sampling: Sampling | None = None
-    """Where points come from unless that is varied; None for the frames' own, or else the ground
-    truth."""
-    seeds: int = 1
-    """Draws of the points, with consecutive seeds."""
-    plots: bool = True
-    """True to write a plot of each study."""
-    plot_format: str = "png"
-    """One of PLOT_FORMATS."""
-    cost: bool = False
-    """True to report the time of the refinement beside its error."""
-    resamples: int = 2000
-    """Bootstrap samples behind the intervals."""
-    cluster: ClusterOptions = field(default_factory=ClusterOptions)
-    """The Ray workers, if any."""
-
-    def __post_init__(self) -> None:
-        if self.seeds < 1:
-            raise UsageError(f"seeds {self.seeds}: the points have to be drawn once at least")
 
 
 def run_sweep(request: SweepRequest, listener: Listener) -> dict[str, Any]:
@@ -102,7 +72,8 @@ def run_sweep(request: SweepRequest, listener: Listener) -> dict[str, Any]:
         for note in state.notes():
             listener.say(note)
         networks = {
-            model: _network(model, request, sampling, tasks, listener) for model in _models(request)
+            model: swept_network(model, request, sampling, tasks, listener)
+            for model in models_of(request)
         }
         runs = [(each, run) for each in networks.values() for run in each.runs]
         to_do = [(each, run) for each, run in runs if not state.is_done(run)]
@@ -129,74 +100,6 @@ def _workers(
         return
     with worker_pool(spread, listener.say, inputs=[request.source]) as pool:
         yield pool
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Network:
-    """A network of the sweep and its runs."""
-
-    refiner: Refiner
-    """The network, loaded."""
-    first: FirstFrame
-    """The frame that its definition was resolved on."""
-    base: dict[str, Any]
-    """The settings that are not varied."""
-    plan: Plan
-    """What its cells need."""
-    runs: tuple[Run, ...]
-    """Of all frames."""
-
-
-def _models(request: SweepRequest) -> list[Model]:
-    """The networks of the cells, each once; one in most sweeps."""
-    cells = [cell for study in request.studies for cell in study.cells()]
-    return list(dict.fromkeys(_model_of(cell, request) for cell in cells))
-
-
-def _model_of(cell: Cell, request: SweepRequest) -> Model:
-    """The network of a cell, varied as `NETWORK` or `NETWORK@WEIGHTS`, and its weights."""
-    network = request.refine.network
-    if "model" not in cell:
-        return network.model, network.checkpoint
-    spec, at, weights = cell["model"].partition("@")
-    if not at and network.checkpoint is not None:
-        raise UsageError("--checkpoint is of one network; vary model=NETWORK@WEIGHTS instead")
-    return spec, Path(weights) if at else None
-
-
-def _network(
-    model: Model,
-    request: SweepRequest,
-    sampling: Sampling,
-    tasks: Sequence[tuple[Task, Frame]],
-    listener: Listener,
-) -> _Network:
-    """The network, loaded, and the runs of its cells."""
-    spec, checkpoint = model
-    cells = [
-        cell
-        for study in request.studies
-        for cell in study.cells()
-        if _model_of(cell, request) == model
-    ]
-    refine = request.refine.with_fields(model=spec, checkpoint=checkpoint)
-    tasks = [
-        (replace(task, request=task.request.with_fields(model=spec, checkpoint=checkpoint)), frame)
-        for task, frame in tasks
-    ]
-    first, refiner = _resolved(replace(request, refine=refine), tasks, listener)
-    definition = refiner.network.definition
-    plan = Plan(cells, definition, refine, sampling, request.seeds, model_identity(refine))
-    for layer in plan.layers:
-        with refiner.network.cut_at(layer):
-            pass  # reports an unknown layer before anything is computed
-    return _Network(
-        refiner=refiner,
-        first=first,
-        base=_base(definition, refine),
-        plan=plan,
-        runs=tuple(run for task, frame in tasks for run in plan.runs(task, frame)),
-    )
 
 
 def _clean(output: Path) -> None:
@@ -257,62 +160,8 @@ def _given(first: int | None, otherwise: int | None) -> int | None:
     return otherwise if first is None else first
 
 
-def _resolved(
-    request: SweepRequest, tasks: Sequence[tuple[Task, Frame]], listener: Listener
-) -> tuple[FirstFrame, Refiner]:
-    """The network, its definition resolved on the first frame that can be read, and that frame.
-
-    Where workers compute, it is loaded here on the CPU, to plan.
-    """
-    errors = []
-    for task, frame in tasks:
-        first = FirstFrame(
-            task=task,
-            frame=frame,
-            seed=request.refine.hold_out.seed,
-            layer=_some_layer(request),
-        )
-        try:
-            inputs = first.read()
-        except InputError as error:
-            errors.append(error)
-            continue
-        refiner = first.load(inputs, device=None if request.cluster.ray is None else "cpu")
-        for note in inputs.notes:
-            if task.request.files.sample is None or not note.startswith("sparse"):
-                listener.say(f"{task.name}: {note}")
-        for note in refiner.network.notes:
-            listener.say(note)
-        base = _base(refiner.network.definition, request.refine)
-        listener.say(
-            f"network: {refiner.network.definition.name}; where not varied: cut at {base['layer']},"
-            f" {base['iterations']} updates of z ({base['update']}, {base['loss']}, step"
-            f" {base['lr']})"
-        )
-        return first, refiner
-    raise errors[0]
-
-
-def _some_layer(request: SweepRequest) -> str | None:
-    """A layer of the study or of the request, as a network may have no default."""
-    axes = [axis for study in request.studies for axis in study.axes if axis.name == "layer"]
-    return axes[0].values[0] if axes else request.refine.method.layer
-
-
-def _base(definition: ModelDefinition, request: RefineRequest) -> dict[str, Any]:
-    """The settings that are not varied."""
-    method = with_preset(request.method)
-    settings = resolve_settings(definition, method)
-    layer = method.layer or definition.default_layer
-    return {
-        "layer": None if layer is None else resolve_layer(definition, layer),
-        **asdict(settings),
-        "propagate": method.propagate or "none",
-    }
-
-
 def _rows(
-    each: _Network, runs: Sequence[Run], state: SweepState, pool: WorkerPool | None
+    each: SweptNetwork, runs: Sequence[Run], state: SweepState, pool: WorkerPool | None
 ) -> Iterator[dict[str, Any]]:
     """Computes and records each run; yields a row for each."""
     if pool is not None:
@@ -340,7 +189,7 @@ def _recorded(run: Run, result: Result, state: SweepState) -> dict[str, Any]:
 def _write(
     request: SweepRequest,
     sampling: Sampling,
-    networks: Mapping[Model, _Network],
+    networks: Mapping[Model, SweptNetwork],
     names: Sequence[str],
     state: SweepState,
 ) -> dict[str, Any]:
@@ -354,7 +203,7 @@ def _write(
     for study in request.studies:
         cells = []
         for cell in study.cells():
-            model = _model_of(cell, request)
+            model = model_of(cell, request)
             plan = networks[model].plan
             figures = _figures(plan.setup(cell), names, lines[model])
             summary = summarise(figures, request.resamples, cost=request.cost)
