@@ -282,6 +282,12 @@ def test_a_sweep_that_was_killed_goes_on_and_ends_the_same(root: Path, after: in
     assert resumed["studies"] == sweep(root, *vary, output=root / "other")["studies"]
 
 
+def test_a_formula_as_a_name_is_text_in_the_tables(tmp_path: Path) -> None:
+    root = pairs_on_disk(tmp_path / "drive", ("=1+1", "b"))
+    sweep(root, "iterations=0")
+    assert [row["frame"] for row in lines(root / "out/sweep_frames.csv")] == ["'=1+1", "b"]
+
+
 def test_an_edited_line_of_the_journal_is_computed_again(root: Path) -> None:
     undisturbed = sweep(root, "iterations=0,2")
     path = root / "out/sweep.jsonl"
