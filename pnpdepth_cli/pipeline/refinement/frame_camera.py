@@ -66,8 +66,10 @@ class FrameCamera:
         intrinsics = np.array(entry["intrinsics"], np.float64).reshape(3, 3)
         distortion = tuple(float(each) for each in entry["distortion"])
         pose = None if entry["pose"] is None else np.array(entry["pose"], float).reshape(3, 4)
-        numbers = [intrinsics, distortion, () if pose is None else pose]
-        if not all(np.isfinite(each).all() for each in numbers) or entry["lens"] not in LENSES:
+        numbers = np.concatenate(
+            [intrinsics.ravel(), distortion, [] if pose is None else pose.ravel()]
+        )
+        if not np.isfinite(numbers).all() or entry["lens"] not in LENSES:
             raise ValueError("no camera has these numbers")
         if min(intrinsics[0, 0], intrinsics[1, 1]) <= 0 or intrinsics[2].tolist() != [0, 0, 1]:
             raise ValueError("no camera has these intrinsics")
