@@ -36,9 +36,10 @@ from pnpdepth_cli.pipeline.sweep import plots as sweep_plots
 from pnpdepth_cli.pipeline.sweep.axes import PARAMETERS, read_axis, studies_of
 from pnpdepth_cli.pipeline.sweep.plan import Method
 from pnpdepth_cli.pipeline.sweep.points import Sampling, frame_points, read_sampling
+from pnpdepth_cli.pipeline.sweep.request import SweepRequest
 from pnpdepth_cli.pipeline.sweep.running import refined_curve
 from pnpdepth_cli.pipeline.sweep.summary import FrameFigures, summarise
-from pnpdepth_cli.pipeline.sweep.sweep import SweepRequest, run_sweep
+from pnpdepth_cli.pipeline.sweep.sweep import run_sweep
 from pnpdepth_cli.sensors import (
     FORWARD_LEFT_UP,
     LIDARS,
