@@ -18,9 +18,8 @@ from pnpdepth_cli.io.file_bytes import damaged, read_bytes
 
 _HEADER_BYTES = 128
 _TYPES = {
-    **{1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4"},
-    **{7: "f4", 9: "f8", 12: "i8", 13: "u8"},
-}
+    1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8",
+}  # fmt: skip
 _MATRIX, _COMPRESSED = 14, 15
 _MOST_BYTES = 1 << 20
 """Of a decompressed variable."""
