@@ -76,7 +76,10 @@ def worker_pool(
         shared = list(inputs)
         if output is not None:
             shared.append(stack.enter_context(_probe(output.absolute())))
-        pool = WorkerPool(stack.enter_context(connected(spread)), spread, shared, say)
+        cluster = stack.enter_context(connected(spread))
+        each = "a GPU" if spread.device == "cuda" else f"{spread.options.cpus_per_worker} CPU cores"
+        say(f"cluster: starting {cluster.workers:,} workers of {each} each")
+        pool = WorkerPool(cluster, spread, shared, say)
         stack.callback(pool.close)
         yield pool
 
