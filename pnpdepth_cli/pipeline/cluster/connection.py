@@ -123,9 +123,8 @@ def _planned(ray: ModuleType, spread: Spread) -> Cluster:
     wanted = options.ray_workers or len(spread.indices) or there
     if wanted > there or not there:
         where = "this machine" if spread.address == LOCAL else f"Ray cluster {spread.address!r}"
-        each = "a GPU" if spread.device == "cuda" else f"{cpus} CPU cores"
         raise ClusterError(
-            f"{where} has devices for {there} workers of {each} each, and {max(1, wanted)} are"
-            " asked for; change --device, --ray-workers or --cpus-per-worker"
+            f"{where} has devices for {there} Ray workers with {spread.each} each, and"
+            f" {max(1, wanted)} asked for; change --device, --ray-workers or --cpus-per-worker"
         )
     return Cluster(ray=ray, workers=wanted, resources=resources)

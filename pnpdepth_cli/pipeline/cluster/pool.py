@@ -77,8 +77,7 @@ def worker_pool(
         if output is not None:
             shared.append(stack.enter_context(_probe(output.absolute())))
         cluster = stack.enter_context(connected(spread))
-        each = "a GPU" if spread.device == "cuda" else f"{spread.options.cpus_per_worker} CPU cores"
-        say(f"cluster: starting {cluster.workers:,} workers of {each} each")
+        say(f"Ray workers: starting {cluster.workers:,}, each with {spread.each}")
         pool = WorkerPool(cluster, spread, shared, say)
         stack.callback(pool.close)
         yield pool
