@@ -87,7 +87,8 @@ def _check_answers(address: str) -> None:
     try:
         with socket.create_connection((host, int(port)), timeout=_CONNECT_S) as server:
             server.sendall(_HTTP2_PREFACE)
-            frame = server.recv(9)
+            with server.makefile("rb") as answer:
+                frame = answer.read(9)
     except (OSError, OverflowError) as error:
         reason = one_line(getattr(error, "strerror", None) or error).lower()
         raise ClusterError(
