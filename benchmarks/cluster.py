@@ -298,7 +298,7 @@ def waited(root: Path, workers: int, job: WaitingJob, seconds: float) -> dict[st
     def begin(begun: Sequence[str]) -> None:
         journal.append(*({"frame": name, "state": "begun"} for name in begun))
 
-    with worker_pool(spread, root, lambda text: None) as pool:
+    with worker_pool(spread, print, inputs=[root]) as pool:
         while sum(1 for _ in pool.figures()) < workers:
             pool.call(time.sleep, 0.1)
             list(pool.results(job, names[:1]))

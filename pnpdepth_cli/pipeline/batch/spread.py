@@ -72,7 +72,8 @@ def spread_rows(
     """
     state = run.state
     assert isinstance(state, BatchState)
-    with worker_pool(spread, state.output, run.say) as pool, run.profile.wall():
+    shared = worker_pool(spread, run.say, inputs=[request.source], output=state.output)
+    with shared as pool, run.profile.wall():
         deciding = _deciding(request, frames, pool)
         job = RefineJob(request=request, model=state.model, deciding=deciding)
         for part in pool.results(

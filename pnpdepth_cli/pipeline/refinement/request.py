@@ -144,7 +144,7 @@ class NetworkChoice:
     )
     device: str = option(
         "cpu",
-        "cpu, cuda, cuda:1, mps, …; batch also takes several, cuda:0,cuda:1, or all.",
+        "cpu, cuda, cuda:1, mps, …; batch and sweep also take several, cuda:0,cuda:1, or all.",
         metavar="NAME",
         show_default=True,
     )

@@ -621,6 +621,13 @@ def test_baselines_are_in_the_summary_the_table_the_csv_and_the_report(
     assert "Simple baselines: means over frames" in (report / "index.html").read_text()
 
 
+def test_a_formula_as_a_name_is_text_in_the_summary(tmp_path: Path) -> None:
+    root = pairs_on_disk(tmp_path / "drive", ("=1+1", "@b"))
+    batch(root)
+    with (root / "out/summary.csv").open(newline="") as file:
+        assert [row["name"] for row in csv.DictReader(file)] == ["'=1+1", "'@b"]
+
+
 def test_digests_of_consecutive_frames_are_those_of_each_alone(root: Path) -> None:
     base = refinement(root)
     requests = [
