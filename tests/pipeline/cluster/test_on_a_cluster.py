@@ -29,6 +29,7 @@ from tests.pipeline.batches import Heard, add_frame, batch, pairs_on_disk, refin
 from tests.pipeline.cluster.nodes import three_nodes
 
 pytest.importorskip("ray")
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="nodes are addresses of loopback")
 NAMES = tuple(f"f{number:02}" for number in range(12))
 TABLES = ("sweep.csv", "sweep_frames.csv", "sweep.tex")
 DEADLY = "        if float(rgb.mean()) > 0.99:\n            import os\n            os._exit(1)\n"
