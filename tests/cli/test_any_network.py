@@ -11,7 +11,7 @@ import torch
 from safetensors.torch import load_file
 from torch import nn
 
-from tests.cli.test_commands import code_of, frame, refine
+from tests.cli.test_commands import code_of
 from tests.pipeline.frames import FrameOnDisk
 
 __all__ = ["frame"]
