@@ -50,7 +50,7 @@ _STOPPING = b"\nfinishing the current frame; press Ctrl-C again to stop at once\
             *("--layout", "--protocol", "--sample", "--limit", "--shard"),
             *("--image-topic", "--points-topic", "--tolerance"),
         ),
-        "Sequences": ("--accumulate", "--poses"),
+        "Sequences": ("--accumulate", "--poses", "--warm-start"),
         "Input": (*grouped_help.LIDAR, *grouped_help.COLMAP, *grouped_help.FILE_READING),
         "Network": grouped_help.NETWORK,
         "Method": grouped_help.METHOD,

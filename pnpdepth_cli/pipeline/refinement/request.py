@@ -81,6 +81,9 @@ class FrameFiles:
     """Which camera of `camera_file`."""
     neighbours: tuple[Neighbour, ...] = ()
     """Other frames of the sequence, whose points are moved into this one."""
+    window: tuple[str, ...] = ()
+    """Names of the frames of its window up to this one, which may begin where the last but one
+    ended. Empty for a frame outside of windows."""
     gt_masks: tuple[Path, ...] = ()
     """Where one of these is 0, the ground truth is unknown."""
     gt_size_ok: bool = False
