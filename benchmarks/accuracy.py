@@ -5,8 +5,8 @@ each frame's error: the network as it is, aligned with the points, refined at th
 every baseline of `pnpdepth_cli.choices.BASELINES`, and `--auto`. The same network, points and
 pixels for all: those with known ground truth in the network's crop. `wins` counts frames where
 `--auto` is not above the aligned network, and at most 3 per cent above the frame's best baseline.
-`--outliers 0.2` puts so many points at random depths; the last column is `--auto` given the others
-alone, as if the outliers were known. `--sigma` adds the fraction of the ground truth that lies
+`--outliers 0.2` gives that fraction of the points random depths; the last column is `--auto` on the
+inliers alone, as if the outliers were known. `--sigma` adds the fraction of the ground truth
 within ± one standard deviation of `--uncertainty`, which should be 68 %. `--render FOLDER` takes
 frames rendered by this project instead. Nothing was tuned on the real frames.
 """
@@ -141,7 +141,7 @@ def measure(
         "paper": torch.from_numpy(refined(network, layer, paper, inputs).after),
         "tuned": torch.from_numpy(refined(network, layer, settings, inputs).after),
     }
-    depths |= {name: made.depth(points, prediction) for name, made in BASELINES.items()}
+    depths |= {name: baseline.depth(points, prediction) for name, baseline in BASELINES.items()}
     start = time.perf_counter()
     auto = chosen(network, inputs)
     auto_s = time.perf_counter() - start

@@ -108,7 +108,7 @@ def main() -> None:
     parser.add_argument("--size", default="48x64", help="HxW")
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--model", default="compact")
-    parser.add_argument("--batch-size", type=int, help="auto if not given")
+    parser.add_argument("--batch-size", type=int, help="default: auto")
     parser.add_argument("--html", action="store_true", help="with a report")
     parser.add_argument("--json", action="store_true")
     args = parser.parse_args()

@@ -2,10 +2,10 @@
 
 Per set and number of points: nearest and linear interpolation of the points, the network's plain
 prediction, and refinement with the definition's defaults; the same points and the same pixels
-(all with known truth) for each. Mean over frames of the per-frame MAE and RMSE.
+(all with known ground truth) for each. Mean over frames of the per-frame MAE and RMSE.
 
-With `--fusion` the network's plain prediction is measured in other ways: with the depth of another
-network as prior (`--prior`), with a useless prior, and with a fifth of the points wrong.
+With `--fusion` only the network's plain prediction is measured: with the depth of another network
+as prior (`--prior`), with an unrelated prior, and with 20 % outliers among the points.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ METHODS = ("nearest", "linear", "plain", "refined")
 
 @dataclass(frozen=True)
 class Settings:
-    """What `pnpdepth refine` would be given."""
+    """Options of `pnpdepth refine`."""
 
     layer: str | None
     iterations: int | None
@@ -82,8 +82,8 @@ def measure_frame(
         "plain": torch.from_numpy(result.before),
         "refined": torch.from_numpy(result.after),
     }
-    truth = torch.from_numpy(frame.gt)
-    scores = {name: score(depth, truth) for name, depth in depths.items()}
+    ground_truth = torch.from_numpy(frame.gt)
+    scores = {name: score(depth, ground_truth) for name, depth in depths.items()}
     return {name: (s.mae, s.rmse) for name, s in scores.items()}
 
 
@@ -114,7 +114,7 @@ def measure_cell(
 def measure_fusion(
     network: Network, prior: Network | None, frame: EvalFrame, count: int | None, seed: int
 ) -> dict[str, tuple[float, float]]:
-    """(MAE, RMSE) of the plain prediction with and without priors and wrong points."""
+    """(MAE, RMSE) of the plain prediction with and without priors and outliers."""
     rows, columns, depth = frame_pixels(frame, count, seed)
     shape = frame.gt.shape
     points = points_on_grid(rows, columns, depth, shape)
@@ -123,18 +123,18 @@ def measure_fusion(
     sparse = np.zeros_like(frame.gt)
     sparse[rows, columns] = depth
     useless = torch.from_numpy(nonsense(rng, shape, frame.gt[::-1, ::-1].copy()))
-    wrong = points_on_grid(rows, columns, outliers(rng, sparse, 0.2)[rows, columns], shape)
+    with_outliers = points_on_grid(rows, columns, outliers(rng, sparse, 0.2)[rows, columns], shape)
     depths = {
         "linear": linear(points),
         "plain": predicted(network, rgb, points),
         "useless prior": predicted(network, rgb, points, aligned(useless, points, kind="median")),
-        "a fifth wrong": predicted(network, rgb, wrong),
+        "20 % outliers": predicted(network, rgb, with_outliers),
     }
     if prior is not None:
         dense = aligned(predicted(prior, rgb, points), points, kind="median")
         depths |= {"prior alone": dense, "with prior": predicted(network, rgb, points, dense)}
-    truth = torch.from_numpy(frame.gt)
-    scores = {name: score(depth, truth) for name, depth in depths.items()}
+    ground_truth = torch.from_numpy(frame.gt)
+    scores = {name: score(depth, ground_truth) for name, depth in depths.items()}
     return {name: (s.mae, s.rmse) for name, s in scores.items()}
 
 
@@ -161,7 +161,7 @@ def predicted(
 def print_fusion(
     network: Network, prior: Network | None, cell: str, frames: list[EvalFrame], count: int | None
 ) -> None:
-    """Lines of a Markdown table, one for each way of a cell."""
+    """Prints rows of a Markdown table, one per variant of the input."""
     results = [measure_fusion(network, prior, frame, count, seed=0) for frame in frames]
     for name in results[0]:
         mae, rmse = np.array([result[name] for result in results]).mean(0)
@@ -176,7 +176,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=1)
     parser.add_argument("--every", type=int, default=1, help="use every n-th frame")
     parser.add_argument("--first", type=int, default=0, help="number of the first frame")
-    parser.add_argument("--fusion", action="store_true", help="priors and wrong points instead")
+    parser.add_argument("--fusion", action="store_true", help="priors and outliers instead")
     parser.add_argument("--prior", help="network whose prediction is the prior of --fusion")
     parser.add_argument("--layer")
     parser.add_argument("--iterations", type=int)

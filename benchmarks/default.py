@@ -140,7 +140,7 @@ def table_row(cell: Case, measured: dict[str, object]) -> str:
 
 
 def frames_of(name: str, data: Path, half: str, count: int) -> list[EvalFrame]:
-    """So many frames of one half of a set, evenly spread."""
+    """`count` evenly spaced frames of one half of a set."""
     frames = list(SETS[name](data))[{"even": 0, "odd": 1}[half] :: 2]
     return [frames[round(i)] for i in np.linspace(0, len(frames) - 1, min(count, len(frames)))]
 

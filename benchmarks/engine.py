@@ -249,7 +249,7 @@ def main() -> None:
     print(
         f"{platform.processor() or platform.machine()}, {torch.get_num_threads()} threads,"
         f" torch {torch.__version__}, fp32, K = {ITERATIONS}, {args.runs} runs, medians; in units"
-        " of a forward pass unless said\n"
+        " of a forward pass unless noted\n"
     )
     print_rows(results)
 

@@ -130,8 +130,8 @@ def latefusion_front(network: LateFusion, rgb: Tensor, sparse: Tensor) -> Any:
 
 def latefusion_rear(network: LateFusion, z: Tensor, kept: Any) -> Tensor:
     image, points, size = kept
-    for place, level in enumerate(LEVELS[2:], start=1):
-        z = network.decoder[level](z, image[-place], points[-place])
+    for index, level in enumerate(LEVELS[2:], start=1):
+        z = network.decoder[level](z, image[-index], points[-index])
     x = F.interpolate(network.inverse(z), size, mode="bilinear", align_corners=False)
     return 1 / (F.softplus(x) + 1 / FARTHEST)
 

@@ -28,8 +28,8 @@ from pnpdepth_cli.pipeline.refinement.resolve import is_dense, resolve_layer, re
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.sensors import occluded_in_map
 
-_WRONG_FACTORS = (0.3, 3.0)
-"""Range of the factor on the depth of wrong points."""
+_OUTLIER_FACTORS = (0.3, 3.0)
+"""Range of the factor on the depth of outliers."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,7 +47,7 @@ class Row:
 
 
 def inputs_of(
-    data: Path, name: str, count: int | None, seed: int, *, frames: int, wrong: float
+    data: Path, name: str, count: int | None, seed: int, *, frames: int, outlier_fraction: float
 ) -> Iterator[Inputs]:
     """Yields evenly spaced frames among every second one, with this seed's points."""
     every_second = list(SETS[name](data))[1::2]
@@ -55,9 +55,9 @@ def inputs_of(
     for frame in (every_second[index] for index in chosen):
         rows, columns, depth = frame_pixels(frame, count, seed)
         rng = np.random.default_rng(seed)
-        bad = rng.random(len(depth)) < wrong
-        factors = np.exp(rng.uniform(*np.log(_WRONG_FACTORS), len(depth)))
-        depth = np.where(bad, depth * factors, depth).astype(np.float32)
+        outlier = rng.random(len(depth)) < outlier_fraction
+        factors = np.exp(rng.uniform(*np.log(_OUTLIER_FACTORS), len(depth)))
+        depth = np.where(outlier, depth * factors, depth).astype(np.float32)
         points = points_on_grid(rows, columns, depth, frame.gt.shape)
         if count is None:  # as the program does with a projected scan
             xy, depth = points.xy.numpy(), points.depth.numpy()
@@ -116,7 +116,9 @@ def main() -> None:
     parser.add_argument("--lr", help="Step size of the hidden points.")
     parser.add_argument("--scale", type=float, help="Of the image during their steps.")
     parser.add_argument("--only", nargs="*", help="Names of methods.")
-    parser.add_argument("--wrong", type=float, default=0.0, help="Fraction of wrong points.")
+    parser.add_argument(
+        "--wrong", dest="outlier_fraction", type=float, default=0.0, help="Fraction of outliers."
+    )
     args = parser.parse_args()
     network = load_network(args.model, None)
     print("| set, points | frames | method | MAE | RMSE | CPU s | kept | worse |")
@@ -130,7 +132,9 @@ def _measure_set(args: argparse.Namespace, network: Network, name: str, count: i
     cases = [
         (inputs, seed)
         for seed in range(args.seeds if count else 1)
-        for inputs in inputs_of(args.data, name, count, seed, frames=args.frames, wrong=args.wrong)
+        for inputs in inputs_of(
+            args.data, name, count, seed, frames=args.frames, outlier_fraction=args.outlier_fraction
+        )
     ]
     label = f"{name}, {count or 'LiDAR'}"
     shown_plain = False

@@ -129,7 +129,7 @@ class ViTDepth(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         self.patches = nn.Conv2d(3, 384, 14, 14)
-        self.place = nn.Parameter(torch.randn(1, 28 * 37, 384) * 0.02)
+        self.positions = nn.Parameter(torch.randn(1, 28 * 37, 384) * 0.02)
         self.blocks = nn.ModuleList(TransformerBlock() for _ in range(12))
         widths = (48, 96, 192, 384)
         self.reassemble = nn.ModuleList(nn.Conv2d(384, width, 1) for width in widths)
@@ -151,7 +151,7 @@ class ViTDepth(nn.Module):
         )
 
     def front(self, x: Tensor) -> Any:
-        tokens = self.patches(x).flatten(2).transpose(1, 2) + self.place
+        tokens = self.patches(x).flatten(2).transpose(1, 2) + self.positions
         maps = []
         for index, block in enumerate(self.blocks):
             tokens = block(tokens)

@@ -18,8 +18,8 @@ TITLES = ("RMSE", "MAE", "MRE", "δ1", "δ2", "δ3")
 STATES = {"paper": "the paper's setting", "tuned": "our setting"}
 PUBLISHED = "published"
 COLOURS = {PUBLISHED: "0.7", STATES["paper"]: "tab:orange", STATES["tuned"]: "tab:blue"}
-SMALL_MOVE = 0.02  # of z's spread, by all steps together: no more than a rounding of the features
-LARGE_STEP = 0.1  # of z's spread, by one step
+SMALL_MOVE = 0.02  # of std(z), by all steps together: comparable to rounding errors of the features
+LARGE_STEP = 0.1  # of std(z), by one step
 
 
 def markdown(table: Table) -> str:
@@ -101,11 +101,11 @@ def _cells(
 ) -> str:
     """Six cells; with the gains over `before` in per cent, the first as printed."""
     cells = []
-    for place, name in enumerate(MEASURES):
+    for column, name in enumerate(MEASURES):
         if name in ERRORS:
             gain = f" ({_gain(values[name], before[name])})" if before else ""
-            if place < len(printed):
-                gain = f" ({printed[place]:+.1f} %)"
+            if column < len(printed):
+                gain = f" ({printed[column]:+.1f} %)"
             cells.append(f"{values[name]:.4f}{gain}")
         else:
             cells.append("†" if fine else f"{values[name]:.1f}")
@@ -163,33 +163,33 @@ def _steps(rows: Sequence[Result]) -> str:
 
 def remarks(rows: Sequence[Result]) -> list[str]:
     """For how many MAE falls; where not, and why; alignments, pixels not scored, divergence."""
-    notes_found = [
+    notes = [
         f"MAE falls for {_count(rows, state, 'before')} at {STATES[state]}" for state in STATES
     ]
     below = _count(rows, "tuned", "linear")
-    notes_found.append(f"at our setting, MAE is below that of the points interpolated for {below}")
+    notes.append(f"at our setting, MAE is below that of the points interpolated for {below}")
     for row in rows:
         if row["aligned"]:
             kinds = ", ".join(f"{kind} in {count}" for kind, count in row["aligned"].items())
-            notes_found.append(
+            notes.append(
                 f"`{row['network']}` does not give metres: its output is aligned with the same"
                 f" points, once for before and after alike ({kinds} frames)"
             )
         for state, title in STATES.items():
             gain = row["settings"][state]["gains"]["mae"]
             if gain <= 0:
-                notes_found.append(
+                notes.append(
                     f"`{row['network']}`: {title} does not improve MAE ({gain:+.2f} %): "
                     + reason(row, state)
                 )
         if row["coverage"] < 0.9995:
-            notes_found.append(
+            notes.append(
                 f"`{row['network']}`: {100 * (1 - row['coverage']):.2f} % of the pixels with known"
                 " ground truth have no positive depth before or after, and are not scored"
             )
         if row["diverged"]:
-            notes_found.append(f"`{row['network']}`: {row['diverged']} refinements diverged")
-    return notes_found
+            notes.append(f"`{row['network']}`: {row['diverged']} refinements diverged")
+    return notes
 
 
 def _count(rows: Sequence[Result], state: str, other: str) -> str:
@@ -239,8 +239,8 @@ def plot(tables: Sequence[Table], path: Path) -> None:
         width = 0.8 / len(bars)
         for number, (title, heights) in enumerate(bars.items()):
             offset = (number - (len(bars) - 1) / 2) * width
-            places = [place + offset for place in range(len(heights))]
-            drawn[title] = axes.bar(places, heights, width, color=COLOURS[title], label=title)
+            positions = [index + offset for index in range(len(heights))]
+            drawn[title] = axes.bar(positions, heights, width, color=COLOURS[title], label=title)
         labels = [f"{row['network']}\n{row['points']:.0f} points" for row in table["rows"]]
         axes.set_xticks(range(len(labels)), labels, fontsize=8)
         axes.axhline(0, color="black", linewidth=0.8)

@@ -101,7 +101,7 @@ def scores_of(depths: dict[str, Depth], gt: Depth) -> tuple[dict[str, dict[str, 
 
 
 def frame_figures(entry: Entry, frame: TableFrame, number: int) -> dict[str, Any]:
-    """What one frame shows of a network: its scores, the loss at the points, the spread of z."""
+    """Scores of a network on one frame, the loss at the points and the standard deviation of z."""
     frame = frame.cut_by(entry.row.cut)
     points = frame.points(entry.row.points, number)
     inputs = frame_inputs(frame.rgb, points, frame.gt)
@@ -112,14 +112,14 @@ def frame_figures(entry: Entry, frame: TableFrame, number: int) -> dict[str, Any
         results["paper"] if same else refined(entry.network, *entry.settings["tuned"], inputs)
     )
     # A step of 100 % is what the engine takes for the standard deviation of z_0.
-    spread = refined(entry.network, layer, replace(paper, iterations=0, lr="100%"), inputs)
+    unmoved = refined(entry.network, layer, replace(paper, iterations=0, lr="100%"), inputs)
     depths = {"linear": linear(points).numpy(), "before": results["paper"].before}
     depths |= {state: result.after for state, result in results.items()}
     scores, coverage = scores_of(depths, frame.gt)
     return {
         "points": len(points),
         "coverage": coverage,
-        "std_z": spread.refinement.step,
+        "std_z": unmoved.refinement.step,
         "diverged": sum(result.diverged is not None for result in results.values()),
         "aligned": None if (fit := results["paper"].alignment) is None else fit.kind,
         "scores": scores,
@@ -235,7 +235,7 @@ def entries_of(
     for row in ROWS:
         wanted = networks_of(row, [name for name in weights if not only or name in only])
         if not wanted and not only:
-            # why there is no tiny edition matters where tiny editions are what is asked for
+            # the reason for a missing tiny edition is noted only where tiny editions are requested
             missing = row.missing if None in weights.values() else ""
             notes.append(missing or f"no weights for the row of {row.name} ({row.family})")
         for name in wanted:

@@ -71,10 +71,12 @@ def main() -> None:
     for name, inputs in frames:
         assert inputs.gt is not None
         gt = torch.from_numpy(inputs.gt)
-        made = {p: refined_frame(networks[p], layer, settings, inputs) for p in PRECISIONS}
+        results = {p: refined_frame(networks[p], layer, settings, inputs) for p in PRECISIONS}
         cells = []
         for depths in DEPTHS:
-            maes = [score(torch.from_numpy(getattr(made[p], depths)), gt).mae for p in PRECISIONS]
+            maes = [
+                score(torch.from_numpy(getattr(results[p], depths)), gt).mae for p in PRECISIONS
+            ]
             cells += compared(*maes)
             for precision, mae in zip(PRECISIONS, maes, strict=True):
                 total[precision, depths] += mae

@@ -75,14 +75,14 @@ def main() -> None:
     for number, frame in enumerate(kitti_dc(parser.parse_args().data)):
         points, gt = visible_points(frame), torch.from_numpy(frame.gt)
         known = gt > 0
-        of_truth = [
+        gt_errors = [
             float((depth - gt)[known].abs().mean()) for depth in depths(network, frame, points)
         ]
         for kind in ("lines", "cells"):
             errors = held_out_errors(network, frame, points, lines=kind == "lines")
-            excess = of_truth[int(np.argmin(errors))] / min(of_truth) - 1
+            excess = gt_errors[int(np.argmin(errors))] / min(gt_errors) - 1
             key = ("odd" if number % 2 else "even", kind)
-            rows.setdefault(key, []).append((kendalltau(errors, of_truth)[0], excess))
+            rows.setdefault(key, []).append((kendalltau(errors, gt_errors)[0], excess))
     for (half, kind), values in rows.items():
         correlation, excess = np.mean(values, axis=0)
         print(

@@ -113,7 +113,7 @@ def projected_maps(data: Path) -> None:
     settings = resolve_settings(network.definition, MethodOptions())
     errors: dict[str, list[list[float]]] = {"even": [], "odd": []}
     for number, frame in enumerate(kitti_dc(data)):
-        truth = torch.from_numpy(frame.gt)
+        ground_truth = torch.from_numpy(frame.gt)
         everything = points_on_grid(*frame_pixels(frame, None, 0), frame.gt.shape)
         hidden = occluded_in_map(
             Points(xy=everything.xy.numpy(), depth=everything.depth.numpy(), size=everything.size)
@@ -123,7 +123,7 @@ def projected_maps(data: Path) -> None:
         for points in (everything, everything.select(~torch.from_numpy(hidden))):
             result = refined(network, layer, settings, frame_inputs(frame.rgb, points, frame.gt))
             for depth in (linear(points), torch.from_numpy(result.after)):
-                row.append(score(depth, truth).mae)
+                row.append(score(depth, ground_truth).mae)
         errors["odd" if number % 2 else "even"].append(row)
     for half, rows in errors.items():
         means = np.mean(rows, axis=0)

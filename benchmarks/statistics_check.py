@@ -29,7 +29,7 @@ ALPHA = 0.05
 SWAPS = 4999
 """Random swaps of a test; up to 12 clusters are tested exactly."""
 _TEST_COLUMNS, _INTERVAL_COLUMNS = 250, 20
-"""Trials that share their random numbers."""
+"""Trials that use the same random numbers."""
 
 
 def normal(rng: np.random.Generator, sequences: int, frames: int) -> Floats:

@@ -115,8 +115,8 @@ def length_of(function: ast.FunctionDef | ast.AsyncFunctionDef) -> int:
 
 def parameters(function: ast.FunctionDef | ast.AsyncFunctionDef) -> int:
     """Returns the number of parameters without self and cls."""
-    given = function.args
-    names = [each.arg for each in (*given.posonlyargs, *given.args, *given.kwonlyargs)]
+    arguments = function.args
+    names = [each.arg for each in (*arguments.posonlyargs, *arguments.args, *arguments.kwonlyargs)]
     return len([name for name in names if name not in ("self", "cls")])
 
 

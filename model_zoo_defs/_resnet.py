@@ -69,11 +69,11 @@ def stages(depth: int, width: int = WIDTH) -> tuple[list[nn.Sequential], int]:
     """
     block = Bottleneck if depth >= 50 else BasicBlock
     channels, built = width, []
-    for place, count in enumerate(BLOCKS[depth]):
-        inner = width * 2**place
+    for index, count in enumerate(BLOCKS[depth]):
+        inner = width * 2**index
         blocks = []
         for number in range(count):
-            blocks.append(block(channels, inner, 2 if place and not number else 1))
+            blocks.append(block(channels, inner, 2 if index and not number else 1))
             channels = inner * block.expansion
         built.append(nn.Sequential(*blocks))
     return built, channels

@@ -106,7 +106,7 @@ class Solve(nn.Module):
 
 
 class Synthesis(nn.Module):
-    """Codes of one layer → the map of the given size that they synthesise."""
+    """Codes of one layer → the map they synthesise, of `size`."""
 
     def forward(self, codes: Tensor, kernel: Tensor, size: tuple[int, int]) -> Tensor:
         return synthesised(codes, kernel, size)

@@ -5,7 +5,7 @@ larger give an answer ten times larger. The depth is built from coarse to fine:
 
 1. `InlierWeights` weighs every point by its agreement with the points around it.
 2. `PointFit` fits a plane through the points around every 1/16 cell, once per head; the weight of
-   a point depends on its distance and on how similar the image features are in the two places.
+   a point depends on its distance and on how similar the image features of the two cells are.
 3. At 1/16, 1/8, 1/4 and 1/2 the residuals at the points (against the depth so far) are averaged
    over cells. The features of the level weigh the residuals of the neighbouring cells and the
    depths of the neighbouring coarser cells.
@@ -13,7 +13,7 @@ larger give an answer ten times larger. The depth is built from coarse to fine:
 
 A prior, the dense depth of any other network aligned to the points, adds candidates: at 1/16
 the prior plus a plane through the points' residuals against it, and at each finer level the
-coarser depths plus the change of the prior between the two places. Where the prior is unknown its
+coarser depths plus the change of the prior between the two cells. Where the prior is unknown its
 candidates are masked, and without a prior none of these layers runs.
 
 A point is evidence, never copied: depth depends smoothly on the features of every level, which

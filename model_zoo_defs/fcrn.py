@@ -2,7 +2,7 @@
 
 ResNet-50 down to 1/32, one convolution without a non-linearity (the paper's z), four
 up-projections to about half the size. The graph is that of the authors' own code, including what
-ports get wrong: strides on the first 1×1 convolution of a stage, a bias in `conv1` and `layer1`,
+ports change: strides on the first 1×1 convolution of a stage, a bias in `conv1` and `layer1`,
 TensorFlow's padding of the pooling, up-projections as four small convolutions whose outputs
 interleave, and a last ReLU.
 

@@ -38,7 +38,7 @@ class NormalisedConv(nn.Module):
 
 
 class NormalisedUNet(nn.Module):
-    """Layers at full, 1/2, 1/4 and 1/8 size, which share weights going down, and back up."""
+    """U-Net at full, 1/2, 1/4 and 1/8 size; the encoder levels use the same weights."""
 
     def __init__(self, layer: type[NormalisedConv] = NormalisedConv, channels: int = 2) -> None:
         super().__init__()

@@ -111,8 +111,8 @@ class SparseToDense(nn.Module):
         self.bn2 = nn.BatchNorm2d(channels)
         self.decoder = nn.Sequential(
             OrderedDict(
-                (f"layer{place + 1}", decoder_layer(decoder, channels >> place))
-                for place in range(4)
+                (f"layer{index + 1}", decoder_layer(decoder, channels >> index))
+                for index in range(4)
             )
         )
         self.conv3 = nn.Conv2d(channels >> 4, 1, 3, padding=1, bias=False)
@@ -134,47 +134,47 @@ LAYERS = ("bn2", "decoder.layer1", "decoder.layer2", "decoder.layer3")
 TINY = partial(SparseToDense, 18, "upproj", width=16)
 
 
-def published(depth: int, decoder: Decoder, modality: str, place: str) -> ModelDefinition:
+def published(depth: int, decoder: Decoder, modality: str, scene: str) -> ModelDefinition:
     """Returns the definition of one published variant."""
     return ModelDefinition(
-        name=f"sparse2dense-r{depth}-{decoder}{modality}{place}",
-        summary=f"ResNet-{depth} with the {decoder} decoder, {'KITTI' if place else 'NYU'} size",
+        name=f"sparse2dense-r{depth}-{decoder}{modality}{scene}",
+        summary=f"ResNet-{depth} with the {decoder} decoder, {'KITTI' if scene else 'NYU'} size",
         paper="Ma & Karaman, Sparse-to-Dense, ICRA 2018",
         licence="published weights: no licence named, not shipped",
         input_kind=MODALITIES[modality],
-        size=SIZES[place],
+        size=SIZES[scene],
         build=partial(SparseToDense, depth, decoder, MODALITIES[modality]),
         layers=LAYERS,
         defaults=RefineDefaults(),
     )
 
 
-def tiny(place: str) -> ModelDefinition:
+def tiny(scene: str) -> ModelDefinition:
     """Returns the definition of the small edition that ships, for one image size."""
     return ModelDefinition(
-        name=f"sparse2dense-tiny{place}",
-        summary=f"sparse2dense-r18-upproj at a quarter of its width, trained on {SCENES[place]}",
+        name=f"sparse2dense-tiny{scene}",
+        summary=f"sparse2dense-r18-upproj at a quarter of its width, trained on {SCENES[scene]}",
         paper="Ma & Karaman, Sparse-to-Dense, ICRA 2018",
         licence="Apache-2.0",
         input_kind="rgb+sparse",
-        size=SIZES[place],
+        size=SIZES[scene],
         build=TINY,
         layers=LAYERS,
         defaults=TUNED,
-        checkpoint=Path(__file__).parent / "weights" / f"sparse2dense-tiny{place}.safetensors",
+        checkpoint=Path(__file__).parent / "weights" / f"sparse2dense-tiny{scene}.safetensors",
     )
 
 
 _PUBLISHED = [
-    published(depth, decoder, modality, place)
+    published(depth, decoder, modality, scene)
     for depth in (18, 50)
     for decoder in DECODERS
     for modality in MODALITIES
-    for place in SIZES
+    for scene in SIZES
 ]
 definitions: dict[str, ModelDefinition] = {
     one.name: one
-    for one in (*_PUBLISHED, _sparse2dense_selfsup.definition, *(tiny(place) for place in SIZES))
+    for one in (*_PUBLISHED, _sparse2dense_selfsup.definition, *(tiny(scene) for scene in SIZES))
 }
 definitions["sparse2dense"] = definitions["sparse2dense-r50-upproj"]
 definitions["sparse2dense-kitti"] = definitions["sparse2dense-r18-upproj-kitti"]

@@ -86,8 +86,8 @@ class SparseConvNet(nn.Module):
         channels = (1, *[width] * len(KERNELS))
         self.sparse_convs = nn.Sequential(
             *(
-                Block(channels[place], width, kernel, per_channel=with_mask)
-                for place, kernel in enumerate(KERNELS)
+                Block(channels[index], width, kernel, per_channel=with_mask)
+                for index, kernel in enumerate(KERNELS)
             )
         )
         self.mask_conv = nn.Conv2d(width + with_mask, 1, 1)
@@ -123,7 +123,7 @@ def _definition(name: str, summary: str, with_mask: bool = True) -> ModelDefinit
         input_kind="sparse",
         size=Multiple(1),
         build=partial(SparseConvNet, with_mask=with_mask),
-        layers=tuple(f"sparse_convs.{place}[0]" for place in range(len(KERNELS))),
+        layers=tuple(f"sparse_convs.{index}[0]" for index in range(len(KERNELS))),
         defaults=TUNED if own else RefineDefaults(),
         checkpoint=weights if own else None,
         read_checkpoint=None if with_mask else from_tensorflow,

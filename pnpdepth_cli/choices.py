@@ -176,6 +176,15 @@ FORMATS = Table(
 )
 """Depth file formats: `pnpdepth_cli.io.formats.DepthFormat`."""
 
+EXPORTS = Table(
+    "pipeline/exports",
+    "EXPORT",
+    group="exports",
+    noun="export",
+    first=("colmap", "nerfstudio", "gaussian-splatting"),
+)
+"""Files for reconstruction programs: `pnpdepth_cli.pipeline.exports.Export`."""
+
 PROPAGATIONS = Table(
     "completion/propagations",
     "propagation",

@@ -48,12 +48,12 @@ class SparsePoints(Generic[A]):
         """
         if (height, width) == self.size:
             return self
-        scale = self._row(width / self.size[1], height / self.size[0])
+        scale = self._like_xy(width / self.size[1], height / self.size[0])
         return self._with((self.xy + 0.5) * scale - 0.5, self.depth, (height, width))
 
     def cropped(self, top: int, left: int, height: int, width: int) -> SparsePoints[A]:
         """Returns the points inside these rows and columns, in coordinates of that crop."""
-        xy = self.xy - self._row(left, top)
+        xy = self.xy - self._like_xy(left, top)
         inside: Any = in_frame(xy, (height, width))
         return self._with(xy[inside], self.depth[inside], (height, width))
 
@@ -105,8 +105,8 @@ class SparsePoints(Generic[A]):
         flat.scatter_reduce_(0, (row * width + column)[inside], self.depth[inside], "amin")
         return flat.masked_fill(flat.isinf(), 0.0).reshape(1, 1, height, width)
 
-    def _row(self, x: float, y: float) -> Any:
-        """(1, 2), or (2,), of the type and on the device of `xy`."""
+    def _like_xy(self, x: float, y: float) -> Any:
+        """(2,): x and y as an array like `xy`, of its dtype and on its device."""
         xy: Any = self.xy
         if hasattr(xy, "new_tensor"):
             return xy.new_tensor([x, y])

@@ -18,6 +18,8 @@ from pnpdepth_cli.models.registry import find_definition
 ROOT = Path(__file__).parent.parent
 README = ROOT / "README.md"
 PAGES = [README, *sorted((ROOT / "docs").rglob("*.md"))]
+RECONSTRUCTION = ROOT / "docs" / "guides" / "reconstruction.md"
+"""Its commands run in tests/test_reconstruction_guide.py, after the Python script of the page."""
 WRITES_FILES = ("refine", "project", "sample", "simulate", "cloud")
 
 
@@ -68,7 +70,10 @@ def test_the_readme_shows_the_main_commands() -> None:
     assert {"refine", "batch"} <= shown
 
 
-@pytest.mark.parametrize("page", [p for p in PAGES if shown_commands(p)], ids=named)
+WITH_COMMANDS = [page for page in PAGES if shown_commands(page) and page != RECONSTRUCTION]
+
+
+@pytest.mark.parametrize("page", WITH_COMMANDS, ids=named)
 def test_the_commands_of_a_page_run(page: Path, folder: Path) -> None:
     for arguments in shown_commands(page):
         overwrite = ["--overwrite"] if arguments[0] in WRITES_FILES else []

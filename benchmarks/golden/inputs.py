@@ -124,7 +124,7 @@ def _in_a_fork(work: Callable[[], None]) -> None:
         finally:
             os._exit(code)
     if os.waitpid(pid, 0)[1]:
-        sys.exit("the networks of the commands cannot be made")
+        sys.exit("the networks of the commands cannot be built")
 
 
 def _save(path: Path, values: Array, *, scale: int | None = None) -> None:
@@ -143,7 +143,7 @@ def _quarter(rgb: Array) -> Array:
 
 
 def _some_of(gt_values: Array, count: int, seed: int = 0) -> Array:
-    """The ground truth at so many pixels, 0 elsewhere."""
+    """The ground truth at `count` random pixels, 0 elsewhere."""
     rows, columns = np.nonzero(gt_values)
     indices = np.random.default_rng(seed).choice(len(rows), min(count, len(rows)), replace=False)
     sparse = np.zeros_like(gt_values)

@@ -52,7 +52,7 @@ class Normaliser:
         for path, name in self._folders:
             text = text.replace(path, name)
         text = self._tree.sub("<tree>/", self._work.sub("<work>", text))
-        text = _TIME.sub(lambda found: f"# {found[0].rsplit(' ', 1)[1]}", text)
+        text = _TIME.sub(lambda match: f"# {match[0].rsplit(' ', 1)[1]}", text)
         for pattern, by in _MEASURED_TEXT:
             text = pattern.sub(by, text)
         return text
@@ -88,12 +88,12 @@ class Normaliser:
         if _MEASURED.match(key) or (not step.figures and isinstance(value, float)):
             return _blank(value)
         if isinstance(value, dict):
-            made = {str(name): self.data(each, step, str(name)) for name, each in value.items()}
+            cleaned = {str(name): self.data(each, step, str(name)) for name, each in value.items()}
             if key.endswith(".json"):  # a record, in which times are
-                made |= {name: "#" for name in ("size", "sha256") if name in made}
-            if str(made.get("checkpoint", "")).endswith(".pt2"):
-                made["checkpoint_sha256"] = "#"  # torch.export writes other bytes every time
-            return made
+                cleaned |= {name: "#" for name in ("size", "sha256") if name in cleaned}
+            if str(cleaned.get("checkpoint", "")).endswith(".pt2"):
+                cleaned["checkpoint_sha256"] = "#"  # torch.export writes other bytes every time
+            return cleaned
         if isinstance(value, list):
             return [self.data(each, step) for each in value]
         return self.text(value) if isinstance(value, str) else value
@@ -136,13 +136,13 @@ class Normaliser:
         """A page: its parts that hold data as data, the rest as lines, or their hash."""
         kept: dict[str, Any] = {}
 
-        def taken(found: re.Match[str]) -> str:
-            parsed = _parsed(found[2])
+        def taken(match: re.Match[str]) -> str:
+            parsed = _parsed(match[2])
             if parsed is None:
-                kept[f"part {len(kept)}"] = _hash(found[2].encode())
+                kept[f"part {len(kept)}"] = _hash(match[2].encode())
             else:
                 kept[f"data {len(kept)}"] = self.data(parsed, step)
-            return f"{found[1]}…</"
+            return f"{match[1]}…</"
 
         body = re.sub(r"(?s)(<(?:script|style)[^>]*>)(.*?)</", taken, text)
         lines = self.text(body).splitlines()
@@ -185,7 +185,7 @@ def _hash(content: bytes) -> str:
 
 
 def _arrays(path: Path) -> dict[str, Array]:
-    """The numbers in a file of a picture, depth or weights; none of another kind of file."""
+    """Arrays in a file of an image, depth or weights; empty for other files."""
     suffix = path.suffix.lower()
     if suffix in _IMAGES:
         with Image.open(path) as image:

@@ -71,11 +71,11 @@ class _Running:
 
 
 class Runner:
-    """Runs groups, so many at once.
+    """Runs groups in parallel.
 
     Attributes:
-        results: What each step left, by its name.
-        seconds: Of the processor, the same way.
+        results: Output of each step, by its name.
+        seconds: CPU time of each step, by its name.
     """
 
     def __init__(
@@ -149,7 +149,7 @@ class Runner:
 
 
 def files_in(folder: Path) -> dict[str, tuple[int, int, int]]:
-    """Size, time and number of every file below the folder, by its place."""
+    """Size, modification time and inode of every file below the folder, by relative path."""
     return {
         path.relative_to(folder).as_posix(): (
             (state := path.stat()).st_size, state.st_mtime_ns, state.st_ino

@@ -1,4 +1,4 @@
-"""A command line whose output is kept, and groups of them that share a folder."""
+"""A command line whose output is kept, and groups of them that run in one folder."""
 
 from __future__ import annotations
 
@@ -40,13 +40,13 @@ class Group:
 def group_of(
     name: str, *steps: tuple[str, str] | Step, shared: bool = False, unordered: bool = False
 ) -> Group:
-    made = [
+    grouped = [
         step
         if isinstance(step, Step)
         else Step(name=f"{name}/{step[0]}", line=step[1], unordered=unordered)
         for step in steps
     ]
-    return Group(name=name, steps=made, shared=shared)
+    return Group(name=name, steps=grouped, shared=shared)
 
 
 def single_steps(name: str, *steps: tuple[str, str], shared: bool = False) -> Iterator[Group]:

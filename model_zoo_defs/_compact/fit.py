@@ -114,10 +114,10 @@ class PointFit(nn.Module):
 
     @staticmethod
     def _cells(points: Points, prior: Prior | None, height: int, width: int) -> list[Tensor]:
-        """Of the points of each cell, weighted, (B, cells) but for the place (B, 2, cells).
+        """Weighted means over the points of each cell, (B, cells) each.
 
-        Place, value, log weight, the same of the residual against the prior where there is one
-        (value, fraction of points where the prior is known), and if there is any point.
+        In order: position (B, 2, cells), value and log weight; with a prior, the residual against
+        it and the fraction of points where it is known; last, whether the cell has a point.
         """
         weight = points.weight
         pixel = (_cell_grid(weight.shape[-2], weight.shape[-1], weight) / 16.0).unsqueeze(0)

@@ -24,7 +24,7 @@ class InlierWeights(nn.Module):
 
     The image is divided into cells with about one point each. A point is compared with the means
     of the 5 x 5 cells around it; its own cell is counted without it. With a prior, the residuals
-    against the prior are compared in the same way. A second pass compares with means that are
+    against the prior are compared likewise. A second pass compares with means that are
     weighted by the result of the first.
     """
 

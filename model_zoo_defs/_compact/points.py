@@ -35,7 +35,7 @@ class Points:
         self.weight = self.mask * weight
 
     def moments(self) -> Tensor:
-        """Share of known pixels, weight, weighted value and square (B, 4, H / 2, W / 2).
+        """Fraction of known pixels, weight, weighted value and square (B, 4, H / 2, W / 2).
 
         Sums over 2 x 2 pixels are all the residuals need; finer positions change them by less
         than half a pixel's slope.

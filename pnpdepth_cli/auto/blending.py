@@ -91,9 +91,10 @@ def best_blend(
         predicted: (C, M) metres of C candidates at M held-out points.
         depth: (M,) metres, measured.
         weights: (M,) 0…1 of each point.
-        default: The candidate to take where no other is better by more than chance.
-        baselines: Candidates that the result is never worse than; of few points, beyond chance.
-        bounds: Those of them that are taken only where everything else is worse than they are.
+        default: Row of the candidate to take unless another is better by CAUTION standard errors.
+        baselines: Rows of `predicted` whose error bounds the result's. Of fewer points than
+            ENOUGH_FOR_BOUND the result may be one standard error above it.
+        bounds: Those of them that are never blended. One is taken if nothing else keeps the bound.
     """
     errors = held_out_error(predicted, depth, weights)
     best = min(baselines, key=lambda one: float(errors[one]), default=None)

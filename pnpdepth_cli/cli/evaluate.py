@@ -23,6 +23,7 @@ from pnpdepth_cli.cli import grouped_help, options
 from pnpdepth_cli.cli.printable import printable
 from pnpdepth_cli.cli.progress import progress_bar
 from pnpdepth_cli.errors import FramesFailedError, UsageError
+from pnpdepth_cli.pipeline.cluster.options import ClusterOptions
 
 if TYPE_CHECKING:
     _Choice = click.Choice[str]
@@ -86,6 +87,7 @@ class _ProtocolName(_Choice):
             *("--no-groups", "--seed", "--measures"),
         ),
         "Output": ("--csv", "--markdown", "--latex", "--html", "--overwrite", "--json"),
+        "Cluster": grouped_help.CLUSTER,
     },
 )
 @click.argument("prediction", type=options.FILE, metavar="PRED")
@@ -191,6 +193,7 @@ class _ProtocolName(_Choice):
     help="Number of frames read at once.",
 )
 @options.no_groups
+@options.options_of_groups(ClusterOptions)
 @options.table_files(
     csv="Write a row per frame.",
     markdown="Write a table of the means.",
@@ -264,6 +267,7 @@ def _request(prediction: Path, truth: Path, given: dict[str, Any]) -> EvalReques
     from pnpdepth_cli.pipeline.evaluation.result import EvalRequest
 
     own = {name: given.pop(name) for name in _REQUEST_OPTIONS}
+    own["cluster"] = ClusterOptions(**options.taken(ClusterOptions, given))
     scales = {field: given.pop(name) for field, name in _SCALE_OPTIONS.items()}
     grouped = not given.pop("no_groups")
     groups = given.pop("measures")

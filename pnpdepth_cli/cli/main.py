@@ -60,6 +60,7 @@ COMMANDS = {
     "sample": "sample:sample",
     "simulate": "simulate:simulate",
     "cloud": "cloud:cloud",
+    "export": "export:export",
     "eval": "evaluate:evaluate",
     "compare": "compare:compare",
     "sweep": "sweep:sweep",

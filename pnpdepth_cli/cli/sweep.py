@@ -15,6 +15,7 @@ from pnpdepth_cli.cli.exit_codes import INTERRUPTED
 from pnpdepth_cli.cli.progress import BatchProgress
 from pnpdepth_cli.errors import FramesFailedError, StorageError
 from pnpdepth_cli.pipeline.batch.request import FrameSelection
+from pnpdepth_cli.pipeline.cluster.options import ClusterOptions
 from pnpdepth_cli.pipeline.refinement.request import FrameFiles, MethodOptions, NetworkChoice
 
 
@@ -34,6 +35,7 @@ from pnpdepth_cli.pipeline.refinement.request import FrameFiles, MethodOptions, 
         "Network": grouped_help.NETWORK,
         "Method": tuple(name for name in grouped_help.METHOD if name != "--seed"),
         "Output": ("--output", "--plots", "--plot-format", "--cost", "--json"),
+        "Cluster": grouped_help.CLUSTER,
     },
 )
 @click.argument("source", type=options.FILE, metavar="FOLDER|LIST")
@@ -63,7 +65,7 @@ from pnpdepth_cli.pipeline.refinement.request import FrameFiles, MethodOptions, 
     metavar="N",
     help="Number of random draws of the points; the first uses --seed.",
 )
-@options.options_of_groups(FrameSelection)
+@options.options_of_groups(FrameSelection, ClusterOptions)
 @click.option("--plots/--no-plots", default=True, help="Draw plots, or write tables only.")
 @click.option(
     "--plot-format",
@@ -128,7 +130,8 @@ def sweep(
     """
     from pnpdepth_cli.pipeline.sweep.axes import read_axis, studies_of
     from pnpdepth_cli.pipeline.sweep.points import read_sampling
-    from pnpdepth_cli.pipeline.sweep.sweep import SweepRequest, run_sweep
+    from pnpdepth_cli.pipeline.sweep.request import SweepRequest
+    from pnpdepth_cli.pipeline.sweep.sweep import run_sweep
 
     own = options.taken(FrameSelection, given)
     request = SweepRequest(
@@ -140,6 +143,7 @@ def sweep(
         plots=given.pop("plots"),
         plot_format=given.pop("plot_format"),
         cost=given.pop("cost"),
+        cluster=ClusterOptions(**options.taken(ClusterOptions, given)),
         refine=options.request_of(given),
         **own,
     )

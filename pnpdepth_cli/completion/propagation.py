@@ -66,7 +66,7 @@ def propagate(
         rgb: (3, H, W) in 0…1, or None.
         kind: A name in `choices.PROPAGATIONS`, or "none".
         sigma: Whether the standard deviation is wanted. It is estimated from the same points; where
-            these have been fitted before, `auto.uncertainty.calibration` tells how much too small
+            these have been fitted before, `auto.uncertainty.calibration` says how much too small
             it is.
 
     Raises:

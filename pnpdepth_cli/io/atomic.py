@@ -6,6 +6,7 @@ import errno
 import os
 import re
 import secrets
+import shutil
 import stat
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
@@ -44,6 +45,38 @@ def atomic_path(path: Path) -> Iterator[Path]:
 
 
 @contextmanager
+def atomic_folder(folder: Path) -> Iterator[Path]:
+    """Adds what is written to the yielded empty folder to `folder`; untouched if anything fails.
+
+    Files of the same name are replaced, others stay. The yielded folder is in `folder`, which is
+    created, and removed again if the block fails.
+
+    Raises:
+        OutputError: The folder cannot be written to, also when that shows only inside the block.
+    """
+    existed = folder.exists()
+    make_folder(folder)
+    temporary = folder / f".{secrets.token_hex(6)}"
+    try:
+        temporary.mkdir()
+        yield temporary
+        for place, _, names in os.walk(temporary, topdown=False):
+            target = folder / Path(place).relative_to(temporary)
+            target.mkdir(exist_ok=True)
+            for name in names:
+                Path(place, name).replace(target / name)
+    except OutputError as error:  # of a file in the temporary folder
+        raise type(error)(str(error).replace(str(temporary), str(folder))) from error
+    except OSError as error:
+        raise cannot_write(folder, error) from error
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+        if not existed:
+            with suppress(OSError):
+                folder.rmdir()  # fails where files are in it: then they are complete
+
+
+@contextmanager
 def all_or_none(paths: Iterable[Path]) -> Iterator[None]:
     """Removes those of the files that did not exist before, if anything inside fails."""
     new = [path for path in paths if not path.exists()]
@@ -65,13 +98,17 @@ def make_folder(folder: Path) -> None:
 
 
 def remove_leftovers(folder: Path) -> int:
-    """Removes temporary files of killed writers and returns how many there were.
+    """Removes temporary files and folders of killed writers and returns how many there were.
 
     To be called only while nobody writes to the folder.
     """
-    leftovers = [p for p in folder.iterdir() if _TEMPORARY.fullmatch(p.name) and p.is_file()]
+    paths = folder.iterdir() if folder.is_dir() else ()
+    leftovers = [path for path in paths if _TEMPORARY.fullmatch(path.name)]
     for path in leftovers:
-        path.unlink(missing_ok=True)
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path)
+        else:
+            path.unlink(missing_ok=True)
     return len(leftovers)
 
 

@@ -94,17 +94,28 @@ class Journal:
                 for data in file:
                     if not data.endswith(b"\n"):
                         break
-                    line = _object(data)
-                    if line is None:
-                        self.lost += 1
-                    elif isinstance(line.get(self._key), str):
-                        self._offsets[line[self._key]] = offset
+                    key = self._key_in(data)
+                    if key is not None:
+                        self._offsets[key] = offset
                     offset += len(data)
         except FileNotFoundError:
             return 0
         except OSError as error:
             raise _cannot_read(self.path, error) from error
         return offset
+
+    def _key_in(self, data: bytes) -> str | None:
+        """The key of a line; None if it has none, or is damaged, which is counted."""
+        if not _is_whole(data):
+            self.lost += 1
+            return None
+        first = f'"{self._key}": '
+        text = data[_CHECKSUM_BYTES:].decode("ascii")
+        if text.startswith(first):  # a tenth of the time of parsing the whole line
+            key = json.JSONDecoder().raw_decode(text, len(first))[0]
+        else:
+            key = json.loads("{" + text).get(self._key)
+        return key if isinstance(key, str) else None
 
 
 def _line(content: Mapping[str, Any]) -> bytes:
@@ -114,11 +125,15 @@ def _line(content: Mapping[str, Any]) -> bytes:
 
 def _object(data: bytes) -> dict[str, Any] | None:
     """The content of a whole line; None if its checksum is wrong or missing."""
-    rest = data.removesuffix(b"\n")[_CHECKSUM_BYTES:]
-    if not data.startswith(_CHECKSUM % zlib.crc32(rest)):
+    if not _is_whole(data):
         return None
-    content: dict[str, Any] = json.loads(b"{" + rest)
+    content: dict[str, Any] = json.loads(b"{" + data[_CHECKSUM_BYTES:])
     return content
+
+
+def _is_whole(data: bytes) -> bool:
+    rest = data.removesuffix(b"\n")[_CHECKSUM_BYTES:]
+    return data.startswith(_CHECKSUM % zlib.crc32(rest))
 
 
 def _cannot_read(path: Path, error: OSError) -> InputError:

@@ -6,20 +6,27 @@ import base64
 import hashlib
 import json
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 from pnpdepth_cli.errors import FileFormatError, InputError, OutputError
-from pnpdepth_cli.io.atomic import atomic_path, cannot_write, make_folder, remove_leftovers
+from pnpdepth_cli.io.atomic import (
+    atomic_folder,
+    atomic_path,
+    cannot_write,
+    make_folder,
+    remove_leftovers,
+)
 from pnpdepth_cli.io.record import plain, read_json, write_json
 from pnpdepth_cli.io.report_view import VIEWER, save_viewer
 
 PAGE = "index.html"
 IMAGES = "pictures"
 _MADE_OF = "report.json"
-_IMAGE = re.compile(r"([0-9a-f]{20})_[a-z_]+\.(?:jpg|js)")
+_IMAGE = re.compile(r"[0-9a-f]{20}_[a-z_]+\.(?:jpg|js)")
 
 
 def check_report_folder(
@@ -70,8 +77,25 @@ def begin_report(folder: Path, made_of: Mapping[str, Any]) -> Path:
     return images
 
 
+@contextmanager
+def whole_report(folder: Path) -> Iterator[Path]:
+    """Yields a folder for a report that replaces the one in `folder`; if it fails, that one stays.
+
+    Raises:
+        OutputError: The folder cannot be written to.
+    """
+    remove_report_leftovers(folder)
+    with atomic_folder(folder) as temporary:
+        yield temporary
+        images = {path.name for path in (temporary / IMAGES).iterdir()}
+        viewer = (temporary / VIEWER).exists()
+    if not viewer:
+        _remove_viewer(folder)
+    _remove_images(folder, lambda name: name not in images)
+
+
 def remove_report_leftovers(folder: Path) -> int:
-    """Removes temporary files of killed writers and returns how many there were.
+    """Removes what killed writers left and returns how many there were.
 
     To be called only while nobody writes to the report.
     """
@@ -125,14 +149,25 @@ def write_report(
         file.write(end)
     if viewer:
         save_viewer(folder)
+    else:
+        _remove_viewer(folder)
+    _remove_images(folder, lambda name: name.partition("_")[0] not in keys)
+    return page.stat().st_size
+
+
+def _remove_viewer(folder: Path) -> None:
     try:
-        if not viewer:
-            (folder / VIEWER).unlink(missing_ok=True)
+        (folder / VIEWER).unlink(missing_ok=True)
+    except OSError as error:
+        raise cannot_write(folder, error) from error
+
+
+def _remove_images(folder: Path, unused: Callable[[str], bool]) -> None:
+    """Removes images of a report, and no other file, by their names."""
+    try:
         for path in (folder / IMAGES).iterdir():
-            name = _IMAGE.fullmatch(path.name)
-            if name is not None and name[1] not in keys:
+            if _IMAGE.fullmatch(path.name) and unused(path.name):
                 path.unlink(missing_ok=True)
-        return page.stat().st_size
     except OSError as error:
         raise cannot_write(folder, error) from error
 

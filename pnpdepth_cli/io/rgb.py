@@ -62,6 +62,23 @@ def read_rgb(path: Path) -> RgbImage:
     return RgbImage(values=np.ascontiguousarray(upright), note=note)
 
 
+def upright_size(path: Path) -> tuple[int, int]:
+    """Returns (H, W) of the image that `read_rgb` returns; of an EXR it reads all of it.
+
+    Raises:
+        InputError: The file is missing or no image.
+    """
+    from PIL import Image
+
+    try:
+        with QUIET_PILLOW, Image.open(path) as image:
+            width, height = image.size
+            return (width, height) if _orientation(image) >= 5 else (height, width)
+    except OSError:
+        shape = read_rgb(path).values.shape
+        return shape[0], shape[1]
+
+
 def _is_16_bit(path: Path, data: bytes, kind: str) -> bool:
     if kind == "PNG":
         return read_png_facts(path, data).bit_depth == 16

@@ -112,12 +112,16 @@ def _fields_of_bin(path: Path, data: bytes) -> int:
 
 
 def _looks_like_scan(rows: NDArray[np.float32]) -> bool:
-    """True if nearly all points have no negative reflectance, and the index of a laser as fifth."""
+    """True if nearly all rows of (N, 4 or 5) are plausible points of a scan.
+
+    Coordinates are not too far, reflectance is not negative, and a fifth column holds whole numbers
+    0…255, the index of a laser.
+    """
     with np.errstate(invalid="ignore"):
         near = (np.abs(rows[:, :3]) <= _FARTHEST_M).all(axis=1) & (rows[:, 3] >= 0)
         laser = rows[:, 4:]
-        named = ((laser >= 0) & (laser < 256) & (laser == np.floor(laser))).all(axis=1)
-    return bool(np.mean(near & named) >= _NEARLY_ALL)
+        numbered = ((laser >= 0) & (laser < 256) & (laser == np.floor(laser))).all(axis=1)
+    return bool(np.mean(near & numbered) >= _NEARLY_ALL)
 
 
 def _parse_npy(path: Path, data: bytes) -> tuple[NDArray[np.float32], str]:

@@ -54,17 +54,17 @@ def preview(
 ) -> None:
     """Writes a PNG of image, sparse depth, depth before and after, and what changed.
 
-    Depths have colours of one scale. The last two panels show the signed change in metres, and the
-    depth before and after where most changed.
+    All depth panels have one colour scale. The last two show the signed change, and a close-up of
+    before and after where the change is largest.
 
     Args:
         rgb: (H, W, 3) in 0..1; None for a network without image.
         sparse_xy: (N, 2) pixel coordinates.
-        sparse_depth: (N,) metres.
-        before: (H, W) metres before refinement.
-        after: (H, W) metres after refinement.
+        sparse_depth: (N,) in `unit`.
+        before: (H, W) in `unit`, before refinement.
+        after: (H, W) in `unit`, after refinement.
         path: The PNG.
-        unit: Of all depths, where it is not the metre.
+        unit: Name of the unit of all depths, for the legend.
         valid: (H, W); the depth after is hatched where false. None: all is valid.
 
     Raises:

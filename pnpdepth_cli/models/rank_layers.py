@@ -89,10 +89,10 @@ def best_layer(
 
 
 def default_layer(network: Network, size: tuple[int, int], point_count: int) -> str | None:
-    """Returns the layer to cut at where no option names one.
+    """Returns the layer whose output z is updated if no option names one.
 
-    It is the one that the definition names, else the one that is ranked first for the spacing of
-    the points, measured on a synthetic frame.
+    It is the definition's, else the one ranked first for the spacing of the points. The ranking
+    runs the network on a synthetic frame. None if the definition has no layers.
 
     Args:
         network: The network.

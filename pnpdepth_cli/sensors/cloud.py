@@ -65,9 +65,7 @@ def cloud_from_depth(
             this fraction from what continues its own surface. 0 keeps all pixels.
     """
     known = kept_pixels(depth, keep, edge)
-    rows, columns = np.nonzero(known)
-    points = np.zeros((*depth.shape, 3))
-    points[known] = camera.unproject(np.column_stack([columns, rows]), depth[known])
+    points = _points(depth, known, camera)
     return PointCloud(
         xyz=points[known].astype(np.float32),
         rgb=None if rgb is None else np.rint(np.clip(rgb[known], 0, 1) * 255).astype(np.uint8),
@@ -105,6 +103,25 @@ def depth_edges(depth: NDArray[np.float32], edge: float) -> Mask:
         jump = bend > edge * middle  # false beside unknown pixels
         np.moveaxis(result, axis, 0)[1:-1] |= jump
     return result
+
+
+def depth_normals(depth: NDArray[np.float32], camera: Camera) -> Floats:
+    """Returns (H, W, 3) unit normals towards the camera; 0 where depth or neighbours are unknown.
+
+    Args:
+        depth: (H, W), 0 = unknown.
+        camera: Intrinsics and distortion of the image that the depth belongs to.
+    """
+    known = kept_pixels(depth, edge=0)
+    return _normals(_points(depth, known, camera), known)
+
+
+def _points(depth: NDArray[np.float32], known: Mask, camera: Camera) -> Floats:
+    """(H, W, 3) points in the camera's frame, 0 where unknown."""
+    rows, columns = np.nonzero(known)
+    points = np.zeros((*depth.shape, 3))
+    points[known] = camera.unproject(np.column_stack([columns, rows]), depth[known])
+    return points
 
 
 def _normals(points: Floats, known: Mask) -> Floats:

@@ -116,27 +116,3 @@ def test_fetch_offline_says_what_is_wrong_in_one_line(
     assert err.count("\n") == 1
     assert not (tmp_path / "name").exists()
     assert code_of(["models", "fetch", "name"]) == 2
-
-
-def test_fetch_pins_the_revision_and_records_hashes(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    hub = pytest.importorskip("huggingface_hub", reason="needs the extra [hf]")
-
-    class Info:
-        sha = "abc123"
-
-    def download(repo: str, *, revision: str, local_dir: Path, allow_patterns: list[str]) -> None:
-        assert (repo, revision) == ("org/name", "abc123")
-        assert not any("bin" in p or "py" in p for p in allow_patterns)
-        local_dir.mkdir()
-        (local_dir / "config.json").write_text("{}")
-
-    monkeypatch.setattr(hub.HfApi, "model_info", lambda *_, **__: Info())
-    monkeypatch.setattr(hub, "snapshot_download", download)
-    fetch = ["models", "fetch", "org/name", "-o", str(tmp_path / "name"), "--json"]
-    assert code_of(fetch) == 0
-    record = json.loads(capsys.readouterr().out)
-    assert record["revision"] == "abc123"
-    assert record == json.loads((tmp_path / "name" / "fetched.json").read_text())
-    assert code_of(fetch) == 2

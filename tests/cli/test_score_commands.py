@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import io
 import json
@@ -287,3 +288,78 @@ def test_relative_predictions_and_missing_pixels_are_options_of_eval(
     assert record["protocol"]["scoring"]["missing"] == "max"
     assert code_of("eval", "out", "gt", "--missing", "max") == 2
     assert "--missing max scores empty predictions as --max-depth" in capsys.readouterr().err
+
+
+def test_a_formula_as_a_name_is_text_in_every_table(frames: Path) -> None:
+    for folder in ("out", "gt"):
+        Path(folder, "a.npy").rename(Path(folder, "=1+1.npy"))
+    assert code_of("eval", "out", "gt", "--csv", "scores.csv", "--markdown", "scores.md") == 0
+    rows = list(csv.DictReader(io.StringIO(Path("scores.csv").read_text())))
+    assert "'=1+1" in [row["name"] for row in rows]
+    with contextlib.redirect_stdout(io.StringIO()) as text:
+        assert code_of("eval", "out", "gt", "--json") == 0
+    for name in ("@run.json", "=run.json"):
+        Path(name).write_text(text.getvalue())
+    assert code_of("compare", "@run.json", "=run.json", "--csv", "c.csv") == 0
+    rows = list(csv.DictReader(io.StringIO(Path("c.csv").read_text())))
+    assert {row["run"] for row in rows} == {"'@run", "'=run"}
+    assert {row["gain [%]"] for row in rows} == {"–", "+0.00"}
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("decimals", 10**9),
+        ("decimals", 10**400),
+        ("decimals", -1),
+        ("decimals", 2.5),
+        ("decimals", "3"),
+        ("shown_factor", 1e300),
+        ("shown_factor", "x"),
+        ("title", 3),
+        ("key", []),
+        ("percent", None),
+        ("higher_is_better", "x"),
+    ],
+    ids=lambda value: str(value)[:20],
+)
+def test_a_run_whose_measures_are_of_another_kind_is_refused_in_one_line(
+    field: str, value: object, frames: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert code_of("eval", "out", "gt", "--json") == 0
+    record = json.loads(capsys.readouterr().out)
+    for measure in record["measures"]:
+        measure[field] = value
+    for name in ("a.json", "b.json"):
+        Path(name).write_text(json.dumps(record))
+    assert code_of("compare", "a.json", "b.json") == 3
+    err = capsys.readouterr().err
+    assert err.startswith("pnpdepth: a.json does not hold scores")
+    assert err.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("pixels", "x"),
+        ("pixels", -1),
+        ("pixels", 10**400),
+        ("known", 2.5),
+        ("sums", ["x"]),
+        ("values", {"rmse": []}),
+        ("values", {"rmse": 10**400}),
+    ],
+    ids=lambda value: str(value)[:20],
+)
+def test_a_run_whose_frames_are_of_another_kind_is_refused_in_one_line(
+    field: str, value: object, frames: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert code_of("eval", "out", "gt", "--json") == 0
+    record = json.loads(capsys.readouterr().out)
+    record["frames"][2][field] = value
+    for name in ("a.json", "b.json"):
+        Path(name).write_text(json.dumps(record))
+    assert code_of("compare", "a.json", "b.json") == 3
+    err = capsys.readouterr().err
+    assert err.startswith("pnpdepth: a.json does not hold scores")
+    assert err.count("\n") == 1

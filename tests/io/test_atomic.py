@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pnpdepth_cli.errors import InputError, OutputError
-from pnpdepth_cli.io.atomic import atomic_path
+from pnpdepth_cli.io.atomic import atomic_folder, atomic_path, remove_leftovers
 from pnpdepth_cli.io.depth import write_depth
 
 
@@ -109,3 +109,41 @@ def test_a_full_disk_is_an_output_error_that_names_the_file(tmp_path: Path, suff
         write_depth(target, depth)
     assert str(caught.value).startswith(f"{target} cannot be written")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_appears_whole_and_other_files_in_it_stay(tmp_path: Path) -> None:
+    folder = tmp_path / "report"
+    (folder / "old").mkdir(parents=True)
+    for name in ("page", "old/a", "mine"):
+        (folder / name).write_text("before")
+    with atomic_folder(folder) as temporary:
+        (temporary / "old").mkdir()
+        for name in ("page", "old/b"):
+            (temporary / name).write_text("after")
+        assert (folder / "page").read_text() == "before"
+    files = [path for path in folder.rglob("*") if path.is_file()]
+    found = {path.relative_to(folder).as_posix(): path.read_text() for path in files}
+    assert found == {"page": "after", "old/a": "before", "old/b": "after", "mine": "before"}
+
+
+@pytest.mark.parametrize("existed", [False, True])
+def test_a_folder_that_fails_stays_as_it_was(tmp_path: Path, existed: bool) -> None:
+    folder = tmp_path / "report"
+    if existed:
+        folder.mkdir()
+
+    def fail() -> None:
+        with atomic_folder(folder) as temporary:
+            (temporary / "page").write_text("half")
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        fail()
+    assert list(tmp_path.rglob("*")) == ([folder] if existed else [])
+
+
+def test_a_folder_left_by_a_killed_writer_is_removed(tmp_path: Path) -> None:
+    (tmp_path / ".0123456789ab" / "deep").mkdir(parents=True)
+    (tmp_path / ".mine").mkdir()
+    assert remove_leftovers(tmp_path) == 1
+    assert [path.name for path in tmp_path.iterdir()] == [".mine"]

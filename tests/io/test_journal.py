@@ -29,6 +29,19 @@ def test_the_newest_line_of_each_key_counts(tmp_path: Path) -> None:
     assert len((tmp_path / "j.jsonl").read_text().splitlines()) == 4
 
 
+def test_lines_appended_together_count_as_lines_appended_one_by_one(tmp_path: Path) -> None:
+    lines = [{"frame": 'a"\\', "n": 1}, {"n": 2, "frame": "b"}, {"frame": 3}, {"frame": "é"}]
+    together, alone = (Journal(tmp_path / name, "frame") for name in ("t.jsonl", "a.jsonl"))
+    together.append(*lines)
+    for line in lines:
+        alone.append(line)
+    assert (tmp_path / "t.jsonl").read_bytes() == (tmp_path / "a.jsonl").read_bytes()
+    for seen in (together, Journal(tmp_path / "t.jsonl", "frame")):
+        assert seen.keys() == ['a"\\', "b", "é"]
+        assert seen.newest("b") == {"n": 2, "frame": "b"}
+        assert seen.lost == 0
+
+
 def test_a_file_that_is_not_there_is_empty(tmp_path: Path) -> None:
     assert Journal(tmp_path / "j.jsonl", "frame").keys() == []
     assert not (tmp_path / "j.jsonl").exists()

@@ -51,7 +51,7 @@ def points_of(view: View, depth: np.ndarray) -> np.ndarray:
     """Unprojects with the pinhole equations alone."""
     v, u = np.mgrid[:HEIGHT, :WIDTH]
     local = np.stack([(u - view.cx) / view.fx, (v - view.cy) / view.fy, np.ones_like(u)], axis=2)
-    return (local * depth[..., None]) @ view.axes.T.astype(float) + view.place
+    return (local * depth[..., None]) @ view.axes.T.astype(float) + view.position
 
 
 def job(out: Path, **changes: object) -> render.Job:

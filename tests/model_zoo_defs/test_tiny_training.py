@@ -140,7 +140,7 @@ def test_the_logarithm_goes_on_below_the_nearest_depth_and_can_climb_back() -> N
 
 LOSSES = (
     recipes.log_error, recipes.log_error_up_to_scale,
-    recipes.share_of_distance, recipes.inverse_error,
+    recipes.relative_error, recipes.inverse_error,
 )  # fmt: skip
 
 

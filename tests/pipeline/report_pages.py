@@ -29,3 +29,8 @@ def frames_of(folder: Path) -> dict[str, dict[str, Any]]:
 def pictures_of(folder: Path) -> dict[str, bytes]:
     """The pictures of a report."""
     return {path.name: path.read_bytes() for path in sorted((folder / "pictures").iterdir())}
+
+
+def everything(folder: Path) -> dict[str, bytes]:
+    """The files of a report by their names."""
+    return {p.name: p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}

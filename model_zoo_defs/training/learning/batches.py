@@ -1,7 +1,8 @@
-"""Batches for networks that learn metric depth: nothing in them changes a picture's geometry.
+"""Batches for networks that learn metric depth: no augmentation changes the geometry of an image.
 
-Windows of frames as the camera took them, mirrored half the time, in other colours, with points
-where a network takes them. Batch number i depends on the seed, i and the frames alone.
+A batch holds windows of frames at their own scale, mirrored with probability 0.5, with changed
+colours and, for networks that take them, sparse points. Batch number i depends only on the seed,
+on i and on the frames.
 """
 
 from __future__ import annotations
@@ -35,10 +36,10 @@ class Batch(NamedTuple):
 
 
 class Batches:
-    """Endless batches; every folder of frames counts alike.
+    """Endless batches; every folder of frames is drawn from equally often.
 
-    points: draws the sparse depth of a window, None: there is none.
-    spliced: the share of windows that are put together of two.
+    points: draws the sparse depth of a window; None: no sparse depth.
+    spliced: fraction of windows that are spliced from two frames.
     """
 
     def __init__(
@@ -55,7 +56,7 @@ class Batches:
     def batch(
         self, number: int, size: int, window: tuple[int, int], shown: tuple[int, int] | None = None
     ) -> Batch:
-        """Batch number `number`: `size` windows (H, W), their pictures resized to `shown`."""
+        """Batch number `number`: `size` windows (H, W), their images resized to `shown`."""
         self._calls += 1
         if self._calls % REFRESH_EVERY == 0:
             for frames in self.sets:
@@ -68,8 +69,8 @@ class Batches:
         rgb = rgb.contiguous(memory_format=torch.channels_last).float() / 255.0
         if shown:
             rgb = F.interpolate(rgb, shown, mode="bilinear", antialias=True)
-        points, truth = (torch.from_numpy(x)[:, None] for x in (sparse, depth))
-        return Batch(recoloured(rng, rgb), points, truth)
+        points, ground_truth = (torch.from_numpy(x)[:, None] for x in (sparse, depth))
+        return Batch(recoloured(rng, rgb), points, ground_truth)
 
     def _one_or_two(
         self, rng: Generator, window: tuple[int, int]
@@ -101,7 +102,7 @@ class Batches:
 def spliced(
     rng: Generator, one: tuple[NDArray[np.uint8], Depth], other: tuple[NDArray[np.uint8], Depth]
 ) -> tuple[NDArray[np.uint8], Depth]:
-    """Columns of one frame left of columns of the other, rows kept, so that metres stay true.
+    """Columns of one frame left of columns of the other; rows, and so metric depths, are kept.
 
     A camera of fixed height and pitch sees the floor of a row equally far in every column.
     """
@@ -115,7 +116,7 @@ def spliced(
 
 
 def recoloured(rng: Generator, rgb: Tensor) -> Tensor:
-    """The pictures (B, 3, h, w) 0..1 in other light, each in its own, and often in other hues."""
+    """Images (B, 3, h, w) 0..1 with random exposure and colour, often permuted channels."""
 
     def each(values: NDArray[np.float64]) -> Tensor:
         return torch.from_numpy(values.astype(np.float32)).view(len(rgb), -1, 1, 1)
@@ -131,21 +132,22 @@ def recoloured(rng: Generator, rgb: Tensor) -> Tensor:
 
 
 def some_points(rng: Generator, depth: Depth) -> Depth:
-    """As many as networks with a picture get, or lines of a LiDAR.
+    """Sparse depth for networks that also take an image: random pixels or LiDAR scan lines.
 
-    Half of the time as 500 of 228 x 304 pixels; 500 of 228 x 912 are in the range of the others.
+    Half of the random pixel sets have the density of 500 of 228 x 304 pixels; the density of 500 of
+    228 x 912 pixels lies in the range of the others.
     """
     kind = rng.random()
     if kind < 0.2:
         return scan_lines(rng, depth)
-    share = 0.0072 if kind < 0.6 else np.exp(rng.uniform(np.log(0.0015), np.log(0.03)))
-    return keep(depth, uniform(rng, depth, max(1, round(share * depth.size))))
+    fraction = 0.0072 if kind < 0.6 else np.exp(rng.uniform(np.log(0.0015), np.log(0.03)))
+    return keep(depth, uniform(rng, depth, max(1, round(fraction * depth.size))))
 
 
 def many_points(rng: Generator, depth: Depth) -> Depth:
-    """As many as networks without a picture get, often 5 per cent, or lines of a LiDAR."""
+    """Sparse depth for networks without an image: random pixels, often 5 %, or LiDAR scan lines."""
     kind = rng.random()
     if kind < 0.4:
         return scan_lines(rng, depth)
-    share = 0.05 if kind < 0.8 else np.exp(rng.uniform(np.log(0.005), np.log(0.2)))
-    return keep(depth, uniform(rng, depth, max(1, round(share * depth.size))))
+    fraction = 0.05 if kind < 0.8 else np.exp(rng.uniform(np.log(0.005), np.log(0.2)))
+    return keep(depth, uniform(rng, depth, max(1, round(fraction * depth.size))))

@@ -1,8 +1,8 @@
-"""Rendered frames as training samples: shards on disk in, augmented pictures and points out.
+"""Rendered frames as training samples: from shards on disk to augmented images and points.
 
 A shard is an .npz file with rgb (N, H, W, 3) uint8 and depth (N, H, W) metres, 0 = unknown.
-Sample number i depends on the seed, i and the frames alone, so an interrupted run goes on with
-the samples it would have seen.
+Sample number i depends only on the seed, on i and on the frames, so a resumed run continues with
+the same samples.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class Sample(NamedTuple):
 class Frames:
     """All frames of some folders' shards; `refresh` adds shards that came since.
 
-    They stay on disk, mapped: runs beside each other share what the system keeps of them in memory.
+    The arrays are memory-mapped: parallel runs use the same page cache.
     """
 
     def __init__(self, *folders: Path):
@@ -53,7 +53,7 @@ class Frames:
             raise FileNotFoundError(f"no shard (*.npz) in {', '.join(map(str, folders))}")
 
     def refresh(self) -> None:
-        """Every shard has been read, folder by folder, in the order of their names."""
+        """Reads the shards not read so far, folder by folder, in the order of their names."""
         for path in (path for folder in self.folders for path in sorted(folder.glob("*.npz"))):
             if path not in self._read:
                 shard = mapped(path)
@@ -68,7 +68,7 @@ class Frames:
 
 
 def mapped(path: Path) -> dict[str, NDArray[Any]]:
-    """The arrays of an uncompressed .npz file, read from the disk where they are looked at.
+    """Memory-mapped arrays of an uncompressed .npz file, by name.
 
     A member of the archive is a .npy file as it is, behind a header of 30 bytes and two fields
     whose lengths it ends with (PKWARE APPNOTE.TXT 6.3.10, section 4.3.7).
@@ -93,10 +93,10 @@ class Samples(Dataset[Sample]):
 
     def __init__(
         self, folders: tuple[Path, ...], size: tuple[int, int], seed: int,
-        prior_share: float = priors.SHARE,
+        prior_fraction: float = priors.PRIOR_FRACTION,
     ):  # fmt: skip
         self.folders, self.size, self.seed = folders, size, seed
-        self.prior_share = prior_share
+        self.prior_fraction = prior_fraction
         self.frames: Frames | None = None
         self._calls = 0
 
@@ -110,7 +110,7 @@ class Samples(Dataset[Sample]):
         while True:
             rgb, depth = self.frames[int(rng.integers(len(self.frames)))]
             other = self.frames[int(rng.integers(len(self.frames)))][1]
-            sample = augmented(rng, rgb, depth, self.size, other, self.prior_share)
+            sample = augmented(rng, rgb, depth, self.size, other, self.prior_fraction)
             if bool((sample.depth > 0).any() and (sample.sparse > 0).any()):
                 return sample
 
@@ -129,66 +129,66 @@ class Counting(Sampler[int]):
 
 
 def normalised(rgb: Tensor) -> Tensor:
-    """rgb (3, H, W) in 0..1 as the network takes it."""
+    """rgb (3, H, W) in 0..1, normalised with the mean and std of ImageNet."""
     mean, std = (torch.tensor(x).view(3, 1, 1) for x in (IMAGENET_MEAN, IMAGENET_STD))
     return (rgb - mean) / std
 
 
 def augmented(
     rng: Generator, rgb: NDArray[np.uint8], depth: NDArray[np.float32], size: tuple[int, int],
-    other: NDArray[np.float32], prior_share: float = priors.SHARE,
+    other: NDArray[np.float32], prior_fraction: float = priors.PRIOR_FRACTION,
 ) -> Sample:  # fmt: skip
-    """A random part of a frame at a random zoom, mirrored half the time, with points and prior.
+    """A random crop at a random zoom, mirrored with probability 0.5, with points and prior.
 
-    other: the depth of an unrelated frame, which a useless prior may show.
+    other: depth of an unrelated frame; a useless prior may be drawn from it.
     """
-    picture, distance = _zoomed_part(rng, rgb, depth, size)
+    image, distance = _zoomed_part(rng, rgb, depth, size)
     if rng.random() < 0.5:
-        picture, distance = picture.flip(-1), distance.flip(-1)
+        image, distance = image.flip(-1), distance.flip(-1)
     distance = distance * float(np.exp(rng.uniform(np.log(0.5), np.log(2.0))))
-    sparse = draw(rng, distance.numpy(), picture.mean(0).numpy())
+    sparse = draw(rng, distance.numpy(), image.mean(0).numpy())
     if rng.random() < 0.15:
-        # colour and depth cameras that are not quite registered
-        picture = _shifted(picture, int(rng.integers(-2, 3)), int(rng.integers(-3, 4)))
-    grey = picture.mean(0).numpy()
-    prior = priors.draw(rng, distance.numpy(), grey, sparse, other, prior_share)
+        # small registration error between the colour and the depth camera
+        image = _shifted(image, int(rng.integers(-2, 3)), int(rng.integers(-3, 4)))
+    grey = image.mean(0).numpy()
+    prior = priors.draw(rng, distance.numpy(), grey, sparse, other, prior_fraction)
     prior = np.zeros_like(sparse) if prior is None else prior
-    picture = degraded(rng, misregistered(rng, picture))
+    image = degraded(rng, misregistered(rng, image))
     points, dense = torch.from_numpy(sparse)[None], torch.from_numpy(prior)[None]
-    return Sample(normalised(picture), points, distance[None], dense)
+    return Sample(normalised(image), points, distance[None], dense)
 
 
-def _shifted(picture: Tensor, down: int, right: int) -> Tensor:
-    """The picture moved by whole pixels, its border repeated."""
-    height, width = picture.shape[-2:]
-    padded = F.pad(picture[None], (3, 3, 3, 3), mode="replicate")[0]
+def _shifted(image: Tensor, down: int, right: int) -> Tensor:
+    """The image moved by whole pixels, its border repeated."""
+    height, width = image.shape[-2:]
+    padded = F.pad(image[None], (3, 3, 3, 3), mode="replicate")[0]
     return padded[:, 3 - down : 3 - down + height, 3 - right : 3 - right + width]
 
 
 def _zoomed_part(
     rng: Generator, rgb: NDArray[np.uint8], depth: NDArray[np.float32], size: tuple[int, int]
 ) -> tuple[Tensor, Tensor]:
-    """A window of the frame resized to `size`: picture (3, h, w) 0..1, depth (h, w)."""
+    """A window of the frame resized to `size`: image (3, h, w) 0..1, depth (h, w)."""
     height, width = depth.shape
     least = max(size[0] / height, size[1] / width)
     zoom = least * float(np.exp(rng.uniform(0.0, np.log(2.5))))
     h, w = min(height, round(size[0] / zoom)), min(width, round(size[1] / zoom))
     top, left = int(rng.integers(height - h + 1)), int(rng.integers(width - w + 1))
     part = (slice(top, top + h), slice(left, left + w))
-    picture = torch.from_numpy(np.ascontiguousarray(rgb[part])).permute(2, 0, 1).float() / 255.0
-    picture = F.interpolate(
-        picture[None], size, mode="bilinear", align_corners=False, antialias=True
-    )[0]
+    image = torch.from_numpy(np.ascontiguousarray(rgb[part])).permute(2, 0, 1).float() / 255.0
+    image = F.interpolate(image[None], size, mode="bilinear", align_corners=False, antialias=True)[
+        0
+    ]
     distance = torch.from_numpy(np.ascontiguousarray(depth[part]))
     distance = F.interpolate(distance[None, None], size, mode="nearest-exact")[0, 0]
-    return picture.contiguous(), distance.contiguous()
+    return image.contiguous(), distance.contiguous()
 
 
 def misregistered(rng: Generator, rgb: Tensor) -> Tensor:
-    """The picture (3, H, W) as a colour camera beside the depth sensor sees it.
+    """The image (3, H, W) misregistered against the depth map.
 
-    Most frames are aligned; some are off by a pixel or so, as after calibration, and some by up to
-    8 % in scale and 5 % in place, as in pictures of RGB-D cameras that nobody registered.
+    65 % of the frames stay aligned, 20 % are off by about a pixel, as after calibration, and 15 %
+    by up to 8 % in scale and 5 % in position, as in unregistered RGB-D images.
     """
     kind = rng.random()
     if kind > 0.35:
@@ -202,7 +202,7 @@ def misregistered(rng: Generator, rgb: Tensor) -> Tensor:
 
 
 def degraded(rng: Generator, rgb: Tensor) -> Tensor:
-    """The picture (3, H, W) 0..1 as a cheaper camera in another light would have taken it."""
+    """The image (3, H, W) 0..1 with random exposure, colour, blur, noise and compression."""
     if rng.random() < 0.8:
         gain = float(np.exp(rng.normal(0.0, 0.2))) * np.exp(rng.normal(0.0, 0.06, (3, 1, 1)))
         rgb = rgb * torch.from_numpy(gain).float()
@@ -229,7 +229,7 @@ def _blurred(rgb: Tensor, sigma: float) -> Tensor:
 
 
 def _block_compressed(rgb: Tensor, step: float) -> Tensor:
-    """What JPEG does: 8 x 8 cosine transforms rounded, high frequencies more coarsely."""
+    """The image after JPEG-like compression: 8 x 8 DCT, coarser steps for high frequencies."""
     k, n = torch.arange(8.0)[:, None], torch.arange(8.0)[None, :]
     basis = torch.cos(torch.pi * (2 * n + 1) * k / 16) * 0.5
     basis[0] = 8**-0.5

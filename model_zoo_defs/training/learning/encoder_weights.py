@@ -25,14 +25,14 @@ def pretrained_encoder() -> dict[str, Tensor]:
 
 
 def converted(published: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """The published tensors the encoder has a place for, folded and renamed."""
+    """The published tensors that the encoder uses, folded and renamed."""
     state = _folded(published, "_conv_stem", "_bn0", "stem")
     number = 0
     for level, rows in STAGES.items():
-        place = 0
+        index = 0
         for *_, expansion, count in rows:
             for _ in range(count):
-                source, target = f"_blocks.{number}.", f"stages.{level}.{place}."
+                source, target = f"_blocks.{number}.", f"stages.{level}.{index}."
                 if expansion != 1:
                     state |= _folded(
                         published, source + "_expand_conv", source + "_bn0", target + "expand"
@@ -43,7 +43,7 @@ def converted(published: Mapping[str, Tensor]) -> dict[str, Tensor]:
                 state |= _folded(
                     published, source + "_project_conv", source + "_bn2", target + "project"
                 )
-                number, place = number + 1, place + 1
+                number, index = number + 1, index + 1
     return state
 
 

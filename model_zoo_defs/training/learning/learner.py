@@ -1,4 +1,4 @@
-"""A network being trained: one step, the running average, the schedule, stopping and going on."""
+"""Training of one network: step, running average of the weights, schedule, save and restore."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ WARM_UP_STEPS = 200
 
 @dataclass(frozen=True, kw_only=True)
 class Schedule:
-    """How long a run is and how fast it learns; the first limit that is reached ends it.
+    """Length and learning rate of a run; the first limit that is reached ends it.
 
-    averaging: how much of the average of the weights stays at each step.
-    decay: the rate is constant until this many steps before the end; None: it falls all along.
+    averaging: decay of the running average of the weights per step.
+    decay: the rate is constant until this many steps before the end; None: it falls throughout.
     Without `minutes` the same seed and frames give the same bytes on the same machine.
     """
 
@@ -35,12 +35,12 @@ class Schedule:
     warm_up: int = WARM_UP_STEPS
 
     def progress(self, step: int, elapsed_s: float) -> float:
-        """How much of the run is done, 0..1, by steps or by the clock, whichever is further."""
+        """Fraction of the run that is done, by steps or by elapsed time, whichever is larger."""
         by_clock = elapsed_s / (self.minutes * 60) if self.minutes else 0.0
         return min(1.0, max(step / self.steps, by_clock))
 
     def rate(self, step: int, elapsed_s: float) -> float:
-        """The learning rate: up in a straight line, then down to 0 on a cosine."""
+        """Learning rate: linear warm-up, then cosine decay to 0."""
         factor = min(1.0, (step + 1) / self.warm_up)
         done = self.progress(step, elapsed_s)
         if self.decay is not None:
@@ -51,7 +51,7 @@ class Schedule:
 class Learner:
     """The network being trained, its running average, and the optimiser.
 
-    A run says in `loss` what is to become small. `out` gets state.pt (everything `restore` needs)
+    Subclasses define `loss`. `out` gets state.pt (everything `restore` needs)
     and NAME.safetensors (the averaged weights, in half precision).
     """
 
@@ -81,29 +81,29 @@ class Learner:
         return [{"params": self.learnt, "factor": 1.0}]
 
     def loss(self, part: Sequence[Tensor]) -> Tensor:
-        """What is to become small, for a part of a batch."""
+        """The loss to minimise, of a part of a batch."""
         raise NotImplementedError
 
     @property
     def progress(self) -> float:
-        """How much of the run is done, 0..1."""
+        """Fraction of the run that is done."""
         return self.schedule.progress(self.step, self.elapsed_s)
 
     def learn(self, batch: Sequence[Tensor]) -> float:
-        """One step of the optimiser has been made; returns the loss."""
+        """Takes one optimiser step; returns the loss."""
         self.network.train()
         for group in self.optimiser.param_groups:
             group["lr"] = group["factor"] * self.schedule.rate(self.step, self.elapsed_s)
         parts = list(zip(*(tensor.chunk(self.lanes) for tensor in batch), strict=True))
         results = list(self.pool.map(self._loss_and_gradients, parts))
-        gradients = zip(*(found for _, found in results), strict=True)
+        gradients = zip(*(part_gradients for _, part_gradients in results), strict=True)
         for parameter, pieces in zip(self.learnt, gradients, strict=True):
             known = [piece for piece in pieces if piece is not None]
             parameter.grad = torch.stack(known).mean(0) if len(known) > 1 else pieces[0]
         nn.utils.clip_grad_norm_(self.learnt, 1.0)
         self.optimiser.step()
         self.step += 1
-        # young averages follow faster, or the first export would be the initial weights
+        # a young average follows faster; else the first export equals the initial weights
         keep = min(self.schedule.averaging, (1 + self.step) / (10 + self.step))
         with torch.no_grad():
             torch._foreach_lerp_(_averaged(self.average), _averaged(self.network), 1.0 - keep)
@@ -112,13 +112,13 @@ class Learner:
     def _loss_and_gradients(
         self, part: Sequence[Tensor]
     ) -> tuple[float, tuple[Tensor | None, ...]]:
-        torch.set_num_threads(1)  # a setting of the thread it is called in
+        torch.set_num_threads(1)  # applies to the calling thread only
         loss = self.loss([tensor.to(self.device) for tensor in part])
         # a stage that trains a part of the network leaves the rest without gradient
         return float(loss.detach()), torch.autograd.grad(loss, self.learnt, allow_unused=True)
 
     def save(self) -> None:
-        """state.pt and the averaged weights hold this moment, whole or not at all."""
+        """Writes state.pt and the averaged weights, each whole or not at all."""
         state = {
             "network": self.network.state_dict(),
             "average": self.average.state_dict(),
@@ -131,11 +131,11 @@ class Learner:
         export(self.exported(), self.weights)
 
     def exported(self) -> nn.Module:
-        """The network whose weights go out."""
+        """The network whose weights are exported."""
         return self.average
 
     def restore(self) -> None:
-        """The run stands where `save` left it; without a state.pt, at its beginning."""
+        """Loads the state written by `save`; without a state.pt, does nothing."""
         if not (self.out / "state.pt").exists():
             return
         state = torch.load(self.out / "state.pt", map_location=self.device)
@@ -146,12 +146,12 @@ class Learner:
 
     @property
     def weights(self) -> Path:
-        """The file with the averaged weights."""
+        """Path of the file with the averaged weights."""
         return self.out / f"{self.name}.safetensors"
 
 
 def _averaged(network: nn.Module) -> list[Tensor]:
-    """Parameters and the running statistics of normalisation, which belong to them."""
+    """Tensors that are averaged: parameters and running statistics of normalisation."""
     statistics = [buffer for buffer in network.buffers() if buffer.is_floating_point()]
     return [*network.parameters(), *statistics]
 
@@ -163,7 +163,7 @@ def _channels_last(network: nn.Module) -> None:
 
 
 def export(network: nn.Module, path: Path) -> None:
-    """The weights are in a safetensors file, in half precision."""
+    """Writes the weights to a safetensors file, in half precision."""
     half = {
         name: tensor.detach()
         .to("cpu", torch.float16 if tensor.is_floating_point() else tensor.dtype)
@@ -176,7 +176,7 @@ def export(network: nn.Module, path: Path) -> None:
 
 
 def append_row(path: Path, row: dict[str, float]) -> None:
-    """The row is in the CSV file, below a header line."""
+    """Appends the row to the CSV file, with a header line if the file is new."""
     new = not path.exists()
     with path.open("a", newline="") as file:
         writer = csv.DictWriter(file, fieldnames=list(row))

@@ -1,7 +1,7 @@
-"""Sparse depth as sensors give it, drawn from dense depth.
+"""Sparse depth with the patterns and errors of real sensors, drawn from dense depth.
 
-`draw` picks one pattern at random, thins it with holes, and adds what real sensors add: noise,
-outliers, and a small shift between depth and image. All maps are (H, W) float32 metres with
+`draw` picks one pattern at random, thins it with holes, and adds noise, outliers and a small shift
+between depth and image. All maps are (H, W) float32 metres with
 0 = unknown; the same generator state gives the same points.
 """
 
@@ -38,30 +38,30 @@ def draw(rng: Generator, depth: Depth, grey: Depth) -> Depth:
 
 
 def strip(rng: Generator, shape: tuple[int, ...]) -> Mask:
-    """The image beyond a random line: a strip of at least 0.1, up to 0.7 of the image."""
+    """The image on one side of a random line: 0.1 to 0.7 of its pixels."""
     height, width = shape
     angle = rng.uniform(0.0, 2.0 * np.pi)
     rows, columns = np.indices(shape, dtype=np.float32)
-    place = np.cos(angle) * rows / height + np.sin(angle) * columns / width
-    return np.asarray(place < np.quantile(place[::4, ::4], rng.uniform(0.1, 0.7)))
+    position = np.cos(angle) * rows / height + np.sin(angle) * columns / width
+    return np.asarray(position < np.quantile(position[::4, ::4], rng.uniform(0.1, 0.7)))
 
 
 def triangulated(rng: Generator, sparse: Depth) -> Depth:
-    """Points with the errors of triangulation: sigma grows with depth, and some are far off."""
+    """Points with triangulation errors: sigma grows with depth, 1 to 5 % are outliers."""
     known = sparse > 0
     if not known.any():
         return sparse
     relative = sparse / np.float32(np.median(sparse[known]))
     sigma = np.float32(rng.uniform(0.0, 0.03)) * relative
     inverse = 1.0 + sigma * rng.standard_normal(sparse.shape, dtype=np.float32)
-    wrong = rng.random(sparse.shape) < rng.uniform(0.01, 0.05)
+    outlier = rng.random(sparse.shape) < rng.uniform(0.01, 0.05)
     factor = np.exp(rng.normal(0.0, 0.6, sparse.shape)).astype(np.float32)
-    inverse = np.where(wrong, factor, np.maximum(inverse, 0.2))
+    inverse = np.where(outlier, factor, np.maximum(inverse, 0.2))
     return np.where(known, sparse / inverse, np.float32(0.0)).astype(np.float32)
 
 
 def zones(rng: Generator, depth: Depth) -> Depth:
-    """A time-of-flight sensor of few zones: one depth each, holes, mixed depths at edges."""
+    """Points of a multi-zone time-of-flight sensor: one depth per zone, holes, mixed edges."""
     rows, columns = (int(n) for n in rng.integers(6, 33, 2))
     height, width = depth.shape
     r = ((np.arange(rows) + 0.5) * height / rows).astype(int)
@@ -71,8 +71,8 @@ def zones(rng: Generator, depth: Depth) -> Depth:
     aside = np.ix_(np.clip(r + reach, 0, height - 1), np.clip(c + reach, 0, width - 1))
     value, second = depth[at], depth[aside]
     mixed = (rng.random(value.shape) < rng.uniform(0.0, 0.5)) & (second > 0)
-    share = rng.random(value.shape, dtype=np.float32)
-    value = np.where(mixed & (value > 0), share * value + (1.0 - share) * second, value)
+    fraction = rng.random(value.shape, dtype=np.float32)
+    value = np.where(mixed & (value > 0), fraction * value + (1.0 - fraction) * second, value)
     returned = rng.random(value.shape) >= rng.uniform(0.0, 0.3)
     if rng.random() < 0.5:
         known = value[value > 0]
@@ -140,8 +140,8 @@ def window(rng: Generator, shape: tuple[int, ...]) -> Mask:
 def scan_lines(rng: Generator, depth: Depth) -> Depth:
     """Points of a spinning LiDAR: slightly bowed lines, dense along them, nothing at the top.
 
-    Some points lie behind what the camera sees at their pixel: the scanner stands elsewhere and
-    looks past the edges (`leak`).
+    Some points lie behind the surface the camera sees at their pixel, because of the parallax
+    between scanner and camera (`leak`).
     """
     height, width = depth.shape
     spacing = float(np.exp(rng.uniform(np.log(1.5), np.log(height / 4))))
@@ -151,8 +151,8 @@ def scan_lines(rng: Generator, depth: Depth) -> Depth:
     lines = np.arange(top, height, spacing)
     across = np.arange(rng.uniform(0.0, stride), width, stride)
     bow, tilt = rng.uniform(-0.04, 0.04) * height, rng.uniform(-0.03, 0.03) * height
-    place = across / width * 2.0 - 1.0
-    rows = lines[:, None] + (bow * place**2 + tilt * place)[None, :]
+    position = across / width * 2.0 - 1.0
+    rows = lines[:, None] + (bow * position**2 + tilt * position)[None, :]
     rows = rows + rng.normal(0.0, 0.3, rows.shape)
     columns = across[None, :] + rng.uniform(-0.4, 0.4, rows.shape)
     returned = rng.random(rows.shape) >= rng.uniform(0.0, 0.4)
@@ -162,9 +162,9 @@ def scan_lines(rng: Generator, depth: Depth) -> Depth:
 
 
 def leak(rng: Generator, depth: Depth) -> Depth:
-    """The depth map with some pixels beside depth edges showing the background behind them.
+    """The depth map with the background's depth at some pixels beside depth edges.
 
-    A pixel looks past an edge k pixels away when the parallax between the two depths,
+    The background is visible past an edge k pixels away when the parallax between the two depths,
     focal x baseline x (1/near − 1/far), is more than k pixels.
     """
     known = depth[depth > 0]
@@ -187,15 +187,15 @@ def leak(rng: Generator, depth: Depth) -> Depth:
 
 
 def faults(rng: Generator, sparse: Depth) -> Depth:
-    """The points with noise, outliers and a shift against the image, each of them sometimes."""
+    """The points with random noise, outliers and shift against the image; each may be absent."""
     mask = sparse > 0
     out = sparse.copy()
     if rng.random() < 0.5:
         out *= 1.0 + rng.uniform(0.0, 0.03) * rng.standard_normal(sparse.shape, dtype=np.float32)
     elif rng.random() < 0.3:
         # structured light: the error grows with the square of the depth
-        share = rng.uniform(0.0, 0.02) / max(float(sparse.max()), 1e-3)
-        out += share * sparse**2 * rng.standard_normal(sparse.shape, dtype=np.float32)
+        gain = rng.uniform(0.0, 0.02) / max(float(sparse.max()), 1e-3)
+        out += gain * sparse**2 * rng.standard_normal(sparse.shape, dtype=np.float32)
     if rng.random() < 0.4:
         most = 0.25 if rng.random() < 0.5 else 0.05
         out = outliers(rng, out, float(rng.uniform(0.0, most)))
@@ -205,25 +205,25 @@ def faults(rng: Generator, sparse: Depth) -> Depth:
     return out
 
 
-def outliers(rng: Generator, sparse: Depth, share: float) -> Depth:
-    """The points with a share of them wrong: off by a factor, anywhere in range, or swapped."""
+def outliers(rng: Generator, sparse: Depth, fraction: float) -> Depth:
+    """The points with a fraction of outliers: scaled, uniform in the depth range, or swapped."""
     rows, columns = np.nonzero(sparse)
-    chosen = rng.random(len(rows)) < share
+    chosen = rng.random(len(rows)) < fraction
     rows, columns = rows[chosen], columns[chosen]
     if not len(rows):
         return sparse
     known, count = sparse[sparse > 0], len(rows)
     kind = rng.integers(4)
     if kind == 0:
-        wrong = (sparse[rows, columns] * np.exp(rng.normal(0.0, 0.7, count))).astype(np.float32)
+        changed = (sparse[rows, columns] * np.exp(rng.normal(0.0, 0.7, count))).astype(np.float32)
     elif kind == 1:
-        wrong = rng.uniform(0.5 * known.min(), 1.3 * known.max(), count).astype(np.float32)
+        changed = rng.uniform(0.5 * known.min(), 1.3 * known.max(), count).astype(np.float32)
     elif kind == 2:
-        wrong = rng.choice(known, count)
+        changed = rng.choice(known, count)
     else:
-        wrong = sparse[rows, columns] * rng.choice((rng.uniform(0.3, 0.8), rng.uniform(1.3, 3.0)))
+        changed = sparse[rows, columns] * rng.choice((rng.uniform(0.3, 0.8), rng.uniform(1.3, 3.0)))
     out = sparse.copy()
-    out[rows, columns] = wrong
+    out[rows, columns] = changed
     return out
 
 

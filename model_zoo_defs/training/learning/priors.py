@@ -1,8 +1,7 @@
-"""Dense priors for training: the ground truth damaged as depth networks damage it, and nonsense.
+"""Dense priors for training: ground truth with the errors of depth networks, and unrelated depth.
 
-`draw` gives a prior (H, W) in metres, aligned to the points as the program aligns the prediction
-of a network, 0 where it is unknown; None when the sample has no prior. The same generator state
-gives the same prior.
+`draw` returns a prior (H, W) in metres, aligned to the points as the program aligns a prediction,
+0 where unknown; None for a sample without prior. The same generator state gives the same prior.
 """
 
 from __future__ import annotations
@@ -20,17 +19,22 @@ from model_zoo_defs.training.learning.patterns import window
 
 Depth = NDArray[np.float32]
 
-SHARE = 0.55
-NONSENSE_SHARE = 0.3
+PRIOR_FRACTION = 0.55
+NONSENSE_FRACTION = 0.3
 
 
 def draw(
-    rng: Generator, depth: Depth, grey: Depth, sparse: Depth, other: Depth, share: float = SHARE
+    rng: Generator,
+    depth: Depth,
+    grey: Depth,
+    sparse: Depth,
+    other: Depth,
+    fraction: float = PRIOR_FRACTION,
 ) -> Depth | None:
-    """A prior of a random kind for a `share` of the samples; `other` is an unrelated depth."""
-    if rng.random() >= share:
+    """A prior of a random kind for a `fraction` of the samples; `other` is an unrelated depth."""
+    if rng.random() >= fraction:
         return None
-    useless = rng.random() < NONSENSE_SHARE
+    useless = rng.random() < NONSENSE_FRACTION
     raw = nonsense(rng, depth.shape, other) if useless else damaged(rng, depth, grey)
     prior = aligned(raw, sparse, affine=bool(rng.random() < 0.4))
     if rng.random() < 0.1:
@@ -67,19 +71,19 @@ def filled(depth: Depth) -> Tensor:
     value = torch.from_numpy(np.log(np.where(depth > 0, depth, 1.0)).astype(np.float32))[None, None]
     levels = [(value * known, known)]
     while min(levels[-1][0].shape[-2:]) > 1:
-        total, share = (F.avg_pool2d(x, 2, ceil_mode=True) for x in levels[-1])
-        levels.append((total, share))
+        total, fraction = (F.avg_pool2d(x, 2, ceil_mode=True) for x in levels[-1])
+        levels.append((total, fraction))
     result = levels[-1][0] / levels[-1][1].clamp(min=1e-6)
-    for total, share in reversed(levels[:-1]):
+    for total, fraction in reversed(levels[:-1]):
         coarse = _enlarged(result, total.shape[-2:])
-        result = torch.where(share > 0, total / share.clamp(min=1e-6), coarse)
+        result = torch.where(fraction > 0, total / fraction.clamp(min=1e-6), coarse)
     return result
 
 
 def damaged(rng: Generator, depth: Depth, grey: Depth) -> Depth:
-    """The ground truth with faults of depth networks, each of them sometimes; metres up to scale.
+    """Ground truth with random errors of depth networks; metres up to scale.
 
-    One number, the severity, makes some priors nearly exact and others poor in all respects.
+    One severity per prior scales all errors: some priors are nearly exact, others poor throughout.
     """
     severity = float(rng.uniform(0.05, 1.0) ** 1.5)
     log_depth = filled(depth)
@@ -95,7 +99,7 @@ def damaged(rng: Generator, depth: Depth, grey: Depth) -> Depth:
 
 
 def nonsense(rng: Generator, shape: tuple[int, ...], other: Depth) -> Depth:
-    """A dense depth that has nothing to do with the sample."""
+    """A dense depth unrelated to the sample."""
     kind = rng.integers(4)
     if kind == 0:
         return np.ones(shape, np.float32)
@@ -106,12 +110,12 @@ def nonsense(rng: Generator, shape: tuple[int, ...], other: Depth) -> Depth:
     if kind == 2:
         rough = rng.normal(0.0, rng.uniform(0.05, 0.5), shape)
         return np.asarray(np.exp(rough), dtype=np.float32)
-    strange = torch.exp(filled(other))
-    return np.asarray(_enlarged(strange, shape)[0, 0].numpy(), dtype=np.float32)
+    unrelated = torch.exp(filled(other))
+    return np.asarray(_enlarged(unrelated, shape)[0, 0].numpy(), dtype=np.float32)
 
 
 def _lost_details(rng: Generator, x: Tensor, severity: float) -> Tensor:
-    """Near things thinner than a few pixels are lost, or grow together (opening, closing)."""
+    """Near objects thinner than a few pixels are removed or merged (opening, closing)."""
     reach = 2 * int(rng.integers(1, 2 + round(4 * severity))) + 1
     sign = 1.0 if rng.random() < 0.75 else -1.0
     grown = F.max_pool2d(sign * x, reach, 1, reach // 2)
@@ -137,12 +141,12 @@ def _displaced(rng: Generator, x: Tensor, severity: float) -> Tensor:
 
 
 def _scale_field(rng: Generator, x: Tensor, severity: float) -> Tensor:
-    """A smooth error of scale; each part of the image is nearer or farther than it is."""
+    """Depth with a smoothly varying scale error."""
     return x + _field(rng, x, int(rng.integers(2, 9))) * float(rng.uniform(0.02, 0.3) * severity)
 
 
 def _contrast(rng: Generator, x: Tensor, severity: float) -> Tensor:
-    """A power of depth."""
+    """Depth raised to a random power."""
     middle = x.mean()
     return middle + (x - middle) * float(np.exp(rng.normal(0.0, 0.35 * severity)))
 
@@ -151,8 +155,8 @@ def _affine(rng: Generator, x: Tensor, severity: float) -> Tensor:
     """An offset of depth or of inverse depth, relative to the nearest depth."""
     sign = 1.0 if rng.random() < 0.5 else -1.0
     linear = torch.exp(sign * (x - x.median()).clamp(-4.0, 4.0))
-    share = float(rng.uniform(-0.7, 1.0) * severity)
-    return sign * torch.log((linear + share * linear.min()).clamp(min=1e-4)) + x.median()
+    ratio = float(rng.uniform(-0.7, 1.0) * severity)
+    return sign * torch.log((linear + ratio * linear.min()).clamp(min=1e-4)) + x.median()
 
 
 def _flat_range(rng: Generator, x: Tensor, severity: float) -> Tensor:
@@ -174,14 +178,14 @@ def _wrong_planes(rng: Generator, x: Tensor, severity: float) -> Tensor:
 
 
 def _tiles(rng: Generator, x: Tensor, severity: float) -> Tensor:
-    """Tiles with a scale each, as networks with small inputs leave them."""
+    """Tiles with a scale each, as tiled inference leaves them."""
     count = rng.integers(2, 5, 2)
     offsets = torch.from_numpy(rng.normal(0.0, 0.1 * severity, (1, 1, *count))).float()
     return x + F.interpolate(offsets, x.shape[-2:], mode="nearest")
 
 
 def _noise(rng: Generator, x: Tensor, severity: float) -> Tensor:
-    """Noise of a random fineness."""
+    """Depth with smooth noise of a random frequency."""
     cells = int(np.exp(rng.uniform(np.log(8.0), np.log(96.0))))
     return x + _field(rng, x, cells) * float(rng.uniform(0.005, 0.1) * severity)
 

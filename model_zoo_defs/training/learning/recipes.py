@@ -1,6 +1,6 @@
-"""What each tiny edition is shown and what is asked of it: losses, stages and starts.
+"""Training recipes of the tiny editions: losses, stages and initial weights.
 
-RECIPES["fcrn-tiny"].stage(0.4)  # 40 per cent of the run are over
+RECIPES["fcrn-tiny"].stage(0.4)  # after 40 % of the run
 """
 
 from __future__ import annotations
@@ -16,25 +16,25 @@ from torch import Tensor, nn
 from model_zoo_defs.training.learning.batches import Points, many_points, some_points
 from model_zoo_defs.training.learning.scaffold import scaffolded
 
-NEAREST = 0.1  # metres; below this a logarithm goes on as a straight line
+NEAREST = 0.1  # metres; below this the logarithm is continued by its tangent
 
 
 def smooth_log(depth: Tensor) -> Tensor:
-    """log(depth), and its tangent below `NEAREST`, where a network's metres may be negative."""
+    """log(depth), continued by its tangent below `NEAREST`, so that negative predictions count."""
     above = depth.clamp(min=NEAREST)
     return torch.log(above) + (depth - above) / NEAREST
 
 
-def log_error(depth: Tensor, truth: Tensor) -> Tensor:
-    """Mean |log depth − log truth| where the truth is known; 0 = unknown."""
-    known = truth > 0
-    return (smooth_log(depth[known]) - torch.log(truth[known])).abs().mean()
+def log_error(depth: Tensor, ground_truth: Tensor) -> Tensor:
+    """Mean |log depth − log ground truth| over known pixels; 0 = unknown."""
+    known = ground_truth > 0
+    return (smooth_log(depth[known]) - torch.log(ground_truth[known])).abs().mean()
 
 
-def log_error_up_to_scale(depth: Tensor, truth: Tensor) -> Tensor:
-    """The same once every picture's mean is taken off, which itself tends to 10 m = 1 slowly."""
+def log_error_up_to_scale(depth: Tensor, ground_truth: Tensor) -> Tensor:
+    """`log_error` after removing the mean of each image, plus 0.1 of that mean towards 10 m = 1."""
     losses = []
-    for one, other in zip(depth, truth, strict=True):
+    for one, other in zip(depth, ground_truth, strict=True):
         known = other > 0
         difference = smooth_log(one[known]) - torch.log(other[known] / 10.0)
         mean = difference.mean()
@@ -42,21 +42,21 @@ def log_error_up_to_scale(depth: Tensor, truth: Tensor) -> Tensor:
     return torch.stack(losses).mean()
 
 
-def share_of_distance(depth: Tensor, truth: Tensor) -> Tensor:
-    """Log of each picture's mean error over its median depth: near and far scenes count alike."""
+def relative_error(depth: Tensor, ground_truth: Tensor) -> Tensor:
+    """Mean log of the MAE of each image over its median depth: near and far scenes count alike."""
     losses = []
-    for one, other in zip(depth, truth, strict=True):
+    for one, other in zip(depth, ground_truth, strict=True):
         known = other > 0
         error = (one[known] - other[known]).abs().mean() / other[known].median()
         losses.append(torch.log(error + 1e-2))
     return torch.stack(losses).mean()
 
 
-def inverse_error(depth: Tensor, truth: Tensor) -> Tensor:
-    """Log of each picture's mean error of inverse depth, times its median depth."""
+def inverse_error(depth: Tensor, ground_truth: Tensor) -> Tensor:
+    """Mean log of the MAE of inverse depth of each image times its median depth."""
     inverse = 1.0 / depth.clamp(min=NEAREST) + (NEAREST - depth).clamp(min=0.0) / NEAREST**2
     losses = []
-    for one, other in zip(inverse, truth, strict=True):
+    for one, other in zip(inverse, ground_truth, strict=True):
         known = other > 0
         error = (one[known] - 1.0 / other[known]).abs().mean() * other[known].median()
         losses.append(torch.log(error + 1e-2))
@@ -68,30 +68,30 @@ Outputs = Callable[[Any, tuple[Tensor, ...]], list[Tensor]]
 
 
 def whole(network: Any, arguments: tuple[Tensor, ...]) -> list[Tensor]:
-    """What the network says."""
+    """The output of the network."""
     return [network(*arguments)]
 
 
 def pyramid(network: Any, arguments: tuple[Tensor, ...]) -> list[Tensor]:
-    """What a network says that has outputs at several sizes, the finest first."""
-    found: list[Tensor] = network.pyramid(*arguments)
-    return found
+    """Outputs of a network at several resolutions, the finest first."""
+    outputs: list[Tensor] = network.pyramid(*arguments)
+    return outputs
 
 
 def coarse(network: Any, arguments: tuple[Tensor, ...]) -> list[Tensor]:
-    """What the coarse half of `eigen` says."""
+    """The output of the coarse half of `eigen`."""
     return [network.coarse(*arguments)]
 
 
 def fine_and_coarse(network: Any, arguments: tuple[Tensor, ...]) -> list[Tensor]:
-    """What both halves of `eigen` say."""
+    """The outputs of both halves of `eigen`, the fine one first."""
     first = network.coarse(*arguments)
     return [network.fine(*arguments, first), first]
 
 
 @torch.no_grad()
 def hand_coarse_depth_on(network: Any) -> None:
-    """The fine half of `eigen` says what the coarse one says: a channel each for log depth ± ."""
+    """Initialises the fine half of `eigen` to pass on the coarse log depth, a channel per sign."""
     fine = network.fine
     for channel, sign in ((0, 1.0), (1, -1.0)):
         fine.conv2.weight[channel] = 0.0
@@ -102,11 +102,11 @@ def hand_coarse_depth_on(network: Any) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class Stage:
-    """A part of a run, up to this share of it.
+    """A part of a run, until this fraction of it.
 
-    window: (H, W) cut out of the frames.
-    shown: (h, w) of the network's picture of the window, where it is not the window's own size.
-    outputs: what is compared with the truth.
+    window: (H, W) of the crops of the frames.
+    shown: (h, w) the network's input image is resized to; None: the size of the window.
+    outputs: function that returns the outputs compared with the ground truth.
     """
 
     window: tuple[int, int]
@@ -117,21 +117,20 @@ class Stage:
 
 @dataclass(frozen=True, kw_only=True)
 class Recipe:
-    """What a network is shown and what is asked of it.
+    """Data, loss, initialisation and stages for the training of one network.
 
     quiet: endings of the names of normalisations that start at 0, the last ones of residual
-        branches, so that a deep network starts as a shallow one.
+        branches, so that a deep network starts out shallow.
     flat: layers that start as this constant, so that no step is lost on finding the mean.
     scaffold: layers that are normalised while they learn, in a network that has no normalisation.
-    start: what else is put in place before the first step.
-    spliced: the share of windows that are put together of two frames, left and right; for networks
-        that would learn rooms by heart.
-    own_start: the network's own initial weights are right; otherwise He's are taken.
-    dropout: the share that dropout drops in training; half, as published, is more than a narrow
-        network has to spare.
+    start: further initialisation of the network before the first step.
+    spliced: fraction of windows that are spliced from two frames, left and right; for networks that
+        overfit to rooms.
+    own_start: whether the network's own initial weights are kept; otherwise He's are taken.
+    dropout: dropout probability in training; the published 0.5 is too much for a narrow network.
     farthest: depth beyond these metres is unknown.
-    half_precision: whether bfloat16 is exact enough and faster; it is neither for depth that comes
-        in as numbers only and for convolutions channel by channel.
+    half_precision: whether to train in bfloat16; it is neither exact enough nor faster for networks
+        with depth input only and for depthwise convolutions.
     """
 
     loss: Loss
@@ -150,7 +149,7 @@ class Recipe:
     half_precision: bool = True
 
     def stage(self, progress: float) -> Stage:
-        """The stage at this share of the run."""
+        """The stage at this fraction of the run."""
         return next((one for one in self.stages if progress < one.until), self.stages[-1])
 
 
@@ -187,11 +186,11 @@ RECIPES = {
         stages=(Stage(window=STREET, shown=(128, 416), outputs=pyramid),),
     ),
     "sparseconv-tiny": Recipe(
-        loss=share_of_distance, points=many_points, own_start=True, half_precision=False,
+        loss=relative_error, points=many_points, own_start=True, half_precision=False,
         stages=(Stage(window=(112, 152)),),
     ),
     "adnn-tiny": Recipe(
-        loss=share_of_distance, points=many_points, own_start=True, half_precision=False,
+        loss=relative_error, points=many_points, own_start=True, half_precision=False,
         stages=(Stage(window=(112, 152)),),
     ),
     "sparse2dense-tiny": WITH_POINTS,

@@ -32,14 +32,14 @@ from model_zoo_defs.training.learning.recipes import RECIPES, Recipe, Stage, wit
 from model_zoo_defs.training.learning.scaffold import without_scaffold
 from pnpdepth_cli.models.definition import ModelDefinition, Multiple
 
-AVERAGING = 0.99  # runs are short, and a stage's weights are of no use to the next one's average
-SETTLING = range(1_000_000_000, 1_000_000_016)  # numbers of batches that no step has
+AVERAGING = 0.99  # runs are short, and the average must not mix the weights of two stages
+SETTLING = range(1_000_000_000, 1_000_000_016)  # batch numbers that no step uses
 SETTLED_ON = 48  # windows in each of them
-COARSER = 0.5  # how much less every next coarser output of a network counts
+COARSER = 0.5  # weight of each next coarser output relative to the finer one
 
 
 def tiny_definition(name: str) -> ModelDefinition:
-    """The definition of that name, out of the file of its family."""
+    """The definition of that name from the file of its family."""
     family = importlib.import_module(f"model_zoo_defs.{name.partition('-tiny')[0]}")
     definition: ModelDefinition = family.definitions[name]
     return definition
@@ -47,9 +47,9 @@ def tiny_definition(name: str) -> ModelDefinition:
 
 @dataclass(frozen=True, kw_only=True)
 class Settings:
-    """One training run; the schedule follows whichever of `minutes` and `steps` is nearer.
+    """One training run; the schedule follows whichever of `minutes` and `steps` ends first.
 
-    lanes: threads on a CPU that learn side by side, each a batch of the recipe's size.
+    lanes: parallel threads on a CPU, each with a batch of the recipe's size.
     """
 
     network: str
@@ -66,7 +66,7 @@ class Settings:
 
 
 class TinyRun(Learner):
-    """One tiny edition being trained."""
+    """Training run of one tiny edition."""
 
     def __init__(self, definition: ModelDefinition, recipe: Recipe, settings: Settings):
         torch.manual_seed(settings.seed)
@@ -79,7 +79,7 @@ class TinyRun(Learner):
         super().__init__(network, schedule, settings.out, definition.name, settings.lanes)
 
     def loss(self, part: Sequence[Tensor]) -> Tensor:
-        """What the recipe asks, of every output of the network, the finest counting most."""
+        """Weighted sum of the recipe's loss over the outputs, the finest weighing most."""
         batch = Batch(*part)
         known = self.known(batch)
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self.recipe.half_precision):
@@ -87,31 +87,31 @@ class TinyRun(Learner):
         total = known.new_zeros(())
         for level, output in enumerate(outputs):
             depth = as_depth(output.float(), self.definition.output_kind)
-            truth = F.interpolate(known, depth.shape[-2:], mode="nearest-exact")
-            total = total + COARSER**level * self.recipe.loss(depth, truth)
+            ground_truth = F.interpolate(known, depth.shape[-2:], mode="nearest-exact")
+            total = total + COARSER**level * self.recipe.loss(depth, ground_truth)
         return total
 
     @property
     def stage(self) -> Stage:
-        """The stage the run is in."""
+        """The current stage."""
         return self.recipe.stage(self.progress)
 
     def known(self, batch: Batch) -> Tensor:
-        """The batch's depth (B, 1, H, W) as far as the recipe looks."""
+        """The batch's depth (B, 1, H, W), 0 beyond the recipe's farthest depth."""
         return torch.where(batch.depth > self.recipe.farthest, 0.0, batch.depth)
 
     def batch(self, number: int) -> Batch:
-        """What step number `number` learns, as the stage it will be in wants it."""
+        """The batch of step number `number`, at the window and image size of its stage."""
         stage = self.recipe.stage(self.schedule.progress(number, self.elapsed_s))
         size = self.recipe.batch * self.lanes
         return self.batches.batch(number, size, stage.window, stage.shown)
 
     @torch.no_grad()
     def save(self) -> None:
-        """The same as any run's, the average's normalisations settled on many windows at once.
+        """Recomputes the average's batch normalisation statistics on large batches, then saves.
 
-        In training every small batch is normalised by itself; with few points in one and the many
-        of a LiDAR in the next, what is kept of that suits neither.
+        Running statistics of small training batches suit neither batches with few points nor
+        those with the many points of a LiDAR.
         """
         kinds = nn.BatchNorm1d | nn.BatchNorm2d
         norms = [layer for layer in self.average.modules() if isinstance(layer, kinds)]
@@ -128,11 +128,11 @@ class TinyRun(Learner):
         super().save()
 
     def exported(self) -> nn.Module:
-        """The average without what only helped it learn."""
+        """The averaged network without the layers that are used only in training."""
         return without_scaffold(self.average)
 
     def arguments(self, batch: Batch) -> tuple[Tensor, ...]:
-        """How the network is called for a batch."""
+        """Arguments of the network for a batch."""
         normalisation = self.definition.normalisation
         assert normalisation is not None
         mean, std = (
@@ -146,25 +146,25 @@ class TinyRun(Learner):
         """The averaged network's depth for a batch, (B, 1, h, w), at the size of this stage."""
         self.average.eval()
         if shown := self.stage.shown:
-            picture = F.interpolate(batch.rgb, shown, mode="bilinear", antialias=True)
-            batch = batch._replace(rgb=picture)
+            rgb = F.interpolate(batch.rgb, shown, mode="bilinear", antialias=True)
+            batch = batch._replace(rgb=rgb)
         output = self.average(*self.arguments(Batch(*(x.to(self.device) for x in batch))))
         return as_depth(output.float().cpu(), self.definition.output_kind)
 
 
 def as_depth(output: Tensor, kind: str) -> Tensor:
-    """Depth out of what a network of this output kind says."""
+    """Depth from the output of a network of this output kind."""
     if kind == "inverse":
         return 1.0 / output.clamp(min=1e-3)
     return output.clamp(-7.0, 7.0).exp() if kind == "log" else output
 
 
 def held_out(settings: Settings, definition: ModelDefinition, recipe: Recipe) -> list[Batch]:
-    """Frames of each validation folder, evenly taken, one by one, with the same points.
+    """Evenly spaced frames of each validation folder as batches of one, with reproducible points.
 
-    Whole, but for the pixels at the right and the bottom that a network's size leaves over.
+    Frames are cropped at the right and the bottom to a multiple of the network's size.
     """
-    found = []
+    frames_with_points = []
     step = definition.size.of if isinstance(definition.size, Multiple) else 1
     for folder in settings.val:
         frames = Frames(folder)
@@ -175,23 +175,23 @@ def held_out(settings: Settings, definition: ModelDefinition, recipe: Recipe) ->
             rgb, depth = rgb[:height, :width], depth[:height, :width]
             rng = np.random.default_rng(int(index))
             sparse = recipe.points(rng, depth) if recipe.points else np.zeros_like(depth)
-            picture = torch.from_numpy(rgb).permute(2, 0, 1)[None].float() / 255.0
-            points, truth = (torch.from_numpy(x)[None, None] for x in (sparse, depth))
-            found.append(Batch(picture, points, truth))
-    return found
+            image = torch.from_numpy(rgb).permute(2, 0, 1)[None].float() / 255.0
+            points, ground_truth = (torch.from_numpy(x)[None, None] for x in (sparse, depth))
+            frames_with_points.append(Batch(image, points, ground_truth))
+    return frames_with_points
 
 
 def scores(run: TinyRun, frames: list[Batch]) -> dict[str, float]:
-    """Means over the frames of MAE and RMSE in metres and δ1 in per cent; a scale is fitted."""
+    """Mean MAE and RMSE in metres and δ1 in per cent; non-metric depth is scaled by medians."""
     rows = []
     for batch in frames:
         depth = F.interpolate(run.depth(batch), batch.depth.shape[-2:], mode="bilinear")
         true = run.known(batch)
-        ours, truth = depth[true > 0], true[true > 0]
+        ours, ground_truth = depth[true > 0], true[true > 0]
         if run.definition.output_scale != "metric":
-            ours = ours * (truth.median() / ours.median())
+            ours = ours * (ground_truth.median() / ours.median())
         ours = ours.clamp(min=1e-3)
-        error, ratio = ours - truth, torch.maximum(ours / truth, truth / ours)
+        error, ratio = ours - ground_truth, torch.maximum(ours / ground_truth, ground_truth / ours)
         close = 100.0 * (ratio < 1.25).float().mean()
         rows.append([error.abs().mean(), error.square().mean().sqrt(), close])
     means = np.array(rows).mean(0)

@@ -41,7 +41,7 @@ NEW_LAYERS = (
     "gain_prior",
     "scale.",
 )
-# a point whose log depth is wrong by less than the first is an inlier, by more than the second not
+# |error of log depth| below which a point is an inlier, and above which it is an outlier
 INLIER_ERROR, OUTLIER_ERROR = 0.05, 0.2
 SIDE_WEIGHT = 0.1
 NEW_LAYER_FACTOR = 8.0
@@ -70,7 +70,7 @@ class Settings:
     decay: int | None = None
     warm_up: int = WARM_UP_STEPS
     averaging: float = 0.999
-    prior_share: float = priors.SHARE
+    prior_fraction: float = priors.PRIOR_FRACTION
     only: tuple[str, ...] = ()
     encoder_rate: float = 0.0
     encoder_stages: tuple[str, ...] = ("s16", "s32")
@@ -79,7 +79,7 @@ class Settings:
 
 
 class Run(Learner):
-    """`compact` being trained."""
+    """Training run of `compact`."""
 
     network: Compact
 
@@ -90,8 +90,8 @@ class Run(Learner):
             network.encoder.load_state_dict(pretrained_encoder())
         if settings.start:
             upgrade(network, load_file(settings.start))
-        # Photographs are what the encoder knows and rendered frames are not: it stays as it is,
-        # or its last stages follow slowly.
+        # The encoder is pretrained on photographs, which rendered frames differ from: it is frozen,
+        # or its last stages are trained at a low rate.
         self.encoder_rate = settings.encoder_rate
         network.encoder.requires_grad_(False)
         if settings.encoder_rate > 0:
@@ -109,7 +109,7 @@ class Run(Learner):
         self.bfloat16 = self.device.type == "cuda" or torch.cpu._is_avx512_bf16_supported()
 
     def groups(self) -> list[dict[str, Any]]:
-        """The encoder learns slower than the rest, layers of the second generation faster."""
+        """Parameter groups: a lower rate for the encoder, a higher one for new layers."""
         groups: dict[float, list[nn.Parameter]] = {}
         for name, parameter in self.network.named_parameters():
             if parameter.requires_grad:
@@ -120,7 +120,7 @@ class Run(Learner):
         return [{"params": some, "factor": factor} for factor, some in groups.items()]
 
     def loss(self, part: Sequence[Tensor]) -> Tensor:
-        """How far the depths of all levels are from the truth, and the side outputs from theirs."""
+        """Depth loss over all levels plus the weighted losses of inlier weights and sigma."""
         rgb, sparse, depth, prior = part
         rgb = rgb.contiguous(memory_format=torch.channels_last)
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self.bfloat16):
@@ -132,20 +132,20 @@ class Run(Learner):
 
 
 def upgrade(network: Compact, weights: Mapping[str, Tensor]) -> None:
-    """The network has these weights; layers that are missing in them stay as they are."""
+    """Loads the weights into the network; layers missing in them keep their initial weights."""
     own = network.state_dict()
     missing = sorted(name for name in own.keys() - weights.keys())
-    strange = sorted(weights.keys() - own.keys())
+    unknown = sorted(weights.keys() - own.keys())
     unexplained = [name for name in missing if not any(layer in name for layer in NEW_LAYERS)]
-    if strange or unexplained:
-        raise ValueError(f"not weights of compact: {', '.join((strange + unexplained)[:5])}")
+    if unknown or unexplained:
+        raise ValueError(f"not weights of compact: {', '.join((unknown + unexplained)[:5])}")
     network.load_state_dict(own | dict(weights))
 
 
-def inlier_loss(logits: Tensor, sparse: Tensor, truth: Tensor) -> Tensor:
+def inlier_loss(logits: Tensor, sparse: Tensor, ground_truth: Tensor) -> Tensor:
     """Cross entropy of the points' inlier weights; all (B, 1, H, W), 0 in depths = unknown."""
-    at = (sparse > 0) & (truth > 0)
-    error = (torch.log(sparse[at]) - torch.log(truth[at])).abs()
+    at = (sparse > 0) & (ground_truth > 0)
+    error = (torch.log(sparse[at]) - torch.log(ground_truth[at])).abs()
     inlier = ((OUTLIER_ERROR - error) / (OUTLIER_ERROR - INLIER_ERROR)).clamp(0.0, 1.0)
     each = F.binary_cross_entropy_with_logits(logits[at], inlier, reduction="none")
     # every sample counts alike, however many points it has
@@ -153,35 +153,37 @@ def inlier_loss(logits: Tensor, sparse: Tensor, truth: Tensor) -> Tensor:
     return (each / count).sum() / len(sparse)
 
 
-def sigma_loss(sigma: Tensor, depth: Tensor, truth: Tensor) -> Tensor:
+def sigma_loss(sigma: Tensor, depth: Tensor, ground_truth: Tensor) -> Tensor:
     """Negative log likelihood of the error of log depth under a Laplace distribution."""
-    known = truth > 0
-    error = (torch.log(depth.detach()[known]) - torch.log(truth[known])).abs()
+    known = ground_truth > 0
+    error = (torch.log(depth.detach()[known]) - torch.log(ground_truth[known])).abs()
     scale = sigma[known]
     return (error / scale + torch.log(scale)).mean()
 
 
-def pyramid_loss(depths: list[Tensor], truth: Tensor) -> Tensor:
-    """The weighted sum of `depth_loss` over the levels; truth (B, 1, H, W), 0 = unknown."""
-    total = truth.new_zeros(())
+def pyramid_loss(depths: list[Tensor], ground_truth: Tensor) -> Tensor:
+    """Weighted sum of `depth_loss` over the levels; `ground_truth` (B, 1, H, W), 0 = unknown."""
+    total = ground_truth.new_zeros(())
     for weight, depth in zip(LEVEL_WEIGHTS, depths, strict=True):
-        stride = truth.shape[-1] // depth.shape[-1]
+        stride = ground_truth.shape[-1] // depth.shape[-1]
         centre = stride // 2
-        total = total + weight * depth_loss(depth, truth[..., centre::stride, centre::stride])
+        total = total + weight * depth_loss(
+            depth, ground_truth[..., centre::stride, centre::stride]
+        )
     return total
 
 
-def depth_loss(depth: Tensor, truth: Tensor) -> Tensor:
+def depth_loss(depth: Tensor, ground_truth: Tensor) -> Tensor:
     """Log of (mean log error + mean error relative to the median depth), averaged over the batch.
 
-    The log makes samples with many and with few points count alike: what is rewarded is the
-    share of its error a sample loses.
+    The log makes samples with many and with few points count alike: the loss measures the
+    relative change of a sample's error.
     """
-    known = truth > 0
-    safe = torch.where(known, truth, depth.detach())
+    known = ground_truth > 0
+    safe = torch.where(known, ground_truth, depth.detach())
     count = known.sum((1, 2, 3)).clamp(min=1)
     log_error = (torch.log(depth) - torch.log(safe)).abs().sum((1, 2, 3)) / count
-    rows = zip(truth.flatten(1), known.flatten(1), strict=True)
+    rows = zip(ground_truth.flatten(1), known.flatten(1), strict=True)
     medians = torch.stack(
         [row[seen].median() if bool(seen.any()) else row.new_ones(()) for row, seen in rows]
     )
@@ -192,7 +194,7 @@ def depth_loss(depth: Tensor, truth: Tensor) -> Tensor:
 def _loader(settings: Settings, first_step: int) -> Iterable[Sample]:
     start = first_step * settings.batch
     numbers = Counting(start, (settings.steps - first_step) * settings.batch)
-    data = Samples(settings.data, settings.size, settings.seed, settings.prior_share)
+    data = Samples(settings.data, settings.size, settings.seed, settings.prior_fraction)
     return DataLoader(
         data, batch_size=settings.batch, sampler=numbers, num_workers=settings.workers,
         prefetch_factor=4 if settings.workers else None,
@@ -252,7 +254,10 @@ def main() -> None:
     parser.add_argument("--averaging", type=float, default=Settings.averaging)
     parser.add_argument("--encoder-rate", type=float, default=0.0, help="times the rate; 0: frozen")
     parser.add_argument("--only", nargs="+", default=[], help="parts of names of layers to train")
-    parser.add_argument("--prior-share", type=float, default=Settings.prior_share)
+    parser.add_argument(
+        "--prior-share", dest="prior_fraction", type=float, default=Settings.prior_fraction,
+        help="fraction of samples with a prior",
+    )  # fmt: skip
     parser.add_argument("--encoder-stages", nargs="+", default=["s16", "s32"])
     parser.add_argument("--save-every", type=int, default=Settings.save_every)
     parser.add_argument("--val-frames", type=int, default=Settings.val_frames)

@@ -1,10 +1,10 @@
-r"""Trains the inlier weights of `compact` by themselves, before or between runs of `train`.
+r"""Trains only the inlier weights of `compact`, before or between runs of `train`.
 
     python -m model_zoo_defs.training.learning.train_inliers --data DIR --start WEIGHTS \
         --out WEIGHTS
 
 The statistics of the points have no parameters, so they are computed once for a few thousand
-samples; what remains is a small network on rows of numbers.
+samples; the trained part is a small network on rows of statistics.
 """
 
 from __future__ import annotations
@@ -67,12 +67,12 @@ class Table(NamedTuple):
 def table(layer: InlierWeights, frames: Frames, count: int, seed: int) -> Table:
     """The table of `count` samples, at most POINTS_PER_SAMPLE points of each.
 
-    The second pass uses the present weights of the first.
+    The second pass uses the current weights of the first.
     """
     parts: list[list[Tensor]] = []
     for number in tqdm(range(count), unit="sample", mininterval=5.0):
         rng = np.random.default_rng((seed, number))
-        sparse, truth, dense = sample(rng, frames)
+        sparse, ground_truth, dense = sample(rng, frames)
         points = Points(sparse)
         prior = Prior(dense, points)
         first = layer.statistics(points, prior, points.mask)
@@ -80,9 +80,9 @@ def table(layer: InlierWeights, frames: Frames, count: int, seed: int) -> Table:
         at = sparse > 0
         use = torch.zeros_like(sparse).masked_scatter(at, torch.sigmoid(log_odds))
         second = layer.statistics(points, prior, use)
-        error = (torch.log(sparse[at]) - torch.log(truth[at])).abs()
+        error = (torch.log(sparse[at]) - torch.log(ground_truth[at])).abs()
         target = ((OUTLIER_ERROR - error) / (OUTLIER_ERROR - INLIER_ERROR)).clamp(0.0, 1.0)
-        known = torch.nonzero(truth[at] > 0).squeeze(1).numpy()
+        known = torch.nonzero(ground_truth[at] > 0).squeeze(1).numpy()
         chosen = torch.from_numpy(rng.permutation(known)[:POINTS_PER_SAMPLE])
         columns = [first[0], first[1], second[0], second[1], log_odds, target]
         parts.append([column[chosen] for column in columns if column is not None])
@@ -92,7 +92,7 @@ def table(layer: InlierWeights, frames: Frames, count: int, seed: int) -> Table:
 
 def fit(score: PointScore, rows: tuple[Tensor, Tensor], offset: Tensor, target: Tensor,
         steps: int) -> float:  # fmt: skip
-    """One pass is trained on its statistics; its log odds are added to `offset` (n,).
+    """Trains one pass on its statistics; its log odds are added to `offset` (n,).
 
     Returns:
         The running mean of the cross entropy at the end.

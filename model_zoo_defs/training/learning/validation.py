@@ -1,4 +1,4 @@
-"""How far a network is below linear interpolation, on fixed frames with fixed points."""
+"""Errors of a network relative to linear interpolation, on fixed frames with fixed points."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ PATTERNS: dict[str, Callable[[np.random.Generator, Depth], Depth]] = {
 class Case(NamedTuple):
     """One frame with points: rgb (1, 3, H, W), sparse (1, 1, H, W), depth and linear (H, W).
 
-    linear: interpolation of the points before any of them was made wrong; prior as `sparse`.
+    linear: interpolation of the points before outliers were added; prior as `sparse`.
     """
 
     pattern: str
@@ -41,7 +41,7 @@ class Case(NamedTuple):
 
 
 def linear_interpolation(sparse: Depth) -> Depth:
-    """The program's own linear interpolation of a map's known pixels, (H, W) metres."""
+    """Linear interpolation of a map's known pixels, (H, W) metres."""
     rows, columns = np.nonzero(sparse)
     points = SparsePoints(
         xy=torch.from_numpy(np.stack([columns, rows], axis=1).astype(np.float32)),
@@ -52,18 +52,18 @@ def linear_interpolation(sparse: Depth) -> Depth:
 
 
 def cases(folder: Path, count: int) -> list[Case]:
-    """`count` frames evenly taken from the folder's, each with every pattern."""
+    """`count` evenly spaced frames of the folder, each with every pattern."""
     frames = Frames(folder)
     chosen = np.linspace(0, len(frames) - 1, min(count, len(frames))).astype(int)
     chosen_cases: list[Case] = []
     for index in chosen:
         rgb, depth = frames[int(index)]
-        picture = normalised(torch.from_numpy(rgb).permute(2, 0, 1).float() / 255.0)[None]
+        image = normalised(torch.from_numpy(rgb).permute(2, 0, 1).float() / 255.0)[None]
         for pattern, draw in PATTERNS.items():
             sparse = draw(np.random.default_rng(int(index)), depth)
             if np.count_nonzero(sparse) >= 3:
                 at = torch.from_numpy(sparse)[None, None]
-                case = Case(pattern, picture, at, depth, linear_interpolation(sparse))
+                case = Case(pattern, image, at, depth, linear_interpolation(sparse))
                 other = frames[(int(index) + 17) % len(frames)][1]
                 rng = np.random.default_rng((int(index), len(pattern)))
                 chosen_cases += [case, *_variants(rng, case, rgb, other)]
@@ -73,7 +73,7 @@ def cases(folder: Path, count: int) -> list[Case]:
 def _variants(
     rng: np.random.Generator, case: Case, rgb: NDArray[np.uint8], other: Depth
 ) -> list[Case]:
-    """The case with a damaged prior, with nonsense as prior, and with a fifth of wrong points."""
+    """The case with a damaged prior, with an unrelated prior, and with 20 % outliers."""
     sparse = case.sparse[0, 0].numpy()
     grey = (rgb.mean(-1) / 255.0).astype(np.float32)
 
@@ -86,14 +86,14 @@ def _variants(
     variants = [with_prior("prior", priors.damaged(rng, case.depth, grey))]
     if case.pattern == "uniform500":
         variants.append(with_prior("nonsense", priors.nonsense(rng, case.depth.shape, other)))
-        wrong = torch.from_numpy(outliers(rng, sparse, 0.2))[None, None]
-        variants.append(case._replace(pattern="uniform500_wrong", sparse=wrong))
+        with_outliers = torch.from_numpy(outliers(rng, sparse, 0.2))[None, None]
+        variants.append(case._replace(pattern="uniform500_wrong", sparse=with_outliers))
     return variants
 
 
 @torch.no_grad()
 def scores(network: nn.Module, some: list[Case], device: torch.device) -> dict[str, float]:
-    """MAE and RMSE of the network in per cent of linear interpolation's, per pattern."""
+    """MAE and RMSE of the network in per cent of those of linear interpolation, per pattern."""
     network.eval()
     ratios: dict[str, list[tuple[float, float]]] = {}
     for case in some:

@@ -1,7 +1,7 @@
 """Makes samples/photos; run with -m and --out samples.
 
 Photos of a room through a lens with radial distortion, and their sparse model by COLMAP: features,
-matching and mapping as a user of a calibrated camera runs them. Needs pycolmap.
+matching and mapping with known intrinsics. Needs pycolmap.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from pnpdepth_cli.sensors.lens import undistort
 
 SCENE, VIEW = 6, 1
 PHOTOS = 8
-WITH_TRUTH = (3, 4)
+WITH_GROUND_TRUTH = (3, 4)
 HEIGHT, WIDTH = 360, 480
 DISTORTION = (-0.12, 0.0, 0.0, 0.0)
 _AMBIENT_RAYS = 8
@@ -38,10 +38,10 @@ _PIVOT_M = 3.0
 
 @dataclass(frozen=True, kw_only=True)
 class LensView(View):
-    """Is a camera with radial distortion."""
+    """A camera with radial distortion."""
 
     def rays(self, u: npt.ArrayLike, v: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """Returns origins and directions (n, 3) of the rays that the lens bends to these pixels."""
+        """Returns origins and directions (n, 3) of the rays through these distorted pixels."""
         seen_at = np.column_stack(
             [
                 (np.asarray(u, np.float64).ravel() - self.cx) / self.fx,
@@ -64,7 +64,7 @@ def make_photos(folder: Path) -> float:
         colour, depth = seen(world, view, rng, ambient_rays=_AMBIENT_RAYS)
         photo = Image.fromarray(photographed(colour, generator(SAMPLE_SEED, 0, 0), clean=True))
         photo.save(folder / "images" / f"{number:02}.jpg", quality=92)
-        if number in WITH_TRUTH:
+        if number in WITH_GROUND_TRUTH:
             write_depth(folder / "gt" / f"{number:02}.png", depth, INDOOR_SCALE)
 
     return float(first.fx)
@@ -73,15 +73,15 @@ def make_photos(folder: Path) -> float:
 def _moved(first: View, number: int) -> LensView:
     along = (number - (PHOTOS - 1) / 2) * _STEP_M
     right, down = first.axes[:, 0], first.axes[:, 1]
-    place = first.place + along * right + 0.1 * (number % 2) * down
+    position = first.position + along * right + 0.1 * (number % 2) * down
     turn = rotation(along / _PIVOT_M, 0.0, 0.0).astype(np.float32)
-    moved = replace(first, place=place.astype(np.float32), axes=turn @ first.axes)
+    moved = replace(first, position=position.astype(np.float32), axes=turn @ first.axes)
     values = {name: getattr(moved, name) for name in View.__annotations__}
     return LensView(**values)
 
 
 def reconstruct(folder: Path, focal_px: float) -> None:
-    """Writes sparse/0/ of the photos in images/, which are of a calibrated camera."""
+    """Writes sparse/0/, the model of the photos in images/, taken by one calibrated camera."""
     import pycolmap
 
     pycolmap.set_random_seed(0)

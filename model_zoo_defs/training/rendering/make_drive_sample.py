@@ -47,7 +47,9 @@ def make_drive(folder: Path) -> None:
     turn = laser_axes()
     for number in range(FRAMES):
         name, ahead = f"drive_{number:03}", STEP_M * number
-        view = replace(start, place=start.place + (start.axes[:, 2] * ahead).astype(np.float32))
+        view = replace(
+            start, position=start.position + (start.axes[:, 2] * ahead).astype(np.float32)
+        )
         colour, depth = seen(world, view, rng, ambient_rays=_AMBIENT_RAYS)
         image = Image.fromarray(photographed(colour, rng, clean=True))
         image.save(folder / "rgb" / f"{name}.jpg", quality=90)

@@ -1,7 +1,7 @@
 """Renders the two frames of samples/: python -m model_zoo_defs.training.rendering.make_samples.
 
 One indoor frame with some random sparse points, and one street frame with a laser scan in
-KITTI's formats. Their seeds are set aside: no training frame was made with them.
+KITTI's formats. Their seeds are reserved: no training frame is rendered with them.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from model_zoo_defs.training.scenes.scenes import build, generator, pick_view
 from model_zoo_defs.training.scenes.world import View, World, looking
 
 SAMPLE_SEED = 770077
-"""Set aside for samples; training uses others."""
+"""Reserved for samples; training uses others."""
 
 INDOOR_SCENE, INDOOR_VIEW = 5, 1
 STREET_SCENE = 13
@@ -33,14 +33,14 @@ INDOOR_SCALE, STREET_SCALE = 1000, 256
 SPARSE_POINTS = 500
 
 _AMBIENT_RAYS = 24
-"""Enough for shadows in corners to be free of grain."""
+"""Enough for noise-free ambient occlusion."""
 
 # The rectified left colour camera of KITTI's first recording day, and its offsets along x from
 # the reference camera (Geiger et al. 2013, calib_cam_to_cam.txt), rounded.
 _FOCAL_PX, _CX, _CY = 721.54, 609.56, 172.85
 _BASELINES_M = (0.0, -0.54, 0.06, -0.48)
 _LASER_IN_CAMERA = np.array([0.0, -0.08, -0.27])
-"""Where the scanner stands in the reference camera's frame (right, down, forward), metres."""
+"""Position of the scanner in the reference camera's frame (right, down, forward), metres."""
 
 _BEAMS, _TOP_DEG, _BOTTOM_DEG = 64, 2.0, -24.8
 _STEP_DEG, _SECTOR_DEG = 0.17, 120.0
@@ -52,7 +52,7 @@ def make_indoor(folder: Path) -> None:
     world, plan = build("room", generator(SAMPLE_SEED, INDOOR_SCENE, 0))
     rng = generator(SAMPLE_SEED, INDOOR_SCENE, 1 + INDOOR_VIEW)
     view = pick_view(world, plan, "room", rng, size=(480, 640))
-    depth = _write_picture(world, view, rng, folder, INDOOR_SCALE)
+    depth = _write_images(world, view, rng, folder, INDOOR_SCALE)
     v, u = np.nonzero(depth)
     keep = np.sort(rng.choice(len(v), SPARSE_POINTS, replace=False))
     sparse = np.zeros_like(depth)
@@ -69,7 +69,7 @@ def make_street(folder: Path) -> None:
         looking((lane, 0.0, 1.65), (0.02, -0.01, 0.0), fov_deg=80, size=(375, 1242)),
         fx=_FOCAL_PX, fy=_FOCAL_PX, cx=_CX, cy=_CY,
     )  # fmt: skip
-    _write_picture(world, view, rng, folder, STREET_SCALE)
+    _write_images(world, view, rng, folder, STREET_SCALE)
     turn = laser_axes()
     scan = laser_scan(world, view, turn, rng)
     _write(folder / "000000.bin", lambda stream: stream.write(scan.astype("<f4").tobytes()))
@@ -78,19 +78,19 @@ def make_street(folder: Path) -> None:
     write_depth(folder / "sparse.png", projected(scan, turn, view), STREET_SCALE)
 
 
-def _write_picture(
+def _write_images(
     world: World, view: View, rng: np.random.Generator, folder: Path, scale: int
 ) -> FloatArray:
     folder.mkdir(parents=True, exist_ok=True)
     colour, depth = seen(world, view, rng, ambient_rays=_AMBIENT_RAYS)
-    picture = Image.fromarray(photographed(colour, rng, clean=True))
-    _write(folder / "rgb.png", lambda stream: picture.save(stream, "PNG", optimize=True))
+    image = Image.fromarray(photographed(colour, rng, clean=True))
+    _write(folder / "rgb.png", lambda stream: image.save(stream, "PNG", optimize=True))
     write_depth(folder / "gt.png", depth, scale)
     return depth
 
 
 def laser_axes() -> npt.NDArray[np.float64]:
-    """Returns R of p_camera = R p_laser + t; the mount is a little off straight, as mounts are."""
+    """Returns R of p_camera = R p_laser + t; the mount is slightly rotated, as real mounts are."""
     straight = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
     off = rotation(yaw=0.008, pitch=-0.004, roll=0.006).astype(np.float64)
     left, _, right = np.linalg.svd(straight @ off)
@@ -112,16 +112,16 @@ def laser_scan(
         ],
         axis=2,
     ).reshape(-1, 3)
-    # The reference camera stands beside the picture's own camera by the latter's baseline.
+    # The reference camera is offset from the image's camera by the latter's baseline.
     axes = view.axes.astype(np.float64)
-    reference = view.place + axes[:, 0] * _BASELINES_M[2]
+    reference = view.position + axes[:, 0] * _BASELINES_M[2]
     origin = reference + axes @ _LASER_IN_CAMERA
     directions = (beams @ turn.T @ axes.T).astype(np.float32)
     origins = np.tile(origin.astype(np.float32), (len(beams), 1))
     hits = world.cast(origins, directions)
     bright = world.table.albedo(hits.material, hits.uv, hits.t * np.float32(0.003)).mean(axis=1)
     facing = np.abs(np.einsum("ij,ij->i", hits.flat, directions))
-    # Glass and polished paint throw most of the pulse elsewhere.
+    # Glass and polished paint reflect most of the pulse away.
     lost = rng.random(len(beams)) < 3 * world.table.mirror[hits.material] + 0.02
     back = hits.met & (hits.t < _REACH_M) & ~lost
     distance = hits.t + rng.normal(0, _RANGE_NOISE_M, len(beams)).astype(np.float32)
@@ -131,7 +131,7 @@ def laser_scan(
 
 
 def calibration_text(turn: npt.NDArray[np.float64]) -> str:
-    """Returns a calibration file as KITTI's object set has it."""
+    """Returns a calibration file in the format of KITTI's object benchmark."""
     rows = {}
     for camera, baseline in enumerate(_BASELINES_M):
         rows[f"P{camera}"] = [
@@ -147,7 +147,7 @@ def calibration_text(turn: npt.NDArray[np.float64]) -> str:
 
 
 def projected(scan: FloatArray, turn: npt.NDArray[np.float64], view: View) -> FloatArray:
-    """Returns the scan as a sparse depth picture; of two points in a pixel the nearer stays."""
+    """Returns the scan as a sparse depth map; of two points in a pixel the nearer is kept."""
     points = scan[:, :3].astype(np.float64) @ turn.T + _LASER_IN_CAMERA
     points = points[points[:, 2] > 0.5]
     u = np.rint((points[:, 0] + _BASELINES_M[2]) / points[:, 2] * view.fx + view.cx).astype(int)
@@ -164,10 +164,10 @@ def write_depth(path: Path, depth: npt.NDArray[np.floating], scale: int) -> None
     stored = np.rint(depth * scale)
     if stored.max() > 65535:
         raise ValueError(f"{path}: depth {depth.max():.1f} m does not fit 16 bits at {scale} per m")
-    picture = Image.fromarray(stored.astype(np.uint16))
+    image = Image.fromarray(stored.astype(np.uint16))
     words = PngInfo()
     words.add_text("pnpdepth:scale", str(scale))
-    _write(path, lambda stream: picture.save(stream, "PNG", pnginfo=words, optimize=True))
+    _write(path, lambda stream: image.save(stream, "PNG", pnginfo=words, optimize=True))
 
 
 def _write(path: Path, fill: Callable[[BytesIO], object]) -> None:

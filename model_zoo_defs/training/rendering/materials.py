@@ -1,4 +1,4 @@
-"""What surfaces of a scene look like: textures with their smaller copies, colour and gloss."""
+"""Materials of a scene's surfaces: textures with mipmaps, colour and gloss."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _TEXELS = int(_STARTS[-1])
 
 @dataclass(frozen=True, kw_only=True)
 class Material:
-    """Says how one surface looks; tile_m is the length that one texture tile covers."""
+    """Appearance of one surface; tile_m is the length that one texture tile covers."""
 
     texture: int
     tile_m: float
@@ -32,14 +32,14 @@ class Material:
 
 
 class Palette:
-    """Makes the materials of one scene; textures are shared between them to save painting."""
+    """Materials of one scene; materials of one kind reuse a few textures."""
 
     def __init__(self, rng: np.random.Generator) -> None:
         self._rng = rng
         self._known: dict[str, list[int]] = {}
-        self._pictures: list[npt.NDArray[np.uint32]] = []
+        self._textures: list[npt.NDArray[np.uint32]] = []
         self.materials: list[Material] = []
-        # Many places keep to a few colours, so that bodies and background look alike.
+        # Half of the scenes have few colours, so that objects and background look alike.
         narrow = rng.random() < 0.5
         self._theme = [
             colour(rng, vivid=0.15) for _ in range(int(rng.integers(2, 5)) if narrow else 0)
@@ -71,11 +71,11 @@ class Palette:
             if len(known) < 10 and (len(known) < 3 or rng.random() < 0.6):
                 known.append(self._store(textures.painted(kind, rng, chosen)))
         else:
-            # Painted about a bright neutral, so that one picture serves every colour.
+            # Painted around a bright neutral, so that one texture serves every colour.
             tint = chosen / 0.75
             if len(known) < 4 and (not known or rng.random() < 0.4):
-                picture = textures.painted(kind, rng, np.full(3, 0.75, np.float32))
-                known.append(self._store(picture))
+                image = textures.painted(kind, rng, np.full(3, 0.75, np.float32))
+                known.append(self._store(image))
         shine = rng.choice([0.0, 0.0, 0.15, 0.5]) if gloss is None else gloss
         offset = (0.0, 0.0) if whole else (float(rng.random()), float(rng.random()))
         self.materials.append(
@@ -92,8 +92,8 @@ class Palette:
         )
         return len(self.materials) - 1
 
-    def _store(self, picture: npt.NDArray[np.uint8]) -> int:
-        level: npt.NDArray[np.floating] = picture.astype(np.float32)
+    def _store(self, image: npt.NDArray[np.uint8]) -> int:
+        level: npt.NDArray[np.floating] = image.astype(np.float32)
         packed = []
         for _ in range(_LEVELS):
             four = np.zeros((*level.shape[:2], 4), np.uint8)
@@ -103,28 +103,28 @@ class Palette:
                 level = (
                     level[::2, ::2] + level[1::2, ::2] + level[::2, 1::2] + level[1::2, 1::2]
                 ) / 4
-        self._pictures.append(np.concatenate(packed))
-        return len(self._pictures) - 1
+        self._textures.append(np.concatenate(packed))
+        return len(self._textures) - 1
 
     def frozen(self) -> MaterialTable:
-        """Returns all materials made so far as arrays, ready to be looked up."""
-        made = self.materials
+        """Returns all materials created so far as arrays for lookup."""
+        rows = self.materials
         return MaterialTable(
-            texels=np.concatenate(self._pictures),
-            texture=np.array([m.texture for m in made], np.int32),
-            tiles_per_m=np.array([1 / m.tile_m for m in made], np.float32),
-            tint=np.array([m.tint for m in made], np.float32),
-            gloss=np.array([m.gloss for m in made], np.float32),
-            mirror=np.array([m.mirror for m in made], np.float32),
-            detail=np.array([m.detail for m in made], np.float32),
-            glow=np.array([m.glow for m in made], np.float32),
-            offset=np.array([m.offset for m in made], np.float32),
+            texels=np.concatenate(self._textures),
+            texture=np.array([m.texture for m in rows], np.int32),
+            tiles_per_m=np.array([1 / m.tile_m for m in rows], np.float32),
+            tint=np.array([m.tint for m in rows], np.float32),
+            gloss=np.array([m.gloss for m in rows], np.float32),
+            mirror=np.array([m.mirror for m in rows], np.float32),
+            detail=np.array([m.detail for m in rows], np.float32),
+            glow=np.array([m.glow for m in rows], np.float32),
+            offset=np.array([m.offset for m in rows], np.float32),
         )
 
 
 @dataclass(frozen=True, kw_only=True)
 class MaterialTable:
-    """Holds one row per material, and the packed texels of all textures at all sizes."""
+    """One row per material, and the packed texels of all textures at all mipmap levels."""
 
     texels: npt.NDArray[np.uint32]
     texture: npt.NDArray[np.int32]
@@ -141,28 +141,28 @@ class MaterialTable:
     ) -> FloatArray:
         """Returns linear reflectance (n, 3) at texture coordinates (n, 2) in metres.
 
-        footprint_m is the width of the surface patch that the ray stands for: it picks the
-        texture size, so far surfaces are smooth rather than sparkling.
+        footprint_m: width of the surface patch seen by the ray; it selects the mipmap level, which
+        avoids aliasing on far surfaces.
         """
         per_m = self.tiles_per_m[material]
-        place = uv * per_m[:, None] + self.offset[material]
+        coordinates = uv * per_m[:, None] + self.offset[material]
         wanted = np.log2(np.maximum(footprint_m * per_m * SIDE, 1.0))
         level = np.minimum((wanted + 0.35).astype(np.int32), _LEVELS - 1)
         base = self.texture[material] * np.int32(_TEXELS) + _STARTS[level]
-        colours = self._bilinear(place, level, base)
+        colours = self._bilinear(coordinates, level, base)
         value = colours * (1 / 255) * self.tint[material]
-        # Fine grain, seen only from near by, keeps close surfaces from looking painted.
+        # Fine grain on close surfaces, where the texture resolution is too low.
         fine = textures.noise_tiles()[3]
-        index = (place * (SIDE * 7 / 3)).astype(np.int32) & (SIDE - 1)
+        index = (coordinates * (SIDE * 7 / 3)).astype(np.int32) & (SIDE - 1)
         grain = (fine[index[:, 1], index[:, 0]] - 0.5) * self.detail[material]
         value *= (1 + grain * np.clip(2 - wanted, 0, 1))[:, None]
         return np.asarray(np.clip(value, 0.0, 1.0) ** 2, np.float32)
 
     def _bilinear(
-        self, place: FloatArray, level: npt.NDArray[np.int32], base: npt.NDArray[np.int32]
+        self, coordinates: FloatArray, level: npt.NDArray[np.int32], base: npt.NDArray[np.int32]
     ) -> FloatArray:
         side = (np.int32(SIDE) >> level).astype(np.int32)
-        spot = place * side[:, None].astype(np.float32) - np.float32(0.5)
+        spot = coordinates * side[:, None].astype(np.float32) - np.float32(0.5)
         corner = np.floor(spot)
         part = spot - corner
         low = corner.astype(np.int64)
@@ -170,7 +170,7 @@ class MaterialTable:
         u0, v0 = low[:, 0] & mask, low[:, 1] & mask
         u1, v1 = (low[:, 0] + 1) & mask, (low[:, 1] + 1) & mask
         fu, fv = part[:, :1], part[:, 1:]
-        total = np.zeros((len(place), 3), np.float32)
+        total = np.zeros((len(coordinates), 3), np.float32)
         for u, v, weight in (
             (u0, v0, (1 - fu) * (1 - fv)),
             (u1, v0, fu * (1 - fv)),

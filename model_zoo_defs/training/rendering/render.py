@@ -26,7 +26,7 @@ from model_zoo_defs.training.scenes.scenes import (
 
 @dataclass(frozen=True, kw_only=True)
 class Job:
-    """Says what to render and where to put it."""
+    """Settings of one rendering run."""
 
     out: Path
     seed: int
@@ -50,12 +50,12 @@ class Job:
 
 
 def shard_path(out: Path, index: int) -> Path:
-    """Returns the file of a shard."""
+    """Returns the path of a shard."""
     return out / f"shard_{index:05d}.npz"
 
 
 def render_shard(job: Job, index: int) -> int:
-    """Writes one shard, unless it is there, and returns how many frames it holds."""
+    """Writes one shard, unless it exists; returns its number of frames."""
     target = shard_path(job.out, index)
     first = index * job.shard_frames
     count = min(job.shard_frames, job.frames - first)
@@ -79,7 +79,7 @@ def render_shard(job: Job, index: int) -> int:
 
 
 def render_all(job: Job, *, workers: int) -> None:
-    """Writes every shard that is missing; the bytes do not depend on the workers."""
+    """Writes every missing shard; the bytes do not depend on the number of workers."""
     job.out.mkdir(parents=True, exist_ok=True)
     indices = range(-(-job.frames // job.shard_frames))
     work = partial(render_shard, job)
@@ -94,32 +94,32 @@ def render_all(job: Job, *, workers: int) -> None:
 
 
 def coloured(depth: npt.NDArray[np.float32]) -> npt.NDArray[np.uint8]:
-    """Returns a picture of log depth, near warm and far cold, unknown black."""
+    """Returns an image of log depth, near warm and far cold, unknown black."""
     known = depth > 0
     if not known.any():
         return np.zeros((*depth.shape, 3), np.uint8)
     value = np.log(np.where(known, depth, 1.0))
     low, high = np.percentile(value[known], (1, 99))
-    share = np.clip((value - low) / max(high - low, 1e-6), 0, 1)
+    relative = np.clip((value - low) / max(high - low, 1e-6), 0, 1)
     stops = np.array([[250, 240, 120], [240, 120, 60], [150, 40, 110], [40, 20, 90], [20, 60, 140]])
-    place = share * (len(stops) - 1)
-    left = np.minimum(place.astype(int), len(stops) - 2)
-    part = (place - left)[..., None]
+    position = relative * (len(stops) - 1)
+    left = np.minimum(position.astype(int), len(stops) - 2)
+    part = (position - left)[..., None]
     colour = stops[left] * (1 - part) + stops[left + 1] * part
     return np.where(known[..., None], colour, 0).astype(np.uint8)
 
 
 def contact_sheet(job: Job, *, columns: int = 4) -> Image.Image:
-    """Returns one picture of job.frames frames, one per scene, rgb above depth."""
-    pictures = []
+    """Returns one image of job.frames frames, one per scene, rgb above depth."""
+    images = []
     for scene in range(job.frames):
         frame = job.scene(scene)[0]
-        pictures.append(np.concatenate([frame.rgb, coloured(frame.depth)], axis=0))
-    while len(pictures) % columns:
-        pictures.append(np.zeros_like(pictures[0]))
+        images.append(np.concatenate([frame.rgb, coloured(frame.depth)], axis=0))
+    while len(images) % columns:
+        images.append(np.zeros_like(images[0]))
     rows = [
-        np.concatenate(pictures[start : start + columns], axis=1)
-        for start in range(0, len(pictures), columns)
+        np.concatenate(images[start : start + columns], axis=1)
+        for start in range(0, len(images), columns)
     ]
     return Image.fromarray(np.concatenate(rows, axis=0))
 
@@ -134,7 +134,7 @@ def _parsed(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--shard-frames", type=int, default=64, help="a multiple of 4")
     parser.add_argument("--kinds", default=",".join(KINDS), help="kinds to draw from")
     parser.add_argument("--camera", choices=tuple(CAMERAS), default="any")
-    parser.add_argument("--contact-sheet", type=Path, help="write one picture of frames instead")
+    parser.add_argument("--contact-sheet", type=Path, help="write one image of frames instead")
     chosen = parser.parse_args(arguments)
     if chosen.out is None and chosen.contact_sheet is None:
         parser.error("give --out, or --contact-sheet")

@@ -1,4 +1,4 @@
-"""The colour that each ray of a view sees: light, shadow, reflection, sky and smooth edges."""
+"""Shading of the rays of a view: light, shadow, reflection, sky and antialiased edges."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ def seen(
 ) -> tuple[FloatArray, FloatArray]:
     """Returns linear colour (H, W, 3) and exact depth along the axis (H, W), 0 unknown.
 
-    More ambient_rays per pixel make the shade in corners smoother.
+    ambient_rays: per pixel, for ambient occlusion; more give less noise.
     """
     shape = (view.height, view.width)
     origins, directions = view.grid()
@@ -32,7 +32,7 @@ def seen(
 def _visibility(
     world: World, hits: Hits, rng: np.random.Generator, *, ambient_rays: int
 ) -> FloatArray:
-    """Returns (n, 1 + lights): the open share of the surroundings, then of each light."""
+    """Returns (n, 1 + lights): unoccluded fraction of the surroundings, then of each light."""
     count = len(hits.t)
     start = hits.points + hits.flat * (1e-3 + 3e-4 * hits.t)[:, None]
     result = np.ones((count, 1 + len(world.lights)), np.float32)
@@ -42,14 +42,14 @@ def _visibility(
         toward = rng.standard_normal((count, 3), dtype=np.float32)
         toward /= np.sqrt(np.einsum("ij,ij->i", toward, toward))[:, None] + 1e-6
         toward += hits.flat * np.float32(1.02)
-        ambient += world.open_share(start, toward, reach)
+        ambient += world.unoccluded(start, toward, reach)
     result[:, 0] = ambient / ambient_rays
     for index, light in enumerate(world.lights):
         jitter = rng.standard_normal((count, 3), dtype=np.float32) * np.float32(light.radius / 2)
-        place = np.asarray(light.place, np.float32)
-        toward = (place + jitter) if light.sun else (place + jitter - start)
+        position = np.asarray(light.position, np.float32)
+        toward = (position + jitter) if light.sun else (position + jitter - start)
         away = np.full(count, 500.0 if light.sun else 0.97, np.float32)
-        result[:, 1 + index] = world.open_share(start, toward.astype(np.float32), away)
+        result[:, 1 + index] = world.unoccluded(start, toward.astype(np.float32), away)
     return result
 
 
@@ -69,11 +69,11 @@ def _smoothed(visible: FloatArray, hits: Hits, shape: tuple[int, int]) -> FloatA
             like = np.abs(offset[here] - offset[there]) < tolerance[here]
             like &= np.einsum("ijk,ijk->ij", normals[here], normals[there]) > 0.9
             like &= material[here] == material[there]
-            share = like.astype(np.float32)
-            total[here] += image[there] * share[..., None]
-            total[there] += image[here] * share[..., None]
-            weight[here] += share
-            weight[there] += share
+            same_surface = like.astype(np.float32)
+            total[here] += image[there] * same_surface[..., None]
+            total[there] += image[here] * same_surface[..., None]
+            weight[here] += same_surface
+            weight[there] += same_surface
         image = total / weight[..., None]
     return image.reshape(-1, channels)
 
@@ -108,14 +108,14 @@ def _radiance(
 
 
 def _toward(
-    place: tuple[float, float, float], sun: bool, points: FloatArray
+    position: tuple[float, float, float], sun: bool, points: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Returns unit directions to the light (n, 3) and how strong it is there (n,)."""
+    """Returns unit directions to the light (n, 3) and its intensity at the points (n,)."""
     if sun:
-        direction = np.asarray(place, np.float32)
+        direction = np.asarray(position, np.float32)
         direction = direction / np.linalg.norm(direction)
         return np.broadcast_to(direction, points.shape), np.ones(len(points), np.float32)
-    toward = np.asarray(place, np.float32) - points
+    toward = np.asarray(position, np.float32) - points
     square = np.einsum("ij,ij->i", toward, toward)
     return toward / np.sqrt(square)[:, None], 1 / (square + 0.4)
 
@@ -126,7 +126,7 @@ def _lit(world: World, hits: Hits, back: FloatArray, visible: FloatArray) -> Flo
     below = np.asarray(world.sky.ambient_down, np.float32)
     light = (below + (above - below) * up) * (0.25 + 0.75 * visible[:, :1])
     for index, lamp in enumerate(world.lights):
-        toward, strength = _toward(lamp.place, lamp.sun, hits.points)
+        toward, strength = _toward(lamp.position, lamp.sun, hits.points)
         cosine = np.clip(np.einsum("ij,ij->i", hits.normals, toward), 0, 1)
         amount = cosine * strength * visible[:, 1 + index]
         light = light + amount[:, None] * np.asarray(lamp.colour, np.float32)
@@ -141,7 +141,7 @@ def _highlights(world: World, hits: Hits, back: FloatArray, visible: FloatArray)
         return result
     normals, points, gloss = hits.normals[shiny], hits.points[shiny], gloss[shiny]
     for index, lamp in enumerate(world.lights):
-        toward, strength = _toward(lamp.place, lamp.sun, points)
+        toward, strength = _toward(lamp.position, lamp.sun, points)
         middle = toward + back[shiny]
         middle /= np.sqrt(np.einsum("ij,ij->i", middle, middle))[:, None] + 1e-6
         peak = np.clip(np.einsum("ij,ij->i", normals, middle), 0, 1) ** (12 + 100 * gloss)
@@ -153,7 +153,7 @@ def _highlights(world: World, hits: Hits, back: FloatArray, visible: FloatArray)
 def _reflect(
     world: World, view: View, hits: Hits, back: FloatArray, facing: FloatArray, colour: FloatArray
 ) -> None:
-    """Adds to `colour` what mirror-like surfaces show of the scene around them."""
+    """Adds reflections of the scene on mirror-like surfaces to `colour`."""
     mirror = world.table.mirror[hits.material]
     pick = np.flatnonzero((mirror > 0) & hits.met)
     if not len(pick):
@@ -164,8 +164,8 @@ def _reflect(
     again = world.cast(start, np.ascontiguousarray(away, dtype=np.float32))
     open_everywhere = np.full((len(pick), 1 + len(world.lights)), 0.7, np.float32)
     other = _radiance(world, view, again, away, open_everywhere, reflect=False)
-    share = mirror[pick] + (1 - mirror[pick]) * 0.8 * (1 - facing[pick]) ** 5
-    colour[pick] = colour[pick] * (1 - share[:, None]) + other * share[:, None]
+    reflected = mirror[pick] + (1 - mirror[pick]) * 0.8 * (1 - facing[pick]) ** 5
+    colour[pick] = colour[pick] * (1 - reflected[:, None]) + other * reflected[:, None]
 
 
 def _sky(world: World, gaze: FloatArray) -> FloatArray:
@@ -195,7 +195,7 @@ def _smooth_edges(
     rng: np.random.Generator,
     ambient_rays: int,
 ) -> None:
-    """Replaces, in `colour`, pixels along edges of bodies by the mean of four samples each."""
+    """Replaces pixels of `colour` along object edges by the mean of four samples each."""
     shape = (view.height, view.width)
     material = np.where(hits.met, hits.material, -1).reshape(shape)
     t = hits.t.reshape(shape)
@@ -215,9 +215,9 @@ def _smooth_edges(
         return
     du, dv = _EDGE_SAMPLES[:, :1], _EDGE_SAMPLES[:, 1:]
     origins, directions = view.rays(u + du, v + dv)
-    found = world.cast(origins, directions)
-    visible = _visibility(world, found, rng, ambient_rays=ambient_rays)
-    sample = _radiance(world, view, found, directions, visible, reflect=True)
+    samples = world.cast(origins, directions)
+    visible = _visibility(world, samples, rng, ambient_rays=ambient_rays)
+    sample = _radiance(world, view, samples, directions, visible, reflect=True)
     # A lamp in the mirror must not outshine the other samples of its pixel.
     four = np.minimum(sample, 6.0).reshape(len(_EDGE_SAMPLES), len(v), 3)
     colour[v, u] = four.mean(axis=0)

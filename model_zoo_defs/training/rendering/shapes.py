@@ -49,11 +49,11 @@ class Group:
         pitch: float = 0.0,
         roll: float = 0.0,
     ) -> None:
-        """Puts a turned and moved copy of the mesh into the group."""
+        """Adds a rotated and translated copy of the mesh."""
         materials = np.full(len(mesh.faces), material, np.int32)
         self._parts.append((_moved(mesh, at, yaw, pitch, roll, 1.0), materials))
 
-    def place(
+    def insert(
         self,
         other: Group,
         at: Point = (0.0, 0.0, 0.0),
@@ -63,7 +63,7 @@ class Group:
         roll: float = 0.0,
         scale: float = 1.0,
     ) -> None:
-        """Puts a scaled, turned and moved copy of another group into this one."""
+        """Adds a scaled, rotated and translated copy of another group."""
         if other._parts:
             mesh, materials = other.merged()
             self._parts.append((_moved(mesh, at, yaw, pitch, roll, scale), materials))

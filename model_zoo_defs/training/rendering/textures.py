@@ -1,4 +1,4 @@
-"""Square tiling pictures of materials, drawn from noise and simple patterns."""
+"""Square tiling textures of materials, drawn from noise and simple patterns."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ SIDE = 256
 
 @lru_cache(maxsize=1)
 def noise_tiles() -> FloatArray:
-    """Returns 12 tiling noise pictures, (12, SIDE, SIDE), mean 0.5; the later the smoother."""
+    """Returns 12 tiling noise images, (12, SIDE, SIDE), mean 0.5, ordered by smoothness."""
     rng = np.random.default_rng(20190513)
     fy = np.fft.fftfreq(SIDE)[:, None] * SIDE
     fx = np.fft.rfftfreq(SIDE)[None, :] * SIDE
@@ -34,7 +34,7 @@ def noise_tiles() -> FloatArray:
 
 
 def noise(rng: np.random.Generator, *, smooth: float = 0.6) -> FloatArray:
-    """Returns one noise picture in [0, 1]; smooth from 0 (white) to 1 (clouds)."""
+    """Returns one noise image in [0, 1]; smooth from 0 (white) to 1 (clouds)."""
     tiles = noise_tiles()
     pick = min(int(smooth * 6), 5) * 2 + int(rng.integers(2))
     shift = rng.integers(SIDE, size=2)
@@ -55,20 +55,20 @@ def colour(rng: np.random.Generator, *, vivid: float = 0.3) -> FloatArray:
         value = colorsys.hsv_to_rgb(rng.random(), rng.uniform(0.25, 0.9), rng.uniform(0.25, 0.95))
         return np.array(value, np.float32)
     base = np.array(_MUTED[int(rng.integers(len(_MUTED)))])
-    spread = base * rng.uniform(0.75, 1.15) + rng.normal(0, 0.03, 3)
-    return np.clip(spread, 0.03, 0.97).astype(np.float32)
+    varied = base * rng.uniform(0.75, 1.15) + rng.normal(0, 0.03, 3)
+    return np.clip(varied, 0.03, 0.97).astype(np.float32)
 
 
-def near(rng: np.random.Generator, base: npt.ArrayLike, spread: float = 0.08) -> FloatArray:
-    """Returns a colour close to the given one."""
-    moved = np.asarray(base) * rng.uniform(1 - 2 * spread, 1 + 2 * spread)
-    return np.clip(moved + rng.normal(0, spread / 2, 3), 0.02, 0.98).astype(np.float32)
+def near(rng: np.random.Generator, base: npt.ArrayLike, deviation: float = 0.08) -> FloatArray:
+    """Returns a random colour close to `base`; `deviation` is relative."""
+    moved = np.asarray(base) * rng.uniform(1 - 2 * deviation, 1 + 2 * deviation)
+    return np.clip(moved + rng.normal(0, deviation / 2, 3), 0.02, 0.98).astype(np.float32)
 
 
-def mixed(first: npt.ArrayLike, second: npt.ArrayLike, share: FloatArray) -> FloatArray:
-    """Returns the picture (SIDE, SIDE, 3) that goes from the first to the second colour."""
+def mixed(first: npt.ArrayLike, second: npt.ArrayLike, weight: FloatArray) -> FloatArray:
+    """Returns the image (SIDE, SIDE, 3) of `first` at weight 0 and `second` at weight 1."""
     a, b = np.asarray(first, np.float32), np.asarray(second, np.float32)
-    return a + (b - a) * np.clip(share, 0, 1)[..., None]
+    return a + (b - a) * np.clip(weight, 0, 1)[..., None]
 
 
 _V, _U = np.meshgrid(
@@ -101,14 +101,14 @@ def _plain(rng: np.random.Generator, base: FloatArray) -> FloatArray:
 
 
 def _plaster(rng: np.random.Generator, base: FloatArray) -> FloatArray:
-    share = 0.7 * noise(rng, smooth=0.9) + 0.3 * noise(rng, smooth=0.3)
-    return mixed(near(rng, base), near(rng, base), share)
+    weight = 0.7 * noise(rng, smooth=0.9) + 0.3 * noise(rng, smooth=0.3)
+    return mixed(near(rng, base), near(rng, base), weight)
 
 
 def _mottled(rng: np.random.Generator, base: FloatArray) -> FloatArray:
-    share = noise(rng, smooth=rng.uniform(0.3, 0.95))
-    share = 0.5 + (share - 0.5) * rng.uniform(1.0, 5.0)
-    return mixed(base, near(rng, base, 0.25) if rng.random() < 0.6 else colour(rng), share)
+    weight = noise(rng, smooth=rng.uniform(0.3, 0.95))
+    weight = 0.5 + (weight - 0.5) * rng.uniform(1.0, 5.0)
+    return mixed(base, near(rng, base, 0.25) if rng.random() < 0.6 else colour(rng), weight)
 
 
 def _wood(rng: np.random.Generator, base: FloatArray) -> FloatArray:
@@ -128,9 +128,9 @@ def _planks(rng: np.random.Generator, base: FloatArray) -> FloatArray:
     return mixed_over(wood, base * 0.35, joint)
 
 
-def mixed_over(picture: FloatArray, ink: npt.ArrayLike, share: FloatArray) -> FloatArray:
-    """Returns the picture with ink laid over it where the share (SIDE, SIDE) is 1."""
-    return picture + (np.asarray(ink, np.float32) - picture) * share[..., None]
+def mixed_over(image: FloatArray, ink: npt.ArrayLike, weight: FloatArray) -> FloatArray:
+    """Returns the image with ink over it where `weight` (SIDE, SIDE) is 1."""
+    return image + (np.asarray(ink, np.float32) - image) * weight[..., None]
 
 
 def _brick(rng: np.random.Generator, base: FloatArray) -> FloatArray:
@@ -143,8 +143,8 @@ def _brick(rng: np.random.Generator, base: FloatArray) -> FloatArray:
 def _tiles(rng: np.random.Generator, base: FloatArray) -> FloatArray:
     count = int(rng.choice([2, 4, 8, 12]))
     value, joint = _cells(rng, count, count, stagger=0.0, gap=rng.uniform(0.03, 0.08))
-    spread = rng.choice([0.03, 0.1, 0.4])
-    tile = base * (1 + spread * (value - 0.5) + 0.1 * (noise(rng) - 0.5))[..., None]
+    contrast = rng.choice([0.03, 0.1, 0.4])
+    tile = base * (1 + contrast * (value - 0.5) + 0.1 * (noise(rng) - 0.5))[..., None]
     return mixed_over(tile, colour(rng, vivid=0.0), joint)
 
 
@@ -174,8 +174,8 @@ def _stripes(rng: np.random.Generator, base: FloatArray) -> FloatArray:
 def _carpet(rng: np.random.Generator, base: FloatArray) -> FloatArray:
     weave = noise(rng, smooth=0.05)
     lines = noise(rng, smooth=0.3)[:, :1]
-    share = rng.uniform(0.2, 0.9) * lines + rng.uniform(0.2, 0.7) * weave
-    return mixed(base * 0.5, np.clip(base * 1.35, 0, 1), share)
+    weight = rng.uniform(0.2, 0.9) * lines + rng.uniform(0.2, 0.7) * weave
+    return mixed(base * 0.5, np.clip(base * 1.35, 0, 1), weight)
 
 
 def _fabric(rng: np.random.Generator, base: FloatArray) -> FloatArray:
@@ -201,18 +201,18 @@ def _marble(rng: np.random.Generator, base: FloatArray) -> FloatArray:
 
 
 def _speckle(rng: np.random.Generator, base: FloatArray) -> FloatArray:
-    picture = base * (0.85 + 0.3 * noise(rng, smooth=0.2)[..., None])
+    image = base * (0.85 + 0.3 * noise(rng, smooth=0.2)[..., None])
     for _ in range(2):
         grains = (noise(rng, smooth=rng.uniform(0, 0.35)) > rng.uniform(0.65, 0.8)).astype(
             np.float32
         )
-        picture = mixed_over(picture, near(rng, base, 0.4), grains)
-    return picture
+        image = mixed_over(image, near(rng, base, 0.4), grains)
+    return image
 
 
 def _foliage(rng: np.random.Generator, base: FloatArray) -> FloatArray:
-    share = 0.5 + 1.5 * (noise(rng, smooth=0.35) - 0.5)
-    return mixed(base * 0.4, np.clip(base * 1.4, 0, 1), share)
+    weight = 0.5 + 1.5 * (noise(rng, smooth=0.35) - 0.5)
+    return mixed(base * 0.4, np.clip(base * 1.4, 0, 1), weight)
 
 
 def _brushed(rng: np.random.Generator, base: FloatArray) -> FloatArray:
@@ -221,7 +221,7 @@ def _brushed(rng: np.random.Generator, base: FloatArray) -> FloatArray:
 
 
 def _poster(rng: np.random.Generator, base: FloatArray) -> FloatArray:
-    """Draws what looks like printed matter: flat shapes, blurred blobs, lines of text."""
+    """Returns printed matter: flat shapes, blurred blobs, lines of text."""
     paper = Image.new("RGB", (SIDE, SIDE), _ink(base))
     draw = ImageDraw.Draw(paper)
     if rng.random() < 0.5:
@@ -281,6 +281,6 @@ KINDS = tuple(_PAINTERS)
 
 
 def painted(kind: str, rng: np.random.Generator, base: FloatArray) -> npt.NDArray[np.uint8]:
-    """Returns a tiling picture (SIDE, SIDE, 3) of the material about its base colour."""
-    picture = _PAINTERS[kind](rng, np.asarray(base, np.float32))
-    return (np.clip(picture, 0, 1) * 255 + 0.5).astype(np.uint8)
+    """Returns a tiling texture (SIDE, SIDE, 3) of the material around its base colour."""
+    image = _PAINTERS[kind](rng, np.asarray(base, np.float32))
+    return (np.clip(image, 0, 1) * 255 + 0.5).astype(np.uint8)

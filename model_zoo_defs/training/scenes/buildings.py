@@ -145,5 +145,5 @@ def row(kit: Kit, group: Group, side: float, x: float) -> None:
         lower, upper = house.bounds()
         width = float(upper[0] - lower[0])
         at = (side * (x + kit.size(0, 1.2)), y + width / 2, 0)
-        group.place(house, at, yaw=-side * np.pi / 2)
+        group.insert(house, at, yaw=-side * np.pi / 2)
         y += width + (0.0 if kit.chance(0.6) else kit.size(0.5, 4))

@@ -142,16 +142,16 @@ def letters(kit: Kit) -> Group:
 
 
 def frame(kit: Kit) -> Group:
-    """Returns a small picture leaning back in its frame."""
+    """Returns a small framed photo leaning back."""
     group, tall = Group(), kit.size(0.1, 0.3)
     wide = tall * kit.size(0.6, 1.4)
     group.add(
         box(wide, 0.015, tall), kit.wood() if kit.chance(0.6) else kit.any_surface(), pitch=-0.2
     )
-    picture = kit.palette.new("poster", tile_m=tall, whole=True, mirror=0.03)
+    photo = kit.palette.new("poster", tile_m=tall, whole=True, mirror=0.03)
     group.add(
         box(wide * 0.82, 0.002, tall * 0.82, fit=tall),
-        picture,
+        photo,
         (0, -0.009, tall * 0.09),
         pitch=-0.2,
     )
@@ -196,7 +196,7 @@ def scatter(
     tallest: float = 0.6,
     things: tuple[Callable[[Kit], Group], ...] = THINGS,
 ) -> None:
-    """Puts about `count` things onto the rectangle, overlapping at times."""
+    """Adds about `count` objects onto the rectangle; some overlap."""
     low, high = area.low, area.high
     for _ in range(count):
         item = things[int(kit.rng.integers(len(things)))](kit)
@@ -205,6 +205,6 @@ def scatter(
             1.0, tallest / float(upper[2]), (high[1] - low[1]) * 1.2 / float(upper[1] - lower[1])
         )
         at = (kit.size(low[0], high[0]), kit.size(low[1], high[1]), area.z)
-        group.place(
+        group.insert(
             item, at, yaw=kit.size(-0.6, 0.6) if kit.chance(0.6) else kit.size(0, 6.3), scale=scale
         )

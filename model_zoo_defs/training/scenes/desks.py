@@ -91,7 +91,7 @@ def desk_scene(kit: Kit) -> Plan:
     for yaw in np.arange(4) * np.pi / 2 + kit.size(-0.2, 0.2):
         side = Group()
         side.add(quads([[(-5, 0, 0), (5, 0, 0), (5, 0, 2.8), (-5, 0, 2.8)]]), paper)
-        group.place(
+        group.insert(
             side,
             (-np.sin(yaw) * far, np.cos(yaw) * far if yaw < 0.7 else np.cos(yaw) * 3.5, 0),
             yaw=float(yaw),
@@ -105,30 +105,30 @@ def desk_scene(kit: Kit) -> Plan:
     heaps = int(kit.rng.integers(2, 7))
     targets = []
     for _ in range(heaps):
-        x, y, spread = kit.size(-half[0], half[0]), kit.size(-half[1], half[1]), kit.size(0.05, 0.4)
+        x, y, radius = kit.size(-half[0], half[0]), kit.size(-half[1], half[1]), kit.size(0.05, 0.4)
         targets.append((x, y, z + kit.size(0, 0.15)))
-        low = (max(-half[0], x - spread), max(-half[1], y - spread))
-        high = (min(half[0], x + spread), min(half[1], y + spread))
+        low = (max(-half[0], x - radius), max(-half[1], y - radius))
+        high = (min(half[0], x + radius), min(half[1], y + radius))
         clutter.scatter(
             kit, group, area=clutter.Rectangle(low, high, z), count=int(kit.rng.integers(4, 14))
         )
         for _ in range(int(kit.rng.integers(0, 4))):
-            group.place(
+            group.insert(
                 _wild(kit),
                 (kit.size(low[0], high[0]), kit.size(low[1], high[1]), z),
                 yaw=kit.size(0, 6.3),
             )
     for _ in range(int(kit.rng.integers(0, 4))):
         maker = furniture.AGAINST_WALL[int(kit.rng.integers(len(furniture.AGAINST_WALL)))]
-        group.place(
+        group.insert(
             maker(kit), (kit.size(-2, 2), far - kit.size(0, 0.5), 0), yaw=kit.size(-0.5, 0.5)
         )
     lights = []
     for _ in range(int(kit.rng.integers(1, 5))):
         power = kit.size(0.3, 1.5)
-        place = (kit.size(-2, 2), kit.size(-2, min(1.5, far - 0.2)), kit.size(1.3, 2.7))
+        position = (kit.size(-2, 2), kit.size(-2, min(1.5, far - 0.2)), kit.size(1.3, 2.7))
         tone = (power, power * kit.size(0.75, 1.0), power * kit.size(0.5, 1.05))
-        lights.append(Light(place=place, colour=tone, radius=kit.size(0.03, 0.4)))
+        lights.append(Light(position=position, colour=tone, radius=kit.size(0.03, 0.4)))
     level = kit.size(0.1, 0.4)
     sky = Sky(
         zenith=(1, 1, 1), horizon=(1, 1, 1), clouds=0.0, ambient_up=(level, level, level),

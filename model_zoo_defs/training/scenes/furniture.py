@@ -88,7 +88,7 @@ def desk(kit: Kit) -> Group:
         group.add(box(w, 0.7, 0.03), wood, (0, -0.35, top - 0.03))
         for side in (-1, 1):
             group.add(box(0.03, 0.65, top - 0.03), wood, (side * (w / 2 - 0.02), -0.35, 0))
-        group.place(monitor(kit), (kit.size(-0.2, 0.2), -0.2, top), yaw=kit.size(-0.3, 0.3))
+        group.insert(monitor(kit), (kit.size(-0.2, 0.2), -0.2, top), yaw=kit.size(-0.3, 0.3))
         group.add(box(0.42, 0.14, 0.02), kit.dark(), (0, -0.5, top))
         scatter(
             kit,
@@ -248,7 +248,7 @@ def kitchen(kit: Kit) -> Group:
     )
     if kit.chance(0.6):
         for side in (-0.25, 0.25):
-            group.place(cupboard(kit, hang=h + kit.size(0.5, 0.65)), (side * w, 0, 0))
+            group.insert(cupboard(kit, hang=h + kit.size(0.5, 0.65)), (side * w, 0, 0))
     return group
 
 
@@ -270,7 +270,7 @@ def floor_lamp(kit: Kit) -> Group:
 def floor_plant(kit: Kit) -> Group:
     """Returns a large pot plant."""
     group = Group()
-    group.place(plant(kit), (0, -0.3, 0), scale=kit.size(1.5, 3.5))
+    group.insert(plant(kit), (0, -0.3, 0), scale=kit.size(1.5, 3.5))
     return group
 
 
@@ -279,7 +279,7 @@ def drawers(kit: Kit) -> Group:
     group = cupboard(kit)
     if kit.chance(0.4):
         upper = group.bounds()[1]
-        group.place(monitor(kit), (0, -0.25, min(float(upper[2]), 0.9)), scale=kit.size(1.0, 1.8))
+        group.insert(monitor(kit), (0, -0.25, min(float(upper[2]), 0.9)), scale=kit.size(1.0, 1.8))
     return group
 
 

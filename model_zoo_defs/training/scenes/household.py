@@ -159,7 +159,7 @@ def laptop(kit: Kit) -> Group:
         kit.palette.new("poster", tile_m=d, whole=True, glow=0.8, mirror=0.05),
         (0, -0.005, d * 0.05),
     )
-    group.place(lid, (0, d / 2, 0.014), pitch=tilt)
+    group.insert(lid, (0, d / 2, 0.014), pitch=tilt)
     return group
 
 

@@ -1,4 +1,4 @@
-"""What every maker of things draws from."""
+"""Random numbers and materials for the builders of objects."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from model_zoo_defs.training.rendering.materials import Palette
 
 @dataclass(frozen=True, kw_only=True)
 class Kit:
-    """Is what every maker of things draws from: random numbers and the scene's materials."""
+    """Random numbers and the scene's materials, passed to every builder of objects."""
 
     rng: np.random.Generator
     palette: Palette
@@ -21,7 +21,7 @@ class Kit:
         return float(self.rng.uniform(low, high))
 
     def chance(self, probability: float) -> bool:
-        """Returns True that often."""
+        """Returns True with this probability."""
         return bool(self.rng.random() < probability)
 
     def surface(self, *kinds: str, tile_m: float = 0.6, vivid: float = 0.35) -> int:

@@ -56,20 +56,20 @@ def tree(kit: Kit, *, far: bool = False) -> Group:
     wide = h * kit.size(0.16, 0.34)
     centres = []
     for index in range(clumps):
-        angle, share = kit.size(0, 6.3), kit.size(0, 1) if not conifer else index / clumps
+        angle, height = kit.size(0, 6.3), kit.size(0, 1) if not conifer else index / clumps
         out = (
             wide
             * kit.size(0.1, 0.9)
-            * ((1 - share) if conifer else np.sqrt(max(0.05, 1 - share * share)))
+            * ((1 - height) if conifer else np.sqrt(max(0.05, 1 - height * height)))
         )
-        z = stem + (h - stem) * share
+        z = stem + (h - stem) * height
         middle = np.array([lean[0] + out * np.cos(angle), lean[1] + out * np.sin(angle), z])
-        radius = wide * kit.size(0.4, 0.75) * (1.2 - 0.6 * share)
+        radius = wide * kit.size(0.4, 0.75) * (1.2 - 0.6 * height)
         count = 40 if far else 200
-        spread = kit.rng.normal(size=(count, 3))
-        spread /= np.linalg.norm(spread, axis=1, keepdims=True)
+        offsets = kit.rng.normal(size=(count, 3))
+        offsets /= np.linalg.norm(offsets, axis=1, keepdims=True)
         centres.append(
-            middle + spread * radius * kit.rng.uniform(0.6, 1.1, (count, 1)) * [1, 1, 0.8]
+            middle + offsets * radius * kit.rng.uniform(0.6, 1.1, (count, 1)) * [1, 1, 0.8]
         )
         if kit.chance(0.8):
             size = radius * kit.size(1.1, 1.7)
@@ -81,7 +81,7 @@ def tree(kit: Kit, *, far: bool = False) -> Group:
             bark,
         )
     size = kit.size(0.1, 0.24) * (2.0 if far else 1.0)
-    group.place(leaves(kit, np.concatenate(centres), size, green))
+    group.insert(leaves(kit, np.concatenate(centres), size, green))
     return group
 
 
@@ -97,7 +97,7 @@ def hedge(kit: Kit, length: float) -> Group:
     points[out == 0, 0] = np.sign(points[out == 0, 0]) * wide / 2
     points[out == 2, 2] = tall / 2
     points += kit.rng.normal(0, 0.05, points.shape)
-    group.place(leaves(kit, points + np.array([0, 0, tall / 2]), 0.07, green))
+    group.insert(leaves(kit, points + np.array([0, 0, tall / 2]), 0.07, green))
     return group
 
 

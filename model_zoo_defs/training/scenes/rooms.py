@@ -20,7 +20,7 @@ from model_zoo_defs.training.scenes.world import Light, Plan, Sky
 
 
 def room(kit: Kit) -> Plan:
-    """Returns a furnished room with its free box and things worth looking at."""
+    """Returns a furnished room with its free box and camera targets."""
     rng = kit.rng
     corridor = kit.chance(0.12)
     w = kit.size(1.4, 2.2) if corridor else kit.size(2.2, 6.5)
@@ -77,7 +77,7 @@ def room(kit: Kit) -> Plan:
             side.add(box(length, 0.03, kit.size(0.05, 0.14)), skirting, (length / 2, -0.015, 0))
         decorate(kit, side, length, min(tall, tall + lift), holes)
         _line_up(kit, side, length, min(w, d), holes, corridor)
-        group.place(side, (*start, 0), yaw=yaw)
+        group.insert(side, (*start, 0), yaw=yaw)
     if not corridor:
         _middle(kit, group, w, d)
     if kit.chance(0.3):
@@ -106,7 +106,7 @@ def room(kit: Kit) -> Plan:
 def _line_up(
     kit: Kit, side: Group, length: float, across: float, holes: Sequence[Hole], corridor: bool
 ) -> None:
-    """Places furniture with its back to the wall, keeping doors free."""
+    """Adds furniture with its back to the wall, keeping doors free."""
     u = kit.size(0.0, 0.8)
     tries = 0
     while u < length - 0.4 and tries < 12:
@@ -123,14 +123,14 @@ def _line_up(
         if u + wide > length or deep > 0.45 * across or blocked:
             u += 0.15
             continue
-        side.place(
+        side.insert(
             item, (u - float(lower[0]), -0.03 - kit.size(0, 0.05), 0), yaw=kit.size(-0.06, 0.06)
         )
         u += wide + (kit.size(0.0, 0.1) if kit.chance(0.5) else kit.size(0.2, 0.9))
 
 
 def _middle(kit: Kit, group: Group, w: float, d: float) -> None:
-    """Places a table with chairs, a rug, single chairs, people and hanging lamps."""
+    """Adds a table with chairs, a rug, single chairs, people and hanging lamps."""
     x, y, yaw = kit.size(0.35, 0.65) * w, kit.size(0.35, 0.65) * d, kit.size(0, 6.3)
     if kit.chance(0.5):
         rug = box(kit.size(1, 2.4), kit.size(0.8, 1.8), 0.008, fit=0.0)
@@ -144,18 +144,20 @@ def _middle(kit: Kit, group: Group, w: float, d: float) -> None:
         ensemble = Group()
         item = furniture.table(kit) if kit.chance(0.7) else furniture.desk(kit)
         lower, upper = item.bounds()
-        ensemble.place(item, (0, -float(lower[1]) / 2, 0))
+        ensemble.insert(item, (0, -float(lower[1]) / 2, 0))
         seat = seating.chair(kit) if kit.chance(0.75) else seating.office_chair(kit)
         for side in (-1, 1):
-            for share in np.linspace(-0.3, 0.3, int(kit.rng.integers(1, 4))):
+            for along in np.linspace(-0.3, 0.3, int(kit.rng.integers(1, 4))):
                 if kit.chance(0.75):
                     at = (
-                        float(share * (upper[0] - lower[0])),
+                        float(along * (upper[0] - lower[0])),
                         side * (-float(lower[1]) / 2 + kit.size(0.1, 0.5)),
                         0,
                     )
-                    ensemble.place(seat, at, yaw=(0.0 if side > 0 else np.pi) + kit.size(-0.5, 0.5))
-        group.place(ensemble, (x, y, 0), yaw=yaw)
+                    ensemble.insert(
+                        seat, at, yaw=(0.0 if side > 0 else np.pi) + kit.size(-0.5, 0.5)
+                    )
+        group.insert(ensemble, (x, y, 0), yaw=yaw)
     for _ in range(int(kit.rng.integers(0, 4))):
         makers = (
             seating.chair,
@@ -167,9 +169,11 @@ def _middle(kit: Kit, group: Group, w: float, d: float) -> None:
             furniture.railing,
         )
         item = makers[int(kit.rng.integers(len(makers)))](kit)
-        group.place(item, (kit.size(0.2, 0.8) * w, kit.size(0.2, 0.8) * d, 0), yaw=kit.size(0, 6.3))
+        group.insert(
+            item, (kit.size(0.2, 0.8) * w, kit.size(0.2, 0.8) * d, 0), yaw=kit.size(0, 6.3)
+        )
     if kit.chance(0.3):
-        group.place(
+        group.insert(
             figures.person(kit),
             (kit.size(0.2, 0.8) * w, kit.size(0.2, 0.8) * d, 0),
             yaw=kit.size(0, 6.3),
@@ -185,7 +189,7 @@ def _middle(kit: Kit, group: Group, w: float, d: float) -> None:
 
 
 def _outside(kit: Kit, group: Group, w: float, d: float) -> None:
-    """Adds what windows show: ground, and at times a wall, a hedge or boxes."""
+    """Adds what is seen through windows: ground and, at random, a wall, a hedge or boxes."""
     ground = kit.surface("paving", "foliage", "speckle", tile_m=3, vivid=0.2)
     group.add(box(80, 80, 0.1), ground, (w / 2, d / 2, -kit.size(0.3, 4)))
     for _ in range(int(kit.rng.integers(0, 6))):
@@ -205,14 +209,16 @@ def _lights(kit: Kit, w: float, d: float, h: float, group: Group) -> tuple[Light
     for _ in range(int(kit.rng.integers(1, 4))):
         warm = kit.size(0.65, 1.0)
         power = kit.size(0.5, 3.0)
-        place = (kit.size(0.15, 0.85) * w, kit.size(0.15, 0.85) * d, kit.size(1.7, h - 0.1))
+        position = (kit.size(0.15, 0.85) * w, kit.size(0.15, 0.85) * d, kit.size(1.7, h - 0.1))
         colour = (power, power * (0.3 + 0.7 * warm), power * warm**2)
-        lights.append(Light(place=place, colour=colour, radius=kit.size(0.05, 0.5)))
+        lights.append(Light(position=position, colour=colour, radius=kit.size(0.05, 0.5)))
     if kit.chance(0.5):
         angle, power = kit.size(0, 6.3), kit.size(2, 9)
-        place = (np.cos(angle), np.sin(angle), kit.size(0.3, 1.2))
+        position = (np.cos(angle), np.sin(angle), kit.size(0.3, 1.2))
         lights.append(
-            Light(place=place, colour=(power, power * 0.93, power * 0.8), radius=0.03, sun=True)
+            Light(
+                position=position, colour=(power, power * 0.93, power * 0.8), radius=0.03, sun=True
+            )
         )
     return tuple(lights)
 

@@ -1,4 +1,4 @@
-"""Random scenes and the views taken of them, each decided by a seed and a number alone."""
+"""Random scenes and views of them; each depends only on a seed and a number."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ from model_zoo_defs.training.scenes.world import Plan, View, World, looking
 KINDS = ("room", "street", "desk")
 """Kinds of scene; a frame stores the index into this."""
 
-SHARES = {"room": 0.5, "street": 0.3, "desk": 0.2}
-"""How often each kind comes, before leaving out kinds that were not asked for."""
+KIND_WEIGHTS = {"room": 0.5, "street": 0.3, "desk": 0.2}
+"""Relative frequency of each kind of scene."""
 
 VIEWS_PER_SCENE = 4
 
@@ -30,13 +30,13 @@ _MAKERS = {"room": room, "street": street, "desk": desk_scene}
 
 
 class Rig(NamedTuple):
-    """Says what a camera sees and how it is carried.
+    """Intrinsics and random pose of a camera.
 
-    fov_deg: horizontal. shift: where its axis lies off the middle of the picture, (right, down) in
-    widths and heights. height: above the floor or road, lowest and highest, metres. roll_deg:
-    standard deviation about level, and in a street also about straight ahead. pitch_deg: mean,
-    upward, and standard deviation; None where it looks at things by itself. clearance: what it
-    keeps from whatever it sees, metres.
+    fov_deg: horizontal. shift: of the principal point from the image centre, (right, down), as
+    fractions of width and height. height: above the floor or road, lowest and highest, metres.
+    roll_deg: standard deviation of roll and, in a street, of yaw. pitch_deg: mean, upward, and
+    standard deviation; None: towards a target of the scene. clearance: least distance to visible
+    surfaces, metres.
     """
 
     fov_deg: float
@@ -49,19 +49,19 @@ class Rig(NamedTuple):
 
 CAMERAS: dict[str, Rig | None] = {
     "any": None,
-    # 304 × 228 px about the middle of half a Kinect picture, focal length 518.86 px; on a robot's
+    # central 304 × 228 px of a Kinect image at half size, focal length 518.86 px; on a robot's
     # mast, looking down at the floor ahead of it
     "nyu": Rig(60.7, (0.0, 0.0), (1.35, 1.45), 0.5, (-17.0, 1.5), 0.8),
     # columns 154 to 1066, rows 136 to 364 of KITTI's left colour camera: 721.5 px, axis at row
     # 173, on a car's roof
     "kitti": Rig(64.6, (0.0, -0.338), (1.6, 1.7), 0.5),
 }
-"""Cameras of the benchmarks, whose metric depth a network can learn from the picture alone."""
+"""Cameras of the benchmarks, whose metric depth a network can learn from the image alone."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Frame:
-    """Is one rendered picture: rgb (H, W, 3), depth in metres (H, W) with 0 = unknown."""
+    """One rendered frame: rgb (H, W, 3), depth in metres (H, W) with 0 = unknown."""
 
     rgb: npt.NDArray[np.uint8]
     depth: FloatArray
@@ -70,7 +70,7 @@ class Frame:
 
 
 def generator(seed: int, scene: int, part: int) -> np.random.Generator:
-    """Returns the random numbers of one part of one scene."""
+    """Returns the random number generator of one part of one scene."""
     return np.random.default_rng([seed, scene, part])
 
 
@@ -90,8 +90,8 @@ def build(kind: str, rng: np.random.Generator) -> tuple[World, Plan]:
 
 
 def pick_kind(rng: np.random.Generator, kinds: tuple[str, ...]) -> str:
-    """Returns one of the kinds, as often as SHARES says."""
-    weights = np.array([SHARES[kind] for kind in kinds])
+    """Returns one of the kinds, drawn with KIND_WEIGHTS."""
+    weights = np.array([KIND_WEIGHTS[kind] for kind in kinds])
     return kinds[int(rng.choice(len(kinds), p=weights / weights.sum()))]
 
 
@@ -104,7 +104,7 @@ def pick_view(
     size: tuple[int, int],
     rig: Rig | None = None,
 ) -> View:
-    """Returns a view (rows, columns) that shows much of the scene; the best of some tries."""
+    """Returns a view (rows, columns) that shows much of the scene, the best of up to 24."""
     height, width = size
     best, best_score = None, -1.0
     for _ in range(24):
@@ -124,31 +124,31 @@ def pick_view(
 def _street_view(
     plan: Plan, rng: np.random.Generator, height: int, width: int, rig: Rig | None
 ) -> View:
-    place = rng.uniform(plan.low, plan.high)
+    position = rng.uniform(plan.low, plan.high)
     yaw = rng.normal(0, 0.06) if rng.random() < 0.7 else rng.uniform(-1.2, 1.2)
-    # A crop of a wide picture may lie off its principal point.
+    # A crop of a wide image may be off-centre to its principal point.
     shift = (float(rng.uniform(-0.8, 0.8)), 0.0) if rng.random() < 0.3 else (0.0, 0.0)
     pitch = rng.normal(-0.02, 0.03)
     fov, roll = rng.uniform(30, 85), rng.normal(0, 0.01)
     shift = (shift[0], float(rng.uniform(-0.15, 0.1)))
     if rig is not None:
-        place[2] = rng.uniform(*rig.height)
+        position[2] = rng.uniform(*rig.height)
         yaw, roll = np.radians(rng.normal(0, rig.roll_deg, 2))
         fov, shift = rig.fov_deg, rig.shift
-    return looking(place, (yaw, pitch, roll), fov_deg=fov, shift=shift, size=(height, width))
+    return looking(position, (yaw, pitch, roll), fov_deg=fov, shift=shift, size=(height, width))
 
 
 def _indoor_view(
     plan: Plan, rng: np.random.Generator, height: int, width: int, rig: Rig | None, *, near: bool
 ) -> View:
-    place = rng.uniform(plan.low, plan.high)
+    position = rng.uniform(plan.low, plan.high)
     target = np.asarray(plan.targets[int(rng.integers(len(plan.targets)))])
     if near:
-        place = target + (place - target) * rng.uniform(0.4, 1.2)
-        place[2] = max(place[2], plan.low[2])
+        position = target + (position - target) * rng.uniform(0.4, 1.2)
+        position[2] = max(position[2], plan.low[2])
     if rig is not None:
-        place[2] = rng.uniform(*rig.height)
-    toward = target - place
+        position[2] = rng.uniform(*rig.height)
+    toward = target - position
     yaw = float(np.arctan2(-toward[0], toward[1]))
     pitch = float(np.arctan2(toward[2], np.hypot(toward[0], toward[1]) + 1e-6))
     pitch = np.clip(pitch, -1.1, 0.5) * rng.uniform(0.4, 1.0) + rng.normal(0, 0.05)
@@ -159,11 +159,11 @@ def _indoor_view(
         roll, fov = np.radians(rng.normal(0, rig.roll_deg)), rig.fov_deg
         if rig.pitch_deg is not None:
             pitch = np.radians(rng.normal(*rig.pitch_deg))
-    return looking(place, (yaw, pitch, roll), fov_deg=fov, size=(height, width))
+    return looking(position, (yaw, pitch, roll), fov_deg=fov, size=(height, width))
 
 
 def _score(world: World, view: View, closest: float) -> float:
-    """Returns how much a view shows: 0 when one close face fills it, near 1 when rich."""
+    """Returns the variety of a view: 0 when one close surface fills it, near 1 for many edges."""
     v, u = np.mgrid[0 : view.height - 1 : 18j, 0 : view.width - 1 : 24j]
     hits = world.cast(*view.rays(u, v))
     t = np.where(hits.met, hits.t, 100.0).reshape(18, 24)

@@ -62,7 +62,7 @@ def _ground(kit: Kit, group: Group, half: float) -> None:
 
 
 def _traffic(kit: Kit, group: Group, half: float) -> list[tuple[float, float, float]]:
-    """Adds parked and moving vehicles; returns places worth looking at."""
+    """Adds parked and moving vehicles; returns camera targets."""
     targets = []
     fleet = [vehicles.car(kit) for _ in range(4)] + [vehicles.lorry(kit)]
     for side in (-1, 1):
@@ -78,7 +78,7 @@ def _traffic(kit: Kit, group: Group, half: float) -> list[tuple[float, float, fl
                     else fleet[int(kit.rng.integers(4))]
                 )
                 x = side * (half - kit.size(0.7, 1.1))
-                group.place(
+                group.insert(
                     vehicle, (x, y, 0), yaw=(0 if side > 0 else np.pi) + kit.size(-0.05, 0.05)
                 )
                 targets.append((x, y, 0.8))
@@ -87,9 +87,9 @@ def _traffic(kit: Kit, group: Group, half: float) -> list[tuple[float, float, fl
         lane = kit.rng.choice([-1, 1]) * half * 0.4
         y = kit.size(7, 70)
         vehicle = fleet[int(kit.rng.integers(5))]
-        group.place(vehicle, (lane, y, 0), yaw=0 if lane > 0 else np.pi)
+        group.insert(vehicle, (lane, y, 0), yaw=0 if lane > 0 else np.pi)
     for _ in range(int(kit.rng.integers(0, 3))):
-        group.place(
+        group.insert(
             vehicles.cyclist(kit),
             (kit.size(-half, half), kit.size(5, 35), 0),
             yaw=kit.rng.choice([0, np.pi]),
@@ -104,27 +104,27 @@ def _verge(kit: Kit, group: Group, side: float, x: float) -> None:
     for y in np.arange(kit.size(0, 8), 75, spacing):
         if kit.chance(density):
             at = (side * (x + kit.size(0.5, 2.0)), float(y) + kit.size(-1, 1), 0.1)
-            group.place(
+            group.insert(
                 trees[int(kit.rng.integers(2))], at, yaw=kit.size(0, 6.3), scale=kit.size(0.6, 1.1)
             )
     post = pole(kit)
     for y in np.arange(kit.size(2, 12), 90, kit.size(12, 30)):
         item = post if kit.chance(0.6) else pole(kit)
-        group.place(
+        group.insert(
             item, (side * (x + 0.4), float(y), 0.1), yaw=0 if side < 0 else np.pi * kit.chance(0.5)
         )
     for _ in range(int(kit.rng.integers(0, 5))):
         at = (side * (x + kit.size(0.3, 2.5)), kit.size(3, 40), 0.12)
-        group.place(figures.person(kit), at, yaw=kit.size(0, 6.3))
+        group.insert(figures.person(kit), at, yaw=kit.size(0, 6.3))
     for _ in range(int(kit.rng.integers(0, 4))):
         item = vehicles.pram(kit) if kit.chance(0.7) else figures.bicycle(kit)
-        group.place(
+        group.insert(
             item, (side * (x + kit.size(0.5, 2.5)), kit.size(3, 40), 0.12), yaw=kit.size(0, 6.3)
         )
     if kit.chance(0.5):
         length = kit.size(5, 18)
         maker = hedge if kit.chance(0.55) else fence
-        group.place(maker(kit, length), (side * (x + kit.size(2.2, 4)), kit.size(5, 25), 0.0))
+        group.insert(maker(kit, length), (side * (x + kit.size(2.2, 4)), kit.size(5, 25), 0.0))
 
 
 def _grove(kit: Kit, group: Group, side: float, x: float) -> None:
@@ -133,9 +133,9 @@ def _grove(kit: Kit, group: Group, side: float, x: float) -> None:
     for _ in range(int(kit.rng.integers(4, 26))):
         at = (side * (x + kit.size(0, 14)), kit.size(3, 80), -0.1)
         item = kinds[int(kit.rng.integers(3))]
-        group.place(item, at, yaw=kit.size(0, 6.3), scale=kit.size(0.6, 1.2))
+        group.insert(item, at, yaw=kit.size(0, 6.3), scale=kit.size(0.6, 1.2))
     for _ in range(int(kit.rng.integers(0, 4))):
-        group.place(
+        group.insert(
             hedge(kit, kit.size(2, 12)), (side * (x + kit.size(0, 5)), kit.size(4, 50), -0.1)
         )
     if kit.chance(0.5):
@@ -152,7 +152,9 @@ def _background(kit: Kit, group: Group) -> None:
         x = kit.size(-60, 60)
         y = kit.size(70, _FAR) if abs(x) < 14 else kit.size(25, _FAR)
         if abs(x) > 9:
-            group.place(far_trees[int(kit.rng.integers(3))], (x, y, -0.1), scale=kit.size(0.7, 1.6))
+            group.insert(
+                far_trees[int(kit.rng.integers(3))], (x, y, -0.1), scale=kit.size(0.7, 1.6)
+            )
     if kit.chance(0.5):
         right, ahead = np.meshgrid(np.linspace(-150, 150, 40), np.linspace(85, 180, 12))
         slope = (ahead - 85) * kit.size(0.05, 0.35)
@@ -203,9 +205,9 @@ def street(kit: Kit) -> Plan:
 def _daylight(kit: Kit) -> tuple[tuple[Light, ...], Sky]:
     overcast = kit.chance(0.35)
     angle, power = kit.size(0, 6.3), kit.size(0.1, 0.4) if overcast else kit.size(1.2, 3.0)
-    place = (np.cos(angle), np.sin(angle), kit.size(0.25, 1.8))
+    position = (np.cos(angle), np.sin(angle), kit.size(0.25, 1.8))
     sun = Light(
-        place=place,
+        position=position,
         colour=(power, power * kit.size(0.85, 1), power * kit.size(0.7, 0.95)),
         radius=0.02,
         sun=True,

@@ -191,7 +191,7 @@ def lorry(kit: Kit) -> Group:
 def cyclist(kit: Kit) -> Group:
     """Returns a bicycle with a rider."""
     group = Group()
-    group.place(figures.bicycle(kit), (0.2, 0, 0), yaw=np.pi / 2)
+    group.insert(figures.bicycle(kit), (0.2, 0, 0), yaw=np.pi / 2)
     cloth, skin = kit.any_surface(), kit.palette.new("plain", (0.75, 0.55, 0.42))
     group.add(rod((0, -0.25, 1.0), (0, 0.1, 1.5), 0.15), cloth)
     group.add(superquadric((0.19, 0.22, 0.27)), skin, (0, 0.17, 1.68))

@@ -1,4 +1,4 @@
-"""Walls of rooms: their openings, what hangs on them and what open doors show."""
+"""Walls of rooms: openings, decoration and the hallway behind open doors."""
 
 from __future__ import annotations
 
@@ -69,10 +69,10 @@ def opening(kit: Kit, side: Group, hole: Hole, paint: int) -> None:
             for z in (0.15, h * 0.55):
                 leaf.add(box((w - 2 * t) * 0.7, 0.055, h * 0.35), door, (w / 2 - t, 0, z))
             leaf.add(rod((w * 0.8, -0.06, 1.02), (w * 0.92, -0.06, 1.02), 0.01), kit.metal())
-            side.place(leaf, (u0 + t, deep * 0.6, 0), yaw=angle)
+            side.insert(leaf, (u0 + t, deep * 0.6, 0), yaw=angle)
         return
-    for share in np.linspace(0, 1, int(kit.rng.integers(1, 4)) + 1)[1:-1]:
-        side.add(box(0.05, 0.05, h), trim, (u0 + w * float(share), deep, v0))
+    for along in np.linspace(0, 1, int(kit.rng.integers(1, 4)) + 1)[1:-1]:
+        side.add(box(0.05, 0.05, h), trim, (u0 + w * float(along), deep, v0))
     if kit.chance(0.4):
         side.add(box(w, 0.04, 0.04), trim, (x, deep, v0 + h * kit.size(0.4, 0.7)))
     side.add(box(w + 0.1, deep + 0.1, 0.03), trim, (x, deep / 2 - 0.1, v0 - 0.03))
@@ -108,7 +108,7 @@ def _hallway(kit: Kit, side: Group, x: float, deep: float, paint: int) -> None:
     side.add(quads([ground]), kit.surface("planks", "carpet", "tiles", vivid=0.1))
     if kit.chance(0.5):
         item = furniture.drawers(kit) if kit.chance(0.5) else seating.chair(kit)
-        side.place(item, (kit.size(left, right), far, 0))
+        side.insert(item, (kit.size(left, right), far, 0))
 
 
 def _curtain(kit: Kit, side: Group, u0: float, u1: float, top: float) -> None:
@@ -123,7 +123,7 @@ def _curtain(kit: Kit, side: Group, u0: float, u1: float, top: float) -> None:
 
 
 def decorate(kit: Kit, side: Group, length: float, height: float, holes: Sequence[Hole]) -> None:
-    """Adds pictures, switches, radiators and shelves where the wall is free."""
+    """Adds posters, switches, radiators and shelves where the wall is free."""
     for _ in range(int(kit.rng.integers(0, 6))):
         u = kit.size(0.3, max(0.4, length - 0.3))
         if any(hole[0] - 0.5 < u < hole[2] + 0.5 for hole in holes):
@@ -136,8 +136,8 @@ def decorate(kit: Kit, side: Group, length: float, height: float, holes: Sequenc
             if thick > 0.01:
                 edge = kit.wood() if kit.chance(0.5) else kit.dark()
                 side.add(box(w + 0.06, thick, h + 0.06), edge, (u, -thick / 2, z - 0.03))
-            picture = kit.palette.new("poster", tile_m=h, whole=True, mirror=kit.size(0, 0.05))
-            side.add(box(w, 0.004, h, fit=h), picture, (u, -thick - 0.002, z))
+            poster = kit.palette.new("poster", tile_m=h, whole=True, mirror=kit.size(0, 0.05))
+            side.add(box(w, 0.004, h, fit=h), poster, (u, -thick - 0.002, z))
         elif choice < 0.75:
             side.add(box(w + 0.3, 0.2, 0.025), kit.wood(), (u, -0.1, z))
             clutter.scatter(
@@ -157,15 +157,15 @@ def decorate(kit: Kit, side: Group, length: float, height: float, holes: Sequenc
 
 def openings(kit: Kit, length: float, height: float) -> list[Hole]:
     """Returns random windows and doors of a wall of this length and height, metres."""
-    found: list[Hole] = []
+    holes: list[Hole] = []
     u = kit.size(0.2, 0.8)
     while u < length - 1.0:
         chance = kit.rng.random()
         w = kit.size(0.7, min(2.0, length - u - 0.2))
         if chance < 0.22:
-            found.append((u, kit.size(0.5, 1.0), u + w, min(height - 0.15, kit.size(1.7, 2.4))))
+            holes.append((u, kit.size(0.5, 1.0), u + w, min(height - 0.15, kit.size(1.7, 2.4))))
         elif chance < 0.4:
             w = min(w, kit.size(0.75, 1.0))
-            found.append((u, 0.0, u + w, min(height - 0.1, kit.size(1.95, 2.15))))
+            holes.append((u, 0.0, u + w, min(height - 0.1, kit.size(1.95, 2.15))))
         u += w + kit.size(0.3, 1.5)
-    return found
+    return holes

@@ -1,4 +1,4 @@
-"""A finished scene that rays can be cast into, and the cameras that look at it."""
+"""A scene for ray casting, and its cameras."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from model_zoo_defs.training.rendering.shapes import FloatArray, Group, IntArray
 
 @dataclass(frozen=True, kw_only=True)
 class Light:
-    """Shines from a place (or, a sun, along a direction) and casts a shadow blurred by radius."""
+    """A light at a position, or a sun in a direction; `radius` blurs its shadows."""
 
-    place: tuple[float, float, float]
+    position: tuple[float, float, float]
     colour: tuple[float, float, float]
     radius: float
     sun: bool = False
@@ -26,7 +26,7 @@ class Light:
 
 @dataclass(frozen=True, kw_only=True)
 class Sky:
-    """Is what rays see that leave the scene, and the light that comes from all sides."""
+    """Colour of rays that leave the scene, and ambient light."""
 
     zenith: tuple[float, float, float]
     horizon: tuple[float, float, float]
@@ -39,13 +39,13 @@ class Sky:
 
 @dataclass(frozen=True, kw_only=True)
 class View:
-    """Is a pinhole camera: pixel (u, v) sees along R [(u - cx) / fx, (v - cy) / fy, 1].
+    """A pinhole camera: the ray of pixel (u, v) is R [(u - cx) / fx, (v - cy) / fy, 1].
 
-    Pixel centres lie at whole numbers. The columns of R are the camera's right, down and
+    Pixel centres are at integers. The columns of R are the camera's right, down and
     forward axes in the world, whose z points up.
     """
 
-    place: FloatArray
+    position: FloatArray
     axes: FloatArray
     fx: float
     fy: float
@@ -60,7 +60,7 @@ class View:
         y = (np.asarray(v, np.float32).ravel() - np.float32(self.cy)) / np.float32(self.fy)
         axes = self.axes
         directions = x[:, None] * axes[:, 0] + y[:, None] * axes[:, 1] + axes[:, 2]
-        return np.tile(self.place, (len(directions), 1)), directions
+        return np.tile(self.position, (len(directions), 1)), directions
 
     def grid(self) -> tuple[FloatArray, FloatArray]:
         """Returns the rays through all pixel centres, row by row."""
@@ -69,7 +69,7 @@ class View:
 
 
 def looking(
-    place: npt.ArrayLike,
+    position: npt.ArrayLike,
     angles: tuple[float, float, float],
     *,
     fov_deg: float,
@@ -79,7 +79,7 @@ def looking(
     """Returns a view along +y turned by yaw (left), pitch (up) and roll, all in radians.
 
     Args:
-        place: (3,) position of the camera, metres.
+        position: (3,) of the camera, metres.
         angles: Yaw, pitch and roll.
         fov_deg: Horizontal field of view.
         size: Rows and columns of the image.
@@ -92,7 +92,7 @@ def looking(
     )
     focal_px = width / 2 / np.tan(np.radians(fov_deg) / 2)
     return View(
-        place=np.asarray(place, np.float32),
+        position=np.asarray(position, np.float32),
         axes=np.ascontiguousarray(axes),
         fx=float(focal_px),
         fy=float(focal_px),
@@ -105,7 +105,7 @@ def looking(
 
 @dataclass(frozen=True, kw_only=True)
 class Hits:
-    """Says for n rays what they met; `t` counts in lengths of the ray's direction."""
+    """First hits of n rays; `t` is in lengths of the ray's direction."""
 
     met: npt.NDArray[np.bool_]
     t: FloatArray
@@ -119,7 +119,7 @@ class Hits:
 
 @dataclass(frozen=True, kw_only=True)
 class Plan:
-    """Says where a scene's things are, for choosing cameras: targets and the free box."""
+    """A scene before ray casting, with camera targets and the free box for cameras."""
 
     group: Group
     lights: tuple[Light, ...]
@@ -131,7 +131,7 @@ class Plan:
 
 @dataclass(frozen=True)
 class World:
-    """Holds a scene's triangles, materials and lights."""
+    """Triangles, materials and lights of a scene."""
 
     mesh: Mesh
     face_material: IntArray
@@ -152,21 +152,21 @@ class World:
 
     def depths(self, origins: FloatArray, directions: FloatArray) -> FloatArray:
         """Returns t of the first hit of every ray, 0 where it leaves the scene."""
-        found = self._embree.run(origins, directions, output=1)
-        return np.where(found["primID"] >= 0, found["tfar"], 0).astype(np.float32)
+        hit = self._embree.run(origins, directions, output=1)
+        return np.where(hit["primID"] >= 0, hit["tfar"], 0).astype(np.float32)
 
     def cast(self, origins: FloatArray, directions: FloatArray) -> Hits:
-        """Returns what the rays meet first; both normals face the ray's origin."""
-        found = self._embree.run(origins, directions, output=1)
-        met = found["primID"] >= 0
-        face = np.where(met, found["primID"], 0).astype(np.int32)
-        t = np.where(met, found["tfar"], 0).astype(np.float32)
+        """Returns the first hits of the rays; both normals face the ray's origin."""
+        hit = self._embree.run(origins, directions, output=1)
+        met = hit["primID"] >= 0
+        face = np.where(met, hit["primID"], 0).astype(np.int32)
+        t = np.where(met, hit["tfar"], 0).astype(np.float32)
         corner = self.mesh.faces[face]
-        u, v = found["u"][:, None], found["v"][:, None]
+        u, v = hit["u"][:, None], hit["v"][:, None]
         mixed = self._attributes[corner[:, 0]] * (1 - u - v)
         mixed += self._attributes[corner[:, 1]] * u
         mixed += self._attributes[corner[:, 2]] * v
-        flat = _facing(_unit(found["Ng"]), directions)
+        flat = _facing(_unit(hit["Ng"]), directions)
         normals = _unit(mixed[:, :3])
         # A smooth normal takes the side of the flat one, then may not turn from the viewer.
         normals = np.where((normals * flat).sum(1, keepdims=True) < 0, -normals, normals)
@@ -181,12 +181,12 @@ class World:
             material=self.face_material[face],
         )
 
-    def open_share(
+    def unoccluded(
         self, origins: FloatArray, directions: FloatArray, reach: npt.NDArray[np.float32]
     ) -> FloatArray:
-        """Returns 1 for every ray that gets `reach` lengths of its direction far, else 0."""
-        found = self._embree.run(origins, directions, dists=reach, query="OCCLUDED")
-        return np.asarray(found != 0, np.float32)
+        """Returns 1 for every ray without a hit within `reach` lengths of its direction, else 0."""
+        hit = self._embree.run(origins, directions, dists=reach, query="OCCLUDED")
+        return np.asarray(hit != 0, np.float32)
 
 
 def _unit(vectors: FloatArray) -> FloatArray:

@@ -22,7 +22,7 @@ from pnpdepth_cli.io.opencv import decode_with_opencv
 
 _WIDTH, _HEIGHT, _BITS, _DESCRIPTION, _SAMPLES, _FORMAT = 256, 257, 258, 270, 277, 339
 _ORIENTATION = 274
-_STRIPS = ((273, 279), (324, 325))  # offsets and byte counts, of strips or of tiles
+_BLOCK_TAGS = ((273, 279), (324, 325))  # offsets and byte counts, of strips or of tiles
 _ASCII, _SHORT, _LONG = 2, 3, 4
 _SIZE = {_ASCII: 1, _SHORT: 2, _LONG: 4}
 
@@ -65,7 +65,7 @@ def read_tiff_facts(path: Path, data: bytes) -> TiffFacts:
     except (struct.error, KeyError, IndexError) as error:
         raise damaged(path, "TIFF", "is cut short or corrupt") from error
     check_pixel_count(path, width, height, file_bytes=len(data))
-    _check_extent(path, data, tags)
+    _check_not_cut_short(path, data, tags)
     return TiffFacts(
         width=width,
         height=height,
@@ -102,10 +102,12 @@ def _first(tags: dict[int, tuple[int, ...]], tag: int, default: int) -> int:
     return (tags.get(tag) or (default,))[0]
 
 
-def _check_extent(path: Path, data: bytes, tags: dict[int, tuple[int, ...]]) -> None:
-    for offsets, counts in _STRIPS:
-        if offsets in tags and len(tags[offsets]) == len(tags.get(counts, ())):
-            needed = max((a + b for a, b in zip(tags[offsets], tags[counts], strict=True)))
+def _check_not_cut_short(path: Path, data: bytes, tags: dict[int, tuple[int, ...]]) -> None:
+    """Raises if the file ends before its last strip or tile, or lists none."""
+    for offsets_tag, counts_tag in _BLOCK_TAGS:
+        offsets, counts = tags.get(offsets_tag, ()), tags.get(counts_tag, ())
+        if offsets and len(offsets) == len(counts):
+            needed = max(a + b for a, b in zip(offsets, counts, strict=True))
             if needed > len(data):
                 raise damaged(path, "TIFF", f"is cut short: {len(data):,} of {needed:,} bytes")
             return

@@ -36,7 +36,7 @@ def matches(root: Path) -> bool:
 
 
 def listing(root: Path) -> Listing:
-    """Returns one frame per line, also with files that do not exist.
+    """Returns a frame for each line of the file; missing files are listed as broken.
 
     Raises:
         FileFormatError: A line is invalid, or two frames would share the files of their results.
@@ -51,11 +51,12 @@ def listing(root: Path) -> Listing:
     broken: list[Unmatched] = []
     taken: dict[str, str] = {}
     for (number, values), name in zip(parts, _names([p for _, p in parts]), strict=True):
-        same = taken.get(name.casefold())
-        if same is not None:
-            alike = "" if same == name else f", which some disks take for {same!r}"
+        earlier = taken.get(name.casefold())
+        if earlier is not None:
+            hint = "" if earlier == name else f", which some disks take for {earlier!r}"
             raise FileFormatError(
-                f"{root}, line {number}: a second frame {one_line(name)!r}{alike}; name it"
+                f"{root}, line {number}: a second frame {one_line(name)!r}{hint}; give it a name"
+                " of its own"
             )
         taken[name.casefold()] = name
         masks = (values["mask"],) if "mask" in values else ()

@@ -61,8 +61,8 @@ def _has_synthias_size(image: Path) -> bool:
 
 
 def _cameras(root: Path) -> Iterator[tuple[list[str], Path, Path]]:
-    """The start of its frames' names, its folder of images and of depth, for each camera."""
-    for rgb in sorted(p for start in ("", "*/") for p in root.glob(f"{start}RGB")):
+    """For each camera: the parts its frames' names start with, its image and its depth folder."""
+    for rgb in sorted(p for pattern in ("RGB", "*/RGB") for p in root.glob(pattern)):
         part, depth = rgb.parent, rgb.with_name("Depth")
         if not depth.is_dir():
             continue
@@ -70,11 +70,13 @@ def _cameras(root: Path) -> Iterator[tuple[list[str], Path, Path]]:
         for camera in sorted(p for p in rgb.glob(_CAMERAS) if p.is_dir()):
             name = camera.relative_to(rgb)
             yield [*prefix, *name.parts], camera, depth / name
-        # RGB and Depth are common names; numbers and size tell the random set from other data.
-        random = (p for p in sorted(rgb.glob("*.png")) if _RANDOM_STEM.fullmatch(p.stem))
-        first = next(random, None)
+        # SYNTHIA-RAND keeps its images directly in RGB. RGB and Depth are common names: numbers and
+        # size distinguish it from other data.
+        images = (p for p in sorted(rgb.glob("*.png")) if _RANDOM_STEM.fullmatch(p.stem))
+        first = next(images, None)
         if first is not None and _has_synthias_size(first):
-            yield prefix, rgb, depth / "Depth" if (depth / "Depth").is_dir() else depth
+            nested = depth / "Depth"
+            yield prefix, rgb, nested if nested.is_dir() else depth
 
 
 LAYOUT = Layout(matches=matches, listing=listing, needs=("RGB", "Depth"))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections import Counter
 from collections.abc import Callable, Generator, Iterator
 from contextlib import closing
@@ -120,10 +121,11 @@ def run_batch(
                 state=state, profile=profile, say=listener.say, stopped=stopped,
                 workers=request.workers, batch_size=request.batch_size,
             )  # fmt: skip
+            proven = len(to_do) < len(batch.chosen)
             if spread is None:
-                refined = _rows(request, batch, to_do, run)
+                refined = _rows(request, batch, to_do, run, proven=proven)
             else:
-                refined = spread_rows(request, spread, batch.frames, to_do, run)
+                refined = spread_rows(request, spread, batch.frames, to_do, run, proven=proven)
             with closing(refined if report is None else _drawn(report, refined)) as rows:
                 listener.begin(len(to_do))
                 for row in rows:
@@ -176,7 +178,7 @@ def _to_do(
 
 
 def _rows(
-    request: BatchRequest, batch: BatchFrames, to_do: list[Frame], run: BatchRun
+    request: BatchRequest, batch: BatchFrames, to_do: list[Frame], run: BatchRun, *, proven: bool
 ) -> Generator[dict[str, Any], None, None]:
     """A row for each frame as it is done; the network is loaded before the first is taken."""
     # these import torch, which a run with nothing to do does not need
@@ -184,7 +186,6 @@ def _rows(
     from pnpdepth_cli.pipeline.batch.running import run_tasks
 
     refiner = resolve_refiner((task_of(request, frame) for frame in batch.frames), run.say)
-    proven = len(to_do) < len(batch.chosen)
     tasks = _tasks(request, batch, to_do)
 
     def rows() -> Generator[dict[str, Any], None, None]:
@@ -242,9 +243,11 @@ def _summarise(
 ) -> dict[str, Any]:
     """Writes summary.csv, summary.json and the report; returns the summary without its frames."""
 
+    digests = [sys.intern(state.settings(task_of(request, frame))) for frame in batch.frames]
+
     def rows() -> Iterator[dict[str, Any]]:
-        for frame in batch.frames:
-            line = state.result_of(task_of(request, frame))
+        for frame, digest in zip(batch.frames, digests, strict=True):
+            line = state.result_of(frame.name, digest)
             if line is not None:
                 yield line["row"]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -85,27 +86,35 @@ def find_frames(request: BatchRequest) -> BatchFrames:
     if sequence.warm_start:
         check_warm_start(request.refine)
         frames = with_windows(frames, sequence.warm_start)
-    number, of = request.shard or (1, 1)
-    shard = in_windows(frames[: request.limit])[number - 1 :: of]
     return BatchFrames(
         layout=layout,
         frames=frames,
-        chosen=[frame for window in shard for frame in window],
+        chosen=_chosen(request, frames[: request.limit]),
         unmatched=tuple(unmatched),
     )
 
 
+def _chosen(request: BatchRequest, frames: list[Frame]) -> list[Frame]:
+    """The frames of the shard: every N-th, or every N-th window."""
+    number, of = request.shard or (1, 1)
+    if not request.sequence.warm_start:
+        return frames[number - 1 :: of]
+    return [frame for window in in_windows(frames)[number - 1 :: of] for frame in window]
+
+
 def task_of(request: BatchRequest, frame: Frame) -> Task:
     """Returns the frame's task; options of the user go before what the data set states."""
-    request = replace(request, refine=request.refine.with_fields(view_3d=request.html_3d))
-    base = request.refine.files
+    refine = request.refine
+    if request.html_3d:
+        refine = refine.with_fields(view_3d=True)
+    base = refine.files
     sparse = frame.sparse if base.sample is None else None
     protocol = frame.protocol if request.protocol is None else find_protocol(request.protocol)
     gt = frame.gt
     if base.sample is not None and gt is None and _is_scan_file(frame.sparse):
         gt = frame.sparse  # points are sampled from the projected scan
     is_scan = _is_scan_file(gt) or (sparse is not None and _is_scan(base, sparse))
-    scan, needs_camera = base.scan, request.refine.outputs.needs_camera or frame.neighbours
+    scan, needs_camera = base.scan, refine.outputs.needs_camera or frame.neighbours
     if is_scan:
         camera = frame.camera if scan.camera is None else scan.camera
         scan = replace(scan, calib=scan.calib or frame.calib, camera=camera)
@@ -129,9 +138,9 @@ def task_of(request: BatchRequest, frame: Frame) -> Task:
     )
     return Task(
         name=frame.name,
-        request=replace(request.refine, files=files),
+        request=replace(refine, files=files),
         inputs=dict(_earlier_files(frame)) | dict(_input_files(files, is_scan=is_scan)),
-        outputs=Outputs.in_folder(request.output, frame.name, request.refine),
+        outputs=Outputs.in_folder(request.output, frame.name, refine),
     )
 
 
@@ -203,8 +212,13 @@ def _outside(output: Path, frames: list[Frame]) -> tuple[list[Frame], list[Unmat
         return frames, []
     folder = output.resolve()
     kept, ignored = [], []
+    is_inside = functools.cache(lambda parent: parent.resolve().is_relative_to(folder))
     for frame in frames:
-        inside = [path for path in source_files(frame) if path.resolve().is_relative_to(folder)]
+        inside = [
+            path
+            for path in source_files(frame)
+            if is_inside(path.parent) or (path.is_symlink() and is_inside(path))
+        ]
         if inside:
             why = "lies in the output folder, which is not searched for frames; move it"
             ignored.append(Unmatched(path=inside[0], why=why))

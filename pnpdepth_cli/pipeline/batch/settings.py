@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -50,6 +50,33 @@ def settings_digest(request: RefineRequest, model: dict[str, Any]) -> str:
     """Returns the SHA-256 of `settings_of`."""
     text = json.dumps(settings_of(request, model), sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()
+
+
+class SettingsDigests:
+    """The `settings_digest` of frames, computed once for consecutive frames of equal settings.
+
+    Args:
+        model: The `model_identity` of their requests.
+    """
+
+    def __init__(self, model: dict[str, Any]) -> None:
+        self._model = model
+        self._last: tuple[Any, str] | None = None
+
+    def of(self, request: RefineRequest) -> str:
+        """Returns the digest of a frame's request."""
+        files = request.files
+        if files.calibration is not None or files.neighbours:  # of arrays, and of each frame alone
+            return settings_digest(request, self._model)
+        scan = replace(files.scan, calib=None, extrinsics=None)
+        alike = replace(
+            files, image=None, sparse=None, gt=None, gt_masks=(), scan=scan,
+            camera_file=None, camera_number=None,
+        )  # fmt: skip
+        key = (alike, request.network, request.method, request.hold_out, request.outputs)
+        if self._last is None or self._last[0] != key:
+            self._last = key, settings_digest(request, self._model)
+        return self._last[1]
 
 
 def model_identity(request: RefineRequest) -> dict[str, Any]:

@@ -53,6 +53,8 @@ def spread_rows(
     frames: Sequence[Frame],
     to_do: Sequence[Frame],
     run: BatchRun,
+    *,
+    proven: bool,
 ) -> Generator[dict[str, Any], None, None]:
     """Refines and records each frame on the workers; yields the rows as they are done.
 
@@ -62,6 +64,7 @@ def spread_rows(
         frames: All frames, the first of which decide what the network leaves open.
         to_do: The frames to refine.
         run: What the frames share.
+        proven: True if a frame was refined with these settings before.
 
     Raises:
         PnpDepthError: As of `run_tasks`.
@@ -69,7 +72,8 @@ def spread_rows(
     """
     state = run.state
     assert isinstance(state, BatchState)
-    with worker_pool(spread, state.output, run.say) as pool, run.profile.wall():
+    shared = worker_pool(spread, run.say, inputs=[request.source], output=state.output)
+    with shared as pool, run.profile.wall():
         deciding = _deciding(request, frames, pool)
         job = RefineJob(request=request, model=state.model, deciding=deciding)
         for part in pool.results(
@@ -77,6 +81,7 @@ def spread_rows(
             to_do,
             begin=lambda begun: state.record(*(begun_line(frame.name) for frame in begun)),
             stopped=run.stopped,
+            proven=proven,
         ):
             lines = [
                 _lost_line(state, request, frame, result) if isinstance(result, Lost) else result

@@ -20,7 +20,7 @@ from pnpdepth_cli.io.atomic import cannot_write, remove_leftovers
 from pnpdepth_cli.io.fingerprint import Fingerprint, fingerprint, is_unchanged
 from pnpdepth_cli.io.journal import Journal
 from pnpdepth_cli.pipeline.batch.frames import Task
-from pnpdepth_cli.pipeline.batch.settings import settings_digest
+from pnpdepth_cli.pipeline.batch.settings import SettingsDigests, settings_digest
 
 Status = Literal["done", "diverged", "failed"]
 
@@ -65,6 +65,7 @@ class BatchState:
     def __init__(self, output: Path, shard: tuple[int, int] | None, model: dict[str, Any]) -> None:
         self.output = output
         self.model = model
+        self._digests = SettingsDigests(model)
         part = "" if shard is None else f".{shard[0]}of{shard[1]}"
         own = output / f"batch{part}.jsonl"
         existed = own.exists()
@@ -99,14 +100,18 @@ class BatchState:
         lines = self._lines(task.name)
         if not lines:
             return NEW
-        digest = self._settings(task)
+        digest = self.settings(task)
         reasons = [self._why_not(line, task, digest) for line in lines]
         return None if None in reasons else reasons[0]
 
-    def result_of(self, task: Task) -> dict[str, Any] | None:
-        """Returns the frame's line with these settings, of this run or before; None without one."""
-        digest = self._settings(task)
-        lines = [line for line in self._lines(task.name) if line.get("settings") == digest]
+    def result_of(self, name: str, digest: str) -> Line | None:
+        """Returns the line of a frame with these settings, of this run or before; or None.
+
+        Args:
+            name: Of the frame.
+            digest: As `settings` returns it.
+        """
+        lines = [line for line in self._lines(name) if line.get("settings") == digest]
         lines.sort(key=lambda line: line["state"] == "failed")
         return lines[0] if lines else None
 
@@ -137,8 +142,9 @@ class BatchState:
         """Appends lines to the manifest of this run."""
         self._own.append(*lines)
 
-    def _settings(self, task: Task) -> str:
-        return settings_digest(task.request, self.model)
+    def settings(self, task: Task) -> str:
+        """Returns the digest of the settings of a frame."""
+        return self._digests.of(task.request)
 
     def _lines(self, name: str) -> list[dict[str, Any]]:
         lines = [journal.newest(name) for journal in (self._own, *self._others)]

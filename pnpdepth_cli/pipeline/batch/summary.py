@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import math
 from collections import Counter
@@ -11,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from pnpdepth_cli.io.atomic import atomic_path
-from pnpdepth_cli.io.csv_text import text_cell
+from pnpdepth_cli.io.csv_text import write_csv
 from pnpdepth_cli.io.record import plain
 
 CSV, JSON = "summary.csv", "summary.json"
@@ -172,12 +171,12 @@ def _add(sums: dict[Any, tuple[int, float]], key: Any, value: float | None) -> N
 
 
 def write_summary(path: Path, head: Mapping[str, Any], rows: Iterable[Mapping[str, Any]]) -> None:
-    """Writes the head as JSON, with the rows as its list `frames`, a line each."""
+    """Writes the head as JSON, with the rows, of JSON's own types, as its list `frames`."""
     text = json.dumps(plain(head), indent=2, ensure_ascii=False, allow_nan=False)
     with atomic_path(path) as temporary, _text_file(temporary) as file:
         file.write(text.removesuffix("\n}") + ',\n  "frames": [')
         for number, row in enumerate(rows):
-            line = json.dumps(plain(row), ensure_ascii=False, allow_nan=False)
+            line = json.dumps(row, ensure_ascii=False, allow_nan=False)
             file.write(f"{',' if number else ''}\n    {line}")
         file.write("\n  ]\n}\n")
 
@@ -204,34 +203,32 @@ def write_table(
         *(f"baseline_{name}_{measure}" for name in baselines for measure in BASELINE_MEASURES),
     ]
     with atomic_path(path) as temporary, _text_file(temporary) as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(header)
-        for row in rows:
-            points, seconds = row.get("points") or {}, row.get("seconds") or {}
-            measured = dict(_measures(row))
-            of_baselines = {
-                name: _baseline_measures(entry)
-                for name, entry in (row.get("baselines") or {}).items()
-            }
-            writer.writerow(
-                [
-                    *(text_cell(row["name"]), row["status"], text_cell(row["message"] or "")),
-                    *(points.get("used"), points.get("held_out"), row.get("improved_fraction")),
-                    *(
-                        measured.get((kind, stage, measure))
-                        for kind, measures in _MEASURED.items()
-                        for stage in _STAGES
-                        for measure in measures
-                    ),
-                    text_cell("; ".join(row.get("warnings") or ())),
-                    *(seconds.get(stage) for stage in ("read", "refine", "write")),
-                    *(
-                        of_baselines.get(name, {}).get(measure)
-                        for name in baselines
-                        for measure in BASELINE_MEASURES
-                    ),
-                ]
-            )
+        write_csv(file, header, (_table_row(row, baselines) for row in rows))
+
+
+def _table_row(row: Mapping[str, Any], baselines: Sequence[str]) -> list[Any]:
+    points, seconds = row.get("points") or {}, row.get("seconds") or {}
+    measured = dict(_measures(row))
+    of_baselines = {
+        name: _baseline_measures(entry) for name, entry in (row.get("baselines") or {}).items()
+    }
+    return [
+        *(row["name"], row["status"], row["message"] or ""),
+        *(points.get("used"), points.get("held_out"), row.get("improved_fraction")),
+        *(
+            measured.get((kind, stage, measure))
+            for kind, measures in _MEASURED.items()
+            for stage in _STAGES
+            for measure in measures
+        ),
+        "; ".join(row.get("warnings") or ()),
+        *(seconds.get(stage) for stage in ("read", "refine", "write")),
+        *(
+            of_baselines.get(name, {}).get(measure)
+            for name in baselines
+            for measure in BASELINE_MEASURES
+        ),
+    ]
 
 
 def _text_file(path: Path) -> Any:

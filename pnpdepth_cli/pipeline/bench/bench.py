@@ -227,7 +227,7 @@ class _Subject:
         if self.request.target == "masked":
             todo[MASKED] = self._masked_part()
         if self.request.files:
-            todo |= self._fitting_parts(output, notes) | self._file_parts()
+            todo |= self._alignment_and_propagation(output, notes) | self._file_parts()
         spent = in_turn(todo, self.request.repeats, device, on_round=on_round)
         peaks = {name: peak_mb(_once(todo[name]), device) for name in _WITH_PEAK if name in todo}
         seconds = {name: Quartiles.of(each) for name, each in spent.items()}
@@ -306,35 +306,35 @@ class _Subject:
             depth_of=prepared.depth_reader(self.settings),
         ).after
 
-    def _fitting_parts(self, output: Any, notes: list[str]) -> dict[str, Timed]:
-        """Alignment and propagation."""
+    def _alignment_and_propagation(self, output: Any, notes: list[str]) -> dict[str, Timed]:
+        """Returns the jobs that time alignment and propagation, without those that fail here."""
         stated = self.network.definition.output_kind
         spaces = (stated,) if stated in SPACES else ("depth", "inverse")
-        at = self.prepared.points
-        at_points = at.sample(self.network.raw_of(output))
+        points = self.prepared.points
+        predicted = points.sample(self.network.raw_of(output))
         depth = self.network.depth_of(output)
-        points = at.resized(*depth.shape[-2:])
+        of_depth = points.resized(*depth.shape[-2:])
         image = self.prepared.frame.rgb
         assert image is not None
-        rgb = F.interpolate(image[None], points.size, mode="bilinear")[0]
-        todo = {
-            "alignment": Timed(run=lambda _: align(at_points, at, spaces, "auto")),
-            "propagation": Timed(run=lambda _: propagate(depth[0, 0], points, rgb, kind="gp")),
+        rgb = F.interpolate(image[None], of_depth.size, mode="bilinear")[0]
+        jobs = {
+            "alignment": Timed(run=lambda _: align(predicted, points, spaces, "auto")),
+            "propagation": Timed(run=lambda _: propagate(depth[0, 0], of_depth, rgb, kind="gp")),
         }
-        for name in list(todo):
+        for name in list(jobs):
             try:
-                todo[name].run(None)
-            except PnpDepthError as error:  # random weights may give a constant
+                jobs[name].run(None)
+            except PnpDepthError as error:  # a constant, as of random weights, fits no points
                 notes.append(f"{name} was not measured: {error}")
-                del todo[name]
-        return todo
+                del jobs[name]
+        return jobs
 
     def _file_parts(self) -> dict[str, Timed]:
         """Reading and writing of files, as `pnpdepth refine` does it."""
         inputs, outputs = read_inputs(self.files_request), plan_outputs(self.files_request)
         with self.network.cut_at(self.layer) as split:
             frame = refine_frame(self.network, split, self.settings, inputs.frame())
-        frame = within_range(outputs.depth, inputs, frame)
+        frame = within_range(outputs, inputs, frame)
         return {
             "reading": Timed(run=lambda _: read_inputs(self.files_request)),
             "writing": Timed(run=lambda _: write_outputs(outputs, inputs, frame)),

@@ -6,7 +6,7 @@ import secrets
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -53,30 +53,43 @@ class _Hand:
 
 
 @contextmanager
-def worker_pool(spread: Spread, output: Path, say: Callable[[str], None]) -> Iterator[WorkerPool]:
+def worker_pool(
+    spread: Spread,
+    say: Callable[[str], None],
+    *,
+    inputs: Sequence[Path],
+    output: Path | None = None,
+) -> Iterator[WorkerPool]:
     """Yields the workers of a cluster; they end with it.
 
     Args:
         spread: Which workers.
-        output: A folder that all of them have to share.
         say: Receives notes.
+        inputs: Files and folders that all nodes have to see.
+        output: A folder that all nodes have to share; a file in it is the probe.
 
     Raises:
         UsageError: Ray is not installed.
         ClusterError: The cluster cannot be used.
     """
-    probe = output.absolute() / f".{secrets.token_hex(6)}"  # removed by the next run if killed
+    with ExitStack() as stack:
+        shared = list(inputs)
+        if output is not None:
+            shared.append(stack.enter_context(_probe(output.absolute())))
+        pool = WorkerPool(stack.enter_context(connected(spread)), spread, shared, say)
+        stack.callback(pool.close)
+        yield pool
+
+
+@contextmanager
+def _probe(folder: Path) -> Iterator[Path]:
+    probe = folder / f".{secrets.token_hex(6)}"  # removed by the next run if this one is killed
     try:
         probe.touch()
     except OSError as error:
-        raise cannot_write(output, error) from error
+        raise cannot_write(folder, error) from error
     try:
-        with connected(spread) as cluster:
-            pool = WorkerPool(cluster, spread, probe, say)
-            try:
-                yield pool
-            finally:
-                pool.close()
+        yield probe
     finally:
         with suppress(OSError):
             probe.unlink()
@@ -86,13 +99,13 @@ class WorkerPool:
     """Workers of a connected cluster; use `worker_pool`."""
 
     def __init__(
-        self, cluster: Cluster, spread: Spread, probe: Path, say: Callable[[str], None]
+        self, cluster: Cluster, spread: Spread, shared: Sequence[Path], say: Callable[[str], None]
     ) -> None:
         self._cluster, self._ray, self._say = cluster, cluster.ray, say
         self._retries = spread.options.retries
         self._start = Start(
             folder=str(Path.cwd()),
-            probe=probe,
+            shared=tuple(shared),
             threads=spread.options.cpus_per_worker,
             max_pixels=chosen_max_pixels(),
         )
@@ -126,6 +139,7 @@ class WorkerPool:
         *,
         begin: Callable[[Sequence[Any]], None] = lambda items: None,
         stopped: Callable[[], bool] = lambda: False,
+        proven: bool = False,
     ) -> Iterator[list[tuple[Any, Any]]]:
         """Yields the items of each piece with their results, or Lost, as pieces are done.
 
@@ -134,6 +148,7 @@ class WorkerPool:
             items: Sent to the workers.
             begin: Called with items before they are handed out.
             stopped: True if nothing more is to be handed out.
+            proven: Whether an item succeeded before, so that errors are of single items.
 
         Raises:
             PnpDepthError: What concerns all items.
@@ -146,7 +161,7 @@ class WorkerPool:
                 self._open(hand)
         pieces = Pieces(items, self._retries)
         self._unproven: list[tuple[Piece, PnpDepthError]] = []
-        self._proven = False
+        self._proven = proven
         try:
             while True:
                 if stopped():
@@ -301,9 +316,10 @@ def _check(facts: Facts) -> None:
                 f"node {facts.node} has {name} {there}, and here it is {here}; install the same"
                 " version on all nodes"
             )
-    if not facts.sees_output:
+    for path in facts.unseen:
+        what = "the output folder" if path.name.startswith(".") else str(path)
         raise ClusterError(
-            f"node {facts.node} does not see the output folder; name a folder that all nodes share"
+            f"node {facts.node} does not see {what}; name a folder that all nodes share"
         )
 
 

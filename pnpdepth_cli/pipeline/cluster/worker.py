@@ -26,8 +26,8 @@ class Start:
 
     folder: str
     """The driver's working folder, which relative paths start from."""
-    probe: Path | None
-    """A file of the driver's output folder, to be seen by every worker."""
+    shared: tuple[Path, ...]
+    """Files and folders that every worker has to see."""
     threads: int
     """Threads of torch, OpenCV and OpenMP."""
     max_pixels: int | None
@@ -44,8 +44,8 @@ class Facts:
     """Its process number."""
     versions: dict[str, str]
     """Of the program, Python and the numerical libraries."""
-    sees_output: bool
-    """Whether the driver's probe file is there."""
+    unseen: tuple[Path, ...]
+    """Those of the shared files and folders that are not there."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,7 +84,7 @@ class Worker:
         for name in _THREADS:  # before torch and OpenCV are imported
             os.environ[name] = str(start.threads)
         os.environ.setdefault("GOMP_SPINCOUNT", "3000")
-        with suppress(OSError):  # the probe tells
+        with suppress(OSError):  # what is shared tells
             os.chdir(start.folder)
         import cv2
         import torch
@@ -92,7 +92,7 @@ class Worker:
         torch.set_num_threads(start.threads)
         cv2.setNumThreads(start.threads)
         set_max_pixels(start.max_pixels)
-        self._probe = start.probe
+        self._shared = start.shared
         self._open = ExitStack()
         self._work: Callable[[Sequence[Any], bool], Done] | None = None
 
@@ -102,7 +102,7 @@ class Worker:
             node=socket.gethostname(),
             pid=os.getpid(),
             versions=software(),
-            sees_output=self._probe is None or self._probe.exists(),
+            unseen=tuple(path for path in self._shared if not path.exists()),
         )
 
     def call(self, function: Callable[..., Any], *arguments: Any) -> Any:

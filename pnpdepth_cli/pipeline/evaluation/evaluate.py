@@ -9,7 +9,8 @@ import numpy as np
 import torch
 
 from pnpdepth_cli.core.metrics import MEASURES, SUMS, measures_of
-from pnpdepth_cli.errors import InputError, PnpDepthError, UsageError
+from pnpdepth_cli.errors import InputError, UsageError
+from pnpdepth_cli.pipeline.cluster.options import spread_of
 from pnpdepth_cli.pipeline.evaluation.averages import Floats, FrameTable
 from pnpdepth_cli.pipeline.evaluation.dependence import (
     MIN_CLUSTERS,
@@ -24,12 +25,14 @@ from pnpdepth_cli.pipeline.evaluation.frame_scoring import (
     FrameScores,
     ScoredFrame,
     score_pair,
+    scored_or_error,
 )
 from pnpdepth_cli.pipeline.evaluation.kitti_devkit import devkit_mean
 from pnpdepth_cli.pipeline.evaluation.pairing import FramePair, in_sequences, pair_frames
 from pnpdepth_cli.pipeline.evaluation.protocols import EvalProtocol, choose_protocol
 from pnpdepth_cli.pipeline.evaluation.resampling import studentised_interval
 from pnpdepth_cli.pipeline.evaluation.result import ErrorBin, EvalRequest, Evaluation, Interval
+from pnpdepth_cli.pipeline.evaluation.spread import spread_scores
 from pnpdepth_cli.pipeline.evaluation.uncertainty import summarise_uncertainty
 from pnpdepth_cli.pipeline.ordered_pool import in_order
 
@@ -67,7 +70,12 @@ def evaluate(
     frames = pairs.frames
     if any(group.in_sequences for group in protocol.measure_groups):
         frames = in_sequences(frames)
-    for scored in _scored(frames, protocol, request, raising=pairs.single):
+    spread, said = spread_of("cpu", request.cluster), list[str]()
+    if spread is None or pairs.single:
+        scored_frames = _scored(frames, protocol, request, raising=pairs.single)
+    else:
+        scored_frames = spread_scores(frames, protocol, request, spread, said.append)
+    for scored in scored_frames:
         rows.append(scored.row)
         kinds.add(scored)
         if scored.uncertainty is not None:
@@ -97,6 +105,7 @@ def evaluate(
         by_distance=_bins(by_distance, DISTANCE_EDGES_PX),
         by_depth=_bins(by_depth, DEPTH_EDGES_M),
         notes=(
+            *said,
             *pairs.notes,
             *kinds.notes(),
             *diagnose(rows, protocol, kinds),
@@ -126,13 +135,10 @@ def _scored(
     """The frames in their order, a few of them worked on at once."""
 
     def scored(pair: FramePair) -> ScoredFrame:
-        try:
-            frame = score_pair(pair, protocol, request.scales)
-        except PnpDepthError as error:
-            if raising:
-                raise
-            return ScoredFrame(row=FrameScores(pair=pair, values={}, error=str(error)))
-        if raising and frame.row.error is not None:
+        if not raising:
+            return scored_or_error(pair, protocol, request.scales)
+        frame = score_pair(pair, protocol, request.scales)
+        if frame.row.error is not None:
             raise InputError(frame.row.error)
         return frame
 

@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 
 from pnpdepth_cli.core.metrics import MEASURES, SUMS, error_sums, measures_of
-from pnpdepth_cli.errors import InputError
+from pnpdepth_cli.errors import InputError, PnpDepthError
 from pnpdepth_cli.io.calibration import read_calibration
 from pnpdepth_cli.io.depth import DepthImage
 from pnpdepth_cli.pipeline.evaluation.frame_reading import Depth, LoadedFrame, Scales, load_frame
@@ -110,6 +110,14 @@ class ScoredFrame:
     """By distance to the nearest sparse point; None unless the user named sparse depth."""
     by_depth: Sums | None = None
     """By depth of the ground truth; None unless the user named sparse depth."""
+
+
+def scored_or_error(pair: FramePair, protocol: EvalProtocol, scales: Scales) -> ScoredFrame:
+    """Returns the scores of a frame's files, or why it has none."""
+    try:
+        return score_pair(pair, protocol, scales)
+    except PnpDepthError as error:
+        return ScoredFrame(row=FrameScores(pair=pair, values={}, error=str(error)))
 
 
 def score_pair(pair: FramePair, protocol: EvalProtocol, scales: Scales) -> ScoredFrame:

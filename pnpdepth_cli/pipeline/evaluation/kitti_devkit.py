@@ -64,16 +64,16 @@ def fill_background(depth: Floats) -> Floats:
     return filled
 
 
-def devkit_errors(predicted: Floats, truth: Floats) -> dict[str, float]:
+def devkit_errors(predicted: Floats, gt: Floats) -> dict[str, float]:
     """Returns the measures of one frame; the logarithmic ones are NaN where the fill left −1.
 
     Args:
         predicted: (H, W) metres, 0 where unknown.
-        truth: (H, W) metres, 0 where unknown; some of it known.
+        gt: (H, W) metres, 0 where unknown; some of it known.
     """
     filled = fill_background(predicted)
-    known = truth.T > 0  # the kit walks down each column
-    p, g = filled.T[known], truth.T[known]
+    known = gt.T > 0  # the kit walks down each column
+    p, g = filled.T[known], gt.T[known]
     with np.errstate(invalid="ignore"):
         error, log_error = np.abs(g - p), _log(g) - _log(p)
         inverse_error = np.abs(1.0 / g.astype(np.float64) - 1.0 / p.astype(np.float64))

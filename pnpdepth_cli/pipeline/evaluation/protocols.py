@@ -93,8 +93,11 @@ class EvalProtocol:
         """The measures in order, and how tables show them."""
         if self.is_devkit:
             return DEVKIT_MEASURES
-        usual = _IN_MILLIMETRES if self.name == "kitti" else MEASURES
-        return (*usual, *(measure for group in self.measure_groups for measure in group.measures))
+        base = _IN_MILLIMETRES if self.name == "kitti" else MEASURES
+        return (
+            *base,
+            *(measure for group in self.measure_groups for measure in group.measures),
+        )
 
     @property
     def measure_groups(self) -> tuple[MeasureGroup, ...]:

@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from pnpdepth_cli.core.metrics import MEASURES, Measure
 from pnpdepth_cli.errors import FileFormatError, UsageError
+from pnpdepth_cli.io.file_bytes import one_line
 from pnpdepth_cli.io.record import read_json
 from pnpdepth_cli.pipeline.evaluation.dependence import groups_by_name
 from pnpdepth_cli.pipeline.evaluation.protocols import PROTOCOLS
 
 _STAGES = ("before", "after")
+_MOST_DECIMALS = 15
+_LARGEST_FACTOR = 1e6
+_MOST_PIXELS = 1 << 53
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,9 +82,10 @@ def read_run(text: str) -> Run:
                 raise UsageError(f"{path} is of eval, which has no before; leave out :before")
             return _eval_run(text, path.stem, record)
         frames = _refinement_frames(path, record, stage)
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
+        fact = one_line(repr(error))
         raise FileFormatError(
-            f"{path} does not hold scores as pnpdepth writes them ({error!r}); create it again"
+            f"{path} does not hold scores as pnpdepth writes them ({fact}); create it again"
         ) from error
     if not frames:
         raise FileFormatError(
@@ -103,20 +108,40 @@ def _eval_run(text: str, label: str, record: Mapping[str, Any]) -> Run:
     return Run(
         label=label,
         path=text,
-        measures=tuple(Measure(**measure) for measure in record["measures"]),
+        measures=tuple(_measure(fields) for fields in record["measures"]),
         # records of earlier versions lack rules that did not exist
         scoring=PROTOCOLS["paper"].scoring() | record["protocol"]["scoring"],
         frames={
-            frame["name"]: RunFrame(
+            str(frame["name"]): RunFrame(
                 values=_numbers(frame["values"]),
-                pixels=frame["pixels"],
-                group=frame.get("group", group),
-                known=frame["known"],
-                sums=tuple(frame.get("sums", ())),
+                pixels=_count(frame["pixels"]),
+                group=str(frame.get("group", group)),
+                known=None if frame["known"] is None else _count(frame["known"]),
+                sums=tuple(float(each) for each in frame.get("sums", ())),
             )
             for frame, group in zip(scored, groups, strict=True)
         },
     )
+
+
+def _measure(fields: Mapping[str, Any]) -> Measure:
+    """The measure of a record. Raises TypeError or ValueError for what no table can show."""
+    measure = Measure(**fields)
+    for name, like in asdict(Measure(key="", title="")).items():
+        value = getattr(measure, name)
+        if type(value) is not type(like):
+            raise TypeError(f"{name} of a measure is {one_line(value)!r}")
+    if not 0 <= measure.decimals <= _MOST_DECIMALS:
+        raise ValueError(f"a measure with {one_line(measure.decimals)} decimals")
+    if not 0 < measure.shown_factor <= _LARGEST_FACTOR:
+        raise ValueError(f"a measure shown × {measure.shown_factor:g}")
+    return measure
+
+
+def _count(value: Any) -> int:
+    if type(value) is not int or not 0 <= value < _MOST_PIXELS:
+        raise ValueError(f"{one_line(value)!r} is no count of pixels")
+    return value
 
 
 def _refinement_frames(path: Path, record: Mapping[str, Any], stage: str) -> dict[str, RunFrame]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import io
 import math
 from collections.abc import Sequence
@@ -11,7 +10,7 @@ from pathlib import Path
 from pnpdepth_cli.core.metrics import Measure
 from pnpdepth_cli.errors import OutputError
 from pnpdepth_cli.io.atomic import atomic_path
-from pnpdepth_cli.io.csv_text import text_cell
+from pnpdepth_cli.io.csv_text import write_csv
 from pnpdepth_cli.pipeline.evaluation.compare import Comparison
 from pnpdepth_cli.pipeline.evaluation.result import ErrorBin, Evaluation, frame_record
 
@@ -76,7 +75,7 @@ def frames_csv(evaluation: Evaluation) -> str:
     columns = [name for name in records[0] if name not in ("values", "error")]
     rows = [
         [*(_cell(r[name]) for name in columns), *(_cell(r["values"].get(key)) for key in keys),
-         text_cell(r["error"] or "")]
+         r["error"] or ""]
         for r in records
     ]  # fmt: skip
     return csv_text([*columns, *keys, "error"], rows)
@@ -139,20 +138,19 @@ def comparison_table(comparison: Comparison) -> tuple[list[str], list[list[str]]
 
 
 def comparison_caption(comparison: Comparison) -> str:
-    """Returns what the table shows, in one line."""
+    """Returns the caption of the table of a comparison, one line."""
     return (
-        f"{len(comparison.names):,} shared frames; gains in per cent of {comparison.runs[0].label};"
+        f"{len(comparison.names):,} shared frames; gains in per cent of the error of"
+        f" {comparison.runs[0].label};"
         f" intervals (95 %) and p-values over {comparison.clusters.describe()}, p adjusted for"
         f" {len(comparison.measures)} measures (Holm)"
     )
 
 
 def csv_text(header: Sequence[str], rows: Rows) -> str:
-    """Returns CSV (RFC 4180, but lines end in \\n)."""
+    """Returns the table as `write_csv` writes it."""
     buffer = io.StringIO()
-    writer = csv.writer(buffer, lineterminator="\n")
-    writer.writerow(header)
-    writer.writerows(rows)
+    write_csv(buffer, header, rows)
     return buffer.getvalue()
 
 
@@ -190,4 +188,4 @@ def _in_markdown(cell: str) -> str:
 def _cell(value: object) -> str:
     if value is None or (isinstance(value, float) and math.isnan(value)):
         return ""
-    return text_cell(value) if isinstance(value, str) else str(value)
+    return str(value)

@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+import hashlib
+import re
+import shutil
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 from pnpdepth_cli.errors import ModelError, OutputError, UsageError
+from pnpdepth_cli.io.atomic import atomic_folder
+from pnpdepth_cli.io.file_bytes import one_line
 from pnpdepth_cli.io.record import sha256_of, write_json
 
-_WANTED = [  # never code, never pickles
-    "config.json",
-    "preprocessor_config.json",
-    "model*.safetensors",
-    "*.safetensors.index.json",
-]
+_WANTED = re.compile(
+    r"(preprocessor_)?config\.json|model[\w.-]*\.safetensors|[\w.-]+\.safetensors\.index\.json"
+)
+"""Files at the top of a repository: never code, never pickles."""
+
 RECORD = "fetched.json"
 
 
@@ -34,7 +39,8 @@ class FetchedModel:
 def fetch_model(repo: str, revision: str | None = None, output: Path | None = None) -> FetchedModel:
     """Downloads the settings and safetensors weights of a Hugging Face repository to a folder.
 
-    What was downloaded is returned, and stored as `fetched.json` in the folder.
+    What was downloaded is returned, and stored as `fetched.json` in the folder. Nothing stays there
+    unless every file has the digest that the repository states.
 
     Args:
         repo: ORG/NAME.
@@ -42,7 +48,7 @@ def fetch_model(repo: str, revision: str | None = None, output: Path | None = No
         output: The folder, which must be empty or missing; None is NAME.
 
     Raises:
-        ModelError: The repository cannot be reached.
+        ModelError: The repository cannot be reached, or a file is not what it states.
         OutputError: The folder holds something.
         UsageError: `repo` is not of the form ORG/NAME.
     """
@@ -53,26 +59,64 @@ def fetch_model(repo: str, revision: str | None = None, output: Path | None = No
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise OutputError(f"{folder} exists; name another folder with -o")
     try:
-        from huggingface_hub import HfApi, snapshot_download
+        from huggingface_hub import HfApi, hf_hub_download
     except ImportError as error:
         raise ModelError(
             f"fetching needs the package {error.name!r}: pip install 'pnpdepth[hf]'"
         ) from None
-    try:
-        pinned = HfApi().model_info(repo, revision=revision).sha
-        snapshot_download(repo, revision=pinned, local_dir=folder, allow_patterns=_WANTED)
-    except Exception as error:  # its own errors, the HTTP client's and the system's
-        reason = " ".join(str(error).split())[:200]
-        raise ModelError(
-            f"{repo} cannot be fetched from Hugging Face ({type(error).__name__}: {reason}); is"
-            " this machine online, and the name right? A folder copied from elsewhere works too"
-        ) from None
-    files = sorted(path for path in folder.iterdir() if path.is_file())
-    fetched = FetchedModel(
-        repository=repo,
-        revision=pinned,
-        folder=str(folder),
-        sha256={path.name: sha256_of(path) for path in files},
-    )
-    write_json(folder / RECORD, asdict(fetched))
+    with atomic_folder(folder) as temporary:
+        try:
+            info = HfApi().model_info(repo, revision=revision, files_metadata=True)
+            files = [file for file in info.siblings or () if _WANTED.fullmatch(file.rfilename)]
+            for file in files:
+                hf_hub_download(repo, file.rfilename, revision=info.sha, local_dir=temporary)
+        except Exception as error:  # its own errors, the HTTP client's and the system's
+            raise _cannot_fetch(repo, error) from None
+        if not files:
+            raise ModelError(f"{repo} has no config.json and no model.safetensors; name another")
+        shutil.rmtree(temporary / ".cache", ignore_errors=True)  # of huggingface_hub
+        for file in files:
+            _check_content(repo, temporary / file.rfilename, file)
+        fetched = FetchedModel(
+            repository=repo,
+            revision=info.sha,
+            folder=str(folder),
+            sha256={file.rfilename: sha256_of(temporary / file.rfilename) for file in files},
+        )
+        write_json(temporary / RECORD, asdict(fetched))
     return fetched
+
+
+def _cannot_fetch(repo: str, error: Exception) -> ModelError:
+    reason = one_line(error)
+    return ModelError(
+        f"{repo} cannot be fetched from Hugging Face ({type(error).__name__}: {reason}); is"
+        " this machine online, and the name right? A folder copied from elsewhere works too"
+    )
+
+
+def _check_content(repo: str, path: Path, stated: Any) -> None:
+    """Raises ModelError unless a file has the digest that the repository states.
+
+    Args:
+        repo: Named in messages.
+        path: The file.
+        stated: Its entry in the repository: the SHA-256 of a file in LFS, the Git blob of others.
+    """
+    if stated.lfs is not None:
+        same = sha256_of(path) == stated.lfs.sha256
+    else:
+        same = _git_blob(path) == stated.blob_id
+    if not same:
+        raise ModelError(
+            f"{repo}: {path.name} arrived with another content than the repository states; fetch it"
+            " again, over another connection if this repeats"
+        )
+
+
+def _git_blob(path: Path) -> str:
+    digest = hashlib.sha1(b"blob %d\0" % path.stat().st_size, usedforsecurity=False)
+    with path.open("rb") as file:
+        while block := file.read(1 << 20):
+            digest.update(block)
+    return digest.hexdigest()

@@ -162,7 +162,7 @@ def _competing_propagations(asked: str | None, *, timed: bool) -> tuple[str, ...
 
 
 def _against_linear(choice: Choice) -> dict[str, Any] | None:
-    """Errors of network, linear interpolation and result at the held-out points of the folds."""
+    """MAE in metres at held-out points of network, linear interpolation and result, if measured."""
     linear = choice.error_of(LINEAR)
     if linear is None or choice.error is None:
         return None
@@ -175,7 +175,7 @@ def _against_linear(choice: Choice) -> dict[str, Any] | None:
 
 
 def choice_notes(choice: Choice, definition: ModelDefinition) -> tuple[str, ...]:
-    """Returns what the user is told of the choice."""
+    """Returns the notes on the choice that are printed."""
     if choice.error is None:
         return (f"choice: {choice}; with fewer than {MIN_POINTS} points none can be held out",)
     errors = {str(one.candidate): one.error for one in choice.scored}

@@ -41,6 +41,8 @@ class Outputs:
     """3D view for a report."""
     record: Path | None = None
     """JSON of settings and scores."""
+    scale: float | None = None
+    """Codes per metre of an integer depth file. None: what suits the frame."""
     colors: str = "blue-orange"
     """Colours of better and worse, one of `choices.COLORS`."""
 
@@ -62,6 +64,7 @@ class Outputs:
             cloud=folder / f"{name}.ply" if request.outputs.ply else None,
             view=folder / f"{name}_view.json" if request.outputs.view_3d else None,
             record=folder / f"{name}.json",
+            scale=request.outputs.output_scale,
             colors=request.outputs.colors,
         )
 
@@ -108,7 +111,7 @@ def plan_outputs(request: RefineRequest) -> Outputs:
         flag = next(flag for flag, given in added.items() if given)
         raise UsageError(f"{flag} writes a second file; name a folder, not {output}, with -o")
     if output.suffix.lower() in DEPTH_SUFFIXES:
-        outputs = Outputs(depth=output)
+        outputs = Outputs(depth=output, scale=asked.output_scale)
     elif output.suffix.lower() in _FILE_SUFFIXES and not output.is_dir():
         raise OutputError(
             f"{output}: depth is written as {' '.join(DEPTH_SUFFIXES)}, or into a folder"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 
@@ -12,6 +11,7 @@ from pnpdepth_cli.io.depth_range import metres
 from pnpdepth_cli.io.formats import format_of_suffix
 from pnpdepth_cli.io.formats.png import LARGEST_CODE
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs
+from pnpdepth_cli.pipeline.refinement.output_files import Outputs
 
 INTEGER_SCALE = 256.0
 """KITTI's codes per metre, for points that have none of their own and fit."""
@@ -22,11 +22,14 @@ _BEYOND_POINTS = 1.5  # depths up to this multiple of the farthest point fit
 _LEAST_CODES = 25.6  # of the nearest point: 2 % of rounding
 
 
-def output_scale(inputs: Inputs) -> float:
+def output_scale(outputs: Outputs, inputs: Inputs) -> float:
     """Returns the codes per metre of an integer depth file for this frame.
 
-    The sparse depth file's own, else 256 unless the points do not fit; known before refinement.
+    What the user asks for, else the sparse depth file's own, else 256 unless the points do not fit;
+    known before refinement.
     """
+    if outputs.scale is not None:
+        return outputs.scale
     if inputs.sparse_scale is not None:
         return inputs.sparse_scale
     nearest, farthest = float(inputs.points.depth.min()), float(inputs.points.depth.max())
@@ -40,18 +43,18 @@ def output_scale(inputs: Inputs) -> float:
     return scale
 
 
-def within_range(path: Path, inputs: Inputs, frame: RefinedFrame) -> RefinedFrame:
+def within_range(outputs: Outputs, inputs: Inputs, frame: RefinedFrame) -> RefinedFrame:
     """Returns the frame with depths that the file's format can hold, and a note if any is clipped.
 
     Args:
-        path: The depth file.
+        outputs: The files that are written.
         inputs: The frame as it was read.
         frame: The refined frame.
     """
-    depth_format = format_of_suffix(path.suffix)
+    depth_format = format_of_suffix(outputs.depth.suffix)
     if depth_format is None or not depth_format.integer:
         return frame
-    scale = output_scale(inputs)
+    scale = output_scale(outputs, inputs)
     nearest, farthest = np.float32(1 / scale), np.float32(LARGEST_CODE / scale)
     known = np.isfinite(frame.after) & (frame.after > 0)
     beyond, below = known & (frame.after > farthest), known & (frame.after < 0.5 / scale)

@@ -23,7 +23,7 @@ from pnpdepth_cli.sensors.cloud import cloud_from_depth
 def write_outputs(outputs: Outputs, inputs: Inputs, frame: RefinedFrame) -> dict[str, Any]:
     """Writes the depth and its images. Returns their entries of the record."""
     make_folder(outputs.depth.parent)
-    write_depth(outputs.depth, frame.after, scale=output_scale(inputs))
+    write_depth(outputs.depth, frame.after, scale=output_scale(outputs, inputs))
     if outputs.sigma is not None and frame.sigma is not None:
         write_depth(outputs.sigma, frame.sigma)
     if outputs.sigma_preview is not None and frame.sigma is not None:

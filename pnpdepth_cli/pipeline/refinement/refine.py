@@ -69,7 +69,7 @@ def write_refined(
 
     The record is the same from run to run, except `seconds` and `peak_memory_mb`.
     """
-    frame = within_range(outputs.depth, inputs, frame)
+    frame = within_range(outputs, inputs, frame)
     record = record_of(refiner, inputs, frame)
     with all_or_none(outputs.paths()):
         with watch("write"):

@@ -44,6 +44,17 @@ def parse_seconds(text: str) -> float:
     return seconds
 
 
+def parse_codes_per_metre(text: str) -> float:
+    """Returns the codes per metre of `256` or `mm`. Raises UsageError for any other text."""
+    try:
+        scale = 1000.0 if text == "mm" else float(text)
+    except ValueError:
+        scale = -1.0
+    if not 0 < scale < float("inf"):
+        raise UsageError(f"--output-scale {text!r} is neither mm nor codes per metre such as 256")
+    return scale
+
+
 @dataclass(frozen=True, kw_only=True)
 class FrameFiles:
     """The files of a frame and how they are read."""
@@ -136,7 +147,7 @@ class NetworkChoice:
     )
     device: str = option(
         "cpu",
-        "cpu, cuda, cuda:1, mps, …; batch, eval and sweep also take cuda:0,cuda:1 and all.",
+        "cpu, cuda, cuda:1, mps, …; batch and sweep also take several, cuda:0,cuda:1, or all.",
         metavar="NAME",
         show_default=True,
     )
@@ -298,6 +309,13 @@ class OutputOptions:
         "Format of the depth file in an output folder.",
         choices=choices.FORMATS,
         show_default=True,
+    )
+    output_scale: float | None = option(
+        None,
+        "Codes per metre of a 16-bit PNG; mm is 1000.  [default: as the sparse depth file, else 256"
+        " or what fits]",
+        metavar="mm|S",
+        parse=parse_codes_per_metre,
     )
     ply: bool = option(False, "Also write a coloured point cloud, NAME.ply.")
     fov_deg: float | None = option(

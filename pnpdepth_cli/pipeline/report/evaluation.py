@@ -17,7 +17,7 @@ from pnpdepth_cli.io.report import (
     begin_report,
     check_report_folder,
     image_key,
-    remove_report_leftovers,
+    whole_report,
     write_report,
 )
 from pnpdepth_cli.io.report_images import error_colours, error_map, save_images
@@ -66,14 +66,12 @@ def write_eval_report(
         on_frame: Called with (done, of) after each frame.
 
     Raises:
-        OutputError: If the report cannot be written.
+        OutputError: If the report cannot be written; then the folder is as it was before.
     """
-    images = begin_report(folder, _SOURCE)
-    remove_report_leftovers(folder)
     columns = _columns(evaluation)
     scored = evaluation.scored
 
-    def entries() -> Iterator[dict[str, Any]]:
+    def entries(images: Path) -> Iterator[dict[str, Any]]:
         drawn = in_order(
             lambda frame: _entry(frame, evaluation, columns, images),
             scored,
@@ -83,7 +81,9 @@ def write_eval_report(
             yield entry
             on_frame(done, len(scored))
 
-    write_report(folder, _head(evaluation, columns), entries())
+    with whole_report(folder) as temporary:
+        images = begin_report(temporary, _SOURCE)
+        write_report(temporary, _head(evaluation, columns), entries(images))
 
 
 def _columns(evaluation: Evaluation) -> list[Column]:

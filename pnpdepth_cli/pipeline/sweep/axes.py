@@ -149,9 +149,10 @@ def _within(high: float) -> Callable[[str], float]:
         try:
             number = float(text)
         except ValueError:
-            raise ValueError(f"{text!r} is no number") from None
-        if not 0 <= number <= high or math.isinf(number):
-            raise ValueError(f"{text} is not 0 or more" + (f" and {high:g} at most" * (high < 1e9)))
+            raise ValueError(f"{text!r} is not a number") from None
+        if not (math.isfinite(number) and 0 <= number <= high):
+            limit = "finite" if math.isinf(high) else f"{high:g} at most"
+            raise ValueError(f"{text} is not 0 or more and {limit}")
         return number
 
     return value

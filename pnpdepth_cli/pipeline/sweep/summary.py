@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import io
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -15,7 +14,7 @@ from torch import Tensor
 
 from pnpdepth_cli.core.metrics import MEASURES
 from pnpdepth_cli.io.atomic import atomic_path
-from pnpdepth_cli.io.csv_text import text_cell
+from pnpdepth_cli.io.csv_text import write_csv
 from pnpdepth_cli.io.record import plain, write_json
 from pnpdepth_cli.pipeline.evaluation.averages import Floats, FrameTable
 from pnpdepth_cli.pipeline.evaluation.dependence import (
@@ -242,7 +241,7 @@ def write_frames(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
             yield [
                 row["study"],
                 *(row["parameters"].get(name) for name in names),
-                *(text_cell(figures.name), figures.seed),
+                *(figures.name, figures.seed),
                 *("failed" if figures.values is None else status, figures.points),
                 *values,
             ]
@@ -257,9 +256,7 @@ def _parameters(studies: Sequence[Mapping[str, Any]]) -> list[str]:
 
 def _write_csv(path: Path, header: Sequence[str], rows: Iterator[list[Any]]) -> None:
     text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(header)
-    writer.writerows(rows)
+    write_csv(text, header, rows)
     _write_text(path, text.getvalue())
 
 

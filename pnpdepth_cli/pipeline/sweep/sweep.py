@@ -2,76 +2,49 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
-from itertools import groupby
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from pnpdepth_cli.auto.predictions import SplitCache
 from pnpdepth_cli.errors import (
-    DeviceError,
     InputError,
     PnpDepthError,
-    StorageError,
-    UsageError,
 )
 from pnpdepth_cli.io.atomic import make_folder, remove_leftovers
 from pnpdepth_cli.io.dataset.frame import Frame
 from pnpdepth_cli.io.lock import locked_folder
-from pnpdepth_cli.models.definition import ModelDefinition
 from pnpdepth_cli.pipeline.batch.batch import Listener
 from pnpdepth_cli.pipeline.batch.frames import Task, find_frames, task_of
-from pnpdepth_cli.pipeline.batch.request import BatchRequest, FrameSelection
-from pnpdepth_cli.pipeline.batch.settings import model_identity
-from pnpdepth_cli.pipeline.refinement.inputs import Inputs, read_inputs
-from pnpdepth_cli.pipeline.refinement.load_refiner import load_refiner
-from pnpdepth_cli.pipeline.refinement.method import with_preset
-from pnpdepth_cli.pipeline.refinement.refiner import Refiner
-from pnpdepth_cli.pipeline.refinement.request import RefineRequest
-from pnpdepth_cli.pipeline.refinement.resolve import resolve_layer, resolve_settings
-from pnpdepth_cli.pipeline.sweep.axes import Cell, Study
-from pnpdepth_cli.pipeline.sweep.plan import Plan, Run, RunId, Setup, sampling_of
+from pnpdepth_cli.pipeline.batch.request import BatchRequest
+from pnpdepth_cli.pipeline.cluster.options import Spread, spread_of
+from pnpdepth_cli.pipeline.cluster.pool import WorkerPool, worker_pool
+from pnpdepth_cli.pipeline.sweep.computing import (
+    Result,
+    by_frame,
+    results_of_frame,
+    spread_results,
+)
+from pnpdepth_cli.pipeline.sweep.networks import (
+    Model,
+    SweptNetwork,
+    model_of,
+    models_of,
+    swept_network,
+)
+from pnpdepth_cli.pipeline.sweep.plan import Run, RunId, Setup, sampling_of
 from pnpdepth_cli.pipeline.sweep.plots import draw_study, need_matplotlib
-from pnpdepth_cli.pipeline.sweep.points import OWN, Sampling, frame_points
-from pnpdepth_cli.pipeline.sweep.running import result_of
+from pnpdepth_cli.pipeline.sweep.points import OWN, Sampling
+from pnpdepth_cli.pipeline.sweep.request import SweepRequest
 from pnpdepth_cli.pipeline.sweep.seeds import over_seeds
 from pnpdepth_cli.pipeline.sweep.state import SweepState
 from pnpdepth_cli.pipeline.sweep.summary import FrameFigures, summarise, write_frames, write_sweep
 from pnpdepth_cli.sensors import SamplePattern
 
-T = TypeVar("T")
 Lines = Mapping[RunId, "dict[str, Any] | None"]
-Model = tuple[str, "Path | None"]
-"""A network and its weights, as the user names them."""
 _GROUND_TRUTH_ONLY = SamplePattern(count=1)
-_RESOLVE_POINTS = 500
-"""Points of the ground truth that the definition is resolved on; the paper uses 500 indoors."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class SweepRequest(FrameSelection):
-    """What to vary, over which frames."""
-
-    studies: Sequence[Study]
-    """As `studies_of` returns them."""
-    sampling: Sampling | None = None
-    """Where points come from unless that is varied; None for the frames' own, or else the ground
-    truth."""
-    seeds: int = 1
-    """Draws of the points, with consecutive seeds."""
-    plots: bool = True
-    """True to write a plot of each study."""
-    plot_format: str = "png"
-    """One of PLOT_FORMATS."""
-    cost: bool = False
-    """True to report the time of the refinement beside its error."""
-    resamples: int = 2000
-    """Bootstrap samples behind the intervals."""
-
-    def __post_init__(self) -> None:
-        if self.seeds < 1:
-            raise UsageError(f"seeds {self.seeds}: the points have to be drawn once at least")
 
 
 def run_sweep(request: SweepRequest, listener: Listener) -> dict[str, Any]:
@@ -85,6 +58,13 @@ def run_sweep(request: SweepRequest, listener: Listener) -> dict[str, Any]:
     """
     if request.plots:
         need_matplotlib()
+    spread = spread_of(request.refine.network.device, request.cluster)
+    if spread is not None:
+        request = replace(
+            request,
+            refine=request.refine.with_fields(device=spread.device),
+            cluster=replace(request.cluster, ray=spread.address),
+        )
     sampling, tasks = _frames(request, listener)
     make_folder(request.output)
     with locked_folder(request.output, None, lambda: _clean(request.output)):
@@ -92,7 +72,8 @@ def run_sweep(request: SweepRequest, listener: Listener) -> dict[str, Any]:
         for note in state.notes():
             listener.say(note)
         networks = {
-            model: _network(model, request, sampling, tasks, listener) for model in _models(request)
+            model: swept_network(model, request, sampling, tasks, listener)
+            for model in models_of(request)
         }
         runs = [(each, run) for each in networks.values() for run in each.runs]
         to_do = [(each, run) for each, run in runs if not state.is_done(run)]
@@ -101,76 +82,24 @@ def run_sweep(request: SweepRequest, listener: Listener) -> dict[str, Any]:
             f" {len(to_do):,} to do"
         )
         listener.begin(len(to_do))
-        for each in networks.values():
-            own = [run for owner, run in to_do if owner is each]
-            for row in _rows(own, each.refiner, state):
-                listener.frame(row)
+        with _workers(spread if to_do else None, request, listener) as pool:
+            for each in networks.values():
+                own = [run for owner, run in to_do if owner is each]
+                for row in _rows(each, own, state, pool):
+                    listener.frame(row)
         return _write(request, sampling, networks, [task.name for task, _ in tasks], state)
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Network:
-    """A network of the sweep and its runs."""
-
-    refiner: Refiner
-    """The network, loaded."""
-    base: dict[str, Any]
-    """The settings that are not varied."""
-    plan: Plan
-    """What its cells need."""
-    runs: tuple[Run, ...]
-    """Of all frames."""
-
-
-def _models(request: SweepRequest) -> list[Model]:
-    """The networks of the cells, each once; one in most sweeps."""
-    cells = [cell for study in request.studies for cell in study.cells()]
-    return list(dict.fromkeys(_model_of(cell, request) for cell in cells))
-
-
-def _model_of(cell: Cell, request: SweepRequest) -> Model:
-    """The network of a cell, varied as `NETWORK` or `NETWORK@WEIGHTS`, and its weights."""
-    network = request.refine.network
-    if "model" not in cell:
-        return network.model, network.checkpoint
-    spec, at, weights = cell["model"].partition("@")
-    if not at and network.checkpoint is not None:
-        raise UsageError("--checkpoint is of one network; vary model=NETWORK@WEIGHTS instead")
-    return spec, Path(weights) if at else None
-
-
-def _network(
-    model: Model,
-    request: SweepRequest,
-    sampling: Sampling,
-    tasks: Sequence[tuple[Task, Frame]],
-    listener: Listener,
-) -> _Network:
-    """The network, loaded, and the runs of its cells."""
-    spec, checkpoint = model
-    cells = [
-        cell
-        for study in request.studies
-        for cell in study.cells()
-        if _model_of(cell, request) == model
-    ]
-    refine = request.refine.with_fields(model=spec, checkpoint=checkpoint)
-    tasks = [
-        (replace(task, request=task.request.with_fields(model=spec, checkpoint=checkpoint)), frame)
-        for task, frame in tasks
-    ]
-    refiner = _resolved(replace(request, refine=refine), tasks, listener)
-    definition = refiner.network.definition
-    plan = Plan(cells, definition, refine, sampling, request.seeds, model_identity(refine))
-    for layer in plan.layers:
-        with refiner.network.cut_at(layer):
-            pass  # reports an unknown layer before anything is computed
-    return _Network(
-        refiner=refiner,
-        base=_base(definition, refine),
-        plan=plan,
-        runs=tuple(run for task, frame in tasks for run in plan.runs(task, frame)),
-    )
+@contextmanager
+def _workers(
+    spread: Spread | None, request: SweepRequest, listener: Listener
+) -> Iterator[WorkerPool | None]:
+    """The workers that are asked for; None for this process alone."""
+    if spread is None:
+        yield None
+        return
+    with worker_pool(spread, listener.say, inputs=[request.source]) as pool:
+        yield pool
 
 
 def _clean(output: Path) -> None:
@@ -231,98 +160,22 @@ def _given(first: int | None, otherwise: int | None) -> int | None:
     return otherwise if first is None else first
 
 
-def _resolved(
-    request: SweepRequest, tasks: Sequence[tuple[Task, Frame]], listener: Listener
-) -> Refiner:
-    """The network, its definition resolved on the first frame that can be read.
-
-    Points of the ground truth are used, so that it does not depend on what is varied.
-    """
-    errors = []
-    for task, frame in tasks:
-        try:
-            inputs = read_inputs(task.request)
-            known = 0 if inputs.gt is None else int((inputs.gt > 0).sum())
-            some = Sampling(sensor="uniform", points=str(min(_RESOLVE_POINTS, known)))
-            points = frame_points(some, request.refine.hold_out.seed, inputs, task.request, frame)
-        except InputError as error:
-            errors.append(error)
-            continue
-        refiner = load_refiner(
-            task.request.with_fields(layer=_some_layer(request)), replace(inputs, points=points)
-        )
-        for note in inputs.notes:
-            if task.request.files.sample is None or not note.startswith("sparse"):
-                listener.say(f"{task.name}: {note}")
-        for note in refiner.network.notes:
-            listener.say(note)
-        base = _base(refiner.network.definition, request.refine)
-        listener.say(
-            f"network: {refiner.network.definition.name}; where not varied: cut at {base['layer']},"
-            f" {base['iterations']} updates of z ({base['update']}, {base['loss']}, step"
-            f" {base['lr']})"
-        )
-        return refiner
-    raise errors[0]
+def _rows(
+    each: SweptNetwork, runs: Sequence[Run], state: SweepState, pool: WorkerPool | None
+) -> Iterator[dict[str, Any]]:
+    """Computes and records each run; yields a row for each."""
+    if pool is not None:
+        for run, result in spread_results(runs, each.first, pool):
+            yield _recorded(run, result, state)
+        return
+    with SplitCache(each.refiner.network) as cache:
+        for frame_runs in by_frame(runs):
+            for run, result in results_of_frame(frame_runs, cache):
+                yield _recorded(run, result, state)
 
 
-def _some_layer(request: SweepRequest) -> str | None:
-    """A layer of the study or of the request, as a network may have no default."""
-    axes = [axis for study in request.studies for axis in study.axes if axis.name == "layer"]
-    return axes[0].values[0] if axes else request.refine.method.layer
-
-
-def _base(definition: ModelDefinition, request: RefineRequest) -> dict[str, Any]:
-    """The settings that are not varied."""
-    method = with_preset(request.method)
-    settings = resolve_settings(definition, method)
-    layer = method.layer or definition.default_layer
-    return {
-        "layer": None if layer is None else resolve_layer(definition, layer),
-        **asdict(settings),
-        "propagate": method.propagate or "none",
-    }
-
-
-def _rows(runs: Sequence[Run], refiner: Refiner, state: SweepState) -> Iterator[dict[str, Any]]:
-    """Computes and records each run; yields a row for each. Frames are read once."""
-    with SplitCache(refiner.network) as cache:
-        for _, of_frame in groupby(runs, key=lambda run: run.frame.name):
-            frame_runs = list(of_frame)
-            inputs = _result_or_error(read_inputs, frame_runs[0].task.request)
-            for _, of_points in groupby(frame_runs, key=lambda run: (run.sampling, run.seed)):
-                same_points = list(of_points)
-                failed = isinstance(inputs, PnpDepthError)
-                drawn = inputs if failed else _result_or_error(_drawn, same_points[0], inputs)
-                for run in same_points:
-                    yield _done(run, drawn, cache, state)
-
-
-def _result_or_error(read: Callable[..., T], *arguments: Any) -> T | PnpDepthError:
-    """The result, or the error of a frame that cannot be used."""
-    try:
-        return read(*arguments)
-    except (StorageError, DeviceError):
-        raise
-    except PnpDepthError as error:
-        return error
-
-
-def _drawn(run: Run, inputs: Inputs) -> Inputs:
-    """The frame with the run's points."""
-    points = frame_points(run.sampling, run.seed, inputs, run.task.request, run.frame)
-    return replace(inputs, points=points)
-
-
-def _done(
-    run: Run, inputs: Inputs | PnpDepthError, cache: SplitCache, state: SweepState
-) -> dict[str, Any]:
-    """Computes and records the run; returns its row for a listener."""
-    result = (
-        inputs
-        if isinstance(inputs, PnpDepthError)
-        else _result_or_error(result_of, run, inputs, cache)
-    )
+def _recorded(run: Run, result: Result, state: SweepState) -> dict[str, Any]:
+    """Records the run; returns its row for a listener."""
     row = {"name": run.frame.name, "status": "done", "message": None}
     if isinstance(result, PnpDepthError):
         state.fail(run, str(result))
@@ -336,7 +189,7 @@ def _done(
 def _write(
     request: SweepRequest,
     sampling: Sampling,
-    networks: Mapping[Model, _Network],
+    networks: Mapping[Model, SweptNetwork],
     names: Sequence[str],
     state: SweepState,
 ) -> dict[str, Any]:
@@ -350,7 +203,7 @@ def _write(
     for study in request.studies:
         cells = []
         for cell in study.cells():
-            model = _model_of(cell, request)
+            model = model_of(cell, request)
             plan = networks[model].plan
             figures = _figures(plan.setup(cell), names, lines[model])
             summary = summarise(figures, request.resamples, cost=request.cost)

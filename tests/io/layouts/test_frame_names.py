@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from pnpdepth_cli.errors import FileFormatError
-from pnpdepth_cli.io.csv_text import text_cell
 from pnpdepth_cli.io.dataset.frame import Hdf5Array
 from pnpdepth_cli.io.dataset.frame_names import name_problem
 from pnpdepth_cli.io.dataset.hdf5 import depth_of, shape_of
@@ -90,16 +89,6 @@ def test_a_name_that_leads_elsewhere_has_no_results(name: str) -> None:
 def test_a_file_name_may_be_too_long_for_the_names_of_its_results() -> None:
     assert name_problem("n" * 240) == "is longer than 239 bytes"
     assert name_problem("C:con") is None  # a name that this system has
-
-
-@pytest.mark.parametrize("text", ["=1+1", "+1", "-1+2", "@SUM(A1)", "\t=1", "\r=1"])
-def test_a_formula_as_a_name_is_text_in_a_table(text: str) -> None:
-    assert text_cell(text) == f"'{text}"
-
-
-@pytest.mark.parametrize("text", ["frame", "1=1", "'=1", ""])
-def test_other_text_stays_as_it_is(text: str) -> None:
-    assert text_cell(text) == text
 
 
 def test_millimetres_in_folders_called_as_synthias_are_not_its_centimetres(tmp_path: Path) -> None:

@@ -20,6 +20,7 @@ from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.pipeline.batch import running as batch_running
 from pnpdepth_cli.pipeline.batch.batch import plan_batch
 from pnpdepth_cli.pipeline.batch.request import BatchRequest
+from pnpdepth_cli.pipeline.batch.settings import SettingsDigests, settings_digest
 from pnpdepth_cli.pipeline.batch.summary import _SCORES, Tally
 from pnpdepth_cli.pipeline.refinement.inputs import read_inputs
 from pnpdepth_cli.pipeline.refinement.refine import refine_image
@@ -618,3 +619,26 @@ def test_baselines_are_in_the_summary_the_table_the_csv_and_the_report(
     print_batch(outcome.summary)
     assert "against every simple baseline" in capsys.readouterr().err
     assert "Simple baselines: means over frames" in (report / "index.html").read_text()
+
+
+def test_a_formula_as_a_name_is_text_in_the_summary(tmp_path: Path) -> None:
+    root = pairs_on_disk(tmp_path / "drive", ("=1+1", "@b"))
+    batch(root)
+    with (root / "out/summary.csv").open(newline="") as file:
+        assert [row["name"] for row in csv.DictReader(file)] == ["'=1+1", "'@b"]
+
+
+def test_digests_of_consecutive_frames_are_those_of_each_alone(root: Path) -> None:
+    base = refinement(root)
+    requests = [
+        base.with_fields(image=Path("a.png")),
+        base.with_fields(image=Path("b.png")),
+        base.with_fields(gt_scale=5.0),
+        base.with_fields(iterations=3),
+        base.with_fields(scan=ScanOptions(camera=3, calib=Path("c.txt"))),
+        base.with_fields(scan=ScanOptions(camera=2)),
+    ]
+    digests = SettingsDigests({"model": "m"})
+    found = [digests.of(each) for each in requests]
+    assert found == [settings_digest(each, {"model": "m"}) for each in requests]
+    assert len(set(found)) == 5

@@ -19,7 +19,7 @@ from pnpdepth_cli.pipeline.batch.batch import plan_batch
 from pnpdepth_cli.pipeline.batch.request import BatchRequest
 from pnpdepth_cli.pipeline.report import batch as report_batch
 from tests.pipeline.batches import NAMES, Heard, add_frame, batch, pairs_on_disk, refinement
-from tests.pipeline.report_pages import frames_of, page_data, pictures_of
+from tests.pipeline.report_pages import everything, frames_of, page_data, pictures_of
 
 _VIEWS = {"first", "second", "map", "image", "sparse", "thumb", "map_thumb"}
 
@@ -32,10 +32,6 @@ def root(tmp_path: Path) -> Path:
 @pytest.fixture
 def report(tmp_path: Path) -> Path:
     return tmp_path / "report"
-
-
-def everything(folder: Path) -> dict[str, bytes]:
-    return {p.name: p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
 
 
 def test_every_frame_is_on_the_page_with_its_pictures(root: Path, report: Path) -> None:

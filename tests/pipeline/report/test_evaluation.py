@@ -12,11 +12,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from pnpdepth_cli.errors import StorageError
 from pnpdepth_cli.io.depth import write_depth
 from pnpdepth_cli.pipeline.evaluation.evaluate import evaluate
 from pnpdepth_cli.pipeline.evaluation.result import EvalRequest, Evaluation
 from pnpdepth_cli.pipeline.report.evaluation import write_eval_report
-from tests.pipeline.report_pages import frames_of, page_data, pictures_of
+from tests.io.test_atomic import no_room_on_disk
+from tests.pipeline.report_pages import everything, frames_of, page_data, pictures_of
 
 NAMES = ("a", "b <i>", "c\nd")
 
@@ -185,3 +187,33 @@ def test_the_same_evaluation_gives_the_same_bytes(root: Path) -> None:
     first = pictures_of(root / "report"), (root / "report/index.html").read_bytes()
     reported(root, workers=3)
     assert first == (pictures_of(root / "report"), (root / "report/index.html").read_bytes())
+
+
+def test_a_full_disk_leaves_no_report(root: Path) -> None:
+    with no_room_on_disk(), pytest.raises(StorageError, match=r"report/index\.html cannot be"):
+        reported(root)
+    assert not (root / "report").exists()
+
+
+def test_a_full_disk_leaves_the_report_of_before(root: Path) -> None:
+    reported(root)
+    before = everything(root / "report")
+    (root / "report" / "notes.txt").write_text("mine")
+    write_depth(root / "out" / "a.npy", np.full((60, 80), 9, np.float32))
+    with no_room_on_disk(), pytest.raises(StorageError):
+        reported(root)
+    assert everything(root / "report") == before | {"notes.txt": b"mine"}
+    reported(root)
+    after = everything(root / "report")
+    assert after["notes.txt"] == b"mine"
+    assert after["index.html"] != before["index.html"]
+
+
+def test_a_new_report_removes_the_pictures_of_frames_that_are_gone(root: Path) -> None:
+    reported(root)
+    before = everything(root / "report")
+    (root / "gt" / "a.npy").unlink()
+    reported(root)
+    after = everything(root / "report")
+    assert len(after) == len(before) * 2 // 3 + 1
+    assert set(after) < set(before)

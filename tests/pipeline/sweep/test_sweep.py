@@ -26,7 +26,7 @@ from pnpdepth_cli.errors import (
 )
 from pnpdepth_cli.io.dataset.frame import Frame
 from pnpdepth_cli.io.lock import locked_folder
-from pnpdepth_cli.pipeline.refinement import refine as refining
+from pnpdepth_cli.pipeline.refinement import load_refiner as refining
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs, read_inputs
 from pnpdepth_cli.pipeline.refinement.load_refiner import load_refiner
 from pnpdepth_cli.pipeline.refinement.refine import refine_image
@@ -36,9 +36,10 @@ from pnpdepth_cli.pipeline.sweep import plots as sweep_plots
 from pnpdepth_cli.pipeline.sweep.axes import PARAMETERS, read_axis, studies_of
 from pnpdepth_cli.pipeline.sweep.plan import Method
 from pnpdepth_cli.pipeline.sweep.points import Sampling, frame_points, read_sampling
+from pnpdepth_cli.pipeline.sweep.request import SweepRequest
 from pnpdepth_cli.pipeline.sweep.running import refined_curve
 from pnpdepth_cli.pipeline.sweep.summary import FrameFigures, summarise
-from pnpdepth_cli.pipeline.sweep.sweep import SweepRequest, run_sweep
+from pnpdepth_cli.pipeline.sweep.sweep import run_sweep
 from pnpdepth_cli.sensors import (
     FORWARD_LEFT_UP,
     LIDARS,
@@ -279,6 +280,12 @@ def test_a_sweep_that_was_killed_goes_on_and_ends_the_same(root: Path, after: in
     resumed = sweep(root, *vary, heard=heard)
     assert heard.to_do == 8 - after
     assert resumed["studies"] == sweep(root, *vary, output=root / "other")["studies"]
+
+
+def test_a_formula_as_a_name_is_text_in_the_tables(tmp_path: Path) -> None:
+    root = pairs_on_disk(tmp_path / "drive", ("=1+1", "b"))
+    sweep(root, "iterations=0")
+    assert [row["frame"] for row in lines(root / "out/sweep_frames.csv")] == ["'=1+1", "b"]
 
 
 def test_an_edited_line_of_the_journal_is_computed_again(root: Path) -> None:

@@ -1,7 +1,7 @@
 """Errors weighted by the surface that a pixel covers, and by bands of range.
 
-A pixel at depth g covers a surface proportional to g² if it faces the camera, so that usual means
-are of the image and weighted ones of the scene.
+A pixel at depth g covers a surface proportional to g² if it faces the camera. Means over pixels are
+of the image, weighted ones of the scene.
 """
 
 from __future__ import annotations

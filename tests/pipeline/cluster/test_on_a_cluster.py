@@ -1,4 +1,4 @@
-"""A batch on a real Ray cluster of three nodes."""
+"""Batches, evaluations and sweeps on a real Ray cluster of three nodes."""
 
 from __future__ import annotations
 
@@ -19,11 +19,18 @@ import pytest
 from pnpdepth_cli.errors import ClusterError
 from pnpdepth_cli.pipeline.cluster import pool
 from pnpdepth_cli.pipeline.cluster.options import ClusterOptions
-from tests.pipeline.batches import Heard, add_frame, batch, pairs_on_disk, results
+from pnpdepth_cli.pipeline.evaluation.evaluate import evaluate
+from pnpdepth_cli.pipeline.evaluation.result import EvalRequest
+from pnpdepth_cli.pipeline.sweep.axes import read_axis, studies_of
+from pnpdepth_cli.pipeline.sweep.points import read_sampling
+from pnpdepth_cli.pipeline.sweep.request import SweepRequest
+from pnpdepth_cli.pipeline.sweep.sweep import run_sweep
+from tests.pipeline.batches import Heard, add_frame, batch, pairs_on_disk, refinement, results
 from tests.pipeline.cluster.nodes import three_nodes
 
 pytest.importorskip("ray")
 NAMES = tuple(f"f{number:02}" for number in range(12))
+TABLES = ("sweep.csv", "sweep_frames.csv", "sweep.tex")
 DEADLY = "        if float(rgb.mean()) > 0.99:\n            import os\n            os._exit(1)\n"
 
 
@@ -155,3 +162,34 @@ def test_a_stopped_batch_ends_with_the_pieces_that_are_begun(cluster: Any, root:
     begun = states(root / "out")
     assert set(begun) == set(heard.names)
     assert set(begun.values()) == {"done"}
+
+
+def test_an_evaluation_equals_that_of_one_process(cluster: Any, root: Path) -> None:
+    request = EvalRequest(
+        prediction=root / "plain", ground_truth=root / "gt",
+        changes={"groups": ("flicker", "edges")},
+    )  # fmt: skip
+    here = evaluate(request).as_record()
+    options = ClusterOptions(ray=cluster.address, ray_workers=2)
+    shown: list[tuple[int, int]] = []
+    there = evaluate(
+        replace(request, cluster=options), on_frame=lambda done, of: shown.append((done, of))
+    )
+    assert there.as_record() == here
+    assert shown[-1] == (len(NAMES), len(NAMES))
+
+
+def test_a_sweep_equals_that_of_one_process(cluster: Any, root: Path) -> None:
+    studies = studies_of([read_axis("iterations=0,2"), read_axis("points=20,50")], one_by_one=True)
+    request = SweepRequest(
+        source=root, output=root / "out", refine=refinement(root), studies=studies,
+        sampling=read_sampling("40"), plots=False, limit=4,
+    )  # fmt: skip
+    tables = []
+    for options in (ClusterOptions(), ClusterOptions(ray=cluster.address, ray_workers=2)):
+        heard = Heard()
+        run_sweep(replace(request, cluster=options), heard)
+        assert len(heard.rows) == heard.to_do > 0
+        tables.append([(root / "out" / name).read_bytes() for name in TABLES])
+        shutil.rmtree(root / "out")
+    assert tables[0] == tables[1]

@@ -1,0 +1,353 @@
+"""Plan, resume and summary of many frames, and what a Ray cluster costs.
+
+`python -m benchmarks.cluster entries --count 1000000` makes a list of so many frames and a manifest
+that says they are done, with a hard link for each result, and prints CPU seconds and peak memory of
+planning, of a run that has nothing to do, and of its summary.
+
+`… overhead FOLDER --frames 60` refines frames of a data set with and without a Ray worker, compares
+the results, and prints the CPU seconds of all processes between the first frame and the last.
+
+`… scaling --workers 16` gives 1 and 16 workers frames whose stand-in network only waits, and prints
+frames a second, and the driver's CPU time with the manifest's lines of such frames written.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import psutil
+
+from benchmarks.batch import make_frames
+from pnpdepth_cli.io.fingerprint import fingerprint
+from pnpdepth_cli.io.journal import Journal
+from pnpdepth_cli.pipeline.batch.batch import run_batch
+from pnpdepth_cli.pipeline.batch.frames import find_frames, task_of
+from pnpdepth_cli.pipeline.batch.request import BatchRequest
+from pnpdepth_cli.pipeline.batch.settings import model_identity, settings_digest
+from pnpdepth_cli.pipeline.cluster.options import LOCAL, ClusterOptions, spread_of
+from pnpdepth_cli.pipeline.cluster.pool import worker_pool
+from pnpdepth_cli.pipeline.cluster.worker import Done
+from pnpdepth_cli.pipeline.refinement.request import RefineRequest
+from pnpdepth_cli.sensors import SamplePattern
+
+LINKS = 50_000
+"""Hard links of a file; ext4 allows 65,000."""
+FOLDER = 1000
+"""Frames of a folder."""
+LINES = 1000
+"""Lines of the manifest written at once."""
+
+
+class Quiet:
+    """Receives the progress of a batch."""
+
+    def say(self, text: str) -> None:
+        """Nothing."""
+
+    def begin(self, to_do: int) -> None:
+        """Nothing."""
+
+    def frame(self, row: dict[str, Any]) -> None:
+        """Nothing."""
+
+
+def request_of(root: Path) -> BatchRequest:
+    refine = RefineRequest.from_fields(preset="fast")
+    return BatchRequest(source=root / "list.csv", output=root / "out", refine=refine)
+
+
+def make_entries(root: Path, count: int) -> None:
+    """A list of frames that share one image, and a manifest of an equal line for each."""
+    make_frames(root, 1, 48, 64)
+    with (root / "list.csv").open("w") as file:
+        file.write("name,image,sparse,gt\n")
+        for number in range(count):
+            name = f"d{number // FOLDER:05}/f{number:07}"
+            file.write(f"{name},rgb/000000.png,sparse/000000.png,gt/000000.png\n")
+    first = root / "first"
+    lines = (root / "list.csv").read_text().splitlines()[:2]
+    (root / "one.csv").write_text("\n".join(lines) + "\n")
+    one = BatchRequest(
+        source=root / "one.csv", output=first, refine=RefineRequest.from_fields(preset="fast")
+    )
+    run_batch(one, Quiet())
+    line = Journal(first / "batch.jsonl", "frame").newest("d00000/f0000000")
+    assert line is not None
+    made = {kind: first / path for kind, path in line["row"]["outputs"].items()}
+    linked(root, made, count)
+    manifest(root, line, count)
+
+
+def linked(root: Path, made: dict[str, Path], count: int) -> None:
+    """The results of each frame, as hard links."""
+    sources: dict[str, Path] = {}
+    for number in range(count):
+        if number % FOLDER == 0:
+            (root / "out" / f"d{number // FOLDER:05}").mkdir(parents=True)
+        for kind, path in made.items():
+            if number % LINKS == 0:
+                sources[kind] = root / f"{kind}{number}{path.suffix}"
+                shutil.copy(path, sources[kind])
+            name = path.name.replace("f0000000", f"f{number:07}")
+            os.link(sources[kind], root / "out" / f"d{number // FOLDER:05}" / name)
+
+
+def manifest(root: Path, line: dict[str, Any], count: int) -> None:
+    request = request_of(root)
+    frame = find_frames(request).frames[0]
+    digest = settings_digest(task_of(request, frame).request, model_identity(request.refine))
+    journal = Journal(root / "out" / "batch.jsonl", "frame")
+    lines: list[dict[str, Any]] = []
+    for number in range(count):
+        folder, stem = f"d{number // FOLDER:05}", f"f{number:07}"
+        name = f"{folder}/{stem}"
+        outputs = {
+            f"{folder}/{Path(path).name.replace('f0000000', stem)}" for path in line["outputs"]
+        }
+        known = {path: asdict(fingerprint(root / "out" / path)) for path in sorted(outputs)}
+        lines.append(
+            line | {"frame": name, "settings": digest, "outputs": known,
+                    "row": line["row"] | {"name": name}}
+        )  # fmt: skip
+        if len(lines) == LINES or number == count - 1:
+            journal.append(*lines)
+            lines.clear()
+
+
+def measured(program: str, *arguments: str) -> dict[str, float]:
+    """CPU seconds, wall seconds and peak memory of a Python process."""
+    before = os.times()
+    start = time.perf_counter()
+    text = "\n".join((
+        program,
+        "status = open('/proc/self/status').read()",
+        "print(status.split('VmHWM:')[1].split()[0])",
+    ))  # fmt: skip
+    done = subprocess.run(
+        [sys.executable, "-c", text, *arguments], capture_output=True, text=True, check=True
+    )
+    after = os.times()
+    cpu = after.children_user + after.children_system
+    return {
+        "cpu_s": round(cpu - before.children_user - before.children_system, 1),
+        "wall_s": round(time.perf_counter() - start, 1),
+        "peak_mb": round(int(done.stdout.split()[-1]) * 1024 / 1e6),
+    }
+
+
+PLAN = """
+import sys; from pathlib import Path
+from benchmarks.cluster import request_of
+from pnpdepth_cli.pipeline.batch.batch import plan_batch
+assert not plan_batch(request_of(Path(sys.argv[1])), lambda text: None)
+"""
+RESUME = """
+import sys; from pathlib import Path
+from benchmarks.cluster import Quiet, request_of
+from pnpdepth_cli.pipeline.batch.batch import run_batch
+counts = run_batch(request_of(Path(sys.argv[1])), Quiet()).summary["counts"]
+assert counts["done"] == counts["frames"], counts
+"""
+
+
+def entries(count: int, folder: Path | None) -> dict[str, Any]:
+    with tempfile.TemporaryDirectory(dir=folder) as temporary:
+        root = Path(temporary)
+        make_entries(root, count)
+        return {
+            "entries": count,
+            "manifest_mb": round((root / "out" / "batch.jsonl").stat().st_size / 1e6),
+            "plan": measured(PLAN, temporary),
+            "resume and summary": measured(RESUME, temporary),
+        }
+
+
+class Clock(Quiet):
+    """CPU seconds of this process and those it started, at the first frame and at the last."""
+
+    def __init__(self) -> None:
+        self.moments: list[tuple[float, float]] = []
+        self.to_do = 0
+
+    def begin(self, to_do: int) -> None:
+        """The frames begin."""
+        self.to_do = to_do
+
+    def frame(self, row: dict[str, Any]) -> None:
+        """One more."""
+        self.moments.append((cpu_seconds(), time.perf_counter()))
+
+    def between(self) -> dict[str, float]:
+        """What the frames between the first row and the last took."""
+        (cpu, wall), (cpu_end, wall_end) = self.moments[0], self.moments[-1]
+        frames = len(self.moments) - 1
+        return {
+            "cpu_s_a_frame": round((cpu_end - cpu) / frames, 4),
+            "wall_s_a_frame": round((wall_end - wall) / frames, 4),
+        }
+
+
+def cpu_seconds() -> float:
+    """Of this process and all its living descendants."""
+    own = psutil.Process()
+    total = 0.0
+    for process in (own, *own.children(recursive=True)):
+        with contextlib.suppress(psutil.Error):
+            times = process.cpu_times()
+            total += times.user + times.system
+    return total
+
+
+def overhead(source: Path, frames: int, model: str) -> dict[str, Any]:
+    with tempfile.TemporaryDirectory() as temporary:
+        found: dict[str, Any] = {"frames": frames}
+        for name, cluster in (
+            ("one process", ClusterOptions()),
+            ("one Ray worker", ClusterOptions(ray=LOCAL, ray_workers=1)),
+        ):
+            clock = Clock()
+            request = BatchRequest(
+                source=source,
+                output=Path(temporary) / name,
+                limit=frames,
+                refine=RefineRequest.from_fields(
+                    model=model, preset="paper", sample=SamplePattern(count=500)
+                ),
+                cluster=cluster,
+            )
+            run_batch(request, clock)
+            found[name] = clock.between()
+        plain, ray = (contents(Path(temporary) / name) for name in list(found)[1:])
+        one, other = (found[name]["cpu_s_a_frame"] for name in list(found)[1:])
+        return found | {"overhead": round(other / one - 1, 3), "equal": plain == ray,
+                        "files": len(plain)}  # fmt: skip
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    """The results below a folder by name; of records, without times and memory."""
+    found = {}
+    for path in sorted(folder.rglob("*")):
+        name = path.relative_to(folder).as_posix()
+        if path.is_dir() or name.startswith(("summary.", "batch.", ".")):
+            continue
+        found[name] = path.read_bytes()
+        if path.suffix == ".json":
+            record = json.loads(found[name])
+            del record["seconds"], record["peak_memory_mb"]
+            found[name] = json.dumps(record).encode()
+    return found
+
+
+@dataclass(frozen=True, kw_only=True)
+class WaitingJob:
+    """Waits as if for a GPU, and returns a line of a manifest for each frame."""
+
+    line: dict[str, Any]
+    """Of a frame that was refined."""
+    wait_s: float
+    """For each frame."""
+
+    @contextlib.contextmanager
+    def opened(self) -> Iterator[Callable[[Sequence[str], bool], Done]]:
+        """Yields the function of a piece."""
+
+        def work(names: Sequence[str], checked: bool) -> Done:
+            time.sleep(self.wait_s * len(names))
+            return Done(results=[self.line | {"frame": name} for name in names])
+
+        yield work
+
+
+def scaling(workers: int, rate: float, seconds: float) -> dict[str, Any]:
+    os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
+    import ray
+
+    with tempfile.TemporaryDirectory() as temporary:
+        root = Path(temporary)
+        line = one_line_of(root)
+        wait_s = workers / rate
+        ray.init(num_cpus=workers, include_dashboard=False, log_to_driver=False)
+        found = {
+            f"{count} workers": waited(root, count, WaitingJob(line=line, wait_s=wait_s), seconds)
+            for count in (1, workers)
+        }
+        ray.shutdown()
+    one, many = (each["frames_a_second"] for each in found.values())
+    return {"wait_s": wait_s, **found, "speedup": round(many / one, 2)}
+
+
+def waited(root: Path, workers: int, job: WaitingJob, seconds: float) -> dict[str, float]:
+    """Frames a second and the driver's CPU time, once all workers have begun."""
+    spread = spread_of("cpu", ClusterOptions(ray=LOCAL, ray_workers=workers))
+    assert spread is not None
+    journal = Journal(root / f"{workers}.jsonl", "frame")
+    names = [f"f{number:07}" for number in range(int(seconds * workers / job.wait_s))]
+
+    def begin(begun: Sequence[str]) -> None:
+        journal.append(*({"frame": name, "state": "begun"} for name in begun))
+
+    with worker_pool(spread, print, inputs=[root]) as pool:
+        while sum(1 for _ in pool.figures()) < workers:
+            pool.call(time.sleep, 0.1)
+            list(pool.results(job, names[:1]))
+        start, cpu = time.perf_counter(), time.process_time()
+        for part in pool.results(job, names, begin=begin):
+            journal.append(*(line for _, line in part))
+        wall = time.perf_counter() - start
+    return {
+        "frames": len(names),
+        "frames_a_second": round(len(names) / wall, 2),
+        "driver_cpu": round((time.process_time() - cpu) / wall, 4),
+    }
+
+
+def one_line_of(root: Path) -> dict[str, Any]:
+    """A line of the manifest of a frame that was refined."""
+    make_frames(root, 1, 48, 64)
+    request = BatchRequest(
+        source=root, output=root / "out", refine=RefineRequest.from_fields(preset="fast")
+    )
+    run_batch(request, Quiet())
+    line = Journal(root / "out" / "batch.jsonl", "frame").newest("000000")
+    assert line is not None
+    return line
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    commands = parser.add_subparsers(dest="command", required=True)
+    of_entries = commands.add_parser("entries")
+    of_entries.add_argument("--count", type=int, default=1_000_000)
+    of_entries.add_argument("--folder", type=Path, help="where the files are made")
+    of_overhead = commands.add_parser("overhead")
+    of_overhead.add_argument("source", type=Path)
+    of_overhead.add_argument("--frames", type=int, default=60)
+    of_overhead.add_argument("--model", default="compact")
+    of_scaling = commands.add_parser("scaling")
+    of_scaling.add_argument("--workers", type=int, default=16)
+    of_scaling.add_argument("--rate", type=float, default=200.0, help="frames a second of all")
+    of_scaling.add_argument("--seconds", type=float, default=30.0)
+    args = parser.parse_args()
+    if args.command == "entries":
+        result = entries(args.count, args.folder)
+    elif args.command == "overhead":
+        result = overhead(args.source, args.frames, args.model)
+    else:
+        result = scaling(args.workers, args.rate, args.seconds)
+    print(json.dumps(result, indent=2))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,45 @@
+"""`pnpdepth export`."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import click
+
+from pnpdepth_cli.choices import EXPORTS
+from pnpdepth_cli.cli import options
+
+
+@click.command(short_help="Write depth for COLMAP, Nerfstudio or 3DGS.")
+@click.argument("results", type=options.FILE)
+@click.option("--to", type=click.Choice(list(EXPORTS)), required=True, help="The program.")
+@click.option("-o", "--output", type=options.FILE, required=True, help="Output folder.")
+@options.overwrite
+@options.as_json
+def export(as_json: bool, **values: Any) -> None:
+    """Write RESULTS, a folder of `batch` or `refine`, for a reconstruction program.
+
+    \b
+    pnpdepth export out/ --to nerfstudio -o scene/
+    pnpdepth export out/ --to colmap -o dense/               # the undistorted project
+    pnpdepth export out/ --to gaussian-splatting -o dense/
+
+    \b
+    colmap              stereo/depth_maps, stereo/normal_maps, for `colmap stereo_fusion`
+    nerfstudio          transforms.json, depths/ (16-bit PNG in millimetres), images/
+    gaussian-splatting  inverse_depths/ (its option -d), sparse/0/depth_params.json
+
+    Camera and pose come from the records, so RESULTS are best those of a COLMAP project
+    (`pnpdepth batch --layout colmap`). OUTPUT may be the project itself.
+    """
+    from pnpdepth_cli.pipeline.export import ExportRequest, export_results
+
+    record = export_results(ExportRequest(**values))
+    if as_json:
+        click.echo(json.dumps(record, indent=2))
+        return
+    for note in record["notes"]:
+        click.echo(note, err=True)
+    frames = f"{record['frames']:,} frame{'' if record['frames'] == 1 else 's'}"
+    click.echo(f"wrote {frames} in {record['unit']}: {values['output']}")

@@ -1,0 +1,114 @@
+"""`pnpdepth export`: results of `refine` or `batch` in the files of a reconstruction program."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+
+from pnpdepth_cli import __version__
+from pnpdepth_cli.choices import EXPORTS
+from pnpdepth_cli.errors import InputError, OutputError, SizeError
+from pnpdepth_cli.io.atomic import all_or_none, make_folder
+from pnpdepth_cli.io.depth import read_depth
+from pnpdepth_cli.io.record import write_json
+from pnpdepth_cli.io.rgb import read_rgb, upright_size
+from pnpdepth_cli.pipeline.exports import Depth, Export, ExportFrame
+from pnpdepth_cli.pipeline.results import ResultFrame, result_frames
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExportRequest:
+    """What the user asks of an export."""
+
+    results: Path
+    """A folder that `refine` or `batch` wrote, or a depth file in it."""
+    to: str
+    """One of `choices.EXPORTS`."""
+    output: Path
+    """The folder to write to; it may hold the images and the model already."""
+    overwrite: bool = False
+    """Whether existing files are replaced."""
+
+
+def export_results(request: ExportRequest) -> dict[str, Any]:
+    """Writes the files and `export_NAME.json`, and returns what that holds.
+
+    Raises:
+        PnpDepthError: An input or output is at fault; then nothing is written.
+    """
+    export: Export = EXPORTS[request.to]
+    if request.output.exists() and not request.output.is_dir():
+        raise OutputError(f"{request.output} is a file; name a folder")
+    frames = [_frame(result, export) for result in result_frames(request.results)]
+    _check_one_unit(frames)
+    written = [*export.files(request.output, frames), request.output / f"export_{request.to}.json"]
+    for path in written:
+        if path.exists() and not request.overwrite:
+            raise OutputError(f"{path} exists; --overwrite replaces it, -o names another folder")
+    make_folder(request.output)
+    record: dict[str, Any] = {
+        "command": "export",
+        "version": __version__,
+        "to": request.to,
+        "results": str(request.results),
+        "frames": len(frames),
+        "unit": frames[0].unit,
+    }
+    with all_or_none(written):
+        record["notes"] = export.write(request.output, frames)
+        record["files"] = [path.as_posix() for path in written[:-1]]
+        write_json(written[-1], record)
+    return record
+
+
+def _frame(result: ResultFrame, export: Export) -> ExportFrame:
+    record, camera, image = result.record, result.camera, result.image
+    if camera is None or image is None:
+        lacks = "a record with its camera" if camera is None else "its image, which was moved"
+        raise InputError(
+            f"{result.depth} lacks {lacks}; refine it again with a COLMAP model, --calib or --fov"
+        )
+    if export.needs_pose and camera.pose is None:
+        raise InputError(
+            f"{result.depth} has no pose in its record; refine it with a COLMAP model, as"
+            " `batch --layout colmap` does"
+        )
+    width, height = record["size"]
+    if upright_size(image) != (height, width):
+        raise SizeError(
+            f"{result.depth} is not of the size of {image}; refine the whole image"
+            " (--protocol whole)"
+        )
+    sparse = record.get("inputs", {}).get("sparse", {})
+    name = (PurePosixPath(result.name).parent / image.name).as_posix()
+    return ExportFrame(
+        image=image,
+        image_name=sparse.get("image") or name,
+        size=(height, width),
+        camera=camera,
+        unit=result.unit,
+        unit_scale=sparse.get("unit_scale") or 1.0,
+        farthest=float(record["points"]["farthest"]),
+        read=functools.partial(_read, result),
+    )
+
+
+def _check_one_unit(frames: Sequence[ExportFrame]) -> None:
+    units = sorted({f"{frame.unit} (--unit-scale {frame.unit_scale:g})" for frame in frames})
+    if len(units) > 1:
+        raise InputError(f"the depths are in different units: {', '.join(units)}; refine all alike")
+
+
+def _read(result: ResultFrame) -> Depth:
+    depth = read_depth(result.depth).values
+    if result.valid is None:
+        return depth
+    valid = read_rgb(result.valid).values[..., 0] > 0
+    if valid.shape != depth.shape:
+        raise SizeError(f"{result.valid} is not of the size of {result.depth}")
+    return np.where(valid, depth, np.float32(0))

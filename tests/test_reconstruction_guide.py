@@ -1,0 +1,57 @@
+"""The guide from a folder of photos to a cloud runs as it is shown, and gives the scene."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from tests.test_readme import RECONSTRUCTION, ROOT, blocks, run, shown_commands
+
+PROGRAMS = ("colmap", "nerfstudio", "gaussian-splatting")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where all that the guide shows was run."""
+    pytest.importorskip("pycolmap")
+    folder = tmp_path_factory.mktemp("guide")
+    shutil.copytree(ROOT / "samples", folder / "samples")
+    (script,) = blocks(RECONSTRUCTION, "python")
+    (folder / "reconstruct.py").write_text(script)
+    for program, *arguments in shown_commands(RECONSTRUCTION):
+        command = [] if program == "python" else ["-m", "pnpdepth_cli", program]
+        run([*command, *arguments], folder)
+    return folder
+
+
+def test_trimesh_reads_a_cloud_on_the_points_of_the_model(folder: Path) -> None:
+    trimesh = pytest.importorskip("trimesh")
+    pycolmap = pytest.importorskip("pycolmap")
+    model = pycolmap.Reconstruction(str(folder / "room" / "dense" / "sparse"))
+    names = sorted(image.name for image in model.images.values())[:3]
+    assert names == ["00.jpg", "01.jpg", "02.jpg"]
+    image = next(each for each in model.images.values() if each.name == names[1])
+    seen = [p.point3D_id for p in image.points2D if p.has_point3D()]
+    points = np.array([model.points3D[n].xyz for n in seen if model.points3D[n].track.length() > 2])
+    pose = image.cam_from_world()
+    depth = (points @ pose.rotation.matrix().T + pose.translation)[:, 2]
+    cloud = trimesh.load(folder / "room" / "scene.ply")
+    assert len(cloud.vertices) > 10_000
+    assert len(cloud.colors) == len(cloud.vertices)
+    near = depth < 50
+    off, _ = cKDTree(cloud.vertices).query(points[near])
+    assert np.median(off / depth[near]) < 0.01
+
+
+def test_every_export_lies_in_the_project(folder: Path) -> None:
+    dense = folder / "room" / "dense"
+    for program in PROGRAMS:
+        record = json.loads((dense / f"export_{program}.json").read_text())
+        assert record["frames"] == 3
+        assert not [note for note in record["notes"] if "distortion" in note]
+        assert all((folder / path).is_file() for path in record["files"])
