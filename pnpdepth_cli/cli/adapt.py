@@ -19,6 +19,7 @@ from pnpdepth_cli.pipeline.adaptation.request import AdaptRequest
 @click.option(
     "-o", "--output", type=options.FILE, required=True, help="File NAME.safetensors to write."
 )
+@options.sample
 @options.options_of_groups(AdaptRequest)
 @options.model
 @options.checkpoint
@@ -28,7 +29,7 @@ from pnpdepth_cli.pipeline.adaptation.request import AdaptRequest
 @options.scan
 @options.overwrite
 @options.as_json
-def adapt(source: Path, output: Path, as_json: bool, **given: Any) -> None:
+def adapt(source: Path, output: Path, sample: str | None, as_json: bool, **given: Any) -> None:
     """Adapt the weights of a network to the frames of FOLDER, without ground truth.
 
     \b
@@ -44,7 +45,8 @@ def adapt(source: Path, output: Path, as_json: bool, **given: Any) -> None:
     from pnpdepth_cli.pipeline.adaptation.adapt import adapt as adapt_network
 
     own = options.taken(AdaptRequest, given)
-    request = AdaptRequest(source=source, output=output, refine=options.request_of(given), **own)
+    refine = options.request_of(given, sample=options.sampled(sample))
+    request = AdaptRequest(source=source, output=output, refine=refine, **own)
     with progress_bar("adapt", "update") as show:
         progress = Progress(
             say=lambda text: click.echo(printable(text), err=True),

@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from pnpdepth_cli.choices import LOSSES, UPDATES
+from pnpdepth_cli.core.losses import Loss
 from pnpdepth_cli.core.masks import Masks
 from pnpdepth_cli.core.refinement import RefineSettings
 from pnpdepth_cli.core.split import InputSplit
@@ -220,7 +221,8 @@ class _Adaptation:
     def _loss(self, frame: FrameOfPoints, hidden: Tensor) -> Tensor:
         output = frame.predict_in_steps(frame.inliers.select(~hidden))
         asked = frame.inliers.select(hidden)
-        return LOSSES[self._settings.loss](asked.sample(frame.depth_of(output)), asked.depth)
+        loss: Loss = LOSSES[self._settings.loss]
+        return loss(asked.sample(frame.depth_of(output)), asked.depth)
 
     @contextmanager
     def _frame(self, split: InputSplit, index: int) -> Iterator[FrameOfPoints]:
