@@ -7,8 +7,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pnpdepth_cli.io.depth_scale import KITTI_SCALE
+
 _SHORTEST_M, _LONGEST_M = 0.02, 1000.0
 _COMMON_M = (0.2, 200.0)
+_FARTHEST_INDOORS_M = 40.0
+"""Below it, a map read by KITTI's scale may be a room in millimetres: 40 m are 10.2 m then."""
 # Codes per metre in use, most likely first: millimetres, KITTI, TUM RGB-D, centimetres.
 _COMMON_SCALES = (1000.0, 256.0, 5000.0, 100.0, 10.0, 1.0)
 
@@ -27,7 +31,8 @@ def describe_range(
     Args:
         depth: Metres of any shape; 0 and values that are not finite are unknown.
         source: What was read.
-        assumed_scale: Name the option that changes the scale.
+        assumed_scale: Whether the scale is assumed. The line then names the option that changes it
+            and, where KITTI's scale gives near depths only, their range if they are millimetres.
         noun: What is counted, in the plural.
         option: That option.
         unit: Of the depth.
@@ -36,6 +41,10 @@ def describe_range(
     hint = f"; {option} to change" if assumed_scale else ""
     if known.size == 0:
         return f"no {noun} with known depth ({source}{hint})"
+    by_kitti = assumed_scale and source.endswith(f"÷ {KITTI_SCALE:g}")
+    if by_kitti and float(known.max()) < _FARTHEST_INDOORS_M:
+        low, high = (metres(float(end) * KITTI_SCALE / 1000) for end in (known.min(), known.max()))
+        hint = f" assumed; if it holds millimetres, {option} 1000 makes it {low}–{high} m"
     count = f"{known.size:,} {noun[:-1] if known.size == 1 else noun}"
     low, high = metres(float(known.min())), metres(float(known.max()))
     extent = low if low == high else f"{low}–{high}"

@@ -14,6 +14,10 @@ from pnpdepth_cli.points import SparsePoints
 
 _OFF = 1.5
 """A prediction that is this factor off the points at the median gets a word of warning."""
+_NO_BETTER = 0.98
+"""Misfit over that of a constant from which on a network is said to know nothing of the scene."""
+_ENOUGH = 20
+"""Fewer points do not say so."""
 
 
 class AlignedDepth:
@@ -75,7 +79,18 @@ class AlignedDepth:
                 "warning: the network's output falls where its kind says it should rise; is it"
                 f" {made.space!r}? --output-kind says otherwise"
             )
+        if len(self._points) >= _ENOUGH and made.misfit > _NO_BETTER * self._misfit_of_median():
+            notes.append(
+                f"warning: network {self._network.definition.name!r} says nothing about this scene:"
+                f" aligned, it is off by {made.misfit:.1%} at the points, their median depth by"
+                f" {self._misfit_of_median():.1%}; check the network, --normalise and the image"
+            )
         return tuple(notes)
+
+    def _misfit_of_median(self) -> float:
+        """What `Alignment.misfit` is for the median depth of the points everywhere."""
+        log_depth = self._points.depth.double().log()
+        return float((log_depth - log_depth.median()).abs().clamp(max=1.0).mean())
 
     def _plain_notes(self, depth: Tensor) -> tuple[str, ...]:
         ratio = float((self._points.sample(depth.detach()) / self._points.depth).median())

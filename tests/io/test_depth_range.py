@@ -74,3 +74,14 @@ def test_real_millimetres_read_as_single_codes_are_noticed(shared_data: Path) ->
     warning = implausible(wrong.values, wrong.scale)
     assert warning is not None
     assert "--depth-scale 1000 (now 1)" in warning
+
+
+def test_a_map_that_may_be_a_room_in_millimetres_is_said_to_be() -> None:
+    kitchen = np.array([[800, 3400]]) / 256
+    line = describe_range(kitchen, "16-bit PNG ÷ 256", assumed_scale=True)
+    assert line == (
+        "2 points, 3.1–13.3 m (16-bit PNG ÷ 256 assumed; if it holds millimetres, --depth-scale"
+        " 1000 makes it 0.8–3.4 m)"
+    )
+    for source, assumed in (("16-bit PNG ÷ 256", False), ("16-bit PNG ÷ 1000", True)):
+        assert "millimetres" not in describe_range(kitchen, source, assumed_scale=assumed)

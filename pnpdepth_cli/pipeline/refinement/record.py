@@ -16,6 +16,7 @@ from pnpdepth_cli.pipeline.refinement.against_linear import compared_with_linear
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs
 from pnpdepth_cli.pipeline.refinement.points import PointError, point_error
 from pnpdepth_cli.pipeline.refinement.refiner import Refiner
+from pnpdepth_cli.pipeline.refinement.resolve import normalisation_name
 from pnpdepth_cli.pipeline.stopwatch import versions
 
 
@@ -41,7 +42,7 @@ def record_of(refiner: Refiner, inputs: Inputs, frame: RefinedFrame) -> dict[str
             "step": frame.refinement.step,
             "propagate": propagate if method.chosen else propagate or "none",
             "output_kind": network.definition.output_kind,
-            "normalise": request.network.normalise,
+            "normalise": normalisation_name(network.definition),
             "holdout": hold_out.holdout,
             "seed": hold_out.seed,
             "precision": request.network.precision,

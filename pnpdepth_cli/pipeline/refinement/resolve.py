@@ -73,6 +73,12 @@ def resolve_definition(network: Network, frame: Frame, choice: NetworkChoice) ->
     return replace(network, notes=tuple(notes))
 
 
+def normalisation_name(definition: ModelDefinition) -> str | None:
+    """Returns the name of the rgb range that the network is given; None if it has none."""
+    names = (name for name, how in NORMALISATIONS.items() if how == definition.normalisation)
+    return None if "rgb" not in definition.input_kind else next(names, None)
+
+
 def resolve_layer(definition: ModelDefinition, layer: str | None) -> str:
     """Returns the name of the layer to cut at.
 

@@ -18,6 +18,7 @@ from pnpdepth_cli.errors import ModelError
 from pnpdepth_cli.models.definition import UNTUNED_DEFAULTS, Fixed, ModelDefinition, Multiple
 from pnpdepth_cli.models.formats.onnx.functions import inlined
 from pnpdepth_cli.models.formats.onnx.graph import OnnxGraph, order_of_nodes
+from pnpdepth_cli.models.formats.onnx.input_range import stated_input_range
 
 MISMATCH = 1e-3
 """The largest deviation from onnxruntime's output, relative to that output's range."""
@@ -44,6 +45,7 @@ def onnx_definition(file: Path, output: str | None = None) -> ModelDefinition:
     channels_last = _channels_last(input_shape)
     height, width = input_shape[1:3] if channels_last else input_shape[2:4]
     fixed = isinstance(height, int) and isinstance(width, int)
+    stated = stated_input_range(model)
     return ModelDefinition(
         name=file.stem,
         input_kind="rgb",
@@ -52,7 +54,7 @@ def onnx_definition(file: Path, output: str | None = None) -> ModelDefinition:
         else Multiple(_patch_size(model) or _ASSUMED_MULTIPLE),
         build=lambda: OnnxGraph(model, file, [chosen]),
         complete=True,
-        normalisation=None,
+        normalisation=None if stated is None else stated[0],
         defaults=UNTUNED_DEFAULTS,
         summary=f"ONNX, opset {_opset(model)}, from {model.producer_name or 'an unknown program'}",
         output_kind="unknown",
@@ -61,6 +63,9 @@ def onnx_definition(file: Path, output: str | None = None) -> ModelDefinition:
         arguments=lambda rgb, _: (_as_input(rgb, channels_last),),
         output=_as_map,
         verify=_FirstImageCheck(file, chosen),
+        assumed=""
+        if stated is None
+        else f"rgb range {stated[1]}, which the graph normalises itself",
     )
 
 
