@@ -12,6 +12,7 @@ import click
 from pnpdepth_cli.cli import options
 from pnpdepth_cli.cli.printable import printable
 from pnpdepth_cli.pipeline.adaptation.request import AdaptRequest
+from pnpdepth_cli.pipeline.refinement.request import parse_sample
 
 
 @click.command(short_help="Adapt a network to the sparse points of a folder.")
@@ -45,7 +46,7 @@ def adapt(source: Path, output: Path, sample: str | None, as_json: bool, **given
     from pnpdepth_cli.pipeline.adaptation.adapt import adapt as adapt_network
 
     own = options.taken(AdaptRequest, given)
-    refine = options.request_of(given, sample=options.sampled(sample))
+    refine = options.request_of(given, sample=parse_sample(sample))
     request = AdaptRequest(source=source, output=output, refine=refine, **own)
     with progress_bar("adapt", "update") as show:
         progress = Progress(

@@ -21,6 +21,7 @@ from pnpdepth_cli.errors import FramesFailedError, StorageError
 from pnpdepth_cli.pipeline.batch.request import BatchRequest
 from pnpdepth_cli.pipeline.batch.sequence_options import SequenceOptions
 from pnpdepth_cli.pipeline.cluster.options import ClusterOptions
+from pnpdepth_cli.pipeline.refinement.request import parse_sample
 from pnpdepth_cli.pipeline.sparse.bag_options import BagOptions
 
 _STOPPING = b"\nfinishing the current frame; press Ctrl-C again to stop at once\n"
@@ -100,7 +101,7 @@ def batch(
     own["cluster"] = ClusterOptions(**options.taken(ClusterOptions, given))
     bag_options = BagOptions(**options.taken(BagOptions, given))
     own["sequence"] = SequenceOptions(**options.taken(SequenceOptions, given))
-    refine = options.request_of(given, sample=options.sampled(sample))
+    refine = options.request_of(given, sample=parse_sample(sample))
     request = BatchRequest(source=source, output=output, refine=refine, **own)
     request = unpacked(
         request,

@@ -26,7 +26,6 @@ from pnpdepth_cli.pipeline.sparse.scan_options import ScanOptions
 
 if TYPE_CHECKING:
     from pnpdepth_cli.pipeline.sparse.outputs import SparseTarget
-    from pnpdepth_cli.sensors import SamplePattern
 
 FILE = click.Path(path_type=Path)
 SEED = click.IntRange(0, LARGEST_SEED)
@@ -246,14 +245,6 @@ def height_and_width(text: str) -> tuple[int, int]:
     if not (x and height.isdecimal() and width.isdecimal() and int(height) and int(width)):
         raise UsageError(f"size {text!r} is not of the form HxW, such as 480x640")
     return int(height), int(width)
-
-
-def sampled(text: str | None) -> SamplePattern | None:
-    """Returns the pattern of `500`, `5%` or `lines:16`; None for None. Raises UsageError."""
-    if text is None:
-        return None
-    kind, colon, count = text.rpartition(":")
-    return request.sample_pattern(kind if colon else "uniform", *count_or_fraction(count))
 
 
 def count_or_fraction(text: str | None) -> tuple[int | None, float | None]:

@@ -415,3 +415,11 @@ def sample_pattern(kind: str, count: int | None, fraction: float | None) -> Samp
     from pnpdepth_cli.sensors import SamplePattern
 
     return SamplePattern(kind=kind, count=count, fraction=fraction)
+
+
+def parse_sample(text: str | None) -> SamplePattern | None:
+    """Returns the pattern of `500`, `5%` or `lines:16`; None for None. Raises UsageError."""
+    if text is None:
+        return None
+    kind, colon, count = text.rpartition(":")
+    return sample_pattern(kind if colon else "uniform", *count_or_fraction(count))
