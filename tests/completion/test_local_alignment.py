@@ -29,94 +29,96 @@ def seen(depth: Tensor, count: int, seed: int = 0) -> SparsePoints:
     return SparsePoints(xy=xy, depth=depth.flatten()[chosen], size=SIZE)
 
 
-def spoiled(points: SparsePoints, share: float = 0.2) -> SparsePoints:
+def spoiled(points: SparsePoints, fraction: float = 0.2) -> SparsePoints:
     """Some points replaced by a depth 2 to 20 times too near or too far."""
     generator = torch.Generator().manual_seed(3)
     random = torch.rand(3, len(points), generator=generator)
     off = (0.7 + 2.3 * random[1]) * torch.where(random[2] < 0.5, -1, 1)
-    depth = torch.where(random[0] < share, points.depth * off.exp(), points.depth)
+    depth = torch.where(random[0] < fraction, points.depth * off.exp(), points.depth)
     return SparsePoints(xy=points.xy, depth=depth, size=points.size)
 
 
-def mean_error(depth: Tensor, truth: Tensor) -> float:
-    return float((depth.log() - truth.log()).abs().mean())
+def mean_error(depth: Tensor, ground_truth: Tensor) -> float:
+    return float((depth.log() - ground_truth.log()).abs().mean())
 
 
 @pytest.mark.parametrize("space", SPACES)
 @pytest.mark.parametrize("count", [3, 30, 400])
 def test_a_prediction_that_is_a_line_away_everywhere_is_restored(space: str, count: int) -> None:
-    truth = scene()
-    value = to_space(truth, space)
+    ground_truth = scene()
+    value = to_space(ground_truth, space)
     prediction = from_space((value + 0.3) / 0.7, space)
     assert torch.allclose(
-        locally_aligned(prediction, seen(truth, count), space=space), truth, rtol=1e-3
+        locally_aligned(prediction, seen(ground_truth, count), space=space), ground_truth, rtol=1e-3
     )
 
 
 @pytest.mark.parametrize("space", SPACES)
 @pytest.mark.parametrize("count", [50, 300])
-def test_a_scale_that_drifts_over_the_picture_is_followed(space: str, count: int) -> None:
-    truth = scene()
+def test_a_scale_that_drifts_over_the_image_is_followed(space: str, count: int) -> None:
+    ground_truth = scene()
     drift = torch.linspace(0.6, 1.5, SIZE[1])
-    points = seen(truth, count)
-    local = locally_aligned(truth * drift, points, space=space)
-    everywhere = aligned(truth * drift, points, kind="affine", space=space)
-    assert mean_error(local, truth) < 0.35 * mean_error(everywhere, truth)
+    points = seen(ground_truth, count)
+    local = locally_aligned(ground_truth * drift, points, space=space)
+    everywhere = aligned(ground_truth * drift, points, kind="affine", space=space)
+    assert mean_error(local, ground_truth) < 0.35 * mean_error(everywhere, ground_truth)
 
 
 def test_near_a_point_the_depth_is_the_points() -> None:
-    truth = scene()
-    points = seen(truth, 60)
-    prediction = scene(seed=3).roll(5, dims=0)  # things in the wrong places
+    ground_truth = scene()
+    points = seen(ground_truth, 60)
+    prediction = scene(seed=3).roll(5, dims=0)  # objects at other positions
     off = points.sample(locally_aligned(prediction, points)).log() - points.depth.log()
     assert float(off.abs().median()) < 0.02
 
 
 @pytest.mark.parametrize("count", [1, 2])
 def test_one_and_two_points_move_the_whole_prediction(count: int) -> None:
-    truth = scene()
-    assert torch.allclose(locally_aligned(truth / 3, seen(truth, count)), truth, rtol=1e-4)
+    ground_truth = scene()
+    assert torch.allclose(
+        locally_aligned(ground_truth / 3, seen(ground_truth, count)), ground_truth, rtol=1e-4
+    )
 
 
-@pytest.mark.parametrize(("count", "share"), [(40, 0.5), (400, 0.05)])
-def test_20_percent_gross_outliers_move_the_depth_by_a_share_of_what_they_would(
-    count: int, share: float, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(("count", "fraction"), [(40, 0.5), (400, 0.05)])
+def test_inlier_weights_reduce_the_effect_of_20_percent_gross_outliers(
+    count: int, fraction: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    truth = scene()
+    ground_truth = scene()
     drift = torch.linspace(0.8, 1.25, SIZE[0])[:, None]
     noise = torch.randn(SIZE, generator=torch.Generator().manual_seed(1))
-    prediction = truth * drift * (1 + 0.02 * noise)
+    prediction = ground_truth * drift * (1 + 0.02 * noise)
 
     def rise() -> float:
         errors = []
         for seed in range(4):
-            points = seen(truth, count, seed)
+            points = seen(ground_truth, count, seed)
             clean, moved = (locally_aligned(prediction, p) for p in (points, spoiled(points)))
-            errors.append(mean_error(moved, truth) - mean_error(clean, truth))
+            errors.append(mean_error(moved, ground_truth) - mean_error(clean, ground_truth))
         return sum(errors)
 
-    doubted = rise()
+    weighted = rise()
     monkeypatch.setattr("pnpdepth_cli.completion.outliers.ALONE", 1e9)
-    assert doubted < share * rise()
+    assert weighted < fraction * rise()
 
 
 def test_where_the_network_has_nothing_there_is_nothing() -> None:
-    truth = scene()
-    prediction = truth / 2
+    ground_truth = scene()
+    prediction = ground_truth / 2
     prediction[:, :20] = 0
     prediction[:, 60:] = math.nan
-    dense = locally_aligned(prediction, seen(truth, 100))
+    dense = locally_aligned(prediction, seen(ground_truth, 100))
     assert bool((dense[:, :20] == 0).all())
     assert bool((dense[:, 60:] == 0).all())
-    assert torch.allclose(dense[:, 20:60], truth[:, 20:60], rtol=1e-3)
+    assert torch.allclose(dense[:, 20:60], ground_truth[:, 20:60], rtol=1e-3)
     with pytest.raises(NoPointsError, match="none of the 100"):
-        locally_aligned(torch.zeros(SIZE), seen(truth, 100))
+        locally_aligned(torch.zeros(SIZE), seen(ground_truth, 100))
 
 
 def test_depth_stays_within_the_bounds_of_a_global_alignment() -> None:
-    truth = scene()
-    points = seen(truth, 100)
-    prediction = truth.clone()
+    ground_truth = scene()
+    points = seen(ground_truth, 100)
+    prediction = ground_truth.clone()
     prediction[0, 0], prediction[0, 1] = 1e6, 1e-6
     dense = locally_aligned(prediction, points, space="inverse")
     assert float(dense.max()) <= float(points.depth.max()) * BEYOND * (1 + 1e-5)
@@ -124,18 +126,18 @@ def test_depth_stays_within_the_bounds_of_a_global_alignment() -> None:
 
 
 def test_the_order_of_the_points_does_not_matter() -> None:
-    truth = scene()
-    points = seen(truth, 100)
+    ground_truth = scene()
+    points = seen(ground_truth, 100)
     other = SparsePoints(xy=points.xy.flip(0), depth=points.depth.flip(0), size=SIZE)
-    prediction = truth.sqrt()
+    prediction = ground_truth.sqrt()
     assert torch.equal(locally_aligned(prediction, points), locally_aligned(prediction, other))
 
 
-def test_lines_between_fewer_places_than_pixels_come_near_those_of_every_pixel(
+def test_a_coarser_grid_is_near_the_alignment_of_every_pixel(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    truth = scene()
-    prediction = truth * torch.linspace(0.6, 1.5, SIZE[1])
-    whole = locally_aligned(prediction, seen(truth, 60))
-    monkeypatch.setattr("pnpdepth_cli.completion.local_alignment._NODES", truth.numel() // 4)
-    assert mean_error(locally_aligned(prediction, seen(truth, 60)), whole) < 0.01
+    ground_truth = scene()
+    prediction = ground_truth * torch.linspace(0.6, 1.5, SIZE[1])
+    whole = locally_aligned(prediction, seen(ground_truth, 60))
+    monkeypatch.setattr("pnpdepth_cli.completion.local_alignment._NODES", ground_truth.numel() // 4)
+    assert mean_error(locally_aligned(prediction, seen(ground_truth, 60)), whole) < 0.01

@@ -80,8 +80,11 @@ def fuzz(folder: Path, seed: int, first: int, count: int) -> FuzzResult:
             first = line["end"] + 1
             _record(result, folder, seed, line)
         if started is not None:
+            data = (folder / started["file"]).read_bytes()  # the worker did not put it right again
             problem = "the process died or hung"
-            result.findings.append(_finding(folder, seed, started["start"], started, problem))
+            result.findings.append(
+                Finding(number=started["start"], file=started["file"], problem=problem, data=data)
+            )
             first = started["start"] + 1
             result.inputs += 1
         elif first < end:
