@@ -36,6 +36,7 @@ from pnpdepth_cli.pipeline.batch.batch import run_batch
 from pnpdepth_cli.pipeline.batch.frames import find_frames, task_of
 from pnpdepth_cli.pipeline.batch.request import BatchRequest
 from pnpdepth_cli.pipeline.batch.settings import model_identity, settings_digest
+from pnpdepth_cli.pipeline.batch.spread import DoneFrame
 from pnpdepth_cli.pipeline.cluster.options import LOCAL, ClusterOptions, spread_of
 from pnpdepth_cli.pipeline.cluster.pool import worker_pool
 from pnpdepth_cli.pipeline.cluster.worker import Done
@@ -265,7 +266,8 @@ class WaitingJob:
 
         def work(names: Sequence[str], checked: bool) -> Done:
             time.sleep(self.wait_s * len(names))
-            return Done(results=[self.line | {"frame": name} for name in names])
+            lines = (self.line | {"frame": name} for name in names)
+            return Done(results=[DoneFrame.of(line, whole=False) for line in lines])
 
         yield work
 
@@ -304,7 +306,7 @@ def waited(root: Path, workers: int, job: WaitingJob, seconds: float) -> dict[st
             list(pool.results(job, names[:1]))
         start, cpu = time.perf_counter(), time.process_time()
         for part in pool.results(job, names, begin=begin):
-            journal.append(*(line for _, line in part))
+            journal.append(*(done.line for _, done in part))
         wall = time.perf_counter() - start
     return {
         "frames": len(names),

@@ -51,7 +51,10 @@ class Listener(Protocol):
         """Called once the network is loaded, with the number of frames to do."""
 
     def frame(self, row: dict[str, Any]) -> None:
-        """Called with the summary's row of each frame that is done or has failed."""
+        """Called with the summary's row of each frame that is done or has failed.
+
+        With workers of a cluster it has only name, status and message.
+        """
 
 
 @dataclass(frozen=True, kw_only=True)

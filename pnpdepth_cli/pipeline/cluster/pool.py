@@ -76,7 +76,9 @@ def worker_pool(
         shared = list(inputs)
         if output is not None:
             shared.append(stack.enter_context(_probe(output.absolute())))
-        pool = WorkerPool(stack.enter_context(connected(spread)), spread, shared, say)
+        cluster = stack.enter_context(connected(spread))
+        say(f"Ray workers: starting {cluster.workers:,}, each with {spread.each}")
+        pool = WorkerPool(cluster, spread, shared, say)
         stack.callback(pool.close)
         yield pool
 

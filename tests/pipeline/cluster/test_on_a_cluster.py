@@ -134,9 +134,9 @@ def test_what_is_wrong_with_a_cluster_is_an_error(
 ) -> None:
     options = ClusterOptions(ray=cluster.address)
     one = replace(options, ray_workers=1)
-    with pytest.raises(ClusterError, match="devices for 3 workers of 1 CPU cores each, and 9 are"):
+    with pytest.raises(ClusterError, match="for 3 Ray workers with 1 CPU core each, and 9 asked"):
         batch(root, cluster=replace(options, ray_workers=9))
-    with pytest.raises(ClusterError, match="devices for 0 workers of a GPU each, and 1 are"):
+    with pytest.raises(ClusterError, match="for 0 Ray workers with one GPU each, and 1 asked"):
         batch(root, cluster=options, refine={"device": "cuda"})
     with monkeypatch.context() as changed:
         changed.setattr(pool, "software", lambda: {"torch": "1.0"})
