@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -29,16 +28,11 @@ from pnpdepth_cli.frames.frame import Frame
 from pnpdepth_cli.models.network import Network, load_network
 from pnpdepth_cli.pipeline.refinement import held_out
 from pnpdepth_cli.points import SparsePoints
-from tests.pipeline.frames import FrameOnDisk, frame_on_disk
+from tests.pipeline.frames import FrameOnDisk
 
 SETTINGS = RefineSettings(iterations=3, lr="5%", update="adam")
 CONFIG = RefinementConfig(layer="middle", settings=SETTINGS)
 ONE = Competition(configs=(CONFIG,), propagations=("gp", "diffusion"))
-
-
-@pytest.fixture
-def frame(tmp_path: Path) -> FrameOnDisk:
-    return frame_on_disk(tmp_path)
 
 
 @pytest.fixture

@@ -6,7 +6,7 @@ from torch import Tensor
 
 from pnpdepth_cli.choices import BASELINES
 from pnpdepth_cli.errors import UsageError
-from pnpdepth_cli.points import SparsePoints
+from tests.completion.scenes import random_points
 
 SIZE = (30, 40)
 
@@ -14,12 +14,6 @@ SIZE = (30, 40)
 def ground_truth() -> Tensor:
     y, x = torch.meshgrid(*(torch.arange(float(n)) for n in SIZE), indexing="ij")
     return 1 + 0.05 * x + 0.1 * y + ((x - 20).square() + (y - 15).square() < 50) * 2.0
-
-
-def seen(depth: Tensor, count: int = 80) -> SparsePoints:
-    chosen = torch.randperm(depth.numel(), generator=torch.Generator().manual_seed(0))[:count]
-    xy = torch.stack([chosen % SIZE[1], chosen // SIZE[1]], dim=1).float()
-    return SparsePoints(xy=xy, depth=depth.flatten()[chosen], size=SIZE)
 
 
 def test_the_table_names_every_simple_baseline() -> None:
@@ -34,7 +28,7 @@ def test_the_table_names_every_simple_baseline() -> None:
 @pytest.mark.parametrize("name", BASELINES)
 def test_a_baseline_is_near_the_ground_truth_and_does_not_change_its_arguments(name: str) -> None:
     depth = ground_truth()
-    points, prediction = seen(depth), depth / 3
+    points, prediction = random_points(depth, 80), depth / 3
     kept = (points.xy.clone(), points.depth.clone(), prediction.clone())
     dense = BASELINES[name].depth(points, prediction)
     assert dense.shape == SIZE
@@ -52,11 +46,11 @@ def test_what_aligns_a_prediction_leaves_unknown_what_is_unknown_and_needs_one(n
     depth = ground_truth()
     prediction = depth / 3
     prediction[:10] = 0
-    dense = BASELINES[name].depth(seen(depth), prediction)
+    dense = BASELINES[name].depth(random_points(depth, 80), prediction)
     assert bool((dense[:10] == 0).all())
     assert bool((dense[10:] > 0).all())
     with pytest.raises(UsageError, match="needs a network's prediction"):
-        BASELINES[name].depth(seen(depth))
+        BASELINES[name].depth(random_points(depth, 80))
 
 
 @pytest.mark.parametrize(
@@ -72,13 +66,13 @@ def test_what_aligns_a_prediction_leaves_unknown_what_is_unknown_and_needs_one(n
 )
 def test_each_alignment_restores_the_prediction_it_models(name, prediction) -> None:  # type: ignore[no-untyped-def]
     depth = ground_truth()
-    dense = BASELINES[name].depth(seen(depth), prediction(depth))
+    dense = BASELINES[name].depth(random_points(depth, 80), prediction(depth))
     assert torch.allclose(dense, depth, rtol=1e-3)
 
 
 @pytest.mark.parametrize("name", BASELINES)
 def test_depth_at_positions_equals_the_dense_depth(name: str) -> None:
-    points, prediction = seen(ground_truth()), ground_truth() / 3
+    points, prediction = random_points(ground_truth(), 80), ground_truth() / 3
     prediction[:4, :4] = 0
     rows, columns = torch.meshgrid(torch.arange(0, 30, 3), torch.arange(0, 40, 3), indexing="ij")
     positions = torch.stack([columns.flatten(), rows.flatten()], dim=1).float()

@@ -9,8 +9,8 @@ import torch
 
 from pnpdepth_cli.completion.outliers import inlier_mask, inlier_weights, outliers
 from pnpdepth_cli.points import SparsePoints
+from tests.completion.scenes import random_points, scene
 from tests.completion.test_gaussian_process import field
-from tests.completion.test_propagation import scene, seen
 
 
 @pytest.mark.parametrize("count", [40, 600])
@@ -44,7 +44,7 @@ def test_points_far_from_the_prediction_are_inliers_where_they_agree(
 
 def test_outliers_are_marked_in_the_order_of_the_points() -> None:
     ground_truth, rgb, prediction = scene()
-    points = seen(ground_truth, 150)
+    points = random_points(ground_truth, 150)
     assert not bool(outliers(prediction, points, rgb).any())
     bad = torch.arange(150) % 6 == 0
     outside = SparsePoints(
@@ -62,7 +62,7 @@ def test_outliers_are_marked_in_the_order_of_the_points() -> None:
 
 
 def test_a_point_alone_among_its_neighbours_has_no_weight() -> None:
-    points = seen(scene()[0], 50)
+    points = random_points(scene()[0], 50)
     residual = 0.01 * torch.randn(50, generator=torch.Generator().manual_seed(2)).double()
     residual[7] = 1.0
     weights = inlier_weights(points, residual)

@@ -2,30 +2,14 @@ from __future__ import annotations
 
 import pytest
 import torch
-from torch import Tensor
 
 from pnpdepth_cli.choices import PROPAGATIONS
 from pnpdepth_cli.completion.propagation import propagate, propagate_at
 from pnpdepth_cli.errors import NoPointsError, UsageError
 from pnpdepth_cli.points import SparsePoints
+from tests.completion.scenes import SIZE, mean_log_error, random_points, scene
 
-SIZE = (48, 64)
 KINDS = ("none", *PROPAGATIONS)
-
-
-def scene() -> tuple[Tensor, Tensor, Tensor]:
-    """Depth (H, W) of a floor, a wall and a box, its image, and a prediction that drifts."""
-    y, x = torch.meshgrid(*(torch.arange(float(n)) for n in SIZE), indexing="ij")
-    depth = torch.minimum(60 / (y - 10).clamp_min(1), 4 + 0.02 * x)
-    depth[20:40, 10:30] = 1.4
-    rgb = torch.stack([0.3 + 0.4 * (depth < 1.5), 0.5 + 0.2 * y / 48, 0.4 + 0 * x])
-    return depth, rgb, depth * (0.7 + 0.5 * x / 64) * torch.where(depth < 1.5, 1.3, 1.0)
-
-
-def seen(depth: Tensor, count: int, seed: int = 0) -> SparsePoints:
-    chosen = torch.randperm(depth.numel(), generator=torch.Generator().manual_seed(seed))[:count]
-    xy = torch.stack([chosen % SIZE[1], chosen // SIZE[1]], dim=1).float()
-    return SparsePoints(xy=xy, depth=depth.flatten()[chosen], size=SIZE)
 
 
 def spoiled(points: SparsePoints) -> SparsePoints:
@@ -37,51 +21,47 @@ def spoiled(points: SparsePoints) -> SparsePoints:
     return SparsePoints(xy=points.xy, depth=depth, size=SIZE)
 
 
-def mean_error(depth: Tensor, ground_truth: Tensor) -> float:
-    return float((depth.log() - ground_truth.log()).abs().mean())
-
-
 @pytest.mark.parametrize("kind", PROPAGATIONS)
 @pytest.mark.parametrize("count", [30, 400])
 @pytest.mark.parametrize("coloured", [True, False])
 def test_a_prediction_that_drifts_is_put_right(kind: str, count: int, coloured: bool) -> None:
-    ground_truth, rgb, prediction = scene()
+    gt, rgb, prediction = scene()
     propagated = propagate(
-        prediction, seen(ground_truth, count), rgb if coloured else None, kind=kind
+        prediction, random_points(gt, count), rgb if coloured else None, kind=kind
     )
     assert propagated.depth.dtype == torch.float32
-    assert mean_error(propagated.depth, ground_truth) < 0.5 * mean_error(prediction, ground_truth)
+    assert mean_log_error(propagated.depth, gt) < 0.5 * mean_log_error(prediction, gt)
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_nothing_left_leaves_the_prediction(kind: str) -> None:
-    ground_truth, rgb, _ = scene()
+    gt, rgb, _ = scene()
     assert torch.allclose(
-        propagate(ground_truth, seen(ground_truth, 50), rgb, kind=kind).depth,
-        ground_truth,
+        propagate(gt, random_points(gt, 50), rgb, kind=kind).depth,
+        gt,
         rtol=1e-6,
     )
 
 
 def test_without_propagation_the_prediction_is_the_result() -> None:
-    ground_truth, rgb, prediction = scene()
+    gt, rgb, prediction = scene()
     assert torch.equal(
-        propagate(prediction, seen(ground_truth, 9), rgb, kind="none").depth, prediction
+        propagate(prediction, random_points(gt, 9), rgb, kind="none").depth, prediction
     )
 
 
 @pytest.mark.parametrize("kind", PROPAGATIONS)
 def test_one_point_moves_all_by_its_factor(kind: str) -> None:
-    ground_truth, rgb, _ = scene()
-    propagated = propagate(ground_truth / 1.5, seen(ground_truth, 1), rgb, kind=kind)
-    assert torch.allclose(propagated.depth, ground_truth, rtol=0.01)
+    gt, rgb, _ = scene()
+    propagated = propagate(gt / 1.5, random_points(gt, 1), rgb, kind=kind)
+    assert torch.allclose(propagated.depth, gt, rtol=0.01)
 
 
 @pytest.mark.parametrize("kind", PROPAGATIONS)
 @pytest.mark.parametrize("count", [2, 3, 4, 5, 6])
 def test_few_points_bring_no_depth_beyond_what_they_say(kind: str, count: int) -> None:
-    ground_truth, rgb, prediction = scene()
-    points = seen(ground_truth, count)
+    gt, rgb, prediction = scene()
+    points = random_points(gt, count)
     propagated = propagate(prediction, points, rgb, kind=kind)
     factor, ratio = propagated.depth / prediction, points.depth / points.sample(prediction)
     assert float(factor.min()) >= float(ratio.min()) * (1 - 1e-5)
@@ -90,19 +70,19 @@ def test_few_points_bring_no_depth_beyond_what_they_say(kind: str, count: int) -
 
 @pytest.mark.parametrize("count", [60, 400])
 def test_the_points_keep_their_depth(count: int) -> None:
-    ground_truth, rgb, prediction = scene()
-    points = seen(ground_truth, count)
+    gt, rgb, prediction = scene()
+    points = random_points(gt, count)
     depth = propagate(prediction, points, rgb).depth
-    assert mean_error(points.sample(depth), points.depth) < 0.01
+    assert mean_log_error(points.sample(depth), points.depth) < 0.01
 
 
 @pytest.mark.parametrize("kind", PROPAGATIONS)
 @pytest.mark.parametrize("count", [60, 400])
 def test_outliers_do_not_propagate(kind: str, count: int) -> None:
-    ground_truth, rgb, prediction = scene()
-    points = seen(ground_truth, count)
+    gt, rgb, prediction = scene()
+    points = random_points(gt, count)
     clean, disturbed = (
-        mean_error(propagate(prediction, p, rgb, kind=kind).depth, ground_truth)
+        mean_log_error(propagate(prediction, p, rgb, kind=kind).depth, gt)
         for p in (points, spoiled(points))
     )
     assert disturbed < 1.5 * clean + 0.01
@@ -111,8 +91,8 @@ def test_outliers_do_not_propagate(kind: str, count: int) -> None:
 @pytest.mark.parametrize("kind", PROPAGATIONS)
 @pytest.mark.parametrize("count", [7, 300])
 def test_the_order_of_the_points_does_not_matter(kind: str, count: int) -> None:
-    ground_truth, rgb, prediction = scene()
-    points = seen(ground_truth, count)
+    gt, rgb, prediction = scene()
+    points = random_points(gt, count)
     other = torch.randperm(count, generator=torch.Generator().manual_seed(1))
     turned = SparsePoints(xy=points.xy[other], depth=points.depth[other], size=SIZE)
     depth, again = (propagate(prediction, p, rgb, kind=kind).depth for p in (points, turned))
@@ -121,8 +101,8 @@ def test_the_order_of_the_points_does_not_matter(kind: str, count: int) -> None:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_an_unknown_prediction_stays_unknown_and_its_points_have_no_effect(kind: str) -> None:
-    ground_truth, rgb, prediction = scene()
-    points = seen(ground_truth, 40)
+    gt, rgb, prediction = scene()
+    points = random_points(gt, 40)
     unknown = prediction.clone()
     unknown[:, :20] = 0
     unknown[0, 30], unknown[0, 31] = torch.inf, torch.nan
@@ -137,8 +117,8 @@ def test_an_unknown_prediction_stays_unknown_and_its_points_have_no_effect(kind:
 
 @pytest.mark.parametrize("kind", PROPAGATIONS)
 def test_points_outside_the_frame_and_farther_ones_at_one_pixel_have_no_effect(kind: str) -> None:
-    ground_truth, rgb, prediction = scene()
-    points = seen(ground_truth, 30)
+    gt, rgb, prediction = scene()
+    points = random_points(gt, 30)
     xy = torch.cat([points.xy, torch.tensor([[-9.0, 5.0], [70.0, 5.0]]), points.xy[:3]])
     depth = torch.cat([points.depth, torch.tensor([30.0, 0.1]), 2 * points.depth[:3]])
     more = SparsePoints(xy=xy, depth=depth, size=SIZE)
@@ -148,21 +128,19 @@ def test_points_outside_the_frame_and_farther_ones_at_one_pixel_have_no_effect(k
 
 @pytest.mark.parametrize("kind", PROPAGATIONS)
 def test_a_flat_prediction_and_image_become_a_surface_through_the_points(kind: str) -> None:
-    ground_truth = scene()[0]
-    points = seen(ground_truth, 100)
+    gt = scene()[0]
+    points = random_points(gt, 100)
     propagated = propagate(
         torch.full(SIZE, 2.0), points, torch.full((3, *SIZE), 0.5), kind=kind
     ).depth
     assert bool((propagated > 0).all())
-    assert mean_error(propagated, ground_truth) < 0.5 * mean_error(
-        torch.full(SIZE, 2.0), ground_truth
-    )
+    assert mean_log_error(propagated, gt) < 0.5 * mean_log_error(torch.full(SIZE, 2.0), gt)
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_depth_at_positions_equals_the_dense_depth(kind: str) -> None:
-    ground_truth, rgb, prediction = scene()
-    points = seen(ground_truth, 40)
+    gt, rgb, prediction = scene()
+    points = random_points(gt, 40)
     positions = torch.tensor([[3.0, 4.0], [63.0, 47.0], [20.0, 30.0]])
     queries = SparsePoints(xy=positions, depth=torch.ones(3), size=SIZE)
     depth = propagate(prediction, points, rgb, kind=kind).depth
@@ -171,16 +149,16 @@ def test_depth_at_positions_equals_the_dense_depth(kind: str) -> None:
 
 
 def test_two_thirds_of_the_ground_truth_lie_within_sigma() -> None:
-    ground_truth, rgb, prediction = scene()
-    propagated = propagate(prediction, seen(ground_truth, 150), rgb, sigma=True)
+    gt, rgb, prediction = scene()
+    propagated = propagate(prediction, random_points(gt, 150), rgb, sigma=True)
     assert propagated.sigma is not None
-    within = ((propagated.depth - ground_truth).abs() <= propagated.sigma).double().mean()
+    within = ((propagated.depth - gt).abs() <= propagated.sigma).double().mean()
     assert 0.5 < float(within) < 0.9
 
 
 def test_impossible_requests_are_refused() -> None:
-    ground_truth, rgb, prediction = scene()
-    points = seen(ground_truth, 9)
+    gt, rgb, prediction = scene()
+    points = random_points(gt, 9)
     with pytest.raises(UsageError, match="unknown propagation 'magic'"):
         propagate(prediction, points, rgb, kind="magic")
     with pytest.raises(UsageError, match="no standard deviation"):
