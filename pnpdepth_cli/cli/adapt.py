@@ -59,7 +59,7 @@ def adapt(source: Path, output: Path, sample: str | None, as_json: bool, **given
         return
     before, after = adapted.losses[0], adapted.losses[adapted.kept]
     click.echo(
-        f"loss at hidden points of {adapted.validation_frames} validation frames:"
+        f"loss at hidden points of the frames for validation ({adapted.validation_frames}):"
         f" {before:.5f} → {after:.5f} ({adapted.change:+.1%}), after {adapted.kept} updates"
     )
     click.echo(printable(f"wrote {request.output} and {request.card}"), err=True)

@@ -88,14 +88,14 @@ def adapt(request: AdaptRequest, progress: Progress) -> Adapted:
         progress.say(note)
     adaptation = _Adaptation(network, settings, tasks)
     progress.say(
-        f"{len(adaptation.training)} frames to learn from, {len(adaptation.validation)} for"
-        " validation"
+        f"frames to learn from: {len(adaptation.training)}; for validation:"
+        f" {len(adaptation.validation)}"
     )
     with network.cut_at_points() as split:
         losses = adaptation.run(split, progress)
     adapted = Adapted(
         network=network.definition.name,
-        checkpoint=None if network.checkpoint is None else str(network.checkpoint),
+        checkpoint=None if choice.checkpoint is None else str(choice.checkpoint),
         source=str(request.source),
         output=str(request.output),
         training_frames=len(adaptation.training),

@@ -82,8 +82,8 @@ Weights of `{adapted.network}`, adapted to the frames of `{adapted.source}` by
 `pnpdepth adapt` {__version__}. Use: `--model {adapted.network} --checkpoint {file}`.
 
 - **Start**: {adapted.checkpoint or "the network's own weights"}.
-- **Data**: {adapted.training_frames} frames to learn from, {adapted.validation_frames} for
-  validation; images and sparse depth, no ground truth.
+- **Data**: frames to learn from: {adapted.training_frames}; for validation:
+  {adapted.validation_frames}; images and sparse depth, no ground truth.
 - **Method**: {adapted.hidden:.0%} of the points of a frame are hidden from the input, and the
   loss (`{adapted.loss}`) is taken at these. {adapted.steps} updates, step size {adapted.lr:g},
   seed {adapted.seed}.

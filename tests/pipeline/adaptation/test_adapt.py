@@ -41,7 +41,8 @@ def test_the_card_says_what_was_learnt_from_what(tmp_path: Path) -> None:
     assert adapted(root, "--steps", "5") == 0
     card = (root / "adapted.md").read_text()
     assert f"`{NETWORK}`, adapted to the frames of `{root}`" in card
-    assert "2 frames to learn from, 1 for" in card
+    assert "frames to learn from: 2; for validation:\n  1;" in card
+    assert "the network's own weights" in card
 
 
 def test_the_same_seed_gives_the_same_bytes(tmp_path: Path) -> None:
