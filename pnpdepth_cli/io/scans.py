@@ -22,6 +22,9 @@ _KITTI_FIELDS = 4
 _NUSCENES_FIELDS = 5
 """x, y, z, intensity and the index of the laser, a whole number."""
 
+_SAMPLE = 4096
+"""Rows that tell the number of fields; checking all takes twice as long as reading them."""
+
 _NEARLY_ALL = 0.95
 """Fraction of points; read with the wrong number of fields, at most half of them look right."""
 
@@ -61,8 +64,8 @@ def read_scan(path: Path, point_fields: int | None = None) -> ScanFile:
         points, source = _READERS[suffix](path, data)
     if not len(points):
         raise NoPointsError(f"{path} holds no point; give a scan with points")
-    bad = ~np.isfinite(points).all(axis=1)
-    if bad.any():
+    if not np.isfinite(points).all():
+        bad = ~np.isfinite(points).all(axis=1)
         raise FileFormatError(
             f"{path}: {int(bad.sum()):,} of {len(points):,} points have no finite coordinates"
             f" (the first is number {int(np.argmax(bad)) + 1:,}); remove them"
@@ -97,7 +100,7 @@ def _fields_of_bin(path: Path, data: bytes) -> int:
     by_size = [n for n in (_KITTI_FIELDS, _NUSCENES_FIELDS) if len(data) % (4 * n) == 0]
     if by_size == [_KITTI_FIELDS]:
         return _KITTI_FIELDS
-    numbers = np.frombuffer(data[: len(data) // 4 * 4], "<f4")
+    numbers = np.frombuffer(data, "<f4", len(data) // 4)
     by_content = [n for n in by_size if _looks_like_scan(numbers.reshape(-1, n))]
     if len(by_content) == 1:
         return by_content[0]
@@ -112,11 +115,12 @@ def _fields_of_bin(path: Path, data: bytes) -> int:
 
 
 def _looks_like_scan(rows: NDArray[np.float32]) -> bool:
-    """True if nearly all rows of (N, 4 or 5) are plausible points of a scan.
+    """True if nearly all rows of (N, 4 or 5), or of a sample of them, are plausible points.
 
     Coordinates are not too far, reflectance is not negative, and a fifth column holds whole numbers
     0…255, the index of a laser.
     """
+    rows = rows[:: -(-len(rows) // _SAMPLE) or 1]
     with np.errstate(invalid="ignore"):
         near = (np.abs(rows[:, :3]) <= _FARTHEST_M).all(axis=1) & (rows[:, 3] >= 0)
         laser = rows[:, 4:]
