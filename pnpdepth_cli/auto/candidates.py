@@ -7,7 +7,7 @@ several networks' depths, and may propagate the residual at the points.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from pnpdepth_cli.core.refine import RefineSettings
@@ -70,6 +70,8 @@ class Candidate:
     """Refinement that it starts from."""
     iterations: int = 0
     """Number of updates of z; 0 is the network's own depth."""
+    prior: Candidate | None = None
+    """Candidate whose depth the network is given as a prior."""
     fused: tuple[Candidate, ...] = ()
     """Candidates whose weighted geometric mean it starts from."""
     weights: tuple[float, ...] = ()
@@ -92,7 +94,9 @@ class Candidate:
             moved = "weights" if self.config.settings.moves_weights else "z"
             return f"{self.iterations} updates of {moved} ({self.config})"
         network, align = self.config.network, self.config.settings.align
-        return network if align == "none" else f"{network} aligned ({align})"
+        aligned = "" if align == "none" else f" aligned ({align})"
+        prior = "" if self.prior is None else f" with {self.prior} as prior"
+        return f"{network}{aligned}{prior}"
 
     @property
     def start(self) -> Candidate:
@@ -103,7 +107,8 @@ class Candidate:
     def configs(self) -> tuple[RefinementConfig, ...]:
         """The refinements that it needs."""
         own = () if self.config is None else (self.config,)
-        return (*own, *(config for each in self.fused for config in each.configs))
+        inner = self.fused if self.prior is None else (self.prior, *self.fused)
+        return (*own, *(config for each in inner for config in each.configs))
 
 
 def fusion(
@@ -143,6 +148,24 @@ def default_config(
     weight = 1.0 if definition.input_kind == "rgb" else WEIGHT_WITH_POINTS
     settings = replace(settings, align=align)
     return RefinementConfig(network=network, layer=layer, settings=settings, weight=weight)
+
+
+def cascades(
+    configs: Sequence[RefinementConfig], definitions: Mapping[str, ModelDefinition]
+) -> tuple[Candidate, ...]:
+    """Returns each network that takes a prior, given each other network's aligned depth.
+
+    Args:
+        configs: One refinement of each network.
+        definitions: Of the networks, by name.
+    """
+    return tuple(
+        Candidate(config=given, prior=Candidate(config=prior))
+        for given in configs
+        if definitions[given.network].takes_prior
+        for prior in configs
+        if prior != given
+    )
 
 
 def more_configs(definition: ModelDefinition, first: RefinementConfig) -> list[RefinementConfig]:
