@@ -12,7 +12,7 @@ import numpy as np
 
 from pnpdepth_cli import __version__
 from pnpdepth_cli.choices import EXPORTS
-from pnpdepth_cli.errors import InputError, OutputError, SizeError
+from pnpdepth_cli.errors import FileFormatError, InputError, OutputError, SizeError
 from pnpdepth_cli.io.atomic import all_or_none, make_folder
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.io.record import write_json
@@ -78,22 +78,28 @@ def _frame(result: ResultFrame, export: Export) -> ExportFrame:
             f"{result.depth} has no pose in its record; refine it with a COLMAP model, as"
             " `batch --layout colmap` does"
         )
-    width, height = record["size"]
+    try:
+        width, height = (int(side) for side in record["size"])
+        farthest = float(record["points"]["farthest"])
+        sparse = record["inputs"]["sparse"]
+        name, unit_scale = sparse.get("image"), float(sparse.get("unit_scale") or 1)
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise FileFormatError(
+            f"{result.depth}: the record beside it is damaged; refine it again"
+        ) from error
     if upright_size(image) != (height, width):
         raise SizeError(
             f"{result.depth} is not of the size of {image}; refine the whole image"
             " (--protocol whole)"
         )
-    sparse = record.get("inputs", {}).get("sparse", {})
-    name = (PurePosixPath(result.name).parent / image.name).as_posix()
     return ExportFrame(
         image=image,
-        image_name=sparse.get("image") or name,
+        image_name=name or (PurePosixPath(result.name).parent / image.name).as_posix(),
         size=(height, width),
         camera=camera,
         unit=result.unit,
-        unit_scale=sparse.get("unit_scale") or 1.0,
-        farthest=float(record["points"]["farthest"]),
+        unit_scale=unit_scale,
+        farthest=farthest,
         read=functools.partial(_read, result),
     )
 

@@ -99,9 +99,22 @@ def test_a_depth_of_another_size_than_its_record_needs_its_own_camera(tmp_path: 
         written(path, tmp_path / "o.ply", fov_deg=None)
 
 
-def test_a_damaged_camera_in_a_record_is_one_line(tmp_path: Path) -> None:
-    path = frame(tmp_path, "a")
-    (tmp_path / "a.json").write_text('{"camera": {"intrinsics": [1, 2], "pose": null}}')
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"intrinsics": [1, 2]},
+        {"intrinsics": [[0, 0, 0]] * 3},
+        {"intrinsics": [[1e999, 0, 0], [0, 1, 0], [0, 0, 1]]},
+        {"distortion": ["x"]},
+        {"lens": "pinhole"},
+        {"pose": [1, 2]},
+    ],
+)
+def test_a_damaged_camera_in_a_record_is_one_line(tmp_path: Path, changes: dict[str, Any]) -> None:
+    path = with_camera(frame(tmp_path, "a"), None)
+    record = json.loads((tmp_path / "a.json").read_text())
+    record["camera"] |= changes
+    (tmp_path / "a.json").write_text(json.dumps(record).replace("Infinity", "1e999"))
     with pytest.raises(FileFormatError, match="the camera in the record beside it is damaged"):
         written(path, tmp_path / "o.ply", fov_deg=None)
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from pnpdepth_cli.choices import EXPORTS
-from pnpdepth_cli.errors import InputError, OutputError, PnpDepthError, SizeError
+from pnpdepth_cli.errors import FileFormatError, InputError, OutputError, PnpDepthError, SizeError
 from pnpdepth_cli.io.depth import write_depth
 from pnpdepth_cli.pipeline.export import ExportRequest, export_results
 from pnpdepth_cli.pipeline.refinement.frame_camera import FrameCamera
@@ -194,6 +194,8 @@ def change(path: Path, **entries: Any) -> None:
         ({"inputs": {}}, InputError, "a_depth.exr lacks its image"),
         ({"size": [9, 9]}, SizeError, "--protocol whole"),
         ({"unit": "m"}, InputError, "in different units"),
+        ({"points": None}, FileFormatError, "the record beside it is damaged"),
+        ({"size": "big"}, FileFormatError, "the record beside it is damaged"),
     ],
 )
 def test_results_that_cannot_be_exported_are_one_line(

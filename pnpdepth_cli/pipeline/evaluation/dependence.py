@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pnpdepth_cli.pipeline.evaluation.averages import Floats
+Floats = NDArray[np.float64]
 
 MIN_CLUSTERS = 5
 """Fewer give no interval: with lognormal errors (σ 0.5) even a studentised one misses too often."""

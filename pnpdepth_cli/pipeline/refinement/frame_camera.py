@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pnpdepth_cli.choices import LENSES
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.io.calibration import read_calibration
 from pnpdepth_cli.io.dataset.protocols import Protocol
@@ -55,16 +56,27 @@ class FrameCamera:
 
     @classmethod
     def of_record(cls, entry: Mapping[str, Any]) -> FrameCamera:
-        """Returns the camera of an entry of `record`. Raises KeyError or ValueError for another."""
-        pose = entry["pose"]
+        """Returns the camera of an entry of `record`.
+
+        Raises:
+            KeyError: A part is missing.
+            TypeError: A part is not of numbers.
+            ValueError: No camera has these numbers.
+        """
+        intrinsics = np.array(entry["intrinsics"], np.float64).reshape(3, 3)
+        distortion = tuple(float(each) for each in entry["distortion"])
+        pose = None if entry["pose"] is None else np.array(entry["pose"], float).reshape(3, 4)
+        numbers = np.concatenate(
+            [intrinsics.ravel(), distortion, [] if pose is None else pose.ravel()]
+        )
+        if not np.isfinite(numbers).all() or entry["lens"] not in LENSES:
+            raise ValueError("no camera has these numbers")
+        if min(intrinsics[0, 0], intrinsics[1, 1]) <= 0 or intrinsics[2].tolist() != [0, 0, 1]:
+            raise ValueError("no camera has these intrinsics")
         return cls(
-            camera=Camera(
-                intrinsics=np.array(entry["intrinsics"], np.float64).reshape(3, 3),
-                distortion=tuple(float(each) for each in entry["distortion"]),
-                lens=str(entry["lens"]),
-            ),
+            camera=Camera(intrinsics=intrinsics, distortion=distortion, lens=entry["lens"]),
             source=str(entry["source"]),
-            pose=None if pose is None else np.array(pose, np.float64).reshape(3, 4),
+            pose=pose,
         )
 
 
