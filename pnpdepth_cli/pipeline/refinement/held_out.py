@@ -215,7 +215,7 @@ def _record(choice: Choice, user: str) -> dict[str, Any]:
 
 
 def _candidate(candidate: Candidate) -> dict[str, Any]:
-    entry = {"candidate": str(candidate)}
+    entry: dict[str, Any] = {"candidate": str(candidate)}
     if candidate.baseline is not None:
         return entry | {"baseline": candidate.baseline}
     if candidate.fused:
