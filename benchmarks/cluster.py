@@ -27,6 +27,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import psutil
 
 from benchmarks.batch import make_frames
@@ -36,6 +37,7 @@ from pnpdepth_cli.pipeline.batch.batch import run_batch
 from pnpdepth_cli.pipeline.batch.frames import find_frames, task_of
 from pnpdepth_cli.pipeline.batch.request import BatchRequest
 from pnpdepth_cli.pipeline.batch.settings import model_identity, settings_digest
+from pnpdepth_cli.pipeline.batch.spread import DoneFrame
 from pnpdepth_cli.pipeline.cluster.options import LOCAL, ClusterOptions, spread_of
 from pnpdepth_cli.pipeline.cluster.pool import worker_pool
 from pnpdepth_cli.pipeline.cluster.worker import Done
@@ -175,64 +177,62 @@ def entries(count: int, folder: Path | None) -> dict[str, Any]:
 
 
 class Clock(Quiet):
-    """CPU seconds of this process and those it started, at the first frame and at the last."""
+    """CPU seconds at the first frame and at the last."""
 
     def __init__(self) -> None:
-        self.moments: list[tuple[float, float]] = []
-        self.to_do = 0
-
-    def begin(self, to_do: int) -> None:
-        """The frames begin."""
-        self.to_do = to_do
+        self.moments: list[tuple[float, float, float]] = []
 
     def frame(self, row: dict[str, Any]) -> None:
         """One more."""
-        self.moments.append((cpu_seconds(), time.perf_counter()))
+        self.moments.append((*cpu_seconds(), time.perf_counter()))
 
     def between(self) -> dict[str, float]:
         """What the frames between the first row and the last took."""
-        (cpu, wall), (cpu_end, wall_end) = self.moments[0], self.moments[-1]
+        spent = np.subtract(self.moments[-1], self.moments[0])
         frames = len(self.moments) - 1
         return {
-            "cpu_s_a_frame": round((cpu_end - cpu) / frames, 4),
-            "wall_s_a_frame": round((wall_end - wall) / frames, 4),
+            "cpu_s_a_frame": round(spent[0] / frames, 4),
+            "wall_s_a_frame": round(spent[2] / frames, 4),
+            "daemons_of_a_core": round(spent[1] / spent[2], 4),
         }
 
 
-def cpu_seconds() -> float:
-    """Of this process and all its living descendants."""
+def cpu_seconds() -> tuple[float, float]:
+    """Of this process and its Ray workers, and of Ray's daemons."""
     own = psutil.Process()
-    total = 0.0
+    workers = daemons = 0.0
     for process in (own, *own.children(recursive=True)):
         with contextlib.suppress(psutil.Error):
-            times = process.cpu_times()
-            total += times.user + times.system
-    return total
+            times, command = process.cpu_times(), " ".join(process.cmdline())
+            if process == own or command.startswith("ray::"):
+                workers += times.user + times.system
+            else:
+                daemons += times.user + times.system
+    return workers, daemons
 
 
 def overhead(source: Path, frames: int, model: str) -> dict[str, Any]:
+    """Of a Ray worker over this process, on the same frames, and whether results are equal."""
+    refine = RefineRequest.from_fields(model=model, preset="paper", sample=SamplePattern(count=500))
+    found: dict[str, Any] = {"frames": frames}
+    made = []
     with tempfile.TemporaryDirectory() as temporary:
-        found: dict[str, Any] = {"frames": frames}
+        out = Path(temporary) / "out"  # of one name, which is in the records
         for name, cluster in (
             ("one process", ClusterOptions()),
             ("one Ray worker", ClusterOptions(ray=LOCAL, ray_workers=1)),
         ):
             clock = Clock()
             request = BatchRequest(
-                source=source,
-                output=Path(temporary) / name,
-                limit=frames,
-                refine=RefineRequest.from_fields(
-                    model=model, preset="paper", sample=SamplePattern(count=500)
-                ),
-                cluster=cluster,
+                source=source, output=out, limit=frames, refine=refine, cluster=cluster
             )
             run_batch(request, clock)
             found[name] = clock.between()
-        plain, ray = (contents(Path(temporary) / name) for name in list(found)[1:])
-        one, other = (found[name]["cpu_s_a_frame"] for name in list(found)[1:])
-        return found | {"overhead": round(other / one - 1, 3), "equal": plain == ray,
-                        "files": len(plain)}  # fmt: skip
+            made.append(contents(out))
+            shutil.rmtree(out)
+    one, other = (found[name]["cpu_s_a_frame"] for name in list(found)[1:])
+    equal = made[0] == made[1]
+    return found | {"overhead": round(other / one - 1, 3), "equal": equal, "files": len(made[0])}
 
 
 def contents(folder: Path) -> dict[str, bytes]:
@@ -265,7 +265,8 @@ class WaitingJob:
 
         def work(names: Sequence[str], checked: bool) -> Done:
             time.sleep(self.wait_s * len(names))
-            return Done(results=[self.line | {"frame": name} for name in names])
+            lines = (self.line | {"frame": name} for name in names)
+            return Done(results=[DoneFrame.of(line, whole=False) for line in lines])
 
         yield work
 
@@ -304,7 +305,7 @@ def waited(root: Path, workers: int, job: WaitingJob, seconds: float) -> dict[st
             list(pool.results(job, names[:1]))
         start, cpu = time.perf_counter(), time.process_time()
         for part in pool.results(job, names, begin=begin):
-            journal.append(*(line for _, line in part))
+            journal.append(*(done.line for _, done in part))
         wall = time.perf_counter() - start
     return {
         "frames": len(names),

@@ -11,7 +11,6 @@ were chosen on frames 2 and 4 with seed 0; frames 1, 3 and 5 with seeds 1 and up
 from __future__ import annotations
 
 import argparse
-import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -116,16 +115,11 @@ METHODS: dict[str, Predict] = {
 }
 
 
-def errors(
-    predict: Predict, inputs: Inputs, how: str, seed: int
-) -> Iterator[tuple[NDArray[np.float64], float, int]]:
-    """Absolute errors at the held-out points, CPU s and points used: alone, then accumulated."""
+def errors(predict: Predict, inputs: Inputs, how: str, seed: int) -> Iterator[NDArray[np.float64]]:
+    """Absolute errors at the held-out points: with the frame's own points, then accumulated."""
     used, held = split(inputs.points, how, seed)
     for each in (replace(inputs, neighbours=()), inputs):
-        start = time.process_time()
-        count = len(each.frame(used).points)
-        spent = time.process_time() - start
-        yield (predict(each, used, held) - held.depth).abs().double().numpy(), spent, count
+        yield (predict(each, used, held) - held.depth).abs().double().numpy()
 
 
 def interval(ratios: NDArray[np.float64]) -> str:
@@ -164,7 +158,7 @@ def _row(args: argparse.Namespace, frames: list[Inputs], how: str, name: str) ->
         for seed in args.seeds:
             inputs = frames[index]
             wrong = contradicted(inputs, split(inputs.points, how, seed)[1])
-            pair = [each for each, _, _ in errors(METHODS[name], inputs, how, seed)]
+            pair = list(errors(METHODS[name], inputs, how, seed))
             of_frame.append([each[part].mean() for part in (slice(None), wrong) for each in pair])
         means += of_frame
         alone, accumulated = np.mean(of_frame, axis=0)[:2]

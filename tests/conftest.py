@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 import torch
 from hypothesis import settings
+
+if TYPE_CHECKING:
+    from tests.pipeline.frames import FrameOnDisk
 
 settings.register_profile("steady", deadline=None, derandomize=True)
 settings.load_profile("steady")
@@ -24,6 +28,14 @@ def shared_data() -> Path:
     return folder
 
 
+@pytest.fixture
+def frame(tmp_path: Path) -> FrameOnDisk:
+    """A small frame and a small network on disk, in tmp_path."""
+    from tests.pipeline.frames import frame_on_disk
+
+    return frame_on_disk(tmp_path)
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Marks the tests that need the real frames, so that -m "not shared_data" leaves them out."""
     for item in items:
@@ -33,6 +45,6 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 @pytest.fixture
 def seeded() -> torch.Generator:
-    """torch's random numbers start from one place; a generator of its own at that place too."""
+    """A generator with seed 0; torch's own random numbers start from seed 0 too."""
     torch.manual_seed(0)
     return torch.Generator().manual_seed(0)

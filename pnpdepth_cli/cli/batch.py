@@ -21,7 +21,7 @@ from pnpdepth_cli.errors import FramesFailedError, StorageError
 from pnpdepth_cli.pipeline.batch.request import BatchRequest
 from pnpdepth_cli.pipeline.batch.sequence_options import SequenceOptions
 from pnpdepth_cli.pipeline.cluster.options import ClusterOptions
-from pnpdepth_cli.pipeline.refinement.request import sample_pattern
+from pnpdepth_cli.pipeline.refinement.request import parse_sample
 from pnpdepth_cli.pipeline.sparse.bag_options import BagOptions
 
 _STOPPING = b"\nfinishing the current frame; press Ctrl-C again to stop at once\n"
@@ -50,7 +50,7 @@ _STOPPING = b"\nfinishing the current frame; press Ctrl-C again to stop at once\
             *("--layout", "--protocol", "--sample", "--limit", "--shard"),
             *("--image-topic", "--points-topic", "--tolerance"),
         ),
-        "Sequences": ("--accumulate", "--poses"),
+        "Sequences": ("--accumulate", "--poses", "--warm-start"),
         "Input": (*grouped_help.LIDAR, *grouped_help.COLMAP, *grouped_help.FILE_READING),
         "Network": grouped_help.NETWORK,
         "Method": grouped_help.METHOD,
@@ -61,11 +61,7 @@ _STOPPING = b"\nfinishing the current frame; press Ctrl-C again to stop at once\
 )
 @click.argument("source", type=options.FILE, metavar="FOLDER|LIST|BAG")
 @click.option("-o", "--output", type=options.FILE, required=True, help="Output folder.")
-@click.option(
-    "--sample",
-    metavar="[PATTERN:]N|P%",
-    help="Sample the sparse depth from the ground truth, as `pnpdepth sample` does.",
-)
+@options.sample
 @options.options_of_groups(BatchRequest, SequenceOptions, ClusterOptions, BagOptions)
 @click.option("--dry-run", is_flag=True, help="List the frames that would be refined, and exit.")
 @options.scan
@@ -105,8 +101,7 @@ def batch(
     own["cluster"] = ClusterOptions(**options.taken(ClusterOptions, given))
     bag_options = BagOptions(**options.taken(BagOptions, given))
     own["sequence"] = SequenceOptions(**options.taken(SequenceOptions, given))
-    pattern = None if sample is None else sample_pattern(*_sample(sample))
-    refine = options.request_of(given, sample=pattern)
+    refine = options.request_of(given, sample=parse_sample(sample))
     request = BatchRequest(source=source, output=output, refine=refine, **own)
     request = unpacked(
         request,
@@ -181,9 +176,3 @@ def _finishing_on_interrupt() -> Iterator[Callable[[], bool]]:
         yield pressed.is_set
     finally:
         signal.signal(signal.SIGINT, before)
-
-
-def _sample(text: str) -> tuple[str, int | None, float | None]:
-    """Returns (pattern, count, fraction) from `500`, `5%` or `lines:16`."""
-    kind, colon, count = text.rpartition(":")
-    return kind if colon else "uniform", *options.count_or_fraction(count)

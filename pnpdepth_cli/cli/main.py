@@ -52,6 +52,7 @@ _CODES_OF_OPTIONS = {
 COMMANDS = {
     "refine": "refine:refine",
     "batch": "batch:batch",
+    "adapt": "adapt:adapt",
     "models": "models:models",
     "layers": "layers:layers",
     "project": "project:project",

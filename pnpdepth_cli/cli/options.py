@@ -150,6 +150,11 @@ max_pixels = click.option(
     callback=_allow_pixels,
     help="Largest image to read; files may have 4 N bytes.  [default: memory / 64, at most 2^28]",
 )
+sample = click.option(
+    "--sample",
+    metavar="[PATTERN:]N|P%",
+    help="Sample the sparse depth from the ground truth, as `pnpdepth sample` does.",
+)
 output_scale = click.option(
     "--output-scale",
     type=float,

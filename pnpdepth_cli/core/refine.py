@@ -169,6 +169,7 @@ def refine_weights(
     weights: MovingWeights,
     settings: RefineSettings,
     *,
+    carried: MovingWeights | None = None,
     on_iteration: Callable[[int, float], None] = lambda iteration, loss: None,
 ) -> Refinement:
     """Returns the depth of one frame after moving weights, which are back in place afterwards.
@@ -177,6 +178,8 @@ def refine_weights(
         frame: The frame, and how the network predicts it.
         weights: The weights that move, θ_0.
         settings: What is updated and how.
+        carried: θ* of the frame before, which moves instead where its L is lower than that of θ_0
+            at the points set aside.
         on_iteration: Called after each step k with k and L(θ_k).
 
     Raises:
@@ -186,6 +189,8 @@ def refine_weights(
     """
     state = WeightsRefinement(frame, weights, settings)
     state.begin()
+    if carried is not None and state.takes(carried):
+        weights = carried
     for iteration in range(state.iterations):
         given, asked = state.mask()
         with torch.enable_grad(), weights.in_place(requires_grad=True) as theta:

@@ -103,6 +103,10 @@ class Refinement:
     """Number of updates after which `after` was predicted: K, or those of the lowest loss."""
     depths: Mapping[int, Tensor] = field(default_factory=dict)
     """Depth (1, 1, h, w) after each of the chosen numbers of updates, as far as they were made."""
+    z: Tensor | None = None
+    """z_K; None where weights moved."""
+    warm: bool = False
+    """Whether it began where the frame before ended."""
 
 
 class FrameRefinement:
@@ -134,6 +138,7 @@ class FrameRefinement:
         self._after: Tensor | None = None  # depth of z_kept
         self._kept = 0
         self._keep_depths = frozenset(keep_depths)
+        self._z = z0
         self._depths: dict[int, Tensor] = {}
         self.losses: list[float] = []
         self.error: PnpDepthError | None = None
@@ -172,7 +177,8 @@ class FrameRefinement:
             if self._settings.line_search:
                 self._best = z, direction
         alpha = self._step * SCHEDULES[self._settings.schedule](updates / self._settings.iterations)
-        return z - alpha * 0.5**self._halvings * direction
+        self._z = z - alpha * 0.5**self._halvings * direction
+        return self._z
 
     def result(self) -> Refinement:
         """Returns the refinement as far as it has come."""
@@ -185,6 +191,7 @@ class FrameRefinement:
             step=self._step,
             kept=self._kept,
             depths=dict(self._depths),
+            z=self._z.detach(),
         )
 
     def _record(self, loss: Tensor, depth: Tensor) -> None:

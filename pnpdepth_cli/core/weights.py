@@ -73,6 +73,10 @@ class MovingWeights:
         """Returns for every element of θ the parameter of the network that it belongs to."""
         return [one.parameter for one in self._stand_ins for _ in one.leaves]
 
+    def values(self) -> dict[nn.Parameter, Tensor]:
+        """Returns W(θ) of every parameter that moves."""
+        return {one.parameter: one.value(self.theta) for one in self._stand_ins}
+
     @contextmanager
     def in_place(self, *, requires_grad: bool = False) -> Iterator[list[Tensor]]:
         """Inside, the network computes with W(θ). Gives θ, as leaves if gradients are wanted."""

@@ -75,6 +75,7 @@ class WeightsRefinement:
         self._checked: dict[int, list[Tensor]] = {0: list(weights.theta)}
         self._started = time.monotonic()
         self._before = torch.empty(0)
+        self._warm = False
         self.losses: list[float] = []
         self.error: DivergedError | None = None
 
@@ -91,6 +92,22 @@ class WeightsRefinement:
         if not bool(at_points.isfinite().all()):
             raise bad_prediction(at_points)
         self._check(0)
+
+    def takes(self, carried: MovingWeights) -> bool:
+        """Begins with the weights of another frame, if L at the points set aside is lower there.
+
+        Without points set aside, L is taken at all inliers.
+        """
+        at = self._aside if len(self._aside) else self._frame.inliers
+        cold = float(self._loss(at.sample(self._predicted(self._shown)), at.depth))
+        plain, self._weights = self._weights, carried
+        warm = float(self._loss(at.sample(self._predicted(self._shown)), at.depth))
+        self._warm = warm < cold
+        if not self._warm:
+            self._weights = plain
+            return False
+        self._check(0)
+        return True
 
     def mask(self) -> tuple[SparsePoints, SparsePoints]:
         """Returns the points that the network is given, and those that L is taken at."""
@@ -135,10 +152,11 @@ class WeightsRefinement:
         self._weights.theta = self._checked[kept]
         return Refinement(
             before=self._before,
-            after=self._predicted(self._frame.points) if kept else self._before,
+            after=self._predicted(self._frame.points) if kept or self._warm else self._before,
             losses=tuple(self.losses),
             step=self._steps[0] if self._steps else 0.0,
             kept=kept,
+            warm=self._warm,
         )
 
     def _check(self, made: int) -> None:

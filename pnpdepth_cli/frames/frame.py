@@ -12,6 +12,7 @@ from torch import Tensor
 
 from pnpdepth_cli.completion.alignment import Alignment
 from pnpdepth_cli.core.refine import Refinement
+from pnpdepth_cli.core.weights import MovingWeights
 from pnpdepth_cli.errors import DivergedError
 from pnpdepth_cli.points import SparsePoints
 
@@ -38,6 +39,18 @@ class Frame:
     def with_points(self, points: SparsePoints) -> Frame:
         """Returns the same image with other sparse depth."""
         return replace(self, points=points)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Carried:
+    """What a frame of a window may take over from the frame before; the first has nothing."""
+
+    change: Tensor | None = None
+    """z_K − z_0 of the frame before."""
+    alignment: Alignment | None = None
+    """Its alignment of the network's output with the points."""
+    weights: MovingWeights | None = None
+    """Its weights, where weights move instead of z."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,6 +84,10 @@ class RefinedFrame:
     result (after) at points that were held out in turns, for a record."""
     baselines: dict[str, dict[str, Any]] | None = None
     """Scores of the baselines, for a record."""
+    in_window: bool = False
+    """Whether it was refined as a frame of a window, which may begin where the one before ended."""
+    carried: Carried | None = None
+    """What the next frame of the window may begin with; dropped once that has begun."""
 
 
 def no_points(points: SparsePoints) -> SparsePoints:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -121,7 +122,7 @@ def refine_frame_weights(
     """
     weights = MovingWeights(frame.network.module, settings.parameters, settings.mask.seed)
     try:
-        with _opened(split, frame, reader, settings.mask.scale) as seen:
+        with opened_frame(split, frame, reader, settings.mask.scale) as seen:
             return refine_weights(
                 seen,
                 weights,
@@ -133,10 +134,10 @@ def refine_frame_weights(
 
 
 @contextmanager
-def _opened(
+def opened_frame(
     split: Split, frame: PreparedFrame, reader: AlignedDepth, scale: float
 ) -> Iterator[FrameOfPoints]:
-    """The frame as the network predicts it from any of its points, after one plain pass.
+    """Yields the frame as the network predicts it from any of its points, after one plain pass.
 
     A split at a layer stays at z_0. One at the points predicts the steps from a reduced image.
     """
@@ -215,7 +216,7 @@ def to_refined_frame(
         after=with_propagation(prepared.frame, prepared.to_image(result.after), propagation),
         used=used,
         held_out=no_points(used),
-        refinement=result,
+        refinement=replace(result, z=None),  # which would stay in memory until it is written
         diverged=diverged,
         alignment=reader.alignment,
         notes=reader.notes,

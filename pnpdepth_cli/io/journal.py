@@ -12,6 +12,7 @@ import os
 import threading
 import zlib
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,26 @@ from pnpdepth_cli.io.record import plain
 
 _CHECKSUM = b'{"crc32": "%08x", '
 _CHECKSUM_BYTES = len(_CHECKSUM % 0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class EncodedLine:
+    """A line as it is in the file, which another process may make."""
+
+    key: str | None
+    """What identifies it."""
+    data: bytes
+    """With its checksum and its end."""
+
+    @classmethod
+    def of(cls, content: Mapping[str, Any], key: str) -> EncodedLine:
+        """Returns the line of this content, identified by its field `key`."""
+        rest = json.dumps(plain(content), allow_nan=False).encode("ascii")[1:]
+        name = content.get(key)
+        return cls(
+            key=name if isinstance(name, str) else None,
+            data=_CHECKSUM % zlib.crc32(rest) + rest + b"\n",
+        )
 
 
 class Journal:
@@ -59,22 +80,25 @@ class Journal:
         except OSError as error:
             raise _cannot_read(self.path, error) from error
 
-    def append(self, *lines: Mapping[str, Any]) -> None:
+    def append(self, *lines: Mapping[str, Any] | EncodedLine) -> None:
         """Appends lines, all in one write.
 
         Raises:
             StorageError: The disk is full or gone; at most an incomplete line was written.
         """
-        texts = [_line(line) for line in lines]
+        encoded = [
+            line if isinstance(line, EncodedLine) else EncodedLine.of(line, self._key)
+            for line in lines
+        ]
         with self._writing:
             try:
-                self._write(b"".join(texts))
+                self._write(b"".join(line.data for line in encoded))
             except OSError as error:
                 raise cannot_write(self.path, error) from error
-            for line, data in zip(lines, texts, strict=True):
-                if isinstance(line.get(self._key), str):
-                    self._offsets[line[self._key]] = self._end
-                self._end += len(data)
+            for line in encoded:
+                if line.key is not None:
+                    self._offsets[line.key] = self._end
+                self._end += len(line.data)
 
     def _write(self, data: bytes) -> None:
         flags = os.O_RDWR | os.O_CREAT | getattr(os, "O_BINARY", 0)
@@ -116,11 +140,6 @@ class Journal:
         else:
             key = json.loads("{" + text).get(self._key)
         return key if isinstance(key, str) else None
-
-
-def _line(content: Mapping[str, Any]) -> bytes:
-    rest = json.dumps(plain(content), allow_nan=False).encode("ascii")[1:]
-    return _CHECKSUM % zlib.crc32(rest) + rest + b"\n"
 
 
 def _object(data: bytes) -> dict[str, Any] | None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -29,16 +28,11 @@ from pnpdepth_cli.frames.frame import Frame
 from pnpdepth_cli.models.network import Network, load_network
 from pnpdepth_cli.pipeline.refinement import held_out
 from pnpdepth_cli.points import SparsePoints
-from tests.pipeline.frames import FrameOnDisk, frame_on_disk
+from tests.pipeline.frames import FrameOnDisk
 
 SETTINGS = RefineSettings(iterations=3, lr="5%", update="adam")
 CONFIG = RefinementConfig(layer="middle", settings=SETTINGS)
 ONE = Competition(configs=(CONFIG,), propagations=("gp", "diffusion"))
-
-
-@pytest.fixture
-def frame(tmp_path: Path) -> FrameOnDisk:
-    return frame_on_disk(tmp_path)
 
 
 @pytest.fixture
@@ -88,7 +82,7 @@ def test_what_is_chosen_is_no_worse_at_held_out_points_than_network_and_baseline
     assert result.choice.held_out == len(inputs.points)
 
 
-def test_held_out_points_do_not_tell_the_depth_that_they_score(
+def test_held_out_points_have_no_influence_on_the_depth_they_score(
     frame: FrameOnDisk, network: Network
 ) -> None:
     inputs = in_memory(frame)
@@ -97,10 +91,10 @@ def test_held_out_points_do_not_tell_the_depth_that_they_score(
     with OpenNetworks({"network": network}) as opened:
         fold = refine_automatically(opened, competition, inputs).folds[0]
         before = fold.at(candidate)
-        wrong = inputs.points.depth.clone()
+        changed = inputs.points.depth.clone()
         held = (inputs.points.xy[:, None] == fold.held_out.xy[None]).all(dim=2).any(dim=1)
-        wrong[held] *= 3
-        other = replace(inputs, points=replace(inputs.points, depth=wrong))
+        changed[held] *= 3
+        other = replace(inputs, points=replace(inputs.points, depth=changed))
         again = refine_automatically(opened, competition, other).folds[0]
         assert torch.equal(again.held_out.xy, fold.held_out.xy)
         assert torch.equal(again.at(candidate), before)
@@ -115,19 +109,19 @@ def test_held_out_points_without_any_inlier_weight_count_alike(
     assert np.isfinite(result.choice.error)
 
 
-def test_wrong_points_are_left_out_and_said_and_the_depth_is_hardly_worse(
+def test_outliers_are_left_out_and_reported_and_the_error_hardly_grows(
     frame: FrameOnDisk, network: Network
 ) -> None:
     inputs = in_memory(frame)
     bad = torch.arange(len(inputs.points)) % 5 == 0
     depth = torch.where(bad, 2.5 * inputs.points.depth, inputs.points.depth)
     spoiled = replace(inputs, points=replace(inputs.points, depth=depth))
-    clean, found = (chosen(network, one) for one in (inputs, spoiled))
-    assert found.notes[0].endswith("points left out, inconsistent with the others")
+    clean, with_outliers = (chosen(network, one) for one in (inputs, spoiled))
+    assert with_outliers.notes[0].endswith("points left out, inconsistent with the others")
     assert not any("left out" in note for note in clean.notes)
-    left = {tuple(xy) for xy in found.frame.used.xy.tolist()}
+    left = {tuple(xy) for xy in with_outliers.frame.used.xy.tolist()}
     assert not left & {tuple(xy) for xy in inputs.points.xy[bad].tolist()}
-    mae = [float(np.abs(one.frame.after - frame.depth).mean()) for one in (clean, found)]
+    mae = [float(np.abs(one.frame.after - frame.depth).mean()) for one in (clean, with_outliers)]
     assert mae[1] < 1.15 * mae[0]
 
 
@@ -175,12 +169,12 @@ def test_few_points_are_enough(frame: FrameOnDisk, network: Network, count: int)
     assert (result.frame.after > 0).all()
 
 
-@pytest.mark.parametrize("places", [1, 2, 3])
-def test_points_at_very_few_places_are_enough(
-    frame: FrameOnDisk, network: Network, places: int
+@pytest.mark.parametrize("positions", [1, 2, 3])
+def test_points_at_very_few_positions_are_enough(
+    frame: FrameOnDisk, network: Network, positions: int
 ) -> None:
     inputs = in_memory(frame, 12)
-    close = inputs.points.xy[torch.arange(12) % places] + 0.01 * torch.arange(12)[:, None]
+    close = inputs.points.xy[torch.arange(12) % positions] + 0.01 * torch.arange(12)[:, None]
     result = chosen(network, replace(inputs, points=replace(inputs.points, xy=close)))
     assert np.isfinite(result.frame.after).all()
     assert (result.frame.after > 0).all()
@@ -204,14 +198,16 @@ def test_further_refinements_are_tried_only_while_there_is_time(
     assert tried(time.monotonic() + 1e9) == {first, *more}
 
 
-def test_all_sets_of_points_share_what_lies_in_front_of_the_cut(
+def test_the_front_runs_once_for_all_sets_of_points(
     frame: FrameOnDisk, network: Network, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     inputs = in_memory(frame)
     sets = [inputs.points, inputs.points.select(torch.arange(60) < 40)]
     fronts: list[object] = []
     front = Split.front
-    monkeypatch.setattr(Split, "front", lambda *given: fronts.append(given) or front(*given))
+    monkeypatch.setattr(
+        Split, "front", lambda *arguments: fronts.append(arguments) or front(*arguments)
+    )
     with OpenNetworks({"network": network}) as opened:
         passes = FramePasses(opened, inputs)
         together = [passes.trajectory(CONFIG, points) for points in sets]
@@ -251,7 +247,7 @@ def test_a_fusion_is_the_geometric_mean_of_its_members(
     assert torch.allclose(fused, one.pow(0.25) * other.pow(0.75))
 
 
-def test_outside_the_hull_of_the_points_a_baseline_gives_way_to_the_default(
+def test_outside_the_hull_of_the_points_the_default_replaces_a_baseline(
     frame: FrameOnDisk, network: Network
 ) -> None:
     inputs = in_memory(frame)

@@ -15,7 +15,7 @@ def test_a_candidate_without_error_is_taken_alone() -> None:
     assert (blend.members, blend.weights, blend.error) == ((1,), (1.0,), 0.0)
 
 
-def test_two_that_are_wrong_in_opposite_ways_are_mixed() -> None:
+def test_two_with_errors_of_opposite_sign_are_mixed() -> None:
     depth = torch.tensor([1.0, 2.0, 3.0, 4.0])
     blend = best_blend(torch.stack([depth + 0.1, depth - 0.3]), depth, torch.ones(4), default=0)
     assert blend.members == (0, 1)
@@ -24,7 +24,7 @@ def test_two_that_are_wrong_in_opposite_ways_are_mixed() -> None:
     assert blend.error < 1e-6
 
 
-def test_two_that_are_wrong_by_opposite_factors_are_mixed_geometrically() -> None:
+def test_two_with_opposite_factors_are_mixed_geometrically() -> None:
     depth = torch.tensor([1.0, 2.0, 3.0, 4.0])
     blend = best_blend(torch.stack([depth * 2, depth / 2]), depth, torch.ones(4), default=0)
     assert blend.geometric

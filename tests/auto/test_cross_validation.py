@@ -61,6 +61,6 @@ def test_neighbouring_scan_lines_are_in_different_folds() -> None:
     assert len(fold[:, 0].unique()) == 4
 
 
-def test_points_at_one_place_are_shared_out_too() -> None:
+def test_points_at_one_position_are_divided_into_folds_too() -> None:
     fold = spatial_folds(points_at(torch.zeros(12, 2), (20, 20)), 3)
     assert torch.equal(torch.bincount(fold), torch.tensor([4, 4, 4]))

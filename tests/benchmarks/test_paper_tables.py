@@ -24,15 +24,15 @@ LENS = np.array([721.3, 721.3, 455.5, 36.4], np.float32)
 
 @pytest.mark.parametrize("row", ROWS, ids=lambda row: f"{row.name}-{row.street}")
 def test_the_papers_figures_give_the_gains_printed_beside_them(row: PaperRow) -> None:
-    for place, printed in enumerate(row.gains):
-        gain = 100 * (1 - row.after[place] / row.before[place])
+    for measure, printed in enumerate(row.gains):
+        gain = 100 * (1 - row.after[measure] / row.before[measure])
         assert gain == pytest.approx(printed, abs=0.12)  # four decimals are printed of the errors
 
 
 def test_every_tiny_network_has_its_rows() -> None:
     tiny = [name for name in names() if "-tiny" in name]
-    found = [(row.street, row.name, networks_of(row, tiny)) for row in ROWS]
-    assert found == [
+    rows = [(row.street, row.name, networks_of(row, tiny)) for row in ROWS]
+    assert rows == [
         (False, "Eigen", ["eigen-tiny"]),
         (False, "FCRN", ["fcrn-tiny"]),
         (False, "Uhrig", ["sparseconv-tiny"]),
@@ -47,10 +47,10 @@ def test_every_tiny_network_has_its_rows() -> None:
 
 
 def test_all_depths_are_scored_on_the_same_pixels() -> None:
-    truth = np.array([[2.0, 2.0, 2.0, 0.0]], np.float32)
+    gt = np.array([[2.0, 2.0, 2.0, 0.0]], np.float32)
     before = np.array([[2.0, 2.2, 9.0, 9.0]], np.float32)
     after = np.array([[2.0, 2.0, -1.0, 9.0]], np.float32)
-    scores, coverage = scores_of({"before": before, "after": after}, truth)
+    scores, coverage = scores_of({"before": before, "after": after}, gt)
     assert scores["before"]["mae"] == pytest.approx(0.1)
     assert scores["before"]["delta1"] == 100
     assert scores["before"]["fine1"] == 50
@@ -59,7 +59,7 @@ def test_all_depths_are_scored_on_the_same_pixels() -> None:
 
 
 @pytest.mark.parametrize(
-    ("std_z", "losses", "said"),
+    ("std_z", "losses", "cause"),
     [
         (10.0, (0.5, 0.4), "too short"),
         (0.05, (0.5, 0.6), "too long"),
@@ -68,10 +68,10 @@ def test_all_depths_are_scored_on_the_same_pixels() -> None:
     ],
 )
 def test_the_reason_follows_from_the_step_and_the_loss(
-    std_z: float, losses: tuple[float, float], said: str
+    std_z: float, losses: tuple[float, float], cause: str
 ) -> None:
     setting = {"loss_before": losses[0], "loss_after": losses[1]}
-    assert said in reason({"std_z": std_z, "settings": {"paper": setting}}, "paper")
+    assert cause in reason({"std_z": std_z, "settings": {"paper": setting}}, "paper")
 
 
 def test_the_scan_of_a_wall_lies_on_it_in_lines() -> None:
@@ -106,7 +106,7 @@ def test_the_same_number_of_points_of_a_frame_is_the_same_points(tmp_path: Path)
     assert not torch.equal(first.xy, other.xy)
 
 
-def test_in_kitti_odometry_the_scan_is_the_truth(tmp_path: Path) -> None:
+def test_in_kitti_odometry_the_scan_is_the_ground_truth(tmp_path: Path) -> None:
     frame = next(data_set(f"kitti={odometry(tmp_path)}", None).frames())
     assert frame.rgb.shape == (228, 912, 3)
     assert frame.scan is None
@@ -119,9 +119,9 @@ def test_frames_that_networks_are_trained_on_are_left_out(tmp_path: Path) -> Non
     for folder in ("train/basement", "val/official"):
         (tmp_path / "ma" / folder).mkdir(parents=True)
         shutil.copy(one, tmp_path / "ma" / folder)
-    found = data_set(f"nyu={tmp_path / 'ma'}", None)
-    assert found.count == 1
-    assert found.notes == ("ma: 1 of 1 frames of val or test; 1 of train left out",)
+    data = data_set(f"nyu={tmp_path / 'ma'}", None)
+    assert data.count == 1
+    assert data.notes == ("ma: 1 of 1 frames of val or test; 1 of train left out",)
     only = data_set(f"nyu={tmp_path / 'ma' / 'train'}", None)
     assert only.count == 1
     assert "all of train: networks may have been trained on them" in only.notes[0]
@@ -131,13 +131,13 @@ def test_odometry_is_tested_on_the_sequences_without_public_poses(tmp_path: Path
     root = odometry(tmp_path)
     source = next(path.parent for path in root.rglob("calib.txt"))
     shutil.copytree(source, source.parent / "17")
-    found = data_set(f"kitti={root}", None)
-    assert found.count == 1
-    assert "1 of sequences 00 to 10 left out" in found.notes[0]
+    data = data_set(f"kitti={root}", None)
+    assert data.count == 1
+    assert "1 of sequences 00 to 10 left out" in data.notes[0]
 
 
 @pytest.mark.parametrize("modality", ["-rgb", "-d", "-rgb-kitti", "-d-kitti"])
-def test_editions_that_see_only_picture_or_depth_stand_in_no_row(modality: str) -> None:
+def test_editions_with_only_image_or_depth_as_input_have_no_row(modality: str) -> None:
     assert not any(row.takes(f"sparse2dense-r18-deconv2{modality}") for row in ROWS)
 
 
@@ -204,16 +204,16 @@ def nyu(folder: Path) -> Path:
 
 def completion(folder: Path) -> Path:
     """A frame of KITTI's depth completion selection."""
-    truth = np.full((100, 400), 15 * 256, np.uint16)
-    scan = np.zeros_like(truth)
+    depth = np.full((100, 400), 15 * 256, np.uint16)
+    scan = np.zeros_like(depth)
     scan[20:, :][::2, ::2] = 15 * 256
-    for name, picture in (
+    for name, values in (
         ("image", np.zeros((100, 400, 3), np.uint8)),
         ("velodyne_raw", scan),
-        ("groundtruth_depth", truth),
+        ("groundtruth_depth", depth),
     ):
         (folder / "completion" / name).mkdir(parents=True)
-        Image.fromarray(picture).save(folder / "completion" / name / "0000000005.png")
+        Image.fromarray(values).save(folder / "completion" / name / "0000000005.png")
     return folder / "completion"
 
 

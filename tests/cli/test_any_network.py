@@ -11,10 +11,8 @@ import torch
 from safetensors.torch import load_file
 from torch import nn
 
-from tests.cli.test_commands import code_of, frame, refine
+from tests.cli.test_commands import code_of, refine
 from tests.pipeline.frames import FrameOnDisk
-
-__all__ = ["frame"]
 
 
 def test_an_unaligned_network_is_aligned_and_recorded(

@@ -1,18 +1,12 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 
 import pytest
 
 from pnpdepth_cli.pipeline.bench import table as bench_table
 from tests.cli.test_commands import code_of
-from tests.pipeline.frames import FrameOnDisk, frame_on_disk
-
-
-@pytest.fixture
-def frame(tmp_path: Path) -> FrameOnDisk:
-    return frame_on_disk(tmp_path)
+from tests.pipeline.frames import FrameOnDisk
 
 
 def bench(frame: FrameOnDisk, *more: str) -> list[str]:

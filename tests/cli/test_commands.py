@@ -12,12 +12,7 @@ from pnpdepth_cli.cli.main import main
 from pnpdepth_cli.cli.options import request_of
 from pnpdepth_cli.cli.refine import refine as refine_command
 from pnpdepth_cli.cli.tables import print_refinement
-from tests.pipeline.frames import FrameOnDisk, frame_on_disk
-
-
-@pytest.fixture
-def frame(tmp_path: Path) -> FrameOnDisk:
-    return frame_on_disk(tmp_path)
+from tests.pipeline.frames import FrameOnDisk
 
 
 def code_of(arguments: list[str]) -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import json
 import os
 import shutil
 import signal
@@ -11,10 +12,13 @@ import sys
 from collections.abc import Mapping
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from pnpdepth_cli.cli import main as main_module
 from pnpdepth_cli.cli.main import _exit_code, run
+from pnpdepth_cli.io.depth import write_depth
+from pnpdepth_cli.io.formats import exr
 
 SAMPLES = Path(__file__).parents[2] / "samples"
 GT = SAMPLES / "indoor" / "gt.png"
@@ -61,6 +65,23 @@ def test_data_for_a_closed_stdout_is_one_line_and_code_2(tmp_path: Path) -> None
 def test_a_reader_that_stops_early_is_no_error(line: str, tmp_path: Path) -> None:
     done = shell(line, tmp_path)
     assert (done.returncode, done.stderr) == (0, "")
+
+
+@POSIX
+def test_what_openexr_prints_to_stdout_does_not_get_between_the_data(tmp_path: Path) -> None:
+    for folder in ("pred", "gt"):
+        (tmp_path / folder).mkdir()
+        for name in "ab":
+            write_depth(tmp_path / folder / f"{name}.exr", np.full((40, 30), 2.0, np.float32))
+    damaged = tmp_path / "pred" / "b.exr"
+    data = bytearray(damaged.read_bytes())
+    second = exr._chunk_table(bytes(data), 2)[0][1]
+    data[second : second + 4] = b"\xff\xff\xff\x7f"  # the number of its first row
+    damaged.write_bytes(data)
+    done = shell("pnpdepth eval pred gt --json", tmp_path)
+    assert done.returncode == 7, done.stderr
+    assert json.loads(done.stdout)["counts"]["scored"] == 1
+    assert "Warning: Exception raised" not in done.stderr  # OpenEXR's own
 
 
 @POSIX

@@ -7,19 +7,12 @@ from pathlib import Path
 import pytest
 
 from tests.cli.test_score_commands import code_of
-from tests.pipeline.batches import pairs_on_disk
 from tests.pipeline.report_pages import frames_of
 
 BATCH = (
     *("batch", "drive", "-o", "out", "--model", "drive/net/my_net.py"),
     *("--checkpoint", "drive/net/my_net.safetensors"),
 )
-
-
-@pytest.fixture
-def root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.chdir(tmp_path)
-    return pairs_on_disk(tmp_path / "drive", ("a", "b"))
 
 
 def test_a_batch_and_its_evaluation_each_have_a_report(

@@ -12,13 +12,6 @@ from pnpdepth_cli.cli import options
 from pnpdepth_cli.cli.sweep import sweep
 from pnpdepth_cli.pipeline.sweep.axes import PARAMETERS
 from tests.cli.test_commands import code_of
-from tests.pipeline.batches import pairs_on_disk
-
-
-@pytest.fixture
-def root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.chdir(tmp_path)
-    return pairs_on_disk(tmp_path / "drive", ("a", "b"))
 
 
 def arguments(*more: str, source: str = "drive") -> list[str]:

@@ -1,4 +1,4 @@
-"""Refinement the slow and obvious way: a hook replaces the output, the whole network runs."""
+"""Reference refinement: a hook replaces the output of the layer, and the whole network runs."""
 
 from __future__ import annotations
 

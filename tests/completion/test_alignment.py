@@ -24,12 +24,14 @@ def scene(count: int, seed: int = 0) -> Tensor:
     return 1 + 9 * torch.rand(count, generator=torch.Generator().manual_seed(seed))
 
 
-def spoiled(depth: Tensor, share: float = 0.2) -> Tensor:
+def spoiled(depth: Tensor, fraction: float = 0.2) -> Tensor:
     """The first points replaced by depths far off, on both sides."""
-    wrong = depth.clone()
-    count = round(share * len(depth))
-    wrong[:count] = wrong[:count] * torch.tensor([0.2, 3.0, 6.0]).repeat(count)[:count]
-    return wrong
+    spoiled_depth = depth.clone()
+    count = round(fraction * len(depth))
+    spoiled_depth[:count] = (
+        spoiled_depth[:count] * torch.tensor([0.2, 3.0, 6.0]).repeat(count)[:count]
+    )
+    return spoiled_depth
 
 
 def output_for(depth: Tensor, space: str, scale: float, shift: float) -> Tensor:
@@ -41,9 +43,9 @@ def output_for(depth: Tensor, space: str, scale: float, shift: float) -> Tensor:
 def test_an_affine_output_is_read_exactly_in_every_space(space: str) -> None:
     d = scene(50)
     x = output_for(d, space, 0.3, 0.05)
-    made = align(x, points_of(d), (space,), "affine")
-    assert (made.scale, made.shift) == pytest.approx((0.3, 0.05), rel=1e-4)
-    assert torch.allclose(made.depth(x), d, rtol=1e-4)
+    alignment = align(x, points_of(d), (space,), "affine")
+    assert (alignment.scale, alignment.shift) == pytest.approx((0.3, 0.05), rel=1e-4)
+    assert torch.allclose(alignment.depth(x), d, rtol=1e-4)
 
 
 @pytest.mark.parametrize("kind", ["median", "scale"])
@@ -51,8 +53,8 @@ def test_an_affine_output_is_read_exactly_in_every_space(space: str) -> None:
 def test_a_factor_of_depth_is_undone_in_every_space(space: str, kind: str) -> None:
     d = scene(40)
     x = {"depth": d / 7, "inverse": 7 / d, "log": (d / 7).log()}[space]
-    made = align(x, points_of(d), (space,), kind)
-    assert torch.allclose(made.depth(x), d, rtol=1e-5)
+    alignment = align(x, points_of(d), (space,), kind)
+    assert torch.allclose(alignment.depth(x), d, rtol=1e-5)
 
 
 @pytest.mark.parametrize("space", SPACES)
@@ -72,16 +74,16 @@ def test_20_percent_gross_outliers_move_the_fit_by_less_than_2_percent(
 
 @pytest.mark.parametrize("sign", [1, -1])
 @pytest.mark.parametrize("seed", range(5))
-def test_auto_recovers_a_disparity_network_from_30_points_of_which_a_fifth_is_wrong(
+def test_auto_aligns_a_disparity_network_from_30_points_with_20_percent_outliers(
     sign: int, seed: int
 ) -> None:
     d = scene(4000, seed)
     x = sign * (37.5 / d + 4.0)
-    made = align(x[:30], points_of(spoiled(d[:30])), ("depth", "inverse"), "auto")
-    assert (made.space, made.kind) == ("inverse", "affine")
-    assert made.falling == (sign > 0)
-    assert float((made.depth(x) / d - 1).abs().max()) < 0.005
-    assert made.outliers == pytest.approx(0.2, abs=0.04)
+    alignment = align(x[:30], points_of(spoiled(d[:30])), ("depth", "inverse"), "auto")
+    assert (alignment.space, alignment.kind) == ("inverse", "affine")
+    assert alignment.falling == (sign > 0)
+    assert float((alignment.depth(x) / d - 1).abs().max()) < 0.005
+    assert alignment.outliers == pytest.approx(0.2, abs=0.04)
 
 
 @pytest.mark.parametrize(
@@ -103,24 +105,24 @@ def test_auto_takes_the_simplest_reading_that_explains_the_points(
     d = scene(100, seed)
     noise = torch.randn(100, generator=torch.Generator().manual_seed(seed + 50))
     noisy = output(d * (1 + 0.02 * noise))
-    made = align(noisy, points_of(d), ("depth", "inverse"), "auto")
-    assert (made.space, made.kind) == wanted
+    alignment = align(noisy, points_of(d), ("depth", "inverse"), "auto")
+    assert (alignment.space, alignment.kind) == wanted
 
 
 def test_depth_at_or_behind_infinity_reads_as_ten_times_the_farthest_point() -> None:
     d = scene(50)
     x = 1 / d
-    made = align(x, points_of(d), ("inverse",), "affine")
+    alignment = align(x, points_of(d), ("inverse",), "affine")
     sky = torch.tensor([-5.0, 0.0])
-    assert torch.allclose(made.depth(sky), torch.full((2,), 10 * float(d.max())), rtol=1e-5)
-    assert made.beyond(torch.cat([sky, x[:8]])) == pytest.approx(0.2)
+    assert torch.allclose(alignment.depth(sky), torch.full((2,), 10 * float(d.max())), rtol=1e-5)
+    assert alignment.beyond(torch.cat([sky, x[:8]])) == pytest.approx(0.2)
 
 
 def test_a_value_held_at_a_bound_still_has_a_gradient() -> None:
     d = scene(50)
-    made = align(d, points_of(d), ("depth",), "scale")
+    alignment = align(d, points_of(d), ("depth",), "scale")
     below = torch.tensor([-3.0], requires_grad=True)
-    held = made.depth(below)
+    held = alignment.depth(below)
     assert float(held.detach()) == pytest.approx(float(d.min()) / 10)
     held.sum().backward()
     assert below.grad is not None
@@ -146,7 +148,7 @@ def test_the_same_points_give_the_same_alignment_and_depths_are_finite_and_posit
     assert bool(depth.isfinite().all())
 
 
-def test_what_cannot_be_aligned_is_said() -> None:
+def test_what_cannot_be_aligned_is_refused() -> None:
     d = scene(20)
     with pytest.raises(ModelError, match="same at all 20"):
         align(torch.ones(20), points_of(d), ("depth",), "affine")

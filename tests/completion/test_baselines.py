@@ -6,35 +6,29 @@ from torch import Tensor
 
 from pnpdepth_cli.choices import BASELINES
 from pnpdepth_cli.errors import UsageError
-from pnpdepth_cli.points import SparsePoints
+from tests.completion.scenes import random_points
 
 SIZE = (30, 40)
 
 
-def truth() -> Tensor:
+def ground_truth() -> Tensor:
     y, x = torch.meshgrid(*(torch.arange(float(n)) for n in SIZE), indexing="ij")
     return 1 + 0.05 * x + 0.1 * y + ((x - 20).square() + (y - 15).square() < 50) * 2.0
 
 
-def seen(depth: Tensor, count: int = 80) -> SparsePoints:
-    chosen = torch.randperm(depth.numel(), generator=torch.Generator().manual_seed(0))[:count]
-    xy = torch.stack([chosen % SIZE[1], chosen // SIZE[1]], dim=1).float()
-    return SparsePoints(xy=xy, depth=depth.flatten()[chosen], size=SIZE)
-
-
 def test_the_table_names_every_simple_baseline() -> None:
-    points_alone = [name for name, made in BASELINES.items() if not made.needs_prediction]
+    points_alone = [name for name, baseline in BASELINES.items() if not baseline.needs_prediction]
     assert points_alone == ["nearest", "linear", "linear-log", "idw", "morphological"]
-    with_prediction = [name for name, made in BASELINES.items() if made.needs_prediction]
+    with_prediction = [name for name, baseline in BASELINES.items() if baseline.needs_prediction]
     assert with_prediction == [
         "median", "scale", "affine", "scale-disparity", "affine-disparity", "local",
     ]  # fmt: skip
 
 
 @pytest.mark.parametrize("name", BASELINES)
-def test_a_baseline_gives_depth_near_the_truth_and_leaves_its_arguments_alone(name: str) -> None:
-    depth = truth()
-    points, prediction = seen(depth), depth / 3
+def test_a_baseline_is_near_the_ground_truth_and_does_not_change_its_arguments(name: str) -> None:
+    depth = ground_truth()
+    points, prediction = random_points(depth, 80), depth / 3
     kept = (points.xy.clone(), points.depth.clone(), prediction.clone())
     dense = BASELINES[name].depth(points, prediction)
     assert dense.shape == SIZE
@@ -45,16 +39,18 @@ def test_a_baseline_gives_depth_near_the_truth_and_leaves_its_arguments_alone(na
     )
 
 
-@pytest.mark.parametrize("name", [n for n, made in BASELINES.items() if made.needs_prediction])
+@pytest.mark.parametrize(
+    "name", [n for n, baseline in BASELINES.items() if baseline.needs_prediction]
+)
 def test_what_aligns_a_prediction_leaves_unknown_what_is_unknown_and_needs_one(name: str) -> None:
-    depth = truth()
+    depth = ground_truth()
     prediction = depth / 3
     prediction[:10] = 0
-    dense = BASELINES[name].depth(seen(depth), prediction)
+    dense = BASELINES[name].depth(random_points(depth, 80), prediction)
     assert bool((dense[:10] == 0).all())
     assert bool((dense[10:] > 0).all())
     with pytest.raises(UsageError, match="needs a network's prediction"):
-        BASELINES[name].depth(seen(depth))
+        BASELINES[name].depth(random_points(depth, 80))
 
 
 @pytest.mark.parametrize(
@@ -68,18 +64,18 @@ def test_what_aligns_a_prediction_leaves_unknown_what_is_unknown_and_needs_one(n
         ("local", lambda d: (d + 2) / 7),
     ],
 )
-def test_each_alignment_restores_the_prediction_it_is_made_for(name, prediction) -> None:  # type: ignore[no-untyped-def]
-    depth = truth()
-    dense = BASELINES[name].depth(seen(depth), prediction(depth))
+def test_each_alignment_restores_the_prediction_it_models(name, prediction) -> None:  # type: ignore[no-untyped-def]
+    depth = ground_truth()
+    dense = BASELINES[name].depth(random_points(depth, 80), prediction(depth))
     assert torch.allclose(dense, depth, rtol=1e-3)
 
 
 @pytest.mark.parametrize("name", BASELINES)
-def test_depth_at_places_is_the_dense_depth_there(name: str) -> None:
-    points, prediction = seen(truth()), truth() / 3
+def test_depth_at_positions_equals_the_dense_depth(name: str) -> None:
+    points, prediction = random_points(ground_truth(), 80), ground_truth() / 3
     prediction[:4, :4] = 0
     rows, columns = torch.meshgrid(torch.arange(0, 30, 3), torch.arange(0, 40, 3), indexing="ij")
-    places = torch.stack([columns.flatten(), rows.flatten()], dim=1).float()
+    positions = torch.stack([columns.flatten(), rows.flatten()], dim=1).float()
     dense = BASELINES[name].depth(points, prediction)
-    there = BASELINES[name].at(places, points, prediction)
+    there = BASELINES[name].at(positions, points, prediction)
     assert torch.equal(there, dense[rows.flatten(), columns.flatten()])

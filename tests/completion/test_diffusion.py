@@ -37,11 +37,13 @@ def step(size: tuple[int, int] = SIZE) -> Tensor:
 
 
 def test_it_is_the_least_squares_solution_of_its_equation() -> None:
-    made = field([(1.0, 1.0), (6.0, 4.0), (2.0, 5.0)], [0.3, -0.2, 0.1], step())
-    u = made.features[..., 2].double().numpy()
+    residuals = field([(1.0, 1.0), (6.0, 4.0), (2.0, 5.0)], [0.3, -0.2, 0.1], step())
+    u = residuals.features[..., 2].double().numpy()
     number = np.arange(48).reshape(SIZE)
     lines, right = [], []
-    for (x, y), r in zip(made.points.xy.int().tolist(), made.residual.tolist(), strict=True):
+    for (x, y), r in zip(
+        residuals.points.xy.int().tolist(), residuals.residual.tolist(), strict=True
+    ):
         lines.append(np.eye(48)[number[y, x]])
         right.append(r)
     for a, b in [
@@ -52,13 +54,13 @@ def test_it_is_the_least_squares_solution_of_its_equation() -> None:
         lines.append(np.sqrt(weight) * (np.eye(48)[a] - np.eye(48)[b]))
         right.append(0.0)
     expected = np.linalg.lstsq(np.array(lines), np.array(right), rcond=None)[0]
-    assert np.allclose(diffuse(made).numpy(), expected.reshape(SIZE), atol=1e-3)
+    assert np.allclose(diffuse(residuals).numpy(), expected.reshape(SIZE), atol=1e-3)
 
 
 def test_an_edge_of_the_prediction_stops_it() -> None:
-    made = diffuse(field([(0.0, 3.0), (7.0, 3.0)], [0.5, -0.5], step()))
-    assert float((made[:, :4] - 0.5).abs().max()) < 0.05
-    assert float((made[:, 4:] + 0.5).abs().max()) < 0.05
+    dense = diffuse(field([(0.0, 3.0), (7.0, 3.0)], [0.5, -0.5], step()))
+    assert float((dense[:, :4] - 0.5).abs().max()) < 0.05
+    assert float((dense[:, 4:] + 0.5).abs().max()) < 0.05
 
 
 @pytest.mark.parametrize("nodes", [12, 10**6])
@@ -67,8 +69,8 @@ def test_one_point_is_everywhere_also_on_a_coarser_grid(
 ) -> None:
     monkeypatch.setattr(diffusion, "_MIN_NODES", nodes)
     monkeypatch.setattr(diffusion, "_MAX_NODES", nodes)
-    made = diffuse(field([(3.4, 2.6)], [0.25], step()))
-    assert torch.allclose(made, torch.full(SIZE, 0.25), atol=1e-5)
+    dense = diffuse(field([(3.4, 2.6)], [0.25], step()))
+    assert torch.allclose(dense, torch.full(SIZE, 0.25), atol=1e-5)
 
 
 @pytest.mark.parametrize(("count", "nodes"), [(3, 2000), (400, 4000), (5000, 30_000)])
@@ -82,6 +84,6 @@ def test_the_grid_is_finer_where_points_are_many(
         return splu(system, **how)
 
     monkeypatch.setattr("scipy.sparse.linalg.splu", noted)
-    places = torch.rand(count, 2, generator=torch.Generator().manual_seed(0)) * 199
-    diffuse(field([(x, y) for x, y in places.tolist()], [0.1] * count, step((200, 300))))
+    positions = torch.rand(count, 2, generator=torch.Generator().manual_seed(0)) * 199
+    diffuse(field([(x, y) for x, y in positions.tolist()], [0.1] * count, step((200, 300))))
     assert solved[0] == pytest.approx(nodes, rel=0.02)

@@ -25,7 +25,7 @@ SIZE = (20, 30)
 def field(
     count: int, *, size: tuple[int, int] = SIZE, colour: bool = True, seed: int = 0
 ) -> ResidualField:
-    """A smooth residual at random pixels of a picture with a step in its prediction."""
+    """A smooth residual at random pixels of an image with a step in its prediction."""
     generator = torch.Generator().manual_seed(seed)
     height, width = size
     chosen = torch.randperm(height * width, generator=generator)[:count]
@@ -63,21 +63,21 @@ def dense_reference(field: ResidualField) -> tuple[np.ndarray, np.ndarray]:
 @pytest.mark.parametrize("count", [1, 2, 7, 60])
 @pytest.mark.parametrize("colour", [True, False])
 def test_mean_and_deviation_are_those_of_the_textbook(count: int, colour: bool) -> None:
-    made = replace(field(count, colour=colour), scale=0.3)
-    mean, deviation = predict_with_sigma(made)
-    expected = dense_reference(made)
+    residuals = replace(field(count, colour=colour), scale=0.3)
+    mean, deviation = predict_with_sigma(residuals)
+    expected = dense_reference(residuals)
     assert np.allclose(mean.numpy(), expected[0], atol=2e-4)
     assert np.allclose(deviation.numpy(), expected[1], rtol=1e-3, atol=3e-3)
 
 
-def test_a_picture_told_block_by_block_is_near_the_one_told_by_all(
+def test_prediction_by_blocks_is_near_the_exact_prediction(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    made = field(120, size=(60, 80))
-    exact, exact_deviation = predict_with_sigma(made)
+    residuals = field(120, size=(60, 80))
+    exact, exact_deviation = predict_with_sigma(residuals)
     monkeypatch.setattr(kriging, "_MAX_EXACT", 10)
     monkeypatch.setattr(kriging, "_MAX_EXACT_SMALL", 10)
-    blocks, deviation = predict_with_sigma(made)
+    blocks, deviation = predict_with_sigma(residuals)
     assert not torch.equal(blocks, exact)
     assert float((blocks - exact).abs().max()) < 0.05
     assert float((blocks - exact).abs().mean()) < 0.005
@@ -91,60 +91,60 @@ def test_the_residual_is_met_at_points_without_noise(
     if not exact:
         monkeypatch.setattr(kriging, "_MAX_EXACT", 10)
         monkeypatch.setattr(kriging, "_MAX_EXACT_SMALL", 10)
-    made = replace(field(90), kernel=Kernel(noise=1e-7))
-    mean = predict(made)
-    assert torch.allclose(made.points.sample(mean).double(), made.residual, atol=2e-3)
+    residuals = replace(field(90), kernel=Kernel(noise=1e-7))
+    mean = predict(residuals)
+    assert torch.allclose(residuals.points.sample(mean).double(), residuals.residual, atol=2e-3)
 
 
 @pytest.mark.parametrize("count", [3, 40])
-def test_single_places_are_told_as_the_whole_picture_is(count: int) -> None:
-    made = fit(field(count))
-    places = torch.tensor([[3.0, 4.0], [29.0, 19.0], [0.0, 0.0]])
-    asked = SparsePoints(xy=places, depth=torch.ones(3), size=SIZE)
-    at = torch.stack([asked.sample(one) for one in made.features.unbind(2)], dim=1)
-    mean = predict(made)
-    assert torch.allclose(predict_at(made, places, at), asked.sample(mean), atol=1e-5)
+def test_prediction_at_positions_equals_the_dense_prediction(count: int) -> None:
+    residuals = fit(field(count))
+    positions = torch.tensor([[3.0, 4.0], [29.0, 19.0], [0.0, 0.0]])
+    queries = SparsePoints(xy=positions, depth=torch.ones(3), size=SIZE)
+    at = torch.stack([queries.sample(one) for one in residuals.features.unbind(2)], dim=1)
+    mean = predict(residuals)
+    assert torch.allclose(predict_at(residuals, positions, at), queries.sample(mean), atol=1e-5)
 
 
-def test_places_among_many_points_are_near_the_picture() -> None:
-    made = fit(field(900, size=(60, 80)))
-    places = torch.tensor([[30.0, 40.0], [79.0, 59.0], [7.0, 8.0]])
-    asked = SparsePoints(xy=places, depth=torch.ones(3), size=(60, 80))
-    at = torch.stack([asked.sample(one) for one in made.features.unbind(2)], dim=1)
-    mean = predict(made)
-    assert torch.allclose(predict_at(made, places, at), asked.sample(mean), atol=0.02)
+def test_with_many_points_prediction_at_positions_is_near_the_dense_prediction() -> None:
+    residuals = fit(field(900, size=(60, 80)))
+    positions = torch.tensor([[30.0, 40.0], [79.0, 59.0], [7.0, 8.0]])
+    queries = SparsePoints(xy=positions, depth=torch.ones(3), size=(60, 80))
+    at = torch.stack([queries.sample(one) for one in residuals.features.unbind(2)], dim=1)
+    mean = predict(residuals)
+    assert torch.allclose(predict_at(residuals, positions, at), queries.sample(mean), atol=0.02)
 
 
-def left_out_by_hand(made: ResidualField, index: int) -> float:
-    others = torch.arange(len(made.points)) != index
-    mean = predict(made.select(others))
-    return float(made.residual[index] - made.points.sample(mean)[index])
+def left_out_by_hand(residuals: ResidualField, index: int) -> float:
+    others = torch.arange(len(residuals.points)) != index
+    mean = predict(residuals.select(others))
+    return float(residuals.residual[index] - residuals.points.sample(mean)[index])
 
 
 def test_errors_of_left_out_points_are_those_of_leaving_them_out() -> None:
-    made = field(12)
-    error, _ = leave_one_out(made, torch.arange(12)[None])
-    by_hand = [left_out_by_hand(made, index) for index in range(12)]
+    residuals = field(12)
+    error, _ = leave_one_out(residuals, torch.arange(12)[None])
+    by_hand = [left_out_by_hand(residuals, index) for index in range(12)]
     assert torch.allclose(error[0], torch.tensor(by_hand).double(), atol=1e-4)
 
 
-def test_a_point_of_no_weight_tells_the_others_nothing() -> None:
-    made = field(12)
+def test_a_point_of_zero_weight_does_not_change_the_others() -> None:
+    residuals = field(12)
     weight = torch.ones(12).double()
     weight[5] = 0
-    spoiled = replace(made, residual=made.residual.index_fill(0, torch.tensor([5]), 9.0))
+    spoiled = replace(residuals, residual=residuals.residual.index_fill(0, torch.tensor([5]), 9.0))
     near = torch.arange(12)[None]
-    clean, _ = leave_one_out(made, near, weight)
-    found, _ = leave_one_out(spoiled, near, weight)
+    clean, _ = leave_one_out(residuals, near, weight)
+    with_outlier, _ = leave_one_out(spoiled, near, weight)
     others = torch.arange(12) != 5
-    assert torch.allclose(found[0, others], clean[0, others], atol=1e-4)
+    assert torch.allclose(with_outlier[0, others], clean[0, others], atol=1e-4)
 
 
 def test_kernel_and_scale_are_chosen_by_the_points_left_out() -> None:
-    made = fit(field(80))
+    residuals = fit(field(80))
     near = torch.arange(80)[None]
-    error, variance = leave_one_out(made, near)
-    within = error.abs() <= made.scale * variance.sqrt()
+    error, variance = leave_one_out(residuals, near)
+    within = error.abs() <= residuals.scale * variance.sqrt()
     assert float(within.double().mean()) == pytest.approx(0.68, abs=0.02)
-    other, _ = leave_one_out(replace(made, kernel=Kernel(depth=1.0, noise=1.0)), near)
+    other, _ = leave_one_out(replace(residuals, kernel=Kernel(depth=1.0, noise=1.0)), near)
     assert float(error.abs().mean()) < float(other.abs().mean())

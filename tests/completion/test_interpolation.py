@@ -27,9 +27,9 @@ FILLS: dict[str, Callable[[SparsePoints], Tensor]] = {
 
 
 def points_at(
-    places: list[tuple[float, float]], depth: list[float], size: tuple[int, int]
+    xy: list[tuple[float, float]], depth: list[float], size: tuple[int, int]
 ) -> SparsePoints:
-    return SparsePoints(xy=torch.tensor(places), depth=torch.tensor(depth), size=size)
+    return SparsePoints(xy=torch.tensor(xy), depth=torch.tensor(depth), size=size)
 
 
 def scattered(
@@ -75,7 +75,7 @@ def test_the_order_of_the_points_does_not_matter(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", FILLS)
-def test_of_points_at_one_place_the_nearest_counts(name: str) -> None:
+def test_of_points_at_one_position_the_nearest_counts(name: str) -> None:
     points = scattered(30, on_grid=True)
     behind = SparsePoints(xy=points.xy, depth=points.depth + 5, size=points.size)
     both = SparsePoints(
@@ -143,8 +143,8 @@ def test_what_is_linear_in_a_space_is_restored_in_it_between_the_corners(
 
 @pytest.mark.parametrize("step", [(1.0, 0.0), (0.0, 1.0), (1.0, 1.0), (3.0, 1.0)])
 def test_linear_of_points_in_a_row_is_the_nearest_point(step: tuple[float, float]) -> None:
-    places = [(2.0 + i * step[0], 3.0 + i * step[1]) for i in range(5)]
-    points = points_at(places, [1.0, 2.0, 3.0, 4.0, 5.0], (12, 16))
+    xy = [(2.0 + i * step[0], 3.0 + i * step[1]) for i in range(5)]
+    points = points_at(xy, [1.0, 2.0, 3.0, 4.0, 5.0], (12, 16))
     assert torch.equal(linear(points), nearest(points))
 
 
@@ -186,11 +186,11 @@ def test_morphological_lets_what_is_near_grow_over_what_is_far() -> None:
     assert bool((filled[:, :18] > 9.9).all())
 
 
-def test_morphological_of_few_points_is_that_of_a_smaller_picture() -> None:
-    places = [(8.0, 8.0), (24.0, 8.0), (8.0, 24.0), (24.0, 24.0)]
+def test_morphological_of_few_points_is_that_of_a_smaller_image() -> None:
+    xy = [(8.0, 8.0), (24.0, 8.0), (8.0, 24.0), (24.0, 24.0)]
     depth = [2.0, 4.0, 6.0, 8.0]
-    small = morphological(points_at(places, depth, (32, 32)))
-    tenfold = [(10 * x + 4.5, 10 * y + 4.5) for x, y in places]
+    small = morphological(points_at(xy, depth, (32, 32)))
+    tenfold = [(10 * x + 4.5, 10 * y + 4.5) for x, y in xy]
     large = morphological(points_at(tenfold, depth, (320, 320)))
     assert torch.allclose(large[4::10, 4::10], small, atol=0.2)
 

@@ -4,119 +4,105 @@ import math
 
 import pytest
 import torch
-from torch import Tensor
 
 from pnpdepth_cli.choices import SPACES
 from pnpdepth_cli.completion.alignment import BEYOND, aligned, from_space, to_space
 from pnpdepth_cli.completion.local_alignment import locally_aligned
 from pnpdepth_cli.errors import NoPointsError
 from pnpdepth_cli.points import SparsePoints
-
-SIZE = (48, 64)
-
-
-def scene(seed: int = 0) -> Tensor:
-    """Depth (H, W): a floor, a wall and a box in front of it."""
-    y, x = torch.meshgrid(*(torch.arange(float(n)) for n in SIZE), indexing="ij")
-    depth = torch.minimum(60 / (y - 10).clamp_min(1), 4 + 0.02 * x)
-    depth[20:40, 10 + seed : 30 + seed] = 1.4
-    return depth
+from tests.completion.scenes import SIZE, mean_log_error, random_points, scene_depth
 
 
-def seen(depth: Tensor, count: int, seed: int = 0) -> SparsePoints:
-    chosen = torch.randperm(depth.numel(), generator=torch.Generator().manual_seed(seed))[:count]
-    xy = torch.stack([chosen % SIZE[1], chosen // SIZE[1]], dim=1).float()
-    return SparsePoints(xy=xy, depth=depth.flatten()[chosen], size=SIZE)
-
-
-def spoiled(points: SparsePoints, share: float = 0.2) -> SparsePoints:
+def spoiled(points: SparsePoints, fraction: float = 0.2) -> SparsePoints:
     """Some points replaced by a depth 2 to 20 times too near or too far."""
     generator = torch.Generator().manual_seed(3)
     random = torch.rand(3, len(points), generator=generator)
     off = (0.7 + 2.3 * random[1]) * torch.where(random[2] < 0.5, -1, 1)
-    depth = torch.where(random[0] < share, points.depth * off.exp(), points.depth)
+    depth = torch.where(random[0] < fraction, points.depth * off.exp(), points.depth)
     return SparsePoints(xy=points.xy, depth=depth, size=points.size)
-
-
-def mean_error(depth: Tensor, truth: Tensor) -> float:
-    return float((depth.log() - truth.log()).abs().mean())
 
 
 @pytest.mark.parametrize("space", SPACES)
 @pytest.mark.parametrize("count", [3, 30, 400])
 def test_a_prediction_that_is_a_line_away_everywhere_is_restored(space: str, count: int) -> None:
-    truth = scene()
-    value = to_space(truth, space)
+    gt = scene_depth()
+    value = to_space(gt, space)
     prediction = from_space((value + 0.3) / 0.7, space)
     assert torch.allclose(
-        locally_aligned(prediction, seen(truth, count), space=space), truth, rtol=1e-3
+        locally_aligned(prediction, random_points(gt, count), space=space),
+        gt,
+        rtol=1e-3,
     )
 
 
 @pytest.mark.parametrize("space", SPACES)
 @pytest.mark.parametrize("count", [50, 300])
-def test_a_scale_that_drifts_over_the_picture_is_followed(space: str, count: int) -> None:
-    truth = scene()
+def test_a_scale_that_drifts_over_the_image_is_followed(space: str, count: int) -> None:
+    gt = scene_depth()
     drift = torch.linspace(0.6, 1.5, SIZE[1])
-    points = seen(truth, count)
-    local = locally_aligned(truth * drift, points, space=space)
-    everywhere = aligned(truth * drift, points, kind="affine", space=space)
-    assert mean_error(local, truth) < 0.35 * mean_error(everywhere, truth)
+    points = random_points(gt, count)
+    local = locally_aligned(gt * drift, points, space=space)
+    everywhere = aligned(gt * drift, points, kind="affine", space=space)
+    assert mean_log_error(local, gt) < 0.35 * mean_log_error(everywhere, gt)
 
 
 def test_near_a_point_the_depth_is_the_points() -> None:
-    truth = scene()
-    points = seen(truth, 60)
-    prediction = scene(seed=3).roll(5, dims=0)  # things in the wrong places
+    gt = scene_depth()
+    points = random_points(gt, 60)
+    prediction = scene_depth(left=13).roll(5, dims=0)  # objects at other positions
     off = points.sample(locally_aligned(prediction, points)).log() - points.depth.log()
     assert float(off.abs().median()) < 0.02
 
 
 @pytest.mark.parametrize("count", [1, 2])
 def test_one_and_two_points_move_the_whole_prediction(count: int) -> None:
-    truth = scene()
-    assert torch.allclose(locally_aligned(truth / 3, seen(truth, count)), truth, rtol=1e-4)
+    gt = scene_depth()
+    assert torch.allclose(
+        locally_aligned(gt / 3, random_points(gt, count)),
+        gt,
+        rtol=1e-4,
+    )
 
 
-@pytest.mark.parametrize(("count", "share"), [(40, 0.5), (400, 0.05)])
-def test_20_percent_gross_outliers_move_the_depth_by_a_share_of_what_they_would(
-    count: int, share: float, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(("count", "fraction"), [(40, 0.5), (400, 0.05)])
+def test_inlier_weights_reduce_the_effect_of_20_percent_gross_outliers(
+    count: int, fraction: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    truth = scene()
+    gt = scene_depth()
     drift = torch.linspace(0.8, 1.25, SIZE[0])[:, None]
     noise = torch.randn(SIZE, generator=torch.Generator().manual_seed(1))
-    prediction = truth * drift * (1 + 0.02 * noise)
+    prediction = gt * drift * (1 + 0.02 * noise)
 
     def rise() -> float:
         errors = []
         for seed in range(4):
-            points = seen(truth, count, seed)
+            points = random_points(gt, count, seed)
             clean, moved = (locally_aligned(prediction, p) for p in (points, spoiled(points)))
-            errors.append(mean_error(moved, truth) - mean_error(clean, truth))
+            errors.append(mean_log_error(moved, gt) - mean_log_error(clean, gt))
         return sum(errors)
 
-    doubted = rise()
+    weighted = rise()
     monkeypatch.setattr("pnpdepth_cli.completion.outliers.ALONE", 1e9)
-    assert doubted < share * rise()
+    assert weighted < fraction * rise()
 
 
 def test_where_the_network_has_nothing_there_is_nothing() -> None:
-    truth = scene()
-    prediction = truth / 2
+    gt = scene_depth()
+    prediction = gt / 2
     prediction[:, :20] = 0
     prediction[:, 60:] = math.nan
-    dense = locally_aligned(prediction, seen(truth, 100))
+    dense = locally_aligned(prediction, random_points(gt, 100))
     assert bool((dense[:, :20] == 0).all())
     assert bool((dense[:, 60:] == 0).all())
-    assert torch.allclose(dense[:, 20:60], truth[:, 20:60], rtol=1e-3)
+    assert torch.allclose(dense[:, 20:60], gt[:, 20:60], rtol=1e-3)
     with pytest.raises(NoPointsError, match="none of the 100"):
-        locally_aligned(torch.zeros(SIZE), seen(truth, 100))
+        locally_aligned(torch.zeros(SIZE), random_points(gt, 100))
 
 
 def test_depth_stays_within_the_bounds_of_a_global_alignment() -> None:
-    truth = scene()
-    points = seen(truth, 100)
-    prediction = truth.clone()
+    gt = scene_depth()
+    points = random_points(gt, 100)
+    prediction = gt.clone()
     prediction[0, 0], prediction[0, 1] = 1e6, 1e-6
     dense = locally_aligned(prediction, points, space="inverse")
     assert float(dense.max()) <= float(points.depth.max()) * BEYOND * (1 + 1e-5)
@@ -124,18 +110,18 @@ def test_depth_stays_within_the_bounds_of_a_global_alignment() -> None:
 
 
 def test_the_order_of_the_points_does_not_matter() -> None:
-    truth = scene()
-    points = seen(truth, 100)
+    gt = scene_depth()
+    points = random_points(gt, 100)
     other = SparsePoints(xy=points.xy.flip(0), depth=points.depth.flip(0), size=SIZE)
-    prediction = truth.sqrt()
+    prediction = gt.sqrt()
     assert torch.equal(locally_aligned(prediction, points), locally_aligned(prediction, other))
 
 
-def test_lines_between_fewer_places_than_pixels_come_near_those_of_every_pixel(
+def test_a_coarser_grid_is_near_the_alignment_of_every_pixel(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    truth = scene()
-    prediction = truth * torch.linspace(0.6, 1.5, SIZE[1])
-    whole = locally_aligned(prediction, seen(truth, 60))
-    monkeypatch.setattr("pnpdepth_cli.completion.local_alignment._NODES", truth.numel() // 4)
-    assert mean_error(locally_aligned(prediction, seen(truth, 60)), whole) < 0.01
+    gt = scene_depth()
+    prediction = gt * torch.linspace(0.6, 1.5, SIZE[1])
+    whole = locally_aligned(prediction, random_points(gt, 60))
+    monkeypatch.setattr("pnpdepth_cli.completion.local_alignment._NODES", gt.numel() // 4)
+    assert mean_log_error(locally_aligned(prediction, random_points(gt, 60)), whole) < 0.01

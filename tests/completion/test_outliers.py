@@ -9,40 +9,42 @@ import torch
 
 from pnpdepth_cli.completion.outliers import inlier_mask, inlier_weights, outliers
 from pnpdepth_cli.points import SparsePoints
+from tests.completion.scenes import random_points, scene
 from tests.completion.test_gaussian_process import field
-from tests.completion.test_propagation import scene, seen
 
 
 @pytest.mark.parametrize("count", [40, 600])
-def test_wrong_points_are_left_out_and_right_ones_are_kept(count: int) -> None:
-    made = field(count, size=(60, 80))
-    assert bool(inlier_mask(made).all())
-    wrong = torch.arange(count) % 7 == 0
+def test_outliers_are_left_out_and_inliers_kept(count: int) -> None:
+    residuals = field(count, size=(60, 80))
+    assert bool(inlier_mask(residuals).all())
+    outlier = torch.arange(count) % 7 == 0
     jump = 1 + torch.rand(count, generator=torch.Generator().manual_seed(1)).double()
     jump = torch.where(torch.arange(count) % 2 == 0, jump, -jump)
-    spoiled = replace(made, residual=torch.where(wrong, made.residual + jump, made.residual))
+    spoiled = replace(
+        residuals, residual=torch.where(outlier, residuals.residual + jump, residuals.residual)
+    )
     kept = spoiled.select(inlier_mask(spoiled))
-    found = 1 - float(((kept.residual - 0.2).abs() > 0.35).sum()) / int(wrong.sum())
-    assert found == 1 if count == 40 else found > 0.9
-    assert len(kept.points) > 0.9 * int((~wrong).sum())
+    recall = 1 - float(((kept.residual - 0.2).abs() > 0.35).sum()) / int(outlier.sum())
+    assert recall == 1 if count == 40 else recall > 0.9
+    assert len(kept.points) > 0.9 * int((~outlier).sum())
 
 
 @pytest.mark.parametrize("count", [120, 250])
-def test_points_far_from_what_is_predicted_are_not_wrong_where_they_lie_together(
+def test_points_far_from_the_prediction_are_inliers_where_they_agree(
     count: int,
 ) -> None:
-    made = field(count, size=(60, 80))
-    x, y = made.points.xy.unbind(1)
+    residuals = field(count, size=(60, 80))
+    x, y = residuals.points.xy.unbind(1)
     corridor = (x < 30) & (y < 30)
     assert 10 < int(corridor.sum()) < count // 4
     deep = torch.where(corridor, 2.0 + x / 30, 0.0).double()
-    kept = inlier_mask(replace(made, residual=made.residual + deep))
+    kept = inlier_mask(replace(residuals, residual=residuals.residual + deep))
     assert int((~kept).sum()) <= int(corridor.sum()) // 3  # those at its edge have other neighbours
 
 
-def test_wrong_points_are_named_in_the_order_of_the_points_and_right_ones_are_not() -> None:
-    truth, rgb, prediction = scene()
-    points = seen(truth, 150)
+def test_outliers_are_marked_in_the_order_of_the_points() -> None:
+    ground_truth, rgb, prediction = scene()
+    points = random_points(ground_truth, 150)
     assert not bool(outliers(prediction, points, rgb).any())
     bad = torch.arange(150) % 6 == 0
     outside = SparsePoints(
@@ -53,14 +55,14 @@ def test_wrong_points_are_named_in_the_order_of_the_points_and_right_ones_are_no
         depth=torch.cat([torch.where(bad, 3 * points.depth, points.depth), outside.depth]),
         size=points.size,
     )
-    found = outliers(prediction, spoiled, rgb)
-    assert int(found[:150][bad].sum()) > 0.9 * int(bad.sum())
-    assert int(found.sum()) < 2 * int(bad.sum())
-    assert not bool(found[150])  # nothing is known there
+    suspected = outliers(prediction, spoiled, rgb)
+    assert int(suspected[:150][bad].sum()) > 0.9 * int(bad.sum())
+    assert int(suspected.sum()) < 2 * int(bad.sum())
+    assert not bool(suspected[150])  # nothing is known there
 
 
 def test_a_point_alone_among_its_neighbours_has_no_weight() -> None:
-    points = seen(scene()[0], 50)
+    points = random_points(scene()[0], 50)
     residual = 0.01 * torch.randn(50, generator=torch.Generator().manual_seed(2)).double()
     residual[7] = 1.0
     weights = inlier_weights(points, residual)

@@ -26,7 +26,7 @@ def test_pure_red_is_where_it_is_in_tables_of_cielab() -> None:
     assert torch.allclose(lab, torch.tensor([53.24, 80.09, 67.20]), atol=0.05)
 
 
-def test_features_of_a_flat_prediction_and_picture_are_finite() -> None:
+def test_features_of_a_flat_prediction_and_image_are_finite() -> None:
     features = features_of(torch.full(SIZE, math.log(3.0)), torch.full((3, *SIZE), 0.5))
     assert bool(features.isfinite().all())
     assert float(features[..., 2:].abs().max()) < 1e-3

@@ -59,7 +59,7 @@ class ResNetDepth(nn.Module):
 
 
 class SkipEncoder(nn.Module):
-    """Returns a list that starts with the very image it was given."""
+    """Returns a list that starts with the input image itself."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -163,7 +163,7 @@ class ViTDepth(nn.Module):
 
 
 class InPlace(nn.Module):
-    """Everything in place: on what is remembered, right behind the cut, on the input itself."""
+    """In-place operations on recorded outputs, right behind the cut and on the input."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -208,8 +208,8 @@ class MiDaSLike(nn.Module):
         self.backbone = nn.Sequential(conv(3, 4), nn.ReLU(inplace=True), conv(4, 4), conv(4, 4))
         self.unit1, self.unit2, self.head = ResidualUnit(4), ResidualUnit(4), conv(4, 1)
         self.features: list[Tensor] = []
-        for place in (0, 2):
-            self.backbone[place].register_forward_hook(
+        for index in (0, 2):
+            self.backbone[index].register_forward_hook(
                 lambda module, inputs, output: self.features.append(output)
             )
 
@@ -222,7 +222,7 @@ class MiDaSLike(nn.Module):
 
 
 class Branching(nn.Module):
-    """Python takes different ways by values, before the cut and behind it."""
+    """Python branches on values, before the cut and behind it."""
 
     def __init__(self, escape: Callable[[Tensor], bool] = lambda y: bool(y.mean() > 0.3)) -> None:
         super().__init__()
@@ -338,11 +338,11 @@ class Detached(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        self.share = conv(4, 4)
+        self.branch = conv(4, 4)
 
     def forward(self, z: Tensor) -> Tensor:
         chosen = torch.arange(4)[:, None, None] == z.argmax(1, keepdim=True)
-        return self.share(chosen.float())
+        return self.branch(chosen.float())
 
 
 class TwoBranches(nn.Module):
@@ -375,7 +375,7 @@ class Appends(nn.Module):
 
 
 class SideEffects(nn.Module):
-    """Parts change the list they are given; a generator; an object that hides tensors."""
+    """Parts that change their list argument; a generator; an object that hides tensors."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -383,13 +383,13 @@ class SideEffects(nn.Module):
         self.many, self.hide, self.head = Generates(), Hides(), conv(4, 1)
 
     def forward(self, x: Tensor) -> Tensor:
-        found: list[Tensor] = []
-        x = self.two(self.one(self.enter(x), found), into=found)
+        tensors: list[Tensor] = []
+        x = self.two(self.one(self.enter(x), tensors), into=tensors)
         hidden = self.hide(x)
         hidden.tensor += 1
         lazy = self.many(x)
         z = self.cut(x) + sum(lazy) + hidden.tensor
-        return self.head(z * found[0] + found[1]).abs() + 1
+        return self.head(z * tensors[0] + tensors[1]).abs() + 1
 
 
 class Generates(nn.Module):
@@ -547,9 +547,9 @@ class Sparse(nn.Module):
         x = self.enter(x)
         affinity = self.to_sparse(x)
         z = self.cut(x)
-        spread = torch.sparse.mm(affinity, z[0].flatten(1)).unflatten(1, z.shape[-2:])
+        propagated = torch.sparse.mm(affinity, z[0].flatten(1)).unflatten(1, z.shape[-2:])
         gate = self.to_sparse(z.detach()).to_dense().mean()
-        return self.head(z + spread[None] * gate).abs() + 1
+        return self.head(z + propagated[None] * gate).abs() + 1
 
 
 class ToSparse(nn.Module):
@@ -648,7 +648,7 @@ def build(name: str) -> nn.Module:
     return network.train()
 
 
-def picture(height: int = 16, width: int = 16) -> Tensor:
+def image(height: int = 16, width: int = 16) -> Tensor:
     return torch.rand(1, 3, height, width, generator=torch.Generator().manual_seed(1))
 
 

@@ -8,12 +8,12 @@ from torch import nn
 
 from pnpdepth_cli.core.influence import InfluentialField, influential_field
 from pnpdepth_cli.core.split import Split
-from tests.core.networks import build, conv, depth_of, picture
+from tests.core.networks import build, conv, depth_of, image
 
 
 def field(network: nn.Module, layer: str, size: int = 32) -> InfluentialField:
     with Split(network, layer) as split:
-        z = split.front(picture(size, size))
+        z = split.front(image(size, size))
         return influential_field(split, z, depth_of)
 
 

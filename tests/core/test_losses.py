@@ -23,7 +23,7 @@ BY_HAND = {
     "berhu": (0.5 + (4 + 1) / 2 + (25 + 1) / 2) / 4,
     "inverse": (0.1 + 0.25 + 0.1) / 4,
     "log": (log(2.5 / 2) + log(2) + log(2)) / 4,
-    # the lower of the two middle errors, log 2.5/2, tells c
+    # the lower of the two middle errors, log 2.5/2, sets c
     "cauchy": C * (log(1 + 1 / 1.4826**2) + 2 * log(1 + (log(2) / C) ** 2)) / 4,
 }
 

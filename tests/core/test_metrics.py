@@ -37,13 +37,13 @@ def test_two_pixels_by_hand() -> None:
     assert (scores.pixels, scores.coverage) == (2, 1)
 
 
-def brute(predicted: np.ndarray, truth: np.ndarray) -> dict[str, float]:
+def brute(predicted: np.ndarray, gt: np.ndarray) -> dict[str, float]:
     pairs = [
         (float(p), float(g))
-        for p, g in zip(predicted.ravel(), truth.ravel(), strict=True)
+        for p, g in zip(predicted.ravel(), gt.ravel(), strict=True)
         if np.isfinite(p) and p > 0 and np.isfinite(g) and g > 0
     ]
-    known = sum(1 for g in truth.ravel() if np.isfinite(g) and g > 0)
+    known = sum(1 for g in gt.ravel() if np.isfinite(g) and g > 0)
     n = len(pairs)
     logs = [log(p) - log(g) for p, g in pairs]
     ratios = [max(p / g, g / p) for p, g in pairs]
@@ -70,24 +70,24 @@ depths = st.one_of(
 
 @given(st.lists(st.tuples(depths, depths), min_size=1, max_size=40))
 def test_scores_are_those_of_plain_numpy(pairs: list[tuple[float, float]]) -> None:
-    predicted, truth = np.array([(2.0, 3.0), *pairs], np.float32).T
-    scores = score(torch.from_numpy(predicted.copy()), torch.from_numpy(truth.copy()))
-    expected = brute(predicted, truth)
+    predicted, gt = np.array([(2.0, 3.0), *pairs], np.float32).T
+    scores = score(torch.from_numpy(predicted.copy()), torch.from_numpy(gt.copy()))
+    expected = brute(predicted, gt)
     assert asdict(scores) == {
         name: pytest.approx(value, rel=1e-9, abs=1e-5) for name, value in expected.items()
     }
 
 
 def test_a_perfect_prediction_scores_perfectly() -> None:
-    truth = torch.rand(3, 4) + 1
-    scores = score(truth, truth)
+    gt = torch.rand(3, 4) + 1
+    scores = score(gt, gt)
     assert (scores.rmse, scores.mae, scores.mre, scores.irmse, scores.silog) == (0, 0, 0, 0, 0)
     assert (scores.delta1, scores.coverage) == (1, 1)
 
 
 def test_a_scale_alone_is_no_error_of_silog() -> None:
-    truth = torch.rand(50) + 1
-    assert score(truth * 3, truth).silog == pytest.approx(0, abs=1e-4)
+    gt = torch.rand(50) + 1
+    assert score(gt * 3, gt).silog == pytest.approx(0, abs=1e-4)
 
 
 def test_half_a_prediction_is_half_the_coverage() -> None:
@@ -118,8 +118,8 @@ def test_every_measure_is_a_score_and_says_its_unit() -> None:
 
 
 def test_the_thresholds_of_delta_can_be_the_papers_kitti_ones() -> None:
-    predicted, truth = torch.tensor([1.009, 1.015, 1.025, 1.04]), torch.ones(4)
-    scores = score(predicted, truth, (1.01, 1.01**2, 1.01**3))
+    predicted, gt = torch.tensor([1.009, 1.015, 1.025, 1.04]), torch.ones(4)
+    scores = score(predicted, gt, (1.01, 1.01**2, 1.01**3))
     assert (scores.delta1, scores.delta2, scores.delta3) == (0.25, 0.5, 0.75)
 
 
@@ -135,9 +135,9 @@ positive = st.lists(st.tuples(st.floats(0.5, 90), st.floats(0.5, 90)), min_size=
 def test_another_unit_of_length_changes_each_measure_as_its_unit_says(
     pairs: list[tuple[float, float]], factor: float
 ) -> None:
-    predicted, truth = torch.tensor(pairs, dtype=torch.float64).T
-    before = asdict(score(predicted, truth, (1.3, 1.7, 2.1)))
-    after = asdict(score(predicted * factor, truth * factor, (1.3, 1.7, 2.1)))
+    predicted, gt = torch.tensor(pairs, dtype=torch.float64).T
+    before = asdict(score(predicted, gt, (1.3, 1.7, 2.1)))
+    after = asdict(score(predicted * factor, gt * factor, (1.3, 1.7, 2.1)))
     power = {"m": 1, "1/km": -1}
     for measure in MEASURES:
         if not measure.higher_is_better:  # a ratio may sit on a threshold
@@ -146,11 +146,11 @@ def test_another_unit_of_length_changes_each_measure_as_its_unit_says(
 
 
 @given(positive)
-def test_prediction_and_truth_can_change_places_in_the_symmetric_measures(
+def test_prediction_and_ground_truth_can_be_swapped_in_symmetric_measures(
     pairs: list[tuple[float, float]],
 ) -> None:
-    predicted, truth = torch.tensor(pairs, dtype=torch.float64).T
-    one, other = asdict(score(predicted, truth)), asdict(score(truth, predicted))
+    predicted, gt = torch.tensor(pairs, dtype=torch.float64).T
+    one, other = asdict(score(predicted, gt)), asdict(score(gt, predicted))
     for key in ("rmse", "mae", "log10", "rmse_log", "irmse", "imae", "silog", "delta1"):
         assert one[key] == pytest.approx(other[key], rel=1e-9, abs=1e-5), key
 
@@ -159,8 +159,8 @@ def test_prediction_and_truth_can_change_places_in_the_symmetric_measures(
 def test_no_mean_absolute_error_is_above_its_root_mean_square(
     pairs: list[tuple[float, float]],
 ) -> None:
-    predicted, truth = torch.tensor(pairs, dtype=torch.float64).T
-    scores = score(predicted, truth)
+    predicted, gt = torch.tensor(pairs, dtype=torch.float64).T
+    scores = score(predicted, gt)
     slack = 1 + 1e-12
     assert scores.mae <= scores.rmse * slack
     assert scores.imae <= scores.irmse * slack
@@ -170,31 +170,31 @@ def test_no_mean_absolute_error_is_above_its_root_mean_square(
 
 
 @given(st.lists(st.tuples(depths, depths, st.integers(0, 2)), min_size=1, max_size=40))
-def test_the_sums_of_the_parts_are_the_sums_of_the_picture(
+def test_the_sums_of_the_parts_are_the_sums_of_the_image(
     rows: list[tuple[float, float, int]],
 ) -> None:
     predicted = torch.tensor([row[0] for row in rows])
-    truth = torch.tensor([row[1] for row in rows])
+    gt = torch.tensor([row[1] for row in rows])
     part = torch.tensor([row[2] for row in rows])
-    parts = error_sums(predicted, truth, part=part, parts=3)
-    torch.testing.assert_close(parts.sum(0), error_sums(predicted, truth)[0])
+    parts = error_sums(predicted, gt, part=part, parts=3)
+    torch.testing.assert_close(parts.sum(0), error_sums(predicted, gt)[0])
     for number in range(3):
         inside = part == number
-        torch.testing.assert_close(parts[number], error_sums(predicted[inside], truth[inside])[0])
+        torch.testing.assert_close(parts[number], error_sums(predicted[inside], gt[inside])[0])
 
 
-def test_the_sums_of_two_pictures_are_those_of_both_together() -> None:
+def test_the_sums_of_two_images_are_those_of_both_together() -> None:
     generator = torch.Generator().manual_seed(0)
-    predicted, truth = (torch.rand(2, 50, generator=generator) * 9 + 1 for _ in range(2))
-    pooled = error_sums(predicted[0], truth[0])[0] + error_sums(predicted[1], truth[1])[0]
-    torch.testing.assert_close(measures_of(pooled), measures_of(error_sums(predicted, truth)[0]))
+    predicted, gt = (torch.rand(2, 50, generator=generator) * 9 + 1 for _ in range(2))
+    pooled = error_sums(predicted[0], gt[0])[0] + error_sums(predicted[1], gt[1])[0]
+    torch.testing.assert_close(measures_of(pooled), measures_of(error_sums(predicted, gt)[0]))
     assert int(pooled[SUMS.index("pixels")]) == 100
 
 
-def test_a_picture_of_many_chunks_is_scored_as_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    predicted, truth = torch.rand(7, 9) + 1, torch.rand(7, 9) + 1
-    part = (truth * 2).long() - 2
-    whole = error_sums(predicted, truth, part=part, parts=2)
+def test_a_image_of_many_chunks_is_scored_as_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    predicted, gt = torch.rand(7, 9) + 1, torch.rand(7, 9) + 1
+    part = (gt * 2).long() - 2
+    whole = error_sums(predicted, gt, part=part, parts=2)
     monkeypatch.setattr("pnpdepth_cli.core.metrics._CHUNK", 10)
-    torch.testing.assert_close(error_sums(predicted, truth, part=part, parts=2), whole)
-    torch.testing.assert_close(error_sums(predicted, truth)[0], whole.sum(0))
+    torch.testing.assert_close(error_sums(predicted, gt, part=part, parts=2), whole)
+    torch.testing.assert_close(error_sums(predicted, gt)[0], whole.sum(0))

@@ -31,11 +31,11 @@ def points() -> SparsePoints:
 
 
 def refined(network: nn.Module, *, per_unit: float = 1.0, **settings: object) -> Refinement:
-    picture = torch.rand(1, 1, 8, 8, generator=torch.Generator().manual_seed(0))
+    image = torch.rand(1, 1, 8, 8, generator=torch.Generator().manual_seed(0))
     with Split(network, "encode") as split:
         return refine(
             split,
-            (picture,),
+            (image,),
             points(),
             RefineSettings(**settings),  # type: ignore[arg-type]
             depth_of=lambda output: per_unit * output.float(),
@@ -46,13 +46,13 @@ def refined(network: nn.Module, *, per_unit: float = 1.0, **settings: object) ->
 def test_z_is_handed_out_in_float32_and_the_rear_of_it_is_the_network_bit_for_bit(
     dtype: torch.dtype,
 ) -> None:
-    network, picture = InHalf(dtype), torch.rand(1, 1, 8, 8)
+    network, image = InHalf(dtype), torch.rand(1, 1, 8, 8)
     with torch.no_grad(), Split(network, "encode") as split:
-        z = split.front(picture)
+        z = split.front(image)
         output = split.rear(z)
         assert z.dtype == torch.float32
         assert output.dtype == dtype
-        assert torch.equal(output, network(picture))
+        assert torch.equal(output, network(image))
 
 
 def test_a_network_in_float64_keeps_its_z() -> None:

@@ -25,7 +25,7 @@ from pnpdepth_cli.errors import (
 )
 from pnpdepth_cli.points import SparsePoints
 from tests.completion.naive import naive_refine, plain
-from tests.core.networks import NETWORKS, TwoBranches, UNet, build, conv, depth_of, picture
+from tests.core.networks import NETWORKS, TwoBranches, UNet, build, conv, depth_of, image
 
 POINTS = SparsePoints(
     xy=torch.tensor([[3.0, 4.0], [10.0, 12.0], [15.0, 15.0], [7.0, 9.0], [0.0, 1.0]]),
@@ -64,7 +64,7 @@ CUTS = {
 def refined(network: nn.Module, layer: str, settings: RefineSettings, **more: Any) -> Refinement:
     points = more.pop("points", POINTS)
     with Split(network, layer) as split:
-        return refine(split, (picture(),), points, settings, depth_of=depth_of, **more)
+        return refine(split, (image(),), points, settings, depth_of=depth_of, **more)
 
 
 def test_every_network_is_compared_except_one_that_no_hook_can_follow() -> None:
@@ -78,11 +78,11 @@ def test_five_updates_are_those_of_running_the_whole_network_every_time(
 ) -> None:
     network = build(name)
     settings = RefineSettings(iterations=5, lr=0.02, update=update)
-    depth, losses = naive_refine(network, layer, picture(), POINTS, settings, depth_of)
+    depth, losses = naive_refine(network, layer, image(), POINTS, settings, depth_of)
     result = refined(network, layer, settings)
     assert torch.equal(result.after, depth)
     assert list(result.losses) == losses
-    whole = depth_of(plain(network, picture()))
+    whole = depth_of(plain(network, image()))
     if name == "vit":  # torch's attention takes another kernel where no gradient is wanted
         torch.testing.assert_close(result.before, whole)
     else:
@@ -94,7 +94,7 @@ def test_five_updates_are_those_of_running_the_whole_network_every_time(
 def test_no_iteration_is_the_plain_prediction_bit_for_bit(name: str) -> None:
     network = build(name)
     result = refined(network, CUTS[name][0], RefineSettings(iterations=0))
-    assert torch.equal(result.after, depth_of(plain(network, picture())))
+    assert torch.equal(result.after, depth_of(plain(network, image())))
     assert result.before is result.after
     assert len(result.losses) == 1
 
@@ -103,7 +103,7 @@ def test_no_iteration_is_the_plain_prediction_bit_for_bit(name: str) -> None:
 @pytest.mark.parametrize("update", UPDATES)
 def test_points_that_agree_with_the_prediction_change_nothing(loss: str, update: str) -> None:
     network = build("unet")
-    predicted = plain(network, picture())
+    predicted = plain(network, image())
     points = SparsePoints(xy=POINTS.xy, depth=POINTS.sample(predicted), size=(16, 16))
     settings = RefineSettings(loss=loss, update=update)
     result = refined(network, "bottleneck", settings, points=points)
@@ -204,10 +204,10 @@ def test_depths_of_a_refinement_that_diverges_are_those_before() -> None:
 # ------------------------------------------------------------------ the step size
 
 
-def test_a_per_cent_step_is_that_share_of_the_standard_deviation_of_z0() -> None:
+def test_a_per_cent_step_is_that_fraction_of_the_standard_deviation_of_z0() -> None:
     network = build("unet")
     with Split(network, "bottleneck") as split, torch.no_grad():
-        std = float(split.front(picture()).std(correction=0))
+        std = float(split.front(image()).std(correction=0))
     assert refined(network, "bottleneck", RefineSettings(lr="3%")).step == pytest.approx(0.03 * std)
 
 
@@ -236,7 +236,7 @@ def test_a_blurred_gradient_moves_what_no_point_reaches() -> None:
 
 
 class Doubling(nn.Module):
-    """depth = 2·z, z the first channel of the picture."""
+    """depth = 2·z, z the first channel of the image."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -248,7 +248,7 @@ class Doubling(nn.Module):
 
 @pytest.mark.parametrize("name", ["resnet", "unet", "midas"])
 @pytest.mark.parametrize("lr", [0.02, 1.0])
-def test_the_kept_iterate_has_the_lowest_loss_and_is_one_of_the_way(name: str, lr: float) -> None:
+def test_the_kept_iterate_has_the_lowest_loss_of_the_trajectory(name: str, lr: float) -> None:
     settings = RefineSettings(iterations=6, lr=lr, update="sign")
     last, best = (
         refined(build(name), CUTS[name][0], replace(settings, keep_best=keep))
@@ -315,7 +315,7 @@ def test_a_line_search_takes_back_what_raises_the_loss_and_goes_half_as_far() ->
 
 
 @pytest.mark.parametrize("update", UPDATES)
-def test_the_result_of_a_line_search_is_the_best_of_its_way(update: str) -> None:
+def test_the_result_of_a_line_search_is_the_best_of_its_trajectory(update: str) -> None:
     settings = RefineSettings(iterations=8, lr=0.5, update=update, line_search=True)
     result = refined(build("unet"), "bottleneck", settings)
     at_points = (POINTS.sample(result.after) - POINTS.depth).abs().mean()
@@ -395,13 +395,13 @@ def test_a_bad_prediction_without_updates_is_handed_over_as_it_is() -> None:
 
 def test_a_step_far_too_large_diverges_and_leaves_the_network_as_it_was() -> None:
     network = build("unet")
-    before = plain(network, picture())
+    before = plain(network, image())
     with pytest.raises(DivergedError, match="try a smaller --lr"):
         refined(network, "bottleneck", RefineSettings(lr=1e38, update="sgd", loss="l2"))
-    assert torch.equal(plain(network, picture()), before)
+    assert torch.equal(plain(network, image()), before)
 
 
-# ------------------------------------------------------------------ no way back to z
+# ------------------------------------------------------------------ no gradient to z
 
 
 class NoWayBack(nn.Module):
@@ -444,7 +444,7 @@ def test_a_forward_wholly_without_gradients_is_refused(mode: Any) -> None:
 def test_another_tensor_that_requires_gradient_does_not_hide_a_missing_one() -> None:
     network = NoWayBack("unused")
     network.scale = torch.ones(1, requires_grad=True)
-    network.head.register_forward_hook(lambda module, given, output: output * network.scale)
+    network.head.register_forward_hook(lambda module, inputs, output: output * network.scale)
     with pytest.raises(LayerError, match="no gradient comes back"):
         refined(network, "cut", RefineSettings())
 
@@ -473,7 +473,7 @@ OTHERS = (
     SparsePoints(xy=torch.tensor([[2.5, 7.0]]), depth=torch.tensor([9.0]), size=(16, 16)),
     SparsePoints(xy=POINTS.xy.flip(1), depth=POINTS.depth * 3, size=(16, 16)),
 )
-PICTURES = torch.cat([picture(), picture().flip(-1) * 2, picture() - 1])
+IMAGES = torch.cat([image(), image().flip(-1) * 2, image() - 1])
 
 
 def refined_at_once(
@@ -481,14 +481,14 @@ def refined_at_once(
 ) -> list[Refinement | PnpDepthError]:
     reads = read if isinstance(read, list) else [read] * 3
     with Split(network, layer) as split:
-        return refine_batch(split, (PICTURES,), OTHERS, settings, depth_of=reads, **more)
+        return refine_batch(split, (IMAGES,), OTHERS, settings, depth_of=reads, **more)
 
 
 def refined_alone(
     network: nn.Module, layer: str, settings: RefineSettings, index: int
 ) -> Refinement:
     with Split(network, layer) as split:
-        x = (PICTURES[index : index + 1],)
+        x = (IMAGES[index : index + 1],)
         return refine(split, x, OTHERS[index], settings, depth_of=depth_of)
 
 
@@ -590,7 +590,7 @@ def test_an_error_of_one_frames_reading_stays_its_own() -> None:
 
 
 class Sequence(nn.Module):
-    """Its z has the batch second, as in nn.Transformer; its output drops it, if asked."""
+    """Its z has the batch second, as in nn.Transformer; its output drops it on request."""
 
     def __init__(self, *, dropping: bool) -> None:
         super().__init__()
@@ -611,7 +611,7 @@ def test_a_network_without_one_part_per_frame_is_refused_and_works_one_at_a_time
         refined_at_once(network, layer, RefineSettings(), read=lambda y: y)
     assert error.value.exit_code == 4
     with Split(network, layer) as split:
-        alone = refine(split, (picture(),), POINTS, RefineSettings(), depth_of=lambda y: y)
+        alone = refine(split, (image(),), POINTS, RefineSettings(), depth_of=lambda y: y)
     assert alone.losses[-1] < alone.losses[0]
 
 
@@ -629,7 +629,7 @@ def test_structures_are_taken_apart_for_each_frame() -> None:
     results = refined_at_once(network, "cut", RefineSettings(), read=lambda y: y["depth"])
     for index, together in enumerate(results):
         assert isinstance(together, Refinement)
-        x = (PICTURES[index : index + 1],)
+        x = (IMAGES[index : index + 1],)
         with Split(network, "cut") as split:
             alone = refine(split, x, OTHERS[index], RefineSettings(), depth_of=lambda y: y["depth"])
         assert torch.equal(together.after, alone.after)

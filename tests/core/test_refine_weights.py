@@ -20,7 +20,7 @@ from pnpdepth_cli.core.weights_refinement import MIN_POINTS, FrameOfPoints
 from pnpdepth_cli.errors import DivergedError, LayerError, UsageError
 from pnpdepth_cli.points import SparsePoints
 from tests.completion.naive import plain
-from tests.core.networks import build, conv, depth_of, picture
+from tests.core.networks import build, conv, depth_of, image
 from tests.core.split.test_split import Failing, same, state_of
 
 SETTINGS = RefineSettings(
@@ -54,7 +54,7 @@ def points(count: int = 40, seed: int = 0) -> SparsePoints:
 def refined(
     network: nn.Module, settings: RefineSettings = SETTINGS, at: SparsePoints | None = None
 ) -> Refinement:
-    at, rgb = at or points(), picture()
+    at, rgb = at or points(), image()
     with InputSplit(network) as split:
         frame = FrameOfPoints(
             points=at,
@@ -77,14 +77,14 @@ def naive(network: nn.Module, at: SparsePoints) -> Tensor:
     network.encoder.requires_grad_(False)
     for _ in range(SETTINGS.iterations):
         away = masks.next()
-        asked = shown.select(away)
-        depth = network(picture(), shown.select(~away).scatter())
-        loss = (asked.sample(depth).log() - asked.depth.log()).abs().mean()
+        hidden = shown.select(away)
+        depth = network(image(), shown.select(~away).scatter())
+        loss = (hidden.sample(depth).log() - hidden.depth.log()).abs().mean()
         gradients = torch.autograd.grad(loss, moved)
         with torch.no_grad():
             for parameter, gradient in zip(moved, gradients, strict=True):
                 parameter -= SETTINGS.lr * gradient
-    depth = network(picture(), at.scatter())
+    depth = network(image(), at.scatter())
     return depth.detach()
 
 
@@ -92,7 +92,7 @@ def naive(network: nn.Module, at: SparsePoints) -> Tensor:
 
 
 def test_what_does_not_depend_on_the_points_runs_once_and_nothing_changes() -> None:
-    network, rgb = TwoInputs().eval(), picture()
+    network, rgb = TwoInputs().eval(), image()
     calls: list[int] = []
     network.encoder[0].forward = _counted(network.encoder[0].forward, calls)  # type: ignore
     frames = [points(40, seed).scatter() for seed in range(3)]
@@ -114,7 +114,7 @@ def test_what_does_not_depend_on_the_points_runs_once_and_nothing_changes() -> N
 
 @pytest.mark.parametrize("name", ["resnet", "unet", "in place", "branching", "updating"])
 def test_a_network_whose_only_input_varies_runs_as_a_whole(name: str) -> None:
-    network, x = build(name), picture()
+    network, x = build(name), image()
     wholes = [depth_of(plain(network, frame)) for frame in (x, x * 0.7)]
     with InputSplit(network) as split, torch.no_grad():
         assert torch.equal(depth_of(split.first(x, varying=(0,))), wholes[0])
@@ -169,7 +169,7 @@ def test_with_target_given_the_loss_at_all_points_falls() -> None:
     network, at = TwoInputs(), points()
     settings = replace(SETTINGS, target="given", update="adam", lr=0.01)
     with Split(network, "enter") as split:
-        z = split.front(picture(), at.scatter())
+        z = split.front(image(), at.scatter())
         frame = FrameOfPoints(
             points=at,
             inliers=at,

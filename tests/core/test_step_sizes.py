@@ -18,7 +18,7 @@ def points(count: int, size: tuple[int, int]) -> SparsePoints:
     return SparsePoints(xy=torch.zeros(count, 2), depth=torch.ones(count), size=size)
 
 
-def test_a_per_cent_step_is_that_share_of_the_standard_deviation_of_z0() -> None:
+def test_a_per_cent_step_is_that_fraction_of_the_standard_deviation_of_z0() -> None:
     z = torch.tensor([1.0, 3.0, 1.0, 3.0])  # standard deviation 1
     assert step_size("3%", z) == pytest.approx(0.03)
     assert step_size(" 3 % ", z * 10) == pytest.approx(0.3)
@@ -36,10 +36,10 @@ def test_what_is_no_step_is_refused(lr: float | str) -> None:
 
 @pytest.mark.parametrize("name", SCHEDULES)
 def test_a_schedule_starts_at_the_whole_step_and_never_reaches_nothing(name: str) -> None:
-    shares = [SCHEDULES[name](k / 20) for k in range(20)]
-    assert shares[0] == 1
-    assert shares == sorted(shares, reverse=True)
-    assert shares[-1] > 0
+    fractions = [SCHEDULES[name](k / 20) for k in range(20)]
+    assert fractions[0] == 1
+    assert fractions == sorted(fractions, reverse=True)
+    assert fractions[-1] > 0
 
 
 def test_a_linear_schedule_falls_by_the_same_amount_every_time() -> None:

@@ -101,10 +101,10 @@ def test_l_bfgs_moves_as_dense_bfgs_does_whatever_the_step(
     z, update = torch.randn(6, dtype=torch.float64), lbfgs()
     steps: list[Tensor] = []
     changes: list[Tensor] = []
-    for made in range(6):
+    for count in range(6):
         gradient = curved @ z
         moved = -alpha * update(gradient)
-        if made:
+        if count:
             torch.testing.assert_close(moved, -dense_bfgs(steps, changes) @ gradient)
         steps.append(moved)
         changes.append(curved @ (z + moved) - gradient)

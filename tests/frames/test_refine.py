@@ -71,8 +71,8 @@ def test_a_frame_that_fails_does_not_lose_the_others(network: Network) -> None:
     network = replace(
         network, definition=replace(network.definition, size=Fixed(32, 32, fit="crop"))
     )
-    wrong = torch.tensor([[1.0, 20.0]])  # left of the square crop
-    outside = SparsePoints(xy=wrong, depth=torch.ones(1), size=(46, 62))
+    xy = torch.tensor([[1.0, 20.0]])  # left of the square crop
+    outside = SparsePoints(xy=xy, depth=torch.ones(1), size=(46, 62))
     frames = [frame_of(0), frame_of(1).with_points(outside), frame_of(2)]
     first, failed, last = together(network, SETTINGS, frames)
     assert isinstance(failed, NoPointsError)

@@ -100,21 +100,21 @@ def test_tiles_of_one_size_cover_the_frame_and_overlap_by_a_quarter(
 @given(
     st.lists(st.tuples(st.floats(-0.5, 149.25), st.floats(-0.5, 99.25)), min_size=1, max_size=30)
 )
-def test_every_point_is_in_a_tile_at_its_place_and_in_no_tile_it_lies_outside_of(
-    places: list[tuple[float, float]],
+def test_every_point_is_in_the_tiles_that_contain_its_position(
+    positions: list[tuple[float, float]],
 ) -> None:
     points = SparsePoints(
-        xy=torch.tensor(places), depth=torch.arange(1.0, len(places) + 1), size=(100, 150)
+        xy=torch.tensor(positions), depth=torch.arange(1.0, len(positions) + 1), size=(100, 150)
     )
-    found = set()
+    depths = set()
     for tile in tiles_of((100, 150), SIDE):
         part = tile.points(points)
         assert part.size == (tile.height, tile.width)
-        found |= set(part.depth.tolist())
+        depths |= set(part.depth.tolist())
         back = part.xy + torch.tensor([float(tile.left), float(tile.top)])
         assert torch.allclose(back, points.xy[part.depth.long() - 1], atol=1e-4)
         assert bool((part.xy >= -0.5).all() and (part.xy < SIDE - 0.5).all())
-    assert found == set(points.depth.tolist())
+    assert depths == set(points.depth.tolist())
 
 
 def test_a_network_that_sees_pixels_alone_gives_the_same_in_tiles_as_in_one_piece() -> None:
@@ -122,10 +122,10 @@ def test_a_network_that_sees_pixels_alone_gives_the_same_in_tiles_as_in_one_piec
     module, one = PixelByPixel(), everywhere((100, 150))
     with Split(module, "features") as split:
         whole = refine_frame(network(module), split, PLAIN, one)
-    found = tiled(module, PLAIN, one)
-    np.testing.assert_allclose(found.after, whole.after, rtol=1e-5)
-    np.testing.assert_allclose(found.before, whole.before, rtol=1e-5)
-    assert found.notes[-1].startswith("tiles: 6 of 64×64 pixels")
+    refined = tiled(module, PLAIN, one)
+    np.testing.assert_allclose(refined.after, whole.after, rtol=1e-5)
+    np.testing.assert_allclose(refined.before, whole.before, rtol=1e-5)
+    assert refined.notes[-1].startswith("tiles: 6 of 64×64 pixels")
 
 
 def test_a_frame_no_larger_than_a_tile_is_refined_in_one_piece() -> None:
@@ -134,9 +134,9 @@ def test_a_frame_no_larger_than_a_tile_is_refined_in_one_piece() -> None:
     settings = RefineSettings(iterations=3)
     with Split(module, "features") as split:
         whole = refine_frame(network(module), split, settings, one)
-    found = tiled(module, settings, one)
-    assert np.array_equal(found.after, whole.after)
-    assert found.notes == whole.notes
+    refined = tiled(module, settings, one)
+    assert np.array_equal(refined.after, whole.after)
+    assert refined.notes == whole.notes
 
 
 def test_the_depths_of_tiles_run_into_each_other_without_a_step() -> None:
@@ -144,30 +144,30 @@ def test_the_depths_of_tiles_run_into_each_other_without_a_step() -> None:
     settings = RefineSettings(iterations=60, lr=0.01)
     after = tiled(OneNumber(), settings, everywhere((64, 400))).after
     assert after.max() / after.min() > 1.15
-    # where two tiles differ by that much, no two neighbours differ by more than its share
+    # the difference between two tiles is distributed evenly over their overlap
     overlap = OVERLAP * SIDE
     steps = np.abs(np.diff(after, axis=1)) / after[:, :-1]
     assert steps.max() < 1.1 * (after.max() / after.min() - 1) / overlap
 
 
-def test_tiles_with_too_few_points_show_the_depth_of_the_whole_frame_and_it_is_said() -> None:
+def test_tiles_with_too_few_points_have_the_depth_of_the_whole_frame() -> None:
     torch.manual_seed(0)
     module = OneNumber()
     one = frame_of([(x, 10 + x) for x in range(10)], [3.0] * 10, (64, 300))
-    found = tiled(module, RefineSettings(iterations=200, lr=0.01), one)
-    assert np.unique(found.after[:, 100:]).size <= 3  # one number, to the last bit of a division
-    np.testing.assert_allclose(found.after[:, 100:], found.after[0, 299], rtol=1e-6)
-    assert "of them left as in the whole frame, with fewer than 5 points" in found.notes[-1]
+    refined = tiled(module, RefineSettings(iterations=200, lr=0.01), one)
+    assert np.unique(refined.after[:, 100:]).size <= 3  # one number, to the last bit of a division
+    np.testing.assert_allclose(refined.after[:, 100:], refined.after[0, 299], rtol=1e-6)
+    assert "of them left as in the whole frame, with fewer than 5 points" in refined.notes[-1]
 
 
 def test_propagation_follows_once_over_all_tiles() -> None:
     torch.manual_seed(0)
     module, one = PixelByPixel(), everywhere((64, 150))
-    found = tiled(module, PLAIN, one, "gp")
-    at_points = one.points.sample(torch.from_numpy(found.after))
+    refined = tiled(module, PLAIN, one, "gp")
+    at_points = one.points.sample(torch.from_numpy(refined.after))
     assert float((at_points - one.points.depth).abs().mean()) < 0.05
     assert (
-        float((one.points.sample(torch.from_numpy(found.before)) - one.points.depth).abs().mean())
+        float((one.points.sample(torch.from_numpy(refined.before)) - one.points.depth).abs().mean())
         > 0.2
     )
 

@@ -19,8 +19,8 @@ from tests.fuzz.mutations import mutated
 
 SECONDS, BYTES = 5.0, 1.5e9
 """CPU time and memory that no input may exceed."""
-SILENCE_S = 120
-"""Wall-clock time without a report after which the worker hangs."""
+START_S, SILENCE_S = 900, 240
+"""Wall-clock time before and between reports after which the worker hangs, on a busy machine."""
 CODES = {0, 2, 3, 4, 5, 6, 7}
 """Exit codes of the program that are not its own bug."""
 
@@ -80,8 +80,11 @@ def fuzz(folder: Path, seed: int, first: int, count: int) -> FuzzResult:
             first = line["end"] + 1
             _record(result, folder, seed, line)
         if started is not None:
+            data = (folder / started["file"]).read_bytes()  # the worker did not put it right again
             problem = "the process died or hung"
-            result.findings.append(_finding(folder, seed, started["start"], started, problem))
+            result.findings.append(
+                Finding(number=started["start"], file=started["file"], problem=problem, data=data)
+            )
             first = started["start"] + 1
             result.inputs += 1
         elif first < end:
@@ -101,7 +104,9 @@ def _reports(folder: Path, seed: int, first: int, count: int) -> Iterator[dict[s
         cwd=Path.cwd(),
     ) as process:
         assert process.stdout is not None
-        while select.select([process.stdout], [], [], SILENCE_S)[0]:
+        silence_s = START_S
+        while select.select([process.stdout], [], [], silence_s)[0]:
+            silence_s = SILENCE_S
             text = process.stdout.readline()
             if not text:
                 return

@@ -16,16 +16,11 @@ from PIL.PngImagePlugin import PngInfo
 
 from pnpdepth_cli.errors import FileFormatError, InputError, UsageError
 from pnpdepth_cli.io.depth import read_depth
+from tests.exr_files import write_exr
 
 CODES = np.array([[0, 256, 512], [1000, 25600, 65534]], dtype=np.uint16)
 METRES = np.array([[0, 1.5, np.nan], [np.inf, -2, 80.25]], dtype=np.float32)
 KNOWN = np.array([[0, 1.5, 0], [0, 0, 80.25]], dtype=np.float32)
-
-
-def write_exr(path: Path, channels: dict[str, np.ndarray], **header: object) -> None:
-    given = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, **header}
-    with OpenEXR.File(given, {k: OpenEXR.Channel(v) for k, v in channels.items()}) as file:
-        file.write(str(path))
 
 
 @pytest.fixture

@@ -5,22 +5,16 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import OpenEXR
 import pytest
 from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
 from pnpdepth_cli.errors import FileFormatError, InputError
 from pnpdepth_cli.io.rgb import read_rgb, srgb_from_linear
+from tests.exr_files import write_exr
 
 COLOURS = np.random.default_rng(1).integers(0, 256, (7, 11, 3)).astype(np.uint8)
 COLOURS_16 = np.random.default_rng(2).integers(0, 65536, (7, 11, 3)).astype(np.uint16)
-
-
-def write_exr(path: Path, channels: dict[str, np.ndarray], **header: object) -> None:
-    given = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, **header}
-    with OpenEXR.File(given, {k: OpenEXR.Channel(v) for k, v in channels.items()}) as file:
-        file.write(str(path))
 
 
 @pytest.mark.parametrize("suffix", [".png", ".tif"])

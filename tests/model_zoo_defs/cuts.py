@@ -30,7 +30,7 @@ def built(definition: ModelDefinition) -> Network:
 
 
 def size_of(network: Network) -> tuple[int, int]:
-    """The picture size it is tried with: its own, or a small one that it takes."""
+    """The image size of the test: the network's fixed size, or a small valid one."""
     size = network.definition.size
     if isinstance(size, Fixed):
         return size.height, size.width
@@ -38,7 +38,7 @@ def size_of(network: Network) -> tuple[int, int]:
 
 
 def frame_for(network: Network, size: tuple[int, int] | None = None) -> tuple[Tensor, ...]:
-    """Its arguments for a made-up picture, of `size_of` by default."""
+    """Arguments of the network for a synthetic image, of `size_of` by default."""
     height, width = size or size_of(network)
     return synthetic_arguments(network, FrameMap.fit(Fixed(height, width), height, width))
 

@@ -39,7 +39,7 @@ def dense(kernel: Array, size: tuple[int, int]) -> Array:
 
 @pytest.mark.parametrize("size", [(1, 1), (5, 8), (6, 7), (12, 9)])
 @pytest.mark.parametrize("k", [11, 5, 3])
-def test_both_ways_through_a_dictionary_are_one_matrix_and_its_transpose(
+def test_analysis_and_synthesis_of_a_dictionary_are_a_matrix_and_its_transpose(
     k: int, size: tuple[int, int]
 ) -> None:
     torch.manual_seed(0)
@@ -55,7 +55,7 @@ def test_both_ways_through_a_dictionary_are_one_matrix_and_its_transpose(
 
 
 def solved(network: Adnn, sparse: Array, iterations: int) -> Array:
-    """ADMM and the way back to depth with dense matrices, from the authors' update rules."""
+    """ADMM and the synthesis of depth with dense matrices, from the authors' update rules."""
     kernels = [getattr(network, f"kernel{i}").detach().numpy() for i in range(3)]
     penalty = [float(getattr(network, f"bias{i}").detach().abs()) / 1000 for i in range(3)]
     sizes = [sparse.shape]
@@ -104,10 +104,10 @@ def test_depth_is_that_of_the_same_iterations_with_dense_matrices(
     rng = np.random.default_rng(0)
     sparse = rng.uniform(1, 9, size) * (rng.random(size) < 0.1)
     with torch.no_grad():
-        found = network(torch.from_numpy(sparse)[None, None])[0, 0].numpy()
+        depth = network(torch.from_numpy(sparse)[None, None])[0, 0].numpy()
     expected = solved(network, sparse, iterations)
     assert np.abs(expected).max() > 1e-3
-    np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(depth, expected, rtol=1e-9, atol=1e-12)
 
 
 def test_the_published_network_iterates_ten_times() -> None:
@@ -130,9 +130,9 @@ def test_depth_is_finite_without_any_point(size: tuple[int, int]) -> None:
 
 def variables() -> dict[str, NDArray[np.float32]]:
     rng = np.random.default_rng(5)
-    found = {name: rng.normal(size=shape, scale=0.05) for name, shape in SHAPES.items()}
-    found |= {f"bias{i}": np.array(0.5 + i) for i in range(3)}
-    return {name: array.astype(np.float32) for name, array in found.items()}
+    arrays = {name: rng.normal(size=shape, scale=0.05) for name, shape in SHAPES.items()}
+    arrays |= {f"bias{i}": np.array(0.5 + i) for i in range(3)}
+    return {name: array.astype(np.float32) for name, array in arrays.items()}
 
 
 def test_the_kernels_have_as_many_values_as_the_authors() -> None:
@@ -141,7 +141,7 @@ def test_the_kernels_have_as_many_values_as_the_authors() -> None:
     assert len(sizes) == 6
 
 
-def test_the_authors_variables_load_from_npz_each_in_its_place(tmp_path: Path) -> None:
+def test_the_authors_variables_load_from_npz_into_their_parameters(tmp_path: Path) -> None:
     arrays = variables()
     np.savez(tmp_path / "adnn.npz", **arrays)
     network = load_network("adnn", tmp_path / "adnn.npz").module

@@ -74,8 +74,8 @@ def test_points_ten_times_as_far_give_depth_ten_times_as_far(
     rgb, sparse = frame(96, 128, 300)
     with torch.no_grad():
         expected = network(rgb, sparse) * factor
-        found = network(rgb, sparse * factor)
-    torch.testing.assert_close(found, expected, rtol=1e-3, atol=0.0)
+        depth = network(rgb, sparse * factor)
+    torch.testing.assert_close(depth, expected, rtol=1e-3, atol=0.0)
 
 
 def test_samples_of_a_batch_do_not_see_each_other(network: Compact) -> None:
@@ -98,11 +98,11 @@ def test_a_plane_seen_at_some_points_is_continued_as_a_plane(network: Compact) -
     torch.manual_seed(0)
     untrained = Compact().eval()
     rows, columns = torch.meshgrid(torch.arange(96.0), torch.arange(128.0), indexing="ij")
-    truth = torch.exp(0.002 * rows - 0.003 * columns).view(1, 1, 96, 128)
+    ground_truth = torch.exp(0.002 * rows - 0.003 * columns).view(1, 1, 96, 128)
     rgb, points = frame(96, 128, 400)
     with torch.no_grad():
-        depth = untrained(torch.zeros_like(rgb), truth * (points > 0))
-    error = (torch.log(depth) - torch.log(truth)).abs()
+        depth = untrained(torch.zeros_like(rgb), ground_truth * (points > 0))
+    error = (torch.log(depth) - torch.log(ground_truth)).abs()
     assert float(error.mean()) < 0.03
 
 
@@ -149,11 +149,11 @@ def test_prior_and_points_ten_times_as_far_give_depth_ten_times_as_far(shaken: C
     prior = prior_of(96, 128)
     with torch.no_grad():
         expected = shaken(rgb, sparse, prior) * 10.0
-        found = shaken(rgb, sparse * 10.0, prior * 10.0)
-    torch.testing.assert_close(found, expected, rtol=1e-3, atol=0.0)
+        depth = shaken(rgb, sparse * 10.0, prior * 10.0)
+    torch.testing.assert_close(depth, expected, rtol=1e-3, atol=0.0)
 
 
-def test_samples_with_and_without_a_prior_share_a_batch(shaken: Compact) -> None:
+def test_samples_with_and_without_a_prior_can_be_in_one_batch(shaken: Compact) -> None:
     one, other = frame(64, 96, 30, seed=1), frame(64, 96, 700, seed=2)
     batch = [torch.cat(pair) for pair in zip(one, other, strict=True)]
     priors = torch.cat([prior_of(64, 96), torch.zeros(1, 1, 64, 96)])
@@ -167,14 +167,14 @@ def test_an_exact_prior_lets_the_untrained_network_know_what_no_point_shows() ->
     """A step between two points is known to the prior alone."""
     torch.manual_seed(0)
     untrained = Compact().eval()
-    truth = torch.full((1, 1, 96, 128), 2.0)
-    truth[..., 64:] = 4.0
+    ground_truth = torch.full((1, 1, 96, 128), 2.0)
+    ground_truth[..., 64:] = 4.0
     rgb, sparse = torch.zeros(1, 3, 96, 128), torch.zeros(1, 1, 96, 128)
     sparse[..., 48, 30], sparse[..., 48, 98] = 2.0, 4.0
     with torch.no_grad():
         errors = [
-            (torch.log(depth) - torch.log(truth)).abs().mean()
-            for depth in (untrained(rgb, sparse, truth), untrained(rgb, sparse))
+            (torch.log(depth) - torch.log(ground_truth)).abs().mean()
+            for depth in (untrained(rgb, sparse, ground_truth), untrained(rgb, sparse))
         ]
     assert errors[0] < 0.7 * errors[1]
 
@@ -193,11 +193,11 @@ def test_rear_of_front_is_the_network_bit_for_bit(
 
 @pytest.mark.parametrize("with_prior", [False, True])
 def test_no_gradient_is_infinite(shaken: Compact, with_prior: bool) -> None:
-    """Cells with one point have no spread, whose square root has no slope."""
+    """Cells with one point have variance 0, where the gradient of the square root is infinite."""
     net = copy.deepcopy(shaken).train()
     rgb, sparse = frame(64, 96, 40)
-    found = net.outputs(rgb, sparse, prior_of(64, 96) if with_prior else None)
-    loss = sum(depth.log().abs().mean() for depth in found.depths) + net.sigma(found).mean()
+    outputs = net.outputs(rgb, sparse, prior_of(64, 96) if with_prior else None)
+    loss = sum(depth.log().abs().mean() for depth in outputs.depths) + net.sigma(outputs).mean()
     assert isinstance(loss, Tensor)
     loss.backward()
     for name, parameter in net.named_parameters():
@@ -213,17 +213,17 @@ def test_untrained_inlier_weights_are_one() -> None:
 
 def test_a_point_without_weight_moves_nothing() -> None:
     sparse = frame(64, 96, 100)[1]
-    wrong = sparse.clone()
-    wrong[..., 32, 48] = 900.0
+    changed = sparse.clone()
+    changed[..., 32, 48] = 900.0
     weight = torch.ones_like(sparse)
     weight[..., 32, 48] = 0.0
-    found = []
-    for depth in (sparse, wrong):
+    depths = []
+    for depth in (sparse, changed):
         points = Points(torch.where(weight > 0, depth, 0.0)) if depth is sparse else Points(depth)
         points.weigh(weight)
         moments = points.moments()
-        found.append(residual_of(moments, torch.zeros(1, 1, 8, 12) - points.median, 8).mean)
-    torch.testing.assert_close(found[0], found[1], rtol=1e-4, atol=1e-4)
+        depths.append(residual_of(moments, torch.zeros(1, 1, 8, 12) - points.median, 8).mean)
+    torch.testing.assert_close(depths[0], depths[1], rtol=1e-4, atol=1e-4)
 
 
 def test_sigma_is_positive_and_its_gradient_reaches_no_depth(shaken: Compact) -> None:
@@ -275,23 +275,23 @@ def test_the_shipped_weights_fit_and_are_small() -> None:
 @pytest.mark.skipif(
     definition.checkpoint is None or not definition.checkpoint.exists(), reason="not trained yet"
 )
-def test_the_shipped_inlier_weights_tell_outliers_on_a_slope() -> None:
+def test_the_shipped_inlier_weights_detect_outliers_on_a_slope() -> None:
     safetensors = pytest.importorskip("safetensors.torch")
     network = definition.build().eval()
     network.load_state_dict(safetensors.load_file(definition.checkpoint))
     generator = torch.Generator().manual_seed(5)
     rows, columns = torch.meshgrid(torch.arange(192.0), torch.arange(256.0), indexing="ij")
-    truth = (2.0 + 0.005 * rows + 0.003 * columns).view(1, 1, 192, 256)
-    known = torch.rand(truth.shape, generator=generator) < 0.01
-    wrong = known & (torch.rand(truth.shape, generator=generator) < 0.2)
+    ground_truth = (2.0 + 0.005 * rows + 0.003 * columns).view(1, 1, 192, 256)
+    known = torch.rand(ground_truth.shape, generator=generator) < 0.01
+    outlier = known & (torch.rand(ground_truth.shape, generator=generator) < 0.2)
     with torch.no_grad():
-        clean, _ = network.inlier_weights(Points(truth * known), None)
+        clean, _ = network.inlier_weights(Points(ground_truth * known), None)
         mixed, _ = network.inlier_weights(
-            Points(truth * known * torch.where(wrong, 2.0, 1.0)), None
+            Points(ground_truth * known * torch.where(outlier, 2.0, 1.0)), None
         )
     assert float(clean[known].mean()) > 0.98
-    assert float(mixed[known & ~wrong].mean()) > 0.95
-    assert float(mixed[wrong].mean()) < 0.3
+    assert float(mixed[known & ~outlier].mean()) > 0.95
+    assert float(mixed[outlier].mean()) < 0.3
 
 
 @pytest.mark.parametrize("layer", ["decoder.s32", "decoder.s8", "decoder.s2"])
@@ -303,11 +303,11 @@ def test_the_path_is_the_same_for_every_frame_as_the_definition_promises(
         split.rear(split.front(*frame(96, 128, 60)))
         assert split.static_graph
         # from no point at all to nearly every cell seen
-        found = []
+        layers = []
         for count in (0, 1, 30, 3000):
             z = split.front(*frame(96, 128, count, seed=count + 1))
-            found.append((count, z.clone(), split.rear(z + 0.1).clone()))
-    for count, z, depth in found:
+            layers.append((count, z.clone(), split.rear(z + 0.1).clone()))
+    for count, z, depth in layers:
         with Split(network, layer) as fresh:
             assert torch.equal(fresh.front(*frame(96, 128, count, seed=count + 1)), z)
             assert torch.equal(fresh.rear(z + 0.1), depth)

@@ -28,10 +28,10 @@ def test_halving_keeps_the_depth_of_the_most_confident_pixel() -> None:
     depth = torch.arange(16.0).reshape(1, 1, 4, 4)
     confidence = torch.zeros(1, 1, 4, 4)
     confidence[0, 0, 1, 1], confidence[0, 0, 2, 3] = 0.8, 0.4
-    picked, share = halved(depth, confidence)
+    picked, fraction = halved(depth, confidence)
     assert picked[0, 0, 0, 0] == 5
     assert picked[0, 0, 1, 1] == 11
-    assert share[0, 0, 0, 0] == pytest.approx(0.2)
+    assert fraction[0, 0, 0, 0] == pytest.approx(0.2)
 
 
 def test_the_networks_have_as_many_values_as_published() -> None:

@@ -1,4 +1,4 @@
-"""fcrn: the authors' file finds its place to the last array, their graph is followed to the pad."""
+"""fcrn: every array of the authors' file loads, and the graph is theirs, padding included."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ def random_arrays(seed: int) -> Fill:
 def reference(rgb: Tensor, arrays: Arrays) -> Tensor:
     """Depth straight from the authors' arrays, written from the facts about their TensorFlow code.
 
-    In their layout (1, rows, columns, channels); convolutions are sums over shifted pictures.
+    In their layout (1, rows, columns, channels); convolutions are sums over shifted images.
     """
 
     def conv(x: Tensor, name: str, stride: int = 1, pads: Any = None) -> Tensor:
@@ -163,7 +163,7 @@ def pooled_by_loop(x: Tensor) -> Tensor:
 # ------------------------------------------------------------------ the authors' file
 
 
-def test_every_array_of_the_published_file_finds_its_place(tmp_path: Path) -> None:
+def test_every_array_of_the_published_file_loads_into_its_parameter(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     arrays = authors(64, lambda shape: rng.random(shape, dtype=np.float32))
     path = write_npy(tmp_path / "NYU_ResNet-UpProj.npy", arrays)
@@ -218,7 +218,7 @@ def test_the_graph_is_the_authors_for_even_and_odd_sizes(
 
 
 @pytest.mark.parametrize(
-    ("gone", "said"),
+    ("gone", "message"),
     [
         (("conv1", "biases"), r"1 missing \(conv1\.bias\)"),
         (("layer1", "biases"), r"1 missing \(layer1\.bias\)"),
@@ -226,11 +226,11 @@ def test_the_graph_is_the_authors_for_even_and_odd_sizes(
     ],
 )
 def test_an_array_that_is_missing_is_named(
-    gone: tuple[str, str], said: str, tmp_path: Path
+    gone: tuple[str, str], message: str, tmp_path: Path
 ) -> None:
     arrays = authors(4, random_arrays(1))
     del arrays[gone[0]][gone[1]]
-    with pytest.raises(CheckpointError, match=said):
+    with pytest.raises(CheckpointError, match=message):
         narrow(arrays, tmp_path)
 
 
@@ -274,7 +274,7 @@ def test_files_of_ports_say_that_they_are_another_network(
         load_network("fcrn", tmp_path / "checkpoint.pth.tar")
 
 
-# ------------------------------------------------------------------ what ports get wrong
+# ------------------------------------------------------------------ what ports change
 
 
 @pytest.mark.parametrize("size", [(6, 8), (7, 9), (6, 9), (2, 2), (1, 5)])

@@ -33,9 +33,9 @@ def test_an_encoder_has_as_many_values_as_nasnet_mobile() -> None:
 
 def test_features_halve_five_times() -> None:
     encoder = Encoder(1, 8, 2)
-    found = encoder(torch.rand(2, 1, 64, 96))
+    pyramid = encoder(torch.rand(2, 1, 64, 96))
     shapes = [(2, channels, 64 >> i, 96 >> i) for i, channels in enumerate(encoder.channels, 1)]
-    assert [tuple(features.shape) for features in found] == shapes
+    assert [tuple(features.shape) for features in pyramid] == shapes
 
 
 def test_nothing_normalises_behind_the_first_strided_convolution() -> None:
@@ -46,7 +46,7 @@ def test_nothing_normalises_behind_the_first_strided_convolution() -> None:
     assert torch.equal(encoder(2 * sparse)[0], 2 * encoder(sparse)[0])
 
 
-def test_a_mean_counts_pixels_inside_the_picture_only() -> None:
+def test_a_mean_counts_pixels_inside_the_image_only() -> None:
     assert torch.equal(averaged(torch.full((1, 1, 5, 6), 3.0)), torch.full((1, 1, 5, 6), 3.0))
 
 
@@ -54,19 +54,19 @@ def test_halving_sees_even_and_odd_pixels() -> None:
     layer = Halved(1, 2).eval().requires_grad_(False)
     layer.even.weight.fill_(1)
     layer.odd.weight.fill_(1)
-    found = layer(torch.arange(16.0).reshape(1, 1, 4, 4))
+    halves = layer(torch.arange(16.0).reshape(1, 1, 4, 4))
     expected = torch.tensor([[[0, 2], [8, 10]], [[5, 7], [13, 15]]]).float()
-    torch.testing.assert_close(found[0], expected, rtol=1e-4, atol=0)
+    torch.testing.assert_close(halves[0], expected, rtol=1e-4, atol=0)
 
 
 @pytest.mark.parametrize("size", [(32, 32), (64, 160)])
-@pytest.mark.parametrize("share", [0.0, 0.01, 1.0])
+@pytest.mark.parametrize("fraction", [0.0, 0.01, 1.0])
 def test_depth_is_between_0_and_200_m_whatever_the_points(
-    size: tuple[int, int], share: float
+    size: tuple[int, int], fraction: float
 ) -> None:
     network = built(TINY).module
     for scale in (1.0, 1e3):
-        sparse = scale * 80 * (torch.rand(1, 1, *size) < share)
+        sparse = scale * 80 * (torch.rand(1, 1, *size) < fraction)
         with torch.no_grad():
             depth = network(scale * torch.randn(1, 3, *size), sparse)
         assert depth.shape == (1, 1, *size)
@@ -74,7 +74,7 @@ def test_depth_is_between_0_and_200_m_whatever_the_points(
         assert bool((depth <= 200.01).all())
 
 
-def test_both_pictures_matter() -> None:
+def test_both_inputs_matter() -> None:
     network = built(TINY).module
     rgb, sparse = frame_for(built(TINY))
     with torch.no_grad():
@@ -107,7 +107,7 @@ def test_every_layer_can_be_cut_at_and_a_step_there_changes_depth(layer: str) ->
     assert_the_cut_changes_nothing_and_a_step_does(network, layer)
 
 
-def test_the_full_network_is_cut_at_the_same_place() -> None:
+def test_the_full_network_is_cut_at_the_same_layer() -> None:
     network = definitions["latefusion"].build().eval()
     rgb, sparse = torch.rand(1, 3, 32, 64), torch.rand(1, 1, 32, 64)
     with torch.no_grad(), Split(network, "decoder.s8") as split:

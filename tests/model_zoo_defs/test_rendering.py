@@ -184,6 +184,6 @@ def test_a_depth_that_does_not_fit_sixteen_bits_is_refused(tmp_path: Path) -> No
 def test_a_written_depth_states_its_scale_and_reads_back(tmp_path: Path) -> None:
     depth = np.array([[0.0, 1.234], [65.0, 0.001]])
     make_samples.write_depth(tmp_path / "d.png", depth, 1000)
-    with Image.open(tmp_path / "d.png") as picture:
-        assert picture.info["pnpdepth:scale"] == "1000"
-        np.testing.assert_array_equal(np.asarray(picture), (depth * 1000).round())
+    with Image.open(tmp_path / "d.png") as image:
+        assert image.info["pnpdepth:scale"] == "1000"
+        np.testing.assert_array_equal(np.asarray(image), (depth * 1000).round())

@@ -43,7 +43,7 @@ def published() -> dict[str, tuple[int, ...]]:
     return shapes
 
 
-def test_pictures_go_in_between_minus_one_and_one() -> None:
+def test_the_input_range_is_minus_one_to_one() -> None:
     """The published weights were trained so, not with ImageNet's mean and deviation."""
     for name in ("sfmlearner", "sfmlearner-tiny"):
         normalisation = definitions[name].normalisation
@@ -135,7 +135,7 @@ def test_every_layer_can_be_cut_at_and_a_step_there_changes_depth(layer: str) ->
     assert_the_cut_changes_nothing_and_a_step_does(network, layer)
 
 
-def test_the_pose_network_published_beside_it_is_told_apart(tmp_path: Path) -> None:
+def test_the_published_pose_network_is_refused_by_name(tmp_path: Path) -> None:
     path = tmp_path / "exp_pose_model_best.pth.tar"
     torch.save({"epoch": 200, "state_dict": {"pose_pred.weight": torch.zeros(12, 256, 1, 1)}}, path)
     with pytest.raises(CheckpointError, match="this is the pose network"):

@@ -28,18 +28,18 @@ def norm(name: str, channels: int) -> Shapes:
     return {f"{name}.{v}": (channels,) for v in vectors} | {f"{name}.num_batches_tracked": ()}
 
 
-def stage(name: str, depth: int, place: int, channels: int, width: int) -> tuple[Shapes, int]:
-    """The tensors of the stage at `place` (0…3) of torchvision's ResNet, and its channels out."""
-    inner, shapes = width << place, Shapes()
+def stage(name: str, depth: int, position: int, channels: int, width: int) -> tuple[Shapes, int]:
+    """Tensor shapes of stage `position` (0…3) of torchvision's ResNet, and its output channels."""
+    inner, shapes = width << position, Shapes()
     out = inner * (4 if depth >= 50 else 1)
-    for number in range(BLOCKS[depth][place]):
+    for number in range(BLOCKS[depth][position]):
         block = f"{name}.{number}"
         convs = [(inner, channels, 3), (inner, inner, 3)]
         if depth >= 50:
             convs = [(inner, channels, 1), (inner, inner, 3), (out, inner, 1)]
         for i, (to, of, k) in enumerate(convs, start=1):
             shapes |= {f"{block}.conv{i}.weight": (to, of, k, k), **norm(f"{block}.bn{i}", to)}
-        if number == 0 and (place or channels != out):
+        if number == 0 and (position or channels != out):
             shapes[f"{block}.downsample.0.weight"] = (out, channels, 1, 1)
             shapes |= norm(f"{block}.downsample.1", out)
         channels = out
@@ -50,8 +50,8 @@ def published(depth: int, decoder: str, channels: int = 4, width: int = 64) -> S
     """Every key and shape of the state dict of a checkpoint of the authors'."""
     shapes = {"conv1.weight": (width, channels, 7, 7), **norm("bn1", width)}
     count = width
-    for place in range(4):
-        more, count = stage(f"layer{place + 1}", depth, place, count, width)
+    for index in range(4):
+        more, count = stage(f"layer{index + 1}", depth, index, count, width)
         shapes |= more
     half = count // 2
     shapes |= {"conv2.weight": (half, count, 1, 1), **norm("bn2", half)}
@@ -72,7 +72,7 @@ def published(depth: int, decoder: str, channels: int = 4, width: int = 64) -> S
 
 
 def filled(shapes: Shapes) -> dict[str, Tensor]:
-    """Random weights that neither vanish nor grow on their way through."""
+    """Random weights that whose activations neither vanish nor grow."""
     generator, state = torch.Generator().manual_seed(2), {}
     for name, shape in shapes.items():
         if name.endswith("num_batches_tracked"):
@@ -103,10 +103,10 @@ class Reference:
         mean, variance = self[f"{name}.running_mean"], self[f"{name}.running_var"]
         return F.batch_norm(x, mean, variance, self[f"{name}.weight"], self[f"{name}.bias"])
 
-    def stage(self, x: Tensor, name: str, place: int, count: int) -> Tensor:
+    def stage(self, x: Tensor, name: str, scene: int, count: int) -> Tensor:
         for number in range(count):
             block = f"{name}.{number}"
-            stride = 2 if place and not number else 1
+            stride = 2 if scene and not number else 1
             bottleneck = f"{block}.conv3.weight" in self.state
             y = F.relu(self.norm(self.conv(x, f"{block}.conv1", 1 if bottleneck else stride),
                                  f"{block}.bn1"))  # fmt: skip
@@ -138,8 +138,8 @@ class Reference:
     def depth(self, x: Tensor, depth: int, decoder: str) -> Tensor:
         size = x.shape[-2:]
         x = F.max_pool2d(F.relu(self.norm(self.conv(x, "conv1", 2), "bn1")), 3, 2, 1)
-        for place, count in enumerate(BLOCKS[depth]):
-            x = self.stage(x, f"layer{place + 1}", place, count)
+        for scene, count in enumerate(BLOCKS[depth]):
+            x = self.stage(x, f"layer{scene + 1}", scene, count)
         x = self.norm(self.conv(x, "conv2"), "bn2")
         for number in range(1, 5):
             x = self.decoder(x, decoder, f"decoder.layer{number}")
@@ -179,8 +179,8 @@ def test_every_variant_has_the_published_keys_and_shapes(depth: int, decoder: st
     for modality, channels in (("", 4), ("-rgb", 3), ("-d", 1)):
         with torch.device("meta"):
             network = definitions[f"sparse2dense-r{depth}-{decoder}{modality}"].build()
-        found = {name: tuple(tensor.shape) for name, tensor in network.state_dict().items()}
-        assert found == published(depth, decoder, channels)
+        shapes = {name: tuple(tensor.shape) for name, tensor in network.state_dict().items()}
+        assert shapes == published(depth, decoder, channels)
 
 
 @pytest.mark.parametrize("depth", [18, 50])
@@ -191,10 +191,10 @@ def test_every_variant_computes_what_the_published_tensors_say(depth: int, decod
     network.load_state_dict(state)
     reference = Reference(state)
     with torch.no_grad():
-        found = network(*frame(100, 130))
+        output = network(*frame(100, 130))
         expected = reference.depth(torch.cat(frame(100, 130), dim=1), depth, decoder)
-    assert found.shape == (1, 1, 100, 130)
-    torch.testing.assert_close(found, expected, rtol=1e-3, atol=1e-4 * float(expected.std()))
+    assert output.shape == (1, 1, 100, 130)
+    torch.testing.assert_close(output, expected, rtol=1e-3, atol=1e-4 * float(expected.std()))
     counters = {name for name in state if name.endswith("num_batches_tracked")}
     assert reference.used == set(state) - counters
 
@@ -215,11 +215,11 @@ def test_sizes_names_and_inputs_are_those_of_the_protocols() -> None:
 
 def test_the_sizes_of_z_are_those_of_the_paper() -> None:
     with torch.device("meta"):
-        for depth, place, channels, columns in ((50, "", 1024, 10), (18, "-kitti", 256, 29)):
-            network = definitions[f"sparse2dense-r{depth}-deconv2{place}"].build().eval()
+        for depth, scene, channels, columns in ((50, "", 1024, 10), (18, "-kitti", 256, 29)):
+            network = definitions[f"sparse2dense-r{depth}-deconv2{scene}"].build().eval()
             seen: list[Tensor] = []
             network.bn2.register_forward_hook(lambda *call, seen=seen: seen.append(call[2]))
-            rgb, sparse = (torch.empty(1, n, 228, 912 if place else 304) for n in (3, 1))
+            rgb, sparse = (torch.empty(1, n, 228, 912 if scene else 304) for n in (3, 1))
             assert network(rgb, sparse).shape == sparse.shape
             assert seen[0].shape == (1, channels, 8, columns)
 
@@ -298,9 +298,9 @@ def test_a_published_file_loads_whole_and_gives_what_its_tensors_say(write: Writ
     assert any("argparse.Namespace, models.ResNet" in note for note in network.notes)
     assert any("data nyudepthv2" in note for note in network.notes)  # its weights fit -kitti too
     with torch.no_grad():
-        found = network.depth_of(network.module(*frame()))
+        depth = network.depth_of(network.module(*frame()))
         expected = Reference(state).depth(torch.cat(frame(), dim=1), 18, "upproj")
-    torch.testing.assert_close(found, expected, rtol=1e-3, atol=1e-4 * float(expected.std()))
+    torch.testing.assert_close(depth, expected, rtol=1e-3, atol=1e-4 * float(expected.std()))
 
 
 @LEGACY
@@ -315,13 +315,13 @@ def test_a_key_too_many_or_too_few_is_named(tmp_path: Path) -> None:
     shapes = {**published(18, "deconv2"), "fc.weight": (3,)}
     del shapes["conv3.weight"]
     torch.save({n: torch.zeros(()).expand(s) for n, s in shapes.items()}, tmp_path / "w.pth")
-    said = r"1 missing \(conv3\.weight\); 1 unexpected \(fc\.weight\)$"
-    with pytest.raises(CheckpointError, match=said):
+    message = r"1 missing \(conv3\.weight\); 1 unexpected \(fc\.weight\)$"
+    with pytest.raises(CheckpointError, match=message):
         load_network("sparse2dense-r18-deconv2", tmp_path / "w.pth")
 
 
 @pytest.mark.parametrize(
-    ("asked", "depth", "decoder", "channels", "right"),
+    ("wanted", "depth", "decoder", "channels", "right"),
     [
         ("sparse2dense-r18-upproj", 50, "upproj", 4, "sparse2dense-r50-upproj"),
         ("sparse2dense", 18, "deconv3", 4, "sparse2dense-r18-deconv3"),
@@ -329,12 +329,12 @@ def test_a_key_too_many_or_too_few_is_named(tmp_path: Path) -> None:
     ],
 )
 def test_weights_of_another_variant_name_the_right_one(
-    asked: str, depth: int, decoder: str, channels: int, right: str, tmp_path: Path
+    wanted: str, depth: int, decoder: str, channels: int, right: str, tmp_path: Path
 ) -> None:
     shapes = published(depth, decoder, channels)
     torch.save({n: torch.zeros(()).expand(s) for n, s in shapes.items()}, tmp_path / "w.pth")
     with pytest.raises(CheckpointError, match=rf"this is {right} or .*; use --model {right}$"):
-        load_network(asked, tmp_path / "w.pth")
+        load_network(wanted, tmp_path / "w.pth")
 
 
 # ------------------------------------------------------------------ the cut
@@ -364,8 +364,8 @@ def selfsup_shapes() -> Shapes:
     for name, to, of in (("conv1_d", 16, 1), ("conv1_img", 48, 3), ("conv6", 512, 512)):
         shapes |= {f"{name}.0.weight": (to, of, 3, 3), **norm(f"{name}.1", to)}
     channels = 64
-    for place in range(4):
-        more, channels = stage(f"conv{place + 2}", 34, place, channels, 64)
+    for index in range(4):
+        more, channels = stage(f"conv{index + 2}", 34, index, channels, 64)
         shapes |= more
     ups = {"convt5": (512, 256), "convt4": (768, 128), "convt3": (384, 64), "convt2": (192, 64)}
     for name, (of, to) in {**ups, "convt1": (128, 64)}.items():
@@ -387,8 +387,8 @@ def test_the_self_supervised_file_loads_and_gives_what_its_tensors_say(tmp_path:
         return F.leaky_relu(w.norm(w.conv(x, f"{name}.0", stride), f"{name}.1"), 0.2)
 
     maps = {1: torch.cat([first(sparse, "conv1_d"), first(255 * rgb, "conv1_img")], 1)}
-    for place, count in enumerate(BLOCKS[34]):
-        maps[place + 2] = w.stage(maps[place + 1], f"conv{place + 2}", place, count)
+    for index, count in enumerate(BLOCKS[34]):
+        maps[index + 2] = w.stage(maps[index + 1], f"conv{index + 2}", index, count)
     x = first(maps[5], "conv6", 2)
     for number in (5, 4, 3, 2, 1):
         weight, more = w[f"convt{number}.0.weight"], int(number > 1)
@@ -396,11 +396,11 @@ def test_the_self_supervised_file_loads_and_gives_what_its_tensors_say(tmp_path:
         x = torch.cat([F.leaky_relu(w.norm(x, f"convt{number}.1"), 0.2), maps[number]], 1)
     expected = 100 * (w.conv(x, "convtf.0") + w["convtf.0.bias"].reshape(1, 1, 1, 1))
     with torch.no_grad():
-        found = network.module(255 * rgb, sparse)
-    assert found.shape == (1, 1, 48, 64)
-    assert bool((found == 0.9).any())
+        depth = network.module(255 * rgb, sparse)
+    assert depth.shape == (1, 1, 48, 64)
+    assert bool((depth == 0.9).any())
     expected = expected.clamp_min(0.9)
-    torch.testing.assert_close(found, expected, rtol=1e-3, atol=1e-4 * float(expected.std()))
+    torch.testing.assert_close(depth, expected, rtol=1e-3, atol=1e-4 * float(expected.std()))
 
 
 def test_the_self_supervised_network_is_cut_at_its_bottleneck() -> None:

@@ -19,18 +19,18 @@ from tests.model_zoo_defs.cuts import assert_the_cut_changes_nothing_and_a_step_
 KERNELS = (11, 7, 5, 3, 3)
 
 
-def sparse_depth(height: int, width: int, share: float = 0.1) -> Tensor:
+def sparse_depth(height: int, width: int, fraction: float = 0.1) -> Tensor:
     generator = torch.Generator().manual_seed(1)
     depth = 1 + 9 * torch.rand(1, 1, height, width, generator=generator)
-    return depth * (torch.rand(depth.shape, generator=generator) < share)
+    return depth * (torch.rand(depth.shape, generator=generator) < fraction)
 
 
 def port(outputs: int = 17) -> dict[str, Tensor]:
     """Every key and shape of the port's checkpoint, with weights of the size of trained ones."""
     generator = torch.Generator().manual_seed(2)
     state, channels = {}, 1
-    for place, kernel in enumerate(KERNELS):
-        name, shape = f"sparse_convs.{place}.sparse_conv", (16, channels, kernel, kernel)
+    for index, kernel in enumerate(KERNELS):
+        name, shape = f"sparse_convs.{index}.sparse_conv", (16, channels, kernel, kernel)
         state[f"{name}.bias"] = 0.1 * torch.randn(16, generator=generator)
         state[f"{name}.conv.weight"] = 1 + torch.randn(shape, generator=generator)
         channels = 16
@@ -78,9 +78,9 @@ def test_a_layer_is_the_sum_over_known_pixels_over_their_number(
     layer = SparseConv(3, 4, kernel, per_channel=per_channel).requires_grad_(False)
     layer.bias.normal_()
     x, mask = torch.randn(1, 3, 9, 11), (torch.rand(1, 1, 9, 11) < 0.05).float()
-    found, grown = layer(x, mask)
+    features, grown = layer(x, mask)
     expected = looped(x[0], mask[0, 0], layer.conv.weight, layer.bias, per_channel)
-    torch.testing.assert_close(found[0], expected)
+    torch.testing.assert_close(features[0], expected)
     reach = kernel // 2
     near = [
         mask[0, 0, max(i - reach, 0) : i + reach + 1, max(j - reach, 0) : j + reach + 1].max()
@@ -121,8 +121,8 @@ def test_untrained_it_averages_the_points() -> None:
 def reference(state: dict[str, Tensor], sparse: Tensor, per_channel: bool) -> Tensor:
     """Depth before the last convolution's bias, straight from the named tensors, in float64."""
     x, mask = sparse.double(), (sparse > 0).double()
-    for place, kernel in enumerate(KERNELS):
-        name = f"sparse_convs.{place}.sparse_conv"
+    for index, kernel in enumerate(KERNELS):
+        name = f"sparse_convs.{index}.sparse_conv"
         channels, box = x.shape[1], torch.ones(1, 1, kernel, kernel).double()
         pixels = F.conv2d(mask, box, padding=kernel // 2)
         count = pixels * channels if per_channel else pixels
@@ -134,9 +134,9 @@ def reference(state: dict[str, Tensor], sparse: Tensor, per_channel: bool) -> Te
     return F.conv2d(torch.cat([x, mask], 1)[:, : last.shape[1]], last)
 
 
-def close(found: Tensor, expected: Tensor) -> None:
+def close(output: Tensor, expected: Tensor) -> None:
     torch.testing.assert_close(
-        found.double(), expected, rtol=1e-4, atol=1e-4 * float(expected.abs().max())
+        output.double(), expected, rtol=1e-4, atol=1e-4 * float(expected.abs().max())
     )
 
 
@@ -151,8 +151,8 @@ def test_the_ports_file_loads_whole_and_gives_what_its_tensors_say(tmp_path: Pat
     assert all(torch.equal(own[name], tensor) for name, tensor in state.items())
     sparse = sparse_depth(40, 60, 0.01)
     with torch.no_grad():
-        found = network.module(sparse)
-    close(found, reference(state, sparse, per_channel=True) + state["mask_conv.bias"])
+        depth = network.module(sparse)
+    close(depth, reference(state, sparse, per_channel=True) + state["mask_conv.bias"])
 
 
 def test_the_tensorflow_variables_load_and_give_what_they_say(tmp_path: Path) -> None:
@@ -161,14 +161,14 @@ def test_the_tensorflow_variables_load_and_give_what_they_say(tmp_path: Path) ->
     network = load_network("sparseconv-nomask", tmp_path / "sparse_cnn.npz")
     kernels = {n: torch.from_numpy(a).permute(3, 2, 0, 1) for n, a in variables.items()}
     state = {"mask_conv.weight": kernels["conv/kernel"]}
-    for place in range(5):
-        name = f"sparse_convs.{place}.sparse_conv"
-        state[f"{name}.conv.weight"] = kernels[f"sp_conv{place + 1}/kernel"]
-        state[f"{name}.bias"] = kernels[f"sp_conv{place + 1}/bias"].flatten()
+    for index in range(5):
+        name = f"sparse_convs.{index}.sparse_conv"
+        state[f"{name}.conv.weight"] = kernels[f"sp_conv{index + 1}/kernel"]
+        state[f"{name}.bias"] = kernels[f"sp_conv{index + 1}/bias"].flatten()
     sparse = sparse_depth(40, 60, 0.01)
     with torch.no_grad():
-        found = network.module(sparse)
-    close(found, reference(state, sparse, per_channel=False))
+        depth = network.module(sparse)
+    close(depth, reference(state, sparse, per_channel=False))
 
 
 def test_a_state_dict_without_the_mask_channel_loads_as_it_is(tmp_path: Path) -> None:

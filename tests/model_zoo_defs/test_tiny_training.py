@@ -43,7 +43,7 @@ def shards(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 class Toy(nn.Module):
-    """Metres from a picture, by one layer."""
+    """Depth in metres from an image, by one layer."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -75,11 +75,11 @@ def test_a_batch_depends_on_its_number_alone(shards: Path) -> None:
     assert not torch.equal(straight.batch(2, 2, (32, 48)).depth, of_another_seed.depth)
 
 
-def test_a_batch_changes_colours_but_neither_metres_nor_places(shards: Path) -> None:
+def test_a_batch_changes_colours_but_neither_depth_nor_geometry(shards: Path) -> None:
     seen = set(np.load(shards / "shard_00000.npz")["depth"].ravel().tolist())
-    found = batches.Batches([shards], 1).batch(0, 8, (32, 48))
-    assert set(found.depth.ravel().tolist()) <= seen
-    for rgb, depth in zip(found.rgb, found.depth[:, 0], strict=True):
+    batch = batches.Batches([shards], 1).batch(0, 8, (32, 48))
+    assert set(batch.depth.ravel().tolist()) <= seen
+    for rgb, depth in zip(batch.rgb, batch.depth[:, 0], strict=True):
         # brightness follows depth in these frames, in whatever light, mirrored or not
         together = torch.corrcoef(torch.stack([rgb.mean(0).ravel(), depth.ravel()]))[0, 1]
         assert together > 0.9
@@ -88,13 +88,13 @@ def test_a_batch_changes_colours_but_neither_metres_nor_places(shards: Path) -> 
 def test_spliced_windows_are_whole_columns_of_frames_in_their_own_rows(shards: Path) -> None:
     frames = np.load(shards / "shard_00000.npz")["depth"]
     columns = {column.tobytes() for frame in frames for column in frame.T}
-    plain, found = (
-        batches.Batches([shards], 1, spliced=share).batch(0, 20, SHAPE).depth[:, 0].numpy()
-        for share in (0.0, 1.0)
+    plain, spliced = (
+        batches.Batches([shards], 1, spliced=fraction).batch(0, 20, SHAPE).depth[:, 0].numpy()
+        for fraction in (0.0, 1.0)
     )
-    assert {column.tobytes() for window in found for column in window.T} <= columns
+    assert {column.tobytes() for window in spliced for column in window.T} <= columns
     # depth grows by one step a column in a whole window, to the left or to the right
-    steps = [len(np.unique(np.round(np.diff(window[-1]), 1))) for window in (*plain, *found)]
+    steps = [len(np.unique(np.round(np.diff(window[-1]), 1))) for window in (*plain, *spliced)]
     assert max(steps[:20]) == 1
     assert np.mean(np.array(steps[20:]) > 1) > 0.5
 
@@ -113,8 +113,8 @@ def test_every_folder_counts_alike(shards: Path, tmp_path: Path) -> None:
         rgb=np.zeros((1, *SHAPE, 3), np.uint8),
         depth=np.full((1, *SHAPE), 50.0, np.float32),
     )
-    found = batches.Batches([shards, tmp_path], 1).batch(0, 200, (8, 8))
-    far = (found.depth == 50.0).flatten(1).all(1).float().mean()
+    batch = batches.Batches([shards, tmp_path], 1).batch(0, 200, (8, 8))
+    far = (batch.depth == 50.0).flatten(1).all(1).float().mean()
     assert 0.35 < far < 0.65
 
 
@@ -131,10 +131,10 @@ def test_points_are_depths_of_the_window_or_of_what_lies_behind(draw: batches.Po
 
 def test_the_logarithm_goes_on_below_the_nearest_depth_and_can_climb_back() -> None:
     depth = torch.tensor([-1.0, 0.0, recipes.NEAREST, 1.0, 20.0], requires_grad=True)
-    found = recipes.smooth_log(depth)
-    assert torch.equal(found[2:], torch.log(depth[2:]))
-    assert bool((found.diff() > 0).all())
-    (gradient,) = torch.autograd.grad(found.sum(), depth)
+    logarithm = recipes.smooth_log(depth)
+    assert torch.equal(logarithm[2:], torch.log(depth[2:]))
+    assert bool((logarithm.diff() > 0).all())
+    (gradient,) = torch.autograd.grad(logarithm.sum(), depth)
     assert bool((gradient > 0).all())
 
 
@@ -145,20 +145,22 @@ LOSSES = (
 
 
 @pytest.mark.parametrize("loss", LOSSES)
-def test_a_loss_is_least_for_the_truth_and_blind_to_unknown_depth(loss: Any) -> None:
-    truth = torch.from_numpy(np.stack([slope(0), slope(5)]))[:, None]
-    best = truth / 10.0 if loss is recipes.log_error_up_to_scale else truth
-    guess = torch.where(truth > 0, best, 7.0)
-    assert loss(guess, truth) == loss(torch.where(truth > 0, best, 70.0), truth)
-    noise = 1.0 + 0.05 * torch.randn(truth.shape, generator=torch.Generator().manual_seed(0))
-    assert loss(guess, truth) < loss(guess * noise, truth)
+def test_a_loss_is_least_for_the_ground_truth_and_ignores_unknown_depth(loss: Any) -> None:
+    ground_truth = torch.from_numpy(np.stack([slope(0), slope(5)]))[:, None]
+    best = ground_truth / 10.0 if loss is recipes.log_error_up_to_scale else ground_truth
+    guess = torch.where(ground_truth > 0, best, 7.0)
+    assert loss(guess, ground_truth) == loss(
+        torch.where(ground_truth > 0, best, 70.0), ground_truth
+    )
+    noise = 1.0 + 0.05 * torch.randn(ground_truth.shape, generator=torch.Generator().manual_seed(0))
+    assert loss(guess, ground_truth) < loss(guess * noise, ground_truth)
 
 
-def test_the_loss_up_to_scale_weighs_a_picture_s_scale_a_tenth() -> None:
-    truth = torch.from_numpy(slope(0))[None, None]
-    guess = torch.where(truth > 0, truth, 1.0) / 10.0
-    found = recipes.log_error_up_to_scale(guess * np.e, truth)
-    torch.testing.assert_close(found, torch.tensor(0.1), atol=1e-5, rtol=0)
+def test_the_loss_up_to_scale_weighs_the_scale_of_an_image_a_tenth() -> None:
+    ground_truth = torch.from_numpy(slope(0))[None, None]
+    guess = torch.where(ground_truth > 0, ground_truth, 1.0) / 10.0
+    loss = recipes.log_error_up_to_scale(guess * np.e, ground_truth)
+    torch.testing.assert_close(loss, torch.tensor(0.1), atol=1e-5, rtol=0)
 
 
 def test_stages_follow_one_another() -> None:
@@ -195,14 +197,14 @@ def test_without_its_scaffold_a_network_says_the_same_and_is_the_published_one()
         network(torch.randn(8, 3, 8, 8) * 3 + 1).square().mean().backward()
         optimiser.step()
     network.eval()
-    copied, found = copy.deepcopy(network), without_scaffold(network)
+    copied, without = copy.deepcopy(network), without_scaffold(network)
     x = torch.randn(4, 3, 8, 8)
-    assert list(found.state_dict()) == keys
+    assert list(without.state_dict()) == keys
     assert len(network.state_dict()) > len(keys)  # it goes on learning with its scaffold
-    torch.testing.assert_close(found(x), network(x), rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(without(x), network(x), rtol=1e-4, atol=1e-5)
     torch.testing.assert_close(copied(x), network(x))
     assert not any(
-        torch.equal(*pair) for pair in zip(before, found.state_dict().values(), strict=True)
+        torch.equal(*pair) for pair in zip(before, without.state_dict().values(), strict=True)
     )
 
 

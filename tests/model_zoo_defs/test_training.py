@@ -1,4 +1,4 @@
-"""The recipe of `compact`: points are drawn as said, and a run learns, stops and goes on."""
+"""Training of `compact`: the drawn points, the losses, and a run that stops and resumes."""
 
 from __future__ import annotations
 
@@ -57,9 +57,7 @@ def shards(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @drawn_often
 @given(seed=seeds, count=st.integers(1, 4000))
-def test_uniform_points_are_as_many_as_asked_and_only_where_depth_is_known(
-    seed: int, count: int
-) -> None:
+def test_uniform_points_have_the_requested_number_and_known_depth(seed: int, count: int) -> None:
     depth = room(seed)
     mask = patterns.uniform(np.random.default_rng(seed), depth, count)
     assert mask.sum() == min(count, np.count_nonzero(depth))
@@ -68,7 +66,7 @@ def test_uniform_points_are_as_many_as_asked_and_only_where_depth_is_known(
 
 @drawn_often
 @given(seed=seeds, count=st.integers(1, 500))
-def test_corner_points_are_as_many_as_asked_and_lie_where_the_picture_changes(
+def test_corner_points_have_the_requested_number_and_lie_at_image_gradients(
     seed: int, count: int
 ) -> None:
     depth = room(seed)
@@ -80,7 +78,7 @@ def test_corner_points_are_as_many_as_asked_and_lie_where_the_picture_changes(
 
 @drawn_often
 @given(seed=seeds, count=st.integers(10, 1000))
-def test_a_grid_has_about_as_many_points_as_asked(seed: int, count: int) -> None:
+def test_a_grid_has_about_the_requested_number_of_points(seed: int, count: int) -> None:
     mask = patterns.jittered_grid(np.random.default_rng(seed), room(seed), count)
     assert 0.5 * count - 10 <= mask.sum() <= 2 * count + 10
 
@@ -133,18 +131,18 @@ def test_the_same_state_draws_the_same_points_without_touching_the_depth(seed: i
 def test_a_prior_is_finite_and_the_same_for_the_same_state(seed: int) -> None:
     depth, other = room(seed), room(seed + 1)
     sparse = patterns.draw(np.random.default_rng(seed), depth, depth / 5.0)
-    found = [
+    drawn = [
         draw_prior(np.random.default_rng(seed), depth, depth / 5.0, sparse, other) for _ in range(2)
     ]
-    if found[0] is None:
-        assert found[1] is None
+    if drawn[0] is None:
+        assert drawn[1] is None
         return
-    assert found[1] is not None
-    assert np.array_equal(found[0], found[1])
-    assert found[0].shape == SHAPE
-    assert found[0].dtype == np.float32
-    assert bool(np.isfinite(found[0]).all())
-    assert bool((found[0] >= 0).all())
+    assert drawn[1] is not None
+    assert np.array_equal(drawn[0], drawn[1])
+    assert drawn[0].shape == SHAPE
+    assert drawn[0].dtype == np.float32
+    assert bool(np.isfinite(drawn[0]).all())
+    assert bool((drawn[0] >= 0).all())
 
 
 @drawn_often
@@ -159,13 +157,13 @@ def test_a_damaged_depth_is_known_everywhere_and_nonsense_too(seed: int) -> None
         assert bool(np.isfinite(prior).all())
 
 
-def test_damaged_depth_is_nearer_to_the_truth_than_nonsense() -> None:
+def test_damaged_depth_is_nearer_to_the_ground_truth_than_unrelated_depth() -> None:
     depth = room(3)
     known = depth > 0
 
     def error(prior: NDArray[np.float32]) -> float:
-        found = aligned(prior, depth, affine=False)
-        return float(np.abs(np.log(found[known] / depth[known])).mean())
+        fitted = aligned(prior, depth, affine=False)
+        return float(np.abs(np.log(fitted[known] / depth[known])).mean())
 
     rng = np.random.default_rng(0)
     of_damaged = np.mean([error(damaged(rng, depth, depth / 5.0)) for _ in range(20)])
@@ -174,35 +172,35 @@ def test_damaged_depth_is_nearer_to_the_truth_than_nonsense() -> None:
 
 
 @pytest.mark.parametrize("affine", [False, True])
-def test_a_prior_off_by_a_scale_or_a_power_is_aligned_despite_wrong_points(affine: bool) -> None:
+def test_a_prior_off_by_a_scale_or_a_power_is_aligned_despite_outliers(affine: bool) -> None:
     depth = room(2)
     sparse = patterns.keep(depth, patterns.uniform(np.random.default_rng(0), depth, 200))
     sparse = patterns.outliers(np.random.default_rng(1), sparse, 0.2)
     prior = 7.0 * depth ** (0.8 if affine else 1.0)
-    found = aligned(prior.astype(np.float32), sparse, affine=affine)
+    fitted = aligned(prior.astype(np.float32), sparse, affine=affine)
     known = depth > 0
-    assert float(np.median(np.abs(np.log(found[known] / depth[known])))) < 0.02
-    assert bool((found[~known] == 0).all())
+    assert float(np.median(np.abs(np.log(fitted[known] / depth[known])))) < 0.02
+    assert bool((fitted[~known] == 0).all())
 
 
 def test_unknown_depth_is_filled_and_known_depth_kept() -> None:
     depth = room(5)
-    found = filled(depth)[0, 0].numpy()
+    dense = filled(depth)[0, 0].numpy()
     known = depth > 0
-    np.testing.assert_allclose(found[known], np.log(depth[known]), rtol=1e-6)
-    assert bool(np.isfinite(found).all())
-    assert found[~known].max() <= np.log(depth.max()) + 1e-6
+    np.testing.assert_allclose(dense[known], np.log(depth[known]), rtol=1e-6)
+    assert bool(np.isfinite(dense).all())
+    assert dense[~known].max() <= np.log(depth.max()) + 1e-6
 
 
 @drawn_often
-@given(seed=seeds, share=st.floats(0.0, 1.0))
-def test_outliers_change_about_the_share_of_points_and_nothing_else(
-    seed: int, share: float
+@given(seed=seeds, fraction=st.floats(0.0, 1.0))
+def test_outliers_change_about_their_fraction_of_the_points_and_nothing_else(
+    seed: int, fraction: float
 ) -> None:
     sparse = patterns.keep(room(seed), patterns.uniform(np.random.default_rng(1), room(seed), 1000))
-    found = patterns.outliers(np.random.default_rng(seed), sparse, share)
-    assert np.array_equal(found > 0, sparse > 0)
-    assert np.count_nonzero(found != sparse) <= 1000 * share + 80
+    noisy = patterns.outliers(np.random.default_rng(seed), sparse, fraction)
+    assert np.array_equal(noisy > 0, sparse > 0)
+    assert np.count_nonzero(noisy != sparse) <= 1000 * fraction + 80
 
 
 @drawn_often
@@ -219,15 +217,15 @@ def test_zones_are_few_and_between_the_depths_of_the_image(seed: int) -> None:
 @drawn_often
 @given(seed=seeds)
 def test_a_strip_leaves_a_part_of_the_image(seed: int) -> None:
-    share = patterns.strip(np.random.default_rng(seed), SHAPE).mean()
-    assert 0.05 < share < 0.75
+    fraction = patterns.strip(np.random.default_rng(seed), SHAPE).mean()
+    assert 0.05 < fraction < 0.75
 
 
 def test_triangulated_points_stay_where_they_are() -> None:
     depth = room(1)
-    found = patterns.triangulated(np.random.default_rng(0), depth)
-    assert np.array_equal(found > 0, depth > 0)
-    assert float(np.median(np.abs(found - depth))) < 0.2
+    points = patterns.triangulated(np.random.default_rng(0), depth)
+    assert np.array_equal(points > 0, depth > 0)
+    assert float(np.median(np.abs(points - depth))) < 0.2
 
 
 def test_a_sample_depends_on_its_number_alone(shards: Path) -> None:
@@ -266,12 +264,12 @@ def test_what_is_mapped_is_what_numpy_reads(
     path = tmp_path_factory.mktemp("mapped") / "arrays.npz"
     arrays |= {f"columns_first_{name}": np.asfortranarray(a) for name, a in arrays.items()}
     np.savez(path, **arrays)
-    found = mapped(path)
+    mapped_arrays = mapped(path)
     with np.load(path) as read:
-        assert set(found) == set(read.files)
+        assert set(mapped_arrays) == set(read.files)
         for name in read.files:
-            assert found[name].dtype == read[name].dtype
-            np.testing.assert_array_equal(found[name], read[name])
+            assert mapped_arrays[name].dtype == read[name].dtype
+            np.testing.assert_array_equal(mapped_arrays[name], read[name])
 
 
 def test_a_compressed_shard_cannot_be_mapped(tmp_path: Path) -> None:
@@ -287,12 +285,12 @@ def test_a_folder_without_shards_is_refused(tmp_path: Path) -> None:
 
 @drawn_often
 @given(seed=seeds)
-def test_a_degraded_picture_is_still_a_picture(seed: int) -> None:
+def test_a_degraded_image_is_still_an_image(seed: int) -> None:
     rgb = torch.rand(3, 32, 48, generator=torch.Generator().manual_seed(seed % 1000))
-    found = degraded(np.random.default_rng(seed), rgb)
-    assert found.shape == rgb.shape
-    assert float(found.min()) >= 0.0
-    assert float(found.max()) <= 1.0
+    result = degraded(np.random.default_rng(seed), rgb)
+    assert result.shape == rgb.shape
+    assert float(result.min()) >= 0.0
+    assert float(result.max()) <= 1.0
 
 
 def test_linear_interpolation_of_a_plane_is_the_plane_inside_the_hull() -> None:
@@ -313,29 +311,35 @@ def test_linear_interpolation_of_points_in_a_row_is_the_nearest_point() -> None:
     assert dense[8, 8] == 3.0
 
 
-def test_the_loss_is_least_for_the_truth_and_blind_to_unknown_depth() -> None:
-    truth = torch.from_numpy(room(1))[None, None]
-    guess = torch.where(truth > 0, truth, 7.0)
-    assert train.depth_loss(guess, truth) < train.depth_loss(guess * 1.01, truth)
-    other = torch.where(truth > 0, guess, 70.0)
-    assert train.depth_loss(guess, truth) == train.depth_loss(other, truth)
+def test_the_loss_is_least_for_the_ground_truth_and_ignores_unknown_depth() -> None:
+    ground_truth = torch.from_numpy(room(1))[None, None]
+    guess = torch.where(ground_truth > 0, ground_truth, 7.0)
+    assert train.depth_loss(guess, ground_truth) < train.depth_loss(guess * 1.01, ground_truth)
+    other = torch.where(ground_truth > 0, guess, 70.0)
+    assert train.depth_loss(guess, ground_truth) == train.depth_loss(other, ground_truth)
 
 
 def test_inlier_weights_are_taught_by_the_error_of_the_points() -> None:
-    truth = torch.full((1, 1, 4, 4), 2.0)
-    sparse = torch.zeros_like(truth)
+    ground_truth = torch.full((1, 1, 4, 4), 2.0)
+    sparse = torch.zeros_like(ground_truth)
     sparse[..., 0, 0], sparse[..., 1, 1] = 2.02, 5.0
-    right, wrong = torch.zeros_like(truth), torch.zeros_like(truth)
+    right, reversed_ = torch.zeros_like(ground_truth), torch.zeros_like(ground_truth)
     right[..., 0, 0], right[..., 1, 1] = 5.0, -5.0
-    wrong[..., 0, 0], wrong[..., 1, 1] = -5.0, 5.0
-    assert train.inlier_loss(right, sparse, truth) < 0.1 < train.inlier_loss(wrong, sparse, truth)
+    reversed_[..., 0, 0], reversed_[..., 1, 1] = -5.0, 5.0
+    assert (
+        train.inlier_loss(right, sparse, ground_truth)
+        < 0.1
+        < train.inlier_loss(reversed_, sparse, ground_truth)
+    )
 
 
 def test_the_best_sigma_is_the_mean_absolute_error_of_log_depth() -> None:
-    truth, depth = torch.ones(1, 1, 4, 4), torch.full((1, 1, 4, 4), 1.1)
+    ground_truth, depth = torch.ones(1, 1, 4, 4), torch.full((1, 1, 4, 4), 1.1)
     error = float(np.log(1.1))
     losses = {
-        factor: float(train.sigma_loss(torch.full_like(truth, factor * error), depth, truth))
+        factor: float(
+            train.sigma_loss(torch.full_like(ground_truth, factor * error), depth, ground_truth)
+        )
         for factor in (0.7, 1.0, 1.4)
     }
     assert min(losses, key=lambda factor: losses[factor]) == 1.0
@@ -355,8 +359,8 @@ def test_weights_of_the_first_generation_give_the_same_depth_in_the_second() -> 
             assert torch.equal(tensor, kept[name])
     with pytest.raises(ValueError, match=r"not weights of compact: fit\.far"):
         train.upgrade(network, {k: v for k, v in kept.items() if not k.startswith("fit.far")})
-    with pytest.raises(ValueError, match="not weights of compact: strange"):
-        train.upgrade(network, kept | {"strange": torch.zeros(1)})
+    with pytest.raises(ValueError, match="not weights of compact: unknown"):
+        train.upgrade(network, kept | {"unknown": torch.zeros(1)})
 
 
 def test_a_constant_rate_falls_in_the_last_steps_alone() -> None:
@@ -372,25 +376,25 @@ def published_names(state: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
     names = {"stem": ("_conv_stem", "_bn0")}
     number = 0
     for level, rows in encoder_weights.STAGES.items():
-        for place in range(sum(row[-1] for row in rows)):
+        for index in range(sum(row[-1] for row in rows)):
             for part, (conv, norm) in {
                 "expand": ("_expand_conv", "_bn0"),
                 "depthwise": ("_depthwise_conv", "_bn1"),
                 "project": ("_project_conv", "_bn2"),
             }.items():
-                key = f"stages.{level}.{place}.{part}"
+                key = f"stages.{level}.{index}.{part}"
                 names[key] = (f"_blocks.{number}.{conv}", f"_blocks.{number}.{norm}")
             number += 1
-    found = {}
+    arrays = {}
     for ours, (conv, norm) in names.items():
         if f"{ours}.weight" in state:
             width = len(state[f"{ours}.bias"])
-            found[f"{conv}.weight"] = state[f"{ours}.weight"]
-            found[f"{norm}.weight"] = torch.full((width,), 2.0)
-            found[f"{norm}.bias"] = torch.ones(width)
-            found[f"{norm}.running_mean"] = torch.zeros(width)
-            found[f"{norm}.running_var"] = torch.full((width,), 1.0 - encoder_weights.EPSILON)
-    return found
+            arrays[f"{conv}.weight"] = state[f"{ours}.weight"]
+            arrays[f"{norm}.weight"] = torch.full((width,), 2.0)
+            arrays[f"{norm}.bias"] = torch.ones(width)
+            arrays[f"{norm}.running_mean"] = torch.zeros(width)
+            arrays[f"{norm}.running_var"] = torch.full((width,), 1.0 - encoder_weights.EPSILON)
+    return arrays
 
 
 def test_published_encoder_weights_are_renamed_and_folded_without_rest() -> None:
@@ -432,7 +436,7 @@ def stop_at(settings_: train.Settings, step: int) -> None:
             return
 
 
-def test_inlier_weights_learn_which_points_are_wrong(shards: Path) -> None:
+def test_inlier_weights_learn_to_detect_outliers(shards: Path) -> None:
     torch.manual_seed(0)
     layer = Compact().inlier_weights
     data = train_inliers.table(layer, Frames(shards), 60, seed=1)
@@ -441,6 +445,6 @@ def test_inlier_weights_learn_which_points_are_wrong(shards: Path) -> None:
     )
     with torch.no_grad():
         log_odds = layer.first(*data.first)
-    wrong, right = data.target == 0, data.target == 1
+    outlier, right = data.target == 0, data.target == 1
     assert loss < 0.7
-    assert float(log_odds[wrong].mean()) < float(log_odds[right].mean()) - 0.5
+    assert float(log_odds[outlier].mean()) < float(log_odds[right].mean()) - 0.5

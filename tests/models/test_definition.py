@@ -70,41 +70,41 @@ NAN, INF = math.nan, math.inf
 NO_SIZES = [0, -4, 1.5, "8", True, None]
 
 
-def refused(make: Callable[..., Any], **wrong: Any) -> str:
-    (field,) = wrong
+def refused(make: Callable[..., Any], **fields: Any) -> str:
+    (field,) = fields
     with pytest.raises(ModelError) as error:
-        make(**wrong)
-    said = str(error.value)
-    assert f" {field}=" in said
-    assert "\n" not in said
+        make(**fields)
+    message = str(error.value)
+    assert f" {field}=" in message
+    assert "\n" not in message
     assert error.value.exit_code == 4
-    return said
+    return message
 
 
-@pytest.mark.parametrize("wrong", NO_SIZES)
-def test_a_side_or_a_multiple_that_is_no_whole_number_above_zero_is_refused(wrong: Any) -> None:
-    assert "Multiple: of=" in refused(Multiple, of=wrong)
-    assert "Near: of=" in refused(Near, of=wrong)
+@pytest.mark.parametrize("value", NO_SIZES)
+def test_a_side_or_a_multiple_that_is_no_whole_number_above_zero_is_refused(value: Any) -> None:
+    assert "Multiple: of=" in refused(Multiple, of=value)
+    assert "Near: of=" in refused(Near, of=value)
     for make in (lambda height: Fixed(height, 8), lambda height: Fixed(height=height, width=8)):
-        assert "not a whole number of at least 1" in refused(make, height=wrong)
-    refused(lambda width: Fixed(8, width), width=wrong)
-    if wrong is not None:
-        refused(lambda longest: Multiple(8, longest), longest=wrong)
-        refused(lambda height: Near(of=8, height=height), height=wrong)
-        refused(lambda width: Near(of=8, width=width), width=wrong)
+        assert "not a whole number of at least 1" in refused(make, height=value)
+    refused(lambda width: Fixed(8, width), width=value)
+    if value is not None:
+        refused(lambda longest: Multiple(8, longest), longest=value)
+        refused(lambda height: Near(of=8, height=height), height=value)
+        refused(lambda width: Near(of=8, width=width), width=value)
 
 
 def test_an_unknown_fit_is_not_taken_for_stretch() -> None:
-    said = refused(lambda fit: Fixed(64, 96, fit), fit="pad")
-    assert "fit='pad' is none of 'stretch', 'crop'" in said
+    message = refused(lambda fit: Fixed(64, 96, fit), fit="pad")
+    assert "fit='pad' is none of 'stretch', 'crop'" in message
 
 
 @pytest.mark.parametrize("field", ["mean", "std"])
 @pytest.mark.parametrize(
-    "wrong", [(1, 1), (1, 1, 1, 1), 0.5, "rgb", (1, 1, NAN), (1, INF, 1), ("1", 1, 1)]
+    "values", [(1, 1), (1, 1, 1, 1), 0.5, "rgb", (1, 1, NAN), (1, INF, 1), ("1", 1, 1)]
 )
-def test_a_normalisation_holds_three_numbers_each(field: str, wrong: Any) -> None:
-    assert "three numbers" in refused(Normalisation, **{field: wrong})
+def test_a_normalisation_holds_three_numbers_each(field: str, values: Any) -> None:
+    assert "three numbers" in refused(Normalisation, **{field: values})
 
 
 def test_a_deviation_is_above_zero_and_a_mean_need_not_be() -> None:
@@ -113,7 +113,7 @@ def test_a_deviation_is_above_zero_and_a_mean_need_not_be() -> None:
 
 
 @pytest.mark.parametrize(
-    ("field", "wrong"),
+    ("field", "value"),
     [
         *(("iterations", value) for value in ("5", -1, 2.0, None)),
         *(("lr", value) for value in ("x%", "", 0, -1, NAN, INF, "inf", None)),
@@ -124,8 +124,8 @@ def test_a_deviation_is_above_zero_and_a_mean_need_not_be() -> None:
         ("layer", 3),
     ],
 )
-def test_a_default_that_refinement_could_not_use_is_refused(field: str, wrong: Any) -> None:
-    assert "RefineDefaults: " in refused(RefineDefaults, **{field: wrong})
+def test_a_default_that_refinement_could_not_use_is_refused(field: str, value: Any) -> None:
+    assert "RefineDefaults: " in refused(RefineDefaults, **{field: value})
 
 
 @pytest.mark.parametrize("lr", ["x%", "", "0%", "3 %", "3%", "0.5", 0.1, 1, True, None])
@@ -139,7 +139,7 @@ def test_a_definition_takes_those_steps_that_refinement_takes(lr: Any) -> None:
 
 
 @pytest.mark.parametrize(
-    ("field", "wrong", "said"),
+    ("field", "value", "message"),
     [
         ("name", 5, "a text is expected"),
         ("input_kind", "depth", "is none of 'rgb', 'sparse', 'rgb+sparse'"),
@@ -158,9 +158,9 @@ def test_a_definition_takes_those_steps_that_refinement_takes(lr: Any) -> None:
     ],
 )
 def test_a_field_of_a_definition_that_makes_no_sense_is_refused_by_its_name(
-    field: str, wrong: Any, said: str
+    field: str, value: Any, message: str
 ) -> None:
-    assert said in refused(definition, **{field: wrong})
+    assert message in refused(definition, **{field: value})
 
 
 def test_a_long_value_is_shortened() -> None:

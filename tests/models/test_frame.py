@@ -35,8 +35,8 @@ def test_any_image_fits_any_policy_and_depth_comes_back_in_its_size(
     policy: Fixed | Multiple, height: int, width: int
 ) -> None:
     frame = FrameMap.fit(policy, height, width)
-    picture = frame.rgb_to_network(torch.rand(1, 3, height, width))
-    assert tuple(picture.shape) == (1, 3, *frame.network)
+    resized = frame.rgb_to_network(torch.rand(1, 3, height, width))
+    assert tuple(resized.shape) == (1, 3, *frame.network)
     if isinstance(policy, Multiple):
         assert frame.network[0] % policy.of == 0
         assert frame.network[1] % policy.of == 0
@@ -72,17 +72,17 @@ def test_a_point_goes_where_its_pixel_goes(
 
 
 @given(st.integers(1, 40), sides, sides)
-def test_padding_moves_neither_a_point_nor_a_bit_of_picture_or_depth(
+def test_padding_moves_neither_a_point_nor_a_bit_of_image_or_depth(
     multiple: int, height: int, width: int
 ) -> None:
     frame = FrameMap.fit(Multiple(multiple), height, width)
     here = every_pixel(height, width)
     assert torch.equal(frame.points_to_network(here).xy, here.xy)
     rgb = torch.rand(1, 3, height, width)
-    picture = frame.rgb_to_network(rgb)
-    assert torch.equal(picture[..., :height, :width], rgb)
-    assert torch.equal(picture[..., -1, :width], rgb[..., -1, :])
-    assert torch.equal(picture[..., :height, -1], rgb[..., -1])
+    padded = frame.rgb_to_network(rgb)
+    assert torch.equal(padded[..., :height, :width], rgb)
+    assert torch.equal(padded[..., -1, :width], rgb[..., -1, :])
+    assert torch.equal(padded[..., :height, -1], rgb[..., -1])
     depth = torch.rand(1, 1, *frame.network)
     assert torch.equal(frame.depth_to_image(depth), depth[0, 0, :height, :width])
 

@@ -44,7 +44,7 @@ def arguments(of: Network, rgb: Tensor | None) -> tuple[Tensor, ...]:
     return of.arguments(FrameMap.fit(Multiple(1), 2, 3), rgb, POINTS)
 
 
-def test_a_picture_is_normalised_and_points_are_scattered() -> None:
+def test_a_image_is_normalised_and_points_are_scattered() -> None:
     normalisation = Normalisation(mean=(0.5, 0.25, 0.0), std=(0.5, 0.25, 2.0))
     rgb, sparse = arguments(
         network(input_kind="rgb+sparse", normalisation=normalisation), torch.full((1, 3, 2, 3), 0.5)
@@ -53,7 +53,7 @@ def test_a_picture_is_normalised_and_points_are_scattered() -> None:
     assert sparse.tolist() == [[[[4, 0, 0], [0, 0, 2]]]]
 
 
-def test_a_network_of_points_alone_needs_no_picture_and_one_of_pictures_does() -> None:
+def test_a_network_of_points_alone_needs_no_image_and_one_of_images_does() -> None:
     assert len(arguments(network(input_kind="sparse"), None)) == 1
     with pytest.raises(UsageError, match="takes an rgb image"):
         arguments(network(), None)
@@ -78,7 +78,7 @@ BAD_SHAPES = [(2, 1, 2, 3), (1, 2, 2, 3), (2, 2, 3), (3,), (), (1, 1, 1, 2, 3)]
 
 
 @pytest.mark.parametrize("shape", BAD_SHAPES)
-def test_anything_else_is_said_with_its_shape(shape: tuple[int, ...]) -> None:
+def test_any_other_output_is_refused_with_its_shape(shape: tuple[int, ...]) -> None:
     with pytest.raises(ModelError, match="shape") as error:
         network().depth_of(torch.zeros(shape))
     assert str(shape) in str(error.value)
@@ -108,7 +108,7 @@ def test_an_output_that_raises_or_is_no_tensor_is_the_definitions_fault() -> Non
         network(output=lambda output: output).depth_of({})
 
 
-def test_what_a_network_returns_without_any_tensor_is_said() -> None:
+def test_an_output_without_any_tensor_is_named() -> None:
     with pytest.raises(ModelError, match="'mine' returns a NoneType without a tensor in it"):
         network().depth_of(None)
     with pytest.raises(ModelError, match="'mine' returns a dict without a tensor in it"):
@@ -117,12 +117,12 @@ def test_what_a_network_returns_without_any_tensor_is_said() -> None:
 
 def test_what_verify_says_is_passed_on_and_what_it_raises_is_the_definitions_fault() -> None:
     assert network().verified(()) == ()
-    assert network(verify=lambda module, given: f"{len(given)}").verified(()) == ("0",)
-    assert network(verify=lambda module, given: None).verified(()) == ()
+    assert network(verify=lambda module, arguments: f"{len(arguments)}").verified(()) == ("0",)
+    assert network(verify=lambda module, arguments: None).verified(()) == ()
     with pytest.raises(ModelError, match="verify of network 'mine' raises ZeroDivisionError"):
-        network(verify=lambda module, given: 1 / 0).verified(())
+        network(verify=lambda module, arguments: 1 / 0).verified(())
 
-    def distrust(module: nn.Module, given: tuple[Tensor, ...]) -> str:
+    def distrust(module: nn.Module, arguments: tuple[Tensor, ...]) -> str:
         raise ModelError("it gives something else")
 
     with pytest.raises(ModelError, match=r"^it gives something else$"):
@@ -142,9 +142,9 @@ def of(build, **more):
 definition = of(lambda: nn.Conv2d(1, 1, 1))
 owned = of(lambda: nn.Conv2d(1, 1, 1), checkpoint=OWN)
 empty = of(nn.Identity)
-made = of(nn.Conv2d(1, 1, 1))
+built = of(nn.Conv2d(1, 1, 1))
 raising = of(lambda: 1 / 0)
-wrong = of(lambda: "text")
+text = of(lambda: "text")
 """
 
 
@@ -181,13 +181,13 @@ def test_a_network_without_weights_needs_none(file: Path) -> None:
     assert load_network(f"{file}:empty", None).checkpoint is None
 
 
-def test_a_build_that_raises_or_gives_no_module_is_said(file: Path) -> None:
+def test_a_build_that_raises_or_returns_no_module_is_refused(file: Path) -> None:
     with pytest.raises(ModelError, match="build of network 'mine' raises ZeroDivisionError"):
         load_network(f"{file}:raising", None)
     with pytest.raises(ModelError, match="gives no torch module"):
-        load_network(f"{file}:wrong", None)
+        load_network(f"{file}:text", None)
     with pytest.raises(ModelError, match="build of network 'mine' is a Conv2d that is made alr"):
-        load_network(f"{file}:made", None)
+        load_network(f"{file}:built", None)
 
 
 def test_a_build_may_import_what_lies_beside_the_file_as_late_as_it_likes(tmp_path: Path) -> None:
@@ -225,7 +225,7 @@ class Nothing(Plain):
 """
 
 
-def test_a_class_whose_forward_lets_no_gradient_back_or_gives_nothing_is_told_so(
+def test_a_forward_without_gradient_or_output_is_refused(
     tmp_path: Path,
 ) -> None:
     file = tmp_path / "nets.py"
@@ -242,7 +242,7 @@ def test_a_class_whose_forward_lets_no_gradient_back_or_gives_nothing_is_told_so
 
 
 @pytest.mark.parametrize("name", ["cuda:99", "meta", "xla", "nonsense", "", "privateuseone", "hpu"])
-def test_a_device_that_is_not_there_is_said_with_the_way_out(name: str) -> None:
+def test_a_missing_device_is_refused_with_a_remedy(name: str) -> None:
     with pytest.raises(DeviceError, match=r"cannot be used: .*; try --device cpu") as error:
         find_device(name)
     assert error.value.exit_code == 6

@@ -31,12 +31,12 @@ def test_fp32_is_the_network_as_it_stands() -> None:
     assert dtype_of("fp32", CPU) is None
 
 
-def test_fp16_on_a_cpu_is_refused_with_a_way_out() -> None:
+def test_fp16_on_a_cpu_is_refused_with_a_remedy() -> None:
     with pytest.raises(DeviceError, match="bf16"):
         load_network("compact", None, "cpu", precision="fp16")
 
 
-def test_another_precision_is_wrong_usage() -> None:
+def test_an_unknown_precision_is_a_usage_error() -> None:
     with pytest.raises(UsageError, match="fp32 bf16 fp16"):
         dtype_of("int8", CPU)
 
@@ -54,24 +54,24 @@ def test_weights_are_cast_once_and_the_rest_stays_in_float32() -> None:
 def test_casting_once_gives_what_autocast_gives_bit_for_bit() -> None:
     plain, lowered = Net().eval(), Net().eval()
     lower(lowered, torch.bfloat16, CPU)
-    picture = torch.rand(1, 3, 16, 16)
+    image = torch.rand(1, 3, 16, 16)
     with torch.no_grad():
         with torch.autocast("cpu", torch.bfloat16):
-            expected = plain(picture)
-        given = lowered(picture)
-    assert given.dtype == torch.bfloat16
-    assert torch.equal(given, expected)
+            expected = plain(image)
+        output = lowered(image)
+    assert output.dtype == torch.bfloat16
+    assert torch.equal(output, expected)
 
 
 def test_a_lowered_network_is_cut_without_a_trace() -> None:
-    network, picture = Net().eval(), torch.rand(1, 3, 16, 16)
+    network, image = Net().eval(), torch.rand(1, 3, 16, 16)
     lower(network, torch.bfloat16, CPU)
     with torch.no_grad():
-        whole = network(picture)
+        whole = network(image)
         with Split(network, "encode.0") as split:
-            assert torch.equal(split.rear(split.front(picture)), whole)
-            assert torch.equal(split.rear(split.front(picture)), whole)
-        assert torch.equal(network(picture), whole)
+            assert torch.equal(split.rear(split.front(image)), whole)
+            assert torch.equal(split.rear(split.front(image)), whole)
+        assert torch.equal(network(image), whole)
 
 
 class Strict(nn.Module):
@@ -86,14 +86,14 @@ class Strict(nn.Module):
         return y.index_add(0, torch.zeros(1, dtype=torch.long), x.new_ones(1, 1, *y.shape[2:]))
 
 
-def test_a_network_that_cannot_is_told_with_a_way_out() -> None:
+def test_a_network_without_bf16_is_refused_with_a_remedy() -> None:
     network = Strict()
     lower(network, torch.bfloat16, CPU)
     with pytest.raises(ModelError, match="--precision fp32"), torch.no_grad():
         network(torch.rand(1, 3, 4, 4))
 
 
-def test_random_weights_are_taken_only_when_asked_for_and_are_said() -> None:
+def test_random_weights_are_used_only_on_request_and_reported() -> None:
     with pytest.raises(CheckpointError, match="--checkpoint"):
         load_network("adnn", None)
     notes = load_network("adnn", None, untrained=True).notes

@@ -48,7 +48,7 @@ def test_the_cheapest_layer_whose_field_is_wide_enough_comes_first(
     assert [one.rank for one in rank_layers(LAYERS, wanted)] == ranks
 
 
-def test_evenly_spread_points_are_apart_by_the_root_of_the_area_of_each() -> None:
+def test_the_spacing_of_uniform_points_is_the_root_of_the_area_of_each() -> None:
     assert point_spacing((100, 400), 100) == 20
 
 

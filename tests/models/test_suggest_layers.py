@@ -1,4 +1,4 @@
-"""Layers worth cutting at, found by their shapes and by what comes back to them."""
+"""Suggested layers, chosen by their shapes and gradients."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from torch import Tensor, nn
 from pnpdepth_cli.errors import ModelError
 from pnpdepth_cli.models.suggest_layers import suggest_layers
 
-PICTURE = torch.rand(1, 3, 32, 48, generator=torch.Generator().manual_seed(0))
+IMAGE = torch.rand(1, 3, 32, 48, generator=torch.Generator().manual_seed(0))
 
 
 class Net(nn.Module):
-    """A front to 1/4 of the picture's size, and two layers back to 1/2; `between` lies amid."""
+    """A front to 1/4 of the image's size, then two layers to 1/2, `between` amid them."""
 
     def __init__(self, between: Callable[[Any], Any] = lambda run: run()) -> None:
         super().__init__()
@@ -53,7 +53,7 @@ CUTS = {
 
 
 def layers_of(network: nn.Module) -> tuple[str, ...]:
-    return suggest_layers(network, (PICTURE,), lambda output: output)
+    return suggest_layers(network, (IMAGE,), lambda output: output)
 
 
 def test_the_last_layer_of_each_resolution_from_the_bottleneck_on_is_listed() -> None:
@@ -71,7 +71,7 @@ def test_a_front_that_is_detached_leaves_the_layers_behind_it(how: str) -> None:
 
 
 @pytest.mark.parametrize("how", CUTS)
-def test_a_forward_wholly_without_gradients_is_said_to_be_one(how: str) -> None:
+def test_a_forward_without_any_gradient_is_reported(how: str) -> None:
     class Whole(nn.Module):
         def __init__(self) -> None:
             super().__init__()
@@ -90,7 +90,7 @@ def test_a_layer_that_runs_twice_is_not_listed() -> None:
     assert layers_of(network) == ("middle", "up")
 
 
-def test_a_forward_without_gradients_that_ends_in_a_layer_is_said_to_be_one() -> None:
+def test_a_forward_without_gradients_that_ends_in_a_layer_is_reported() -> None:
     network = Net()
     network.forward = torch.no_grad()(network.forward)  # type: ignore[method-assign]
     with pytest.raises(ModelError, match="no gradient comes back"):

@@ -90,7 +90,7 @@ def test_depth_around_a_moved_object_is_about_as_good_as_without_neighbours() ->
     assert np.mean(more) < 1.06 * np.mean(alone)
 
 
-def test_a_scan_farther_in_time_gives_way_to_a_nearer_one() -> None:
+def test_a_scan_farther_in_time_is_replaced_by_a_nearer_one() -> None:
     own, one, two = (room((0, 0, 0), None, seed) for seed in range(3))
     near = NeighbourScan(points=one, motion=STILL, apart=1)
     far = NeighbourScan(points=two, motion=STILL, apart=2)
@@ -102,7 +102,7 @@ def test_a_scan_farther_in_time_gives_way_to_a_nearer_one() -> None:
     assert distance.min() >= 2
 
 
-def test_a_wrong_motion_is_corrected_by_the_surfaces() -> None:
+def test_an_inaccurate_motion_is_corrected_by_the_surfaces() -> None:
     own, ahead = room((0, 0, 0), -1.0, 0), room((0, 0, 0.5), -1.0, 1)
     xyz = CAMERA.unproject(ahead.xy, ahead.depth)
     motion = registered(surface_of(own, CAMERA), xyz, from_ahead(0.6), CAMERA)

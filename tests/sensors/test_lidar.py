@@ -47,7 +47,7 @@ def test_directions_are_unit_vectors_at_the_sensors_angles() -> None:
 
 
 @pytest.mark.parametrize(
-    "wrong",
+    "values",
     [
         {"elevations_deg": ()},
         {"elevations_deg": (91.0,)},
@@ -57,7 +57,7 @@ def test_directions_are_unit_vectors_at_the_sensors_angles() -> None:
         {"range_noise": -0.1},
     ],
 )
-def test_a_sensor_that_cannot_be_is_refused(wrong: dict[str, object]) -> None:
+def test_a_sensor_that_cannot_be_is_refused(values: dict[str, object]) -> None:
     right = {"name": "x", "elevations_deg": (0.0,), "azimuth_step_deg": 1.0, "max_range": 5.0}
     with pytest.raises(UsageError, match="sensor 'x'"):
-        Lidar(**(right | wrong))  # type: ignore[arg-type]
+        Lidar(**(right | values))  # type: ignore[arg-type]

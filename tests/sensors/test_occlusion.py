@@ -1,4 +1,4 @@
-"""The occlusion filter, on a scene computed exactly and on frames with truth."""
+"""The occlusion filter, on a scene computed exactly and on frames with ground truth."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def board_before_wall(left_m: float) -> tuple[NDArray[np.float64], NDArray[np.bo
     on_board = (np.abs(5 * y) < 0.5) & (np.abs(5 * z) < 0.5)
     x = np.where(on_board, 5.0, 20.0)
     scan = np.column_stack([x, x * y, x * z])
-    # the camera's ray to a wall point passes the board's plane at a quarter of the way
+    # the camera's ray to a wall point passes the board's plane at a quarter of its length
     at_board = np.array([0, -left_m, 0]) * 0.75 + scan * 0.25
     hidden = ~on_board & (np.abs(at_board[:, 1]) < 0.5) & (np.abs(at_board[:, 2]) < 0.5)
     return scan, hidden
@@ -61,7 +61,7 @@ def test_wall_seen_past_a_board_is_hidden_and_little_else(left_m: float) -> None
     assert scan[removed, 0].min() == 20  # the foreground itself stays
 
 
-def test_a_scanner_in_the_cameras_place_hides_nothing_far_from_an_edge() -> None:
+def test_a_scanner_at_the_cameras_position_hides_nothing_far_from_an_edge() -> None:
     scan, _ = board_before_wall(0.0)
     camera = Camera(intrinsics=K, rotation=FORWARD_LEFT_UP)
     got = project_velodyne(scan, camera, SIZE)
@@ -104,50 +104,50 @@ def test_settings_that_mean_nothing_are_refused() -> None:
 
 
 def kept_and_removed(
-    hidden: NDArray[np.bool_], depth: NDArray[np.floating], truth: NDArray[np.floating]
+    hidden: NDArray[np.bool_], depth: NDArray[np.floating], gt: NDArray[np.floating]
 ) -> tuple[float, float]:
-    """Shares: kept of the points within 10 % of the truth, removed of the others."""
-    known = truth > 0
-    agrees = np.abs(depth[known] - truth[known]) <= 0.1 * truth[known]
+    """Fraction kept of the points within 10 % of the ground truth, and removed of the others."""
+    known = gt > 0
+    agrees = np.abs(depth[known] - gt[known]) <= 0.1 * gt[known]
     gone = hidden[known]
     return float((~gone[agrees]).mean()), float(gone[~agrees].mean())
 
 
-def test_on_the_rendered_street_most_points_that_contradict_the_truth_go() -> None:
+def test_on_the_rendered_street_most_points_that_contradict_the_ground_truth_go() -> None:
     calibration = read_calibration(STREET / "calib.txt")
     camera = Camera(
         intrinsics=calibration.intrinsics,
         rotation=calibration.rotation,
         translation=calibration.translation,
     )
-    truth = read_depth(STREET / "gt.png").values
+    gt = read_depth(STREET / "gt.png").values
     scan = read_scan(STREET / "000000.bin").points
-    points = project_velodyne(scan, camera, truth.shape, ProjectionSettings(occlusion=None))
+    points = project_velodyne(scan, camera, gt.shape, ProjectionSettings(occlusion=None))
     column, row = np.floor(points.xy + 0.5).astype(int).T
-    kept_rows = project_velodyne(scan, camera, truth.shape).index
+    kept_rows = project_velodyne(scan, camera, gt.shape).index
     hidden = ~np.isin(points.index, kept_rows)
-    kept, removed = kept_and_removed(hidden, points.depth, truth[row, column])
+    kept, removed = kept_and_removed(hidden, points.depth, gt[row, column])
     assert kept >= 0.95
     assert removed >= 0.7
 
 
-def test_on_kitti_most_points_that_contradict_the_truth_go(shared_data: Path) -> None:
+def test_on_kitti_most_points_that_contradict_the_ground_truth_go(shared_data: Path) -> None:
     folder = shared_data / "kitti_dc"
     calibration = read_calibration(folder)
     scanner = calibration.intrinsics @ calibration.translation
-    hidden, depth, truth = [], [], []
+    hidden, depth, gt = [], [], []
     for path in sorted((folder / "velodyne_raw").glob("*.png")):
         raw = read_depth(path).values
         row, column = np.nonzero(raw)
         xy = np.column_stack([column, row]).astype(np.float64)
         depth.append(raw[row, column].astype(np.float64))
-        truth.append(read_depth(folder / "groundtruth" / path.name).values[row, column])
+        gt.append(read_depth(folder / "groundtruth" / path.name).values[row, column])
         hidden.append(
             hidden_points(
                 xy, depth[-1], raw.shape, focal_px=float(calibration.intrinsics[0, 0]),
                 scanner=scanner, settings=OcclusionFilter(),
             )
         )  # fmt: skip
-    kept, removed = kept_and_removed(*(np.concatenate(x) for x in (hidden, depth, truth)))
+    kept, removed = kept_and_removed(*(np.concatenate(x) for x in (hidden, depth, gt)))
     assert kept >= 0.95
     assert removed >= 0.65

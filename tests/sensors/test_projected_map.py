@@ -109,11 +109,11 @@ def test_a_frame_is_read_without_occluded_points_unless_they_are_kept(tmp_path: 
 def test_kittis_maps_are_recognised_and_its_filtered_scans_are_not(shared_data: Path) -> None:
     for path in sorted((shared_data / "kitti_dc" / "velodyne_raw").glob("*.png")):
         raw = read_depth(path).values
-        truth = read_depth(path.parents[1] / "groundtruth" / path.name).values
+        gt = read_depth(path.parents[1] / "groundtruth" / path.name).values
         points = points_of(raw)
         hidden = occluded_in_map(points)
         assert hidden is not None
-        true_depth = truth[tuple(points.xy.astype(int).T[::-1])]
+        true_depth = gt[tuple(points.xy.astype(int).T[::-1])]
         agrees = np.abs(points.depth - true_depth) <= 0.1 * true_depth
         known = true_depth > 0
         assert (~hidden[known & agrees]).mean() > 0.985

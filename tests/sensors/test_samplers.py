@@ -46,11 +46,11 @@ def test_the_same_seed_gives_the_same_points(kind: str) -> None:
 
 @settings(deadline=None, max_examples=30)
 @given(count=st.integers(1, 3000), seed=st.integers(0, 2**32))
-def test_uniform_gives_exactly_the_number_asked_for(count: int, seed: int) -> None:
+def test_uniform_returns_exactly_the_requested_number(count: int, seed: int) -> None:
     assert len(sample_points(HOLES, SamplePattern(count=count), seed).depth) == count
 
 
-def test_uniform_of_a_share_is_of_the_known_pixels() -> None:
+def test_uniform_of_a_fraction_is_of_the_known_pixels() -> None:
     known = np.count_nonzero(HOLES)
     assert len(sample_points(HOLES, SamplePattern(fraction=0.05), 0).depth) == round(0.05 * known)
 
@@ -78,10 +78,10 @@ def test_lines_keeps_whole_rows() -> None:
 
 
 def test_features_lie_at_the_corners_of_the_image() -> None:
-    picture = np.full((160, 200, 3), 0.2, np.float32)
-    picture[40:120, 50:150] = 0.9
+    image = np.full((160, 200, 3), 0.2, np.float32)
+    image[40:120, 50:150] = 0.9
     depth = np.full((160, 200), 3, np.float32)
-    got = sample_points(depth, SamplePattern(kind="features", count=8), 0, image=picture)
+    got = sample_points(depth, SamplePattern(kind="features", count=8), 0, image=image)
     corners = np.array([[50, 40], [149, 40], [50, 119], [149, 119]])
     away = np.abs(got.xy[:, None] - corners).max(axis=2)
     assert away.min(axis=1).max() <= 6
@@ -105,19 +105,19 @@ def test_region_keeps_all_of_it_or_a_number_at_random() -> None:
     assert len(some.depth) == 17
 
 
-def test_noise_has_the_size_asked_for() -> None:
+def test_noise_has_the_requested_size() -> None:
     every = SamplePattern(count=DEPTH.size)
     clean = sample_points(DEPTH, every, 3)
     metres = sample_points(DEPTH, every, 3, noise=SampleNoise(metres=0.05))
     assert (metres.depth - clean.depth).std() == pytest.approx(0.05, rel=0.1)
     relative = sample_points(DEPTH, every, 3, noise=SampleNoise(relative=0.02))
     assert (relative.depth / clean.depth - 1).std() == pytest.approx(0.02, rel=0.1)
-    wrong = sample_points(DEPTH, every, 3, noise=SampleNoise(outliers=0.1))
-    assert np.count_nonzero(wrong.depth != clean.depth) == DEPTH.size // 10
-    assert clean.depth.min() <= wrong.depth.min() <= wrong.depth.max() <= clean.depth.max()
+    noisy = sample_points(DEPTH, every, 3, noise=SampleNoise(outliers=0.1))
+    assert np.count_nonzero(noisy.depth != clean.depth) == DEPTH.size // 10
+    assert clean.depth.min() <= noisy.depth.min() <= noisy.depth.max() <= clean.depth.max()
 
 
-def test_jitter_moves_places_and_leaves_depths() -> None:
+def test_jitter_moves_positions_and_keeps_depths() -> None:
     clean = sample_points(DEPTH, SamplePattern(count=500), 3)
     moved = sample_points(DEPTH, SamplePattern(count=500), 3, noise=SampleNoise(jitter_px=0.7))
     lost = moved.dropped.get("outside the image", 0)
@@ -128,7 +128,7 @@ def test_jitter_moves_places_and_leaves_depths() -> None:
 
 
 @pytest.mark.parametrize(
-    ("given_", "said"),
+    ("options", "message"),
     [
         ({"kind": "spiral", "count": 3}, "spiral"),
         ({"count": 0}, "at least one"),
@@ -141,9 +141,9 @@ def test_jitter_moves_places_and_leaves_depths() -> None:
         ({"count": 3, "region": (0, 0, 1, 1)}, "region"),
     ],
 )
-def test_a_pattern_that_makes_no_sense_is_refused(given_: dict[str, object], said: str) -> None:
-    with pytest.raises(UsageError, match=said):
-        SamplePattern(**given_)  # type: ignore[arg-type]
+def test_a_pattern_that_makes_no_sense_is_refused(options: dict[str, object], message: str) -> None:
+    with pytest.raises(UsageError, match=message):
+        SamplePattern(**options)  # type: ignore[arg-type]
 
 
 def test_what_the_depth_map_cannot_give_is_refused() -> None:
@@ -161,11 +161,11 @@ def test_what_the_depth_map_cannot_give_is_refused() -> None:
         )
 
 
-@pytest.mark.parametrize("wrong", [-1.0, float("nan"), float("inf")])
+@pytest.mark.parametrize("value", [-1.0, float("nan"), float("inf")])
 @pytest.mark.parametrize("name", ["metres", "relative", "outliers", "jitter_px"])
-def test_noise_that_makes_no_sense_is_refused(name: str, wrong: float) -> None:
+def test_noise_that_makes_no_sense_is_refused(name: str, value: float) -> None:
     with pytest.raises(UsageError):
-        SampleNoise(**{name: wrong})
+        SampleNoise(**{name: value})
 
 
 def test_a_plain_image_has_no_features() -> None:
@@ -174,7 +174,7 @@ def test_a_plain_image_has_no_features() -> None:
         sample_points(DEPTH, SamplePattern(kind="features", count=3), 0, image=flat)
 
 
-def test_features_of_a_real_frame_spread_over_it(shared_data: Path) -> None:
+def test_features_of_a_real_frame_cover_it(shared_data: Path) -> None:
     from pnpdepth_cli.io.depth import read_depth
     from pnpdepth_cli.io.rgb import read_rgb
 

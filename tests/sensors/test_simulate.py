@@ -43,14 +43,14 @@ def test_points_lie_on_the_beams_elevations() -> None:
     assert set(np.rint(elevation).astype(int)) == set(range(-14, 15, 2))
 
 
-@pytest.mark.parametrize("place", [(0.3, 0.0, 0.0), (0.0, -0.8, -0.3), (-0.5, 0.4, 0.5)])
-def test_from_another_place_every_point_lies_on_the_wall_it_hits(
-    place: tuple[float, float, float],
+@pytest.mark.parametrize("translation", [(0.3, 0.0, 0.0), (0.0, -0.8, -0.3), (-0.5, 0.4, 0.5)])
+def test_from_another_position_every_point_lies_on_the_wall_it_hits(
+    translation: tuple[float, float, float],
 ) -> None:
     # a wall that runs away to the right: n · p = 6 with n = (-0.4, 0, 1)
     x = (np.arange(320) - K[0, 2]) / K[0, 0]
     depth = np.broadcast_to(6 / (1 - 0.4 * x), (240, 320))
-    camera = replace(CAMERA, translation=np.array(place))
+    camera = replace(CAMERA, translation=np.array(translation))
     got = simulate_lidar(depth, camera, IDEAL, seed=0)
     points = camera.unproject(got.xy, got.depth)
     np.testing.assert_allclose(points @ [-0.4, 0, 1], 6, atol=0.02)
@@ -97,7 +97,7 @@ def test_range_noise_moves_points_along_their_beams() -> None:
     assert abs(error.mean()) < 0.01
 
 
-def test_drop_out_and_maximum_range_take_their_share() -> None:
+def test_dropout_and_maximum_range_remove_points() -> None:
     depth = np.full((240, 320), 10.0)
     full = simulate_lidar(depth, CAMERA, IDEAL, seed=0)
     thin = simulate_lidar(depth, CAMERA, IDEAL, seed=0, settings=SimulationSettings(dropout=0.3))
@@ -136,29 +136,34 @@ def test_unknown_depth_gives_no_points() -> None:
     assert simulate_lidar(half, CAMERA, IDEAL, seed=0).xy[:, 0].min() >= 159.5
 
 
-def test_a_share_that_is_none_is_refused() -> None:
-    for wrong in ({"dropout": 1.0}, {"rotation_noise_deg": float("nan")}):
+def test_an_invalid_fraction_is_refused() -> None:
+    for settings in ({"dropout": 1.0}, {"rotation_noise_deg": float("nan")}):
         with pytest.raises(UsageError):
-            SimulationSettings(**wrong)
+            SimulationSettings(**settings)
 
 
 PAPER_PERCENT = {"vlp-16": 5.3, "vlp-32c": 28.8, "hdl-32e": 10.3, "hdl-64e": 18.7}
 
 
-def test_the_papers_sensors_give_about_its_shares_of_samples_in_its_order() -> None:
+def test_the_papers_sensors_give_about_its_fractions_of_samples_in_its_order() -> None:
     # SYNTHIA's sequences are 1280×760 with a focal length of 532.74; at 0.4 of that size
     intrinsics = np.array([[213.1, 0, 255.5], [0, 213.1, 151.5], [0, 0, 1]])
     synthia = Camera(intrinsics=intrinsics, rotation=FORWARD_LEFT_UP)
     depth = np.full((304, 512), 10.0)
-    shares = {
+    fractions = {
         name: 100
         * len(simulate_lidar(depth, synthia, LIDARS[f"paper-{name}"], 0).depth)
         / depth.size
         for name in PAPER_PERCENT
     }
-    assert sorted(shares, key=shares.__getitem__) == ["vlp-16", "hdl-32e", "hdl-64e", "vlp-32c"]
+    assert sorted(fractions, key=fractions.__getitem__) == [
+        "vlp-16",
+        "hdl-32e",
+        "hdl-64e",
+        "vlp-32c",
+    ]
     for name, percent in PAPER_PERCENT.items():
-        assert shares[name] == pytest.approx(percent, rel=0.1), name
+        assert fractions[name] == pytest.approx(percent, rel=0.1), name
 
 
 def test_the_real_sensor_seen_on_the_street_has_the_density_of_kitti() -> None:
@@ -183,6 +188,6 @@ def test_noise_beyond_all_bounds_leaves_no_point_and_is_refused() -> None:
         simulate_lidar(np.full((240, 320), 8.0), CAMERA, IDEAL, 0, settings)
 
 
-def test_a_scanner_of_too_many_points_a_turn_is_refused_before_they_are_made() -> None:
+def test_a_scanner_of_too_many_points_a_turn_is_refused_before_simulation() -> None:
     with pytest.raises(UsageError, match="1,474,560,000 points per revolution"):
         Lidar(name="x", elevations_deg=(0.0,) * 4096, azimuth_step_deg=0.001, max_range=9)

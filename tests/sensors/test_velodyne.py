@@ -20,8 +20,8 @@ SIZE = (80, 101)
 ALL = ProjectionSettings(occlusion=None)
 
 
-def camera(**given: object) -> Camera:
-    return Camera(**({"intrinsics": K, "rotation": FORWARD_LEFT_UP} | given))  # type: ignore[arg-type]
+def camera(**fields: object) -> Camera:
+    return Camera(**({"intrinsics": K, "rotation": FORWARD_LEFT_UP} | fields))  # type: ignore[arg-type]
 
 
 def rotation(x: float, y: float, z: float) -> NDArray[np.float64]:
@@ -36,7 +36,7 @@ def rotation(x: float, y: float, z: float) -> NDArray[np.float64]:
 
 def test_a_scan_projects_as_computed_by_hand() -> None:
     # The scanner (x forward, y left, z up) is 0.5 m left of, 1 m above, 2 m behind the camera.
-    place = camera(translation=np.array([-0.5, -1.0, -2.0]))
+    posed = camera(translation=np.array([-0.5, -1.0, -2.0]))
     scan = np.array(
         [
             [12.0, 0.0, 0.0, 0.3],  # camera (-0.5, -1, 10): u = 50 - 5, v = 40 - 10
@@ -46,7 +46,7 @@ def test_a_scan_projects_as_computed_by_hand() -> None:
             [12.0, 9.0, 0.0, 0.3],  # camera (-9.5, ., 10): u = -45
         ]
     )
-    got = project_velodyne(scan, place, SIZE, ALL)
+    got = project_velodyne(scan, posed, SIZE, ALL)
     np.testing.assert_allclose(got.xy, [[45, 30], [65, 50], [52, 41.5]], atol=1e-5)
     np.testing.assert_allclose(got.depth, [10, 5, 4], rtol=1e-6)
     assert got.index.tolist() == [0, 1, 2]
@@ -66,7 +66,7 @@ def test_range_is_the_distance_from_the_camera_instead_of_z() -> None:
     assert project_velodyne(scan, wide, SIZE, settings_).depth.tolist() == [5]
 
 
-def test_of_two_points_on_a_pixel_the_nearer_wins_and_keeps_its_place_in_it() -> None:
+def test_of_two_points_on_a_pixel_the_nearer_wins_and_keeps_its_subpixel_position() -> None:
     scan = np.array([[20.0, 0.02, 0.0], [10.0, 0.03, 0.0], [10.0, 1.0, 0.0]])
     got = project_velodyne(scan, camera(), SIZE, ALL)
     assert got.index.tolist() == [1, 2]
@@ -95,8 +95,8 @@ def test_a_scan_that_the_camera_does_not_see_says_where_its_points_are() -> None
     assert "\n" not in str(error.value)
 
 
-def test_the_outermost_half_pixels_belong_to_the_picture_and_no_more() -> None:
-    # u = 50 - 10 y: the left border of the picture is at -0.5, the right one at 100.5
+def test_the_outermost_half_pixels_belong_to_the_image_and_no_more() -> None:
+    # u = 50 - 10 y: the left border of the image is at -0.5, the right one at 100.5
     scan = np.array([[10.0, y, 0] for y in (5.0499, 5.0501, -5.0499, -5.0501)])
     assert project_velodyne(scan, camera(), SIZE, ALL).index.tolist() == [0, 2]
 
@@ -162,7 +162,7 @@ def test_distortion_is_opencvs(seed: int, coefficients: tuple[float, ...]) -> No
     np.testing.assert_allclose(ours, theirs[:, 0], atol=1e-8)
 
 
-def test_a_lens_model_does_not_fold_points_from_outside_into_the_picture() -> None:
+def test_a_lens_model_does_not_fold_points_from_outside_into_the_image() -> None:
     # 1 - 0.4 r² turns back at r = 0.91: a point at r = 1.58 would land on the axis
     eye = camera(distortion=(-0.4, 0.0, 0.0, 0.0))
     folded = np.array([[10.0, 15.8, 0.0]])

@@ -101,6 +101,9 @@ class Frame:
     neighbours: tuple[Neighbour, ...] = ()
     """Other frames whose points are moved into this one."""
 
+    window: tuple[Frame, ...] = ()
+    """The frames of its window up to and with this one; empty outside of windows."""
+
     masks: tuple[Path, ...] = ()
     """Images or arrays of the ground truth's size; where one is 0, the ground truth is unknown."""
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from pnpdepth_cli.errors import FileFormatError, UsageError
 from pnpdepth_cli.io.file_bytes import check_pixel_count, damaged
 from pnpdepth_cli.io.formats import DepthFormat, StoredArray, WriteOptions
+from pnpdepth_cli.io.own_output import silent_thread
 
 _DEPTH_NAMES = frozenset({"z", "depth"})
 _TILED, _DEEP, _MULTIPART = 0x200, 0x800, 0x1000  # bits of the version field
@@ -38,7 +39,7 @@ def read_exr_channels(path: Path, data: bytes) -> dict[str, NDArray[Any]]:
             count = len(file.parts)
             for index in range(count):
                 _check_header(path, file.header(index), len(data))
-        with OpenEXR.File(str(path), separate_channels=True) as file:
+        with silent_thread(), OpenEXR.File(str(path), separate_channels=True) as file:
             parts = [_part_channels(part) for part in file.parts]
             names = [str(part.name()) for part in file.parts]
     except FileFormatError:

@@ -12,16 +12,14 @@ from typing import Any
 from pnpdepth_cli.errors import FileFormatError
 from pnpdepth_cli.io.dataset.frame import Frame, Hdf5Array, Listing
 from pnpdepth_cli.io.dataset.hdf5 import shape_of
+from pnpdepth_cli.io.dataset.matlab import read_matlab_array
 from pnpdepth_cli.io.dataset.protocols import PROTOCOLS
-from pnpdepth_cli.io.file_bytes import one_line, read_bytes, size_of_regular_file
+from pnpdepth_cli.io.file_bytes import one_line, read_bytes
 from pnpdepth_cli.io.layouts import Layout
 
 _LABELED = "nyu_depth_v2_labeled.mat"
 _MOST_FRAMES = 100_000
 """The official file has 1,449."""
-
-_MOST_SPLIT_BYTES = 1 << 16
-"""splits.mat has 2.6 kB; scipy decompresses all of it."""
 
 
 def matches(root: Path) -> bool:
@@ -58,7 +56,7 @@ def _split(folder: Path, count: int) -> list[int]:
         source = text
         words: Any = read_bytes(text).decode("utf-8", "replace").split()
     elif matlab.is_file():
-        source, words = matlab, _test_numbers(matlab)
+        source, words = matlab, read_matlab_array(matlab, "testNdxs")[:_MOST_FRAMES]
     else:
         return []
     try:
@@ -70,18 +68,6 @@ def _split(folder: Path, count: int) -> list[int]:
     if not numbers or not 1 <= numbers[0] <= numbers[-1] <= count:
         raise FileFormatError(f"{source}: frame numbers must be from 1 to {count:,}")
     return numbers
-
-
-def _test_numbers(path: Path) -> Any:
-    from scipy.io import loadmat
-
-    size = size_of_regular_file(path)
-    if size > _MOST_SPLIT_BYTES:
-        raise FileFormatError(f"{path} has {size:,} bytes; the official file has 2.6 kB")
-    try:
-        return loadmat(path, variable_names=["testNdxs"])["testNdxs"].ravel()[:_MOST_FRAMES]
-    except Exception as error:  # scipy raises many kinds for a damaged file
-        raise FileFormatError(f"{path} has no testNdxs ({one_line(error)})") from error
 
 
 LAYOUT = Layout(matches=matches, listing=listing, needs=("nyu_depth_v2_labeled.mat",))

@@ -6,15 +6,18 @@ import sys
 from collections import Counter
 from collections.abc import Callable, Generator, Iterator
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any, Protocol
 
+from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.io.atomic import make_folder
 from pnpdepth_cli.io.dataset.frame import Frame
 from pnpdepth_cli.io.lock import in_turn, locked_folder
+from pnpdepth_cli.io.record import plain
 from pnpdepth_cli.io.report import remove_report_leftovers
 from pnpdepth_cli.pipeline.batch.frames import (
     BatchFrames,
+    Task,
     find_frames,
     source_files,
     task_of,
@@ -22,6 +25,8 @@ from pnpdepth_cli.pipeline.batch.frames import (
 from pnpdepth_cli.pipeline.batch.profile import BatchProfile
 from pnpdepth_cli.pipeline.batch.request import BatchRequest
 from pnpdepth_cli.pipeline.batch.run import BatchRun
+from pnpdepth_cli.pipeline.batch.sequence import in_windows
+from pnpdepth_cli.pipeline.batch.sequence_options import SequenceOptions
 from pnpdepth_cli.pipeline.batch.settings import model_identity, settings_of
 from pnpdepth_cli.pipeline.batch.spread import spread_request, spread_rows
 from pnpdepth_cli.pipeline.batch.state import NEW, BatchState, remove_all_leftovers
@@ -46,7 +51,10 @@ class Listener(Protocol):
         """Called once the network is loaded, with the number of frames to do."""
 
     def frame(self, row: dict[str, Any]) -> None:
-        """Called with the summary's row of each frame that is done or has failed."""
+        """Called with the summary's row of each frame that is done or has failed.
+
+        With workers of a cluster it has only name, status and message.
+        """
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,6 +92,11 @@ def run_batch(
             full disk.
     """
     request, spread = spread_request(request)
+    if spread is not None and request.sequence.warm_start:
+        raise UsageError(
+            "--warm-start refines frames in order, in one process; give each process a --shard of"
+            " the windows instead of --ray"
+        )
     batch = find_frames(request)
     report = _report_of(request, batch)
     for note in _notes_of(request, batch):
@@ -176,13 +189,26 @@ def _rows(
     from pnpdepth_cli.pipeline.batch.running import run_tasks
 
     refiner = resolve_refiner((task_of(request, frame) for frame in batch.frames), run.say)
-    tasks = (task_of(request, frame) for frame in to_do)
+    tasks = _tasks(request, batch, to_do)
 
     def rows() -> Generator[dict[str, Any], None, None]:
         with opened_groups(refiner, run.batch_size, run.say) as groups:
             yield from run_tasks(tasks, groups, run, proven=proven)
 
     return rows()
+
+
+def _tasks(request: BatchRequest, batch: BatchFrames, to_do: list[Frame]) -> Iterator[Task]:
+    """The frames to refine in their order, and within windows those that they begin with."""
+    if not request.sequence.warm_start:
+        yield from (task_of(request, frame) for frame in to_do)
+        return
+    by_name = {frame.name: frame for frame in batch.frames}
+    for wanted in in_windows(to_do):
+        names = {frame.name for frame in wanted}
+        for each in wanted[-1].window:
+            task = task_of(request, by_name[each.name])
+            yield replace(task, written=task.name in names)
 
 
 def _report_of(request: BatchRequest, batch: BatchFrames) -> BatchReport | None:
@@ -252,6 +278,8 @@ def _summarise(
         "baselines": tally.mean_baselines(),
         "unmatched": [str(each) for each in batch.unmatched],
     }
+    if request.sequence != SequenceOptions():
+        summary["sequence"] = plain(asdict(request.sequence))
     if request.profile:
         summary["profile"] = profile.summary()
     write_summary(request.output / JSON, summary, rows())

@@ -14,7 +14,12 @@ from pnpdepth_cli.io.dataset.frame_names import name_problem
 from pnpdepth_cli.io.file_bytes import one_line
 from pnpdepth_cli.io.layouts import LAYOUTS, find_protocol, list_frames
 from pnpdepth_cli.pipeline.batch.request import BatchRequest
-from pnpdepth_cli.pipeline.batch.sequence import with_neighbours
+from pnpdepth_cli.pipeline.batch.sequence import (
+    check_warm_start,
+    in_windows,
+    with_neighbours,
+    with_windows,
+)
 from pnpdepth_cli.pipeline.refinement.output_files import Outputs
 from pnpdepth_cli.pipeline.refinement.request import FrameFiles, RefineRequest
 
@@ -45,6 +50,8 @@ class Task:
     """The files that are read for it, by their part."""
     outputs: Outputs
     """The files that are written for it."""
+    written: bool = True
+    """False for a frame that is refined only because another begins where it ends."""
 
 
 def find_frames(request: BatchRequest) -> BatchFrames:
@@ -76,13 +83,23 @@ def find_frames(request: BatchRequest) -> BatchFrames:
         )
     sequence = request.sequence
     frames = with_neighbours(frames, sequence.accumulate, sequence.poses)
-    number, of = request.shard or (1, 1)
+    if sequence.warm_start:
+        check_warm_start(request.refine)
+        frames = with_windows(frames, sequence.warm_start)
     return BatchFrames(
         layout=layout,
         frames=frames,
-        chosen=frames[: request.limit][number - 1 :: of],
+        chosen=_chosen(request, frames[: request.limit]),
         unmatched=tuple(unmatched),
     )
+
+
+def _chosen(request: BatchRequest, frames: list[Frame]) -> list[Frame]:
+    """The frames of the shard: every N-th, or every N-th window."""
+    number, of = request.shard or (1, 1)
+    if not request.sequence.warm_start:
+        return frames[number - 1 :: of]
+    return [frame for window in in_windows(frames)[number - 1 :: of] for frame in window]
 
 
 def task_of(request: BatchRequest, frame: Frame) -> Task:
@@ -110,6 +127,7 @@ def task_of(request: BatchRequest, frame: Frame) -> Task:
         camera_file=frame.calib if needs_camera and not is_scan else None,
         camera_number=frame.camera if scan.camera is None else scan.camera,
         neighbours=frame.neighbours,
+        window=tuple(each.name for each in frame.window),
         gt_masks=frame.masks,
         gt_size_ok=frame.gt_other_size,
         sparse_size_ok=base.sparse_size_ok or frame.sparse_other_size,
@@ -121,7 +139,7 @@ def task_of(request: BatchRequest, frame: Frame) -> Task:
     return Task(
         name=frame.name,
         request=replace(refine, files=files),
-        inputs=dict(_input_files(files, is_scan=is_scan)),
+        inputs=dict(_earlier_files(frame)) | dict(_input_files(files, is_scan=is_scan)),
         outputs=Outputs.in_folder(request.output, frame.name, refine),
     )
 
@@ -171,6 +189,15 @@ def _input_files(files: FrameFiles, *, is_scan: bool) -> Iterator[tuple[str, Pat
             yield from ((f"calib {p.name}", p) for p in sorted(calib.glob("calib_*.txt")))
         else:
             yield "calib", calib
+
+
+def _earlier_files(frame: Frame) -> Iterator[tuple[str, Path]]:
+    """The files of the frames before in the window, on which this one's result depends."""
+    for each in frame.window[:-1]:
+        for number, path in enumerate(source_files(each)):
+            if path.is_file():
+                yield f"file {number} of {each.name}", path
+        yield from ((f"sparse of {other.sparse.stem}", other.sparse) for other in each.neighbours)
 
 
 def _holds_the_frames(output: Path) -> OutputError:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from pnpdepth_cli.core.refine import RefineSettings
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.errors import DeviceError, NoPointsError, PnpDepthError, UsageError
-from pnpdepth_cli.frames.frame import RefinedFrame
+from pnpdepth_cli.frames.frame import Carried, RefinedFrame
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs
 from pnpdepth_cli.pipeline.refinement.method import needs_folds
 from pnpdepth_cli.pipeline.refinement.refiner import Opened, Refiner
@@ -72,6 +72,7 @@ class FrameGroups:
         self._count: dict[tuple[int, int], int] = {}  # by size, how many go together
         self._limit: dict[tuple[int, int], int] = {}  # by size, how many fit into memory
         self._inexact: set[tuple[int, int]] = set()
+        self._carried: dict[str, Carried] = {}  # of the last frame, by the first of its window
         self._alone: list[_Alone] = []  # the last frames, of one size not tried yet
 
     @property
@@ -106,7 +107,21 @@ class FrameGroups:
         wanted = self._wanted or min(_MAX_FRAMES, pixels // (size[0] * size[1]))
         return max(1, min(wanted, self._limit.get(size, wanted)))
 
+    def _refined_in_window(self, inputs: Inputs) -> RefinedFrame | Exception:
+        """The frame, beginning where the one before in its window ended; alone if that failed."""
+        first, begins = inputs.window[0], len(inputs.window) == 1
+        carried = Carried() if begins else self._carried.get(first, Carried())
+        self._carried = {}
+        try:
+            frame = self.refiner.refine_next(self._opened, inputs, carried)
+        except Exception as error:  # concerns this frame only
+            return error
+        self._carried = {first: frame.carried or Carried()}
+        return replace(frame, carried=None)
+
     def _refined_alone(self, inputs: Inputs) -> RefinedFrame | Exception:
+        if inputs.window:
+            return self._refined_in_window(inputs)
         start = time.perf_counter()
         try:
             frame = self.refiner.refine(self._opened, inputs)
@@ -225,6 +240,8 @@ def _why_alone(request: RefineRequest) -> str | None:
         return "tiles go through the network one by one"
     if moves_weights(request.method):
         return "weights are updated for each frame alone"
+    if request.files.window:
+        return "each frame of a window begins where the one before ended"
     return None
 
 

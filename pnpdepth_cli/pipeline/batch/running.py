@@ -91,6 +91,8 @@ def run_tasks(
                 if run.stopped():
                     break
                 for task, read, result in _refined(groups, group, profile):
+                    if not task.written:
+                        continue
                     if isinstance(result, Exception):
                         if not proven and isinstance(result, ModelError | UsageError):
                             raise result

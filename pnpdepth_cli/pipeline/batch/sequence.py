@@ -1,4 +1,4 @@
-"""The sequences that the frames of a data set are of: their order, poses and neighbours."""
+"""The sequences that the frames of a data set are of: their poses, neighbours and windows."""
 
 from __future__ import annotations
 
@@ -14,6 +14,8 @@ from pnpdepth_cli.io.dataset.frame import Frame, Neighbour
 from pnpdepth_cli.io.oxts import read_oxts_poses
 from pnpdepth_cli.io.poses import read_poses
 from pnpdepth_cli.pipeline.evaluation.dependence import groups_by_name
+from pnpdepth_cli.pipeline.refinement.method import needs_folds
+from pnpdepth_cli.pipeline.refinement.request import RefineRequest
 
 Floats = NDArray[np.float64]
 
@@ -26,6 +28,36 @@ def sequences_of(frames: Sequence[Frame]) -> list[list[int]]:
         group = name if frame.group is None else frame.group
         sequences.setdefault((group, frame.camera), []).append(index)
     return list(sequences.values())
+
+
+def with_windows(frames: Sequence[Frame], length: int) -> list[Frame]:
+    """Returns the frames, each with its window: so many frames of its sequence in a row."""
+    result = list(frames)
+    for sequence in sequences_of(frames) if length else ():
+        for place, index in enumerate(sequence):
+            first = place - place % length
+            window = tuple(frames[other] for other in sequence[first : place + 1])
+            result[index] = replace(frames[index], window=window)
+    return result
+
+
+def in_windows(frames: Sequence[Frame]) -> list[list[Frame]]:
+    """Returns the frames by window, in the order of the first frame of each."""
+    windows: dict[str, list[Frame]] = {}
+    for frame in frames:
+        windows.setdefault((*frame.window, frame)[0].name, []).append(frame)
+    return list(windows.values())
+
+
+def check_warm_start(request: RefineRequest) -> None:
+    """Raises UsageError if the method cannot begin where the frame before ended."""
+    if needs_folds(request):
+        raise UsageError(
+            "--warm-start goes with a fixed method, not with the choice by held-out points; give"
+            " --preset fast, or another option of the method"
+        )
+    if request.network.tile is not None:
+        raise UsageError("--warm-start does not go with --tile")
 
 
 def with_neighbours(frames: Sequence[Frame], reach: int, poses: Path | None) -> list[Frame]:

@@ -24,8 +24,16 @@ class SequenceOptions:
         metavar="FILE",
     )
 
+    warm_start: int = option(
+        0,
+        "Refine windows of N frames in order, each frame from where the one before ended.",
+        metavar="N",
+    )
+
     def __post_init__(self) -> None:
         if self.accumulate < 0:
             raise UsageError(f"--accumulate {self.accumulate}: give a number of frames, 0 or more")
+        if self.warm_start < 0 or self.warm_start == 1:
+            raise UsageError(f"--warm-start {self.warm_start}: give a window of 2 frames or more")
         if self.poses is not None and not self.accumulate:
             raise UsageError("--poses is for --accumulate; give --accumulate 2, say")

@@ -31,6 +31,8 @@ def settings_of(request: RefineRequest, model: dict[str, Any], *groups: str) -> 
     if "scan" in fields:
         fields["scan"] = asdict(fields["scan"])
         del fields["scan"]["calib"], fields["scan"]["extrinsics"]
+    if not fields.get("window"):
+        fields.pop("window", None)
     neighbours = fields.pop("neighbours", ())
     if neighbours:
         fields["neighbours"] = [(each.motion, each.apart) for each in neighbours]

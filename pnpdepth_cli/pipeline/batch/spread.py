@@ -10,11 +10,13 @@ from typing import TYPE_CHECKING, Any
 
 from pnpdepth_cli.io.dataset.frame import Frame
 from pnpdepth_cli.io.fingerprint import Fingerprint
+from pnpdepth_cli.io.journal import EncodedLine
 from pnpdepth_cli.pipeline.batch.frames import Task, compared, task_of
 from pnpdepth_cli.pipeline.batch.profile import BatchProfile
 from pnpdepth_cli.pipeline.batch.request import BatchRequest
 from pnpdepth_cli.pipeline.batch.run import BatchRun
 from pnpdepth_cli.pipeline.batch.state import (
+    KEY,
     BatchState,
     Line,
     Status,
@@ -83,12 +85,12 @@ def spread_rows(
             stopped=run.stopped,
             proven=proven,
         ):
-            lines = [
-                _lost_line(state, request, frame, result) if isinstance(result, Lost) else result
+            done = [
+                _given_up(state, request, frame, result) if isinstance(result, Lost) else result
                 for frame, result in part
             ]
-            state.record(*lines)
-            yield from (line["row"] for line in lines)
+            state.record(*(each.line for each in done))
+            yield from (each.row for each in done)
         run.profile.add_workers(pool.figures())
 
 
@@ -105,10 +107,28 @@ def _deciding(
     return ()
 
 
-def _lost_line(state: BatchState, request: BatchRequest, frame: Frame, lost: Lost) -> Line:
+@dataclass(frozen=True, kw_only=True)
+class DoneFrame:
+    """A frame that a worker has done; the driver need not parse its line."""
+
+    row: dict[str, Any]
+    """For a listener: the summary's row if a report is drawn of it, else its first fields."""
+    line: EncodedLine
+    """For the manifest."""
+
+    @classmethod
+    def of(cls, line: Line, *, whole: bool) -> DoneFrame:
+        """Returns what the driver takes of a line, with its whole row or the first fields of it."""
+        row = line["row"]
+        shown = row if whole else {name: row[name] for name in ("name", "status", "message")}
+        return cls(row=shown, line=EncodedLine.of(line, KEY))
+
+
+def _given_up(state: BatchState, request: BatchRequest, frame: Frame, lost: Lost) -> DoneFrame:
     task = task_of(request, frame)
     paths = {part: str(path) for part, path in task.inputs.items()}
-    return failed_line(state, task, failed_row(task.name, paths, lost.message))
+    line = failed_line(state, task, failed_row(task.name, paths, lost.message))
+    return DoneFrame.of(line, whole=True)
 
 
 def first_readable(request: BatchRequest, frames: Sequence[Frame]) -> int | None:
@@ -121,7 +141,7 @@ def first_readable(request: BatchRequest, frames: Sequence[Frame]) -> int | None
 
 @dataclass(frozen=True, kw_only=True)
 class RefineJob:
-    """Refines frames on a worker; its results are lines of the manifest."""
+    """Refines frames on a worker; its results are `DoneFrame`s."""
 
     request: BatchRequest
     """How, on one device."""
@@ -150,7 +170,7 @@ class RefineJob:
         with opened_groups(refiner, run.batch_size, run.say) as groups:
 
             def refine(frames: Sequence[Frame], proven: bool) -> Done:
-                done = refined_lines(self.request, frames, groups, run, proven=proven)
+                done = done_frames(self.request, frames, groups, run, proven=proven)
                 said = tuple(notes)
                 notes.clear()
                 return replace(done, notes=said)
@@ -158,7 +178,7 @@ class RefineJob:
             yield refine
 
 
-def refined_lines(
+def done_frames(
     request: BatchRequest,
     frames: Sequence[Frame],
     groups: FrameGroups | None,
@@ -166,14 +186,17 @@ def refined_lines(
     *,
     proven: bool,
 ) -> Done:
-    """Returns the lines of these frames, refined and written."""
+    """Returns a `DoneFrame` of each of these frames, refined and written."""
     from pnpdepth_cli.pipeline.batch.running import run_tasks
 
     assert isinstance(run.state, LineCollector)
     tasks = (task_of(request, frame) for frame in frames)
     rows = list(run_tasks(tasks, groups, run, proven=proven))
     return Done(
-        results=[run.state.lines.pop(frame.name) for frame in frames],
+        results=[
+            DoneFrame.of(run.state.lines.pop(frame.name), whole=request.html is not None)
+            for frame in frames
+        ],
         proves=any(row["status"] != "failed" for row in rows),
         multiple=groups.largest if groups else 1,
         figures=run.profile.summary(),

@@ -18,7 +18,7 @@ from typing import Any, Literal, Protocol
 from pnpdepth_cli.errors import OutputError
 from pnpdepth_cli.io.atomic import cannot_write, remove_leftovers
 from pnpdepth_cli.io.fingerprint import Fingerprint, fingerprint, is_unchanged
-from pnpdepth_cli.io.journal import Journal
+from pnpdepth_cli.io.journal import EncodedLine, Journal
 from pnpdepth_cli.pipeline.batch.frames import Task
 from pnpdepth_cli.pipeline.batch.settings import SettingsDigests, settings_digest
 
@@ -26,6 +26,8 @@ Status = Literal["done", "diverged", "failed"]
 
 Line = dict[str, Any]
 """A line of a run manifest."""
+KEY = "frame"
+"""Identifies a line, by the name of its frame."""
 NEW = "new"
 _MANIFEST = re.compile(r"batch(\.\d+of\d+)?\.jsonl")
 
@@ -69,7 +71,7 @@ class BatchState:
         part = "" if shard is None else f".{shard[0]}of{shard[1]}"
         own = output / f"batch{part}.jsonl"
         existed = own.exists()
-        self._own = Journal(own, "frame")
+        self._own = Journal(own, KEY)
         self.read_others()
         self.fresh = not existed and not self._others
         """True if no batch wrote to the folder before."""
@@ -78,7 +80,7 @@ class BatchState:
         """Reads what the other shards have done up to now."""
         paths = sorted(self.output.iterdir()) if self.output.is_dir() else []
         self._others = [
-            Journal(path, "frame")
+            Journal(path, KEY)
             for path in paths
             if _MANIFEST.fullmatch(path.name) and path.name != self._own.path.name
         ]
@@ -138,7 +140,7 @@ class BatchState:
         """Records why the frame failed; the next run tries it again."""
         self.record(failed_line(self, task, row))
 
-    def record(self, *lines: dict[str, Any]) -> None:
+    def record(self, *lines: Line | EncodedLine) -> None:
         """Appends lines to the manifest of this run."""
         self._own.append(*lines)
 

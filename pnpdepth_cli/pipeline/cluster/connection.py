@@ -87,7 +87,8 @@ def _check_answers(address: str) -> None:
     try:
         with socket.create_connection((host, int(port)), timeout=_CONNECT_S) as server:
             server.sendall(_HTTP2_PREFACE)
-            frame = server.recv(9)
+            with server.makefile("rb") as answer:
+                frame = answer.read(9)
     except (OSError, OverflowError) as error:
         reason = one_line(getattr(error, "strerror", None) or error).lower()
         raise ClusterError(
@@ -123,9 +124,8 @@ def _planned(ray: ModuleType, spread: Spread) -> Cluster:
     wanted = options.ray_workers or len(spread.indices) or there
     if wanted > there or not there:
         where = "this machine" if spread.address == LOCAL else f"Ray cluster {spread.address!r}"
-        each = "a GPU" if spread.device == "cuda" else f"{cpus} CPU cores"
         raise ClusterError(
-            f"{where} has devices for {there} workers of {each} each, and {max(1, wanted)} are"
-            " asked for; change --device, --ray-workers or --cpus-per-worker"
+            f"{where} has devices for {there} Ray workers with {spread.each} each, and"
+            f" {max(1, wanted)} asked for; change --device, --ray-workers or --cpus-per-worker"
         )
     return Cluster(ray=ray, workers=wanted, resources=resources)

@@ -67,6 +67,12 @@ class Spread:
     options: ClusterOptions
     """The user's."""
 
+    @property
+    def each(self) -> str:
+        """What a worker has, in words."""
+        cpus = self.options.cpus_per_worker
+        return "one GPU" if self.device == "cuda" else f"{cpus} CPU core{'s' if cpus > 1 else ''}"
+
 
 def spread_of(device: str, options: ClusterOptions) -> Spread | None:
     """Returns the workers asked for; None for this process alone.

@@ -1,4 +1,4 @@
-"""A pool of Ray workers: hands out pieces, two at a time per worker, and replaces dead workers."""
+"""A pool of Ray workers: hands out pieces, two at a time, and replaces dead workers."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from typing import Any
 from pnpdepth_cli.budget import chosen_max_pixels
 from pnpdepth_cli.errors import ClusterError, ModelError, PnpDepthError, UsageError
 from pnpdepth_cli.io.atomic import cannot_write
-from pnpdepth_cli.io.file_bytes import one_line
 from pnpdepth_cli.pipeline.cluster.connection import Cluster, connected
+from pnpdepth_cli.pipeline.cluster.failures import check_facts, own_error, reason_of
 from pnpdepth_cli.pipeline.cluster.options import Spread
 from pnpdepth_cli.pipeline.cluster.pieces import Piece, Pieces, piece_size
-from pnpdepth_cli.pipeline.cluster.worker import Done, Facts, Job, Start, Worker, software
+from pnpdepth_cli.pipeline.cluster.worker import Done, Facts, Job, Start, Worker
 
 _DEEP = 2
 """Pieces that a worker has: one it does, and one that waits."""
@@ -37,15 +37,19 @@ class Lost:
 
 
 @dataclass(kw_only=True)
-class _Hand:
+class _Member:
     """A worker as the driver knows it."""
 
     number: int
+    """Counts the workers that were started."""
     actor: Any
+    """Its handle."""
     calls: deque[tuple[Any, Piece | None]] = field(default_factory=deque)
     """References in their order, with the piece that each does."""
     facts: Facts | None = None
+    """Of its node; None before it has started."""
     ready: bool = False
+    """Whether it has opened the job."""
     done: Done | None = None
     """The piece before."""
     items: int = 0
@@ -76,7 +80,9 @@ def worker_pool(
         shared = list(inputs)
         if output is not None:
             shared.append(stack.enter_context(_probe(output.absolute())))
-        pool = WorkerPool(stack.enter_context(connected(spread)), spread, shared, say)
+        cluster = stack.enter_context(connected(spread))
+        say(f"Ray workers: starting {cluster.workers:,}, each with {spread.each}")
+        pool = WorkerPool(cluster, spread, shared, say)
         stack.callback(pool.close)
         yield pool
 
@@ -113,7 +119,7 @@ class WorkerPool:
         self._job_reference: Any = None
         self._started = self._failed_starts = 0
         self._last_ready = time.monotonic()
-        self._hands = [self._new_hand() for _ in range(cluster.workers)]
+        self._members = [self._new_member() for _ in range(cluster.workers)]
 
     def call(self, function: Callable[..., Any], *arguments: Any) -> Any:
         """Returns what the function returns on the first worker that is ready.
@@ -122,15 +128,15 @@ class WorkerPool:
             PnpDepthError: What it raises.
             ClusterError: The worker died.
         """
-        while not any(hand.facts for hand in self._hands):
+        while not any(member.facts for member in self._members):
             list(self._finished(Pieces((), 0)))
-        hand = next(hand for hand in self._hands if hand.facts)
+        member = next(member for member in self._members if member.facts)
         try:
-            return self._ray.get(hand.actor.call.remote(function, *arguments))
+            return self._ray.get(member.actor.call.remote(function, *arguments))
         except self._ray.exceptions.RayTaskError as error:
-            raise _own_error(error) from None
+            raise own_error(error) from None
         except self._ray.exceptions.RayError as error:
-            raise ClusterError(f"the first worker died: {_reason(error)}; run again") from None
+            raise ClusterError(f"the first worker died: {reason_of(error)}; run again") from None
 
     def results(
         self,
@@ -155,10 +161,10 @@ class WorkerPool:
             ClusterError: No worker can be started.
         """
         self._job, self._job_reference = job, self._ray.put(job)
-        for hand in self._hands:
-            hand.ready, hand.done = False, None
-            if hand.facts:
-                self._open(hand)
+        for member in self._members:
+            member.ready, member.done = False, None
+            if member.facts:
+                self._open(member)
         pieces = Pieces(items, self._retries)
         self._unproven: list[tuple[Piece, PnpDepthError]] = []
         self._proven = proven
@@ -179,83 +185,85 @@ class WorkerPool:
         """Returns for each living worker its node, process number, items and the job's figures."""
         return [
             {
-                "node": hand.facts.node,
-                "pid": hand.facts.pid,
-                "items": hand.items,
-                **(hand.done.figures if hand.done else {}),
+                "node": member.facts.node,
+                "pid": member.facts.pid,
+                "items": member.items,
+                **(member.done.figures if member.done else {}),
             }
-            for hand in self._hands
-            if hand.facts is not None
+            for member in self._members
+            if member.facts is not None
         ]
 
     def close(self) -> None:
         """Ends all workers, whatever they do."""
-        for hand in self._hands:
-            self._kill(hand)
+        for member in self._members:
+            self._kill(member)
 
-    def _new_hand(self) -> _Hand:
+    def _new_member(self) -> _Member:
         self._started += 1
         remote = self._ray.remote(Worker)
         options = {"scheduling_strategy": "SPREAD", "max_restarts": 0, **self._cluster.resources}
-        hand = _Hand(number=self._started, actor=remote.options(**options).remote(self._start))
-        hand.calls.append((hand.actor.facts.remote(), None))
-        return hand
+        member = _Member(number=self._started, actor=remote.options(**options).remote(self._start))
+        member.calls.append((member.actor.facts.remote(), None))
+        return member
 
-    def _open(self, hand: _Hand) -> None:
-        hand.calls.append((hand.actor.open.remote(self._job_reference), None))
+    def _open(self, member: _Member) -> None:
+        member.calls.append((member.actor.open.remote(self._job_reference), None))
 
     def _busy(self) -> bool:
-        return any(piece is not None for hand in self._hands for _, piece in hand.calls)
+        return any(piece is not None for member in self._members for _, piece in member.calls)
 
     def _hand_out(self, pieces: Pieces, begin: Callable[[Sequence[Any]], None]) -> None:
         for _ in range(_DEEP):
-            for hand in self._hands:
-                if hand.ready and len(hand.calls) < _DEEP:
-                    piece = pieces.take(self._size_for(hand, len(pieces)))
+            for member in self._members:
+                if member.ready and len(member.calls) < _DEEP:
+                    piece = pieces.take(self._size_for(member, len(pieces)))
                     if piece is None:
                         return
                     begin(piece.items)
                     checked = piece.checked or self._proven
-                    reference = hand.actor.run.remote(piece.items, checked)
-                    hand.calls.append((reference, piece))
+                    reference = member.actor.run.remote(piece.items, checked)
+                    member.calls.append((reference, piece))
 
-    def _size_for(self, hand: _Hand, left: int) -> int:
-        done = hand.done
+    def _size_for(self, member: _Member, left: int) -> int:
+        done = member.done
         pace = None if done is None else done.seconds / max(1, len(done.results))
-        return piece_size(left, len(self._hands), pace, 1 if done is None else done.multiple)
+        return piece_size(left, len(self._members), pace, 1 if done is None else done.multiple)
 
     def _finished(self, pieces: Pieces) -> Iterator[list[tuple[Any, Any]]]:
         """Waits for calls to end, and yields the items of pieces among them."""
-        waiting = {hand.calls[0][0]: hand for hand in self._hands if hand.calls}
+        waiting = {member.calls[0][0]: member for member in self._members if member.calls}
         if not waiting:
             return
         ended, _ = self._ray.wait(list(waiting), num_returns=1, timeout=_POLL_S)
         ended += self._ray.wait(list(waiting), num_returns=len(waiting), timeout=0)[0]
         self._check_start()
         for reference in dict.fromkeys(ended):
-            hand = waiting[reference]
+            member = waiting[reference]
             try:
                 result = self._ray.get(reference)
             except self._ray.exceptions.RayTaskError as error:
-                self._failed(hand, _own_error(error))
+                self._failed(member, own_error(error))
             except self._ray.exceptions.RayError as error:
-                yield from self._replace(hand, pieces, _reason(error))
+                yield from self._replace(member, pieces, reason_of(error))
             else:
-                yield from self._take(hand, result, pieces)
+                yield from self._take(member, result, pieces)
 
-    def _take(self, hand: _Hand, result: Any, pieces: Pieces) -> Iterator[list[tuple[Any, Any]]]:
-        _, piece = hand.calls.popleft()
+    def _take(
+        self, member: _Member, result: Any, pieces: Pieces
+    ) -> Iterator[list[tuple[Any, Any]]]:
+        _, piece = member.calls.popleft()
         if isinstance(result, Facts):
-            _check(result)
-            hand.facts = result
+            check_facts(result)
+            member.facts = result
             if self._job is not None:
-                self._open(hand)
+                self._open(member)
         elif piece is None:
-            hand.ready, self._failed_starts = True, 0
+            member.ready, self._failed_starts = True, 0
         else:
-            hand.done, hand.items = result, hand.items + len(piece.items)
+            member.done, member.items = result, member.items + len(piece.items)
             for note in result.notes:
-                if hand.number == 1 or note.startswith("warning"):
+                if member.number == 1 or note.startswith("warning"):
                     self._say(note)
             if result.proves:
                 self._prove(pieces)
@@ -268,25 +276,27 @@ class WorkerPool:
             pieces.put_back(Piece(items=piece.items, kills=piece.kills, checked=True))
         self._unproven.clear()
 
-    def _failed(self, hand: _Hand, error: PnpDepthError) -> None:
-        _, piece = hand.calls.popleft()
+    def _failed(self, member: _Member, error: PnpDepthError) -> None:
+        _, piece = member.calls.popleft()
         of_settings = isinstance(error, ModelError) or type(error) is UsageError
         if piece is None or not of_settings:
             raise error
         self._unproven.append((piece, error))
 
-    def _replace(self, hand: _Hand, pieces: Pieces, reason: str) -> Iterator[list[tuple[Any, Any]]]:
+    def _replace(
+        self, member: _Member, pieces: Pieces, reason: str
+    ) -> Iterator[list[tuple[Any, Any]]]:
         """Starts another worker; hands out again what the dead one had."""
-        self._kill(hand)
-        had = [piece for _, piece in hand.calls if piece is not None]
+        self._kill(member)
+        had = [piece for _, piece in member.calls if piece is not None]
         for piece in reversed(had[1:]):
             pieces.put_back(piece)
-        where = f" on {hand.facts.node}" if hand.facts else ""
+        where = f" on {member.facts.node}" if member.facts else ""
         self._failed_starts += not had
         if self._failed_starts >= _FAILED_STARTS:
             raise ClusterError(f"workers die when they start{where}: {reason}")
-        self._say(f"warning: worker {hand.number}{where} died ({reason}); another is started")
-        self._hands[self._hands.index(hand)] = self._new_hand()
+        self._say(f"warning: worker {member.number}{where} died ({reason}); another is started")
+        self._members[self._members.index(member)] = self._new_member()
         if had:
             item = pieces.lost(had[0])
             if item is not None:
@@ -294,7 +304,7 @@ class WorkerPool:
 
     def _check_start(self) -> None:
         """Raises ClusterError if no worker has been ready for long."""
-        if any(hand.ready or hand.facts for hand in self._hands):
+        if any(member.ready or member.facts for member in self._members):
             self._last_ready = time.monotonic()
         if time.monotonic() - self._last_ready > _NO_WORKER_S:
             raise ClusterError(
@@ -302,43 +312,6 @@ class WorkerPool:
                 " status`, and run the same command to continue"
             )
 
-    def _kill(self, hand: _Hand) -> None:
+    def _kill(self, member: _Member) -> None:
         with suppress(Exception):
-            self._ray.kill(hand.actor)
-
-
-def _check(facts: Facts) -> None:
-    """Raises ClusterError if the worker's node differs from this one."""
-    for name, here in software().items():
-        there = facts.versions.get(name)
-        if there != here:
-            raise ClusterError(
-                f"node {facts.node} has {name} {there}, and here it is {here}; install the same"
-                " version on all nodes"
-            )
-    for path in facts.unseen:
-        what = "the output folder" if path.name.startswith(".") else str(path)
-        raise ClusterError(
-            f"node {facts.node} does not see {what}; name a folder that all nodes share"
-        )
-
-
-def _own_error(error: Any) -> PnpDepthError:
-    cause = error.cause
-    if isinstance(cause, PnpDepthError):
-        return cause
-    raise cause if isinstance(cause, Exception) else error
-
-
-def _reason(error: Exception) -> str:
-    """What Ray says of a worker's death, in a few words."""
-    text = one_line(str(error))
-    if "error raised in its creation task" in text:
-        return str(error).strip().splitlines()[-1][:200]
-    if "No module named 'pnpdepth_cli'" in text:
-        return "pnpdepth is not installed on its node; install the same version on all nodes"
-    if "out of memory" in text.lower() or "OOM" in text.split("Some common causes")[0]:
-        return "out of memory"
-    if "node" in text.lower() and "died" in text.split("Worker exit type")[0].lower():
-        return "its node is gone"
-    return "its process ended unexpectedly"
+            self._ray.kill(member.actor)

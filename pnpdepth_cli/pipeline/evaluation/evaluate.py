@@ -105,7 +105,7 @@ def evaluate(
         by_distance=_bins(by_distance, DISTANCE_EDGES_PX),
         by_depth=_bins(by_depth, DEPTH_EDGES_M),
         notes=(
-            *said,
+            *(note for note in said if note.startswith("warning")),
             *pairs.notes,
             *kinds.notes(),
             *diagnose(rows, protocol, kinds),

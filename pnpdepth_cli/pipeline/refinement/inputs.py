@@ -84,6 +84,8 @@ class Inputs:
     """The camera in pixels of the image frame. None: unknown."""
     neighbours: tuple[NeighbourScan, ...] = ()
     """Points of other frames of the sequence; then the camera is known."""
+    window: tuple[str, ...] = ()
+    """As in the request."""
 
     @property
     def size(self) -> tuple[int, int]:
@@ -181,6 +183,7 @@ def read_inputs(request: RefineRequest) -> Inputs:
         unit=sparse.unit,
         camera=camera,
         neighbours=neighbours,
+        window=files.window,
     )
 
 

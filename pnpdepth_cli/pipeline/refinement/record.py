@@ -60,6 +60,7 @@ def record_of(refiner: Refiner, inputs: Inputs, frame: RefinedFrame) -> dict[str
         },
         "loss": list(frame.refinement.losses),
         "kept": frame.refinement.kept,
+        **({"warm_start": frame.refinement.warm} if frame.in_window else {}),
         "sparse_error": _before_after(frame, lambda d: point_error(d, frame.used)),
         "held_out_error": _before_after(frame, lambda d: point_error(d, frame.held_out)),
         "scores": _before_after(frame, lambda d: _score(d, inputs.gt)),

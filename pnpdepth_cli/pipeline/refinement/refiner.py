@@ -16,9 +16,10 @@ from pnpdepth_cli.completion.interpolation import linear
 from pnpdepth_cli.core.refine import RefineSettings
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.errors import PnpDepthError
-from pnpdepth_cli.frames.frame import Frame, RefinedFrame
+from pnpdepth_cli.frames.frame import Carried, Frame, RefinedFrame
 from pnpdepth_cli.frames.refine import OnIteration, refine_frame, refine_frames
 from pnpdepth_cli.frames.tiles import refine_tiled
+from pnpdepth_cli.frames.warm_start import refine_next
 from pnpdepth_cli.io.record import sha256_of
 from pnpdepth_cli.models.network import Network
 from pnpdepth_cli.pipeline.refinement.held_out import best_candidates, refine_with_folds
@@ -92,6 +93,20 @@ class Refiner:
             refined = refine_frame(
                 network, opened, settings, frame, propagation=propagation, on_iteration=on_iteration
             )
+        return replace(refined, held_out=held_out)
+
+    def refine_next(self, opened: Opened, inputs: Inputs, carried: Carried) -> RefinedFrame:
+        """Returns one frame of a window, which may begin where the frame before ended.
+
+        Raises:
+            PnpDepthError: The frame cannot be refined.
+        """
+        assert isinstance(opened, Split)
+        torch.manual_seed(self.request.hold_out.seed)
+        frame, held_out = self._split_frame(inputs)
+        refined = refine_next(
+            self.network, opened, self.settings, frame, carried, propagation=self._propagation
+        )
         return replace(refined, held_out=held_out)
 
     def checked(self, opened: Opened, inputs: Inputs, frame: RefinedFrame) -> RefinedFrame:

@@ -92,6 +92,9 @@ class FrameFiles:
     """Which camera of `camera_file`."""
     neighbours: tuple[Neighbour, ...] = ()
     """Other frames of the sequence, whose points are moved into this one."""
+    window: tuple[str, ...] = ()
+    """Names of the frames of its window up to this one, which may begin where the last but one
+    ended. Empty for a frame outside of windows."""
     gt_masks: tuple[Path, ...] = ()
     """Where one of these is 0, the ground truth is unknown."""
     gt_size_ok: bool = False
@@ -420,3 +423,11 @@ def sample_pattern(kind: str, count: int | None, fraction: float | None) -> Samp
     from pnpdepth_cli.sensors import SamplePattern
 
     return SamplePattern(kind=kind, count=count, fraction=fraction)
+
+
+def parse_sample(text: str | None) -> SamplePattern | None:
+    """Returns the pattern of `500`, `5%` or `lines:16`; None for None. Raises UsageError."""
+    if text is None:
+        return None
+    kind, colon, count = text.rpartition(":")
+    return sample_pattern(kind if colon else "uniform", *count_or_fraction(count))

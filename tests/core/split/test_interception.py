@@ -11,11 +11,11 @@ from torch import nn
 from pnpdepth_cli.core.split.interception import Interception
 
 
-def twice(module: nn.Module, given: Any, run: Callable[[], Any]) -> Any:
+def twice(module: nn.Module, arguments: Any, run: Callable[[], Any]) -> Any:
     return run() * 2
 
 
-def plain(module: nn.Module, given: Any, run: Callable[[], Any]) -> Any:
+def plain(module: nn.Module, arguments: Any, run: Callable[[], Any]) -> Any:
     return run()
 
 
@@ -42,11 +42,11 @@ def test_every_submodule_has_its_own_forward_back() -> None:
     assert vars(network[1])["forward"] is own
 
 
-def test_a_handler_is_given_the_submodule_and_its_arguments() -> None:
+def test_a_handler_receives_the_submodule_and_its_arguments() -> None:
     seen: list[Any] = []
 
-    def note(module: nn.Module, given: Any, run: Callable[[], Any]) -> Any:
-        seen.append((module, given))
+    def note(module: nn.Module, arguments: Any, run: Callable[[], Any]) -> Any:
+        seen.append((module, arguments))
         return run()
 
     layer = nn.Identity()

@@ -1,4 +1,4 @@
-"""How a place to cut is written and read."""
+"""Parsing and printing of layer names."""
 
 from __future__ import annotations
 

@@ -18,7 +18,7 @@ def recording(**changes: object) -> Recording:
     return Recording(calls=calls, cut=1, **fields)  # type: ignore[arg-type]
 
 
-def test_a_call_is_found_by_its_submodule_and_number() -> None:
+def test_a_call_is_looked_up_by_its_submodule_and_number() -> None:
     assert [recording().index(ONE, count) for count in range(3)] == [0, 2, None]
     assert recording().index(nn.Identity(), 0) is None
 

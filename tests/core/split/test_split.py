@@ -31,7 +31,7 @@ from tests.core.networks import (
     build,
     conv,
     depth_of,
-    picture,
+    image,
 )
 
 NO_CUT = {
@@ -52,7 +52,7 @@ NO_CUT = {
 
 @pytest.mark.parametrize("name", NETWORKS)
 def test_the_rear_of_the_front_is_the_network_bit_for_bit_at_every_layer(name: str) -> None:
-    network, x = build(name), picture()
+    network, x = build(name), image()
     frames = [x, x.flip(3) * 0.7, x]
     wholes = [depth_of(plain(network, frame)) for frame in frames]
     layers = [layer for layer, _ in network.named_modules(remove_duplicate=False) if layer]
@@ -78,7 +78,7 @@ def test_the_rear_of_the_front_is_the_network_bit_for_bit_at_every_layer(name: s
 
 @pytest.mark.parametrize("layer", ["cut", "head", "enter"])
 def test_an_encoder_under_inference_mode_can_be_left_and_the_decoder_refined(layer: str) -> None:
-    network, x = build("half inference"), picture()
+    network, x = build("half inference"), image()
     with Split(network, layer) as split:
         z = split.front(x).requires_grad_(True)
         output = split.rear(z)
@@ -94,7 +94,7 @@ def test_it_holds_at_every_layer_of_compact() -> None:
     for parameter in network.parameters():
         if parameter.ndim > 1:  # some start at zero, where any cut would do
             nn.init.normal_(parameter, std=0.1)
-    x, sparse = picture(32, 32), torch.zeros(1, 1, 32, 32)
+    x, sparse = image(32, 32), torch.zeros(1, 1, 32, 32)
     sparse[..., ::5, ::3] = 1 + 4 * torch.rand(sparse[..., ::5, ::3].shape)
     arguments = (x, sparse, 1 + 4 * torch.rand(1, 1, 32, 32))
     several = {"encoder", "fit", "inlier_weights"}  # return several tensors
@@ -144,15 +144,15 @@ def test_a_value_that_a_users_layer_reads_within_torchs_encoder_is_seen() -> Non
 
 
 def test_a_compiled_network_can_be_cut() -> None:
-    network, x = build("unet"), picture()
+    network, x = build("unet"), image()
     whole = plain(network, x)
     compiled = torch.compile(network, backend="eager")
     with Split(compiled, "_orig_mod.bottleneck") as split, torch.no_grad():
         assert torch.equal(split.rear(split.front(x)), whole)
 
 
-def test_a_second_front_starts_over_with_the_new_picture() -> None:
-    network, x, other = build("unet"), picture(), picture() * 0.5
+def test_a_second_front_starts_over_with_the_new_image() -> None:
+    network, x, other = build("unet"), image(), image() * 0.5
     whole = plain(network, other)
     with Split(network, "bottleneck") as split, torch.no_grad():
         split.rear(split.front(x))
@@ -175,7 +175,7 @@ class ChoosesByValue(nn.Module):
 
 def test_a_network_that_chooses_by_value_is_learned_anew_for_every_frame() -> None:
     torch.manual_seed(0)
-    network, x = ChoosesByValue(), picture()
+    network, x = ChoosesByValue(), image()
     frames = [x, x * 0.5, x, x * 0.5]
     wholes = [plain(network, frame) for frame in frames]
     with Split(network, "cut") as split, torch.no_grad():
@@ -186,7 +186,7 @@ def test_a_network_that_chooses_by_value_is_learned_anew_for_every_frame() -> No
 
 
 def test_a_frame_of_another_size_is_learned_anew() -> None:
-    network, frames = build("unet"), [picture(), picture(32, 16), picture() * 0.5]
+    network, frames = build("unet"), [image(), image(32, 16), image() * 0.5]
     wholes = [plain(network, frame) for frame in frames]
     with Split(network, "bottleneck") as split, torch.no_grad():
         for frame, whole in zip(frames, wholes, strict=True):
@@ -194,7 +194,7 @@ def test_a_frame_of_another_size_is_learned_anew() -> None:
 
 
 def test_further_frames_are_not_watched_and_hold_no_more_memory() -> None:
-    network, x = build("unet"), picture()
+    network, x = build("unet"), image()
     whole = plain(network, x)
     held: list[list[int]] = []
     with Split(network, "bottleneck") as split, torch.no_grad(), ExitStack() as stack:
@@ -215,7 +215,7 @@ def _bytes(output: Any) -> int:
 
 
 def test_the_network_may_be_called_for_itself_while_it_is_cut() -> None:
-    network, x, other = build("repeated"), picture(), picture() * 0.5
+    network, x, other = build("repeated"), image(), image() * 0.5
     whole, other_whole = plain(network, x), plain(network, other)
     with Split(network, "head") as split, torch.no_grad():
         z = split.front(x)
@@ -229,7 +229,7 @@ def test_the_network_may_be_called_for_itself_while_it_is_cut() -> None:
 
 
 def test_the_front_runs_once_and_what_does_not_depend_on_z_twice_at_most() -> None:
-    network, x = TwoBranches(), picture()
+    network, x = TwoBranches(), image()
     with Split(network, "cut") as split, torch.no_grad():
         z = split.front(x)
         assert (network.front.calls, network.guide.calls) == (1, 0)
@@ -244,7 +244,7 @@ def test_the_front_runs_once_and_what_does_not_depend_on_z_twice_at_most() -> No
 def test_a_rear_pass_costs_the_operations_behind_the_cut_only() -> None:
     from torch.utils.flop_counter import FlopCounterMode
 
-    network, x = build("unet"), picture()
+    network, x = build("unet"), image()
     with Split(network, "bottleneck") as split, torch.no_grad():
         z = split.front(x)
         split.rear(z)
@@ -255,7 +255,7 @@ def test_a_rear_pass_costs_the_operations_behind_the_cut_only() -> None:
 
 
 def test_the_outermost_finished_submodule_is_remembered_and_its_parts_are_let_go() -> None:
-    network, x = build("resnet"), picture()
+    network, x = build("resnet"), image()
     inner: list[weakref.ref[Tensor]] = []
     original = network.layer1[0].conv2.forward
 
@@ -271,11 +271,11 @@ def test_the_outermost_finished_submodule_is_remembered_and_its_parts_are_let_go
         assert [reference() for reference in inner] == [None]
 
 
-def test_nothing_of_a_picture_stays_in_memory_after_the_split_closes() -> None:
-    network, x = build("unet"), picture()
+def test_nothing_of_a_image_stays_in_memory_after_the_split_closes() -> None:
+    network, x = build("unet"), image()
     seen: list[weakref.ref[Tensor]] = []
     hook = network.bottleneck.register_forward_hook(
-        lambda module, given, output: seen.extend((weakref.ref(given[0]), weakref.ref(output)))
+        lambda module, inputs, output: seen.extend((weakref.ref(inputs[0]), weakref.ref(output)))
     )
     split = Split(network, "ups.0")
     with split:
@@ -292,7 +292,7 @@ def test_nothing_of_a_picture_stays_in_memory_after_the_split_closes() -> None:
 
 
 def test_an_exception_holds_nothing_once_it_is_dropped() -> None:
-    network, x = build("unet"), picture()
+    network, x = build("unet"), image()
     with torch.no_grad(), Split(network, "bottleneck") as split:
         kept = weakref.ref(split.front(x))
         with pytest.raises(ModelError):
@@ -306,7 +306,7 @@ def test_an_exception_holds_nothing_once_it_is_dropped() -> None:
 
 
 def test_only_z_requires_gradient_and_no_parameter_gets_one() -> None:
-    network, x = build("resnet"), picture()
+    network, x = build("resnet"), image()
     with Split(network, "layer2") as split:
         z = split.front(x)
         assert not z.requires_grad
@@ -319,7 +319,7 @@ def test_only_z_requires_gradient_and_no_parameter_gets_one() -> None:
 
 
 def test_an_in_place_operation_behind_the_cut_changes_neither_z_nor_the_arguments() -> None:
-    network, x = InPlace(), picture()
+    network, x = InPlace(), image()
     x_before = x.clone()
     with Split(network, "b") as split, torch.no_grad():
         z = split.front(x)
@@ -341,7 +341,7 @@ def test_z_is_safe_where_the_cut_layer_gives_back_its_own_input() -> None:
             out = self.head(self.cut(y))
             return out + F.relu_(y).mean()
 
-    network, x = Network(), picture()
+    network, x = Network(), image()
     with Split(network, "cut") as split, torch.no_grad():
         z = split.front(x)
         before = z.clone()
@@ -352,7 +352,7 @@ def test_z_is_safe_where_the_cut_layer_gives_back_its_own_input() -> None:
 
 def test_a_cut_whose_output_is_changed_under_another_name_is_refused() -> None:
     with Split(InPlace(), "flat") as split, torch.no_grad():
-        z = split.front(picture())
+        z = split.front(image())
         with pytest.raises(LayerError, match="memory of an earlier tensor"):
             split.rear(z)
 
@@ -361,7 +361,7 @@ def test_a_cut_whose_output_is_changed_under_another_name_is_refused() -> None:
 
 
 def test_every_call_of_a_layer_can_be_named_and_is_another_cut() -> None:
-    network, x = build("repeated"), picture()
+    network, x = build("repeated"), image()
     shapes = []
     for call in (1, 2, 3):
         with Split(network, f"same#{call}") as split, torch.no_grad():
@@ -372,18 +372,18 @@ def test_every_call_of_a_layer_can_be_named_and_is_another_cut() -> None:
 
 def test_a_layer_called_several_times_asks_which_call() -> None:
     with Split(Repeated(), "same") as split, torch.no_grad():
-        z = split.front(picture())
+        z = split.front(image())
         with pytest.raises(LayerError, match="is called 3 times; say which call: same#1, same#2"):
             split.rear(z)
 
 
 def test_a_call_too_far_says_how_many_there_are() -> None:
     with Split(Repeated(), "same#4") as split, pytest.raises(LayerError, match="only 3 times"):
-        split.front(picture())
+        split.front(image())
 
 
 def test_a_shared_layer_can_be_cut_under_either_name() -> None:
-    network, x = build("repeated"), picture()
+    network, x = build("repeated"), image()
     outputs = []
     for name in ("enter", "alias"):
         with Split(network, name) as split, torch.no_grad():
@@ -405,7 +405,7 @@ def test_a_shared_layer_can_be_cut_under_either_name() -> None:
 def test_a_layer_with_several_outputs_names_them_and_each_can_be_cut(
     kind: str, names: tuple[str, ...]
 ) -> None:
-    network, x = build(f"{kind} output"), picture()
+    network, x = build(f"{kind} output"), image()
     with Split(network, "cut") as split, pytest.raises(LayerError) as error:
         split.front(x)
     assert str(error.value).endswith(f"say which: {', '.join(names)}")
@@ -417,16 +417,16 @@ def test_a_layer_with_several_outputs_names_them_and_each_can_be_cut(
         assert not torch.equal(changed, plain(network, x))
 
 
-def test_an_output_that_is_not_there_is_said_with_those_that_are() -> None:
+def test_a_missing_output_is_named_with_those_that_exist() -> None:
     with (
         Split(Structured("dict"), "cut[wide]") as split,
         pytest.raises(LayerError, match=r"no such output; it has cut\[deep\], cut\[shallow\]"),
     ):
-        split.front(picture())
+        split.front(image())
 
 
 @pytest.mark.parametrize(
-    ("name", "said"),
+    ("name", "message"),
     [
         ("botleneck", "did you mean bottleneck"),
         ("encoder.stage.0.0", "did you mean encoder.stages.0.0"),
@@ -438,10 +438,10 @@ def test_an_output_that_is_not_there_is_said_with_those_that_are() -> None:
         ("bottleneck#x", "the form is"),
     ],
 )
-def test_an_unknown_layer_is_refused_with_what_is_near(name: str, said: str) -> None:
+def test_an_unknown_layer_is_refused_with_what_is_near(name: str, message: str) -> None:
     with pytest.raises(LayerError) as error:
         Split(UNet(), name)
-    assert said in str(error.value)
+    assert message in str(error.value)
     assert "\n" not in str(error.value)
 
 
@@ -450,15 +450,15 @@ def test_a_container_that_is_never_called_points_to_its_parts() -> None:
         Split(UNet(), "encoder.stages") as split,
         pytest.raises(LayerError, match=r"never runs .* cut at a part of it: encoder.stages.0"),
     ):
-        split.front(picture())
+        split.front(image())
 
 
-def test_a_layer_that_never_runs_is_said_so() -> None:
+def test_a_layer_that_never_runs_is_an_error() -> None:
     network = nn.Sequential(conv(3, 1))
     network.unused = conv(1, 1)
     network.forward = network[0].forward  # type: ignore[method-assign]
     with Split(network, "unused") as split, pytest.raises(LayerError, match="never runs"):
-        split.front(picture())
+        split.front(image())
 
 
 def test_a_layer_whose_output_is_no_tensor_is_refused() -> None:
@@ -466,7 +466,7 @@ def test_a_layer_whose_output_is_no_tensor_is_refused() -> None:
         Split(build("side effects"), "hide") as split,
         pytest.raises(LayerError, match="returns no tensor"),
     ):
-        split.front(picture())
+        split.front(image())
 
 
 def test_the_rear_needs_a_front() -> None:
@@ -519,7 +519,7 @@ def prepared(name: str) -> nn.Module:
     parameters = list(network.parameters())
     parameters[0].requires_grad_(False)
     parameters[-1].grad = torch.ones_like(parameters[-1])
-    parts[1].register_forward_pre_hook(lambda module, given: None)
+    parts[1].register_forward_pre_hook(lambda module, inputs: None)
     parts[-1].forward = parts[-1].forward  # type: ignore[method-assign]
     return network
 
@@ -536,7 +536,7 @@ LAYERS = {
 
 @pytest.mark.parametrize("name", LAYERS)
 def test_the_network_is_as_before_when_the_split_closes(name: str) -> None:
-    network, x = prepared(name), picture()
+    network, x = prepared(name), image()
     before = state_of(network)
     with Split(network, LAYERS[name]) as split:
         z = split.front(x).requires_grad_(True)
@@ -559,7 +559,7 @@ def use(network: nn.Module, x: Tensor, kind: type[BaseException]) -> None:
 def test_the_network_is_as_before_after_an_exception_at_any_stage(
     stage: str, kind: type[BaseException]
 ) -> None:
-    network, x = prepared("updating"), picture()
+    network, x = prepared("updating"), image()
     network.enter = Failing(network.enter, 1 if stage == "front" else 0, kind)
     network.head = Failing(network.head, {"first rear": 1, "second rear": 2}.get(stage, 0), kind)
     if stage == "entering":
@@ -593,7 +593,7 @@ class Failing(nn.Module):
 
 
 def test_a_rear_that_failed_can_be_tried_again() -> None:
-    network, x = build("unet"), picture()
+    network, x = build("unet"), image()
     with Split(network, "bottleneck") as split, torch.no_grad():
         z = split.front(x)
         with pytest.raises(ModelError, match="the network's forward raises RuntimeError"):
@@ -602,7 +602,7 @@ def test_a_rear_that_failed_can_be_tried_again() -> None:
 
 
 def test_two_splits_of_one_network_can_be_open_one_in_the_other() -> None:
-    network, x = build("unet"), picture()
+    network, x = build("unet"), image()
     whole, before = plain(network, x), state_of(network)
     with torch.no_grad(), Split(network, "bottleneck") as outer:
         z = outer.front(x)
@@ -623,9 +623,9 @@ def test_a_forward_keeps_its_signature_while_cut() -> None:
 
 
 def test_the_networks_own_hooks_run_in_every_pass() -> None:
-    network, x = MiDaSLike().eval(), picture()
+    network, x = MiDaSLike().eval(), image()
     calls = Counting(nn.Identity())
-    network.backbone[1].register_forward_hook(lambda module, given, output: calls(None))
+    network.backbone[1].register_forward_hook(lambda module, inputs, output: calls(None))
     with Split(network, "unit1") as split, torch.no_grad():
         z = split.front(x)
         for _ in range(3):
@@ -634,9 +634,9 @@ def test_the_networks_own_hooks_run_in_every_pass() -> None:
 
 
 def test_a_hook_that_changes_an_output_is_obeyed() -> None:
-    network, x = UNetTail(), picture(16, 16).mean(1, keepdim=True).expand(1, 4, 16, 16)
-    network.a.register_forward_hook(lambda module, given, output: output * 2)
-    network.b.register_forward_pre_hook(lambda module, given: (given[0] + 1,))
+    network, x = UNetTail(), image(16, 16).mean(1, keepdim=True).expand(1, 4, 16, 16)
+    network.a.register_forward_hook(lambda module, inputs, output: output * 2)
+    network.b.register_forward_pre_hook(lambda module, inputs: (inputs[0] + 1,))
     for layer in ("a", "b"):
         with Split(network, layer) as split, torch.no_grad():
             assert torch.equal(split.rear(split.front(x)), plain(network, x))
@@ -652,7 +652,7 @@ def test_keyword_arguments_and_more_than_one_argument_reach_the_network() -> Non
             rgb.mul_(2), sparse.add_(1)
             return self.head(torch.cat([self.image(rgb), self.points(sparse)], 1)) + sparse
 
-    network, x = Network(), picture()
+    network, x = Network(), image()
     with torch.no_grad():
         whole = network(x.clone(), x[:, :1].clone())
         with Split(network, "points") as split:
@@ -662,7 +662,7 @@ def test_keyword_arguments_and_more_than_one_argument_reach_the_network() -> Non
 
 
 def test_what_a_rear_gives_is_not_touched_by_the_next() -> None:
-    network, x = build("vit"), picture()
+    network, x = build("vit"), image()
     with Split(network, "encoder.blocks.1[0]") as split, torch.no_grad():
         z = split.front(x)
         first = split.rear(z)

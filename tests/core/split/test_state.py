@@ -7,11 +7,11 @@ from torch import nn
 
 from pnpdepth_cli.core.split import Split
 from tests.completion.naive import plain
-from tests.core.networks import Updating, build, picture
+from tests.core.networks import Updating, build, image
 
 
 def test_buffers_start_from_the_same_values_in_every_pass() -> None:
-    network, x = build("updating"), picture()
+    network, x = build("updating"), image()
     whole = plain(network, x)
     average = network.get_buffer("average")
     with Split(network, "cut") as split, torch.no_grad():
@@ -24,7 +24,7 @@ def test_buffers_start_from_the_same_values_in_every_pass() -> None:
 
 
 def test_batch_norms_in_training_mode_keep_their_statistics() -> None:
-    network, x = build("resnet").train(), picture()
+    network, x = build("resnet").train(), image()
     before = {name: value.clone() for name, value in network.state_dict().items()}
     with Split(network, "layer2") as split, torch.no_grad():
         split.rear(split.front(x))
@@ -44,7 +44,7 @@ def test_a_parameter_that_the_forward_overwrites_is_put_back() -> None:
     network = Clamping()
     before = network.head.weight.detach().clone()
     with Split(network, "cut") as split, torch.no_grad():
-        z = split.front(picture())
+        z = split.front(image())
         assert torch.equal(split.rear(z), split.rear(z))
         assert not torch.equal(network.head.weight, before)
     assert torch.equal(network.head.weight, before)

@@ -1,4 +1,4 @@
-"""Tensors inside structures are found, replaced, and left where nothing is known of them."""
+"""Tensors inside structures are collected and replaced; unknown objects stay unchanged."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ class Two(NamedTuple):
 @dataclass(frozen=True)
 class Frozen:
     a: Any
-    made: Any = field(init=False, default=None)
+    created: Any = field(init=False, default=None)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "made", torch.zeros(1))
+        object.__setattr__(self, "created", torch.zeros(1))
 
 
 @dataclass
@@ -48,7 +48,7 @@ STRUCTURES: list[tuple[Any, list[tuple[str, ...]]]] = [
     (OrderedDict(b=t, a=None), [("b",)]),
     (defaultdict(list, a=[t]), [("a", "0")]),
     (Two(t), [("0",)]),
-    (Frozen(t), [("a",), ("made",)]),
+    (Frozen(t), [("a",), ("created",)]),
     (Slotted(t), [("a",)]),
     (Stack(t, t), [("0",), ("1",)]),
     (Encoded(last=t, hidden=(t,)), [("last",), ("hidden", "0")]),

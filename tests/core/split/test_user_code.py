@@ -53,7 +53,7 @@ def test_a_real_allocation_that_fails_on_the_cpu_is_recognised() -> None:
     assert is_out_of_memory(error.value)
 
 
-def test_the_line_of_a_file_is_said_however_the_file_is_named(
+def test_the_line_of_a_file_is_named_however_the_file_is_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     file = tmp_path / "raises.py"

@@ -15,21 +15,21 @@ from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.core.split.saved import SavedTensors
 from pnpdepth_cli.core.split.watch import Watch
 from tests.completion.naive import plain
-from tests.core.networks import Branching, Counting, build, conv, picture
+from tests.core.networks import Branching, Counting, build, conv, image
 
 
 class Behind(nn.Module):
-    """A branch behind the cut that is given what `way` makes of z."""
+    """A branch behind the cut whose input is `operation` of z and y."""
 
-    def __init__(self, way: Callable[[Tensor, Tensor], Tensor]) -> None:
+    def __init__(self, operation: Callable[[Tensor, Tensor], Tensor]) -> None:
         super().__init__()
         self.enter, self.cut, self.head = conv(3, 4), conv(4, 4), conv(4, 1)
-        self.way, self.branch = way, Counting(conv(4, 4))
+        self.operation, self.branch = operation, Counting(conv(4, 4))
 
     def forward(self, x: Tensor) -> Tensor:
         y = self.enter(x)
         z = self.cut(y)
-        return self.head(z + self.branch(self.way(z, y)))
+        return self.head(z + self.branch(self.operation(z, y)))
 
 
 DEPENDENT: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
@@ -59,10 +59,10 @@ INDEPENDENT: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
 }
 
 
-@pytest.mark.parametrize("way", DEPENDENT)
-def test_a_branch_that_depends_on_z_in_whatever_way_runs_again(way: str) -> None:
+@pytest.mark.parametrize("operation", DEPENDENT)
+def test_a_branch_that_depends_on_z_by_any_operation_runs_again(operation: str) -> None:
     torch.manual_seed(0)
-    network, x = Behind(DEPENDENT[way]), picture()
+    network, x = Behind(DEPENDENT[operation]), image()
     with Split(network, "cut") as split, torch.no_grad():
         z = split.front(x)
         split.rear(z)
@@ -73,9 +73,9 @@ def test_a_branch_that_depends_on_z_in_whatever_way_runs_again(way: str) -> None
         assert torch.equal(split.rear(-z), memoised)
 
 
-@pytest.mark.parametrize("way", INDEPENDENT)
-def test_a_branch_that_does_not_depend_on_z_does_not(way: str) -> None:
-    network, x = Behind(INDEPENDENT[way]), picture()
+@pytest.mark.parametrize("operation", INDEPENDENT)
+def test_a_branch_that_does_not_depend_on_z_does_not(operation: str) -> None:
+    network, x = Behind(INDEPENDENT[operation]), image()
     with Split(network, "cut") as split, torch.no_grad():
         z = split.front(x)
         for k in range(4):
@@ -94,25 +94,25 @@ def test_a_branch_that_does_not_depend_on_z_does_not(way: str) -> None:
         lambda y: int((y > 0).sum()) > 400,
     ],
 )
-def test_python_may_take_another_way_at_another_z(escape: Callable[[Tensor], bool]) -> None:
+def test_python_may_take_another_branch_at_another_z(escape: Callable[[Tensor], bool]) -> None:
     torch.manual_seed(0)
-    network, x = Branching(escape), picture()
+    network, x = Branching(escape), image()
     for sign in (1, -1):
         with Split(network, "cut") as split, torch.no_grad():
             z = split.front(x)
             z = sign * z.abs()
-            ways = [split.rear(each) for each in (z, -z, z, -z)]
-        for way, each in zip(ways, (z, -z), strict=False):
+            outputs = [split.rear(each) for each in (z, -z, z, -z)]
+        for output, each in zip(outputs, (z, -z), strict=False):
             with Split(network, "cut") as fresh, torch.no_grad():
                 fresh.front(x)
-                assert torch.equal(fresh.rear(each), way)
-        assert torch.equal(ways[0], ways[2])
-        assert torch.equal(ways[1], ways[3])
-        assert not torch.equal(ways[0], ways[1])
+                assert torch.equal(fresh.rear(each), output)
+        assert torch.equal(outputs[0], outputs[2])
+        assert torch.equal(outputs[1], outputs[3])
+        assert not torch.equal(outputs[0], outputs[1])
 
 
 def test_a_native_operator_that_reads_z_unseen_runs_again() -> None:
-    network, x = build("native"), picture()
+    network, x = build("native"), image()
     for gradient in (False, True):
         with Split(network, "cut") as split, torch.set_grad_enabled(gradient):
             z = split.front(x)
@@ -171,28 +171,28 @@ def test_reading_makes_no_copy() -> None:
 
 
 def replaceable(call: Callable[[Tensor], object]) -> bool:
-    given = torch.ones(2, 3)
+    argument = torch.ones(2, 3)
     watch = Watch(())
     with watch:
         since = watch.now()
-        output = call(given)
-        return watch.can_stand_for(since, (given,), output)
+        output = call(argument)
+        return watch.can_stand_for(since, (argument,), output)
 
 
-def test_an_output_stands_for_a_call_that_made_it_and_did_nothing_else() -> None:
+def test_an_output_replaces_a_call_without_side_effects() -> None:
     assert replaceable(lambda t: t + 1)
     assert replaceable(lambda t: {"a": [t + 1, 5, "text", None]})
     assert replaceable(lambda t: (t + 1).relu_().view(3, 2))
 
 
-def test_an_output_does_not_stand_for_more() -> None:
-    made = torch.ones(2, 3)
+def test_an_output_does_not_replace_a_call_with_aliases_or_side_effects() -> None:
+    constant = torch.ones(2, 3)
     assert not replaceable(lambda t: t)
     assert not replaceable(lambda t: t.view(3, 2))
     assert not replaceable(lambda t: t.add_(1))
     assert not replaceable(lambda t: (t.add_(1), t + 1)[1])
-    assert not replaceable(lambda t: (made.add_(1), t + 1)[1])
-    assert not replaceable(lambda t: made)
+    assert not replaceable(lambda t: (constant.add_(1), t + 1)[1])
+    assert not replaceable(lambda t: constant)
     assert not replaceable(lambda t: iter([t + 1]))
     assert not replaceable(lambda t: {"a": t + 1, "b": object()})
     assert not replaceable(lambda t: [(t + 1)] * 2)
@@ -208,12 +208,12 @@ def test_tensor_methods_are_themselves_in_a_watched_pass() -> None:
 
     before = (Tensor.numpy, Tensor.tolist)
     with Split(Behind(look), "cut") as split, torch.no_grad():
-        split.rear(split.front(picture()))
+        split.rear(split.front(image()))
     assert seen == [True]
 
 
 def test_two_threads_can_learn_networks_at_the_same_time() -> None:
-    x, way = picture(), DEPENDENT["numpy"]
+    x, operation = image(), DEPENDENT["numpy"]
     expected: list[Tensor] = []
 
     def learn(network: nn.Module, results: list[Tensor]) -> None:
@@ -224,7 +224,7 @@ def test_two_threads_can_learn_networks_at_the_same_time() -> None:
                     results += [split.rear(z), split.rear(-z)]
 
     torch.manual_seed(0)
-    networks = [Behind(way) for _ in range(3)]
+    networks = [Behind(operation) for _ in range(3)]
     learn(networks[0], expected)
     results: list[list[Tensor]] = [[] for _ in networks]
     threads = [
@@ -241,7 +241,7 @@ def test_two_threads_can_learn_networks_at_the_same_time() -> None:
 
 def test_tensor_methods_are_themselves_again_after_a_watched_pass() -> None:
     before = (Tensor.numpy, Tensor.tolist)
-    network, x = build("unet"), picture()
+    network, x = build("unet"), image()
     with Split(network, "bottleneck") as split, torch.no_grad():
         z = split.front(x)
         with pytest.raises(Exception):  # noqa: B017
@@ -294,7 +294,7 @@ def test_what_other_threads_do_with_tensors_meanwhile_is_their_own_matter() -> N
 
 
 def test_a_pass_is_the_same_while_other_threads_read_tensors() -> None:
-    network, x = Behind(DEPENDENT["a value"]), picture()
+    network, x = Behind(DEPENDENT["a value"]), image()
     with Split(network, "cut") as split, torch.no_grad():
         z = split.front(x)
         alone = [split.rear(z), split.rear(-z)]

@@ -24,14 +24,9 @@ from pnpdepth_cli.io.layouts import (
     read_frames,
 )
 from tests.colmap_models import write_text_model
+from tests.empty_files import touch
 
 DEPTH = np.random.default_rng(0).uniform(1, 9, (12, 16)).astype(np.float32)
-
-
-def touch(*paths: Path) -> None:
-    for path in paths:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.touch()
 
 
 def pairs(root: Path) -> None:

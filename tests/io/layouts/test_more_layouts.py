@@ -11,16 +11,11 @@ import pytest
 from pnpdepth_cli.cli.main import main
 from pnpdepth_cli.errors import FileFormatError, InputError
 from pnpdepth_cli.io.layouts import find_layout, list_frames, read_frames
+from tests.empty_files import touch
 from tests.pipeline.frames import frame_on_disk
 from tests.pipeline.scan_frames import HEIGHT, WIDTH, scan_on_disk
 
 DRIVE = "2011_09_26_drive_0002_sync"
-
-
-def touch(*paths: Path) -> None:
-    for path in paths:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.touch()
 
 
 def raw_drive(root: Path) -> Path:

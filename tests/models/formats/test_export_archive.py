@@ -49,22 +49,22 @@ class Net(nn.Module):
 def archive(tmp_path: Path) -> Path:
     torch.manual_seed(0)
     sides = {2: 32 * Dim("rows", min=1, max=64), 3: 32 * Dim("columns", min=1, max=64)}
-    net, picture = Net().eval(), torch.rand(1, 3, 64, 96)
-    program = torch.export.export(net, (picture,), dynamic_shapes=(sides,))
+    net, image = Net().eval(), torch.rand(1, 3, 64, 96)
+    program = torch.export.export(net, (image,), dynamic_shapes=(sides,))
     torch.export.save(program, tmp_path / "net.pt2")
     return tmp_path / "net.pt2"
 
 
 def rewritten(file: Path, name: str, change: Change) -> Path:
     """The archive with one entry changed, or added where there is none of that name."""
-    with zipfile.ZipFile(file) as given:
-        entries = {info.filename: given.read(info) for info in given.infolist()}
+    with zipfile.ZipFile(file) as source:
+        entries = {info.filename: source.read(info) for info in source.infolist()}
     full = f"{next(iter(entries)).partition('/')[0]}/{name}"
     entries[full] = change(entries.get(full, b""))
     target = file.with_name(f"{file.stem}_changed.pt2")
-    with zipfile.ZipFile(target, "w", zipfile.ZIP_STORED) as made:
+    with zipfile.ZipFile(target, "w", zipfile.ZIP_STORED) as archive_out:
         for entry, content in entries.items():
-            made.writestr(entry, content)
+            archive_out.writestr(entry, content)
     return target
 
 
@@ -76,9 +76,9 @@ def call(target: str) -> Change:
     """The first operator is another one."""
 
     def change(program: str) -> str:
-        found = json.loads(program)
-        found["graph_module"]["graph"]["nodes"][0]["target"] = target
-        return json.dumps(found)
+        program_json = json.loads(program)
+        program_json["graph_module"]["graph"]["nodes"][0]["target"] = target
+        return json.dumps(program_json)
 
     return texts(change)
 
@@ -94,7 +94,7 @@ def size(text: str) -> Change:
 
 
 def name(text: str) -> Change:
-    """The picture goes by another name."""
+    """The image input has another name."""
     return texts(lambda program: program.replace('"rgb"', json.dumps(text)))
 
 
@@ -155,17 +155,17 @@ HOSTILE: dict[str, tuple[str, Change, str]] = {
 
 @pytest.mark.parametrize("kind", HOSTILE)
 def test_what_could_do_more_than_compute_is_refused_in_one_line(archive: Path, kind: str) -> None:
-    entry, change, said = HOSTILE[kind]
+    entry, change, message = HOSTILE[kind]
     with pytest.raises(ModelError, match=r"is not read: .*only plain tensors") as error:
         find_definition(str(rewritten(archive, entry, change)))
-    assert said in str(error.value)
+    assert message in str(error.value)
     assert "\n" not in str(error.value)
 
 
-@pytest.mark.parametrize("place", ["example inputs", "weights"])
-def test_no_pickle_in_an_archive_is_run(archive: Path, tmp_path: Path, place: str) -> None:
+@pytest.mark.parametrize("entry", ["example inputs", "weights"])
+def test_no_pickle_in_an_archive_is_run(archive: Path, tmp_path: Path, entry: str) -> None:
     trap = tmp_path / "trap"
-    if place == "weights":
+    if entry == "weights":
         hostile = rewritten(archive, "data/weights/weight_0", lambda _: saved(Touch(trap)))
         hostile = rewritten(hostile, WEIGHTS, PICKLED)
     else:

@@ -46,13 +46,13 @@ def prompt_depth_anything() -> Any:
     return lively(transformers.PromptDepthAnythingForDepthEstimation(config), 0.1)
 
 
-def lively(made: Any, deviation: float = 0.3) -> Any:
-    """As initialised, the output does not depend on the picture."""
+def lively(network: Any, deviation: float = 0.3) -> Any:
+    """As initialised, the output does not depend on the image."""
     with torch.no_grad():
-        for parameter in made.parameters():
+        for parameter in network.parameters():
             if parameter.ndim > 1:
                 parameter.normal_(std=deviation)
-    return made
+    return network
 
 
 def dpt() -> Any:
@@ -153,10 +153,10 @@ def test_a_folder_loads_lists_layers_and_refines_without_network_access(
     assert (definition.output_kind, definition.output_scale) == NETWORKS[name][2]
     assert definition.layers
     frame = FrameMap.fit(definition.size, 60, 90)
-    places = torch.randperm(60 * 90, generator=torch.Generator().manual_seed(0))[:100]
+    chosen = torch.randperm(60 * 90, generator=torch.Generator().manual_seed(0))[:100]
     points = SparsePoints(
-        xy=torch.stack([places % 90, places // 90], dim=1).float(),
-        depth=1 + 3 * (places // 90).float() / 60, size=(60, 90),
+        xy=torch.stack([chosen % 90, chosen // 90], dim=1).float(),
+        depth=1 + 3 * (chosen // 90).float() / 60, size=(60, 90),
     )  # fmt: skip
     at = frame.points_to_network(points)
     rgb = torch.rand(1, 3, 60, 90, generator=torch.Generator().manual_seed(0))
@@ -175,7 +175,7 @@ def test_a_folder_loads_lists_layers_and_refines_without_network_access(
     assert bool((result.after > 0).all())
 
 
-def test_prompt_depth_anything_is_given_the_points_as_coarse_dense_depth(tmp_path: Path) -> None:
+def test_prompt_depth_anything_receives_the_points_as_coarse_dense_depth(tmp_path: Path) -> None:
     definition = hf_definition(saved(tmp_path / "p", "prompt_depth_anything"))
     assert definition.input_kind == "rgb+sparse"
     sparse = torch.zeros(1, 1, 384, 512)  # twice the prompt's size: a plane that rises to the right
@@ -195,7 +195,7 @@ def test_a_metric_depth_anything_gives_depth_in_metres(tmp_path: Path) -> None:
     assert (definition.output_kind, definition.default_alignment) == ("depth", "none")
 
 
-def test_the_picture_is_sized_as_the_folder_says(tmp_path: Path) -> None:
+def test_the_image_is_resized_as_the_folder_says(tmp_path: Path) -> None:
     assert hf_definition(saved(tmp_path / "d", "dpt")).size == Fixed(64, 64)
     near = hf_definition(saved(tmp_path / "a", "depth_anything")).size
     assert near == Near(of=14, height=56, width=56)
@@ -204,7 +204,7 @@ def test_the_picture_is_sized_as_the_folder_says(tmp_path: Path) -> None:
     assert FrameMap.fit(Near(of=14, height=518, width=518), 5, 9).network == (294, 518)
 
 
-def test_unfinished_folders_are_refused_with_the_way_out(tmp_path: Path) -> None:
+def test_incomplete_folders_are_refused_with_a_remedy(tmp_path: Path) -> None:
     folder = saved(tmp_path / "net", "glpn")
     weights = folder / "model.safetensors"
     weights.rename(folder / "pytorch_model.bin")

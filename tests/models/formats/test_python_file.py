@@ -38,7 +38,7 @@ def test_a_file_gives_its_definition_and_may_import_what_is_beside_it(tmp_path: 
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         ("x = 1\n\nraise ValueError('a\\nb')\n", "raises ValueError: a b (line 3)"),
         ("def f():\n    return 1 / 0\n\nf()\n", "ZeroDivisionError: division by zero (line 2)"),
@@ -52,47 +52,47 @@ def test_a_file_gives_its_definition_and_may_import_what_is_beside_it(tmp_path: 
     ],
 )
 @pytest.mark.parametrize("relative", [True, False])
-def test_a_model_file_at_fault_is_said_with_its_line(
-    text: str, said: str, relative: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_an_error_in_a_model_file_names_its_line(
+    text: str, message: str, relative: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     file = written(tmp_path, text)
     monkeypatch.chdir(tmp_path)
     with pytest.raises(ModelError) as error:
         find_definition("mine.py" if relative else str(file))
-    assert said in str(error.value)
+    assert message in str(error.value)
     assert "mine.py" in str(error.value)
     assert "\n" not in str(error.value)
     assert error.value.exit_code == 4
 
 
 @pytest.mark.parametrize(
-    ("wrong", "said"),
+    ("field", "message"),
     [
         ("size=32", "ModelDefinition 'mine': size=32 is a int"),
         ("size=Multiple(0)", "Multiple: of=0"),
         ("size=Multiple(8), output_kind='disparity'", "'mine': output_kind='disparity' is none of"),
     ],
 )
-def test_a_wrong_field_of_a_definition_is_said_with_its_file_and_line(
-    wrong: str, said: str, tmp_path: Path
+def test_an_invalid_field_of_a_definition_is_named_with_its_file_and_line(
+    field: str, message: str, tmp_path: Path
 ) -> None:
-    file = written(tmp_path, GOOD.replace("size=Multiple(8)", wrong, 1))
+    file = written(tmp_path, GOOD.replace("size=Multiple(8)", field, 1))
     written(tmp_path, "WIDTH = 7", "beside.py")
     with pytest.raises(ModelError) as error:
         find_definition(str(file))
     assert str(error.value).startswith(f"model file {file}: ")
-    assert said in str(error.value)
+    assert message in str(error.value)
     assert "(line " in str(error.value)
     assert "\n" not in str(error.value)
 
 
-def test_a_network_that_is_made_already_is_not_taken_for_a_function(tmp_path: Path) -> None:
+def test_a_network_instance_is_not_taken_for_a_function(tmp_path: Path) -> None:
     file = written(tmp_path, "from torch import nn\nnet = nn.Conv2d(3, 1, 1)\n")
     with pytest.raises(ModelError, match=r"'net' in .* is a Conv2d that is made already; name its"):
         find_definition(f"{file}:net")
 
 
-def test_a_file_that_is_not_there_or_lacks_the_attribute_is_said(tmp_path: Path) -> None:
+def test_a_missing_file_or_attribute_is_named(tmp_path: Path) -> None:
     with pytest.raises(ModelError, match="does not exist"):
         find_definition(str(tmp_path / "absent.py"))
     file = written(tmp_path, "x = 1")

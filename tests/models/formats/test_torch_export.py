@@ -55,7 +55,7 @@ def test_what_is_no_exported_program_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("suffix", [".pt", ".pth", ".torchscript", ".safetensors", ".pth.tar"])
-def test_weights_as_a_model_are_refused_with_the_way_out(suffix: str) -> None:
+def test_weights_as_a_model_are_refused_with_a_remedy(suffix: str) -> None:
     with pytest.raises(ModelError, match=r"--checkpoint.*ONNX"):
         find_definition(f"net{suffix}")
 
@@ -88,7 +88,7 @@ def needs(width):
 
 
 @pytest.mark.parametrize("attribute", ["", ":Net", ":make"])
-def test_a_bare_class_or_factory_is_a_network_and_what_is_assumed_is_said(
+def test_a_bare_class_or_factory_is_a_network_and_its_assumptions_are_printed(
     tmp_path: Path, attribute: str
 ) -> None:
     file = tmp_path / "bare.py"

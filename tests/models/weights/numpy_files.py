@@ -17,12 +17,12 @@ class _Python2Pickler(pickle._Pickler):
 
     dispatch: ClassVar[Any] = dict(pickle._Pickler.dispatch)
 
-    def _string(self, given: str | bytes) -> None:
-        raw = given.encode("latin-1") if isinstance(given, str) else given
+    def _string(self, arguments: str | bytes) -> None:
+        raw = arguments.encode("latin-1") if isinstance(arguments, str) else arguments
         short = len(raw) < 256
         start = b"U" + bytes([len(raw)]) if short else b"T" + len(raw).to_bytes(4, "little")
         self.write(start + raw)
-        self.memoize(given)
+        self.memoize(arguments)
 
     dispatch[str] = _string
     dispatch[bytes] = _string

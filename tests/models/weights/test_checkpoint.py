@@ -83,7 +83,7 @@ def test_the_state_dict_may_lie_beside_other_things(key: str, tmp_path: Path) ->
     assert equal(loaded(tmp_path / "w.pth")[0], weights())
 
 
-def test_a_prefix_of_every_key_is_stripped_and_said(tmp_path: Path) -> None:
+def test_a_prefix_of_every_key_is_stripped_and_reported(tmp_path: Path) -> None:
     torch.save({f"module.{k}": v for k, v in weights().items()}, tmp_path / "w.pth")
     state, notes = loaded(tmp_path / "w.pth")
     assert equal(state, weights())
@@ -155,7 +155,7 @@ def test_a_folder_with_one_file_of_weights_is_that_file(tmp_path: Path) -> None:
     assert notes == [f"checkpoint {tmp_path.name}: epoch_7.pth"]
 
 
-def test_a_prefix_given_twice_is_stripped_twice(tmp_path: Path) -> None:
+def test_a_repeated_prefix_is_stripped_twice(tmp_path: Path) -> None:
     torch.save({f"module.module.{n}": t for n, t in weights().items()}, tmp_path / "w.pth")
     assert equal(loaded(tmp_path / "w.pth")[0], weights())
 
@@ -197,16 +197,16 @@ def test_a_compressed_archive_is_refused_before_torch_unpacks_it(tmp_path: Path)
         read_checkpoint(tmp_path / "w.pth")
 
 
-@pytest.mark.parametrize("told", [10**5000, "a" * 10**5], ids=["number", "text"])
-def test_what_the_training_was_told_is_cut_short_or_left_out(told: Any, tmp_path: Path) -> None:
-    args = argparse.Namespace(arch="resnet18", width=told)
+@pytest.mark.parametrize("metadata", [10**5000, "a" * 10**5], ids=["number", "text"])
+def test_training_metadata_is_shortened_or_left_out(metadata: Any, tmp_path: Path) -> None:
+    args = argparse.Namespace(arch="resnet18", width=metadata)
     torch.save({"args": args, "state_dict": weights()}, tmp_path / "w.pth")
     _, notes = loaded(tmp_path / "w.pth")
     assert notes[-1].startswith("checkpoint w.pth: trained with arch resnet18")
     assert len(notes[-1]) < 200
 
 
-def test_what_the_training_was_told_is_said(tmp_path: Path) -> None:
+def test_training_metadata_is_reported(tmp_path: Path) -> None:
     args = argparse.Namespace(arch="resnet18", data="kitti", lr=0.1, secret="x", decoder=None)
     torch.save({"args": args, "state_dict": weights()}, tmp_path / "w.pth")
     notes = loaded(tmp_path / "w.pth")[1]
@@ -232,11 +232,11 @@ def test_every_kind_of_misfit_is_listed_and_nothing_is_loaded(tmp_path: Path) ->
     before = {k: v.clone() for k, v in network.state_dict().items()}
     with pytest.raises(CheckpointError) as error:
         load_checkpoint(network, definition(), tmp_path / "w.pth")
-    said = str(error.value)
-    assert "does not fit network 'net': 2 missing (norm.weight, norm.bias)" in said
-    assert "1 unexpected (extra.weight)" in said
-    assert "1 of another shape (conv.bias (7,) for (4,))" in said
-    assert "\n" not in said
+    message = str(error.value)
+    assert "does not fit network 'net': 2 missing (norm.weight, norm.bias)" in message
+    assert "1 unexpected (extra.weight)" in message
+    assert "1 of another shape (conv.bias (7,) for (4,))" in message
+    assert "\n" not in message
     assert error.value.exit_code == 4
     assert equal(network.state_dict(), before)
 
@@ -251,7 +251,7 @@ def test_the_checkpoint_of_another_network_is_refused_in_few_words(tmp_path: Pat
     assert len(str(error.value)) < 500
 
 
-def test_a_definition_that_cannot_read_the_layout_is_said(tmp_path: Path) -> None:
+def test_a_definition_that_cannot_read_the_layout_is_named(tmp_path: Path) -> None:
     torch.save(weights(), tmp_path / "w.pth")
     for fault in (KeyError("x"), TypeError("x"), IndexError("x"), AttributeError("x")):
 
@@ -279,7 +279,7 @@ def test_a_network_that_refuses_its_state_is_one_line(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("content", "said"),
+    ("content", "message"),
     [
         ({}, "no state dict; it holds nothing"),
         ({"epoch": 1, "best": 0.3}, "no state dict; it holds epoch, best"),
@@ -289,9 +289,11 @@ def test_a_network_that_refuses_its_state_is_one_line(tmp_path: Path) -> None:
         ({"state_dict": {"a": 1}}, "no state dict; it holds state_dict"),
     ],
 )
-def test_a_file_without_named_tensors_is_said(content: Any, said: str, tmp_path: Path) -> None:
+def test_a_file_without_named_tensors_is_refused(
+    content: Any, message: str, tmp_path: Path
+) -> None:
     torch.save(content, tmp_path / "w.pth")
-    with pytest.raises(CheckpointError, match=said):
+    with pytest.raises(CheckpointError, match=message):
         read_checkpoint(tmp_path / "w.pth")
 
 
@@ -302,7 +304,7 @@ def test_weights_of_another_known_network_name_it(tmp_path: Path) -> None:
     assert str(error.value).endswith("does not fit network 'net': this is nconv; use --model nconv")
 
 
-def test_of_several_that_fit_the_one_that_ends_as_asked_comes_first(tmp_path: Path) -> None:
+def test_of_several_that_fit_the_one_with_the_requested_ending_comes_first(tmp_path: Path) -> None:
     state = find_definition("sparse2dense-r18-deconv3").build().state_dict()
     torch.save(state, tmp_path / "w.pth")
     with pytest.raises(CheckpointError, match=r"--model sparse2dense-r18-deconv3-kitti$"):
@@ -316,14 +318,14 @@ def test_of_several_that_fit_the_one_that_ends_as_asked_comes_first(tmp_path: Pa
 # ------------------------------------------------------------------ broken files
 
 
-def test_a_path_that_is_no_file_is_said(tmp_path: Path) -> None:
+def test_a_path_that_is_no_file_is_refused(tmp_path: Path) -> None:
     with pytest.raises(CheckpointError, match="does not exist"):
         read_checkpoint(tmp_path / "absent.pth")
     with pytest.raises(CheckpointError, match="is a folder without weights"):
         read_checkpoint(tmp_path)
 
 
-def test_a_pointer_to_a_file_that_was_not_fetched_is_said(tmp_path: Path) -> None:
+def test_a_pointer_to_a_file_that_was_not_fetched_is_named(tmp_path: Path) -> None:
     pointer = "version https://git-lfs.github.com/spec/v1\noid sha256:b497\nsize 126396039\n"
     (tmp_path / "w.pth.tar").write_text(pointer)
     with pytest.raises(CheckpointError, match="is a Git LFS pointer"):
@@ -360,8 +362,8 @@ def test_a_truncated_file_is_refused_wherever_it_ends(save: str, tmp_path: Path)
     else:
         SAVES[save](weights(), whole)
     content = whole.read_bytes()
-    for share in (0.001, 0.1, 0.3, 0.5, 0.7, 0.9, 0.999):
-        whole.write_bytes(content[: int(len(content) * share)])
+    for fraction in (0.001, 0.1, 0.3, 0.5, 0.7, 0.9, 0.999):
+        whole.write_bytes(content[: int(len(content) * fraction)])
         one_line_about(whole)
 
 
@@ -429,7 +431,7 @@ def test_nothing_in_a_pickle_is_run(
 
 
 @pytest.mark.parametrize("save", SAVES)
-def test_the_tensors_of_a_whole_module_are_taken_out_and_that_is_said(
+def test_the_tensors_of_a_whole_module_are_extracted_and_reported(
     save: str, tmp_path: Path
 ) -> None:
     torch.manual_seed(3)

@@ -59,15 +59,15 @@ def test_a_pickled_dict_of_dicts_gives_its_arrays_to_the_bit(
     written_by: str, tmp_path: Path
 ) -> None:
     path = write_npy(tmp_path / "x.npy", layers(), written_by)
-    found = read_numpy_file(path)
-    assert list(found) == ["conv1.weights", "conv1.biases", "bn_conv1.mean", "alone"]
+    arrays = read_numpy_file(path)
+    assert list(arrays) == ["conv1.weights", "conv1.biases", "bn_conv1.mean", "alone"]
     numpys = np.load(path, allow_pickle=True, encoding="latin1").item()
-    for name, tensor in found.items():
+    for name, tensor in arrays.items():
         layer, _, key = name.partition(".")
         own = numpys[layer][key] if key else numpys[layer]
         assert np.array_equal(tensor.numpy(), own)
         assert tensor.numpy().dtype == own.dtype
-    assert found["conv1.weights"].is_contiguous()
+    assert arrays["conv1.weights"].is_contiguous()
 
 
 def test_what_numpy_saves_today_is_read(tmp_path: Path) -> None:
@@ -81,10 +81,10 @@ def test_every_type_order_and_shape_is_read(code: str, written_by: str, tmp_path
     base = np.arange(24).reshape(2, 3, 4).astype(np.dtype(code))
     arrays = {"c": base, "fortran": np.asfortranarray(base), "turned": base.T, "part": base[:, 1:]}
     arrays |= {"number": np.array(base[1, 1, 1]), "empty": base[:0]}
-    found = read_numpy_file(write_npy(tmp_path / "x.npy", arrays, written_by))
+    read = read_numpy_file(write_npy(tmp_path / "x.npy", arrays, written_by))
     for name, array in arrays.items():
-        assert found[name].shape == array.shape
-        assert np.array_equal(found[name].numpy(), array)
+        assert read[name].shape == array.shape
+        assert np.array_equal(read[name].numpy(), array)
 
 
 @pytest.mark.parametrize("save", [np.savez, np.savez_compressed])
@@ -93,22 +93,22 @@ def test_an_archive_gives_its_arrays_by_name(save: Any, tmp_path: Path) -> None:
     arrays = {"kernel0": rng.normal(size=(11, 11, 1, 8)), "bias0": np.float32(0.5)}
     arrays["turned"] = np.asfortranarray(rng.normal(size=(3, 5)).astype(np.float32))
     save(tmp_path / "x.npz", **arrays)
-    found = read_numpy_file(tmp_path / "x.npz")
-    assert set(found) == set(arrays)
-    assert all(np.array_equal(found[name].numpy(), array) for name, array in arrays.items())
+    read = read_numpy_file(tmp_path / "x.npz")
+    assert set(read) == set(arrays)
+    assert all(np.array_equal(read[name].numpy(), array) for name, array in arrays.items())
 
 
-def test_an_array_named_twice_is_one_and_no_array_is_made_twice(tmp_path: Path) -> None:
+def test_an_array_named_twice_is_read_once(tmp_path: Path) -> None:
     array = np.arange(1000.0)
-    found = read_numpy_file(write_npy(tmp_path / "x.npy", {"a": array, "b": array}))
-    assert found["a"].data_ptr() == found["b"].data_ptr()
+    arrays = read_numpy_file(write_npy(tmp_path / "x.npy", {"a": array, "b": array}))
+    assert arrays["a"].data_ptr() == arrays["b"].data_ptr()
 
 
 # ------------------------------------------------------------------ what is no such file
 
 
 @pytest.mark.parametrize(
-    ("content", "said"),
+    ("content", "message"),
     [
         ([1, 2], "no dict of arrays"),
         ("text", "no dict of arrays"),
@@ -121,8 +121,8 @@ def test_an_array_named_twice_is_one_and_no_array_is_made_twice(tmp_path: Path) 
         ({"a": torch.nn.Identity()}, "a is no array but a torch.nn"),
     ],
 )
-def test_other_contents_are_named(content: Any, said: str, tmp_path: Path) -> None:
-    assert said in refused(with_object(tmp_path / "x.npy", pickled(content, "4")))
+def test_other_contents_are_named(content: Any, message: str, tmp_path: Path) -> None:
+    assert message in refused(with_object(tmp_path / "x.npy", pickled(content, "4")))
 
 
 def test_a_plain_array_or_several_objects_are_no_checkpoint(tmp_path: Path) -> None:
@@ -155,22 +155,22 @@ def test_nothing_of_a_hostile_pickle_runs(kind: str, written_by: str, tmp_path: 
 class HostileArray:
     """Reconstructs as an array whose parts are calls."""
 
-    def __init__(self, marker: Path, place: str) -> None:
-        self.call, self.place = Hostile(exec, f"open({str(marker)!r}, 'w').close()"), place
+    def __init__(self, marker: Path, field: str) -> None:
+        self.call, self.field = Hostile(exec, f"open({str(marker)!r}, 'w').close()"), field
 
     def __reduce__(self) -> Any:
         _, arguments, state = np.ones(2, dtype=np.float32).__reduce__()  # type: ignore[misc]
         version, shape, dtype, fortran, data = state
         parts = {"version": version, "shape": shape, "dtype": dtype, "fortran": fortran}
-        parts |= {"data": data, self.place: self.call}
+        parts |= {"data": data, self.field: self.call}
         return np.ones(1).__reduce__()[0], arguments, tuple(parts.values())
 
 
-@pytest.mark.parametrize("place", ["version", "shape", "dtype", "fortran", "data"])
-def test_an_array_made_of_calls_runs_none_of_them(place: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("field", ["version", "shape", "dtype", "fortran", "data"])
+def test_calls_inside_an_array_are_not_run(field: str, tmp_path: Path) -> None:
     marker = tmp_path / "ran"
-    path = with_object(tmp_path / "bad.npy", pickled({"a": HostileArray(marker, place)}, "4"))
-    if place in ("version", "fortran"):  # what it would have been makes no difference
+    path = with_object(tmp_path / "bad.npy", pickled({"a": HostileArray(marker, field)}, "4"))
+    if field in ("version", "fortran"):  # what it would have been makes no difference
         assert torch.equal(read_numpy_file(path)["a"], torch.ones(2))
     else:
         refused(path)

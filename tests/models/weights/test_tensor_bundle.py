@@ -63,14 +63,14 @@ def index_of(entries: dict[str, bytes], *, shards: int = 1, blocks: int = 1) -> 
     rows = [(b"", header), *((k.encode(), v) for k, v in sorted(entries.items()))]
     data, handles = b"", []
     for part in np.array_split(np.arange(len(rows)), blocks):
-        made = block([rows[i] for i in part])
-        handles.append((rows[part[-1]][0], varint(len(data)) + varint(len(made) - 5)))
-        data += made
-    places = []
-    for made in (block([]), block(handles)):
-        places.append(varint(len(data)) + varint(len(made) - 5))
-        data += made
-    footer = b"".join(places).ljust(40, b"\0") + struct.pack("<Q", 0xDB4775248B80FB57)
+        content = block([rows[i] for i in part])
+        handles.append((rows[part[-1]][0], varint(len(data)) + varint(len(content) - 5)))
+        data += content
+    tables = []
+    for content in (block([]), block(handles)):
+        tables.append(varint(len(data)) + varint(len(content) - 5))
+        data += content
+    footer = b"".join(tables).ljust(40, b"\0") + struct.pack("<Q", 0xDB4775248B80FB57)
     return data + footer
 
 
@@ -89,7 +89,7 @@ def refused(index: Path) -> str:
 
 
 def test_what_tensorflow_wrote_is_read_to_the_bit_and_text_is_left_out(tmp_path: Path) -> None:
-    found = read_checkpoint(written(tmp_path))
+    tensors = read_checkpoint(written(tmp_path))
     expected = {
         "conv1.biases": torch.tensor([-1, 2.5, 3]),
         "conv1.weights": torch.arange(12.0).reshape(1, 2, 2, 3),
@@ -97,10 +97,10 @@ def test_what_tensorflow_wrote_is_read_to_the_bit_and_text_is_left_out(tmp_path:
         "half": torch.tensor([[1.5]], dtype=torch.float16),
         "kind": torch.tensor([True, False]),
     }
-    assert found.keys() == expected.keys()
+    assert tensors.keys() == expected.keys()
     for name, tensor in expected.items():
-        assert found[name].dtype == tensor.dtype
-        assert torch.equal(found[name], tensor)
+        assert tensors[name].dtype == tensor.dtype
+        assert torch.equal(tensors[name], tensor)
 
 
 @pytest.mark.parametrize("blocks", [1, 2, 7])
@@ -113,10 +113,10 @@ def test_an_index_of_many_blocks_and_two_shards_is_read_whole(blocks: int, tmp_p
     (tmp_path / "x.index").write_bytes(index_of(entries, shards=2, blocks=blocks))
     for n, content in enumerate(contents):
         (tmp_path / f"x.data-0000{n}-of-00002").write_bytes(content)
-    found = read_tensor_bundle(tmp_path / "x.index")
-    assert len(found) == 40
+    tensors = read_tensor_bundle(tmp_path / "x.index")
+    assert len(tensors) == 40
     for name, array in arrays.items():
-        assert np.array_equal(found[name.replace("/", ".")].numpy(), array)
+        assert np.array_equal(tensors[name.replace("/", ".")].numpy(), array)
 
 
 def test_the_prefix_alone_says_what_to_name(tmp_path: Path) -> None:
@@ -132,7 +132,7 @@ def test_values_that_are_not_beside_it_are_named(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("entries", "said"),
+    ("entries", "message"),
     [
         ({"a": entry(1, (2,), 4, 8)}, "goes beyond its 8 bytes"),
         ({"a": entry(1, (3,), 0, 8)}, "of shape (3,) goes beyond its 8 bytes"),
@@ -146,9 +146,9 @@ def test_values_that_are_not_beside_it_are_named(tmp_path: Path) -> None:
     ],
 )
 def test_what_claims_more_or_other_than_is_there_is_refused(
-    entries: dict[str, bytes], said: str, tmp_path: Path
+    entries: dict[str, bytes], message: str, tmp_path: Path
 ) -> None:
-    assert said in refused(bundle(tmp_path, entries, b"\0" * 8))
+    assert message in refused(bundle(tmp_path, entries, b"\0" * 8))
 
 
 def shared_keys(count: int) -> bytes:
@@ -159,11 +159,11 @@ def shared_keys(count: int) -> bytes:
 
 
 def index_of_blocks(data: bytes, handles: list[bytes]) -> bytes:
-    places = []
+    tables = []
     for part in (block([]), block([(b"", handle) for handle in handles])):
-        places.append(varint(len(data)) + varint(len(part) - 5))
+        tables.append(varint(len(data)) + varint(len(part) - 5))
         data += part
-    return data + b"".join(places).ljust(40, b"\0") + struct.pack("<Q", 0xDB4775248B80FB57)
+    return data + b"".join(tables).ljust(40, b"\0") + struct.pack("<Q", 0xDB4775248B80FB57)
 
 
 def test_names_that_grow_from_one_another_take_no_memory(tmp_path: Path) -> None:
@@ -198,7 +198,7 @@ def test_a_changed_byte_is_refused_or_gives_tensors_of_what_is_there(
     content[at] = byte
     index.write_bytes(content)
     try:
-        found = read_tensor_bundle(index)
+        tensors = read_tensor_bundle(index)
     except CheckpointError:
         return
-    assert sum(t.numel() * t.element_size() for t in found.values()) <= 81
+    assert sum(t.numel() * t.element_size() for t in tensors.values()) <= 81

@@ -206,7 +206,7 @@ BOMBS = {
     "text longer than the file": (b"\x80\x02X" + struct.pack("<I", 2**32 - 1) + b"a.", b""),
     "bytes longer than the file": (b"\x80\x05\x96" + struct.pack("<Q", 2**62) + b"a.", b""),
     "a number longer than the file": (b"\x80\x02\x8b" + struct.pack("<i", 2**31 - 1) + b"a.", b""),
-    "an unknown place in the memo": (b"\x80\x02j" + struct.pack("<I", 2**32 - 1) + b".", b""),
+    "an unknown index in the memo": (b"\x80\x02j" + struct.pack("<I", 2**32 - 1) + b".", b""),
 }
 
 
@@ -225,13 +225,13 @@ def test_a_length_that_no_file_has_is_refused_in_the_older_layout_too(tmp_path: 
         read_tensor_file(tmp_path / "x.pt")
 
 
-def test_tensors_of_one_storage_share_it(tmp_path: Path) -> None:
+def test_tensors_of_one_storage_use_the_same_memory(tmp_path: Path) -> None:
     whole = torch.zeros(10**6)
     content = {"args": argparse.Namespace(lr=1), **{str(n): whole[n:] for n in range(300)}}
     torch.save(content, tmp_path / "x.pt")
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    found = read_tensor_file(tmp_path / "x.pt").content
-    assert [len(found[str(n)]) for n in range(300)] == [10**6 - n for n in range(300)]
+    tensors = read_tensor_file(tmp_path / "x.pt").content
+    assert [len(tensors[str(n)]) for n in range(300)] == [10**6 - n for n in range(300)]
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 50_000  # kB
 
 
@@ -249,7 +249,7 @@ def test_a_compressed_archive_is_refused_before_it_is_unpacked(tmp_path: Path) -
         read_tensor_file(path)
 
 
-def test_entries_that_share_their_bytes_are_refused(tmp_path: Path) -> None:
+def test_entries_with_overlapping_bytes_are_refused(tmp_path: Path) -> None:
     path = archive_of(tmp_path / "x.pt", pickle.dumps(1), b"\0" * 5000)
     data = path.read_bytes()
     start = data.index(b"PK\x01\x02")  # the directory, whose entries for the storage are repeated

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from pnpdepth_cli.errors import ClusterError
-from pnpdepth_cli.pipeline.cluster import pool
+from pnpdepth_cli.pipeline.cluster import failures
 from pnpdepth_cli.pipeline.cluster.options import ClusterOptions
 from pnpdepth_cli.pipeline.evaluation.evaluate import evaluate
 from pnpdepth_cli.pipeline.evaluation.result import EvalRequest
@@ -29,6 +29,7 @@ from tests.pipeline.batches import Heard, add_frame, batch, pairs_on_disk, refin
 from tests.pipeline.cluster.nodes import three_nodes
 
 pytest.importorskip("ray")
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="nodes are addresses of loopback")
 NAMES = tuple(f"f{number:02}" for number in range(12))
 TABLES = ("sweep.csv", "sweep_frames.csv", "sweep.tex")
 DEADLY = "        if float(rgb.mean()) > 0.99:\n            import os\n            os._exit(1)\n"
@@ -134,12 +135,12 @@ def test_what_is_wrong_with_a_cluster_is_an_error(
 ) -> None:
     options = ClusterOptions(ray=cluster.address)
     one = replace(options, ray_workers=1)
-    with pytest.raises(ClusterError, match="devices for 3 workers of 1 CPU cores each, and 9 are"):
+    with pytest.raises(ClusterError, match="for 3 Ray workers with 1 CPU core each, and 9 asked"):
         batch(root, cluster=replace(options, ray_workers=9))
-    with pytest.raises(ClusterError, match="devices for 0 workers of a GPU each, and 1 are"):
+    with pytest.raises(ClusterError, match="for 0 Ray workers with one GPU each, and 1 asked"):
         batch(root, cluster=options, refine={"device": "cuda"})
     with monkeypatch.context() as changed:
-        changed.setattr(pool, "software", lambda: {"torch": "1.0"})
+        changed.setattr(failures, "software", lambda: {"torch": "1.0"})
         with pytest.raises(ClusterError, match=r"has torch .* and here it is 1\.0; install the"):
             batch(root, cluster=one)
     with monkeypatch.context() as changed:

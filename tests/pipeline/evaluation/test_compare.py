@@ -22,13 +22,13 @@ def compare(paths: list[str], **settings: Any) -> Comparison:
     return compare_runs(CompareRequest(paths=paths, **settings))
 
 
-def run(root: Path, name: str, errors: dict[str, list[float]], **given: Any) -> str:
+def run(root: Path, name: str, errors: dict[str, list[float]], **frames: Any) -> str:
     """A saved evaluation of frames of 4 pixels at 10 m with these errors."""
     for frame, error in errors.items():
         for folder, depth in ((name, 10 + np.array([error])), ("gt", np.full((1, len(error)), 10))):
             (root / folder).mkdir(exist_ok=True)
             write_depth(root / folder / f"{frame}.npy", depth.astype(np.float32))
-    request = EvalRequest(prediction=root / name, ground_truth=root / "gt", resamples=0, **given)
+    request = EvalRequest(prediction=root / name, ground_truth=root / "gt", resamples=0, **frames)
     path = root / f"{name}.json"
     write_json(path, evaluate(request).as_record())
     return str(path)
@@ -39,74 +39,74 @@ BETTER = {"a": [1.0, 1.0], "b": [3.0, 3.0], "c": [0.5, 0.5]}
 
 
 def test_a_lower_error_is_a_positive_gain(tmp_path: Path) -> None:
-    found = compare([run(tmp_path, "one", FIRST), run(tmp_path, "two", BETTER)])
-    gain = found.gains[0]["mae"]
+    comparison = compare([run(tmp_path, "one", FIRST), run(tmp_path, "two", BETTER)])
+    gain = comparison.gains[0]["mae"]
     assert gain.percent == pytest.approx(100 * 2.5 / 7)
     assert gain.difference == pytest.approx(-2.5 / 3)
     assert gain.p_value == 2 / 8  # all three got better: two of the eight swaps differ as much
     assert np.isnan([gain.low_percent, gain.high_percent]).all()  # three frames are too few
-    assert found.exact
-    assert [r.label for r in found.runs] == ["one", "two"]
-    assert found.runs[0].mean["mae"] == pytest.approx(7 / 3)
-    (note,) = found.notes
+    assert comparison.exact
+    assert [r.label for r in comparison.runs] == ["one", "two"]
+    assert comparison.runs[0].mean["mae"] == pytest.approx(7 / 3)
+    (note,) = comparison.notes
     assert note == (
         "warning: 3 frames are too few independent ones to conclude anything from 4 measures: the"
         " smallest possible p is 0.25, adjusted 1; there is no interval below 5"
     )
 
 
-def test_a_higher_share_below_the_threshold_is_a_positive_gain(tmp_path: Path) -> None:
-    found = compare([run(tmp_path, "one", FIRST), run(tmp_path, "two", BETTER)])
-    assert found.runs[0].mean["delta1"] == pytest.approx(2 / 3)
-    assert found.gains[0]["delta1"].percent == 0  # 1.3 and 1.4 are above 1.25
+def test_a_higher_fraction_below_the_threshold_is_a_positive_gain(tmp_path: Path) -> None:
+    comparison = compare([run(tmp_path, "one", FIRST), run(tmp_path, "two", BETTER)])
+    assert comparison.runs[0].mean["delta1"] == pytest.approx(2 / 3)
+    assert comparison.gains[0]["delta1"].percent == 0  # 1.3 and 1.4 are above 1.25
     half = {"a": [3.0, 1.0]}
-    found = compare([run(tmp_path, "half", half), run(tmp_path, "whole", {"a": [1.0, 1.0]})])
-    assert found.gains[0]["delta1"].percent == pytest.approx(100)
+    comparison = compare([run(tmp_path, "half", half), run(tmp_path, "whole", {"a": [1.0, 1.0]})])
+    assert comparison.gains[0]["delta1"].percent == pytest.approx(100)
 
 
 def test_a_run_is_no_better_than_itself(tmp_path: Path) -> None:
     path = run(tmp_path, "one", FIRST)
-    found = compare([path, path])
-    for gain in found.gains[0].values():
+    comparison = compare([path, path])
+    for gain in comparison.gains[0].values():
         assert (gain.percent, gain.p_value, gain.p_adjusted) == (0, 1, 1)
-    assert [r.label for r in found.runs] == [path, path]
+    assert [r.label for r in comparison.runs] == [path, path]
 
 
-def test_frames_are_paired_by_name_and_the_others_told(tmp_path: Path) -> None:
+def test_frames_are_paired_by_name_and_the_others_reported(tmp_path: Path) -> None:
     one = run(tmp_path, "one", {"a": [2.0], "b": [4.0], "only one": [9.0]})
     (tmp_path / "gt" / "only one.npy").unlink()
     two = run(tmp_path, "two", {"b": [2.0], "a": [1.0]})
-    found = compare([one, two])
-    assert found.names == ("a", "b")
-    assert found.runs[0].mean["mae"] == pytest.approx(3)
-    note = found.notes[0]
+    comparison = compare([one, two])
+    assert comparison.names == ("a", "b")
+    assert comparison.runs[0].mean["mae"] == pytest.approx(3)
+    note = comparison.notes[0]
     assert "1 frames of" in note
     assert note.endswith("left out: only one")
 
 
 def test_one_frame_has_a_gain_but_nothing_to_resample(tmp_path: Path) -> None:
-    found = compare([run(tmp_path, "one", {"a": [2.0]}), run(tmp_path, "two", {"a": [1.0]})])
-    gain = found.gains[0]["mae"]
+    comparison = compare([run(tmp_path, "one", {"a": [2.0]}), run(tmp_path, "two", {"a": [1.0]})])
+    gain = comparison.gains[0]["mae"]
     assert gain.percent == pytest.approx(50)
     assert np.isnan([gain.low_percent, gain.high_percent, gain.p_value]).all()
-    assert found.as_record()["gains"][0]["mae"]["p_value"] is None
+    assert comparison.as_record()["gains"][0]["mae"]["p_value"] is None
 
 
 def test_pooled_runs_are_compared_over_their_pixels(tmp_path: Path) -> None:
     pooled: dict[str, Any] = {"changes": {"average": "pooled"}}
     one = run(tmp_path, "one", {"a": [2.0], "b": [4.0, 4.0, 4.0]}, **pooled)
     two = run(tmp_path, "two", {"a": [1.0], "b": [4.0, 4.0, 4.0]}, **pooled)
-    found = compare([one, two])
-    assert found.runs[0].mean["mae"] == pytest.approx(14 / 4)
-    assert found.gains[0]["mae"].percent == pytest.approx(100 / 14)
-    assert found.gains[0]["mae"].p_value == 1  # only a differs: any swap is as large
+    comparison = compare([one, two])
+    assert comparison.runs[0].mean["mae"] == pytest.approx(14 / 4)
+    assert comparison.gains[0]["mae"].percent == pytest.approx(100 / 14)
+    assert comparison.gains[0]["mae"].p_value == 1  # only a differs: any swap is as large
 
 
 def test_three_runs_are_each_compared_with_the_first(tmp_path: Path) -> None:
     paths = [run(tmp_path, name, errors) for name, errors in
              (("one", FIRST), ("two", BETTER), ("three", FIRST))]  # fmt: skip
-    found = compare(paths)
-    assert [gains["mae"].percent > 0 for gains in found.gains] == [True, False]
+    comparison = compare(paths)
+    assert [gains["mae"].percent > 0 for gains in comparison.gains] == [True, False]
 
 
 def test_many_frames_are_tested_with_random_swaps_of_the_seed(tmp_path: Path) -> None:
@@ -114,10 +114,12 @@ def test_many_frames_are_tested_with_random_swaps_of_the_seed(tmp_path: Path) ->
     first = {f"{n:02}": [float(rng.uniform(1, 2))] for n in range(20)}
     second = {name: [error[0] * float(rng.uniform(0.7, 1.2))] for name, error in first.items()}
     paths = [run(tmp_path, "one", first), run(tmp_path, "two", second)]
-    found = compare(paths, resamples=500, seed=1, grouped=False)
-    assert not found.exact
-    assert found.as_record() == compare(paths, resamples=500, seed=1, grouped=False).as_record()
-    assert found.gains != compare(paths, resamples=500, seed=2, grouped=False).gains
+    comparison = compare(paths, resamples=500, seed=1, grouped=False)
+    assert not comparison.exact
+    assert (
+        comparison.as_record() == compare(paths, resamples=500, seed=1, grouped=False).as_record()
+    )
+    assert comparison.gains != compare(paths, resamples=500, seed=2, grouped=False).gains
 
 
 SIX = {f"{n:04}": [error] for n, error in enumerate((2.0, 5.0, 1.0, 4.0, 1.5, 3.0))}
@@ -130,11 +132,11 @@ def scaled(errors: dict[str, list[float]], factors: list[float]) -> dict[str, li
 
 def test_six_frames_have_an_interval_around_the_gain(tmp_path: Path) -> None:
     better = scaled(SIX, [0.5, 0.8, 0.6, 0.7, 0.9, 0.55])
-    found = compare([run(tmp_path, "one", SIX), run(tmp_path, "two", better)])
-    gain = found.gains[0]["mae"]
+    comparison = compare([run(tmp_path, "one", SIX), run(tmp_path, "two", better)])
+    gain = comparison.gains[0]["mae"]
     assert gain.low_percent < gain.percent < gain.high_percent
     assert gain.p_value == 2 / 64
-    (note,) = found.notes
+    (note,) = comparison.notes
     assert note.endswith("4 measures: the smallest possible p is 0.031, adjusted 0.12")
     same = compare([run(tmp_path, "one", SIX), run(tmp_path, "half", scaled(SIX, [0.5] * 6))])
     equal = same.gains[0]["mae"]
@@ -143,13 +145,15 @@ def test_six_frames_have_an_interval_around_the_gain(tmp_path: Path) -> None:
 
 def test_p_values_are_adjusted_for_the_number_of_measures(tmp_path: Path) -> None:
     better = scaled(SIX, [0.5, 0.8, 0.6, 0.7, 0.9, 0.55])
-    found = compare([run(tmp_path, "one", SIX), run(tmp_path, "two", better)], all_measures=True)
-    p_values = [gain.p_value for gain in found.gains[0].values()]
-    smallest = min(found.gains[0].values(), key=lambda gain: gain.p_value)
-    assert len(p_values) == len(found.measures) == 12
+    comparison = compare(
+        [run(tmp_path, "one", SIX), run(tmp_path, "two", better)], all_measures=True
+    )
+    p_values = [gain.p_value for gain in comparison.gains[0].values()]
+    smallest = min(comparison.gains[0].values(), key=lambda gain: gain.p_value)
+    assert len(p_values) == len(comparison.measures) == 12
     main = compare([run(tmp_path, "one", SIX), run(tmp_path, "two", better)])
     assert [measure.key for measure in main.measures] == ["rmse", "mae", "mre", "delta1"]
-    assert main.gains[0]["rmse"].p_value == found.gains[0]["rmse"].p_value
+    assert main.gains[0]["rmse"].p_value == comparison.gains[0]["rmse"].p_value
     assert smallest.p_adjusted == pytest.approx(min(1, 12 * min(p_values)))
 
 
@@ -171,9 +175,9 @@ def test_a_correlated_sequence_is_swapped_in_blocks(tmp_path: Path) -> None:
     drift = np.cumsum(rng.normal(0, 0.05, 120))
     first = {f"{n:04}": [3.0] for n in range(120)}
     second = {f"{n:04}": [3.0 + float(drift[n])] for n in range(120)}
-    found = compare([run(tmp_path, "one", first), run(tmp_path, "two", second)])
-    assert found.clusters.count <= 10
-    assert "consecutive frames" in found.clusters.describe()
+    comparison = compare([run(tmp_path, "one", first), run(tmp_path, "two", second)])
+    assert comparison.clusters.count <= 10
+    assert "consecutive frames" in comparison.clusters.describe()
 
 
 def test_different_rules_are_refused_and_named(tmp_path: Path) -> None:
@@ -203,7 +207,7 @@ def test_runs_without_a_common_frame_are_refused(tmp_path: Path) -> None:
         compare([one, two])
 
 
-def test_other_pixels_and_other_truth_are_warned_of(tmp_path: Path) -> None:
+def test_other_pixels_and_other_ground_truth_cause_a_warning(tmp_path: Path) -> None:
     one = run(tmp_path, "one", {"a": [1.0, 1.0]})
     less = run(tmp_path, "less", {"a": [1.0, -10.0]})
     (note,) = compare([one, less]).notes
@@ -228,20 +232,20 @@ def test_a_batch_is_compared_with_what_it_started_from(tmp_path: Path) -> None:
     ]
     (tmp_path / "summary.json").write_text(json.dumps({"counts": {}, "frames": frames}))
     for result in (tmp_path, tmp_path / "summary.json"):
-        found = compare([f"{tmp_path}/summary.json:before", str(result)])
-        assert found.names == ("drive/1", "drive/2")
-        assert [m.key for m in found.measures] == ["rmse", "mae", "delta1"]
-        assert found.gains[0]["rmse"].percent == 50
-        assert found.gains[0]["delta1"].percent == pytest.approx(20)
-        assert [r.label for r in found.runs] == ["summary:before", "summary"]
+        comparison = compare([f"{tmp_path}/summary.json:before", str(result)])
+        assert comparison.names == ("drive/1", "drive/2")
+        assert [m.key for m in comparison.measures] == ["rmse", "mae", "delta1"]
+        assert comparison.gains[0]["rmse"].percent == 50
+        assert comparison.gains[0]["delta1"].percent == pytest.approx(20)
+        assert [r.label for r in comparison.runs] == ["summary:before", "summary"]
 
 
 def test_a_refinement_can_be_compared_with_an_evaluation(tmp_path: Path) -> None:
     (tmp_path / "a.json").write_text(json.dumps({"settings": {}, "scores": SCORES}))
     one = run(tmp_path, "one", {"a": [1.0] * 90})
-    found = compare([one, str(tmp_path / "a.json")])
-    assert found.names == ("a",)
-    assert [m.key for m in found.measures] == ["rmse", "mae", "delta1"]
+    comparison = compare([one, str(tmp_path / "a.json")])
+    assert comparison.names == ("a",)
+    assert [m.key for m in comparison.measures] == ["rmse", "mae", "delta1"]
 
 
 BROKEN = [
@@ -256,11 +260,11 @@ BROKEN = [
 ]
 
 
-@pytest.mark.parametrize(("text", "said"), BROKEN)
-def test_a_file_without_scores_is_refused(tmp_path: Path, text: str, said: str) -> None:
+@pytest.mark.parametrize(("text", "message"), BROKEN)
+def test_a_file_without_scores_is_refused(tmp_path: Path, text: str, message: str) -> None:
     one = run(tmp_path, "one", FIRST)
     (tmp_path / "broken.json").write_text(text)
-    with pytest.raises(FileFormatError, match=said):
+    with pytest.raises(FileFormatError, match=message):
         compare([one, str(tmp_path / "broken.json")])
 
 

@@ -27,14 +27,14 @@ def depth_file(path: Path, rows: Any, scale: float = 1000) -> Path:
     return path
 
 
-def scored(root: Path, **given: Any) -> Evaluation:
+def scored(root: Path, **options: Any) -> Evaluation:
     changes = {
-        name: given.pop(name)
-        for name in list(given)
+        name: options.pop(name)
+        for name in list(options)
         if name not in {each.name for each in fields(EvalRequest)}
     }
     return evaluate(
-        EvalRequest(prediction=root / "out", ground_truth=root / "gt", changes=changes, **given)
+        EvalRequest(prediction=root / "out", ground_truth=root / "gt", changes=changes, **options)
     )
 
 
@@ -58,26 +58,28 @@ def test_each_image_counts_alike_or_each_pixel(two: Path) -> None:
 
 
 def test_coverage_is_of_each_frame_and_of_all(two: Path) -> None:
-    found = scored(two)
-    assert [(f.name, f.pixels, f.known, f.coverage) for f in found.frames] == [
+    result = scored(two)
+    assert [(f.name, f.pixels, f.known, f.coverage) for f in result.frames] == [
         ("a", 2, 2, 1.0), ("ü b", 1, 2, 0.5),
     ]  # fmt: skip
-    assert found.coverage == 0.75
-    assert any("1 pixels (25.00%) of the ground truth have no prediction" in n for n in found.notes)
-    assert found.unscored() is None
+    assert result.coverage == 0.75
+    assert any(
+        "1 pixels (25.00%) of the ground truth have no prediction" in n for n in result.notes
+    )
+    assert result.unscored() is None
 
 
 def test_a_frame_without_prediction_is_counted_and_lowers_the_coverage(two: Path) -> None:
     depth_file(two / "gt" / "c.npy", [[1, 1]])
-    found = scored(two)
-    assert [frame.name for frame in found.missing] == ["c"]
-    assert found.mean["rmse"] == 2
-    assert found.coverage == 3 / 6
-    assert found.unscored() == (
+    result = scored(two)
+    assert [frame.name for frame in result.missing] == ["c"]
+    assert result.mean["rmse"] == 2
+    assert result.coverage == 3 / 6
+    assert result.unscored() == (
         "1 of 3 frames were not scored (1 without prediction, 0 with a faulty file); the means are"
         " over the other 2"
     )
-    assert "warning: 1 of 3 frames have no prediction: c" in found.notes
+    assert "warning: 1 of 3 frames have no prediction: c" in result.notes
 
 
 FAULTS = [
@@ -87,15 +89,17 @@ FAULTS = [
 ]
 
 
-@pytest.mark.parametrize(("spoil", "said"), FAULTS)
-def test_a_frame_at_fault_is_told_and_stops_no_other(two: Path, spoil: Any, said: str) -> None:
+@pytest.mark.parametrize(("spoil", "message"), FAULTS)
+def test_a_failed_frame_is_reported_and_the_others_are_scored(
+    two: Path, spoil: Any, message: str
+) -> None:
     spoil(two / "out" / "a_depth.npy")
-    found = scored(two)
-    assert [frame.name for frame in found.failed] == ["a"]
-    assert found.mean["rmse"] == 3
-    assert said in (found.frames[0].error or "")
-    assert any(note.startswith("warning: frame a was not scored") for note in found.notes)
-    assert "1 with a faulty file" in (found.unscored() or "")
+    result = scored(two)
+    assert [frame.name for frame in result.failed] == ["a"]
+    assert result.mean["rmse"] == 3
+    assert message in (result.frames[0].error or "")
+    assert any(note.startswith("warning: frame a was not scored") for note in result.notes)
+    assert "1 with a faulty file" in (result.unscored() or "")
 
 
 def test_where_nothing_can_be_scored_the_first_reason_is_the_error(two: Path) -> None:
@@ -105,21 +109,21 @@ def test_where_nothing_can_be_scored_the_first_reason_is_the_error(two: Path) ->
         scored(two)
 
 
-def test_two_single_files_raise_what_is_wrong_with_them(two: Path) -> None:
-    prediction, truth = two / "out" / "a_depth.npy", two / "gt" / "a.npy"
-    found = evaluate(EvalRequest(prediction=prediction, ground_truth=truth))
-    assert (found.mean["rmse"], found.interval) == (1, None)
+def test_two_single_files_raise_their_error(two: Path) -> None:
+    prediction, gt = two / "out" / "a_depth.npy", two / "gt" / "a.npy"
+    result = evaluate(EvalRequest(prediction=prediction, ground_truth=gt))
+    assert (result.mean["rmse"], result.interval) == (1, None)
     depth_file(prediction, [[1, 1, 1]])
     with pytest.raises(
         SizeError, match=r"a_depth\.npy is 3×1 but the ground truth .*a\.npy is 2×1; --res"
     ):
-        evaluate(EvalRequest(prediction=prediction, ground_truth=truth))
+        evaluate(EvalRequest(prediction=prediction, ground_truth=gt))
     depth_file(prediction, [[0, 0]])
     with pytest.raises(InputError, match="holds no valid depth"):
-        evaluate(EvalRequest(prediction=prediction, ground_truth=truth))
-    depth_file(truth, [[0, 0]])
+        evaluate(EvalRequest(prediction=prediction, ground_truth=gt))
+    depth_file(gt, [[0, 0]])
     with pytest.raises(InputError, match=r"a\.npy has no known depth where protocol paper scores"):
-        evaluate(EvalRequest(prediction=prediction, ground_truth=truth))
+        evaluate(EvalRequest(prediction=prediction, ground_truth=gt))
 
 
 def brute(p: np.ndarray, g: np.ndarray, counts: np.ndarray) -> dict[str, float]:
@@ -142,16 +146,16 @@ def brute(p: np.ndarray, g: np.ndarray, counts: np.ndarray) -> dict[str, float]:
 
 @pytest.fixture(scope="module")
 def random_frames(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, np.ndarray, np.ndarray]:
-    """Six frames of 640×480 with truth from 0.2 to 12 m, and predictions with holes."""
+    """Six frames of 640×480 with ground truth from 0.2 to 12 m, and predictions with holes."""
     root, rng = tmp_path_factory.mktemp("random"), np.random.default_rng(0)
-    truth = rng.uniform(0.2, 12, (6, 480, 640)).astype(np.float32)
-    prediction = (truth * np.exp(rng.normal(0, 0.2, truth.shape))).astype(np.float32)
-    truth[rng.random(truth.shape) < 0.3] = 0
-    prediction[rng.random(truth.shape) < 0.1] = 0
+    gt = rng.uniform(0.2, 12, (6, 480, 640)).astype(np.float32)
+    prediction = (gt * np.exp(rng.normal(0, 0.2, gt.shape))).astype(np.float32)
+    gt[rng.random(gt.shape) < 0.3] = 0
+    prediction[rng.random(gt.shape) < 0.1] = 0
     for number in range(6):
         depth_file(root / "out" / f"{number}_depth.npy", prediction[number])
-        depth_file(root / "gt" / f"{number}.npy", truth[number])
-    return root, prediction, truth
+        depth_file(root / "gt" / f"{number}.npy", gt[number])
+    return root, prediction, gt
 
 
 def means(rows: list[dict[str, float]]) -> dict[str, Any]:
@@ -161,13 +165,13 @@ def means(rows: list[dict[str, float]]) -> dict[str, Any]:
 def test_a_published_protocol_is_what_plain_numpy_makes_of_its_definition(
     random_frames: tuple[Path, np.ndarray, np.ndarray],
 ) -> None:
-    root, prediction, truth = random_frames
-    inside = np.zeros(truth.shape[1:], bool)
+    root, prediction, gt = random_frames
+    inside = np.zeros(gt.shape[1:], bool)
     inside[45:471, 41:601] = True
     clipped = np.clip(prediction, np.float32(1e-3), 10)  # empty predictions too, as BTS does
 
     def expected(depth: np.ndarray) -> dict[str, Any]:
-        pairs = zip(depth, truth, strict=True)
+        pairs = zip(depth, gt, strict=True)
         return means([brute(p, g, inside & (g > 1e-3) & (g < 10)) for p, g in pairs])
 
     assert scored(root, protocol="nyu").mean == expected(clipped)
@@ -176,14 +180,14 @@ def test_a_published_protocol_is_what_plain_numpy_makes_of_its_definition(
     assert skipped.coverage == scored(root, protocol="nyu").coverage < 1
 
 
-def test_crop_bounds_and_mask_can_each_be_given_alone(
+def test_crop_bounds_and_mask_can_each_be_set_alone(
     random_frames: tuple[Path, np.ndarray, np.ndarray], tmp_path: Path
 ) -> None:
-    root, prediction, truth = random_frames
-    everything = np.ones(truth.shape[1:], bool)
+    root, prediction, gt = random_frames
+    everything = np.ones(gt.shape[1:], bool)
     crop = np.zeros_like(everything)
     crop[20:60, 10:110] = True
-    frames = list(zip(prediction, truth, strict=True))
+    frames = list(zip(prediction, gt, strict=True))
     assert scored(root, crop="10,20,100,40").mean == means([brute(p, g, crop) for p, g in frames])
     far = scored(root, min_depth=2.0, max_depth=5.0)
     assert far.mean == means([brute(p, g, (g > 2) & (g < 5)) for p, g in frames])
@@ -206,14 +210,14 @@ def test_the_interval_holds_the_mean_and_is_of_the_seed(
     random_frames: tuple[Path, np.ndarray, np.ndarray],
 ) -> None:
     root = random_frames[0]
-    found = scored(root, resamples=500, seed=1)
-    assert found.interval is not None
-    for key, mean in found.mean.items():
-        assert found.interval.low[key] <= mean <= found.interval.high[key], key
-    assert found.interval == scored(root, resamples=500, seed=1).interval
-    assert found.interval != scored(root, resamples=500, seed=2).interval
+    result = scored(root, resamples=500, seed=1)
+    assert result.interval is not None
+    for key, mean in result.mean.items():
+        assert result.interval.low[key] <= mean <= result.interval.high[key], key
+    assert result.interval == scored(root, resamples=500, seed=1).interval
+    assert result.interval != scored(root, resamples=500, seed=2).interval
     assert scored(root, resamples=0).interval is None
-    assert found.describe_interval().endswith("studentised bootstrap over 6 frames")
+    assert result.describe_interval().endswith("studentised bootstrap over 6 frames")
 
 
 def test_missing_pixels_are_skipped_clamped_or_refused(two: Path) -> None:
@@ -248,9 +252,9 @@ def test_protocols_of_papers_score_empty_predictions_as_the_lower_bound(tmp_path
 def test_an_empty_frame_counts_in_the_development_kit(tmp_path: Path) -> None:
     depth_file(tmp_path / "out" / "a.npy", [[0, 0]])
     depth_file(tmp_path / "gt" / "a.npy", [[2, 4]])
-    found = scored(tmp_path, protocol="kitti-devkit")
-    assert found.mean["mae"] == 4  # against −1 m, as the kit does
-    assert math.isnan(found.mean["log_mae"])
+    result = scored(tmp_path, protocol="kitti-devkit")
+    assert result.mean["mae"] == 4  # against −1 m, as the kit does
+    assert math.isnan(result.mean["log_mae"])
 
 
 def test_few_groups_of_frames_have_no_interval_and_say_so(tmp_path: Path) -> None:
@@ -258,10 +262,10 @@ def test_few_groups_of_frames_have_no_interval_and_say_so(tmp_path: Path) -> Non
         for number in range(4):
             depth_file(tmp_path / "out" / drive / f"{number:04}_depth.npy", [[2 + number]])
             depth_file(tmp_path / "gt" / drive / f"{number:04}.npy", [[2]])
-    found = scored(tmp_path)
-    assert found.interval is None
-    assert "no interval: 2 groups of frames are too few" in found.notes[-1]
-    assert [frame["group"] for frame in found.as_record()["frames"]] == ["a"] * 4 + ["b"] * 4
+    result = scored(tmp_path)
+    assert result.interval is None
+    assert "no interval: 2 groups of frames are too few" in result.notes[-1]
+    assert [frame["group"] for frame in result.as_record()["frames"]] == ["a"] * 4 + ["b"] * 4
     assert scored(tmp_path, grouped=False).interval is not None
 
 
@@ -273,8 +277,8 @@ def test_the_group_of_a_manifest_goes_before_the_name(tmp_path: Path) -> None:
         lines.append(f"{number}.png,gt/{number}.npy,{'ab'[number % 2]}")
         cv2.imwrite(str(tmp_path / f"{number}.png"), np.zeros((1, 1, 3), np.uint8))
     (tmp_path / "list.csv").write_text("\n".join(lines))
-    found = evaluate(EvalRequest(prediction=tmp_path / "out", ground_truth=tmp_path / "list.csv"))
-    assert [frame.pair.group for frame in found.frames] == ["a", "b", "a"]
+    result = evaluate(EvalRequest(prediction=tmp_path / "out", ground_truth=tmp_path / "list.csv"))
+    assert [frame.pair.group for frame in result.frames] == ["a", "b", "a"]
 
 
 def test_a_mask_of_another_size_or_missing_for_a_frame_is_a_fault(two: Path) -> None:
@@ -282,9 +286,9 @@ def test_a_mask_of_another_size_or_missing_for_a_frame_is_a_fault(two: Path) -> 
     with pytest.raises(InputError, match=r"mask .*a\.npy is 3×1 but the ground truth"):
         scored(two, mask=two / "masks")
     depth_file(two / "masks" / "a.npy", [[1, 0]])
-    found = scored(two, mask=two / "masks")
-    assert found.frames[0].pixels == 1
-    assert "has no mask in" in (found.frames[1].error or "")
+    result = scored(two, mask=two / "masks")
+    assert result.frames[0].pixels == 1
+    assert "has no mask in" in (result.frames[1].error or "")
 
 
 def test_integer_files_are_read_by_option_then_by_themselves_then_by_protocol(
@@ -309,22 +313,22 @@ FACTORS = [(1000.0, "1000"), (256.0, "256"), (0.1, "1/10"), (1000 / 256, "3.906"
            (256 / 1000, "1/3.906")]  # fmt: skip
 
 
-@pytest.mark.parametrize(("factor", "said"), FACTORS)
+@pytest.mark.parametrize(("factor", "message"), FACTORS)
 def test_a_round_factor_between_the_two_sides_is_warned_of(
-    tmp_path: Path, factor: float, said: str
+    tmp_path: Path, factor: float, message: str
 ) -> None:
-    truth = np.random.default_rng(0).uniform(1, 4, (6, 8)).astype(np.float32)
-    depth_file(tmp_path / "gt" / "a.npy", truth)
-    depth_file(tmp_path / "out" / "a.npy", truth * np.float32(factor * 1.03))
+    gt = np.random.default_rng(0).uniform(1, 4, (6, 8)).astype(np.float32)
+    depth_file(tmp_path / "gt" / "a.npy", gt)
+    depth_file(tmp_path / "out" / "a.npy", gt * np.float32(factor * 1.03))
     (warning,) = (n for n in scored(tmp_path).notes if n.startswith("warning"))
-    assert f"about {said}: a scale is probably wrong; float files hold metres" in warning
+    assert f"about {message}: a scale is probably wrong; float files hold metres" in warning
 
 
 def test_the_scale_that_would_help_is_named_and_helps(tmp_path: Path) -> None:
-    truth = np.random.default_rng(0).uniform(1, 4, (6, 8)).astype(np.float32)
-    depth_file(tmp_path / "out" / "a.png", truth)
+    gt = np.random.default_rng(0).uniform(1, 4, (6, 8)).astype(np.float32)
+    depth_file(tmp_path / "out" / "a.png", gt)
     (tmp_path / "gt").mkdir()
-    cv2.imwrite(str(tmp_path / "gt" / "a.png"), np.rint(truth * 1000).astype(np.uint16))
+    cv2.imwrite(str(tmp_path / "gt" / "a.png"), np.rint(gt * 1000).astype(np.uint16))
     (warning,) = (n for n in scored(tmp_path).notes if n.startswith("warning"))
     assert warning.endswith("; --gt-scale 1000 (now 256) would remove it")
     (warning,) = (
@@ -338,21 +342,23 @@ def test_the_scale_that_would_help_is_named_and_helps(tmp_path: Path) -> None:
     assert not [n for n in right.notes if n.startswith("warning")]
 
 
-def test_a_usual_error_is_no_factor(two: Path) -> None:
+def test_a_typical_error_is_no_factor(two: Path) -> None:
     assert not [n for n in scored(two).notes if "scale is probably wrong" in n]
 
 
-def test_sparse_input_in_the_truth_is_warned_of_and_can_be_left_out(tmp_path: Path) -> None:
-    truth = np.random.default_rng(0).uniform(1, 4, (10, 10)).astype(np.float32)
-    points = np.zeros_like(truth)
-    points[0, :4] = truth[0, :4]  # the truth itself
-    points[1, :3] = truth[1, :3] + 0.2  # measured anew
-    prediction = np.where(points > 0, points, truth + 1)
-    depth_file(tmp_path / "gt" / "a.npy", truth)
+def test_sparse_input_in_the_ground_truth_causes_a_warning_and_can_be_excluded(
+    tmp_path: Path,
+) -> None:
+    gt = np.random.default_rng(0).uniform(1, 4, (10, 10)).astype(np.float32)
+    points = np.zeros_like(gt)
+    points[0, :4] = gt[0, :4]  # the ground truth itself
+    points[1, :3] = gt[1, :3] + 0.2  # measured anew
+    prediction = np.where(points > 0, points, gt + 1)
+    depth_file(tmp_path / "gt" / "a.npy", gt)
     depth_file(tmp_path / "out" / "a.npy", prediction)
     depth_file(tmp_path / "sparse.npy", points)
-    found = scored(tmp_path, sparse=tmp_path / "sparse.npy")
-    (warning,) = (n for n in found.notes if n.startswith("warning"))
+    result = scored(tmp_path, sparse=tmp_path / "sparse.npy")
+    (warning,) = (n for n in result.notes if n.startswith("warning"))
     assert "4 of the scored pixels (4.00%) have a point of the sparse input" in warning
     assert "--exclude-sparse" in warning
     without = scored(tmp_path, sparse=tmp_path / "sparse.npy", exclude_sparse=True)
@@ -362,10 +368,10 @@ def test_sparse_input_in_the_truth_is_warned_of_and_can_be_left_out(tmp_path: Pa
 
 
 def test_the_same_depth_in_other_codes_is_still_the_sparse_input(tmp_path: Path) -> None:
-    truth = np.random.default_rng(0).uniform(1, 4, (10, 10)).astype(np.float32)
-    depth_file(tmp_path / "gt" / "a.png", truth, scale=256)
-    depth_file(tmp_path / "out" / "a.png", truth, scale=1000)
-    depth_file(tmp_path / "s.png", np.where(np.eye(10) > 0, truth, 0), scale=1000)
+    gt = np.random.default_rng(0).uniform(1, 4, (10, 10)).astype(np.float32)
+    depth_file(tmp_path / "gt" / "a.png", gt, scale=256)
+    depth_file(tmp_path / "out" / "a.png", gt, scale=1000)
+    depth_file(tmp_path / "s.png", np.where(np.eye(10) > 0, gt, 0), scale=1000)
     assert scored(tmp_path, sparse=tmp_path / "s.png").frames[0].leaked == 10
 
 
@@ -373,9 +379,9 @@ def test_the_record_beside_a_prediction_is_enough_to_find_the_leak(two: Path) ->
     sparse = depth_file(two / "s.npy", [[1, 0]])
     record = {"inputs": {"sparse": {"path": str(sparse)}}}
     (two / "out" / "a.json").write_text(json.dumps(record))
-    found = scored(two)
-    assert [(f.has_sparse, f.leaked) for f in found.frames] == [(True, 1), (False, 0)]
-    assert (found.by_distance, found.by_depth) == ((), ())
+    result = scored(two)
+    assert [(f.has_sparse, f.leaked) for f in result.frames] == [(True, 1), (False, 0)]
+    assert (result.by_distance, result.by_depth) == ((), ())
     sampled = {"inputs": {"sparse": {"sampled_from": "gt"}}, "points": {"used": 2}}
     (two / "out" / "a.json").write_text(json.dumps(sampled))
     assert scored(two).frames[0].leaked == 2
@@ -395,31 +401,31 @@ def test_a_sparse_file_that_the_record_names_but_is_spoilt_does_no_harm(two: Pat
 
 def test_the_parts_by_distance_and_by_depth_are_plain_numpy(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
-    truth = rng.uniform(0.5, 30, (40, 50)).astype(np.float32)
-    prediction = (truth * rng.uniform(0.8, 1.2, truth.shape)).astype(np.float32)
+    gt = rng.uniform(0.5, 30, (40, 50)).astype(np.float32)
+    prediction = (gt * rng.uniform(0.8, 1.2, gt.shape)).astype(np.float32)
     prediction[:3] = 0
-    points = np.zeros_like(truth)
-    places = [(5, 5), (30, 44), (39, 0)]
-    for v, u in places:
+    points = np.zeros_like(gt)
+    pixels = [(5, 5), (30, 44), (39, 0)]
+    for v, u in pixels:
         points[v, u] = 2
-    for folder, depth in (("out", prediction), ("gt", truth)):
+    for folder, depth in (("out", prediction), ("gt", gt)):
         depth_file(tmp_path / folder / "a.npy", depth)
         depth_file(tmp_path / folder / "b.npy", depth)
-    found = scored(tmp_path, sparse=depth_file(tmp_path / "s.npy", points))
+    result = scored(tmp_path, sparse=depth_file(tmp_path / "s.npy", points))
     v, u = np.mgrid[:40, :50]
-    distance = np.min([np.hypot(v - y, u - x) for y, x in places], axis=0)
-    for parts, quantity in ((found.by_distance, distance), (found.by_depth, truth)):
-        assert sum(part.known for part in parts) == 2 * truth.size
+    distance = np.min([np.hypot(v - y, u - x) for y, x in pixels], axis=0)
+    for parts, quantity in ((result.by_distance, distance), (result.by_depth, gt)):
+        assert sum(part.known for part in parts) == 2 * gt.size
         for part in parts:
             inside = (quantity >= part.low) & (quantity < part.high)
             assert part.known == 2 * inside.sum()
             assert part.pixels == 2 * (inside & (prediction > 0)).sum()
-            expected = brute(prediction, truth, inside)
+            expected = brute(prediction, gt, inside)
             for key in ("rmse", "mae", "mre"):
                 assert getattr(part, key) == pytest.approx(expected[key], rel=1e-9), part
 
 
-def test_a_smaller_prediction_is_resized_only_where_asked(tmp_path: Path) -> None:
+def test_a_smaller_prediction_is_resized_only_on_request(tmp_path: Path) -> None:
     depth_file(tmp_path / "gt" / "a.npy", [[1, 1, 3, 3], [1, 1, 3, 3]])
     depth_file(tmp_path / "out" / "a.npy", [[1, 3]])
     with pytest.raises(InputError, match="--resize nearest or bilinear"):
@@ -427,19 +433,19 @@ def test_a_smaller_prediction_is_resized_only_where_asked(tmp_path: Path) -> Non
     assert scored(tmp_path, resize="nearest").mean["mae"] == 0
     assert scored(tmp_path, resize="bilinear").mean["mae"] == 0.25
     depth_file(tmp_path / "out" / "a.npy", [[0, 3]])
-    found = scored(tmp_path, resize="bilinear")
-    assert (found.frames[0].pixels, found.mean["mae"]) == (4, 0)
+    result = scored(tmp_path, resize="bilinear")
+    assert (result.frames[0].pixels, result.mean["mae"]) == (4, 0)
 
 
 def test_the_development_kits_figures_come_with_their_own_names_and_fill(two: Path) -> None:
-    found = scored(two, protocol="kitti-devkit")
-    assert list(found.mean) == [
+    result = scored(two, protocol="kitti-devkit")
+    assert list(result.mean) == [
         "mae", "rmse", "inverse_mae", "inverse_rmse", "log_mae", "log_rmse",
         "scale_invariant_log", "abs_relative", "squared_relative",
     ]  # fmt: skip
-    assert found.frames[1].values["mae"] == 3
-    assert found.frames[1].coverage == 0.5
-    assert any("was filled in from its neighbours" in note for note in found.notes)
+    assert result.frames[1].values["mae"] == 3
+    assert result.frames[1].coverage == 0.5
+    assert any("was filled in from its neighbours" in note for note in result.notes)
 
 
 def test_the_development_kit_takes_the_largest_code_for_a_depth(tmp_path: Path) -> None:
@@ -451,26 +457,26 @@ def test_the_development_kit_takes_the_largest_code_for_a_depth(tmp_path: Path) 
     assert scored(tmp_path).frames[0].pixels == 1
 
 
-def test_empty_rows_that_the_kit_does_not_fill_are_told(tmp_path: Path) -> None:
+def test_empty_rows_that_the_kit_does_not_fill_are_reported(tmp_path: Path) -> None:
     depth_file(tmp_path / "out" / "a.npy", [[1], [0], [1]])
     depth_file(tmp_path / "gt" / "a.npy", [[1], [1], [1]])
-    found = scored(tmp_path, protocol="kitti-devkit")
-    assert found.mean["mae"] == pytest.approx(2 / 3)
-    assert math.isnan(found.mean["log_mae"])
-    assert any("empty rows between filled ones" in note for note in found.notes)
-    assert found.as_record()["mean"]["log_mae"] is None
+    result = scored(tmp_path, protocol="kitti-devkit")
+    assert result.mean["mae"] == pytest.approx(2 / 3)
+    assert math.isnan(result.mean["log_mae"])
+    assert any("empty rows between filled ones" in note for note in result.notes)
+    assert result.as_record()["mean"]["log_mae"] is None
 
 
-def test_the_truth_of_a_data_set_is_cut_as_its_layout_says(tmp_path: Path) -> None:
+def test_the_ground_truth_of_a_data_set_is_cropped_by_its_layout(tmp_path: Path) -> None:
     h5py = pytest.importorskip("h5py")
-    truth = np.random.default_rng(0).uniform(1, 4, (480, 640)).astype(np.float32)
+    gt = np.random.default_rng(0).uniform(1, 4, (480, 640)).astype(np.float32)
     (tmp_path / "gt").mkdir()
     with h5py.File(tmp_path / "gt" / "00001.h5", "w") as file:
-        file["rgb"], file["depth"] = np.zeros((3, 480, 640), np.uint8), truth
-    cut = LAYOUT_PROTOCOLS["nyu"].apply(truth)
+        file["rgb"], file["depth"] = np.zeros((3, 480, 640), np.uint8), gt
+    cut = LAYOUT_PROTOCOLS["nyu"].apply(gt)
     depth_file(tmp_path / "out" / "00001_depth.npy", cut)
-    found = scored(tmp_path)
-    assert (found.mean["rmse"], found.frames[0].pixels) == (0, 228 * 304)
+    result = scored(tmp_path)
+    assert (result.mean["rmse"], result.frames[0].pixels) == (0, 228 * 304)
 
 
 def test_nyus_own_file_is_scored_at_its_whole_size_with_eigens_crop(tmp_path: Path) -> None:
@@ -485,11 +491,11 @@ def test_nyus_own_file_is_scored_at_its_whole_size_with_eigens_crop(tmp_path: Pa
     predictions = depths * rng.uniform(0.9, 1.1, depths.shape).astype(np.float32)
     for number, prediction in enumerate(predictions, start=1):
         depth_file(tmp_path / "out" / f"{number:04}_depth.npy", prediction)
-    found = scored(tmp_path, protocol="nyu-eigen", layout_protocol="whole")
+    result = scored(tmp_path, protocol="nyu-eigen", layout_protocol="whole")
     error = (predictions - depths)[:, 45:471, 41:601].astype(np.float64)
     expected = np.sqrt((error**2).mean(axis=(1, 2))).mean()
-    assert found.mean["rmse"] == pytest.approx(expected, rel=1e-6)
-    assert scored(tmp_path, protocol="nyu", layout_protocol="whole").mean == found.mean
+    assert result.mean["rmse"] == pytest.approx(expected, rel=1e-6)
+    assert scored(tmp_path, protocol="nyu", layout_protocol="whole").mean == result.mean
     with pytest.raises(InputError, match=r"no frame could be scored; the first: .*304×228"):
         scored(tmp_path, protocol="nyu-eigen")
 
@@ -499,16 +505,16 @@ def test_a_layout_protocol_without_a_data_set_is_refused(two: Path) -> None:
         scored(two, layout_protocol="whole")
 
 
-def test_predictions_of_kittis_benchmark_crop_are_put_in_their_place(tmp_path: Path) -> None:
+def test_predictions_of_kittis_benchmark_crop_are_aligned_with_the_frame(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
-    truth = rng.uniform(2, 60, (375, 1242)).astype(np.float32)
+    gt = rng.uniform(2, 60, (375, 1242)).astype(np.float32)
     prediction = rng.uniform(2, 60, (352, 1216)).astype(np.float32)
-    depth_file(tmp_path / "gt" / "a.npy", truth)
+    depth_file(tmp_path / "gt" / "a.npy", gt)
     depth_file(tmp_path / "out" / "a.npy", prediction)
     with pytest.raises(InputError, match="--pred-crop kb puts"):
         scored(tmp_path)
     skipped = scored(tmp_path, prediction_crop="kb")
-    error = prediction.astype(np.float64) - truth[375 - 352 :, 13 : 13 + 1216]
+    error = prediction.astype(np.float64) - gt[375 - 352 :, 13 : 13 + 1216]
     assert skipped.mean["rmse"] == pytest.approx(np.sqrt((error**2).mean()), rel=1e-6)
     assert skipped.coverage == pytest.approx(352 * 1216 / (375 * 1242))
     # BTS and AdaBins paste the crop into zeros, clip, and score inside Garg's crop
@@ -516,7 +522,7 @@ def test_predictions_of_kittis_benchmark_crop_are_put_in_their_place(tmp_path: P
     whole[23:, 13:1229] = prediction
     inside = (slice(153, 371), slice(44, 1197))
     clipped = np.clip(whole, 1e-3, 80)[inside].astype(np.float64)
-    expected = np.sqrt(((clipped - truth[inside]) ** 2).mean())
+    expected = np.sqrt(((clipped - gt[inside]) ** 2).mean())
     garg = scored(tmp_path, protocol="garg", prediction_crop="kb")
     assert garg.mean["rmse"] == pytest.approx(expected, rel=1e-6)
     same = scored(tmp_path, prediction_crop="13,23,1216,352")
@@ -533,34 +539,36 @@ REFUSED = [
 ]
 
 
-@pytest.mark.parametrize(("given", "said"), REFUSED)
-def test_an_option_without_sense_is_refused(two: Path, given: dict[str, Any], said: str) -> None:
-    with pytest.raises(UsageError, match=said):
-        scored(two, **given)
+@pytest.mark.parametrize(("options", "message"), REFUSED)
+def test_an_option_without_sense_is_refused(
+    two: Path, options: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(UsageError, match=message):
+        scored(two, **options)
 
 
 def test_the_worst_frames_come_first_in_either_direction(two: Path) -> None:
-    found = scored(two)
-    assert [f.name for f in found.worst("rmse")] == ["ü b", "a"]
-    assert [f.name for f in found.worst("delta3")] == ["a", "ü b"]
+    result = scored(two)
+    assert [f.name for f in result.worst("rmse")] == ["ü b", "a"]
+    assert [f.name for f in result.worst("delta3")] == ["a", "ü b"]
 
 
-def test_progress_is_told_frame_by_frame(two: Path) -> None:
-    told: list[tuple[int, int]] = []
+def test_progress_is_reported_per_frame(two: Path) -> None:
+    progress: list[tuple[int, int]] = []
     request = EvalRequest(prediction=two / "out", ground_truth=two / "gt")
-    evaluate(request, on_frame=lambda done, of: told.append((done, of)))
-    assert told == [(1, 2), (2, 2)]
+    evaluate(request, on_frame=lambda done, of: progress.append((done, of)))
+    assert progress == [(1, 2), (2, 2)]
 
 
 def test_real_frames_of_kitti_score_as_plain_numpy_does(shared_data: Path) -> None:
-    """The scan itself against the accumulated truth: where it hits, it is good but not perfect."""
+    """The scan itself against the accumulated ground truth: small errors, but not zero."""
     folder = shared_data / "kitti_dc"
     request = EvalRequest(
         prediction=folder / "velodyne_raw", ground_truth=folder / "groundtruth", protocol="kitti"
     )
-    found = evaluate(request)
-    assert len(found.scored) == 6
-    for frame in found.frames:
+    result = evaluate(request)
+    assert len(result.scored) == 6
+    for frame in result.frames:
         p, g = (
             cv2.imread(str(folder / part / f"{frame.name}.png"), cv2.IMREAD_UNCHANGED) / 256
             for part in ("velodyne_raw", "groundtruth")
@@ -574,18 +582,18 @@ def sequences(tmp_path: Path) -> Path:
     """Two sequences of two frames, and the intrinsics."""
     rng = np.random.default_rng(0)
     for name in ("a/0", "a/1", "b/0", "b/1"):
-        truth = rng.uniform(2, 9, (20, 30))
-        depth_file(tmp_path / "gt" / f"{name}.npy", truth)
-        depth_file(tmp_path / "out" / f"{name}.npy", truth * rng.uniform(0.9, 1.1, truth.shape))
+        gt = rng.uniform(2, 9, (20, 30))
+        depth_file(tmp_path / "gt" / f"{name}.npy", gt)
+        depth_file(tmp_path / "out" / f"{name}.npy", gt * rng.uniform(0.9, 1.1, gt.shape))
     (tmp_path / "K.txt").write_text("K: 50 0 15 0 50 10 0 0 1\n")
     return tmp_path
 
 
-def test_additional_measures_follow_the_usual_ones(sequences: Path) -> None:
-    usual, more = scored(sequences), scored(sequences, groups=("area", "flicker"))
-    assert list(more.mean)[: len(usual.mean)] == list(usual.mean)
-    assert usual.mean.items() <= more.mean.items()
-    assert more.protocol.scoring() == usual.protocol.scoring()
+def test_additional_measures_follow_the_default_ones(sequences: Path) -> None:
+    default, more = scored(sequences), scored(sequences, groups=("area", "flicker"))
+    assert list(more.mean)[: len(default.mean)] == list(default.mean)
+    assert default.mean.items() <= more.mean.items()
+    assert more.protocol.scoring() == default.protocol.scoring()
     first, second, third, fourth = (frame.values["flicker"] for frame in more.frames)
     assert math.isnan(first)
     assert math.isnan(third)
@@ -596,9 +604,9 @@ def test_additional_measures_follow_the_usual_ones(sequences: Path) -> None:
 def test_measures_of_the_scene_need_intrinsics(sequences: Path) -> None:
     with pytest.raises(InputError, match="--measures cloud needs the intrinsics of frame a/0"):
         scored(sequences, groups=("cloud",))
-    found = scored(sequences, groups=("cloud", "normals"), calib=sequences / "K.txt")
-    assert found.mean["f_score"] > 0
-    assert found.mean["normal_angle"] > 0
+    result = scored(sequences, groups=("cloud", "normals"), calib=sequences / "K.txt")
+    assert result.mean["f_score"] > 0
+    assert result.mean["normal_angle"] > 0
     with pytest.raises(InputError, match="--measures distance needs the sparse depth of frame"):
         scored(sequences, groups=("distance",))
 
@@ -615,20 +623,20 @@ def test_unknown_and_unfitting_measures_are_refused(two: Path) -> None:
 def test_points_sampled_from_the_ground_truth_are_excluded_as_they_were_drawn(
     tmp_path: Path,
 ) -> None:
-    truth = np.random.default_rng(0).uniform(2, 9, (20, 30)).astype(np.float32)
-    points = sample_points(truth, SamplePattern(count=50), seed=7)
+    gt = np.random.default_rng(0).uniform(2, 9, (20, 30)).astype(np.float32)
+    points = sample_points(gt, SamplePattern(count=50), seed=7)
     x, y = np.rint(points.xy).astype(int).T
-    depth = truth + 1
-    depth[y, x] = truth[y, x]  # copies the points
-    depth_file(tmp_path / "gt" / "a.npy", truth)
+    depth = gt + 1
+    depth[y, x] = gt[y, x]  # copies the points
+    depth_file(tmp_path / "gt" / "a.npy", gt)
     depth_file(tmp_path / "out" / "a_depth.npy", depth)
     sampling = {"sampled_from": "gt/a.npy", **asdict(SamplePattern(count=50)), "seed": 7}
     record = {"inputs": {"sparse": sampling}, "points": {"used": 50}}
     (tmp_path / "out" / "a.json").write_text(json.dumps(record))
     assert scored(tmp_path).mean["mae"] == pytest.approx(1 - 50 / 600, rel=1e-5)
-    found = scored(tmp_path, exclude_sparse=True)
-    assert found.frames[0].pixels == 550
-    assert found.mean["mae"] == pytest.approx(1, rel=1e-5)
+    result = scored(tmp_path, exclude_sparse=True)
+    assert result.frames[0].pixels == 550
+    assert result.mean["mae"] == pytest.approx(1, rel=1e-5)
     record["points"]["used"] = 51
     (tmp_path / "out" / "a.json").write_text(json.dumps(record))
     with pytest.raises(InputError, match="it is of another ground truth; give them with --sparse"):

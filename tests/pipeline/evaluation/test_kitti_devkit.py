@@ -29,30 +29,30 @@ def filled_by_loops(depth: np.ndarray) -> np.ndarray:
     height, width = depth.shape
     out = np.where(depth > 0, depth, F(-1))
     for row in out:
-        places = [u for u in range(width) if row[u] >= 0]
-        for a, b in pairwise(places):
+        known = [u for u in range(width) if row[u] >= 0]
+        for a, b in pairwise(known):
             for u in range(a + 1, b):
                 row[u] = min(row[a], row[b])
-        if places:
-            row[: places[0]] = row[places[0]]
-            row[places[-1] + 1 :] = row[places[-1]]
+        if known:
+            row[: known[0]] = row[known[0]]
+            row[known[-1] + 1 :] = row[known[-1]]
     for column in out.T:
-        places = [v for v in range(height) if column[v] >= 0]
-        if places:
-            column[: places[0]] = column[places[0]]
-            column[places[-1] + 1 :] = column[places[-1]]
+        known = [v for v in range(height) if column[v] >= 0]
+        if known:
+            column[: known[0]] = column[known[0]]
+            column[known[-1] + 1 :] = column[known[-1]]
     return out
 
 
-def errors_by_loops(predicted: np.ndarray, truth: np.ndarray) -> dict[str, float]:
+def errors_by_loops(predicted: np.ndarray, gt: np.ndarray) -> dict[str, float]:
     """The nine errors in single precision, added up down each column, column after column."""
     predicted = filled_by_loops(predicted)
     sums = {measure.key: F(0) for measure in DEVKIT_MEASURES}
     log_sum, count = F(0), 0
-    height, width = truth.shape
+    height, width = gt.shape
     for u in range(width):
         for v in range(height):
-            g, p = truth[v, u], predicted[v, u]
+            g, p = gt[v, u], predicted[v, u]
             if g <= 0:
                 continue
             error = abs(g - p)
@@ -70,38 +70,38 @@ def errors_by_loops(predicted: np.ndarray, truth: np.ndarray) -> dict[str, float
             log_sum += log_error
             count += 1
     n = F(count)
-    found = {key: value / n for key, value in sums.items()}
+    errors = {key: value / n for key, value in sums.items()}
     with np.errstate(invalid="ignore"):
-        found["scale_invariant_log"] = np.sqrt(found["log_rmse"] - log_sum * log_sum / (n * n))
+        errors["scale_invariant_log"] = np.sqrt(errors["log_rmse"] - log_sum * log_sum / (n * n))
     for key in ("rmse", "inverse_rmse", "log_rmse"):
-        found[key] = np.sqrt(found[key])
-    return {key: float(value) for key, value in found.items()}
+        errors[key] = np.sqrt(errors[key])
+    return {key: float(value) for key, value in errors.items()}
 
 
 def codes(least: int) -> st.SearchStrategy[np.ndarray]:
-    """Small pictures of KITTI's codes, many of them unknown."""
+    """Small images of KITTI's depth codes, many of them unknown."""
     some = st.one_of(st.just(0), st.integers(0, 3), st.integers(least, 20_000))
     return arrays(np.uint16, (4, 5), elements=some)
 
 
-def metres(picture: np.ndarray) -> np.ndarray:
-    return picture.astype(F) / F(256)
+def metres(stored: np.ndarray) -> np.ndarray:
+    return stored.astype(F) / F(256)
 
 
 @given(codes(1))
-def test_what_is_missing_is_filled_as_by_the_loops_of_the_definition(picture: np.ndarray) -> None:
-    depth = metres(picture)
+def test_what_is_missing_is_filled_as_by_the_loops_of_the_definition(stored: np.ndarray) -> None:
+    depth = metres(stored)
     np.testing.assert_array_equal(fill_background(depth), filled_by_loops(depth))
 
 
 @given(codes(1), codes(1))
 def test_the_errors_are_those_of_the_loops_digit_for_digit(
-    predicted: np.ndarray, truth: np.ndarray
+    predicted: np.ndarray, gt: np.ndarray
 ) -> None:
-    truth[0, 0] = 256
-    found = devkit_errors(metres(predicted), metres(truth))
-    assert found == pytest.approx(
-        errors_by_loops(metres(predicted), metres(truth)), rel=0, abs=0, nan_ok=True
+    gt[0, 0] = 256
+    errors = devkit_errors(metres(predicted), metres(gt))
+    assert errors == pytest.approx(
+        errors_by_loops(metres(predicted), metres(gt)), rel=0, abs=0, nan_ok=True
     )
 
 
@@ -136,11 +136,11 @@ def test_two_pixels_by_hand() -> None:
 
 
 def test_the_figures_are_those_of_the_official_program() -> None:
-    """Printed by evaluate_depth of the kit (g++ -O3) for the sample's scan and its truth."""
+    """Printed by evaluate_depth of the kit (g++ -O3) for the sample's scan and its ground truth."""
     predicted = read_depth(SAMPLES / "street" / "sparse.png").values
-    truth = read_depth(SAMPLES / "street" / "gt.png").values
+    gt = read_depth(SAMPLES / "street" / "gt.png").values
     printed = "5.375677 11.679524 0.025707 0.039534 0.325306 0.521867 0.501333 0.289888 0.218769"
-    errors = devkit_errors(predicted, truth)
+    errors = devkit_errors(predicted, gt)
     assert " ".join(f"{errors[measure.key]:f}" for measure in DEVKIT_MEASURES) == printed
 
 

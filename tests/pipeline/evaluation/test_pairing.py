@@ -51,7 +51,7 @@ def test_a_stem_says_which_frame_it_is_of(stem: str, name: str) -> None:
     assert frame_name(stem) == name
 
 
-def test_the_files_of_a_refinement_find_their_truth_and_pictures_are_left_aside(
+def test_the_files_of_a_refinement_are_paired_with_ground_truth_without_images(
     tmp_path: Path,
 ) -> None:
     out, gt = folders(
@@ -78,7 +78,7 @@ def test_frames_in_folders_of_their_own_are_matched_with_the_folder(tmp_path: Pa
     assert matched(pairs) == {"one/1": "1_depth.png", "two/1": "1_depth.png", "two/2": None}
 
 
-def test_a_truth_without_prediction_stays_in_the_list_and_an_extra_prediction_is_told(
+def test_missing_predictions_are_listed_and_extra_predictions_reported(
     tmp_path: Path,
 ) -> None:
     out, gt = folders(tmp_path, ["a.png", "x.png", "y.png"], ["a.png", "b.png"])
@@ -97,7 +97,7 @@ def test_hidden_files_links_in_circles_and_unreadable_folders_do_no_harm(tmp_pat
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root can read every folder")
-def test_an_unreadable_folder_is_told(tmp_path: Path) -> None:
+def test_an_unreadable_folder_is_reported(tmp_path: Path) -> None:
     out, gt = folders(tmp_path, ["a.png", "closed/b.png"], ["a.png"])
     (out / "closed").chmod(0)
     try:
@@ -173,7 +173,7 @@ def test_the_record_beside_a_prediction_names_its_sparse_depth(tmp_path: Path) -
     assert not frames[0].sparse_named
 
 
-def test_the_truth_can_be_a_data_set_of_a_known_layout(tmp_path: Path) -> None:
+def test_the_ground_truth_can_be_a_data_set_of_a_known_layout(tmp_path: Path) -> None:
     out, _ = folders(tmp_path, ["a_depth.png", "b_depth.png"], [])
     data = tmp_path / "data"
     for name in ("rgb/a.png", "rgb/b.png", "sparse/a.png", "sparse/b.png", "gt/a.png"):

@@ -70,15 +70,17 @@ REFUSED: list[tuple[str, dict[str, Any], str]] = [
 ]
 
 
-@pytest.mark.parametrize(("name", "changes", "said"), REFUSED)
-def test_a_setting_without_sense_is_refused(name: str, changes: dict[str, Any], said: str) -> None:
+@pytest.mark.parametrize(("name", "changes", "message"), REFUSED)
+def test_a_setting_without_sense_is_refused(
+    name: str, changes: dict[str, Any], message: str
+) -> None:
     with pytest.raises(UsageError) as error:
         choose_protocol(name, **changes)
-    assert said in str(error.value)
+    assert message in str(error.value)
     assert "\n" not in str(error.value)
 
 
-def test_what_is_not_given_stays_as_published() -> None:
+def test_unset_fields_stay_as_published() -> None:
     changed = choose_protocol("eigen", max_depth=50.0, crop=None, clip=None)
     assert changed == replace(PROTOCOLS["eigen"], max_depth=50.0)
 

@@ -48,8 +48,8 @@ def test_each_end_is_the_farther_one_of_bootstrap_t_and_students_t() -> None:
     student = stats.t.interval(0.95, 8, loc=values.mean(), scale=stats.sem(values))
     expected = (min(bootstrap[0], student[0]), max(bootstrap[1], student[1]))
     assert expected == pytest.approx((student[0], bootstrap[1]))  # the errors are skewed
-    found = interval(values[:, None], 3000, seed=7)
-    assert np.ravel(found) == pytest.approx(expected, rel=1e-9)
+    bounds = interval(values[:, None], 3000, seed=7)
+    assert np.ravel(bounds) == pytest.approx(expected, rel=1e-9)
 
 
 def test_the_standard_error_of_a_pooled_measure_is_the_delta_methods() -> None:
@@ -102,15 +102,15 @@ def test_the_exact_p_value_is_the_fraction_of_all_swaps_that_differ_as_much(
     values = np.array(changes, float)
     swaps = [abs(np.dot(signs, values)) for signs in product((1, -1), repeat=len(values))]
     expected = np.mean([swap >= abs(values.sum()) - 1e-9 for swap in swaps])
-    (found,), exact = sign_flip_p_values(difference_of(values), len(values), 1000, seed=0)
+    (p_value,), exact = sign_flip_p_values(difference_of(values), len(values), 1000, seed=0)
     assert exact
-    assert found == expected
+    assert p_value == expected
 
 
 def test_the_exact_p_value_is_that_of_scipys_paired_permutations() -> None:
     first = np.random.default_rng(0).lognormal(0, 1, 10)
     second = first * np.random.default_rng(1).lognormal(0.2, 0.3, 10)
-    (found,), _ = sign_flip_p_values(difference_of(second - first), 10, 2000, seed=0)
+    (p_value,), _ = sign_flip_p_values(difference_of(second - first), 10, 2000, seed=0)
     expected = stats.permutation_test(
         (second, first),
         lambda a, b, axis: np.mean(a - b, axis=axis),
@@ -118,7 +118,7 @@ def test_the_exact_p_value_is_that_of_scipys_paired_permutations() -> None:
         vectorized=True,
         n_resamples=np.inf,
     )
-    assert found == pytest.approx(expected.pvalue, rel=1e-12)
+    assert p_value == pytest.approx(expected.pvalue, rel=1e-12)
 
 
 def test_the_sampled_p_value_is_near_the_exact_one_and_never_zero() -> None:
@@ -136,8 +136,8 @@ def test_a_measure_without_a_number_has_no_interval_and_no_p_value() -> None:
     low, high = interval(rows, 50)
     assert np.isfinite(low[0])
     assert np.isnan([low[1], high[1]]).all()
-    found, _ = sign_flip_p_values(lambda flips: flips @ rows + rows[0], 3, 50, seed=0)
-    assert np.isnan(found[1])
+    p_values, _ = sign_flip_p_values(lambda flips: flips @ rows + rows[0], 3, 50, seed=0)
+    assert np.isnan(p_values[1])
 
 
 def test_holm_multiplies_the_smallest_most_and_keeps_the_order() -> None:

@@ -21,7 +21,7 @@ def test_stacked_disparities_are_scored_as_monodepth2_does(tmp_path: Path) -> No
     disparity = (1 / (np.where(gt > 0, gt, 5) * rng.lognormal(0, 0.2, gt.shape))).astype("f4") / 30
     np.save(tmp_path / "disps.npy", disparity)
     np.savez_compressed(tmp_path / "gt_depths.npz", data=gt)
-    found = evaluate(
+    result = evaluate(
         EvalRequest(
             prediction=tmp_path / "disps.npy",
             ground_truth=tmp_path / "gt_depths.npz",
@@ -44,14 +44,14 @@ def test_stacked_disparities_are_scored_as_monodepth2_does(tmp_path: Path) -> No
         p = np.clip(p * ratios[-1], 1e-3, 80)
         errors.append((np.mean(np.abs(t - p) / t), np.sqrt(np.mean((t - p) ** 2))))
     abs_rel, rmse = np.mean(errors, axis=0)
-    assert [frame.name for frame in found.frames] == [f"{n:04}" for n in range(6)]
-    assert found.mean["mre"] == pytest.approx(abs_rel, rel=1e-6)
-    assert found.mean["rmse"] == pytest.approx(rmse, rel=1e-6)
+    assert [frame.name for frame in result.frames] == [f"{n:04}" for n in range(6)]
+    assert result.mean["mre"] == pytest.approx(abs_rel, rel=1e-6)
+    assert result.mean["rmse"] == pytest.approx(rmse, rel=1e-6)
     med = np.median(ratios)
-    spread = np.std(np.array(ratios) / med)
+    deviation = np.std(np.array(ratios) / med)
     assert any(
-        note.startswith(f"scale-by median: factor {med:.4g}") and f"{spread:.3f}" in note
-        for note in found.notes
+        note.startswith(f"scale-by median: factor {med:.4g}") and f"{deviation:.3f}" in note
+        for note in result.notes
     )
 
 

@@ -18,7 +18,7 @@ from pnpdepth_cli.pipeline.evaluation.uncertainty import (
 
 
 def frame(rng: np.random.Generator, factor: float) -> FrameUncertainty:
-    """A frame whose standard deviation is wrong by a factor."""
+    """A frame whose standard deviation is off by a factor."""
     gt = rng.uniform(2, 6, (200, 200)).astype(np.float32)
     sigma = rng.uniform(0.02, 0.2, gt.shape).astype(np.float32)
     depth = (gt + sigma * rng.normal(size=gt.shape)).astype(np.float32)
@@ -75,8 +75,8 @@ def test_the_sigma_beside_a_prediction_is_evaluated(tmp_path: Path) -> None:
     write_depth(tmp_path / "out" / "a_depth.npy", (gt + rng.normal(0, 0.1, gt.shape)).astype("f4"))
     write_depth(tmp_path / "out" / "a_sigma.exr", np.full(gt.shape, 0.1, np.float32))
     request = EvalRequest(prediction=tmp_path / "out", ground_truth=tmp_path / "gt")
-    found = evaluate(request)
-    assert found.uncertainty is not None
-    assert found.uncertainty.within_1_sigma == pytest.approx(0.683, abs=0.03)
-    assert found.as_record()["uncertainty"]["frames"] == 1
-    assert not any("have no ground truth" in note for note in found.notes)
+    result = evaluate(request)
+    assert result.uncertainty is not None
+    assert result.uncertainty.within_1_sigma == pytest.approx(0.683, abs=0.03)
+    assert result.as_record()["uncertainty"]["frames"] == 1
+    assert not any("have no ground truth" in note for note in result.notes)

@@ -22,6 +22,7 @@ from pnpdepth_cli.sensors.cloud import depth_edges
 from tests.colmap_models import HEIGHT, WIDTH, write_text_model
 from tests.pipeline.batches import Heard, batch, pairs_on_disk
 from tests.pipeline.frames import FrameOnDisk, frame_on_disk, run
+from tests.pipeline.scan_frames import FOCAL_PX, scan_on_disk
 
 
 @pytest.fixture
@@ -110,6 +111,15 @@ def test_a_colmap_model_gives_camera_and_pose(tmp_path: Path) -> None:
     left, right = camera.unproject(corners, np.ones(2))[:, 0]
     assert x.min() == pytest.approx(left * z[x.argmin()] - 0.1, abs=0.3)
     assert x.max() == pytest.approx(right * z[x.argmax()] - 0.1, abs=0.3)
+
+
+def test_a_scan_gives_the_camera_of_its_calibration(tmp_path: Path) -> None:
+    frame, scan = frame_on_disk(tmp_path), scan_on_disk(tmp_path)
+    changes = {"image": scan.image, "sparse": scan.scan, "scan": ScanOptions(calib=scan.calib)}
+    record = run(frame, ply=True, **changes).record
+    assert record["camera"]["intrinsics"] == [[FOCAL_PX, 0, 31.5], [0, FOCAL_PX, 23.5], [0, 0, 1]]
+    assert record["cloud"]["frame"] == "camera"
+    assert record["cloud"]["points"] == len(points_of(tmp_path / "out" / "img.ply")) > 100
 
 
 def test_a_field_of_view_beside_a_known_camera_is_refused(tmp_path: Path) -> None:

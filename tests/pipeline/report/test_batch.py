@@ -34,24 +34,24 @@ def report(tmp_path: Path) -> Path:
     return tmp_path / "report"
 
 
-def test_every_frame_is_on_the_page_with_its_pictures(root: Path, report: Path) -> None:
+def test_every_frame_is_on_the_page_with_its_images(root: Path, report: Path) -> None:
     batch(root, html=report)
     frames = frames_of(report)
     assert tuple(frames) == NAMES
-    pictures = pictures_of(report)
+    images = pictures_of(report)
     for frame in frames.values():
-        assert {n.partition("_")[2][:-4] for n in pictures if n.startswith(frame["key"])} == _VIEWS
+        assert {n.partition("_")[2][:-4] for n in images if n.startswith(frame["key"])} == _VIEWS
         assert {*frame["views"], "thumb", "map_thumb"} == _VIEWS
-    assert len(pictures) == len(NAMES) * len(_VIEWS)
-    assert all(each[:3] == b"\xff\xd8\xff" for each in pictures.values())
+    assert len(images) == len(NAMES) * len(_VIEWS)
+    assert all(each[:3] == b"\xff\xd8\xff" for each in images.values())
 
 
-def test_gains_are_those_of_depth_against_truth(root: Path, report: Path) -> None:
+def test_gains_are_those_of_depth_against_ground_truth(root: Path, report: Path) -> None:
     batch(root, html=report)
     batch(root, output=root / "plain", refine={"iterations": 0})
-    truth = read_depth(root / "gt/b.png").values
+    gt = read_depth(root / "gt/b.png").values
     before, after = (
-        np.abs(read_depth(root / out / "b_depth.png").values - truth).mean()
+        np.abs(read_depth(root / out / "b_depth.png").values - gt).mean()
         for out in ("plain", "out")
     )
     values = frames_of(report)["b"]["values"]
@@ -62,9 +62,9 @@ def test_gains_are_those_of_depth_against_truth(root: Path, report: Path) -> Non
     assert 0 < values["improved"] < 1
 
 
-def test_the_pictures_are_the_panels_of_the_files_on_disk(root: Path, report: Path) -> None:
+def test_the_images_are_the_panels_of_the_files_on_disk(root: Path, report: Path) -> None:
     batch(root, html=report)
-    frame, pictures = frames_of(report)["c"], pictures_of(report)
+    frame, images = frames_of(report)["c"], pictures_of(report)
     preview, improvement = (
         open_page(root / f"out/c_{kind}.png") for kind in ("preview", "improvement")
     )
@@ -74,7 +74,7 @@ def test_the_pictures_are_the_panels_of_the_files_on_disk(root: Path, report: Pa
         ("image", preview.panels()["Image"]),
         ("map", improvement.panels()["Change of error"]),
     ):
-        shown = np.asarray(Image.open(io.BytesIO(pictures[f"{frame['key']}_{view}.jpg"])))
+        shown = np.asarray(Image.open(io.BytesIO(images[f"{frame['key']}_{view}.jpg"])))
         scaled = cv2.resize(panel, shown.shape[1::-1], interpolation=cv2.INTER_AREA)
         assert np.abs(shown.astype(int) - scaled).mean() < 6, view
     assert frame["scale_m"] == [preview.content["low_m"], preview.content["high_m"]]
@@ -83,9 +83,9 @@ def test_the_pictures_are_the_panels_of_the_files_on_disk(root: Path, report: Pa
 
 def test_frames_of_an_earlier_run_without_a_report_are_in_it(root: Path, report: Path) -> None:
     batch(root, limit=2)
-    heard = Heard()
-    batch(root, heard, html=report)
-    assert heard.names == ["c", "d"]
+    watcher = Heard()
+    batch(root, watcher, html=report)
+    assert watcher.names == ["c", "d"]
     resumed = everything(report)
     shutil.rmtree(report)
     shutil.rmtree(root / "out")
@@ -102,7 +102,7 @@ def test_a_second_run_writes_the_same_page_and_draws_nothing(root: Path, report:
     assert drawn == {p: p.stat().st_mtime_ns for p in (report / "pictures").iterdir()}
 
 
-def test_a_frame_that_is_redone_has_new_pictures_and_the_old_ones_go(
+def test_a_frame_that_is_redone_has_new_images_and_the_old_ones_go(
     root: Path, report: Path
 ) -> None:
     batch(root, html=report)
@@ -115,7 +115,7 @@ def test_a_frame_that_is_redone_has_new_pictures_and_the_old_ones_go(
     assert len(pictures_of(report)) == len(NAMES) * len(_VIEWS)
 
 
-def test_a_picture_that_is_missing_is_drawn_again(root: Path, report: Path) -> None:
+def test_a_image_that_is_missing_is_drawn_again(root: Path, report: Path) -> None:
     batch(root, html=report)
     before = everything(report)
     (report / "pictures" / f"{frames_of(report)['b']['key']}_map.jpg").unlink()
@@ -124,7 +124,7 @@ def test_a_picture_that_is_missing_is_drawn_again(root: Path, report: Path) -> N
 
 
 def test_a_failed_frame_is_listed_with_its_reason(root: Path, report: Path) -> None:
-    (root / "rgb/b.png").write_bytes(b"no picture")
+    (root / "rgb/b.png").write_bytes(b"no image")
     batch(root, html=report)
     data = page_data(report)
     assert [frame["name"] for frame in data["frames"]] == ["a", "c", "d"]
@@ -138,7 +138,7 @@ def test_a_failed_frame_is_listed_with_its_reason(root: Path, report: Path) -> N
 
 def test_a_batch_of_nothing_but_failures_has_a_report_too(root: Path, report: Path) -> None:
     for name in NAMES:
-        (root / f"rgb/{name}.png").write_bytes(b"no picture")
+        (root / f"rgb/{name}.png").write_bytes(b"no image")
     batch(root, html=report)
     assert frames_of(report) == {}
     assert len(page_data(report)["without"]) == 4
@@ -151,7 +151,7 @@ def test_a_batch_that_is_stopped_has_a_report_of_what_is_done(root: Path, report
     assert page_data(report)["tiles"][0]["remark"] == "3 pending"
 
 
-def test_the_page_says_how_frames_were_refined_and_that_each_may_have_its_own_way(
+def test_the_page_states_the_refinement_and_that_it_may_differ_per_frame(
     root: Path, report: Path, tmp_path: Path
 ) -> None:
     batch(root, html=report, refine={"propagate": "gp"})
@@ -168,7 +168,7 @@ def titles(report: Path) -> list[str]:
     return [column["title"] for column in page_data(report)["columns"]]
 
 
-def test_without_truth_gains_are_those_at_held_out_points(root: Path, report: Path) -> None:
+def test_without_ground_truth_gains_are_those_at_held_out_points(root: Path, report: Path) -> None:
     shutil.rmtree(root / "gt")
     batch(root, html=report, refine={"holdout": 0.3})
     frame = frames_of(report)["a"]
@@ -180,7 +180,9 @@ def test_without_truth_gains_are_those_at_held_out_points(root: Path, report: Pa
     ]  # fmt: skip
 
 
-def test_with_neither_truth_nor_held_out_points_there_is_no_gain(root: Path, report: Path) -> None:
+def test_with_neither_ground_truth_nor_held_out_points_there_is_no_gain(
+    root: Path, report: Path
+) -> None:
     shutil.rmtree(root / "gt")
     batch(root, html=report)
     assert not [title for title in titles(report) if "gain" in title]
@@ -190,7 +192,7 @@ def test_with_neither_truth_nor_held_out_points_there_is_no_gain(root: Path, rep
     assert any("proves nothing" in note for note in frames_of(report)["a"]["notes"])
 
 
-def test_where_only_some_frames_have_truth_the_others_have_no_figures(
+def test_frames_without_ground_truth_have_no_figures_beside_those_with_it(
     root: Path, report: Path
 ) -> None:
     for name in "bcd":
@@ -213,7 +215,7 @@ def test_the_shard_that_ends_last_reports_all_frames(root: Path, report: Path) -
     assert len(pictures_of(report)) == len(NAMES) * len(_VIEWS)
 
 
-def test_strange_names_of_frames_reach_the_page_as_they_are(root: Path, report: Path) -> None:
+def test_unusual_frame_names_reach_the_page_unchanged(root: Path, report: Path) -> None:
     names = ["<b>&'\"", "two\nlines", "ü \u2028"]
     for name in names:
         add_frame(root, name)
@@ -228,22 +230,22 @@ def test_the_report_may_lie_in_the_results_and_the_results_among_the_frames(root
         assert tuple(frames_of(report)) == NAMES
 
 
-def refused(root: Path, place: Path, **changes: Any) -> str:
+def refused(root: Path, output: Path, **changes: Any) -> str:
     request = BatchRequest(
-        source=root, output=root / "out", html=place, refine=refinement(root, **changes)
+        source=root, output=root / "out", html=output, refine=refinement(root, **changes)
     )
     with pytest.raises(OutputError) as first:
-        batch(root, html=place, refine=changes)
+        batch(root, html=output, refine=changes)
     with pytest.raises(OutputError) as planned:
         plan_batch(request, lambda text: None)
     assert str(first.value) == str(planned.value)
     return str(first.value)
 
 
-def test_places_among_the_inputs_or_around_them_are_refused(root: Path, tmp_path: Path) -> None:
+def test_outputs_inside_the_inputs_or_around_them_are_refused(root: Path, tmp_path: Path) -> None:
     assert "which is read" in refused(root, root / "rgb" / "report", overwrite=True)
-    for place in (root, root / "out", tmp_path):
-        assert "holds the results" in refused(root, place, overwrite=True)
+    for output in (root, root / "out", tmp_path):
+        assert "holds the results" in refused(root, output, overwrite=True)
     assert not (root / "out").exists()
 
 
@@ -254,7 +256,7 @@ def test_a_list_has_its_files_elsewhere_which_are_safe_as_well(root: Path, tmp_p
         batch(root, source=listed, output=tmp_path / "out", html=root, refine={"overwrite": True})
 
 
-def test_another_batchs_report_is_replaced_only_if_asked(root: Path, report: Path) -> None:
+def test_another_batchs_report_is_replaced_only_on_request(root: Path, report: Path) -> None:
     batch(root, html=report)
     before = everything(report)
     with pytest.raises(OutputError, match="--overwrite replaces the report"):
@@ -264,7 +266,7 @@ def test_another_batchs_report_is_replaced_only_if_asked(root: Path, report: Pat
     assert page_data(report)["title"].endswith("other")
 
 
-def test_a_preview_that_went_missing_costs_one_frame_its_pictures(root: Path, report: Path) -> None:
+def test_a_preview_that_went_missing_costs_one_frame_its_images(root: Path, report: Path) -> None:
     batch(root)
     (root / "out/b_preview.png").unlink()
     batch(root, limit=1, html=report)
@@ -291,9 +293,9 @@ def test_a_disk_that_is_full_while_drawing_ends_the_run_and_the_next_one_goes_on
         batch(root, html=report)
     assert not (report / "index.html").exists()
     (report / "pictures" / ".0123456789ab.jpg").write_bytes(b"half")
-    heard = Heard()
-    batch(root, heard, html=report)
-    assert heard.said[1].startswith("removed 1 half-written files")
+    watcher = Heard()
+    batch(root, watcher, html=report)
+    assert watcher.said[1].startswith("removed 1 half-written files")
     resumed = everything(report)
     shutil.rmtree(report)
     batch(root, html=report)

@@ -1,4 +1,4 @@
-"""Reports of evaluations: what is on the page, and what the pictures show."""
+"""Reports of evaluations: the content of the page and its images."""
 
 from __future__ import annotations
 
@@ -27,34 +27,34 @@ NAMES = ("a", "b <i>", "c\nd")
 def root(tmp_path: Path) -> Path:
     rng = np.random.default_rng(0)
     for number, name in enumerate(NAMES):
-        truth = rng.uniform(1, 9, (60, 80)).astype(np.float32)
-        for folder, depth in (("out", truth + 0.1 * (number + 1)), ("gt", truth)):
+        gt = rng.uniform(1, 9, (60, 80)).astype(np.float32)
+        for folder, depth in (("out", gt + 0.1 * (number + 1)), ("gt", gt)):
             (tmp_path / folder).mkdir(exist_ok=True)
             write_depth(tmp_path / folder / f"{name}.npy", depth.astype(np.float32))
     return tmp_path
 
 
-def reported(root: Path, **given: Any) -> Evaluation:
-    found = evaluate(EvalRequest(prediction=root / "out", ground_truth=root / "gt", **given))
-    write_eval_report(root / "report", found)
-    return found
+def reported(root: Path, **options: Any) -> Evaluation:
+    result = evaluate(EvalRequest(prediction=root / "out", ground_truth=root / "gt", **options))
+    write_eval_report(root / "report", result)
+    return result
 
 
-def picture(root: Path, name: str, view: str) -> np.ndarray:
+def panel(root: Path, name: str, view: str) -> np.ndarray:
     key = frames_of(root / "report")[name]["key"]
     data = pictures_of(root / "report")[f"{key}_{view}.jpg"]
     return np.asarray(Image.open(io.BytesIO(data))).astype(int)
 
 
 def test_the_page_has_the_means_the_protocol_and_every_frame(root: Path) -> None:
-    found = reported(root, protocol="kitti")
+    result = reported(root, protocol="kitti")
     data = page_data(root / "report")
-    assert dict(data["facts"])["Protocol"] == found.protocol.describe()
+    assert dict(data["facts"])["Protocol"] == result.protocol.describe()
     assert data["tables"][0]["rows"][0][:2] == ["RMSE [mm] ↓", "200.0"]
     assert data["columns"][data["sort_by"]]["key"] == "rmse"
     frames = frames_of(root / "report")
     assert tuple(frames) == NAMES
-    for row in found.frames:
+    for row in result.frames:
         assert frames[row.name]["values"] == row.values | {"coverage": 1.0}
     (rmse,) = (column for column in data["columns"] if column["key"] == "rmse")
     assert (rmse["unit"], rmse["factor"]) == ("mm", 1000)
@@ -72,13 +72,13 @@ def test_unscored_frames_are_listed_with_their_reason(root: Path) -> None:
     assert list(frames_of(root / "report")) == ["c\nd"]
 
 
-def test_the_slider_has_prediction_and_truth_in_the_same_colours(root: Path) -> None:
-    truth = np.full((60, 80), 2, np.float32)
-    truth[:, 40:] = 6
-    write_depth(root / "gt/a.npy", truth)
-    write_depth(root / "out/a.npy", truth[:, ::-1].copy())
+def test_the_slider_has_prediction_and_ground_truth_in_the_same_colours(root: Path) -> None:
+    gt = np.full((60, 80), 2, np.float32)
+    gt[:, 40:] = 6
+    write_depth(root / "gt/a.npy", gt)
+    write_depth(root / "out/a.npy", gt[:, ::-1].copy())
     reported(root)
-    first, second = picture(root, "a", "first"), picture(root, "a", "second")
+    first, second = panel(root, "a", "first"), panel(root, "a", "second")
     assert np.abs(first - second[:, ::-1]).mean() < 3
     low, high = frames_of(root / "report")["a"]["scale_m"]
     assert (low, high) == (2, 6)
@@ -87,14 +87,14 @@ def test_the_slider_has_prediction_and_truth_in_the_same_colours(root: Path) -> 
 def test_the_map_is_orange_where_the_prediction_is_too_far_and_dark_where_none_counts(
     root: Path,
 ) -> None:
-    truth = np.full((60, 80), 4, np.float32)
-    truth[:20] = 0
+    gt = np.full((60, 80), 4, np.float32)
+    gt[:20] = 0
     prediction = np.full((60, 80), 4, np.float32)
     prediction[:, 40:] = 5
-    write_depth(root / "gt/a.npy", truth)
+    write_depth(root / "gt/a.npy", gt)
     write_depth(root / "out/a.npy", prediction)
     reported(root)
-    shown = picture(root, "a", "map")
+    shown = panel(root, "a", "map")
     height, width = shown.shape[:2]
     unknown = shown[: height // 4].mean((0, 1))
     right = shown[height // 2 :, : width // 3].mean((0, 1))
@@ -102,9 +102,9 @@ def test_the_map_is_orange_where_the_prediction_is_too_far_and_dark_where_none_c
     assert unknown.max() < 80
     assert right.min() > 180
     assert far == pytest.approx([220, 105, 0], abs=6)
-    said = frames_of(root / "report")["a"]["map"]
-    assert said["ends"] == ["too near by 1 m or more", "too far by 1 m or more"]
-    assert said["unknown"] == "not scored"
+    values = frames_of(root / "report")["a"]["map"]
+    assert values["ends"] == ["too near by 1 m or more", "too far by 1 m or more"]
+    assert values["unknown"] == "not scored"
 
 
 def test_the_image_is_shown_where_the_predictions_record_names_one(root: Path) -> None:
@@ -117,7 +117,7 @@ def test_the_image_is_shown_where_the_predictions_record_names_one(root: Path) -
     reported(root)
     views = [frame["views"] for frame in frames_of(root / "report").values()]
     assert ["image" in each for each in views] == [True, False, False]
-    assert picture(root, "a", "image").mean((0, 1)) == pytest.approx([255, 0, 0], abs=3)
+    assert panel(root, "a", "image").mean((0, 1)) == pytest.approx([255, 0, 0], abs=3)
 
 
 def test_with_sparse_points_the_errors_by_distance_and_depth_are_on_the_page(root: Path) -> None:
@@ -137,14 +137,14 @@ def test_a_standard_deviation_has_a_calibration_plot_and_a_sparsification_curve(
 ) -> None:
     rng = np.random.default_rng(1)
     for name in NAMES:
-        truth = np.load(root / "gt" / f"{name}.npy")
-        sigma = rng.uniform(0.05, 0.5, truth.shape).astype(np.float32)
+        gt = np.load(root / "gt" / f"{name}.npy")
+        sigma = rng.uniform(0.05, 0.5, gt.shape).astype(np.float32)
         (root / "out" / f"{name}.npy").unlink()
-        depth = truth + sigma * rng.normal(size=truth.shape)
+        depth = gt + sigma * rng.normal(size=gt.shape)
         write_depth(root / "out" / f"{name}_depth.npy", np.maximum(depth, 0.1).astype(np.float32))
         np.save(root / "out" / f"{name}_sigma.npy", sigma)
-    found = reported(root)
-    assert found.uncertainty is not None
+    result = reported(root)
+    assert result.uncertainty is not None
     calibration, sparsification = page_data(root / "report")["charts"]
     observed = calibration["lines"][0]["points"]
     assert observed == [[x, pytest.approx(x, abs=0.02)] for x, _ in observed]
@@ -152,7 +152,7 @@ def test_a_standard_deviation_has_a_calibration_plot_and_a_sparsification_curve(
     assert by_sigma[0] == by_error[0] == 1
     assert 1 > by_sigma[0.5] > by_error[0.5] > 0
     area = np.trapezoid([by_sigma[x] - by_error[x] for x in by_sigma], list(by_sigma))
-    assert area == pytest.approx(found.uncertainty.ause)
+    assert area == pytest.approx(result.uncertainty.ause)
 
 
 def test_an_evaluation_without_a_standard_deviation_has_no_charts(root: Path) -> None:
@@ -168,14 +168,14 @@ def test_what_the_development_kit_fills_in_is_shown_filled(root: Path) -> None:
     reported(root, protocol="kitti-devkit")
     assert page_data(root / "report")["labels"]["first"] == "Prediction (filled in)"
     assert frames_of(root / "report")["a"]["map"]["unknown"] is None
-    shown = picture(root, "a", "first")
+    shown = panel(root, "a", "first")
     assert np.abs(shown - shown[0, 0]).max() < 6
 
 
-def test_a_file_that_goes_after_scoring_costs_one_frame_its_pictures(root: Path) -> None:
-    found = evaluate(EvalRequest(prediction=root / "out", ground_truth=root / "gt"))
+def test_a_file_that_goes_after_scoring_costs_one_frame_its_images(root: Path) -> None:
+    result = evaluate(EvalRequest(prediction=root / "out", ground_truth=root / "gt"))
     (root / "out/a.npy").unlink()
-    write_eval_report(root / "report", found)
+    write_eval_report(root / "report", result)
     frames = frames_of(root / "report")
     assert frames["a"]["key"] is None
     assert "a.npy" in frames["a"]["notes"][-1]

@@ -1,4 +1,4 @@
-"""Small ONNX networks on disk, made without an exporter."""
+"""Small ONNX networks on disk, written without an exporter."""
 
 from __future__ import annotations
 
@@ -27,11 +27,9 @@ def write_network(
         values = rng.normal(size=size) / np.sqrt(np.prod(size[1:]))
         return numpy_helper.from_array(values.astype(np.float32), name)
 
-    picture = "nchw" if channels_last else "rgb"
+    image = "nchw" if channels_last else "rgb"
     body = [
-        helper.make_node(
-            "Conv", [picture, "w1"], ["a"], "enc/conv.1", pads=[1] * 4, strides=[2, 2]
-        ),
+        helper.make_node("Conv", [image, "w1"], ["a"], "enc/conv.1", pads=[1] * 4, strides=[2, 2]),
         helper.make_node("Relu", ["a"], ["b"], "enc/relu.1"),
         helper.make_node("Conv", ["b", "w2"], ["c"], "enc/conv.2", pads=[1] * 4, strides=[2, 2]),
         helper.make_node("Relu", ["c"], ["d"]),
@@ -56,7 +54,7 @@ def write_network(
         [helper.make_tensor_value_info(name, TensorProto.FLOAT, None) for name in outputs],
         constants,
     )
-    made = helper.make_model(graph, opset_imports=[helper.make_opsetid("", opset)])
-    made.ir_version = 8
-    save(made, str(path))
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", opset)])
+    model.ir_version = 8
+    save(model, str(path))
     return path

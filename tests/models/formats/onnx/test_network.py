@@ -29,7 +29,7 @@ from pnpdepth_cli.points import SparsePoints
 from tests.models.formats.onnx.onnx_files import write_network
 
 
-def picture(*shape: int) -> torch.Tensor:
+def image(*shape: int) -> torch.Tensor:
     return torch.rand(shape, generator=torch.Generator().manual_seed(0))
 
 
@@ -56,7 +56,7 @@ def test_a_cut_at_any_node_gives_the_network_bit_for_bit(
     shape = (1, 32, 48, 3) if channels_last else (1, 3, 32, 48)
     path = write_network(tmp_path / "net.onnx", shape=shape, channels_last=channels_last)
     module = load_network(str(path), None).module
-    x = picture(*shape)
+    x = image(*shape)
     with torch.no_grad():
         whole = module(x)
         for name, _ in module.named_children():
@@ -70,19 +70,19 @@ def test_fixed_and_free_input_sizes_agree_with_onnxruntime(
 ) -> None:
     network = load_network(str(write_network(tmp_path / "net.onnx", shape=shape)), None)
     assert network.definition.verify is not None
-    said = network.definition.verify(network.module, (picture(1, 3, 32, 48),))
-    assert "agrees with onnxruntime" in said
+    note = network.definition.verify(network.module, (image(1, 3, 32, 48),))
+    assert "agrees with onnxruntime" in note
 
 
-def test_a_wrong_reading_is_refused_with_the_first_node_that_differs(
+def test_an_incorrect_conversion_is_refused_with_the_first_node_that_differs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     right = OPERATORS["Resize"]
-    monkeypatch.setitem(OPERATORS, "Resize", lambda node, given: right(node, given).flip(3))
+    monkeypatch.setitem(OPERATORS, "Resize", lambda node, options: right(node, options).flip(3))
     network = load_network(str(write_network(tmp_path / "net.onnx")), None)
     assert network.definition.verify is not None
     with pytest.raises(ModelError, match=r"first node that differs is 'dec/up' \(OnnxNode\(Resize"):
-        network.definition.verify(network.module, (picture(1, 3, 32, 48),))
+        network.definition.verify(network.module, (image(1, 3, 32, 48),))
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
@@ -91,17 +91,17 @@ def test_an_inverse_depth_of_either_sign_is_aligned_and_refined(
 ) -> None:
     network = load_network(str(write_network(tmp_path / "net.onnx", sign=sign)), None)
     with torch.no_grad():
-        raw = network.module(picture(1, 3, 32, 48))
-    places = torch.randperm(32 * 48, generator=torch.Generator().manual_seed(1))[:80]
-    near = raw.abs().flatten()[places]
+        raw = network.module(image(1, 3, 32, 48))
+    chosen = torch.randperm(32 * 48, generator=torch.Generator().manual_seed(1))[:80]
+    near = raw.abs().flatten()[chosen]
     true = 1 / (near - 0.9 * near.min())
     points = SparsePoints(
-        xy=torch.stack([places % 48, places // 48], dim=1).float(), depth=true, size=(32, 48)
+        xy=torch.stack([chosen % 48, chosen // 48], dim=1).float(), depth=true, size=(32, 48)
     )
     depth_of = AlignedDepth(network, points, "auto")
     with Split(network.module, network.definition.layers[0]) as split:
         result = refine(
-            split, (picture(1, 3, 32, 48),), points, RefineSettings(iterations=3),
+            split, (image(1, 3, 32, 48),), points, RefineSettings(iterations=3),
             depth_of=depth_of,
         )  # fmt: skip
     assert depth_of.alignment is not None
@@ -115,20 +115,20 @@ def test_fastdepth_reproduces_its_published_prediction_and_is_refined(shared_dat
     nyu = shared_data / "nyu"
     rgb = torch.from_numpy(np.load(nyu / "rgb.npy").transpose(2, 0, 1)[None]).float()
     published = torch.from_numpy(np.load(nyu / "pred.npy"))
-    truth = torch.from_numpy(np.load(nyu / "depth.npy")).float().reshape(224, 224)
+    gt = torch.from_numpy(np.load(nyu / "depth.npy")).float().reshape(224, 224)
     with torch.no_grad():
         assert float((network.module(rgb) - published).abs().mean()) < 1e-5
     assert network.definition.verify is not None
     network.definition.verify(network.module, (rgb,))
-    places = torch.randperm(224 * 224, generator=torch.Generator().manual_seed(0))[:200]
+    chosen = torch.randperm(224 * 224, generator=torch.Generator().manual_seed(0))[:200]
     points = SparsePoints(
-        xy=torch.stack([places % 224, places // 224], dim=1).float(),
-        depth=truth.flatten()[places], size=(224, 224),
+        xy=torch.stack([chosen % 224, chosen // 224], dim=1).float(),
+        depth=gt.flatten()[chosen], size=(224, 224),
     )  # fmt: skip
     settings = RefineSettings(iterations=5, lr="3%", update="adam")
     with Split(network.module, network.definition.layers[0]) as split:
         result = refine(split, (rgb,), points, settings, depth_of=network.depth_of)
-    before, after = (float((d[0, 0] - truth).abs().mean()) for d in (result.before, result.after))
+    before, after = (float((d[0, 0] - gt).abs().mean()) for d in (result.before, result.after))
     assert after < 0.8 * before
 
 
@@ -154,20 +154,20 @@ def test_an_opset_from_the_future_is_refused(tmp_path: Path) -> None:
 
 def test_several_outputs_are_listed_and_one_can_be_named(tmp_path: Path) -> None:
     path = write_network(tmp_path / "net.onnx", outputs=("depth", "g"))
-    said = refused(path)
-    assert "2 outputs" in said
-    assert "depth" in said
-    assert f"{path}:depth" in said
+    message = refused(path)
+    assert "2 outputs" in message
+    assert "depth" in message
+    assert f"{path}:depth" in message
     assert "no output 'x'" in refused(path, f"{path}:x")
     assert load_network(f"{path}:g", None).module.output_names == ("g",)
 
 
 @pytest.mark.parametrize("shape", [(1, 4, 32, 48), (2, 3, 32, 48), (1, 3, 32)])
-def test_what_takes_no_single_rgb_picture_is_refused(
+def test_a_network_without_a_single_rgb_input_is_refused(
     tmp_path: Path, shape: tuple[int, ...]
 ) -> None:
-    said = refused(write_network(tmp_path / "net.onnx", shape=shape))
-    assert "×".join(map(str, shape)) in said
+    message = refused(write_network(tmp_path / "net.onnx", shape=shape))
+    assert "×".join(map(str, shape)) in message
 
 
 def test_a_layer_without_gradient_is_named(tmp_path: Path) -> None:
@@ -216,7 +216,7 @@ def test_arithmetic_on_shapes_is_no_layer_and_leaves_the_cut_exact(tmp_path: Pat
     names = [name for name, _ in network.module.named_children()]
     assert not any(name.startswith("shape/") for name in names)
     for height, width in ((32, 48), (64, 32)):
-        x = picture(1, 3, height, width)
+        x = image(1, 3, height, width)
         with torch.no_grad():
             whole = network.module(x)
             assert whole.shape[-2:] == (2 * height, 2 * width)
@@ -226,7 +226,7 @@ def test_arithmetic_on_shapes_is_no_layer_and_leaves_the_cut_exact(tmp_path: Pat
                     assert torch.equal(split.rear(z), whole), name
                     assert torch.equal(split.rear(z), whole), name
     assert network.definition.verify is not None
-    network.definition.verify(network.module, (picture(1, 3, 32, 48),))
+    network.definition.verify(network.module, (image(1, 3, 32, 48),))
 
 
 # ------------------------------------------------------------------ half precision, quantised
@@ -242,7 +242,7 @@ def test_a_network_in_half_precision_is_run_though_its_nodes_are_not_in_order(
     half = convert_float_to_float16(whole, keep_io_types=keep_io_types)
     onnx.save(half, tmp_path / "half.onnx")
     network = load_network(str(tmp_path / "half.onnx"), None)
-    x = picture(1, 3, 32, 48)
+    x = image(1, 3, 32, 48)
     assert "agrees with onnxruntime" in network.verified((x,))[0]
     expected = load_network(str(tmp_path / "net.onnx"), None).module(x)
     assert torch.allclose(network.module(x), expected, atol=1e-2)
@@ -275,7 +275,7 @@ def test_a_node_may_have_the_name_of_an_attribute_of_modules(tmp_path: Path) -> 
     assert "training_" in dict(network.module.named_modules())
     network.module.train()
     with Split(network.module.eval(), "training_") as split:
-        x = picture(1, 3, 32, 48)
+        x = image(1, 3, 32, 48)
         assert torch.equal(split.rear(split.front(x)), network.module(x))
 
 
@@ -283,7 +283,7 @@ def test_an_operator_that_the_output_does_not_need_is_not_looked_at(tmp_path: Pa
     node = helper.make_node("RandomUniformLike", ["depth"], ["noise"])
     path = write_network(tmp_path / "net.onnx", nodes=(node,))
     network = load_network(str(path), None)
-    assert "agrees with onnxruntime" in network.verified((picture(1, 3, 32, 48),))[0]
+    assert "agrees with onnxruntime" in network.verified((image(1, 3, 32, 48),))[0]
 
 
 def test_a_value_that_nothing_gives_and_a_circle_are_refused(tmp_path: Path) -> None:
@@ -333,7 +333,7 @@ BOMBS = {
 
 
 @pytest.mark.parametrize("kind", BOMBS)
-def test_constants_far_larger_than_the_file_are_refused_before_they_are_made(
+def test_constants_far_larger_than_the_file_are_refused_before_allocation(
     kind: str, tmp_path: Path
 ) -> None:
     tail = [
@@ -377,7 +377,7 @@ def test_functions_are_written_out_but_neither_recursive_nor_exponential_ones(
     tmp_path: Path,
 ) -> None:
     chain = with_functions(tmp_path / "a.onnx", lambda n: [f"f{n + 1}"] if n < 3 else [], 4)
-    x = picture(1, 3, 32, 48)
+    x = image(1, 3, 32, 48)
     plain = load_network(str(write_network(tmp_path / "net.onnx")), None)
     assert torch.equal(load_network(str(chain), None).module(x), plain.module(x))
     ring = with_functions(tmp_path / "b.onnx", lambda n: [f"f{1 - n}"], 2)

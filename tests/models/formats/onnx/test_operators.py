@@ -27,38 +27,38 @@ def normal(*shape: int) -> np.ndarray:
 
 
 def model_of(
-    op: str, given: list[np.ndarray | None], opset: int, outputs: int, **attributes: Any
+    op: str, inputs: list[np.ndarray | None], opset: int, outputs: int, **attributes: Any
 ) -> onnx.ModelProto:
     """One node whose first input is the graph's and whose others are constants."""
-    names = [f"in{n}" if value is not None else "" for n, value in enumerate(given)]
+    names = [f"in{n}" if value is not None else "" for n, value in enumerate(inputs)]
     node = helper.make_node(op, names, [f"out{n}" for n in range(outputs)], **attributes)
     kinds = {np.dtype(F32): TensorProto.FLOAT, np.dtype(I64): TensorProto.INT64,
              np.dtype(bool): TensorProto.BOOL}  # fmt: skip
-    assert given[0] is not None
+    assert inputs[0] is not None
     graph = helper.make_graph(
         [node],
         "g",
-        [helper.make_tensor_value_info("in0", kinds[given[0].dtype], given[0].shape)],
+        [helper.make_tensor_value_info("in0", kinds[inputs[0].dtype], inputs[0].shape)],
         [onnx.ValueInfoProto(name=f"out{n}") for n in range(outputs)],
-        [numpy_helper.from_array(v, f"in{n}") for n, v in enumerate(given) if n and v is not None],
+        [numpy_helper.from_array(v, f"in{n}") for n, v in enumerate(inputs) if n and v is not None],
     )
-    made = helper.make_model(graph, opset_imports=[helper.make_opsetid("", opset)])
-    made.ir_version = 10
-    return made
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", opset)])
+    model.ir_version = 10
+    return model
 
 
 def both(
-    op: str, given: list[np.ndarray | None], opset: int, outputs: int = 1, **attributes: Any
+    op: str, inputs: list[np.ndarray | None], opset: int, outputs: int = 1, **attributes: Any
 ) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    model = model_of(op, given, opset, outputs, **attributes)
+    model = model_of(op, inputs, opset, outputs, **attributes)
     session = ort.InferenceSession(model.SerializeToString(), providers=["CPUExecutionProvider"])
-    true = session.run(None, {"in0": given[0]})
-    ours = OnnxGraph(model, Path("x.onnx"))(torch.from_numpy(given[0]))
+    true = session.run(None, {"in0": inputs[0]})
+    ours = OnnxGraph(model, Path("x.onnx"))(torch.from_numpy(inputs[0]))
     return [t.numpy() for t in (ours.values() if isinstance(ours, dict) else [ours])], true
 
 
-def check(op: str, given: list[np.ndarray | None], opset: int = 17, **more: Any) -> None:
-    ours, true = both(op, given, opset, **more)
+def check(op: str, inputs: list[np.ndarray | None], opset: int = 17, **more: Any) -> None:
+    ours, true = both(op, inputs, opset, **more)
     for one, other in zip(ours, true, strict=True):
         assert one.shape == other.shape
         assert one.dtype == other.dtype
@@ -170,7 +170,7 @@ PADS = [
 
 @pytest.mark.parametrize("pads", PADS, ids=str)
 @pytest.mark.parametrize("stride", [1, 2])
-def test_convolutions_with_every_way_to_pad(pads: dict[str, Any], stride: int) -> None:
+def test_convolutions_with_every_kind_of_padding(pads: dict[str, Any], stride: int) -> None:
     weight, bias = normal(6, 4, 3, 3), normal(6)
     check("Conv", [X, weight, bias], strides=[stride, stride], **pads)
     check("Conv", [X, normal(4, 1, 3, 3)], group=4, strides=[stride, stride], **pads)

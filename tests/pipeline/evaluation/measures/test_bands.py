@@ -21,17 +21,19 @@ PIXELS = [
 
 
 def test_errors_by_area_are_weighted_by_the_squared_depth() -> None:
-    found = area_errors(FRAME)
+    errors = area_errors(FRAME)
     area = sum(g * g for *_, g in PIXELS)
-    assert found["area_mae"] == pytest.approx(sum(g * g * abs(p - g) for *_, p, g in PIXELS) / area)
-    assert found["area_mre"] == pytest.approx(sum(g * abs(p - g) for *_, p, g in PIXELS) / area)
+    assert errors["area_mae"] == pytest.approx(
+        sum(g * g * abs(p - g) for *_, p, g in PIXELS) / area
+    )
+    assert errors["area_mre"] == pytest.approx(sum(g * abs(p - g) for *_, p, g in PIXELS) / area)
 
 
 def test_bands_of_range_hold_their_lower_end() -> None:
-    found = area_errors(FRAME)
+    errors = area_errors(FRAME)
     near = [abs(p - g) for *_, p, g in PIXELS if 5 <= g < 10]
-    assert found["mae_5_10"] == pytest.approx(np.mean(near))
-    assert math.isnan(found["mae_40_80"])
+    assert errors["mae_5_10"] == pytest.approx(np.mean(near))
+    assert math.isnan(errors["mae_40_80"])
 
 
 def test_bands_of_distance_are_of_the_nearest_point() -> None:
@@ -41,24 +43,24 @@ def test_bands_of_distance_are_of_the_nearest_point() -> None:
     for y, x, p, g in PIXELS:
         apart = np.hypot(*(points - (y, x)).T).min()
         errors[max(low for low in errors if low <= apart)].append(abs(p - g))
-    found = distance_errors(FRAME)
+    measured = distance_errors(FRAME)
     for low, listed in errors.items():
-        value = found[f"mae_from_{low}_px"]
+        value = measured[f"mae_from_{low}_px"]
         assert value == pytest.approx(np.mean(listed)) if listed else math.isnan(value)
 
 
 def test_flicker_is_the_change_of_the_error_and_of_the_scale() -> None:
     before = random_frame(1)
-    found = flicker(replace(FRAME, previous=before))
+    errors = flicker(replace(FRAME, previous=before))
     changes = [
         abs((p - g) - (float(before.depth[y, x]) - float(before.gt[y, x])))
         for y, x, p, g in PIXELS
         if before.depth[y, x] > 0 and before.gt[y, x] > 0
     ]
-    assert found["flicker"] == pytest.approx(np.mean(changes))
+    assert errors["flicker"] == pytest.approx(np.mean(changes))
     scales = [
         np.median(f.depth[f.both].astype(float) / f.gt[f.both].astype(float))
         for f in (before, FRAME)
     ]
-    assert found["scale_flicker"] == pytest.approx(abs(np.log(scales[1] / scales[0])))
+    assert errors["scale_flicker"] == pytest.approx(abs(np.log(scales[1] / scales[0])))
     assert all(math.isnan(value) for value in flicker(FRAME).values())

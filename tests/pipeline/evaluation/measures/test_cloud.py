@@ -21,14 +21,14 @@ def test_chamfer_and_f_score_are_those_of_all_pairs() -> None:
     apart = cdist(*clouds)
     accuracy, completeness = apart.min(axis=1), apart.min(axis=0)
     precision, recall = ((d < 0.1).mean() for d in (accuracy, completeness))
-    found = cloud_errors(frame)
-    assert found["chamfer"] == pytest.approx((accuracy.mean() + completeness.mean()) / 2)
-    assert found["f_score"] == pytest.approx(2 * precision * recall / (precision + recall))
+    errors = cloud_errors(frame)
+    assert errors["chamfer"] == pytest.approx((accuracy.mean() + completeness.mean()) / 2)
+    assert errors["f_score"] == pytest.approx(2 * precision * recall / (precision + recall))
 
 
 def test_the_ground_truth_itself_is_perfect_and_nothing_is_none() -> None:
     gt = random_frame(1).gt
-    found = cloud_errors(MeasuredFrame(depth=gt, gt=gt, intrinsics=K))
-    assert (found["chamfer"], found["f_score"]) == (0, 1)
+    errors = cloud_errors(MeasuredFrame(depth=gt, gt=gt, intrinsics=K))
+    assert (errors["chamfer"], errors["f_score"]) == (0, 1)
     none = cloud_errors(MeasuredFrame(depth=np.zeros_like(gt), gt=gt, intrinsics=K))
     assert np.isnan(list(none.values())).all()

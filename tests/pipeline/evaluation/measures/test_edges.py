@@ -18,8 +18,8 @@ def step(column: int) -> np.ndarray:
 
 
 def errors(depth: np.ndarray, gt: np.ndarray) -> tuple[float, float]:
-    found = boundary_errors(MeasuredFrame(depth=depth, gt=gt))
-    return found["dbe_accuracy"], found["dbe_completeness"]
+    measured = boundary_errors(MeasuredFrame(depth=depth, gt=gt))
+    return measured["dbe_accuracy"], measured["dbe_completeness"]
 
 
 @pytest.mark.parametrize("shift", [0, 1, 4, 9])
@@ -44,13 +44,13 @@ def test_errors_are_ibims_formulas_over_all_pairs_of_edge_pixels() -> None:
     rng = np.random.default_rng(0)
     noise = (cv2.GaussianBlur(rng.uniform(size=(50, 70)), (0, 0), 3) for _ in range(2))
     gt, depth = (np.where(n > 0.5, 4, 2).astype(np.float32) for n in noise)
-    found = errors(depth, gt)
+    measured = errors(depth, gt)
     own, true = (np.argwhere(edges_of(each)) for each in (depth, gt))
     apart = cdist(own, true)
     to_gt, to_own = apart.min(axis=1), apart.min(axis=0)
     near = to_gt[to_gt < 10]
     both = np.minimum(to_gt, 10).sum() + np.minimum(to_own, 10).sum()
-    assert found == pytest.approx((near.mean(), both / (len(own) + len(true))), rel=1e-5)
+    assert measured == pytest.approx((near.mean(), both / (len(own) + len(true))), rel=1e-5)
 
 
 def test_holes_make_no_edges_and_sparse_ground_truth_has_none() -> None:

@@ -27,15 +27,15 @@ def test_normals_of_a_plane_are_the_planes() -> None:
 
 
 @pytest.mark.parametrize("degrees", [5, 20, 40])
-def test_a_tilted_plane_is_wrong_by_its_tilt(degrees: float) -> None:
-    found = errors(plane(tilted(degrees), 5), plane(tilted(0), 5))
-    assert found["normal_angle"] == pytest.approx(degrees, abs=1e-3)
-    assert found["plane_angle"] == pytest.approx(degrees, abs=1e-3)
-    assert found["planarity"] == pytest.approx(0, abs=1e-5)
-    assert (found["normal_11"], found["normal_30"]) == (degrees < 11.25, degrees < 30)
+def test_the_error_of_a_tilted_plane_is_its_tilt(degrees: float) -> None:
+    measured = errors(plane(tilted(degrees), 5), plane(tilted(0), 5))
+    assert measured["normal_angle"] == pytest.approx(degrees, abs=1e-3)
+    assert measured["plane_angle"] == pytest.approx(degrees, abs=1e-3)
+    assert measured["planarity"] == pytest.approx(0, abs=1e-5)
+    assert (measured["normal_11"], measured["normal_30"]) == (degrees < 11.25, degrees < 30)
 
 
-def test_planarity_is_the_spread_about_the_plane_of_least_squares() -> None:
+def test_planarity_is_the_deviation_from_the_least_squares_plane() -> None:
     gt = plane(tilted(0), 5)
     noisy = (gt + np.random.default_rng(0).normal(0, 0.05, gt.shape)).astype(np.float32)
     points = MeasuredFrame(depth=noisy, gt=gt, intrinsics=K).points(noisy)

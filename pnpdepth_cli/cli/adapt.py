@@ -1,0 +1,65 @@
+"""`pnpdepth adapt`."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import click
+
+from pnpdepth_cli.cli import options
+from pnpdepth_cli.cli.printable import printable
+from pnpdepth_cli.pipeline.adaptation.request import AdaptRequest
+from pnpdepth_cli.pipeline.refinement.request import parse_sample
+
+
+@click.command(short_help="Adapt a network to the sparse points of a folder.")
+@click.argument("source", type=options.FILE, metavar="FOLDER|LIST")
+@click.option(
+    "-o", "--output", type=options.FILE, required=True, help="File NAME.safetensors to write."
+)
+@options.sample
+@options.options_of_groups(AdaptRequest)
+@options.model
+@options.checkpoint
+@options.device
+@options.seed
+@options.depth_scale
+@options.scan
+@options.overwrite
+@options.as_json
+def adapt(source: Path, output: Path, sample: str | None, as_json: bool, **given: Any) -> None:
+    """Adapt the weights of a network to the frames of FOLDER, without ground truth.
+
+    \b
+    pnpdepth adapt drive_0001/ -o adapted.safetensors
+    pnpdepth batch drive_0001/ -o out/ --checkpoint adapted.safetensors
+
+    Some points of a frame are hidden from the network's input, and the weights learn to predict
+    them. The network must take sparse depth. Every tenth frame is for validation: the weights with
+    the smallest loss at its hidden points are written, with a model card beside them.
+    """
+    from pnpdepth_cli.cli.progress import progress_bar
+    from pnpdepth_cli.pipeline.adaptation.adapt import Progress
+    from pnpdepth_cli.pipeline.adaptation.adapt import adapt as adapt_network
+
+    own = options.taken(AdaptRequest, given)
+    refine = options.request_of(given, sample=parse_sample(sample))
+    request = AdaptRequest(source=source, output=output, refine=refine, **own)
+    with progress_bar("adapt", "update") as show:
+        progress = Progress(
+            say=lambda text: click.echo(printable(text), err=True),
+            step=lambda done, of, text: show(done, of, text),
+        )
+        adapted = adapt_network(request, progress)
+    if as_json:
+        click.echo(json.dumps(asdict(adapted), indent=2))
+        return
+    before, after = adapted.losses[0], adapted.losses[adapted.kept]
+    click.echo(
+        f"loss at hidden points of the frames for validation ({adapted.validation_frames}):"
+        f" {before:.5f} → {after:.5f} ({adapted.change:+.1%}), after {adapted.kept} updates"
+    )
+    click.echo(printable(f"wrote {request.output} and {request.card}"), err=True)

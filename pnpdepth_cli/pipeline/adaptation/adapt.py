@@ -1,0 +1,239 @@
+"""`pnpdepth adapt`: a network's weights learn from the points of a folder, without ground truth.
+
+As in `--target masked` (`core.refine`), points are hidden from the network's input and asked for;
+here the weights keep what they learn, over all frames. Every tenth frame is for validation: the
+weights with the smallest loss at its hidden points are written, the first among them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from pnpdepth_cli.choices import LOSSES, UPDATES
+from pnpdepth_cli.core.losses import Loss
+from pnpdepth_cli.core.masks import Masks
+from pnpdepth_cli.core.refinement import RefineSettings
+from pnpdepth_cli.core.split import InputSplit
+from pnpdepth_cli.core.step_sizes import SCHEDULES, step_size
+from pnpdepth_cli.core.update_rules import Update
+from pnpdepth_cli.core.weights import MovingWeights
+from pnpdepth_cli.core.weights_refinement import FrameOfPoints
+from pnpdepth_cli.errors import DivergedError, InputError, NoPointsError
+from pnpdepth_cli.frames.prepare import PreparedFrame, prepare
+from pnpdepth_cli.frames.refine import opened_frame
+from pnpdepth_cli.io.layouts import list_frames
+from pnpdepth_cli.models.network import Network, load_network
+from pnpdepth_cli.pipeline.adaptation.request import AdaptRequest
+from pnpdepth_cli.pipeline.adaptation.weights_file import Adapted, write_adapted
+from pnpdepth_cli.pipeline.batch.frames import Task, task_of
+from pnpdepth_cli.pipeline.batch.request import BatchRequest
+from pnpdepth_cli.pipeline.refinement.inputs import read_inputs
+from pnpdepth_cli.pipeline.refinement.request import HoldOut, MethodOptions
+from pnpdepth_cli.pipeline.refinement.resolve import (
+    is_dense,
+    resolve_definition,
+    resolve_settings,
+)
+
+VALIDATED = 10
+"""Every so-manieth frame is for validation; of fewer frames, the last."""
+MOST_VALIDATED = 16
+STEPS_A_VISIT = 4
+"""Updates on a frame before the next is taken."""
+CHECKS = 5
+"""How often the validation frames are looked at, besides before the first update."""
+_IN_MEMORY = 64
+"""Frames that are kept in memory."""
+
+OnStep = Callable[[int, int, str], None]
+"""Called with (updates made, of, text)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Progress:
+    """Receives the progress of an adaptation."""
+
+    say: Callable[[str], None]
+    """Receives notes, one line each."""
+    step: OnStep
+    """Called after the updates of each visit of a frame."""
+
+
+def adapt(request: AdaptRequest, progress: Progress) -> Adapted:
+    """Writes the adapted weights and their card; returns what was learnt.
+
+    Raises:
+        InputError: There are fewer than two frames, or a file cannot be used.
+        UsageError: The network takes no sparse depth.
+        DivergedError: The loss is not finite.
+        OutputError: A file cannot be written.
+    """
+    tasks = _tasks(request)
+    choice, seed = request.refine.network, request.refine.hold_out.seed
+    network = load_network(choice.model, choice.checkpoint, choice.device)
+    first = read_inputs(tasks[0].request)
+    network = resolve_definition(network, first.frame(), choice)
+    options = MethodOptions(target="masked", iterations=request.steps, lr=str(request.lr))
+    settings = resolve_settings(
+        network.definition, options, HoldOut(seed=seed), dense=is_dense(first.points)
+    )
+    for note in (*first.notes, *network.notes):
+        progress.say(note)
+    adaptation = _Adaptation(network, settings, tasks)
+    progress.say(
+        f"frames to learn from: {len(adaptation.training)}; for validation:"
+        f" {len(adaptation.validation)}"
+    )
+    with network.cut_at_points() as split:
+        losses = adaptation.run(split, progress)
+    adapted = Adapted(
+        network=network.definition.name,
+        checkpoint=None if choice.checkpoint is None else str(choice.checkpoint),
+        source=str(request.source),
+        output=str(request.output),
+        training_frames=len(adaptation.training),
+        validation_frames=len(adaptation.validation),
+        steps=request.steps,
+        kept=adaptation.kept,
+        lr=request.lr,
+        seed=seed,
+        loss=settings.loss,
+        hidden=settings.mask.fraction,
+        losses=losses,
+    )
+    write_adapted(request, adapted, network.module, adaptation.best.values())
+    return adapted
+
+
+def _tasks(request: AdaptRequest) -> list[Task]:
+    layout, listing = list_frames(request.source, request.layout)
+    frames = listing.frames[: request.limit]
+    if len(frames) < 2:
+        raise InputError(
+            f"{request.source} ({layout}) has {len(frames)} frame; an adaptation needs 2 or more"
+        )
+    batch = BatchRequest(
+        source=request.source,
+        output=request.output,
+        refine=request.refine,
+        protocol=request.protocol,
+    )
+    return [task_of(batch, frame) for frame in frames]
+
+
+class _Adaptation:
+    """The state of an adaptation: its frames, the weights, and the best of them.
+
+    Args:
+        network: The network.
+        settings: Of the masked updates; their iterations are those of all frames together.
+        tasks: The frames.
+    """
+
+    def __init__(self, network: Network, settings: RefineSettings, tasks: Sequence[Task]) -> None:
+        every = list(range(len(tasks)))
+        validation = every[VALIDATED - 1 :: VALIDATED] or every[-1:]
+        chosen = np.linspace(0, len(validation) - 1, min(MOST_VALIDATED, len(validation)))
+        self.validation = [validation[round(place)] for place in chosen]
+        self.training = [index for index in every if index not in set(validation)]
+        self._network, self._settings = network, settings
+        self._prepared = lru_cache(_IN_MEMORY)(lambda index: _prepared(network, tasks[index]))
+        self._generator = torch.Generator().manual_seed(settings.mask.seed)
+        self._weights = MovingWeights(network.module, "weights")
+        self._rules: list[Update] = []
+        self._alphas: list[float] = []
+        self.best, self.kept = self._weights, 0
+
+    def run(self, split: InputSplit, progress: Progress) -> dict[int, float]:
+        """Makes all updates. Returns the validation loss by the number of updates."""
+        of, made = self._settings.iterations, 0
+        losses = {0: self._validated(split)}
+        best = self._weights.theta
+        for index in self._visits():
+            visit = min(STEPS_A_VISIT, of - made)
+            loss = self._visited(split, index, made, visit)
+            checked = (made + visit) * CHECKS // of > made * CHECKS // of
+            made += visit
+            progress.step(made, of, f"loss {loss:.4f}")
+            if checked:
+                losses[made] = self._validated(split)
+                if losses[made] < losses[self.kept]:
+                    best, self.kept = list(self._weights.theta), made
+        self._weights.theta = list(best)
+        return losses
+
+    def _visits(self) -> Iterator[int]:
+        """The frames to learn from, shuffled anew when all were visited."""
+        left = -(-self._settings.iterations // STEPS_A_VISIT)
+        while left > 0:
+            order = torch.randperm(len(self.training), generator=self._generator).tolist()
+            yield from (self.training[place] for place in order[:left])
+            left -= len(order)
+
+    def _visited(self, split: InputSplit, index: int, made: int, steps: int) -> float:
+        """Updates the weights on a frame. Returns the mean loss."""
+        total = 0.0
+        with self._frame(split, index) as frame:
+            masks = Masks(frame.inliers, self._settings.mask, self._generator)
+            for step in range(made, made + steps):
+                hidden = masks.next()
+                with torch.enable_grad(), self._weights.in_place(requires_grad=True) as theta:
+                    loss = self._loss(frame, hidden)
+                    loss.backward()  # type: ignore[no-untyped-call]
+                if not bool(loss.isfinite()):
+                    raise DivergedError(
+                        f"the loss is not finite after {step} updates; try a smaller --lr"
+                    )
+                self._update([value.grad for value in theta], step)
+                total += float(loss.detach())
+        return total / steps
+
+    def _update(self, gradients: Sequence[Tensor | None], step: int) -> None:
+        if not self._rules:
+            self._weights.keep([gradient is not None for gradient in gradients])
+            self._rules = [UPDATES[self._settings.update]() for _ in self._weights.theta]
+            lr = self._settings.lr
+            self._alphas = [step_size(lr, each) for each in self._weights.parameters()]
+        factor = SCHEDULES[self._settings.schedule](step / self._settings.iterations)
+        known = [gradient for gradient in gradients if gradient is not None]
+        moving = zip(self._weights.theta, self._alphas, self._rules, known, strict=True)
+        self._weights.theta = [
+            value - factor * alpha * rule(gradient) for value, alpha, rule, gradient in moving
+        ]
+
+    def _validated(self, split: InputSplit) -> float:
+        """The mean loss at hidden points of the validation frames, the same each time."""
+        losses = []
+        for index in self.validation:
+            generator = torch.Generator().manual_seed(self._settings.mask.seed)
+            with self._frame(split, index) as frame, torch.no_grad(), self._weights.in_place():
+                hidden = Masks(frame.inliers, self._settings.mask, generator).next()
+                losses.append(float(self._loss(frame, hidden)))
+        return float(np.mean(losses))
+
+    def _loss(self, frame: FrameOfPoints, hidden: Tensor) -> Tensor:
+        output = frame.predict_in_steps(frame.inliers.select(~hidden))
+        asked = frame.inliers.select(hidden)
+        loss: Loss = LOSSES[self._settings.loss]
+        return loss(asked.sample(frame.depth_of(output)), asked.depth)
+
+    @contextmanager
+    def _frame(self, split: InputSplit, index: int) -> Iterator[FrameOfPoints]:
+        prepared = self._prepared(index)
+        reader = prepared.depth_reader(self._settings)
+        with opened_frame(split, prepared, reader, self._settings.mask.scale) as frame:
+            yield frame
+
+
+def _prepared(network: Network, task: Task) -> PreparedFrame:
+    frame = prepare(network, read_inputs(task.request).frame())
+    if len(frame.points) < 2:
+        raise NoPointsError(f"{task.name}: {len(frame.points)} points; hiding some needs 2")
+    return frame

@@ -1,0 +1,39 @@
+"""A synthetic scene, sparse points of it, and the error of its completion."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from pnpdepth_cli.points import SparsePoints
+
+SIZE = (48, 64)
+
+
+def scene_depth(left: int = 10) -> Tensor:
+    """Depth (H, W) in metres: a floor, a wall, and a box from column `left` on."""
+    y, x = torch.meshgrid(*(torch.arange(float(n)) for n in SIZE), indexing="ij")
+    depth = torch.minimum(60 / (y - 10).clamp_min(1), 4 + 0.02 * x)
+    depth[20:40, left : left + 20] = 1.4
+    return depth
+
+
+def scene() -> tuple[Tensor, Tensor, Tensor]:
+    """`scene_depth`, its image (3, H, W), and a prediction (H, W) with a drifting scale."""
+    depth = scene_depth()
+    y, x = torch.meshgrid(*(torch.arange(float(n)) for n in SIZE), indexing="ij")
+    rgb = torch.stack([0.3 + 0.4 * (depth < 1.5), 0.5 + 0.2 * y / 48, 0.4 + 0 * x])
+    return depth, rgb, depth * (0.7 + 0.5 * x / 64) * torch.where(depth < 1.5, 1.3, 1.0)
+
+
+def random_points(depth: Tensor, count: int, seed: int = 0) -> SparsePoints:
+    """`count` random pixels of a depth (H, W)."""
+    height, width = depth.shape
+    chosen = torch.randperm(depth.numel(), generator=torch.Generator().manual_seed(seed))[:count]
+    xy = torch.stack([chosen % width, chosen // width], dim=1).float()
+    return SparsePoints(xy=xy, depth=depth.flatten()[chosen], size=(height, width))
+
+
+def mean_log_error(depth: Tensor, ground_truth: Tensor) -> float:
+    """Mean absolute error of log depth."""
+    return float((depth.log() - ground_truth.log()).abs().mean())
