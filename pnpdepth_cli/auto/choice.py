@@ -134,8 +134,10 @@ class Competition:
 
     @property
     def fusion(self) -> Candidate:
-        """All networks fused; it also continues baselines outside the hull of the points."""
-        return fusion(self.members, [each.weight for each in self.configs], self._propagate)
+        """Networks and cascades fused; it also continues baselines outside the points' hull."""
+        members = [*self.members, *self.cascades]
+        weights = [each.config.weight for each in members if each.config is not None]
+        return fusion(members, weights, self._propagate)
 
     @property
     def members(self) -> list[Candidate]:
