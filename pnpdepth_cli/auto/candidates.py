@@ -19,7 +19,7 @@ WEIGHT_WITH_POINTS = 3.0
 """Weight in the fusion of a network that takes the points, against 1 of one that does not.
 
 A network given another's depth as a prior counts as one more. On even frames of ICL-NUIM, 7-Scenes
-and KITTI 1 : 3 was better than 1 : 1, and of seven weightings with a prior 1 : 3 : 2.7 was the best.
+and KITTI 1 : 3 was better than 1 : 1, and 1 : 3 : 2.7 the best of seven weightings with a prior.
 """
 FUSED_ITERATIONS = 5
 """Updates of z before propagation. More fit what propagation fits anyway."""
