@@ -33,9 +33,7 @@ def test_trimesh_reads_a_cloud_on_the_points_of_the_model(folder: Path) -> None:
     trimesh = pytest.importorskip("trimesh")
     pycolmap = pytest.importorskip("pycolmap")
     model = pycolmap.Reconstruction(str(folder / "room" / "dense" / "sparse"))
-    names = sorted(image.name for image in model.images.values())[:3]
-    assert names == ["00.jpg", "01.jpg", "02.jpg"]
-    image = next(each for each in model.images.values() if each.name == names[1])
+    image = sorted(model.images.values(), key=lambda each: each.name)[1]
     seen = [p.point3D_id for p in image.points2D if p.has_point3D()]
     points = np.array([model.points3D[n].xyz for n in seen if model.points3D[n].track.length() > 2])
     pose = image.cam_from_world()
@@ -43,7 +41,7 @@ def test_trimesh_reads_a_cloud_on_the_points_of_the_model(folder: Path) -> None:
     cloud = trimesh.load(folder / "room" / "scene.ply")
     assert len(cloud.vertices) > 10_000
     assert len(cloud.colors) == len(cloud.vertices)
-    near = depth < 50
+    near = depth < 1.5 * np.median(depth)
     off, _ = cKDTree(cloud.vertices).query(points[near])
     assert np.median(off / depth[near]) < 0.01
 
