@@ -7,6 +7,7 @@ leave black at or below 0, white above 0, and the two some 1 to 255 apart.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -92,17 +93,21 @@ def _operand(node: Any, name: str, constants: Constants) -> NDArray[np.float64] 
 
 def _constants(graph: Any) -> Constants:
     """The small constants of the graph by name."""
-    from onnx import numpy_helper
-
     tensors = {each.name: each for each in graph.initializer}
     for node in graph.node:
         if node.op_type == "Constant":
             values = [a.t for a in node.attribute if a.name == "value"]
             tensors |= dict(zip(node.output, values, strict=False))
-    return {
-        name: numpy_helper.to_array(tensor).astype(np.float64)
-        if int(np.prod(tensor.dims, dtype=np.float64)) <= _MOST_CONSTANTS
-        and not tensor.external_data
-        else np.empty(0)
-        for name, tensor in tensors.items()
-    }
+    return {name: _constant(tensor) for name, tensor in tensors.items()}
+
+
+def _constant(tensor: Any) -> NDArray[np.float64]:
+    """The values of a small constant; none of one that is large, elsewhere or damaged."""
+    from onnx import numpy_helper
+
+    if math.prod(tensor.dims) > _MOST_CONSTANTS or tensor.external_data:
+        return np.empty(0)
+    try:
+        return np.asarray(numpy_helper.to_array(tensor), np.float64)
+    except Exception:  # onnx raises many kinds; the graph's own reader names the tensor
+        return np.empty(0)

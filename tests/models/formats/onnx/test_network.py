@@ -286,6 +286,17 @@ def test_an_operator_that_the_output_does_not_need_is_not_looked_at(tmp_path: Pa
     assert "agrees with onnxruntime" in network.verified((image(1, 3, 32, 48),))[0]
 
 
+@pytest.mark.parametrize("dims", [[4], [-1], [2**62, 2**62], [2**62] * 20])
+def test_a_constant_of_another_shape_than_its_values_is_refused(
+    tmp_path: Path, dims: list[int]
+) -> None:
+    def reshape(model: Any) -> None:
+        del model.graph.initializer[0].dims[:]
+        model.graph.initializer[0].dims.extend(dims)
+
+    assert "\n" not in refused(edited(tmp_path / "a.onnx", reshape))
+
+
 def test_a_value_that_nothing_gives_and_a_circle_are_refused(tmp_path: Path) -> None:
     def break_off(model: Any) -> None:
         model.graph.node[0].input[0] = "nowhere"
