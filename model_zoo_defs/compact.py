@@ -201,6 +201,7 @@ definitions = {
         licence="Apache-2.0",
         input_kind="rgb+sparse",
         size=Multiple(32, longest=1280),
+        takes_prior=True,
         static_graph=True,
         image_encoder="encoder",
         normalisation=Normalisation(mean=IMAGENET_MEAN, std=IMAGENET_STD),

@@ -222,6 +222,9 @@ LAYOUTS = Table(
 COLORS = ("blue-orange", "paper")
 """Colours of what became better and worse: blue and orange, or the paper's red and green."""
 
+PREVIEWS = ("all", "worst", "none")
+"""Which frames get images of their result; worst: those worse than linear interpolation."""
+
 FRAME_PROTOCOLS = ("whole", "nyu", "kitti-odometry", "kitti-depth")
 """What of a frame the paper's experiments use: `pnpdepth_cli.io.dataset.protocols.PROTOCOLS`."""
 

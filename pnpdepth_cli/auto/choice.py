@@ -109,6 +109,8 @@ class Competition:
 
     configs: tuple[RefinementConfig, ...]
     """One refinement of each network, the user's first."""
+    cascades: tuple[Candidate, ...] = ()
+    """Networks that are given another network's depth as a prior."""
     more_configs: tuple[RefinementConfig, ...] = ()
     """Further refinements, tried while the deadline allows."""
     propagations: tuple[str, ...]
@@ -132,8 +134,10 @@ class Competition:
 
     @property
     def fusion(self) -> Candidate:
-        """All networks fused; it also continues baselines outside the hull of the points."""
-        return fusion(self.members, [each.weight for each in self.configs], self._propagate)
+        """Networks and cascades fused; it also continues baselines outside the points' hull."""
+        members = [*self.members, *self.cascades]
+        weights = [each.config.weight for each in members if each.config is not None]
+        return fusion(members, weights, self._propagate)
 
     @property
     def members(self) -> list[Candidate]:
@@ -148,7 +152,10 @@ class Competition:
         for config, member in zip(self.configs, self.members, strict=True):
             yield Candidate(config=config)
             yield replace(member, propagate=self._propagate)
-        for pair in combinations(self.members[:FUSED_NETWORKS], 2):
+        for cascade in self.cascades:
+            yield cascade
+            yield replace(cascade, propagate=self._propagate)
+        for pair in combinations([*self.cascades, *self.members][:FUSED_NETWORKS], 2):
             for weight in (*FUSION_WEIGHTS, 0.5):
                 yield fusion(pair, (weight, 1 - weight), self._propagate)
 

@@ -120,15 +120,22 @@ class FramePasses:
         self._outputs: dict[str, Any] = {}  # of networks that take only the image
         self._encoded: dict[str, Any] = {}  # what encoders of the image returned, by network
 
-    def trajectory(self, config: RefinementConfig, points: SparsePoints) -> Trajectory:
+    def trajectory(
+        self, config: RefinementConfig, points: SparsePoints, prior: Tensor | None = None
+    ) -> Trajectory:
         """Returns the refinement of the frame with these points.
+
+        Args:
+            config: The network and how it is refined.
+            points: In the image frame.
+            prior: (H, W) metres, for a network that takes one.
 
         Raises:
             PnpDepthError: The refinement fails.
         """
         network = self._opened.networks[config.network]
         with out_of_memory_is_a_device_error(network.device):
-            prepared = prepare(network, self._frame.with_points(points))
+            prepared = prepare(network, replace(self._frame, points=points, prior=prior))
             if not len(prepared.points):
                 raise prepared.no_points_error()
             reader = prepared.depth_reader(config.settings)
@@ -254,18 +261,22 @@ class CandidateDepths:
     ) -> None:
         self._passes, self._frame = passes, frame
         self._reference, self._default = reference, default
-        self._trajectories: dict[RefinementConfig, Trajectory | PnpDepthError] = {}
+        self._trajectories: dict[
+            tuple[RefinementConfig, Candidate | None], Trajectory | PnpDepthError
+        ] = {}
 
-    def trajectory(self, config: RefinementConfig) -> Trajectory:
+    def trajectory(self, config: RefinementConfig, prior: Candidate | None = None) -> Trajectory:
         """Returns the refinement; raises its PnpDepthError, computed or remembered."""
-        if config not in self._trajectories:
+        key = config, prior
+        if key not in self._trajectories:
             try:
-                made = self._passes.trajectory(config, self._frame.points)
+                given = None if prior is None else self.dense(prior)
+                made = self._passes.trajectory(config, self._frame.points, given)
             except PnpDepthError as error:
-                self._trajectories[config] = error
+                self._trajectories[key] = error
                 raise
-            self._trajectories[config] = made
-        known = self._trajectories[config]
+            self._trajectories[key] = made
+        known = self._trajectories[key]
         if isinstance(known, PnpDepthError):
             raise known
         return known
@@ -319,7 +330,7 @@ class CandidateDepths:
             depth: Tensor = made
             return depth
         config = candidate.config or self._reference
-        return self.trajectory(config).after(candidate.iterations)
+        return self.trajectory(config, candidate.prior).after(candidate.iterations)
 
     def _prediction_for(self, baseline: str) -> Tensor | None:
         return self.prediction if BASELINES[baseline].needs_prediction else None

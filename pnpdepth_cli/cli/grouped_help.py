@@ -40,8 +40,8 @@ METHOD = (
     *("--holdout", "--seed"),
 )
 OUTPUT = (
-    *("--output", "--format", "--output-scale", "--ply", "--fov", "--colors", "--baselines"),
-    *("--uncertainty", "--overwrite", "--json"),
+    *("--output", "--format", "--output-scale", "--ply", "--fov", "--colors", "--previews"),
+    *("--baselines", "--uncertainty", "--overwrite", "--json"),
 )
 CLUSTER = ("--ray", "--ray-workers", "--cpus-per-worker", "--retries")
 COMMON = frozenset(

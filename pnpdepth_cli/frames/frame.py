@@ -27,6 +27,9 @@ class Frame:
     """(3, H, W) float32 in 0…1. None without an image."""
     points: SparsePoints
     """Sparse depth in the image frame."""
+    prior: Tensor | None = None
+    """(H, W) metres, 0 = unknown: another network's depth, aligned with the points, for networks
+    that take one. None without."""
 
     @property
     def size(self) -> tuple[int, int]:

@@ -35,6 +35,8 @@ class PreparedFrame:
     """Arguments of the network."""
     points: SparsePoints
     """The points that the network sees, in its frame and on its device."""
+    prior: Tensor | None = None
+    """(1, 1, h, w) metres, 0 = unknown: the dense prior in the network's frame. None without."""
 
     @property
     def varying(self) -> tuple[int, ...]:
@@ -48,7 +50,7 @@ class PreparedFrame:
 
     def arguments_for(self, points: SparsePoints) -> tuple[Tensor, ...]:
         """Returns the arguments of the network for some of the points; the image is the same."""
-        return self.network.arguments_of(self.image, points)
+        return self.network.arguments_of(self.image, points, self.prior)
 
     def reduced(self, scale: float) -> PreparedFrame | None:
         """Returns the frame with sides of about this fraction, in the same field of view.
@@ -65,8 +67,11 @@ class PreparedFrame:
         if image is not None:
             image = F.interpolate(image, size, mode="bilinear", align_corners=False, antialias=True)
         points = self.points.resized(*size)
-        arguments = self.network.arguments_of(image, points)
-        return replace(self, image=image, points=points, arguments=arguments)
+        prior = self.prior
+        if prior is not None:
+            prior = F.interpolate(prior, size, mode="nearest-exact")
+        arguments = self.network.arguments_of(image, points, prior)
+        return replace(self, image=image, points=points, prior=prior, arguments=arguments)
 
     def depth_reader(
         self, settings: RefineSettings, alignment: Alignment | None = None
@@ -113,11 +118,15 @@ def prepare(network: Network, frame: Frame) -> PreparedFrame:
     to_network = FrameMap.fit(network.definition.size, *frame.size)
     points = to_network.points_to_network(frame.points)
     image = network.image_of(to_network, None if frame.rgb is None else frame.rgb[None])
+    prior = None
+    if frame.prior is not None and network.definition.takes_prior:
+        prior = to_network.prior_to_network(frame.prior[None, None]).to(network.device)
     return PreparedFrame(
         network=network,
         frame=frame,
         map=to_network,
         image=image,
-        arguments=network.arguments_of(image, points),
+        arguments=network.arguments_of(image, points, prior),
         points=points.tensors(network.device),
+        prior=prior,
     )

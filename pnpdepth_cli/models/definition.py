@@ -248,6 +248,9 @@ class ModelDefinition:
     image_encoder: str | None = None
     """Name of a submodule whose output depends on the image alone. It runs once for several sets of
     points of one image."""
+    takes_prior: bool = False
+    """True if forward takes one more argument, which may be left out: a dense prior (1, 1, H, W) in
+    metres with 0 = unknown, such as another network's depth aligned with the points."""
     static_graph: bool = False
     """True if the network runs the same submodules in the same order for all images of one size,
     even where values of tensors reach Python code. Then the cut is learned only once."""

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from pnpdepth_cli.models.definition import Fixed, Multiple, Near
 from pnpdepth_cli.points import SparsePoints
+
+_ROUNDING = 1e-4  # of weights with a sum of 1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,6 +57,19 @@ class FrameMap:
             )
         bottom, right = (self.network[0] - self.resized[0], self.network[1] - self.resized[1])
         return F.pad(image, (0, right, 0, bottom), mode="replicate") if bottom or right else image
+
+    def prior_to_network(self, depth: Tensor) -> Tensor:
+        """Depth (1, 1, H, W), 0 = unknown → (1, 1, h, w); unknown in the padding.
+
+        A pixel is known where everything that it is interpolated from is.
+        """
+        top, left, height, width = self.crop
+        depth = depth[..., top : top + height, left : left + width]
+        known = (depth > 0).to(depth.dtype)
+        if (height, width) != self.resized:
+            depth, known = (_resize(each, self.resized) for each in (depth, known))
+        bottom, right = (self.network[0] - self.resized[0], self.network[1] - self.resized[1])
+        return F.pad(torch.where(known > 1 - _ROUNDING, depth, 0.0), (0, right, 0, bottom))
 
     def points_to_network(self, points: SparsePoints) -> SparsePoints:
         """The points inside the crop, at their places in the network's frame."""

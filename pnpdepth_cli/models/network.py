@@ -104,12 +104,15 @@ class Network:
         std = rgb.new_tensor(normalise.std).reshape(1, 3, 1, 1)
         return ((frame.rgb_to_network(rgb) - mean) / std).to(self.device)
 
-    def arguments_of(self, image: Tensor | None, points: SparsePoints) -> tuple[Tensor, ...]:
+    def arguments_of(
+        self, image: Tensor | None, points: SparsePoints, prior: Tensor | None = None
+    ) -> tuple[Tensor, ...]:
         """Returns the positional arguments of the network's forward.
 
         Args:
             image: From `image_of`.
             points: As of `arguments`.
+            prior: (1, 1, h, w) metres, 0 = unknown, for a network that takes one; None without.
 
         Raises:
             ModelError: As of `arguments`.
@@ -123,7 +126,7 @@ class Network:
                 f"arguments of network {self.definition.name!r} gives a"
                 f" {type(arguments).__name__}, where a tuple is expected"
             )
-        return arguments
+        return arguments if prior is None else (*arguments, prior)
 
     def verified(self, arguments: tuple[Tensor, ...]) -> tuple[str, ...]:
         """Returns the notes of the definition's `verify` on the network's arguments for a frame.

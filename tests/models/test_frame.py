@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from pnpdepth_cli.models.definition import Fixed, Multiple
+from pnpdepth_cli.models.definition import Fixed, Multiple, Near
 from pnpdepth_cli.models.frame import FrameMap
 from pnpdepth_cli.points import SparsePoints
 
@@ -148,3 +148,22 @@ def test_depth_of_points_is_never_touched() -> None:
     for policy in (Fixed(30, 40), Fixed(30, 40, "crop"), Multiple(32, longest=32)):
         there = FrameMap.fit(policy, 33, 47).points_to_network(here)
         assert set(there.depth.tolist()) <= set(here.depth.tolist())
+
+
+@pytest.mark.parametrize("size", [Multiple(32), Fixed(20, 30), Fixed(20, 30, "crop"), Near(of=16)])
+def test_a_prior_keeps_its_depths_and_is_unknown_beside_unknown_pixels_and_padding(
+    size: Fixed | Multiple | Near,
+) -> None:
+    frame = FrameMap.fit(size, 50, 70)
+    prior = torch.full((1, 1, 50, 70), 3.0)
+    prior[..., 20:30, 20:30] = 0.0
+    mapped = frame.prior_to_network(prior)
+    assert tuple(mapped.shape[-2:]) == frame.network
+    known = mapped[mapped > 0]
+    assert torch.allclose(known, torch.full_like(known, 3.0))
+    assert 0 < len(known) < mapped.numel()
+    assert bool((mapped[..., frame.resized[0] :, :] == 0).all())
+    assert bool((mapped[..., frame.resized[1] :] == 0).all())
+    plain = torch.full((1, 1, 50, 70), 3.0)
+    full = frame.prior_to_network(plain)[..., : frame.resized[0], : frame.resized[1]]
+    assert torch.allclose(full, torch.full_like(full, 3.0))

@@ -11,7 +11,7 @@ import traceback
 from collections import deque
 from collections.abc import Generator, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -211,6 +211,7 @@ def _write(
         with run.profile(WRITING):
             state.begin(task)
             outcome = write_refined(task.outputs, refiner, read.inputs, frame, read.watch)
+            task = replace(task, outputs=outcome.outputs)
             written = {
                 kind: path.relative_to(state.output).as_posix()
                 for kind, path in task.outputs.by_kind().items()

@@ -170,6 +170,8 @@ class BatchState:
                 return f"input changed: {part}"
         for path in task.outputs.paths():
             known = written.get(path.relative_to(self.output).as_posix())
+            if known is None and path in task.outputs.optional():
+                continue
             if known is None or not is_unchanged(path, known):
                 return f"result {'changed' if path.exists() else 'missing'}: {path.name}"
         return None

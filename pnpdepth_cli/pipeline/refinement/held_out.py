@@ -15,6 +15,7 @@ from pnpdepth_cli.auto.candidates import (
     FUSED_ITERATIONS,
     Candidate,
     RefinementConfig,
+    cascades,
     default_config,
     more_configs,
 )
@@ -72,8 +73,10 @@ def competition_of(
         if timed:
             own = own if own == first else replace(own)
             more += [*([own] if own != first else []), *more_configs(network.definition, own)]
+    definitions = {name: network.definition for name, network, _, _ in networks}
     return Competition(
         configs=tuple(configs),
+        cascades=cascades(configs, definitions),
         more_configs=tuple(more),
         propagations=_competing_propagations(options.propagate, timed=timed),
     )
@@ -212,7 +215,7 @@ def _record(choice: Choice, user: str) -> dict[str, Any]:
 
 
 def _candidate(candidate: Candidate) -> dict[str, Any]:
-    entry = {"candidate": str(candidate)}
+    entry: dict[str, Any] = {"candidate": str(candidate)}
     if candidate.baseline is not None:
         return entry | {"baseline": candidate.baseline}
     if candidate.fused:
@@ -222,6 +225,8 @@ def _candidate(candidate: Candidate) -> dict[str, Any]:
             "propagate": candidate.propagate,
         }
     assert candidate.config is not None
+    if candidate.prior is not None:
+        entry |= {"prior": _candidate(candidate.prior)}
     return entry | {
         "network": candidate.config.network,
         "layer": candidate.config.layer,

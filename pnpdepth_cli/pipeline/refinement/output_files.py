@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -45,22 +45,21 @@ class Outputs:
     """Codes per metre of an integer depth file. None: what suits the frame."""
     colors: str = "blue-orange"
     """Colours of better and worse, one of `choices.COLORS`."""
+    previews: str = "all"
+    """Which results get their images, one of `choices.PREVIEWS`."""
 
     @classmethod
     def in_folder(cls, folder: Path, name: str, request: RefineRequest) -> Outputs:
         """Returns the paths in a folder, those of σ if wanted; slashes in names are subfolders."""
-        of_sigma = {}
-        if request.hold_out.uncertainty:
-            of_sigma = {
-                "sigma": folder / f"{name}_sigma.exr",
-                "sigma_preview": folder / f"{name}_sigma_preview.png",
-                "valid": folder / f"{name}_valid.png",
-            }
+        sigma = request.hold_out.uncertainty
         return cls(
             depth=folder / f"{name}_depth.{request.outputs.format}",
-            **of_sigma,
+            sigma=folder / f"{name}_sigma.exr" if sigma else None,
+            valid=folder / f"{name}_valid.png" if sigma else None,
+            sigma_preview=folder / f"{name}_sigma_preview.png" if sigma else None,
             preview=folder / f"{name}_preview.png",
             improvement=folder / f"{name}_improvement.png",
+            previews=request.outputs.previews,
             cloud=folder / f"{name}.ply" if request.outputs.ply else None,
             view=folder / f"{name}_view.json" if request.outputs.view_3d else None,
             record=folder / f"{name}.json",
@@ -86,6 +85,21 @@ class Outputs:
     def paths(self) -> list[Path]:
         """Returns every file that will be written."""
         return list(self.by_kind().values())
+
+    def optional(self) -> list[Path]:
+        """Returns the images that some results lack."""
+        images = (self.preview, self.improvement, self.sigma_preview)
+        return [path for path in images if path is not None and self.previews != "all"]
+
+    def of_result(self, *, worse: bool) -> Outputs:
+        """Returns the files to write for a result.
+
+        Args:
+            worse: Whether it is worse than linear interpolation.
+        """
+        if self.previews == "all" or (self.previews == "worst" and worse):
+            return self
+        return replace(self, preview=None, improvement=None, sigma_preview=None)
 
     def write_record(self, record: dict[str, Any]) -> None:
         """Writes the record, if it is wanted."""

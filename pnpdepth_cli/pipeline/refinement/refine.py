@@ -26,6 +26,8 @@ class RefineOutcome:
 
     record: dict[str, Any]
     """What <stem>.json holds."""
+    outputs: Outputs
+    """The files that were written."""
     diverged: DivergedError | None
     """Why the refinement stopped early. None if it did not."""
 
@@ -71,10 +73,13 @@ def write_refined(
     """
     frame = within_range(outputs, inputs, frame)
     record = record_of(refiner, inputs, frame)
+    planned, outputs = outputs, outputs.of_result(worse=bool(record["linear"]["worse"]))
     with all_or_none(outputs.paths()):
         with watch("write"):
             record |= write_outputs(outputs, inputs, frame)
         record["seconds"] = watch.seconds
         record["peak_memory_mb"] = peak_memory_mb(refiner.network.device)
         outputs.write_record(record)
-    return RefineOutcome(record=record, diverged=frame.diverged)
+    for path in {*planned.paths()} - {*outputs.paths()}:
+        path.unlink(missing_ok=True)  # of an earlier result
+    return RefineOutcome(record=record, outputs=outputs, diverged=frame.diverged)

@@ -332,6 +332,14 @@ class OutputOptions:
         choices=choices.COLORS,
         show_default=True,
     )
+    previews: str = option(
+        "all",
+        "Which frames get preview and improvement images: all, worst (those worse than linear"
+        " interpolation), or none.",
+        alias="--pictures",
+        choices=choices.PREVIEWS,
+        show_default=True,
+    )
     overwrite: bool = option(False, "Replace existing results.")
 
     @property

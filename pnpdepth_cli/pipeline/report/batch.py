@@ -115,7 +115,10 @@ class BatchReport:
 
     def _draw(self, row: Row) -> dict[str, Any]:
         """As `drawn`; returns the page's entry of the images."""
-        paths = [self.output / row["outputs"][kind] for kind in ("preview", "improvement")]
+        files = [row["outputs"].get(kind) for kind in ("preview", "improvement")]
+        if None in files:
+            return {"key": None}
+        paths = [self.output / name for name in files]
         try:
             view = self._view_of(row)
             made_of = [*paths, *([] if view is None else [view])]
