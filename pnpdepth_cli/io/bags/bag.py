@@ -38,12 +38,17 @@ class Bag:
         self._decode = typestore.deserialize_ros1 if ros1 else typestore.deserialize_cdr
 
     def topics(self, kinds: Sequence[str]) -> dict[str, int]:
-        """Returns the topics of these message types with their number of messages."""
-        return {
-            name: int(info.msgcount)
-            for name, info in sorted(self._reader.topics.items())
-            if info.msgtype in kinds
-        }
+        """Returns the topics of these message types with their number of messages.
+
+        Raises:
+            FileFormatError: The bag is damaged.
+        """
+        with _as_our_errors(self.path):
+            return {
+                name: int(info.msgcount)
+                for name, info in sorted(self._reader.topics.items())
+                if info.msgtype in kinds
+            }
 
     def messages(self, topics: Sequence[str]) -> Iterator[tuple[str, int, Any]]:
         """Yields (topic, nanoseconds at which it was logged, message) in the order of the log.
