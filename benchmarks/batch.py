@@ -95,7 +95,7 @@ def measure(
         "frames": watcher.done,
         "memory_mb": watcher.memory_mb,
         "peak_mb": peak,
-        "said": watcher.notes,
+        "notes": watcher.notes,
         "profile": profile,
         "seconds_of_nothing_to_do": again,
     }
@@ -124,7 +124,7 @@ def main() -> None:
     for count, memory in result["memory_mb"].items():
         print(f"  after {count:6,} frames: {memory:6.1f} MB in use")
     print(f"  peak: {result['peak_mb']:.1f} MB")
-    for text in result["said"]:
+    for text in result["notes"]:
         print(f"  {text}")
     profile = result["profile"]
     for stage, seconds in profile["seconds"].items():

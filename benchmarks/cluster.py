@@ -23,7 +23,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +34,7 @@ from benchmarks.batch import make_frames
 from pnpdepth_cli.io.fingerprint import fingerprint
 from pnpdepth_cli.io.journal import Journal
 from pnpdepth_cli.pipeline.batch.batch import run_batch
-from pnpdepth_cli.pipeline.batch.frames import find_frames, task_of
+from pnpdepth_cli.pipeline.batch.frames import COMPARED_EVERY, find_frames, task_of
 from pnpdepth_cli.pipeline.batch.request import BatchRequest
 from pnpdepth_cli.pipeline.batch.settings import model_identity, settings_digest
 from pnpdepth_cli.pipeline.batch.spread import DoneFrame
@@ -88,39 +88,43 @@ def make_entries(root: Path, count: int) -> None:
     line = Journal(first / "batch.jsonl", "frame").newest("d00000/f0000000")
     assert line is not None
     made = {kind: first / path for kind, path in line["row"]["outputs"].items()}
-    linked(root, made, count)
-    manifest(root, line, count)
+    manifest(root, line, linked(root, made, count), count)
 
 
-def linked(root: Path, made: dict[str, Path], count: int) -> None:
-    """The results of each frame, as hard links."""
-    sources: dict[str, Path] = {}
+def linked(root: Path, made: dict[str, Path], count: int) -> dict[str, list[Path]]:
+    """The results of each frame, as hard links; returns the files that they are links of."""
+    sources: dict[str, list[Path]] = {kind: [] for kind in made}
     for number in range(count):
+        folder = root / "out" / f"d{number // FOLDER:05}"
         if number % FOLDER == 0:
-            (root / "out" / f"d{number // FOLDER:05}").mkdir(parents=True)
+            folder.mkdir(parents=True)
         for kind, path in made.items():
             if number % LINKS == 0:
-                sources[kind] = root / f"{kind}{number}{path.suffix}"
-                shutil.copy(path, sources[kind])
-            name = path.name.replace("f0000000", f"f{number:07}")
-            os.link(sources[kind], root / "out" / f"d{number // FOLDER:05}" / name)
+                sources[kind].append(root / f"{kind}{number}{path.suffix}")
+                shutil.copy(path, sources[kind][-1])
+            os.link(sources[kind][-1], f"{folder}/{path.name.replace('f0000000', f'f{number:07}')}")
+    return sources
 
 
-def manifest(root: Path, line: dict[str, Any], count: int) -> None:
+def manifest(root: Path, line: dict[str, Any], sources: dict[str, list[Path]], count: int) -> None:
+    """A line for each frame: it is done."""
     request = request_of(root)
-    frame = find_frames(request).frames[0]
-    digest = settings_digest(task_of(request, frame).request, model_identity(request.refine))
+    frames = find_frames(request).frames
+    model = model_identity(request.refine)
+    digests = [settings_digest(task_of(request, frames[n]).request, model) for n in (0, 1)]
     journal = Journal(root / "out" / "batch.jsonl", "frame")
+    outputs = {kind: Path(path) for kind, path in line["row"]["outputs"].items()}
+    known = {kind: [fingerprint(path).as_record() for path in sources[kind]] for kind in outputs}
     lines: list[dict[str, Any]] = []
     for number in range(count):
-        folder, stem = f"d{number // FOLDER:05}", f"f{number:07}"
-        name = f"{folder}/{stem}"
-        outputs = {
-            f"{folder}/{Path(path).name.replace('f0000000', stem)}" for path in line["outputs"]
+        name = f"d{number // FOLDER:05}/f{number:07}"
+        written = {
+            str(path).replace("d00000/f0000000", name): known[kind][number // LINKS]
+            for kind, path in outputs.items()
         }
-        known = {path: asdict(fingerprint(root / "out" / path)) for path in sorted(outputs)}
+        digest = digests[bool(number % COMPARED_EVERY)]
         lines.append(
-            line | {"frame": name, "settings": digest, "outputs": known,
+            line | {"frame": name, "settings": digest, "outputs": written,
                     "row": line["row"] | {"name": name}}
         )  # fmt: skip
         if len(lines) == LINES or number == count - 1:

@@ -1,27 +1,32 @@
-"""Refinement by hidden points against plain and the paper's.
+"""Refinement by hidden points against plain and updates of z.
 
-Usage: `python -m benchmarks.masked --data PATH`. MAE and RMSE in metres over the pixels with known
-ground truth, CPU seconds of a refinement, steps that were kept, and the fraction of frames whose
-MAE is above the plain one's by more than 1 %. Points are drawn from the ground truth; KITTI's are
-its own LiDAR's. Every second frame is measured, from the second on: the constants were chosen on
-the others and on rendered frames.
+Usage: `python -m benchmarks.masked --data PATH --csv FILE`. MAE and RMSE in metres over the pixels
+with known ground truth, CPU seconds of a refinement, and steps that were kept. Points are drawn
+from the ground truth; KITTI's are its own LiDAR's without occluded points. Constants were chosen on
+the even frames of each set (`--half even`); the odd ones are for reporting.
+
+FILE gets a line for each method and frame as soon as it is measured. What it holds already is not
+measured again, so that a run that was cut goes on where it ended. The table is made from FILE.
 """
 
 from __future__ import annotations
 
 import argparse
+import csv
 import time
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from benchmarks.frames import SETS, frame_inputs, frame_pixels, points_on_grid
+from benchmarks.accuracy import frames_of, opened
+from benchmarks.frames import SETS, EvalFrame, frame_inputs, frame_pixels, points_on_grid
 from pnpdepth_cli.core.metrics import score
+from pnpdepth_cli.frames.frame import DepthMap
 from pnpdepth_cli.frames.refine import refine_frame, with_propagation
-from pnpdepth_cli.models.network import Network, load_network
+from pnpdepth_cli.models.network import Network
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs
 from pnpdepth_cli.pipeline.refinement.request import HoldOut, MethodOptions
 from pnpdepth_cli.pipeline.refinement.resolve import is_dense, resolve_layer, resolve_settings
@@ -30,139 +35,232 @@ from pnpdepth_cli.sensors import occluded_in_map
 
 _OUTLIER_FACTORS = (0.3, 3.0)
 """Range of the factor on the depth of outliers."""
+MASKED = MethodOptions(target="masked")
+METHODS: Mapping[str, MethodOptions] = {
+    "updates of z": MethodOptions(),
+    "masked, 4 steps": replace(MASKED, iterations=4),
+    "masked, 8 steps": replace(MASKED, iterations=8),
+    "masked, 40 steps": replace(MASKED, iterations=40),
+    "masked": MASKED,
+    "channels of z": MethodOptions(parameters="channels"),
+    "all points, weights": MethodOptions(parameters="weights"),
+    "masked, lora:8": replace(MASKED, parameters="lora:8"),
+}
+TABLE = ("updates of z", "masked, 8 steps", "masked", "masked, 40 steps")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Row:
+class Case:
+    """A frame with some points."""
+
+    network: str
+    """Name of the network."""
+    frames: str
+    """Name of the set, or a folder of rendered frames."""
+    points: int | None
+    """Number of points; None for the sensor's own."""
+    outliers: float
+    """Fraction of the points with a wrong depth."""
+    seed: int
+    """Of the points."""
+    frame: str
+    """Name of the frame."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Row(Case):
     """One method on one frame."""
 
+    method: str
+    """Its name in the table."""
     mae: float
     """Metres."""
     rmse: float
     """Metres."""
-    seconds: float
-    """CPU time of the refinement."""
+    cpu_s: float
+    """CPU time of the refinement, the plain prediction included."""
     kept: int
     """Updates that the depth was predicted after."""
 
 
-def inputs_of(
-    data: Path, name: str, count: int | None, seed: int, *, frames: int, outlier_fraction: float
-) -> Iterator[Inputs]:
-    """Yields evenly spaced frames among every second one, with this seed's points."""
-    every_second = list(SETS[name](data))[1::2]
-    chosen = np.unique(np.linspace(0, len(every_second) - 1, frames).round().astype(int))
-    for frame in (every_second[index] for index in chosen):
-        rows, columns, depth = frame_pixels(frame, count, seed)
-        rng = np.random.default_rng(seed)
-        outlier = rng.random(len(depth)) < outlier_fraction
-        factors = np.exp(rng.uniform(*np.log(_OUTLIER_FACTORS), len(depth)))
-        depth = np.where(outlier, depth * factors, depth).astype(np.float32)
-        points = points_on_grid(rows, columns, depth, frame.gt.shape)
-        if count is None:  # as the program does with a projected scan
-            xy, depth = points.xy.numpy(), points.depth.numpy()
-            occluded = occluded_in_map(SparsePoints(xy=xy, depth=depth, size=points.size))
-            points = points if occluded is None else points.select(torch.from_numpy(~occluded))
-        yield frame_inputs(frame.rgb, points, frame.gt)
+def inputs_of(frame: EvalFrame, case: Case) -> Inputs:
+    """Returns the frame with the points of the case."""
+    rows, columns, depth = frame_pixels(frame, case.points, case.seed)
+    rng = np.random.default_rng(case.seed)
+    outlier = rng.random(len(depth)) < case.outliers
+    factors = np.exp(rng.uniform(*np.log(_OUTLIER_FACTORS), len(depth)))
+    depth = np.where(outlier, depth * factors, depth).astype(np.float32)
+    points = points_on_grid(rows, columns, depth, frame.gt.shape)
+    if case.points is None:  # as the program does with a projected scan
+        xy, depth = points.xy.numpy(), points.depth.numpy()
+        occluded = occluded_in_map(SparsePoints(xy=xy, depth=depth, size=points.size))
+        points = points if occluded is None else points.select(torch.from_numpy(~occluded))
+    return frame_inputs(frame.rgb, points, frame.gt)
 
 
-def measured(network: Network, method: MethodOptions, inputs: Inputs, seed: int) -> tuple[Row, Row]:
-    """Returns the plain prediction's row and that of the refinement."""
-    assert inputs.gt is not None
-    gt, definition = torch.from_numpy(inputs.gt), network.definition
+def measured(network: Network, method: str, inputs: Inputs, case: Case) -> list[Row]:
+    """Returns the rows of a method on one frame: plain, refined, and with propagation."""
+    options, hold_out = METHODS[method], HoldOut(seed=case.seed)
     settings = resolve_settings(
-        definition, method, HoldOut(seed=seed), dense=is_dense(inputs.points)
+        network.definition, options, hold_out, dense=is_dense(inputs.points)
     )
-    layer = resolve_layer(definition, method.layer)
+    layer = resolve_layer(network.definition, options.layer)
     start = time.process_time()
     with network.cut_at_points() if settings.masked else network.cut_at(layer) as split:
         frame = refine_frame(network, split, settings, inputs.frame())
     seconds = time.process_time() - start
-    propagated = with_propagation(inputs.frame(), frame.after, "gp")
-    seconds_propagated = time.process_time() - start
-    plain, after, last = (
-        score(torch.from_numpy(depth), gt) for depth in (frame.before, frame.after, propagated)
-    )
-    kept = frame.refinement.kept
-    return (
-        Row(mae=plain.mae, rmse=plain.rmse, seconds=0.0, kept=0),
-        Row(mae=after.mae, rmse=after.rmse, seconds=seconds, kept=kept),
-        Row(mae=last.mae, rmse=last.rmse, seconds=seconds_propagated, kept=kept),
+    rows = [
+        _row(case, inputs, "plain", frame.before, 0.0),
+        _row(case, inputs, method, frame.after, seconds, frame.refinement.kept),
+    ]
+    if method in ("masked", "updates of z"):
+        depth = with_propagation(inputs.frame(), frame.after, "gp")
+        seconds = time.process_time() - start
+        rows.append(_row(case, inputs, f"{method} + gp", depth, seconds, frame.refinement.kept))
+    return rows
+
+
+def _row(
+    case: Case, inputs: Inputs, method: str, depth: DepthMap, cpu_s: float, kept: int = 0
+) -> Row:
+    assert inputs.gt is not None
+    scores = score(torch.from_numpy(depth), torch.from_numpy(inputs.gt))
+    return Row(
+        **asdict(case), method=method, mae=scores.mae, rmse=scores.rmse, cpu_s=cpu_s, kept=kept
     )
 
 
-def methods(
-    steps: list[int], lr: str | None = None, scale: float | None = None
-) -> dict[str, MethodOptions]:
-    """Returns what is compared, by the name in the table."""
-    masked = MethodOptions(target="masked", lr=lr, mask_scale=scale)
-    return {
-        "paper's update": MethodOptions(),
-        **{f"masked, {k} steps": replace(masked, iterations=k) for k in steps},
-        "masked": masked,
-    }
+class Results:
+    """The rows of a CSV file, which gets a new one as soon as it is known.
+
+    Args:
+        path: The file; made if there is none.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path, self._names = path, [field.name for field in fields(Row)]
+        if not path.exists():
+            path.write_text(",".join(self._names) + "\n")
+        with path.open(newline="") as file:
+            self.rows = [_parsed(line) for line in csv.DictReader(file)]
+
+    def has(self, case: Case, method: str) -> bool:
+        """Whether the method was measured on this frame."""
+        return any(_case(row) == case and row.method == method for row in self.rows)
+
+    def add(self, rows: Sequence[Row]) -> None:
+        """Writes rows of one frame; one that is there already is left out."""
+        new = [row for row in rows if not self.has(_case(row), row.method)]
+        with self._path.open("a", newline="") as file:
+            csv.DictWriter(file, self._names).writerows(asdict(row) for row in new)
+        self.rows += new
+
+
+def _case(row: Row) -> Case:
+    return Case(**{field.name: getattr(row, field.name) for field in fields(Case)})
+
+
+def _parsed(line: Mapping[str, str]) -> Row:
+    return Row(
+        network=line["network"],
+        frames=line["frames"],
+        points=int(line["points"]) if line["points"] else None,
+        outliers=float(line["outliers"]),
+        seed=int(line["seed"]),
+        frame=line["frame"],
+        method=line["method"],
+        mae=float(line["mae"]),
+        rmse=float(line["rmse"]),
+        cpu_s=float(line["cpu_s"]),
+        kept=int(line["kept"]),
+    )
+
+
+def table(rows: Sequence[Row]) -> Iterator[str]:
+    """Yields the lines of a table with a row for each group of cases and method."""
+    yield "| network, set, points | cases | method | MAE | RMSE | CPU s | kept | worse |"
+    yield "|" + "---|" * 8
+    plain = {_case(row): row for row in rows if row.method == "plain"}
+    groups = dict.fromkeys(
+        (row.network, row.frames, row.points, row.outliers, row.method) for row in rows
+    )
+    for group in sorted(groups, key=lambda g: (g[:2], g[2] or 0, g[3], list(groups).index(g))):
+        chosen = [
+            row
+            for row in rows
+            if (row.network, row.frames, row.points, row.outliers, row.method) == group
+        ]
+        yield _line(chosen, [plain[_case(row)] for row in chosen])
+
+
+def _line(rows: Sequence[Row], plain: Sequence[Row]) -> str:
+    first = rows[0]
+    wrong = f", {first.outliers:.0%} wrong" if first.outliers else ""
+    label = f"{first.network}, {first.frames}, {first.points or 'LiDAR'}{wrong}"
+    errors = []
+    for name in ("mae", "rmse"):
+        mean, before = (
+            float(np.mean([getattr(row, name) for row in some])) for some in (rows, plain)
+        )
+        errors.append(f"{mean:.4f} ({mean / before - 1:+.1%})")
+    cpu_s, kept = (
+        float(np.mean([getattr(row, name) for row in rows])) for name in ("cpu_s", "kept")
+    )
+    worse = float(np.mean([a.mae > 1.01 * b.mae for a, b in zip(rows, plain, strict=True)]))
+    cells = (label, len(rows), first.method, *errors, f"{cpu_s:.1f}", f"{kept:.0f}", f"{worse:.0%}")
+    return f"| {' | '.join(map(str, cells))} |"
+
+
+def _cases(args: argparse.Namespace, model: str) -> Iterator[tuple[EvalFrame, Case]]:
+    """Evenly spaced frames of one half of each set, with the points of each seed."""
+    for seed in range(args.seeds):
+        for name in args.sets:
+            half = frames_of(name, args.data, model, 1)[args.half == "odd" :: 2]
+            count = min(args.frames, len(half))
+            indices = np.linspace(0, len(half) - 1, count).round().astype(int)
+            for points in [None] if name == "kitti_dc" else args.points:
+                if points is None and seed:  # the LiDAR's points are the same
+                    continue
+                for frame in (half[index] for index in indices):
+                    yield (
+                        frame,
+                        Case(
+                            network=model,
+                            frames=name,
+                            points=points,
+                            outliers=args.outliers,
+                            seed=seed,
+                            frame=frame.name,
+                        ),
+                    )
 
 
 def main() -> None:
-    """Measure and print one row for every method, set and number of points."""
+    """Measure what FILE lacks, and print its table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--data", type=Path, required=True)
-    parser.add_argument("--sets", nargs="+", choices=SETS, default=list(SETS))
+    parser.add_argument("--csv", type=Path, required=True, help="Results, one line a frame.")
+    parser.add_argument(
+        "--sets", nargs="+", default=list(SETS), help="Names, or folders of rendered frames."
+    )
     parser.add_argument("--points", nargs="+", type=int, default=[20, 100, 500])
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--frames", type=int, default=100, help="Of each set, at most.")
-    parser.add_argument("--model", default="compact")
-    parser.add_argument("--steps", nargs="*", type=int, default=[12, 40])
-    parser.add_argument("--lr", help="Step size of the hidden points.")
-    parser.add_argument("--scale", type=float, help="Of the image during their steps.")
-    parser.add_argument("--only", nargs="*", help="Names of methods.")
+    parser.add_argument("--half", choices=("even", "odd"), default="odd")
+    parser.add_argument("--models", nargs="+", default=["compact"])
+    parser.add_argument("--methods", nargs="+", choices=METHODS, default=TABLE)
     parser.add_argument(
-        "--wrong", dest="outlier_fraction", type=float, default=0.0, help="Fraction of outliers."
+        "--wrong", dest="outliers", type=float, default=0.0, help="Fraction of outliers."
     )
     args = parser.parse_args()
-    network = load_network(args.model, None)
-    print("| set, points | frames | method | MAE | RMSE | CPU s | kept | worse |")
-    print("|" + "---|" * 8)
-    for name in args.sets:
-        for count in [None] if name == "kitti_dc" else args.points:
-            _measure_set(args, network, name, count)
-
-
-def _measure_set(args: argparse.Namespace, network: Network, name: str, count: int | None) -> None:
-    cases = [
-        (inputs, seed)
-        for seed in range(args.seeds if count else 1)
-        for inputs in inputs_of(
-            args.data, name, count, seed, frames=args.frames, outlier_fraction=args.outlier_fraction
-        )
-    ]
-    label = f"{name}, {count or 'LiDAR'}"
-    shown_plain = False
-    for title, method in methods(args.steps, args.lr, args.scale).items():
-        if args.only and title not in args.only:
-            continue
-        rows = [measured(network, method, inputs, seed) for inputs, seed in cases]
-        plain, refined, propagated = zip(*rows, strict=True)
-        if not shown_plain:
-            print(_line(label, "plain", plain, plain), flush=True)
-            shown_plain = True
-        print(_line(label, title, refined, plain), flush=True)
-        print(_line(label, f"{title} + gp", propagated, plain), flush=True)
-
-
-def _line(label: str, title: str, rows: Sequence[Row], plain: Sequence[Row]) -> str:
-    mean = {
-        name: float(np.mean([getattr(row, name) for row in rows]))
-        for name in ("mae", "rmse", "seconds", "kept")
-    }
-    of_plain = {
-        name: mean[name] / float(np.mean([getattr(row, name) for row in plain]))
-        for name in ("mae", "rmse")
-    }
-    worse = np.mean([a.mae > 1.01 * b.mae for a, b in zip(rows, plain, strict=True)])
-    errors = (f"{mean[name]:.4f} ({of_plain[name] - 1:+.1%})" for name in ("mae", "rmse"))
-    cells = (label, len(rows), title, *errors, f"{mean['seconds']:.1f}", f"{mean['kept']:.0f}")
-    return f"| {' | '.join(map(str, cells))} | {worse:.0%} |"
+    results = Results(args.csv)
+    for model in args.models:
+        network = opened(model, args.data)
+        for frame, case in _cases(args, model):
+            for method in args.methods:
+                if not results.has(case, method):
+                    results.add(measured(network, method, inputs_of(frame, case), case))
+    print("\n".join(table(results.rows)))
 
 
 if __name__ == "__main__":

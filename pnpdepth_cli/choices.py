@@ -100,7 +100,7 @@ UPDATES = Table(
     "update_rule",
     group="updates",
     noun="update rule",
-    first=("sign", "sgd", "normalised", "momentum", "adam", "lbfgs"),
+    first=("sign", "sgd", "normalised", "momentum", "adam", "adam-short", "lbfgs"),
 )
 """U: each entry creates a rule that turns gradients into directions of z."""
 
@@ -214,10 +214,20 @@ LAYOUTS = Table(
     first=(
         *("manifest", "nyu-mat", "kitti-odometry", "kitti-object", "kitti-depth", "kitti-raw"),
         *("tum", "7scenes", "synthia", "colmap", "void", "diode", "ibims", "scannet"),
-        *("arkitscenes", "hypersim", "nuscenes", "pairs", "nyu-h5"),
+        *("arkitscenes", "hypersim", "nuscenes", "ddad", "pairs", "nyu-h5"),
     ),
 )
 """Data set layouts, in the order in which they are guessed: `pnpdepth_cli.io.layouts.Layout`."""
+
+STORES = {
+    "s3": "s3fs",
+    "gs": "gcsfs",
+    "hf": "huggingface_hub",
+    "https": "aiohttp",
+    "http": "aiohttp",
+    "file": "nothing",
+}
+"""Stores of files by the scheme of their addresses, with the package that fsspec needs."""
 
 COLORS = ("blue-orange", "paper")
 """Colours of what became better and worse: blue and orange, or the paper's red and green."""

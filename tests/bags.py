@@ -22,12 +22,14 @@ def write_bag(
     compressed: bool = False,
     static: bool = True,
     info: bool = True,
+    poses: str = "",
     compression: Any = None,
 ) -> Path:
     """A bag of ROS 1 (.bag), ROS 2 with MCAP (.mcap) or SQLite (a folder), by the path's suffix.
 
     Images have 30 ms between them, and each a scan 4 ms later; the scans are of a wall 5 m ahead.
-    `compression` is rosbags' of the chunks.
+    With `poses`, base moves 0.3 m along x from one image to the next: "odometry" or "tf", or the
+    camera does: "pose". `compression` is rosbags' of the chunks.
     """
     ros1 = path.suffix == ".bag"
     store = message_types(ros1=ros1)
@@ -36,7 +38,7 @@ def write_bag(
         opened.set_compression(compression)
     with opened as writer:
         connections: dict[str, Any] = {}
-        messages = _messages(store.types, ros1, frames, compressed, static, info)
+        messages = _messages(store.types, ros1, frames, compressed, static, info, poses)
         for topic, time_ns, message in messages:
             kind = message.__msgtype__
             if topic not in connections:
@@ -63,7 +65,7 @@ def _writer(path: Path) -> Any:
 
 
 def _messages(
-    types: Any, ros1: bool, frames: int, compressed: bool, static: bool, info: bool
+    types: Any, ros1: bool, frames: int, compressed: bool, static: bool, info: bool, poses: str
 ) -> Iterator[tuple[str, int, Any]]:
     def header(time_ns: int, frame: str) -> Any:
         stamp = types["builtin_interfaces/msg/Time"](sec=time_ns // 10**9, nanosec=time_ns % 10**9)
@@ -81,11 +83,44 @@ def _messages(
                 time_ns,
                 _camera_info(types, header(time_ns, "camera"), ros1),
             )
+        if poses:
+            yield _moved(types, header(time_ns - 15_000_000, "odom"), 0.3 * number - 0.15, poses)
         pixels = np.full((HEIGHT, WIDTH, 3), 40 + number % 200, np.uint8)
         pixels[:, : WIDTH // 2, 0] = 200
         yield _image(types, header(time_ns, "camera"), pixels, time_ns, compressed)
         cloud = _cloud(types, header(time_ns + 4_000_000, "lidar"))
         yield POINTS, time_ns + 5_000_000, cloud
+    if poses:
+        last = start + 30_000_000 * frames - 15_000_000
+        yield _moved(types, header(last, "odom"), 0.3 * frames - 0.15, poses)
+
+
+def _moved(types: Any, header: Any, x: float, kind: str) -> tuple[str, int, Any]:
+    """The pose of base, or for "pose" of the camera, at x metres."""
+    time_ns = header.stamp.sec * 10**9 + header.stamp.nanosec
+    turn = types["geometry_msgs/msg/Quaternion"](x=0.0, y=0.0, z=0.0, w=1.0)
+    vector = types["geometry_msgs/msg/Vector3"](x=x, y=0.0, z=0.0)
+    if kind == "tf":
+        transform = types["geometry_msgs/msg/Transform"](translation=vector, rotation=turn)
+        link = types["geometry_msgs/msg/TransformStamped"](
+            header=header, child_frame_id="base", transform=transform
+        )
+        return "/tf", time_ns, types["tf2_msgs/msg/TFMessage"](transforms=[link])
+    point = types["geometry_msgs/msg/Point"](x=x, y=0.0, z=0.0)
+    pose = types["geometry_msgs/msg/Pose"](position=point, orientation=turn)
+    if kind == "pose":
+        message = types["geometry_msgs/msg/PoseStamped"](header=header, pose=pose)
+        return "/vio/pose", time_ns, message
+    still = types["geometry_msgs/msg/Vector3"](x=0.0, y=0.0, z=0.0)
+    twist = types["geometry_msgs/msg/Twist"](linear=still, angular=still)
+    with_twist = types["geometry_msgs/msg/TwistWithCovariance"](
+        twist=twist, covariance=np.zeros(36)
+    )
+    with_pose = types["geometry_msgs/msg/PoseWithCovariance"](pose=pose, covariance=np.zeros(36))
+    message = types["nav_msgs/msg/Odometry"](
+        header=header, child_frame_id="base", pose=with_pose, twist=with_twist
+    )
+    return "/odom", time_ns, message
 
 
 def _transforms(types: Any, header: Any) -> Any:

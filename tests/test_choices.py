@@ -58,7 +58,8 @@ def test_an_unknown_name_is_an_error_that_names_the_nearest(table: Table) -> Non
 
 def test_losses_and_update_rules_are_the_files_of_their_folders() -> None:
     assert list(choices.LOSSES) == ["l1", "l2", "huber", "berhu", "inverse", "log", "cauchy"]
-    assert list(choices.UPDATES) == ["sign", "sgd", "normalised", "momentum", "adam", "lbfgs"]
+    rules = ["sign", "sgd", "normalised", "momentum", "adam", "adam-short", "lbfgs"]
+    assert list(choices.UPDATES) == rules
     assert all(callable(entry) for entry in (*choices.LOSSES.values(), *choices.UPDATES.values()))
 
 

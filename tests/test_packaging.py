@@ -23,14 +23,16 @@ def test_the_wheel_holds_every_package_but_the_training_code() -> None:
     from setuptools import find_packages
 
     find = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["packages"]
-    found = find_packages(str(ROOT), **find["find"])
+    packages = find_packages(str(ROOT), **find["find"])
     folders = (
         p.parent
         for r in ("pnpdepth_cli", "model_zoo_defs")
         for p in (ROOT / r).rglob("__init__.py")
     )
     names = (".".join(f.relative_to(ROOT).parts) for f in folders)
-    assert sorted(found) == sorted(n for n in names if not n.startswith("model_zoo_defs.training"))
+    assert sorted(packages) == sorted(
+        n for n in names if not n.startswith("model_zoo_defs.training")
+    )
 
 
 @pytest.mark.skipif(sys.version_info < (3, 11), reason="tomllib came with Python 3.11")

@@ -25,9 +25,9 @@ def points(xy: list[tuple[float, float]], size: tuple[int, int]) -> SparsePoints
 
 @given(sides, sides, sides, sides, st.lists(st.tuples(shares, shares), min_size=1, max_size=9))
 def test_a_frame_there_and_back_is_the_same_frame(
-    height: int, width: int, h: int, w: int, places: list[tuple[float, float]]
+    height: int, width: int, h: int, w: int, pixels: list[tuple[float, float]]
 ) -> None:
-    here = points([(u * width - 0.5, v * height - 0.5) for u, v in places], (height, width))
+    here = points([(u * width - 0.5, v * height - 0.5) for u, v in pixels], (height, width))
     there = here.resized(h, w)
     assert there.size == (h, w)
     assert torch.equal(there.depth, here.depth)
@@ -62,10 +62,10 @@ def test_on_the_grid_a_sample_is_plain_indexing(height: int, width: int, seed: i
     sides, sides, st.lists(st.tuples(shares, shares), min_size=1, max_size=9), st.integers(0, 99)
 )
 def test_off_the_grid_a_sample_is_bilinear_with_the_border_held(
-    height: int, width: int, places: list[tuple[float, float]], seed: int
+    height: int, width: int, pixels: list[tuple[float, float]], seed: int
 ) -> None:
     dense = torch.rand(1, 1, height, width, generator=torch.Generator().manual_seed(seed % 99))
-    here = points([(u * width - 0.5, v * height - 0.5) for u, v in places], (height, width))
+    here = points([(u * width - 0.5, v * height - 0.5) for u, v in pixels], (height, width))
     grid = ((here.xy.double() + 0.5) / torch.tensor([width, height]) * 2 - 1)[None, None]
     expected = F.grid_sample(dense.double(), grid, padding_mode="border", align_corners=False)
     torch.testing.assert_close(
@@ -106,10 +106,10 @@ def test_two_maps_at_once_are_refused() -> None:
     st.lists(st.tuples(shares, shares, st.floats(0.5, 80, width=32)), max_size=30),
 )
 def test_scattered_points_are_on_their_pixels_and_the_nearest_wins(
-    height: int, width: int, places: list[tuple[float, float, float]]
+    height: int, width: int, pixels: list[tuple[float, float, float]]
 ) -> None:
-    xy = torch.tensor([(u * width - 0.5, v * height - 0.5) for u, v, _ in places]).reshape(-1, 2)
-    here = SparsePoints(xy=xy, depth=torch.tensor([d for *_, d in places]), size=(height, width))
+    xy = torch.tensor([(u * width - 0.5, v * height - 0.5) for u, v, _ in pixels]).reshape(-1, 2)
+    here = SparsePoints(xy=xy, depth=torch.tensor([d for *_, d in pixels]), size=(height, width))
     expected = torch.zeros(height, width)
     for (x, y), depth in zip(here.xy.round().tolist(), here.depth.tolist(), strict=True):
         row, column = min(max(int(y), 0), height - 1), min(max(int(x), 0), width - 1)

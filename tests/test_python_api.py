@@ -88,7 +88,9 @@ def test_maps_rows_and_points_are_the_same(network: pnp.Network, frame: Frame) -
     )
     settings = pnp.RefineSettings(iterations=1)
     with pnp.Refiner(network, settings=settings) as refiner:
-        depths = [refiner.refine(rgb, given).depth for given in (sparse, rows, points)]
+        depths = [
+            refiner.refine(rgb, sparse_depth).depth for sparse_depth in (sparse, rows, points)
+        ]
     assert np.array_equal(depths[0], depths[1])
     assert np.array_equal(depths[0], depths[2])
 

@@ -107,18 +107,18 @@ def _without_outliers(
     if bool(suspected.any()):
         consistent = depths_of(frame.with_points(points.select(~suspected)))
     try:
-        found = outliers(consistent.prediction, points, frame.rgb)
+        outlying = outliers(consistent.prediction, points, frame.rgb)
     except PnpDepthError:
         return frame, depths, ()
     if len(points) >= MIN_POINTS_FOR_JOINT_OUTLIERS:
-        found = found | suspected
-    count = int(found.sum())
+        outlying = outlying | suspected
+    count = int(outlying.sum())
     if not count:
         return frame, depths, ()
     note = f"outliers: {count:,} of {len(points):,} points left out, inconsistent with the others"
-    if torch.equal(found, suspected):
-        return frame.with_points(points.select(~found)), consistent, (note,)
-    frame = frame.with_points(points.select(~found))
+    if torch.equal(outlying, suspected):
+        return frame.with_points(points.select(~outlying)), consistent, (note,)
+    frame = frame.with_points(points.select(~outlying))
     return frame, depths_of(frame), (note,)
 
 

@@ -163,11 +163,11 @@ def cascades(
         definitions: Of the networks, by name.
     """
     return tuple(
-        Candidate(config=given, prior=Candidate(config=prior))
-        for given in configs
-        if definitions[given.network].takes_prior
+        Candidate(config=config, prior=Candidate(config=prior))
+        for config in configs
+        if definitions[config.network].takes_prior
         for prior in configs
-        if prior != given
+        if prior != config
     )
 
 

@@ -270,12 +270,12 @@ class CandidateDepths:
         key = config, prior
         if key not in self._trajectories:
             try:
-                given = None if prior is None else self.dense(prior)
-                made = self._passes.trajectory(config, self._frame.points, given)
+                dense_prior = None if prior is None else self.dense(prior)
+                refined = self._passes.trajectory(config, self._frame.points, dense_prior)
             except PnpDepthError as error:
                 self._trajectories[key] = error
                 raise
-            self._trajectories[key] = made
+            self._trajectories[key] = refined
         known = self._trajectories[key]
         if isinstance(known, PnpDepthError):
             raise known
@@ -326,8 +326,7 @@ class CandidateDepths:
             return weighted_mean(members, candidate.weights, geometric=True)
         if candidate.baseline is not None:
             name = candidate.baseline
-            made: Any = BASELINES[name].depth(self._frame.points, self._prediction_for(name))
-            depth: Tensor = made
+            depth: Tensor = BASELINES[name].depth(self._frame.points, self._prediction_for(name))
             return depth
         config = candidate.config or self._reference
         return self.trajectory(config, candidate.prior).after(candidate.iterations)

@@ -30,7 +30,7 @@ from pnpdepth_cli.pipeline.refinement.request import parse_sample
 @options.scan
 @options.overwrite
 @options.as_json
-def adapt(source: Path, output: Path, sample: str | None, as_json: bool, **given: Any) -> None:
+def adapt(source: Path, output: Path, sample: str | None, as_json: bool, **values: Any) -> None:
     """Adapt the weights of a network to the frames of FOLDER, without ground truth.
 
     \b
@@ -45,8 +45,8 @@ def adapt(source: Path, output: Path, sample: str | None, as_json: bool, **given
     from pnpdepth_cli.pipeline.adaptation.adapt import Progress
     from pnpdepth_cli.pipeline.adaptation.adapt import adapt as adapt_network
 
-    own = options.taken(AdaptRequest, given)
-    refine = options.request_of(given, sample=parse_sample(sample))
+    own = options.taken(AdaptRequest, values)
+    refine = options.request_of(values, sample=parse_sample(sample))
     request = AdaptRequest(source=source, output=output, refine=refine, **own)
     with progress_bar("adapt", "update") as show:
         progress = Progress(

@@ -48,7 +48,7 @@ _STOPPING = b"\nfinishing the current frame; press Ctrl-C again to stop at once\
     groups={
         "Frames": (
             *("--layout", "--protocol", "--sample", "--limit", "--shard"),
-            *("--image-topic", "--points-topic", "--tolerance"),
+            *("--image-topic", "--points-topic", "--poses-topic", "--tolerance"),
         ),
         "Sequences": ("--accumulate", "--poses", "--warm-start"),
         "Input": (*grouped_help.LIDAR, *grouped_help.COLMAP, *grouped_help.FILE_READING),
@@ -59,8 +59,8 @@ _STOPPING = b"\nfinishing the current frame; press Ctrl-C again to stop at once\
         "Cluster": grouped_help.CLUSTER,
     },
 )
-@click.argument("source", type=options.FILE, metavar="FOLDER|LIST|BAG")
-@click.option("-o", "--output", type=options.FILE, required=True, help="Output folder.")
+@click.argument("source", type=options.Address(), metavar="FOLDER|LIST|BAG")
+@click.option("-o", "--output", type=options.Address(), required=True, help="Output folder.")
 @options.sample
 @options.options_of_groups(BatchRequest, SequenceOptions, ClusterOptions, BagOptions)
 @click.option("--dry-run", is_flag=True, help="List the frames that would be refined, and exit.")
@@ -73,7 +73,7 @@ def batch(
     sample: str | None,
     dry_run: bool,
     as_json: bool,
-    **given: Any,
+    **values: Any,
 ) -> None:
     """Refine all frames of FOLDER, of a LIST of them (CSV or JSON lines), or of a ROS BAG.
 
@@ -97,11 +97,11 @@ def batch(
     from pnpdepth_cli.pipeline.batch.bags import unpacked
     from pnpdepth_cli.pipeline.batch.batch import plan_batch
 
-    own = options.taken(BatchRequest, given)
-    own["cluster"] = ClusterOptions(**options.taken(ClusterOptions, given))
-    bag_options = BagOptions(**options.taken(BagOptions, given))
-    own["sequence"] = SequenceOptions(**options.taken(SequenceOptions, given))
-    refine = options.request_of(given, sample=parse_sample(sample))
+    own = options.taken(BatchRequest, values)
+    own["cluster"] = ClusterOptions(**options.taken(ClusterOptions, values))
+    bag_options = BagOptions(**options.taken(BagOptions, values))
+    own["sequence"] = SequenceOptions(**options.taken(SequenceOptions, values))
+    refine = options.request_of(values, sample=parse_sample(sample))
     request = BatchRequest(source=source, output=output, refine=refine, **own)
     request = unpacked(
         request,

@@ -50,7 +50,7 @@ if TYPE_CHECKING:
     help="Measure the paper's seven networks, beside its Table IV.",
 )
 @options.as_json
-def bench(size: str | None, repeats: int, table: bool, as_json: bool, **given: Any) -> None:
+def bench(size: str | None, repeats: int, table: bool, as_json: bool, **values: Any) -> None:
     """Measure the run time of a refinement on this machine, by part and in forward passes.
 
     \b
@@ -67,21 +67,21 @@ def bench(size: str | None, repeats: int, table: bool, as_json: bool, **given: A
     if repeats < 1:
         raise UsageError(f"repeats {repeats}: there must be at least one")
     if table:
-        if given["target"] != "given":
+        if values["target"] != "given":
             raise UsageError("--table measures the paper's updates and not --target masked")
         refused = {"--size": size} | {
-            f"--{name}": given[name] for name in ("checkpoint", "layer", "iterations")
+            f"--{name}": values[name] for name in ("checkpoint", "layer", "iterations")
         }
         if clash := [name for name, value in refused.items() if value is not None]:
             raise UsageError(
                 f"--table measures the paper's networks and cannot be combined with {clash[0]}"
             )
-        _table(repeats, given["precision"], given["device"], as_json)
+        _table(repeats, values["precision"], values["device"], as_json)
         return
     from pnpdepth_cli.pipeline.bench.bench import BenchRequest, run_bench
 
     request = BenchRequest(
-        size=options.height_and_width(size) if size else None, repeats=repeats, **given
+        size=options.height_and_width(size) if size else None, repeats=repeats, **values
     )
     with progress_bar("bench", "round") as show:
         result = run_bench(request, on_round=show)

@@ -205,7 +205,7 @@ class _ProtocolName(_Choice):
     metavar="FOLDER",
     help="Write an HTML report: every frame beside its ground truth, the worst first.",
 )
-def evaluate(prediction: Path, truth: Path, html: Path | None, **given: Any) -> None:
+def evaluate(prediction: Path, truth: Path, html: Path | None, **values: Any) -> None:
     """Score the depth in PRED against the ground truth in GT: two files, or two folders.
 
     \b
@@ -231,12 +231,12 @@ def evaluate(prediction: Path, truth: Path, html: Path | None, **given: Any) -> 
     from pnpdepth_cli.pipeline.report import evaluation as report_eval
 
     names = [each.name for each in fields(score_tables.TableFiles)]
-    tables = score_tables.TableFiles(**{name: given.pop(name) for name in names})
+    tables = score_tables.TableFiles(**{name: values.pop(name) for name in names})
     tables.check((prediction, truth))
     if html is not None:
-        inputs = [p for p in (prediction, truth, given["sparse"], given["mask"]) if p is not None]
+        inputs = [p for p in (prediction, truth, values["sparse"], values["mask"]) if p is not None]
         report_eval.check_eval_report(html, inputs, overwrite=tables.overwrite)
-    request = _request(prediction, truth, given)
+    request = _request(prediction, truth, values)
     with progress_bar("eval", "frame") as show:
         evaluation = run_evaluation(request, on_frame=show)
     protocol = evaluation.protocol.describe()
@@ -261,27 +261,27 @@ def evaluate(prediction: Path, truth: Path, html: Path | None, **given: Any) -> 
         raise FramesFailedError(unscored)
 
 
-def _request(prediction: Path, truth: Path, given: dict[str, Any]) -> EvalRequest:
+def _request(prediction: Path, truth: Path, values: dict[str, Any]) -> EvalRequest:
     """Returns the request of the other options; those without an own field change the protocol."""
     from pnpdepth_cli.pipeline.evaluation.frame_reading import Scales
     from pnpdepth_cli.pipeline.evaluation.result import EvalRequest
 
-    own = {name: given.pop(name) for name in _REQUEST_OPTIONS}
-    own["cluster"] = ClusterOptions(**options.taken(ClusterOptions, given))
-    scales = {field: given.pop(name) for field, name in _SCALE_OPTIONS.items()}
-    grouped = not given.pop("no_groups")
-    groups = given.pop("measures")
+    own = {name: values.pop(name) for name in _REQUEST_OPTIONS}
+    own["cluster"] = ClusterOptions(**options.taken(ClusterOptions, values))
+    scales = {field: values.pop(name) for field, name in _SCALE_OPTIONS.items()}
+    grouped = not values.pop("no_groups")
+    groups = values.pop("measures")
     derived = {
         "groups": None if groups is None else tuple(dict.fromkeys(groups.split(","))),
-        "thresholds": _thresholds(given.pop("delta")),
-        "exclude_sparse": given.pop("exclude_sparse") or None,
+        "thresholds": _thresholds(values.pop("delta")),
+        "exclude_sparse": values.pop("exclude_sparse") or None,
     }
     return EvalRequest(
         prediction=prediction,
         ground_truth=truth,
         grouped=grouped,
         scales=Scales(**scales),
-        changes=given | derived,
+        changes=values | derived,
         **own,
     )
 

@@ -20,7 +20,7 @@ from pnpdepth_cli.pipeline.sparse.bag_options import BagOptions
 @click.option("--limit", type=click.IntRange(1), metavar="N", help="Only the first N frames.")
 @options.overwrite
 @options.as_json
-def frames(bag: Path, output: Path, limit: int | None, as_json: bool, **given: Any) -> None:
+def frames(bag: Path, output: Path, limit: int | None, as_json: bool, **values: Any) -> None:
     """Write the images of a BAG and the scans nearest in time as files.
 
     \b
@@ -29,13 +29,13 @@ def frames(bag: Path, output: Path, limit: int | None, as_json: bool, **given: A
     pnpdepth batch drive/ -o refined/
 
     BAG is a file of ROS 1 (.bag) or ROS 2 (.mcap, .db3), or a folder that ROS 2 recorded. OUTPUT
-    gets rgb/, sparse/ (PLY) and calib.txt, from camera_info and tf_static.
+    gets rgb/, sparse/ (PLY), calib.txt from camera_info and tf_static, and poses.txt from odometry.
     """
     from pnpdepth_cli.pipeline.sparse.frames import FramesRequest, write_frames
 
-    bag_options = BagOptions(**options.taken(BagOptions, given))
+    bag_options = BagOptions(**options.taken(BagOptions, values))
     request = FramesRequest(
-        bag=bag, output=output, options=bag_options, limit=limit, overwrite=given["overwrite"]
+        bag=bag, output=output, options=bag_options, limit=limit, overwrite=values["overwrite"]
     )
     record = write_frames(request, lambda text: click.echo(printable(text), err=True))
     if as_json:

@@ -28,7 +28,9 @@ from pnpdepth_cli.pipeline.refinement.request import NetworkChoice
 )
 @options.device
 @options.as_json
-def layers(size: str | None, every: bool, sparse: Path | None, as_json: bool, **given: Any) -> None:
+def layers(
+    size: str | None, every: bool, sparse: Path | None, as_json: bool, **values: Any
+) -> None:
     """List the layers a network can be cut at.
 
     For each layer: shape and stride of z, the fraction of the network's cost behind the cut (which
@@ -36,7 +38,7 @@ def layers(size: str | None, every: bool, sparse: Path | None, as_json: bool, **
     """
     from pnpdepth_cli.pipeline.networks.layers import list_layers
 
-    choice = NetworkChoice(**given)
+    choice = NetworkChoice(**values)
     with progress_bar("layers", "layer") as show:
         result = list_layers(
             choice,

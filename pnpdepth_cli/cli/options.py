@@ -10,7 +10,7 @@ import click
 
 from pnpdepth_cli.budget import set_max_pixels
 from pnpdepth_cli.errors import UsageError
-from pnpdepth_cli.pipeline.options import OptionField, options_of
+from pnpdepth_cli.pipeline.options import OptionField, options_of, parse_file
 from pnpdepth_cli.pipeline.refinement import request
 from pnpdepth_cli.pipeline.refinement.request import (
     LARGEST_SEED,
@@ -29,6 +29,15 @@ if TYPE_CHECKING:
 
 FILE = click.Path(path_type=Path)
 SEED = click.IntRange(0, LARGEST_SEED)
+
+
+class Address(click.Path):
+    """A local path, or the address of a file or folder in a store."""
+
+    def convert(self, value: Any, param: Any, ctx: Any) -> Any:
+        """Returns the path."""
+        text = super().convert(value, param, ctx)
+        return parse_file(text) if isinstance(text, str) else text
 
 
 class Renamed(click.Option):
@@ -205,37 +214,37 @@ no_groups = click.option(
 )
 
 
-def taken(group: type, given: dict[str, Any]) -> dict[str, Any]:
-    """Returns the options of this group by name; they are taken out of `given`."""
+def taken(group: type, values: dict[str, Any]) -> dict[str, Any]:
+    """Returns the options of this group by name; they are removed from `values`."""
     names = [each.name for each in options_of(group)]
-    return {name: given.pop(name) for name in names if name in given}
+    return {name: values.pop(name) for name in names if name in values}
 
 
-def request_of(given: dict[str, Any], **others: Any) -> RefineRequest:
+def request_of(values: dict[str, Any], **others: Any) -> RefineRequest:
     """Returns the request that these options of a command make.
 
     Args:
-        given: Values of the options of `scan` and `options_of_groups`, by their names.
+        values: Of the options of `scan` and `options_of_groups`, by their names.
         **others: Other fields of the request.
     """
-    scan_options = ScanOptions(**taken(ScanOptions, given))
-    others |= {"colmap": ColmapOptions(**taken(ColmapOptions, given))}
-    if isinstance(given.get("model"), tuple):  # of the commands that take several
-        first, *more = given["model"]
+    scan_options = ScanOptions(**taken(ScanOptions, values))
+    others |= {"colmap": ColmapOptions(**taken(ColmapOptions, values))}
+    if isinstance(values.get("model"), tuple):  # of the commands that take several
+        first, *more = values["model"]
         others |= {"model": first, "more_models": tuple(more)}
-        given = {name: value for name, value in given.items() if name != "model"}
-    return RefineRequest.from_fields(scan=scan_options, **given, **others)
+        values = {name: value for name, value in values.items() if name != "model"}
+    return RefineRequest.from_fields(scan=scan_options, **values, **others)
 
 
-def sparse_target(given: dict[str, Any]) -> SparseTarget:
-    """Returns where sparse depth is written; its options are taken out of `given`."""
+def sparse_target(values: dict[str, Any]) -> SparseTarget:
+    """Returns where sparse depth is written; its options are removed from `values`."""
     from pnpdepth_cli.pipeline.sparse.outputs import SparseTarget
 
     return SparseTarget(
-        output=given.pop("output"),
-        overlay=given.pop("overlay", None),
-        depth_scale=given.pop("output_scale"),
-        overwrite=given.pop("overwrite"),
+        output=values.pop("output"),
+        overlay=values.pop("overlay", None),
+        depth_scale=values.pop("output_scale"),
+        overwrite=values.pop("overwrite"),
     )
 
 

@@ -22,7 +22,7 @@ from pnpdepth_cli.pipeline.sparse.scan_options import ScanOptions
 @click.option("--overlay", type=options.FILE, help="Also write a PNG of the points on the image.")
 @options.overwrite
 @options.as_json
-def project(scan: Path, image: Path | None, size: str | None, as_json: bool, **given: Any) -> None:
+def project(scan: Path, image: Path | None, size: str | None, as_json: bool, **values: Any) -> None:
     """Project a LiDAR SCAN (KITTI's BIN, NPY, PCD or PLY) to a sparse depth map.
 
     \b
@@ -35,11 +35,11 @@ def project(scan: Path, image: Path | None, size: str | None, as_json: bool, **g
     from pnpdepth_cli.cli.tables import print_sparse
     from pnpdepth_cli.pipeline.sparse.project import ProjectRequest, project_scan
 
-    target = options.sparse_target(given)
+    target = options.sparse_target(values)
     record = project_scan(
         ProjectRequest(
             scan=scan,
-            options=ScanOptions(**given),
+            options=ScanOptions(**values),
             target=target,
             image=image,
             size=options.height_and_width(size) if size else None,

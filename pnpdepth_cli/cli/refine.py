@@ -46,7 +46,7 @@ from pnpdepth_cli.cli.progress import progress_bar
 )
 @options.refinement
 @options.as_json
-def refine(as_json: bool, **given: Any) -> None:
+def refine(as_json: bool, **values: Any) -> None:
     """Refine a depth network's prediction for IMAGE with sparse depth.
 
     \b
@@ -61,7 +61,7 @@ def refine(as_json: bool, **given: Any) -> None:
     from pnpdepth_cli.cli.tables import print_refinement
     from pnpdepth_cli.pipeline.refinement.refine import refine_image
 
-    request = options.request_of(given)
+    request = options.request_of(values)
     with progress_bar("refine", "update") as show:
 
         def show_update(done: int, of: int, loss: float) -> None:

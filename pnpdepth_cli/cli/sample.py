@@ -57,7 +57,7 @@ _NOISE = {
 @click.option("--overlay", type=options.FILE, help="Also write a PNG of the points on --image.")
 @options.overwrite
 @options.as_json
-def sample(count: str | None, region: str | None, as_json: bool, **given: Any) -> None:
+def sample(count: str | None, region: str | None, as_json: bool, **values: Any) -> None:
     """Sample sparse depth from the dense DEPTH.
 
     \b
@@ -80,8 +80,8 @@ def sample(count: str | None, region: str | None, as_json: bool, **given: Any) -
     from pnpdepth_cli.pipeline.sparse.sample import SampleRequest, sample_depth
 
     points, fraction = options.count_or_fraction(count)
-    target = options.sparse_target(given)
-    noise = {key: given.pop(name) for key, name in _NOISE.items()}
+    target = options.sparse_target(values)
+    noise = {key: values.pop(name) for key, name in _NOISE.items()}
     record = sample_depth(
         SampleRequest(
             target=target,
@@ -89,7 +89,7 @@ def sample(count: str | None, region: str | None, as_json: bool, **given: Any) -
             fraction=fraction,
             region=_region(region) if region else None,
             noise=noise,
-            **given,
+            **values,
         )
     )
     if as_json:

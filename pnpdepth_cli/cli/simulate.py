@@ -66,7 +66,7 @@ from pnpdepth_cli.cli import options
 @options.output_scale
 @options.overwrite
 @options.as_json
-def simulate(as_json: bool, **given: Any) -> None:
+def simulate(as_json: bool, **values: Any) -> None:
     """Simulate the sparse depth of a LiDAR in the scene of the dense DEPTH.
 
     \b
@@ -82,8 +82,8 @@ def simulate(as_json: bool, **given: Any) -> None:
     from pnpdepth_cli.cli.tables import print_sparse
     from pnpdepth_cli.pipeline.sparse.simulate import SimulateRequest, simulate_scan
 
-    target = options.sparse_target(given)
-    record = simulate_scan(SimulateRequest.from_fields(target=target, **given))
+    target = options.sparse_target(values)
+    record = simulate_scan(SimulateRequest.from_fields(target=target, **values))
     if as_json:
         click.echo(json.dumps(record, indent=2))
     else:

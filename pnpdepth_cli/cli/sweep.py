@@ -88,7 +88,7 @@ def sweep(
     one_by_one: bool,
     sample: str | None,
     as_json: bool,
-    **given: Any,
+    **values: Any,
 ) -> None:
     """Vary the refinement or the points over frames with ground truth, and plot the errors.
 
@@ -133,18 +133,18 @@ def sweep(
     from pnpdepth_cli.pipeline.sweep.request import SweepRequest
     from pnpdepth_cli.pipeline.sweep.sweep import run_sweep
 
-    own = options.taken(FrameSelection, given)
+    own = options.taken(FrameSelection, values)
     request = SweepRequest(
         source=source,
         output=output,
         studies=studies_of([read_axis(text) for text in vary], one_by_one=one_by_one),
         sampling=None if sample is None else read_sampling(sample),
-        seeds=given.pop("seeds"),
-        plots=given.pop("plots"),
-        plot_format=given.pop("plot_format"),
-        cost=given.pop("cost"),
-        cluster=ClusterOptions(**options.taken(ClusterOptions, given)),
-        refine=options.request_of(given),
+        seeds=values.pop("seeds"),
+        plots=values.pop("plots"),
+        plot_format=values.pop("plot_format"),
+        cost=values.pop("cost"),
+        cluster=ClusterOptions(**options.taken(ClusterOptions, values)),
+        refine=options.request_of(values),
         **own,
     )
     with _Progress() as progress:

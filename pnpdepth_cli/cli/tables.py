@@ -136,6 +136,9 @@ def print_batch(summary: Mapping[str, Any]) -> None:
         if mean["scores"] is not None:
             _score_rows(table, mean["scores"], beside["scores"])
             table.caption = f"scored on the ground truth of {mean['scores']['frames']:,} frames"
+        elif mean["held_out_error"] is None and (folds := beside["folds"]) is not None:
+            title = f"error at points in turn held out, {folds['frames']:,} frames, MAE"
+            _fold_row(table, title, folds, unit)
         console.print(table)
     if summary["baselines"]:
         rows = {

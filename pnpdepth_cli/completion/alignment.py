@@ -144,8 +144,8 @@ def aligned(prediction: Tensor, points: SparsePoints, *, kind: str, space: str =
     """
     known, points = where_predicted(prediction, points)
     x = to_space(torch.where(known, prediction, 1.0), space)
-    made = align(points.sample(x), points, (space,), kind)
-    return torch.where(known, made.depth(x), 0.0)
+    fit = align(points.sample(x), points, (space,), kind)
+    return torch.where(known, fit.depth(x), 0.0)
 
 
 def where_predicted(prediction: Tensor, points: SparsePoints) -> tuple[Tensor, SparsePoints]:
@@ -169,22 +169,22 @@ def _fitted(x: Tensor, d: Tensor, space: str, kind: str) -> Alignment | None:
     if line is None or not all(map(math.isfinite, line)) or line[0] == 0:
         return None
     bounds = (float(d.min()) / BEYOND, float(d.max()) * BEYOND)
-    made = Alignment(
+    fit = Alignment(
         space=space, kind=kind, scale=line[0], shift=line[1], bounds=bounds, points=len(x)
     )
-    off = (made.depth(x).log() - d.log()).abs()
+    off = (fit.depth(x).log() - d.log()).abs()
     error = float(off.sort().values[: max(1, round(_BEST * len(off)))].mean())
     gross = max(3 * _NORMAL_MAD * float(off.median()), 0.05)
     misfit = float(off.clamp_max(_MAX_ERROR).mean())
-    return replace(made, error=error, misfit=misfit, outliers=float((off > gross).double().mean()))
+    return replace(fit, error=error, misfit=misfit, outliers=float((off > gross).double().mean()))
 
 
-def _bic(made: Alignment) -> float:
-    parameters = {"none": 0, "affine": 2}.get(made.kind, 1)
-    error = max(made.misfit, _MIN_ERROR)
+def _bic(fit: Alignment) -> float:
+    parameters = {"none": 0, "affine": 2}.get(fit.kind, 1)
+    error = max(fit.misfit, _MIN_ERROR)
     # A parameter can fit outliers: on rendered frames, with and without outliers, twice BIC's
     # price of a parameter chose best.
-    return 2 * (made.points * math.log(error) + parameters * math.log(max(2, made.points)))
+    return 2 * (fit.points * math.log(error) + parameters * math.log(max(2, fit.points)))
 
 
 def _median(x: Tensor, y: Tensor, space: str) -> tuple[float, float] | None:

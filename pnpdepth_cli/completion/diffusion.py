@@ -78,7 +78,7 @@ def _readings(field: ResidualField, rows: int, columns: int) -> Any:
     left, top = x.floor(), y.floor()
     fx, fy = x - left, y - top
     right, bottom = x.ceil(), y.ceil()
-    places = torch.stack(
+    nodes = torch.stack(
         [
             top * columns + left,
             top * columns + right,
@@ -88,5 +88,5 @@ def _readings(field: ResidualField, rows: int, columns: int) -> Any:
     )
     weights = torch.stack([(1 - fx) * (1 - fy), fx * (1 - fy), (1 - fx) * fy, fx * fy])
     which = torch.arange(len(xy)).repeat(4, 1)
-    values = (weights.flatten().numpy(), (which.flatten().numpy(), places.long().flatten().numpy()))
+    values = (weights.flatten().numpy(), (which.flatten().numpy(), nodes.long().flatten().numpy()))
     return coo_array(values, shape=(len(xy), rows * columns)).tocsr()

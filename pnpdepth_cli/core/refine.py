@@ -192,9 +192,9 @@ def refine_weights(
     if carried is not None and state.takes(carried):
         weights = carried
     for iteration in range(state.iterations):
-        given, asked = state.mask()
+        shown, hidden = state.mask()
         with torch.enable_grad(), weights.in_place(requires_grad=True) as theta:
-            loss = state.loss(frame.predict_in_steps(given), asked)
+            loss = state.loss(frame.predict_in_steps(shown), hidden)
             gradients = _gradients(loss, theta)
         state.update(loss, gradients)
         if state.error is not None:

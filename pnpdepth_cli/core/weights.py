@@ -25,7 +25,7 @@ class _StandIn:
 
     parameter: nn.Parameter
     """W."""
-    places: tuple[tuple[nn.Module, str], ...]
+    users: tuple[tuple[nn.Module, str], ...]
     """The submodules that use it, each with its name there."""
     leaves: tuple[int, ...]
     """Positions of its parts in θ: one of W's shape, or A and B."""
@@ -60,14 +60,14 @@ class MovingWeights:
         generator = torch.Generator().manual_seed(seed)
         self.theta: list[Tensor] = []
         self._stand_ins: list[_StandIn] = []
-        for parameter, places in _places(network).items():
+        for parameter, users in _users_of(network).items():
             start = [parameter.detach().float()]
             if rank is not None:
                 start = _low_rank(parameter, rank, generator)
             leaves = range(len(self.theta), len(self.theta) + len(start))
             self.theta += start
             if start:
-                self._stand_ins.append(_StandIn(parameter, tuple(places), tuple(leaves)))
+                self._stand_ins.append(_StandIn(parameter, tuple(users), tuple(leaves)))
 
     def parameters(self) -> list[Tensor]:
         """Returns for every element of θ the parameter of the network that it belongs to."""
@@ -84,12 +84,12 @@ class MovingWeights:
         try:
             for one in self._stand_ins:
                 value = one.value(leaves)
-                for module, name in one.places:
+                for module, name in one.users:
                     module.__dict__[name] = value
             yield leaves
         finally:
             for one in self._stand_ins:
-                for module, name in one.places:
+                for module, name in one.users:
                     module.__dict__.pop(name, None)
 
     def keep(self, reached: Sequence[bool]) -> None:
@@ -104,7 +104,7 @@ class MovingWeights:
             start = len(self.theta)
             self.theta += [theta[index] for index in one.leaves]
             leaves = tuple(range(start, len(self.theta)))
-            self._stand_ins.append(_StandIn(one.parameter, one.places, leaves))
+            self._stand_ins.append(_StandIn(one.parameter, one.users, leaves))
 
 
 def rank_of(parameters: str) -> int | None:
@@ -120,9 +120,9 @@ def rank_of(parameters: str) -> int | None:
     return int(rank)
 
 
-def _places(network: nn.Module) -> dict[nn.Parameter, list[tuple[nn.Module, str]]]:
+def _users_of(network: nn.Module) -> dict[nn.Parameter, list[tuple[nn.Module, str]]]:
     """The submodules that use each floating-point parameter under its own name."""
-    places: dict[nn.Parameter, list[tuple[nn.Module, str]]] = {}
+    users: dict[nn.Parameter, list[tuple[nn.Module, str]]] = {}
     for module in network.modules():
         for name, parameter in module.named_parameters(recurse=False, remove_duplicate=False):
             if (
@@ -130,8 +130,8 @@ def _places(network: nn.Module) -> dict[nn.Parameter, list[tuple[nn.Module, str]
                 and getattr(module, name, None) is parameter
                 and not isinstance(module, torch.jit.ScriptModule)
             ):
-                places.setdefault(parameter, []).append((module, name))
-    return places
+                users.setdefault(parameter, []).append((module, name))
+    return users
 
 
 def _low_rank(parameter: nn.Parameter, rank: int, generator: torch.Generator) -> list[Tensor]:

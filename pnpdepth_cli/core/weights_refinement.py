@@ -116,9 +116,9 @@ class WeightsRefinement:
         away = self._masks.next()
         return self._shown.select(~away), self._shown.select(away)
 
-    def loss(self, output: Any, asked: SparsePoints) -> Tensor:
+    def loss(self, output: Any, points: SparsePoints) -> Tensor:
         """Returns L of the network's output at these points."""
-        return self._loss(asked.sample(self._frame.depth_of(output)), asked.depth)
+        return self._loss(points.sample(self._frame.depth_of(output)), points.depth)
 
     def update(self, loss: Tensor, gradients: Sequence[Tensor | None]) -> None:
         """Moves the weights: θ_{k+1} = θ_k − α·U(∂L/∂θ_k). Sets `error` where that diverges."""
@@ -131,7 +131,7 @@ class WeightsRefinement:
             self.error = self._diverged(done)
             return
         self.losses.append(float(loss.detach()))
-        factor = SCHEDULES[self._settings.schedule](done / self._settings.iterations)
+        factor = SCHEDULES[self._settings.schedule](done / self._planned())
         self._weights.theta = [
             value - factor * alpha * rule(gradient)
             for value, alpha, rule, gradient in zip(
@@ -141,10 +141,11 @@ class WeightsRefinement:
 
     def finished(self) -> bool:
         """Whether no further step is worth its time, by the points set aside and the budget."""
-        made, of = len(self.losses), self._settings.iterations
-        if made == of or made * CHECKS // of > (made - 1) * CHECKS // of:
-            self._check(made)
-        return self._out_of_time() or self._getting_worse()
+        steps, of = len(self.losses), self._settings.iterations
+        last = steps >= self._planned()
+        if last or steps * CHECKS // of > (steps - 1) * CHECKS // of:
+            self._check(steps)
+        return last or self._getting_worse()
 
     def result(self) -> Refinement:
         """Returns the refinement with the best weights, given all points."""
@@ -159,19 +160,19 @@ class WeightsRefinement:
             warm=self._warm,
         )
 
-    def _check(self, made: int) -> None:
+    def _check(self, steps: int) -> None:
         """Notes the loss at the points set aside; without any, that the last weights count."""
-        self._checked[made] = list(self._weights.theta)
+        self._checked[steps] = list(self._weights.theta)
         if len(self._aside):
             at_points = self._aside.sample(self._predicted(self._shown))
-            self._errors[made] = float(self._loss(at_points, self._aside.depth))
+            self._errors[steps] = float(self._loss(at_points, self._aside.depth))
 
     def _kept(self) -> int:
         """The step that counts: the last, unless another is better beyond chance."""
         last = max(self._checked)
         if not self._errors:
             return last
-        best = min(self._errors, key=lambda made: self._errors[made])
+        best = min(self._errors, key=lambda steps: self._errors[steps])
         return best if self._beyond_chance(best, last) else last
 
     def _beyond_chance(self, better: int, worse: int) -> bool:
@@ -190,14 +191,21 @@ class WeightsRefinement:
     def _getting_worse(self) -> bool:
         if not self._errors:
             return False
-        best = min(self._errors, key=lambda made: self._errors[made])
-        later = [made for made in self._errors if made > best]
-        return sum(self._beyond_chance(best, made) for made in later) >= PATIENCE
+        best = min(self._errors, key=lambda steps: self._errors[steps])
+        later = [steps for steps in self._errors if steps > best]
+        return sum(self._beyond_chance(best, steps) for steps in later) >= PATIENCE
 
-    def _out_of_time(self) -> bool:
-        budget, spent = self._settings.time_budget_s, time.monotonic() - self._started
-        # A step and the last prediction must still fit.
-        return budget is not None and spent + 2 * spent / max(1, len(self.losses)) > budget
+    def _planned(self) -> int:
+        """Number of steps in all: those of the settings, or as many as fit in the time budget.
+
+        α falls to 0 with the last of them, so that a budget shortens the schedule.
+        """
+        steps, budget = len(self.losses), self._settings.time_budget_s
+        if budget is None:
+            return self._settings.iterations
+        each = (time.monotonic() - self._started) / steps
+        # The last prediction takes less than a step.
+        return max(steps, min(self._settings.iterations, int(budget / each) - 1))
 
     def _start_rules(self, gradients: Sequence[Tensor | None]) -> None:
         """Begins with those weights that a gradient reaches."""
@@ -212,8 +220,8 @@ class WeightsRefinement:
         self._rules = [UPDATES[update]() for _ in self._weights.theta]
         self._steps = [step_size(lr, parameter) for parameter in self._weights.parameters()]
 
-    def _diverged(self, made: int) -> DivergedError:
+    def _diverged(self, steps: int) -> DivergedError:
         return DivergedError(
-            f"the loss or its gradient is not finite after {made} steps of the weights; try a"
+            f"the loss or its gradient is not finite after {steps} steps of the weights; try a"
             " smaller --lr"
         )

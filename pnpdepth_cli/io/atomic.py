@@ -60,11 +60,11 @@ def atomic_folder(folder: Path) -> Iterator[Path]:
     try:
         temporary.mkdir()
         yield temporary
-        for place, _, names in os.walk(temporary, topdown=False):
-            target = folder / Path(place).relative_to(temporary)
+        for directory, _, names in os.walk(temporary, topdown=False):
+            target = folder / Path(directory).relative_to(temporary)
             target.mkdir(exist_ok=True)
             for name in names:
-                Path(place, name).replace(target / name)
+                Path(directory, name).replace(target / name)
     except OutputError as error:  # of a file in the temporary folder
         raise type(error)(str(error).replace(str(temporary), str(folder))) from error
     except OSError as error:

@@ -117,18 +117,18 @@ def read_rigid_motion(path: Path) -> tuple[Floats, Floats]:
 
 def _robot(path: Path, text: str, camera: int | None) -> Calibration:
     """OpenCV's, ROS's or Kalibr's."""
-    found = camera_in_yaml(path, parse_yaml(path, text), camera)
-    _check_intrinsics(path, found.intrinsics)
-    rotation, translation = found.pose or (np.eye(3), np.zeros(3))
+    yaml_camera = camera_in_yaml(path, parse_yaml(path, text), camera)
+    _check_intrinsics(path, yaml_camera.intrinsics)
+    rotation, translation = yaml_camera.pose or (np.eye(3), np.zeros(3))
     return Calibration(
-        intrinsics=found.intrinsics,
+        intrinsics=yaml_camera.intrinsics,
         rotation=rotation,
         translation=translation,
-        distortion=found.distortion,
-        size=found.size,
-        has_pose=found.pose is not None,
-        source=found.source,
-        lens=found.lens,
+        distortion=yaml_camera.distortion,
+        size=yaml_camera.size,
+        has_pose=yaml_camera.pose is not None,
+        source=yaml_camera.source,
+        lens=yaml_camera.lens,
     )
 
 

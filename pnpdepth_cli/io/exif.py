@@ -43,10 +43,10 @@ def read_focal_length(path: Path, size: tuple[int, int]) -> ExifFocalLength | No
         size: (H, W) of the image as it is used, of the same field of view as the file.
     """
     values = _tags(path)
-    found = _of_film(values, size) or _of_sensor(values, size)
-    if found is None or not _PLAUSIBLE[0] <= found.pixels / max(size) <= _PLAUSIBLE[1]:
+    focal = _of_film(values, size) or _of_sensor(values, size)
+    if focal is None or not _PLAUSIBLE[0] <= focal.pixels / max(size) <= _PLAUSIBLE[1]:
         return None
-    return found
+    return focal
 
 
 def _of_film(values: Mapping[int, float], size: tuple[int, int]) -> ExifFocalLength | None:

@@ -16,6 +16,18 @@ def read_bytes(path: Path) -> bytes:
         InputError: There is no such file, or it is a folder, a device or a pipe.
         FileFormatError: It is empty, or larger than the budget.
     """
+    check_size(path)
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise cannot_read(path, error) from error
+    if not data:
+        raise _empty(path)
+    return data
+
+
+def check_size(path: Path) -> None:
+    """Raises the errors of `read_bytes` that show without reading the file."""
     size = size_of_regular_file(path)
     limit = budget().max_file_bytes
     if size > limit:
@@ -23,13 +35,12 @@ def read_bytes(path: Path) -> bytes:
             f"{path} has {size:,} bytes, more than {limit:,}; make it smaller, or allow more with"
             " --max-pixels"
         )
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise cannot_read(path, error) from error
-    if not data:
-        raise FileFormatError(f"{path} is empty (0 bytes); copy or create it again")
-    return data
+    if not size:
+        raise _empty(path)
+
+
+def _empty(path: Path) -> FileFormatError:
+    return FileFormatError(f"{path} is empty (0 bytes); copy or create it again")
 
 
 def size_of_regular_file(path: Path) -> int:

@@ -55,6 +55,8 @@ class Journal:
 
     Attributes:
         lost: Number of lines that are damaged or edited.
+        end: Offset behind the last complete line.
+        writing: Held while lines are written.
     """
 
     def __init__(self, path: Path, key: str) -> None:
@@ -62,21 +64,27 @@ class Journal:
         self.lost = 0
         self._key = key
         self._offsets: dict[str, int] = {}
-        self._writing = threading.Lock()
-        self._end = self._index()
+        self.writing = threading.Lock()
+        self.end = self._index()
 
     def keys(self) -> list[str]:
         """Returns the keys in the order in which they first appeared."""
         return list(self._offsets)
 
-    def newest(self, key: str) -> dict[str, Any] | None:
-        """Returns the newest line with this key; None if there is none."""
+    def newest(self, key: str, before: str | None = None) -> dict[str, Any] | None:
+        """Returns the newest line with this key; None if there is none.
+
+        Args:
+            key: What identifies the line.
+            before: A field that holds an object. It and those behind it are left out, if it is
+                there, which takes less time where they are long.
+        """
         if key not in self._offsets:
             return None
         try:
             with self.path.open("rb") as file:
                 file.seek(self._offsets[key])
-                return _object(file.readline())
+                return _object(file.readline(), before)
         except OSError as error:
             raise _cannot_read(self.path, error) from error
 
@@ -90,22 +98,22 @@ class Journal:
             line if isinstance(line, EncodedLine) else EncodedLine.of(line, self._key)
             for line in lines
         ]
-        with self._writing:
+        with self.writing:
             try:
                 self._write(b"".join(line.data for line in encoded))
             except OSError as error:
                 raise cannot_write(self.path, error) from error
             for line in encoded:
                 if line.key is not None:
-                    self._offsets[line.key] = self._end
-                self._end += len(line.data)
+                    self._offsets[line.key] = self.end
+                self.end += len(line.data)
 
     def _write(self, data: bytes) -> None:
         flags = os.O_RDWR | os.O_CREAT | getattr(os, "O_BINARY", 0)
         with os.fdopen(os.open(self.path, flags, 0o666), "r+b", buffering=0) as file:
-            if file.seek(0, os.SEEK_END) != self._end:
-                file.truncate(self._end)
-            file.seek(self._end)
+            if file.seek(0, os.SEEK_END) != self.end:
+                file.truncate(self.end)
+            file.seek(self.end)
             rest = memoryview(data)
             while rest:  # a disk that is nearly full takes a part
                 rest = rest[file.write(rest) :]
@@ -142,11 +150,14 @@ class Journal:
         return key if isinstance(key, str) else None
 
 
-def _object(data: bytes) -> dict[str, Any] | None:
+def _object(data: bytes, before: str | None = None) -> dict[str, Any] | None:
     """The content of a whole line; None if its checksum is wrong or missing."""
     if not _is_whole(data):
         return None
-    content: dict[str, Any] = json.loads(b"{" + data[_CHECKSUM_BYTES:])
+    # in a text of JSON the quotes would be escaped
+    end = -1 if before is None else data.find(f', "{before}": {{'.encode())
+    text = data[_CHECKSUM_BYTES:] if end < 0 else data[_CHECKSUM_BYTES:end] + b"}"
+    content: dict[str, Any] = json.loads(b"{" + text)
     return content
 
 

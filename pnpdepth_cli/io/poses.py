@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pnpdepth_cli.errors import FileFormatError
+from pnpdepth_cli.errors import FileFormatError, InputError
 from pnpdepth_cli.io.file_bytes import read_bytes
 from pnpdepth_cli.io.rotation import rotation_of
 
 _KITTI_COLUMNS, _TUM_COLUMNS = 12, 8
 _ROTATION_TOLERANCE = 1e-3
 
+Floats = NDArray[np.float64]
 
-def read_poses(path: Path) -> NDArray[np.float64]:
+
+def read_poses(path: Path) -> Floats:
     """Returns the poses (N, 3, 4) from each camera's frame to the world's, in file order.
 
     Args:
@@ -26,17 +29,42 @@ def read_poses(path: Path) -> NDArray[np.float64]:
         FileFormatError: A row has other numbers, or its rotation is none.
         InputError: The file cannot be read.
     """
-    poses = []
-    for number, line in enumerate(read_bytes(path).decode("utf-8", "replace").splitlines(), 1):
-        words = line.partition("#")[0].split()
-        if words:
-            poses.append(_pose(path, number, words))
+    poses = [pose for _, _, pose in pose_rows(path)]
     if not poses:
         raise FileFormatError(f"{path} has no poses")
     return np.stack(poses)
 
 
-def _pose(path: Path, number: int, words: list[str]) -> NDArray[np.float64]:
+def read_pose_of_each(path: Path, count: int, what: str) -> Floats:
+    """Returns the poses (count, 3, 4) of a file that has one row for each of something.
+
+    Args:
+        path: As `read_poses` takes it.
+        count: Number of poses that are needed.
+        what: What they are of, in the plural.
+
+    Raises:
+        InputError: The file has another number of poses, or cannot be read.
+    """
+    poses = read_poses(path)
+    if len(poses) != count:
+        raise InputError(
+            f"{path} has {len(poses)} poses for {count} {what}; it needs one row for each, in"
+            " their order"
+        )
+    return poses
+
+
+def pose_rows(path: Path) -> Iterator[tuple[int, Floats, Floats]]:
+    """Yields (line, its numbers, the pose (3, 4)) of each row, as `read_poses` takes them."""
+    for number, line in enumerate(read_bytes(path).decode("utf-8", "replace").splitlines(), 1):
+        words = line.partition("#")[0].split()
+        if words:
+            yield number, *_pose(path, number, words)
+
+
+def _pose(path: Path, number: int, words: list[str]) -> tuple[Floats, Floats]:
+    """The numbers of a row, and the pose (3, 4)."""
     try:
         values = np.array(words, np.float64)
     except ValueError:
@@ -53,4 +81,4 @@ def _pose(path: Path, number: int, words: list[str]) -> NDArray[np.float64]:
     is_rotation = np.allclose(rotation @ rotation.T, np.eye(3), atol=_ROTATION_TOLERANCE)
     if not (np.isfinite(pose).all() and is_rotation and np.linalg.det(rotation) > 0):
         raise FileFormatError(f"{path}: line {number} holds no rotation")
-    return pose
+    return values, pose

@@ -7,7 +7,7 @@ import hashlib
 import json
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -24,7 +24,9 @@ from pnpdepth_cli.io.record import plain, read_json, write_json
 from pnpdepth_cli.io.report_view import VIEWER, save_viewer
 
 PAGE = "index.html"
-IMAGES = "pictures"
+IMAGES = "images"
+_OLD_IMAGES = "pictures"
+"""Its earlier name; images there are removed when such a report is replaced."""
 _MADE_OF = "report.json"
 _IMAGE = re.compile(r"[0-9a-f]{20}_[a-z_]+\.(?:jpg|js)")
 
@@ -91,7 +93,8 @@ def whole_report(folder: Path) -> Iterator[Path]:
         viewer = (temporary / VIEWER).exists()
     if not viewer:
         _remove_viewer(folder)
-    _remove_images(folder, lambda name: name not in images)
+    _remove_images(folder / IMAGES, lambda name: name not in images)
+    _remove_old_images(folder)
 
 
 def remove_report_leftovers(folder: Path) -> int:
@@ -99,9 +102,9 @@ def remove_report_leftovers(folder: Path) -> int:
 
     To be called only while nobody writes to the report.
     """
-    folders = [each for each in (folder, folder / IMAGES) if each.is_dir()]
+    folders = (folder, folder / IMAGES, folder / _OLD_IMAGES)
     try:
-        return sum(remove_leftovers(each) for each in folders)
+        return sum(remove_leftovers(each) for each in folders if each.is_dir())
     except OSError as error:
         raise cannot_write(folder, error) from error
 
@@ -151,7 +154,8 @@ def write_report(
         save_viewer(folder)
     else:
         _remove_viewer(folder)
-    _remove_images(folder, lambda name: name.partition("_")[0] not in keys)
+    _remove_images(folder / IMAGES, lambda name: name.partition("_")[0] not in keys)
+    _remove_old_images(folder)
     return page.stat().st_size
 
 
@@ -162,14 +166,23 @@ def _remove_viewer(folder: Path) -> None:
         raise cannot_write(folder, error) from error
 
 
-def _remove_images(folder: Path, unused: Callable[[str], bool]) -> None:
+def _remove_old_images(folder: Path) -> None:
+    """Removes images of an earlier version's report, and their folder if it is then empty."""
+    old = folder / _OLD_IMAGES
+    if old.is_dir():
+        _remove_images(old, lambda name: True)
+        with suppress(OSError):
+            old.rmdir()  # fails where files of others are in it
+
+
+def _remove_images(images: Path, unused: Callable[[str], bool]) -> None:
     """Removes images of a report, and no other file, by their names."""
     try:
-        for path in (folder / IMAGES).iterdir():
+        for path in images.iterdir():
             if _IMAGE.fullmatch(path.name) and unused(path.name):
                 path.unlink(missing_ok=True)
     except OSError as error:
-        raise cannot_write(folder, error) from error
+        raise cannot_write(images, error) from error
 
 
 def _is_of(folder: Path, made_of: Mapping[str, Any] | None) -> bool:

@@ -81,9 +81,13 @@ def error_map(prediction: Depth, ground_truth: Depth, grey: NDArray[np.float32] 
     return ErrorMap(pixels=pixels, strongest_m=strongest)
 
 
-def gain_colours() -> list[str]:
-    """Returns the colours of an improvement map as #rrggbb, from worse to better."""
-    return _hexadecimal(paint_gain(*_strengths()))
+def gain_colours(colors: str) -> list[str]:
+    """Returns the colours of an improvement map as #rrggbb, from worse to better.
+
+    Args:
+        colors: One of `choices.COLORS`.
+    """
+    return _hexadecimal(paint_gain(*_strengths(), colors))
 
 
 def error_colours() -> list[str]:

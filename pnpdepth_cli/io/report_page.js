@@ -38,7 +38,7 @@ function shown(column, value) {
 }
 
 const titled = (column) => column.title + (column.unit ? ` [${column.unit}]` : "");
-const imageOf = (frame, view) => `pictures/${frame.key}_${view}.jpg`;
+const imageOf = (frame, view) => `images/${frame.key}_${view}.jpg`;
 
 // ---- the head of the page ----
 
@@ -440,7 +440,7 @@ async function loadSpace(frame, figure, stage) {
   try {
     if (!space.loaded) await loadScript("viewer.js");
     space.loaded = true;
-    await loadScript(`pictures/${frame.key}_view.js`);
+    await loadScript(`images/${frame.key}_view.js`);
     if (space.frame !== frame) return; // another frame was opened meanwhile
     fillSpace(frame, figure, stage, content);
   } catch (error) {

@@ -133,7 +133,7 @@ def _opencv_or_ros(path: Path, fields: Mapping[str, Any]) -> CameraInYaml:
     values = _numbers(path, _MATRICES[0], matrix)
     if len(values) != 9:
         raise FileFormatError(f"{path}: {_MATRICES[0]} has {len(values)} numbers instead of 9")
-    found: Any = next((fields[name] for name in _DISTORTIONS if name in fields), [])
+    coefficients: Any = next((fields[name] for name in _DISTORTIONS if name in fields), [])
     model = fields.get("distortion_model")
     width, height = (fields.get(f"image_{n}", fields.get(n)) for n in ("width", "height"))
     fisheye = bool(fields.get("fisheye_model")) if model is None else False
@@ -144,7 +144,7 @@ def _opencv_or_ros(path: Path, fields: Mapping[str, Any]) -> CameraInYaml:
         path,
         matrix=np.reshape(values, (3, 3)),
         lens="fisheye" if fisheye else _lens(path, str(model or "none")),
-        distortion=_numbers(path, "distortion", found),
+        distortion=_numbers(path, "distortion", coefficients),
         size=size,
         pose=_pose(path, fields),
         source="ROS camera_info" if model is not None else "OpenCV calibration",

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,7 @@ from pnpdepth_cli.errors import FileFormatError, NoPointsError
 from pnpdepth_cli.io.file_bytes import read_bytes
 from pnpdepth_cli.io.file_kind import kind_of
 from pnpdepth_cli.io.formats.npy import parse_npy
+from pnpdepth_cli.io.formats.npz import parse_npz
 from pnpdepth_cli.io.point_files import parse_pcd, parse_ply
 
 _FARTHEST_M = 1e5
@@ -43,6 +45,8 @@ class ScanFile:
 def read_scan(path: Path, point_fields: int | None = None) -> ScanFile:
     """Returns the points of a KITTI or nuScenes .bin, .npy (N, 3 or more columns), .pcd or .ply.
 
+    Also of an .npz whose array `data` is as in an .npy, which is how DDAD stores scans.
+
     Args:
         path: The file; its suffix says the format.
         point_fields: Float32 numbers of a point in a .bin; None: recognised from name and content.
@@ -56,7 +60,7 @@ def read_scan(path: Path, point_fields: int | None = None) -> ScanFile:
         raise FileFormatError(f"{path} is not a scan; give a file of {', '.join(SCAN_SUFFIXES)}")
     data = read_bytes(path)
     kind = kind_of(data)
-    if kind not in (None, "NPY"):
+    if kind not in (None, "NPY") and (kind, suffix) != ("NPZ", ".npz"):
         raise FileFormatError(f"{path} is a {kind} file, not a scan; check what is given as scan")
     if suffix == ".bin":
         points, source = _parse_bin(path, data, point_fields)
@@ -131,7 +135,15 @@ def _looks_like_scan(rows: NDArray[np.float32]) -> bool:
 def _parse_npy(path: Path, data: bytes) -> tuple[NDArray[np.float32], str]:
     if kind_of(data) != "NPY":
         raise FileFormatError(f"{path} is not an NPY file; save it with numpy.save")
-    array = parse_npy(path, data)
+    return _points_of(path, parse_npy(path, data)), "NPY scan"
+
+
+def _parse_npz(path: Path, data: bytes) -> tuple[NDArray[np.float32], str]:
+    return _points_of(path, parse_npz(path, data, "data")[1]), "DDAD scan"
+
+
+def _points_of(path: Path, array: NDArray[Any]) -> NDArray[np.float32]:
+    """The first columns of (N, 3 or more) floats."""
     if array.ndim != 2 or array.shape[1] < 3 or array.dtype.kind != "f":
         shape = "×".join(str(n) for n in array.shape)
         raise FileFormatError(
@@ -139,11 +151,12 @@ def _parse_npy(path: Path, data: bytes) -> tuple[NDArray[np.float32], str]:
             " x y z in the first columns"
         )
     with np.errstate(over="ignore"):
-        return np.ascontiguousarray(array[:, :3], np.float32), "NPY scan"
+        return np.ascontiguousarray(array[:, :3], np.float32)
 
 
 _READERS: dict[str, Callable[[Path, bytes], tuple[NDArray[np.float32], str]]] = {
     ".npy": _parse_npy,
+    ".npz": _parse_npz,
     ".pcd": parse_pcd,
     ".ply": parse_ply,
 }

@@ -60,29 +60,29 @@ class AlignedDepth:
                 self.notes = self._notes(self.alignment, raw.detach())
         return self.alignment.depth(raw)
 
-    def _notes(self, made: Alignment, raw: Tensor) -> tuple[str, ...]:
+    def _notes(self, fit: Alignment, raw: Tensor) -> tuple[str, ...]:
         decided = " (decided from the points)" if self._kind == "auto" else ""
         notes = [
-            f"alignment {made}{decided}; {made.points:,} points, off by {made.error:.1%} of depth"
-            f" over the best 70 %, {made.outliers:.0%} outliers"
+            f"alignment {fit}{decided}; {fit.points:,} points, off by {fit.error:.1%} of depth"
+            f" over the best 70 %, {fit.outliers:.0%} outliers"
         ]
-        beyond = made.beyond(raw)
+        beyond = fit.beyond(raw)
         if beyond > 0:
-            near, far = made.bounds
+            near, far = fit.bounds
             notes.append(
                 f"alignment: {beyond:.2%} of the image came out nearer than {near:.3g} m or"
                 f" farther than {far:.3g} m, or at no depth at all, and reads as these bounds"
             )
         stated = self._network.definition.output_kind in SPACES
-        if stated and made.scale < 0:
+        if stated and fit.scale < 0:
             notes.append(
                 "warning: the network's output falls where its kind says it should rise; is it"
-                f" {made.space!r}? --output-kind says otherwise"
+                f" {fit.space!r}? --output-kind says otherwise"
             )
-        if len(self._points) >= _ENOUGH and made.misfit > _NO_BETTER * self._misfit_of_median():
+        if len(self._points) >= _ENOUGH and fit.misfit > _NO_BETTER * self._misfit_of_median():
             notes.append(
                 f"warning: network {self._network.definition.name!r} says nothing about this scene:"
-                f" aligned, it is off by {made.misfit:.1%} at the points, their median depth by"
+                f" aligned, it is off by {fit.misfit:.1%} at the points, their median depth by"
                 f" {self._misfit_of_median():.1%}; check the network, --normalise and the image"
             )
         return tuple(notes)

@@ -178,7 +178,7 @@ UNTUNED_DEFAULTS = RefineDefaults(
 Chosen with FastDepth on rendered rooms; Adam with steps of 3 % left a quarter more of the error.
 """
 
-MASKED_DEFAULTS = RefineDefaults(
+WEIGHTS_DEFAULTS = RefineDefaults(
     iterations=16,
     lr=5e-4,
     loss="log",
@@ -186,13 +186,21 @@ MASKED_DEFAULTS = RefineDefaults(
     schedule="cosine",
     parameters="weights",
 )
-"""For updates of weights, with points hidden from the input or without."""
+"""For updates of weights by the points that the network is given."""
+
+MASKED_DEFAULTS = replace(
+    WEIGHTS_DEFAULTS, iterations=12, lr=7e-4, update="adam-short", schedule="linear"
+)
+"""For updates of weights by points hidden from the input; the gain of 16 of the steps above."""
 
 DENSE_SPACING = 10.0
 """Mean spacing of the points in pixels below which they are dense, as those of a LiDAR are."""
 
-MASKED_DENSE_DEFAULTS = replace(MASKED_DEFAULTS, iterations=8, lr=2e-4, mask_scale=0.5)
+WEIGHTS_DENSE_DEFAULTS = replace(WEIGHTS_DEFAULTS, iterations=8, lr=2e-4)
 """The same for dense points, of which half a frame's tell more: more steps follow their noise."""
+
+MASKED_DENSE_DEFAULTS = replace(MASKED_DEFAULTS, iterations=6, lr=3e-4, mask_scale=0.5)
+"""The same for dense points hidden from the input."""
 
 
 def _inputs_in_order(
@@ -237,7 +245,7 @@ class ModelDefinition:
     defaults: RefineDefaults = RefineDefaults()
     """Its settings of refinement where no option sets them."""
     masked: RefineDefaults = MASKED_DEFAULTS
-    """The same where weights are updated, as with points hidden from the input."""
+    """The same where weights are updated by points hidden from the input."""
     masked_dense: RefineDefaults = MASKED_DENSE_DEFAULTS
     """The same for points that lie closer than `DENSE_SPACING`."""
     checkpoint: Path | None = None

@@ -72,7 +72,7 @@ class FrameMap:
         return F.pad(torch.where(known > 1 - _ROUNDING, depth, 0.0), (0, right, 0, bottom))
 
     def points_to_network(self, points: SparsePoints) -> SparsePoints:
-        """The points inside the crop, at their places in the network's frame."""
+        """The points inside the crop, with their pixel coordinates in the network's frame."""
         resized = points.cropped(*self.crop).resized(*self.resized)
         return SparsePoints(xy=resized.xy, depth=resized.depth, size=self.network)
 

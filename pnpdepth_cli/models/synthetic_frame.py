@@ -29,11 +29,11 @@ def synthetic_frame(size: tuple[int, int], count: int = _POINTS) -> tuple[Tensor
     generator = torch.Generator().manual_seed(0)
     coarse = torch.rand(1, 3, max(2, height // 8), max(2, width // 8), generator=generator)
     rgb = F.interpolate(coarse, size, mode="bilinear")
-    places = torch.randperm(height * width, generator=generator)[:count]
-    y, x = places // width, places % width
+    pixels = torch.randperm(height * width, generator=generator)[:count]
+    y, x = pixels // width, pixels % width
     points = SparsePoints(
         xy=torch.stack([x, y], dim=1).float(),
-        depth=2 + 3 * y.float() / height + torch.rand(len(places), generator=generator),
+        depth=2 + 3 * y.float() / height + torch.rand(len(pixels), generator=generator),
         size=size,
     )
     return rgb, points

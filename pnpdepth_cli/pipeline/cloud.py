@@ -16,7 +16,7 @@ from pnpdepth_cli.errors import InputError, OutputError, SizeError, UsageError
 from pnpdepth_cli.io.atomic import make_folder
 from pnpdepth_cli.io.cloud_files import CLOUD_SUFFIXES, write_cloud
 from pnpdepth_cli.io.depth import read_depth
-from pnpdepth_cli.io.poses import read_poses
+from pnpdepth_cli.io.poses import read_pose_of_each
 from pnpdepth_cli.io.record import write_json
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.pipeline.refinement.frame_camera import (
@@ -129,13 +129,7 @@ def _poses(request: CloudRequest, frames: list[ResultFrame]) -> list[NDArray[np.
                 " refine it again as the others"
             )
         return poses
-    rows = read_poses(request.poses)
-    if len(rows) != len(frames):
-        raise InputError(
-            f"{request.poses} has {len(rows)} poses for {len(frames)} depth files; it needs one"
-            " row for each, in the order of their names"
-        )
-    return list(rows)
+    return list(read_pose_of_each(request.poses, len(frames), "depth files"))
 
 
 def _image(request: CloudRequest, frame: ResultFrame) -> Path | None:

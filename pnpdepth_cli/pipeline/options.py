@@ -8,7 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, field, fields
+from pathlib import Path
 from typing import Any
+
+from pnpdepth_cli.io.remote.address import path_of
 
 _KEY = "option"
 
@@ -72,6 +75,11 @@ class OptionField:
     def flag(self) -> str:
         """Spelling on the command line."""
         return self.option.flag or "--" + self.name.replace("_", "-")
+
+
+def parse_file(text: str) -> Path:
+    """Returns the path of a local file, or of one in a store. Raises UsageError as `path_of`."""
+    return path_of(text)
 
 
 def option(default: Any, help: str, **details: Any) -> Any:

@@ -94,8 +94,8 @@ def test_the_embedded_network_predicts_differently_with_a_prior(frame: Frame) ->
     compact = load_network("compact", None)
     config = default_config(compact.definition, "decoder.s8", PLAIN, network="compact")
     plain = Candidate(config=config)
-    given = Candidate(config=config, prior=Candidate(config=CONFIGS[0]))
+    candidate = Candidate(config=config, prior=Candidate(config=CONFIGS[0]))
     with OpenNetworks({"brightness": BRIGHTNESS, "compact": compact}) as opened:
         depths = CandidateDepths(FramePasses(opened, frame), frame, CONFIGS[0], plain)
-        assert not torch.equal(depths.dense(given), depths.dense(plain))
-        assert bool((depths.dense(given) > 0).all())
+        assert not torch.equal(depths.dense(candidate), depths.dense(plain))
+        assert bool((depths.dense(candidate) > 0).all())

@@ -42,8 +42,8 @@ def test_align_every_fits_at_each_update(
 ) -> None:
     fits = {}
     for more in ([], ["--align-every"]):
-        given = [*refine(frame, "--align", "scale", "--json", "--overwrite", *more)]
-        assert code_of(given) == 0
+        arguments = [*refine(frame, "--align", "scale", "--json", "--overwrite", *more)]
+        assert code_of(arguments) == 0
         record = json.loads(capsys.readouterr().out)
         fits[bool(more)] = record["alignment"]["scale"]
         assert record["loss"][-1] < record["loss"][0]
@@ -58,8 +58,8 @@ def test_an_onnx_file_is_refined_layers_listed_and_checked(
 
     net = str(write_network(frame.folder / "net.onnx"))
     out = frame.folder / "o.exr"
-    given = ["refine", str(frame.image), "--sparse", str(frame.sparse), "--model", net]
-    assert code_of([*given, "-o", str(out), "--iterations", "2", "--json"]) == 0
+    arguments = ["refine", str(frame.image), "--sparse", str(frame.sparse), "--model", net]
+    assert code_of([*arguments, "-o", str(out), "--iterations", "2", "--json"]) == 0
     record = json.loads(capsys.readouterr().out)
     assert record["settings"]["layer"] == "Relu_d"
     assert any("agrees with onnxruntime" in note for note in record["notes"])
@@ -72,8 +72,8 @@ def test_an_onnx_file_is_refined_layers_listed_and_checked(
     assert code_of(["layers", "--model", net, "--sparse", str(frame.sparse)]) == 0
     assert "pixels apart" in capsys.readouterr().out
     assert code_of(["models", "check", net, "--image", str(frame.image), "--json"]) == 0
-    found = json.loads(capsys.readouterr().out)
-    assert set(found["layers"].values()) == {"ok"}
+    layers = json.loads(capsys.readouterr().out)
+    assert set(layers["layers"].values()) == {"ok"}
     assert code_of(["models", "check", net]) == 0
     assert "Relu_d: ok" in capsys.readouterr().out
 
@@ -98,7 +98,7 @@ def test_a_published_checkpoint_is_converted_and_nothing_is_replaced(
     assert "does not exist" in capsys.readouterr().err
 
 
-def test_fetch_offline_says_what_is_wrong_in_one_line(
+def test_fetch_offline_is_an_error_of_one_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     hub = pytest.importorskip("huggingface_hub", reason="needs the extra [hf]")

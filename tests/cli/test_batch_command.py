@@ -7,7 +7,6 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -36,20 +35,20 @@ def arguments(*more: str, source: str = "drive") -> list[str]:
     ]  # fmt: skip
 
 
-def test_it_says_what_it_took_for_granted_and_what_came_out(
+def test_assumptions_and_results_are_printed(
     root: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert code_of(arguments()) == 0
     out, err = capsys.readouterr()
     assert out == ""
-    for said in (
+    for text in (
         "layout: pairs (guessed; --layout names another): 4 frames, 4 with ground truth",
         "4 frames: 0 done already, 4 to do (4 new)",
         "means over frames",
         "4 of 4 frames done",
         "wrote out/summary.json  out/summary.csv",
     ):
-        assert said in err
+        assert text in err
 
 
 def test_json_prints_the_summary_without_frames_and_nothing_else(
@@ -94,13 +93,13 @@ EXITS: list[tuple[list[str], int, str]] = [
 ]
 
 
-@pytest.mark.parametrize(("more", "code", "said"), EXITS)
-def test_the_exit_code_says_whose_mistake_it_was(
-    root: Path, capsys: pytest.CaptureFixture[str], more: list[str], code: int, said: str
+@pytest.mark.parametrize(("more", "code", "message"), EXITS)
+def test_the_exit_code_is_that_of_the_kind_of_error(
+    root: Path, capsys: pytest.CaptureFixture[str], more: list[str], code: int, message: str
 ) -> None:
     assert code_of(arguments(*more)) == code
     err = capsys.readouterr().err
-    assert said in err.splitlines()[-1]
+    assert message in err.splitlines()[-1]
     assert "Traceback" not in err
 
 
@@ -138,8 +137,8 @@ def test_the_profile_is_a_table_on_stderr_and_part_of_the_summary(
     assert code_of(arguments("--profile", "--json", "--batch-size", "1")) == 0
     out, err = capsys.readouterr()
     assert json.loads(out)["profile"]["frames"] == 4
-    for said in ("where the time went", "waiting for a frame to be written", "4 frames, "):
-        assert said in err
+    for text in ("where the time went", "waiting for a frame to be written", "4 frames, "):
+        assert text in err
     assert code_of(arguments("--profile", "--batch-size", "auto")) == 0
     assert "no frame was refined; there are no times" in capsys.readouterr().err
 
@@ -179,7 +178,7 @@ def test_neither_a_dry_run_nor_one_with_nothing_to_do_needs_torch(root: Path) ->
         assert "all of them done already" in done.stderr
 
 
-def test_ctrl_c_finishes_the_frame_says_how_to_go_on_and_exits_130(
+def test_ctrl_c_finishes_the_frame_prints_how_to_continue_and_exits_130(
     root: Path, tmp_path: Path
 ) -> None:
     slow = root / "net/my_net.py"
@@ -225,12 +224,12 @@ def test_without_a_terminal_there_is_a_line_a_minute(
 ) -> None:
     now = 0.0
     monkeypatch.setattr(progress.time, "monotonic", lambda: now)
-    with BatchProgress() as told:
-        told.begin(600)
+    with BatchProgress() as display:
+        display.begin(600)
         for number in range(300):
             now += 1.0
             status = "failed" if number == 10 else "done"
-            told.frame({"name": "x", "status": status, "message": "bad"})
+            display.frame({"name": "x", "status": status, "message": "bad"})
     lines = capsys.readouterr().err.splitlines()
     assert lines[0] == "failed: x: bad"
     assert lines[1] == "60 of 600 frames, 1.0 frames a second, 9 min left, 1 failed"
@@ -241,32 +240,32 @@ def test_on_a_terminal_there_is_a_bar(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
-    with BatchProgress() as told:
-        told.begin(2)
-        told.frame({"name": "x", "status": "failed", "message": "bad"})
-        told.frame({"name": "y", "status": "done", "message": None})
+    with BatchProgress() as display:
+        display.begin(2)
+        display.frame({"name": "x", "status": "failed", "message": "bad"})
+        display.frame({"name": "y", "status": "done", "message": None})
     err = capsys.readouterr().err
     assert "failed: x: bad\n" in err
     assert "2/2" in err
 
 
 @pytest.mark.parametrize(
-    ("seconds", "said"),
+    ("seconds", "text"),
     [(0.4, "0 s"), (29, "29 s"), (90, "2 min"), (3599, "1 h 0 min"), (9000, "2 h 30 min")],
 )
-def test_durations_are_said_shortly(seconds: float, said: str) -> None:
-    assert progress._duration(seconds) == said
+def test_durations_are_printed_in_short_form(seconds: float, text: str) -> None:
+    assert progress._duration(seconds) == text
 
 
 def test_the_choices_are_those_that_there_are() -> None:
     assert list(FRAME_PROTOCOLS) == list(PROTOCOLS)
 
 
-def test_real_frames_of_a_drive_are_told_as_what_they_are(
+def test_the_layout_of_a_real_drive_is_recognised_and_reported(
     shared_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    given: dict[str, Any] = {"source": str(shared_data / "kitti_dc"), "out": str(tmp_path / "out")}
-    assert code_of(["batch", given["source"], "-o", given["out"], "--limit", "1"]) == 0
+    source, output = str(shared_data / "kitti_dc"), str(tmp_path / "out")
+    assert code_of(["batch", source, "-o", output, "--limit", "1"]) == 0
     err = capsys.readouterr().err
     assert "layout: kitti-depth (guessed; --layout names another): 6 frames, 6 with" in err
     assert "1 of 6 frames done, 5 pending" in err

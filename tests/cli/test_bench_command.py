@@ -51,7 +51,7 @@ def test_the_papers_table_shows_its_figures_beside_ours(
 
 
 @pytest.mark.parametrize(
-    ("more", "code", "said"),
+    ("more", "code", "message"),
     [
         (["--table", "--layer", "encode"], 2, "--layer"),
         (["--repeats", "0"], 2, "at least one"),
@@ -60,16 +60,16 @@ def test_the_papers_table_shows_its_figures_beside_ours(
         (["--layer", "encod"], 4, "encode"),
     ],
 )
-def test_the_exit_code_says_whose_mistake_it_was(
+def test_the_exit_code_is_that_of_the_kind_of_error(
     frame: FrameOnDisk,
     capsys: pytest.CaptureFixture[str],
     more: list[str],
     code: int,
-    said: str,
+    message: str,
 ) -> None:
-    given = ["bench", *more] if "--table" in more else bench(frame, *more)
-    assert code_of(given) == code
+    arguments = ["bench", *more] if "--table" in more else bench(frame, *more)
+    assert code_of(arguments) == code
     out, err = capsys.readouterr()
     assert out == ""
-    assert said in err
+    assert message in err
     assert "Traceback" not in err

@@ -12,7 +12,7 @@ from pnpdepth_cli.cli.main import cli
 from pnpdepth_cli.io.depth_writing import write_depth
 
 
-def test_the_points_are_counted_and_the_camera_is_said(tmp_path: Path) -> None:
+def test_the_points_are_counted_and_the_camera_is_reported(tmp_path: Path) -> None:
     write_depth(tmp_path / "d.exr", np.full((24, 32), 2, np.float32))
     arguments = ["cloud", str(tmp_path / "d.exr"), "--fov", "60", "-o", str(tmp_path / "d.ply")]
     result = CliRunner().invoke(cli, arguments)

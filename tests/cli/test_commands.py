@@ -63,18 +63,18 @@ EXITS = [
 ]
 
 
-@pytest.mark.parametrize(("options", "code", "said"), EXITS)
-def test_the_exit_code_says_whose_mistake_it_was(
+@pytest.mark.parametrize(("options", "code", "message"), EXITS)
+def test_the_exit_code_is_that_of_the_kind_of_error(
     frame: FrameOnDisk,
     capsys: pytest.CaptureFixture[str],
     options: list[str],
     code: int,
-    said: str,
+    message: str,
 ) -> None:
     assert code_of(refine(frame, *options)) == code
     out, err = capsys.readouterr()
     assert out == ""
-    assert said in err
+    assert message in err
     assert "Traceback" not in err
 
 
@@ -234,11 +234,11 @@ def test_the_scale_of_the_truth_names_its_own_option(
 
 
 @pytest.mark.parametrize(
-    ("said", "spins"),
+    ("variables", "spins"),
     [({}, "3000"), ({"GOMP_SPINCOUNT": "7"}, "7"), ({"OMP_WAIT_POLICY": "active"}, "None")],
 )
-def test_idle_threads_sleep_soon_unless_the_user_says_how_they_wait(
-    said: dict[str, str], spins: str
+def test_idle_threads_sleep_soon_unless_the_user_sets_how_they_wait(
+    variables: dict[str, str], spins: str
 ) -> None:
     code = (
         "import os\nfrom pnpdepth_cli.cli.main import main\n"
@@ -247,7 +247,11 @@ def test_idle_threads_sleep_soon_unless_the_user_says_how_they_wait(
     )
     others = {k: v for k, v in os.environ.items() if k not in ("GOMP_SPINCOUNT", "OMP_WAIT_POLICY")}
     done = subprocess.run(
-        [sys.executable, "-c", code], env=others | said, capture_output=True, text=True, check=True
+        [sys.executable, "-c", code],
+        env=others | variables,
+        capture_output=True,
+        text=True,
+        check=True,
     )
     assert done.stdout.splitlines()[-1] == spins
 
@@ -259,7 +263,7 @@ def test_a_depth_worse_than_linear_interpolation_is_named_so(
     assert "this depth is worse than linear interpolation" in capsys.readouterr().err
 
 
-def test_the_title_says_when_the_network_is_not_used(
+def test_the_title_states_that_the_network_is_not_used(
     frame: FrameOnDisk, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert code_of([*refine(frame, "--auto", "--json")]) == 0
@@ -272,6 +276,6 @@ def test_several_models_are_the_first_and_more() -> None:
     context = refine_command.make_context(
         "refine", ["a.png", "--sparse", "s.png", "--model", "fcrn-tiny", "--model", "eigen-tiny"]
     )
-    given = {name: value for name, value in context.params.items() if name != "as_json"}
-    network = request_of(given).network
+    values = {name: value for name, value in context.params.items() if name != "as_json"}
+    network = request_of(values).network
     assert (network.model, network.more_models) == ("fcrn-tiny", ("eigen-tiny",))

@@ -19,9 +19,9 @@ def help_of(*arguments: str) -> str:
 
 
 def command(name: str) -> GroupedCommand:
-    found = cli.get_command(click.Context(cli), name)
-    assert isinstance(found, GroupedCommand)
-    return found
+    command_of_name = cli.get_command(click.Context(cli), name)
+    assert isinstance(command_of_name, GroupedCommand)
+    return command_of_name
 
 
 @pytest.mark.parametrize("name", GROUPED)
@@ -59,5 +59,5 @@ def test_the_help_of_refine_is_at_most_60_lines_in_four_groups() -> None:
 
 
 @pytest.mark.parametrize("arguments", [("refine",), ("models", "check")])
-def test_the_help_says_that_a_python_file_is_run(arguments: tuple[str, ...]) -> None:
+def test_the_help_states_that_a_python_file_is_run(arguments: tuple[str, ...]) -> None:
     assert "is Python code and is run" in " ".join(help_of(*arguments, "--help").split())

@@ -133,8 +133,8 @@ def test_a_folder_without_permission_is_one_line(option: str, code: int, tmp_pat
     closed = tmp_path / "closed"
     closed.mkdir(mode=0)
     shutil.copytree(SAMPLES / "indoor", tmp_path / "indoor")
-    given = {"--sparse": "indoor/sparse.png", "-o": "out"} | {option: "closed/x.png"}
-    words = " ".join(f"{name} {value}" for name, value in given.items())
+    values = {"--sparse": "indoor/sparse.png", "-o": "out"} | {option: "closed/x.png"}
+    words = " ".join(f"{name} {value}" for name, value in values.items())
     done = shell(f"pnpdepth refine indoor/rgb.png {words}", tmp_path)
     closed.chmod(0o700)
     assert done.returncode == code, done.stderr

@@ -45,18 +45,18 @@ def test_another_update_starts_from_the_papers_step() -> None:
     )
 
 
-def test_what_the_user_says_holds() -> None:
-    asked = replace(
+def test_the_users_options_override_the_definition() -> None:
+    request = replace(
         METHOD, update="adam", lr="2%", schedule="linear", blur=0.5, keep_best=True,
         iterations=3, parameters="channels", proximity=0.5, line_search=True,
     )  # fmt: skip
-    settings = resolve_settings(STRANGER, asked)
+    settings = resolve_settings(STRANGER, request)
     for name in (
         *("update", "lr", "schedule", "keep_best", "iterations"),
         *("parameters", "line_search"),
     ):
-        assert getattr(settings, name) == getattr(asked, name)
-    assert (settings.blur, settings.proximity) == (asked.blur, asked.proximity)
+        assert getattr(settings, name) == getattr(request, name)
+    assert (settings.blur, settings.proximity) == (request.blur, request.proximity)
     assert resolve_settings(STRANGER, replace(METHOD, blur=0)).blur == 0
 
 

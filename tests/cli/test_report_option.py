@@ -34,26 +34,26 @@ def test_a_batch_and_its_evaluation_each_have_a_report(
 def test_an_evaluation_replaces_a_report_only_if_asked(
     root: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    given = ("eval", "drive/gt", "drive/gt", "--html")
-    assert code_of(*given, "scores") == 0
+    arguments = ("eval", "drive/gt", "drive/gt", "--html")
+    assert code_of(*arguments, "scores") == 0
     before = Path("scores/index.html").stat().st_mtime_ns
     capsys.readouterr()
-    assert code_of(*given, "scores") == 2
+    assert code_of(*arguments, "scores") == 2
     assert capsys.readouterr().err == (
         "pnpdepth: scores is not empty; --overwrite replaces the report in it, or name another"
         " folder\n"
     )
     assert Path("scores/index.html").stat().st_mtime_ns == before
-    assert code_of(*given, "scores", "--overwrite") == 0
+    assert code_of(*arguments, "scores", "--overwrite") == 0
     assert Path("scores/index.html").stat().st_mtime_ns > before
 
 
-@pytest.mark.parametrize("place", ["drive/gt", "drive/gt/report", "drive", "."])
+@pytest.mark.parametrize("folder", ["drive/gt", "drive/gt/report", "drive", "."])
 def test_an_evaluation_writes_neither_into_its_inputs_nor_around_them(
-    root: Path, capsys: pytest.CaptureFixture[str], place: str
+    root: Path, capsys: pytest.CaptureFixture[str], folder: str
 ) -> None:
     before = sorted(root.rglob("*"))
-    assert code_of("eval", "drive/gt", "drive/gt", "--html", place, "--overwrite") == 2
+    assert code_of("eval", "drive/gt", "drive/gt", "--html", folder, "--overwrite") == 2
     out, err = capsys.readouterr()
     assert (out, err.count("\n")) == ("", 1)
     assert "which is read; name another folder" in err

@@ -155,18 +155,18 @@ EXITS = [
 ]
 
 
-@pytest.mark.parametrize(("arguments", "code", "said"), EXITS)
-def test_the_exit_code_says_whose_mistake_it_was(
+@pytest.mark.parametrize(("arguments", "code", "message"), EXITS)
+def test_the_exit_code_is_that_of_the_kind_of_error(
     frames: Path,
     capsys: pytest.CaptureFixture[str],
     arguments: list[str],
     code: int,
-    said: str,
+    message: str,
 ) -> None:
     assert code_of(*arguments) == code
     out, err = capsys.readouterr()
     assert out == ""
-    assert said in err
+    assert message in err
     assert "Traceback" not in err
 
 

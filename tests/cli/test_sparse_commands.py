@@ -17,7 +17,7 @@ def frame(tmp_path: Path) -> ScanOnDisk:
     return scan_on_disk(tmp_path)
 
 
-def test_project_says_what_it_dropped_and_wrote(
+def test_project_reports_dropped_points_and_written_files(
     frame: ScanOnDisk, capsys: pytest.CaptureFixture[str]
 ) -> None:
     sparse = frame.folder / "sparse.png"
@@ -33,7 +33,7 @@ def test_project_says_what_it_dropped_and_wrote(
 
 
 @pytest.mark.parametrize(
-    ("options", "code", "said"),
+    ("options", "code", "message"),
     [
         (["--size", "48"], 2, "HxW"),
         (["--size", "48x64", "--camera", "1"], 2, "leave out --camera"),
@@ -42,14 +42,18 @@ def test_project_says_what_it_dropped_and_wrote(
         (["--size", "48x64", "--min-range", "90"], 3, "none of the scan's"),
     ],
 )
-def test_the_exit_code_of_project_says_whose_mistake_it_was(
-    frame: ScanOnDisk, capsys: pytest.CaptureFixture[str], options: list[str], code: int, said: str
+def test_the_exit_code_of_project_is_that_of_the_kind_of_error(
+    frame: ScanOnDisk,
+    capsys: pytest.CaptureFixture[str],
+    options: list[str],
+    code: int,
+    message: str,
 ) -> None:
     sparse = frame.folder / "sparse.png"
     arguments = ["project", str(frame.scan), "--calib", str(frame.calib), "-o", str(sparse)]
     assert code_of([*arguments, *options]) == code
     err = capsys.readouterr().err
-    assert said in err
+    assert message in err
     assert err.count("\n") == 1
     assert not sparse.exists()
 
@@ -126,7 +130,7 @@ def test_max_pixels_refuses_and_allows_an_image_by_its_size(
     assert code_of(arguments) == 0
 
 
-def test_point_fields_says_how_the_points_of_a_scan_are_stored(
+def test_point_fields_sets_how_the_points_of_a_scan_are_stored(
     frame: ScanOnDisk, capsys: pytest.CaptureFixture[str]
 ) -> None:
     scan = np.fromfile(frame.scan, "<f4").reshape(-1, 4)

@@ -21,7 +21,7 @@ def arguments(*more: str, source: str = "drive") -> list[str]:
     ]  # fmt: skip
 
 
-def test_a_sweep_prints_a_table_a_study_and_says_what_it_wrote(
+def test_a_sweep_prints_a_table_per_study_and_the_files_it_wrote(
     root: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     vary = ("--one-by-one", "--vary", "points=20,60", "--vary", "loss=l1,l2", "--seeds", "2")
@@ -76,17 +76,17 @@ EXITS: list[tuple[list[str], int, str]] = [
 ]
 
 
-@pytest.mark.parametrize(("more", "code", "said"), EXITS)
-def test_the_exit_code_says_whose_mistake_it_was(
-    root: Path, capsys: pytest.CaptureFixture[str], more: list[str], code: int, said: str
+@pytest.mark.parametrize(("more", "code", "message"), EXITS)
+def test_the_exit_code_is_that_of_the_kind_of_error(
+    root: Path, capsys: pytest.CaptureFixture[str], more: list[str], code: int, message: str
 ) -> None:
     assert code_of(arguments(*more, "--no-plots")) == code
     err = capsys.readouterr().err
-    assert said in err.splitlines()[-1]
+    assert message in err.splitlines()[-1]
     assert "Traceback" not in err
 
 
-def test_why_frames_failed_is_said_once_for_each(
+def test_why_a_frame_failed_is_reported_once(
     root: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert code_of(arguments("--vary", "points=500", "--vary", "lr=1,2", "--no-plots")) == 7
@@ -112,18 +112,18 @@ def test_an_empty_folder_and_frames_without_truth_are_input_errors(
     assert not Path("out").exists()
 
 
-def test_ctrl_c_says_how_to_go_on_and_exits_130(
+def test_ctrl_c_prints_how_to_continue_and_exits_130(
     root: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from pnpdepth_cli.pipeline.sweep import running as sweep_running
 
     own, calls = sweep_running.refined_curve, []
 
-    def interrupted(*given: object) -> object:
-        calls.append(given)
+    def interrupted(*request: object) -> object:
+        calls.append(request)
         if len(calls) == 2:
             raise KeyboardInterrupt
-        return own(*given)  # type: ignore[arg-type]
+        return own(*request)  # type: ignore[arg-type]
 
     monkeypatch.setattr(sweep_running, "refined_curve", interrupted)
     vary = ("--vary", "lr=1%,3%", "--no-plots")
@@ -143,17 +143,17 @@ def test_options_that_a_sweep_would_not_heed_are_not_there() -> None:
     names = {option.name for option in sweep.params}
     assert not names & {"format", "overwrite", "holdout"}
     assert {"layer", "lr", "keep_best", "calib", "device"} <= names
-    given = click.command()(options.refinement(lambda: None)).params
-    assert {"format", "overwrite", "holdout"} <= {option.name for option in given}
+    parameters = click.command()(options.refinement(lambda: None)).params
+    assert {"format", "overwrite", "holdout"} <= {option.name for option in parameters}
 
 
-def test_the_sample_frames_give_a_table_and_a_picture(
+def test_the_sample_frames_give_a_table_and_a_plot(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     samples = Path(__file__).parents[2] / "samples/frames.csv"
     out = tmp_path / "sweep"
-    given = ["--limit", "1", "--sample", "500", "--vary", "iterations=0,2"]
-    assert code_of(["sweep", str(samples), "-o", str(out), *given, "--json"]) == 0
+    options = ["--limit", "1", "--sample", "500", "--vary", "iterations=0,2"]
+    assert code_of(["sweep", str(samples), "-o", str(out), *options, "--json"]) == 0
     first, second = json.loads(capsys.readouterr().out)["studies"][0]["cells"]
     assert first["measures"]["mae"]["refined"] == first["measures"]["mae"]["plain"]
     assert second["measures"]["mae"]["refined"] < second["measures"]["mae"]["plain"]

@@ -108,7 +108,7 @@ def test_a_ratio_on_the_threshold_is_not_below_it() -> None:
     assert score(torch.tensor([0.8 + 1e-6]), torch.tensor([1.0])).delta1 == 1
 
 
-def test_every_measure_is_a_score_and_says_its_unit() -> None:
+def test_every_measure_is_a_score_with_a_unit() -> None:
     keys = [measure.key for measure in MEASURES]
     assert sorted([*keys, "pixels", "coverage"]) == sorted(f.name for f in fields(Scores))
     units = {measure.key: measure.unit for measure in MEASURES}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import itertools
 from dataclasses import replace
 from typing import Any
 
@@ -11,6 +12,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from pnpdepth_cli.core import weights_refinement
 from pnpdepth_cli.core.masks import Masks, set_aside
 from pnpdepth_cli.core.refine import Refinement, RefineSettings, refine_weights
 from pnpdepth_cli.core.refinement import MaskSettings
@@ -185,6 +187,16 @@ def test_with_target_given_the_loss_at_all_points_falls() -> None:
 
 def test_a_budget_ends_the_steps() -> None:
     assert len(refined(TwoInputs(), replace(SETTINGS, time_budget_s=1e-9)).losses) == 1
+
+
+def test_a_budget_shortens_the_schedule_and_the_last_step_counts(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    clock = itertools.count()
+    monkeypatch.setattr(weights_refinement.time, "monotonic", lambda: float(next(clock)))
+    settings = replace(SETTINGS, iterations=100, schedule="linear", time_budget_s=10.0)
+    result = refined(TwoInputs(), settings)  # the clock is read twice a step: 2 s each
+    assert (len(result.losses), result.kept) == (4, 4)
 
 
 # ------------------------------------------------------------------ leaving no trace

@@ -12,6 +12,7 @@ from pnpdepth_cli.choices import UPDATES
 from pnpdepth_cli.core.update_rules import Update
 from pnpdepth_cli.core.update_rules import lbfgs as lbfgs_module
 from pnpdepth_cli.core.update_rules.adam import update_rule as adam
+from pnpdepth_cli.core.update_rules.adam_short import update_rule as adam_short
 from pnpdepth_cli.core.update_rules.lbfgs import update_rule as lbfgs
 from pnpdepth_cli.core.update_rules.momentum import update_rule as momentum
 from pnpdepth_cli.core.update_rules.normalised import update_rule as normalised
@@ -47,6 +48,7 @@ def optimised(make: Callable[[list[Tensor]], torch.optim.Optimizer], steps: int 
         (momentum, lambda p: torch.optim.SGD(p, lr=0.1, momentum=0.9)),
         (adam, lambda p: torch.optim.Adam(p, lr=0.1, eps=1e-12)),
         (lambda: adam(0.5, 0.9, 1e-8), lambda p: torch.optim.Adam(p, 0.1, (0.5, 0.9), 1e-8)),
+        (adam_short, lambda p: torch.optim.Adam(p, 0.1, (0.8, 0.95), 1e-12)),
     ],
 )
 def test_an_update_is_that_of_torch_optim(

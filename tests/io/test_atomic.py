@@ -122,8 +122,8 @@ def test_a_folder_appears_whole_and_other_files_in_it_stay(tmp_path: Path) -> No
             (temporary / name).write_text("after")
         assert (folder / "page").read_text() == "before"
     files = [path for path in folder.rglob("*") if path.is_file()]
-    found = {path.relative_to(folder).as_posix(): path.read_text() for path in files}
-    assert found == {"page": "after", "old/a": "before", "old/b": "after", "mine": "before"}
+    contents = {path.relative_to(folder).as_posix(): path.read_text() for path in files}
+    assert contents == {"page": "after", "old/a": "before", "old/b": "after", "mine": "before"}
 
 
 @pytest.mark.parametrize("existed", [False, True])

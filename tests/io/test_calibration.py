@@ -62,7 +62,7 @@ def test_kittis_odometry_file_has_the_scanner_in_tr(tmp_path: Path) -> None:
     assert np.array_equal(got.translation, want.translation)
 
 
-def test_a_plain_text_file_and_its_json_say_the_same(tmp_path: Path) -> None:
+def test_a_plain_text_file_and_its_json_are_read_the_same(tmp_path: Path) -> None:
     text = read_calibration(write(tmp_path, YAML, "a.yaml"))
     values = {
         "K": [[700.5, 0, 600], [0, 701, 170], [0, 0, 1]],
@@ -108,13 +108,13 @@ BROKEN = [
 ]
 
 
-@pytest.mark.parametrize(("text", "said"), BROKEN)
+@pytest.mark.parametrize(("text", "message"), BROKEN)
 def test_what_is_missing_or_wrong_is_named_in_one_line(
-    tmp_path: Path, text: str, said: str
+    tmp_path: Path, text: str, message: str
 ) -> None:
     with pytest.raises(FileFormatError) as error:
         read_calibration(write(tmp_path, text))
-    assert said in str(error.value)
+    assert message in str(error.value)
     assert "\n" not in str(error.value)
     assert "calib.txt" in str(error.value)
 
@@ -124,7 +124,7 @@ def test_a_camera_of_a_plain_file_is_refused(tmp_path: Path) -> None:
         read_calibration(write(tmp_path, YAML), 1)
 
 
-def test_a_folder_without_kittis_files_says_which_are_missing(tmp_path: Path) -> None:
+def test_a_folder_without_kittis_files_is_an_error_that_names_them(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"has no calib_cam_to_cam\.txt"):
         read_calibration(tmp_path)
     (tmp_path / "calib_cam_to_cam.txt").write_text("x: 1")
@@ -132,7 +132,7 @@ def test_a_folder_without_kittis_files_says_which_are_missing(tmp_path: Path) ->
         read_calibration(tmp_path)
 
 
-def test_a_picture_given_as_calibration_is_recognised(tmp_path: Path) -> None:
+def test_an_image_as_calibration_is_recognised(tmp_path: Path) -> None:
     path = tmp_path / "calib.txt"
     path.write_bytes(b"\x89PNG\r\n\x1a\n" + bytes(20))
     with pytest.raises(FileFormatError, match="not a text file"):

@@ -106,9 +106,11 @@ def test_altered_bytes_never_raise_anything_but_our_errors(
 ) -> None:
     content = bytearray((valid / name).read_bytes())
     # Most of a file's meaning is in its first bytes.
-    places = st.one_of(st.integers(0, min(400, len(content)) - 1), st.integers(0, len(content) - 1))
-    for place in data.draw(st.lists(places, min_size=1, max_size=6)):
-        content[place] = data.draw(st.integers(0, 255))
+    positions = st.one_of(
+        st.integers(0, min(400, len(content)) - 1), st.integers(0, len(content) - 1)
+    )
+    for position in data.draw(st.lists(positions, min_size=1, max_size=6)):
+        content[position] = data.draw(st.integers(0, 255))
     path = tmp_path_factory.getbasetemp() / name
     path.write_bytes(content)
     assert_only_our_errors(path)

@@ -59,7 +59,7 @@ def test_a_scale_that_would_be_plausible_is_proposed(
     assert warning.startswith("median depth ")
 
 
-def test_a_float_file_in_millimetres_is_told_what_it_must_hold() -> None:
+def test_a_float_file_in_millimetres_is_an_error_that_names_metres() -> None:
     warning = implausible(np.full(3, 2500.0))
     assert warning == (
         "median depth 2,500.0 m is implausible, the scale is probably wrong: "
@@ -76,7 +76,7 @@ def test_real_millimetres_read_as_single_codes_are_noticed(shared_data: Path) ->
     assert "--depth-scale 1000 (now 1)" in warning
 
 
-def test_a_map_that_may_be_a_room_in_millimetres_is_said_to_be() -> None:
+def test_a_map_that_may_be_a_room_in_millimetres_gets_a_note() -> None:
     kitchen = np.array([[800, 3400]]) / 256
     line = describe_range(kitchen, "16-bit PNG ÷ 256", assumed_scale=True)
     assert line == (

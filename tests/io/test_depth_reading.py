@@ -30,7 +30,7 @@ def png(tmp_path: Path) -> Path:
     return path
 
 
-def test_a_16_bit_png_without_scale_is_taken_as_kitti_and_says_so(png: Path) -> None:
+def test_a_16_bit_png_without_scale_is_read_as_kitti_with_a_note(png: Path) -> None:
     depth = read_depth(png)
     assert np.array_equal(depth.values, CODES.astype(np.float32) / 256)
     assert depth.values.dtype == np.float32
@@ -85,7 +85,7 @@ def test_a_16_bit_tiff_has_the_same_rule(tmp_path: Path) -> None:
     assert np.array_equal(read_depth(path).values, (CODES / 1000).astype(np.float32))
 
 
-def test_the_largest_code_is_unknown_and_that_is_said(tmp_path: Path) -> None:
+def test_the_largest_code_is_unknown_and_gets_a_note(tmp_path: Path) -> None:
     path = tmp_path / "d.png"
     cv2.imwrite(str(path), np.array([[65535, 1000, 65535]], dtype=np.uint16))
     depth = read_depth(path, scale=1000)
@@ -319,14 +319,14 @@ def test_float_tiff_holds_metres(tmp_path: Path, dtype: type) -> None:
 
 
 @pytest.mark.parametrize("suffix", [".png", ".tif", ".jpg", ".webp"])
-def test_8_bits_are_refused_as_a_picture_of_depth(tmp_path: Path, suffix: str) -> None:
+def test_8_bits_are_refused_as_a_preview_of_depth(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"d{suffix}"
     Image.fromarray(np.zeros((3, 4), np.uint8)).save(path)
     with pytest.raises(FileFormatError, match="8 bits cannot hold depth"):
         read_depth(path)
 
 
-def test_a_16_bit_png_of_three_equal_channels_is_depth_and_that_is_said(tmp_path: Path) -> None:
+def test_a_16_bit_png_of_three_equal_channels_is_depth_and_gets_a_note(tmp_path: Path) -> None:
     path = tmp_path / "rgb.png"
     cv2.imwrite(str(path), np.repeat(np.where(CODES == 0, 65535, CODES)[:, :, None], 3, axis=2))
     depth = read_depth(path, scale=100)

@@ -86,9 +86,7 @@ def test_the_depth_given_is_not_changed(tmp_path: Path, suffix: str) -> None:
 
 
 @pytest.mark.parametrize("suffix", DEPTH_SUFFIXES)
-def test_a_picture_in_another_memory_layout_is_written_the_same(
-    tmp_path: Path, suffix: str
-) -> None:
+def test_an_image_in_another_memory_layout_is_written_the_same(tmp_path: Path, suffix: str) -> None:
     depth = np.arange(1, 13, dtype=np.float32).reshape(3, 4)
     write_depth(tmp_path / f"d{suffix}", depth[::-1].T)
     assert np.array_equal(read_depth(tmp_path / f"d{suffix}").values, depth[::-1].T)

@@ -25,10 +25,10 @@ def photo(path: Path, tags: dict[int, object]) -> Path:
 def test_the_equivalent_on_film_has_the_same_diagonal_field_of_view(
     tmp_path: Path, suffix: str
 ) -> None:
-    found = read_focal_length(photo(tmp_path / f"a{suffix}", {0xA405: 50}), (300, 400))
-    assert found is not None
-    assert found.pixels == pytest.approx(50 / math.hypot(36, 24) * 500)
-    assert "50 mm" in found.source
+    focal = read_focal_length(photo(tmp_path / f"a{suffix}", {0xA405: 50}), (300, 400))
+    assert focal is not None
+    assert focal.pixels == pytest.approx(50 / math.hypot(36, 24) * 500)
+    assert "50 mm" in focal.source
 
 
 def test_the_sensor_is_used_without_an_equivalent_and_follows_a_resized_photo(
@@ -36,9 +36,9 @@ def test_the_sensor_is_used_without_an_equivalent_and_follows_a_resized_photo(
 ) -> None:
     # 5 mm and 100 pixels per mm on an image that was 800 pixels wide when it was taken
     tags = {0x920A: 5.0, 0xA20E: 1000.0, 0xA210: 3, 0xA002: 800, 0xA003: 600}
-    found = read_focal_length(photo(tmp_path / "a.jpg", tags), (300, 400))
-    assert found is not None
-    assert found.pixels == pytest.approx(5 * 100 / 2)
+    focal = read_focal_length(photo(tmp_path / "a.jpg", tags), (300, 400))
+    assert focal is not None
+    assert focal.pixels == pytest.approx(5 * 100 / 2)
 
 
 @pytest.mark.parametrize(

@@ -35,7 +35,7 @@ def test_a_new_time_alone_is_no_change_new_content_is(tmp_path: Path) -> None:
     assert not is_unchanged(path, known)
 
 
-def test_a_file_that_is_not_there_is_said(tmp_path: Path) -> None:
+def test_a_missing_file_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="cannot be read"):
         fingerprint(tmp_path / "no")
 

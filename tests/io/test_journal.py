@@ -144,3 +144,11 @@ def test_threads_may_append_at_once(tmp_path: Path) -> None:
 def test_a_folder_in_its_place_is_said(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="cannot be read"):
         Journal(tmp_path, "frame")
+
+
+def test_a_line_is_read_up_to_a_field(tmp_path: Path) -> None:
+    journal = Journal(tmp_path / "j.jsonl", "frame")
+    name = 'a", "row": {'
+    journal.append({"frame": name, "state": "done", "row": {"row": 1}}, {"frame": "b", "n": 1})
+    assert journal.newest(name, before="row") == {"frame": name, "state": "done"}
+    assert journal.newest("b", before="row") == {"frame": "b", "n": 1}

@@ -30,20 +30,20 @@ def no_long_wait(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 class Alone:
-    """Whether a run was told that nobody else is there."""
+    """Counts how often a run was called as the only one."""
 
     def __init__(self) -> None:
-        self.told = 0
+        self.calls = 0
 
     def __call__(self) -> None:
-        self.told += 1
+        self.calls += 1
 
 
 def test_one_run_at_a_time_and_after_it_another(tmp_path: Path) -> None:
     for _ in range(2):
         alone = Alone()
         with locked_folder(tmp_path, None, alone):
-            assert alone.told == 1
+            assert alone.calls == 1
             with (
                 pytest.raises(OutputError, match="another batch writes there; wait for it"),
                 locked_folder(tmp_path, None, Alone()),
@@ -54,7 +54,7 @@ def test_one_run_at_a_time_and_after_it_another(tmp_path: Path) -> None:
 def test_shards_of_one_division_run_together_and_only_the_first_is_alone(tmp_path: Path) -> None:
     first, second = Alone(), Alone()
     with locked_folder(tmp_path, (1, 3), first), locked_folder(tmp_path, (3, 3), second):
-        assert (first.told, second.told) == (1, 0)
+        assert (first.calls, second.calls) == (1, 0)
         for shard in ((1, 3), (3, 3), (1, 2), None):
             with pytest.raises(OutputError), locked_folder(tmp_path, shard, Alone()):
                 pass

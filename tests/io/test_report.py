@@ -18,6 +18,7 @@ from pnpdepth_cli.io.report import (
     check_report_folder,
     image_key,
     remove_report_leftovers,
+    whole_report,
     write_report,
 )
 from tests.pipeline.report_pages import page_data
@@ -83,17 +84,35 @@ def test_frames_are_taken_one_by_one(tmp_path: Path) -> None:
     assert len(page_data(tmp_path)["frames"]) == 3000
 
 
-def test_pictures_of_no_frame_are_removed_and_nothing_else(tmp_path: Path) -> None:
-    pictures = begin_report(tmp_path, {})
+def test_images_of_no_frame_are_removed_and_nothing_else(tmp_path: Path) -> None:
+    images = begin_report(tmp_path, {})
     kept, stale = image_key("a"), image_key("b")
     for name in (f"{kept}_map.jpg", f"{stale}_map.jpg", "mine.jpg", f"{stale}.txt"):
-        (pictures / name).write_bytes(b"x")
+        (images / name).write_bytes(b"x")
     write_report(tmp_path, HEAD, [frame("a", kept), frame("without")])
-    left = {path.name for path in pictures.iterdir()}
+    left = {path.name for path in images.iterdir()}
     assert left == {f"{kept}_map.jpg", "mine.jpg", f"{stale}.txt"}
 
 
-def test_keys_tell_parts_apart() -> None:
+def test_a_report_of_an_earlier_version_is_replaced_with_its_images(tmp_path: Path) -> None:
+    begin_report(tmp_path, {"command": "batch"})
+    old, image = tmp_path / "pictures", f"{image_key('a')}_map.jpg"
+    old.mkdir()
+    (old / image).write_bytes(b"x")
+    (old / ".0123456789ab.jpg").write_bytes(b"half")
+    check_report_folder(tmp_path, [], made_of={"command": "batch"}, overwrite=False)
+    assert remove_report_leftovers(tmp_path) == 1
+    write_report(tmp_path, HEAD, [frame("a", image_key("a"))])
+    assert not old.exists()
+    old.mkdir()
+    for name in (image, "mine.jpg"):
+        (old / name).write_bytes(b"x")
+    with whole_report(tmp_path) as folder:
+        begin_report(folder, {"command": "eval"})
+    assert [path.name for path in old.iterdir()] == ["mine.jpg"]
+
+
+def test_keys_of_different_parts_differ() -> None:
     keys = {
         image_key("a", "bc"),
         image_key("ab", "c"),
@@ -104,8 +123,8 @@ def test_keys_tell_parts_apart() -> None:
 
 
 def test_what_a_killed_writer_left_is_removed(tmp_path: Path) -> None:
-    pictures = begin_report(tmp_path, {})
-    for path in (tmp_path / ".0123456789ab.html", pictures / ".0123456789ab.jpg"):
+    images = begin_report(tmp_path, {})
+    for path in (tmp_path / ".0123456789ab.html", images / ".0123456789ab.jpg"):
         path.write_bytes(b"half")
     assert remove_report_leftovers(tmp_path) == 2
     assert remove_report_leftovers(tmp_path / "nowhere") == 0
@@ -122,11 +141,11 @@ def test_a_page_that_fails_midway_leaves_the_old_one(tmp_path: Path) -> None:
     with pytest.raises(OutputError):
         write_report(tmp_path, HEAD, broken())
     assert [each["name"] for each in page_data(tmp_path)["frames"]] == ["old"]
-    assert {p.name for p in tmp_path.iterdir()} == {"index.html", "pictures", "report.json"}
+    assert {p.name for p in tmp_path.iterdir()} == {"index.html", "images", "report.json"}
 
 
 @pytest.mark.parametrize(
-    ("folder", "said"),
+    ("folder", "message"),
     [
         ("in", "lies in in, which is read"),
         ("in/deep/report", "lies in in, which is read"),
@@ -137,15 +156,15 @@ def test_a_page_that_fails_midway_leaves_the_old_one(tmp_path: Path) -> None:
     ],
 )
 def test_inputs_and_other_files_are_safe(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, folder: str, said: str
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, folder: str, message: str
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    for made in ("in", "full"):
-        Path(made).mkdir()
+    for name in ("in", "full"):
+        Path(name).mkdir()
     Path("file").write_text("mine")
     Path("full/notes.txt").write_text("mine")
     Path("link").symlink_to("in")
-    with pytest.raises(OutputError, match=said):
+    with pytest.raises(OutputError, match=message):
         check_report_folder(Path(folder), [Path("in")], made_of=None, overwrite=False)
     if folder != "full":
         with pytest.raises(OutputError):

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from pnpdepth_cli.choices import COLORS
 from pnpdepth_cli.errors import FileFormatError, InputError
 from pnpdepth_cli.io.colours import paint_gain
 from pnpdepth_cli.io.page import open_page
@@ -22,9 +23,9 @@ ORANGE, BLUE = [220, 105, 0], [25, 90, 190]
 
 
 def size_of(path: Path) -> tuple[int, int]:
-    with Image.open(path) as picture:
-        assert picture.format == "JPEG"
-        return picture.size
+    with Image.open(path) as image:
+        assert image.format == "JPEG"
+        return image.size
 
 
 @pytest.mark.parametrize(
@@ -48,14 +49,14 @@ def test_views_and_thumbs_are_of_bounded_size(
     assert size_of(tmp_path / "k_thumb.jpg") == size_of(tmp_path / "k_map_thumb.jpg") == thumb
 
 
-def test_the_error_map_tells_too_far_from_too_near() -> None:
+def test_the_error_map_has_different_colours_for_too_far_and_too_near() -> None:
     truth = np.full((1, 4), 2, np.float32)
     prediction = np.array([[3, 1, 2, 0]], np.float32)
-    found = error_map(prediction, truth, None)
-    assert found.strongest_m == 1
-    assert found.pixels[0, 0].tolist() == ORANGE
-    assert found.pixels[0, 1].tolist() == BLUE
-    right, none = found.pixels[0, 2], found.pixels[0, 3]
+    colours = error_map(prediction, truth, None)
+    assert colours.strongest_m == 1
+    assert colours.pixels[0, 0].tolist() == ORANGE
+    assert colours.pixels[0, 1].tolist() == BLUE
+    right, none = colours.pixels[0, 2], colours.pixels[0, 3]
     assert len(set(right.tolist())) == len(set(none.tolist())) == 1
     assert right[0] > 150 > 80 > none[0]
 
@@ -67,10 +68,12 @@ def test_an_error_map_without_any_error_is_grey() -> None:
 
 
 def test_the_legends_go_from_end_to_end() -> None:
-    for colours, ends in ((error_colours(), (BLUE, ORANGE)), (gain_colours(), None)):
+    legends = [(error_colours(), [BLUE, ORANGE])]
+    for name in COLORS:
+        ends = [paint_gain(np.array(s), np.array(0.88), name).tolist() for s in (-1.0, 1.0)]
+        legends.append((gain_colours(name), ends))
+    for colours, ends in legends:
         assert all(len(colour) == 7 for colour in colours)
-        if ends is None:
-            ends = tuple(paint_gain(np.array(s), np.array(0.88)).tolist() for s in (-1.0, 1.0))
         for colour, end in zip((colours[0], colours[-1]), ends, strict=True):
             assert [int(colour[i : i + 2], 16) for i in (1, 3, 5)] == end
 

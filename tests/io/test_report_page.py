@@ -30,7 +30,7 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Of a batch of five frames, one with a strange name, and one that failed."""
     root = pairs_on_disk(tmp_path_factory.mktemp("batch"))
     add_frame(root, STRANGE, cv2.imread(str(root / "net/img.png"))[::-1])
-    (root / "rgb/d.png").write_bytes(b"no picture")
+    (root / "rgb/d.png").write_bytes(b"no image")
     batch(root, html=root / "out/report")
     return root / "out/report"
 
@@ -92,14 +92,14 @@ def test_it_opens_from_disk_without_an_error_and_without_a_network(page: webdriv
     one(page, "#rows .open").click()
     wait(page, lambda: loaded(page, "img"))
     assert page.get_log("browser") == []
-    asked = [
+    requests = [
         message["params"]["request"]["url"]
         for entry in page.get_log("performance")
         for message in [json.loads(entry["message"])["message"]]
         if message["method"] == "Network.requestWillBeSent"
     ]
-    assert len(asked) > 10
-    assert {url.split(":")[0] for url in asked} <= {"file", "data"}
+    assert len(requests) > 10
+    assert {url.split(":")[0] for url in requests} <= {"file", "data"}
 
 
 def test_names_stay_text(page: webdriver.Chrome) -> None:
@@ -166,17 +166,17 @@ def test_a_frame_opens_moves_on_and_closes_by_keyboard_alone(page: webdriver.Chr
     wait(page, lambda: focused(page) == order[0])
 
 
-def test_the_slider_moves_by_keyboard_and_says_where_it_is(page: webdriver.Chrome) -> None:
+def test_the_slider_moves_by_keyboard_and_names_its_position(page: webdriver.Chrome) -> None:
     one(page, "#rows .open").send_keys(Keys.ENTER)
     slider = page.switch_to.active_element
     assert slider.get_attribute("type") == "range"
-    for key, place in ((Keys.ARROW_RIGHT, 51), (Keys.HOME, 0), (Keys.END, 100)):
+    for key, position in ((Keys.ARROW_RIGHT, 51), (Keys.HOME, 0), (Keys.END, 100)):
         slider.send_keys(key)
-        said = f"{place} % Before, {100 - place} % After"
-        assert slider.get_attribute("aria-valuetext") == said
+        text = f"{position} % Before, {100 - position} % After"
+        assert slider.get_attribute("aria-valuetext") == text
         clip = page.execute_script("return document.querySelector('.over').style.clipPath")
-        assert clip.startswith(f"inset(0px {100 - place}%")
-        assert one(page, ".handle").get_attribute("style") == f"left: {place}%;"
+        assert clip.startswith(f"inset(0px {100 - position}%")
+        assert one(page, ".handle").get_attribute("style") == f"left: {position}%;"
 
 
 def test_the_slider_follows_the_pointer(page: webdriver.Chrome) -> None:
@@ -195,7 +195,7 @@ def test_what_failed_is_listed_with_its_reason(page: webdriver.Chrome) -> None:
     assert "d.png" in text
 
 
-def test_the_histogram_counts_all_frames_and_is_told_in_words(page: webdriver.Chrome) -> None:
+def test_the_histogram_counts_all_frames_and_has_a_text_alternative(page: webdriver.Chrome) -> None:
     bars = page.find_elements(By.CSS_SELECTOR, "#chart .bar title")
     counts = [int(b.get_attribute("textContent").split(": ")[1].split()[0]) for b in bars]
     assert sum(counts) == 4
@@ -241,17 +241,17 @@ def test_every_control_has_a_name(page: webdriver.Chrome) -> None:
                 assert control.accessible_name, control.get_attribute("outerHTML")
         if part == "main":
             one(page, "#rows .open").send_keys(Keys.ENTER)
-    for picture in page.find_elements(By.CSS_SELECTOR, "#views img"):
-        assert picture.get_attribute("alt")
+    for image in page.find_elements(By.CSS_SELECTOR, "#views img"):
+        assert image.get_attribute("alt")
 
 
 @pytest.fixture(scope="module")
 def thousand(tmp_path_factory: pytest.TempPathFactory, report: Path) -> Path:
-    """A report of 1,000 frames, every one with pictures of its own."""
+    """A report of 1,000 frames, every one with its own images."""
     folder = tmp_path_factory.mktemp("thousand")
-    pictures = begin_report(folder, {})
+    images = begin_report(folder, {})
     pixels = np.random.default_rng(0).integers(0, 255, (120, 160, 3), np.uint8)
-    save_images(pictures, "0", {"map": pixels, "second": pixels}, thumb="second")
+    save_images(images, "0", {"map": pixels, "second": pixels}, thumb="second")
     head = page_data(report)
     head.pop("frames")
     example = frames_of(report)["a"]
@@ -259,7 +259,7 @@ def thousand(tmp_path_factory: pytest.TempPathFactory, report: Path) -> Path:
     def frame(number: int) -> dict[str, Any]:
         key = image_key(str(number))
         for thumb in ("thumb", "map_thumb"):
-            shutil.copy(pictures / f"0_{thumb}.jpg", pictures / f"{key}_{thumb}.jpg")
+            shutil.copy(images / f"0_{thumb}.jpg", images / f"{key}_{thumb}.jpg")
         values = [number % 97 / 100 - 0.3] * len(head["columns"])
         return example | {"name": f"drive/{number:06}", "key": key, "values": values}
 
@@ -271,7 +271,7 @@ def test_a_thousand_frames_are_usable_within_seconds_and_few_thumbnails_are_read
     chrome: webdriver.Chrome, thousand: Path
 ) -> None:
     size(chrome, 1280, 900)
-    for _ in range(2):  # pictures that the browser has in memory are not read ahead either
+    for _ in range(2):  # images that the browser has in memory are not read ahead either
         chrome.get_log("performance")
         chrome.get((thousand / "index.html").as_uri())
     assert len(names(chrome)) == 1000

@@ -92,16 +92,16 @@ def test_before_after_and_ground_truth_are_drawn_and_differ(page: webdriver.Chro
 def test_it_opens_from_disk_without_an_error_and_without_a_network(page: webdriver.Chrome) -> None:
     open_view(page)
     pixels(page)
-    said = [entry["message"] for entry in page.get_log("browser")]
-    assert [text for text in said if "GL Driver Message" not in text] == []
-    asked = [
+    messages = [entry["message"] for entry in page.get_log("browser")]
+    assert [text for text in messages if "GL Driver Message" not in text] == []
+    requests = [
         message["params"]["request"]["url"]
         for entry in page.get_log("performance")
         for message in [json.loads(entry["message"])["message"]]
         if message["method"] == "Network.requestWillBeSent"
     ]
-    assert any(url.endswith(VIEWER) for url in asked)
-    assert {url.split(":")[0] for url in asked} <= {"file", "data"}
+    assert any(url.endswith(VIEWER) for url in requests)
+    assert {url.split(":")[0] for url in requests} <= {"file", "data"}
 
 
 def test_nothing_is_loaded_before_the_view_is_opened(page: webdriver.Chrome) -> None:
@@ -146,11 +146,11 @@ def test_a_phone_shows_it_without_overflow_and_leaves_touches_to_it(page: webdri
     assert canvas.accessible_name.endswith("points")
 
 
-def test_a_view_that_is_missing_is_said(page: webdriver.Chrome, root: Path) -> None:
+def test_a_missing_view_is_reported(page: webdriver.Chrome, root: Path) -> None:
     (key,) = [
         each["key"] for each in page_data(root / "out" / "report")["frames"] if each["name"] == "b"
     ]
-    script = root / "out" / "report" / "pictures" / f"{key}_view.js"
+    script = root / "out" / "report" / "images" / f"{key}_view.js"
     moved = script.rename(script.with_suffix(".away"))
     try:
         ask_for_view(page, "b")
@@ -164,10 +164,10 @@ def test_a_report_without_views_allows_and_holds_no_other_script(tmp_path: Path)
     report = root / "out" / "report"
     batch(root, html=report, html_3d=True, refine={"fov_deg": 60.0})
     assert (report / VIEWER).stat().st_size > 500_000
-    assert len(list((report / "pictures").glob("*_view.js"))) == 1
+    assert len(list((report / "images").glob("*_view.js"))) == 1
     batch(root, html=report, refine={"fov_deg": 60.0})
     assert not (report / VIEWER).exists()
-    assert list((report / "pictures").glob("*_view.js")) == []
+    assert list((report / "images").glob("*_view.js")) == []
     text = (report / "index.html").read_text()
     assert " file:;" not in text.split("script-src")[1].split('"')[0]
 

@@ -72,7 +72,7 @@ def test_other_colour_modes_become_rgb(tmp_path: Path, mode: str) -> None:
     assert np.array_equal(read_rgb(path).values, np.ones((3, 5, 3), np.float32))
 
 
-# What is stored when the upright picture is [[0, 1, 2], [3, 4, 5]], by EXIF orientation.
+# What is stored when the upright image is [[0, 1, 2], [3, 4, 5]], by EXIF orientation.
 STORED = {
     1: [[0, 1, 2], [3, 4, 5]],
     2: [[2, 1, 0], [5, 4, 3]],
@@ -110,12 +110,12 @@ def test_the_rotation_agrees_with_pillow(tmp_path: Path) -> None:
         exif[0x0112] = orientation
         path = tmp_path / "a.png"
         Image.fromarray(COLOURS).save(path, exif=exif)
-        with Image.open(path) as picture:
-            expected = np.asarray(ImageOps.exif_transpose(picture))
+        with Image.open(path) as image:
+            expected = np.asarray(ImageOps.exif_transpose(image))
         assert np.array_equal(np.rint(read_rgb(path).values * 255), expected)
 
 
-def test_linear_exr_is_given_the_srgb_curve_and_says_so(tmp_path: Path) -> None:
+def test_linear_exr_gets_the_srgb_curve_and_a_note(tmp_path: Path) -> None:
     path = tmp_path / "a.exr"
     linear = np.array([[0.0, 0.001, 0.2140411], [0.5, 1.0, 0.0031308]], dtype=np.float32)
     write_exr(path, {"R": linear, "G": linear, "B": np.zeros_like(linear)})
@@ -128,7 +128,7 @@ def test_linear_exr_is_given_the_srgb_curve_and_says_so(tmp_path: Path) -> None:
     assert not image.values[:, :, 2].any()
 
 
-def test_exr_beyond_white_is_clipped_and_says_how_much(tmp_path: Path) -> None:
+def test_exr_beyond_white_is_clipped_and_the_note_has_the_fraction(tmp_path: Path) -> None:
     path = tmp_path / "a.exr"
     bright = np.array([[0.5, 4.0], [np.nan, np.inf]], dtype=np.float16)
     write_exr(path, {"R": bright, "G": bright, "B": bright})
@@ -148,7 +148,7 @@ def test_grey_exr_and_layered_exr_are_read(tmp_path: Path) -> None:
     assert read_rgb(tmp_path / "l.exr").values[0, 0].tolist() == [0, 1, 1]
 
 
-def test_exr_without_one_picture_lists_its_channels(tmp_path: Path) -> None:
+def test_exr_without_one_image_lists_its_channels(tmp_path: Path) -> None:
     ones = np.ones((2, 3), np.float32)
     write_exr(tmp_path / "a.exr", {"U": ones, "V": ones})
     with pytest.raises(FileFormatError, match=r"\(U, V\)"):
@@ -161,7 +161,7 @@ def test_a_float_tiff_is_refused(tmp_path: Path) -> None:
         read_rgb(tmp_path / "a.tif")
 
 
-def test_only_the_first_page_is_read_and_that_is_said(tmp_path: Path) -> None:
+def test_only_the_first_page_is_read_with_a_note(tmp_path: Path) -> None:
     first, second = Image.fromarray(COLOURS), Image.new("RGB", (11, 7))
     first.save(tmp_path / "a.tif", save_all=True, append_images=[second])
     image = read_rgb(tmp_path / "a.tif")
@@ -169,7 +169,7 @@ def test_only_the_first_page_is_read_and_that_is_said(tmp_path: Path) -> None:
     assert np.array_equal(np.rint(image.values * 255), COLOURS)
 
 
-def test_damaged_exif_does_not_spoil_a_good_picture(tmp_path: Path) -> None:
+def test_an_image_with_damaged_exif_is_read(tmp_path: Path) -> None:
     path = tmp_path / "a.jpg"
     Image.new("RGB", (8, 8), "white").save(path, exif=b"Exif\0\0MM\0*\0\0\0\x08\0\x05\x01\x12")
     assert read_rgb(path).values.min() == 1
@@ -179,7 +179,7 @@ def test_damaged_exif_does_not_spoil_a_good_picture(tmp_path: Path) -> None:
     ("content", "fact"),
     [(b"", "is empty"), (b"hello, world", "is not an image"), (b"\x93NUMPY\x01\x00", "not an im")],
 )
-def test_what_is_no_picture_is_refused(tmp_path: Path, content: bytes, fact: str) -> None:
+def test_what_is_no_image_is_refused(tmp_path: Path, content: bytes, fact: str) -> None:
     path = tmp_path / "a.png"
     path.write_bytes(content)
     with pytest.raises(FileFormatError, match=fact) as caught:
@@ -200,7 +200,7 @@ def test_a_missing_file_and_a_folder_are_named(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", ["JPEG", "PNG", "WEBP", "TIFF"])
-def test_every_truncation_of_a_picture_is_refused(tmp_path: Path, kind: str) -> None:
+def test_every_truncation_of_an_image_is_refused(tmp_path: Path, kind: str) -> None:
     buffer = io.BytesIO()
     Image.fromarray(np.kron(COLOURS, np.ones((6, 6, 1), np.uint8))).save(buffer, kind)
     content = buffer.getvalue()
@@ -241,8 +241,8 @@ def test_a_real_frame_is_read_as_other_programs_read_it(shared_data: Path) -> No
     path = shared_data / "7scenes" / "frame-000000.color.jpg"
     values = read_rgb(path).values
     assert values.shape == (480, 640, 3)
-    with Image.open(path) as picture:
-        assert np.array_equal(np.rint(values * 255), np.asarray(picture))
+    with Image.open(path) as image:
+        assert np.array_equal(np.rint(values * 255), np.asarray(image))
 
 
 def test_a_real_jpeg_cut_in_half_is_refused(shared_data: Path, tmp_path: Path) -> None:

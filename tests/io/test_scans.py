@@ -127,7 +127,7 @@ def test_a_bin_that_ends_within_a_point_is_refused(tmp_path: Path, lost: int) ->
 
 
 @pytest.mark.parametrize("name", sorted(set(FILES) - {"kitti.bin", "scan.npy"}))
-def test_a_scan_with_fewer_points_than_its_header_says_is_refused(
+def test_a_scan_with_fewer_points_than_its_header_states_is_refused(
     tmp_path: Path, name: str
 ) -> None:
     short = FILES[name](POINTS).replace(b" 37\n", b" 9037\n")
@@ -145,7 +145,7 @@ def test_points_that_are_no_numbers_are_refused_and_counted(tmp_path: Path, name
         read_scan(tmp_path / name)
 
 
-def test_a_beam_without_return_in_a_pcd_is_left_out_and_said(tmp_path: Path) -> None:
+def test_a_beam_without_return_in_a_pcd_is_left_out_with_a_note(tmp_path: Path) -> None:
     organised = POINTS.copy()
     organised[[4, 9]] = np.nan
     (tmp_path / "a.pcd").write_bytes(pcd_bytes(organised))
@@ -155,7 +155,7 @@ def test_a_beam_without_return_in_a_pcd_is_left_out_and_said(tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize(
-    ("name", "content", "said"),
+    ("name", "content", "message"),
     [
         ("a.png", b"\x89PNG\r\n\x1a\n" + bytes(24), "not a scan; give a file of .bin"),
         ("a.bin", b"\x89PNG\r\n\x1a\n" + bytes(24), "is a PNG file"),
@@ -170,13 +170,13 @@ def test_a_beam_without_return_in_a_pcd_is_left_out_and_said(tmp_path: Path) -> 
         ("a.ply", ply_bytes(POINTS).replace(b"uchar red", b"list uchar int red"), "not one number"),
     ],
 )
-def test_what_is_no_scan_is_said_in_one_line(
-    tmp_path: Path, name: str, content: bytes, said: str
+def test_what_is_no_scan_is_an_error_of_one_line(
+    tmp_path: Path, name: str, content: bytes, message: str
 ) -> None:
     (tmp_path / name).write_bytes(content)
     with pytest.raises(FileFormatError) as error:
         read_scan(tmp_path / name)
-    assert said in str(error.value)
+    assert message in str(error.value)
     assert "\n" not in str(error.value)
 
 
@@ -196,7 +196,16 @@ def test_a_list_of_points_with_integers_is_not_taken_for_metres(tmp_path: Path) 
 
 
 def test_every_suffix_has_a_reader() -> None:
-    assert SCAN_SUFFIXES == (".bin", ".npy", ".pcd", ".ply")
+    assert SCAN_SUFFIXES == (".bin", ".npy", ".npz", ".pcd", ".ply")
+
+
+def test_the_points_of_an_npz_are_its_array_data(tmp_path: Path) -> None:
+    points = np.array([[1, 2, 3, 9], [4, 5, 6, 9]], np.float32)
+    np.savez_compressed(tmp_path / "a.npz", data=points, other=np.zeros(3))
+    assert read_scan(tmp_path / "a.npz").points.tolist() == points[:, :3].tolist()
+    (tmp_path / "a.npz").rename(tmp_path / "a.bin")
+    with pytest.raises(FileFormatError, match="is a NPZ file, not a scan"):
+        read_scan(tmp_path / "a.bin")
 
 
 def test_kittis_scans_are_read_whole(shared_data: Path) -> None:
@@ -215,7 +224,7 @@ def nuscenes_bytes(points: NDArray[np.float32]) -> bytes:
 
 @pytest.mark.parametrize("name", ["LIDAR_TOP__1532402927647951.pcd.bin", "renamed.bin"])
 @pytest.mark.parametrize("count", [37, 40])
-def test_a_nuscenes_scan_is_told_from_kittis_by_name_and_content(
+def test_a_nuscenes_scan_is_recognised_by_name_and_content(
     tmp_path: Path, name: str, count: int
 ) -> None:
     points = np.resize(POINTS, (count, 3))

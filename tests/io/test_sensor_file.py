@@ -32,7 +32,7 @@ def test_even_elevations_go_down_from_the_top(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         ("elevations_deg = [1\n", "not valid TOML"),
         ("elevations_deg = [1]\n", "azimuth_step_deg is missing"),
@@ -46,16 +46,16 @@ def test_even_elevations_go_down_from_the_top(tmp_path: Path) -> None:
     ],
 )
 def test_what_is_missing_or_wrong_is_named_in_one_line(
-    tmp_path: Path, text: str, said: str
+    tmp_path: Path, text: str, message: str
 ) -> None:
     with pytest.raises(FileFormatError) as error:
         read_sensor(write(tmp_path, text))
-    assert said in str(error.value)
+    assert message in str(error.value)
     assert "\n" not in str(error.value)
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         ("elevations_deg = " + "[" * 5000 + "]" * 5000, "not valid TOML"),
         ("elevations_deg = [1]\nazimuth_step_deg = 1" + "0" * 400 + "\n", "not a number"),
@@ -65,8 +65,8 @@ def test_what_is_missing_or_wrong_is_named_in_one_line(
     ],
     ids=["nested", "400-digits", "5000-digits", "many-beams", "list-in-list"],
 )
-def test_a_hostile_file_is_refused_in_one_line(tmp_path: Path, text: str, said: str) -> None:
-    with pytest.raises(FileFormatError, match=said) as error:
+def test_a_hostile_file_is_refused_in_one_line(tmp_path: Path, text: str, message: str) -> None:
+    with pytest.raises(FileFormatError, match=message) as error:
         read_sensor(write(tmp_path, text))
     assert "\n" not in str(error.value)
     assert len(str(error.value)) < 500

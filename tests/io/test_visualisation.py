@@ -31,9 +31,9 @@ BLUE, ORANGE = [25, 90, 190], [220, 105, 0]
 
 
 def pixels_of(path: Path) -> np.ndarray:
-    with Image.open(path) as picture:
-        picture.load()
-        return np.asarray(picture)
+    with Image.open(path) as image:
+        image.load()
+        return np.asarray(image)
 
 
 def scene(height: int, width: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -131,7 +131,7 @@ def test_a_place_that_cannot_be_written_is_an_output_error(tmp_path: Path) -> No
 
 
 def panel(path: Path, height: int, width: int, factor: int) -> np.ndarray:
-    """One colour per pixel of the original, from the panel of an improvement picture."""
+    """One colour per pixel of the original, from the panel of an improvement image."""
     page = pixels_of(path)[58 : 58 + height * factor, 24 : 24 + width * factor]
     return page[factor // 2 :: factor, factor // 2 :: factor]
 
@@ -236,7 +236,7 @@ def test_points_are_coloured_discs_where_they_lie(
     assert np.ptp(colours[12, 17].astype(int)) == 0
 
 
-def test_used_and_held_out_points_are_told_apart(tmp_path: Path) -> None:
+def test_used_and_held_out_points_have_different_colours(tmp_path: Path) -> None:
     rgb, depth, xy = scene(30, 40)
     truth = at(depth, xy)
     for name, held_out in [("used.png", False), ("held.png", True)]:
@@ -299,7 +299,7 @@ def test_stronger_change_is_stronger_colour() -> None:
 
 
 @pytest.mark.parametrize("kind", ["kitti_dc", "7scenes"])
-def test_pictures_of_real_frames_are_written(shared_data: Path, tmp_path: Path, kind: str) -> None:
+def test_previews_of_real_frames_are_written(shared_data: Path, tmp_path: Path, kind: str) -> None:
     if kind == "kitti_dc":
         folder = shared_data / kind
         rgb = read_rgb(sorted((folder / "image").glob("*"))[0]).values

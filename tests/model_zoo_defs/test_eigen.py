@@ -80,7 +80,7 @@ def test_a_folder_with_both_published_files_loads_and_gives_what_their_tensors_s
 
 
 @pytest.mark.parametrize("part", ["coarse_model_12.pth", "fine_model_7.pth"])
-def test_one_file_alone_says_how_both_are_named(folder: Path, part: str) -> None:
+def test_one_file_alone_is_an_error_that_names_both(folder: Path, part: str) -> None:
     with pytest.raises(
         CheckpointError, match=rf"this is the {part.partition('_')[0]} network only"
     ):

@@ -266,7 +266,7 @@ def test_a_state_dict_of_ours_loads_too(tmp_path: Path) -> None:
         ("upSample.layer1.upper_branch.conv1.weight", "dontLoveBugs"),
     ],
 )
-def test_files_of_ports_say_that_they_are_another_network(
+def test_files_of_ports_are_an_error_that_names_another_network(
     key: str, port: str, tmp_path: Path
 ) -> None:
     torch.save({"epoch": 1, "state_dict": {key: torch.zeros(1)}}, tmp_path / "checkpoint.pth.tar")

@@ -177,7 +177,7 @@ def test_a_start_is_what_the_recipe_says() -> None:
     assert bool((toy(torch.rand(1, 3, 8, 8)) == 2.0).all())
 
 
-def test_without_its_scaffold_a_network_says_the_same_and_is_the_published_one() -> None:
+def test_without_its_scaffold_a_network_predicts_the_same_and_is_the_published_one() -> None:
     torch.manual_seed(0)
     plain = nn.Sequential(
         nn.Conv2d(3, 5, 3),

@@ -115,7 +115,7 @@ def test_an_output_without_any_tensor_is_named() -> None:
         network().raw_of({"depth": None})
 
 
-def test_what_verify_says_is_passed_on_and_what_it_raises_is_the_definitions_fault() -> None:
+def test_notes_of_verify_are_passed_on_and_what_it_raises_is_the_definitions_fault() -> None:
     assert network().verified(()) == ()
     assert network(verify=lambda module, arguments: f"{len(arguments)}").verified(()) == ("0",)
     assert network(verify=lambda module, arguments: None).verified(()) == ()

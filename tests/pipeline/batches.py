@@ -19,16 +19,16 @@ from tests.pipeline.frames import frame_on_disk
 NAMES = ("a", "b", "c", "d")
 
 
-class Heard:
-    """Everything a batch tells."""
+class RecordingListener:
+    """Records the messages and rows of a batch."""
 
     def __init__(self) -> None:
-        self.said: list[str] = []
+        self.messages: list[str] = []
         self.rows: list[dict[str, Any]] = []
         self.to_do = 0
 
     def say(self, text: str) -> None:
-        self.said.append(text)
+        self.messages.append(text)
 
     def begin(self, to_do: int) -> None:
         self.to_do = to_do
@@ -45,15 +45,15 @@ def pairs_on_disk(root: Path, names: tuple[str, ...] = NAMES, gt: bool = True) -
     """rgb/ sparse/ gt/ with these frames, all a little different, and net/ with a network."""
     net = root / "net"
     net.mkdir(parents=True)
-    made = frame_on_disk(net)
-    image = cv2.imread(str(made.image))
+    frame = frame_on_disk(net)
+    image = cv2.imread(str(frame.image))
     for number, name in enumerate(names):
         add_frame(root, name, np.roll(image, number, axis=1), gt=gt)
     return root
 
 
 def add_frame(root: Path, name: str, image: Any = None, gt: bool = True) -> None:
-    """One more frame, of the network's own picture by default."""
+    """One more frame, with the image of the network by default."""
     net = root / "net"
     for part, file in (("rgb", "img"), ("sparse", "s"), *([("gt", "gt")] if gt else [])):
         target = root / part / f"{name}.png"
@@ -66,29 +66,29 @@ def add_frame(root: Path, name: str, image: Any = None, gt: bool = True) -> None
 
 def refinement(root: Path, **changes: Any) -> RefineRequest:
     """A request to refine with the network in net/, without the choice unless it is asked for."""
-    given: dict[str, Any] = {
+    fields: dict[str, Any] = {
         "propagate": None if {"preset", "auto"} & changes.keys() else "none",
         "model": str(root / "net" / "my_net.py"),
         "checkpoint": root / "net" / "my_net.safetensors",
     }
-    return RefineRequest.from_fields(**given | changes)
+    return RefineRequest.from_fields(**fields | changes)
 
 
 def batch(
     root: Path,
-    heard: Heard | None = None,
+    listener: RecordingListener | None = None,
     *,
     stopped: Any = lambda: False,
     refine: dict[str, Any] | None = None,
     **changes: Any,
 ) -> BatchOutcome:
     """A batch of the folder into its out/."""
-    given: dict[str, Any] = {
+    fields: dict[str, Any] = {
         "source": root,
         "output": root / "out",
         "refine": refinement(root, **(refine or {})),
     }
-    return run_batch(BatchRequest(**given | changes), heard or Heard(), stopped)
+    return run_batch(BatchRequest(**fields | changes), listener or RecordingListener(), stopped)
 
 
 def refine_one_by_one(root: Path, names: tuple[str, ...], **changes: Any) -> None:
@@ -101,7 +101,7 @@ def refine_one_by_one(root: Path, names: tuple[str, ...], **changes: Any) -> Non
 
 def results(folder: Path) -> dict[str, bytes | dict[str, Any]]:
     """Every result below a folder: bytes, and records without what depends on time and machine."""
-    found: dict[str, bytes | dict[str, Any]] = {}
+    contents: dict[str, bytes | dict[str, Any]] = {}
     for path in sorted(folder.rglob("*")):
         name = path.relative_to(folder).as_posix()
         if path.is_dir() or name.startswith(("summary.", "batch.", ".batch.")):
@@ -109,10 +109,10 @@ def results(folder: Path) -> dict[str, bytes | dict[str, Any]]:
         if path.suffix == ".json" and not path.name.startswith("."):  # those need not be whole
             record = json.loads(path.read_text())
             del record["seconds"], record["peak_memory_mb"]
-            found[name] = record
+            contents[name] = record
         else:
-            found[name] = path.read_bytes()
-    return found
+            contents[name] = path.read_bytes()
+    return contents
 
 
 def times(folder: Path) -> dict[str, int]:

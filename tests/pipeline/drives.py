@@ -21,12 +21,12 @@ def drive_on_disk(root: Path, frames: int = 4, *, points: int = 400) -> Path:
     Every frame is 0.1 m ahead of the one before; there are two walls and a floor.
     """
     (root / "net").mkdir(parents=True)
-    made = frame_on_disk(root / "net", HEIGHT, WIDTH)
+    frame = frame_on_disk(root / "net", HEIGHT, WIDTH)
     for part in ("rgb", "sparse", "calib"):
         (root / part).mkdir()
     y, x = np.mgrid[:HEIGHT, :WIDTH]
     right, down = (x - 30.5) / FOCAL_PX, (y - 22.5) / FOCAL_PX
-    image = cv2.imread(str(made.image))
+    image = cv2.imread(str(frame.image))
     rows = []
     for number in range(frames):
         with np.errstate(divide="ignore"):

@@ -26,9 +26,9 @@ def frames_of(folder: Path) -> dict[str, dict[str, Any]]:
     }
 
 
-def pictures_of(folder: Path) -> dict[str, bytes]:
-    """The pictures of a report."""
-    return {path.name: path.read_bytes() for path in sorted((folder / "pictures").iterdir())}
+def images_of(folder: Path) -> dict[str, bytes]:
+    """Returns the images of a report by name."""
+    return {path.name: path.read_bytes() for path in sorted((folder / "images").iterdir())}
 
 
 def everything(folder: Path) -> dict[str, bytes]:

@@ -20,14 +20,14 @@ t: [0.1, -0.05, -0.2]
 
 @dataclass(frozen=True)
 class ScanOnDisk:
-    """Files of one frame; places (N, 2) are where the scan's points land in the picture."""
+    """Files of one frame; xy (N, 2) are the pixel coordinates of the scan's points."""
 
     folder: Path
     image: Path
     scan: Path
     calib: Path
     gt: Path
-    places: NDArray[np.float64]
+    xy: NDArray[np.float64]
     depth: NDArray[np.float64]
 
 
@@ -36,15 +36,15 @@ def scan_on_disk(folder: Path) -> ScanOnDisk:
     y, x = np.mgrid[:HEIGHT, :WIDTH]
     truth = (4 + 0.02 * x).astype(np.float32)
     image, scan, calib, gt = (folder / n for n in ("img.png", "img.bin", "calib.txt", "gt.png"))
-    picture = np.stack([255 * x / WIDTH, 255 * y / HEIGHT, 128 + 0 * x], -1).astype(np.uint8)
-    cv2.imwrite(str(image), picture)
+    rgb = np.stack([255 * x / WIDTH, 255 * y / HEIGHT, 128 + 0 * x], -1).astype(np.uint8)
+    cv2.imwrite(str(image), rgb)
     write_depth(gt, truth, scale=1000)
     pixels = rng.permutation(HEIGHT * WIDTH)[:150]
-    places = np.column_stack([pixels % WIDTH, pixels // WIDTH]) + rng.uniform(-0.4, 0.4, (150, 2))
-    depth = 4 + 0.02 * places[:, 0]
-    in_camera = np.column_stack([(places - [31.5, 23.5]) / FOCAL_PX, np.ones(150)]) * depth[:, None]
+    xy = np.column_stack([pixels % WIDTH, pixels // WIDTH]) + rng.uniform(-0.4, 0.4, (150, 2))
+    depth = 4 + 0.02 * xy[:, 0]
+    in_camera = np.column_stack([(xy - [31.5, 23.5]) / FOCAL_PX, np.ones(150)]) * depth[:, None]
     turn = np.array([[0, -1, 0], [0, 0, -1], [1, 0, 0]])
     points = (in_camera - [0.1, -0.05, -0.2]) @ turn
     np.column_stack([points, np.zeros(150)]).astype("<f4").tofile(scan)
     calib.write_text(CALIBRATION)
-    return ScanOnDisk(folder, image, scan, calib, gt, places, depth)
+    return ScanOnDisk(folder, image, scan, calib, gt, xy, depth)

@@ -126,7 +126,7 @@ def test_3dgs_gets_the_inverse_depth_of_the_model(root: Path) -> None:
         assert inverse == pytest.approx(1 / DEPTH, rel=2e-4)
 
 
-def test_unknown_depth_is_said_to_3dgs_users(root: Path) -> None:
+def test_unknown_depth_is_reported_to_3dgs_users(root: Path) -> None:
     depth = DEPTH.copy()
     depth[:2] = 0
     record = export(results(root, depth), "gaussian-splatting", root)

@@ -88,7 +88,7 @@ def test_an_empty_range_is_a_mistake_of_the_user() -> None:
         ProjectionSettings(min_range=5, max_range=5)
 
 
-def test_a_scan_that_the_camera_does_not_see_says_where_its_points_are() -> None:
+def test_a_scan_outside_the_image_is_an_error_that_counts_its_points() -> None:
     scan = np.array([[-5.0, 0, 0], [1.0, 50, 0], [1.0, 40, 0]])
     with pytest.raises(NoPointsError, match=r"1 behind the camera, 2 outside the image") as error:
         project_velodyne(scan, camera(), SIZE)

@@ -92,7 +92,7 @@ class Watch(TorchDispatchMode):
         self._marked.add(_storage(tensor))
 
     def injected(self, z: Tensor, original: Tensor | None) -> None:
-        """Notes that the network goes on with z, in the place of `original` if that exists."""
+        """Notes that the network goes on with z, in place of `original` if that exists."""
         self.touch(z)
         if original is not None:
             self._twins = (original, z)

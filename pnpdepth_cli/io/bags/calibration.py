@@ -12,7 +12,11 @@ from pnpdepth_cli.io.calibration import Calibration
 from pnpdepth_cli.io.extrinsics import Extrinsics, inverse, pose_of_quaternion
 from pnpdepth_cli.io.robot_calibration import camera_in_yaml
 
-_STATIC = "/tf_static"
+STATIC = "/tf_static"
+"""End of the name of the topic of fixed transforms."""
+
+Links = dict[str, dict[str, Extrinsics]]
+"""Pose of the second frame in the first."""
 
 
 def camera_info_topic(bag: Bag, image_topic: str) -> str | None:
@@ -62,22 +66,41 @@ def static_pose(bag: Bag, camera: str, scanner: str) -> Extrinsics | None:
     """Returns the pose of the scanner's frame in the camera's, by /tf_static; None without one."""
     if camera == scanner:
         return np.eye(3), np.zeros(3)
-    links: dict[str, dict[str, Extrinsics]] = {}
-    topics = [name for name in bag.topics(TRANSFORMS) if name.endswith(_STATIC)]
+    return chained(static_links(bag), camera, scanner)
+
+
+def static_links(bag: Bag) -> Links:
+    """Returns the transforms of /tf_static, each in both directions."""
+    links: Links = {}
+    topics = [name for name in bag.topics(TRANSFORMS) if name.endswith(STATIC)]
     for _, _, message in bag.messages(topics):
         for each in message.transforms:
-            parent, child = frame_of(each), str(each.child_frame_id).lstrip("/")
-            shift, turn = each.transform.translation, each.transform.rotation
-            pose = pose_of_quaternion(
-                bag.path, [shift.x, shift.y, shift.z], [turn.x, turn.y, turn.z, turn.w]
-            )
-            links.setdefault(parent, {})[child] = pose
-            links.setdefault(child, {})[parent] = inverse(pose)
-    return _chained(links, camera, scanner)
+            add_link(links, *link_of(bag, each))
+    return links
 
 
-def _chained(links: dict[str, dict[str, Extrinsics]], start: str, end: str) -> Extrinsics | None:
-    """x_start = pose · x_end along the shortest chain of transforms."""
+def link_of(bag: Bag, message: Any) -> tuple[str, str, Extrinsics]:
+    """Returns (parent, child, pose of the child in the parent) of a TransformStamped."""
+    parent, child = frame_of(message), str(message.child_frame_id).lstrip("/")
+    shift, turn = message.transform.translation, message.transform.rotation
+    return parent, child, pose_in_message(bag, shift, turn)
+
+
+def pose_in_message(bag: Bag, shift: Any, turn: Any) -> Extrinsics:
+    """Returns the pose of a vector and a quaternion. Raises FileFormatError if it is none."""
+    return pose_of_quaternion(
+        bag.path, [shift.x, shift.y, shift.z], [turn.x, turn.y, turn.z, turn.w]
+    )
+
+
+def add_link(links: Links, parent: str, child: str, pose: Extrinsics) -> None:
+    """Adds the pose of a child in its parent to the links, and its inverse."""
+    links.setdefault(parent, {})[child] = pose
+    links.setdefault(child, {})[parent] = inverse(pose)
+
+
+def chained(links: Links, start: str, end: str) -> Extrinsics | None:
+    """Returns the pose x_start = pose · x_end along the shortest chain of links; None if none."""
     poses: dict[str, Extrinsics] = {start: (np.eye(3), np.zeros(3))}
     waiting = deque([start])
     while waiting and end not in poses:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -40,6 +40,12 @@ class Hdf5Array:
 
 Source = Path | Hdf5Array
 
+
+def path_of(source: Source) -> Path:
+    """Returns the file that a source lies in."""
+    return source if isinstance(source, Path) else source.path
+
+
 Pose = tuple[tuple[float, ...], ...]
 """(3, 4): rotation and, in the last column, translation in metres."""
 
@@ -48,11 +54,14 @@ Pose = tuple[tuple[float, ...], ...]
 class Neighbour:
     """Another frame of the same sequence, whose points are moved into this one."""
 
-    sparse: Path
-    """Its sparse depth."""
+    frame: Frame
+    """Its files."""
 
-    motion: Pose
-    """(3, 4) from the other camera's frame to this one's, metres."""
+    motion: Pose | None
+    """(3, 4) from the other camera's frame to this one's, metres. None: to be estimated."""
+
+    poses: str
+    """Where the motion is from, for a person."""
 
     apart: int
     """Frames between the two, at least 1."""
@@ -104,6 +113,9 @@ class Frame:
     window: tuple[Frame, ...] = ()
     """The frames of its window up to and with this one; empty outside of windows."""
 
+    compared: bool = False
+    """Whether a fixed method without ground truth is compared with linear interpolation here."""
+
     masks: tuple[Path, ...] = ()
     """Images or arrays of the ground truth's size; where one is 0, the ground truth is unknown."""
 
@@ -118,7 +130,8 @@ class Frame:
 
     def __post_init__(self) -> None:
         for source in (self.image, self.sparse, self.gt, self.calib, *self.masks):
-            _check_no_nul(source.path if isinstance(source, Hdf5Array) else source)
+            if source is not None:
+                _check_no_nul(path_of(source))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -142,7 +155,7 @@ class Unmatched:
 class Listing:
     """What a data set holds."""
 
-    frames: list[Frame]
+    frames: Sequence[Frame]
     """Complete frames, in a fixed order."""
 
     broken: tuple[Unmatched, ...] = ()
@@ -152,9 +165,9 @@ class Listing:
     """Other files beside them."""
 
 
-def _check_no_nul(path: Path | None) -> None:
+def _check_no_nul(path: Path) -> None:
     """Raises FileFormatError for a path that no file can have: an index file may hold any text."""
-    if path is not None and "\0" in str(path):
+    if "\0" in str(path):
         name = str(path).replace("\0", "\\0")
         raise FileFormatError(f"{name}: a file name holds a NUL character; correct the file's list")
 

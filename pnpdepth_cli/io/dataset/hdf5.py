@@ -74,7 +74,7 @@ def _with_array(path: Path, name: str, use: Callable[[Any], Any]) -> Any:
             array = file[name] if isinstance(link, h5py.HardLink) else None
             if array is None or array.external or array.is_virtual:
                 raise FileFormatError(
-                    f"{path}: {name} lies in another file or place; copy its values into this one"
+                    f"{path}: {name} is stored outside the file; copy its values into this one"
                 )
             return use(array)
     except PnpDepthError:

@@ -46,9 +46,9 @@ def read_matlab_array(path: Path, name: str) -> NDArray[np.int64]:
             if kind == _COMPRESSED:
                 content = zlib.decompressobj().decompress(content, _MOST_BYTES)
                 kind, content = next(_elements(content, 0, order))
-            found = _numbers(content, name, order) if kind == _MATRIX else None
-            if found is not None:
-                return found
+            values = _numbers(content, name, order) if kind == _MATRIX else None
+            if values is not None:
+                return values
     except (struct.error, zlib.error, StopIteration, ValueError, OverflowError) as error:
         raise damaged(path, "MATLAB file", f"cannot be read ({error})") from error
     raise FileFormatError(f"{path} has no {name}; it is of another kind")
@@ -71,8 +71,8 @@ def _elements(data: bytes, position: int, order: str) -> Iterator[tuple[int, byt
 
 def _numbers(matrix: bytes, name: str, order: str) -> NDArray[np.int64] | None:
     """The values of a variable of this name; None for another."""
-    _, _, (_, found), (kind, content) = list(_elements(matrix, 0, order))[:4]
-    if found.decode("ascii", "replace") != name:
+    _, _, (_, variable), (kind, content) = list(_elements(matrix, 0, order))[:4]
+    if variable.decode("ascii", "replace") != name:
         return None
     if kind not in _TYPES:
         raise ValueError(f"{name} is not made of numbers")

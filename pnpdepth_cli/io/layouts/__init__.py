@@ -168,4 +168,4 @@ def read_frames(root: Path, name: str | None = None) -> list[Frame]:
         raise InputError(str(listing.broken[0]))
     if not listing.frames:
         raise InputError(f"{root} looks like {layout!r} but has no frame in it")
-    return listing.frames
+    return list(listing.frames)

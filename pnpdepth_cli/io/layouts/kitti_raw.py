@@ -76,11 +76,11 @@ def _drives(root: Path) -> list[Path]:
 def _annotated(root: Path, drive: Path, camera: str) -> dict[str, Path]:
     """KITTI's annotated depth of a drive, by frame number."""
     inside = Path("proj_depth", "groundtruth", camera)
-    places = [drive / inside]
+    folders = [drive / inside]
     for base in (root, root.parent, root.parent.parent):
         for part in ("train", "val"):
-            places.append(base / "data_depth_annotated" / part / drive.name / inside)
-    return next((by_stem(p, (".png",)) for p in places if p.is_dir()), {})
+            folders.append(base / "data_depth_annotated" / part / drive.name / inside)
+    return next((by_stem(p, (".png",)) for p in folders if p.is_dir()), {})
 
 
 LAYOUT = Layout(

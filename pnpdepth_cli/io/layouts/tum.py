@@ -1,25 +1,30 @@
 """`tum`: TUM RGB-D, rgb.txt and depth.txt with a time and a path per line, paired by time.
 
 An associations.txt (of TUM's associate.py, or of ICL-NUIM) pairs them itself: a time and a path
-twice per line.
+twice per line. Poses are those of groundtruth.txt beside them, at the times of the images.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
 from pnpdepth_cli.errors import FileFormatError
-from pnpdepth_cli.io.dataset.frame import Frame, Listing, Unmatched
+from pnpdepth_cli.io.dataset.frame import Frame, Listing, Pose, Unmatched
 from pnpdepth_cli.io.file_bytes import check_value_count, one_line, read_bytes
 from pnpdepth_cli.io.layouts import Layout
+from pnpdepth_cli.io.trajectory import read_trajectory
 
 _SCALE = 5000.0
 _ASSOCIATIONS = "associations.txt"
 _LONGEST_GAP_S = 0.02
 """As the data set's own tool associates them."""
+_TRAJECTORY = "groundtruth.txt"
+_LONGEST_POSE_GAP_S = 0.1
+"""Between poses, which motion capture takes at 100 Hz."""
 
 
 def matches(root: Path) -> bool:
@@ -32,6 +37,7 @@ def listing(root: Path) -> Listing:
     """Returns one frame for each image with a depth image within 0.02 s; each is used once."""
     if (root / _ASSOCIATIONS).is_file():
         return Listing(frames=_associated(root / _ASSOCIATIONS))
+    pose_at = _poses_of(root)
     images, depths = _listed(root / "rgb.txt"), _listed(root / "depth.txt")
     partner_of: dict[int, int] = {}
     taken: set[int] = set()
@@ -45,6 +51,7 @@ def listing(root: Path) -> Listing:
             image=images[i][1],
             gt=depths[partner_of[i]][1],
             gt_scale=_SCALE,
+            pose=pose_at(images[i][0]),
         )
         for i in sorted(partner_of)
     ]
@@ -66,21 +73,53 @@ def listing(root: Path) -> Listing:
 
 def _associated(path: Path) -> list[Frame]:
     """The frames of a file of pairs, whichever of the two comes first."""
-    frames = []
+    frames, pose_at = [], _poses_of(path.parent)
     for number, line in enumerate(read_bytes(path).decode("utf-8", "replace").splitlines(), 1):
         words = line.split("#", 1)[0].split()
         if not words:
             continue
         files = [path.parent / word for word in words[1::2]]
         depths = [file for file in files if "depth" in file.parts[-2:][0].lower()]
-        if len(words) != 4 or len(depths) != 1:
+        times = [_time(word) for word in words[::2]]
+        if len(words) != 4 or len(depths) != 1 or None in times:
             raise FileFormatError(
                 f"{path}, line {number}: {one_line(line)[:60]!r} is not a time and a path of rgb,"
                 " and a time and a path of depth"
             )
-        (image,) = (file for file in files if file not in depths)
-        frames.append(Frame(name=image.stem, image=image, gt=depths[0], gt_scale=_SCALE))
+        ((time_s, image),) = (
+            each for each in zip(times, files, strict=True) if each[1] not in depths
+        )
+        frames.append(
+            Frame(
+                name=image.stem,
+                image=image,
+                gt=depths[0],
+                gt_scale=_SCALE,
+                pose=None if time_s is None else pose_at(time_s),
+            )
+        )
     return frames
+
+
+def _time(word: str) -> float | None:
+    """The time in a word; None if it is no finite number."""
+    try:
+        return float(word) if math.isfinite(float(word)) else None
+    except ValueError:
+        return None
+
+
+def _poses_of(root: Path) -> Callable[[float], Pose | None]:
+    """A function from a time to the camera's pose at it; None where there is none."""
+    if not (root / _TRAJECTORY).is_file():
+        return lambda time_s: None
+    trajectory = read_trajectory(root / _TRAJECTORY)
+
+    def pose_at(time_s: float) -> Pose | None:
+        pose = trajectory.at(time_s, _LONGEST_POSE_GAP_S)
+        return None if pose is None else tuple(map(tuple, pose.tolist()))
+
+    return pose_at
 
 
 def _close_pairs(
@@ -105,14 +144,12 @@ def _listed(path: Path) -> list[tuple[float, Path]]:
         words = line.split("#", 1)[0].split()
         if not words:
             continue
-        try:
-            if not math.isfinite(float(words[0])):
-                raise ValueError("not finite")
-            entries.append((float(words[0]), path.parent / words[1]))
-        except (ValueError, IndexError) as error:
+        time_s = _time(words[0])
+        if time_s is None or len(words) < 2:
             raise FileFormatError(
                 f"{path}, line {number}: {one_line(line)[:60]!r} is not a time and a path"
-            ) from error
+            )
+        entries.append((time_s, path.parent / words[1]))
     return sorted(entries)
 
 

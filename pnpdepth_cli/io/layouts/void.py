@@ -50,8 +50,8 @@ def listing(root: Path) -> Listing:
 
 def _sequences(root: Path) -> list[Path]:
     starts = ("", "*/", "data/*/", "*/data/*/")
-    found = {p.parent for start in starts for p in root.glob(f"{start}sparse_depth")}
-    return sorted(p for p in found if all((p / part).is_dir() for part in _PARTS))
+    sequences = {p.parent for start in starts for p in root.glob(f"{start}sparse_depth")}
+    return sorted(p for p in sequences if all((p / part).is_dir() for part in _PARTS))
 
 
 def _test_split(sequence: Path) -> set[tuple[str, str]] | None:

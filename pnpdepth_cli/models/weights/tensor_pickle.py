@@ -202,18 +202,18 @@ def _read_row_of_pickles(file: IO[bytes], size: int) -> TensorFile:
     read_object(note_type, skip_tensors=True)
     end = file.tell()
     keys = read_object()
-    places: dict[str, tuple[int, int]] = {}
+    extents: dict[str, tuple[int, int]] = {}
     for key in keys if isinstance(keys, list) else ():
         (count,) = struct.unpack("<q", file.read(8))
         length = count * types[str(key)[:MAX_NAME]].itemsize
         if count < 0 or file.tell() + length > size:
             raise BrokenFileError("a storage goes beyond the end of the file")
-        places[str(key)] = (file.tell(), length)
+        extents[str(key)] = (file.tell(), length)
         file.seek(length, 1)
 
     def load(key: str) -> Tensor:
-        place, length = places[key]
-        file.seek(place)
+        position, length = extents[key]
+        file.seek(position)
         return _bytes_of(file, length)
 
     file.seek(start)

@@ -43,7 +43,7 @@ from pnpdepth_cli.pipeline.refinement.resolve import (
 )
 
 VALIDATED = 10
-"""Every so-manieth frame is for validation; of fewer frames, the last."""
+"""One frame in this many is for validation; of fewer frames, the last."""
 MOST_VALIDATED = 16
 STEPS_A_VISIT = 4
 """Updates on a frame before the next is taken."""
@@ -80,7 +80,13 @@ def adapt(request: AdaptRequest, progress: Progress) -> Adapted:
     network = load_network(choice.model, choice.checkpoint, choice.device)
     first = read_inputs(tasks[0].request)
     network = resolve_definition(network, first.frame(), choice)
-    options = MethodOptions(target="masked", iterations=request.steps, lr=str(request.lr))
+    options = MethodOptions(
+        target="masked",
+        iterations=request.steps,
+        lr=str(request.lr),
+        update="adam",
+        schedule="cosine",
+    )
     settings = resolve_settings(
         network.definition, options, HoldOut(seed=seed), dense=is_dense(first.points)
     )
@@ -141,7 +147,7 @@ class _Adaptation:
         every = list(range(len(tasks)))
         validation = every[VALIDATED - 1 :: VALIDATED] or every[-1:]
         chosen = np.linspace(0, len(validation) - 1, min(MOST_VALIDATED, len(validation)))
-        self.validation = [validation[round(place)] for place in chosen]
+        self.validation = [validation[round(position)] for position in chosen]
         self.training = [index for index in every if index not in set(validation)]
         self._network, self._settings = network, settings
         self._prepared = lru_cache(_IN_MEMORY)(lambda index: _prepared(network, tasks[index]))
@@ -153,19 +159,19 @@ class _Adaptation:
 
     def run(self, split: InputSplit, progress: Progress) -> dict[int, float]:
         """Makes all updates. Returns the validation loss by the number of updates."""
-        of, made = self._settings.iterations, 0
+        of, updates = self._settings.iterations, 0
         losses = {0: self._validated(split)}
         best = self._weights.theta
         for index in self._visits():
-            visit = min(STEPS_A_VISIT, of - made)
-            loss = self._visited(split, index, made, visit)
-            checked = (made + visit) * CHECKS // of > made * CHECKS // of
-            made += visit
-            progress.step(made, of, f"loss {loss:.4f}")
+            visit = min(STEPS_A_VISIT, of - updates)
+            loss = self._visited(split, index, updates, visit)
+            checked = (updates + visit) * CHECKS // of > updates * CHECKS // of
+            updates += visit
+            progress.step(updates, of, f"loss {loss:.4f}")
             if checked:
-                losses[made] = self._validated(split)
-                if losses[made] < losses[self.kept]:
-                    best, self.kept = list(self._weights.theta), made
+                losses[updates] = self._validated(split)
+                if losses[updates] < losses[self.kept]:
+                    best, self.kept = list(self._weights.theta), updates
         self._weights.theta = list(best)
         return losses
 
@@ -174,15 +180,15 @@ class _Adaptation:
         left = -(-self._settings.iterations // STEPS_A_VISIT)
         while left > 0:
             order = torch.randperm(len(self.training), generator=self._generator).tolist()
-            yield from (self.training[place] for place in order[:left])
+            yield from (self.training[index] for index in order[:left])
             left -= len(order)
 
-    def _visited(self, split: InputSplit, index: int, made: int, steps: int) -> float:
+    def _visited(self, split: InputSplit, index: int, first: int, steps: int) -> float:
         """Updates the weights on a frame. Returns the mean loss."""
         total = 0.0
         with self._frame(split, index) as frame:
             masks = Masks(frame.inliers, self._settings.mask, self._generator)
-            for step in range(made, made + steps):
+            for step in range(first, first + steps):
                 hidden = masks.next()
                 with torch.enable_grad(), self._weights.in_place(requires_grad=True) as theta:
                     loss = self._loss(frame, hidden)
@@ -220,9 +226,9 @@ class _Adaptation:
 
     def _loss(self, frame: FrameOfPoints, hidden: Tensor) -> Tensor:
         output = frame.predict_in_steps(frame.inliers.select(~hidden))
-        asked = frame.inliers.select(hidden)
+        hidden_points = frame.inliers.select(hidden)
         loss: Loss = LOSSES[self._settings.loss]
-        return loss(asked.sample(frame.depth_of(output)), asked.depth)
+        return loss(hidden_points.sample(frame.depth_of(output)), hidden_points.depth)
 
     @contextmanager
     def _frame(self, split: InputSplit, index: int) -> Iterator[FrameOfPoints]:

@@ -75,7 +75,7 @@ def write_adapted(
 
 def card_of(adapted: Adapted, file: str) -> str:
     """Returns the model card in Markdown."""
-    rows = "\n".join(f"| {made} | {loss:.5f} |" for made, loss in adapted.losses.items())
+    rows = "\n".join(f"| {updates} | {loss:.5f} |" for updates, loss in adapted.losses.items())
     return f"""# {file}
 
 Weights of `{adapted.network}`, adapted to the frames of `{adapted.source}` by

@@ -20,7 +20,8 @@ def unpacked(
 ) -> BatchRequest:
     """Returns the request with the frames of its bag as source; any other request as it is.
 
-    The frames are in OUTPUT_frames, and stay there for the next run.
+    The frames are in OUTPUT_frames, and stay there for the next run. Their poses are used where
+    points are accumulated and no others are given.
 
     Args:
         request: Of the batch.
@@ -34,10 +35,11 @@ def unpacked(
     if not is_bag(request.source):
         if options != BagOptions():
             raise UsageError(
-                f"{request.source} is no bag, so --image-topic, --points-topic and --tolerance do"
-                " not apply"
+                f"{request.source} is no bag, so --image-topic, --points-topic, --poses-topic and"
+                " --tolerance do not apply"
             )
         return request
+    from pnpdepth_cli.pipeline.sparse.frame_poses import POSES
     from pnpdepth_cli.pipeline.sparse.frames import FramesRequest, write_frames, written_before
 
     folder = request.output.with_name(f"{request.output.name}_frames")
@@ -49,4 +51,7 @@ def unpacked(
             raise UsageError(f"--dry-run writes nothing; run `pnpdepth frames {request.source}`")
         record = write_frames(frames, say)
         say(f"bag: wrote {record['frames']:,} frames to {folder}")
-    return replace(request, source=folder)
+    sequence, poses = request.sequence, folder / POSES
+    if sequence.accumulate and sequence.poses is None and poses.is_file():
+        sequence = replace(sequence, poses=poses)
+    return replace(request, source=folder, sequence=sequence)

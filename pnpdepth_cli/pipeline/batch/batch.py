@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import sys
+from array import array
 from collections import Counter
 from collections.abc import Callable, Generator, Iterator
 from contextlib import closing
 from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 from pnpdepth_cli.errors import UsageError
-from pnpdepth_cli.io.atomic import make_folder
-from pnpdepth_cli.io.dataset.frame import Frame
+from pnpdepth_cli.io.dataset.frame_list import FrameList
 from pnpdepth_cli.io.lock import in_turn, locked_folder
 from pnpdepth_cli.io.record import plain
+from pnpdepth_cli.io.remote.address import RemotePath
 from pnpdepth_cli.io.report import remove_report_leftovers
 from pnpdepth_cli.pipeline.batch.frames import (
     BatchFrames,
@@ -22,10 +24,11 @@ from pnpdepth_cli.pipeline.batch.frames import (
     source_files,
     task_of,
 )
+from pnpdepth_cli.pipeline.batch.output_folder import opened_output
 from pnpdepth_cli.pipeline.batch.profile import BatchProfile
 from pnpdepth_cli.pipeline.batch.request import BatchRequest
 from pnpdepth_cli.pipeline.batch.run import BatchRun
-from pnpdepth_cli.pipeline.batch.sequence import in_windows
+from pnpdepth_cli.pipeline.batch.sequence import in_windows, note_of_poses
 from pnpdepth_cli.pipeline.batch.sequence_options import SequenceOptions
 from pnpdepth_cli.pipeline.batch.settings import model_identity, settings_of
 from pnpdepth_cli.pipeline.batch.spread import spread_request, spread_rows
@@ -101,16 +104,14 @@ def run_batch(
     report = _report_of(request, batch)
     for note in _notes_of(request, batch):
         listener.say(note)
-    make_folder(request.output)
 
-    def clean() -> None:
-        leftovers = remove_all_leftovers(request.output)
-        leftovers += 0 if report is None else remove_report_leftovers(report.folder)
-        if leftovers:
-            listener.say(f"removed {leftovers:,} half-written files of a run that was killed")
-
-    with locked_folder(request.output, request.shard, clean):
-        state = BatchState(request.output, request.shard, model_identity(request.refine))
+    with (
+        opened_output(request.output) as folder,
+        locked_folder(
+            folder.local, request.shard, lambda: _clean(folder.local, report, listener.say)
+        ),
+    ):
+        state = BatchState(folder, request.shard, model_identity(request.refine))
         for note in state.notes():
             listener.say(note)
         to_do, reasons = _to_do(request, batch, state)
@@ -120,6 +121,7 @@ def run_batch(
         if report is not None:
             report.begin()
         if to_do:
+            state.announce(to_do.names())
             run = BatchRun(
                 state=state, profile=profile, say=listener.say, stopped=stopped,
                 workers=request.workers, batch_size=request.batch_size,
@@ -129,15 +131,26 @@ def run_batch(
                 refined = _rows(request, batch, to_do, run, proven=proven)
             else:
                 refined = spread_rows(request, spread, batch.frames, to_do, run, proven=proven)
-            with closing(refined if report is None else _drawn(report, refined)) as rows:
+            with (
+                closing(state),
+                closing(refined if report is None else _drawn(report, refined)) as rows,
+            ):
                 listener.begin(len(to_do))
                 for row in rows:
                     began += 1
                     listener.frame(row)
-        with in_turn(request.output):  # so the summary of the shard that ends last stays
+        with in_turn(folder.local):  # so the summary of the shard that ends last stays
             state.read_others()
             summary = _summarise(request, batch, state, report, profile)
     return BatchOutcome(summary=summary, stopped=began < len(to_do))
+
+
+def _clean(folder: Path, report: BatchReport | None, say: Callable[[str], None]) -> None:
+    """Removes what a killed run left half-written."""
+    leftovers = remove_all_leftovers(folder)
+    leftovers += 0 if report is None else remove_report_leftovers(report.folder)
+    if leftovers:
+        say(f"removed {leftovers:,} half-written files of a run that was killed")
 
 
 def plan_batch(request: BatchRequest, say: Callable[[str], None]) -> list[Planned]:
@@ -147,12 +160,13 @@ def plan_batch(request: BatchRequest, say: Callable[[str], None]) -> list[Planne
     _report_of(request, batch)
     for note in _notes_of(request, batch):
         say(note)
-    state = BatchState(request.output, request.shard, model_identity(request.refine))
     planned = []
-    for frame in batch.chosen:
-        why = state.why_to_do(task_of(request, frame))
-        if why is not None:
-            planned.append(Planned(name=frame.name, why=why))
+    with opened_output(request.output, create=False) as folder:
+        state = BatchState(folder, request.shard, model_identity(request.refine))
+        for frame in batch.chosen:
+            why = state.why_to_do(task_of(request, frame))
+            if why is not None:
+                planned.append(Planned(name=frame.name, why=why))
     reasons = Counter(each.why for each in planned)
     say(_plan_text(len(batch.chosen), len(batch.chosen) - len(planned), reasons))
     return planned
@@ -160,35 +174,35 @@ def plan_batch(request: BatchRequest, say: Callable[[str], None]) -> list[Planne
 
 def _to_do(
     request: BatchRequest, batch: BatchFrames, state: BatchState
-) -> tuple[list[Frame], Counter[str]]:
+) -> tuple[FrameList, Counter[str]]:
     """The frames that are to be done, and how many for which reason.
 
     OutputError if one would replace a file that no batch wrote, unless --overwrite is set.
     """
-    frames, reasons = [], Counter[str]()
+    numbers, reasons = array("q"), Counter[str]()
     if state.fresh and not request.refine.outputs.overwrite:
         state.check_foreign(request.output / name for name in (CSV, JSON))
-    for frame in batch.chosen:
+    for number, frame in enumerate(batch.chosen):
         task = task_of(request, frame)
         why = state.why_to_do(task)
         if why is None:
             continue
         if why == NEW and not request.refine.outputs.overwrite:
             state.check_foreign(task.outputs.paths())
-        frames.append(frame)
+        numbers.append(number)
         reasons[why] += 1
-    return frames, reasons
+    return batch.chosen.taken(numbers), reasons
 
 
 def _rows(
-    request: BatchRequest, batch: BatchFrames, to_do: list[Frame], run: BatchRun, *, proven: bool
+    request: BatchRequest, batch: BatchFrames, to_do: FrameList, run: BatchRun, *, proven: bool
 ) -> Generator[dict[str, Any], None, None]:
     """A row for each frame as it is done; the network is loaded before the first is taken."""
     # these import torch, which a run with nothing to do does not need
     from pnpdepth_cli.pipeline.batch.resolving import opened_groups, resolve_refiner
     from pnpdepth_cli.pipeline.batch.running import run_tasks
 
-    refiner = resolve_refiner((task_of(request, frame) for frame in batch.frames), run.say)
+    refiner = resolve_refiner(request, batch.frames, run.say)
     tasks = _tasks(request, batch, to_do)
 
     def rows() -> Generator[dict[str, Any], None, None]:
@@ -198,7 +212,7 @@ def _rows(
     return rows()
 
 
-def _tasks(request: BatchRequest, batch: BatchFrames, to_do: list[Frame]) -> Iterator[Task]:
+def _tasks(request: BatchRequest, batch: BatchFrames, to_do: FrameList) -> Iterator[Task]:
     """The frames to refine in their order, and within windows those that they begin with."""
     if not request.sequence.warm_start:
         yield from (task_of(request, frame) for frame in to_do)
@@ -215,6 +229,8 @@ def _report_of(request: BatchRequest, batch: BatchFrames) -> BatchReport | None:
     """The report, if one is wanted. OutputError if it cannot or may not be written there."""
     if request.html is None:
         return None
+    if isinstance(request.output, RemotePath) or isinstance(request.html, RemotePath):
+        raise UsageError("--html needs local folders; give a local -o and a local report folder")
     from pnpdepth_cli.pipeline.report.batch import BatchReport
 
     report = BatchReport(
@@ -222,6 +238,7 @@ def _report_of(request: BatchRequest, batch: BatchFrames) -> BatchReport | None:
         output=request.output,
         workers=request.workers,
         view_3d=request.html_3d,
+        colors=request.refine.outputs.colors,
     )
     files = (path for frame in batch.frames for path in source_files(frame))
     inputs = [request.source, *(files if request.html.exists() else ())]
@@ -249,15 +266,15 @@ def _summarise(
     digests = [sys.intern(state.settings(task_of(request, frame))) for frame in batch.frames]
 
     def rows() -> Iterator[dict[str, Any]]:
-        for frame, digest in zip(batch.frames, digests, strict=True):
-            line = state.result_of(frame.name, digest)
+        for name, digest in zip(batch.frames.names(), digests, strict=True):
+            line = state.result_of(name, digest)
             if line is not None:
                 yield line["row"]
 
     tally = Tally()
     for row in rows():
         tally.add(row)
-    write_table(request.output / CSV, rows(), tally.baseline_names)
+    write_table(state.folder.local / CSV, rows(), tally.baseline_names)
     known, method = sum(tally.counts.values()), resolve_method(request.refine)
     summary = {
         "command": "batch",
@@ -282,7 +299,8 @@ def _summarise(
         summary["sequence"] = plain(asdict(request.sequence))
     if request.profile:
         summary["profile"] = profile.summary()
-    write_summary(request.output / JSON, summary, rows())
+    write_summary(state.folder.local / JSON, summary, rows())
+    state.folder.publish([CSV, JSON])
     if report is not None:
         report.write(summary, rows)
     return summary
@@ -290,15 +308,19 @@ def _summarise(
 
 def _notes_of(request: BatchRequest, batch: BatchFrames) -> Iterator[str]:
     """What was assumed, and warnings of files that are in no frame."""
-    with_gt = sum(frame.gt is not None for frame in batch.frames)
+    patterns = list(batch.frames.patterns())
+    with_gt = batch.frames.count_of("gt")
     guessed = " (guessed; --layout names another)" if request.layout is None else ""
     yield (
         f"layout: {batch.layout}{guessed}: {_count(len(batch.frames), 'frame')},"
         f" {with_gt:,} with ground truth"
     )
-    cut = sorted({f.protocol.name for f in batch.frames if f.protocol.halved or f.protocol.crop})
+    cut = sorted({f.protocol.name for f in patterns if f.protocol.halved or f.protocol.crop})
     if cut and request.protocol is None:
         yield f"protocol: {', '.join(cut)} cuts the frames; --protocol whole keeps all of them"
+    poses = note_of_poses(patterns)
+    if poses is not None:
+        yield poses
     if request.limit is not None:
         yield f"limit: the first {request.limit:,} of them"
     if request.shard is not None:

@@ -3,16 +3,26 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterator
+from array import array
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TypeVar
 
 from pnpdepth_cli.errors import InputError, OutputError, UsageError
 from pnpdepth_cli.io.colmap.model import model_files
-from pnpdepth_cli.io.dataset.frame import SCAN_ONLY_SUFFIXES, Frame, Source, Unmatched
+from pnpdepth_cli.io.dataset.frame import (
+    SCAN_ONLY_SUFFIXES,
+    Frame,
+    Source,
+    Unmatched,
+    path_of,
+)
+from pnpdepth_cli.io.dataset.frame_list import FrameList
 from pnpdepth_cli.io.dataset.frame_names import name_problem
 from pnpdepth_cli.io.file_bytes import one_line
 from pnpdepth_cli.io.layouts import LAYOUTS, find_protocol, list_frames
+from pnpdepth_cli.io.remote.address import RemotePath
 from pnpdepth_cli.pipeline.batch.request import BatchRequest
 from pnpdepth_cli.pipeline.batch.sequence import (
     check_warm_start,
@@ -21,7 +31,18 @@ from pnpdepth_cli.pipeline.batch.sequence import (
     with_windows,
 )
 from pnpdepth_cli.pipeline.refinement.output_files import Outputs
-from pnpdepth_cli.pipeline.refinement.request import FrameFiles, RefineRequest
+from pnpdepth_cli.pipeline.refinement.request import (
+    FrameFiles,
+    NeighbourFiles,
+    RefineRequest,
+)
+
+Item = TypeVar("Item")
+COMPARED_EVERY = 20
+"""One frame of so many is refined again without a fifth of its points, for the comparison."""
+
+_LISTS = (".csv", ".jsonl")
+_IN_OUTPUT = "lies in the output folder, which is not searched for frames; move it"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,9 +51,9 @@ class BatchFrames:
 
     layout: str
     """Name of the layout."""
-    frames: list[Frame]
+    frames: FrameList
     """All frames of the source."""
-    chosen: list[Frame]
+    chosen: FrameList
     """Those within the limit and the shard."""
     unmatched: tuple[Unmatched, ...]
     """Files that are in no frame, and why."""
@@ -52,6 +73,8 @@ class Task:
     """The files that are written for it."""
     written: bool = True
     """False for a frame that is refined only because another begins where it ends."""
+    compared: bool = False
+    """Whether a fixed method is compared with linear interpolation without ground truth."""
 
 
 def find_frames(request: BatchRequest) -> BatchFrames:
@@ -62,12 +85,13 @@ def find_frames(request: BatchRequest) -> BatchFrames:
         UsageError: If none has sparse depth.
         OutputError: If the output is a file, or holds the frames.
     """
+    _check_stored(request.source)
     if request.output.exists() and not request.output.is_dir():
         raise OutputError(f"{request.output} is a file; name a folder")
     if request.source.is_dir() and _is_inside(request.source, request.output):
         raise _holds_the_frames(request.output)
     layout, listing = list_frames(request.source, request.layout)
-    frames, unmatched = _own_names(_outside(request.output, listing.frames))
+    frames, unmatched = _usable(request.output, FrameList.of(listing.frames))
     lost = [*listing.broken, *listing.spare]
     unmatched += [each for each in lost if not _is_inside(each.path, request.output)]
     if not frames:
@@ -76,16 +100,19 @@ def find_frames(request: BatchRequest) -> BatchFrames:
             f"{request.source} looks like {layout!r} but has no frame in it{first};"
             f" layouts are {', '.join(LAYOUTS)}"
         )
-    if request.refine.files.sample is None and all(frame.sparse is None for frame in frames):
+    if request.refine.files.sample is None and not frames.count_of("sparse"):
         raise UsageError(
             f"{request.source} looks like {layout!r}, which has no sparse depth; --sample 500"
             " draws so many points from the ground truth"
         )
     sequence = request.sequence
-    frames = with_neighbours(frames, sequence.accumulate, sequence.poses)
+    if sequence.accumulate:
+        frames = FrameList(with_neighbours(frames, sequence.accumulate, sequence.poses))
     if sequence.warm_start:
         check_warm_start(request.refine)
-        frames = with_windows(frames, sequence.warm_start)
+        frames = FrameList(with_windows(frames, sequence.warm_start))
+    for number in range(0, len(frames), COMPARED_EVERY):
+        frames.set(number, replace(frames[number], compared=True))
     return BatchFrames(
         layout=layout,
         frames=frames,
@@ -94,12 +121,26 @@ def find_frames(request: BatchRequest) -> BatchFrames:
     )
 
 
-def _chosen(request: BatchRequest, frames: list[Frame]) -> list[Frame]:
+def _check_stored(source: Path) -> None:
+    """Raises an error for a source in a store that is no list of frames."""
+    if not isinstance(source, RemotePath):
+        return
+    if source.suffix not in _LISTS:
+        raise UsageError(
+            f"{source}: folders in a store are not searched for frames; give a list of them"
+            f" ({' or '.join(_LISTS)})"
+        )
+    if not source.exists():
+        raise InputError(f"{source}: no such object; check the address")
+
+
+def _chosen(request: BatchRequest, frames: FrameList) -> FrameList:
     """The frames of the shard: every N-th, or every N-th window."""
     number, of = request.shard or (1, 1)
     if not request.sequence.warm_start:
         return frames[number - 1 :: of]
-    return [frame for window in in_windows(frames)[number - 1 :: of] for frame in window]
+    windows = in_windows(frames)[number - 1 :: of]
+    return FrameList(frame for window in windows for frame in window)
 
 
 def task_of(request: BatchRequest, frame: Frame) -> Task:
@@ -107,18 +148,41 @@ def task_of(request: BatchRequest, frame: Frame) -> Task:
     refine = request.refine
     if request.html_3d:
         refine = refine.with_fields(view_3d=True)
-    base = refine.files
+    needs_camera = refine.outputs.needs_camera or bool(frame.neighbours)
+    files = _files_of(request, frame, needs_camera=needs_camera)
+    neighbours = tuple(
+        NeighbourFiles(
+            files=_files_of(request, each.frame, needs_camera=True),
+            motion=each.motion,
+            poses=each.poses,
+            apart=each.apart,
+        )
+        for each in frame.neighbours
+    )
+    files = replace(files, neighbours=neighbours, window=tuple(each.name for each in frame.window))
+    return Task(
+        name=frame.name,
+        request=replace(refine, files=files),
+        inputs=dict(_earlier_files(frame)) | dict(_input_files(files)),
+        outputs=Outputs.in_folder(request.output, frame.name, refine),
+        compared=frame.compared,
+    )
+
+
+def _files_of(request: BatchRequest, frame: Frame, *, needs_camera: bool) -> FrameFiles:
+    """The files of a frame, without its neighbours and window."""
+    base = request.refine.files
     sparse = frame.sparse if base.sample is None else None
     protocol = frame.protocol if request.protocol is None else find_protocol(request.protocol)
     gt = frame.gt
     if base.sample is not None and gt is None and _is_scan_file(frame.sparse):
         gt = frame.sparse  # points are sampled from the projected scan
-    is_scan = _is_scan_file(gt) or (sparse is not None and _is_scan(base, sparse))
-    scan, needs_camera = base.scan, refine.outputs.needs_camera or frame.neighbours
+    is_scan = _reads_scan(replace(base, calibration=frame.calibration), sparse, gt)
+    scan = base.scan
     if is_scan:
         camera = frame.camera if scan.camera is None else scan.camera
         scan = replace(scan, calib=scan.calib or frame.calib, camera=camera)
-    files = replace(
+    return replace(
         base,
         image=frame.image,
         sparse=sparse,
@@ -126,8 +190,6 @@ def task_of(request: BatchRequest, frame: Frame) -> Task:
         calibration=frame.calibration,
         camera_file=frame.calib if needs_camera and not is_scan else None,
         camera_number=frame.camera if scan.camera is None else scan.camera,
-        neighbours=frame.neighbours,
-        window=tuple(each.name for each in frame.window),
         gt_masks=frame.masks,
         gt_size_ok=frame.gt_other_size,
         sparse_size_ok=base.sparse_size_ok or frame.sparse_other_size,
@@ -136,22 +198,29 @@ def task_of(request: BatchRequest, frame: Frame) -> Task:
         scan=scan,
         protocol=protocol,
     )
-    return Task(
-        name=frame.name,
-        request=replace(refine, files=files),
-        inputs=dict(_earlier_files(frame)) | dict(_input_files(files, is_scan=is_scan)),
-        outputs=Outputs.in_folder(request.output, frame.name, refine),
+
+
+def deciding(frames: Sequence[Item], first: int) -> list[Item]:
+    """Returns the frames behind the first readable one that decide together with it.
+
+    On these, candidates are compared, and input ranges where the network states none.
+    """
+    count = len(frames) - first - 1
+    return [frames[first + 1 + i] for i in sorted({count // 2, count - 1})] if count else []
+
+
+def _reads_scan(files: FrameFiles, sparse: Path | None, gt: Source | None) -> bool:
+    """Whether one of them is a scan that is projected, which needs the scanner's pose."""
+    return _is_scan_file(gt) or (sparse is not None and _is_scan(files, sparse))
+
+
+def _is_scan(files: FrameFiles, sparse: Path) -> bool:
+    suffix, known = sparse.suffix.lower(), files.calibration
+    return (
+        suffix in SCAN_ONLY_SUFFIXES
+        or (suffix == ".npy" and files.scan.calib is not None)
+        or (suffix == ".npz" and known is not None and known.has_pose)
     )
-
-
-def compared(count: int) -> list[int]:
-    """Returns which of the frames behind the first candidates are compared on."""
-    return sorted({count // 2, count - 1}) if count else []
-
-
-def _is_scan(base: FrameFiles, sparse: Path) -> bool:
-    suffix = sparse.suffix.lower()
-    return suffix in SCAN_ONLY_SUFFIXES or (suffix == ".npy" and base.scan.calib is not None)
 
 
 def _is_scan_file(source: Source | None) -> bool:
@@ -161,10 +230,10 @@ def _is_scan_file(source: Source | None) -> bool:
 def source_files(frame: Frame) -> list[Path]:
     """Returns the files of the frame's image, sparse depth and ground truth."""
     parts = [frame.image, frame.sparse, frame.gt]
-    return [part if isinstance(part, Path) else part.path for part in parts if part is not None]
+    return [path_of(part) for part in parts if part is not None]
 
 
-def _input_files(files: FrameFiles, *, is_scan: bool) -> Iterator[tuple[str, Path]]:
+def _input_files(files: FrameFiles) -> Iterator[tuple[str, Path]]:
     parts: dict[str, Source | None] = {
         "image": files.image,
         "sparse": files.sparse,
@@ -173,16 +242,17 @@ def _input_files(files: FrameFiles, *, is_scan: bool) -> Iterator[tuple[str, Pat
     for part, source in parts.items():
         if source is None:
             continue
-        path = source if isinstance(source, Path) else source.path
+        path = path_of(source)
         if part == "sparse" and path.is_dir():  # a COLMAP model
             yield from ((f"sparse {file.name}", file) for file in model_files(path))
         else:
             yield part, path
-    yield from ((f"sparse of {each.sparse.stem}", each.sparse) for each in files.neighbours)
+    for each in files.neighbours:
+        yield from _neighbour_files(each.files, estimated=each.motion is None)
     if files.gt is not None:
         yield from ((f"mask {number}", path) for number, path in enumerate(files.gt_masks))
     calib, extrinsics = files.scan.calib or files.camera_file, files.scan.extrinsics
-    if is_scan and extrinsics is not None:
+    if _reads_scan(files, files.sparse, files.gt) and extrinsics is not None:
         yield "extrinsics", extrinsics
     if calib is not None:
         if calib.is_dir():
@@ -191,13 +261,23 @@ def _input_files(files: FrameFiles, *, is_scan: bool) -> Iterator[tuple[str, Pat
             yield "calib", calib
 
 
+def _neighbour_files(files: FrameFiles, *, estimated: bool) -> Iterator[tuple[str, Path]]:
+    """The files of a neighbour that are read: its points and, to estimate motion, its image."""
+    points = files.sparse or files.gt
+    if points is not None:
+        path = path_of(points)
+        yield f"sparse of {path.stem}", path
+        if estimated and files.image is not None:
+            yield f"image of {path.stem}", path_of(files.image)
+
+
 def _earlier_files(frame: Frame) -> Iterator[tuple[str, Path]]:
     """The files of the frames before in the window, on which this one's result depends."""
     for each in frame.window[:-1]:
-        for number, path in enumerate(source_files(each)):
-            if path.is_file():
-                yield f"file {number} of {each.name}", path
-        yield from ((f"sparse of {other.sparse.stem}", other.sparse) for other in each.neighbours)
+        for other in (each, *(neighbour.frame for neighbour in each.neighbours)):
+            for number, path in enumerate(source_files(other)):
+                if path.is_file():
+                    yield f"file {number} of {other.name}", path
 
 
 def _holds_the_frames(output: Path) -> OutputError:
@@ -206,47 +286,50 @@ def _holds_the_frames(output: Path) -> OutputError:
     )
 
 
-def _outside(output: Path, frames: list[Frame]) -> tuple[list[Frame], list[Unmatched]]:
-    """The frames without a file in the output folder, and the others as unmatched files."""
-    if not output.exists():
-        return frames, []
-    folder = output.resolve()
-    kept, ignored = [], []
-    is_inside = functools.cache(lambda parent: parent.resolve().is_relative_to(folder))
-    for frame in frames:
-        inside = [
-            path
-            for path in source_files(frame)
-            if is_inside(path.parent) or (path.is_symlink() and is_inside(path))
-        ]
-        if inside:
-            why = "lies in the output folder, which is not searched for frames; move it"
-            ignored.append(Unmatched(path=inside[0], why=why))
-        else:
-            kept.append(frame)
-    if frames and not kept:
-        raise _holds_the_frames(output)
-    return kept, ignored
-
-
-def _own_names(listed: tuple[list[Frame], list[Unmatched]]) -> tuple[list[Frame], list[Unmatched]]:
-    """The frames with a unique name that is fit for their results, and the others as unmatched."""
-    frames, ignored = listed
-    kept: dict[str, Frame] = {}
-    for frame in frames:
-        why = f"is a second frame {frame.name!r}; rename it" if frame.name in kept else None
-        if frame.name == "summary":
-            why = "would be recorded in summary.json, which is the batch's own; rename it"
-        problem = name_problem(frame.name)
-        if problem is not None:
-            why = f"is named {one_line(frame.name)!r}, which {problem}; rename it"
+def _usable(output: Path, frames: FrameList) -> tuple[FrameList, list[Unmatched]]:
+    """The frames outside of the output folder whose name is fit for results, and the others."""
+    kept, ignored = array("q"), []
+    inside, names, within = _finder(output), set[str](), 0
+    for number, name in enumerate(frames.names()):
+        path = None if inside is None else inside(frames[number])
+        within += path is not None
+        why = _problem_of_name(name, names) if path is None else _IN_OUTPUT
         if why is None:
-            kept[frame.name] = frame
+            names.add(name)
+            kept.append(number)
         else:
-            source = frame.image or frame.sparse
-            path = source if isinstance(source, Path) else Path(str(source))
-            ignored.append(Unmatched(path=path, why=why))
-    return list(kept.values()), ignored
+            frame = frames[number]
+            file = path_of(frame.image or frame.sparse or Path(name))
+            ignored.append(Unmatched(path=path or file, why=why))
+    if frames and within == len(frames):
+        raise _holds_the_frames(output)
+    return (frames.taken(kept) if ignored else frames), ignored
+
+
+def _finder(output: Path) -> Callable[[Frame], Path | None] | None:
+    """A function of a frame that returns a file of it in the output folder; None without one."""
+    if not output.exists():
+        return None
+    folder = output.resolve()
+    is_inside = functools.cache(lambda parent: parent.resolve().is_relative_to(folder))
+
+    def found(frame: Frame) -> Path | None:
+        for path in source_files(frame):
+            if is_inside(path.parent) or (path.is_symlink() and is_inside(path)):
+                return path
+        return None
+
+    return found
+
+
+def _problem_of_name(name: str, taken: Collection[str]) -> str | None:
+    """Why a frame of this name cannot have results; None if it can."""
+    problem = name_problem(name)
+    if problem is not None:
+        return f"is named {one_line(name)!r}, which {problem}; rename it"
+    if name == "summary":
+        return "would be recorded in summary.json, which is the batch's own; rename it"
+    return f"is a second frame {name!r}; rename it" if name in taken else None
 
 
 def _is_inside(path: Path, folder: Path) -> bool:

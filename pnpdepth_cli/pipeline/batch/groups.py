@@ -21,6 +21,7 @@ from pnpdepth_cli.core.refine import RefineSettings
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.errors import DeviceError, NoPointsError, PnpDepthError, UsageError
 from pnpdepth_cli.frames.frame import Carried, RefinedFrame
+from pnpdepth_cli.pipeline.refinement.against_linear import needs_comparison
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs
 from pnpdepth_cli.pipeline.refinement.method import needs_folds
 from pnpdepth_cli.pipeline.refinement.refiner import Opened, Refiner
@@ -91,6 +92,12 @@ class FrameGroups:
             if frames is not None:
                 return frames
         return [self._refined_alone(inputs) for inputs in group]
+
+    def compared(self, inputs: Inputs, frame: RefinedFrame) -> RefinedFrame:
+        """Returns the frame with its error beside that of linear interpolation, if it lacks one."""
+        if not needs_comparison(inputs, frame):
+            return frame
+        return self.refiner.compared(self._opened, inputs, frame)
 
     def try_out(self) -> None:
         """Decides for a size, once enough frames of it were refined one at a time."""

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterable, Iterator, Sequence
+import functools
+from collections.abc import Callable, Iterator, Sequence
 
-from pnpdepth_cli.errors import PnpDepthError, UsageError
-from pnpdepth_cli.pipeline.batch.frames import Task, compared
+from pnpdepth_cli.errors import UsageError
+from pnpdepth_cli.io.dataset.frame import Frame
+from pnpdepth_cli.pipeline.batch.frames import Task, deciding, task_of
 from pnpdepth_cli.pipeline.batch.groups import FrameGroups
-from pnpdepth_cli.pipeline.refinement.inputs import Inputs, read_inputs
+from pnpdepth_cli.pipeline.batch.reading import read_task
+from pnpdepth_cli.pipeline.batch.request import BatchRequest
+from pnpdepth_cli.pipeline.refinement.inputs import Inputs
 from pnpdepth_cli.pipeline.refinement.load_refiner import load_refiner
-from pnpdepth_cli.pipeline.refinement.method import resolve_method
 from pnpdepth_cli.pipeline.refinement.refiner import Refiner
 
 
@@ -26,24 +29,26 @@ def opened_groups(
         yield FrameGroups(refiner, opened, batch_size, say)
 
 
-def resolve_refiner(tasks: Iterable[Task], say: Callable[[str], None]) -> Refiner | None:
+def resolve_refiner(
+    request: BatchRequest, frames: Sequence[Frame], say: Callable[[str], None]
+) -> Refiner | None:
     """Returns the network with its definition resolved on the first frame that can be read.
 
     Args:
-        tasks: Of all frames, also those that are done or of another shard, so that every run
+        request: The batch.
+        frames: All frames, also those that are done or of another shard, so that every run
             decides the same.
         say: Receives what was decided.
 
     Returns:
         None if no frame can be read.
     """
-    remaining = iter(tasks)
-    for task in remaining:
+    for number, frame in enumerate(frames):
+        task = task_of(request, frame)
         first = readable(task)
         if first is not None:
-            chosen = resolve_method(task.request).chosen
-            others = list(remaining) if chosen else []
-            return refiner_on(task, first, [others[i] for i in compared(len(others))], say)
+            more = [task_of(request, other) for other in deciding(frames, number)]
+            return refiner_on(task, first, more, say)
     return None
 
 
@@ -54,7 +59,7 @@ def readable(task: Task) -> Inputs | None:
         UsageError: An option is wrong, for all frames.
     """
     try:
-        return read_inputs(task.request)
+        return read_task(task)[0]
     except UsageError:
         raise
     except Exception:
@@ -69,16 +74,22 @@ def refiner_on(
     Args:
         task: The first frame that can be read.
         first: Its contents.
-        others: More frames that candidates are compared on, where the method is chosen.
+        others: More frames, on which the candidates are compared where the method is chosen, and
+            the input ranges where the network does not state its own.
         say: Receives what was decided.
     """
     for note in first.notes:
         say(f"{task.name}: {note}")
-    refiner = load_refiner(task.request, first)
+
+    @functools.cache
+    def more() -> list[Inputs]:
+        return [inputs for inputs in map(readable, others) if inputs is not None]
+
+    refiner = load_refiner(task.request, first, more)
     for note in refiner.network.notes:
         say(note)
     if refiner.method.chosen:
-        return _with_shortlist(refiner, others, first, say)
+        return _with_shortlist(refiner, [first, *more()], say)
     s = refiner.settings
     say(
         f"network: {refiner.network.definition.name} cut at {refiner.layer}, {s.iterations}"
@@ -88,13 +99,9 @@ def refiner_on(
 
 
 def _with_shortlist(
-    refiner: Refiner, others: Sequence[Task], first: Inputs, say: Callable[[str], None]
+    refiner: Refiner, frames: Sequence[Inputs], say: Callable[[str], None]
 ) -> Refiner:
     """The refiner with the candidates that are best on these frames."""
-    frames = [first]
-    for other in others:
-        with contextlib.suppress(PnpDepthError):  # it is read again later, which reports its error
-            frames.append(read_inputs(other.request))
     refiner = refiner.with_shortlist_of(frames)
     assert refiner.competition is not None
     names = "; ".join(str(candidate) for candidate in refiner.competition.shortlist or ())

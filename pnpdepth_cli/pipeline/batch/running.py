@@ -26,6 +26,7 @@ from pnpdepth_cli.frames.frame import RefinedFrame
 from pnpdepth_cli.io.fingerprint import Fingerprint
 from pnpdepth_cli.pipeline.batch.frames import Task
 from pnpdepth_cli.pipeline.batch.groups import FrameGroups
+from pnpdepth_cli.pipeline.batch.output_folder import published, staged
 from pnpdepth_cli.pipeline.batch.profile import (
     NETWORK,
     READING,
@@ -34,10 +35,11 @@ from pnpdepth_cli.pipeline.batch.profile import (
     WRITING,
     BatchProfile,
 )
+from pnpdepth_cli.pipeline.batch.reading import read_task
 from pnpdepth_cli.pipeline.batch.run import BatchRun
-from pnpdepth_cli.pipeline.batch.state import FrameRecorder, Status, input_fingerprints
+from pnpdepth_cli.pipeline.batch.state import Fingerprints, FrameRecorder, Status
 from pnpdepth_cli.pipeline.batch.summary import failed_row, row_of
-from pnpdepth_cli.pipeline.refinement.inputs import Inputs, read_inputs
+from pnpdepth_cli.pipeline.refinement.inputs import Inputs
 from pnpdepth_cli.pipeline.refinement.refine import write_refined
 from pnpdepth_cli.pipeline.refinement.refiner import Refiner
 from pnpdepth_cli.pipeline.stopwatch import Stopwatch
@@ -94,7 +96,8 @@ def run_tasks(
                     if not task.written:
                         continue
                     if isinstance(result, Exception):
-                        if not proven and isinstance(result, ModelError | UsageError):
+                        of_all = not proven and isinstance(result, ModelError | UsageError)
+                        if of_all or isinstance(result, StorageError):
                             raise result
                         writing.append(writers.submit(_failed, run.state, task, result))
                     else:
@@ -190,7 +193,11 @@ def _refined(
     of_frames = iter(results)
     for task, read in group:
         if isinstance(read, ReadFrame):
-            yield task, read, next(of_frames)
+            result = next(of_frames)
+            if groups is not None and task.compared and isinstance(result, RefinedFrame):
+                with profile(NETWORK), read.watch("check"):
+                    result = groups.compared(read.inputs, result)
+            yield task, read, result
         else:
             yield task, None, read
 
@@ -198,8 +205,7 @@ def _refined(
 def _read(task: Task, profile: BatchProfile) -> ReadFrame:
     watch = Stopwatch()
     with watch("read"), profile(READING):
-        fingerprints = input_fingerprints(task)
-        inputs = read_inputs(task.request)
+        inputs, fingerprints = read_task(task)
     return ReadFrame(inputs=inputs, fingerprints=fingerprints, watch=watch)
 
 
@@ -208,17 +214,18 @@ def _write(
 ) -> Row:
     state = run.state
     try:
-        with run.profile(WRITING):
+        with run.profile(WRITING), staged(task.outputs, state.output) as stage:
             state.begin(task)
-            outcome = write_refined(task.outputs, refiner, read.inputs, frame, read.watch)
-            task = replace(task, outputs=outcome.outputs)
+            outcome = write_refined(stage, refiner, read.inputs, frame, read.watch)
+            outputs, known = published(outcome.outputs, task.outputs, stage, state.output)
+            task = replace(task, outputs=outputs)
             written = {
                 kind: path.relative_to(state.output).as_posix()
                 for kind, path in task.outputs.by_kind().items()
             }
             row = row_of(task.name, _paths(task), outcome.record, written)
             status: Status = "diverged" if outcome.diverged else "done"
-            state.finish(task, status, row, read.fingerprints)
+            state.finish(task, status, row, Fingerprints(read=read.fingerprints, written=known))
     except StorageError:
         raise
     except Exception as error:

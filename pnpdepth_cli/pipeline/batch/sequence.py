@@ -2,22 +2,33 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pnpdepth_cli.errors import InputError, UsageError
+from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.io.dataset.frame import Frame, Neighbour
 from pnpdepth_cli.io.oxts import read_oxts_poses
-from pnpdepth_cli.io.poses import read_poses
+from pnpdepth_cli.io.poses import read_pose_of_each
 from pnpdepth_cli.pipeline.evaluation.dependence import groups_by_name
 from pnpdepth_cli.pipeline.refinement.method import needs_folds
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest
 
 Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True)
+class KnownPose:
+    """The pose of a frame."""
+
+    matrix: Floats
+    """(3, 4) from the camera's frame to the world's, metres."""
+    source: str
+    """Where it is from, for a person."""
 
 
 def sequences_of(frames: Sequence[Frame]) -> list[list[int]]:
@@ -34,9 +45,9 @@ def with_windows(frames: Sequence[Frame], length: int) -> list[Frame]:
     """Returns the frames, each with its window: so many frames of its sequence in a row."""
     result = list(frames)
     for sequence in sequences_of(frames) if length else ():
-        for place, index in enumerate(sequence):
-            first = place - place % length
-            window = tuple(frames[other] for other in sequence[first : place + 1])
+        for number, index in enumerate(sequence):
+            first = number - number % length
+            window = tuple(frames[other] for other in sequence[first : number + 1])
             result[index] = replace(frames[index], window=window)
     return result
 
@@ -66,63 +77,74 @@ def with_neighbours(frames: Sequence[Frame], reach: int, poses: Path | None) -> 
     Args:
         frames: All frames of the data set.
         reach: Number of frames to each side; 0 returns the frames as they are.
-        poses: A file with a row for each frame. None: the frames' own poses.
+        poses: A file with a row for each frame. None: the frames' own poses; where a frame has
+            none, the motion is to be estimated.
 
     Raises:
-        InputError: A frame has no pose, or the file has another number of them.
-        UsageError: The frames' points are those of all images already.
+        InputError: The file has another number of poses.
+        UsageError: A frame has no points, or its points are those of all images already.
     """
     if not reach:
         return list(frames)
     known = _poses(frames, poses)
     result = list(frames)
     for sequence in sequences_of(frames):
-        for place, index in enumerate(sequence):
-            near = range(max(0, place - reach), min(len(sequence), place + reach + 1))
+        for number, index in enumerate(sequence):
+            near = range(max(0, number - reach), min(len(sequence), number + reach + 1))
             neighbours = (
                 _neighbour(frames[sequence[other]], known[sequence[other]], known[index], apart)
                 for other in near
-                if (apart := abs(other - place))
+                if (apart := abs(other - number))
             )
             result[index] = replace(frames[index], neighbours=tuple(neighbours))
     return result
 
 
-def _neighbour(other: Frame, other_pose: Floats, pose: Floats, apart: int) -> Neighbour:
-    if other.sparse is None or other.sparse.is_dir():
+def note_of_poses(frames: Sequence[Frame]) -> str | None:
+    """Returns which poses the neighbours of the frames have, as a line; None without neighbours."""
+    counts = Counter(each.poses for frame in frames for each in frame.neighbours)
+    if len(counts) < 2:
+        return next((f"poses: {poses}" for poses in counts), None)
+    total = sum(counts.values())
+    kinds = ", ".join(f"{poses} ({count:,} of {total:,})" for poses, count in counts.items())
+    return f"poses of neighbours: {kinds}"
+
+
+def _neighbour(
+    other: Frame, other_pose: KnownPose | None, pose: KnownPose | None, apart: int
+) -> Neighbour:
+    if (other.sparse or other.gt) is None or (other.sparse is not None and other.sparse.is_dir()):
         raise UsageError(
             f"{other.name}: --accumulate takes depth maps or scans of single frames, not"
-            f" {'sampled points' if other.sparse is None else 'a COLMAP model'}"
+            f" {'images alone' if other.sparse is None else 'a COLMAP model'}"
         )
-    rotation = pose[:, :3].T
-    turn = rotation @ other_pose[:, :3]
-    shift = rotation @ (other_pose[:, 3] - pose[:, 3])
+    if pose is None or other_pose is None:
+        kind = "scans" if other.image is None else "images"
+        return Neighbour(frame=other, motion=None, poses=f"estimated from the {kind}", apart=apart)
+    rotation = pose.matrix[:, :3].T
+    turn = rotation @ other_pose.matrix[:, :3]
+    shift = rotation @ (other_pose.matrix[:, 3] - pose.matrix[:, 3])
     rows = np.column_stack([turn, shift])
     motion = tuple(tuple(float(value) for value in row) for row in rows)
-    return Neighbour(sparse=other.sparse, motion=motion, apart=apart)
+    return Neighbour(frame=other, motion=motion, poses=pose.source, apart=apart)
 
 
-def _poses(frames: Sequence[Frame], path: Path | None) -> list[Floats]:
-    """(3, 4) of each frame, from the camera's frame to the world's."""
+def _poses(frames: Sequence[Frame], path: Path | None) -> list[KnownPose | None]:
+    """The pose of each frame; None where it is unknown."""
     if path is not None:
-        rows = read_poses(path)
-        if len(rows) != len(frames):
-            raise InputError(
-                f"{path} has {len(rows)} poses for {len(frames)} frames; it needs one row for each,"
-                " in the order of the frames"
-            )
-        return list(rows)
-    poses = [None if frame.pose is None else np.array(frame.pose) for frame in frames]
+        rows = read_pose_of_each(path, len(frames), "frames")
+        return [KnownPose(matrix=row, source=str(path)) for row in rows]
+    poses = [
+        None
+        if frame.pose is None
+        else KnownPose(matrix=np.array(frame.pose), source="the layout's")
+        for frame in frames
+    ]
     for sequence in sequences_of(frames):
         packets = [frames[index].oxts for index in sequence]
         first = frames[sequence[0]]
         if first.calib is not None and None not in packets:
             read = read_oxts_poses([p for p in packets if p], first.calib, first.camera)
             for index, pose in zip(sequence, read, strict=True):
-                poses[index] = pose
-    for frame, known in zip(frames, poses, strict=True):
-        if known is None:
-            raise InputError(
-                f"{frame.name} has no camera pose, which --accumulate needs; give --poses"
-            )
-    return [pose for pose in poses if pose is not None]
+                poses[index] = KnownPose(matrix=pose, source="KITTI's inertial system")
+    return poses

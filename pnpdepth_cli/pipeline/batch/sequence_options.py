@@ -15,12 +15,14 @@ class SequenceOptions:
 
     accumulate: int = option(
         0,
-        "Add the points of the N frames before and after, moved by the poses of the camera.",
+        "Add the points of the N frames before and after, moved by the camera's poses or, without"
+        " poses, by its motion as estimated from images or scans.",
         metavar="N",
     )
     poses: Path | None = option(
         None,
-        "Camera poses of the frames in their order (KITTI or TUM rows).  [default: the layout's]",
+        "Camera poses of the frames in their order (KITTI or TUM rows).  [default: the layout's,"
+        " else estimated]",
         metavar="FILE",
     )
 

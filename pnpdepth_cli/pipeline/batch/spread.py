@@ -9,18 +9,19 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pnpdepth_cli.io.dataset.frame import Frame
-from pnpdepth_cli.io.fingerprint import Fingerprint
+from pnpdepth_cli.io.dataset.frame_list import FrameList
 from pnpdepth_cli.io.journal import EncodedLine
-from pnpdepth_cli.pipeline.batch.frames import Task, compared, task_of
+from pnpdepth_cli.io.remote.address import RemotePath
+from pnpdepth_cli.pipeline.batch.frames import Task, deciding, source_files, task_of
 from pnpdepth_cli.pipeline.batch.profile import BatchProfile
 from pnpdepth_cli.pipeline.batch.request import BatchRequest
 from pnpdepth_cli.pipeline.batch.run import BatchRun
 from pnpdepth_cli.pipeline.batch.state import (
     KEY,
     BatchState,
+    Fingerprints,
     Line,
     Status,
-    begun_line,
     failed_line,
     finished_line,
 )
@@ -53,7 +54,7 @@ def spread_rows(
     request: BatchRequest,
     spread: Spread,
     frames: Sequence[Frame],
-    to_do: Sequence[Frame],
+    to_do: FrameList,
     run: BatchRun,
     *,
     proven: bool,
@@ -80,8 +81,8 @@ def spread_rows(
         job = RefineJob(request=request, model=state.model, deciding=deciding)
         for part in pool.results(
             job,
-            to_do,
-            begin=lambda begun: state.record(*(begun_line(frame.name) for frame in begun)),
+            largest_first(to_do),
+            begin=lambda begun: state.begin_all(frame.name for frame in begun),
             stopped=run.stopped,
             proven=proven,
         ):
@@ -94,6 +95,23 @@ def spread_rows(
         run.profile.add_workers(pool.figures())
 
 
+def largest_first(frames: FrameList) -> FrameList:
+    """Returns the frames by falling size of their first file, in powers of two, else in order.
+
+    A large frame that is begun last would keep one worker busy while the others wait.
+    """
+    sizes = [_magnitude(source_files(frame)[0]) for frame in frames]
+    return frames.taken(sorted(range(len(sizes)), key=lambda number: -sizes[number]))
+
+
+def _magnitude(path: Path) -> int:
+    """The bit length of the file's size; 0 if it is unknown, as in a store."""
+    try:
+        return 0 if isinstance(path, RemotePath) else path.stat().st_size.bit_length()
+    except OSError:
+        return 0
+
+
 def _deciding(
     request: BatchRequest, frames: Sequence[Frame], pool: WorkerPool
 ) -> tuple[Frame, ...]:
@@ -102,8 +120,7 @@ def _deciding(
         found = pool.call(first_readable, request, frames[start : start + _SEARCHED])
         if found is not None:
             first = start + found
-            others = range(first + 1, len(frames))
-            return (frames[first], *(frames[others[i]] for i in compared(len(others))))
+            return (frames[first], *deciding(frames, first))
     return ()
 
 
@@ -217,11 +234,9 @@ class LineCollector:
     def begin(self, task: Task) -> None:
         """Does nothing: the driver has recorded it."""
 
-    def finish(
-        self, task: Task, status: Status, row: dict[str, Any], read: dict[str, Fingerprint]
-    ) -> None:
+    def finish(self, task: Task, status: Status, row: dict[str, Any], known: Fingerprints) -> None:
         """Keeps the line of a frame that is done."""
-        self.lines[task.name] = finished_line(self, task, status, row, read)
+        self.lines[task.name] = finished_line(self, task, status, row, known)
 
     def fail(self, task: Task, row: dict[str, Any]) -> None:
         """Keeps the line of a frame that failed."""

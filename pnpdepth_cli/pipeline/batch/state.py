@@ -11,15 +11,20 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Iterable
-from dataclasses import asdict
+from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import Any, Literal, Protocol
 
 from pnpdepth_cli.errors import OutputError
 from pnpdepth_cli.io.atomic import cannot_write, remove_leftovers
-from pnpdepth_cli.io.fingerprint import Fingerprint, fingerprint, is_unchanged
+from pnpdepth_cli.io.fingerprint import Fingerprint, is_unchanged
 from pnpdepth_cli.io.journal import EncodedLine, Journal
+from pnpdepth_cli.io.remote.address import RemotePath
+from pnpdepth_cli.io.remote.segments import SegmentedJournal
+from pnpdepth_cli.io.remote.store import StatusIndex
 from pnpdepth_cli.pipeline.batch.frames import Task
+from pnpdepth_cli.pipeline.batch.output_folder import OutputFolder
 from pnpdepth_cli.pipeline.batch.settings import SettingsDigests, settings_digest
 
 Status = Literal["done", "diverged", "failed"]
@@ -29,7 +34,18 @@ Line = dict[str, Any]
 KEY = "frame"
 """Identifies a line, by the name of its frame."""
 NEW = "new"
+_LINES_AT_ONCE = 1000
 _MANIFEST = re.compile(r"batch(\.\d+of\d+)?\.jsonl")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fingerprints:
+    """What identifies the files of a frame that is done."""
+
+    read: dict[str, Fingerprint]
+    """Of its inputs when they were read, by part."""
+    written: dict[Path, Fingerprint]
+    """Of its results."""
 
 
 class FrameRecorder(Protocol):
@@ -46,10 +62,8 @@ class FrameRecorder(Protocol):
     def begin(self, task: Task) -> None:
         """Records that files of this frame may exist from now on."""
 
-    def finish(
-        self, task: Task, status: Status, row: dict[str, Any], read: dict[str, Fingerprint]
-    ) -> None:
-        """Records that the frame is done, with the fingerprints of its inputs."""
+    def finish(self, task: Task, status: Status, row: dict[str, Any], known: Fingerprints) -> None:
+        """Records that the frame is done, with the fingerprints of its files."""
 
     def fail(self, task: Task, row: dict[str, Any]) -> None:
         """Records why the frame failed."""
@@ -59,26 +73,32 @@ class BatchState:
     """The run manifests of an output folder; this run writes its own and reads all of them.
 
     Args:
-        output: The folder.
+        folder: The folder that is written to.
         shard: (i, n) of this run; None for all frames.
         model: The network's `model_identity`.
     """
 
-    def __init__(self, output: Path, shard: tuple[int, int] | None, model: dict[str, Any]) -> None:
-        self.output = output
+    def __init__(
+        self, folder: OutputFolder, shard: tuple[int, int] | None, model: dict[str, Any]
+    ) -> None:
+        self.output = folder.output
         self.model = model
+        self.folder = folder
         self._digests = SettingsDigests(model)
+        self._index = StatusIndex()
+        self._announced = False
+        self._start = f"{folder.output}/"
         part = "" if shard is None else f".{shard[0]}of{shard[1]}"
-        own = output / f"batch{part}.jsonl"
+        own = folder.local / f"batch{part}.jsonl"
         existed = own.exists()
-        self._own = Journal(own, KEY)
+        self._own = folder.journal(own, KEY)
         self.read_others()
         self.fresh = not existed and not self._others
         """True if no batch wrote to the folder before."""
 
     def read_others(self) -> None:
         """Reads what the other shards have done up to now."""
-        paths = sorted(self.output.iterdir()) if self.output.is_dir() else []
+        paths = sorted(self.folder.local.iterdir()) if self.folder.local.is_dir() else []
         self._others = [
             Journal(path, KEY)
             for path in paths
@@ -99,7 +119,7 @@ class BatchState:
 
         The reason is a word or two, with details after a colon.
         """
-        lines = self._lines(task.name)
+        lines = self._lines(task.name, before="row")
         if not lines:
             return NEW
         digest = self.settings(task)
@@ -120,21 +140,43 @@ class BatchState:
     def check_foreign(self, paths: Iterable[Path]) -> None:
         """Raises OutputError if one of the files exists, and no batch wrote it."""
         for path in paths:
-            if path.exists():
+            if self._exists(path):
                 raise OutputError(
                     f"{path} exists, and no batch wrote it; --overwrite replaces such files, -o"
                     " names another folder"
                 )
 
+    def _exists(self, path: Path) -> bool:
+        if isinstance(path, RemotePath):
+            return self._index.status(path) is not None
+        return path.exists()
+
+    def announce(self, names: Iterable[str]) -> None:
+        """Records that files of all these frames may exist, where a line for each is too slow."""
+        if isinstance(self._own, SegmentedJournal):
+            self._announced = True
+            remaining = iter(names)
+            while some := [begun_line(name) for name in islice(remaining, _LINES_AT_ONCE)]:
+                self._own.append(*some)
+            self._own.publish()
+
+    def close(self) -> None:
+        """Puts the lines of this run into the store, if the output is there."""
+        if isinstance(self._own, SegmentedJournal):
+            self._own.publish()
+
+    def begin_all(self, names: Iterable[str]) -> None:
+        """Records that files of these frames may exist from now on."""
+        if not self._announced:
+            self.record(*(begun_line(name) for name in names))
+
     def begin(self, task: Task) -> None:
         """Records that files of this frame may exist from now on."""
-        self.record(begun_line(task.name))
+        self.begin_all([task.name])
 
-    def finish(
-        self, task: Task, status: Status, row: dict[str, Any], read: dict[str, Fingerprint]
-    ) -> None:
-        """Records that the frame is done, with the fingerprints of its inputs and outputs."""
-        self.record(finished_line(self, task, status, row, read))
+    def finish(self, task: Task, status: Status, row: dict[str, Any], known: Fingerprints) -> None:
+        """Records that the frame is done, with the fingerprints of its files."""
+        self.record(finished_line(self, task, status, row, known))
 
     def fail(self, task: Task, row: dict[str, Any]) -> None:
         """Records why the frame failed; the next run tries it again."""
@@ -148,9 +190,16 @@ class BatchState:
         """Returns the digest of the settings of a frame."""
         return self._digests.of(task.request)
 
-    def _lines(self, name: str) -> list[dict[str, Any]]:
-        lines = [journal.newest(name) for journal in (self._own, *self._others)]
+    def _lines(self, name: str, before: str | None = None) -> list[dict[str, Any]]:
+        lines = [journal.newest(name, before) for journal in (self._own, *self._others)]
         return [line for line in lines if line is not None]
+
+    def _relative(self, path: Path) -> str:
+        """The path below the output folder; `Path.relative_to` takes ten times as long."""
+        text = str(path)
+        if os.sep == "/" and text.startswith(self._start):
+            return text[len(self._start) :]
+        return path.relative_to(self.output).as_posix()
 
     def _why_not(self, line: dict[str, Any], task: Task, digest: str) -> str | None:
         if line["state"] == "begun":
@@ -159,21 +208,18 @@ class BatchState:
             return "failed before"
         if line.get("settings") != digest:
             return "other settings"
-        read, written = (
-            {name: Fingerprint(**known) for name, known in line[kind].items()}
-            for kind in ("inputs", "outputs")
-        )
+        read, written = line["inputs"], line["outputs"]
         if read.keys() != task.inputs.keys():
             return "other input files"
         for part, path in task.inputs.items():
-            if not is_unchanged(path, read[part]):
+            if not is_unchanged(path, Fingerprint(**read[part]), self._index):
                 return f"input changed: {part}"
         for path in task.outputs.paths():
-            known = written.get(path.relative_to(self.output).as_posix())
+            known = written.get(self._relative(path))
             if known is None and path in task.outputs.optional():
                 continue
-            if known is None or not is_unchanged(path, known):
-                return f"result {'changed' if path.exists() else 'missing'}: {path.name}"
+            if known is None or not is_unchanged(path, Fingerprint(**known), self._index):
+                return f"result {'changed' if self._exists(path) else 'missing'}: {path.name}"
         return None
 
 
@@ -187,18 +233,17 @@ def finished_line(
     task: Task,
     status: Status,
     row: dict[str, Any],
-    read: dict[str, Fingerprint],
+    known: Fingerprints,
 ) -> Line:
     """Returns the line of a frame whose files are written."""
-    written = {path: fingerprint(path) for path in task.outputs.paths()}
     return {
         "frame": task.name,
         "state": status,
         "settings": settings_digest(task.request, recorder.model),
-        "inputs": {part: asdict(known) for part, known in read.items()},
+        "inputs": {part: each.as_record() for part, each in known.read.items()},
         "outputs": {
-            path.relative_to(recorder.output).as_posix(): asdict(known)
-            for path, known in written.items()
+            path.relative_to(recorder.output).as_posix(): each.as_record()
+            for path, each in known.written.items()
         },
         "row": row,
     }
@@ -208,11 +253,6 @@ def failed_line(recorder: FrameRecorder, task: Task, row: dict[str, Any]) -> Lin
     """Returns the line of a frame that could not be refined."""
     digest = settings_digest(task.request, recorder.model)
     return {"frame": task.name, "state": "failed", "settings": digest, "row": row}
-
-
-def input_fingerprints(task: Task) -> dict[str, Fingerprint]:
-    """Returns the fingerprints of the frame's files. Raises InputError if one is missing."""
-    return {part: fingerprint(path) for part, path in task.inputs.items()}
 
 
 def remove_all_leftovers(output: Path) -> int:

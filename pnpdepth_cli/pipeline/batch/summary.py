@@ -26,6 +26,7 @@ _MEASURED = {
     "scores": _SCORES,
 }
 _STAGES = ("before", "after")
+_FOLD_STAGES = (*_STAGES, "linear")
 BASELINE_MEASURES = ("held_out_mae", "mae", "rmse")
 _EFFECTIVE = ("layer", "iterations", "lr", "step", "loss", "update", "align")
 
@@ -84,6 +85,7 @@ class Tally:
         self._units: set[str] = set()
         self._compared, self._worse = 0, 0
         self._linear: dict[tuple[str, str], tuple[int, float]] = {}
+        self._folds: dict[str, tuple[int, float]] = {}
         self._sums: dict[tuple[str, str, str], tuple[int, float]] = {}
         self._baselines: dict[tuple[str, str], tuple[int, float]] = {}
 
@@ -101,6 +103,9 @@ class Tally:
         for kind in ("scores", "held_out_error"):
             for measure in _MEASURED[kind]:
                 _add(self._linear, (kind, measure), (linear.get(kind) or {}).get(measure))
+        if linear.get("worse") is not None and linear.get("folds"):
+            for stage in _FOLD_STAGES:
+                _add(self._folds, stage, linear["folds"][stage])
         for name, entry in (row.get("baselines") or {}).items():
             for measure, value in _baseline_measures(entry).items():
                 _add(self._baselines, (name, measure), value)
@@ -126,7 +131,10 @@ class Tally:
         return {kind: mean if mean["frames"] else None for kind, mean in means.items()}
 
     def mean_linear(self) -> dict[str, Any]:
-        """Returns the means of linear interpolation's scores, and how many frames are worse."""
+        """Returns the means of linear interpolation's scores, and how many frames are worse.
+
+        "folds" has the mean errors of all three at points that were held out in turns.
+        """
         means: dict[str, Any] = {
             kind: {
                 measure: total / count if count else None
@@ -135,7 +143,14 @@ class Tally:
             }
             for kind in ("scores", "held_out_error")
         }
-        return means | {"frames": self._compared, "worse": self._worse}
+        folds = {stage: total / count for stage, (count, total) in self._folds.items() if count}
+        if folds:
+            folds["frames"] = max(count for count, _ in self._folds.values())
+        return means | {
+            "folds": folds or None,
+            "frames": self._compared,
+            "worse": self._worse,
+        }
 
     def mean_baselines(self) -> dict[str, dict[str, Any]] | None:
         """Returns {"linear": {"frames": 9, "held_out_mae": …, "mae": …, "rmse": …}, …}."""

@@ -27,6 +27,7 @@ from pnpdepth_cli.frames.refine import refine_frame
 from pnpdepth_cli.io.depth import write_depth
 from pnpdepth_cli.models.definition import Fixed
 from pnpdepth_cli.models.network import Network, load_network, out_of_memory_is_a_device_error
+from pnpdepth_cli.models.rank_layers import default_layer
 from pnpdepth_cli.models.synthetic_frame import synthetic_frame
 from pnpdepth_cli.pipeline.bench.timing import Quartiles, Timed, in_turn, peak_mb
 from pnpdepth_cli.pipeline.refinement.inputs import read_inputs
@@ -194,6 +195,7 @@ class _Subject:
             outputs=OutputOptions(output=folder / "out", overwrite=True),
         )
         _write_frame(refine_request.files, rgb, points)
+        layer = request.layer or default_layer(network, points.size, len(points))
         prepared = prepare(network, Frame(rgb=rgb[0], points=points))
         if not len(prepared.points):
             raise NoPointsError(
@@ -203,7 +205,7 @@ class _Subject:
             request=request,
             files_request=refine_request,
             network=network,
-            layer=resolve_layer(definition, request.layer),
+            layer=resolve_layer(definition, layer),
             settings=resolve_settings(definition, refine_request.method),
             prepared=prepared,
         )

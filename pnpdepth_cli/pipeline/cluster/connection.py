@@ -105,8 +105,8 @@ def _check_answers(address: str) -> None:
 def _choose_gpus(indices: tuple[int, ...]) -> None:
     """Makes these GPUs of the machine the cluster's."""
     if indices:
-        given = os.environ.get("CUDA_VISIBLE_DEVICES")
-        names = [] if given is None else given.split(",")
+        visible = os.environ.get("CUDA_VISIBLE_DEVICES")
+        names = [] if visible is None else visible.split(",")
         chosen = [names[i] if i < len(names) else str(i) for i in indices]
         os.environ["CUDA_VISIBLE_DEVICES"] = ",".join(chosen)
 

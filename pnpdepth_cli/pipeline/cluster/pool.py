@@ -2,23 +2,23 @@
 
 from __future__ import annotations
 
-import secrets
 import time
-from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from pnpdepth_cli.budget import chosen_max_pixels
 from pnpdepth_cli.errors import ClusterError, ModelError, PnpDepthError, UsageError
-from pnpdepth_cli.io.atomic import cannot_write
+from pnpdepth_cli.io.remote.address import RemotePath
 from pnpdepth_cli.pipeline.cluster.connection import Cluster, connected
 from pnpdepth_cli.pipeline.cluster.failures import check_facts, own_error, reason_of
+from pnpdepth_cli.pipeline.cluster.member import Member
 from pnpdepth_cli.pipeline.cluster.options import Spread
 from pnpdepth_cli.pipeline.cluster.pieces import Piece, Pieces, piece_size
-from pnpdepth_cli.pipeline.cluster.worker import Done, Facts, Job, Start, Worker
+from pnpdepth_cli.pipeline.cluster.probe import probe_in
+from pnpdepth_cli.pipeline.cluster.worker import Facts, Job, Start, Worker
 
 _DEEP = 2
 """Pieces that a worker has: one it does, and one that waits."""
@@ -26,6 +26,7 @@ _POLL_S = 0.5
 _NO_WORKER_S = 300.0
 """How long a cluster may take to start a worker, such as on a machine that it starts first."""
 _FAILED_STARTS = 3
+_CLOSE_S = 5.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,26 +35,6 @@ class Lost:
 
     message: str
     """What is known of it."""
-
-
-@dataclass(kw_only=True)
-class _Member:
-    """A worker as the driver knows it."""
-
-    number: int
-    """Counts the workers that were started."""
-    actor: Any
-    """Its handle."""
-    calls: deque[tuple[Any, Piece | None]] = field(default_factory=deque)
-    """References in their order, with the piece that each does."""
-    facts: Facts | None = None
-    """Of its node; None before it has started."""
-    ready: bool = False
-    """Whether it has opened the job."""
-    done: Done | None = None
-    """The piece before."""
-    items: int = 0
-    """All it has done."""
 
 
 @contextmanager
@@ -78,27 +59,13 @@ def worker_pool(
     """
     with ExitStack() as stack:
         shared = list(inputs)
-        if output is not None:
-            shared.append(stack.enter_context(_probe(output.absolute())))
+        if output is not None and not isinstance(output, RemotePath):
+            shared.append(stack.enter_context(probe_in(output.absolute())))
         cluster = stack.enter_context(connected(spread))
         say(f"Ray workers: starting {cluster.workers:,}, each with {spread.each}")
         pool = WorkerPool(cluster, spread, shared, say)
         stack.callback(pool.close)
         yield pool
-
-
-@contextmanager
-def _probe(folder: Path) -> Iterator[Path]:
-    probe = folder / f".{secrets.token_hex(6)}"  # removed by the next run if this one is killed
-    try:
-        probe.touch()
-    except OSError as error:
-        raise cannot_write(folder, error) from error
-    try:
-        yield probe
-    finally:
-        with suppress(OSError):
-            probe.unlink()
 
 
 class WorkerPool:
@@ -196,18 +163,22 @@ class WorkerPool:
 
     def close(self) -> None:
         """Ends all workers, whatever they do."""
+        idle = [member for member in self._members if member.facts and not member.calls]
+        with suppress(Exception):
+            closing = [member.actor.close.remote() for member in idle]
+            self._ray.wait(closing, num_returns=len(closing), timeout=_CLOSE_S)
         for member in self._members:
             self._kill(member)
 
-    def _new_member(self) -> _Member:
+    def _new_member(self) -> Member:
         self._started += 1
         remote = self._ray.remote(Worker)
         options = {"scheduling_strategy": "SPREAD", "max_restarts": 0, **self._cluster.resources}
-        member = _Member(number=self._started, actor=remote.options(**options).remote(self._start))
+        member = Member(number=self._started, actor=remote.options(**options).remote(self._start))
         member.calls.append((member.actor.facts.remote(), None))
         return member
 
-    def _open(self, member: _Member) -> None:
+    def _open(self, member: Member) -> None:
         member.calls.append((member.actor.open.remote(self._job_reference), None))
 
     def _busy(self) -> bool:
@@ -225,7 +196,7 @@ class WorkerPool:
                     reference = member.actor.run.remote(piece.items, checked)
                     member.calls.append((reference, piece))
 
-    def _size_for(self, member: _Member, left: int) -> int:
+    def _size_for(self, member: Member, left: int) -> int:
         done = member.done
         pace = None if done is None else done.seconds / max(1, len(done.results))
         return piece_size(left, len(self._members), pace, 1 if done is None else done.multiple)
@@ -249,9 +220,7 @@ class WorkerPool:
             else:
                 yield from self._take(member, result, pieces)
 
-    def _take(
-        self, member: _Member, result: Any, pieces: Pieces
-    ) -> Iterator[list[tuple[Any, Any]]]:
+    def _take(self, member: Member, result: Any, pieces: Pieces) -> Iterator[list[tuple[Any, Any]]]:
         _, piece = member.calls.popleft()
         if isinstance(result, Facts):
             check_facts(result)
@@ -276,7 +245,7 @@ class WorkerPool:
             pieces.put_back(Piece(items=piece.items, kills=piece.kills, checked=True))
         self._unproven.clear()
 
-    def _failed(self, member: _Member, error: PnpDepthError) -> None:
+    def _failed(self, member: Member, error: PnpDepthError) -> None:
         _, piece = member.calls.popleft()
         of_settings = isinstance(error, ModelError) or type(error) is UsageError
         if piece is None or not of_settings:
@@ -284,7 +253,7 @@ class WorkerPool:
         self._unproven.append((piece, error))
 
     def _replace(
-        self, member: _Member, pieces: Pieces, reason: str
+        self, member: Member, pieces: Pieces, reason: str
     ) -> Iterator[list[tuple[Any, Any]]]:
         """Starts another worker; hands out again what the dead one had."""
         self._kill(member)
@@ -312,6 +281,6 @@ class WorkerPool:
                 " status`, and run the same command to continue"
             )
 
-    def _kill(self, member: _Member) -> None:
+    def _kill(self, member: Member) -> None:
         with suppress(Exception):
             self._ray.kill(member.actor)

@@ -15,6 +15,7 @@ from typing import Any, Protocol
 
 from pnpdepth_cli import __version__
 from pnpdepth_cli.budget import set_max_pixels
+from pnpdepth_cli.io.remote.copies import remove_copies
 
 _THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 _LIBRARIES = ("torch", "numpy", "opencv-python-headless")
@@ -113,6 +114,11 @@ class Worker:
         """Ends the job before, and opens this one."""
         self._open.close()
         self._work = self._open.enter_context(job.opened())
+
+    def close(self) -> None:
+        """Ends the job, and removes copies of files in a store."""
+        self._open.close()
+        remove_copies()
 
     def run(self, items: Sequence[Any], checked: bool) -> Done:
         """Does a piece of the job."""

@@ -70,11 +70,11 @@ def evaluate(
     frames = pairs.frames
     if any(group.in_sequences for group in protocol.measure_groups):
         frames = in_sequences(frames)
-    spread, said = spread_of("cpu", request.cluster), list[str]()
+    spread, messages = spread_of("cpu", request.cluster), list[str]()
     if spread is None or pairs.single:
         scored_frames = _scored(frames, protocol, request, raising=pairs.single)
     else:
-        scored_frames = spread_scores(frames, protocol, request, spread, said.append)
+        scored_frames = spread_scores(frames, protocol, request, spread, messages.append)
     for scored in scored_frames:
         rows.append(scored.row)
         kinds.add(scored)
@@ -105,7 +105,7 @@ def evaluate(
         by_distance=_bins(by_distance, DISTANCE_EDGES_PX),
         by_depth=_bins(by_depth, DEPTH_EDGES_M),
         notes=(
-            *(note for note in said if note.startswith("warning")),
+            *(note for note in messages if note.startswith("warning")),
             *pairs.notes,
             *kinds.notes(),
             *diagnose(rows, protocol, kinds),

@@ -80,7 +80,7 @@ class ScoreJob:
         """Yields a function that scores frames."""
 
         def score(frames: Sequence[Numbered], checked: bool) -> Done:
-            found = [scored_or_error(pair, self.protocol, self.scales) for _, pair in frames]
-            return Done(results=found)
+            results = [scored_or_error(pair, self.protocol, self.scales) for _, pair in frames]
+            return Done(results=results)
 
         yield score

@@ -21,6 +21,7 @@ from pnpdepth_cli.models.rank_layers import (
 )
 from pnpdepth_cli.models.synthetic_frame import synthetic_frame
 from pnpdepth_cli.pipeline.refinement.request import NetworkChoice
+from pnpdepth_cli.sensors import occluded_in_map
 
 DEFAULT_SIZE = (240, 320)
 """Rows and columns of the synthetic frame where neither a size nor sparse depth is given."""
@@ -65,7 +66,9 @@ def list_layers(
     own = (policy.height, policy.width) if isinstance(policy, Fixed) else DEFAULT_SIZE
     if sparse is not None:
         points = read_sparse(sparse, size=size or own).points
-        size, count = size or points.size, len(points)
+        hidden = occluded_in_map(points)  # refine drops them
+        count = len(points) if hidden is None else int((~hidden).sum())
+        size = size or points.size
     names = list(network.definition.layers)
     if every:
         names = [name for name, _ in network.module.named_modules() if name]

@@ -10,6 +10,7 @@ import torch
 from pnpdepth_cli.completion.interpolation import linear
 from pnpdepth_cli.core.metrics import score
 from pnpdepth_cli.frames.frame import DepthMap, RefinedFrame
+from pnpdepth_cli.pipeline.refinement.inputs import Inputs
 from pnpdepth_cli.pipeline.refinement.points import point_error
 
 
@@ -47,3 +48,8 @@ def compared_with_linear(frame: RefinedFrame, gt: DepthMap | None) -> dict[str, 
         compared["folds"] = frame.interpolation
         worse.append(frame.interpolation["after"] > frame.interpolation["linear"])
     return compared | {"worse": worse[0] if worse else None}
+
+
+def needs_comparison(inputs: Inputs, frame: RefinedFrame) -> bool:
+    """Returns whether nothing of the frame can be scored: no ground truth, no held-out points."""
+    return inputs.gt is None and not len(frame.held_out) and frame.interpolation is None

@@ -94,17 +94,17 @@ def camera_of_frame(
         UsageError: An output needs the camera, and nothing gives it; or --fov repeats it.
         SizeError: The calibration is of another image.
     """
-    files, asked = request.files, request.outputs
+    files, outputs = request.files, request.outputs
     known = of_points or _of_files(files, size)
-    if asked.fov_deg is not None:
+    if outputs.fov_deg is not None:
         if known is not None:
             raise UsageError(f"the camera is known ({known.source}); leave out --fov")
-        known = camera_of_fov(asked.fov_deg, size)
-    if known is None and asked.needs_camera:
+        known = camera_of_fov(outputs.fov_deg, size)
+    if known is None and outputs.needs_camera:
         image = files.image if isinstance(files.image, Path) else None
         known = None if image is None else camera_of_exif(image, size)
         if known is None:
-            flag, named = "--ply" if asked.ply else "--html-3d", image or files.sparse
+            flag, named = "--ply" if outputs.ply else "--html-3d", image or files.sparse
             raise UsageError(
                 f"{flag} needs the camera, and {named} has neither a calibration nor a focal length"
                 " in EXIF; give --calib or --fov"
@@ -148,8 +148,8 @@ def camera_of_fov(fov_deg: float, size: tuple[int, int]) -> FrameCamera:
 
 def camera_of_exif(image: Path, size: tuple[int, int]) -> FrameCamera | None:
     """Returns the camera of an image's EXIF, without distortion; None if EXIF does not give it."""
-    found = read_focal_length(image, size)
-    return None if found is None else _pinhole(found.pixels, size, found.source)
+    focal = read_focal_length(image, size)
+    return None if focal is None else _pinhole(focal.pixels, size, focal.source)
 
 
 def _of_files(files: FrameFiles, size: tuple[int, int]) -> FrameCamera | None:

@@ -157,11 +157,11 @@ def best_candidates(
     return tuple(best)
 
 
-def _competing_propagations(asked: str | None, *, timed: bool) -> tuple[str, ...]:
+def _competing_propagations(propagation: str | None, *, timed: bool) -> tuple[str, ...]:
     """The propagation that was asked for, or all; without a time budget the fast ones."""
-    if asked is None:
+    if propagation is None:
         return tuple(name for name in PROPAGATIONS if timed or PROPAGATIONS[name].at is not None)
-    return () if asked == "none" else (asked,)
+    return () if propagation == "none" else (propagation,)
 
 
 def _against_linear(choice: Choice) -> dict[str, Any] | None:

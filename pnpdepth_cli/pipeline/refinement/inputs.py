@@ -29,9 +29,9 @@ from pnpdepth_cli.pipeline.refinement.frame_camera import FrameCamera, camera_of
 from pnpdepth_cli.pipeline.refinement.method import PAPER
 from pnpdepth_cli.pipeline.refinement.neighbours import (
     read_neighbours,
-    record_of_neighbours,
     with_moved_points,
 )
+from pnpdepth_cli.pipeline.refinement.points import split_points
 from pnpdepth_cli.pipeline.refinement.request import FrameFiles, RefineRequest
 from pnpdepth_cli.pipeline.sparse.colmap import read_colmap_points
 from pnpdepth_cli.pipeline.sparse.colmap_options import METRES, ColmapOptions
@@ -163,28 +163,41 @@ def read_inputs(request: RefineRequest) -> Inputs:
         raise _size_error(files, ground_truth.values.shape, sparse.points.size)
     size = whole or (None if ground_truth is None else ground_truth.whole) or sparse.points.size
     camera = camera_of_frame(request, sparse.camera, size)
+    held_out = request.hold_out
+    used, _ = split_points(
+        sparse.points, held_out.holdout if files.neighbours else 0, held_out.seed
+    )
     neighbours = read_neighbours(
-        files, camera, lambda path: _read_sparse(request, path, size).points
+        files, used, camera, lambda other: _points_of(request, other, size)
     )
     parts = {"image": image, "sparse": sparse, "gt": ground_truth}
     notes = [note for part in parts.values() if part is not None for note in part.notes]
     if ground_truth is not None and files.sparse is not None:
         notes += _leak_warning(sparse.points, ground_truth.values)
         notes += _scale_warning(sparse.points, ground_truth.values)
-    notes += () if camera is None else camera.notes
+    notes += (*(() if camera is None else camera.notes), *neighbours.notes)
     return Inputs(
         rgb=None if image is None else image.values,
         points=sparse.points,
         gt=None if ground_truth is None else ground_truth.values,
         sparse_scale=sparse.scale,
         record={name: part.record for name, part in parts.items() if part is not None}
-        | ({"neighbours": record_of_neighbours(files)} if neighbours else {}),
+        | ({"neighbours": list(neighbours.record)} if neighbours.record else {}),
         notes=tuple(notes),
         unit=sparse.unit,
         camera=camera,
-        neighbours=neighbours,
+        neighbours=neighbours.scans,
         window=files.window,
     )
+
+
+def _points_of(request: RefineRequest, files: FrameFiles, size: tuple[int, int]) -> SparsePoints:
+    """The points of another frame of the sequence, read or sampled as it does itself."""
+    if files.sparse is not None:
+        return _read_sparse(replace(request, files=files), files.sparse, size).points
+    image = None if files.image is None else _read_image(files, files.image)
+    ground_truth = None if files.gt is None else _read_ground_truth(files, files.gt, size)
+    return _sampled(files, image, ground_truth, request.hold_out.seed).points
 
 
 def _read_sparse(request: RefineRequest, path: Path, size: tuple[int, int] | None) -> _Sparse:
@@ -197,7 +210,7 @@ def _read_sparse(request: RefineRequest, path: Path, size: tuple[int, int] | Non
             f"{path} is no COLMAP model, so --unit-scale, --min-track and --max-reprojection do not"
             " apply"
         )
-    if files.scan.describes(path):
+    if files.is_scan(path):
         return _read_scan(files, path, size)
     keep = files.scan.keep_occluded or request.method.preset == PAPER
     return _read_points(files, path, size, keep_occluded=keep)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from pnpdepth_cli.core.refine import RefineSettings
 from pnpdepth_cli.errors import UsageError
@@ -27,8 +27,15 @@ COMPANION = "compact"
 """The network that competes beside the user's, where there is an image."""
 
 
-def load_refiner(request: RefineRequest, first: Inputs) -> Refiner:
+def load_refiner(
+    request: RefineRequest, first: Inputs, more: Callable[[], Sequence[Inputs]] = tuple
+) -> Refiner:
     """Returns the refiner that is asked for; this first frame decides what the network leaves open.
+
+    Args:
+        request: What is asked for.
+        first: The first frame.
+        more: Gives further frames, which decide as well; called only if a network needs it.
 
     Raises:
         UsageError: The request combines what cannot be combined.
@@ -43,10 +50,15 @@ def load_refiner(request: RefineRequest, first: Inputs) -> Refiner:
     if choice.tile is not None and needs_folds(request):
         raise UsageError("--tile goes with none of --auto, --baselines and --uncertainty")
     frame, networks = first.frame(), []
+
+    def more_frames() -> list[Frame]:
+        return [each.frame() for each in more()]
+
     for number, spec in enumerate((choice.model, *choice.more_models)):
         checkpoint = choice.checkpoint if number == 0 else None
         network = load_network(spec, checkpoint, choice.device, precision=choice.precision)
-        networks.append(resolve_definition(network, frame, choice if number == 0 else _PLAIN))
+        own = choice if number == 0 else _PLAIN
+        networks.append(resolve_definition(network, frame, own, more_frames))
     return refiner_of(request, networks, first)
 
 

@@ -113,19 +113,19 @@ def plan_outputs(request: RefineRequest) -> Outputs:
     Raises:
         OutputError: One exists and may not be replaced, or is one of the inputs.
     """
-    files, asked = request.files, request.outputs
+    files, options = request.files, request.outputs
     sources = [files.image, files.sparse, files.gt, files.scan.calib]
     inputs = [path for path in sources if isinstance(path, Path)]
     stem = inputs[0].stem
-    output = asked.output or Path(f"{stem}_refined")
-    if f".{asked.format}" not in DEPTH_SUFFIXES:
-        raise UsageError(f"format {asked.format!r} is not one of {' '.join(DEPTH_SUFFIXES)}")
-    added = {"--uncertainty": request.hold_out.uncertainty, "--ply": asked.ply}
+    output = options.output or Path(f"{stem}_refined")
+    if f".{options.format}" not in DEPTH_SUFFIXES:
+        raise UsageError(f"format {options.format!r} is not one of {' '.join(DEPTH_SUFFIXES)}")
+    added = {"--uncertainty": request.hold_out.uncertainty, "--ply": options.ply}
     if output.suffix.lower() in DEPTH_SUFFIXES and any(added.values()):
-        flag = next(flag for flag, given in added.items() if given)
+        flag = next(flag for flag, requested in added.items() if requested)
         raise UsageError(f"{flag} writes a second file; name a folder, not {output}, with -o")
     if output.suffix.lower() in DEPTH_SUFFIXES:
-        outputs = Outputs(depth=output, scale=asked.output_scale)
+        outputs = Outputs(depth=output, scale=options.output_scale)
     elif output.suffix.lower() in _FILE_SUFFIXES and not output.is_dir():
         raise OutputError(
             f"{output}: depth is written as {' '.join(DEPTH_SUFFIXES)}, or into a folder"
@@ -140,6 +140,6 @@ def plan_outputs(request: RefineRequest) -> Outputs:
     for path in outputs.paths():
         if path.resolve() in resolved:
             raise OutputError(f"{path} is one of the inputs; name another output with -o")
-        if path.exists() and not asked.overwrite:
+        if path.exists() and not options.overwrite:
             raise OutputError(f"{path} exists; --overwrite replaces it, -o names another path")
     return outputs

@@ -29,9 +29,9 @@ from pnpdepth_cli.pipeline.refinement.points import point_error, split_points
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest
 from pnpdepth_cli.points import SparsePoints
 
-_CHECK_FOLDS = 5
+_COMPARED_FOLDS = 5
 """One of so many folds is held out to compare a fixed method with linear interpolation."""
-_MIN_CHECKED = 5
+_MIN_COMPARED = 5
 """Fewer points do not compare a method with linear interpolation."""
 
 Opened = Split | OpenNetworks
@@ -109,15 +109,16 @@ class Refiner:
         )
         return replace(refined, held_out=held_out)
 
-    def checked(self, opened: Opened, inputs: Inputs, frame: RefinedFrame) -> RefinedFrame:
+    def compared(self, opened: Opened, inputs: Inputs, frame: RefinedFrame) -> RefinedFrame:
         """Returns the refined frame with its method's error at held-out points beside linear's.
 
         For a fixed method without ground truth: it is run once more without a fifth of the points.
+        The frame is returned as it is where its points are too few or the method fails.
         """
         points = inputs.points
-        if len(points) < _MIN_CHECKED:
+        if len(points) < _MIN_COMPARED:
             return frame
-        held = spatial_folds(points, _CHECK_FOLDS, seed=self.request.hold_out.seed) == 0
+        held = spatial_folds(points, _COMPARED_FOLDS, seed=self.request.hold_out.seed) == 0
         kept, left = points.select(~held), points.select(held)
         try:
             again = self.refine(opened, replace(inputs, points=kept, gt=None))
@@ -171,8 +172,8 @@ class Refiner:
 
     def _split_frame(self, inputs: Inputs) -> tuple[Frame, SparsePoints]:
         """The frame with the points to use, and the points held out."""
-        asked = self.request.hold_out
-        used, held_out = split_points(inputs.points, asked.holdout, asked.seed)
+        hold_out = self.request.hold_out
+        used, held_out = split_points(inputs.points, hold_out.holdout, hold_out.seed)
         return inputs.frame(used), held_out
 
     @property

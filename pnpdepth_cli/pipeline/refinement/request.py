@@ -19,7 +19,7 @@ from pnpdepth_cli.pipeline.sparse.scan_options import ScanOptions
 
 if TYPE_CHECKING:
     from pnpdepth_cli.io.calibration import Calibration
-    from pnpdepth_cli.io.dataset.frame import Neighbour, Source
+    from pnpdepth_cli.io.dataset.frame import Pose, Source
     from pnpdepth_cli.io.dataset.protocols import Protocol
     from pnpdepth_cli.sensors import SamplePattern
 
@@ -90,7 +90,7 @@ class FrameFiles:
     """Calibration of the camera, where `sparse` is no LiDAR scan and an output needs the camera."""
     camera_number: int | None = None
     """Which camera of `camera_file`."""
-    neighbours: tuple[Neighbour, ...] = ()
+    neighbours: tuple[NeighbourFiles, ...] = ()
     """Other frames of the sequence, whose points are moved into this one."""
     window: tuple[str, ...] = ()
     """Names of the frames of its window up to this one, which may begin where the last but one
@@ -103,6 +103,32 @@ class FrameFiles:
     """Which pixels of the ground truth serve as sparse depth."""
     protocol: Protocol = field(default_factory=_whole_frame)
     """Which part of the frame is used."""
+
+    def is_scan(self, sparse: Path) -> bool:
+        """Returns whether sparse depth is a scan that is projected.
+
+        An .npz is one where the data set gives the pose of the scanner; else as `scan.describes`.
+
+        Raises:
+            UsageError: It is not, and an option is given that only a scan has.
+        """
+        if sparse.suffix.lower() == ".npz" and self.calibration is not None:
+            return self.calibration.has_pose
+        return self.scan.describes(sparse)
+
+
+@dataclass(frozen=True, kw_only=True)
+class NeighbourFiles:
+    """Another frame of the sequence, whose points are moved into this one."""
+
+    files: FrameFiles
+    """Its files."""
+    motion: Pose | None
+    """(3, 4) from the other camera's frame to this one's, metres. None: it is estimated."""
+    poses: str
+    """Where the motion is from, for a person."""
+    apart: int
+    """Frames between the two, at least 1."""
 
 
 @dataclass(frozen=True, kw_only=True)

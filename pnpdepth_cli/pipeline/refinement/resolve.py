@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import torch
@@ -20,6 +20,8 @@ from pnpdepth_cli.models.definition import (
     DENSE_SPACING,
     IMAGENET_MEAN,
     IMAGENET_STD,
+    WEIGHTS_DEFAULTS,
+    WEIGHTS_DENSE_DEFAULTS,
     ModelDefinition,
     Normalisation,
     RefineDefaults,
@@ -43,11 +45,22 @@ FastDepth, whose range is 0…1, has ratios down to 0.61 in 13 frames of 7-Scene
 """
 
 
-def resolve_definition(network: Network, frame: Frame, choice: NetworkChoice) -> Network:
+def resolve_definition(
+    network: Network,
+    frame: Frame,
+    choice: NetworkChoice,
+    more_frames: Callable[[], Sequence[Frame]] = tuple,
+) -> Network:
     """Returns the network with a definition that leaves nothing open, and notes on the decisions.
 
     The user's choice wins over the definition. An input range that neither states is the one whose
-    prediction fits the points of this first frame best.
+    prediction fits the points best, in the mean over the frames.
+
+    Args:
+        network: The network.
+        frame: The first frame.
+        choice: What the user chose.
+        more_frames: Gives further frames; called only where the input range is open.
 
     Raises:
         UsageError: The choice is not one of the possible values.
@@ -66,7 +79,7 @@ def resolve_definition(network: Network, frame: Frame, choice: NetworkChoice) ->
     network = replace(network, definition=definition)
     with out_of_memory_is_a_device_error(network.device):
         if definition.normalisation is None and frame.rgb is not None:
-            network, note = _with_best_input_range(network, frame)
+            network, note = _with_best_input_range(network, [frame, *more_frames()])
             notes.append(note)
         if definition.verify is not None:
             notes += network.verified(prepare(network, frame).arguments)
@@ -130,9 +143,7 @@ def resolve_settings(
     """
     hold_out = hold_out or HoldOut()
     of_weights = moves_weights(method)
-    defaults = definition.masked_dense if dense else definition.masked
-    if not of_weights:
-        defaults = definition.defaults
+    defaults = _defaults_of(definition, method, dense=dense)
     iterations = defaults.iterations if method.iterations is None else method.iterations
     if iterations < 0:
         raise UsageError(f"iterations {iterations} is negative; 0 gives the plain prediction")
@@ -166,6 +177,17 @@ def resolve_settings(
     if of_weights:
         _check_weights(definition, method, settings)
     return settings
+
+
+def _defaults_of(
+    definition: ModelDefinition, method: MethodOptions, *, dense: bool
+) -> RefineDefaults:
+    """The settings where no option sets them, by what is updated and by which points."""
+    if method.target == "masked":
+        return definition.masked_dense if dense else definition.masked
+    if moves_weights(method):
+        return WEIGHTS_DENSE_DEFAULTS if dense else WEIGHTS_DEFAULTS
+    return definition.defaults
 
 
 def is_dense(points: SparsePoints) -> bool:
@@ -226,19 +248,16 @@ def _check_weights(
         raise UsageError(f"{flag} is for updates of z; weights are updated here")
 
 
-def _with_best_input_range(network: Network, frame: Frame) -> tuple[Network, str]:
-    errors: dict[str, float] = {}
+def _with_best_input_range(network: Network, frames: Sequence[Frame]) -> tuple[Network, str]:
     candidates = {
         name: replace(network, definition=replace(network.definition, normalisation=how))
         for name, how in NORMALISATIONS.items()
     }
-    for name, candidate in candidates.items():
-        try:
-            errors[name] = _alignment_error(candidate, frame)
-        except (ModelError, NoPointsError):
-            errors[name] = float("inf")
+    errors = {name: _mean_alignment_error(each, frames) for name, each in candidates.items()}
     chosen, rival = chosen_input_range(errors)
     listed = ", ".join(f"{name} {error:.1%}" for name, error in errors.items())
+    if len(frames) > 1:
+        listed += f", mean of {len(frames)} frames"
     if rival is None:
         return candidates[chosen], (
             f"input: rgb range {chosen!r} (error after alignment: {listed}); --normalise changes it"
@@ -263,6 +282,19 @@ def chosen_input_range(errors: Mapping[str, float]) -> tuple[str, str | None]:
     rival = min((name for name in errors if name != chosen), key=lambda name: errors[name])
     unsure = errors[chosen] > _CLEARLY_BETTER * errors[rival]
     return chosen, rival if unsure else None
+
+
+def _mean_alignment_error(network: Network, frames: Sequence[Frame]) -> float:
+    """The mean over frames with points in the network's view; infinite where the network fails."""
+    errors = []
+    for frame in frames:
+        try:
+            errors.append(_alignment_error(network, frame))
+        except NoPointsError:
+            continue
+        except ModelError:
+            return float("inf")
+    return sum(errors) / len(errors) if errors else float("inf")
 
 
 def _alignment_error(network: Network, frame: Frame) -> float:

@@ -68,6 +68,8 @@ class BatchReport:
     """Threads that draw."""
     view_3d: bool = False
     """Whether the frames have 3D views."""
+    colors: str = "blue-orange"
+    """Colours of the improvement maps."""
 
     def check(self, inputs: Sequence[Path], *, overwrite: bool) -> None:
         """Raises OutputError for a folder that the report cannot or may not be written to."""
@@ -107,6 +109,7 @@ class BatchReport:
         results = (row for row in rows() if row["outputs"])
         entries = in_order(entry, results, self.workers)
         head = _head(summary, overview, columns, measured)
+        head["map_colours"] = gain_colours(self.colors)
         write_report(self.folder, head, entries, viewer=self.view_3d)
 
     def _source(self) -> dict[str, Any]:
@@ -278,7 +281,6 @@ def _head(
             "sparse": "Sparse depth",
             "gt": "Ground truth",
         },
-        "map_colours": gain_colours(),
         "without_title": f"Not refined: {len(overview.failed):,}",
         "without": overview.failed,
         **figures(columns, "rmse_gain" if measured else "rmse_after"),

@@ -25,6 +25,13 @@ class BagOptions:
         show_default=True,
     )
 
+    poses_topic: str | None = option(
+        None,
+        "Topic of the camera's poses in a bag: odometry, poses or transforms.  [default: the only"
+        " one]",
+        metavar="TOPIC",
+    )
+
     def __post_init__(self) -> None:
         if not self.tolerance >= 0:
             raise UsageError(f"--tolerance {self.tolerance:g} is no time; give 0 s or more")

@@ -25,6 +25,7 @@ from pnpdepth_cli.io.bags.pairing import Stamped, nearest_pairs
 from pnpdepth_cli.io.calibration import Calibration
 from pnpdepth_cli.io.record import plain, read_json, write_json
 from pnpdepth_cli.pipeline.sparse.bag_options import BagOptions
+from pnpdepth_cli.pipeline.sparse.frame_poses import POSES, write_poses
 
 RECORD = "frames.json"
 _FOLDERS = ("rgb", "sparse")
@@ -38,7 +39,7 @@ class FramesRequest:
     """A file or a folder."""
 
     output: Path
-    """The folder for rgb/, sparse/, calib.txt and frames.json."""
+    """The folder for rgb/, sparse/, calib.txt, poses.txt and frames.json."""
 
     options: BagOptions = field(default_factory=BagOptions)
     """Which messages make a frame."""
@@ -71,22 +72,23 @@ def write_frames(request: FramesRequest, say: Callable[[str], None]) -> dict[str
         )
         say(f"topics: images of {topics[0]}, points of {topics[1]}")
         _clear(request)
-        lost, frames, calibrated = 0, 0, False
+        lost, times, camera, poses = 0, list[float](), None, None
         pairs = nearest_pairs(_stream(bag, *topics), options.tolerance)
         for image, scan in pairs:
             if scan is None:
                 lost += 1
                 continue
-            if not calibrated:
-                calibrated = True
-                _write_calibration(request.output, bag, topics[0], image, scan, say)
+            if camera is None:
+                camera = _write_calibration(request.output, bag, topics[0], image, scan, say)
             _write_frame(request.output, topics, image, scan)
-            frames += 1
-            if frames == request.limit:
+            times.append(image.time_s)
+            if len(times) == request.limit:
                 break
+        if camera is not None:
+            poses = write_poses(request.output, bag, options.poses_topic, camera, times, say)
     if lost:
         say(f"warning: {lost:,} images have no scan within {options.tolerance:g} s")
-    if not frames:
+    if not times:
         raise InputError(
             f"{request.bag}: no image of {topics[0]} has a scan of {topics[1]} within"
             f" {options.tolerance:g} s; check the clocks, or give a larger --tolerance"
@@ -95,7 +97,8 @@ def write_frames(request: FramesRequest, say: Callable[[str], None]) -> dict[str
         "image_topic": topics[0],
         "points_topic": topics[1],
         "complete": True,
-        "frames": frames,
+        "frames": len(times),
+        "poses": poses,
         "images_without_scan": lost,
     }
     write_json(request.output / RECORD, record)
@@ -127,7 +130,8 @@ def _clear(request: FramesRequest) -> None:
         make_folder(request.output / name)
         for path in (request.output / name).iterdir():
             path.unlink()
-    (request.output / "calib.txt").unlink(missing_ok=True)
+    for name in ("calib.txt", POSES):
+        (request.output / name).unlink(missing_ok=True)
     write_json(request.output / RECORD, _identity(request) | {"complete": False})
 
 
@@ -174,13 +178,16 @@ def _write_calibration(
     image: Stamped,
     scan: Stamped,
     say: Callable[[str], None],
-) -> None:
-    """Writes calib.txt as far as the bag holds a calibration; says what is missing."""
+) -> str:
+    """Writes calib.txt as far as the bag holds a calibration; says what is missing.
+
+    Returns the name of the camera's frame.
+    """
     topic = camera_info_topic(bag, image_topic)
     camera = None if topic is None else camera_of_bag(bag, topic)
     if camera is None:
         say(f"warning: {bag.path} has no camera_info of {image_topic}; refine with --calib")
-        return
+        return frame_of(image.message)
     calibration, frame = camera
     names = frame or frame_of(image.message), frame_of(scan.message)
     pose = static_pose(bag, *names)
@@ -194,6 +201,7 @@ def _write_calibration(
         calibration = replace(calibration, rotation=pose[0], translation=pose[1], has_pose=True)
     with atomic_path(folder / "calib.txt") as temporary:
         temporary.write_text(_calibration_text(calibration))
+    return names[0]
 
 
 def _calibration_text(calibration: Calibration) -> str:

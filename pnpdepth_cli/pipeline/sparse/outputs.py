@@ -59,7 +59,7 @@ class SparseTarget:
             if path.resolve() in taken:
                 raise OutputError(f"{path} is an input or named twice; give another output")
             if path.exists() and not self.overwrite:
-                raise OutputError(f"{path} exists; --overwrite replaces it, -o names another place")
+                raise OutputError(f"{path} exists; --overwrite replaces it, -o names another path")
             taken.add(path.resolve())
 
 

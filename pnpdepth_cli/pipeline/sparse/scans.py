@@ -38,6 +38,10 @@ _OFF_CENTRE = 0.15
 """Fraction of the image's side by which a principal point may be off centre without warning."""
 
 
+_ONE_DIRECTION = ("KITTI", "nuScenes", "DDAD")
+"""Sources of calibrations whose files give the pose in one direction."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class ScanPoints:
     """A projected scan."""
@@ -101,7 +105,7 @@ def read_scan_points(
         occlusion=None if options.keep_occluded else OcclusionFilter(),
     )
     camera = camera_of(calibration)
-    if not calibration.source.startswith(("KITTI", "nuScenes")):  # whose files have one direction
+    if not calibration.source.startswith(_ONE_DIRECTION):
         warnings += check_direction(scan.points, camera, size)
     points = project_velodyne(scan.points, camera, size, settings)
     source = f"{scan.source} of {len(scan.points):,} points, {calibration.source}"

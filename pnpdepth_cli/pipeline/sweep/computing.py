@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -40,14 +41,31 @@ class FirstFrame:
     """Of the points."""
     layer: str | None
     """A layer to cut at, as a network may have no default."""
+    others: tuple[tuple[Task, Frame], ...] = ()
+    """Further frames, which decide the input range as well."""
 
     def read(self) -> Inputs:
-        """Returns it with points of the ground truth, so as not to depend on what is varied."""
-        inputs = read_inputs(self.task.request)
+        """Returns it with points of the ground truth, so as not to depend on what is varied.
+
+        Raises:
+            InputError: It cannot be read.
+        """
+        return self._read(self.task, self.frame)
+
+    def _read(self, task: Task, frame: Frame) -> Inputs:
+        inputs = read_inputs(task.request)
         known = 0 if inputs.gt is None else int((inputs.gt > 0).sum())
         some = Sampling(sensor="uniform", points=str(min(_RESOLVE_POINTS, known)))
-        points = frame_points(some, self.seed, inputs, self.task.request, self.frame)
+        points = frame_points(some, self.seed, inputs, task.request, frame)
         return replace(inputs, points=points)
+
+    def _read_others(self) -> list[Inputs]:
+        """Those that can be read."""
+        read = []
+        for task, frame in self.others:
+            with contextlib.suppress(PnpDepthError):  # it is read again later, which reports this
+                read.append(self._read(task, frame))
+        return read
 
     def load(self, inputs: Inputs, device: str | None = None) -> Refiner:
         """Returns the network, resolved on what `read` returned.
@@ -59,7 +77,7 @@ class FirstFrame:
         request = self.task.request.with_fields(layer=self.layer)
         if device is not None:
             request = request.with_fields(device=device)
-        return load_refiner(request, inputs)
+        return load_refiner(request, inputs, self._read_others)
 
 
 def by_frame(runs: Sequence[Run]) -> list[list[Run]]:
@@ -122,7 +140,7 @@ class SweepJob:
         with SplitCache(refiner.network) as cache:
 
             def compute(frames: Sequence[Sequence[Run]], checked: bool) -> Done:
-                found = [[result for _, result in results_of_frame(f, cache)] for f in frames]
-                return Done(results=found)
+                results = [[result for _, result in results_of_frame(f, cache)] for f in frames]
+                return Done(results=results)
 
             yield compute

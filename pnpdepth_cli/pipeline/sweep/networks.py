@@ -11,7 +11,7 @@ from pnpdepth_cli.errors import InputError, UsageError
 from pnpdepth_cli.io.dataset.frame import Frame
 from pnpdepth_cli.models.definition import ModelDefinition
 from pnpdepth_cli.pipeline.batch.batch import Listener
-from pnpdepth_cli.pipeline.batch.frames import Task
+from pnpdepth_cli.pipeline.batch.frames import Task, deciding
 from pnpdepth_cli.pipeline.batch.settings import model_identity
 from pnpdepth_cli.pipeline.refinement.method import with_preset
 from pnpdepth_cli.pipeline.refinement.refiner import Refiner
@@ -81,7 +81,7 @@ def swept_network(
         for task, frame in tasks
     ]
     first, refiner = _resolved(replace(request, refine=refine), tasks, listener)
-    definition = refiner.network.definition
+    definition = _with_layer(refiner, request)
     plan = Plan(cells, definition, refine, sampling, request.seeds, model_identity(refine))
     for layer in plan.layers:
         with refiner.network.cut_at(layer):
@@ -103,12 +103,13 @@ def _resolved(
     Where workers compute, it is loaded here on the CPU, to plan.
     """
     errors = []
-    for task, frame in tasks:
+    for number, (task, frame) in enumerate(tasks):
         first = FirstFrame(
             task=task,
             frame=frame,
             seed=request.refine.hold_out.seed,
             layer=_some_layer(request),
+            others=tuple(deciding(tasks, number)),
         )
         try:
             inputs = first.read()
@@ -121,7 +122,7 @@ def _resolved(
                 listener.say(f"{task.name}: {note}")
         for note in refiner.network.notes:
             listener.say(note)
-        base = _base(refiner.network.definition, request.refine)
+        base = _base(_with_layer(refiner, request), request.refine)
         listener.say(
             f"network: {refiner.network.definition.name}; where not varied: cut at {base['layer']},"
             f" {base['iterations']} updates of z ({base['update']}, {base['loss']}, step"
@@ -135,6 +136,14 @@ def _some_layer(request: SweepRequest) -> str | None:
     """A layer of the study or of the request, as a network may have no default."""
     axes = [axis for study in request.studies for axis in study.axes if axis.name == "layer"]
     return axes[0].values[0] if axes else request.refine.method.layer
+
+
+def _with_layer(refiner: Refiner, request: SweepRequest) -> ModelDefinition:
+    """The definition; its default layer is the one that `refine` cuts the first frame at."""
+    definition = refiner.network.definition
+    if _some_layer(request) is not None:
+        return definition
+    return replace(definition, defaults=replace(definition.defaults, layer=refiner.layer))
 
 
 def _base(definition: ModelDefinition, request: RefineRequest) -> dict[str, Any]:

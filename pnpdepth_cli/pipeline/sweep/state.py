@@ -59,7 +59,7 @@ class SweepState:
                 "seed": run.seed,
                 "sampling": asdict(run.sampling),
                 "method": None if run.method is None else run.method.record(),
-                "inputs": {name: asdict(fingerprint(p)) for name, p in _files(run).items()},
+                "inputs": {name: fingerprint(p).as_record() for name, p in _files(run).items()},
                 **result,
             }
         )

@@ -377,7 +377,7 @@ def test_a_layer_called_several_times_asks_which_call() -> None:
             split.rear(z)
 
 
-def test_a_call_too_far_says_how_many_there_are() -> None:
+def test_a_call_beyond_the_last_is_an_error_that_names_their_number() -> None:
     with Split(Repeated(), "same#4") as split, pytest.raises(LayerError, match="only 3 times"):
         split.front(image())
 

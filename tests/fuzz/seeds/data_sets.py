@@ -10,7 +10,7 @@ import numpy as np
 from pnpdepth_cli.io.depth_writing import write_depth
 from tests.colmap_models import write_text_model
 from tests.fuzz.seeds.seed import DRY_RUN, Seed
-from tests.io.layouts import test_benchmark_layouts, test_nuscenes
+from tests.io.layouts import test_benchmark_layouts, test_ddad, test_nuscenes
 from tests.io.test_colmap import write_binary_model
 
 _SAMPLED = ("--sample", "20")
@@ -22,7 +22,7 @@ _POSE = "1 0 0 {} 0 1 0 0 0 0 1 0\n"
 def write_seeds(folder: Path, depth: np.ndarray, rng: np.random.Generator) -> list[Seed]:
     """Returns what a batch reads before its first frame, and the arrays in HDF5 files."""
     image = (folder / "rgb.png").read_bytes()
-    parts = (_manifests, _colmap, _tum, _odometry, _void, _nuscenes)
+    parts = (_manifests, _colmap, _tum, _odometry, _void, _nuscenes, _ddad)
     return [
         *(seed for part in parts for seed in part(folder, image)),
         *_with_h5py(folder, image, depth),
@@ -99,6 +99,11 @@ def _nuscenes(folder: Path, image: bytes) -> list[Seed]:
     test_nuscenes.write(folder / "nuscenes")
     tables = sorted((folder / "nuscenes/v1.0-mini").iterdir())
     return _indices(*(path.relative_to(folder).as_posix() for path in tables))
+
+
+def _ddad(folder: Path, image: bytes) -> list[Seed]:
+    test_ddad.write_scene(folder / "ddad/000000")
+    return _indices("ddad/000000/scene_0a.json", "ddad/000000/calibration/k.json")
 
 
 def _with_h5py(folder: Path, image: bytes, depth: np.ndarray) -> list[Seed]:

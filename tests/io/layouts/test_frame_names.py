@@ -121,7 +121,7 @@ def test_an_array_in_another_file_is_refused(tmp_path: Path, kind: str) -> None:
         else:
             raw = [(str(tmp_path / "raw"), 0, 64)]
             file.create_dataset("depth", shape=(4, 4), dtype="<f4", external=raw)
-    with pytest.raises(FileFormatError, match="lies in another file"):
+    with pytest.raises(FileFormatError, match="stored outside the file"):
         shape_of(tmp_path / "a.h5", "depth")
 
 

@@ -193,6 +193,15 @@ def test_tum_pairs_each_image_with_the_nearest_depth_once(tmp_path: Path) -> Non
         read_frames(tmp_path)
 
 
+def test_tum_poses_are_those_at_the_times_of_the_images(tmp_path: Path) -> None:
+    tum(tmp_path)
+    assert [frame.pose for frame in read_frames(tmp_path)] == [None, None]
+    (tmp_path / "groundtruth.txt").write_text("1 5 0 0 0 0 0 1\n1.02 7 0 0 0 0 0 1\n")
+    first, second = read_frames(tmp_path)
+    assert first.pose == ((1, 0, 0, 5), (0, 1, 0, 0), (0, 0, 1, 0))
+    assert second.pose is None  # 1.033 s is after the last pose
+
+
 def test_synthias_sequences_pair_each_camera_with_its_depth(tmp_path: Path) -> None:
     sequence = tmp_path / "SYNTHIA-SEQS-01-DAWN"
     synthia(sequence)
@@ -264,7 +273,7 @@ _ROW = "1 0 0 0 0 1 0 0 0 0 1 0\n"
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         ("\n", "holds 0 poses"),
         (_ROW[2:], "00.txt, line 1"),
@@ -274,14 +283,14 @@ _ROW = "1 0 0 0 0 1 0 0 0 0 1 0\n"
     ],
 )
 def test_poses_that_are_not_twelve_numbers_a_frame_are_refused(
-    tmp_path: Path, text: str, said: str
+    tmp_path: Path, text: str, message: str
 ) -> None:
     kitti_odometry(tmp_path)
     (tmp_path / "poses").mkdir()
     (tmp_path / "poses/00.txt").write_text(text)
     with pytest.raises(InputError) as error:
         read_frames(tmp_path)
-    assert said in str(error.value)
+    assert message in str(error.value)
     assert "\n" not in str(error.value)
 
 
@@ -342,7 +351,7 @@ def test_an_hdf5_file_that_is_damaged_or_of_another_kind_is_named(tmp_path: Path
         depth_of(wrong)
 
 
-def test_a_manifest_says_all_that_a_frame_can_have(tmp_path: Path) -> None:
+def test_a_manifest_has_all_that_a_frame_can_have(tmp_path: Path) -> None:
     touch(tmp_path / "i.png", tmp_path / "s.bin", tmp_path / "c.txt", tmp_path / "deep/g.png")
     row = {
         "image": "i.png", "sparse": "s.bin", "gt": "deep/g.png", "calib": "c.txt", "camera": 3,
@@ -365,7 +374,7 @@ def test_a_manifest_says_all_that_a_frame_can_have(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         ("image,sparse\nlost.png,s.png\n", "lost.png does not exist; correct line 2 of "),
         ("image,depth\ni.png,s.png\n", "'depth' is not one of"),
@@ -376,17 +385,17 @@ def test_a_manifest_says_all_that_a_frame_can_have(tmp_path: Path) -> None:
     ],
 )
 def test_a_line_of_a_manifest_that_means_nothing_is_named(
-    tmp_path: Path, text: str, said: str
+    tmp_path: Path, text: str, message: str
 ) -> None:
     touch(tmp_path / "i.png")
     (tmp_path / "m.csv").write_text(text)
     with pytest.raises(InputError) as error:
         read_frames(tmp_path / "m.csv")
-    assert said in str(error.value)
+    assert message in str(error.value)
     assert "\n" not in str(error.value)
 
 
-def test_what_is_no_data_set_is_said(tmp_path: Path) -> None:
+def test_what_is_no_data_set_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="does not look like any layout"):
         read_frames(tmp_path)
     with pytest.raises(InputError, match="does not look like 'tum'"):
@@ -418,7 +427,7 @@ def test_protocols_cut_what_the_paper_says() -> None:
 
 
 @pytest.mark.parametrize("name", PROTOCOLS)
-def test_places_move_as_the_picture_is_cut(name: str) -> None:
+def test_pixel_coordinates_move_as_the_image_is_cut(name: str) -> None:
     protocol = PROTOCOLS[name]
     rows, columns = np.indices((480, 1240))
     part = protocol.apply(np.stack([columns, rows], axis=2))
@@ -454,7 +463,7 @@ def test_a_depth_file_is_read_with_the_scale_of_its_frame(tmp_path: Path) -> Non
     assert np.array_equal(read_frame_ground_truth(read_frames(tmp_path / "m.csv")[0]), DEPTH)
 
 
-def test_a_listing_tells_what_is_in_no_frame(tmp_path: Path) -> None:
+def test_a_listing_has_the_files_of_no_frame(tmp_path: Path) -> None:
     pairs(tmp_path)
     touch(tmp_path / "rgb/c.png", tmp_path / "sparse/d.png", tmp_path / "gt/e.exr")
     touch(tmp_path / "calib/f.txt", tmp_path / "rgb/.hidden.png", tmp_path / "rgb/notes.txt")
@@ -468,7 +477,7 @@ def test_a_listing_tells_what_is_in_no_frame(tmp_path: Path) -> None:
 
 def test_folders_in_pairs_go_with_folders_of_the_same_name(tmp_path: Path) -> None:
     for part in ("rgb", "sparse"):
-        touch(*(tmp_path / part / place for place in ("x.png", "one/x.png", "two/deep/x.png")))
+        touch(*(tmp_path / part / file for file in ("x.png", "one/x.png", "two/deep/x.png")))
     touch(tmp_path / "gt/one/x.exr")
     frames = {frame.name: frame for frame in read_frames(tmp_path)}
     assert list(frames) == ["one/x", "two/deep/x", "x"]
@@ -476,7 +485,7 @@ def test_folders_in_pairs_go_with_folders_of_the_same_name(tmp_path: Path) -> No
     assert [name for name, frame in frames.items() if frame.gt] == ["one/x"]
 
 
-def test_two_files_of_one_frame_are_both_left_out_and_told(tmp_path: Path) -> None:
+def test_two_files_of_one_frame_are_both_left_out_and_reported(tmp_path: Path) -> None:
     pairs(tmp_path)
     touch(tmp_path / "rgb/a.jpg")
     _, listing = list_frames(tmp_path)
@@ -495,7 +504,7 @@ def test_links_are_followed_but_not_in_circles(tmp_path: Path) -> None:
 
 
 def test_a_manifest_names_frames_of_one_stem_by_their_folders(tmp_path: Path) -> None:
-    touch(*(tmp_path / "data" / place for place in ("one/x.png", "two/x.png", "y.png")))
+    touch(*(tmp_path / "data" / name for name in ("one/x.png", "two/x.png", "y.png")))
     (tmp_path / "m.csv").write_text(
         "image,name\ndata/one/x.png,\ndata/two/x.png,\ndata/y.png,mine\n"
     )

@@ -74,6 +74,13 @@ def test_associations_pair_images_and_depth(line: str, tmp_path: Path) -> None:
         read_frames(tmp_path)
 
 
+def test_associated_frames_have_the_poses_at_the_times_of_their_images(tmp_path: Path) -> None:
+    (tmp_path / "associations.txt").write_text("1 depth/1.png 1.5 rgb/1.png\n")
+    (tmp_path / "groundtruth.txt").write_text("1 5 0 0 0 0 0 1\n1.5 7 0 0 0 0 0 1\n")
+    (frame,) = read_frames(tmp_path)
+    assert frame.pose == ((1, 0, 0, 7), (0, 1, 0, 0), (0, 0, 1, 0))
+
+
 def test_the_parent_of_data_sets_of_one_layout_has_their_frames(tmp_path: Path) -> None:
     for scene in ("chess", "fire"):
         for kind in ("color", "depth"):

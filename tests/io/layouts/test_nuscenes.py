@@ -92,7 +92,7 @@ def test_a_changed_pose_of_the_car_is_another_setting(tmp_path: Path) -> None:
     assert len(digests) == 2
 
 
-def test_a_missing_scan_and_incomplete_tables_are_said(tmp_path: Path) -> None:
+def test_a_missing_scan_and_incomplete_tables_are_reported(tmp_path: Path) -> None:
     write(tmp_path)
     (tmp_path / "samples/LIDAR_TOP/a.pcd.bin").unlink()
     listing = list_frames(tmp_path)[1]

@@ -382,7 +382,7 @@ def test_a_zip_that_is_no_checkpoint_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
-def test_a_torchscript_archive_says_what_to_save_instead(tmp_path: Path) -> None:
+def test_a_torchscript_archive_is_an_error_that_names_what_to_save(tmp_path: Path) -> None:
     torch.jit.save(torch.jit.script(nn.Conv2d(1, 1, 1)), tmp_path / "w.pt")
     assert "state_dict() of its module" in one_line_about(tmp_path / "w.pt")
 

@@ -239,7 +239,7 @@ def with_directory_size(path: Path, size: int) -> None:
 
 
 @pytest.mark.parametrize("method", ["STORED", "DEFLATED", "BZIP2", "LZMA"])
-def test_an_archive_whose_directory_says_less_than_it_inflates_to_takes_no_memory(
+def test_an_archive_that_inflates_beyond_its_directory_takes_no_memory(
     method: str, tmp_path: Path
 ) -> None:
     path = tmp_path / "x.npz"

@@ -119,7 +119,7 @@ def test_an_index_of_many_blocks_and_two_shards_is_read_whole(blocks: int, tmp_p
         assert np.array_equal(tensors[name.replace("/", ".")].numpy(), array)
 
 
-def test_the_prefix_alone_says_what_to_name(tmp_path: Path) -> None:
+def test_the_prefix_alone_is_an_error_that_names_the_file(tmp_path: Path) -> None:
     prefix = written(tmp_path).with_suffix("")
     with pytest.raises(CheckpointError, match=r"x\.ckpt does not exist; x\.ckpt\.index does"):
         read_checkpoint(prefix)

@@ -36,7 +36,7 @@ def test_adapted_weights_fit_hidden_points_better_and_are_used_by_checkpoint(
     assert model["checkpoint"] == str(root / "adapted.safetensors")
 
 
-def test_the_card_says_what_was_learnt_from_what(tmp_path: Path) -> None:
+def test_the_card_names_the_weights_and_their_frames(tmp_path: Path) -> None:
     root = drive_on_disk(tmp_path, frames=3)
     assert adapted(root, "--steps", "5") == 0
     card = (root / "adapted.md").read_text()

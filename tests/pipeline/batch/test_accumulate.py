@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,12 +12,16 @@ import numpy as np
 import pytest
 
 from pnpdepth_cli.cli.main import run
-from pnpdepth_cli.errors import InputError, PnpDepthError, UsageError
+from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.io.dataset.frame import Frame
-from pnpdepth_cli.pipeline.batch.sequence import with_neighbours
+from pnpdepth_cli.pipeline.batch.sequence import note_of_poses, with_neighbours
 from pnpdepth_cli.pipeline.batch.sequence_options import SequenceOptions
-from tests.pipeline.batches import Heard, batch
+from pnpdepth_cli.sensors import SamplePattern
+from tests.pipeline.batches import RecordingListener, batch
 from tests.pipeline.drives import drive_on_disk, without_results
+from tests.pipeline.frames import frame_on_disk
+
+DRIVE = Path(__file__).parents[3] / "samples/drive"
 
 
 def accumulating(root: Path, **changes: Any) -> Any:
@@ -71,9 +77,9 @@ def test_a_frame_is_done_again_when_a_neighbours_points_change(tmp_path: Path) -
     root = drive_on_disk(tmp_path)
     accumulating(root)
     (root / "sparse/drive_000.png").write_bytes((root / "sparse/drive_003.png").read_bytes())
-    heard = Heard()
-    accumulating(root, heard=heard)
-    assert heard.names == ["drive_000", "drive_001"]
+    listener = RecordingListener()
+    accumulating(root, listener=listener)
+    assert listener.names == ["drive_000", "drive_001"]
 
 
 def test_other_poses_make_frames_be_done_again(tmp_path: Path) -> None:
@@ -81,9 +87,9 @@ def test_other_poses_make_frames_be_done_again(tmp_path: Path) -> None:
     accumulating(root)
     rows = (root / "poses.txt").read_text().splitlines()
     (root / "poses.txt").write_text("\n".join([*rows[:3], "1 0 0 0 0 1 0 0 0 0 1 0.35"]))
-    heard = Heard()
-    accumulating(root, heard=heard)
-    assert heard.names == ["drive_002", "drive_003"]
+    listener = RecordingListener()
+    accumulating(root, listener=listener)
+    assert listener.names == ["drive_002", "drive_003"]
 
 
 def test_frames_of_another_sequence_or_camera_are_no_neighbours(tmp_path: Path) -> None:
@@ -94,7 +100,7 @@ def test_frames_of_another_sequence_or_camera_are_no_neighbours(tmp_path: Path) 
         for name, camera in kinds
     ]
     linked = with_neighbours(frames, 2, None)
-    assert [[each.sparse.stem for each in frame.neighbours] for frame in linked] == [
+    assert [[each.frame.sparse.stem for each in frame.neighbours] for frame in linked] == [
         ["a_2_2"], ["a_1_2"], [], ["a_2_3"], ["a_1_3"],
     ]  # fmt: skip
 
@@ -114,18 +120,75 @@ def test_motion_leads_from_the_neighbours_camera_to_the_frames() -> None:
     )
 
 
-@pytest.mark.parametrize(
-    ("frame", "error", "says"),
-    [
-        (Frame(name="a", sparse=Path("s.png")), InputError, "a has no camera pose"),
-        (Frame(name="a", pose=((1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0))), UsageError, "sampled"),
-    ],
-)
-def test_what_accumulation_lacks_is_named(
-    frame: Frame, error: type[PnpDepthError], says: str
-) -> None:
-    with pytest.raises(error, match=says):
+def test_a_frame_without_points_cannot_be_accumulated() -> None:
+    frame = Frame(name="a", pose=((1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0)))
+    with pytest.raises(UsageError, match="not images alone"):
         with_neighbours([frame, frame], 1, None)
+
+
+def test_the_note_names_the_poses_that_are_used() -> None:
+    pose = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))
+    own = Frame(name="a_1", image=Path("i.png"), sparse=Path("s.png"), pose=pose)
+    without = replace(own, name="a_2", pose=None)
+    assert note_of_poses([own]) is None
+    assert note_of_poses(with_neighbours([own, own], 1, None)) == "poses: the layout's"
+    estimated = "poses: estimated from the images"
+    assert note_of_poses(with_neighbours([own, without], 1, None)) == estimated
+    assert note_of_poses(with_neighbours([own, own, without], 1, None)) == (
+        "poses of neighbours: the layout's (2 of 4), estimated from the images (2 of 4)"
+    )
+
+
+def rendered_drive(root: Path) -> Path:
+    """The drive of `samples/` without its poses, and net/ with a network."""
+    for part in ("rgb", "sparse", "calib"):
+        shutil.copytree(DRIVE / part, root / part)
+    (root / "net").mkdir()
+    frame_on_disk(root / "net")
+    return root
+
+
+def without_poses(root: Path, **changes: Any) -> Any:
+    return accumulating(root, limit=1, sequence=SequenceOptions(accumulate=1), **changes)
+
+
+def test_without_poses_the_motion_is_estimated_and_recorded(tmp_path: Path) -> None:
+    root, listener = rendered_drive(tmp_path), RecordingListener()
+    without_poses(root, listener=listener)
+    assert "poses: estimated from the images" in listener.messages
+    record = record_of(root, "drive_000")
+    (neighbour,) = record["inputs"]["neighbours"]
+    assert neighbour["poses"] == "estimated from the images"
+    assert neighbour["basis"].endswith("matches of the images")
+    assert abs(neighbour["motion"][2][3] - 0.6) < 0.03
+    assert record["points"]["moved"] > 500
+
+
+def test_a_frame_is_done_again_when_the_image_of_its_motion_changes(tmp_path: Path) -> None:
+    root, listener = rendered_drive(tmp_path), RecordingListener()
+    without_poses(root)
+    shutil.copy(root / "rgb/drive_002.jpg", root / "rgb/drive_001.jpg")
+    without_poses(root, listener=listener)
+    assert listener.names == ["drive_000"]
+
+
+def test_a_frame_whose_motion_cannot_be_estimated_fails_with_the_reason(tmp_path: Path) -> None:
+    root = drive_on_disk(tmp_path, frames=2)
+    listener = RecordingListener()
+    accumulating(root, listener=listener, sequence=SequenceOptions(accumulate=1))
+    assert len(listener.rows) == 2
+    for row in listener.rows:
+        assert "no motion to a neighbour can be estimated" in row["message"]
+        assert row["message"].endswith("give --poses, or leave out --accumulate")
+
+
+def test_neighbours_of_sampled_frames_are_sampled(tmp_path: Path) -> None:
+    root = drive_on_disk(tmp_path, frames=2)
+    shutil.copytree(root / "sparse", root / "gt")
+    accumulating(root, refine={"iterations": 1, "sample": SamplePattern(count=200)})
+    record = record_of(root, "drive_000")
+    assert record["points"]["moved"] > 20
+    assert record["inputs"]["neighbours"][0]["path"].endswith("gt/drive_001.png")
 
 
 def test_the_command_names_what_is_missing(
@@ -134,8 +197,6 @@ def test_the_command_names_what_is_missing(
     root = drive_on_disk(tmp_path, frames=2)
     command = ["batch", str(root), "-o", str(root / "out"), "--iterations", "1"]
     command += ["--model", str(root / "net/my_net.py")]
-    assert run([*command, "--accumulate", "2"]) == 3
-    assert "has no camera pose, which --accumulate needs" in capsys.readouterr().err
     (root / "poses.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n")
     assert run([*command, "--accumulate", "2", "--poses", str(root / "poses.txt")]) == 3
     assert "has 1 poses for 2 frames" in capsys.readouterr().err
@@ -149,6 +210,6 @@ def test_a_frame_without_calibration_fails_with_the_reason(tmp_path: Path) -> No
     (root / "calib/drive_001.txt").unlink()
     (root / "calib/drive_000.txt").unlink()
     (root / "calib").rmdir()
-    heard = Heard()
-    accumulating(root, heard=heard)
-    assert ["needs the camera" in row["message"] for row in heard.rows] == [True, True]
+    listener = RecordingListener()
+    accumulating(root, listener=listener)
+    assert ["needs the camera" in row["message"] for row in listener.rows] == [True, True]

@@ -17,6 +17,7 @@ from pnpdepth_cli.cli.tables import print_batch
 from pnpdepth_cli.core.metrics import Scores
 from pnpdepth_cli.errors import InputError, LayerError, ModelError, OutputError, UsageError
 from pnpdepth_cli.io.depth import read_depth
+from pnpdepth_cli.pipeline.batch import reading as batch_reading
 from pnpdepth_cli.pipeline.batch import running as batch_running
 from pnpdepth_cli.pipeline.batch.batch import plan_batch
 from pnpdepth_cli.pipeline.batch.request import BatchRequest
@@ -30,7 +31,7 @@ from pnpdepth_cli.pipeline.sparse.scan_options import ScanOptions
 from pnpdepth_cli.sensors import SamplePattern
 from tests.pipeline.batches import (
     NAMES,
-    Heard,
+    RecordingListener,
     add_frame,
     batch,
     pairs_on_disk,
@@ -49,8 +50,8 @@ def root(tmp_path: Path) -> Path:
 
 
 def summary(root: Path) -> dict[str, Any]:
-    found: dict[str, Any] = json.loads((root / "out" / "summary.json").read_text())
-    return found
+    content: dict[str, Any] = json.loads((root / "out" / "summary.json").read_text())
+    return content
 
 
 def test_a_batch_equals_as_many_single_refinements_byte_for_byte(root: Path) -> None:
@@ -64,9 +65,13 @@ def test_a_batch_equals_as_many_single_refinements_byte_for_byte(root: Path) -> 
 
 def test_so_does_a_batch_of_lidar_scans(tmp_path: Path) -> None:
     root = pairs_on_disk(tmp_path / "drive", ())
-    made = scan_on_disk(root / "net")
-    parts = (("image", "rgb", made.image), ("sparse", "sparse", made.scan), ("gt", "gt", made.gt))
-    for _, part, file in (*parts, ("", "calib", made.calib)):
+    on_disk = scan_on_disk(root / "net")
+    parts = (
+        ("image", "rgb", on_disk.image),
+        ("sparse", "sparse", on_disk.scan),
+        ("gt", "gt", on_disk.gt),
+    )
+    for _, part, file in (*parts, ("", "calib", on_disk.calib)):
         (root / part).mkdir(exist_ok=True)
         for name in "ab":
             shutil.copy(file, root / part / f"{name}{file.suffix}")
@@ -84,10 +89,10 @@ def test_so_does_a_batch_of_lidar_scans(tmp_path: Path) -> None:
 def test_a_second_run_does_nothing(root: Path) -> None:
     batch(root)
     before = times(root / "out")
-    heard = Heard()
-    batch(root, heard)
-    assert heard.to_do == 0
-    assert heard.said[-1] == "4 frames, all of them done already"
+    listener = RecordingListener()
+    batch(root, listener)
+    assert listener.to_do == 0
+    assert listener.messages[-1] == "4 frames, all of them done already"
     assert times(root / "out") == before
     assert [row["name"] for row in summary(root)["frames"]] == list(NAMES)
 
@@ -122,11 +127,11 @@ def test_only_what_is_missing_or_changed_is_done_again(root: Path, change: Any, 
     (root / "gt/b.png").unlink()
     batch(root)
     change(root)
-    asked = BatchRequest(source=root, output=root / "out", refine=refinement(root))
-    assert [(p.name, p.why) for p in plan_batch(asked, lambda text: None)] == [("b", why)]
-    heard = Heard()
-    batch(root, heard)
-    assert heard.names == ["b"]
+    request = BatchRequest(source=root, output=root / "out", refine=refinement(root))
+    assert [(p.name, p.why) for p in plan_batch(request, lambda text: None)] == [("b", why)]
+    listener = RecordingListener()
+    batch(root, listener)
+    assert listener.names == ["b"]
     redone = results(root / "out")
     shutil.rmtree(root / "out")
     batch(root)
@@ -138,9 +143,9 @@ def test_a_file_that_was_only_touched_or_moved_has_not_changed(root: Path) -> No
     os.utime(root / "rgb/a.png", (1, 1))
     os.utime(root / "out/b_depth.png", (1, 1))
     moved = root.rename(root.with_name("moved"))
-    heard = Heard()
-    batch(moved, heard)
-    assert heard.names == []
+    listener = RecordingListener()
+    batch(moved, listener)
+    assert listener.names == []
 
 
 @pytest.mark.parametrize(
@@ -148,39 +153,39 @@ def test_a_file_that_was_only_touched_or_moved_has_not_changed(root: Path) -> No
 )
 def test_other_settings_do_all_again(root: Path, settings: dict[str, Any]) -> None:
     batch(root)
-    heard = Heard()
-    batch(root, heard, refine=settings)
-    assert heard.names == list(NAMES)
-    assert "4 to do (4 other settings)" in heard.said[1]
+    listener = RecordingListener()
+    batch(root, listener, refine=settings)
+    assert listener.names == list(NAMES)
+    assert "4 to do (4 other settings)" in listener.messages[1]
 
 
 def test_another_network_in_the_same_file_does_all_again(root: Path) -> None:
     batch(root)
     model = root / "net/my_net.py"
     model.write_text(model.read_text().replace("2 + 3", "2.5 + 3"))
-    heard = Heard()
-    batch(root, heard)
-    assert heard.names == list(NAMES)
+    listener = RecordingListener()
+    batch(root, listener)
+    assert listener.names == list(NAMES)
 
 
-def test_a_bad_frame_is_told_counted_and_passed_over(root: Path) -> None:
+def test_a_bad_frame_is_reported_counted_and_skipped(root: Path) -> None:
     good = (root / "rgb/b.png").read_bytes()
     (root / "rgb/b.png").write_bytes(good[:200])
-    heard = Heard()
-    counts = batch(root, heard).summary["counts"]
+    listener = RecordingListener()
+    counts = batch(root, listener).summary["counts"]
     assert (counts["done"], counts["failed"], counts["pending"]) == (3, 1, 0)
-    assert [row["status"] for row in heard.rows] == ["done", "failed", "done", "done"]
-    assert "b.png: PNG is cut short" in heard.rows[1]["message"]
+    assert [row["status"] for row in listener.rows] == ["done", "failed", "done", "done"]
+    assert "b.png: PNG is cut short" in listener.rows[1]["message"]
     assert not list((root / "out").glob("b*_*"))
     (root / "rgb/b.png").write_bytes(good)
-    again = Heard()
+    again = RecordingListener()
     counts = batch(root, again).summary["counts"]
     assert again.names == ["b"]
     assert (counts["done"], counts["failed"]) == (4, 0)
 
 
 def test_the_first_frame_may_be_the_bad_one_and_even_all(root: Path) -> None:
-    (root / "rgb/a.png").write_bytes(b"no picture")
+    (root / "rgb/a.png").write_bytes(b"no image")
     assert batch(root).summary["counts"]["done"] == 3
     for name in "bcd":
         (root / f"sparse/{name}.png").write_bytes(b"no depth")
@@ -192,8 +197,8 @@ def test_depth_that_does_not_fit_the_format_is_clipped_and_noted(root: Path) -> 
     model = root / "net/my_net.py"
     far = "(2 + 900 * (rgb[0, 2, 0, 0] < 0.3)) + 3"
     model.write_text(model.read_text().replace("2 + 3", far))
-    heard = Heard()
-    outcome = batch(root, heard, refine={"iterations": 0})
+    listener = RecordingListener()
+    outcome = batch(root, listener, refine={"iterations": 0})
     assert outcome.summary["counts"]["done"] == 4
     clipped = []
     for name in "abcd":
@@ -212,9 +217,9 @@ def test_a_divergence_keeps_the_last_good_depth_and_is_counted(root: Path) -> No
     outcome = batch(root, refine={"lr": "1e4"})
     assert outcome.summary["counts"]["diverged"] == 4
     assert (read_depth(root / "out/a_depth.png").values > 0).all()
-    heard = Heard()
-    batch(root, heard, refine={"lr": "1e4"})
-    assert heard.names == []
+    listener = RecordingListener()
+    batch(root, listener, refine={"lr": "1e4"})
+    assert listener.names == []
 
 
 def test_a_mistake_that_concerns_all_frames_stops_the_batch_at_once(root: Path) -> None:
@@ -251,16 +256,16 @@ def test_frames_of_several_sizes_go_through(root: Path) -> None:
     assert read_depth(root / "out/e_depth.png").values.shape == (20, 33)
 
 
-def test_every_file_without_a_partner_is_told(root: Path) -> None:
+def test_every_file_without_a_partner_is_reported(root: Path) -> None:
     (root / "sparse/b.png").unlink()
     shutil.copy(root / "gt/a.png", root / "gt/lost.png")
     shutil.copy(root / "sparse/a.png", root / "sparse/spare.png")
-    heard = Heard()
-    outcome = batch(root, heard)
+    listener = RecordingListener()
+    outcome = batch(root, listener)
     assert outcome.summary["counts"]["frames"] == 3
-    told = "\n".join(heard.said)
+    messages = "\n".join(listener.messages)
     for name in ("rgb/b.png", "gt/lost.png", "sparse/spare.png"):
-        assert f"warning: {root / name} has no partner" in told
+        assert f"warning: {root / name} has no partner" in messages
     assert len(outcome.summary["unmatched"]) == 3
 
 
@@ -281,14 +286,14 @@ ODD = ("with space", "ümlaut 深度", "new\nline", "-dash", "quote'\"", "perc%e
 def test_any_name_that_a_file_can_have_will_do(tmp_path: Path) -> None:
     undecodable = os.fsdecode(b"caf\xe9")
     root = pairs_on_disk(tmp_path / "drive", (*ODD, undecodable))
-    heard = Heard()
-    batch(root, heard)
-    assert {row["status"] for row in heard.rows} == {"done"}
+    listener = RecordingListener()
+    batch(root, listener)
+    assert {row["status"] for row in listener.rows} == {"done"}
     names = sorted((*ODD, undecodable))
     assert sorted(row["name"] for row in summary(root)["frames"]) == names
     with (root / "out/summary.csv").open(encoding="utf-8", newline="") as file:
         assert len(list(csv.DictReader(file))) == len(names)
-    again = Heard()
+    again = RecordingListener()
     batch(root, again)
     assert again.names == []
 
@@ -302,7 +307,7 @@ def test_links_that_go_round_in_circles_end(root: Path) -> None:
     }  # fmt: skip
 
 
-def test_a_folder_that_cannot_be_read_is_told_and_left_out(
+def test_a_folder_that_cannot_be_read_is_reported_and_left_out(
     root: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (root / "rgb/locked").mkdir()
@@ -314,17 +319,17 @@ def test_a_folder_that_cannot_be_read_is_told_and_left_out(
         return scandir(path)
 
     monkeypatch.setattr(os, "scandir", scan)
-    heard = Heard()
-    assert batch(root, heard).summary["counts"]["done"] == 4
-    assert any("locked cannot be read (permission denied)" in text for text in heard.said)
+    listener = RecordingListener()
+    assert batch(root, listener).summary["counts"]["done"] == 4
+    assert any("locked cannot be read (permission denied)" in text for text in listener.messages)
 
 
 def test_results_inside_the_input_are_never_taken_as_input(root: Path) -> None:
     for output in (root / "rgb" / "out", root / "gt" / "deep" / "out"):
         batch(root, output=output, refine={"format": "exr"})
-        heard = Heard()
-        outcome = batch(root, heard, output=output)
-        assert heard.names == list(NAMES)
+        listener = RecordingListener()
+        outcome = batch(root, listener, output=output)
+        assert listener.names == list(NAMES)
         assert outcome.summary["unmatched"] == []
         shutil.rmtree(output)
 
@@ -370,40 +375,40 @@ def test_a_name_that_leads_elsewhere_or_to_the_summary_is_left_out(root: Path) -
 
 def test_a_listed_file_that_is_not_there_is_a_failed_frame(root: Path) -> None:
     (root / "list.csv").write_text("image,sparse\nrgb/a.png,sparse/a.png\nno.png,sparse/b.png\n")
-    heard = Heard()
-    counts = batch(root, heard, source=root / "list.csv").summary["counts"]
+    listener = RecordingListener()
+    counts = batch(root, listener, source=root / "list.csv").summary["counts"]
     assert (counts["done"], counts["failed"]) == (1, 1)
-    assert any("no.png does not exist; correct line 3" in text for text in heard.said)
+    assert any("no.png does not exist; correct line 3" in text for text in listener.messages)
 
 
 def test_shards_share_a_folder_without_overlap_and_the_limit_comes_first(root: Path) -> None:
     parts = []
     for number in (1, 2, 3):
-        heard = Heard()
-        outcome = batch(root, heard, shard=(number, 3))
-        parts.append(heard.names)
+        listener = RecordingListener()
+        outcome = batch(root, listener, shard=(number, 3))
+        parts.append(listener.names)
     assert parts == [["a", "d"], ["b"], ["c"]]
     assert outcome.summary["counts"]["done"] == 4
-    heard = Heard()
-    batch(root, heard)
-    assert heard.names == []
-    heard = Heard()
-    outcome = batch(root, heard, limit=3, shard=(2, 2), output=root / "few")
-    assert heard.names == ["b"]
+    listener = RecordingListener()
+    batch(root, listener)
+    assert listener.names == []
+    listener = RecordingListener()
+    outcome = batch(root, listener, limit=3, shard=(2, 2), output=root / "few")
+    assert listener.names == ["b"]
     assert outcome.summary["counts"]["pending"] == 3
 
 
 def test_the_summary_has_the_means_of_its_rows_and_all_earlier_frames(root: Path) -> None:
     batch(root, limit=2, refine={"holdout": 0.2})
     outcome = batch(root, refine={"holdout": 0.2})
-    found = summary(root)
-    rows = found.pop("frames")
-    assert found == json.loads(json.dumps(outcome.summary))
+    content = summary(root)
+    rows = content.pop("frames")
+    assert content == json.loads(json.dumps(outcome.summary))
     assert [row["name"] for row in rows] == list(NAMES)
     for kind in ("sparse_error", "held_out_error", "scores"):
-        assert found["mean"][kind]["frames"] == 4
+        assert content["mean"][kind]["frames"] == 4
         for stage in ("before", "after"):
-            for measure, mean in found["mean"][kind][stage].items():
+            for measure, mean in content["mean"][kind][stage].items():
                 values = [row[kind][stage][measure] for row in rows]
                 assert mean == pytest.approx(np.mean(values), rel=1e-12)
     record = json.loads((root / "out/b.json").read_text())
@@ -424,13 +429,13 @@ def test_the_table_has_every_score() -> None:
 
 
 def test_a_batch_can_be_stopped_between_frames_and_goes_on(root: Path) -> None:
-    asked = iter([False, False, True])
-    heard = Heard()
-    outcome = batch(root, heard, stopped=lambda: next(asked))
+    stops = iter([False, False, True])
+    listener = RecordingListener()
+    outcome = batch(root, listener, stopped=lambda: next(stops))
     assert outcome.stopped
-    assert heard.names == ["a", "b"]
+    assert listener.names == ["a", "b"]
     assert outcome.summary["counts"]["pending"] == 2
-    again = Heard()
+    again = RecordingListener()
     assert not batch(root, again).stopped
     assert again.names == ["c", "d"]
 
@@ -464,17 +469,17 @@ def test_a_protocol_cuts_image_points_and_truth_alike(root: Path) -> None:
     cv2.imwrite(str(root / "rgb/a.png"), image)
     for part in ("sparse", "gt"):
         cv2.imwrite(str(root / part / "a.png"), depth)
-    asked = {"iterations": 0, "depth_scale": 1000.0}
-    batch(root, source=root / "list.csv", refine=asked)
+    options = {"iterations": 0, "depth_scale": 1000.0}
+    batch(root, source=root / "list.csv", refine=options)
     assert read_depth(root / "out/a_depth.png").values.shape == (228, 304)
     record = json.loads((root / "out/a.json").read_text())
     assert record["size"] == [304, 228]
     assert record["points"]["used"] == np.count_nonzero(depth)
-    batch(root, source=root / "list.csv", refine=asked, protocol="whole")
+    batch(root, source=root / "list.csv", refine=options, protocol="whole")
     assert read_depth(root / "out/a_depth.png").values.shape == size
 
 
-def test_an_empty_folder_says_which_layouts_there_are(tmp_path: Path) -> None:
+def test_an_empty_folder_is_an_error_that_names_the_layouts(tmp_path: Path) -> None:
     with pytest.raises(
         InputError, match=r"any layout; layouts need: nyu-mat .*; pairs rgb, sparse"
     ):
@@ -510,7 +515,7 @@ def test_only_a_few_frames_are_in_memory_at_once(
         most = max(most, len(alive))
         return inputs
 
-    monkeypatch.setattr(batch_running, "read_inputs", watched)
+    monkeypatch.setattr(batch_reading, "read_inputs", watched)
     batch(root, workers=1, batch_size=batch_size)
     assert most <= most_allowed
 
@@ -538,11 +543,11 @@ def test_reading_and_writing_go_on_while_the_network_runs(
             second_is_refined.set()
         return refine(self, split, inputs)
 
-    def writing(*given: Any) -> Any:
+    def writing(*arguments: Any) -> Any:
         assert second_is_refined.wait(60), "the second frame waits until the first is written"
-        return write(*given)
+        return write(*arguments)
 
-    monkeypatch.setattr(batch_running, "read_inputs", reading)
+    monkeypatch.setattr(batch_reading, "read_inputs", reading)
     monkeypatch.setattr(batch_running, "write_refined", writing)
     monkeypatch.setattr(Refiner, "refine", refining)
     assert batch(root, workers=1).summary["counts"]["done"] == 4
@@ -560,17 +565,17 @@ def test_frames_in_hdf5_files_are_cut_sampled_and_known_by_their_file(
         with h5py.File(rooms / "official" / f"{number:05}.h5", "w") as file:
             file["rgb"] = np.full((3, 480, 640), 50 * number, np.uint8)
             file["depth"] = np.tile(1 + number + x, (480, 1))
-    asked = {"sample": SamplePattern(kind="uniform", count=100), "iterations": 1}
-    heard = Heard()
-    batch(rooms, heard, refine=asked)
-    assert heard.names == ["official_00001", "official_00002"]
-    assert any("protocol: nyu cuts the frames" in text for text in heard.said)
+    options = {"sample": SamplePattern(kind="uniform", count=100), "iterations": 1}
+    listener = RecordingListener()
+    batch(rooms, listener, refine=options)
+    assert listener.names == ["official_00001", "official_00002"]
+    assert any("protocol: nyu cuts the frames" in text for text in listener.messages)
     record = json.loads((rooms / "out/official_00002.json").read_text())
     assert record["size"] == [304, 228]
     assert record["points"]["used"] == 100
     assert record["scores"]["after"]["pixels"] == 304 * 228
-    again = Heard()
-    batch(rooms, again, refine=asked)
+    again = RecordingListener()
+    batch(rooms, again, refine=options)
     assert again.names == []
 
 
@@ -639,6 +644,24 @@ def test_digests_of_consecutive_frames_are_those_of_each_alone(root: Path) -> No
         base.with_fields(scan=ScanOptions(camera=2)),
     ]
     digests = SettingsDigests({"model": "m"})
-    found = [digests.of(each) for each in requests]
-    assert found == [settings_digest(each, {"model": "m"}) for each in requests]
-    assert len(set(found)) == 5
+    known = [digests.of(each) for each in requests]
+    assert known == [settings_digest(each, {"model": "m"}) for each in requests]
+    assert len(set(known)) == 5
+
+
+def test_a_fixed_method_without_ground_truth_is_compared_with_linear_on_every_20th_frame(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "200")
+    root = pairs_on_disk(tmp_path / "drive", tuple(f"{i:02}" for i in range(21)), gt=False)
+    batch(root)
+    written = summary(root)
+    compared = [row["name"] for row in written["frames"] if row["linear"]["folds"]]
+    assert compared == ["00", "20"]
+    folds = [row["linear"]["folds"] for row in written["frames"] if row["linear"]["folds"]]
+    mean = written["linear"]["folds"]
+    assert mean["frames"] == written["linear"]["frames"] == 2
+    for stage in ("before", "after", "linear"):
+        assert mean[stage] == pytest.approx(np.mean([each[stage] for each in folds]))
+    print_batch(written)
+    assert "error at points in turn held out, 2 frames, MAE" in capsys.readouterr().err

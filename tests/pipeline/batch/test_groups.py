@@ -18,7 +18,7 @@ from pnpdepth_cli.pipeline.batch import groups as batch_groups
 from pnpdepth_cli.pipeline.batch import resolving
 from pnpdepth_cli.pipeline.refinement.refiner import Refiner
 from tests.pipeline.batches import (
-    Heard,
+    RecordingListener,
     add_frame,
     batch,
     pairs_on_disk,
@@ -48,15 +48,15 @@ def plain_convolutions() -> Iterator[None]:
 @pytest.fixture
 def passes(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """How many frames went together each time, trials included."""
-    found: list[int] = []
+    sizes: list[int] = []
     refine_together = Refiner.refine_together
 
     def counted(refiner: Refiner, split: Any, group: Any, settings: Any) -> Any:
-        found.append(len(group))
+        sizes.append(len(group))
         return refine_together(refiner, split, group, settings)
 
     monkeypatch.setattr(Refiner, "refine_together", counted)
-    return found
+    return sizes
 
 
 def small_frame(root: Path, name: str, size: tuple[int, int] = (20, 33)) -> None:
@@ -66,7 +66,7 @@ def small_frame(root: Path, name: str, size: tuple[int, int] = (20, 33)) -> None
 
 
 def paint_in_shades(root: Path) -> None:
-    """The pictures differ in their means."""
+    """The images differ in their means."""
     for number, name in enumerate(NAMES):
         cv2.imwrite(str(root / f"rgb/{name}.png"), np.full((46, 62, 3), 20 * number, np.uint8))
 
@@ -92,11 +92,11 @@ def alone(root: Path, **refine: Any) -> dict[str, Any]:
 def test_groups_equal_as_many_single_refinements_byte_for_byte(
     root: Path, passes: list[int], size: int, groups: list[int]
 ) -> None:
-    heard = Heard()
-    batch(root, heard, batch_size=size, refine={"holdout": 0.3, "seed": 5})
+    listener = RecordingListener()
+    batch(root, listener, batch_size=size, refine={"holdout": 0.3, "seed": 5})
     assert passes == groups  # two of them the trial's
-    assert any("equal bit for bit" in text for text in heard.said)
-    assert heard.names == list(NAMES)
+    assert any("equal bit for bit" in text for text in listener.messages)
+    assert listener.names == list(NAMES)
     together = results(root / "out")
     shutil.rmtree(root / "out")
     refine_one_by_one(root, NAMES, holdout=0.3, seed=5)
@@ -108,17 +108,17 @@ def test_groups_equal_as_many_single_refinements_byte_for_byte(
 def test_other_sizes_and_bad_frames_between_them_change_nothing(
     root: Path, passes: list[int]
 ) -> None:
-    (root / "rgb/d.png").write_bytes(b"no picture")
+    (root / "rgb/d.png").write_bytes(b"no image")
     for name in ("e2", "x", "y", "z"):
         small_frame(root, name)
     add_frame(root, "zz")
-    heard = Heard()
-    batch(root, heard, batch_size=2)
+    listener = RecordingListener()
+    batch(root, listener, batch_size=2)
     # a b tried; c, a bad one and e go together; the small e2; f g, h alone; x y tried; then z, zz
     assert passes == [2, 2, 2, 2, 2, 2]
-    bad = [row["name"] for row in heard.rows if row["status"] == "failed"]
+    bad = [row["name"] for row in listener.rows if row["status"] == "failed"]
     assert bad == ["d"]
-    assert heard.names == [*"abcde", "e2", *"fghxyz", "zz"]
+    assert listener.names == [*"abcde", "e2", *"fghxyz", "zz"]
     together = results(root / "out")
     assert together == alone(root)
 
@@ -131,10 +131,10 @@ def test_a_frame_whose_points_the_network_does_not_see_leaves_the_others_as_they
     left = np.zeros((46, 62), np.uint16)
     left[10, 1] = left[20, 2] = 2000
     cv2.imwrite(str(root / "sparse/f.png"), left)
-    heard = Heard()
-    batch(root, heard, batch_size=4)
+    listener = RecordingListener()
+    batch(root, listener, batch_size=4)
     assert passes == [4, 4, 4]
-    (failed,) = [row for row in heard.rows if row["status"] == "failed"]
+    (failed,) = [row for row in listener.rows if row["status"] == "failed"]
     assert failed["name"] == "f"
     assert "none of the 2 sparse points" in failed["message"]
     together = results(root / "out")
@@ -153,10 +153,10 @@ def test_a_diverging_frame_in_a_group_leaves_the_others_as_they_are(
          "        return torch.exp(gain * self.decode(self.middle(self.encode(rgb))))"),
     )  # fmt: skip
     cv2.imwrite(str(root / "rgb/f.png"), np.full((46, 62, 3), 255, np.uint8))
-    heard = Heard()
-    batch(root, heard, batch_size=4, refine={"lr": "1e4"})
+    listener = RecordingListener()
+    batch(root, listener, batch_size=4, refine={"lr": "1e4"})
     assert passes == [4, 4, 4]
-    states = {row["name"]: row["status"] for row in heard.rows}
+    states = {row["name"]: row["status"] for row in listener.rows}
     assert states == {name: "diverged" if name == "f" else "done" for name in NAMES}
     together = results(root / "out")
     assert together == alone(root, lr="1e4")
@@ -164,12 +164,12 @@ def test_a_diverging_frame_in_a_group_leaves_the_others_as_they_are(
 
 @pytest.mark.usefixtures("plain_convolutions")
 def test_a_batch_stopped_among_groups_goes_on_to_the_same_results(root: Path) -> None:
-    asked = iter([False, False, False, True])
-    heard = Heard()
-    assert batch(root, heard, batch_size=2, stopped=lambda: next(asked)).stopped
-    assert heard.names == ["a", "b", "c", "d"]
+    stops = iter([False, False, False, True])
+    listener = RecordingListener()
+    assert batch(root, listener, batch_size=2, stopped=lambda: next(stops)).stopped
+    assert listener.names == ["a", "b", "c", "d"]
     (root / "out/b_depth.png").unlink()
-    again = Heard()
+    again = RecordingListener()
     batch(root, again, batch_size=2)
     assert again.names == ["b", "e", "f", "g", "h"]
     together = results(root / "out")
@@ -180,9 +180,9 @@ def test_what_auto_does_never_shows_in_the_results(
     root: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(batch_groups, "_MAX_FRAMES", 3)
-    heard = Heard()
-    batch(root, heard, refine={"lr": "5%"})
-    assert sum("batch size" in text for text in heard.said) == 1
+    listener = RecordingListener()
+    batch(root, listener, refine={"lr": "5%"})
+    assert sum("batch size" in text for text in listener.messages) == 1
     together = results(root / "out")
     assert together == alone(root, lr="5%")
 
@@ -198,12 +198,12 @@ def test_auto_takes_frames_together_only_where_that_is_faster(
 ) -> None:
     monkeypatch.setattr(batch_groups, "_MAX_FRAMES", 3)
     monkeypatch.setattr(batch_groups, "_MAX_TIME_RATIO", faster)
-    heard = Heard()
-    batch(root, heard)
+    listener = RecordingListener()
+    batch(root, listener)
     assert passes == ([3, 3, 3] if goes_together else [3, 3])
-    (said,) = [text for text in heard.said if "batch size" in text]
-    assert ("equal bit for bit" in said) == goes_together
-    assert ("no faster" in said) != goes_together
+    (note,) = [text for text in listener.messages if "batch size" in text]
+    assert ("equal bit for bit" in note) == goes_together
+    assert ("no faster" in note) != goes_together
 
 
 ROUNDS = (FORMULA, f"{FORMULA} + 1e-5 * rgb.mean()")
@@ -217,27 +217,28 @@ def test_where_bits_differ_auto_goes_on_one_at_a_time(
     monkeypatch.setattr(batch_groups, "_MAX_FRAMES", 3)
     paint_in_shades(root)
     change_network(root, ROUNDS)
-    heard = Heard()
-    batch(root, heard)
+    listener = RecordingListener()
+    batch(root, listener)
     assert passes == [3]  # the plain prediction was enough to know
     assert any(
-        "batch size: 1 for 62×46; 3 together differ in the last bits" in text for text in heard.said
+        "batch size: 1 for 62×46; 3 together differ in the last bits" in text
+        for text in listener.messages
     )
     together = results(root / "out")
     assert together == alone(root)
 
 
 @pytest.mark.usefixtures("plain_convolutions")
-def test_a_number_by_the_user_may_alter_the_last_bits_and_that_is_said_and_recorded(
+def test_a_number_by_the_user_may_alter_the_last_bits_with_a_note_and_a_record(
     root: Path, passes: list[int]
 ) -> None:
     paint_in_shades(root)
     change_network(root, ROUNDS)
-    heard = Heard()
-    batch(root, heard, batch_size=3)
+    listener = RecordingListener()
+    batch(root, listener, batch_size=3)
     assert passes == [3, 3]
-    (said,) = [text for text in heard.said if "batch size" in text]
-    assert said.startswith("warning: batch size: 3 frames of 62×46 together differ from one at a")
+    (note,) = [text for text in listener.messages if "batch size" in text]
+    assert note.startswith("warning: batch size: 3 frames of 62×46 together differ from one at a")
     for name in NAMES:
         notes = json.loads((root / f"out/{name}.json").read_text())["notes"]
         together = "refined together with 2 others, which alters the last bits" in notes
@@ -262,20 +263,22 @@ def test_a_network_that_mixes_frames_gets_them_one_at_a_time_whatever_is_asked(
 ) -> None:
     paint_in_shades(root)
     change_network(root, change)
-    heard = Heard()
-    batch(root, heard, batch_size=3)
+    listener = RecordingListener()
+    batch(root, listener, batch_size=3)
     assert passes == [3]
-    assert any(why in text for text in heard.said)
+    assert any(why in text for text in listener.messages)
     together = results(root / "out")
     assert together == alone(root)
 
 
 def test_a_network_for_one_frame_alone_gets_one_at_a_time(root: Path, passes: list[int]) -> None:
     change_network(root, ("        return", "        assert len(rgb) == 1\n        return"))
-    heard = Heard()
-    assert batch(root, heard, batch_size=4).summary["counts"]["done"] == len(NAMES)
+    listener = RecordingListener()
+    assert batch(root, listener, batch_size=4).summary["counts"]["done"] == len(NAMES)
     assert passes == [4]
-    assert any("batch size: 1 for 62×46; together: the network's" in text for text in heard.said)
+    assert any(
+        "batch size: 1 for 62×46; together: the network's" in text for text in listener.messages
+    )
 
 
 @pytest.mark.usefixtures("plain_convolutions")
@@ -313,28 +316,28 @@ def test_afterwards_the_network_is_as_before(
     refiners: list[Refiner] = []
     load = resolving.load_refiner
 
-    def loaded(*given: Any) -> Refiner:
-        refiner = load(*given)
+    def loaded(*arguments: Any) -> Refiner:
+        refiner = load(*arguments)
         refiner.network.module.encode.train()
         refiner.network.module.decode.weight.requires_grad_(True)
         refiners.append(refiner)
         return refiner
 
-    class Stops(Heard):
+    class Stops(RecordingListener):
         def frame(self, row: dict[str, Any]) -> None:
             super().frame(row)
             if how == "full disk" and len(self.rows) == 2:
                 raise StorageError("full")
 
     monkeypatch.setattr(resolving, "load_refiner", loaded)
-    asked = iter([False, False, how == "stop", *[False] * 9])
-    heard = Stops()
+    stops = iter([False, False, how == "stop", *[False] * 9])
+    listener = Stops()
     if how == "full disk":
         with pytest.raises(StorageError):
-            batch(root, heard, stopped=lambda: next(asked))
+            batch(root, listener, stopped=lambda: next(stops))
     else:
-        batch(root, heard, stopped=lambda: next(asked))
-    assert len(heard.rows) == (len(NAMES) if how == "end" else 2)
+        batch(root, listener, stopped=lambda: next(stops))
+    assert len(listener.rows) == (len(NAMES) if how == "end" else 2)
     (refiner,) = refiners
     module = refiner.network.module
     assert all("forward" not in vars(part) for part in module.modules())
@@ -342,26 +345,26 @@ def test_afterwards_the_network_is_as_before(
     assert [n for n, p in module.named_parameters() if p.requires_grad] == ["decode.weight"]
 
 
-def test_the_profile_says_where_the_time_went(root: Path) -> None:
-    (root / "rgb/b.png").write_bytes(b"no picture")
+def test_the_profile_has_the_time_of_each_stage(root: Path) -> None:
+    (root / "rgb/b.png").write_bytes(b"no image")
     assert "profile" not in batch(root, limit=1).summary
-    found = batch(root, profile=True).summary["profile"]
+    profile = batch(root, profile=True).summary["profile"]
     stored = json.loads((root / "out/summary.json").read_text())["profile"]
-    assert stored == found
-    seconds = found["seconds"]
-    assert found["frames"] == 6
+    assert stored == profile
+    seconds = profile["seconds"]
+    assert profile["frames"] == 6
     assert all(seconds[stage] > 0 for stage in ("network", "reading", "writing", "wall"))
     of_the_main_thread = ("network", "waiting_for_reader", "waiting_for_writer")
     assert sum(seconds[stage] for stage in of_the_main_thread) <= seconds["wall"]
-    assert found["frames_per_second"] == pytest.approx(6 / seconds["wall"], rel=1e-2)
-    assert found["network_busy"] == pytest.approx(seconds["network"] / seconds["wall"], rel=1e-2)
+    assert profile["frames_per_second"] == pytest.approx(6 / seconds["wall"], rel=1e-2)
+    assert profile["network_busy"] == pytest.approx(seconds["network"] / seconds["wall"], rel=1e-2)
 
 
 def test_what_is_chosen_for_each_frame_by_itself_is_never_refined_together(
     root: Path, passes: list[int]
 ) -> None:
-    heard = Heard()
-    batch(root, heard, batch_size=2, limit=3, refine={"uncertainty": True})
+    listener = RecordingListener()
+    batch(root, listener, batch_size=2, limit=3, refine={"uncertainty": True})
     assert passes == []
-    assert [row["status"] for row in heard.rows] == ["done"] * 3
-    assert any("choose the method for each frame alone" in text for text in heard.said)
+    assert [row["status"] for row in listener.rows] == ["done"] * 3
+    assert any("choose the method for each frame alone" in text for text in listener.messages)

@@ -5,18 +5,18 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from tests.pipeline.batches import Heard, batch, pairs_on_disk
+from tests.pipeline.batches import RecordingListener, batch, pairs_on_disk
 
 IMAGES = ("preview", "improvement")
 
 
 def with_images(root: Path) -> set[str]:
     """Frames with images; each has both or none."""
-    found = {
+    names = {
         kind: {p.name.split("_")[0] for p in root.glob(f"out/*_{kind}.png")} for kind in IMAGES
     }
-    assert found["preview"] == found["improvement"]
-    return found["preview"]
+    assert names["preview"] == names["improvement"]
+    return names["preview"]
 
 
 def worse(root: Path) -> set[str]:
@@ -40,13 +40,13 @@ def test_all_frames_none_or_those_worse_than_linear_interpolation_have_images(
 def test_a_batch_without_images_is_done_when_it_runs_again(tmp_path: Path) -> None:
     root = pairs_on_disk(tmp_path, ("a", "b"))
     batch(root, refine={"previews": "none"})
-    heard = Heard()
-    batch(root, heard, refine={"previews": "none"})
-    assert heard.to_do == 0
+    listener = RecordingListener()
+    batch(root, listener, refine={"previews": "none"})
+    assert listener.to_do == 0
 
 
 def test_the_report_has_frames_without_images(tmp_path: Path) -> None:
     root, report = pairs_on_disk(tmp_path / "frames", ("a",)), tmp_path / "report"
     batch(root, refine={"previews": "none"}, html=report)
     assert (report / "index.html").exists()
-    assert not list((report / "pictures").glob("*.jpg"))
+    assert not list((report / "images").glob("*.jpg"))

@@ -15,7 +15,7 @@ import pytest
 from pnpdepth_cli.errors import OutputError, StorageError
 from pnpdepth_cli.io import lock
 from tests.io.test_atomic import no_room_on_disk
-from tests.pipeline.batches import NAMES, Heard, batch, pairs_on_disk, results
+from tests.pipeline.batches import NAMES, RecordingListener, batch, pairs_on_disk, results
 
 ROOT = Path(__file__).parents[3]
 
@@ -42,22 +42,22 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
     folder.mkdir(parents=True)
     mount = ["mount", "-t", "tmpfs", "-o", "size=100k", "tmpfs", str(folder)]
     try:
-        made = subprocess.run(mount, capture_output=True, text=True, check=False)
+        mounted = subprocess.run(mount, capture_output=True, text=True, check=False)
     except FileNotFoundError:
         pytest.skip("there is no mount program")
-    if made.returncode:
-        pytest.skip(f"a small file system cannot be mounted here: {made.stderr.strip()}")
+    if mounted.returncode:
+        pytest.skip(f"a small file system cannot be mounted here: {mounted.stderr.strip()}")
     yield folder
     subprocess.run(["umount", str(folder)], check=True)
 
 
-def in_folder(folder: Path, root: Path, heard: Heard | None = None) -> Any:
+def in_folder(folder: Path, root: Path, listener: RecordingListener | None = None) -> Any:
     """A batch into ./out of this folder, so that records name the same paths everywhere."""
     before = Path.cwd()
     folder.mkdir(exist_ok=True)
     os.chdir(folder)
     try:
-        return batch(root, heard, output=Path("out"))
+        return batch(root, listener, output=Path("out"))
     finally:
         os.chdir(before)
 
@@ -88,9 +88,9 @@ def test_files_that_cannot_grow_stop_it_too(tmp_path: Path) -> None:
     with no_room_on_disk(), pytest.raises(StorageError, match="file too large"):
         batch(root)
     assert results(root / "out") == {}
-    heard = Heard()
-    batch(root, heard)
-    assert heard.names == list(NAMES)
+    listener = RecordingListener()
+    batch(root, listener)
+    assert listener.names == list(NAMES)
 
 
 def test_a_second_run_on_the_same_folder_is_refused(
@@ -99,7 +99,7 @@ def test_a_second_run_on_the_same_folder_is_refused(
     monkeypatch.setattr(lock, "_START_S", 0.1)
     root = pairs_on_disk(tmp_path / "drive")
 
-    class Twice(Heard):
+    class Twice(RecordingListener):
         def frame(self, row: dict[str, Any]) -> None:
             super().frame(row)
             with pytest.raises(OutputError, match="another batch writes there; wait"):
@@ -107,17 +107,17 @@ def test_a_second_run_on_the_same_folder_is_refused(
             with pytest.raises(OutputError, match="without --shard, writes there"):
                 batch(root, shard=(1, 2))
 
-    heard = Twice()
-    batch(root, heard, limit=1)
-    assert heard.names == ["a"]
+    listener = Twice()
+    batch(root, listener, limit=1)
+    assert listener.names == ["a"]
     batch(root)
 
 
 def test_shards_run_at_once_but_not_twice_nor_with_others(tmp_path: Path) -> None:
     root = pairs_on_disk(tmp_path / "drive")
-    inner = Heard()
+    inner = RecordingListener()
 
-    class Beside(Heard):
+    class Beside(RecordingListener):
         def frame(self, row: dict[str, Any]) -> None:
             super().frame(row)
             if row["name"] != "a":
@@ -148,10 +148,10 @@ def test_a_manifest_with_a_torn_end_and_nonsense_is_read_as_far_as_it_goes(
     lines[of_b] = '{"frame": "b", "state": "done", "settings": 3}\n'
     torn = lines.pop(of_d)
     manifest.write_text("".join(lines) + "no JSON\n[]\n" + torn[: len(torn) // 2])
-    heard = Heard()
-    batch(root, heard)
-    assert heard.names == ["b", "d"]
-    assert any("3 lines of" in text for text in heard.said)
-    heard = Heard()
-    batch(root, heard)
-    assert heard.names == []
+    listener = RecordingListener()
+    batch(root, listener)
+    assert listener.names == ["b", "d"]
+    assert any("3 lines of" in text for text in listener.messages)
+    listener = RecordingListener()
+    batch(root, listener)
+    assert listener.names == []

@@ -13,7 +13,7 @@ import pytest
 from pnpdepth_cli.cli.main import run
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.pipeline.batch.sequence_options import SequenceOptions
-from tests.pipeline.batches import Heard, batch
+from tests.pipeline.batches import RecordingListener, batch
 from tests.pipeline.drives import drive_on_disk, without_results
 
 REFINE = {"iterations": 3, "update": "sign", "lr": "0.02"}
@@ -60,9 +60,9 @@ def test_the_bytes_do_not_depend_on_the_shards(tmp_path: Path) -> None:
 
 
 def test_a_shard_has_whole_windows(tmp_path: Path) -> None:
-    root, heard = drive_on_disk(tmp_path, frames=5), Heard()
-    warm(root, heard=heard, length=2, shard=(1, 2))
-    assert heard.names == ["drive_000", "drive_001", "drive_004"]
+    root, listener = drive_on_disk(tmp_path, frames=5), RecordingListener()
+    warm(root, listener=listener, length=2, shard=(1, 2))
+    assert listener.names == ["drive_000", "drive_001", "drive_004"]
 
 
 def test_a_missing_result_is_made_again_from_the_start_of_its_window(tmp_path: Path) -> None:
@@ -70,9 +70,9 @@ def test_a_missing_result_is_made_again_from_the_start_of_its_window(tmp_path: P
     warm(root)
     whole = depths(root)
     (root / "out/drive_002_depth.png").unlink()
-    heard = Heard()
-    warm(root, heard=heard)
-    assert heard.names == ["drive_002"]
+    listener = RecordingListener()
+    warm(root, listener=listener)
+    assert listener.names == ["drive_002"]
     assert depths(root) == whole
 
 
@@ -81,9 +81,9 @@ def test_a_change_of_a_frame_makes_the_rest_of_its_window_be_done_again(tmp_path
     warm(root)
     image = cv2.imread(str(root / "rgb/drive_001.png"))
     cv2.imwrite(str(root / "rgb/drive_001.png"), 255 - image)
-    heard = Heard()
-    warm(root, heard=heard)
-    assert heard.names == ["drive_001", "drive_002"]
+    listener = RecordingListener()
+    warm(root, listener=listener)
+    assert listener.names == ["drive_001", "drive_002"]
 
 
 def test_no_start_is_taken_across_a_cut(tmp_path: Path) -> None:
@@ -98,9 +98,9 @@ def test_no_start_is_taken_across_a_cut(tmp_path: Path) -> None:
 def test_a_frame_that_fails_does_not_end_its_window(tmp_path: Path) -> None:
     root = drive_on_disk(tmp_path, frames=3)
     (root / "rgb/drive_001.png").write_bytes(b"no image")
-    heard = Heard()
-    warm(root, heard=heard)
-    assert [row["status"] for row in heard.rows] == ["done", "failed", "done"]
+    listener = RecordingListener()
+    warm(root, listener=listener)
+    assert [row["status"] for row in listener.rows] == ["done", "failed", "done"]
     assert records(root)[-1]["warm_start"] is True
 
 

@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from pnpdepth_cli.errors import LayerError, UsageError
+from pnpdepth_cli.pipeline.bench import bench
 from pnpdepth_cli.pipeline.bench.bench import (
     FIRST_FRAME,
     FULL,
@@ -32,50 +33,50 @@ def frame(tmp_path_factory: pytest.TempPathFactory) -> FrameOnDisk:
 
 
 def request(frame: FrameOnDisk, **more: object) -> BenchRequest:
-    given = {"model": str(frame.model), "checkpoint": frame.checkpoint, "size": (40, 60)}
-    given |= {"points": 80, "repeats": 2}
-    return BenchRequest(**given | more)  # type: ignore[arg-type]
+    fields = {"model": str(frame.model), "checkpoint": frame.checkpoint, "size": (40, 60)}
+    fields |= {"points": 80, "repeats": 2}
+    return BenchRequest(**fields | more)  # type: ignore[arg-type]
 
 
 @pytest.fixture(scope="module")
-def found(frame: FrameOnDisk) -> Bench:
+def result(frame: FrameOnDisk) -> Bench:
     return run_bench(request(frame, precision="bf16"))
 
 
 def test_every_part_is_timed_as_often_as_asked_and_compared_with_one_forward_pass(
-    found: Bench,
+    result: Bench,
 ) -> None:
-    assert [part.name for part in found.parts] == [
+    assert [part.name for part in result.parts] == [
         *("forward", "front", "rear", "rear backward", "refinement", FIRST_FRAME, FULL),
         *("alignment", "propagation", "reading", "writing"),
     ]
-    forward = found.part("forward").seconds.median
-    for part in found.parts:
+    forward = result.part("forward").seconds.median
+    for part in result.parts:
         assert 0 < part.seconds.lower <= part.seconds.median <= part.seconds.upper
         assert part.seconds.runs == 2
         assert part.forwards == part.seconds.median / forward
 
 
-def test_the_limit_follows_from_the_parts_and_from_counted_operations(found: Bench) -> None:
-    front, rear = (found.part(name).seconds.median for name in ("front", "rear"))
-    assert found.limit_measured == (front + 11 * rear) / (front + rear)
+def test_the_limit_follows_from_the_parts_and_from_counted_operations(result: Bench) -> None:
+    front, rear = (result.part(name).seconds.median for name in ("front", "rear"))
+    assert result.limit_measured == (front + 11 * rear) / (front + rear)
     # encode 20·30·8 outputs of 3·9 products; middle, which is cut at, 20·30·8 of 8·9; decode, the
     # one part behind, 20·30·8 inputs into 16 outputs each.
     ahead, behind = 4800 * (27 + 72), 4800 * 16
-    assert found.limit_by_flops == (ahead + 11 * behind) / (ahead + behind)
+    assert result.limit_by_flops == (ahead + 11 * behind) / (ahead + behind)
 
 
-def test_low_precision_is_compared_with_fp32(found: Bench, frame: FrameOnDisk) -> None:
-    assert found.precision == "bf16"
-    assert found.depth_change is not None
-    assert 0 < found.depth_change < 0.02
+def test_low_precision_is_compared_with_fp32(result: Bench, frame: FrameOnDisk) -> None:
+    assert result.precision == "bf16"
+    assert result.depth_change is not None
+    assert 0 < result.depth_change < 0.02
     full = run_bench(request(frame, files=False))
     assert full.depth_change is None
     assert FULL not in [part.name for part in full.parts]
 
 
-def test_the_record_is_json_and_says_what_was_measured(found: Bench) -> None:
-    record = json.loads(json.dumps(found.record()))
+def test_the_record_is_json_and_holds_the_measurements(result: Bench) -> None:
+    record = json.loads(json.dumps(result.record()))
     assert record["network_size"] == record["size"] == [40, 60]
     assert (record["points"], record["iterations"], record["layer"]) == (80, 5, "middle")
     assert record["threads"] == torch.get_num_threads()
@@ -89,10 +90,10 @@ def test_refinement_by_hidden_points_is_timed_where_asked_for() -> None:
         run_bench(replace(request, model="fcrn-tiny"))
 
 
-def test_a_network_without_weights_gets_random_ones_and_says_so(frame: FrameOnDisk) -> None:
-    found = run_bench(request(frame, checkpoint=None, files=False))
-    assert found.checkpoint is None
-    assert any("weights: random" in note for note in found.notes)
+def test_a_network_without_weights_gets_random_ones_and_a_note(frame: FrameOnDisk) -> None:
+    result = run_bench(request(frame, checkpoint=None, files=False))
+    assert result.checkpoint is None
+    assert any("weights: random" in note for note in result.notes)
 
 
 def test_depths_that_a_png_cannot_hold_end_no_bench(tmp_path: Path) -> None:
@@ -108,7 +109,14 @@ def test_nothing_is_left_behind(frame: FrameOnDisk, tmp_path: Path, monkeypatch)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_layer_that_is_not_there_and_no_repeats_are_told(frame: FrameOnDisk) -> None:
+def test_where_no_layer_is_named_the_cut_is_that_of_refine(
+    frame: FrameOnDisk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(bench, "default_layer", lambda network, size, count: "encode")
+    assert run_bench(request(frame, files=False)).layer == "encode"
+
+
+def test_a_missing_layer_and_no_repeats_are_errors(frame: FrameOnDisk) -> None:
     with pytest.raises(LayerError, match="midle"):
         run_bench(request(frame, layer="midle"))
     with pytest.raises(UsageError, match="at least one"):
@@ -128,8 +136,8 @@ def test_parts_run_in_turn_and_the_first_round_does_not_count() -> None:
     ran: list[str] = []
     rounds: list[tuple[int, int]] = []
     todo = {
-        "a": Timed(run=lambda given: ran.append(f"a{given}"), prepare=lambda: len(ran)),
-        "b": Timed(run=lambda given: ran.append("b")),
+        "a": Timed(run=lambda prepared: ran.append(f"a{prepared}"), prepare=lambda: len(ran)),
+        "b": Timed(run=lambda prepared: ran.append("b")),
     }
     spent = in_turn(todo, 2, CPU, on_round=lambda done, of: rounds.append((done, of)))
     assert ran == ["a0", "b", "a2", "b", "a4", "b"]

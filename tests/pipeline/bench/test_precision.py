@@ -14,7 +14,7 @@ from tests.pipeline.frames import frame_on_disk
 
 
 @pytest.fixture
-def asked(tmp_path: Path) -> RefineRequest:
+def request_of_frame(tmp_path: Path) -> RefineRequest:
     frame = frame_on_disk(tmp_path)
     return RefineRequest.from_fields(
         image=frame.image,
@@ -27,12 +27,12 @@ def asked(tmp_path: Path) -> RefineRequest:
     )
 
 
-def test_bf16_refines_to_nearly_the_depth_of_fp32_and_the_record_says_so(
-    asked: RefineRequest,
+def test_bf16_refines_to_nearly_the_depth_of_fp32_and_is_recorded(
+    request_of_frame: RefineRequest,
 ) -> None:
     records, depths = {}, {}
     for precision in ("fp32", "bf16"):
-        record = refine_image(asked.with_fields(precision=precision)).record
+        record = refine_image(request_of_frame.with_fields(precision=precision)).record
         records[precision] = json.loads(json.dumps(record))["settings"]["precision"]
         depths[precision] = read_depth(Path(record["outputs"]["depth"])).values
         assert record["sparse_error"]["after"]["mae"] < record["sparse_error"]["before"]["mae"]
@@ -41,6 +41,6 @@ def test_bf16_refines_to_nearly_the_depth_of_fp32_and_the_record_says_so(
     assert 0 < apart.mean() < 0.02
 
 
-def test_a_batch_in_another_precision_is_done_again(asked: RefineRequest) -> None:
-    other = asked.with_fields(precision="bf16")
-    assert settings_digest(asked, {}) != settings_digest(other, {})
+def test_a_batch_in_another_precision_is_done_again(request_of_frame: RefineRequest) -> None:
+    other = request_of_frame.with_fields(precision="bf16")
+    assert settings_digest(request_of_frame, {}) != settings_digest(other, {})

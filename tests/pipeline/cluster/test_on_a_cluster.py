@@ -25,7 +25,14 @@ from pnpdepth_cli.pipeline.sweep.axes import read_axis, studies_of
 from pnpdepth_cli.pipeline.sweep.points import read_sampling
 from pnpdepth_cli.pipeline.sweep.request import SweepRequest
 from pnpdepth_cli.pipeline.sweep.sweep import run_sweep
-from tests.pipeline.batches import Heard, add_frame, batch, pairs_on_disk, refinement, results
+from tests.pipeline.batches import (
+    RecordingListener,
+    add_frame,
+    batch,
+    pairs_on_disk,
+    refinement,
+    results,
+)
 from tests.pipeline.cluster.nodes import three_nodes
 
 pytest.importorskip("ray")
@@ -56,7 +63,7 @@ def root(frames: Path) -> Iterator[Path]:
     shutil.rmtree(frames / "out", ignore_errors=True)
 
 
-class Doing(Heard):
+class Doing(RecordingListener):
     """Does something at a row."""
 
     def __init__(self, number: int, what: Callable[[], Any]) -> None:
@@ -77,10 +84,10 @@ def states(output: Path) -> dict[str, str]:
 
 def test_results_equal_those_of_one_process_when_a_node_is_lost(cluster: Any, root: Path) -> None:
     lost = cluster.worker_nodes.copy().pop()
-    heard = Doing(2, lambda: cluster.remove_node(lost, allow_graceful=False))
-    outcome = batch(root, heard, cluster=ClusterOptions(ray=cluster.address), profile=True)
+    listener = Doing(2, lambda: cluster.remove_node(lost, allow_graceful=False))
+    outcome = batch(root, listener, cluster=ClusterOptions(ray=cluster.address), profile=True)
     cluster.add_node(num_cpus=1, node_ip_address="127.0.0.5")
-    assert sorted(heard.names) == list(NAMES)
+    assert sorted(listener.names) == list(NAMES)
     assert results(root / "out") == results(root / "plain")
     assert set(states(root / "out").values()) == {"done"}
     assert outcome.summary["counts"]["done"] == len(NAMES)
@@ -95,10 +102,10 @@ def test_a_frame_that_kills_its_worker_is_named_and_the_others_are_done(
     model = root / "net" / "my_net.py"
     start = "    def forward(self, rgb):\n"
     model.write_text(model.read_text().replace(start, start + DEADLY))
-    heard = Heard()
-    batch(root, heard, cluster=ClusterOptions(ray=cluster.address, ray_workers=2, retries=1))
-    rows = {row["name"]: row for row in heard.rows}
-    assert len(rows) == len(heard.rows) == 6
+    listener = RecordingListener()
+    batch(root, listener, cluster=ClusterOptions(ray=cluster.address, ray_workers=2, retries=1))
+    rows = {row["name"]: row for row in listener.rows}
+    assert len(rows) == len(listener.rows) == 6
     assert rows["bad"]["status"] == "failed"
     assert rows["bad"]["message"].startswith("its worker died 2 times")
     assert {row["status"] for name, row in rows.items() if name != "bad"} == {"done"}
@@ -107,9 +114,9 @@ def test_a_frame_that_kills_its_worker_is_named_and_the_others_are_done(
 def test_a_killed_driver_is_resumed(cluster: Any, root: Path) -> None:
     program = (
         "import sys; from pathlib import Path\n"
-        "from tests.pipeline.batches import Heard, batch\n"
+        "from tests.pipeline.batches import RecordingListener, batch\n"
         "from pnpdepth_cli.pipeline.cluster.options import ClusterOptions\n"
-        "class Telling(Heard):\n"
+        "class Telling(RecordingListener):\n"
         "    def frame(self, row): print(row['name'], flush=True)\n"
         "options = ClusterOptions(ray=sys.argv[2], ray_workers=1)\n"
         "batch(Path(sys.argv[1]), Telling(), cluster=options)\n"
@@ -124,9 +131,9 @@ def test_a_killed_driver_is_resumed(cluster: Any, root: Path) -> None:
     driver.wait()
     driver.stdout.close()
     assert states(root / "out")[first] == "done"
-    heard = Heard()
-    batch(root, heard)
-    assert first not in heard.names
+    listener = RecordingListener()
+    batch(root, listener)
+    assert first not in listener.names
     assert results(root / "out") == results(root / "plain")
 
 
@@ -151,17 +158,17 @@ def test_what_is_wrong_with_a_cluster_is_an_error(
 
 
 def test_a_stopped_batch_ends_with_the_pieces_that_are_begun(cluster: Any, root: Path) -> None:
-    heard = Heard()
+    listener = RecordingListener()
     outcome = batch(
         root,
-        heard,
-        stopped=lambda: bool(heard.rows),
+        listener,
+        stopped=lambda: bool(listener.rows),
         cluster=ClusterOptions(ray=cluster.address, ray_workers=1),
     )
     assert outcome.stopped
-    assert 1 <= len(heard.rows) < len(NAMES)
+    assert 1 <= len(listener.rows) < len(NAMES)
     begun = states(root / "out")
-    assert set(begun) == set(heard.names)
+    assert set(begun) == set(listener.names)
     assert set(begun.values()) == {"done"}
 
 
@@ -188,9 +195,9 @@ def test_a_sweep_equals_that_of_one_process(cluster: Any, root: Path) -> None:
     )  # fmt: skip
     tables = []
     for options in (ClusterOptions(), ClusterOptions(ray=cluster.address, ray_workers=2)):
-        heard = Heard()
-        run_sweep(replace(request, cluster=options), heard)
-        assert len(heard.rows) == heard.to_do > 0
+        listener = RecordingListener()
+        run_sweep(replace(request, cluster=options), listener)
+        assert len(listener.rows) == listener.to_do > 0
         tables.append([(root / "out" / name).read_bytes() for name in TABLES])
         shutil.rmtree(root / "out")
     assert tables[0] == tables[1]

@@ -4,10 +4,10 @@ from pnpdepth_cli.pipeline.cluster.pieces import Piece, Pieces, piece_size
 
 
 def handed_out(pieces: Pieces, wanted: int) -> list[list[int]]:
-    found = []
+    items = []
     while (piece := pieces.take(wanted)) is not None:
-        found.append(list(piece.items))
-    return found
+        items.append(list(piece.items))
+    return items
 
 
 def test_every_item_is_handed_out_once_in_order() -> None:

@@ -48,10 +48,10 @@ class Actor(Worker):
         return Facts(node="here", pid=0, versions=software(), unseen=())
 
     def __getattribute__(self, name: str) -> Any:
-        found = super().__getattribute__(name)
+        attribute = super().__getattribute__(name)
         if name not in ("facts", "open", "run", "call"):
-            return found
-        return SimpleNamespace(remote=lambda *arguments: Reference(self, found, arguments))
+            return attribute
+        return SimpleNamespace(remote=lambda *arguments: Reference(self, attribute, arguments))
 
 
 class Calls:
@@ -104,36 +104,40 @@ class DoublingJob:
         yield work
 
 
-def pool_of(workers: int, said: list[str], retries: int = 2) -> WorkerPool:
+def pool_of(workers: int, messages: list[str], retries: int = 2) -> WorkerPool:
     spread = spread_of("cpu", ClusterOptions(ray="auto", retries=retries))
     assert spread is not None
     calls: Any = Calls()
-    return WorkerPool(Cluster(ray=calls, workers=workers, resources={}), spread, (), said.append)
+    return WorkerPool(
+        Cluster(ray=calls, workers=workers, resources={}), spread, (), messages.append
+    )
 
 
-def results(job: DoublingJob, count: int, **given: Any) -> tuple[dict[int, Any], list[str]]:
-    said: list[str] = []
-    found = [pair for part in pool_of(3, said).results(job, range(count), **given) for pair in part]
-    assert len(found) == len(dict(found)), "an item was done twice"
-    return dict(found), said
+def results(job: DoublingJob, count: int, **options: Any) -> tuple[dict[int, Any], list[str]]:
+    messages: list[str] = []
+    pairs = [
+        pair for part in pool_of(3, messages).results(job, range(count), **options) for pair in part
+    ]
+    assert len(pairs) == len(dict(pairs)), "an item was done twice"
+    return dict(pairs), messages
 
 
 def test_every_item_has_its_result() -> None:
     begun: list[int] = []
-    found, said = results(DoublingJob(), 40, begin=begun.extend)
-    assert found == {item: 2 * item for item in range(40)}
+    pairs, messages = results(DoublingJob(), 40, begin=begun.extend)
+    assert pairs == {item: 2 * item for item in range(40)}
     assert sorted(begun) == list(range(40))
-    assert said == []
+    assert messages == []
 
 
 def test_an_item_that_kills_its_workers_is_lost_and_no_other() -> None:
-    found, said = results(DoublingJob(deadly=[17]), 40)
-    lost = found.pop(17)
+    pairs, messages = results(DoublingJob(deadly=[17]), 40)
+    lost = pairs.pop(17)
     assert isinstance(lost, Lost)
     assert lost.message.startswith("its worker died 3 times")
-    assert found == {item: 2 * item for item in range(40) if item != 17}
-    assert 3 <= len(said) <= 9
-    assert "another is started" in said[0]
+    assert pairs == {item: 2 * item for item in range(40) if item != 17}
+    assert 3 <= len(messages) <= 9
+    assert "another is started" in messages[0]
 
 
 def test_an_error_of_the_settings_ends_the_run_if_nothing_was_done_before() -> None:
@@ -163,6 +167,6 @@ def test_workers_that_die_at_once_end_the_run(monkeypatch: pytest.MonkeyPatch) -
 
 def test_nothing_is_handed_out_once_stopped() -> None:
     begun: list[int] = []
-    found, _ = results(DoublingJob(), 1000, begin=begun.extend, stopped=lambda: len(begun) > 3)
-    assert 3 < len(found) < 1000
-    assert sorted(found) == sorted(begun)
+    pairs, _ = results(DoublingJob(), 1000, begin=begun.extend, stopped=lambda: len(begun) > 3)
+    assert 3 < len(pairs) < 1000
+    assert sorted(pairs) == sorted(begun)

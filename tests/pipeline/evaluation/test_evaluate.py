@@ -257,7 +257,7 @@ def test_an_empty_frame_counts_in_the_development_kit(tmp_path: Path) -> None:
     assert math.isnan(result.mean["log_mae"])
 
 
-def test_few_groups_of_frames_have_no_interval_and_say_so(tmp_path: Path) -> None:
+def test_few_groups_of_frames_have_no_interval_but_a_note(tmp_path: Path) -> None:
     for drive in ("a", "b"):
         for number in range(4):
             depth_file(tmp_path / "out" / drive / f"{number:04}_depth.npy", [[2 + number]])

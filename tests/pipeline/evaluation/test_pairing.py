@@ -47,7 +47,7 @@ NAMES = [
 
 
 @pytest.mark.parametrize(("stem", "name"), NAMES)
-def test_a_stem_says_which_frame_it_is_of(stem: str, name: str) -> None:
+def test_a_stem_names_its_frame(stem: str, name: str) -> None:
     assert frame_name(stem) == name
 
 

@@ -85,7 +85,7 @@ def test_unset_fields_stay_as_published() -> None:
     assert changed == replace(PROTOCOLS["eigen"], max_depth=50.0)
 
 
-def test_the_description_says_what_is_scored_and_whether_it_was_changed() -> None:
+def test_the_description_states_what_is_scored_and_whether_it_was_changed() -> None:
     assert PROTOCOLS["eigen"].describe() == (
         "eigen: all known ground truth in 0.001–80 m, crop eigen, predictions clipped to the same"
         " range, empty predictions scored as the lower bound, δ below 1.25, 1.5625, 1.95312,"

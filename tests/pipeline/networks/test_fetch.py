@@ -33,11 +33,11 @@ class Server(ThreadingHTTPServer):
     sent: dict[str, bytes]
     cut: bool
     redirect: str | None
-    asked: list[str]
+    requested: list[str]
 
     def __init__(self) -> None:
         super().__init__(("127.0.0.1", 0), Handler)
-        self.sent, self.cut, self.redirect, self.asked = dict(FILES), False, None, []
+        self.sent, self.cut, self.redirect, self.requested = dict(FILES), False, None, []
 
     @property
     def url(self) -> str:
@@ -58,7 +58,7 @@ class Handler(BaseHTTPRequestHandler):
     server: Server
 
     def do_GET(self) -> None:
-        self.server.asked.append(self.path)
+        self.server.requested.append(self.path)
         if self.path.startswith("/api/models/"):
             siblings = [entry(name, data) for name, data in FILES.items()]
             info = {"id": "org/name", "sha": COMMIT, "siblings": siblings, "tags": []}
@@ -92,17 +92,17 @@ class Handler(BaseHTTPRequestHandler):
 def server(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Server]:
     from huggingface_hub import constants
 
-    with Server() as made:
+    with Server() as server:
         template = constants.HUGGINGFACE_CO_URL_TEMPLATE
         path = template.removeprefix(constants.ENDPOINT)
-        monkeypatch.setattr(constants, "ENDPOINT", made.url)
-        monkeypatch.setattr(constants, "HUGGINGFACE_CO_URL_TEMPLATE", made.url + path)
+        monkeypatch.setattr(constants, "ENDPOINT", server.url)
+        monkeypatch.setattr(constants, "HUGGINGFACE_CO_URL_TEMPLATE", server.url + path)
         monkeypatch.setattr("time.sleep", lambda _: None)
         monkeypatch.chdir(tmp_path)
-        thread = threading.Thread(target=made.serve_forever, daemon=True)
+        thread = threading.Thread(target=server.serve_forever, daemon=True)
         thread.start()
-        yield made
-        made.shutdown()
+        yield server
+        server.shutdown()
 
 
 def failed(capsys: pytest.CaptureFixture[str]) -> str:
@@ -158,7 +158,7 @@ def test_a_redirect_in_a_circle_is_refused(
 ) -> None:
     server.redirect = f"{server.url}/org/name/resolve/{COMMIT}/config.json"
     assert "cannot be fetched" in failed(capsys)
-    assert len(server.asked) < 100
+    assert len(server.requested) < 100
 
 
 def test_a_redirect_to_another_kind_of_address_reads_no_local_file(

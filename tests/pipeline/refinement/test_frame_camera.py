@@ -20,14 +20,9 @@ from pnpdepth_cli.pipeline.sparse.scan_options import ScanOptions
 from pnpdepth_cli.sensors.camera import Camera
 from pnpdepth_cli.sensors.cloud import depth_edges
 from tests.colmap_models import HEIGHT, WIDTH, write_text_model
-from tests.pipeline.batches import Heard, batch, pairs_on_disk
+from tests.pipeline.batches import RecordingListener, batch, pairs_on_disk
 from tests.pipeline.frames import FrameOnDisk, frame_on_disk, run
 from tests.pipeline.scan_frames import FOCAL_PX, scan_on_disk
-
-
-@pytest.fixture
-def frame(tmp_path: Path) -> FrameOnDisk:
-    return frame_on_disk(tmp_path)
 
 
 def points_of(path: Path) -> np.ndarray:
@@ -155,19 +150,19 @@ def test_a_batch_writes_a_cloud_of_each_frame_and_a_lost_one_again(tmp_path: Pat
     root = pairs_on_disk(tmp_path, ("a", "b"))
     (root / "calib.txt").write_text("K: [50, 0, 30, 0, 50, 20, 0, 0, 1]\n")
     batch(root)
-    heard = Heard()
-    batch(root, heard, refine={"ply": True})
-    assert heard.names == ["a", "b"]
+    listener = RecordingListener()
+    batch(root, listener, refine={"ply": True})
+    assert listener.names == ["a", "b"]
     (root / "out/b.ply").unlink()
-    heard = Heard()
-    batch(root, heard, refine={"ply": True})
-    assert heard.names == ["b"]
-    assert heard.rows[0]["outputs"]["cloud"] == "b.ply"
+    listener = RecordingListener()
+    batch(root, listener, refine={"ply": True})
+    assert listener.names == ["b"]
+    assert listener.rows[0]["outputs"]["cloud"] == "b.ply"
     assert len(points_of(root / "out/b.ply")) > 100
     (root / "calib.txt").write_text("K: [60, 0, 30, 0, 60, 20, 0, 0, 1]\n")
-    heard = Heard()
-    batch(root, heard, refine={"ply": True})
-    assert heard.names == ["a", "b"]
+    listener = RecordingListener()
+    batch(root, listener, refine={"ply": True})
+    assert listener.names == ["a", "b"]
 
 
 def test_a_batch_without_a_camera_ends_before_the_first_frame(tmp_path: Path) -> None:

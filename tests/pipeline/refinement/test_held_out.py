@@ -20,15 +20,10 @@ from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.models.definition import InputKind
 from pnpdepth_cli.models.network import Network, load_network
 from pnpdepth_cli.pipeline.refinement import held_out
-from tests.pipeline.batches import NAMES, Heard, batch, pairs_on_disk, results, times
-from tests.pipeline.frames import FrameOnDisk, frame_on_disk, run
+from tests.pipeline.batches import NAMES, RecordingListener, batch, pairs_on_disk, results, times
+from tests.pipeline.frames import FrameOnDisk, run
 
 CONFIG = RefinementConfig(layer="middle", settings=RefineSettings(iterations=3))
-
-
-@pytest.fixture
-def frame(tmp_path: Path) -> FrameOnDisk:
-    return frame_on_disk(tmp_path)
 
 
 @pytest.fixture
@@ -45,7 +40,7 @@ def network(frame: FrameOnDisk) -> Network:
         ("rgb", 0.3, False),
     ],
 )
-def test_of_a_network_that_takes_the_points_it_is_said_what_holding_some_out_does_to_it(
+def test_a_network_that_takes_the_points_gets_a_note_on_held_out_points(
     frame: FrameOnDisk, network: Network, kind: InputKind, network_m: float, warned: bool
 ) -> None:
     scored = [ScoredCandidate(candidate=Candidate(baseline=name), error=0.2) for name in BASELINES]
@@ -76,29 +71,29 @@ def test_the_networks_error_is_that_of_the_network_alone(frame: FrameOnDisk) -> 
 
 
 @pytest.mark.parametrize(
-    ("asked", "tried"), [(None, {"none", "gp"}), ("gp", {"none", "gp"}),
+    ("propagation", "tried"), [(None, {"none", "gp"}), ("gp", {"none", "gp"}),
                          ("none", {"none"})],
 )  # fmt: skip
 def test_with_auto_only_the_propagation_that_is_asked_for_competes(
-    frame: FrameOnDisk, asked: str | None, tried: set[str]
+    frame: FrameOnDisk, propagation: str | None, tried: set[str]
 ) -> None:
-    record = run(frame, auto=True, propagate=asked).record
+    record = run(frame, auto=True, propagate=propagation).record
     assert {each.get("propagate", "none") for each in record["auto"]["tried"]} == tried
-    assert record["settings"]["propagate"] == asked
+    assert record["settings"]["propagate"] == propagation
 
 
-def test_the_record_says_what_was_chosen_and_everything_that_was_tried(frame: FrameOnDisk) -> None:
+def test_the_record_has_the_choice_and_every_candidate(frame: FrameOnDisk) -> None:
     record = run(frame, auto=True, gt=frame.gt).record
-    made = record["auto"]
-    assert abs(sum(each["weight"] for each in made["chosen"]) - 1) < 1e-9
-    errors = [each["held_out_mae"] for each in made["tried"]]
+    choice = record["auto"]
+    assert abs(sum(each["weight"] for each in choice["chosen"]) - 1) < 1e-9
+    errors = [each["held_out_mae"] for each in choice["tried"]]
     assert errors == sorted(errors)
-    limit = min(each["held_out_mae"] for each in made["tried"] if "baseline" in each)
-    assert made["held_out_mae"] <= limit + 1e-6
-    assert made["held_out_points"] == 60
+    limit = min(each["held_out_mae"] for each in choice["tried"] if "baseline" in each)
+    assert choice["held_out_mae"] <= limit + 1e-6
+    assert choice["held_out_points"] == 60
     assert any(note.startswith("choice: ") for note in record["notes"])
     saved = json.loads((frame.folder / "out" / "img.json").read_text())
-    assert saved["auto"] == json.loads(json.dumps(made))
+    assert saved["auto"] == json.loads(json.dumps(choice))
 
 
 def test_without_options_of_the_method_it_is_chosen_by_held_out_points(
@@ -114,7 +109,7 @@ def test_without_options_of_the_method_it_is_chosen_by_held_out_points(
 
 
 @pytest.mark.parametrize(
-    ("asked", "why"),
+    ("options", "why"),
     [
         ({"iterations": 2}, "--iterations"),
         ({"layer": "encode"}, "--layer"),
@@ -123,14 +118,14 @@ def test_without_options_of_the_method_it_is_chosen_by_held_out_points(
     ],
 )
 def test_an_option_of_the_method_fixes_it(
-    frame: FrameOnDisk, asked: dict[str, Any], why: str
+    frame: FrameOnDisk, options: dict[str, Any], why: str
 ) -> None:
-    record = run(frame, **({"propagate": None} | asked)).record
+    record = run(frame, **({"propagate": None} | options)).record
     assert record["method"] == {"kind": "fixed", "why": why, "networks": ["tiny"]}
     assert record["auto"] is None
     settings = record["settings"]
-    assert {name: settings[name] for name in asked if name != "preset"} == {
-        name: value for name, value in asked.items() if name != "preset"
+    assert {name: settings[name] for name in options if name != "preset"} == {
+        name: value for name, value in options.items() if name != "preset"
     }
 
 
@@ -181,14 +176,14 @@ def test_the_same_request_gives_the_same_bytes(frame: FrameOnDisk) -> None:
 
 
 def test_baselines_are_scored_at_held_out_points_and_against_the_truth(frame: FrameOnDisk) -> None:
-    found = run(frame, baselines=True, gt=frame.gt).record["baselines"]
-    assert set(found) == {*BASELINES, "network", "result"}
-    for row in found.values():
+    baselines = run(frame, baselines=True, gt=frame.gt).record["baselines"]
+    assert set(baselines) == {*BASELINES, "network", "result"}
+    for row in baselines.values():
         assert row["held_out_mae"] > 0
         assert row["scores"]["mae"] > 0
     plain = run(frame, gt=frame.gt, output=frame.folder / "plain").record["scores"]
-    assert found["result"]["scores"]["mae"] == plain["after"]["mae"]  # nothing else has changed
-    assert found["network"]["scores"]["mae"] == plain["before"]["mae"]
+    assert baselines["result"]["scores"]["mae"] == plain["after"]["mae"]  # nothing else has changed
+    assert baselines["network"]["scores"]["mae"] == plain["before"]["mae"]
 
 
 def test_the_standard_deviation_is_positive_and_in_a_file_of_its_own(frame: FrameOnDisk) -> None:
@@ -213,14 +208,14 @@ def test_propagation_follows_refinement(frame: FrameOnDisk) -> None:
 
 def test_a_batch_finds_its_ways_on_a_few_frames_and_checks_them_on_each(tmp_path: Path) -> None:
     root = pairs_on_disk(tmp_path / "drive")
-    heard = Heard()
-    batch(root, heard, refine={"auto": True})
-    (said,) = [text for text in heard.said if text.startswith("choice: ")]
-    found = said.partition(": best on ")[2].partition(": ")[2].split("; ")
+    listener = RecordingListener()
+    batch(root, listener, refine={"auto": True})
+    (note,) = [text for text in listener.messages if text.startswith("choice: ")]
+    candidates = note.partition(": best on ")[2].partition(": ")[2].split("; ")
     for name in NAMES:
-        made = json.loads((root / "out" / f"{name}.json").read_text())["auto"]
-        tried = {each["candidate"] for each in made["tried"]}
-        assert set(found) <= tried
+        choice = json.loads((root / "out" / f"{name}.json").read_text())["auto"]
+        tried = {each["candidate"] for each in choice["tried"]}
+        assert set(candidates) <= tried
         assert {*BASELINES, "tiny aligned (auto)"} <= tried
     before = times(root / "out")
     batch(root, refine={"auto": True})
@@ -233,11 +228,11 @@ def test_a_frame_that_no_way_can_be_found_on_does_not_stop_a_batch(
     root = pairs_on_disk(tmp_path / "drive")
     whole, calls = held_out.refine_automatically, []
 
-    def failing_first(*given: Any, **options: Any) -> Any:
+    def failing_first(*arguments: Any, **options: Any) -> Any:
         calls.append(None)
         if len(calls) == 1:
             raise ModelError("no way")
-        return whole(*given, **options)
+        return whole(*arguments, **options)
 
     monkeypatch.setattr(held_out, "refine_automatically", failing_first)
     batch(root, refine={"auto": True})

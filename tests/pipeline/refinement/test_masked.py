@@ -2,33 +2,26 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 import torch
 
 from pnpdepth_cli import Refiner, load_network
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.io.depth import read_depth
-from pnpdepth_cli.models.definition import MASKED_DEFAULTS, MASKED_DENSE_DEFAULTS
+from pnpdepth_cli.models.definition import MASKED_DEFAULTS, WEIGHTS_DENSE_DEFAULTS
 from pnpdepth_cli.pipeline.refinement.request import HoldOut, MethodOptions
 from pnpdepth_cli.pipeline.refinement.resolve import resolve_settings
 from tests.core.split.test_split import same, state_of
-from tests.pipeline.frames import FrameOnDisk, frame_on_disk, run
+from tests.pipeline.frames import FrameOnDisk, run
 
 MASKED = {"model": "compact", "checkpoint": None, "target": "masked", "iterations": 3}
-
-
-@pytest.fixture
-def frame(tmp_path: Path) -> FrameOnDisk:
-    return frame_on_disk(tmp_path)
 
 
 def depth_bytes(frame: FrameOnDisk) -> bytes:
     return (frame.folder / "out" / "img_depth.png").read_bytes()
 
 
-def test_masked_points_change_the_depth_and_the_record_says_how(frame: FrameOnDisk) -> None:
+def test_masked_points_change_the_depth_and_are_recorded(frame: FrameOnDisk) -> None:
     record = run(frame, gt=frame.gt, **MASKED).record
     settings = record["settings"]
     assert (settings["target"], settings["parameters"]) == ("masked", "weights")
@@ -68,7 +61,7 @@ def test_a_network_of_images_moves_weights_behind_the_cut_by_all_points(
     record = run(frame, parameters=parameters, lr="0.01").record
     assert record["settings"]["layer"] == "middle"
     assert record["loss"][-1] < record["loss"][0]
-    assert len(record["loss"]) == MASKED_DENSE_DEFAULTS.iterations
+    assert len(record["loss"]) == WEIGHTS_DENSE_DEFAULTS.iterations
 
 
 def test_a_network_is_as_before_after_the_refiner_closes(frame: FrameOnDisk) -> None:
@@ -110,8 +103,19 @@ def test_dense_points_have_defaults_of_their_own(frame: FrameOnDisk) -> None:
     definition = load_network("compact").definition
     method = MethodOptions(target="masked")
     settings = resolve_settings(definition, method, dense=True)
-    assert (settings.iterations, settings.lr, settings.mask.scale) == (8, 2e-4, 0.5)
-    assert run(frame, **MASKED | {"iterations": None}).record["settings"]["lr"] == 2e-4
+    assert (settings.iterations, settings.lr, settings.mask.scale) == (6, 3e-4, 0.5)
+    assert run(frame, **MASKED | {"iterations": None}).record["settings"]["lr"] == 3e-4
+
+
+@pytest.mark.parametrize(("dense", "expected"), [(False, (16, 5e-4)), (True, (8, 2e-4))])
+def test_weights_moved_by_given_points_keep_their_defaults(
+    dense: bool, expected: tuple[int, float]
+) -> None:
+    definition = load_network("compact").definition
+    settings = resolve_settings(definition, MethodOptions(parameters="weights"), dense=dense)
+    assert (settings.iterations, settings.lr) == expected
+    assert (settings.update, settings.schedule, settings.loss) == ("adam", "cosine", "log")
+    assert (settings.target, settings.mask.scale) == ("given", 1.0)
 
 
 def test_seed_and_budget_reach_the_settings() -> None:

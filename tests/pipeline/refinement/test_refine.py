@@ -22,12 +22,7 @@ from pnpdepth_cli.errors import (
 )
 from pnpdepth_cli.io.depth import read_depth, write_depth
 from pnpdepth_cli.models.network import load_network
-from tests.pipeline.frames import FrameOnDisk, frame_on_disk, run
-
-
-@pytest.fixture
-def frame(tmp_path: Path) -> FrameOnDisk:
-    return frame_on_disk(tmp_path)
+from tests.pipeline.frames import FrameOnDisk, run
 
 
 def files(folder: Path) -> set[str]:
@@ -159,7 +154,7 @@ def test_of_a_result_that_cannot_be_written_whole_nothing_stays(
     assert not list((frame.folder / "out").iterdir())
 
 
-def test_the_record_says_every_setting_that_changes_the_depth(frame: FrameOnDisk) -> None:
+def test_the_record_has_every_setting_that_changes_the_depth(frame: FrameOnDisk) -> None:
     plain = run(frame).record["settings"]
     for name, value in (("propagate", "gp"), ("output_kind", "inverse"), ("normalise", "bytes")):
         other = run(frame, overwrite=True, **{name: value}).record["settings"]
@@ -197,7 +192,7 @@ def test_one_point_is_enough(frame: FrameOnDisk) -> None:
     assert record["sparse_error"]["after"]["mae"] < record["sparse_error"]["before"]["mae"]
 
 
-def test_a_divergence_writes_the_last_good_depth_and_says_so(frame: FrameOnDisk) -> None:
+def test_a_divergence_writes_the_last_good_depth_and_is_reported(frame: FrameOnDisk) -> None:
     model = frame.folder / "bad.py"
     text = frame.model.read_text().replace(
         "2 + 3 * self.decode(torch.tanh(self.middle(self.encode(rgb))))",
@@ -253,12 +248,12 @@ BAD = [
 ]
 
 
-@pytest.mark.parametrize(("changes", "error", "said"), BAD)
+@pytest.mark.parametrize(("changes", "error", "message"), BAD)
 def test_a_mistake_gives_one_clear_line_and_writes_nothing(
-    frame: FrameOnDisk, changes: dict[str, Any], error: type[PnpDepthError], said: str
+    frame: FrameOnDisk, changes: dict[str, Any], error: type[PnpDepthError], message: str
 ) -> None:
     before = files(frame.folder)
-    with pytest.raises(error, match=said) as caught:
+    with pytest.raises(error, match=message) as caught:
         run(frame, **changes)
     assert "\n" not in str(caught.value)
     assert files(frame.folder) == before

@@ -12,14 +12,23 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from pnpdepth_cli.choices import COLORS
 from pnpdepth_cli.errors import OutputError, StorageError
+from pnpdepth_cli.io.colours import paint_gain
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.io.page import open_page
 from pnpdepth_cli.pipeline.batch.batch import plan_batch
 from pnpdepth_cli.pipeline.batch.request import BatchRequest
 from pnpdepth_cli.pipeline.report import batch as report_batch
-from tests.pipeline.batches import NAMES, Heard, add_frame, batch, pairs_on_disk, refinement
-from tests.pipeline.report_pages import everything, frames_of, page_data, pictures_of
+from tests.pipeline.batches import (
+    NAMES,
+    RecordingListener,
+    add_frame,
+    batch,
+    pairs_on_disk,
+    refinement,
+)
+from tests.pipeline.report_pages import everything, frames_of, images_of, page_data
 
 _VIEWS = {"first", "second", "map", "image", "sparse", "thumb", "map_thumb"}
 
@@ -38,7 +47,7 @@ def test_every_frame_is_on_the_page_with_its_images(root: Path, report: Path) ->
     batch(root, html=report)
     frames = frames_of(report)
     assert tuple(frames) == NAMES
-    images = pictures_of(report)
+    images = images_of(report)
     for frame in frames.values():
         assert {n.partition("_")[2][:-4] for n in images if n.startswith(frame["key"])} == _VIEWS
         assert {*frame["views"], "thumb", "map_thumb"} == _VIEWS
@@ -64,7 +73,7 @@ def test_gains_are_those_of_depth_against_ground_truth(root: Path, report: Path)
 
 def test_the_images_are_the_panels_of_the_files_on_disk(root: Path, report: Path) -> None:
     batch(root, html=report)
-    frame, images = frames_of(report)["c"], pictures_of(report)
+    frame, images = frames_of(report)["c"], images_of(report)
     preview, improvement = (
         open_page(root / f"out/c_{kind}.png") for kind in ("preview", "improvement")
     )
@@ -83,9 +92,9 @@ def test_the_images_are_the_panels_of_the_files_on_disk(root: Path, report: Path
 
 def test_frames_of_an_earlier_run_without_a_report_are_in_it(root: Path, report: Path) -> None:
     batch(root, limit=2)
-    watcher = Heard()
-    batch(root, watcher, html=report)
-    assert watcher.names == ["c", "d"]
+    listener = RecordingListener()
+    batch(root, listener, html=report)
+    assert listener.names == ["c", "d"]
     resumed = everything(report)
     shutil.rmtree(report)
     shutil.rmtree(root / "out")
@@ -96,10 +105,10 @@ def test_frames_of_an_earlier_run_without_a_report_are_in_it(root: Path, report:
 def test_a_second_run_writes_the_same_page_and_draws_nothing(root: Path, report: Path) -> None:
     batch(root, html=report)
     before = everything(report)
-    drawn = {p: p.stat().st_mtime_ns for p in (report / "pictures").iterdir()}
+    drawn = {p: p.stat().st_mtime_ns for p in (report / "images").iterdir()}
     batch(root, html=report)
     assert before == everything(report)
-    assert drawn == {p: p.stat().st_mtime_ns for p in (report / "pictures").iterdir()}
+    assert drawn == {p: p.stat().st_mtime_ns for p in (report / "images").iterdir()}
 
 
 def test_a_frame_that_is_redone_has_new_images_and_the_old_ones_go(
@@ -111,14 +120,14 @@ def test_a_frame_that_is_redone_has_new_images_and_the_old_ones_go(
     batch(root, html=report)
     after = frames_of(report)
     assert {name for name in NAMES if before[name]["key"] != after[name]["key"]} == {"a"}
-    assert not [name for name in pictures_of(report) if name.startswith(before["a"]["key"])]
-    assert len(pictures_of(report)) == len(NAMES) * len(_VIEWS)
+    assert not [name for name in images_of(report) if name.startswith(before["a"]["key"])]
+    assert len(images_of(report)) == len(NAMES) * len(_VIEWS)
 
 
 def test_a_image_that_is_missing_is_drawn_again(root: Path, report: Path) -> None:
     batch(root, html=report)
     before = everything(report)
-    (report / "pictures" / f"{frames_of(report)['b']['key']}_map.jpg").unlink()
+    (report / "images" / f"{frames_of(report)['b']['key']}_map.jpg").unlink()
     batch(root, html=report)
     assert before == everything(report)
 
@@ -212,7 +221,7 @@ def test_the_shard_that_ends_last_reports_all_frames(root: Path, report: Path) -
     assert list(frames_of(report)) == ["a", "c"]
     batch(root, html=report, shard=(2, 2))
     assert tuple(frames_of(report)) == NAMES
-    assert len(pictures_of(report)) == len(NAMES) * len(_VIEWS)
+    assert len(images_of(report)) == len(NAMES) * len(_VIEWS)
 
 
 def test_unusual_frame_names_reach_the_page_unchanged(root: Path, report: Path) -> None:
@@ -292,11 +301,21 @@ def test_a_disk_that_is_full_while_drawing_ends_the_run_and_the_next_one_goes_on
     with pytest.raises(StorageError):
         batch(root, html=report)
     assert not (report / "index.html").exists()
-    (report / "pictures" / ".0123456789ab.jpg").write_bytes(b"half")
-    watcher = Heard()
-    batch(root, watcher, html=report)
-    assert watcher.said[1].startswith("removed 1 half-written files")
+    (report / "images" / ".0123456789ab.jpg").write_bytes(b"half")
+    listener = RecordingListener()
+    batch(root, listener, html=report)
+    assert listener.messages[1].startswith("removed 1 half-written files")
     resumed = everything(report)
     shutil.rmtree(report)
     batch(root, html=report)
     assert resumed == everything(report)
+
+
+@pytest.mark.parametrize("colors", COLORS)
+def test_the_legend_has_the_colours_of_the_improvement_maps(
+    root: Path, report: Path, colors: str
+) -> None:
+    batch(root, html=report, refine={"colors": colors})
+    worse, better = (paint_gain(np.array(s), np.array(0.88), colors) for s in (-1.0, 1.0))
+    shown = page_data(report)["map_colours"]
+    assert [shown[0], shown[-1]] == ["#" + bytes(each).hex() for each in (worse, better)]

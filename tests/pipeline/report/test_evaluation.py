@@ -18,7 +18,7 @@ from pnpdepth_cli.pipeline.evaluation.evaluate import evaluate
 from pnpdepth_cli.pipeline.evaluation.result import EvalRequest, Evaluation
 from pnpdepth_cli.pipeline.report.evaluation import write_eval_report
 from tests.io.test_atomic import no_room_on_disk
-from tests.pipeline.report_pages import everything, frames_of, page_data, pictures_of
+from tests.pipeline.report_pages import everything, frames_of, images_of, page_data
 
 NAMES = ("a", "b <i>", "c\nd")
 
@@ -42,7 +42,7 @@ def reported(root: Path, **options: Any) -> Evaluation:
 
 def panel(root: Path, name: str, view: str) -> np.ndarray:
     key = frames_of(root / "report")[name]["key"]
-    data = pictures_of(root / "report")[f"{key}_{view}.jpg"]
+    data = images_of(root / "report")[f"{key}_{view}.jpg"]
     return np.asarray(Image.open(io.BytesIO(data))).astype(int)
 
 
@@ -184,9 +184,9 @@ def test_a_file_that_goes_after_scoring_costs_one_frame_its_images(root: Path) -
 
 def test_the_same_evaluation_gives_the_same_bytes(root: Path) -> None:
     reported(root, workers=1)
-    first = pictures_of(root / "report"), (root / "report/index.html").read_bytes()
+    first = images_of(root / "report"), (root / "report/index.html").read_bytes()
     reported(root, workers=3)
-    assert first == (pictures_of(root / "report"), (root / "report/index.html").read_bytes())
+    assert first == (images_of(root / "report"), (root / "report/index.html").read_bytes())
 
 
 def test_a_full_disk_leaves_no_report(root: Path) -> None:
@@ -209,7 +209,7 @@ def test_a_full_disk_leaves_the_report_of_before(root: Path) -> None:
     assert after["index.html"] != before["index.html"]
 
 
-def test_a_new_report_removes_the_pictures_of_frames_that_are_gone(root: Path) -> None:
+def test_a_new_report_removes_the_images_of_frames_that_are_gone(root: Path) -> None:
     reported(root)
     before = everything(root / "report")
     (root / "gt" / "a.npy").unlink()

@@ -27,11 +27,11 @@ from tests.pipeline.frames import frame_on_disk
 KINDS = ("ros1.bag", "ros2", "drive.mcap")
 
 
-def written(bag: Path, folder: Path, **given: object) -> list[str]:
+def written(bag: Path, folder: Path, **options: object) -> list[str]:
     """What was said while the frames of a bag were written."""
-    said: list[str] = []
-    write_frames(FramesRequest(bag=bag, output=folder, **given), said.append)  # type: ignore[arg-type]
-    return said
+    messages: list[str] = []
+    write_frames(FramesRequest(bag=bag, output=folder, **options), messages.append)  # type: ignore[arg-type]
+    return messages
 
 
 @pytest.mark.parametrize("compressed", [False, True])
@@ -40,9 +40,9 @@ def test_a_bag_becomes_frames_with_a_calibration(
     kind: str, compressed: bool, tmp_path: Path
 ) -> None:
     bag = write_bag(tmp_path / kind, compressed=compressed)
-    said = written(bag, tmp_path / "frames")
+    messages = written(bag, tmp_path / "frames")
     topic = f"{IMAGES}/compressed" if compressed else IMAGES
-    assert said[0] == f"topics: images of {topic}, points of {POINTS}"
+    assert messages[0] == f"topics: images of {topic}, points of {POINTS}"
     frames = read_frames(tmp_path / "frames")
     assert [frame.name for frame in frames] == [f"1700000000_0{n}0000" for n in (0, 3, 6)]
     pixels = read_rgb(frames[1].image).values  # type: ignore[arg-type]
@@ -92,13 +92,13 @@ def test_several_topics_are_listed_and_one_can_be_named(tmp_path: Path) -> None:
     assert len(written(bag, tmp_path / "frames", options=named)) == 2
 
 
-def test_a_bag_without_calibration_says_what_is_missing(tmp_path: Path) -> None:
+def test_a_bag_without_calibration_gets_a_note_that_names_it(tmp_path: Path) -> None:
     bag = write_bag(tmp_path / "a.mcap", static=False)
-    said = written(bag, tmp_path / "a")
-    assert "no static transform from camera to lidar; refine with --extrinsics" in said[-1]
+    messages = written(bag, tmp_path / "a")
+    assert "no static transform from camera to lidar; refine with --extrinsics" in messages[-1]
     assert not read_calibration(tmp_path / "a" / "calib.txt").has_pose
-    said = written(write_bag(tmp_path / "b.mcap", info=False), tmp_path / "b")
-    assert "has no camera_info of /front/image_raw; refine with --calib" in said[-1]
+    messages = written(write_bag(tmp_path / "b.mcap", info=False), tmp_path / "b")
+    assert "has no camera_info of /front/image_raw; refine with --calib" in messages[-1]
 
 
 def test_images_without_a_scan_in_time_are_counted(tmp_path: Path) -> None:

@@ -83,7 +83,7 @@ def test_points_of_a_real_model_project_onto_their_keypoints() -> None:
         assert off.max() < 0.01
 
 
-def test_depth_is_in_model_units_and_every_output_says_so(tmp_path: Path, project: Path) -> None:
+def test_depth_is_in_model_units_in_every_output(tmp_path: Path, project: Path) -> None:
     record = refine(frame_on_disk(tmp_path), project)
     assert record["unit"] == "model units"
     assert 3.4 < record["points"]["nearest"] < record["points"]["farthest"] < 4.6

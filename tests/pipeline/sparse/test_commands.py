@@ -45,7 +45,7 @@ def projecting(frame: ScanOnDisk, output: str = "sparse.csv", **more: object) ->
 def test_a_projected_scan_lands_where_it_was_made_to(frame: ScanOnDisk) -> None:
     record = project_scan(projecting(frame))
     got = read_sparse(frame.folder / "sparse.csv", size=(60, 100)).points
-    np.testing.assert_allclose(got.xy, frame.places, atol=1e-3)
+    np.testing.assert_allclose(got.xy, frame.xy, atol=1e-3)
     np.testing.assert_allclose(got.depth, frame.depth, atol=1e-4)
     assert record["points"]["count"] == 150
     assert json.loads((frame.folder / "sparse.json").read_text()) == json.loads(json.dumps(record))
@@ -55,7 +55,7 @@ def test_a_projected_scan_lands_where_it_was_made_to(frame: ScanOnDisk) -> None:
 def test_every_depth_format_holds_the_same_points(frame: ScanOnDisk, suffix: str) -> None:
     project_scan(projecting(frame, f"sparse{suffix}"))
     got = read_depth(frame.folder / f"sparse{suffix}").values
-    column, row = np.floor(frame.places + 0.5).astype(int).T
+    column, row = np.floor(frame.xy + 0.5).astype(int).T
     want = np.zeros((48, 64))
     want[row, column] = frame.depth
     np.testing.assert_allclose(got, want, atol=0.002 if suffix == ".png" else 1e-4)
@@ -79,11 +79,11 @@ def test_the_size_comes_from_image_option_or_calibration(frame: ScanOnDisk) -> N
     assert by_option["points"] == by_file["points"]
 
 
-def refused(frame: ScanOnDisk, error: type[PnpDepthError], said: str, **more: object) -> None:
+def refused(frame: ScanOnDisk, error: type[PnpDepthError], message: str, **more: object) -> None:
     before = sorted(frame.folder.rglob("*"))
     with pytest.raises(error) as caught:
         project_scan(projecting(frame, **more))  # type: ignore[arg-type]
-    assert said in str(caught.value)
+    assert message in str(caught.value)
     assert "\n" not in str(caught.value)
     assert sorted(frame.folder.rglob("*")) == before
 
@@ -104,7 +104,7 @@ def test_bad_input_is_refused_in_one_line_and_nothing_is_written(frame: ScanOnDi
     refused(frame, NoPointsError, "150 behind the camera", scan=cut)
 
 
-def test_a_picture_of_another_camera_is_noticed(frame: ScanOnDisk) -> None:
+def test_an_image_of_another_camera_is_an_error_or_gets_a_warning(frame: ScanOnDisk) -> None:
     small = frame.folder / "small.png"
     Image.new("RGB", (20, 15)).save(small)
     refused(frame, SizeError, "small.png is 20×15, which does not contain", image=small)
@@ -122,7 +122,7 @@ def test_a_calibration_without_a_scanner_is_refused(frame: ScanOnDisk) -> None:
     refused(frame, UsageError, "has no pose of the scanner")
 
 
-def test_results_are_replaced_only_when_that_is_said(frame: ScanOnDisk) -> None:
+def test_results_are_replaced_only_with_overwrite(frame: ScanOnDisk) -> None:
     project_scan(projecting(frame))
     refused(frame, OutputError, "exists; --overwrite")
     target = SparseTarget(output=frame.folder / "sparse.csv", overwrite=True)
@@ -156,9 +156,9 @@ def sampling(frame: ScanOnDisk, output: str, **more: object) -> SampleRequest:
 def test_the_seed_is_in_the_png_and_in_the_record(frame: ScanOnDisk) -> None:
     sample_depth(sampling(frame, "u.png", count=100, seed=11))
     assert np.count_nonzero(read_depth(frame.folder / "u.png").values) == 100
-    made = json.loads(Image.open(frame.folder / "u.png").text["pnpdepth:made"])
-    assert made["seed"] == 11
-    assert made["pattern"]["kind"] == "uniform"
+    settings = json.loads(Image.open(frame.folder / "u.png").text["pnpdepth:made"])
+    assert settings["seed"] == 11
+    assert settings["pattern"]["kind"] == "uniform"
     assert json.loads((frame.folder / "u.json").read_text())["seed"] == 11
     assert read_depth(frame.folder / "u.png").scale == 256
 
@@ -169,11 +169,11 @@ def test_the_same_seed_gives_the_same_bytes(frame: ScanOnDisk) -> None:
     assert (frame.folder / "a.png").read_bytes() == (frame.folder / "b.png").read_bytes()
 
 
-def test_fewer_edges_than_asked_for_is_said(frame: ScanOnDisk) -> None:
+def test_fewer_edges_than_requested_are_reported(frame: ScanOnDisk) -> None:
     request = sampling(frame, "e.png", pattern="edges", count=3000, image=frame.image)
-    picture = np.zeros((48, 64, 3), np.uint8)
-    picture[:, 30:] = 255
-    cv2.imwrite(str(frame.image), picture)
+    image = np.zeros((48, 64, 3), np.uint8)
+    image[:, 30:] = 255
+    cv2.imwrite(str(frame.image), image)
     record = sample_depth(request)
     assert record["points"]["count"] < 3000
     assert any("of the 3,000 points asked for" in note for note in record["notes"])
@@ -188,8 +188,8 @@ def simulating(frame: ScanOnDisk, output: str, **more: object) -> SimulateReques
 def test_a_simulated_sensor_of_ones_own_measures_the_truth(frame: ScanOnDisk) -> None:
     sensor = frame.folder / "mine.toml"
     sensor.write_text("top_deg = 20\nstep_deg = 2\nbeams = 21\nazimuth_step_deg = 0.5\n")
-    for output, place in (("camera.csv", {}), ("scanner.csv", {"at_scanner": True})):
-        record = simulate_scan(simulating(frame, output, sensor=str(sensor), **place))
+    for output, position in (("camera.csv", {}), ("scanner.csv", {"at_scanner": True})):
+        record = simulate_scan(simulating(frame, output, sensor=str(sensor), **position))
         got = read_sparse(frame.folder / output, size=(60, 100)).points
         np.testing.assert_allclose(got.depth, 4 + 0.02 * got.xy[:, 0], atol=0.02)
         assert record["sensor"]["name"] == "mine"

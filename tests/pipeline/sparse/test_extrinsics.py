@@ -39,7 +39,7 @@ def test_extrinsics_of_a_file_complete_a_calibration(scene: ScanOnDisk) -> None:
         read_scan_points(scene.scan, options, (HEIGHT, WIDTH))
     options = ScanOptions(calib=scene.calib, extrinsics=scene.folder / "pose.txt")
     read = read_scan_points(scene.scan, options, (HEIGHT, WIDTH))
-    np.testing.assert_allclose(read.points.xy, scene.places[read.points.index], atol=1e-3)
+    np.testing.assert_allclose(read.points.xy, scene.xy[read.points.index], atol=1e-3)
 
 
 def test_projecting_with_extrinsics_records_their_path(scene: ScanOnDisk) -> None:
@@ -78,7 +78,7 @@ def test_extrinsics_of_the_wrong_direction_are_recognised(scene: ScanOnDisk) -> 
         calib=scene.calib, extrinsics=scene.folder / "inverse.txt", inverse_extrinsics=True
     )
     read = read_scan_points(scene.scan, right, (HEIGHT, WIDTH))
-    np.testing.assert_allclose(read.points.xy, scene.places[read.points.index], atol=1e-3)
+    np.testing.assert_allclose(read.points.xy, scene.xy[read.points.index], atol=1e-3)
     assert not [note for note in read.notes if "extrinsics" in note]
 
 

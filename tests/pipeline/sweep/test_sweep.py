@@ -50,7 +50,7 @@ from pnpdepth_cli.sensors import (
     sample_points,
     simulate_lidar,
 )
-from tests.pipeline.batches import Heard, pairs_on_disk, refinement
+from tests.pipeline.batches import RecordingListener, pairs_on_disk, refinement
 
 CALIB = "60 0 31\n0 60 23\n0 0 1\n"
 
@@ -63,12 +63,12 @@ def root(tmp_path: Path) -> Path:
 def sweep(
     root: Path,
     *vary: str,
-    heard: Heard | None = None,
+    listener: RecordingListener | None = None,
     one_by_one: bool = False,
     refine: dict[str, Any] | None = None,
     **changes: Any,
 ) -> dict[str, Any]:
-    given: dict[str, Any] = {
+    fields: dict[str, Any] = {
         "source": root,
         "output": root / "out",
         "refine": refinement(root, **(refine or {})),
@@ -76,7 +76,7 @@ def sweep(
         "plots": False,
         "resamples": 50,
     }
-    return run_sweep(SweepRequest(**given | changes), heard or Heard())
+    return run_sweep(SweepRequest(**fields | changes), listener or RecordingListener())
 
 
 def one_frame(root: Path, **changes: Any) -> tuple[RefineRequest, Inputs]:
@@ -88,8 +88,8 @@ def one_frame(root: Path, **changes: Any) -> tuple[RefineRequest, Inputs]:
 def alone(root: Path, **changes: Any) -> dict[str, Any]:
     """The scores before and after of frame a by `pnpdepth refine`."""
     request, _ = one_frame(root, output=root / "alone.npy", overwrite=True, **changes)
-    found: dict[str, Any] = refine_image(request).record["scores"]
-    return found
+    scores: dict[str, Any] = refine_image(request).record["scores"]
+    return scores
 
 
 def journal(folder: Path) -> list[dict[str, Any]]:
@@ -101,7 +101,7 @@ def lines(path: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-class Killed(Heard):
+class Killed(RecordingListener):
     """Somebody who kills the sweep after so many runs."""
 
     def __init__(self, after: int) -> None:
@@ -138,10 +138,10 @@ def test_what_is_propagated_afterwards_is_scored_so_and_the_plain_network_is_not
 ) -> None:
     sweep(root, "propagate=none,gp", "iterations=0,2")
     wanted = alone(root, iterations=0, propagate="gp")
-    found = lines(root / "out/sweep_frames.csv")
+    rows = lines(root / "out/sweep_frames.csv")
     (line,) = [
         each
-        for each in found
+        for each in rows
         if (each["propagate"], each["iterations"], each["frame"]) == ("gp", "0", "a")
     ]
     assert float(line["mae_refined"]) == wanted["after"]["mae"]
@@ -181,15 +181,15 @@ def test_all_numbers_of_updates_come_from_one_run_and_the_network_is_loaded_once
     monkeypatch.setattr(refining, "load_network", lambda *a, **k: loaded.append(a) or own(*a, **k))
     sweep(root, "points=20,60", "iterations=0,1,2,5")
     assert len(loaded) == 1
-    found = journal(root / "out")
-    assert len(found) == 2 * 2 * 2  # frames × points × (linear and one refinement)
-    assert [list(each["scores"]) for each in found[:2]] == [["linear"], ["0", "1", "2", "5"]]
+    entries = journal(root / "out")
+    assert len(entries) == 2 * 2 * 2  # frames × points × (linear and one refinement)
+    assert [list(each["scores"]) for each in entries[:2]] == [["linear"], ["0", "1", "2", "5"]]
 
 
 def test_where_the_step_falls_with_the_updates_each_number_is_a_run_of_its_own(root: Path) -> None:
     sweep(root, "iterations=1,4", refine={"schedule": "linear"})
-    found = lines(root / "out/sweep_frames.csv")
-    (line,) = [each for each in found if (each["iterations"], each["frame"]) == ("4", "a")]
+    rows = lines(root / "out/sweep_frames.csv")
+    (line,) = [each for each in rows if (each["iterations"], each["frame"]) == ("4", "a")]
     wanted = alone(root, iterations=4, schedule="linear")["after"]["mae"]
     assert float(line["mae_refined"]) == wanted
     assert len(journal(root / "out")) == 2 * 3
@@ -204,11 +204,21 @@ def test_one_by_one_shares_what_the_tables_have_in_common(root: Path) -> None:
     assert same[0] == same[1] == same[2]
 
 
-def test_the_record_says_what_holds_where_it_is_not_varied(root: Path) -> None:
+def test_the_record_has_the_settings_that_are_not_varied(root: Path) -> None:
     record = sweep(root, "layer=encode,1", sampling=read_sampling("grid:20"), refine={"lr": "2%"})
     base = record["base"]
     assert (base["layer"], base["lr"], base["iterations"]) == ("middle", "2%", 5)
     assert (base["sensor"], base["points"]) == ("grid", "20")
+
+
+def test_where_no_layer_is_named_the_cut_is_that_of_refine(
+    root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(refining, "default_layer", lambda network, size, count: "encode")
+    record = sweep(root, "iterations=0,2")
+    assert record["base"]["layer"] == "encode"
+    named = sweep(root, "iterations=0,2", refine={"layer": "encode"}, output=root / "named")
+    assert record["studies"] == named["studies"]
 
 
 def test_a_refinement_that_diverges_counts_with_its_last_good_depth(root: Path) -> None:
@@ -216,22 +226,22 @@ def test_a_refinement_that_diverges_counts_with_its_last_good_depth(root: Path) 
     formula = "2 + 3 * self.decode(torch.tanh(self.middle(self.encode(rgb))))"
     exponential = "torch.exp(self.decode(self.middle(self.encode(rgb))))"
     model.write_text(model.read_text().replace(formula, exponential))
-    heard = Heard()
-    record = sweep(root, "lr=0.01,1e4", "iterations=0,5", heard=heard)
+    listener = RecordingListener()
+    record = sweep(root, "lr=0.01,1e4", "iterations=0,5", listener=listener)
     cells = record["studies"][0]["cells"]
     assert [cell["diverged"] for cell in cells] == [0, 0, 0, 2]
     values = cells[3]["measures"]["mae"]
     last_good = alone(root, lr="1e4", iterations=5)["after"]["mae"]
-    found = lines(root / "out/sweep_frames.csv")
-    (line,) = [e for e in found if e["status"] == "diverged" and e["frame"] == "a"]
+    rows = lines(root / "out/sweep_frames.csv")
+    (line,) = [e for e in rows if e["status"] == "diverged" and e["frame"] == "a"]
     assert float(line["mae_refined"]) == last_good
     assert values["refined"] == pytest.approx(
         np.mean(
-            [float(e["mae_refined"]) for e in found if e["lr"] == "1e4" and e["iterations"] == "5"]
+            [float(e["mae_refined"]) for e in rows if e["lr"] == "1e4" and e["iterations"] == "5"]
         )
     )
-    (told, _) = [row["message"] for row in heard.rows if row["status"] == "diverged"]
-    assert "try a smaller --lr" in told
+    (message, _) = [row["message"] for row in listener.rows if row["status"] == "diverged"]
+    assert "try a smaller --lr" in message
 
 
 # going on
@@ -242,10 +252,10 @@ def test_the_same_command_again_computes_nothing_and_writes_the_same(root: Path)
     vary = ("points=20,60", "iterations=0,2")
     sweep(root, *vary, seeds=2, plots=True)
     before = [(root / "out" / name).read_bytes() for name in names]
-    heard = Heard()
-    sweep(root, *vary, seeds=2, plots=True, heard=heard)
-    assert heard.to_do == 0
-    assert heard.rows == []
+    listener = RecordingListener()
+    sweep(root, *vary, seeds=2, plots=True, listener=listener)
+    assert listener.to_do == 0
+    assert listener.rows == []
     assert [(root / "out" / name).read_bytes() for name in names] == before
 
 
@@ -257,13 +267,13 @@ def test_other_values_only_compute_what_is_missing(root: Path) -> None:
         (("points=20,40", "iterations=1,2,5"), 4),  # and linear of each
         (("lr=0.01,0.1", "points=20"), 2),  # lr 0.01 is the network's default
     ):
-        heard = Heard()
-        sweep(root, *vary, heard=heard)
-        assert heard.to_do == runs, vary
+        listener = RecordingListener()
+        sweep(root, *vary, listener=listener)
+        assert listener.to_do == runs, vary
     for vary, runs in (("sensor=uniform:30", 4), ("sensor=uniform:30,own", 4)):
-        heard = Heard()
-        sweep(root, vary, heard=heard)
-        assert heard.to_do == runs, vary
+        listener = RecordingListener()
+        sweep(root, vary, listener=listener)
+        assert listener.to_do == runs, vary
     fresh = sweep(root, "points=20,60", "iterations=1,2,5", output=root / "fresh")
     grown = sweep(root, "points=20,60", "iterations=1,2,5")
     assert grown["studies"] == fresh["studies"]
@@ -273,12 +283,12 @@ def test_other_values_only_compute_what_is_missing(root: Path) -> None:
 def test_a_sweep_that_was_killed_goes_on_and_ends_the_same(root: Path, after: int) -> None:
     vary = ("points=20,60", "iterations=0,3")
     with pytest.raises(KeyboardInterrupt):
-        sweep(root, *vary, heard=Killed(after))
+        sweep(root, *vary, listener=Killed(after))
     with (root / "out/sweep.jsonl").open("a") as file:
         file.write('{"run": "torn')
-    heard = Heard()
-    resumed = sweep(root, *vary, heard=heard)
-    assert heard.to_do == 8 - after
+    listener = RecordingListener()
+    resumed = sweep(root, *vary, listener=listener)
+    assert listener.to_do == 8 - after
     assert resumed["studies"] == sweep(root, *vary, output=root / "other")["studies"]
 
 
@@ -292,28 +302,28 @@ def test_an_edited_line_of_the_journal_is_computed_again(root: Path) -> None:
     undisturbed = sweep(root, "iterations=0,2")
     path = root / "out/sweep.jsonl"
     path.write_text(path.read_text().replace('"rmse"', '"other"', 1))
-    heard = Heard()
-    resumed = sweep(root, "iterations=0,2", heard=heard)
-    assert heard.to_do == 1
-    assert any("1 lines of" in text and "are damaged" in text for text in heard.said)
+    listener = RecordingListener()
+    resumed = sweep(root, "iterations=0,2", listener=listener)
+    assert listener.to_do == 1
+    assert any("1 lines of" in text and "are damaged" in text for text in listener.messages)
     assert resumed["studies"] == undisturbed["studies"]
 
 
 def test_what_was_made_of_a_file_that_changed_is_computed_again(root: Path) -> None:
     sweep(root, "iterations=0,2")
     cv2.imwrite(str(root / "rgb/b.png"), np.zeros((46, 62, 3), np.uint8))
-    heard = Heard()
-    sweep(root, "iterations=0,2", heard=heard)
-    assert heard.names == ["b", "b"]
+    listener = RecordingListener()
+    sweep(root, "iterations=0,2", listener=listener)
+    assert listener.names == ["b", "b"]
 
 
 def test_other_weights_are_another_network(root: Path) -> None:
     sweep(root, "iterations=0,2")
     network = root / "net/my_net.py"
     network.write_text(network.read_text().replace("2 + 3 *", "2 + 4 *"))
-    heard = Heard()
-    sweep(root, "iterations=0,2", heard=heard)
-    assert heard.to_do == 4
+    listener = RecordingListener()
+    sweep(root, "iterations=0,2", listener=listener)
+    assert listener.to_do == 4
 
 
 # points
@@ -322,12 +332,12 @@ def test_other_weights_are_another_network(root: Path) -> None:
 def test_points_of_a_pattern_are_those_of_sample_with_the_same_seed(root: Path) -> None:
     request, inputs = one_frame(root)
     sampling = replace(read_sampling("uniform:30"), noise=0.1, outliers=0.2, jitter=0.3)
-    found = frame_points(sampling, 7, inputs, request, Frame(name="a"))
+    points = frame_points(sampling, 7, inputs, request, Frame(name="a"))
     assert inputs.gt is not None
     noise = SampleNoise(metres=0.1, outliers=0.2, jitter_px=0.3)
     wanted = sample_points(inputs.gt, SamplePattern(count=30), 7, noise=noise)
-    assert np.array_equal(found.xy.numpy(), wanted.xy)
-    assert np.array_equal(found.depth.numpy(), wanted.depth)
+    assert np.array_equal(points.xy.numpy(), wanted.xy)
+    assert np.array_equal(points.depth.numpy(), wanted.depth)
 
 
 def test_a_lidar_stands_where_the_camera_is(root: Path, tmp_path: Path) -> None:
@@ -335,22 +345,22 @@ def test_a_lidar_stands_where_the_camera_is(root: Path, tmp_path: Path) -> None:
     calib.write_text(CALIB)
     request, inputs = one_frame(root)
     sampling = Sampling(sensor="vlp-16", rotation_noise=2)
-    found = frame_points(sampling, 3, inputs, request, Frame(name="a", calib=calib))
+    points = frame_points(sampling, 3, inputs, request, Frame(name="a", calib=calib))
     k = np.array([[60, 0, 31], [0, 60, 23], [0, 0, 1.0]])
     camera = Camera(intrinsics=k, rotation=FORWARD_LEFT_UP, translation=np.zeros(3))
     assert inputs.gt is not None
     settings = SimulationSettings(rotation_noise_deg=2)
     wanted = simulate_lidar(inputs.gt, camera, LIDARS["vlp-16"], 3, settings)
-    assert np.array_equal(found.xy.numpy(), wanted.xy)
-    assert np.array_equal(found.depth.numpy(), wanted.depth)
+    assert np.array_equal(points.xy.numpy(), wanted.xy)
+    assert np.array_equal(points.depth.numpy(), wanted.depth)
 
 
 def test_so_many_of_the_frames_own_points_are_among_them(root: Path) -> None:
     request, inputs = one_frame(root)
     own = {tuple(xy) for xy in inputs.points.xy.tolist()}
     for points, count in (("20", 20), ("50%", 30), ("100%", 60), (None, 60)):
-        found = frame_points(Sampling(points=points), 0, inputs, request, Frame(name="a"))
-        kept = {tuple(xy) for xy in found.xy.tolist()}
+        sampled = frame_points(Sampling(points=points), 0, inputs, request, Frame(name="a"))
+        kept = {tuple(xy) for xy in sampled.xy.tolist()}
         assert len(kept) == count
         assert kept <= own
     with pytest.raises(InputError, match="61 points of 60; ask for fewer"):
@@ -364,11 +374,11 @@ def test_seeds_draw_other_points_and_only_where_something_is_random(root: Path) 
         if line["frame"] == "a" and line["method"] is None:
             seeds.setdefault(line["sampling"]["sensor"], []).append(line["seed"])
     assert seeds == {"own": [5], "grid": [5], "uniform": [5, 6, 7]}
-    found = [e for e in lines(root / "out/sweep_frames.csv") if e["sensor"] == "uniform:40"]
-    assert len({each["mae_linear"] for each in found if each["frame"] == "a"}) == 3
+    rows = [e for e in lines(root / "out/sweep_frames.csv") if e["sensor"] == "uniform:40"]
+    assert len({each["mae_linear"] for each in rows if each["frame"] == "a"}) == 3
 
 
-def test_what_sample_says_is_of_its_pattern_and_not_of_other_sensors(
+def test_the_count_of_sample_is_of_its_pattern_and_not_of_other_sensors(
     root: Path, tmp_path: Path
 ) -> None:
     calib = tmp_path / "calib.txt"
@@ -389,9 +399,9 @@ def test_what_sample_says_is_of_its_pattern_and_not_of_other_sensors(
 def test_frames_without_sparse_depth_have_points_of_the_truth(root: Path, tmp_path: Path) -> None:
     listed = tmp_path / "frames.csv"
     listed.write_text(f"image,gt\n{root}/rgb/a.png,{root}/gt/a.png\n")
-    heard = Heard()
-    sweep(root, "points=10,5%", source=listed, heard=heard)
-    assert any("points: uniform of the ground truth" in said for said in heard.said)
+    listener = RecordingListener()
+    sweep(root, "points=10,5%", source=listed, listener=listener)
+    assert any("points: uniform of the ground truth" in text for text in listener.messages)
     with pytest.raises(UsageError, match="needs a number of points"):
         sweep(root, "lr=1%,3%", source=listed)
 
@@ -406,7 +416,7 @@ def figures(name: str, seed: int, refined: Sequence[float], plain: float = 2.0) 
 
 def test_a_mean_is_over_frames_of_each_frames_mean_over_seeds() -> None:
     # the measures are rmse, mae, mre and δ1
-    found = summarise(
+    summary = summarise(
         [
             figures("a", 0, [1, 1, 1, 3]),
             figures("a", 1, [2, 1, 1, 3]),
@@ -414,15 +424,15 @@ def test_a_mean_is_over_frames_of_each_frames_mean_over_seeds() -> None:
         ],
         resamples=200,
     )
-    rmse, mae, delta1 = (found["measures"][key] for key in ("rmse", "mae", "delta1"))
-    assert found["frames"] == 2
+    rmse, mae, delta1 = (summary["measures"][key] for key in ("rmse", "mae", "delta1"))
+    assert summary["frames"] == 2
     assert rmse["refined"] == (1.5 + 3) / 2
     assert (rmse["refined_low"], rmse["refined_high"]) == (None, None)  # of two frames
     assert mae["gain"] == 50
     assert mae["gain_over_linear"] == 75
     assert delta1["gain"] == 50  # of δ1 more is better
     assert delta1["gain_over_linear"] == -25
-    assert found["points"] == (10 + 20 + 10) / 3
+    assert summary["points"] == (10 + 20 + 10) / 3
 
 
 def test_the_interval_of_a_cell_is_over_its_frames() -> None:
@@ -441,33 +451,33 @@ def test_the_interval_of_a_cell_is_over_its_frames() -> None:
 
 def test_one_frame_has_no_interval_and_a_frame_that_failed_once_is_left_out() -> None:
     failed = FrameFigures(name="b", seed=1, values=None)
-    found = summarise([figures("a", 0, [1] * 4), figures("b", 0, [9] * 4), failed], resamples=10)
-    assert (found["frames"], found["failed"]) == (1, 1)
-    assert found["measures"]["rmse"]["refined"] == 1
-    assert found["measures"]["rmse"]["refined_low"] is None
+    summary = summarise([figures("a", 0, [1] * 4), figures("b", 0, [9] * 4), failed], resamples=10)
+    assert (summary["frames"], summary["failed"]) == (1, 1)
+    assert summary["measures"]["rmse"]["refined"] == 1
+    assert summary["measures"]["rmse"]["refined_low"] is None
     assert summarise([failed], resamples=10)["measures"] is None
 
 
 # what can be wrong
 
 
-def test_a_frame_that_cannot_be_done_is_told_counted_and_left_out_of_the_mean(root: Path) -> None:
+def test_a_failed_frame_is_reported_counted_and_left_out_of_the_mean(root: Path) -> None:
     (root / "rgb/b.png").write_bytes(b"")
-    heard = Heard()
-    record = sweep(root, "iterations=0,2", heard=heard)
-    assert [row["status"] for row in heard.rows] == ["done", "done", "failed", "failed"]
+    listener = RecordingListener()
+    record = sweep(root, "iterations=0,2", listener=listener)
+    assert [row["status"] for row in listener.rows] == ["done", "done", "failed", "failed"]
     cell = record["studies"][0]["cells"][1]
     assert (cell["frames"], cell["failed"]) == (1, 1)
-    again = Heard()
-    sweep(root, "iterations=0,2", heard=again)
+    again = RecordingListener()
+    sweep(root, "iterations=0,2", listener=again)
     assert again.names == ["b", "b"]  # it is tried again
 
 
-def test_frames_without_truth_are_said_and_none_at_all_is_an_error(root: Path) -> None:
+def test_frames_without_ground_truth_are_reported_and_none_at_all_is_an_error(root: Path) -> None:
     (root / "gt/a.png").unlink()
-    heard = Heard()
-    assert sweep(root, "iterations=0,2", heard=heard)["frames"] == ["b"]
-    assert "warning: 1 frames have no ground truth and are left out" in heard.said
+    listener = RecordingListener()
+    assert sweep(root, "iterations=0,2", listener=listener)["frames"] == ["b"]
+    assert "warning: 1 frames have no ground truth and are left out" in listener.messages
     (root / "gt/b.png").unlink()
     (root / "gt").rmdir()
     with pytest.raises(InputError, match="none of its 2 frames has ground truth"):
@@ -488,11 +498,11 @@ def test_a_folder_that_is_locked_or_holds_other_results_is_refused(root: Path) -
     assert (out / "sweep.csv").read_text() == "mine"
 
 
-def test_a_layer_that_is_not_there_is_told_before_anything_is_computed(root: Path) -> None:
-    heard = Heard()
+def test_a_missing_layer_is_an_error_before_anything_is_computed(root: Path) -> None:
+    listener = RecordingListener()
     with pytest.raises(LayerError, match="midle"):
-        sweep(root, "layer=encode,midle", heard=heard)
-    assert heard.rows == []
+        sweep(root, "layer=encode,midle", listener=listener)
+    assert listener.rows == []
 
 
 BAD = [
@@ -519,11 +529,11 @@ BAD = [
 ]
 
 
-@pytest.mark.parametrize(("text", "said"), BAD)
-def test_what_cannot_be_varied_is_named_with_the_way_out(text: str, said: str) -> None:
+@pytest.mark.parametrize(("text", "message"), BAD)
+def test_what_cannot_be_varied_is_named_with_the_way_out(text: str, message: str) -> None:
     with pytest.raises(PnpDepthError) as raised:
         read_axis(text)
-    assert said in str(raised.value)
+    assert message in str(raised.value)
     assert raised.value.exit_code in (2, 3)
 
 
@@ -543,17 +553,17 @@ def test_a_sensor_with_its_own_number_does_not_go_with_points(root: Path) -> Non
         sweep(root, "points=20,40", "sensor=grid:30,uniform")
 
 
-# pictures
+# plots
 
 
-def test_every_study_has_a_picture(root: Path) -> None:
+def test_every_study_has_a_plot(root: Path) -> None:
     record = sweep(
         root, "layer=0,1", "loss=l1,log", "points=20,50%", one_by_one=True, plots=True, seeds=2
     )
     for study in record["studies"]:
-        picture = cv2.imread(str(root / "out" / study["plot"]))
-        assert picture.shape == (580, 1440, 3)
-        assert (picture < 128).mean() > 0.005
+        plot = cv2.imread(str(root / "out" / study["plot"]))
+        assert plot.shape == (580, 1440, 3)
+        assert (plot < 128).mean() > 0.005
 
 
 @pytest.mark.parametrize(
@@ -566,7 +576,7 @@ def test_every_study_has_a_picture(root: Path) -> None:
         ("points=20,60", "lr=1%,3%", "lr"),
     ],
 )
-def test_numbers_go_along_a_picture_and_more_values_before_fewer(
+def test_numbers_are_on_the_x_axis_and_more_values_before_fewer(
     first: str, second: str, along: str
 ) -> None:
     axes = read_axis(first), read_axis(second)
@@ -584,7 +594,7 @@ def test_axes_have_units_and_numbers_only_where_all_values_are_of_one_kind() -> 
     assert {axis.title for axis in PARAMETERS.values()} > {"sensor", "loss"}
 
 
-def test_without_matplotlib_it_is_said_at_once_which_extra_is_missing(
+def test_without_matplotlib_an_error_names_the_extra_at_once(
     root: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "matplotlib", None)
@@ -614,8 +624,8 @@ def test_each_network_has_its_own_cells(root: Path) -> None:
     state = {name: 1.1 * value for name, value in load_file(weights).items()}
     save_file(state, other)
     models = [f"{net}@{weights}", f"{net}@{other}"]
-    found = sweep(root, f"model={','.join(models)}", "points=20,60", refine={"checkpoint": None})
-    cells = found["studies"][0]["cells"]
+    record = sweep(root, f"model={','.join(models)}", "points=20,60", refine={"checkpoint": None})
+    cells = record["studies"][0]["cells"]
     assert [cell["parameters"]["model"] for cell in cells] == [m for m in models for _ in range(2)]
     for model, checkpoint in zip(models, (weights, other), strict=True):
         alone = sweep(
@@ -624,7 +634,7 @@ def test_each_network_has_its_own_cells(root: Path) -> None:
         own = [cell["measures"] for cell in cells if cell["parameters"]["model"] == model]
         assert own == [cell["measures"] for cell in alone["studies"][0]["cells"]]
     assert cells[0]["measures"] != cells[2]["measures"]
-    assert [found["model"]["checkpoint"], found["more_models"][0]["checkpoint"]] == [
+    assert [record["model"]["checkpoint"], record["more_models"][0]["checkpoint"]] == [
         str(weights),
         str(other),
     ]
@@ -633,10 +643,10 @@ def test_each_network_has_its_own_cells(root: Path) -> None:
 
 
 def test_each_seed_is_a_draw_of_the_points(root: Path) -> None:
-    found = sweep(root, "seed=0,3", sampling=read_sampling("40"))
-    drawn = [cell["measures"]["mae"]["refined"] for cell in found["studies"][0]["cells"]]
+    record = sweep(root, "seed=0,3", sampling=read_sampling("40"))
+    drawn = [cell["measures"]["mae"]["refined"] for cell in record["studies"][0]["cells"]]
     both = sweep(root, "points=40", seeds=4, sampling=read_sampling("40"), output=root / "both")
-    assert both["frames"] == found["frames"]
+    assert both["frames"] == record["frames"]
     with (root / "both" / "sweep_frames.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     for seed, value in zip((0, 3), drawn, strict=True):
@@ -645,8 +655,8 @@ def test_each_seed_is_a_draw_of_the_points(root: Path) -> None:
 
 
 def test_presets_are_varied(root: Path) -> None:
-    found = sweep(root, "preset=paper,fast", refine={"propagate": None})
-    paper, fast = (cell["measures"]["mae"]["refined"] for cell in found["studies"][0]["cells"])
+    record = sweep(root, "preset=paper,fast", refine={"propagate": None})
+    paper, fast = (cell["measures"]["mae"]["refined"] for cell in record["studies"][0]["cells"])
     alone = sweep(
         root, "iterations=5", refine={"preset": "paper", "propagate": None}, output=root / "alone"
     )
@@ -655,8 +665,8 @@ def test_presets_are_varied(root: Path) -> None:
 
 
 def test_the_cost_stands_beside_the_error_where_it_is_asked_for(root: Path) -> None:
-    found = sweep(root, "iterations=0,1,4", cost=True)
-    times = [cell["time_s"] for cell in found["studies"][0]["cells"]]
+    record = sweep(root, "iterations=0,1,4", cost=True)
+    times = [cell["time_s"] for cell in record["studies"][0]["cells"]]
     assert 0 < times[0] <= times[1] < times[2]
     with (root / "out" / "sweep.csv").open(newline="") as file:
         assert [float(row["time_s"]) for row in csv.DictReader(file)] == times
@@ -671,9 +681,9 @@ def test_a_column_of_the_csv_has_a_name_of_its_own(root: Path) -> None:
 
 
 def test_tables_are_written_as_latex(root: Path) -> None:
-    found = sweep(root, "points=20,60", "iterations=0,5")
+    record = sweep(root, "points=20,60", "iterations=0,5")
     lines = (root / "out" / "sweep.tex").read_text().splitlines()
-    (mae,) = {f"{found['studies'][0]['cells'][0]['measures']['mae']['refined']:.4f}"}
+    (mae,) = {f"{record['studies'][0]['cells'][0]['measures']['mae']['refined']:.4f}"}
     first = lines[lines.index(r"\midrule") + 1]
     assert first.startswith("20 & 0 & ")
     assert first.split(" & ")[4] == mae

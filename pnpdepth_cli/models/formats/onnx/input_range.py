@@ -56,7 +56,7 @@ def _first_arithmetic(model: Any) -> tuple[float, float] | None:
     graph = model.graph
     constants = _constants(graph)
     (name,) = (each.name for each in graph.input if each.name not in constants)
-    factor, offset, found = 1.0, 0.0, False
+    factor, offset, has_operation = 1.0, 0.0, False
     while (node := _only_consumer(graph, name)) is not None:
         if node.op_type not in _PASSED:
             operand = _operand(node, name, constants)
@@ -67,9 +67,9 @@ def _first_arithmetic(model: Any) -> tuple[float, float] | None:
                 factor, offset = factor * scale, offset * scale
             else:
                 offset += float(operand.mean()) * (1 if node.op_type == "Add" else -1)
-            found = True
+            has_operation = True
         name = node.output[0]
-    return (factor, offset) if found else None
+    return (factor, offset) if has_operation else None
 
 
 def _only_consumer(graph: Any, name: str) -> Any:

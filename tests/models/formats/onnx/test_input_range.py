@@ -59,8 +59,8 @@ def graph(*steps: tuple[str, Any], side_branch: bool = False) -> Any:
 def test_the_range_is_the_one_whose_normalised_images_lie_around_zero(
     steps: list[tuple[str, Any]], expected: Normalisation | None
 ) -> None:
-    found = stated_input_range(graph(*steps))
-    assert (None if found is None else found[0]) == expected
+    input_range = stated_input_range(graph(*steps))
+    assert (None if input_range is None else input_range[0]) == expected
 
 
 def test_a_graph_whose_input_goes_two_ways_states_nothing() -> None:

@@ -1,0 +1,57 @@
+"""Reads the files of a frame, those in a store through local copies."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import fields, is_dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from pnpdepth_cli.errors import PnpDepthError
+from pnpdepth_cli.io.fingerprint import Fingerprint, fingerprint
+from pnpdepth_cli.io.remote.address import RemotePath
+from pnpdepth_cli.io.remote.copies import local_files, renamed
+from pnpdepth_cli.pipeline.batch.frames import Task
+from pnpdepth_cli.pipeline.refinement.inputs import Inputs, read_inputs
+
+
+def read_task(task: Task) -> tuple[Inputs, dict[str, Fingerprint]]:
+    """Returns the contents of a frame's files, and their fingerprints by part.
+
+    Names in records and messages are those of the task, not of copies.
+
+    Raises:
+        PnpDepthError: As of `read_inputs` and `local_files`.
+    """
+    if not any(isinstance(path, RemotePath) for path in task.inputs.values()):
+        fingerprints = _fingerprints(task)
+        return read_inputs(task.request), fingerprints
+    with local_files(task.inputs.values()) as copies:
+        fingerprints = _fingerprints(task)
+        names = {str(copy): str(path) for path, copy in copies.items()}
+        try:
+            inputs = read_inputs(_with_copies(task.request, copies))
+        except PnpDepthError as error:
+            raise type(error)(renamed(str(error), names)) from error
+    return (
+        replace(inputs, record=renamed(inputs.record, names), notes=renamed(inputs.notes, names)),
+        fingerprints,
+    )
+
+
+def _fingerprints(task: Task) -> dict[str, Fingerprint]:
+    return {part: fingerprint(path) for part, path in task.inputs.items()}
+
+
+def _with_copies(value: Any, copies: Mapping[Path, Path]) -> Any:
+    """The request with the copies in the positions of the files in a store."""
+    if isinstance(value, RemotePath):
+        return copies.get(value, value)
+    if isinstance(value, tuple):
+        return tuple(_with_copies(item, copies) for item in value)
+    if is_dataclass(value) and not isinstance(value, type):
+        old = {field.name: getattr(value, field.name) for field in fields(value) if field.init}
+        new = {name: _with_copies(item, copies) for name, item in old.items()}
+        changed = {name: item for name, item in new.items() if item is not old[name]}
+        return replace(value, **changed) if any(changed) else value
+    return value

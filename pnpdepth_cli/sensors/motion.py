@@ -1,0 +1,175 @@
+"""The motion of a camera between two frames, estimated where no pose is known.
+
+With images: SIFT keypoints of both (Lowe, "Distinctive image features from scale-invariant
+keypoints", 2004) are matched, those of the other frame get depth from its sparse points, and the
+perspective-n-point problem is solved in RANSAC (Fischler and Bolles, 1981). The frame's own depth
+takes no part in it. Without images: generalized ICP of the two scans (Segal et al., 2009), by
+small_gicp. An estimate that few matches or points support is refused.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from pnpdepth_cli.errors import UsageError
+from pnpdepth_cli.sensors.camera import Camera
+from pnpdepth_cli.sensors.sparse import Mask, Points
+
+Floats = NDArray[np.float64]
+
+MIN_INLIERS = 30
+"""Matches that agree with the motion; fewer support no estimate."""
+MIN_FRACTION = 0.25
+"""Of the matches, or of the points of a scan, that agree with the motion."""
+
+_KEYPOINTS = 3000
+_RATIO = 0.8  # Lowe's, of the distances to the nearest and the next descriptor
+_REPROJECTION_PX = 2.0
+_REACH = 1.2  # mean spacings of the points, from a keypoint to the nearest
+_JUMP = 1.1  # ratio of depths of the points around a keypoint
+_VOXEL, _PAIR = 0.015, 0.15  # fractions of the median depth: voxels and farthest pairs of ICP
+
+
+@dataclass(frozen=True, kw_only=True)
+class Keypoints:
+    """SIFT keypoints of an image."""
+
+    xy: Floats
+    """(K, 2) pixel coordinates."""
+    descriptors: NDArray[np.float32]
+    """(K, 128)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class MotionEstimate:
+    """An estimated motion, or why it is refused."""
+
+    motion: Floats | None
+    """(3, 4) from the other camera's frame to this one's, metres. None: refused."""
+    basis: str
+    """What supports it, or why it is refused; for a person."""
+
+
+def keypoints_of(rgb: NDArray[np.float32]) -> Keypoints:
+    """Returns the keypoints of an image (H, W, 3) in 0…1."""
+    grey = cv2.cvtColor((rgb * 255).round().astype(np.uint8), cv2.COLOR_RGB2GRAY)
+    # OpenCV's annotations lack SIFT
+    keypoints, descriptors = cv2.SIFT_create(nfeatures=_KEYPOINTS).detectAndCompute(grey, None)  # type: ignore[attr-defined, unused-ignore]
+    if descriptors is None:
+        return Keypoints(xy=np.empty((0, 2)), descriptors=np.empty((0, 128), np.float32))
+    return Keypoints(
+        xy=np.array([each.pt for each in keypoints], np.float64), descriptors=descriptors
+    )
+
+
+def motion_of_images(
+    here: Keypoints, there: Keypoints, points: Points, camera: Camera
+) -> MotionEstimate:
+    """Returns the motion from the other camera's frame to this one's, from matched keypoints.
+
+    Args:
+        here: Of this frame.
+        there: Of the other frame.
+        points: Sparse depth of the other frame.
+        camera: Intrinsics and lens of both.
+    """
+    at, to = _matches(here, there)
+    depth, known = _depth_at(points, at)
+    at, to, depth = at[known], to[known], depth[known]
+    if len(at) < MIN_INLIERS:
+        return _refused(f"{len(at)} matches with depth, at least {MIN_INLIERS} are needed")
+    focal_px = float(camera.intrinsics[0, 0])
+    rays = camera.unproject(to, np.ones(len(to)))[:, :2]
+    solved, turn, shift, index = cv2.solvePnPRansac(
+        camera.unproject(at, depth), rays, np.eye(3), None, iterationsCount=1000,
+        reprojectionError=_REPROJECTION_PX / focal_px, confidence=0.9999,
+        flags=cv2.SOLVEPNP_SQPNP,
+    )  # fmt: skip
+    inliers = np.empty(0, np.intp) if not solved or index is None else index.ravel()
+    basis = f"{len(inliers)} of {len(at)} matches of the images"
+    if len(inliers) < max(MIN_INLIERS, MIN_FRACTION * len(at)):
+        return _refused(f"{basis} agree")
+    xyz = camera.unproject(at[inliers], depth[inliers])
+    turn, shift = cv2.solvePnPRefineLM(xyz, rays[inliers], np.eye(3), None, turn, shift)
+    motion = np.column_stack([cv2.Rodrigues(turn)[0], shift])
+    return _plausible(motion, float(np.median(points.depth)), basis)
+
+
+def motion_of_scans(here: Points, there: Points, camera: Camera) -> MotionEstimate:
+    """Returns the motion from the other camera's frame to this one's, from the points of both.
+
+    Raises:
+        UsageError: small_gicp is not installed.
+    """
+    try:
+        import small_gicp
+    except ImportError:
+        raise UsageError(
+            "motion between frames without images needs small_gicp: pip install 'pnpdepth[icp]'"
+        ) from None
+    if min(len(here), len(there)) < MIN_INLIERS:
+        return _refused(f"{min(len(here), len(there))} points, at least {MIN_INLIERS} are needed")
+    median = float(np.median(here.depth))
+    clouds = [
+        small_gicp.preprocess_points(
+            camera.unproject(each.xy, each.depth), downsampling_resolution=_VOXEL * median
+        )
+        for each in (here, there)
+    ]
+    (target, tree), (source, _) = clouds
+    result = small_gicp.align(
+        target, source, tree, registration_type="GICP", max_correspondence_distance=_PAIR * median
+    )
+    basis = f"{result.num_inliers} of {source.size()} voxels of the scans"
+    if not result.converged or result.num_inliers < MIN_FRACTION * source.size():
+        return _refused(f"{basis} agree")
+    return _plausible(np.array(result.T_target_source)[:3], median, basis)
+
+
+def _matches(here: Keypoints, there: Keypoints) -> tuple[Floats, Floats]:
+    """(M, 2) keypoints of the other image, and (M, 2) their partners in this one."""
+    if min(len(here.xy), len(there.xy)) < 2:
+        return np.empty((0, 2)), np.empty((0, 2))
+    pairs = cv2.BFMatcher(cv2.NORM_L2).knnMatch(there.descriptors, here.descriptors, k=2)
+    clear = [best for best, second in pairs if best.distance < _RATIO * second.distance]
+    return there.xy[[m.queryIdx for m in clear]], here.xy[[m.trainIdx for m in clear]]
+
+
+def _depth_at(points: Points, xy: Floats) -> tuple[Floats, Mask]:
+    """Depth (M,) on the plane through the points around each pixel, and where it is known.
+
+    Inverse depth is linear in the pixel coordinates on a plane.
+    """
+    from scipy.interpolate import LinearNDInterpolator
+    from scipy.spatial import QhullError, cKDTree
+
+    nothing = np.zeros(len(xy)), np.zeros(len(xy), bool)
+    if len(points) < MIN_INLIERS or not len(xy):
+        return nothing
+    height, width = points.size
+    spacing = np.sqrt(height * width / len(points))
+    distance, near = cKDTree(points.xy).query(xy, k=4)
+    around = points.depth[near]
+    smooth = around.max(axis=1) < _JUMP * around.min(axis=1)
+    try:
+        inverse = LinearNDInterpolator(points.xy, 1 / points.depth.astype(np.float64))(xy)
+    except QhullError:  # all on one line
+        return nothing
+    known = smooth & (distance[:, 0] < _REACH * spacing) & np.isfinite(inverse)
+    return np.divide(1, inverse, where=known, out=np.zeros(len(xy))), known
+
+
+def _plausible(motion: Floats, median: float, basis: str) -> MotionEstimate:
+    """The motion unless it is longer than the median depth."""
+    length = float(np.linalg.norm(motion[:, 3]))
+    if not length <= median:
+        return _refused(f"{length:.1f} m of motion at a median depth of {median:.1f} m")
+    return MotionEstimate(motion=motion, basis=basis)
+
+
+def _refused(why: str) -> MotionEstimate:
+    return MotionEstimate(motion=None, basis=why)

@@ -1,0 +1,108 @@
+"""Motion between frames without poses, on the rendered drive of `samples/` and on made-up scans."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pnpdepth_cli.errors import UsageError
+from pnpdepth_cli.io.depth import read_depth
+from pnpdepth_cli.io.poses import read_poses
+from pnpdepth_cli.io.rgb import read_rgb
+from pnpdepth_cli.sensors import Camera, Points
+from pnpdepth_cli.sensors.motion import Keypoints, keypoints_of, motion_of_images, motion_of_scans
+from tests.sensors.test_accumulation import CAMERA as ROOM_CAMERA
+from tests.sensors.test_accumulation import from_ahead, room
+
+DRIVE = Path(__file__).parents[2] / "samples/drive"
+CAMERA = Camera(intrinsics=np.array([[360.77, 0, 304.53], [0, 360.77, 86.18], [0, 0, 1]]))
+
+
+def points_of(number: int) -> Points:
+    depth = read_depth(DRIVE / f"sparse/drive_{number:03}.png").values
+    y, x = np.nonzero(depth)
+    xy = np.column_stack([x, y]).astype(np.float32)
+    return Points(xy=xy, depth=depth[y, x], size=(depth.shape[0], depth.shape[1]))
+
+
+def image(number: int) -> Keypoints:
+    return keypoints_of(read_rgb(DRIVE / f"rgb/drive_{number:03}.jpg").values)
+
+
+def ahead_in_the_drive() -> float:
+    return float(read_poses(DRIVE / "poses.txt")[1, 2, 3])
+
+
+def test_the_motion_between_two_images_is_that_of_the_poses() -> None:
+    estimate = motion_of_images(image(0), image(1), points_of(1), CAMERA)
+    assert estimate.motion is not None
+    np.testing.assert_allclose(estimate.motion[:, :3], np.eye(3), atol=2e-3)
+    np.testing.assert_allclose(estimate.motion[:, 3], [0, 0, ahead_in_the_drive()], atol=0.03)
+    assert estimate.basis.endswith("matches of the images")
+
+
+def test_the_same_images_give_the_same_motion() -> None:
+    first, second = (
+        motion_of_images(image(0), image(1), points_of(1), CAMERA).motion for _ in range(2)
+    )
+    assert first is not None
+    assert second is not None
+    assert first.tobytes() == second.tobytes()
+
+
+def test_images_of_another_scene_give_no_motion() -> None:
+    photo = read_rgb(Path(__file__).parents[2] / "samples/indoor/rgb.png").values
+    estimate = motion_of_images(keypoints_of(photo), image(1), points_of(1), CAMERA)
+    assert estimate.motion is None
+    assert "needed" in estimate.basis or "agree" in estimate.basis
+
+
+def test_an_image_without_texture_gives_no_motion() -> None:
+    blank = keypoints_of(np.full((187, 621, 3), 0.5, np.float32))
+    estimate = motion_of_images(blank, image(1), points_of(1), CAMERA)
+    assert estimate.motion is None
+    assert estimate.basis.startswith("0 matches")
+
+
+def seen_from(points: Points, shift: tuple[float, float, float]) -> tuple[Keypoints, Keypoints]:
+    """Keypoints at the points, as matched in a camera that has moved, and in their own image."""
+    descriptors = np.random.default_rng(0).random((len(points), 128)).astype(np.float32)
+    moved = ROOM_CAMERA.unproject(points.xy, points.depth) + np.array(shift)
+    here = Keypoints(xy=ROOM_CAMERA.pixels_of(moved), descriptors=descriptors)
+    return here, Keypoints(xy=points.xy.astype(np.float64), descriptors=descriptors)
+
+
+def test_a_motion_beyond_the_median_depth_is_refused() -> None:
+    points = room((0, 0, 0), None, 0, count=400)
+    median = float(np.median(points.depth))
+    estimate = motion_of_images(*seen_from(points, (0.5, 0, 0)), points, ROOM_CAMERA)
+    assert estimate.motion is not None
+    np.testing.assert_allclose(estimate.motion[:, 3], [0.5, 0, 0], atol=1e-3)
+    estimate = motion_of_images(*seen_from(points, (1.5 * median, 0, 0)), points, ROOM_CAMERA)
+    assert estimate.motion is None
+    assert "of motion at a median depth of" in estimate.basis
+
+
+def test_too_few_points_give_no_motion() -> None:
+    points = points_of(1)
+    few = points.select(np.arange(len(points)) < 5)
+    assert motion_of_images(image(0), image(1), few, CAMERA).motion is None
+    assert motion_of_scans(few, few, CAMERA).motion is None
+
+
+def test_the_motion_between_two_scans_is_found_without_images() -> None:
+    pytest.importorskip("small_gicp")
+    own, ahead = room((0, 0, 0), -1.0, 0), room((0, 0, 0.3), -1.0, 1)
+    estimate = motion_of_scans(own, ahead, ROOM_CAMERA)
+    assert estimate.motion is not None
+    np.testing.assert_allclose(estimate.motion, from_ahead(0.3), atol=0.02)
+
+
+def test_scans_need_small_gicp_which_the_message_names(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "small_gicp", None)
+    own = room((0, 0, 0), None, 0)
+    with pytest.raises(UsageError, match=r"pip install 'pnpdepth\[icp\]'"):
+        motion_of_scans(own, own, ROOM_CAMERA)
