@@ -24,6 +24,7 @@ from pnpdepth_cli.pipeline.batch.state import (
     Status,
     failed_line,
     finished_line,
+    remove_all_leftovers,
 )
 from pnpdepth_cli.pipeline.batch.summary import failed_row
 from pnpdepth_cli.pipeline.cluster.options import Spread, spread_of
@@ -93,6 +94,8 @@ def spread_rows(
             state.record(*(each.line for each in done))
             yield from (each.row for each in done)
         run.profile.add_workers(pool.figures())
+    if pool.replaced and request.shard is None:  # a shard's folder has files that others write
+        remove_all_leftovers(state.folder.local)
 
 
 def largest_first(frames: FrameList) -> FrameList:

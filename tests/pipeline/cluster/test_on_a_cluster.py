@@ -84,9 +84,17 @@ def states(output: Path) -> dict[str, str]:
 
 def test_results_equal_those_of_one_process_when_a_node_is_lost(cluster: Any, root: Path) -> None:
     lost = cluster.worker_nodes.copy().pop()
-    listener = Doing(2, lambda: cluster.remove_node(lost, allow_graceful=False))
+    half_written = root / "out" / ".0123456789ab.png"
+
+    def lose_a_node() -> None:
+        half_written.write_bytes(b"of a worker that died")
+        cluster.remove_node(lost, allow_graceful=False)
+
+    listener = Doing(2, lose_a_node)
     outcome = batch(root, listener, cluster=ClusterOptions(ray=cluster.address), profile=True)
     cluster.add_node(num_cpus=1, node_ip_address="127.0.0.5")
+    cluster.wait_for_nodes()  # until the lost one counts as dead
+    assert not half_written.exists()
     assert sorted(listener.names) == list(NAMES)
     assert results(root / "out") == results(root / "plain")
     assert set(states(root / "out").values()) == {"done"}
