@@ -41,7 +41,7 @@ class Hdf5Array:
 Source = Path | Hdf5Array
 
 
-def path_of(source: Source) -> Path:
+def file_of(source: Source) -> Path:
     """Returns the file that a source lies in."""
     return source if isinstance(source, Path) else source.path
 
@@ -131,7 +131,7 @@ class Frame:
     def __post_init__(self) -> None:
         for source in (self.image, self.sparse, self.gt, self.calib, *self.masks):
             if source is not None:
-                _check_no_nul(path_of(source))
+                _check_no_nul(file_of(source))
 
 
 @dataclass(frozen=True, kw_only=True)

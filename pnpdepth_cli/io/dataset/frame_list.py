@@ -59,9 +59,9 @@ class FrameList(Sequence[Frame]):
 
     def count_of(self, part: str) -> int:
         """Returns how many frames have a file of this part: image, sparse, gt or calib."""
-        place = 2 + 2 * _FILES.index(part)
+        column = 2 + 2 * _FILES.index(part)
         return sum(
-            (getattr(row[0], part) if len(row) == 1 else row[place]) is not None
+            (getattr(row[0], part) if len(row) == 1 else row[column]) is not None
             for row in self._rows
         )
 

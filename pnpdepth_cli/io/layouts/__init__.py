@@ -137,20 +137,20 @@ def _data_sets(root: Path, name: str | None) -> list[tuple[Path, str]]:
     try:
         return [(root, find_layout(root, name))]
     except InputError as error:
-        found = []
+        data_sets = []
         for folder in sorted(root.iterdir()) if root.is_dir() else []:
             if folder.is_dir() and not folder.name.startswith("."):
                 with suppress(InputError):
-                    found.append((folder, find_layout(folder, name)))
-        layouts = sorted({layout for _, layout in found})
+                    data_sets.append((folder, find_layout(folder, name)))
+        layouts = sorted({layout for _, layout in data_sets})
         if len(layouts) > 1:
             raise InputError(
                 f"{root} holds folders of several layouts ({', '.join(layouts)}); give one of"
                 " them, or name the layout"
             ) from error
-        if not found:
+        if not data_sets:
             raise
-        return found
+        return data_sets
 
 
 def read_frames(root: Path, name: str | None = None) -> list[Frame]:

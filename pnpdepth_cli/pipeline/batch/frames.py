@@ -16,7 +16,7 @@ from pnpdepth_cli.io.dataset.frame import (
     Frame,
     Source,
     Unmatched,
-    path_of,
+    file_of,
 )
 from pnpdepth_cli.io.dataset.frame_list import FrameList
 from pnpdepth_cli.io.dataset.frame_names import name_problem
@@ -230,7 +230,7 @@ def _is_scan_file(source: Source | None) -> bool:
 def source_files(frame: Frame) -> list[Path]:
     """Returns the files of the frame's image, sparse depth and ground truth."""
     parts = [frame.image, frame.sparse, frame.gt]
-    return [path_of(part) for part in parts if part is not None]
+    return [file_of(part) for part in parts if part is not None]
 
 
 def _input_files(files: FrameFiles) -> Iterator[tuple[str, Path]]:
@@ -242,7 +242,7 @@ def _input_files(files: FrameFiles) -> Iterator[tuple[str, Path]]:
     for part, source in parts.items():
         if source is None:
             continue
-        path = path_of(source)
+        path = file_of(source)
         if part == "sparse" and path.is_dir():  # a COLMAP model
             yield from ((f"sparse {file.name}", file) for file in model_files(path))
         else:
@@ -265,10 +265,10 @@ def _neighbour_files(files: FrameFiles, *, estimated: bool) -> Iterator[tuple[st
     """The files of a neighbour that are read: its points and, to estimate motion, its image."""
     points = files.sparse or files.gt
     if points is not None:
-        path = path_of(points)
+        path = file_of(points)
         yield f"sparse of {path.stem}", path
         if estimated and files.image is not None:
-            yield f"image of {path.stem}", path_of(files.image)
+            yield f"image of {path.stem}", file_of(files.image)
 
 
 def _earlier_files(frame: Frame) -> Iterator[tuple[str, Path]]:
@@ -299,7 +299,7 @@ def _usable(output: Path, frames: FrameList) -> tuple[FrameList, list[Unmatched]
             kept.append(number)
         else:
             frame = frames[number]
-            file = path_of(frame.image or frame.sparse or Path(name))
+            file = file_of(frame.image or frame.sparse or Path(name))
             ignored.append(Unmatched(path=path or file, why=why))
     if frames and within == len(frames):
         raise _holds_the_frames(output)
@@ -313,13 +313,13 @@ def _finder(output: Path) -> Callable[[Frame], Path | None] | None:
     folder = output.resolve()
     is_inside = functools.cache(lambda parent: parent.resolve().is_relative_to(folder))
 
-    def found(frame: Frame) -> Path | None:
+    def file_inside(frame: Frame) -> Path | None:
         for path in source_files(frame):
             if is_inside(path.parent) or (path.is_symlink() and is_inside(path)):
                 return path
         return None
 
-    return found
+    return file_inside
 
 
 def _problem_of_name(name: str, taken: Collection[str]) -> str | None:

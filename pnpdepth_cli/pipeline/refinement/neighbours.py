@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from pnpdepth_cli.errors import InputError
-from pnpdepth_cli.io.dataset.frame import Frame, Source, path_of
+from pnpdepth_cli.io.dataset.frame import Frame, Source, file_of
 from pnpdepth_cli.io.dataset.protocols import Protocol
 from pnpdepth_cli.io.dataset.reading import read_frame_image
 from pnpdepth_cli.io.fingerprint import fingerprint
@@ -113,7 +113,7 @@ def _estimated(
 
 
 def _keypoints(image: Source, protocol: Protocol) -> Keypoints:
-    digest = fingerprint(path_of(image)).sha256
+    digest = fingerprint(file_of(image)).sha256
     return _keypoints_of_content(image, protocol, digest)
 
 
@@ -126,7 +126,7 @@ def _keypoints_of_content(image: Source, protocol: Protocol, digest: str) -> Key
 def _record_of(files: FrameFiles) -> dict[str, Any]:
     source = files.sparse or files.gt
     assert source is not None
-    return {"path": str(source), "sha256": fingerprint(path_of(source)).sha256}
+    return {"path": str(source), "sha256": fingerprint(file_of(source)).sha256}
 
 
 def _name_of(files: FrameFiles) -> str:
