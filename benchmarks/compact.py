@@ -5,7 +5,8 @@ prediction, and refinement with the definition's defaults; the same points and t
 (all with known ground truth) for each. Mean over frames of the per-frame MAE and RMSE.
 
 With `--fusion` only the network's plain prediction is measured: with the depth of another network
-as prior (`--prior`), with an unrelated prior, and with 20 % outliers among the points.
+as prior (`--prior`), with an unrelated prior, and with 20 % outliers among the points, which are
+all given or left out where they are suspected.
 """
 
 from __future__ import annotations
@@ -33,6 +34,7 @@ from model_zoo_defs.training.learning.patterns import outliers
 from model_zoo_defs.training.learning.priors import nonsense
 from pnpdepth_cli.completion.alignment import aligned
 from pnpdepth_cli.completion.interpolation import linear, nearest
+from pnpdepth_cli.completion.outliers import outliers as suspected
 from pnpdepth_cli.core.metrics import score
 from pnpdepth_cli.models.frame import FrameMap
 from pnpdepth_cli.models.network import Network, load_network
@@ -124,11 +126,16 @@ def measure_fusion(
     sparse[rows, columns] = depth
     useless = torch.from_numpy(nonsense(rng, shape, frame.gt[::-1, ::-1].copy()))
     with_outliers = points_on_grid(rows, columns, outliers(rng, sparse, 0.2)[rows, columns], shape)
+    followed = predicted(network, rgb, with_outliers)
+    fewer = with_outliers.select(~suspected(followed, with_outliers, rgb[0]))
     depths = {
         "linear": linear(points),
         "plain": predicted(network, rgb, points),
         "useless prior": predicted(network, rgb, points, aligned(useless, points, kind="median")),
-        "20 % outliers": predicted(network, rgb, with_outliers),
+        "20 % outliers": followed,
+        "20 % outliers, suspected ones left out": predicted(network, rgb, fewer),
+        "linear, 20 % outliers": linear(with_outliers),
+        "linear, suspected ones left out": linear(fewer),
     }
     if prior is not None:
         dense = aligned(predicted(prior, rgb, points), points, kind="median")
