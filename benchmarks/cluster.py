@@ -22,7 +22,8 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+import zlib
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -32,15 +33,14 @@ import psutil
 
 from benchmarks.batch import make_frames
 from pnpdepth_cli.io.fingerprint import fingerprint
-from pnpdepth_cli.io.journal import Journal
+from pnpdepth_cli.io.journal import EncodedLine, Journal
 from pnpdepth_cli.pipeline.batch.batch import run_batch
-from pnpdepth_cli.pipeline.batch.frames import COMPARED_EVERY, find_frames, task_of
+from pnpdepth_cli.pipeline.batch.frames import COMPARED_EVERY
 from pnpdepth_cli.pipeline.batch.request import BatchRequest
-from pnpdepth_cli.pipeline.batch.settings import model_identity, settings_digest
 from pnpdepth_cli.pipeline.batch.spread import DoneFrame
 from pnpdepth_cli.pipeline.cluster.options import LOCAL, ClusterOptions, spread_of
 from pnpdepth_cli.pipeline.cluster.pool import worker_pool
-from pnpdepth_cli.pipeline.cluster.worker import Done
+from pnpdepth_cli.pipeline.cluster.worker import Done, Work
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest
 from pnpdepth_cli.sensors import SamplePattern
 
@@ -71,65 +71,58 @@ def request_of(root: Path) -> BatchRequest:
 
 
 def make_entries(root: Path, count: int) -> None:
-    """A list of frames that share one image, and a manifest of an equal line for each."""
+    """A list of frames that share one image, and a manifest that says they are done."""
     make_frames(root, 1, 48, 64)
     with (root / "list.csv").open("w") as file:
         file.write("name,image,sparse,gt\n")
         for number in range(count):
-            name = f"d{number // FOLDER:05}/f{number:07}"
-            file.write(f"{name},rgb/000000.png,sparse/000000.png,gt/000000.png\n")
-    first = root / "first"
-    lines = (root / "list.csv").read_text().splitlines()[:2]
-    (root / "one.csv").write_text("\n".join(lines) + "\n")
-    one = BatchRequest(
-        source=root / "one.csv", output=first, refine=RefineRequest.from_fields(preset="fast")
-    )
-    run_batch(one, Quiet())
-    line = Journal(first / "batch.jsonl", "frame").newest("d00000/f0000000")
-    assert line is not None
-    made = {kind: first / path for kind, path in line["row"]["outputs"].items()}
-    manifest(root, line, linked(root, made, count), count)
+            file.write(f"{name_of(number)},rgb/000000.png,sparse/000000.png,gt/000000.png\n")
+    lines = (root / "list.csv").read_text().splitlines()[:3]
+    (root / "two.csv").write_text("\n".join(lines) + "\n")
+    refine = RefineRequest.from_fields(preset="fast")
+    two = BatchRequest(source=root / "two.csv", output=root / "first", refine=refine)
+    run_batch(two, Quiet())  # the first has other settings: it is compared
+    journal = Journal(root / "first" / "batch.jsonl", "frame")
+    first = [line for n in (0, 1) if (line := journal.newest(name_of(n))) is not None]
+    made = Journal(root / "out" / "batch.jsonl", "frame")
+    for start in range(0, count, LINKS):
+        numbers = range(start, min(start + LINKS, count))
+        lines_of = [linked(root, line, n, numbers) for n, line in enumerate(first)]
+        for block in range(start, numbers.stop, LINES):
+            made.append(
+                *(
+                    renamed(lines_of[bool(n % COMPARED_EVERY)], n)
+                    for n in range(block, min(block + LINES, numbers.stop))
+                )
+            )
 
 
-def linked(root: Path, made: dict[str, Path], count: int) -> dict[str, list[Path]]:
-    """The results of each frame, as hard links; returns the files that they are links of."""
-    sources: dict[str, list[Path]] = {kind: [] for kind in made}
-    for number in range(count):
-        folder = root / "out" / f"d{number // FOLDER:05}"
-        if number % FOLDER == 0:
-            folder.mkdir(parents=True)
-        for kind, path in made.items():
-            if number % LINKS == 0:
-                sources[kind].append(root / f"{kind}{number}{path.suffix}")
-                shutil.copy(path, sources[kind][-1])
-            os.link(sources[kind][-1], f"{folder}/{path.name.replace('f0000000', f'f{number:07}')}")
-    return sources
+def name_of(number: int) -> str:
+    return f"d{number // FOLDER:05}/f{number:07}"
 
 
-def manifest(root: Path, line: dict[str, Any], sources: dict[str, list[Path]], count: int) -> None:
-    """A line for each frame: it is done."""
-    request = request_of(root)
-    frames = find_frames(request).frames
-    model = model_identity(request.refine)
-    digests = [settings_digest(task_of(request, frames[n]).request, model) for n in (0, 1)]
-    journal = Journal(root / "out" / "batch.jsonl", "frame")
-    outputs = {kind: Path(path) for kind, path in line["row"]["outputs"].items()}
-    known = {kind: [fingerprint(path).as_record() for path in sources[kind]] for kind in outputs}
-    lines: list[dict[str, Any]] = []
-    for number in range(count):
-        name = f"d{number // FOLDER:05}/f{number:07}"
-        written = {
-            str(path).replace("d00000/f0000000", name): known[kind][number // LINKS]
-            for kind, path in outputs.items()
-        }
-        digest = digests[bool(number % COMPARED_EVERY)]
-        lines.append(
-            line | {"frame": name, "settings": digest, "outputs": written,
-                    "row": line["row"] | {"name": name}}
-        )  # fmt: skip
-        if len(lines) == LINES or number == count - 1:
-            journal.append(*lines)
-            lines.clear()
+def linked(root: Path, line: dict[str, Any], kind: int, numbers: range) -> bytes:
+    """Links the results of one of the two frames for others of its kind; returns their line."""
+    old, known = name_of(kind), {}
+    mine = [n for n in numbers if bool(n % COMPARED_EVERY) == kind]
+    for path in line["outputs"]:
+        source = root / f"{numbers.start}{path.replace('/', '')}"
+        shutil.copy(root / "first" / path, source)
+        for number in mine:
+            target = root / "out" / path.replace(old, name_of(number))
+            if number % FOLDER in (0, 1):
+                target.parent.mkdir(parents=True, exist_ok=True)
+            os.link(source, target)
+        known[path] = fingerprint(source).as_record()
+    return EncodedLine.of(line | {"outputs": known}, "frame").data.replace(old.encode(), b"%s")
+
+
+def renamed(line: bytes, number: int) -> EncodedLine:
+    """The line with the name of another frame."""
+    name = name_of(number)
+    rest = line[len(b'{"crc32": "00000000", ') : -1].replace(b"%s", name.encode())
+    data = b'{"crc32": "%08x", ' % zlib.crc32(rest) + rest + b"\n"
+    return EncodedLine(key=name, data=data)
 
 
 def measured(program: str, *arguments: str) -> dict[str, float]:
@@ -264,10 +257,10 @@ class WaitingJob:
     """For each frame."""
 
     @contextlib.contextmanager
-    def opened(self) -> Iterator[Callable[[Sequence[str], bool], Done]]:
+    def opened(self) -> Iterator[Work]:
         """Yields the function of a piece."""
 
-        def work(names: Sequence[str], checked: bool) -> Done:
+        def work(names: Sequence[str], checked: bool, finish: bool) -> Done:
             time.sleep(self.wait_s * len(names))
             lines = (self.line | {"frame": name} for name in names)
             return Done(results=[DoneFrame.of(line, whole=False) for line in lines])

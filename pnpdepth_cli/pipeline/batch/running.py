@@ -11,6 +11,7 @@ import traceback
 from collections import deque
 from collections.abc import Generator, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -75,6 +76,18 @@ def run_tasks(
         ModelError: For an error of the network before any frame was refined.
         UsageError: For an error of the settings before any frame was refined.
     """
+    with closing(run_arriving(tasks, groups, run, proven=proven)) as rows:
+        yield from (row for row in rows if row is not None)
+
+
+def run_arriving(
+    tasks: Iterable[Task | None], groups: FrameGroups | None, run: BatchRun, *, proven: bool
+) -> Generator[Row | None, None, None]:
+    """Does what `run_tasks` does, with tasks that arrive in the meantime.
+
+    A None among the tasks says that the next one has not arrived. It yields None, so that the
+    caller can fetch more; threads go on reading and writing the frames before it.
+    """
     profile, workers = run.profile, run.workers
     writing: deque[Future[Row]] = deque()
 
@@ -92,6 +105,9 @@ def run_tasks(
             for group in _gathered(reading, groups, profile):
                 if run.stopped():
                     break
+                if group is None:
+                    yield None
+                    continue
                 for task, read, result in _refined(groups, group, profile):
                     if not task.written:
                         continue
@@ -118,15 +134,18 @@ def run_tasks(
 
 
 def _read_ahead(
-    tasks: Iterable[Task],
+    tasks: Iterable[Task | None],
     readers: ThreadPoolExecutor,
     workers: int,
     groups: FrameGroups | None,
     profile: BatchProfile,
-) -> Generator[tuple[Task, Future[ReadFrame]], None, None]:
+) -> Generator[tuple[Task, Future[ReadFrame]] | None, None, None]:
     waiting: deque[tuple[Task, Future[ReadFrame]]] = deque()
     try:
         for task in tasks:
+            if task is None:
+                yield None
+                continue
             waiting.append((task, readers.submit(_read, task, profile)))
             if len(waiting) > 2 * workers + (groups.largest - 1 if groups else 0):
                 yield waiting.popleft()
@@ -138,17 +157,21 @@ def _read_ahead(
 
 
 def _gathered(
-    reading: Iterable[tuple[Task, Future[ReadFrame]]],
+    reading: Iterable[tuple[Task, Future[ReadFrame]] | None],
     groups: FrameGroups | None,
     profile: BatchProfile,
-) -> Generator[list[tuple[Task, ReadFrame | Exception]], None, None]:
+) -> Generator[list[tuple[Task, ReadFrame | Exception]] | None, None, None]:
     """The frames in their order, in groups of one size that go together.
 
-    One that could not be read keeps its position and does not count.
+    One that could not be read keeps its position and does not count. A None stays one.
     """
     group: list[tuple[Task, ReadFrame | Exception]] = []
     size: tuple[int, int] | None = None
-    for task, future in reading:
+    for each in reading:
+        if each is None:
+            yield None
+            continue
+        task, future = each
         with profile(WAITING_TO_READ):
             read = _outcome(future)
         if isinstance(read, ReadFrame):

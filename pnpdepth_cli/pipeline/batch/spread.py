@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Iterator, Sequence
-from contextlib import contextmanager
+from collections import deque
+from collections.abc import Generator, Iterator, Sequence
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -29,7 +30,7 @@ from pnpdepth_cli.pipeline.batch.state import (
 from pnpdepth_cli.pipeline.batch.summary import failed_row
 from pnpdepth_cli.pipeline.cluster.options import Spread, spread_of
 from pnpdepth_cli.pipeline.cluster.pool import Lost, WorkerPool, worker_pool
-from pnpdepth_cli.pipeline.cluster.worker import Done
+from pnpdepth_cli.pipeline.cluster.worker import Done, Work
 
 if TYPE_CHECKING:
     from pnpdepth_cli.pipeline.batch.groups import FrameGroups
@@ -171,7 +172,7 @@ class RefineJob:
     """The first frame that can be read, and others that candidates are compared on."""
 
     @contextmanager
-    def opened(self) -> Iterator[Callable[[Sequence[Frame], bool], Done]]:
+    def opened(self) -> Iterator[Work]:
         """Yields a function that refines frames; the network is loaded and cut once."""
         from pnpdepth_cli.pipeline.batch.resolving import opened_groups, readable, refiner_on
 
@@ -187,10 +188,13 @@ class RefineJob:
             state=collector, profile=BatchProfile(), say=notes.append, stopped=lambda: False,
             workers=self.request.workers, batch_size=self.request.batch_size,
         )  # fmt: skip
-        with opened_groups(refiner, run.batch_size, run.say) as groups:
+        with (
+            opened_groups(refiner, run.batch_size, run.say) as groups,
+            closing(FrameStream(self.request, groups, run)) as stream,
+        ):
 
-            def refine(frames: Sequence[Frame], proven: bool) -> Done:
-                done = done_frames(self.request, frames, groups, run, proven=proven)
+            def refine(frames: Sequence[Frame], proven: bool, finish: bool) -> Done:
+                done = stream.refined(frames, proven=proven, finish=finish)
                 said = tuple(notes)
                 notes.clear()
                 return replace(done, notes=said)
@@ -198,29 +202,66 @@ class RefineJob:
             yield refine
 
 
-def done_frames(
-    request: BatchRequest,
-    frames: Sequence[Frame],
-    groups: FrameGroups | None,
-    run: BatchRun,
-    *,
-    proven: bool,
-) -> Done:
-    """Returns a `DoneFrame` of each of these frames, refined and written."""
-    from pnpdepth_cli.pipeline.batch.running import run_tasks
+class FrameStream:
+    """Refines frames that come in pieces, and reads and writes across the ends of pieces.
 
-    assert isinstance(run.state, LineCollector)
-    tasks = (task_of(request, frame) for frame in frames)
-    rows = list(run_tasks(tasks, groups, run, proven=proven))
-    return Done(
-        results=[
-            DoneFrame.of(run.state.lines.pop(frame.name), whole=request.html is not None)
-            for frame in frames
-        ],
-        proves=any(row["status"] != "failed" for row in rows),
-        multiple=groups.largest if groups else 1,
-        figures=run.profile.summary(),
-    )
+    Args:
+        request: How, on one device.
+        groups: The network, open; None if no frame could be read.
+        run: What the frames share; its state is a `LineCollector`.
+    """
+
+    def __init__(self, request: BatchRequest, groups: FrameGroups | None, run: BatchRun) -> None:
+        assert isinstance(run.state, LineCollector)
+        self._request, self._groups, self._run = request, groups, run
+        self._lines = run.state.lines
+        self._frames: deque[Frame] = deque()
+        self._finish = True
+        self._rows: Generator[dict[str, Any] | None, None, None] | None = None
+
+    def refined(self, frames: Sequence[Frame], *, proven: bool, finish: bool) -> Done:
+        """Returns a `DoneFrame` of each frame that is refined and written up to now.
+
+        Args:
+            frames: Further frames.
+            proven: True if a frame was refined with these settings before.
+            finish: Whether to wait for all frames. If not, it returns when the last was taken to
+                be read.
+        """
+        from pnpdepth_cli.pipeline.batch.running import run_arriving
+
+        self._frames.extend(frames)
+        self._finish = finish
+        if self._rows is None:
+            self._rows = run_arriving(self._tasks(), self._groups, self._run, proven=proven)
+        rows: list[dict[str, Any]] = []
+        try:
+            while (row := next(self._rows)) is not None:
+                rows.append(row)
+        except StopIteration:
+            self._rows = None
+        except BaseException:
+            self.close()
+            raise
+        whole = self._request.html is not None
+        return Done(
+            results=[DoneFrame.of(self._lines.pop(row["name"]), whole=whole) for row in rows],
+            proves=any(row["status"] != "failed" for row in rows),
+            multiple=self._groups.largest if self._groups else 1,
+            figures=self._run.profile.summary(),
+        )
+
+    def close(self) -> None:
+        """Drops the frames that are not refined yet."""
+        self._frames.clear()
+        self._lines.clear()
+        if self._rows is not None:
+            self._rows.close()
+            self._rows = None
+
+    def _tasks(self) -> Iterator[Task | None]:
+        while self._frames or not self._finish:
+            yield task_of(self._request, self._frames.popleft()) if self._frames else None
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -24,7 +24,15 @@ class Member:
     """Of its node; None before it has started."""
     ready: bool = False
     """Whether it has opened the job."""
+    streams: bool = False
+    """Whether it may have items that no call finishes."""
+    unfinished: list[Any] = field(default_factory=list)
+    """Items of calls that have ended, without a result yet, in their order."""
     done: Done | None = None
-    """The piece before."""
+    """Of the call before."""
     items: int = 0
     """All it has done."""
+    finished: int = 0
+    """Those of this job."""
+    seconds: float = 0.0
+    """In calls of this job."""

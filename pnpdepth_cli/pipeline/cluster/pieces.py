@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 _PIECE_S = 2.0
@@ -23,6 +23,8 @@ class Piece:
     """How often its worker died, if it is a single item."""
     checked: bool = False
     """Whether an error of the settings is this piece's own, as others succeeded with them."""
+    alone: bool = False
+    """Whether its worker is to do nothing else meanwhile, as one died of it."""
 
 
 class Pieces:
@@ -63,11 +65,11 @@ class Pieces:
         count = len(piece.items)
         if count > 1:
             for half in (piece.items[count // 2 :], piece.items[: count // 2]):
-                self.put_back(Piece(items=half, checked=piece.checked))
+                self.put_back(replace(piece, items=half, alone=True))
             return None
         if piece.kills >= self._retries:
             return piece.items[0]
-        self.put_back(Piece(items=piece.items, kills=piece.kills + 1, checked=piece.checked))
+        self.put_back(replace(piece, kills=piece.kills + 1, alone=True))
         return None
 
     def drop(self) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -130,6 +130,7 @@ class WorkerPool:
         self._job, self._job_reference = job, self._ray.put(job)
         for member in self._members:
             member.ready, member.done = False, None
+            member.finished, member.seconds = 0, 0.0
             if member.facts:
                 self._open(member)
         pieces = Pieces(items, self._retries)
@@ -187,24 +188,33 @@ class WorkerPool:
         member.calls.append((member.actor.open.remote(self._job_reference), None))
 
     def _busy(self) -> bool:
-        return any(piece is not None for member in self._members for _, piece in member.calls)
+        return any(
+            member.unfinished or any(piece is not None for _, piece in member.calls)
+            for member in self._members
+        )
 
     def _hand_out(self, pieces: Pieces, begin: Callable[[Sequence[Any]], None]) -> None:
         for _ in range(_DEEP):
             for member in self._members:
-                if member.ready and len(member.calls) < _DEEP:
-                    piece = pieces.take(self._size_for(member, len(pieces)))
-                    if piece is None:
-                        return
+                if not member.ready or len(member.calls) >= _DEEP:
+                    continue
+                piece = pieces.take(self._size_for(member, len(pieces)))
+                if member.streams and (piece is None or piece.alone):
+                    self._run(member, Piece(items=(), checked=True), finish=True)
+                if piece is not None:
                     begin(piece.items)
-                    checked = piece.checked or self._proven
-                    reference = member.actor.run.remote(piece.items, checked)
-                    member.calls.append((reference, piece))
+                    piece = replace(piece, checked=piece.checked or self._proven)
+                    self._run(member, piece, finish=piece.alone or not piece.checked)
+
+    def _run(self, member: Member, piece: Piece, *, finish: bool) -> None:
+        reference = member.actor.run.remote(piece.items, piece.checked, finish)
+        member.calls.append((reference, piece))
+        member.streams = not finish
 
     def _size_for(self, member: Member, left: int) -> int:
-        done = member.done
-        pace = None if done is None else done.seconds / max(1, len(done.results))
-        return piece_size(left, len(self._members), pace, 1 if done is None else done.multiple)
+        pace = member.seconds / member.finished if member.finished else None
+        multiple = 1 if member.done is None else member.done.multiple
+        return piece_size(left, len(self._members), pace, multiple)
 
     def _finished(self, pieces: Pieces) -> Iterator[list[tuple[Any, Any]]]:
         """Waits for calls to end, and yields the items of pieces among them."""
@@ -235,25 +245,29 @@ class WorkerPool:
         elif piece is None:
             member.ready, self._failed_starts = True, 0
         else:
-            member.done, member.items = result, member.items + len(piece.items)
+            count = len(result.results)
+            begun = [*member.unfinished, *piece.items]
+            member.done, member.unfinished = result, begun[count:]
+            member.items, member.finished = member.items + count, member.finished + count
+            member.seconds += result.seconds
             for note in result.notes:
                 if member.number == 1 or note.startswith("warning"):
                     self._say(note)
             if result.proves:
                 self._prove(pieces)
-            yield list(zip(piece.items, result.results, strict=True))
+            yield list(zip(begun[:count], result.results, strict=True))
 
     def _prove(self, pieces: Pieces) -> None:
         """The settings are good, so pieces that failed by them fail by themselves."""
         self._proven = True
         for piece, _ in self._unproven:
-            pieces.put_back(Piece(items=piece.items, kills=piece.kills, checked=True))
+            pieces.put_back(replace(piece, checked=True))
         self._unproven.clear()
 
     def _failed(self, member: Member, error: PnpDepthError) -> None:
         _, piece = member.calls.popleft()
         of_settings = isinstance(error, ModelError) or type(error) is UsageError
-        if piece is None or not of_settings:
+        if piece is None or piece.checked or not of_settings:
             raise error
         self._unproven.append((piece, error))
 
@@ -264,7 +278,8 @@ class WorkerPool:
         self._kill(member)
         had = [piece for _, piece in member.calls if piece is not None]
         for piece in reversed(had[1:]):
-            pieces.put_back(piece)
+            if piece.items:
+                pieces.put_back(piece)
         where = f" on {member.facts.node}" if member.facts else ""
         self._failed_starts += not had
         if self._failed_starts >= _FAILED_STARTS:
@@ -272,7 +287,8 @@ class WorkerPool:
         self._say(f"warning: worker {member.number}{where} died ({reason}); another is started")
         self._members[self._members.index(member)] = self._new_member()
         if had:
-            item = pieces.lost(had[0])
+            begun = (*member.unfinished, *had[0].items)
+            item = pieces.lost(replace(had[0], items=begun)) if begun else None
             if item is not None:
                 yield [(item, Lost(message=f"its worker died {self._retries + 1} times: {reason}"))]
 

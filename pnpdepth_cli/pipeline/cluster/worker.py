@@ -51,10 +51,10 @@ class Facts:
 
 @dataclass(frozen=True, kw_only=True)
 class Done:
-    """A piece that is done."""
+    """What a worker has done in a call."""
 
     results: Sequence[Any]
-    """One for each item, in their order."""
+    """Of the next items in the order in which they came, with those of pieces before."""
     seconds: float = 0.0
     """How long it took, which the worker measures."""
     proves: bool = True
@@ -67,11 +67,18 @@ class Done:
     """Of all pieces of this worker up to now."""
 
 
+Work = Callable[[Sequence[Any], bool, bool], Done]
+"""A function of a piece's items, whether others succeeded, and whether all results are wanted now.
+
+Where they are not, items may be finished in later calls.
+"""
+
+
 class Job(Protocol):
     """Work on items; it is pickled and sent to each worker once."""
 
-    def opened(self) -> AbstractContextManager[Callable[[Sequence[Any], bool], Done]]:
-        """Returns, for `with`, a function of a piece's items, and whether others succeeded."""
+    def opened(self) -> AbstractContextManager[Work]:
+        """Returns, for `with`, what does a piece."""
 
 
 class Worker:
@@ -95,7 +102,7 @@ class Worker:
         set_max_pixels(start.max_pixels)
         self._shared = start.shared
         self._open = ExitStack()
-        self._work: Callable[[Sequence[Any], bool], Done] | None = None
+        self._work: Work | None = None
 
     def facts(self) -> Facts:
         """Returns what has to be equal on all nodes."""
@@ -120,11 +127,11 @@ class Worker:
         self._open.close()
         remove_copies()
 
-    def run(self, items: Sequence[Any], checked: bool) -> Done:
-        """Does a piece of the job."""
+    def run(self, items: Sequence[Any], checked: bool, finish: bool) -> Done:
+        """Does a piece of the job; `finish` also all that is left of those before."""
         assert self._work is not None
         began = time.perf_counter()
-        done = self._work(items, checked)
+        done = self._work(items, checked, finish)
         return replace(done, seconds=time.perf_counter() - began)
 
 

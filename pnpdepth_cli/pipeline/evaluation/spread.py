@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 from pnpdepth_cli.pipeline.cluster.options import Spread
 from pnpdepth_cli.pipeline.cluster.pool import Lost, worker_pool
-from pnpdepth_cli.pipeline.cluster.worker import Done
+from pnpdepth_cli.pipeline.cluster.worker import Done, Work
 from pnpdepth_cli.pipeline.evaluation.frame_reading import Scales
 from pnpdepth_cli.pipeline.evaluation.frame_scoring import (
     FrameScores,
@@ -76,10 +76,10 @@ class ScoreJob:
     """Codes per metre of integer files."""
 
     @contextmanager
-    def opened(self) -> Iterator[Callable[[Sequence[Numbered], bool], Done]]:
+    def opened(self) -> Iterator[Work]:
         """Yields a function that scores frames."""
 
-        def score(frames: Sequence[Numbered], checked: bool) -> Done:
+        def score(frames: Sequence[Numbered], checked: bool, finish: bool) -> Done:
             results = [scored_or_error(pair, self.protocol, self.scales) for _, pair in frames]
             return Done(results=results)
 

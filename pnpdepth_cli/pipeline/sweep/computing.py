@@ -14,7 +14,7 @@ from pnpdepth_cli.errors import DeviceError, PnpDepthError, StorageError
 from pnpdepth_cli.io.dataset.frame import Frame
 from pnpdepth_cli.pipeline.batch.frames import Task
 from pnpdepth_cli.pipeline.cluster.pool import Lost, WorkerPool
-from pnpdepth_cli.pipeline.cluster.worker import Done
+from pnpdepth_cli.pipeline.cluster.worker import Done, Work
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs, read_inputs
 from pnpdepth_cli.pipeline.refinement.load_refiner import load_refiner
 from pnpdepth_cli.pipeline.refinement.refiner import Refiner
@@ -134,12 +134,12 @@ class SweepJob:
     """The frame that the network's definition is resolved on."""
 
     @contextmanager
-    def opened(self) -> Iterator[Callable[[Sequence[Sequence[Run]], bool], Done]]:
+    def opened(self) -> Iterator[Work]:
         """Yields a function of the runs of several frames."""
         refiner = self.first.load(self.first.read())
         with SplitCache(refiner.network) as cache:
 
-            def compute(frames: Sequence[Sequence[Run]], checked: bool) -> Done:
+            def compute(frames: Sequence[Sequence[Run]], checked: bool, finish: bool) -> Done:
                 results = [[result for _, result in results_of_frame(f, cache)] for f in frames]
                 return Done(results=results)
 

@@ -14,7 +14,7 @@ from pnpdepth_cli.errors import ClusterError, ModelError, StorageError
 from pnpdepth_cli.pipeline.cluster.connection import Cluster
 from pnpdepth_cli.pipeline.cluster.options import ClusterOptions, spread_of
 from pnpdepth_cli.pipeline.cluster.pool import Lost, WorkerPool
-from pnpdepth_cli.pipeline.cluster.worker import Done, Facts, Worker, software
+from pnpdepth_cli.pipeline.cluster.worker import Done, Facts, Job, Work, Worker, software
 
 
 class RayError(Exception):
@@ -92,14 +92,35 @@ class DoublingJob:
     error: Callable[[str], Exception] = ModelError
 
     @contextmanager
-    def opened(self) -> Iterator[Callable[[Sequence[int], bool], Done]]:
-        def work(items: Sequence[int], checked: bool) -> Done:
+    def opened(self) -> Iterator[Work]:
+        def work(items: Sequence[int], checked: bool, finish: bool) -> Done:
             if set(items) & set(self.deadly):
                 raise SystemExit
             if set(items) & set(self.raising) and not checked:
                 raise self.error("bad settings")
             failed = [item if item in self.raising else 2 * item for item in items]
             return Done(results=failed)
+
+        yield work
+
+
+@dataclass
+class LaggingJob:
+    """Doubles numbers, the last three of which it keeps for the next call; some kill the worker."""
+
+    deadly: Sequence[int] = ()
+
+    @contextmanager
+    def opened(self) -> Iterator[Work]:
+        kept: list[int] = []
+
+        def work(items: Sequence[int], checked: bool, finish: bool) -> Done:
+            kept.extend(items)
+            ready = kept[: len(kept) if finish else -3]
+            del kept[: len(ready)]
+            if set(ready) & set(self.deadly):
+                raise SystemExit
+            return Done(results=[2 * item for item in ready], seconds=0.1)
 
         yield work
 
@@ -113,7 +134,7 @@ def pool_of(workers: int, messages: list[str], retries: int = 2) -> WorkerPool:
     )
 
 
-def results(job: DoublingJob, count: int, **options: Any) -> tuple[dict[int, Any], list[str]]:
+def results(job: Job, count: int, **options: Any) -> tuple[dict[int, Any], list[str]]:
     messages: list[str] = []
     pairs = [
         pair for part in pool_of(3, messages).results(job, range(count), **options) for pair in part
@@ -138,6 +159,17 @@ def test_an_item_that_kills_its_workers_is_lost_and_no_other() -> None:
     assert pairs == {item: 2 * item for item in range(40) if item != 17}
     assert 3 <= len(messages) <= 9
     assert "another is started" in messages[0]
+
+
+def test_results_that_come_with_a_later_call_are_of_their_items() -> None:
+    assert results(LaggingJob(), 200)[0] == {item: 2 * item for item in range(200)}
+
+
+def test_an_item_that_kills_its_workers_in_a_later_call_is_lost_and_no_other() -> None:
+    pairs, messages = results(LaggingJob(deadly=[77]), 200)
+    assert isinstance(pairs.pop(77), Lost)
+    assert pairs == {item: 2 * item for item in range(200) if item != 77}
+    assert 3 <= len(messages) <= 9
 
 
 def test_an_error_of_the_settings_ends_the_run_if_nothing_was_done_before() -> None:
