@@ -23,24 +23,22 @@ def read_task(task: Task) -> tuple[Inputs, dict[str, Fingerprint]]:
     Raises:
         PnpDepthError: As of `read_inputs` and `local_files`.
     """
+    with local_files(task.inputs.values()):  # so that a copy is of the content that is compared
+        fingerprints = {part: fingerprint(path) for part, path in task.inputs.items()}
+        return read_frame(task), fingerprints
+
+
+def read_frame(task: Task) -> Inputs:
+    """Returns what `read_task` does, without fingerprints."""
     if not any(isinstance(path, RemotePath) for path in task.inputs.values()):
-        fingerprints = _fingerprints(task)
-        return read_inputs(task.request), fingerprints
+        return read_inputs(task.request)
     with local_files(task.inputs.values()) as copies:
-        fingerprints = _fingerprints(task)
         names = {str(copy): str(path) for path, copy in copies.items()}
         try:
             inputs = read_inputs(_with_copies(task.request, copies))
         except PnpDepthError as error:
             raise type(error)(renamed(str(error), names)) from error
-    return (
-        replace(inputs, record=renamed(inputs.record, names), notes=renamed(inputs.notes, names)),
-        fingerprints,
-    )
-
-
-def _fingerprints(task: Task) -> dict[str, Fingerprint]:
-    return {part: fingerprint(path) for part, path in task.inputs.items()}
+    return replace(inputs, record=renamed(inputs.record, names), notes=renamed(inputs.notes, names))
 
 
 def _with_copies(value: Any, copies: Mapping[Path, Path]) -> Any:

@@ -10,11 +10,12 @@ from pathlib import Path
 from typing import Any
 
 from pnpdepth_cli.errors import InputError, PnpDepthError, UsageError
-from pnpdepth_cli.io.dataset.frame import IMAGE_SUFFIXES
+from pnpdepth_cli.io.dataset.frame import IMAGE_SUFFIXES, file_of
 from pnpdepth_cli.io.depth import DEPTH_SUFFIXES
 from pnpdepth_cli.io.file_bytes import one_line
 from pnpdepth_cli.io.layouts import Frame, Source, find_layout, find_protocol, list_frames
 from pnpdepth_cli.io.record import read_json
+from pnpdepth_cli.io.remote.address import RemotePath
 from pnpdepth_cli.pipeline.evaluation.dependence import groups_by_name
 from pnpdepth_cli.pipeline.evaluation.stacks import stack_size
 
@@ -98,13 +99,23 @@ def pair_frames(
         InputError: For a missing path, or folders without a common name.
     """
     for path in (prediction, ground_truth, *(p for p in (sparse, mask, calib) if p)):
+        _check_local(path)
         if not path.exists():
             raise InputError(f"{path}: no such file or folder; check the path")
     pairs = _found_pairs(prediction, ground_truth, sparse, mask, layout_protocol)
+    for frame in (pair.frame for pair in pairs.frames):
+        for part in (frame.image, frame.sparse, frame.gt):
+            if part is not None:
+                _check_local(file_of(part))
     if calib is None:
         return pairs
     frames = (replace(each, frame=replace(each.frame, calib=calib)) for each in pairs.frames)
     return replace(pairs, frames=tuple(frames))
+
+
+def _check_local(path: Path) -> None:
+    if isinstance(path, RemotePath):
+        raise UsageError(f"{path}: eval reads local files; copy the frames from the store first")
 
 
 def _found_pairs(

@@ -13,9 +13,10 @@ from pnpdepth_cli.auto.predictions import SplitCache
 from pnpdepth_cli.errors import DeviceError, PnpDepthError, StorageError
 from pnpdepth_cli.io.dataset.frame import Frame
 from pnpdepth_cli.pipeline.batch.frames import Task
+from pnpdepth_cli.pipeline.batch.reading import read_frame
 from pnpdepth_cli.pipeline.cluster.pool import Lost, WorkerPool
 from pnpdepth_cli.pipeline.cluster.worker import Done, Work
-from pnpdepth_cli.pipeline.refinement.inputs import Inputs, read_inputs
+from pnpdepth_cli.pipeline.refinement.inputs import Inputs
 from pnpdepth_cli.pipeline.refinement.load_refiner import load_refiner
 from pnpdepth_cli.pipeline.refinement.refiner import Refiner
 from pnpdepth_cli.pipeline.sweep.plan import Run
@@ -53,7 +54,7 @@ class FirstFrame:
         return self._read(self.task, self.frame)
 
     def _read(self, task: Task, frame: Frame) -> Inputs:
-        inputs = read_inputs(task.request)
+        inputs = read_frame(task)
         known = 0 if inputs.gt is None else int((inputs.gt > 0).sum())
         some = Sampling(sensor="uniform", points=str(min(_RESOLVE_POINTS, known)))
         points = frame_points(some, self.seed, inputs, task.request, frame)
@@ -87,7 +88,7 @@ def by_frame(runs: Sequence[Run]) -> list[list[Run]]:
 
 def results_of_frame(runs: Sequence[Run], cache: SplitCache) -> Iterator[tuple[Run, Result]]:
     """Yields the runs of one frame with their results; the frame is read once."""
-    inputs = _result_or_error(read_inputs, runs[0].task.request)
+    inputs = _result_or_error(read_frame, runs[0].task)
     for _, of_points in groupby(runs, key=lambda run: (run.sampling, run.seed)):
         same_points = list(of_points)
         failed = isinstance(inputs, PnpDepthError)

@@ -12,10 +12,12 @@ from pnpdepth_cli.auto.predictions import SplitCache
 from pnpdepth_cli.errors import (
     InputError,
     PnpDepthError,
+    UsageError,
 )
 from pnpdepth_cli.io.atomic import make_folder, remove_leftovers
 from pnpdepth_cli.io.dataset.frame import Frame
 from pnpdepth_cli.io.lock import locked_folder
+from pnpdepth_cli.io.remote.address import RemotePath
 from pnpdepth_cli.pipeline.batch.batch import Listener
 from pnpdepth_cli.pipeline.batch.frames import Task, find_frames, task_of
 from pnpdepth_cli.pipeline.batch.request import BatchRequest
@@ -56,6 +58,8 @@ def run_sweep(request: SweepRequest, listener: Listener) -> dict[str, Any]:
     Raises:
         PnpDepthError: For what concerns all frames.
     """
+    if isinstance(request.output, RemotePath):
+        raise UsageError(f"{request.output}: sweep writes to a local folder; name one with -o")
     if request.plots:
         need_matplotlib()
     spread = spread_of(request.refine.network.device, request.cluster)
