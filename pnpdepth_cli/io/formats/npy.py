@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import math
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,10 @@ from numpy.typing import NDArray
 from pnpdepth_cli.errors import FileFormatError
 from pnpdepth_cli.io.file_bytes import check_value_count, damaged
 from pnpdepth_cli.io.formats import DepthFormat, StoredArray, WriteOptions
+
+_parsing = threading.Lock()
+"""Held while numpy parses a header as Python: CPython 3.11 mixes up the recursion depths of threads
+that do so at once, and raises SystemError for a good file."""
 
 
 def parse_npy(path: Path, data: bytes) -> NDArray[Any]:
@@ -51,12 +56,13 @@ def read_npy_header(
     stream = io.BytesIO(data)
     try:
         version = npy_format.read_magic(stream)
-        if version == (1, 0):
-            shape, fortran_order, dtype = npy_format.read_array_header_1_0(stream)
-        elif version == (2, 0):
-            shape, fortran_order, dtype = npy_format.read_array_header_2_0(stream)
-        else:
-            raise ValueError(f"version {version[0]}.{version[1]} of the format")
+        with _parsing:
+            if version == (1, 0):
+                shape, fortran_order, dtype = npy_format.read_array_header_1_0(stream)
+            elif version == (2, 0):
+                shape, fortran_order, dtype = npy_format.read_array_header_2_0(stream)
+            else:
+                raise ValueError(f"version {version[0]}.{version[1]} of the format")
     except Exception as error:  # numpy parses the header as Python, which raises many kinds
         raise damaged(path, kind, f"cannot be read ({error})") from error
     if dtype.hasobject:
