@@ -95,8 +95,8 @@ def spread_rows(
             state.record(*(each.line for each in done))
             yield from (each.row for each in done)
         run.profile.add_workers(pool.figures())
-    if pool.replaced and request.shard is None:  # a shard's folder has files that others write
-        remove_all_leftovers(state.folder.local)
+    if request.shard is None:  # else other shards may be writing there
+        remove_all_leftovers(state.folder.local)  # of workers that died
 
 
 def largest_first(frames: FrameList) -> FrameList:

@@ -149,11 +149,6 @@ class WorkerPool:
         finally:
             self._job = None
 
-    @property
-    def replaced(self) -> bool:
-        """True if a worker has died and another was started."""
-        return self._started > len(self._members)
-
     def figures(self) -> list[dict[str, Any]]:
         """Returns for each living worker its node, process number, items and the job's figures."""
         return [
