@@ -16,7 +16,7 @@ from pnpdepth_cli.errors import FileFormatError
 from pnpdepth_cli.io.file_bytes import check_value_count, damaged
 from pnpdepth_cli.io.formats import DepthFormat, StoredArray, WriteOptions
 
-_parsing = threading.Lock()
+HEADER_LOCK = threading.Lock()
 """Held while numpy parses a header as Python: CPython 3.11 mixes up the recursion depths of threads
 that do so at once, and raises SystemError for a good file."""
 
@@ -56,7 +56,7 @@ def read_npy_header(
     stream = io.BytesIO(data)
     try:
         version = npy_format.read_magic(stream)
-        with _parsing:
+        with HEADER_LOCK:
             if version == (1, 0):
                 shape, fortran_order, dtype = npy_format.read_array_header_1_0(stream)
             elif version == (2, 0):

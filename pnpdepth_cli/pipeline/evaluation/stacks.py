@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import FileFormatError
 from pnpdepth_cli.io.formats import StoredArray
+from pnpdepth_cli.io.formats.npy import HEADER_LOCK
 
 STACK_SUFFIXES = (".npy", ".npz")
 _ARRAY_PARTS = {
@@ -72,7 +73,7 @@ def _stack(path: Path) -> Sequence[NDArray[Any]] | NDArray[Any] | None:
 
 
 def _member(file: Any, path: Path) -> NDArray[Any]:
-    with file:
+    with file, HEADER_LOCK:
         version = np.lib.format.read_magic(file)
         read = {
             (1, 0): np.lib.format.read_array_header_1_0,
