@@ -56,6 +56,9 @@ def weighted_mean(depths: Tensor, weights: Sequence[float], *, geometric: bool) 
         return depths[0]
     weight = torch.tensor(weights, dtype=depths.dtype).reshape(-1, *[1] * (depths.ndim - 1))
     known = depths > 0
+    if bool(known.all()):
+        mean = ((depths.log() if geometric else depths) * weight).sum(dim=0) / weight.sum()
+        return mean.exp() if geometric else mean
     weight = torch.where(known, weight, 0.0)
     values = torch.where(known, depths, 1.0)
     total = weight.sum(dim=0)

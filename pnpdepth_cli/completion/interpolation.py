@@ -9,14 +9,22 @@ everywhere. Without any, NoPointsError is raised.
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING, Any
 
+import cv2
+import numpy as np
 import torch
 import torch.nn.functional as F
+from numpy.typing import NDArray
 from torch import Tensor
 
 from pnpdepth_cli.completion.alignment import from_space, to_space
+from pnpdepth_cli.completion.remembered import remembered
 from pnpdepth_cli.errors import NoPointsError
 from pnpdepth_cli.points import SparsePoints
+
+if TYPE_CHECKING:
+    from scipy.spatial import Delaunay, cKDTree
 
 IDW_NEIGHBOURS = 6
 IDW_POWER = 4.0
@@ -26,6 +34,7 @@ FILL_SHARE = 0.03
 _IDW_PIXELS = 1 << 18  # pixels looked up at once: what bounds the memory
 _AT_A_POINT = 0.25  # pixels; closer than this, a point is as close as can be
 _WORTH_THREADS = 1 << 15  # neighbours; for fewer, threads cost more than they save
+_DIAMOND = np.uint8([[abs(x) + abs(y) <= 2 for x in range(-2, 3)] for y in range(-2, 3)])
 _BLUR_SIGMA = 1.1  # pixels; what OpenCV makes of the 5 × 5 Gaussian kernel of the paper's code
 
 
@@ -47,18 +56,15 @@ def linear(points: SparsePoints, xy: Tensor | None = None, *, space: str = "dept
         space: Quantity that is linear, one of `choices.SPACES`.
     """
     from scipy.interpolate import LinearNDInterpolator
-    from scipy.spatial import QhullError
 
     points = distinct(points)
     pixels = _queries(points, xy)
     dense = torch.full((len(pixels),), torch.nan, dtype=torch.float64)
-    if len(points) >= 3:
+    triangles = _triangles(points.xy.double().cpu().numpy())
+    if triangles is not None:
         value = to_space(points.depth.double().cpu(), space)
-        try:
-            within = LinearNDInterpolator(points.xy.double().cpu().numpy(), value.numpy())
-            dense = from_space(torch.from_numpy(within(pixels.numpy())), space)
-        except QhullError:  # no triangle: all points on one line
-            pass
+        within = LinearNDInterpolator(triangles, value.numpy())
+        dense = from_space(torch.from_numpy(within(pixels.numpy())), space)
     outside = dense.isnan()
     _, number = nearest_points(points, pixels[outside], 1)
     dense[outside] = points.depth.double().cpu()[number[:, 0]]
@@ -126,24 +132,22 @@ def morphological(points: SparsePoints) -> Tensor:
     with fewer points the grid is coarser in proportion. Holes that they fill by a 31 × 31 dilation
     and by each column's topmost value are filled with the nearest depth here, which is better.
     """
-    from scipy.ndimage import distance_transform_edt, median_filter
+    from scipy.ndimage import distance_transform_edt
 
     points = distinct(points)
     height, width = points.size
     shrink = min(1.0, math.sqrt(len(points) / (FILL_SHARE * height * width)))
     coarse = points.resized(max(1, round(height * shrink)), max(1, round(width * shrink)))
-    sparse = _within_frame(coarse).scatter().cpu()
+    sparse = _within_frame(coarse).scatter().cpu()[0, 0]
     # minus depth: the maximum is the nearest, and minus infinity is unknown
-    value = torch.where(sparse > 0, -sparse, -torch.inf)
-    for _ in range(2):  # two crosses of 3 × 3 make the diamond
-        value = torch.maximum(_dilated(value, 3, 1), _dilated(value, 1, 3))
-    value = -_dilated(-_dilated(value, 5, 5), 5, 5)
-    value = torch.where(value.isinf(), _dilated(value, 7, 7), value)
+    value = torch.where(sparse > 0, -sparse, -torch.inf).numpy()
+    value = _dilated(value, _DIAMOND)
+    value = -_dilated(-_dilated(value, _square(5)), _square(5))
+    value = np.where(np.isinf(value), _dilated(value, _square(7)), value)
     nearest_known = distance_transform_edt(
-        value[0, 0].isinf().numpy(), return_distances=False, return_indices=True
+        np.isinf(value), return_distances=False, return_indices=True
     )
-    filled = value[0, 0].numpy()[tuple(nearest_known)]
-    smooth = torch.from_numpy(median_filter(filled, 5, mode="nearest"))
+    smooth = torch.from_numpy(cv2.medianBlur(value[tuple(nearest_known)], 5))
     dense = -_blurred(smooth[None, None])
     if dense.shape[-2:] != points.size:
         dense = F.interpolate(dense, points.size, mode="bilinear", align_corners=False)
@@ -158,10 +162,15 @@ def distinct(points: SparsePoints) -> SparsePoints:
     """
     if not len(points):
         raise NoPointsError("there is no sparse point to interpolate; give at least one")
-    xy, which = torch.unique(points.xy, dim=0, return_inverse=True)
-    depth = points.depth.new_full((len(xy),), torch.inf)
+    xy, depth = points.xy.cpu().numpy(), points.depth.cpu().numpy()
+    order = np.lexsort(xy.T[::-1])  # faster than torch.unique
+    xy, depth = xy[order], depth[order]
+    new = np.append(True, (xy[1:] != xy[:-1]).any(axis=1))
+    (first,) = new.nonzero()
     return SparsePoints(
-        xy=xy, depth=depth.scatter_reduce(0, which, points.depth, "amin"), size=points.size
+        xy=torch.from_numpy(xy[first]).to(points.xy.device),
+        depth=torch.from_numpy(np.minimum.reduceat(depth, first)).to(points.depth.device),
+        size=points.size,
     )
 
 
@@ -184,13 +193,34 @@ def nearest_points(points: SparsePoints, xy: Tensor, count: int) -> tuple[Tensor
 
     The nearest point comes first.
     """
+    distance, number = _nearest(points.xy.double().cpu().numpy(), xy.numpy(), count)
+    return torch.from_numpy(distance), torch.from_numpy(number)
+
+
+@remembered(8)
+def _nearest(points: NDArray[np.float64], xy: NDArray[np.float64], count: int) -> Any:
+    """The same of coordinates (N, 2) and (M, 2)."""
+    among = np.arange(1, count + 1)
+    many = len(xy) * count > _WORTH_THREADS
+    return _tree(points).query(xy, among, workers=-1 if many else 1)
+
+
+@remembered(2)
+def _tree(points: NDArray[np.float64]) -> cKDTree:
     from scipy.spatial import cKDTree
 
-    tree = cKDTree(points.xy.double().cpu().numpy())
-    among = torch.arange(1, count + 1).numpy()
-    many = len(xy) * count > _WORTH_THREADS
-    distance, number = tree.query(xy.numpy(), among, workers=-1 if many else 1)
-    return torch.from_numpy(distance), torch.from_numpy(number)
+    return cKDTree(points)
+
+
+@remembered(2)
+def _triangles(points: NDArray[np.float64]) -> Delaunay | None:
+    """The points' triangulation; None if there is no triangle."""
+    from scipy.spatial import Delaunay, QhullError
+
+    try:
+        return Delaunay(points) if len(points) >= 3 else None
+    except QhullError:  # all points on one line
+        return None
 
 
 def _within_frame(points: SparsePoints) -> SparsePoints:
@@ -201,9 +231,13 @@ def _within_frame(points: SparsePoints) -> SparsePoints:
     return SparsePoints(xy=xy, depth=points.depth, size=points.size)
 
 
-def _dilated(value: Tensor, height: int, width: int) -> Tensor:
-    """The greatest value within height × width pixels."""
-    return F.max_pool2d(value, (height, width), 1, (height // 2, width // 2))
+def _dilated(value: NDArray[np.float32], kernel: NDArray[np.uint8]) -> NDArray[np.float32]:
+    # What lies outside has no effect: a replicated pixel is below the kernel itself.
+    return np.asarray(cv2.dilate(value, kernel, borderType=cv2.BORDER_REPLICATE), np.float32)
+
+
+def _square(side: int) -> NDArray[np.uint8]:
+    return np.ones((side, side), np.uint8)
 
 
 def _blurred(value: Tensor) -> Tensor:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import functools
 from dataclasses import dataclass, replace
 
+import cv2
 import torch
 from torch import Tensor
 
@@ -17,11 +18,6 @@ from pnpdepth_cli.completion.interpolation import distinct
 from pnpdepth_cli.points import SparsePoints, in_frame
 
 _FLAT_DEPTH, _FLAT_COLOUR = 1e-3, 1.0  # added to standard deviations: a flat image has no edges
-_XYZ_OF_RGB = (
-    (0.4124564, 0.3575761, 0.1804375),
-    (0.2126729, 0.7151522, 0.0721750),
-    (0.0193339, 0.1191920, 0.9503041),
-)  # IEC 61966-2-1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,7 +42,7 @@ class ResidualField:
     """A residual that is known at N points of an image."""
 
     features: Tensor
-    """(H, W, 3 or 6), see `features_of`."""
+    """(3 or 6, H, W), see `features_of`."""
     points: SparsePoints
     """The points in the image frame, on the CPU."""
     at: Tensor
@@ -57,6 +53,10 @@ class ResidualField:
     """Covariance; `gaussian_process.fit` chooses it."""
     scale: float = 1.0
     """Standard deviation of the field; `gaussian_process.fit` chooses it."""
+
+    def features_at(self, queries: SparsePoints) -> Tensor:
+        """Returns the features (M, 3 or 6) at the coordinates of M points."""
+        return _sampled(self.features, queries)
 
     def select(self, mask: Tensor) -> ResidualField:
         """Returns the field with only the points where mask (N,) is true."""
@@ -88,13 +88,13 @@ def residual_field(prediction: Tensor, points: SparsePoints, rgb: Tensor | None)
     return ResidualField(
         features=features,
         points=points,
-        at=torch.stack([points.sample(one) for one in features.unbind(2)], dim=1),
+        at=_sampled(features, points),
         residual=points.depth.double().log() - predicted.log(),
     )
 
 
 def features_of(log_depth: Tensor, rgb: Tensor | None) -> Tensor:
-    """Returns (H, W, 3 or 6) float32: x and y, predicted log depth, CIELAB colour.
+    """Returns (3 or 6, H, W) float32: x and y, predicted log depth, CIELAB colour.
 
     x and y are in units of the longer side; depth and colour in standard deviations over the image.
 
@@ -104,31 +104,30 @@ def features_of(log_depth: Tensor, rgb: Tensor | None) -> Tensor:
     """
     height, width = log_depth.shape
     y, x = (torch.arange(float(n)) / max(height, width) for n in (height, width))
-    position = torch.stack([x.expand(height, width), y[:, None].expand(height, width)], dim=-1)
-    known = log_depth[log_depth.isfinite()].double()
-    u = (log_depth - known.mean()) / (known.std(correction=0) + _FLAT_DEPTH)
-    maps = [position, u.nan_to_num(0.0)[..., None]]
-    if rgb is not None:
-        maps.append(_colour(rgb))
-    return torch.cat(maps, dim=-1).float()
+    known = log_depth.isfinite()
+    std, mean = torch.std_mean(log_depth[known].double(), correction=0)
+    u = torch.where(known, (log_depth - mean) / (std + _FLAT_DEPTH), 0.0)
+    maps = torch.stack([x.expand(height, width), y[:, None].expand(height, width), u]).float()
+    return maps if rgb is None else torch.cat([maps, _colour(rgb)])
+
+
+def _sampled(features: Tensor, points: SparsePoints) -> Tensor:
+    """(N, 3 or 6): the features at the points."""
+    return torch.stack([points.sample(one) for one in features], dim=1)
 
 
 @functools.lru_cache(maxsize=1)
 def _colour(rgb: Tensor) -> Tensor:
-    """CIELAB (H, W, 3), its mean 0 and its standard deviation over the image about 1.
+    """CIELAB (3, H, W), its mean 0 and its standard deviation over the image about 1.
 
     Remembered for the last image, whose residuals are propagated several times.
     """
     lab = cielab(rgb)
-    lab = lab - lab.mean(dim=(0, 1))
-    return lab / (lab.square().sum(dim=-1).mean().sqrt() + _FLAT_COLOUR)
+    lab = lab - lab.mean(dim=(1, 2), keepdim=True)
+    return lab / (lab.square().sum(dim=0).mean().sqrt() + _FLAT_COLOUR)
 
 
 def cielab(rgb: Tensor) -> Tensor:
-    """Returns (H, W, 3) CIELAB (CIE 1976, white D65) of an sRGB image (3, H, W) in 0…1."""
-    linear = torch.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055).clamp_min(0) ** 2.4)
-    matrix = rgb.new_tensor(_XYZ_OF_RGB)
-    xyz = torch.einsum("ij,jhw->ihw", matrix / matrix.sum(dim=1, keepdim=True), linear)
-    root = xyz.clamp_min(1e-6).pow(1 / 3)
-    x, y, z = torch.where(xyz > 216 / 24389, root, xyz * (24389 / 27 / 116) + 16 / 116)
-    return torch.stack([116 * y - 16, 500 * (x - y), 200 * (y - z)], dim=-1)
+    """Returns (3, H, W) CIELAB (CIE 1976, white D65) of an sRGB image (3, H, W) in 0…1."""
+    image = rgb.float().permute(1, 2, 0).contiguous().numpy()
+    return torch.from_numpy(cv2.cvtColor(image, cv2.COLOR_RGB2Lab)).permute(2, 0, 1).contiguous()

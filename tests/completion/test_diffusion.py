@@ -23,7 +23,7 @@ def field(xy: list[tuple[float, float]], residual: list[float], log_depth: Tenso
         size=(log_depth.shape[0], log_depth.shape[1]),
     )
     features = features_of(log_depth, None)
-    at = torch.stack([points.sample(one) for one in features.unbind(2)], dim=1)
+    at = torch.stack([points.sample(one) for one in features], dim=1)
     return ResidualField(
         features=features, points=points, at=at, residual=torch.tensor(residual).double()
     )
@@ -38,7 +38,7 @@ def step(size: tuple[int, int] = SIZE) -> Tensor:
 
 def test_it_is_the_least_squares_solution_of_its_equation() -> None:
     residuals = field([(1.0, 1.0), (6.0, 4.0), (2.0, 5.0)], [0.3, -0.2, 0.1], step())
-    u = residuals.features[..., 2].double().numpy()
+    u = residuals.features[2].double().numpy()
     number = np.arange(48).reshape(SIZE)
     lines, right = [], []
     for (x, y), r in zip(

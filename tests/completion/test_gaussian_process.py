@@ -36,7 +36,7 @@ def field(
     points = SparsePoints(xy=xy, depth=torch.ones(count), size=size)
     features = features_of(log, rgb)
     residual = torch.sin(xy[:, 0] / width * 3).double() * 0.3 + 0.2
-    at = torch.stack([points.sample(one) for one in features.unbind(2)], dim=1)
+    at = torch.stack([points.sample(one) for one in features], dim=1)
     return ResidualField(features=features, points=points, at=at, residual=residual)
 
 
@@ -45,7 +45,7 @@ def dense_reference(field: ResidualField) -> tuple[np.ndarray, np.ndarray]:
     lengths = np.array([1, 1, field.kernel.depth, *[field.kernel.colour] * 3])
     lengths = lengths[: field.at.shape[1]]
     a = field.at.double().numpy()
-    b = field.features.double().numpy().reshape(-1, a.shape[1])
+    b = field.features.double().numpy().reshape(a.shape[1], -1).T
 
     def covariance(p: np.ndarray, q: np.ndarray) -> np.ndarray:
         apart = np.linalg.norm((p[:, None] - q[None]) / lengths, axis=2)
@@ -101,7 +101,7 @@ def test_prediction_at_positions_equals_the_dense_prediction(count: int) -> None
     residuals = fit(field(count))
     positions = torch.tensor([[3.0, 4.0], [29.0, 19.0], [0.0, 0.0]])
     queries = SparsePoints(xy=positions, depth=torch.ones(3), size=SIZE)
-    at = torch.stack([queries.sample(one) for one in residuals.features.unbind(2)], dim=1)
+    at = residuals.features_at(queries)
     mean = predict(residuals)
     assert torch.allclose(predict_at(residuals, positions, at), queries.sample(mean), atol=1e-5)
 
@@ -110,7 +110,7 @@ def test_with_many_points_prediction_at_positions_is_near_the_dense_prediction()
     residuals = fit(field(900, size=(60, 80)))
     positions = torch.tensor([[30.0, 40.0], [79.0, 59.0], [7.0, 8.0]])
     queries = SparsePoints(xy=positions, depth=torch.ones(3), size=(60, 80))
-    at = torch.stack([queries.sample(one) for one in residuals.features.unbind(2)], dim=1)
+    at = residuals.features_at(queries)
     mean = predict(residuals)
     assert torch.allclose(predict_at(residuals, positions, at), queries.sample(mean), atol=0.02)
 

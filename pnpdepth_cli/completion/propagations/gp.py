@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import torch
 from torch import Tensor
 
 from pnpdepth_cli.completion.gaussian_process import fit, predict, predict_at, predict_with_sigma
@@ -13,8 +12,7 @@ from pnpdepth_cli.points import SparsePoints
 
 def _at(field: ResidualField, queries: SparsePoints) -> Tensor:
     """With many points, each query is predicted from the points nearest to it."""
-    features = torch.stack([queries.sample(one) for one in field.features.unbind(2)], dim=1)
-    return predict_at(fit(field), queries.xy, features)
+    return predict_at(fit(field), queries.xy, field.features_at(queries))
 
 
 propagation = Propagation(
