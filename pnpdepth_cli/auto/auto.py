@@ -29,6 +29,8 @@ MIN_POINTS = 5
 """With fewer points none is held out."""
 ENOUGH_HELD_OUT = 100
 """With this many held-out points no further fold is scored."""
+MOST_SCORED = 1000
+"""Of more held-out points a random part is scored."""
 MIN_POINTS_FOR_JOINT_OUTLIERS = 50
 """From this many points on, points inconsistent with other points alone are outliers too."""
 
@@ -135,8 +137,8 @@ def _folds(
     masks = [fold == number for number in range(scored)]
     return tuple(
         Fold(
-            held_out=points.select(held),
-            inlier_weights=weights[held],
+            held_out=points.select(some),
+            inlier_weights=weights[some],
             depths=CandidateDepths(
                 passes,
                 frame.with_points(points.select(~held)),
@@ -146,7 +148,17 @@ def _folds(
         )
         for held in masks
         if 0 < int(held.sum()) < len(points)
+        for some in [_part_of(held, seed)]
     )
+
+
+def _part_of(held: Tensor, seed: int) -> Tensor:
+    """(N,) bool: the held-out points that are scored."""
+    (numbers,) = held.nonzero(as_tuple=True)
+    drawn = torch.randperm(len(numbers), generator=torch.Generator().manual_seed(seed))
+    part = torch.zeros_like(held)
+    part[numbers[drawn[:MOST_SCORED]]] = True
+    return part
 
 
 def _inlier_weights(points: SparsePoints, prediction: Tensor) -> Tensor:

@@ -19,7 +19,8 @@ from pnpdepth_cli.auto.blending import weighted_mean
 from pnpdepth_cli.auto.candidates import Candidate, RefinementConfig
 from pnpdepth_cli.choices import BASELINES, LOSSES
 from pnpdepth_cli.completion.interpolation import in_hull
-from pnpdepth_cli.completion.propagation import propagate, propagate_at
+from pnpdepth_cli.completion.propagation import fitted_kernel, propagate, propagate_at
+from pnpdepth_cli.completion.residual_field import Kernel
 from pnpdepth_cli.core.refine import Refinement, refine_from
 from pnpdepth_cli.core.split import InputSplit, Split
 from pnpdepth_cli.core.split.user_code import wrap_user_errors
@@ -264,6 +265,7 @@ class CandidateDepths:
         self._trajectories: dict[
             tuple[RefinementConfig, Candidate | None], Trajectory | PnpDepthError
         ] = {}
+        self._kernels: dict[str, Kernel] = {}
 
     def trajectory(self, config: RefinementConfig, prior: Candidate | None = None) -> Trajectory:
         """Returns the refinement; raises its PnpDepthError, computed or remembered."""
@@ -304,15 +306,21 @@ class CandidateDepths:
         return propagate(depth, frame.points, frame.rgb, kind=candidate.propagate).depth
 
     def at(self, xy: Tensor, candidate: Candidate) -> Tensor:
-        """Returns the candidate's depth (M,) metres at pixel coordinates (M, 2)."""
+        """Returns the candidate's depth (M,) metres at pixel coordinates (M, 2).
+
+        All candidates' residuals are propagated with the kernel that fits the first one's.
+        """
         frame, name = self._frame, candidate.baseline
         if candidate.within_hull:
             inside = in_hull(frame.points, xy)
             unlimited = self.at(xy, replace(candidate, within_hull=False))
             return torch.where(inside, unlimited, self.at(xy, self._default))
         if candidate.propagate != "none":
-            start = self._start(candidate)
-            return propagate_at(start, frame.points, frame.rgb, xy, kind=candidate.propagate)
+            start, kind = self._start(candidate), candidate.propagate
+            residual = start, frame.points, frame.rgb
+            if kind not in self._kernels:
+                self._kernels[kind] = fitted_kernel(*residual, kind)
+            return propagate_at(*residual, xy, kind=kind, kernel=self._kernels[kind])
         if name is None:
             queries = SparsePoints(xy=xy, depth=xy.new_ones(len(xy)), size=frame.size)
             return queries.sample(self._start(candidate))

@@ -9,22 +9,22 @@ everywhere. Without any, NoPointsError is raised.
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import cv2
 import numpy as np
 import torch
 import torch.nn.functional as F
 from numpy.typing import NDArray
+from scipy.interpolate import LinearNDInterpolator
+from scipy.ndimage import distance_transform_edt
+from scipy.spatial import ConvexHull, Delaunay, QhullError, cKDTree
 from torch import Tensor
 
 from pnpdepth_cli.completion.alignment import from_space, to_space
 from pnpdepth_cli.completion.remembered import remembered
 from pnpdepth_cli.errors import NoPointsError
 from pnpdepth_cli.points import SparsePoints
-
-if TYPE_CHECKING:
-    from scipy.spatial import Delaunay, cKDTree
 
 IDW_NEIGHBOURS = 6
 IDW_POWER = 4.0
@@ -34,7 +34,9 @@ FILL_SHARE = 0.03
 _IDW_PIXELS = 1 << 18  # pixels looked up at once: what bounds the memory
 _AT_A_POINT = 0.25  # pixels; closer than this, a point is as close as can be
 _WORTH_THREADS = 1 << 15  # neighbours; for fewer, threads cost more than they save
-_DIAMOND = np.uint8([[abs(x) + abs(y) <= 2 for x in range(-2, 3)] for y in range(-2, 3)])
+_DIAMOND = np.array(
+    [[abs(x) + abs(y) <= 2 for x in range(-2, 3)] for y in range(-2, 3)], dtype=np.uint8
+)
 _BLUR_SIGMA = 1.1  # pixels; what OpenCV makes of the 5 × 5 Gaussian kernel of the paper's code
 
 
@@ -55,8 +57,6 @@ def linear(points: SparsePoints, xy: Tensor | None = None, *, space: str = "dept
         xy: (M, 2) pixel coordinates. None: every pixel.
         space: Quantity that is linear, one of `choices.SPACES`.
     """
-    from scipy.interpolate import LinearNDInterpolator
-
     points = distinct(points)
     pixels = _queries(points, xy)
     dense = torch.full((len(pixels),), torch.nan, dtype=torch.float64)
@@ -78,8 +78,6 @@ def in_hull(points: SparsePoints, xy: Tensor | None = None) -> Tensor:
         points: Sparse depth.
         xy: (M, 2) pixel coordinates. None: every pixel.
     """
-    from scipy.spatial import ConvexHull, QhullError
-
     pixels = _queries(points, xy)
     inside = torch.zeros(len(pixels), dtype=torch.bool)
     if len(points) >= 3:
@@ -132,8 +130,6 @@ def morphological(points: SparsePoints) -> Tensor:
     with fewer points the grid is coarser in proportion. Holes that they fill by a 31 × 31 dilation
     and by each column's topmost value are filled with the nearest depth here, which is better.
     """
-    from scipy.ndimage import distance_transform_edt
-
     points = distinct(points)
     height, width = points.size
     shrink = min(1.0, math.sqrt(len(points) / (FILL_SHARE * height * width)))
@@ -207,16 +203,12 @@ def _nearest(points: NDArray[np.float64], xy: NDArray[np.float64], count: int) -
 
 @remembered(2)
 def _tree(points: NDArray[np.float64]) -> cKDTree:
-    from scipy.spatial import cKDTree
-
     return cKDTree(points)
 
 
 @remembered(2)
 def _triangles(points: NDArray[np.float64]) -> Delaunay | None:
     """The points' triangulation; None if there is no triangle."""
-    from scipy.spatial import Delaunay, QhullError
-
     try:
         return Delaunay(points) if len(points) >= 3 else None
     except QhullError:  # all points on one line

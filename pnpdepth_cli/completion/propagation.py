@@ -11,14 +11,14 @@ and points outside the frame have no effect. Of points at the same coordinates t
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from pnpdepth_cli.choices import PROPAGATIONS
 from pnpdepth_cli.completion.outliers import without_outliers
-from pnpdepth_cli.completion.residual_field import ResidualField, residual_field
+from pnpdepth_cli.completion.residual_field import Kernel, ResidualField, residual_field
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.points import SparsePoints
 
@@ -28,10 +28,15 @@ NONE = "none"
 
 @dataclass(frozen=True, kw_only=True)
 class Propagation:
-    """A method that predicts the residual away from the points."""
+    """A method that predicts the residual away from the points.
+
+    `dense`, `at` and `with_sigma` take a field whose kernel `fit` has chosen.
+    """
 
     title: str
     """What it does, in a few words."""
+    fit: Callable[[ResidualField], ResidualField] = lambda field: field
+    """Chooses the field's kernel."""
     dense: Callable[[ResidualField], Tensor]
     """Residual (H, W) float32 at every pixel."""
     at: Callable[[ResidualField, SparsePoints], Tensor] | None = None
@@ -79,7 +84,7 @@ def propagate(
     known = prediction.isfinite() & (prediction > 0)
     if propagation is None:
         return Propagated(depth=torch.where(known, prediction, 0.0).float())
-    field = without_outliers(residual_field(prediction, points, rgb))
+    field = propagation.fit(without_outliers(residual_field(prediction, points, rgb)))
     if sigma:
         residual, deviation = propagation.with_sigma(field)
     else:
@@ -98,6 +103,7 @@ def propagate_at(
     xy: Tensor,
     *,
     kind: str = "gp",
+    kernel: Kernel | None = None,
 ) -> Tensor:
     """Returns the propagated depth (M,) metres at pixel coordinates only; 0 where it is unknown.
 
@@ -107,6 +113,7 @@ def propagate_at(
         rgb: (3, H, W) in 0…1, or None.
         xy: (M, 2) pixel coordinates.
         kind: As of `propagate`, which has the errors too.
+        kernel: What `fitted_kernel` gave. None: it is fitted.
     """
     propagation = None if kind == NONE else PROPAGATIONS[kind]
     queries = SparsePoints(xy=xy, depth=torch.ones_like(xy[:, 0]), size=points.size)
@@ -115,12 +122,22 @@ def propagate_at(
     if propagation is None:
         return predicted.float()
     field = without_outliers(residual_field(prediction, points, rgb))
+    field = propagation.fit(field) if kernel is None else replace(field, kernel=kernel)
     queries = queries.tensors()
     if propagation.at is None:
         residual = queries.sample(propagation.dense(field))
     else:
         residual = propagation.at(field, queries)
     return (predicted * _clamped(residual, field).exp().to(predicted.device)).float()
+
+
+def fitted_kernel(
+    prediction: Tensor, points: SparsePoints, rgb: Tensor | None, kind: str
+) -> Kernel:
+    """Returns the kernel that fits the residual best; arguments and errors as of `propagate`."""
+    field = without_outliers(residual_field(prediction, points, rgb))
+    kernel: Kernel = PROPAGATIONS[kind].fit(field).kernel
+    return kernel
 
 
 def _clamped(residual: Tensor, field: ResidualField) -> Tensor:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import functools
 from dataclasses import dataclass, replace
 
-import cv2
 import torch
 from torch import Tensor
 
@@ -18,6 +17,11 @@ from pnpdepth_cli.completion.interpolation import distinct
 from pnpdepth_cli.points import SparsePoints, in_frame
 
 _FLAT_DEPTH, _FLAT_COLOUR = 1e-3, 1.0  # added to standard deviations: a flat image has no edges
+_XYZ_OF_RGB = (
+    (0.4124564, 0.3575761, 0.1804375),
+    (0.2126729, 0.7151522, 0.0721750),
+    (0.0193339, 0.1191920, 0.9503041),
+)  # IEC 61966-2-1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -129,5 +133,9 @@ def _colour(rgb: Tensor) -> Tensor:
 
 def cielab(rgb: Tensor) -> Tensor:
     """Returns (3, H, W) CIELAB (CIE 1976, white D65) of an sRGB image (3, H, W) in 0…1."""
-    image = rgb.float().permute(1, 2, 0).contiguous().numpy()
-    return torch.from_numpy(cv2.cvtColor(image, cv2.COLOR_RGB2Lab)).permute(2, 0, 1).contiguous()
+    linear = torch.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055).clamp_min(0) ** 2.4)
+    matrix = rgb.new_tensor(_XYZ_OF_RGB)
+    xyz = torch.einsum("ij,jhw->ihw", matrix / matrix.sum(dim=1, keepdim=True), linear)
+    root = xyz.clamp_min(1e-6).pow(1 / 3)
+    x, y, z = torch.where(xyz > 216 / 24389, root, xyz * (24389 / 27 / 116) + 16 / 116)
+    return torch.stack([116 * y - 16, 500 * (x - y), 200 * (y - z)])

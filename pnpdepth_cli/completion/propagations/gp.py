@@ -12,12 +12,13 @@ from pnpdepth_cli.points import SparsePoints
 
 def _at(field: ResidualField, queries: SparsePoints) -> Tensor:
     """With many points, each query is predicted from the points nearest to it."""
-    return predict_at(fit(field), queries.xy, field.features_at(queries))
+    return predict_at(field, queries.xy, field.features_at(queries))
 
 
 propagation = Propagation(
     title="Gaussian process",
-    dense=lambda field: predict(fit(field)),
+    fit=fit,
+    dense=predict,
     at=_at,
-    with_sigma=lambda field: predict_with_sigma(fit(field)),
+    with_sigma=predict_with_sigma,
 )
