@@ -40,7 +40,7 @@ def diffuse(field: ResidualField) -> Tensor:
     wanted = min(max(_NODES_PER_POINT * len(field.points), _MIN_NODES), _MAX_NODES)
     shrink = min(1.0, math.sqrt(wanted / (height * width)))
     rows, columns = max(1, round(height * shrink)), max(1, round(width * shrink))
-    nodes = F.interpolate(field.features[None], (rows, columns), mode="area")[0]
+    nodes = F.interpolate(torch.stack(field.features)[None], (rows, columns), mode="area")[0]
     number = torch.arange(rows * columns).reshape(rows, columns)
     first = torch.cat([number[:, :-1].flatten(), number[:-1].flatten()])
     second = torch.cat([number[:, 1:].flatten(), number[1:].flatten()])

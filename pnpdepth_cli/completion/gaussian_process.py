@@ -160,8 +160,8 @@ def _predict(field: ResidualField, *, sigma: bool) -> Tensor:
     if step == 1:
         return _predict_grid(field, sigma=sigma)
     coarse = (max(1, round(size[0] / step)), max(1, round(size[1] / step)))
-    features = F.interpolate(field.features[None], coarse, mode="area")[0]
-    grid = replace(field, features=features, points=field.points.resized(*coarse))
+    features = F.interpolate(torch.stack(field.features)[None], coarse, mode="area")[0]
+    grid = replace(field, features=features.unbind(), points=field.points.resized(*coarse))
     values = _predict_grid(grid, sigma=sigma)[None]
     return F.interpolate(values, size, mode="bilinear", align_corners=False)[0]
 
@@ -178,7 +178,7 @@ def _predict_grid(field: ResidualField, *, sigma: bool) -> Tensor:
     """The same, predicted at every pixel of the field's features."""
     height, width = field.points.size
     if _is_exact(field):
-        queries = field.features.flatten(1).t()[None]
+        queries = torch.stack(field.features, dim=-1).reshape(1, height * width, -1)
         return _solve(field, _all_points(field), queries, sigma).reshape(-1, height, width)
     side = _block_side(field.points)
     layers = [_predict_blocks(field, side, shift, sigma) for shift in (0, side // 2)]
@@ -277,7 +277,7 @@ def _predict_blocks(
     height, width = field.points.size
     rows, columns = (math.ceil((n + shift) / side) for n in (height, width))
     padding = (shift, columns * side - shift - width, shift, rows * side - shift - height)
-    padded = F.pad(field.features[None], padding, mode="replicate")[0]
+    padded = F.pad(torch.stack(field.features)[None], padding, mode="replicate")[0]
     blocks = padded.reshape(-1, rows, side, columns, side).permute(1, 3, 2, 4, 0)
     middles = torch.cartesian_prod(torch.arange(rows), torch.arange(columns)).flip(1).double()
     _, near = nearest_points(field.points, (middles + 0.5) * side - 0.5 - shift, NEIGHBOURS)

@@ -45,8 +45,8 @@ class Kernel:
 class ResidualField:
     """A residual that is known at N points of an image."""
 
-    features: Tensor
-    """(3 or 6, H, W), see `features_of`."""
+    features: tuple[Tensor, ...]
+    """3 or 6 maps (H, W), see `features_of`."""
     points: SparsePoints
     """The points in the image frame, on the CPU."""
     at: Tensor
@@ -97,8 +97,8 @@ def residual_field(prediction: Tensor, points: SparsePoints, rgb: Tensor | None)
     )
 
 
-def features_of(log_depth: Tensor, rgb: Tensor | None) -> Tensor:
-    """Returns (3 or 6, H, W) float32: x and y, predicted log depth, CIELAB colour.
+def features_of(log_depth: Tensor, rgb: Tensor | None) -> tuple[Tensor, ...]:
+    """Returns 3 or 6 maps (H, W) float32: x and y, predicted log depth, CIELAB colour.
 
     x and y are in units of the longer side; depth and colour in standard deviations over the image.
 
@@ -109,13 +109,14 @@ def features_of(log_depth: Tensor, rgb: Tensor | None) -> Tensor:
     height, width = log_depth.shape
     y, x = (torch.arange(float(n)) / max(height, width) for n in (height, width))
     known = log_depth.isfinite()
-    std, mean = torch.std_mean(log_depth[known].double(), correction=0)
+    values = log_depth if bool(known.all()) else log_depth[known]  # picking them is slow
+    std, mean = torch.std_mean(values.double(), correction=0)
     u = torch.where(known, (log_depth - mean) / (std + _FLAT_DEPTH), 0.0)
-    maps = torch.stack([x.expand(height, width), y[:, None].expand(height, width), u]).float()
-    return maps if rgb is None else torch.cat([maps, _colour(rgb)])
+    maps = x.expand(height, width), y[:, None].expand(height, width), u.float()
+    return maps if rgb is None else (*maps, *_colour(rgb))
 
 
-def _sampled(features: Tensor, points: SparsePoints) -> Tensor:
+def _sampled(features: tuple[Tensor, ...], points: SparsePoints) -> Tensor:
     """(N, 3 or 6): the features at the points."""
     return torch.stack([points.sample(one) for one in features], dim=1)
 

@@ -45,7 +45,7 @@ def dense_reference(field: ResidualField) -> tuple[np.ndarray, np.ndarray]:
     lengths = np.array([1, 1, field.kernel.depth, *[field.kernel.colour] * 3])
     lengths = lengths[: field.at.shape[1]]
     a = field.at.double().numpy()
-    b = field.features.double().numpy().reshape(a.shape[1], -1).T
+    b = torch.stack(field.features, dim=-1).double().numpy().reshape(-1, a.shape[1])
 
     def covariance(p: np.ndarray, q: np.ndarray) -> np.ndarray:
         apart = np.linalg.norm((p[:, None] - q[None]) / lengths, axis=2)

@@ -27,6 +27,8 @@ def test_pure_red_is_where_it_is_in_tables_of_cielab() -> None:
 
 
 def test_features_of_a_flat_prediction_and_image_are_finite() -> None:
-    features = features_of(torch.full(SIZE, math.log(3.0)), torch.full((3, *SIZE), 0.5))
+    features = torch.stack(
+        features_of(torch.full(SIZE, math.log(3.0)), torch.full((3, *SIZE), 0.5))
+    )
     assert bool(features.isfinite().all())
     assert float(features[2:].abs().max()) < 1e-3
