@@ -100,6 +100,17 @@ def test_held_out_points_have_no_influence_on_the_depth_they_score(
         assert torch.equal(again.at(candidate), before)
 
 
+def test_of_many_held_out_points_a_part_is_scored_and_none_is_shown(
+    frame: FrameOnDisk, network: Network, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(auto, "MOST_SCORED", 7)
+    inputs = in_memory(frame)
+    for fold in chosen(network, inputs).folds:
+        assert len(fold.held_out) == 7
+        kept = len(inputs.points) * (auto.FOLDS - 1) / auto.FOLDS
+        assert len(fold.depths.points) == pytest.approx(kept, abs=3)
+
+
 def test_held_out_points_without_any_inlier_weight_count_alike(
     frame: FrameOnDisk, network: Network, monkeypatch: pytest.MonkeyPatch
 ) -> None:
