@@ -7,6 +7,9 @@ planning, of a run that has nothing to do, and of its summary.
 `… overhead FOLDER --frames 60` refines frames of a data set with and without a Ray worker, compares
 the results, and prints the CPU seconds of all processes between the first frame and the last.
 
+`… nodes FOLDER --frames 60` refines them on a cluster of three nodes on loopback, one of which is
+lost after a third of the frames, and compares the results with those of one process.
+
 `… scaling --workers 16` gives 1 and 16 workers frames whose stand-in network only waits, and prints
 frames a second, and the driver's CPU time with the manifest's lines of such frames written.
 """
@@ -210,7 +213,6 @@ def cpu_seconds() -> tuple[float, float]:
 
 def overhead(source: Path, frames: int, model: str) -> dict[str, Any]:
     """Of a Ray worker over this process, on the same frames, and whether results are equal."""
-    refine = RefineRequest.from_fields(model=model, preset="paper", sample=SamplePattern(count=500))
     found: dict[str, Any] = {"frames": frames}
     made = []
     with tempfile.TemporaryDirectory() as temporary:
@@ -220,16 +222,51 @@ def overhead(source: Path, frames: int, model: str) -> dict[str, Any]:
             ("one Ray worker", ClusterOptions(ray=LOCAL, ray_workers=1)),
         ):
             clock = Clock()
-            request = BatchRequest(
-                source=source, output=out, limit=frames, refine=refine, cluster=cluster
-            )
-            run_batch(request, clock)
+            made.append(made_by(clock, source, out, frames, model, cluster))
             found[name] = clock.between()
-            made.append(contents(out))
-            shutil.rmtree(out)
     one, other = (found[name]["cpu_s_a_frame"] for name in list(found)[1:])
     equal = made[0] == made[1]
     return found | {"overhead": round(other / one - 1, 3), "equal": equal, "files": len(made[0])}
+
+
+class LosingANode(Quiet):
+    """Removes a node from a cluster when so many frames are done."""
+
+    def __init__(self, cluster: Any, after: int) -> None:
+        self._cluster, self._left = cluster, after
+
+    def frame(self, row: dict[str, Any]) -> None:
+        """Counts the frame."""
+        self._left -= 1
+        if self._left == 0:
+            lost = next(iter(self._cluster.worker_nodes))
+            self._cluster.remove_node(lost, allow_graceful=False)
+
+
+def nodes(source: Path, frames: int, model: str) -> dict[str, Any]:
+    """Whether results of three nodes, one of which is lost, equal those of one process."""
+    from tests.pipeline.cluster.nodes import three_nodes
+
+    with tempfile.TemporaryDirectory() as temporary:
+        out = Path(temporary) / "out"
+        one = made_by(Quiet(), source, out, frames, model, ClusterOptions())
+        with three_nodes() as cluster:
+            options = ClusterOptions(ray=cluster.address)
+            losing = LosingANode(cluster, max(1, frames // 3))
+            other = made_by(losing, source, out, frames, model, options)
+    return {"frames": frames, "files": len(one), "equal": one == other}
+
+
+def made_by(
+    listener: Quiet, source: Path, out: Path, frames: int, model: str, cluster: ClusterOptions
+) -> dict[str, bytes]:
+    """The results of a batch, which are removed."""
+    refine = RefineRequest.from_fields(model=model, preset="paper", sample=SamplePattern(count=500))
+    request = BatchRequest(source=source, output=out, limit=frames, refine=refine, cluster=cluster)
+    run_batch(request, listener)
+    made = contents(out)
+    shutil.rmtree(out)
+    return made
 
 
 def contents(folder: Path) -> dict[str, bytes]:
@@ -333,6 +370,10 @@ def main() -> None:
     of_overhead.add_argument("source", type=Path)
     of_overhead.add_argument("--frames", type=int, default=60)
     of_overhead.add_argument("--model", default="compact")
+    of_nodes = commands.add_parser("nodes")
+    of_nodes.add_argument("source", type=Path)
+    of_nodes.add_argument("--frames", type=int, default=60)
+    of_nodes.add_argument("--model", default="compact")
     of_scaling = commands.add_parser("scaling")
     of_scaling.add_argument("--workers", type=int, default=16)
     of_scaling.add_argument("--rate", type=float, default=200.0, help="frames a second of all")
@@ -342,6 +383,8 @@ def main() -> None:
         result = entries(args.count, args.folder)
     elif args.command == "overhead":
         result = overhead(args.source, args.frames, args.model)
+    elif args.command == "nodes":
+        result = nodes(args.source, args.frames, args.model)
     else:
         result = scaling(args.workers, args.rate, args.seconds)
     print(json.dumps(result, indent=2))
