@@ -213,8 +213,8 @@ def cpu_seconds() -> tuple[float, float]:
 
 def overhead(source: Path, frames: int, model: str) -> dict[str, Any]:
     """Of a Ray worker over this process, on the same frames, and whether results are equal."""
-    found: dict[str, Any] = {"frames": frames}
-    made = []
+    figures: dict[str, Any] = {"frames": frames}
+    results = []
     with tempfile.TemporaryDirectory() as temporary:
         out = Path(temporary) / "out"  # of one name, which is in the records
         for name, cluster in (
@@ -222,11 +222,15 @@ def overhead(source: Path, frames: int, model: str) -> dict[str, Any]:
             ("one Ray worker", ClusterOptions(ray=LOCAL, ray_workers=1)),
         ):
             clock = Clock()
-            made.append(made_by(clock, source, out, frames, model, cluster))
-            found[name] = clock.between()
-    one, other = (found[name]["cpu_s_a_frame"] for name in list(found)[1:])
-    equal = made[0] == made[1]
-    return found | {"overhead": round(other / one - 1, 3), "equal": equal, "files": len(made[0])}
+            results.append(made_by(clock, source, out, frames, model, cluster))
+            figures[name] = clock.between()
+    one, other = (figures[name]["cpu_s_a_frame"] for name in list(figures)[1:])
+    equal = results[0] == results[1]
+    return figures | {
+        "overhead": round(other / one - 1, 3),
+        "equal": equal,
+        "files": len(results[0]),
+    }
 
 
 class LosingANode(Quiet):
@@ -271,17 +275,17 @@ def made_by(
 
 def contents(folder: Path) -> dict[str, bytes]:
     """The results below a folder by name; of records, without times and memory."""
-    found = {}
+    results = {}
     for path in sorted(folder.rglob("*")):
         name = path.relative_to(folder).as_posix()
         if path.is_dir() or name.startswith(("summary.", "batch.", ".")):
             continue
-        found[name] = path.read_bytes()
+        results[name] = path.read_bytes()
         if path.suffix == ".json":
-            record = json.loads(found[name])
+            record = json.loads(results[name])
             del record["seconds"], record["peak_memory_mb"]
-            found[name] = json.dumps(record).encode()
-    return found
+            results[name] = json.dumps(record).encode()
+    return results
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -314,13 +318,13 @@ def scaling(workers: int, rate: float, seconds: float) -> dict[str, Any]:
         line = one_line_of(root)
         wait_s = workers / rate
         ray.init(num_cpus=workers, include_dashboard=False, log_to_driver=False)
-        found = {
+        speeds = {
             f"{count} workers": waited(root, count, WaitingJob(line=line, wait_s=wait_s), seconds)
             for count in (1, workers)
         }
         ray.shutdown()
-    one, many = (each["frames_a_second"] for each in found.values())
-    return {"wait_s": wait_s, **found, "speedup": round(many / one, 2)}
+    one, many = (each["frames_a_second"] for each in speeds.values())
+    return {"wait_s": wait_s, **speeds, "speedup": round(many / one, 2)}
 
 
 def waited(root: Path, workers: int, job: WaitingJob, seconds: float) -> dict[str, float]:

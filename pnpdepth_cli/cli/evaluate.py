@@ -91,7 +91,7 @@ class _ProtocolName(_Choice):
     },
 )
 @click.argument("prediction", type=options.FILE, metavar="PRED")
-@click.argument("truth", type=options.FILE, metavar="GT")
+@click.argument("ground_truth", type=options.FILE, metavar="GT")
 @click.option(
     "--protocol",
     type=_ProtocolName(EVAL_PROTOCOLS),
@@ -205,7 +205,7 @@ class _ProtocolName(_Choice):
     metavar="FOLDER",
     help="Write an HTML report: every frame beside its ground truth, the worst first.",
 )
-def evaluate(prediction: Path, truth: Path, html: Path | None, **values: Any) -> None:
+def evaluate(prediction: Path, ground_truth: Path, html: Path | None, **values: Any) -> None:
     """Score the depth in PRED against the ground truth in GT: two files, or two folders.
 
     \b
@@ -232,11 +232,13 @@ def evaluate(prediction: Path, truth: Path, html: Path | None, **values: Any) ->
 
     names = [each.name for each in fields(score_tables.TableFiles)]
     tables = score_tables.TableFiles(**{name: values.pop(name) for name in names})
-    tables.check((prediction, truth))
+    tables.check((prediction, ground_truth))
     if html is not None:
-        inputs = [p for p in (prediction, truth, values["sparse"], values["mask"]) if p is not None]
+        inputs = [
+            p for p in (prediction, ground_truth, values["sparse"], values["mask"]) if p is not None
+        ]
         report_eval.check_eval_report(html, inputs, overwrite=tables.overwrite)
-    request = _request(prediction, truth, values)
+    request = _request(prediction, ground_truth, values)
     with progress_bar("eval", "frame") as show:
         evaluation = run_evaluation(request, on_frame=show)
     protocol = evaluation.protocol.describe()
@@ -261,7 +263,7 @@ def evaluate(prediction: Path, truth: Path, html: Path | None, **values: Any) ->
         raise FramesFailedError(unscored)
 
 
-def _request(prediction: Path, truth: Path, values: dict[str, Any]) -> EvalRequest:
+def _request(prediction: Path, ground_truth: Path, values: dict[str, Any]) -> EvalRequest:
     """Returns the request of the other options; those without an own field change the protocol."""
     from pnpdepth_cli.pipeline.evaluation.frame_reading import Scales
     from pnpdepth_cli.pipeline.evaluation.result import EvalRequest
@@ -278,7 +280,7 @@ def _request(prediction: Path, truth: Path, values: dict[str, Any]) -> EvalReque
     }
     return EvalRequest(
         prediction=prediction,
-        ground_truth=truth,
+        ground_truth=ground_truth,
         grouped=grouped,
         scales=Scales(**scales),
         changes=values | derived,

@@ -121,9 +121,9 @@ def _deciding(
 ) -> tuple[Frame, ...]:
     """The frames that a run in one process resolves its network on; none if none can be read."""
     for start in range(0, len(frames), _SEARCHED):
-        found = pool.call(first_readable, request, frames[start : start + _SEARCHED])
-        if found is not None:
-            first = start + found
+        offset = pool.call(first_readable, request, frames[start : start + _SEARCHED])
+        if offset is not None:
+            first = start + offset
             return (frames[first], *deciding(frames, first))
     return ()
 
@@ -156,8 +156,10 @@ def first_readable(request: BatchRequest, frames: Sequence[Frame]) -> int | None
     """Returns which frame is the first that can be read; to be called on a worker."""
     from pnpdepth_cli.pipeline.batch.resolving import readable
 
-    found = (i for i, frame in enumerate(frames) if readable(task_of(request, frame)) is not None)
-    return next(found, None)
+    readable_ones = (
+        i for i, frame in enumerate(frames) if readable(task_of(request, frame)) is not None
+    )
+    return next(readable_ones, None)
 
 
 @dataclass(frozen=True, kw_only=True)
