@@ -3,7 +3,8 @@
 1. Outliers, points inconsistent with their neighbours, are removed.
 2. Some of the other points are held out. Every candidate predicts them from the rest
    (`predictions`), and the best one, or mean of a few, is chosen (`choice`).
-3. The chosen candidates are given all points.
+3. The chosen candidates are given all points. If there is time, a chosen network that takes the
+   points first makes steps by points hidden from its input (`core.refine.refine_weights`).
 
 The networks alone and every baseline are candidates, so that the result is never worse than they
 are at the held-out points.
@@ -11,7 +12,8 @@ are at the held-out points.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
@@ -49,6 +51,8 @@ class AutoRefined:
     """The folds."""
     notes: tuple[str, ...]
     """What a person should know."""
+    hidden_points: Mapping[str, int] = field(default_factory=dict)
+    """Steps by hidden points that were kept, by network."""
 
 
 def refine_automatically(
@@ -69,18 +73,21 @@ def refine_automatically(
     frame, depths, notes = _without_outliers(passes, competition, frame)
     folds = _folds(passes, competition, frame, depths.prediction, seed)
     choice = choose(folds, competition)
+    refined = _refined(choice, competition, depths)
     return AutoRefined(
-        frame=_refined(choice, competition, depths),
+        frame=refined,
         choice=choice,
         depths=depths,
         folds=folds,
         notes=notes,
+        hidden_points=depths.kept_steps,
     )
 
 
 def _refined(choice: Choice, competition: Competition, depths: CandidateDepths) -> RefinedFrame:
     """The chosen mean from all points; losses are those of the heaviest refinement in it."""
-    after = choice.mean([depths.dense(candidate) for candidate in choice.candidates])
+    final = depths.with_hidden_points(competition.hidden_points, until=competition.deadline)
+    after = choice.mean([final.dense(candidate) for candidate in choice.candidates])
     heaviest = max(zip(choice.weights, choice.candidates, strict=True), key=lambda one: one[0])[1]
     config = next(iter(heaviest.configs), competition.configs[0])
     before = depths.trajectory(competition.configs[0]).frame.before

@@ -21,6 +21,8 @@ WEIGHT_WITH_POINTS = 3.0
 A network given another's depth as a prior counts as one more. On even frames of ICL-NUIM, 7-Scenes
 and KITTI 1 : 3 was better than 1 : 1, and 1 : 3 : 2.7 the best of seven weightings with a prior.
 """
+HIDDEN_POINT_STEPS = 40
+"""Steps by hidden points that the chosen networks make if there is time; of dense points fewer."""
 FUSED_ITERATIONS = 5
 """Updates of z before propagation. More fit what propagation fits anyway."""
 
@@ -135,7 +137,7 @@ def fusion(
 def default_config(
     definition: ModelDefinition, layer: str, settings: RefineSettings, *, network: str = "network"
 ) -> RefinementConfig:
-    """Returns the refinement of a network that competes without a time budget.
+    """Returns the refinement of a network that competes.
 
     A network whose output is metric is aligned too, where the points say that it should be.
 
@@ -169,21 +171,3 @@ def cascades(
         for prior in configs
         if prior != config
     )
-
-
-def more_configs(definition: ModelDefinition, first: RefinementConfig) -> list[RefinementConfig]:
-    """Returns further refinements of a network, for when there is time: other steps and layers.
-
-    Args:
-        definition: Of the network.
-        first: The refinement that competes in any case.
-    """
-    own = first.settings
-    adam = replace(own, update="adam", lr="3%", schedule="constant", blur=0.0, iterations=10)
-    layers = [first.layer, *(other for other in definition.layers if other != first.layer)]
-    configs = [
-        replace(first, layer=layer, settings=settings)
-        for layer in layers
-        for settings in (own, adam)
-    ]
-    return [each for each in dict.fromkeys(configs) if each != first]

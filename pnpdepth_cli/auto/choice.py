@@ -7,8 +7,8 @@ another one is better beyond chance. What is taken is never worse than any basel
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from itertools import combinations
 
 import torch
@@ -111,16 +111,16 @@ class Competition:
     """One refinement of each network, the user's first."""
     cascades: tuple[Candidate, ...] = ()
     """Networks that are given another network's depth as a prior."""
-    more_configs: tuple[RefinementConfig, ...] = ()
-    """Further refinements, tried while the deadline allows."""
     propagations: tuple[str, ...]
     """Propagations that compete, the default first."""
     shortlist: tuple[Candidate, ...] | None = None
     """Only these, the networks and the baselines compete, such as the best of other frames."""
     fixed: Candidate | None = None
     """This candidate is taken; the others are only scored."""
+    hidden_points: Mapping[RefinementConfig, RefinementConfig] = field(default_factory=dict)
+    """Refinements by hidden points that chosen networks get. They do not compete."""
     deadline: float | None = None
-    """Time by `time.monotonic` after which no further refinement is tried."""
+    """Time by `time.monotonic` after which nothing is tried and no step by hidden points begins."""
 
     @property
     def network(self) -> Candidate:
@@ -192,13 +192,9 @@ def choose(folds: Sequence[Fold], competition: Competition) -> Choice:
 
 
 def _score_all(board: _Scoreboard, competition: Competition) -> None:
-    """Scores the candidates, and further refinements, while the deadline allows."""
+    """Scores the candidates while the deadline allows."""
     board.deadline = competition.deadline
     board.score(competition.candidates())
-    for config in competition.more_configs:
-        left_s = (competition.deadline or 0.0) - time.monotonic()
-        if left_s > 0:
-            board.score(_updates(config.within(left_s / (len(board.folds) + 1))))
     board.score(each for config in competition.configs for each in _updates(config))
     errors = board.errors()
     starts = [each for each in errors if each.config is not None and each.propagate == "none"]

@@ -7,6 +7,9 @@ is computed when a candidate first needs it.
 
 from __future__ import annotations
 
+import contextlib
+import copy
+import time
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
@@ -266,6 +269,25 @@ class CandidateDepths:
             tuple[RefinementConfig, Candidate | None], Trajectory | PnpDepthError
         ] = {}
         self._kernels: dict[str, Kernel] = {}
+        self._hidden_points: Mapping[RefinementConfig, RefinementConfig] = {}
+        self._until: float | None = None
+        self.kept_steps: dict[str, int] = {}
+        """Steps by hidden points that were kept, by network."""
+
+    def with_hidden_points(
+        self, configs: Mapping[RefinementConfig, RefinementConfig], *, until: float | None
+    ) -> CandidateDepths:
+        """Returns the same where networks' own depths are those after steps by hidden points.
+
+        A refinement that fails, or for which there is no time, leaves the network's own depth.
+
+        Args:
+            configs: The refinements by hidden points, by the networks' own.
+            until: Time by `time.monotonic` after which no step begins. None sets no limit.
+        """
+        other = copy.copy(self)
+        other._hidden_points, other._until = configs, until
+        return other
 
     def trajectory(self, config: RefinementConfig, prior: Candidate | None = None) -> Trajectory:
         """Returns the refinement; raises its PnpDepthError, computed or remembered."""
@@ -336,8 +358,30 @@ class CandidateDepths:
             name = candidate.baseline
             depth: Tensor = BASELINES[name].depth(self._frame.points, self._prediction_for(name))
             return depth
-        config = candidate.config or self._reference
-        return self.trajectory(config, candidate.prior).after(candidate.iterations)
+        config, iterations = candidate.config or self._reference, candidate.iterations
+        if candidate.prior is None and not iterations:
+            return self._own(config)
+        return self.trajectory(config, candidate.prior).after(iterations)
+
+    def _own(self, config: RefinementConfig) -> Tensor:
+        """(H, W): the network's own depth, after steps by hidden points where these are made."""
+        if config in self._hidden_points:
+            with contextlib.suppress(PnpDepthError):
+                return self._after_hidden_points(config, self._hidden_points[config])
+        return self.trajectory(config).after(0)
+
+    def _after_hidden_points(self, config: RefinementConfig, moved: RefinementConfig) -> Tensor:
+        if (moved, None) not in self._trajectories:
+            timed = moved
+            if self._until is not None:
+                left_s = self._until - time.monotonic()
+                if left_s <= 0:
+                    return self.trajectory(config).after(0)
+                timed = moved.within(left_s)
+            refined = self._passes.trajectory(timed, self._frame.points)
+            self._trajectories[moved, None] = refined
+            self.kept_steps[config.network] = refined.frame.refinement.kept
+        return self.trajectory(moved).after(moved.settings.iterations)
 
     def _prediction_for(self, baseline: str) -> Tensor | None:
-        return self.prediction if BASELINES[baseline].needs_prediction else None
+        return self._own(self._reference) if BASELINES[baseline].needs_prediction else None

@@ -14,9 +14,7 @@ from pnpdepth_cli.auto.auto import MIN_POINTS, AutoRefined, refine_automatically
 from pnpdepth_cli.auto.candidates import (
     Candidate,
     RefinementConfig,
-    default_config,
     fusion,
-    more_configs,
 )
 from pnpdepth_cli.auto.choice import Competition
 from pnpdepth_cli.auto.predictions import FramePasses, OpenNetworks, SplitCache
@@ -191,22 +189,20 @@ def test_points_at_very_few_positions_are_enough(
     assert (result.frame.after > 0).all()
 
 
-def test_further_refinements_are_tried_only_while_there_is_time(
+def test_after_the_deadline_only_the_default_and_what_bounds_it_are_scored(
     frame: FrameOnDisk, network: Network
 ) -> None:
-    inputs = in_memory(frame)
-    first = default_config(network.definition, "middle", SETTINGS)
-    more = tuple(more_configs(network.definition, first))
-    assert {config.layer for config in more} == {"encode", "middle"}
+    inputs, refined = in_memory(frame), Candidate(config=CONFIG, iterations=3)
 
-    def tried(deadline: float | None) -> set[RefinementConfig]:
-        competition = replace(ONE, configs=(first,), more_configs=more, deadline=deadline)
-        scored = chosen(network, inputs, competition).choice.scored
-        return {one.candidate.config for one in scored if one.candidate.config is not None}
+    def scored(deadline: float | None) -> set[Candidate]:
+        choice = chosen(network, inputs, replace(ONE, deadline=deadline)).choice
+        return {one.candidate for one in choice.scored}
 
-    assert tried(None) == {first}
-    assert tried(time.monotonic() - 1) == {first}
-    assert tried(time.monotonic() + 1e9) == {first, *more}
+    assert refined in scored(None)
+    assert refined in scored(time.monotonic() + 1e9)
+    late = scored(time.monotonic() - 1)
+    assert refined not in late
+    assert {ONE.network, ONE.default} < late
 
 
 def test_the_front_runs_once_for_all_sets_of_points(

@@ -1,19 +1,23 @@
-"""Points hidden from a network's input, as a candidate of the choice by held-out points."""
+"""Steps by hidden points, which chosen networks make after the choice."""
 
 from __future__ import annotations
 
+import time
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+import numpy as np
+import pytest
 import torch
 
-from pnpdepth_cli.auto.auto import refine_automatically
-from pnpdepth_cli.auto.candidates import Candidate, RefinementConfig
+from pnpdepth_cli.auto.auto import AutoRefined, refine_automatically
+from pnpdepth_cli.auto.candidates import HIDDEN_POINT_STEPS, Candidate, RefinementConfig
 from pnpdepth_cli.auto.choice import Competition
 from pnpdepth_cli.auto.predictions import FramePasses, OpenNetworks
 from pnpdepth_cli.core.refine import RefineSettings
+from pnpdepth_cli.frames.frame import Frame
 from pnpdepth_cli.frames.refine import refine_frame
-from pnpdepth_cli.models.definition import ModelDefinition
 from pnpdepth_cli.models.network import Network, load_network
 from pnpdepth_cli.pipeline.refinement.held_out import competition_of
 from pnpdepth_cli.pipeline.refinement.method import resolve_method
@@ -47,32 +51,68 @@ def test_its_trajectory_is_the_refinement_alone_and_the_network_stays(tmp_path: 
     assert same(before, state_of(network.module))
 
 
-def test_it_competes_while_there_is_time(tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def compact() -> Network:
+    return load_network("compact", None)
+
+
+def refined(network: Network, frame: Frame, **changes: Any) -> AutoRefined:
+    """The frame by `compact`, the choice being fixed."""
+    competition = Competition(
+        configs=(PLAIN,),
+        propagations=(),
+        fixed=Candidate(config=PLAIN),
+        hidden_points={PLAIN: MASKED},
+    )
+    with OpenNetworks({"network": network}) as opened:
+        return refine_automatically(opened, replace(competition, **changes), frame)
+
+
+def test_a_chosen_network_makes_its_steps_and_the_choice_is_made_before_them(
+    tmp_path: Path, compact: Network
+) -> None:
     frame = in_memory(frame_on_disk(tmp_path))
-    competition = Competition(configs=(PLAIN,), more_configs=(MASKED,), propagations=("gp",))
-    late = replace(competition, deadline=0.0)
-    early = replace(competition, deadline=1e9)
-    with OpenNetworks({"network": load_network("compact", None)}) as opened:
-        tried = [
-            {str(each.candidate) for each in refine_automatically(opened, one, frame).choice.scored}
-            for one in (late, early)
-        ]
-    name = str(Candidate(config=MASKED, iterations=2))
-    assert name == "2 updates of weights (network, hidden points, adam, step 0.0001)"
-    assert name not in tried[0]
-    assert name in tried[1]
+    plain, moved = refined(compact, frame, hidden_points={}), refined(compact, frame)
+    with compact.cut_at_points() as split:
+        alone = refine_frame(compact, split, MASKED.settings, frame)
+    assert np.array_equal(moved.frame.after, alone.after)
+    assert not np.array_equal(moved.frame.after, plain.frame.after)
+    assert moved.choice == plain.choice
+    assert (plain.hidden_points, moved.hidden_points) == ({}, {"network": 2})
 
 
-def test_it_is_tried_first_and_only_where_the_network_takes_points(tmp_path: Path) -> None:
+def test_no_step_is_made_after_the_deadline(tmp_path: Path, compact: Network) -> None:
+    frame = in_memory(frame_on_disk(tmp_path))
+    late = refined(compact, frame, deadline=time.monotonic() - 1)
+    assert np.array_equal(late.frame.after, refined(compact, frame, hidden_points={}).frame.after)
+    assert late.hidden_points == {}
+
+
+def test_a_refinement_that_fails_leaves_the_networks_own_depth(
+    tmp_path: Path, compact: Network
+) -> None:
+    frame = in_memory(frame_on_disk(tmp_path))
+    wild = replace(MASKED, settings=replace(MASKED.settings, lr=1e30, iterations=5))
+    result = refined(compact, frame, hidden_points={PLAIN: wild})
+    assert np.array_equal(result.frame.after, refined(compact, frame, hidden_points={}).frame.after)
+
+
+def test_steps_are_made_where_there_is_time_and_the_network_takes_points(tmp_path: Path) -> None:
     disk = frame_on_disk(tmp_path)
     networks = [load_network("compact", None), load_network(str(disk.model), disk.checkpoint)]
-    first = [_more_configs(network)[0].settings.masked for network in networks]
-    assert first == [True, False]
-
-
-def _more_configs(network: Network) -> tuple[RefinementConfig, ...]:
-    definition: ModelDefinition = network.definition
     method = resolve_method(RefineRequest())
-    settings = resolve_settings(definition, method.options)
-    plan = ("network", network, definition.layers[0], settings)
-    return competition_of(method, [plan], timed=True).more_configs
+    plans = [
+        (
+            each.definition.name,
+            each,
+            each.definition.layers[0],
+            resolve_settings(each.definition, method.options),
+        )
+        for each in networks
+    ]
+    assert competition_of(method, plans, timed=False).hidden_points == {}
+    for dense, steps in ((False, HIDDEN_POINT_STEPS), (True, 6)):
+        (pair,) = competition_of(method, plans, timed=True, dense=dense).hidden_points.items()
+        assert [config.network for config in pair] == ["compact", "compact"]
+        assert pair[1].settings.masked
+        assert pair[1].settings.iterations == steps

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from typing import Any
 
@@ -13,11 +13,11 @@ from torch import Tensor
 from pnpdepth_cli.auto.auto import MIN_POINTS, AutoRefined, refine_automatically
 from pnpdepth_cli.auto.candidates import (
     FUSED_ITERATIONS,
+    HIDDEN_POINT_STEPS,
     Candidate,
     RefinementConfig,
     cascades,
     default_config,
-    more_configs,
 )
 from pnpdepth_cli.auto.choice import Choice, Competition
 from pnpdepth_cli.auto.predictions import OpenNetworks
@@ -38,14 +38,19 @@ LINEAR = Candidate(baseline="linear")
 
 
 def competition_of(
-    method: Method, networks: Sequence[tuple[str, Network, str, RefineSettings]], *, timed: bool
+    method: Method,
+    networks: Sequence[tuple[str, Network, str, RefineSettings]],
+    *,
+    timed: bool,
+    dense: bool = False,
 ) -> Competition:
     """Returns which candidates compete for a request.
 
     Args:
         method: Of the request.
         networks: Name, network, layer and settings of each network, the user's first.
-        timed: Whether further refinements are tried while time is left.
+        timed: Whether chosen networks make steps by hidden points while time is left.
+        dense: Whether the points lie as close as a LiDAR's.
     """
     options = method.options
     if not method.chosen:
@@ -57,34 +62,36 @@ def competition_of(
             propagate=options.propagate or "none",
         )
         return Competition(configs=(config,), propagations=(), fixed=fixed)
-    configs, more = [], []
+    configs = []
     for name, network, layer, settings in networks:
-        own = default_config(network.definition, layer, settings, network=name)
+        config = default_config(network.definition, layer, settings, network=name)
         if options.iterations is None and options.lr is None:
-            count = min(FUSED_ITERATIONS, own.settings.iterations)
+            count = min(FUSED_ITERATIONS, config.settings.iterations)
             if network.definition.input_kind != "rgb":
                 count = 0
-            first = replace(own, settings=replace(own.settings, iterations=count))
-        else:
-            first = own
-        configs.append(first)
-        if timed and "sparse" in network.definition.input_kind:
-            more.append(replace(own, settings=_masked_settings(network.definition)))
-        if timed:
-            own = own if own == first else replace(own)
-            more += [*([own] if own != first else []), *more_configs(network.definition, own)]
+            config = replace(config, settings=replace(config.settings, iterations=count))
+        configs.append(config)
     definitions = {name: network.definition for name, network, _, _ in networks}
+    hidden_points = {
+        config: _by_hidden_points(config, definitions[config.network], dense=dense)
+        for config in configs
+        if timed and "sparse" in definitions[config.network].input_kind
+    }
     return Competition(
         configs=tuple(configs),
         cascades=cascades(configs, definitions),
-        more_configs=tuple(more),
-        propagations=_competing_propagations(options.propagate, timed=timed),
+        propagations=_competing_propagations(options.propagate),
+        hidden_points=hidden_points,
     )
 
 
-def _masked_settings(definition: ModelDefinition) -> RefineSettings:
-    """The settings by which points hidden from a network's input refine it."""
-    return resolve_settings(definition, MethodOptions(target="masked"))
+def _by_hidden_points(
+    config: RefinementConfig, definition: ModelDefinition, *, dense: bool
+) -> RefinementConfig:
+    settings = resolve_settings(definition, MethodOptions(target="masked"), dense=dense)
+    if not dense:
+        settings = replace(settings, iterations=HIDDEN_POINT_STEPS)
+    return replace(config, settings=settings)
 
 
 def refine_with_folds(
@@ -120,6 +127,8 @@ def refine_with_folds(
             choice=_record(result.choice, user),
             notes=(*refined.notes, *choice_notes(result.choice, definition)),
         )
+    if result.hidden_points:
+        refined = _with_steps(refined, result.hidden_points)
     if hold_out.baselines:
         refined = replace(refined, baselines=baseline_scores(result, gt))
     if hold_out.uncertainty:
@@ -157,10 +166,10 @@ def best_candidates(
     return tuple(best)
 
 
-def _competing_propagations(propagation: str | None, *, timed: bool) -> tuple[str, ...]:
-    """The propagation that was asked for, or all; without a time budget the fast ones."""
+def _competing_propagations(propagation: str | None) -> tuple[str, ...]:
+    """The propagation that was asked for, or the fast ones."""
     if propagation is None:
-        return tuple(name for name in PROPAGATIONS if timed or PROPAGATIONS[name].at is not None)
+        return tuple(name for name in PROPAGATIONS if PROPAGATIONS[name].at is not None)
     return () if propagation == "none" else (propagation,)
 
 
@@ -196,6 +205,14 @@ def choice_notes(choice: Choice, definition: ModelDefinition) -> tuple[str, ...]
         f"choice: {definition.name} takes the points itself, and was scored with gaps where some"
         " were held out; if it is trained for points like these, see what --preset fast gives",
     )
+
+
+def _with_steps(frame: RefinedFrame, kept: Mapping[str, int]) -> RefinedFrame:
+    """The frame with a note and a record of the steps by hidden points that were kept."""
+    steps = ", ".join(f"{count} with {name}" for name, count in kept.items())
+    note = f"hidden points: steps made after the choice and kept: {steps}"
+    record = None if frame.choice is None else frame.choice | {"hidden_point_steps": dict(kept)}
+    return replace(frame, choice=record, notes=(*frame.notes, note))
 
 
 def _record(choice: Choice, user: str) -> dict[str, Any]:

@@ -111,7 +111,9 @@ def refiner_of(
         settings=own,
         method=method,
         networks={name: each for name, each, _, _ in plans},
-        competition=competition_of(method, plans, timed=timed) if folds else None,
+        competition=competition_of(method, plans, timed=timed, dense=is_dense(first.points))
+        if folds
+        else None,
     )
 
 

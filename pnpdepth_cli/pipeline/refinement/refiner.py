@@ -167,7 +167,8 @@ class Refiner:
         frames = [self._split_frame(inputs)[0] for inputs in group]
         with OpenNetworks(self.networks) as opened:
             seed = self.request.hold_out.seed
-            best = best_candidates(opened, self.competition, seed, frames)
+            choosing = replace(self.competition, hidden_points={})
+            best = best_candidates(opened, choosing, seed, frames)
         return replace(self, competition=replace(self.competition, shortlist=best))
 
     def _split_frame(self, inputs: Inputs) -> tuple[Frame, SparsePoints]:

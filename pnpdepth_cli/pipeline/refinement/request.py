@@ -308,8 +308,8 @@ class HoldOut:
     )
     time_budget_s: float | None = option(
         None,
-        "Cap on the time of the choice, such as 5s; what is left tries other layers and steps."
-        " Where weights are updated, no update begins that would not end in time.",
+        "Cap on the time of the choice, such as 30s; in what is left, chosen networks that take"
+        " the points make steps by hidden points. No step begins that would not end in time.",
         flag="--time-budget",
         metavar="SECONDS",
         parse=parse_seconds,
