@@ -154,6 +154,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=1, help="draws of the points of each frame")
     parser.add_argument("--networks", nargs="+", help="only these")
     parser.add_argument("--sets", nargs="+", help="only these")
+    parser.add_argument("--points", nargs="+", type=int, help="only these numbers of points")
     parser.add_argument("--json", type=Path, help="everything, to this file")
     args = parser.parse_args()
     print("| " + " | ".join(HEAD) + " |\n|" + "---|" * len(HEAD))
@@ -163,6 +164,8 @@ def main() -> None:
         if args.networks and cell.network not in args.networks:
             continue
         if args.sets and cell.frames not in args.sets:
+            continue
+        if args.points and cell.points is not None and cell.points not in args.points:
             continue
         network = networks.setdefault(cell.network, opened(cell.network, args.data))
         frames = frames_of(cell.frames, args.data, args.half, args.frames)
