@@ -49,7 +49,8 @@ def competition_of(
     Args:
         method: Of the request.
         networks: Name, network, layer and settings of each network, the user's first.
-        timed: Whether chosen networks make steps by hidden points while time is left.
+        timed: Whether chosen networks make steps by hidden points while time is left, and slow
+            propagations compete.
         dense: Whether the points lie as close as a LiDAR's.
     """
     options = method.options
@@ -80,7 +81,7 @@ def competition_of(
     return Competition(
         configs=tuple(configs),
         cascades=cascades(configs, definitions),
-        propagations=_competing_propagations(options.propagate),
+        propagations=_competing_propagations(options.propagate, timed=timed),
         hidden_points=hidden_points,
     )
 
@@ -166,10 +167,10 @@ def best_candidates(
     return tuple(best)
 
 
-def _competing_propagations(propagation: str | None) -> tuple[str, ...]:
-    """The propagation that was asked for, or the fast ones."""
+def _competing_propagations(propagation: str | None, *, timed: bool) -> tuple[str, ...]:
+    """The propagation that was asked for, or all; without a time budget the fast ones."""
     if propagation is None:
-        return tuple(name for name in PROPAGATIONS if PROPAGATIONS[name].at is not None)
+        return tuple(name for name in PROPAGATIONS if timed or PROPAGATIONS[name].at is not None)
     return () if propagation == "none" else (propagation,)
 
 
