@@ -32,7 +32,9 @@ MIN_POINTS = 5
 ENOUGH_HELD_OUT = 100
 """With this many held-out points no further fold is scored."""
 MOST_SCORED = 1000
-"""Of more held-out points a random part is scored."""
+"""Of more held-out points of a fold a random part is scored."""
+ENOUGH_FOR_INTERPOLATION = 500
+"""With fewer held-out points all folds are scored before a baseline of points is chosen alone."""
 MIN_POINTS_FOR_JOINT_OUTLIERS = 50
 """From this many points on, points inconsistent with other points alone are outliers too."""
 
@@ -48,7 +50,7 @@ class AutoRefined:
     depths: CandidateDepths
     """The candidates' depths from all points."""
     folds: tuple[Fold, ...]
-    """The folds."""
+    """The folds that were scored."""
     notes: tuple[str, ...]
     """What a person should know."""
     hidden_points: Mapping[str, int] = field(default_factory=dict)
@@ -72,13 +74,18 @@ def refine_automatically(
     passes = FramePasses(opened, frame)
     frame, depths, notes = _without_outliers(passes, competition, frame)
     folds = _folds(passes, competition, frame, depths.prediction, seed)
-    choice = choose(folds, competition)
+    scored = folds[: _enough(len(frame.points))]
+    choice = choose(scored, competition)
+    unsure = choice.is_interpolation and choice.held_out < ENOUGH_FOR_INTERPOLATION
+    if unsure and len(scored) < len(folds):
+        scored = folds
+        choice = choose(scored, competition)
     refined = _refined(choice, competition, depths)
     return AutoRefined(
         frame=refined,
         choice=choice,
         depths=depths,
-        folds=folds,
+        folds=scored,
         notes=notes,
         hidden_points=depths.kept_steps,
     )
@@ -134,14 +141,13 @@ def _without_outliers(
 def _folds(
     passes: FramePasses, competition: Competition, frame: Frame, prediction: Tensor, seed: int
 ) -> tuple[Fold, ...]:
-    """The folds that are scored: one of many points, all of a few."""
+    """All folds."""
     points = frame.points
     if len(points) < MIN_POINTS:
         return ()
     weights = _inlier_weights(points, prediction)
     fold = spatial_folds(points, FOLDS, seed=seed)
-    scored = min(FOLDS, max(1, round(ENOUGH_HELD_OUT * FOLDS / len(points))))
-    masks = [fold == number for number in range(scored)]
+    masks = [fold == number for number in range(FOLDS)]
     return tuple(
         Fold(
             held_out=points.select(some),
@@ -157,6 +163,11 @@ def _folds(
         if 0 < int(held.sum()) < len(points)
         for some in [_part_of(held, seed)]
     )
+
+
+def _enough(points: int) -> int:
+    """Number of folds that are scored: one of many points, all of a few."""
+    return min(FOLDS, max(1, round(ENOUGH_HELD_OUT * FOLDS / max(1, points))))
 
 
 def _part_of(held: Tensor, seed: int) -> Tensor:

@@ -58,6 +58,14 @@ class Choice:
     scored: tuple[ScoredCandidate, ...] = ()
     """Every candidate that was tried, the best first."""
 
+    @property
+    def is_interpolation(self) -> bool:
+        """Whether a baseline alone is chosen, of the points alone."""
+        first, *others = self.candidates
+        if others or first.baseline is None:
+            return False
+        return not BASELINES[first.baseline].needs_prediction
+
     def __str__(self) -> str:
         if len(self.candidates) == 1:
             return str(self.candidates[0])
@@ -93,10 +101,14 @@ class Fold:
     """(M,) 0…1, the weight of each point in a score."""
     depths: CandidateDepths
     """Depths from all other points."""
+    predictions: dict[Candidate, Tensor] = field(default_factory=dict)
+    """Depth (M,) metres at the held-out points of each candidate that was asked for."""
 
     def at(self, candidate: Candidate) -> Tensor:
         """Returns the candidate's depth (M,) metres at the held-out points."""
-        return self.depths.at(self.held_out.xy, candidate)
+        if candidate not in self.predictions:
+            self.predictions[candidate] = self.depths.at(self.held_out.xy, candidate)
+        return self.predictions[candidate]
 
     def predicted(self, choice: Choice) -> Tensor:
         """Returns the depth (M,) metres of the chosen mean at the held-out points."""

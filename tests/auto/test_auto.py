@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -16,7 +17,7 @@ from pnpdepth_cli.auto.candidates import (
     RefinementConfig,
     fusion,
 )
-from pnpdepth_cli.auto.choice import Competition
+from pnpdepth_cli.auto.choice import Choice, Competition, Fold
 from pnpdepth_cli.auto.predictions import FramePasses, OpenNetworks, SplitCache
 from pnpdepth_cli.choices import BASELINES
 from pnpdepth_cli.completion.interpolation import in_hull
@@ -96,6 +97,38 @@ def test_held_out_points_have_no_influence_on_the_depth_they_score(
         again = refine_automatically(opened, competition, other).folds[0]
         assert torch.equal(again.held_out.xy, fold.held_out.xy)
         assert torch.equal(again.at(candidate), before)
+
+
+@pytest.mark.parametrize(
+    ("candidate", "enough", "scored"),
+    [
+        (Candidate(baseline="linear"), 500, [1, 5]),
+        (Candidate(baseline="linear"), 10, [1]),
+        (Candidate(baseline="local"), 500, [1]),
+        (Candidate(config=CONFIG), 500, [1]),
+    ],
+)
+def test_interpolation_alone_is_chosen_only_at_enough_held_out_points(
+    frame: FrameOnDisk,
+    network: Network,
+    monkeypatch: pytest.MonkeyPatch,
+    candidate: Candidate,
+    enough: int,
+    scored: list[int],
+) -> None:
+    calls = []
+
+    def choose(folds: Sequence[Fold], competition: Competition) -> Choice:
+        calls.append(len(folds))
+        held_out = sum(len(fold.held_out) for fold in folds)
+        return Choice(candidates=(candidate,), weights=(1.0,), held_out=held_out)
+
+    monkeypatch.setattr(auto, "choose", choose)
+    monkeypatch.setattr(auto, "ENOUGH_HELD_OUT", 12)
+    monkeypatch.setattr(auto, "ENOUGH_FOR_INTERPOLATION", enough)
+    result = chosen(network, in_memory(frame))
+    assert calls == scored
+    assert len(result.folds) == scored[-1]
 
 
 def test_of_many_held_out_points_a_part_is_scored_and_none_is_shown(
