@@ -43,16 +43,12 @@ class RefinementConfig:
     def __str__(self) -> str:
         s = self.settings
         aligned = "" if s.align == "none" else f", aligned ({s.align})"
-        if s.masked:
-            return f"{self.network}, hidden points, {s.update}, step {s.lr}{aligned}"
         return f"{self.network} cut at {self.layer}, {s.update}, step {s.lr}{aligned}"
 
     @property
     def competing_iterations(self) -> tuple[int, ...]:
-        """Numbers of updates above 0 that compete, ascending; of weights, the best is taken."""
+        """Numbers of updates of z above 0 that compete, ascending."""
         most = self.settings.iterations
-        if self.settings.moves_weights:
-            return (most,)
         return tuple(sorted({*(k for k in ITERATIONS if k < most), most} - {0}))
 
     def within(self, seconds: float) -> RefinementConfig:
@@ -96,8 +92,7 @@ class Candidate:
         if self.config is None:
             return "network"
         if self.iterations:
-            moved = "weights" if self.config.settings.moves_weights else "z"
-            return f"{self.iterations} updates of {moved} ({self.config})"
+            return f"{self.iterations} updates of z ({self.config})"
         network, align = self.config.network, self.config.settings.align
         aligned = "" if align == "none" else f" aligned ({align})"
         prior = "" if self.prior is None else f" with {self.prior} as prior"
