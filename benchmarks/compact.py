@@ -7,13 +7,16 @@ prediction, and refinement with the definition's defaults; the same points and t
 With `--fusion` only the network's plain prediction is measured: with the depth of another network
 as prior (`--prior`), with an unrelated prior, and with 20 % outliers among the points, which are
 all given or left out where they are suspected.
+
+Images are moved into the frame of the points as `refine` does (`--registration frame`), as `batch`
+does for a set (`set`), or not at all (`off`).
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,12 +26,14 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from benchmarks.frames import (
+    REGISTRATIONS,
     SETS,
     EvalFrame,
     frame_inputs,
     frame_pixels,
     points_on_grid,
     refined,
+    registered,
 )
 from model_zoo_defs.training.learning.patterns import outliers
 from model_zoo_defs.training.learning.priors import nonsense
@@ -91,16 +96,17 @@ def measure_frame(
 
 def measure_cell(
     network: Network,
-    frames: Iterable[EvalFrame],
+    frames: Sequence[EvalFrame],
     count: int | None,
     seeds: int,
     settings: Settings,
+    registration: str,
 ) -> dict[str, float]:
     """Means over frames and seeds, gains over linear in per cent, and wins."""
     results = [
         measure_frame(network, frame, count, seed, settings)
-        for frame in frames
         for seed in range(seeds if count is not None else 1)
+        for frame in registered(frames, count, seed, registration)
     ]
     row: dict[str, float] = {"frames": len(results)}
     for number, measure in enumerate(("MAE", "RMSE")):
@@ -166,7 +172,11 @@ def predicted(
 
 
 def print_fusion(
-    network: Network, prior: Network | None, cell: str, frames: list[EvalFrame], count: int | None
+    network: Network,
+    prior: Network | None,
+    cell: str,
+    frames: Sequence[EvalFrame],
+    count: int | None,
 ) -> None:
     """Prints rows of a Markdown table, one per variant of the input."""
     results = [measure_fusion(network, prior, frame, count, seed=0) for frame in frames]
@@ -185,6 +195,7 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=0, help="number of the first frame")
     parser.add_argument("--fusion", action="store_true", help="priors and outliers instead")
     parser.add_argument("--prior", help="network whose prediction is the prior of --fusion")
+    parser.add_argument("--registration", choices=REGISTRATIONS, default="frame")
     parser.add_argument("--layer")
     parser.add_argument("--iterations", type=int)
     parser.add_argument("--lr")
@@ -199,9 +210,10 @@ def main() -> None:
         frames = list(SETS[name](args.data))[args.first :: args.every]
         cell = f"{name}, {count} points" if count else f"{name}, its LiDAR"
         if args.fusion:
-            print_fusion(network, prior, cell, frames, count)
+            moved = registered(frames, count, 0, args.registration)
+            print_fusion(network, prior, cell, moved, count)
             continue
-        table[cell] = measure_cell(network, frames, count, args.seeds, settings)
+        table[cell] = measure_cell(network, frames, count, args.seeds, settings, args.registration)
         if not args.json:
             print_row(cell, table[cell], header=len(table) == 1)
     if args.json:

@@ -25,12 +25,14 @@ from torch import Tensor
 
 from benchmarks.accuracy import Case, Errors, errors_of, opened
 from benchmarks.frames import (
+    REGISTRATIONS,
     SETS,
     EvalFrame,
     frame_inputs,
     frame_pixels,
     points_on_grid,
     refined,
+    registered,
 )
 from pnpdepth_cli.auto.auto import AutoRefined, refine_automatically
 from pnpdepth_cli.auto.candidates import Candidate
@@ -155,6 +157,7 @@ def main() -> None:
     parser.add_argument("--networks", nargs="+", help="only these")
     parser.add_argument("--sets", nargs="+", help="only these")
     parser.add_argument("--points", nargs="+", type=int, help="only these numbers of points")
+    parser.add_argument("--registration", choices=REGISTRATIONS, default="frame")
     parser.add_argument("--json", type=Path, help="everything, to this file")
     args = parser.parse_args()
     print("| " + " | ".join(HEAD) + " |\n|" + "---|" * len(HEAD))
@@ -170,7 +173,11 @@ def main() -> None:
         network = networks.setdefault(cell.network, opened(cell.network, args.data))
         frames = frames_of(cell.frames, args.data, args.half, args.frames)
         seeds = range(args.seeds if cell.points else 1)
-        rows = [measure(network, f, cell.points, s) for s in seeds for f in frames]
+        rows = [
+            measure(network, frame, cell.points, seed)
+            for seed in seeds
+            for frame in registered(frames, cell.points, seed, args.registration)
+        ]
         measured = summary(rows)
         print(table_row(cell, measured), flush=True)
         everything.append({"cell": vars(cell), "summary": measured, "frames": rows})

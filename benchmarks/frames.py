@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from pnpdepth_cli.completion.image_registration import estimated, evidence
 from pnpdepth_cli.core.refine import RefineSettings
 from pnpdepth_cli.frames.frame import RefinedFrame
 from pnpdepth_cli.frames.refine import refine_frame
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.models.network import Network
+from pnpdepth_cli.pipeline.batch.frames import registering
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs
 from pnpdepth_cli.points import SparsePoints
 
@@ -87,6 +89,30 @@ def points_on_grid(
     return SparsePoints(
         xy=torch.from_numpy(xy), depth=torch.from_numpy(depth.astype(np.float32)), size=shape
     )
+
+
+REGISTRATIONS = ("off", "frame", "set")
+"""Images as they are, moved as `refine` moves each alone, and as `batch` moves those of a set."""
+
+
+def registered(
+    frames: Sequence[EvalFrame], count: int | None, seed: int, how: str
+) -> list[EvalFrame]:
+    """The frames with their images moved into the frame of these points, as the program does."""
+    if how == "off":
+        return list(frames)
+    known = []
+    for frame in frames:
+        points = points_on_grid(*frame_pixels(frame, count, seed), frame.gt.shape)
+        known.append(evidence(frame.rgb, points))
+    if how == "set":
+        found = [estimated(registering(known, 0))] * len(frames)
+    else:
+        found = [estimated([each]) for each in known]
+    return [
+        frame if one is None else replace(frame, rgb=one.applied(frame.rgb))
+        for frame, one in zip(frames, found, strict=True)
+    ]
 
 
 def frame_inputs(rgb: NDArray[np.float32], points: SparsePoints, gt: Depth) -> Inputs:

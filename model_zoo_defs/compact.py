@@ -9,7 +9,8 @@ larger give an answer ten times larger. The depth is built from coarse to fine:
 3. At 1/16, 1/8, 1/4 and 1/2 the residuals at the points (against the depth so far) are averaged
    over cells. The features of the level weigh the residuals of the neighbouring cells and the
    depths of the neighbouring coarser cells.
-4. The last step to full size mixes the 3 x 3 neighbours with weights predicted from the features.
+4. At the finest levels the depth is propagated among neighbouring cells and pulled to the points.
+5. The last step to full size mixes the 3 x 3 neighbours with weights predicted from the features.
 
 A prior, the dense depth of any other network aligned to the points, adds candidates: at 1/16
 the prior plus a plane through the points' residuals against it, and at each finer level the
@@ -38,6 +39,7 @@ from model_zoo_defs._compact.decoder import (
     Block,
     Head,
     SigmaHead,
+    SpatialPropagation,
     bilinear_logits,
     neighbours,
     prior_candidates,
@@ -55,6 +57,8 @@ from pnpdepth_cli.models.definition import (
     Normalisation,
     RefineDefaults,
 )
+
+PROPAGATED = ("s4", "s2")
 
 
 class Outputs(NamedTuple):
@@ -113,6 +117,9 @@ class Compact(nn.Module):
         nn.init.zeros_(self.enlarge_prior.weight)
         self.enlarge_prior.bias = nn.Parameter(torch.full((4,), PRIOR_BIAS))
         self.gain_prior = nn.Parameter(torch.tensor(PRIOR_GAIN))
+        self.propagation = nn.ModuleDict(
+            {level: SpatialPropagation(width[level]) for level in PROPAGATED}
+        )
         self.scale = SigmaHead(width["s2"] + hints)
 
     def forward(self, rgb: Tensor, sparse: Tensor, prior: Tensor | None = None) -> Tensor:
@@ -162,6 +169,8 @@ class Compact(nn.Module):
                 of_prior = prior_candidates(guide, fit.of_prior, depth, level)
             features = self.decoder[level](*inputs)
             depth = self.heads[level](features, before, candidates, residual, of_prior)
+            if level in self.propagation:
+                depth = self.propagation[level](features, depth, moments, stride)
             depths.append(depth)
             if self.training:  # every level answers for its own step only
                 depth = depth.detach()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, TypedDict
 
@@ -17,7 +17,7 @@ from pnpdepth_cli.core.refine import RefineSettings
 from pnpdepth_cli.errors import DivergedError, InputError, NoPointsError, SizeError, UsageError
 from pnpdepth_cli.models import network as networks
 from pnpdepth_cli.models.network import Network
-from pnpdepth_cli.pipeline.refinement.inputs import Inputs
+from pnpdepth_cli.pipeline.refinement.inputs import Inputs, registration_of
 from pnpdepth_cli.pipeline.refinement.load_refiner import refiner_of
 from pnpdepth_cli.pipeline.refinement.method import needs_folds
 from pnpdepth_cli.pipeline.refinement.refiner import Opened
@@ -96,6 +96,9 @@ class RefinerOptions(TypedDict, total=False):
     """Refine larger frames in tiles of this side length, pixels."""
     seed: int
     """Of the random choices of `auto`, `uncertainty` and the masks."""
+    registration: str | tuple[float, float, float]
+    """Whether the image is moved into the frame of the points: "auto", if their depth edges show
+    that it is not registered; "off"; or by (zoom, right, down), pixels."""
 
 
 class Refiner:
@@ -151,7 +154,7 @@ class Refiner:
             InputError: Image or points cannot be used.
             DivergedError: The loss became non-finite; `last_good` is the Refined before that.
         """
-        inputs = _inputs(image, sparse)
+        inputs = replace(_inputs(image, sparse), registration=registration_of(self._request))
         if self._opened is None:
             refiner = self._resolve(inputs)
             opened = refiner.opened()

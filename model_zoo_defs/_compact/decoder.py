@@ -23,6 +23,8 @@ PRIOR_GAIN, PRIOR_BIAS, PRIOR_SIDE = 4.5, -3.0, -2.0
 # The initial weights (as logits) make the untrained network a fair interpolator: follow the depth
 # so far, correct it by the residual of the own cell, else of the nearest ones.
 KEEP, STAY = 4.0, -2.0
+STAY_PUT, PULL = 6.0, -4.0
+PROPAGATION_STEPS = 6
 NEIGHBOURS = (-0.5, 0.5, -0.5, 0.5, 2.5, 0.5, -0.5, 0.5, -0.5)
 
 
@@ -103,6 +105,37 @@ class Head(nn.Module):
         corrections = torch.cat([nothing, neighbours(residual.mean)], dim=1)
         corrected = ((correct + reliability).softmax(1) * corrections).sum(1, keepdim=True)
         return cast(Tensor, before + moved + corrected + rest)
+
+
+class SpatialPropagation(nn.Module):
+    """Propagation of depth among 3 x 3 neighbours, several times with the same weights.
+
+    After every step the depth is pulled to the points of its cell, by at most their inlier weight
+    (Cheng et al., "Depth estimation via affinity learned with convolutional spatial propagation
+    network", ECCV 2018). Untrained, depth hardly changes.
+    """
+
+    def __init__(self, channels: int):
+        super().__init__()
+        self.weigh = nn.Conv2d(channels, 9 + 1, 3, padding=1)
+        nn.init.normal_(self.weigh.weight, std=1e-2)
+        bias = torch.zeros(10)
+        bias[4], bias[9] = STAY_PUT, PULL
+        self.weigh.bias = nn.Parameter(bias)
+
+    def forward(self, features: Tensor, depth: Tensor, moments: Tensor, stride: int) -> Tensor:
+        """The propagated depth (B, 1, h, w) of a level; `moments` as `Points.moments`."""
+        weights = self.weigh(features).float()
+        follow = weights[:, :9].softmax(1)
+        if stride > 2:
+            moments = F.avg_pool2d(moments, stride // 2)
+        count, density, value, _ = moments.chunk(4, dim=1)
+        at_points = value / density.clamp(min=1e-6)
+        pull = torch.sigmoid(weights[:, 9:]) * density / count.clamp(min=1e-6)
+        for _ in range(PROPAGATION_STEPS):
+            depth = (follow * neighbours(depth)).sum(1, keepdim=True)
+            depth = depth + pull * (at_points - depth)
+        return depth
 
 
 class SigmaHead(nn.Module):

@@ -28,7 +28,10 @@ LIDAR = (
     "--point-fields",
 )
 COLMAP = ("--unit-scale", "--min-track", "--max-reprojection")
-FILE_READING = ("--depth-scale", "--gt-scale", "--channel", "--sparse-size-ok", "--max-pixels")
+FILE_READING = (
+    *("--depth-scale", "--gt-scale", "--channel", "--sparse-size-ok", "--registration"),
+    "--max-pixels",
+)
 NETWORK = (
     *("--model", "--checkpoint", "--layer", "--align", "--align-every", "--output-kind"),
     *("--normalise", "--precision", "--device", "--tile"),

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from pnpdepth_cli.completion.alignment import Alignment
+from pnpdepth_cli.completion.image_registration import ImageRegistration
 from pnpdepth_cli.core.refine import Refinement
 from pnpdepth_cli.core.weights import MovingWeights
 from pnpdepth_cli.errors import DivergedError
@@ -30,6 +31,8 @@ class Frame:
     prior: Tensor | None = None
     """(H, W) metres, 0 = unknown: another network's depth, aligned with the points, for networks
     that take one. None without."""
+    registration: ImageRegistration | None = None
+    """How `rgb` was moved into the frame of the points. None: it was not."""
 
     @property
     def size(self) -> tuple[int, int]:
@@ -84,6 +87,8 @@ class RefinedFrame:
     result (after) at points that were held out in turns, for a record."""
     baselines: dict[str, dict[str, Any]] | None = None
     """Scores of the baselines, for a record."""
+    registration: ImageRegistration | None = None
+    """How the image was moved into the frame of the points. None: it was not."""
     in_window: bool = False
     """Whether it was refined as a frame of a window, which may begin where the one before ended."""
     carried: Carried | None = None

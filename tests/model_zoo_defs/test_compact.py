@@ -8,6 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from model_zoo_defs._compact.decoder import SpatialPropagation
 from model_zoo_defs._compact.points import Points, residual_of
 from model_zoo_defs.compact import Compact, definitions
 from pnpdepth_cli.core.split import Split
@@ -224,6 +225,42 @@ def test_a_point_without_weight_moves_nothing() -> None:
         moments = points.moments()
         depths.append(residual_of(moments, torch.zeros(1, 1, 8, 12) - points.median, 8).mean)
     torch.testing.assert_close(depths[0], depths[1], rtol=1e-4, atol=1e-4)
+
+
+def propagation(stay: float, pull: float) -> SpatialPropagation:
+    """With the same weights everywhere, as logits of staying and of being pulled."""
+    module = SpatialPropagation(2)
+    torch.nn.init.zeros_(module.weigh.weight)
+    assert module.weigh.bias is not None
+    with torch.no_grad():
+        module.weigh.bias[4], module.weigh.bias[9] = stay, pull
+    return module
+
+
+@pytest.mark.parametrize("stride", [2, 4])
+def test_propagation_keeps_a_constant_depth_and_smooths_another(stride: int) -> None:
+    size = (32 // stride, 64 // stride)
+    features, none = torch.randn(1, 2, *size), torch.zeros(1, 4, 16, 32)
+    constant = torch.full((1, 1, *size), 0.7)
+    module = propagation(0.0, 0.0)
+    torch.testing.assert_close(module(features, constant, none, stride), constant)
+    rough = torch.randn(1, 1, *size)
+    smoothed = module(features, rough, none, stride).detach()
+    assert float(smoothed.std()) < 0.3 * float(rough.std())
+
+
+def test_propagated_depth_is_pulled_to_points_by_their_inlier_weight() -> None:
+    sparse = torch.zeros(1, 1, 16, 16)
+    sparse[..., 4, 4], sparse[..., 12, 12] = 2.0, 8.0  # log depth ∓0.69 about the median
+    points = Points(sparse)
+    weight = torch.ones_like(sparse)
+    weight[..., 12, 12] = 0.0
+    points.weigh(weight)
+    module, depth = propagation(20.0, 4.0), torch.full((1, 1, 8, 8), 0.3)
+    pulled = module(torch.zeros(1, 2, 8, 8), depth, points.moments(), 2).detach()
+    assert float(pulled[..., 2, 2]) == pytest.approx(float(points.value[..., 4, 4]), abs=1e-3)
+    pulled[..., 2, 2] = 0.3
+    torch.testing.assert_close(pulled, depth, atol=1e-4, rtol=0)
 
 
 def test_sigma_is_positive_and_its_gradient_reaches_no_depth(shaken: Compact) -> None:

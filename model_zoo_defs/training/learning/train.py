@@ -34,6 +34,7 @@ from model_zoo_defs.training.learning.validation import Case, cases, scores
 # Layers that the first generation of the network did not have; `upgraded` leaves them as they
 # are initialised, which changes no output without a prior.
 NEW_LAYERS = (
+    "propagation.",
     "inlier_weights.",
     "enter_prior.",
     "weigh_prior.",

@@ -1,7 +1,8 @@
-"""Renders the two frames of samples/: python -m model_zoo_defs.training.rendering.make_samples.
+"""Renders three frames of samples/: python -m model_zoo_defs.training.rendering.make_samples.
 
-One indoor frame with some random sparse points, and one street frame with a laser scan in
-KITTI's formats. Their seeds are reserved: no training frame is rendered with them.
+One indoor frame with some random sparse points, one of a colour camera that is not registered to
+the depth camera, and one street frame with a laser scan in KITTI's formats. Their seeds are
+reserved: no training frame is rendered with them.
 """
 
 from __future__ import annotations
@@ -29,6 +30,10 @@ SAMPLE_SEED = 770077
 INDOOR_SCENE, INDOOR_VIEW = 5, 1
 STREET_SCENE = 13
 
+UNREGISTERED_SCENE = 22
+_COLOUR_FOCAL, _COLOUR_ASIDE_M = 0.9, 0.025
+"""Focal length of the colour over the depth camera, and the distance between them."""
+
 INDOOR_SCALE, STREET_SCALE = 1000, 256
 SPARSE_POINTS = 500
 
@@ -53,11 +58,35 @@ def make_indoor(folder: Path) -> None:
     rng = generator(SAMPLE_SEED, INDOOR_SCENE, 1 + INDOOR_VIEW)
     view = pick_view(world, plan, "room", rng, size=(480, 640))
     depth = _write_images(world, view, rng, folder, INDOOR_SCALE)
+    _write_points(folder, depth, rng)
+
+
+def _write_points(folder: Path, depth: FloatArray, rng: np.random.Generator) -> None:
+    """Writes sparse.png with random pixels of the depth."""
     v, u = np.nonzero(depth)
     keep = np.sort(rng.choice(len(v), SPARSE_POINTS, replace=False))
     sparse = np.zeros_like(depth)
     sparse[v[keep], u[keep]] = depth[v[keep], u[keep]]
     write_depth(folder / "sparse.png", sparse, INDOOR_SCALE)
+
+
+def make_unregistered(folder: Path) -> None:
+    """Writes rgb.jpg of a colour camera beside the depth camera of sparse.png and gt.png."""
+    world, plan = build("room", generator(SAMPLE_SEED, UNREGISTERED_SCENE, 0))
+    rng = generator(SAMPLE_SEED, UNREGISTERED_SCENE, 1)
+    view = pick_view(world, plan, "room", rng, size=(480, 640))
+    focal_px = np.float32(view.fx * _COLOUR_FOCAL)
+    aside = replace(
+        view, position=view.position + view.axes[:, 0] * np.float32(_COLOUR_ASIDE_M),
+        fx=float(focal_px), fy=float(focal_px),
+    )  # fmt: skip
+    folder.mkdir(parents=True, exist_ok=True)
+    colour, _ = seen(world, aside, rng, ambient_rays=_AMBIENT_RAYS)
+    image = Image.fromarray(photographed(colour, rng, clean=True))
+    _write(folder / "rgb.jpg", lambda stream: image.save(stream, "JPEG", quality=90))
+    _, depth = seen(world, view, rng, ambient_rays=1)
+    write_depth(folder / "gt.png", depth, INDOOR_SCALE)
+    _write_points(folder, depth, rng)
 
 
 def make_street(folder: Path) -> None:
@@ -179,12 +208,13 @@ def _write(path: Path, fill: Callable[[BytesIO], object]) -> None:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Writes both frames below the folder that the command line names."""
+    """Writes the frames below the folder that the command line names."""
     parser = argparse.ArgumentParser(description="Render the frames of samples/.")
     parser.add_argument("--out", type=Path, required=True)
     out = parser.parse_args(arguments).out
     make_indoor(out / "indoor")
     make_street(out / "street")
+    make_unregistered(out / "unregistered")
 
 
 if __name__ == "__main__":

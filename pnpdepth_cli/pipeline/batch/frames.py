@@ -40,6 +40,8 @@ from pnpdepth_cli.pipeline.refinement.request import (
 Item = TypeVar("Item")
 COMPARED_EVERY = 20
 """One frame of so many is refined again without a fifth of its points, for the comparison."""
+REGISTERING = 16
+"""Frames that decide together how images are moved into the frame of the points."""
 
 _LISTS = (".csv", ".jsonl")
 _IN_OUTPUT = "lies in the output folder, which is not searched for frames; move it"
@@ -207,6 +209,13 @@ def deciding(frames: Sequence[Item], first: int) -> list[Item]:
     """
     count = len(frames) - first - 1
     return [frames[first + 1 + i] for i in sorted({count // 2, count - 1})] if count else []
+
+
+def registering(frames: Sequence[Item], first: int) -> list[Item]:
+    """Returns the frames, the first readable one among them, that decide the registration."""
+    count = len(frames) - first
+    chosen = {first + i * (count - 1) // (REGISTERING - 1) for i in range(REGISTERING)}
+    return [frames[i] for i in sorted(chosen)]
 
 
 def _reads_scan(files: FrameFiles, sparse: Path | None, gt: Source | None) -> bool:

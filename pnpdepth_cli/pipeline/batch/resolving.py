@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import functools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.io.dataset.frame import Frame
-from pnpdepth_cli.pipeline.batch.frames import Task, deciding, task_of
+from pnpdepth_cli.pipeline.batch.frames import Task, deciding, registering, task_of
 from pnpdepth_cli.pipeline.batch.groups import FrameGroups
 from pnpdepth_cli.pipeline.batch.reading import read_task
 from pnpdepth_cli.pipeline.batch.request import BatchRequest
@@ -48,7 +48,8 @@ def resolve_refiner(
         first = readable(task)
         if first is not None:
             more = [task_of(request, other) for other in deciding(frames, number)]
-            return refiner_on(task, first, more, say)
+            many = [task_of(request, other) for other in registering(frames, number)]
+            return refiner_on(task, first, more, many, say)
     return None
 
 
@@ -67,7 +68,11 @@ def readable(task: Task) -> Inputs | None:
 
 
 def refiner_on(
-    task: Task, first: Inputs, others: Sequence[Task], say: Callable[[str], None]
+    task: Task,
+    first: Inputs,
+    others: Sequence[Task],
+    many: Sequence[Task],
+    say: Callable[[str], None],
 ) -> Refiner:
     """Returns the network with its definition resolved on this frame.
 
@@ -76,6 +81,7 @@ def refiner_on(
         first: Its contents.
         others: More frames, on which the candidates are compared where the method is chosen, and
             the input ranges where the network does not state its own.
+        many: Frames that decide how images are moved into the frame of the points.
         say: Receives what was decided.
     """
     for note in first.notes:
@@ -88,6 +94,8 @@ def refiner_on(
     refiner = load_refiner(task.request, first, more)
     for note in refiner.network.notes:
         say(note)
+    if first.registration == "auto":
+        refiner = _with_registration(refiner, map(readable, many), say)
     if refiner.method.chosen:
         return _with_shortlist(refiner, [first, *more()], say)
     s = refiner.settings
@@ -95,6 +103,20 @@ def refiner_on(
         f"network: {refiner.network.definition.name} cut at {refiner.layer}, {s.iterations}"
         f" updates of z ({s.update}, {s.loss}, step {s.lr})"
     )
+    return refiner
+
+
+def _with_registration(
+    refiner: Refiner, frames: Iterable[Inputs | None], say: Callable[[str], None]
+) -> Refiner:
+    """The refiner with the registration that the images of these frames share."""
+    refiner = refiner.with_registration_of(inputs for inputs in frames if inputs is not None)
+    for (height, width), registration in refiner.registrations.items():
+        if registration is not None:
+            say(
+                f"images of {width}×{height} are moved into the frame of the points by"
+                f" {registration}; --registration off leaves them"
+            )
     return refiner
 
 

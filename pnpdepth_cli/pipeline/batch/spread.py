@@ -13,7 +13,13 @@ from pnpdepth_cli.io.dataset.frame import Frame
 from pnpdepth_cli.io.dataset.frame_list import FrameList
 from pnpdepth_cli.io.journal import EncodedLine
 from pnpdepth_cli.io.remote.address import RemotePath
-from pnpdepth_cli.pipeline.batch.frames import Task, deciding, source_files, task_of
+from pnpdepth_cli.pipeline.batch.frames import (
+    Task,
+    deciding,
+    registering,
+    source_files,
+    task_of,
+)
 from pnpdepth_cli.pipeline.batch.profile import BatchProfile
 from pnpdepth_cli.pipeline.batch.request import BatchRequest
 from pnpdepth_cli.pipeline.batch.run import BatchRun
@@ -79,8 +85,13 @@ def spread_rows(
     assert isinstance(state, BatchState)
     shared = worker_pool(spread, run.say, inputs=[request.source], output=state.output)
     with shared as pool, run.profile.wall():
-        deciding = _deciding(request, frames, pool)
-        job = RefineJob(request=request, model=state.model, deciding=deciding)
+        first = _first_readable(request, frames, pool)
+        job = RefineJob(
+            request=request,
+            model=state.model,
+            deciding=() if first is None else (frames[first], *deciding(frames, first)),
+            registering=() if first is None else tuple(registering(frames, first)),
+        )
         for part in pool.results(
             job,
             largest_first(to_do),
@@ -116,16 +127,13 @@ def _magnitude(path: Path) -> int:
         return 0
 
 
-def _deciding(
-    request: BatchRequest, frames: Sequence[Frame], pool: WorkerPool
-) -> tuple[Frame, ...]:
-    """The frames that a run in one process resolves its network on; none if none can be read."""
+def _first_readable(request: BatchRequest, frames: Sequence[Frame], pool: WorkerPool) -> int | None:
+    """Which frame is the first that a run in one process would resolve its network on."""
     for start in range(0, len(frames), _SEARCHED):
         offset = pool.call(first_readable, request, frames[start : start + _SEARCHED])
         if offset is not None:
-            first = start + offset
-            return (frames[first], *deciding(frames, first))
-    return ()
+            return start + int(offset)
+    return None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -172,6 +180,8 @@ class RefineJob:
     """The network's `model_identity`."""
     deciding: tuple[Frame, ...]
     """The first frame that can be read, and others that candidates are compared on."""
+    registering: tuple[Frame, ...] = ()
+    """The frames that decide how images are moved into the frame of the points."""
 
     @contextmanager
     def opened(self) -> Iterator[Work]:
@@ -184,7 +194,8 @@ class RefineJob:
             first, *others = (task_of(self.request, frame) for frame in self.deciding)
             inputs = readable(first)
             if inputs is not None:
-                refiner = refiner_on(first, inputs, others, notes.append)
+                many = [task_of(self.request, frame) for frame in self.registering]
+                refiner = refiner_on(first, inputs, others, many, notes.append)
         collector = LineCollector(output=self.request.output, model=self.model)
         run = BatchRun(
             state=collector, profile=BatchProfile(), say=notes.append, stopped=lambda: False,

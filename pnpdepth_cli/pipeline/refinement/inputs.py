@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from pnpdepth_cli.completion.image_registration import ImageRegistration, estimated, evidence
 from pnpdepth_cli.errors import InputError, NoPointsError, SizeError, UsageError
 from pnpdepth_cli.frames.frame import Frame
 from pnpdepth_cli.io.dataset.frame import SCAN_ONLY_SUFFIXES, Hdf5Array, Source
@@ -86,6 +88,8 @@ class Inputs:
     """Points of other frames of the sequence; then the camera is known."""
     window: tuple[str, ...] = ()
     """As in the request."""
+    registration: ImageRegistration | Literal["auto"] | None = None
+    """How the image is moved into the frame of the points; "auto": as the points tell."""
 
     @property
     def size(self) -> tuple[int, int]:
@@ -97,10 +101,37 @@ class Inputs:
         points = self.points if points is None else points
         if self.neighbours and self.camera is not None:
             points = with_moved_points(points, self.neighbours, self.camera.camera)
-        rgb = self.rgb
+        registration = self.registration_by(points)
+        rgb = self.registered(registration)
         if rgb is not None:
             rgb = np.ascontiguousarray(rgb.transpose(2, 0, 1))
-        return Frame(rgb=None if rgb is None else torch.from_numpy(rgb), points=points)
+        return Frame(
+            rgb=None if rgb is None else torch.from_numpy(rgb),
+            points=points,
+            registration=registration,
+        )
+
+    def registration_by(self, points: SparsePoints) -> ImageRegistration | None:
+        """Returns how the image is moved into the frame of the points; None if it is not."""
+        if self.rgb is None:
+            return None
+        if self.registration != "auto":
+            return self.registration
+        if len(points) == len(self.points):  # a selection of as many is all of them
+            return self._registration_by_all
+        return estimated([evidence(self.rgb, points)])
+
+    @functools.cached_property
+    def _registration_by_all(self) -> ImageRegistration | None:
+        """How all points say that the image is moved: asked for more than once of most frames."""
+        assert self.rgb is not None
+        return estimated([evidence(self.rgb, self.points)])
+
+    def registered(self, registration: ImageRegistration | None) -> ImageArray | None:
+        """Returns the image moved so; None without an image."""
+        if self.rgb is None or registration is None:
+            return self.rgb
+        return registration.applied(self.rgb)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -188,7 +219,23 @@ def read_inputs(request: RefineRequest) -> Inputs:
         camera=camera,
         neighbours=neighbours.scans,
         window=files.window,
+        registration=registration_of(request),
     )
+
+
+def registration_of(request: RefineRequest) -> ImageRegistration | Literal["auto"] | None:
+    """Returns how the image is to be moved into the frame of the points, as in `Inputs`.
+
+    A calibrated scan and SfM points are registered; the paper's setting moves no image.
+    """
+    files = request.files
+    if files.registration == "off":
+        return None
+    if not isinstance(files.registration, str):
+        zoom, right, down = files.registration
+        return ImageRegistration(zoom=zoom, right=right, down=down)
+    calibrated = files.sparse is not None and (files.sparse.is_dir() or files.is_scan(files.sparse))
+    return None if calibrated or request.method.preset == PAPER else "auto"
 
 
 def _points_of(request: RefineRequest, files: FrameFiles, size: tuple[int, int]) -> SparsePoints:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ from pnpdepth_cli.sensors.cloud import cloud_from_depth
 
 def write_outputs(outputs: Outputs, inputs: Inputs, frame: RefinedFrame) -> dict[str, Any]:
     """Writes the depth and its images. Returns their entries of the record."""
+    inputs = replace(inputs, rgb=inputs.registered(frame.registration))
     make_folder(outputs.depth.parent)
     write_depth(outputs.depth, frame.after, scale=output_scale(outputs, inputs))
     if outputs.sigma is not None and frame.sigma is not None:

@@ -49,6 +49,7 @@ def record_of(refiner: Refiner, inputs: Inputs, frame: RefinedFrame) -> dict[str
             "tile": request.network.tile,
             "device": str(network.device),
         },
+        "registration": asdict(frame.registration) if frame.registration else None,
         "alignment": asdict(frame.alignment) if frame.alignment else None,
         "size": [inputs.size[1], inputs.size[0]],
         "points": {

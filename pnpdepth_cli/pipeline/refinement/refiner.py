@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
@@ -12,6 +12,12 @@ import torch
 from pnpdepth_cli.auto.choice import Competition
 from pnpdepth_cli.auto.cross_validation import spatial_folds
 from pnpdepth_cli.auto.predictions import OpenNetworks
+from pnpdepth_cli.completion.image_registration import (
+    Evidence,
+    ImageRegistration,
+    estimated,
+    evidence,
+)
 from pnpdepth_cli.completion.interpolation import linear
 from pnpdepth_cli.core.refine import RefineSettings
 from pnpdepth_cli.core.split import Split
@@ -31,6 +37,8 @@ from pnpdepth_cli.points import SparsePoints
 
 _COMPARED_FOLDS = 5
 """One of so many folds is held out to compare a fixed method with linear interpolation."""
+_TRIED = 3
+"""After so many frames that say nothing of the registration, no more are read."""
 _MIN_COMPARED = 5
 """Fewer points do not compare a method with linear interpolation."""
 
@@ -56,6 +64,9 @@ class Refiner:
     """All networks that compete by name, the user's first; `network` alone for a fixed method."""
     competition: Competition | None = None
     """Which candidates compete, where points are held out in turns."""
+    registrations: Mapping[tuple[int, int], ImageRegistration | None] = field(default_factory=dict)
+    """How the images of one size are moved into the frame of the points, where many frames decide
+    it. A frame of another size decides alone."""
 
     def opened(self) -> Opened:
         """Returns the networks, to be opened by `with` for all frames."""
@@ -81,7 +92,7 @@ class Refiner:
         frame, held_out = self._split_frame(inputs)
         if self.competition is not None and isinstance(opened, OpenNetworks):
             refined = refine_with_folds(opened, self.competition, self.request, frame, inputs.gt)
-            return replace(refined, held_out=held_out)
+            return _finished(refined, frame, held_out)
         assert isinstance(opened, Split)
         network, settings, propagation = self.network, self.settings, self._propagation
         if side := self.request.network.tile:
@@ -93,7 +104,7 @@ class Refiner:
             refined = refine_frame(
                 network, opened, settings, frame, propagation=propagation, on_iteration=on_iteration
             )
-        return replace(refined, held_out=held_out)
+        return _finished(refined, frame, held_out)
 
     def refine_next(self, opened: Opened, inputs: Inputs, carried: Carried) -> RefinedFrame:
         """Returns one frame of a window, which may begin where the frame before ended.
@@ -107,7 +118,7 @@ class Refiner:
         refined = refine_next(
             self.network, opened, self.settings, frame, carried, propagation=self._propagation
         )
-        return replace(refined, held_out=held_out)
+        return _finished(refined, frame, held_out)
 
     def compared(self, opened: Opened, inputs: Inputs, frame: RefinedFrame) -> RefinedFrame:
         """Returns the refined frame with its method's error at held-out points beside linear's.
@@ -157,8 +168,8 @@ class Refiner:
             self.network, split, settings, frames, propagation=self._propagation
         )
         return [
-            replace(each, held_out=points) if isinstance(each, RefinedFrame) else each
-            for each, points in zip(refined, held_out, strict=True)
+            _finished(each, frame, points) if isinstance(each, RefinedFrame) else each
+            for each, frame, points in zip(refined, frames, held_out, strict=True)
         ]
 
     def with_shortlist_of(self, group: Sequence[Inputs]) -> Refiner:
@@ -171,10 +182,32 @@ class Refiner:
             best = best_candidates(opened, choosing, seed, frames)
         return replace(self, competition=replace(self.competition, shortlist=best))
 
+    def with_registration_of(self, group: Iterable[Inputs]) -> Refiner:
+        """Returns the same refiner with the registration that the images of these frames share.
+
+        Images of the size of the first one decide, for all frames of that size.
+        """
+        usable = list[Evidence]()
+        for read, inputs in enumerate(group, 1):
+            if inputs.rgb is not None and inputs.registration == "auto":
+                known = evidence(inputs.rgb, self._split_points(inputs)[0])
+                usable += [] if known is None else [known]
+            if read == _TRIED and not usable:  # such as scans, none of which will tell
+                break
+        if not usable:
+            return self
+        return replace(self, registrations={usable[0].size: estimated(usable)})
+
+    def _split_points(self, inputs: Inputs) -> tuple[SparsePoints, SparsePoints]:
+        """The points to use, and the points held out."""
+        hold_out = self.request.hold_out
+        return split_points(inputs.points, hold_out.holdout, hold_out.seed)
+
     def _split_frame(self, inputs: Inputs) -> tuple[Frame, SparsePoints]:
         """The frame with the points to use, and the points held out."""
-        hold_out = self.request.hold_out
-        used, held_out = split_points(inputs.points, hold_out.holdout, hold_out.seed)
+        used, held_out = self._split_points(inputs)
+        if inputs.registration == "auto" and inputs.size in self.registrations:
+            inputs = replace(inputs, registration=self.registrations[inputs.size])
         return inputs.frame(used), held_out
 
     @property
@@ -191,3 +224,11 @@ class Refiner:
             "checkpoint": str(checkpoint) if checkpoint else None,
             "checkpoint_sha256": sha256_of(checkpoint) if checkpoint else None,
         }
+
+
+def _finished(refined: RefinedFrame, frame: Frame, held_out: SparsePoints) -> RefinedFrame:
+    """The refined frame with what was decided before it was refined."""
+    notes = refined.notes
+    if frame.registration is not None:
+        notes = (f"image: moved into the frame of the points by {frame.registration}", *notes)
+    return replace(refined, held_out=held_out, registration=frame.registration, notes=notes)

@@ -55,6 +55,21 @@ def parse_codes_per_metre(text: str) -> float:
     return scale
 
 
+def parse_registration(text: str) -> str | tuple[float, float, float]:
+    """Returns `auto` or `off`, or the three numbers of `0.9,-5,0`. Raises UsageError otherwise."""
+    if text in ("auto", "off"):
+        return text
+    try:
+        zoom, right, down = (float(part) for part in text.split(","))
+        if 0.1 <= zoom <= 10 and abs(right) < float("inf") and abs(down) < float("inf"):
+            return zoom, right, down
+    except ValueError:
+        pass
+    raise UsageError(
+        f"--registration {text!r} is neither auto, off, nor ZOOM,RIGHT,DOWN such as 0.9,-5,0"
+    )
+
+
 @dataclass(frozen=True, kw_only=True)
 class FrameFiles:
     """The files of a frame and how they are read."""
@@ -79,6 +94,14 @@ class FrameFiles:
     )
     sparse_size_ok: bool = option(
         False, "Accept a sparse depth map of another size; its points are moved to the image."
+    )
+    registration: str | tuple[float, float, float] = option(
+        "auto",
+        "Whether the image is moved into the frame of the points: auto, if their depth edges show"
+        " that it is not registered; off; or by ZOOM,RIGHT,DOWN in pixels.",
+        metavar="auto|off|Z,R,D",
+        parse=parse_registration,
+        show_default=True,
     )
     colmap: ColmapOptions = field(default_factory=ColmapOptions)
     """Which points are used where `sparse` is a COLMAP model."""

@@ -1,0 +1,132 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pnpdepth_cli.completion.image_registration import (
+    Evidence,
+    ImageRegistration,
+    estimated,
+    evidence,
+)
+from pnpdepth_cli.points import SparsePoints
+from tests.completion.unregistered import SIZE, UNREGISTERED, frame
+
+
+def evidence_of(
+    seed: int, registration: ImageRegistration | None = None, count: int = 500
+) -> Evidence:
+    known = evidence(*frame(seed, registration, count))
+    assert known is not None
+    return known
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize(
+    "registration",
+    [
+        UNREGISTERED,
+        ImageRegistration(zoom=1.08, right=6.0, down=0.0),
+        ImageRegistration(zoom=1.0, right=-9.0, down=5.0),
+    ],
+    ids=str,
+)
+def test_zoom_and_shift_between_the_cameras_are_found(
+    seed: int, registration: ImageRegistration
+) -> None:
+    found = estimated([evidence_of(seed, registration)])
+    assert found is not None
+    assert found.zoom == pytest.approx(registration.zoom, abs=0.012)
+    assert found.right == pytest.approx(registration.right, abs=1.5)
+    assert found.down == pytest.approx(registration.down, abs=1.5)
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("count", [20, 100, 500, 4000])
+def test_a_registered_image_stays(seed: int, count: int) -> None:
+    assert estimated([evidence_of(seed, count=count)]) is None
+
+
+def test_frames_with_few_points_show_together_what_each_does_not() -> None:
+    frames = [evidence_of(seed, UNREGISTERED, count=80) for seed in range(8)]
+    assert [estimated([each]) for each in frames].count(None) >= 6
+    found = estimated(frames)
+    assert found is not None
+    assert found.zoom == pytest.approx(UNREGISTERED.zoom, abs=0.02)
+
+
+def test_frames_of_another_size_than_the_first_are_left_out() -> None:
+    first, other = evidence_of(0, UNREGISTERED), evidence_of(1)
+    smaller = Evidence(log_likelihood=other.log_likelihood[:, 1:-1], size=(200, 320))
+    assert estimated([first, smaller]) == estimated([first])
+
+
+def test_no_frame_shows_nothing() -> None:
+    assert estimated([]) is None
+
+
+def test_points_that_were_found_in_the_image_show_nothing() -> None:
+    rgb, _ = frame(0)
+    contrast = np.abs(np.diff(rgb.mean(-1), axis=1))[:, :-1] > 0.1
+    rows, columns = np.nonzero(contrast)
+    rng = np.random.default_rng(0)
+    chosen = rng.choice(len(rows), 300, replace=False)
+    points = SparsePoints(
+        xy=torch.from_numpy(np.stack([columns, rows], axis=1)[chosen].astype(np.float32)),
+        depth=torch.from_numpy(rng.uniform(1, 5, 300).astype(np.float32)),
+        size=SIZE,
+    )
+    assert evidence(rgb, points) is None
+
+
+def test_scan_lines_few_points_and_points_of_one_side_show_nothing() -> None:
+    rgb, points = frame(0, UNREGISTERED, count=4000)
+    assert evidence(rgb, points.select(points.xy[:, 1] % 8 == 0)) is None
+    assert evidence(rgb, points.select(torch.arange(4000) < 9)) is None
+    assert evidence(rgb, points.select(points.xy[:, 0] < 100)) is None
+
+
+@pytest.mark.parametrize("line", [True, False], ids=["on a line", "at one depth"])
+def test_points_without_a_depth_edge_show_nothing_or_leave_the_image(line: bool) -> None:
+    rgb, points = frame(0, UNREGISTERED)
+    xy = points.xy.clone()
+    if line:
+        xy[:, 1] = 100.0
+    known = evidence(rgb, SparsePoints(xy=xy, depth=torch.full((500,), 2.0), size=SIZE))
+    assert known is None or estimated([known]) is None
+
+
+def test_an_image_without_an_edge_stays() -> None:
+    _, points = frame(0)
+    grey = np.full((*SIZE, 3), 0.5, np.float32)
+    known = evidence(grey, points)
+    assert known is None or estimated([known]) is None
+
+
+def test_the_same_frame_gives_the_same_bytes() -> None:
+    first, second = (evidence_of(3, UNREGISTERED) for _ in range(2))
+    assert first.log_likelihood.tobytes() == second.log_likelihood.tobytes()
+
+
+def test_an_unmoved_image_keeps_every_bit() -> None:
+    rgb, _ = frame(0)
+    assert (ImageRegistration(zoom=1.0, right=0.0, down=0.0).applied(rgb) == rgb).all()
+
+
+@given(right=st.integers(-6, 6), down=st.integers(-6, 6))
+def test_an_image_moved_by_whole_pixels_keeps_its_values(right: int, down: int) -> None:
+    rgb = np.random.default_rng(0).random((20, 30, 3), np.float32)
+    moved = ImageRegistration(zoom=1.0, right=float(right), down=float(down)).applied(rgb)
+    expected = np.roll(rgb, (-down, -right), axis=(0, 1))
+    assert (moved[6:-6, 6:-6] == expected[6:-6, 6:-6]).all()
+
+
+def test_the_colour_of_a_pixel_is_where_the_registration_says() -> None:
+    y, x = np.mgrid[:41, :61].astype(np.float32)
+    ramp = np.stack([x, y, x + y], axis=-1)
+    moved = ImageRegistration(zoom=0.5, right=4.0, down=-2.0).applied(ramp)
+    assert moved[30, 40, 0] == pytest.approx(30 + 0.5 * (40 - 30) + 4)
+    assert moved[30, 40, 1] == pytest.approx(20 + 0.5 * (30 - 20) - 2)

@@ -1,0 +1,46 @@
+"""Scenes of flat boxes whose image is not registered to their depth."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from pnpdepth_cli.completion.image_registration import ImageRegistration
+from pnpdepth_cli.points import SparsePoints
+
+SIZE = (240, 320)
+UNREGISTERED = ImageRegistration(zoom=0.9, right=-5.0, down=3.0)
+
+
+def boxes(seed: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Image (H, W, 3) and depth (H, W) of forty boxes in front of a wall, larger than `SIZE`."""
+    rng = np.random.default_rng(seed)
+    height, width = (2 * side for side in SIZE)
+    depth = np.full((height, width), 6.0, np.float32)
+    rgb = np.full((height, width, 3), 0.5, np.float32)
+    for distance in sorted(rng.uniform(1.0, 5.0, 40), reverse=True):
+        top, left = int(rng.integers(height - 40)), int(rng.integers(width - 40))
+        bottom, right = top + int(rng.integers(30, 120)), left + int(rng.integers(30, 120))
+        depth[top:bottom, left:right] = distance
+        rgb[top:bottom, left:right] = rng.uniform(0, 1, 3)
+    return rgb + rng.normal(0, 0.02, rgb.shape).astype(np.float32), depth
+
+
+def frame(
+    seed: int, registration: ImageRegistration | None = None, count: int = 500
+) -> tuple[NDArray[np.float32], SparsePoints]:
+    """Image and random points of a frame with this registration; None: it is registered."""
+    rgb, depth = boxes(seed)
+    inner = tuple(slice(side // 2, side // 2 + side) for side in SIZE)
+    if registration is not None:  # as the other camera sees the scene: moved by the inverse
+        rgb = registration.inverse().applied(rgb)
+    rgb, depth = np.clip(rgb[inner], 0, 1), depth[inner]
+    chosen = np.random.default_rng(seed).choice(depth.size, count, replace=False)
+    rows, columns = np.unravel_index(chosen, depth.shape)
+    points = SparsePoints(
+        xy=torch.from_numpy(np.stack([columns, rows], axis=1).astype(np.float32)),
+        depth=torch.from_numpy(depth[rows, columns]),
+        size=SIZE,
+    )
+    return rgb, points
