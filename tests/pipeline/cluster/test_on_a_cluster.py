@@ -17,7 +17,6 @@ import numpy as np
 import pytest
 
 from pnpdepth_cli.errors import ClusterError
-from pnpdepth_cli.pipeline.batch.state import remove_all_leftovers
 from pnpdepth_cli.pipeline.cluster import failures
 from pnpdepth_cli.pipeline.cluster.options import ClusterOptions
 from pnpdepth_cli.pipeline.evaluation.evaluate import evaluate
@@ -83,6 +82,16 @@ def states(output: Path) -> dict[str, str]:
     return {line["frame"]: line["state"] for line in lines}
 
 
+def different(root: Path) -> list[str]:
+    """The names of the results that differ from those of one process.
+
+    Hidden files are left out: a worker dies some time after its node or driver, maybe writing.
+    """
+    there, plain = results(root / "out"), results(root / "plain")
+    names = {name for name in there.keys() | plain.keys() if not Path(name).name.startswith(".")}
+    return sorted(name for name in names if there.get(name) != plain.get(name))
+
+
 def test_results_equal_those_of_one_process_when_a_node_is_lost(cluster: Any, root: Path) -> None:
     lost = cluster.worker_nodes.copy().pop()
     half_written = root / "out" / ".0123456789ab.png"
@@ -96,9 +105,8 @@ def test_results_equal_those_of_one_process_when_a_node_is_lost(cluster: Any, ro
     cluster.add_node(num_cpus=1, node_ip_address="127.0.0.5")
     assert not half_written.exists()
     cluster.wait_for_nodes(timeout=120)  # until the lost one counts as dead
-    remove_all_leftovers(root / "out")  # its worker may have written for a moment longer
     assert sorted(listener.names) == list(NAMES)
-    assert results(root / "out") == results(root / "plain")
+    assert different(root) == []
     assert set(states(root / "out").values()) == {"done"}
     assert outcome.summary["counts"]["done"] == len(NAMES)
     assert sum(each["items"] for each in outcome.summary["profile"]["workers"]) <= len(NAMES)
@@ -144,7 +152,7 @@ def test_a_killed_driver_is_resumed(cluster: Any, root: Path) -> None:
     listener = RecordingListener()
     batch(root, listener)
     assert first not in listener.names
-    assert results(root / "out") == results(root / "plain")
+    assert different(root) == []
 
 
 def test_what_is_wrong_with_a_cluster_is_an_error(
