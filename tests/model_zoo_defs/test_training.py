@@ -353,7 +353,7 @@ def test_weights_of_the_first_generation_give_the_same_depth_in_the_second() -> 
         for name, tensor in old.state_dict().items()
         if not any(layer in name for layer in train.NEW_LAYERS)
     }
-    train.upgrade(network, kept)
+    assert train.upgrade(network, kept) == sorted(network.state_dict().keys() - kept.keys())
     for name, tensor in network.state_dict().items():
         if name in kept:
             assert torch.equal(tensor, kept[name])

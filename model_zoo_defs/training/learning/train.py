@@ -31,7 +31,7 @@ from model_zoo_defs.training.learning.encoder_weights import pretrained_encoder
 from model_zoo_defs.training.learning.learner import WARM_UP_STEPS, Learner, Schedule, append_row
 from model_zoo_defs.training.learning.validation import Case, cases, scores
 
-# Layers that the first generation of the network did not have; `upgraded` leaves them as they
+# Layers that the first generation of the network did not have; `upgrade` leaves them as they
 # are initialised, which changes no output without a prior.
 NEW_LAYERS = (
     "propagation.",
@@ -89,8 +89,7 @@ class Run(Learner):
         network = Compact()
         if settings.pretrained:
             network.encoder.load_state_dict(pretrained_encoder())
-        if settings.start:
-            upgrade(network, load_file(settings.start))
+        self.new = upgrade(network, load_file(settings.start)) if settings.start else ()
         # The encoder is pretrained on photographs, which rendered frames differ from: it is frozen,
         # or its last stages are trained at a low rate.
         self.encoder_rate = settings.encoder_rate
@@ -110,13 +109,13 @@ class Run(Learner):
         self.bfloat16 = self.device.type == "cuda" or torch.cpu._is_avx512_bf16_supported()
 
     def groups(self) -> list[dict[str, Any]]:
-        """Parameter groups: a lower rate for the encoder, a higher one for new layers."""
+        """Parameter groups: the encoder learns more slowly, untrained layers faster."""
         groups: dict[float, list[nn.Parameter]] = {}
         for name, parameter in self.network.named_parameters():
             if parameter.requires_grad:
-                new = any(layer in name for layer in NEW_LAYERS)
-                slow = name.startswith("encoder.")
-                factor = self.encoder_rate if slow else NEW_LAYER_FACTOR if new else 1.0
+                factor = NEW_LAYER_FACTOR if name in self.new else 1.0
+                if name.startswith("encoder."):
+                    factor = self.encoder_rate
                 groups.setdefault(factor, []).append(parameter)
         return [{"params": some, "factor": factor} for factor, some in groups.items()]
 
@@ -132,8 +131,12 @@ class Run(Learner):
         return pyramid_loss(outputs.depths, depth) + SIDE_WEIGHT * side
 
 
-def upgrade(network: Compact, weights: Mapping[str, Tensor]) -> None:
-    """Loads the weights into the network; layers missing in them keep their initial weights."""
+def upgrade(network: Compact, weights: Mapping[str, Tensor]) -> list[str]:
+    """Loads the weights into the network; layers missing in them keep their initial weights.
+
+    Returns:
+        The names of the missing weights.
+    """
     own = network.state_dict()
     missing = sorted(name for name in own.keys() - weights.keys())
     unknown = sorted(weights.keys() - own.keys())
@@ -141,6 +144,7 @@ def upgrade(network: Compact, weights: Mapping[str, Tensor]) -> None:
     if unknown or unexplained:
         raise ValueError(f"not weights of compact: {', '.join((unknown + unexplained)[:5])}")
     network.load_state_dict(own | dict(weights))
+    return missing
 
 
 def inlier_loss(logits: Tensor, sparse: Tensor, ground_truth: Tensor) -> Tensor:
@@ -235,6 +239,11 @@ def _report(run: Run, held_out: list[Case], loss: float) -> None:
         tqdm.write(f"step {run.step}: {results}")
 
 
+def _size(text: str) -> tuple[int, int]:
+    height, width = text.split("x")
+    return int(height), int(width)
+
+
 def main() -> None:
     """Reads the command line and trains."""
     parser = argparse.ArgumentParser(
@@ -247,6 +256,9 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--minutes", type=float, help="end after this long at the latest")
     parser.add_argument("--resume", action="store_true", help="go on from RUN_DIR/state.pt")
+    parser.add_argument(
+        "--window", dest="size", type=_size, default=Settings.size, help="height x width in pixels"
+    )
     parser.add_argument("--batch", type=int, default=Settings.batch)
     parser.add_argument("--lr", type=float, default=Settings.lr)
     parser.add_argument("--start", type=Path, help="weights to start from")
