@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from model_zoo_defs.compact import Compact
 from model_zoo_defs.training.learning import patterns
-from model_zoo_defs.training.learning.dataset import Frames, Samples, degraded, mapped
+from model_zoo_defs.training.learning.dataset import Frames, Samples, augmented, degraded, mapped
 from model_zoo_defs.training.learning.learner import Schedule
 from model_zoo_defs.training.learning.priors import aligned, damaged, filled, nonsense
 from model_zoo_defs.training.learning.priors import draw as draw_prior
@@ -234,6 +234,14 @@ def test_a_sample_depends_on_its_number_alone(shards: Path) -> None:
     for one, other in zip(straight[2], jumping[2], strict=True):
         assert torch.equal(one, other)
     assert not torch.equal(straight[2].sparse, Samples((shards,), (32, 64), 4)[2].sparse)
+
+
+def test_windows_are_never_enlarged() -> None:
+    depth = np.arange(1, 97 * 131 + 1, dtype=np.float32).reshape(97, 131)
+    rgb = np.zeros((97, 131, 3), np.uint8)
+    for seed in range(20):
+        sample = augmented(np.random.default_rng(seed), rgb, depth, (64, 96), depth)
+        assert sample.depth.unique().numel() == 64 * 96
 
 
 def test_new_shards_are_picked_up(shards: Path, tmp_path: Path) -> None:

@@ -168,10 +168,14 @@ def _shifted(image: Tensor, down: int, right: int) -> Tensor:
 def _zoomed_part(
     rng: Generator, rgb: NDArray[np.uint8], depth: NDArray[np.float32], size: tuple[int, int]
 ) -> tuple[Tensor, Tensor]:
-    """A window of the frame resized to `size`: image (3, h, w) 0..1, depth (h, w)."""
+    """A window of the frame resized to `size`: image (3, h, w) 0..1, depth (h, w).
+
+    It is shrunk, and enlarged only if the frame is smaller than `size`.
+    """
     height, width = depth.shape
     least = max(size[0] / height, size[1] / width)
-    zoom = least * float(np.exp(rng.uniform(0.0, np.log(2.5))))
+    most = max(least, min(1.0, 2.5 * least))
+    zoom = float(np.exp(rng.uniform(np.log(least), np.log(most))))
     h, w = min(height, round(size[0] / zoom)), min(width, round(size[1] / zoom))
     top, left = int(rng.integers(height - h + 1)), int(rng.integers(width - w + 1))
     part = (slice(top, top + h), slice(left, left + w))
