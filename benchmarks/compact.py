@@ -31,6 +31,7 @@ from benchmarks.frames import (
     EvalFrame,
     frame_inputs,
     frame_pixels,
+    nyu,
     points_on_grid,
     refined,
     registered,
@@ -54,8 +55,13 @@ CELLS = (
     ("icl_nuim", 500),
     ("icl_nuim", 100),
     ("icl_nuim", 20),
+    ("nyu", 500),
+    ("nyu", 100),
+    ("nyu", 20),
     ("kitti_dc", None),
 )
+FEW = {"nyu": nyu}
+"""Sets of so few frames that all are taken."""
 METHODS = ("nearest", "linear", "plain", "refined")
 
 
@@ -207,7 +213,10 @@ def main() -> None:
     prior = load_network(args.prior, None) if args.prior else None
     table = {}
     for name, count in CELLS:
-        frames = list(SETS[name](args.data))[args.first :: args.every]
+        if name in FEW:
+            frames = list(FEW[name](args.data))
+        else:
+            frames = list(SETS[name](args.data))[args.first :: args.every]
         cell = f"{name}, {count} points" if count else f"{name}, its LiDAR"
         if args.fusion:
             moved = registered(frames, count, 0, args.registration)

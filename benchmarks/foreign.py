@@ -27,10 +27,9 @@ from benchmarks.frames import (
     refined,
     seven_scenes,
 )
+from benchmarks.frames import nyu as nyu_frames
 from pnpdepth_cli.core.metrics import score
 from pnpdepth_cli.core.refine import RefineSettings
-from pnpdepth_cli.io.depth import read_depth
-from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.models.definition import Normalisation
 from pnpdepth_cli.models.network import Network, load_network
 
@@ -58,15 +57,8 @@ def as_fastdepth_sees_it(frame: EvalFrame) -> EvalFrame:
 
 def nyu(data: Path) -> list[EvalFrame]:
     """The two NYU frames, as FastDepth sees them."""
-    folder = data / "nyu"
-    ready = (np.load(folder / f"{name}.npy").squeeze() for name in ("rgb", "depth"))
-    rgb, gt = (values.astype(np.float32) for values in ready)
-    frames = [EvalFrame("nyu", np.ascontiguousarray(rgb), np.ascontiguousarray(gt))]
-    for path in sorted((folder / "metric3d").glob("rgb_*.jpg")):
-        depth = path.with_name(path.name.replace("rgb", "sync_depth")).with_suffix(".png")
-        frame = EvalFrame(path.stem, read_rgb(path).values, read_depth(depth, scale=1000).values)
-        frames.append(as_fastdepth_sees_it(frame))
-    return frames
+    small, *large = nyu_frames(data)
+    return [small, *(as_fastdepth_sees_it(frame) for frame in large)]
 
 
 def variants(network: Network) -> Iterator[tuple[str, str, RefineSettings]]:

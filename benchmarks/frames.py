@@ -59,6 +59,16 @@ def kitti_dc(root: Path) -> Iterator[EvalFrame]:
         yield EvalFrame(path.stem, read_rgb(path).values, gt, scan)
 
 
+def nyu(root: Path) -> Iterator[EvalFrame]:
+    """Two Kinect frames of 224×224 and 480×640 pixels."""
+    ready = (np.load(root / "nyu" / f"{name}.npy").squeeze() for name in ("rgb", "depth"))
+    rgb, gt = (np.ascontiguousarray(values.astype(np.float32)) for values in ready)
+    yield EvalFrame("nyu", rgb, gt)
+    for path in sorted((root / "nyu" / "metric3d").glob("rgb_*.jpg")):
+        depth = path.with_name(path.name.replace("rgb", "sync_depth")).with_suffix(".png")
+        yield EvalFrame(path.stem, read_rgb(path).values, read_depth(depth, scale=1000).values)
+
+
 SETS = {"7scenes": seven_scenes, "icl_nuim": icl_nuim, "kitti_dc": kitti_dc}
 
 
