@@ -172,8 +172,6 @@ class Compact(nn.Module):
             if level in self.propagation:
                 depth = self.propagation[level](features, depth, moments, stride)
             depths.append(depth)
-            if self.training:  # every level answers for its own step only
-                depth = depth.detach()
             extra = [resize(fit.distance, (size[0] * 2, size[1] * 2))] if level == "s16" else []
             if level == "s4":
                 extra, features = [F.pixel_unshuffle(rgb, 2)], self.narrow(features)
