@@ -34,7 +34,7 @@ ENOUGH_HELD_OUT = 100
 MOST_SCORED = 1000
 """Of more held-out points of a fold a random part is scored."""
 ENOUGH_FOR_INTERPOLATION = 500
-"""With fewer held-out points all folds are scored before a baseline of points is chosen alone."""
+"""With fewer held-out points all folds are scored before baselines of points get most weight."""
 MIN_POINTS_FOR_JOINT_OUTLIERS = 50
 """From this many points on, points inconsistent with other points alone are outliers too."""
 

@@ -60,11 +60,13 @@ class Choice:
 
     @property
     def is_interpolation(self) -> bool:
-        """Whether a baseline alone is chosen, of the points alone."""
-        first, *others = self.candidates
-        if others or first.baseline is None:
-            return False
-        return not BASELINES[first.baseline].needs_prediction
+        """Whether baselines of points alone have most of the weight."""
+        weight = sum(
+            weight
+            for weight, each in zip(self.weights, self.candidates, strict=True)
+            if each.baseline is not None and not BASELINES[each.baseline].needs_prediction
+        )
+        return weight > 0.5
 
     def __str__(self) -> str:
         if len(self.candidates) == 1:

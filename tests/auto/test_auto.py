@@ -100,28 +100,32 @@ def test_held_out_points_have_no_influence_on_the_depth_they_score(
 
 
 @pytest.mark.parametrize(
-    ("candidate", "enough", "scored"),
+    ("candidate", "weight", "enough", "scored"),
     [
-        (Candidate(baseline="linear"), 500, [1, 5]),
-        (Candidate(baseline="linear"), 10, [1]),
-        (Candidate(baseline="local"), 500, [1]),
-        (Candidate(config=CONFIG), 500, [1]),
+        (Candidate(baseline="linear"), 1.0, 500, [1, 5]),
+        (Candidate(baseline="linear"), 0.75, 500, [1, 5]),
+        (Candidate(baseline="linear"), 0.5, 500, [1]),
+        (Candidate(baseline="linear"), 1.0, 10, [1]),
+        (Candidate(baseline="local"), 1.0, 500, [1]),
+        (Candidate(config=CONFIG), 1.0, 500, [1]),
     ],
 )
-def test_interpolation_alone_is_chosen_only_at_enough_held_out_points(
+def test_interpolation_gets_most_weight_only_at_enough_held_out_points(
     frame: FrameOnDisk,
     network: Network,
     monkeypatch: pytest.MonkeyPatch,
     candidate: Candidate,
+    weight: float,
     enough: int,
     scored: list[int],
 ) -> None:
     calls = []
+    candidates, weights = (candidate, Candidate(config=CONFIG)), (weight, 1 - weight)
 
     def choose(folds: Sequence[Fold], competition: Competition) -> Choice:
         calls.append(len(folds))
         held_out = sum(len(fold.held_out) for fold in folds)
-        return Choice(candidates=(candidate,), weights=(1.0,), held_out=held_out)
+        return Choice(candidates=candidates, weights=weights, held_out=held_out)
 
     monkeypatch.setattr(auto, "choose", choose)
     monkeypatch.setattr(auto, "ENOUGH_HELD_OUT", 12)
