@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 
 from pnpdepth_cli.errors import ClusterError
+from pnpdepth_cli.pipeline.batch.state import remove_all_leftovers
 from pnpdepth_cli.pipeline.cluster import failures
 from pnpdepth_cli.pipeline.cluster.options import ClusterOptions
 from pnpdepth_cli.pipeline.evaluation.evaluate import evaluate
@@ -85,10 +86,12 @@ def states(output: Path) -> dict[str, str]:
 def different(root: Path) -> list[str]:
     """The names of the results that differ from those of one process.
 
-    Hidden files are left out: a worker dies some time after its node or driver, maybe writing.
+    A worker dies some time after its node or driver; what it leaves half-written is removed, as
+    the next run does.
     """
+    remove_all_leftovers(root / "out")
     there, plain = results(root / "out"), results(root / "plain")
-    names = {name for name in there.keys() | plain.keys() if not Path(name).name.startswith(".")}
+    names = there.keys() | plain.keys()
     return sorted(name for name in names if there.get(name) != plain.get(name))
 
 
