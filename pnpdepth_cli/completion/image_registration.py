@@ -153,7 +153,7 @@ def estimated(frames: Iterable[Evidence | None]) -> ImageRegistration | None:
         + (down / size[0] / _SHIFT_SIGMA)[None, :, None] ** 2
         + (right / size[1] / _SHIFT_SIGMA)[None, None, :] ** 2
     )
-    logits = total - prior / 2 + np.log(_normaliser(prior))
+    logits = total - prior / 2 - logsumexp(-prior / 2)
     unmoved = total[len(_ZOOMS) // 2, len(down) // 2, len(right) // 2]
     if logsumexp(logits) - unmoved < FOUND:
         return None
@@ -163,10 +163,6 @@ def estimated(frames: Iterable[Evidence | None]) -> ImageRegistration | None:
         right=round(float(right @ probability.sum((0, 1))), 2),
         down=round(float(down @ probability.sum((0, 2))), 2),
     )
-
-
-def _normaliser(prior: Floats) -> float:
-    return 1.0 / float(np.exp(-prior / 2).sum())
 
 
 def _shifts(count: int, size: tuple[int, int]) -> Floats:
