@@ -2,53 +2,68 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
 from typing import cast
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from model_zoo_defs._compact.cloud import Cloud
 from model_zoo_defs._compact.points import Points, Prior
 
 # The weight of a point as a function of its log odds of being an inlier: steep, because a softmax
-# over few candidates follows a doubtful point too far, and 1 for most inliers.
-STEEPNESS, SHIFT = 4.0, 2.0
+# over few candidates follows a doubtful point too far. Its half is at log odds of 2: an inlier
+# that is left out costs less than an outlier that is kept.
+STEEPNESS, THRESHOLD = 4.0, 2.0
 # Up to this expected fraction of outliers in an image their log odds gain the margin, which falls
 # to 0 at twice the fraction: isolated points of clean images lie on thin objects.
 CLEAN_FRACTION, CLEAN_MARGIN = 0.03, 7.0
+# Messages to so many points are computed at a time: bounds the memory.
+CHUNK = 4096
+WIDTH, MESSAGE, ROUNDS, HEADS = 32, 48, 2, 4
+# per pair of points: agreement in depth, and position; per pair, agreement in the residual
+AGREEMENT, POSITION, PRIOR_AGREEMENT = 6, 5, 7
 
 
 class InlierWeights(nn.Module):
     """A weight 0..1 for every point from its agreement with the points around it.
 
-    The image is divided into cells with about one point each. A point is compared with the means
-    of the 5 x 5 cells around it; its own cell is counted without it. With a prior, the residuals
-    against the prior are compared likewise. A second pass compares with means that are
-    weighted by the result of the first.
+    A small graph network: every point has a state, and `Messages` of its nearest neighbours and
+    the mean state of the image update it. A message depends on the difference of the two log
+    depths and on where the neighbour is; with a prior also on the difference of the residuals
+    against it.
     """
-
-    WIDTHS = (1.0, 2.5)
-    SCALES = (0.02, 0.06, 0.2)
-    # of the point, and their means over all points of the image: how clean these points are
-    STATISTICS = 2 * (len(WIDTHS) * (len(SCALES) + 3) + 1)
 
     def __init__(self) -> None:
         super().__init__()
-        self.first = PointScore(self.STATISTICS)
-        self.second = PointScore(self.STATISTICS)
-        nn.init.constant_(self.first.leave.bias, 4.0)  # weights of exactly 1
+        self.enter = ExactLinear(2, WIDTH)
+        self.enter_prior = ExactLinear(2, WIDTH, bias=False)
+        self.rounds = nn.ModuleList(Messages() for _ in range(ROUNDS))
+        self.score = ExactLinear(WIDTH, WIDTH)
+        self.leave = ExactLinear(WIDTH, 1)
+        nn.init.zeros_(self.leave.weight)
+        nn.init.constant_(self.leave.bias, 4.0)  # weights of exactly 1
 
     def forward(self, points: Points, prior: Prior | None) -> tuple[Tensor, Tensor]:
         """(weights, logits), both (B, 1, H, W), 1 and 0 away from the points."""
         at, nothing = points.mask > 0, torch.zeros_like(points.mask)
         with torch.autocast(points.mask.device.type, enabled=False):
-            log_odds = self.first(*self.statistics(points, prior, points.mask))
-            use = nothing.masked_scatter(at, torch.sigmoid(log_odds.detach()))
-            log_odds = log_odds + self.second(*self.statistics(points, prior, use))
+            log_odds = self.log_odds(Cloud.of(points, prior), with_prior=prior is not None)
         logits = nothing.masked_scatter(at, log_odds)
-        weights = torch.sigmoid(STEEPNESS * (logits + self._margin(points, logits)) + SHIFT)
+        weights = torch.sigmoid(STEEPNESS * (logits + self._margin(points, logits) - THRESHOLD))
         return torch.where(at, weights, 1.0), logits
+
+    def log_odds(self, cloud: Cloud, *, with_prior: bool) -> Tensor:
+        """Log odds (n,) of being an inlier."""
+        state = self.enter(torch.stack([cloud.found.float().mean(1), cloud.log_spacing / 3], 1))
+        if with_prior:
+            size = torch.tanh(cloud.residual.abs() / 0.2) * cloud.valid
+            state = state + self.enter_prior(torch.stack([cloud.valid, size], 1))
+        state = F.relu(state)
+        for messages in self.rounds:
+            state = messages(state, cloud, with_prior=with_prior)
+        return cast(Tensor, self.leave(F.relu(self.score(state))).squeeze(1))
 
     @staticmethod
     def _margin(points: Points, logits: Tensor) -> Tensor:
@@ -57,102 +72,77 @@ class InlierWeights(nn.Module):
         outliers = (points.mask * torch.sigmoid(-logits)).sum((1, 2, 3), keepdim=True) / count
         return CLEAN_MARGIN * (1.0 - (outliers / CLEAN_FRACTION - 1.0).clamp(0.0, 1.0))
 
-    def statistics(
-        self, points: Points, prior: Prior | None, use: Tensor
-    ) -> tuple[Tensor, Tensor | None]:
-        """Statistics (n, STATISTICS) of every point of the batch, and of its prior residual.
 
-        Args:
-            points: The sparse depth of the batch.
-            prior: Its prior, or None.
-            use: Weights (B, 1, H, W) of the points in the means that they are compared with.
-        """
-        known = points.mask.squeeze(1) > 0
-        rows = _each(known, points.value, use, self._statistics)
-        if prior is None:
-            return rows, None
-        of_prior = _each(known, prior.residual, use * prior.valid, self._statistics)
-        at = known.unsqueeze(1)
-        single = torch.stack([prior.valid[at], prior.residual[at].abs().clamp(max=2.0)], 1)
-        return rows, torch.cat([of_prior, single], 1) * prior.valid[at].unsqueeze(1)
+class Messages(nn.Module):
+    """One round of messages: the new state (n, WIDTH) of every point.
 
-    def _statistics(self, rows: Tensor, columns: Tensor, value: Tensor, use: Tensor,
-                    size: tuple[int, int]) -> Tensor:  # fmt: skip
-        """Agreement with, number and deviation of the points around each point (n, STATISTICS)."""
-        step = max(1.0, (size[0] * size[1] / max(1, len(rows))) ** 0.5)
-        across = int(size[1] / step) + 5  # a margin of two empty cells
-        down = int(size[0] / step) + 5
-        row, column = (rows / step).long() + 2, (columns / step).long() + 2
-        cell = row * across + column
-        length = down * across
-        count = torch.bincount(cell, use, length)
-        total = torch.bincount(cell, use * value, length)
-        shifts = [(i, j) for i in range(-2, 3) for j in range(-2, 3)]
-        offset = torch.tensor([i * across + j for i, j in shifts], device=cell.device)
-        around = cell.unsqueeze(1) + offset
-        own = (offset == 0) * use.unsqueeze(1)
-        counts = count[around] - own
-        means = (total[around] - own * value.unsqueeze(1)) / counts.clamp(min=0.5)
-        occupied = (counts > 0.5).float()
-        # distance between cells, from the point to the middle of the other cell
-        rest_row, rest_column = rows / step - row + 1.5, columns / step - column + 1.5
-        shift = torch.tensor(shifts, device=cell.device, dtype=torch.float32)
-        square = (shift[:, 0] - rest_row.unsqueeze(1)).square()
-        square = square + (shift[:, 1] - rest_column.unsqueeze(1)).square()
-        difference = (means - value.unsqueeze(1)) * occupied
-        nearest = torch.where(occupied > 0, difference.abs(), 2.0).amin(1, keepdim=True)
-        table = [nearest.clamp(max=2.0)]
-        for width in self.WIDTHS:
-            weight = occupied * torch.exp(-square / width**2)
-            number = weight.sum(1, keepdim=True)
-            weight = weight / (number + 0.05)
-            mean = (weight * means).sum(1, keepdim=True)
-            deviation = (weight * (means - mean).abs()).sum(1, keepdim=True)
-            signed = (weight * torch.tanh(difference / 0.2)).sum(1, keepdim=True)
-            agreement = [
-                (weight * torch.exp(-difference.abs() / scale)).sum(1, keepdim=True)
-                for scale in self.SCALES
-            ]
-            table += [*agreement, torch.log1p(number), deviation.clamp(max=2.0), signed]
-        each = torch.cat(table, 1)
-        return torch.cat([each, each.mean(0, keepdim=True).expand_as(each)], 1)
+    Messages are averaged with weights that they predict themselves, and their maximum is taken.
+    The layers that make messages are plain parameters, because they run once per CHUNK of points:
+    how often a submodule runs may not depend on the number of points (`static_graph`).
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.pair = _matrix(MESSAGE, AGREEMENT + POSITION)
+        self.pair_prior = _matrix(MESSAGE, PRIOR_AGREEMENT)
+        self.bias = nn.Parameter(torch.zeros(MESSAGE))
+        self.neighbour = ExactLinear(WIDTH, MESSAGE, bias=False)
+        self.message, self.message_bias = _matrix(WIDTH, MESSAGE), nn.Parameter(torch.zeros(WIDTH))
+        self.attention = _matrix(HEADS, MESSAGE)
+        self.update = ExactLinear(4 * WIDTH, 2 * WIDTH)
+        self.change = ExactLinear(2 * WIDTH, WIDTH)
+        nn.init.zeros_(self.change.weight)
+
+    def forward(self, state: Tensor, cloud: Cloud, *, with_prior: bool) -> Tensor:
+        sent = self.neighbour(state) + self.bias
+        chunks = [
+            self._received(sent, cloud, slice(first, first + CHUNK), with_prior)
+            for first in range(0, len(state), CHUNK)
+        ]
+        received = torch.cat(chunks) if chunks else state.new_zeros((0, 2 * WIDTH))
+        each = torch.split(state, list(cloud.counts))
+        images = [states.mean(0, keepdim=True).expand_as(states) for states in each]
+        hidden = self.update(torch.cat([state, received, torch.cat(images)], 1))
+        return state + cast(Tensor, self.change(F.relu(hidden)))
+
+    def _received(self, sent: Tensor, cloud: Cloud, some: slice, with_prior: bool) -> Tensor:
+        """Weighted mean and maximum (m, 2 WIDTH) of the messages to some of the points."""
+        near, found = cloud.near[some], cloud.found[some].unsqueeze(2)
+        difference = F.embedding(near, cloud.value.unsqueeze(1))[..., 0] - cloud.value[
+            some
+        ].unsqueeze(1)
+        shift = F.embedding(near, cloud.position) - cloud.position[some].unsqueeze(1)
+        distance = shift.square().sum(2, keepdim=True).sqrt()
+        spacing = cloud.log_spacing[some].view(-1, 1, 1).expand_as(distance)
+        place = [shift / 2, distance / 2, 1 / (distance + 0.3), spacing / 3]
+        pairs = torch.cat([_agreement(difference), *place], 2) * found
+        hidden = F.linear(pairs, self.pair) + F.embedding(near, sent)
+        if with_prior:
+            valid = (cloud.valid[near] * cloud.valid[some].unsqueeze(1)).unsqueeze(2)
+            difference = cloud.residual[near] - cloud.residual[some].unsqueeze(1)
+            of_prior = torch.cat([_agreement(difference) * valid, valid], 2) * found
+            hidden = hidden + F.linear(of_prior, self.pair_prior)
+        hidden = F.relu(hidden)
+        message = F.relu(F.linear(hidden, self.message, self.message_bias)) * found
+        attention = F.linear(hidden, self.attention).masked_fill(~found, -1e4).softmax(1)
+        mean = (
+            (attention.unsqueeze(3) * message.view(*message.shape[:2], HEADS, -1)).sum(1).flatten(1)
+        )
+        return torch.cat([mean, message.amax(1)], 1)
 
 
 class ExactLinear(nn.Linear):
     """A linear layer that stays in float32 at any precision: only plain `nn.Linear` is cast."""
 
 
-class PointScore(nn.Module):
-    """Log odds (n,) from the statistics of n points and of their residuals against a prior."""
-
-    def __init__(self, statistics: int):
-        super().__init__()
-        self.enter = ExactLinear(statistics, 24)
-        self.enter_prior = ExactLinear(statistics + 2, 24, bias=False)
-        self.leave = ExactLinear(24, 1)
-        for layer in (self.enter_prior, self.leave):
-            nn.init.zeros_(layer.weight)
-        nn.init.constant_(self.leave.bias, 0.0)
-
-    def forward(self, rows: Tensor, of_prior: Tensor | None) -> Tensor:
-        hidden = self.enter(rows)
-        if of_prior is not None:
-            hidden = hidden + self.enter_prior(of_prior)
-        return cast(Tensor, self.leave(F.relu(hidden)).squeeze(1))
+def _agreement(difference: Tensor) -> Tensor:
+    """Differences of log depth (...,) at several scales (..., AGREEMENT)."""
+    signed = [torch.tanh(difference / scale) for scale in (0.02, 0.06, 0.2, 0.7)]
+    same = [torch.exp(-difference.abs() / scale) for scale in (0.03, 0.1)]
+    return torch.stack(signed + same, -1)
 
 
-def _each(
-    known: Tensor, value: Tensor, use: Tensor,
-    statistics: Callable[[Tensor, Tensor, Tensor, Tensor, tuple[int, int]], Tensor],
-) -> Tensor:  # fmt: skip
-    """The statistics of the points of every sample, one below the other, in the order of `known`.
-
-    known: (B, H, W); value, use: (B, 1, H, W).
-    """
-    table = []
-    for mask, values, uses in zip(known, value, use, strict=True):
-        rows, columns = torch.nonzero(mask, as_tuple=True)
-        size = (int(mask.shape[0]), int(mask.shape[1]))
-        points = (rows.float(), columns.float(), values[0][rows, columns], uses[0][rows, columns])
-        table.append(statistics(*points, size))
-    return torch.cat(table)
+def _matrix(rows: int, columns: int) -> nn.Parameter:
+    """Weights (rows, columns), initialised as those of `nn.Linear`."""
+    bound = 1 / math.sqrt(columns)
+    return nn.Parameter(torch.empty(rows, columns).uniform_(-bound, bound))

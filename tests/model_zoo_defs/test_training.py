@@ -444,15 +444,26 @@ def stop_at(settings_: train.Settings, step: int) -> None:
             return
 
 
-def test_inlier_weights_learn_to_detect_outliers(shards: Path) -> None:
+def test_inlier_weights_learn_to_detect_outliers(
+    shards: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(train_inliers, "MOST_POINTS", 300)
     torch.manual_seed(0)
     layer = Compact().inlier_weights
-    data = train_inliers.table(layer, Frames(shards), 60, seed=1)
-    loss = train_inliers.fit(
-        layer.first, data.first, torch.zeros_like(data.target), data.target, steps=60
-    )
+    examples = train_inliers.drawn((shards,), 24, seed=1, workers=0)
+    loss = train_inliers.fit(layer, examples, steps=150, seed=1)
+    outliers, inliers = [], []
     with torch.no_grad():
-        log_odds = layer.first(*data.first)
-    outlier, right = data.target == 0, data.target == 1
+        for cloud, target in examples:
+            log_odds = layer.log_odds(cloud, with_prior=bool(cloud.valid.any()))
+            outliers.append(log_odds[target == 0])
+            inliers.append(log_odds[target == 1])
     assert loss < 0.7
-    assert float(log_odds[outlier].mean()) < float(log_odds[right].mean()) - 0.5
+    assert float(torch.cat(outliers).mean()) < float(torch.cat(inliers).mean()) - 0.5
+
+
+def test_many_points_are_cut_to_a_strip_of_rows() -> None:
+    depth = torch.full((100, 90), 2.0)
+    cloud, target = train_inliers.example(depth, depth * 1.3, torch.zeros_like(depth), where=1.0)
+    assert train_inliers.MOST_POINTS <= len(cloud.value) < train_inliers.MOST_POINTS + 2 * 90
+    assert torch.equal(target, torch.zeros_like(target))

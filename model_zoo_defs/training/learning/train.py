@@ -150,12 +150,18 @@ def upgrade(network: Compact, weights: Mapping[str, Tensor]) -> list[str]:
 def inlier_loss(logits: Tensor, sparse: Tensor, ground_truth: Tensor) -> Tensor:
     """Cross entropy of the points' inlier weights; all (B, 1, H, W), 0 in depths = unknown."""
     at = (sparse > 0) & (ground_truth > 0)
-    error = (torch.log(sparse[at]) - torch.log(ground_truth[at])).abs()
-    inlier = ((OUTLIER_ERROR - error) / (OUTLIER_ERROR - INLIER_ERROR)).clamp(0.0, 1.0)
+    inlier = inlier_targets(sparse[at], ground_truth[at])
     each = F.binary_cross_entropy_with_logits(logits[at], inlier, reduction="none")
     # every sample counts alike, however many points it has
     count = at.sum((1, 2, 3), keepdim=True).clamp(min=1).expand_as(at)[at]
     return (each / count).sum() / len(sparse)
+
+
+def inlier_targets(sparse: Tensor, ground_truth: Tensor) -> Tensor:
+    """How far points (n,) are inliers, 0..1; nan where the ground truth is unknown."""
+    error = (torch.log(sparse) - torch.log(ground_truth)).abs()
+    target = ((OUTLIER_ERROR - error) / (OUTLIER_ERROR - INLIER_ERROR)).clamp(0.0, 1.0)
+    return torch.where(ground_truth > 0, target, torch.nan)
 
 
 def sigma_loss(sigma: Tensor, depth: Tensor, ground_truth: Tensor) -> Tensor:

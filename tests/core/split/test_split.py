@@ -103,7 +103,8 @@ def test_it_holds_at_every_layer_of_compact() -> None:
         whole = network(*arguments)
         cut = 0
         for layer, module in network.named_modules():
-            unused = isinstance(module, nn.ModuleDict) or layer.split(".")[0] in ("", "scale")
+            container = isinstance(module, nn.ModuleDict | nn.ModuleList)
+            unused = container or layer.split(".")[0] in ("", "scale")
             if not unused and layer not in several:
                 with Split(network, layer) as split:
                     z = split.front(*arguments)

@@ -1,0 +1,115 @@
+"""Neighbours of points and the weights predicted from them."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor, nn
+
+from model_zoo_defs._compact import cloud as clouds
+from model_zoo_defs._compact import inliers
+from model_zoo_defs._compact.cloud import NEIGHBOURS, Cloud, neighbours
+from model_zoo_defs._compact.inliers import InlierWeights
+from model_zoo_defs._compact.points import Points, Prior
+
+SIZE = (64, 96)
+
+
+def sparse_map(count: int, seed: int = 0) -> Tensor:
+    """(1, 1, 64, 96) metres with `count` points."""
+    generator = torch.Generator().manual_seed(seed)
+    sparse = torch.zeros(SIZE[0] * SIZE[1])
+    at = torch.randperm(len(sparse), generator=generator)[:count]
+    sparse[at] = 1.0 + 4.0 * torch.rand(len(at), generator=generator)
+    return sparse.view(1, 1, *SIZE)
+
+
+def prior_map(seed: int = 0) -> Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    prior = 1.0 + 4.0 * torch.rand(1, 1, *SIZE, generator=generator)
+    prior[..., :20, :30] = 0.0
+    return prior
+
+
+@pytest.fixture(scope="module")
+def shaken() -> InlierWeights:
+    """A layer with random weights everywhere."""
+    torch.manual_seed(1)
+    layer = InlierWeights()
+    for parameter in layer.parameters():
+        nn.init.normal_(parameter, std=0.2)
+    return layer
+
+
+@given(seed=st.integers(0, 10_000), count=st.integers(1, 200))
+@settings(max_examples=30, deadline=None)
+def test_neighbours_are_the_nearest_points_of_the_cells_around(seed: int, count: int) -> None:
+    position = torch.rand(count, 2, generator=torch.Generator().manual_seed(seed)) * count**0.5
+    near, found = neighbours(position)
+    cells = position.long()
+    crowded = torch.unique(cells, dim=0, return_counts=True)[1].amax() > clouds.CELL_POINTS
+    if bool(crowded):
+        return
+    reachable = (cells[:, None] - cells[None]).abs().amax(2) <= 2
+    square = torch.cdist(position, position).square().masked_fill(~reachable, torch.inf)
+    square.fill_diagonal_(torch.inf)
+    expected = square.sort(1).values[:, :NEIGHBOURS]
+    assert torch.equal(found.sum(1), (expected < torch.inf).sum(1))
+    distance = (position[near] - position[:, None]).square().sum(2)
+    for row, own, known in zip(expected, distance, found, strict=True):
+        torch.testing.assert_close(own[known], row[row < torch.inf], rtol=1e-3, atol=1e-4)
+
+
+def test_on_a_grid_they_are_the_nearest_twelve() -> None:
+    rows, columns = torch.meshgrid(torch.arange(9.0), torch.arange(9.0), indexing="ij")
+    position = torch.stack([rows, columns], -1).flatten(0, 1) + 0.5
+    near, found = neighbours(position)
+    middle = 4 * 9 + 4
+    assert bool(found[middle].all())
+    square = (position[near[middle]] - position[middle]).square().sum(1)
+    assert square.tolist() == [1.0] * 4 + [2.0] * 4 + [4.0] * 4
+
+
+@pytest.mark.parametrize("count", [0, 1, 2])
+def test_points_without_neighbours_have_a_weight(shaken: InlierWeights, count: int) -> None:
+    weights, logits = shaken(Points(sparse_map(count)), None)
+    assert bool(torch.isfinite(weights).all())
+    assert int((logits != 0).sum()) == count
+
+
+def test_images_of_a_batch_do_not_influence_each_other(shaken: InlierWeights) -> None:
+    maps, priors = [sparse_map(70, 1), sparse_map(300, 2)], [prior_map(1), prior_map(2)]
+    together = Points(torch.cat(maps))
+    weights, logits = shaken(together, Prior(torch.cat(priors), together))
+    for number, (sparse, prior) in enumerate(zip(maps, priors, strict=True)):
+        points = Points(sparse)
+        alone = shaken(points, Prior(prior, points))
+        torch.testing.assert_close(logits[number], alone[1][0], rtol=1e-4, atol=1e-5)
+        torch.testing.assert_close(weights[number], alone[0][0], rtol=1e-3, atol=1e-4)
+
+
+def test_the_size_of_the_chunks_changes_nothing(
+    shaken: InlierWeights, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    points = Points(sparse_map(300))
+    whole = Cloud.of(points, None)
+    expected = shaken(points, None)[1]
+    monkeypatch.setattr(clouds, "CHUNK", 7)
+    monkeypatch.setattr(inliers, "CHUNK", 7)
+    assert torch.equal(Cloud.of(points, None).near, whole.near)
+    torch.testing.assert_close(shaken(points, None)[1], expected, rtol=1e-4, atol=1e-5)
+
+
+def test_a_prior_that_is_unknown_everywhere_is_as_no_prior(shaken: InlierWeights) -> None:
+    points = Points(sparse_map(200))
+    nothing = Prior(torch.zeros(1, 1, *SIZE), points)
+    torch.testing.assert_close(shaken(points, nothing)[1], shaken(points, None)[1])
+
+
+def test_depths_ten_times_larger_have_the_same_weights(shaken: InlierWeights) -> None:
+    sparse = sparse_map(200)
+    torch.testing.assert_close(
+        shaken(Points(10 * sparse), None)[0], shaken(Points(sparse), None)[0], rtol=1e-2, atol=1e-3
+    )
