@@ -5,8 +5,8 @@ prediction, and refinement with the definition's defaults; the same points and t
 (all with known ground truth) for each. Mean over frames of the per-frame MAE and RMSE.
 
 With `--fusion` only the network's plain prediction is measured: with the depth of another network
-as prior (`--prior`), with an unrelated prior, and with 20 % outliers among the points, which are
-all given or left out where they are suspected.
+as prior (`--prior`), with an unrelated prior, and with 20 % outliers among the points: all points
+are given, or those that look like outliers are left out, or all outliers.
 
 Images are moved into the frame of the points as `refine` does (`--registration frame`), as `batch`
 does for a set (`set`), or not at all (`off`).
@@ -38,6 +38,7 @@ from benchmarks.frames import (
 )
 from model_zoo_defs.training.learning.patterns import outliers
 from model_zoo_defs.training.learning.priors import nonsense
+from model_zoo_defs.training.learning.train import INLIER_ERROR
 from pnpdepth_cli.completion.alignment import aligned
 from pnpdepth_cli.completion.interpolation import linear, nearest
 from pnpdepth_cli.completion.outliers import outliers as suspected
@@ -63,6 +64,8 @@ CELLS = (
 FEW = {"nyu": nyu}
 """Sets of so few frames that all are taken."""
 METHODS = ("nearest", "linear", "plain", "refined")
+OUTLIER_DRAWS = 4
+"""Sets of outliers per frame, each of one of four kinds, drawn at random."""
 
 
 @dataclass(frozen=True)
@@ -126,35 +129,57 @@ def measure_cell(
 
 
 def measure_fusion(
-    network: Network, prior: Network | None, frame: EvalFrame, count: int | None, seed: int
+    network: Network, prior: Network | None, frame: EvalFrame, count: int | None, number: int
 ) -> dict[str, tuple[float, float]]:
-    """(MAE, RMSE) of the plain prediction with and without priors and outliers."""
-    rows, columns, depth = frame_pixels(frame, count, seed)
+    """(MAE, RMSE) of the plain prediction with and without priors and outliers.
+
+    number: of the frame in its set; the useless prior and the outliers depend on it.
+    """
+    rows, columns, depth = frame_pixels(frame, count, 0)
     shape = frame.gt.shape
     points = points_on_grid(rows, columns, depth, shape)
     rgb = torch.from_numpy(frame.rgb).permute(2, 0, 1)[None]
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng((0, number))
     sparse = np.zeros_like(frame.gt)
     sparse[rows, columns] = depth
     useless = torch.from_numpy(nonsense(rng, shape, frame.gt[::-1, ::-1].copy()))
-    with_outliers = points_on_grid(rows, columns, outliers(rng, sparse, 0.2)[rows, columns], shape)
-    followed = predicted(network, rgb, with_outliers)
-    fewer = with_outliers.select(~suspected(followed, with_outliers, rgb[0]))
     depths = {
-        "linear": linear(points),
-        "plain": predicted(network, rgb, points),
-        "useless prior": predicted(network, rgb, points, aligned(useless, points, kind="median")),
-        "20 % outliers": followed,
-        "20 % outliers, suspected ones left out": predicted(network, rgb, fewer),
-        "linear, 20 % outliers": linear(with_outliers),
-        "linear, suspected ones left out": linear(fewer),
+        "linear": [linear(points)],
+        "plain": [predicted(network, rgb, points)],
+        "useless prior": [predicted(network, rgb, points, aligned(useless, points, kind="median"))],
     }
     if prior is not None:
         dense = aligned(predicted(prior, rgb, points), points, kind="median")
-        depths |= {"prior alone": dense, "with prior": predicted(network, rgb, points, dense)}
+        depths |= {"prior alone": [dense], "with prior": [predicted(network, rgb, points, dense)]}
+    for _ in range(OUTLIER_DRAWS):
+        wrong = outliers(rng, sparse, 0.2)[rows, columns]
+        for name, one in depths_with_outliers(
+            network, rgb, points, points_on_grid(rows, columns, wrong, shape)
+        ).items():
+            depths.setdefault(name, []).append(one)
     ground_truth = torch.from_numpy(frame.gt)
-    scores = {name: score(depth, ground_truth) for name, depth in depths.items()}
-    return {name: (s.mae, s.rmse) for name, s in scores.items()}
+    scores = {name: [score(one, ground_truth) for one in each] for name, each in depths.items()}
+    return {
+        name: (float(np.mean([s.mae for s in each])), float(np.mean([s.rmse for s in each])))
+        for name, each in scores.items()
+    }
+
+
+def depths_with_outliers(
+    network: Network, rgb: Tensor, points: SparsePoints, with_outliers: SparsePoints
+) -> dict[str, Tensor]:
+    """Depths (H, W) from all of these points, and without those that are or look like outliers."""
+    followed = predicted(network, rgb, with_outliers)
+    fewer = with_outliers.select(~suspected(followed, with_outliers, rgb[0]))
+    error = (torch.log(with_outliers.depth) - torch.log(points.depth)).abs()
+    inliers = points.select(error < INLIER_ERROR)
+    return {
+        "20 % outliers": followed,
+        "20 % outliers, suspected ones left out": predicted(network, rgb, fewer),
+        "20 % outliers, known and left out": predicted(network, rgb, inliers),
+        "linear, 20 % outliers": linear(with_outliers),
+        "linear, suspected ones left out": linear(fewer),
+    }
 
 
 @torch.no_grad()
@@ -185,7 +210,9 @@ def print_fusion(
     count: int | None,
 ) -> None:
     """Prints rows of a Markdown table, one per variant of the input."""
-    results = [measure_fusion(network, prior, frame, count, seed=0) for frame in frames]
+    results = [
+        measure_fusion(network, prior, frame, count, number) for number, frame in enumerate(frames)
+    ]
     for name in results[0]:
         mae, rmse = np.array([result[name] for result in results]).mean(0)
         print(f"| {cell} | {len(frames)} | {name} | {mae:.4f} | {rmse:.4f} |", flush=True)
