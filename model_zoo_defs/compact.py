@@ -139,8 +139,7 @@ class Compact(nn.Module):
     def outputs(self, rgb: Tensor, sparse: Tensor, prior: Tensor | None = None) -> Outputs:
         """The depths of all levels and what the other outputs are computed from."""
         points = Points(sparse)
-        guide = None if prior is None else Prior(prior, points)
-        weights, inlier_logits = self.inlier_weights(points, guide)
+        weights, inlier_logits = self.inlier_weights(points)
         points.weigh(weights)
         guide = None if prior is None else Prior(prior, points)
         moments = points.moments()

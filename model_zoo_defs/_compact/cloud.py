@@ -10,7 +10,7 @@ from typing import NamedTuple, Self
 import torch
 from torch import Tensor
 
-from model_zoo_defs._compact.points import Points, Prior
+from model_zoo_defs._compact.points import Points
 
 NEIGHBOURS = 12
 # How many points of a cell of the search grid, which holds about one, may be neighbours.
@@ -22,15 +22,13 @@ CHUNK = 4096
 class Cloud(NamedTuple):
     """The points of a batch, one below the other, and the neighbours of each in its image.
 
-    value: log depth minus its median (n,). residual, valid: of the prior at the points (n,), 0
-    without a prior. position: rows and columns (n, 2) in spacings, the side of the square that
-    holds one point on average. log_spacing (n,): its log, in pixels. near, found: the neighbours'
-    numbers (n, NEIGHBOURS), nearest first, and whether there is one. counts: points per image.
+    value: log depth minus its median (n,). position: rows and columns (n, 2) in spacings, the side
+    of the square that holds one point on average. log_spacing (n,): its log, in pixels. near,
+    found: the neighbours' numbers (n, NEIGHBOURS), nearest first, and whether there is one.
+    counts: points per image.
     """
 
     value: Tensor
-    residual: Tensor
-    valid: Tensor
     position: Tensor
     log_spacing: Tensor
     near: Tensor
@@ -38,31 +36,24 @@ class Cloud(NamedTuple):
     counts: tuple[int, ...]
 
     @classmethod
-    def of(cls, points: Points, prior: Prior | None) -> Self:
+    def of(cls, points: Points) -> Self:
         """The cloud of all points of a batch."""
         known = points.mask.squeeze(1) > 0
         size = (int(known.shape[1]), int(known.shape[2]))
         clouds = []
-        for number, mask in enumerate(known):
+        for mask, value in zip(known, points.value.squeeze(1), strict=True):
             rows, columns = torch.nonzero(mask, as_tuple=True)
-            value = points.value[number, 0][mask]
-            parts = [torch.zeros_like(value)] * 2
-            if prior is not None:
-                parts = [x[number, 0][mask] for x in (prior.residual, prior.valid)]
-            clouds.append(cls.of_image(rows.float(), columns.float(), size, value, *parts))
+            clouds.append(cls.of_image(rows.float(), columns.float(), size, value[mask]))
         return cls.joined(clouds)
 
     @classmethod
-    def of_image(
-        cls, rows: Tensor, columns: Tensor, size: tuple[int, int], value: Tensor,
-        residual: Tensor, valid: Tensor,
-    ) -> Self:  # fmt: skip
+    def of_image(cls, rows: Tensor, columns: Tensor, size: tuple[int, int], value: Tensor) -> Self:
         """The cloud of one image's points at these pixels (n,) each; size is (height, width)."""
         spacing = max(1.0, math.sqrt(size[0] * size[1] / max(1, len(rows))))
         position = torch.stack([rows, columns], 1) / spacing
         near, found = neighbours(position)
         log_spacing = torch.full_like(rows, math.log(spacing))
-        return cls(value, residual, valid, position, log_spacing, near, found, (len(rows),))
+        return cls(value, position, log_spacing, near, found, (len(rows),))
 
     @classmethod
     def joined(cls, clouds: Sequence[Self]) -> Self:
@@ -71,8 +62,6 @@ class Cloud(NamedTuple):
         starts = accumulate((len(cloud.value) for cloud in clouds), initial=0)
         return cls(
             value=torch.cat([cloud.value for cloud in clouds]),
-            residual=torch.cat([cloud.residual for cloud in clouds]),
-            valid=torch.cat([cloud.valid for cloud in clouds]),
             position=torch.cat([cloud.position for cloud in clouds]),
             log_spacing=torch.cat([cloud.log_spacing for cloud in clouds]),
             near=torch.cat([c.near + start for c, start in zip(clouds, starts, strict=False)]),

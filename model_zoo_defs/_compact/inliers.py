@@ -10,7 +10,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from model_zoo_defs._compact.cloud import Cloud
-from model_zoo_defs._compact.points import Points, Prior
+from model_zoo_defs._compact.points import Points
 
 # The weight of a point as a function of its log odds of being an inlier: steep, because a softmax
 # over few candidates follows a doubtful point too far. Its half is at log odds of 2: an inlier
@@ -22,8 +22,8 @@ CLEAN_FRACTION, CLEAN_MARGIN = 0.015, 7.0
 # Messages to so many points are computed at a time: bounds the memory.
 CHUNK = 4096
 WIDTH, MESSAGE, ROUNDS, HEADS = 32, 48, 2, 4
-# per pair of points: agreement in depth, and position; per pair, agreement in the residual
-AGREEMENT, POSITION, PRIOR_AGREEMENT = 6, 5, 7
+# numbers per pair of points: agreement in depth, and position
+AGREEMENT, POSITION = 6, 5
 
 
 class InlierWeights(nn.Module):
@@ -31,38 +31,33 @@ class InlierWeights(nn.Module):
 
     A small graph network: every point has a state, and `Messages` of its nearest neighbours and
     the mean state of the image update it. A message depends on the difference of the two log
-    depths and on where the neighbour is; with a prior also on the difference of the residuals
-    against it.
+    depths and on where the neighbour is.
     """
 
     def __init__(self) -> None:
         super().__init__()
         self.enter = ExactLinear(2, WIDTH)
-        self.enter_prior = ExactLinear(2, WIDTH, bias=False)
         self.rounds = nn.ModuleList(Messages() for _ in range(ROUNDS))
         self.score = ExactLinear(WIDTH, WIDTH)
         self.leave = ExactLinear(WIDTH, 1)
         nn.init.zeros_(self.leave.weight)
         nn.init.constant_(self.leave.bias, 4.0)  # weights of exactly 1
 
-    def forward(self, points: Points, prior: Prior | None) -> tuple[Tensor, Tensor]:
+    def forward(self, points: Points) -> tuple[Tensor, Tensor]:
         """(weights, logits), both (B, 1, H, W), 1 and 0 away from the points."""
         at, nothing = points.mask > 0, torch.zeros_like(points.mask)
         with torch.autocast(points.mask.device.type, enabled=False):
-            log_odds = self.log_odds(Cloud.of(points, prior), with_prior=prior is not None)
+            log_odds = self.log_odds(Cloud.of(points))
         logits = nothing.masked_scatter(at, log_odds)
         weights = torch.sigmoid(STEEPNESS * (logits + self._margin(points, logits) - THRESHOLD))
         return torch.where(at, weights, 1.0), logits
 
-    def log_odds(self, cloud: Cloud, *, with_prior: bool) -> Tensor:
+    def log_odds(self, cloud: Cloud) -> Tensor:
         """Log odds (n,) of being an inlier."""
-        state = self.enter(torch.stack([cloud.found.float().mean(1), cloud.log_spacing / 3], 1))
-        if with_prior:
-            size = torch.tanh(cloud.residual.abs() / 0.2) * cloud.valid
-            state = state + self.enter_prior(torch.stack([cloud.valid, size], 1))
-        state = F.relu(state)
+        known = cloud.found.float().mean(1)
+        state = F.relu(self.enter(torch.stack([known, cloud.log_spacing / 3], 1)))
         for messages in self.rounds:
-            state = messages(state, cloud, with_prior=with_prior)
+            state = messages(state, cloud)
         return cast(Tensor, self.leave(F.relu(self.score(state))).squeeze(1))
 
     @staticmethod
@@ -84,7 +79,6 @@ class Messages(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         self.pair = _matrix(MESSAGE, AGREEMENT + POSITION)
-        self.pair_prior = _matrix(MESSAGE, PRIOR_AGREEMENT)
         self.bias = nn.Parameter(torch.zeros(MESSAGE))
         self.neighbour = ExactLinear(WIDTH, MESSAGE, bias=False)
         self.message, self.message_bias = _matrix(WIDTH, MESSAGE), nn.Parameter(torch.zeros(WIDTH))
@@ -93,10 +87,10 @@ class Messages(nn.Module):
         self.change = ExactLinear(2 * WIDTH, WIDTH)
         nn.init.zeros_(self.change.weight)
 
-    def forward(self, state: Tensor, cloud: Cloud, *, with_prior: bool) -> Tensor:
+    def forward(self, state: Tensor, cloud: Cloud) -> Tensor:
         sent = self.neighbour(state) + self.bias
         chunks = [
-            self._received(sent, cloud, slice(first, first + CHUNK), with_prior)
+            self._received(sent, cloud, slice(first, first + CHUNK))
             for first in range(0, len(state), CHUNK)
         ]
         received = torch.cat(chunks) if chunks else state.new_zeros((0, 2 * WIDTH))
@@ -105,7 +99,7 @@ class Messages(nn.Module):
         hidden = self.update(torch.cat([state, received, torch.cat(images)], 1))
         return state + cast(Tensor, self.change(F.relu(hidden)))
 
-    def _received(self, sent: Tensor, cloud: Cloud, some: slice, with_prior: bool) -> Tensor:
+    def _received(self, sent: Tensor, cloud: Cloud, some: slice) -> Tensor:
         """Weighted mean and maximum (m, 2 WIDTH) of the messages to some of the points."""
         near, found = cloud.near[some], cloud.found[some].unsqueeze(2)
         difference = F.embedding(near, cloud.value.unsqueeze(1))[..., 0] - cloud.value[
@@ -117,11 +111,6 @@ class Messages(nn.Module):
         place = [shift / 2, distance / 2, 1 / (distance + 0.3), spacing / 3]
         pairs = torch.cat([_agreement(difference), *place], 2) * found
         hidden = F.linear(pairs, self.pair) + F.embedding(near, sent)
-        if with_prior:
-            valid = (cloud.valid[near] * cloud.valid[some].unsqueeze(1)).unsqueeze(2)
-            difference = cloud.residual[near] - cloud.residual[some].unsqueeze(1)
-            of_prior = torch.cat([_agreement(difference) * valid, valid], 2) * found
-            hidden = hidden + F.linear(of_prior, self.pair_prior)
         hidden = F.relu(hidden)
         message = F.relu(F.linear(hidden, self.message, self.message_bias)) * found
         attention = F.linear(hidden, self.attention).masked_fill(~found, -1e4).softmax(1)

@@ -12,7 +12,7 @@ from model_zoo_defs._compact import cloud as clouds
 from model_zoo_defs._compact import inliers
 from model_zoo_defs._compact.cloud import NEIGHBOURS, Cloud, neighbours
 from model_zoo_defs._compact.inliers import InlierWeights
-from model_zoo_defs._compact.points import Points, Prior
+from model_zoo_defs._compact.points import Points
 
 SIZE = (64, 96)
 
@@ -24,13 +24,6 @@ def sparse_map(count: int, seed: int = 0) -> Tensor:
     at = torch.randperm(len(sparse), generator=generator)[:count]
     sparse[at] = 1.0 + 4.0 * torch.rand(len(at), generator=generator)
     return sparse.view(1, 1, *SIZE)
-
-
-def prior_map(seed: int = 0) -> Tensor:
-    generator = torch.Generator().manual_seed(seed)
-    prior = 1.0 + 4.0 * torch.rand(1, 1, *SIZE, generator=generator)
-    prior[..., :20, :30] = 0.0
-    return prior
 
 
 @pytest.fixture(scope="module")
@@ -74,18 +67,16 @@ def test_on_a_grid_they_are_the_nearest_twelve() -> None:
 
 @pytest.mark.parametrize("count", [0, 1, 2])
 def test_points_without_neighbours_have_a_weight(shaken: InlierWeights, count: int) -> None:
-    weights, logits = shaken(Points(sparse_map(count)), None)
+    weights, logits = shaken(Points(sparse_map(count)))
     assert bool(torch.isfinite(weights).all())
     assert int((logits != 0).sum()) == count
 
 
 def test_images_of_a_batch_do_not_influence_each_other(shaken: InlierWeights) -> None:
-    maps, priors = [sparse_map(70, 1), sparse_map(300, 2)], [prior_map(1), prior_map(2)]
-    together = Points(torch.cat(maps))
-    weights, logits = shaken(together, Prior(torch.cat(priors), together))
-    for number, (sparse, prior) in enumerate(zip(maps, priors, strict=True)):
-        points = Points(sparse)
-        alone = shaken(points, Prior(prior, points))
+    maps = [sparse_map(70, 1), sparse_map(300, 2)]
+    weights, logits = shaken(Points(torch.cat(maps)))
+    for number, sparse in enumerate(maps):
+        alone = shaken(Points(sparse))
         torch.testing.assert_close(logits[number], alone[1][0], rtol=1e-4, atol=1e-5)
         torch.testing.assert_close(weights[number], alone[0][0], rtol=1e-3, atol=1e-4)
 
@@ -94,22 +85,16 @@ def test_the_size_of_the_chunks_changes_nothing(
     shaken: InlierWeights, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     points = Points(sparse_map(300))
-    whole = Cloud.of(points, None)
-    expected = shaken(points, None)[1]
+    whole = Cloud.of(points)
+    expected = shaken(points)[1]
     monkeypatch.setattr(clouds, "CHUNK", 7)
     monkeypatch.setattr(inliers, "CHUNK", 7)
-    assert torch.equal(Cloud.of(points, None).near, whole.near)
-    torch.testing.assert_close(shaken(points, None)[1], expected, rtol=1e-4, atol=1e-5)
-
-
-def test_a_prior_that_is_unknown_everywhere_is_as_no_prior(shaken: InlierWeights) -> None:
-    points = Points(sparse_map(200))
-    nothing = Prior(torch.zeros(1, 1, *SIZE), points)
-    torch.testing.assert_close(shaken(points, nothing)[1], shaken(points, None)[1])
+    assert torch.equal(Cloud.of(points).near, whole.near)
+    torch.testing.assert_close(shaken(points)[1], expected, rtol=1e-4, atol=1e-5)
 
 
 def test_depths_ten_times_larger_have_the_same_weights(shaken: InlierWeights) -> None:
     sparse = sparse_map(200)
     torch.testing.assert_close(
-        shaken(Points(10 * sparse), None)[0], shaken(Points(sparse), None)[0], rtol=1e-2, atol=1e-3
+        shaken(Points(10 * sparse))[0], shaken(Points(sparse))[0], rtol=1e-2, atol=1e-3
     )

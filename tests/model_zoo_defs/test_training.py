@@ -455,7 +455,7 @@ def test_inlier_weights_learn_to_detect_outliers(
     outliers, inliers = [], []
     with torch.no_grad():
         for cloud, target in examples:
-            log_odds = layer.log_odds(cloud, with_prior=bool(cloud.valid.any()))
+            log_odds = layer.log_odds(cloud)
             outliers.append(log_odds[target == 0])
             inliers.append(log_odds[target == 1])
     assert loss < 0.7
@@ -464,6 +464,6 @@ def test_inlier_weights_learn_to_detect_outliers(
 
 def test_many_points_are_cut_to_a_strip_of_rows() -> None:
     depth = torch.full((100, 90), 2.0)
-    cloud, target = train_inliers.example(depth, depth * 1.3, torch.zeros_like(depth), where=1.0)
+    cloud, target = train_inliers.example(depth, depth * 1.3, where=1.0)
     assert train_inliers.MOST_POINTS <= len(cloud.value) < train_inliers.MOST_POINTS + 2 * 90
     assert torch.equal(target, torch.zeros_like(target))

@@ -25,7 +25,7 @@ from tqdm import tqdm
 
 from model_zoo_defs._compact.cloud import Cloud
 from model_zoo_defs._compact.inliers import InlierWeights
-from model_zoo_defs._compact.points import Points, Prior
+from model_zoo_defs._compact.points import Points
 from model_zoo_defs.compact import Compact
 from model_zoo_defs.training.learning.dataset import Samples
 from model_zoo_defs.training.learning.learner import export
@@ -50,7 +50,7 @@ class Examples(Dataset[Example]):
     """Clouds of augmented samples; outliers are added to most of them."""
 
     def __init__(self, folders: tuple[Path, ...], count: int, seed: int):
-        self.samples = Samples(folders, WINDOW, seed)
+        self.samples = Samples(folders, WINDOW, seed, prior_fraction=0.0)
         self.count, self.seed = count, seed
 
     def __len__(self) -> int:
@@ -62,16 +62,15 @@ class Examples(Dataset[Example]):
         sparse = sample.sparse[0].numpy()
         if rng.random() < OUTLIERS_IN:
             sparse = outliers(rng, sparse, float(rng.uniform(0.0, MOST_OUTLIERS)))
-        return example(torch.from_numpy(sparse), sample.depth[0], sample.prior[0], rng.random())
+        return example(torch.from_numpy(sparse), sample.depth[0], rng.random())
 
 
-def example(sparse: Tensor, ground_truth: Tensor, prior: Tensor, where: float) -> Example:
+def example(sparse: Tensor, ground_truth: Tensor, where: float) -> Example:
     """The points of a strip of rows as an example; all (H, W) metres, 0 = unknown.
 
     where: position of the strip, 0 (top) to 1 (bottom), of images with more than MOST_POINTS.
     """
     points = Points(sparse[None, None])
-    dense = Prior(prior[None, None], points)
     rows, columns = torch.nonzero(sparse > 0, as_tuple=True)
     first = int(where * max(0, len(rows) - MOST_POINTS))
     top, bottom = int(rows[first]), int(rows[min(first + MOST_POINTS, len(rows)) - 1])
@@ -79,18 +78,16 @@ def example(sparse: Tensor, ground_truth: Tensor, prior: Tensor, where: float) -
         top, bottom = 0, len(sparse) - 1
     inside = (rows >= top) & (rows <= bottom)
     rows, columns = rows[inside], columns[inside]
-    value, residual, valid = (
-        x[0, 0, rows, columns] for x in (points.value, dense.residual, dense.valid)
-    )
+    value = points.value[0, 0, rows, columns]
     size = (bottom + 1 - top, sparse.shape[1])
-    cloud = Cloud.of_image((rows - top).float(), columns.float(), size, value, residual, valid)
+    cloud = Cloud.of_image((rows - top).float(), columns.float(), size, value)
     return Example(cloud, inlier_targets(sparse[rows, columns], ground_truth[rows, columns]))
 
 
 def loss_of(layer: InlierWeights, examples: Sequence[Example]) -> Tensor:
     """Mean over the examples of the mean cross entropy of their points."""
     cloud = Cloud.joined([one.cloud for one in examples])
-    log_odds = layer.log_odds(cloud, with_prior=bool(cloud.valid.any()))
+    log_odds = layer.log_odds(cloud)
     total = log_odds.new_zeros(())
     for logits, one in zip(torch.split(log_odds, list(cloud.counts)), examples, strict=True):
         known = ~one.target.isnan()
