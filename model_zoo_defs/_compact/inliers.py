@@ -102,10 +102,9 @@ class Messages(nn.Module):
     def _received(self, sent: Tensor, cloud: Cloud, some: slice) -> Tensor:
         """Weighted mean and maximum (m, 2 WIDTH) of the messages to some of the points."""
         near, found = cloud.near[some], cloud.found[some].unsqueeze(2)
-        difference = F.embedding(near, cloud.value.unsqueeze(1))[..., 0] - cloud.value[
-            some
-        ].unsqueeze(1)
-        shift = F.embedding(near, cloud.position) - cloud.position[some].unsqueeze(1)
+        table = torch.cat([cloud.value.unsqueeze(1), cloud.position], 1)
+        relative = F.embedding(near, table) - table[some].unsqueeze(1)
+        difference, shift = relative[..., 0], relative[..., 1:]
         distance = shift.square().sum(2, keepdim=True).sqrt()
         spacing = cloud.log_spacing[some].view(-1, 1, 1).expand_as(distance)
         place = [shift / 2, distance / 2, 1 / (distance + 0.3), spacing / 3]
@@ -114,9 +113,8 @@ class Messages(nn.Module):
         hidden = F.relu(hidden)
         message = F.relu(F.linear(hidden, self.message, self.message_bias)) * found
         attention = F.linear(hidden, self.attention).masked_fill(~found, -1e4).softmax(1)
-        mean = (
-            (attention.unsqueeze(3) * message.view(*message.shape[:2], HEADS, -1)).sum(1).flatten(1)
-        )
+        per_head = message.view(*message.shape[:2], HEADS, -1)
+        mean = (attention.unsqueeze(3) * per_head).sum(1).flatten(1)
         return torch.cat([mean, message.amax(1)], 1)
 
 
