@@ -65,13 +65,12 @@ class Outputs(NamedTuple):
     """Everything the network computes; training looks at all of it.
 
     depths: metres at 1/16, 1/8, 1/4, 1/2 and full size; features (B, 16, h, w) and residual of
-    the level at 1/2; inlier_logits: (B, 1, H, W), read at the points.
+    the level at 1/2.
     """
 
     depths: list[Tensor]
     features: Tensor
     hints: Tensor
-    inlier_logits: Tensor
 
 
 class Compact(nn.Module):
@@ -139,8 +138,7 @@ class Compact(nn.Module):
     def outputs(self, rgb: Tensor, sparse: Tensor, prior: Tensor | None = None) -> Outputs:
         """The depths of all levels and what the other outputs are computed from."""
         points = Points(sparse)
-        weights, inlier_logits = self.inlier_weights(points)
-        points.weigh(weights)
+        points.weigh(self.inlier_weights(points))
         guide = None if prior is None else Prior(prior, points)
         moments = points.moments()
         image = self.encoder(rgb)
@@ -176,7 +174,7 @@ class Compact(nn.Module):
                 extra, features = [F.pixel_unshuffle(rgb, 2)], self.narrow(features)
         depths.append(self._enlarge(features, depth, guide, fit.of_prior))
         metres = [torch.exp(depth + points.median) for depth in depths]
-        return Outputs(metres, features, torch.cat(hints, 1), inlier_logits)
+        return Outputs(metres, features, torch.cat(hints, 1))
 
     def _enlarge(
         self, features: Tensor, depth: Tensor, prior: Prior | None, fit: PriorFit | None

@@ -43,14 +43,14 @@ class InlierWeights(nn.Module):
         nn.init.zeros_(self.leave.weight)
         nn.init.constant_(self.leave.bias, 4.0)  # weights of exactly 1
 
-    def forward(self, points: Points) -> tuple[Tensor, Tensor]:
-        """(weights, logits), both (B, 1, H, W), 1 and 0 away from the points."""
+    def forward(self, points: Points) -> Tensor:
+        """The weights (B, 1, H, W), 1 away from the points."""
         at, nothing = points.mask > 0, torch.zeros_like(points.mask)
         with torch.autocast(points.mask.device.type, enabled=False):
             log_odds = self.log_odds(Cloud.of(points))
         logits = nothing.masked_scatter(at, log_odds)
         weights = torch.sigmoid(STEEPNESS * (logits + self._margin(points, logits) - THRESHOLD))
-        return torch.where(at, weights, 1.0), logits
+        return torch.where(at, weights, 1.0)
 
     def log_odds(self, cloud: Cloud) -> Tensor:
         """Log odds (n,) of being an inlier."""

@@ -208,7 +208,7 @@ def test_no_gradient_is_infinite(shaken: Compact, with_prior: bool) -> None:
 
 def test_untrained_inlier_weights_are_one() -> None:
     points = Points(frame(64, 96, 100)[1])
-    weights, _ = Compact().inlier_weights(points)
+    weights = Compact().inlier_weights(points)
     assert torch.equal(weights, torch.ones_like(weights))
 
 
@@ -322,8 +322,8 @@ def test_the_shipped_inlier_weights_detect_outliers_on_a_slope() -> None:
     known = torch.rand(ground_truth.shape, generator=generator) < 0.01
     outlier = known & (torch.rand(ground_truth.shape, generator=generator) < 0.2)
     with torch.no_grad():
-        clean, _ = network.inlier_weights(Points(ground_truth * known))
-        mixed, _ = network.inlier_weights(
+        clean = network.inlier_weights(Points(ground_truth * known))
+        mixed = network.inlier_weights(
             Points(ground_truth * known * torch.where(outlier, 2.0, 1.0))
         )
     assert float(clean[known].mean()) > 0.98

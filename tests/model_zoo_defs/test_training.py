@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -327,18 +328,12 @@ def test_the_loss_is_least_for_the_ground_truth_and_ignores_unknown_depth() -> N
     assert train.depth_loss(guess, ground_truth) == train.depth_loss(other, ground_truth)
 
 
-def test_inlier_weights_are_taught_by_the_error_of_the_points() -> None:
-    ground_truth = torch.full((1, 1, 4, 4), 2.0)
-    sparse = torch.zeros_like(ground_truth)
-    sparse[..., 0, 0], sparse[..., 1, 1] = 2.02, 5.0
-    right, reversed_ = torch.zeros_like(ground_truth), torch.zeros_like(ground_truth)
-    right[..., 0, 0], right[..., 1, 1] = 5.0, -5.0
-    reversed_[..., 0, 0], reversed_[..., 1, 1] = -5.0, 5.0
-    assert (
-        train.inlier_loss(right, sparse, ground_truth)
-        < 0.1
-        < train.inlier_loss(reversed_, sparse, ground_truth)
-    )
+def test_the_target_of_an_inlier_falls_with_the_error_of_the_point() -> None:
+    ground_truth = torch.tensor([2.0, 2.0, 2.0, 0.0])
+    sparse = torch.tensor([2.02, 2.0 * math.exp(0.125), 5.0, 2.0])
+    target = train_inliers.inlier_targets(sparse, ground_truth)
+    torch.testing.assert_close(target[:3], torch.tensor([1.0, 0.5, 0.0]))
+    assert bool(target[3].isnan())
 
 
 def test_the_best_sigma_is_the_mean_absolute_error_of_log_depth() -> None:

@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-import torch.nn.functional as F
 from safetensors.torch import load_file
 from torch import Tensor, nn
 from torch.utils.data import DataLoader
@@ -42,9 +41,7 @@ NEW_LAYERS = (
     "gain_prior",
     "scale.",
 )
-# |error of log depth| below which a point is an inlier, and above which it is an outlier
-INLIER_ERROR, OUTLIER_ERROR = 0.05, 0.2
-SIDE_WEIGHT = 0.1
+SIGMA_WEIGHT = 0.1
 NEW_LAYER_FACTOR = 8.0
 # weights of the depths at 1/16, 1/8, 1/4, 1/2 and full size
 LEVEL_WEIGHTS = (0.15, 0.2, 0.3, 0.4, 1.0)
@@ -100,6 +97,8 @@ class Run(Learner):
         if settings.only:
             for name, parameter in network.named_parameters():
                 parameter.requires_grad_(any(layer in name for layer in settings.only))
+        # `train_inliers` trains it: the loss of depth makes it worse at outliers
+        network.inlier_weights.requires_grad_(False)
         schedule = Schedule(
             lr=settings.lr, steps=settings.steps, minutes=settings.minutes,
             averaging=settings.averaging, decay=settings.decay, warm_up=settings.warm_up,
@@ -120,15 +119,14 @@ class Run(Learner):
         return [{"params": some, "factor": factor} for factor, some in groups.items()]
 
     def loss(self, part: Sequence[Tensor]) -> Tensor:
-        """Depth loss over all levels plus the weighted losses of inlier weights and sigma."""
+        """Depth loss over all levels plus the weighted loss of sigma."""
         rgb, sparse, depth, prior = part
         rgb = rgb.contiguous(memory_format=torch.channels_last)
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self.bfloat16):
             outputs = self.network.outputs(rgb, sparse, prior if bool(prior.any()) else None)
             sigma = self.network.sigma(outputs)
-        side = inlier_loss(outputs.inlier_logits, sparse, depth)
-        side = side + sigma_loss(sigma, outputs.depths[-1], depth)
-        return pyramid_loss(outputs.depths, depth) + SIDE_WEIGHT * side
+        of_sigma = sigma_loss(sigma, outputs.depths[-1], depth)
+        return pyramid_loss(outputs.depths, depth) + SIGMA_WEIGHT * of_sigma
 
 
 def upgrade(network: Compact, weights: Mapping[str, Tensor]) -> list[str]:
@@ -145,23 +143,6 @@ def upgrade(network: Compact, weights: Mapping[str, Tensor]) -> list[str]:
         raise ValueError(f"not weights of compact: {', '.join((unknown + unexplained)[:5])}")
     network.load_state_dict(own | dict(weights))
     return missing
-
-
-def inlier_loss(logits: Tensor, sparse: Tensor, ground_truth: Tensor) -> Tensor:
-    """Cross entropy of the points' inlier weights; all (B, 1, H, W), 0 in depths = unknown."""
-    at = (sparse > 0) & (ground_truth > 0)
-    inlier = inlier_targets(sparse[at], ground_truth[at])
-    each = F.binary_cross_entropy_with_logits(logits[at], inlier, reduction="none")
-    # every sample counts alike, however many points it has
-    count = at.sum((1, 2, 3), keepdim=True).clamp(min=1).expand_as(at)[at]
-    return (each / count).sum() / len(sparse)
-
-
-def inlier_targets(sparse: Tensor, ground_truth: Tensor) -> Tensor:
-    """How far points (n,) are inliers, 0..1; nan where the ground truth is unknown."""
-    error = (torch.log(sparse) - torch.log(ground_truth)).abs()
-    target = ((OUTLIER_ERROR - error) / (OUTLIER_ERROR - INLIER_ERROR)).clamp(0.0, 1.0)
-    return torch.where(ground_truth > 0, target, torch.nan)
 
 
 def sigma_loss(sigma: Tensor, depth: Tensor, ground_truth: Tensor) -> Tensor:

@@ -30,13 +30,15 @@ from model_zoo_defs.compact import Compact
 from model_zoo_defs.training.learning.dataset import Samples
 from model_zoo_defs.training.learning.learner import export
 from model_zoo_defs.training.learning.patterns import outliers
-from model_zoo_defs.training.learning.train import inlier_targets, upgrade
+from model_zoo_defs.training.learning.train import upgrade
 
 BATCH, RATE, STEPS = 4, 3e-3, 6000
 WINDOW = (384, 512)
 # a strip of the image with so many points is enough of a sample
 MOST_POINTS = 3000
 OUTLIERS_IN, MOST_OUTLIERS = 0.6, 0.35
+# |error of log depth| below which a point is an inlier, and above which it is an outlier
+INLIER_ERROR, OUTLIER_ERROR = 0.05, 0.2
 
 
 class Example(NamedTuple):
@@ -82,6 +84,13 @@ def example(sparse: Tensor, ground_truth: Tensor, where: float) -> Example:
     size = (bottom + 1 - top, sparse.shape[1])
     cloud = Cloud.of_image((rows - top).float(), columns.float(), size, value)
     return Example(cloud, inlier_targets(sparse[rows, columns], ground_truth[rows, columns]))
+
+
+def inlier_targets(sparse: Tensor, ground_truth: Tensor) -> Tensor:
+    """How far points (n,) are inliers, 0..1; nan where the ground truth is unknown."""
+    error = (torch.log(sparse) - torch.log(ground_truth)).abs()
+    target = ((OUTLIER_ERROR - error) / (OUTLIER_ERROR - INLIER_ERROR)).clamp(0.0, 1.0)
+    return torch.where(ground_truth > 0, target, torch.nan)
 
 
 def loss_of(layer: InlierWeights, examples: Sequence[Example]) -> Tensor:
