@@ -38,7 +38,7 @@ from benchmarks.frames import (
 )
 from model_zoo_defs.training.learning.patterns import outliers
 from model_zoo_defs.training.learning.priors import nonsense
-from model_zoo_defs.training.learning.train import INLIER_ERROR
+from model_zoo_defs.training.learning.train_inliers import INLIER_ERROR
 from pnpdepth_cli.completion.alignment import aligned
 from pnpdepth_cli.completion.interpolation import linear, nearest
 from pnpdepth_cli.completion.outliers import outliers as suspected

@@ -9,7 +9,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from model_zoo_defs._compact.cloud import Cloud
+from model_zoo_defs._compact.cloud import CHUNK, Cloud
 from model_zoo_defs._compact.points import Points
 
 # The weight of a point as a function of its log odds of being an inlier: steep, because a softmax
@@ -19,8 +19,6 @@ STEEPNESS, THRESHOLD = 4.0, 2.0
 # Up to this expected fraction of outliers in an image their log odds gain the margin, which falls
 # to 0 at twice the fraction: isolated points of clean images lie on thin objects.
 CLEAN_FRACTION, CLEAN_MARGIN = 0.015, 7.0
-# Messages to so many points are computed at a time: bounds the memory.
-CHUNK = 4096
 WIDTH, MESSAGE, ROUNDS, HEADS = 32, 48, 2, 4
 # numbers per pair of points: agreement in depth, and position
 AGREEMENT, POSITION = 6, 5

@@ -10,7 +10,6 @@ it is trained on them for a few epochs.
 from __future__ import annotations
 
 import argparse
-import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -28,7 +27,7 @@ from model_zoo_defs._compact.inliers import InlierWeights
 from model_zoo_defs._compact.points import Points
 from model_zoo_defs.compact import Compact
 from model_zoo_defs.training.learning.dataset import Samples
-from model_zoo_defs.training.learning.learner import export
+from model_zoo_defs.training.learning.learner import Schedule, export
 from model_zoo_defs.training.learning.patterns import outliers
 from model_zoo_defs.training.learning.train import upgrade
 
@@ -112,12 +111,12 @@ def fit(layer: InlierWeights, examples: Sequence[Example], steps: int, seed: int
         The running mean of the cross entropy at the end.
     """
     optimiser = torch.optim.AdamW(layer.parameters(), lr=RATE, weight_decay=1e-3)
+    schedule = Schedule(lr=RATE, steps=steps, warm_up=100)
     rng = np.random.default_rng(seed)
     smooth = 0.0
     for step in tqdm(range(steps), unit="step", mininterval=5.0):
-        warm = min(1.0, (step + 1) / 100)
         for group in optimiser.param_groups:
-            group["lr"] = RATE * warm * 0.5 * (1.0 + math.cos(math.pi * step / steps))
+            group["lr"] = schedule.rate(step, 0.0)
         loss = loss_of(layer, [examples[int(i)] for i in rng.integers(len(examples), size=BATCH)])
         optimiser.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
