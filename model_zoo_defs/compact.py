@@ -3,7 +3,8 @@
 Everything happens in log depth minus the median log depth of the points, so depths ten times
 larger give an answer ten times larger. The depth is built from coarse to fine:
 
-1. `InlierWeights` weighs every point by its agreement with the points around it.
+1. `InlierWeights` weighs every point by its agreement with the points around it, which counts more
+   where the colours are similar.
 2. `PointFit` fits a plane through the points around every 1/16 cell, once per head; the weight of
    a point depends on its distance and on how similar the image features of the two cells are.
 3. At 1/16, 1/8, 1/4 and 1/2 the residuals at the points (against the depth so far) are averaged
@@ -138,7 +139,7 @@ class Compact(nn.Module):
     def outputs(self, rgb: Tensor, sparse: Tensor, prior: Tensor | None = None) -> Outputs:
         """The depths of all levels and what the other outputs are computed from."""
         points = Points(sparse)
-        points.weigh(self.inlier_weights(points))
+        points.weigh(self.inlier_weights(points, rgb))
         guide = None if prior is None else Prior(prior, points)
         moments = points.moments()
         image = self.encoder(rgb)

@@ -8,6 +8,7 @@ from itertools import accumulate
 from typing import NamedTuple, Self
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from model_zoo_defs._compact.points import Points
@@ -22,13 +23,14 @@ CHUNK = 4096
 class Cloud(NamedTuple):
     """The points of a batch, one below the other, and the neighbours of each in its image.
 
-    value: log depth minus its median (n,). position: rows and columns (n, 2) in spacings, the side
-    of the square that holds one point on average. log_spacing (n,): its log, in pixels. near,
-    found: the neighbours' numbers (n, NEIGHBOURS), nearest first, and whether there is one.
-    counts: points per image.
+    value: log depth minus its median (n,). colour (n, 3): of the normalised image around the point.
+    position: rows and columns (n, 2) in spacings, the side of the square that holds one point on
+    average. log_spacing (n,): its log, in pixels. near, found: the neighbours' numbers
+    (n, NEIGHBOURS), nearest first, and whether there is one. counts: points per image.
     """
 
     value: Tensor
+    colour: Tensor
     position: Tensor
     log_spacing: Tensor
     near: Tensor
@@ -36,24 +38,24 @@ class Cloud(NamedTuple):
     counts: tuple[int, ...]
 
     @classmethod
-    def of(cls, points: Points) -> Self:
-        """The cloud of all points of a batch."""
-        known = points.mask.squeeze(1) > 0
-        size = (int(known.shape[1]), int(known.shape[2]))
-        clouds = []
-        for mask, value in zip(known, points.value.squeeze(1), strict=True):
-            rows, columns = torch.nonzero(mask, as_tuple=True)
-            clouds.append(cls.of_image(rows.float(), columns.float(), size, value[mask]))
-        return cls.joined(clouds)
+    def of(cls, points: Points, rgb: Tensor) -> Self:
+        """The cloud of all points of a batch and its normalised images (B, 3, H, W)."""
+        maps = zip(points.mask, points.value, rgb, strict=True)
+        return cls.joined(
+            [cls.of_image(mask[0] > 0, value[0], image) for mask, value, image in maps]
+        )
 
     @classmethod
-    def of_image(cls, rows: Tensor, columns: Tensor, size: tuple[int, int], value: Tensor) -> Self:
-        """The cloud of one image's points at these pixels (n,) each; size is (height, width)."""
-        spacing = max(1.0, math.sqrt(size[0] * size[1] / max(1, len(rows))))
-        position = torch.stack([rows, columns], 1) / spacing
+    def of_image(cls, mask: Tensor, value: Tensor, rgb: Tensor) -> Self:
+        """The cloud of the points of one image: mask and value (H, W), rgb (3, H, W)."""
+        rows, columns = torch.nonzero(mask, as_tuple=True)
+        spacing = max(1.0, math.sqrt(mask.numel() / max(1, len(rows))))
+        position = torch.stack([rows, columns], 1).float() / spacing
         near, found = neighbours(position)
-        log_spacing = torch.full_like(rows, math.log(spacing))
-        return cls(value, position, log_spacing, near, found, (len(rows),))
+        padded = F.pad(rgb[None].float(), (2, 2, 2, 2), mode="replicate")
+        colour = F.avg_pool2d(padded, 5, 1)[0, :, rows, columns].t()
+        log_spacing = torch.full_like(position[:, 0], math.log(spacing))
+        return cls(value[mask], colour, position, log_spacing, near, found, (len(rows),))
 
     @classmethod
     def joined(cls, clouds: Sequence[Self]) -> Self:
@@ -62,6 +64,7 @@ class Cloud(NamedTuple):
         starts = accumulate((len(cloud.value) for cloud in clouds), initial=0)
         return cls(
             value=torch.cat([cloud.value for cloud in clouds]),
+            colour=torch.cat([cloud.colour for cloud in clouds]),
             position=torch.cat([cloud.position for cloud in clouds]),
             log_spacing=torch.cat([cloud.log_spacing for cloud in clouds]),
             near=torch.cat([c.near + start for c, start in zip(clouds, starts, strict=False)]),

@@ -20,16 +20,16 @@ STEEPNESS, THRESHOLD = 4.0, 2.0
 # to 0 at twice the fraction: isolated points of clean images lie on thin objects.
 CLEAN_FRACTION, CLEAN_MARGIN = 0.015, 7.0
 WIDTH, MESSAGE, ROUNDS, HEADS = 32, 48, 2, 4
-# numbers per pair of points: agreement in depth, and position
-AGREEMENT, POSITION = 6, 5
+# numbers per pair of points: agreement in depth and in colour, and position
+AGREEMENT, COLOUR, POSITION = 6, 6, 5
 
 
 class InlierWeights(nn.Module):
     """A weight 0..1 for every point from its agreement with the points around it.
 
     A small graph network: every point has a state, and `Messages` of its nearest neighbours and
-    the mean state of the image update it. A message depends on the difference of the two log
-    depths and on where the neighbour is.
+    the mean state of the image update it. A message depends on the differences of the two log
+    depths and of the two colours and on where the neighbour is.
     """
 
     def __init__(self) -> None:
@@ -41,11 +41,11 @@ class InlierWeights(nn.Module):
         nn.init.zeros_(self.leave.weight)
         nn.init.constant_(self.leave.bias, 4.0)  # weights of exactly 1
 
-    def forward(self, points: Points) -> Tensor:
-        """The weights (B, 1, H, W), 1 away from the points."""
+    def forward(self, points: Points, rgb: Tensor) -> Tensor:
+        """The weights (B, 1, H, W), 1 away from the points; rgb (B, 3, H, W) is normalised."""
         at, nothing = points.mask > 0, torch.zeros_like(points.mask)
         with torch.autocast(points.mask.device.type, enabled=False):
-            log_odds = self.log_odds(Cloud.of(points))
+            log_odds = self.log_odds(Cloud.of(points, rgb))
         logits = nothing.masked_scatter(at, log_odds)
         weights = torch.sigmoid(STEEPNESS * (logits + self._margin(points, logits) - THRESHOLD))
         return torch.where(at, weights, 1.0)
@@ -76,7 +76,7 @@ class Messages(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        self.pair = _matrix(MESSAGE, AGREEMENT + POSITION)
+        self.pair = _matrix(MESSAGE, AGREEMENT + COLOUR + POSITION)
         self.bias = nn.Parameter(torch.zeros(MESSAGE))
         self.neighbour = ExactLinear(WIDTH, MESSAGE, bias=False)
         self.message, self.message_bias = _matrix(WIDTH, MESSAGE), nn.Parameter(torch.zeros(WIDTH))
@@ -100,13 +100,13 @@ class Messages(nn.Module):
     def _received(self, sent: Tensor, cloud: Cloud, some: slice) -> Tensor:
         """Weighted mean and maximum (m, 2 WIDTH) of the messages to some of the points."""
         near, found = cloud.near[some], cloud.found[some].unsqueeze(2)
-        table = torch.cat([cloud.value.unsqueeze(1), cloud.position], 1)
+        table = torch.cat([cloud.value.unsqueeze(1), cloud.position, cloud.colour], 1)
         relative = F.embedding(near, table) - table[some].unsqueeze(1)
-        difference, shift = relative[..., 0], relative[..., 1:]
+        difference, shift, colour = relative[..., 0], relative[..., 1:3], relative[..., 3:]
         distance = shift.square().sum(2, keepdim=True).sqrt()
         spacing = cloud.log_spacing[some].view(-1, 1, 1).expand_as(distance)
         place = [shift / 2, distance / 2, 1 / (distance + 0.3), spacing / 3]
-        pairs = torch.cat([_agreement(difference), *place], 2) * found
+        pairs = torch.cat([_agreement(difference), _similarity(colour), *place], 2) * found
         hidden = F.linear(pairs, self.pair) + F.embedding(near, sent)
         hidden = F.relu(hidden)
         message = F.relu(F.linear(hidden, self.message, self.message_bias)) * found
@@ -125,6 +125,13 @@ def _agreement(difference: Tensor) -> Tensor:
     signed = [torch.tanh(difference / scale) for scale in (0.02, 0.06, 0.2, 0.7)]
     same = [torch.exp(-difference.abs() / scale) for scale in (0.03, 0.1)]
     return torch.stack(signed + same, -1)
+
+
+def _similarity(difference: Tensor) -> Tensor:
+    """Differences of colour (..., 3) and of their size at several scales (..., COLOUR)."""
+    size = difference.abs().sum(-1, keepdim=True)
+    near = [torch.exp(-size / scale) for scale in (0.3, 1.0)]
+    return torch.cat([difference / 2, size / 3, *near], -1)
 
 
 def _matrix(rows: int, columns: int) -> nn.Parameter:

@@ -207,8 +207,8 @@ def test_no_gradient_is_infinite(shaken: Compact, with_prior: bool) -> None:
 
 
 def test_untrained_inlier_weights_are_one() -> None:
-    points = Points(frame(64, 96, 100)[1])
-    weights = Compact().inlier_weights(points)
+    rgb, sparse = frame(64, 96, 100)
+    weights = Compact().inlier_weights(Points(sparse), rgb)
     assert torch.equal(weights, torch.ones_like(weights))
 
 
@@ -321,11 +321,11 @@ def test_the_shipped_inlier_weights_detect_outliers_on_a_slope() -> None:
     ground_truth = (2.0 + 0.005 * rows + 0.003 * columns).view(1, 1, 192, 256)
     known = torch.rand(ground_truth.shape, generator=generator) < 0.01
     outlier = known & (torch.rand(ground_truth.shape, generator=generator) < 0.2)
+    grey = torch.zeros(1, 3, 192, 256)
     with torch.no_grad():
-        clean = network.inlier_weights(Points(ground_truth * known))
-        mixed = network.inlier_weights(
-            Points(ground_truth * known * torch.where(outlier, 2.0, 1.0))
-        )
+        clean = network.inlier_weights(Points(ground_truth * known), grey)
+        with_outliers = ground_truth * known * torch.where(outlier, 2.0, 1.0)
+        mixed = network.inlier_weights(Points(with_outliers), grey)
     assert float(clean[known].mean()) > 0.98
     assert float(mixed[known & ~outlier].mean()) > 0.95
     assert float(mixed[outlier].mean()) < 0.3

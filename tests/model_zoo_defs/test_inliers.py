@@ -26,6 +26,11 @@ def sparse_map(count: int, seed: int = 0) -> Tensor:
     return sparse.view(1, 1, *SIZE)
 
 
+def images(count: int, seed: int = 0) -> Tensor:
+    """(count, 3, 64, 96) normalised."""
+    return torch.randn(count, 3, *SIZE, generator=torch.Generator().manual_seed(seed))
+
+
 @pytest.fixture(scope="module")
 def shaken() -> InlierWeights:
     """A layer with random weights everywhere."""
@@ -67,7 +72,7 @@ def test_on_a_grid_they_are_the_nearest_twelve() -> None:
 @pytest.mark.parametrize("count", [0, 1, 2])
 def test_points_without_neighbours_have_a_weight(shaken: InlierWeights, count: int) -> None:
     points = Points(sparse_map(count))
-    weights = shaken(points)
+    weights = shaken(points, images(1))
     assert bool(torch.isfinite(weights).all())
     assert torch.equal(weights != 1, points.mask > 0)
 
@@ -75,29 +80,51 @@ def test_points_without_neighbours_have_a_weight(shaken: InlierWeights, count: i
 def test_images_of_a_batch_do_not_influence_each_other(shaken: InlierWeights) -> None:
     maps = [sparse_map(70, 1), sparse_map(300, 2)]
     together = Points(torch.cat(maps))
-    log_odds = shaken.log_odds(Cloud.of(together)).split([70, 300])
-    weights = shaken(together)
+    rgb = images(2)
+    log_odds = shaken.log_odds(Cloud.of(together, rgb)).split([70, 300])
+    weights = shaken(together, rgb)
     for number, sparse in enumerate(maps):
-        alone = Points(sparse)
-        expected = shaken.log_odds(Cloud.of(alone))
+        alone, own = Points(sparse), rgb[number : number + 1]
+        expected = shaken.log_odds(Cloud.of(alone, own))
         torch.testing.assert_close(log_odds[number], expected, rtol=1e-4, atol=1e-5)
-        torch.testing.assert_close(weights[number], shaken(alone)[0], rtol=1e-3, atol=1e-4)
+        torch.testing.assert_close(weights[number], shaken(alone, own)[0], rtol=1e-3, atol=1e-4)
 
 
 def test_the_size_of_the_chunks_changes_nothing(
     shaken: InlierWeights, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     points = Points(sparse_map(300))
-    whole = Cloud.of(points)
+    whole = Cloud.of(points, images(1))
     expected = shaken.log_odds(whole)
     monkeypatch.setattr(clouds, "CHUNK", 7)
     monkeypatch.setattr(inliers, "CHUNK", 7)
-    assert torch.equal(Cloud.of(points).near, whole.near)
+    assert torch.equal(Cloud.of(points, images(1)).near, whole.near)
     torch.testing.assert_close(shaken.log_odds(whole), expected, rtol=1e-4, atol=1e-5)
 
 
 def test_depths_ten_times_larger_have_the_same_weights(shaken: InlierWeights) -> None:
     sparse = sparse_map(200)
+    rgb = images(1)
     torch.testing.assert_close(
-        shaken(Points(10 * sparse)), shaken(Points(sparse)), rtol=1e-2, atol=1e-3
+        shaken(Points(10 * sparse), rgb), shaken(Points(sparse), rgb), rtol=1e-2, atol=1e-3
     )
+
+
+def test_the_colour_of_a_point_is_the_mean_of_25_pixels() -> None:
+    rgb = images(1)
+    sparse = torch.zeros(1, 1, *SIZE)
+    sparse[..., 10, 20] = sparse[..., 0, 95] = 2.0
+    corner, inside = Cloud.of(Points(sparse), rgb).colour
+    torch.testing.assert_close(inside, rgb[0, :, 8:13, 18:23].mean((1, 2)))
+    # at the corner, its own pixel counts nine times
+    rows, columns = [0, 0, 0, 1, 2], [93, 94, 95, 95, 95]
+    torch.testing.assert_close(corner, rgb[0][:, rows][:, :, columns].mean((1, 2)))
+
+
+def test_only_differences_of_colour_count(shaken: InlierWeights) -> None:
+    points, rgb = Points(sparse_map(200)), images(1)
+    log_odds = shaken.log_odds(Cloud.of(points, rgb)).detach()
+    brighter = shaken.log_odds(Cloud.of(points, rgb + 1.0))
+    torch.testing.assert_close(log_odds, brighter, rtol=1e-3, atol=1e-3)
+    other = shaken.log_odds(Cloud.of(points, images(1, seed=1)))
+    assert float((log_odds - other.detach()).abs().max()) > 0.01

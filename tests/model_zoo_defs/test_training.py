@@ -459,6 +459,7 @@ def test_inlier_weights_learn_to_detect_outliers(
 
 def test_many_points_are_cut_to_a_strip_of_rows() -> None:
     depth = torch.full((100, 90), 2.0)
-    cloud, target = train_inliers.example(depth, depth * 1.3, where=1.0)
+    rgb = torch.zeros(3, 100, 90)
+    cloud, target = train_inliers.example(depth, depth * 1.3, rgb, where=1.0)
     assert train_inliers.MOST_POINTS <= len(cloud.value) < train_inliers.MOST_POINTS + 2 * 90
     assert torch.equal(target, torch.zeros_like(target))

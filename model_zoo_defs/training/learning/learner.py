@@ -103,10 +103,7 @@ class Learner:
         nn.utils.clip_grad_norm_(self.learnt, 1.0)
         self.optimiser.step()
         self.step += 1
-        # a young average follows faster; else the first export equals the initial weights
-        keep = min(self.schedule.averaging, (1 + self.step) / (10 + self.step))
-        with torch.no_grad():
-            torch._foreach_lerp_(_averaged(self.average), _averaged(self.network), 1.0 - keep)
+        follow(self.average, self.network, self.step, self.schedule.averaging)
         return float(sum(loss for loss, _ in results) / len(results))
 
     def _loss_and_gradients(
@@ -148,6 +145,14 @@ class Learner:
     def weights(self) -> Path:
         """Path of the file with the averaged weights."""
         return self.out / f"{self.name}.safetensors"
+
+
+@torch.no_grad()
+def follow(average: nn.Module, network: nn.Module, step: int, decay: float) -> None:
+    """Updates the running average of the weights after a step (1 is the first)."""
+    # a young average follows faster; else the first export equals the initial weights
+    keep = min(decay, (1 + step) / (10 + step))
+    torch._foreach_lerp_(_averaged(average), _averaged(network), 1.0 - keep)
 
 
 def _averaged(network: nn.Module) -> list[Tensor]:

@@ -1,15 +1,16 @@
-r"""Trains only the inlier weights of `compact`, before or between runs of `train`.
+r"""Trains only the inlier weights of `compact`, from scratch, before or between runs of `train`.
 
     python -m model_zoo_defs.training.learning.train_inliers --data DIR --start WEIGHTS \
         --out WEIGHTS
 
-The trained part sees points, no image: the clouds of some thousand samples are drawn once, then
-it is trained on them for a few epochs.
+The trained part sees the points and their colours: the clouds of some thousand samples are drawn
+once, then it is trained on them for a few epochs.
 """
 
 from __future__ import annotations
 
 import argparse
+import copy
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -27,14 +28,15 @@ from model_zoo_defs._compact.inliers import InlierWeights
 from model_zoo_defs._compact.points import Points
 from model_zoo_defs.compact import Compact
 from model_zoo_defs.training.learning.dataset import Samples
-from model_zoo_defs.training.learning.learner import Schedule, export
+from model_zoo_defs.training.learning.learner import Schedule, export, follow
 from model_zoo_defs.training.learning.patterns import outliers
 from model_zoo_defs.training.learning.train import upgrade
 
-BATCH, RATE, STEPS = 4, 3e-3, 6000
+BATCH, RATE, STEPS = 4, 3e-3, 8000
 WINDOW = (384, 512)
 # a strip of the image with so many points is enough of a sample
 MOST_POINTS = 3000
+LAYER = "inlier_weights."
 OUTLIERS_IN, MOST_OUTLIERS = 0.6, 0.35
 # |error of log depth| below which a point is an inlier, and above which it is an outlier
 INLIER_ERROR, OUTLIER_ERROR = 0.05, 0.2
@@ -63,26 +65,28 @@ class Examples(Dataset[Example]):
         sparse = sample.sparse[0].numpy()
         if rng.random() < OUTLIERS_IN:
             sparse = outliers(rng, sparse, float(rng.uniform(0.0, MOST_OUTLIERS)))
-        return example(torch.from_numpy(sparse), sample.depth[0], rng.random())
+        return example(torch.from_numpy(sparse), sample.depth[0], sample.rgb, rng.random())
 
 
-def example(sparse: Tensor, ground_truth: Tensor, where: float) -> Example:
-    """The points of a strip of rows as an example; all (H, W) metres, 0 = unknown.
+def example(sparse: Tensor, ground_truth: Tensor, rgb: Tensor, where: float) -> Example:
+    """The points of a strip of rows as an example.
 
-    where: position of the strip, 0 (top) to 1 (bottom), of images with more than MOST_POINTS.
+    Args:
+        sparse: Points (H, W) in metres, 0 = unknown.
+        ground_truth: Depth (H, W) in metres, 0 = unknown.
+        rgb: The normalised image (3, H, W).
+        where: Position of the strip, 0 (top) to 1 (bottom), of images with more than MOST_POINTS.
     """
-    points = Points(sparse[None, None])
-    rows, columns = torch.nonzero(sparse > 0, as_tuple=True)
-    first = int(where * max(0, len(rows) - MOST_POINTS))
-    top, bottom = int(rows[first]), int(rows[min(first + MOST_POINTS, len(rows)) - 1])
-    if len(rows) <= MOST_POINTS:
-        top, bottom = 0, len(sparse) - 1
-    inside = (rows >= top) & (rows <= bottom)
-    rows, columns = rows[inside], columns[inside]
-    value = points.value[0, 0, rows, columns]
-    size = (bottom + 1 - top, sparse.shape[1])
-    cloud = Cloud.of_image((rows - top).float(), columns.float(), size, value)
-    return Example(cloud, inlier_targets(sparse[rows, columns], ground_truth[rows, columns]))
+    value = Points(sparse[None, None]).value[0, 0]
+    rows = torch.nonzero(sparse > 0)[:, 0]
+    if len(rows) > MOST_POINTS:
+        first = int(where * (len(rows) - MOST_POINTS))
+        strip = slice(int(rows[first]), int(rows[first + MOST_POINTS - 1]) + 1)
+        sparse, value, ground_truth = sparse[strip], value[strip], ground_truth[strip]
+        rgb = rgb[:, strip]
+    at = sparse > 0
+    cloud = Cloud.of_image(at, value, rgb)
+    return Example(cloud, inlier_targets(sparse[at], ground_truth[at]))
 
 
 def inlier_targets(sparse: Tensor, ground_truth: Tensor) -> Tensor:
@@ -105,12 +109,13 @@ def loss_of(layer: InlierWeights, examples: Sequence[Example]) -> Tensor:
 
 
 def fit(layer: InlierWeights, examples: Sequence[Example], steps: int, seed: int) -> float:
-    """Trains the layer.
+    """Trains the layer; it ends with the running average of its weights.
 
     Returns:
         The running mean of the cross entropy at the end.
     """
     optimiser = torch.optim.AdamW(layer.parameters(), lr=RATE, weight_decay=1e-3)
+    average = copy.deepcopy(layer)
     schedule = Schedule(lr=RATE, steps=steps, warm_up=100)
     rng = np.random.default_rng(seed)
     smooth = 0.0
@@ -122,7 +127,9 @@ def fit(layer: InlierWeights, examples: Sequence[Example], steps: int, seed: int
         loss.backward()  # type: ignore[no-untyped-call]
         torch.nn.utils.clip_grad_norm_(layer.parameters(), 1.0)
         optimiser.step()
+        follow(average, layer, step + 1, schedule.averaging)
         smooth += (float(loss.detach()) - smooth) * max(0.005, 1.0 / (step + 1))
+    layer.load_state_dict(average.state_dict())
     return smooth
 
 
@@ -147,14 +154,15 @@ def main() -> None:
     parser.add_argument("--val", type=Path, help="folder of shards kept for validation")
     parser.add_argument("--start", type=Path, required=True, help="weights of the network")
     parser.add_argument("--out", type=Path, required=True, help="file for the weights")
-    parser.add_argument("--samples", type=int, default=8000)
+    parser.add_argument("--samples", type=int, default=16_000)
     parser.add_argument("--steps", type=int, default=STEPS)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--workers", type=int, default=0)
     options = parser.parse_args()
     torch.manual_seed(options.seed)
     network = Compact()
-    upgrade(network, load_file(options.start))
+    start = load_file(options.start)
+    upgrade(network, {name: start[name] for name in start if not name.startswith(LAYER)})
     examples = drawn(tuple(options.data), options.samples, options.seed, options.workers)
     loss = fit(network.inlier_weights, examples, options.steps, options.seed)
     print(f"{len(examples)} samples, cross entropy {loss:.4f}")
