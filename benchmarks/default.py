@@ -33,6 +33,7 @@ from benchmarks.frames import (
     points_on_grid,
     refined,
     registered,
+    without_occluded,
 )
 from pnpdepth_cli.auto.auto import AutoRefined, refine_automatically
 from pnpdepth_cli.auto.candidates import Candidate
@@ -41,8 +42,6 @@ from pnpdepth_cli.models.network import Network
 from pnpdepth_cli.pipeline.refinement.load_refiner import refiner_of
 from pnpdepth_cli.pipeline.refinement.request import MethodOptions, RefineRequest
 from pnpdepth_cli.pipeline.refinement.resolve import resolve_settings
-from pnpdepth_cli.points import SparsePoints
-from pnpdepth_cli.sensors import occluded_in_map
 
 ROOMS = ("7scenes", "icl_nuim")
 COUNTS = (20, 100, 500)
@@ -62,12 +61,9 @@ def cells() -> Iterator[Case]:
 
 def measure(network: Network, frame: EvalFrame, count: int | None, seed: int) -> dict[str, object]:
     """MAE and RMSE of every column on one frame, the choice, and its time."""
-    rows, columns, depth = frame_pixels(frame, count, seed)
-    points = points_on_grid(rows, columns, depth, frame.gt.shape)
     if count is None:  # as the commands read a projected scan
-        arrays = SparsePoints(xy=points.xy.numpy(), depth=points.depth.numpy(), size=points.size)
-        hidden = occluded_in_map(arrays)
-        points = points if hidden is None else points.select(torch.from_numpy(~hidden))
+        frame = without_occluded(frame)
+    points = points_on_grid(*frame_pixels(frame, count, seed), frame.gt.shape)
     inputs = frame_inputs(frame.rgb, points, frame.gt)
     refiner = refiner_of(RefineRequest(), [network], inputs)
     assert refiner.competition is not None

@@ -20,6 +20,7 @@ from pnpdepth_cli.models.network import Network
 from pnpdepth_cli.pipeline.batch.frames import registering
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs
 from pnpdepth_cli.points import SparsePoints
+from pnpdepth_cli.sensors import Points, occluded_in_map
 
 Depth = NDArray[np.float32]
 
@@ -99,6 +100,19 @@ def points_on_grid(
     return SparsePoints(
         xy=torch.from_numpy(xy), depth=torch.from_numpy(depth.astype(np.float32)), size=shape
     )
+
+
+def without_occluded(frame: EvalFrame) -> EvalFrame:
+    """The frame without the LiDAR points that the program drops as occluded from the camera."""
+    assert frame.sensor is not None
+    rows, columns, depth = frame_pixels(frame, None, 0)
+    xy = np.stack([columns, rows], axis=1).astype(np.float32)
+    hidden = occluded_in_map(Points(xy=xy, depth=depth, size=frame.gt.shape))
+    if hidden is None:
+        return frame
+    sensor = frame.sensor.copy()
+    sensor[rows[hidden], columns[hidden]] = 0.0
+    return replace(frame, sensor=sensor)
 
 
 REGISTRATIONS = ("off", "frame", "set")

@@ -22,7 +22,14 @@ import numpy as np
 import torch
 
 from benchmarks.accuracy import frames_of, opened
-from benchmarks.frames import SETS, EvalFrame, frame_inputs, frame_pixels, points_on_grid
+from benchmarks.frames import (
+    SETS,
+    EvalFrame,
+    frame_inputs,
+    frame_pixels,
+    points_on_grid,
+    without_occluded,
+)
 from pnpdepth_cli.core.metrics import score
 from pnpdepth_cli.frames.frame import DepthMap
 from pnpdepth_cli.frames.refine import refine_frame, with_propagation
@@ -30,8 +37,6 @@ from pnpdepth_cli.models.network import Network
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs
 from pnpdepth_cli.pipeline.refinement.request import HoldOut, MethodOptions
 from pnpdepth_cli.pipeline.refinement.resolve import is_dense, resolve_layer, resolve_settings
-from pnpdepth_cli.points import SparsePoints
-from pnpdepth_cli.sensors import occluded_in_map
 
 _OUTLIER_FACTORS = (0.3, 3.0)
 """Range of the factor on the depth of outliers."""
@@ -85,16 +90,14 @@ class Row(Case):
 
 def inputs_of(frame: EvalFrame, case: Case) -> Inputs:
     """Returns the frame with the points of the case."""
+    if case.points is None:  # as the program does with a projected scan
+        frame = without_occluded(frame)
     rows, columns, depth = frame_pixels(frame, case.points, case.seed)
     rng = np.random.default_rng(case.seed)
     outlier = rng.random(len(depth)) < case.outliers
     factors = np.exp(rng.uniform(*np.log(_OUTLIER_FACTORS), len(depth)))
     depth = np.where(outlier, depth * factors, depth).astype(np.float32)
     points = points_on_grid(rows, columns, depth, frame.gt.shape)
-    if case.points is None:  # as the program does with a projected scan
-        xy, depth = points.xy.numpy(), points.depth.numpy()
-        occluded = occluded_in_map(SparsePoints(xy=xy, depth=depth, size=points.size))
-        points = points if occluded is None else points.select(torch.from_numpy(~occluded))
     return frame_inputs(frame.rgb, points, frame.gt)
 
 

@@ -16,7 +16,14 @@ import torch
 from scipy.stats import kendalltau
 from torch import Tensor
 
-from benchmarks.frames import EvalFrame, frame_inputs, frame_pixels, kitti_dc, points_on_grid
+from benchmarks.frames import (
+    EvalFrame,
+    frame_inputs,
+    frame_pixels,
+    kitti_dc,
+    points_on_grid,
+    without_occluded,
+)
 from pnpdepth_cli.auto import cross_validation
 from pnpdepth_cli.choices import BASELINES
 from pnpdepth_cli.completion.outliers import inlier_weights
@@ -25,7 +32,6 @@ from pnpdepth_cli.models.network import Network, load_network
 from pnpdepth_cli.pipeline.refinement.request import MethodOptions
 from pnpdepth_cli.pipeline.refinement.resolve import resolve_layer, resolve_settings
 from pnpdepth_cli.points import SparsePoints
-from pnpdepth_cli.sensors import Points, occluded_in_map
 
 INTERPOLATIONS = ("linear", "nearest", "linear-log", "idw", "morphological")
 FOLDS = 4
@@ -41,14 +47,6 @@ def depths(network: Network, frame: EvalFrame, points: SparsePoints) -> Iterator
         result = refine_frame(network, split, settings, inputs.frame())
     yield torch.from_numpy(result.before)
     yield torch.from_numpy(result.after)
-
-
-def visible_points(frame: EvalFrame) -> SparsePoints:
-    """The frame's LiDAR points without occluded ones."""
-    points = points_on_grid(*frame_pixels(frame, None, 0), frame.gt.shape)
-    arrays = Points(xy=points.xy.numpy(), depth=points.depth.numpy(), size=points.size)
-    hidden = occluded_in_map(arrays)
-    return points if hidden is None else points.select(~torch.from_numpy(hidden))
 
 
 def held_out_errors(
@@ -73,7 +71,9 @@ def main() -> None:
     network = load_network("compact", None, "cpu")
     rows: dict[tuple[str, str], list[tuple[float, float]]] = {}
     for number, frame in enumerate(kitti_dc(parser.parse_args().data)):
-        points, gt = visible_points(frame), torch.from_numpy(frame.gt)
+        visible = without_occluded(frame)
+        points = points_on_grid(*frame_pixels(visible, None, 0), frame.gt.shape)
+        gt = torch.from_numpy(frame.gt)
         known = gt > 0
         gt_errors = [
             float((depth - gt)[known].abs().mean()) for depth in depths(network, frame, points)

@@ -16,7 +16,14 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from benchmarks.frames import frame_inputs, frame_pixels, kitti_dc, points_on_grid, refined
+from benchmarks.frames import (
+    frame_inputs,
+    frame_pixels,
+    kitti_dc,
+    points_on_grid,
+    refined,
+    without_occluded,
+)
 from pnpdepth_cli.completion.interpolation import linear
 from pnpdepth_cli.core.metrics import score
 from pnpdepth_cli.io.calibration import read_calibration
@@ -31,9 +38,7 @@ from pnpdepth_cli.sensors import (
     LIDARS,
     Camera,
     OcclusionFilter,
-    Points,
     ProjectionSettings,
-    occluded_in_map,
     project_velodyne,
     simulate_lidar,
 )
@@ -114,13 +119,9 @@ def projected_maps(data: Path) -> None:
     errors: dict[str, list[list[float]]] = {"even": [], "odd": []}
     for number, frame in enumerate(kitti_dc(data)):
         ground_truth = torch.from_numpy(frame.gt)
-        everything = points_on_grid(*frame_pixels(frame, None, 0), frame.gt.shape)
-        hidden = occluded_in_map(
-            Points(xy=everything.xy.numpy(), depth=everything.depth.numpy(), size=everything.size)
-        )
-        assert hidden is not None
         row = []
-        for points in (everything, everything.select(~torch.from_numpy(hidden))):
+        for given in (frame, without_occluded(frame)):
+            points = points_on_grid(*frame_pixels(given, None, 0), frame.gt.shape)
             result = refined(network, layer, settings, frame_inputs(frame.rgb, points, frame.gt))
             for depth in (linear(points), torch.from_numpy(result.after)):
                 row.append(score(depth, ground_truth).mae)
