@@ -18,7 +18,7 @@ from model_zoo_defs._compact.points import Points
 STEEPNESS, THRESHOLD = 4.0, 2.0
 # Up to this expected fraction of outliers in an image their log odds gain the margin, which falls
 # to 0 at twice the fraction: isolated points of clean images lie on thin objects.
-CLEAN_FRACTION, CLEAN_MARGIN = 0.015, 7.0
+CLEAN_FRACTION, CLEAN_MARGIN = 0.03, 7.0
 WIDTH, MESSAGE, ROUNDS, HEADS = 32, 48, 2, 4
 # numbers per pair of points: agreement in depth and in colour, and position
 AGREEMENT, COLOUR, POSITION = 6, 6, 5
