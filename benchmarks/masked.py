@@ -218,7 +218,7 @@ def _cases(args: argparse.Namespace, model: str) -> Iterator[tuple[EvalFrame, Ca
     """Evenly spaced frames of one half of each set, with the points of each seed."""
     for seed in range(args.seeds):
         for name in args.sets:
-            half = frames_of(name, args.data, model, 1)[args.half == "odd" :: 2]
+            half = frames_of(name, args.data, model)[args.half == "odd" :: 2]
             count = min(args.frames, len(half))
             indices = np.linspace(0, len(half) - 1, count).round().astype(int)
             for points in [None] if name == "kitti_dc" else args.points:
