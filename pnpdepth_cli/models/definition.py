@@ -189,9 +189,9 @@ WEIGHTS_DEFAULTS = RefineDefaults(
 """For updates of weights by the points that the network is given."""
 
 MASKED_DEFAULTS = replace(
-    WEIGHTS_DEFAULTS, iterations=12, lr=7e-4, update="adam-short", schedule="linear"
+    WEIGHTS_DEFAULTS, iterations=20, lr=3.5e-4, update="adam-short", schedule="linear"
 )
-"""For updates of weights by points hidden from the input; the gain of 16 of the steps above."""
+"""For updates of weights by points hidden from the input."""
 
 DENSE_SPACING = 10.0
 """Mean spacing of the points in pixels below which they are dense, as those of a LiDAR are."""
