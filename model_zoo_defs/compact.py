@@ -207,6 +207,7 @@ definitions = {
         input_kind="rgb+sparse",
         size=Multiple(32, longest=1280),
         takes_prior=True,
+        weighs_points=True,
         static_graph=True,
         image_encoder="encoder",
         normalisation=Normalisation(mean=IMAGENET_MEAN, std=IMAGENET_STD),

@@ -61,6 +61,13 @@ class SparsePoints(Generic[A]):
         """Returns the points where mask, (N,) bool of the same library, is true."""
         return self._with(self.xy[mask], self.depth[mask], self.size)
 
+    def joined(self: SparsePoints[Tensor], others: SparsePoints[Tensor]) -> SparsePoints[Tensor]:
+        """Returns these points and others of the same frame."""
+        import torch
+
+        xy, depth = torch.cat([self.xy, others.xy]), torch.cat([self.depth, others.depth])
+        return self._with(xy, depth, self.size)
+
     def tensors(self, device: torch.device | str = "cpu") -> SparsePoints[Tensor]:
         """Returns the points as tensors on the device; arrays already there are not copied."""
         import torch

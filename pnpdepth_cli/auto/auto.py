@@ -132,9 +132,7 @@ def _without_outliers(
     if not count:
         return frame, depths, ()
     note = f"outliers: {count:,} of {len(points):,} points left out, inconsistent with the others"
-    if torch.equal(outlying, suspected):
-        return frame.with_points(points.select(~outlying)), consistent, (note,)
-    frame = frame.with_points(points.select(~outlying))
+    frame = frame.without(outlying)
     return frame, depths_of(frame), (note,)
 
 

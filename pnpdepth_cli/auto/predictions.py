@@ -125,7 +125,12 @@ class FramePasses:
         self._encoded: dict[str, Any] = {}  # what encoders of the image returned, by network
 
     def trajectory(
-        self, config: RefinementConfig, points: SparsePoints, prior: Tensor | None = None
+        self,
+        config: RefinementConfig,
+        points: SparsePoints,
+        *,
+        prior: Tensor | None = None,
+        outliers: SparsePoints | None = None,
     ) -> Trajectory:
         """Returns the refinement of the frame with these points.
 
@@ -133,13 +138,15 @@ class FramePasses:
             config: The network and how it is refined.
             points: In the image frame.
             prior: (H, W) metres, for a network that takes one.
+            outliers: Points that were left out, for a network that weighs its points.
 
         Raises:
             PnpDepthError: The refinement fails.
         """
         network = self._opened.networks[config.network]
         with out_of_memory_is_a_device_error(network.device):
-            prepared = prepare(network, replace(self._frame, points=points, prior=prior))
+            frame = replace(self._frame, points=points, outliers=outliers, prior=prior)
+            prepared = prepare(network, frame)
             if not len(prepared.points):
                 raise prepared.no_points_error()
             reader = prepared.depth_reader(config.settings)
@@ -295,7 +302,7 @@ class CandidateDepths:
         if key not in self._trajectories:
             try:
                 dense_prior = None if prior is None else self.dense(prior)
-                refined = self._passes.trajectory(config, self._frame.points, dense_prior)
+                refined = self._pass(config, dense_prior)
             except PnpDepthError as error:
                 self._trajectories[key] = error
                 raise
@@ -304,6 +311,10 @@ class CandidateDepths:
         if isinstance(known, PnpDepthError):
             raise known
         return known
+
+    def _pass(self, config: RefinementConfig, prior: Tensor | None = None) -> Trajectory:
+        frame = self._frame
+        return self._passes.trajectory(config, frame.points, prior=prior, outliers=frame.outliers)
 
     @property
     def points(self) -> SparsePoints:
@@ -378,7 +389,7 @@ class CandidateDepths:
                 if left_s <= 0:
                     return self.trajectory(config).after(0)
                 timed = moved.within(left_s)
-            refined = self._passes.trajectory(timed, self._frame.points)
+            refined = self._pass(timed)
             self._trajectories[moved, None] = refined
             self.kept_steps[config.network] = refined.frame.refinement.kept
         return self.trajectory(moved).after(moved.settings.iterations)

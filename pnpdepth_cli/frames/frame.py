@@ -28,6 +28,8 @@ class Frame:
     """(3, H, W) float32 in 0…1. None without an image."""
     points: SparsePoints
     """Sparse depth in the image frame."""
+    outliers: SparsePoints | None = None
+    """Points that were left out as outliers, for networks that weigh their points."""
     prior: Tensor | None = None
     """(H, W) metres, 0 = unknown: another network's depth, aligned with the points, for networks
     that take one. None without."""
@@ -42,6 +44,11 @@ class Frame:
     def with_points(self, points: SparsePoints) -> Frame:
         """Returns the same image with other sparse depth."""
         return replace(self, points=points)
+
+    def without(self, outliers: Tensor) -> Frame:
+        """Returns the frame with those points, of (N,) bool, left out as outliers."""
+        left_out = self.points.select(outliers)
+        return replace(self, points=self.points.select(~outliers), outliers=left_out)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -34,7 +34,7 @@ class PreparedFrame:
     arguments: tuple[Tensor, ...]
     """Arguments of the network."""
     points: SparsePoints
-    """The points that the network sees, in its frame and on its device."""
+    """The points that the network sees, in its frame and on its device, without outliers."""
     prior: Tensor | None = None
     """(1, 1, h, w) metres, 0 = unknown: the dense prior in the network's frame. None without."""
 
@@ -117,6 +117,9 @@ def prepare(network: Network, frame: Frame) -> PreparedFrame:
     """
     to_network = FrameMap.fit(network.definition.size, *frame.size)
     points = to_network.points_to_network(frame.points)
+    given = points
+    if frame.outliers is not None and network.definition.weighs_points:
+        given = points.joined(to_network.points_to_network(frame.outliers))
     image = network.image_of(to_network, None if frame.rgb is None else frame.rgb[None])
     prior = None
     if frame.prior is not None and network.definition.takes_prior:
@@ -126,7 +129,7 @@ def prepare(network: Network, frame: Frame) -> PreparedFrame:
         frame=frame,
         map=to_network,
         image=image,
-        arguments=network.arguments_of(image, points, prior),
+        arguments=network.arguments_of(image, given, prior),
         points=points.tensors(network.device),
         prior=prior,
     )

@@ -259,6 +259,9 @@ class ModelDefinition:
     takes_prior: bool = False
     """True if forward takes one more argument, which may be left out: a dense prior (1, 1, H, W) in
     metres with 0 = unknown, such as another network's depth aligned with the points."""
+    weighs_points: bool = False
+    """True if the network itself finds outliers among its points. It is then given those, too, that
+    are left out elsewhere as outliers."""
     static_graph: bool = False
     """True if the network runs the same submodules in the same order for all images of one size,
     even where values of tensors reach Python code. Then the cut is learned only once."""

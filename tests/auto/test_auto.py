@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from pnpdepth_cli.auto import auto
+from pnpdepth_cli.auto import auto, predictions
 from pnpdepth_cli.auto.auto import MIN_POINTS, AutoRefined, refine_automatically
 from pnpdepth_cli.auto.candidates import (
     Candidate,
@@ -24,6 +24,7 @@ from pnpdepth_cli.completion.interpolation import in_hull
 from pnpdepth_cli.core.refine import RefineSettings
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.frames.frame import Frame
+from pnpdepth_cli.frames.prepare import PreparedFrame, prepare
 from pnpdepth_cli.models.network import Network, load_network
 from pnpdepth_cli.pipeline.refinement import held_out
 from pnpdepth_cli.points import SparsePoints
@@ -169,6 +170,27 @@ def test_outliers_are_left_out_and_reported_and_the_error_hardly_grows(
     assert not left & {tuple(xy) for xy in inputs.points.xy[bad].tolist()}
     mae = [float(np.abs(one.frame.after - frame.depth).mean()) for one in (clean, with_outliers)]
     assert mae[1] < 1.15 * mae[0]
+
+
+def test_outliers_that_are_left_out_stay_known_to_networks_that_weigh_their_points(
+    frame: FrameOnDisk, network: Network, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    inputs = in_memory(frame)
+    bad = torch.arange(len(inputs.points)) % 5 == 0
+    depth = torch.where(bad, 2.5 * inputs.points.depth, inputs.points.depth)
+    spoiled = replace(inputs, points=replace(inputs.points, depth=depth))
+    prepared: list[Frame] = []
+
+    def recorded(network: Network, frame: Frame) -> PreparedFrame:
+        prepared.append(frame)
+        return prepare(network, frame)
+
+    monkeypatch.setattr(predictions, "prepare", recorded)
+    used = chosen(network, spoiled).frame.used
+    of_all, *_, of_a_fold = prepared
+    assert of_all.outliers is None
+    assert of_a_fold.outliers is not None
+    assert len(of_a_fold.outliers) == len(spoiled.points) - len(used) > 0
 
 
 def test_what_cannot_be_fitted_to_points_equally_far_does_not_compete(
