@@ -13,8 +13,14 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.accuracy import opened
-from benchmarks.frames import SETS, EvalFrame, frame_inputs, frame_pixels, points_on_grid
-from benchmarks.scan_line_folds import visible_points
+from benchmarks.frames import (
+    SETS,
+    EvalFrame,
+    frame_inputs,
+    frame_pixels,
+    points_on_grid,
+    without_occluded,
+)
 from pnpdepth_cli.auto.auto import refine_automatically
 from pnpdepth_cli.auto.predictions import OpenNetworks
 from pnpdepth_cli.auto.uncertainty import uncertainty
@@ -40,9 +46,8 @@ def coverage(
 ) -> list[float]:
     """Fractions of the ground truth within ± 1, 2, 3 and 4 σ."""
     if count is None:
-        points = visible_points(frame)
-    else:
-        points = points_on_grid(*frame_pixels(frame, count, 0), frame.gt.shape)
+        frame = without_occluded(frame)
+    points = points_on_grid(*frame_pixels(frame, count, 0), frame.gt.shape)
     inputs = frame_inputs(frame.rgb, points, frame.gt)
     request = RefineRequest(method=MethodOptions(preset=preset), hold_out=HoldOut(uncertainty=True))
     refiner = refiner_of(request, [network], inputs)
