@@ -16,7 +16,8 @@ larger give an answer ten times larger. The depth is built from coarse to fine:
 A prior, the dense depth of any other network aligned to the points, adds candidates: at 1/16
 the prior plus a plane through the points' residuals against it, and at each finer level the
 coarser depths plus the change of the prior between the two cells. Where the prior is unknown its
-candidates are masked, and without a prior none of these layers runs.
+candidates are masked, and without a prior none of these layers runs. A prior that does not
+help to predict the points from each other (`prior.explains`) is unknown everywhere.
 
 A point is evidence, never copied: depth depends smoothly on the features of every level, which
 is what refinement moves.
@@ -31,6 +32,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from model_zoo_defs._compact.cloud import Cloud
 from model_zoo_defs._compact.decoder import (
     DECODER_CHANNELS,
     PRIOR_BIAS,
@@ -49,7 +51,8 @@ from model_zoo_defs._compact.decoder import (
 from model_zoo_defs._compact.encoder import ENCODER_CHANNELS, Encoder
 from model_zoo_defs._compact.fit import FIT_HEADS, PointFit, PriorFit
 from model_zoo_defs._compact.inliers import InlierWeights
-from model_zoo_defs._compact.points import Points, Prior, residual_of, resize
+from model_zoo_defs._compact.points import Points, residual_of, resize
+from model_zoo_defs._compact.prior import Prior
 from pnpdepth_cli.models.definition import (
     IMAGENET_MEAN,
     IMAGENET_STD,
@@ -139,8 +142,9 @@ class Compact(nn.Module):
     def outputs(self, rgb: Tensor, sparse: Tensor, prior: Tensor | None = None) -> Outputs:
         """The depths of all levels and what the other outputs are computed from."""
         points = Points(sparse)
-        points.weigh(self.inlier_weights(points, rgb))
-        guide = None if prior is None else Prior(prior, points)
+        cloud = Cloud.of(points, rgb)
+        points.weigh(self.inlier_weights(points, cloud))
+        guide = None if prior is None else Prior(prior, points, cloud)
         moments = points.moments()
         image = self.encoder(rgb)
         fit = self.fit(image["s16"], image["s32"], points, guide)

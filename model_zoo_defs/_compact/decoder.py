@@ -9,7 +9,8 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from model_zoo_defs._compact.fit import FIT_HEADS, PriorFit
-from model_zoo_defs._compact.points import MASKED, Prior, Residual, resize
+from model_zoo_defs._compact.points import MASKED, Residual, resize
+from model_zoo_defs._compact.prior import Prior
 
 DECODER_CHANNELS = {"s2": 16, "s4": 32, "s8": 64, "s16": 96, "s32": 96}
 STRIDES = {"s16": 16, "s8": 8, "s4": 4, "s2": 2}

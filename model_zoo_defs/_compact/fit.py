@@ -9,7 +9,8 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from model_zoo_defs._compact.encoder import ENCODER_CHANNELS
-from model_zoo_defs._compact.points import MASKED, Points, Prior, resize
+from model_zoo_defs._compact.points import MASKED, Points, resize
+from model_zoo_defs._compact.prior import Prior
 
 FIT_HEADS = 4
 FIT_KEY = 16

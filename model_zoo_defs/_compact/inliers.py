@@ -41,11 +41,11 @@ class InlierWeights(nn.Module):
         nn.init.zeros_(self.leave.weight)
         nn.init.constant_(self.leave.bias, 4.0)  # weights of exactly 1
 
-    def forward(self, points: Points, rgb: Tensor) -> Tensor:
-        """The weights (B, 1, H, W), 1 away from the points; rgb (B, 3, H, W) is normalised."""
+    def forward(self, points: Points, cloud: Cloud) -> Tensor:
+        """The weights (B, 1, H, W), 1 away from the points; the cloud is of these points."""
         at, nothing = points.mask > 0, torch.zeros_like(points.mask)
         with torch.autocast(points.mask.device.type, enabled=False):
-            log_odds = self.log_odds(Cloud.of(points, rgb))
+            log_odds = self.log_odds(cloud)
         logits = nothing.masked_scatter(at, log_odds)
         weights = torch.sigmoid(STEEPNESS * (logits + self._margin(points, logits) - THRESHOLD))
         return torch.where(at, weights, 1.0)

@@ -1,4 +1,4 @@
-"""Sparse depth and a prior as log depth, and the residuals of the points."""
+"""Sparse depth as log depth, and the residuals of the points."""
 
 from __future__ import annotations
 
@@ -8,8 +8,6 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-# a prior further than this from the median, in log depth, is clamped
-PRIOR_RANGE = 4.0
 MASKED = -1e4
 
 
@@ -71,41 +69,6 @@ def residual_of(moments: Tensor, depth: Tensor, stride: int) -> Residual:
     std = torch.sqrt((squared / known - mean * mean).clamp(min=0.0) + 1e-6)
     weight = torch.log((density / count.clamp(min=1e-6)).clamp(min=1e-6))
     return Residual(mean, std, density, torch.where(count > 0, weight, MASKED))
-
-
-class Prior:
-    """A dense depth in the units of `Points`, 0 where unknown, and where it is known.
-
-    value, valid: (B, 1, H, W).
-    """
-
-    def __init__(self, depth: Tensor, points: Points):
-        valid = (depth > 0) & torch.isfinite(depth)
-        self.valid = valid.to(torch.float32)
-        value = torch.log(torch.where(valid, depth, 1.0).to(torch.float32)) - points.median
-        self.value = value.clamp(-PRIOR_RANGE, PRIOR_RANGE) * self.valid
-        # residuals of the points against the prior, on the pixels where both are known
-        self.weight = points.weight * self.valid
-        self.residual = (points.value - self.value) * self.valid * points.mask
-        weighted = self.weight * self.residual
-        parts = [points.mask * self.valid, self.weight, weighted, weighted * self.residual]
-        self.moments = F.avg_pool2d(torch.cat(parts, dim=1), 2)
-
-    def at(self, stride: int) -> tuple[Tensor, Tensor]:
-        """Value and validity at the centre pixels of the cells of `stride` pixels."""
-        start = stride // 2
-        part = (..., slice(start, None, stride), slice(start, None, stride))
-        return self.value[part], self.valid[part]
-
-    def hints(self, before: Tensor, stride: int) -> Tensor:
-        """Value relative to `before`, validity, residual and std (B, 4, h, w) of a level."""
-        value, valid = self.at(stride)
-        sums = F.avg_pool2d(self.moments, stride // 2) if stride > 2 else self.moments
-        _, density, mean, square = sums.chunk(4, dim=1)
-        known = density.clamp(min=1e-6)
-        mean = mean / known
-        std = torch.sqrt((square / known - mean * mean).clamp(min=0.0) + 1e-6)
-        return torch.cat([(value - before) * valid, valid, mean, std], dim=1)
 
 
 def resize(x: Tensor, size: torch.Size | tuple[int, int]) -> Tensor:

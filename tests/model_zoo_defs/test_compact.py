@@ -8,8 +8,10 @@ import pytest
 import torch
 from torch import Tensor
 
+from model_zoo_defs._compact.cloud import Cloud
 from model_zoo_defs._compact.decoder import SpatialPropagation
 from model_zoo_defs._compact.points import Points, residual_of
+from model_zoo_defs._compact.prior import Prior
 from model_zoo_defs.compact import Compact, definitions
 from pnpdepth_cli.core.split import Split
 
@@ -107,13 +109,31 @@ def test_a_plane_seen_at_some_points_is_continued_as_a_plane(network: Compact) -
     assert float(error.mean()) < 0.03
 
 
-def prior_of(height: int, width: int, seed: int = 3) -> Tensor:
-    """A smooth depth with a window in which it is unknown."""
+def prior_of(sparse: Tensor, seed: int = 3) -> Tensor:
+    """A rough depth near that of the points, with a window in which it is unknown."""
     generator = torch.Generator().manual_seed(seed)
+    height, width = sparse.shape[-2:]
     coarse = 1.0 + 3.0 * torch.rand(1, 1, 4, 5, generator=generator)
     prior = torch.nn.functional.interpolate(coarse, (height, width), mode="bilinear")
+    error = 0.9 + 0.2 * torch.rand(sparse.shape, generator=generator)
+    prior = torch.where(sparse > 0, sparse * error, prior)
     prior[..., 10:30, 20:60] = 0.0
     return prior
+
+
+def shuffled(sparse: Tensor, seed: int = 4) -> Tensor:
+    """A prior with the depths of other points at every point."""
+    at = sparse > 0
+    order = torch.randperm(int(at.sum()), generator=torch.Generator().manual_seed(seed))
+    prior = torch.full_like(sparse, 2.0)
+    prior[at] = sparse[at][order]
+    return prior
+
+
+def weights_of(network: Compact, sparse: Tensor, rgb: Tensor) -> Tensor:
+    """The inlier weights of points."""
+    points = Points(sparse)
+    return network.inlier_weights(points, Cloud.of(points, rgb))
 
 
 @pytest.fixture(scope="module")
@@ -139,7 +159,7 @@ def test_a_prior_changes_the_depth_and_leaves_it_finite(shaken: Compact) -> None
     for count in (0, 1, 300):
         rgb, sparse = frame(96, 128, count)
         with torch.no_grad():
-            depth = shaken(rgb, sparse, prior_of(96, 128))
+            depth = shaken(rgb, sparse, prior_of(sparse))
             assert not torch.equal(depth, shaken(rgb, sparse))
         assert bool(torch.isfinite(depth).all())
         assert bool((depth > 0).all())
@@ -147,7 +167,7 @@ def test_a_prior_changes_the_depth_and_leaves_it_finite(shaken: Compact) -> None
 
 def test_prior_and_points_ten_times_as_far_give_depth_ten_times_as_far(shaken: Compact) -> None:
     rgb, sparse = frame(96, 128, 300)
-    prior = prior_of(96, 128)
+    prior = prior_of(sparse)
     with torch.no_grad():
         expected = shaken(rgb, sparse, prior) * 10.0
         depth = shaken(rgb, sparse * 10.0, prior * 10.0)
@@ -157,11 +177,47 @@ def test_prior_and_points_ten_times_as_far_give_depth_ten_times_as_far(shaken: C
 def test_samples_with_and_without_a_prior_can_be_in_one_batch(shaken: Compact) -> None:
     one, other = frame(64, 96, 30, seed=1), frame(64, 96, 700, seed=2)
     batch = [torch.cat(pair) for pair in zip(one, other, strict=True)]
-    priors = torch.cat([prior_of(64, 96), torch.zeros(1, 1, 64, 96)])
+    priors = torch.cat([prior_of(one[1]), torch.zeros(1, 1, 64, 96)])
     with torch.no_grad():
         together = shaken(*batch, priors)
         apart = torch.cat([shaken(*one, priors[:1]), shaken(*other)])
     torch.testing.assert_close(together, apart, rtol=1e-3, atol=1e-4)
+
+
+@pytest.mark.parametrize("useless", ["constant", "shuffled"])
+def test_a_prior_that_does_not_explain_the_points_is_unknown_everywhere(useless: str) -> None:
+    rgb, sparse = frame(96, 128, 200)
+    points = Points(sparse)
+    prior = torch.full_like(sparse, 3.0) if useless == "constant" else shuffled(sparse)
+    assert not bool(Prior(prior, points, Cloud.of(points, rgb)).valid.any())
+
+
+def test_each_image_of_a_batch_keeps_or_loses_its_own_prior() -> None:
+    one, other = frame(64, 96, 90, seed=1), frame(64, 96, 300, seed=2)
+    rgb, sparse = (torch.cat(pair) for pair in zip(one, other, strict=True))
+    points = Points(sparse)
+    priors = torch.cat([prior_of(sparse[:1]), shuffled(sparse[1:])])
+    valid = Prior(priors, points, Cloud.of(points, rgb)).valid
+    assert torch.equal(valid[0] > 0, priors[0] > 0)
+    assert not bool(valid[1].any())
+
+
+def test_outliers_among_the_points_do_not_hide_that_a_prior_explains_the_others() -> None:
+    rgb, sparse = frame(96, 128, 200)
+    points, prior, outlier = Points(sparse), sparse.clone(), torch.zeros_like(sparse)
+    outlier.view(-1)[torch.nonzero(sparse.view(-1)).squeeze(1)[::4]] = 1.0
+    prior = torch.where(outlier > 0, 80.0, prior)
+    cloud = Cloud.of(points, rgb)
+    assert not bool(Prior(prior, points, cloud).valid.any())
+    points.weigh(1.0 - outlier)
+    assert bool(Prior(prior, points, cloud).valid.any())
+
+
+@pytest.mark.parametrize("count", [0, 1])
+def test_a_prior_is_used_where_no_two_points_can_tell(count: int) -> None:
+    rgb, sparse = frame(64, 96, count)
+    points, prior = Points(sparse), torch.full((1, 1, 64, 96), 2.0)
+    assert bool(Prior(prior, points, Cloud.of(points, rgb)).valid.all())
 
 
 def test_an_exact_prior_lets_the_untrained_network_know_what_no_point_shows() -> None:
@@ -185,7 +241,8 @@ def test_an_exact_prior_lets_the_untrained_network_know_what_no_point_shows() ->
 def test_rear_of_front_is_the_network_bit_for_bit(
     shaken: Compact, layer: str, with_prior: bool
 ) -> None:
-    inputs = [*frame(96, 128, 200), *([prior_of(96, 128)] if with_prior else [])]
+    rgb, sparse = frame(96, 128, 200)
+    inputs = [rgb, sparse, *([prior_of(sparse)] if with_prior else [])]
     with torch.no_grad():
         expected = shaken(*inputs)
     with Split(shaken, layer) as split:
@@ -197,7 +254,7 @@ def test_no_gradient_is_infinite(shaken: Compact, with_prior: bool) -> None:
     """Cells with one point have variance 0, where the gradient of the square root is infinite."""
     net = copy.deepcopy(shaken).train()
     rgb, sparse = frame(64, 96, 40)
-    outputs = net.outputs(rgb, sparse, prior_of(64, 96) if with_prior else None)
+    outputs = net.outputs(rgb, sparse, prior_of(sparse) if with_prior else None)
     loss = sum(depth.log().abs().mean() for depth in outputs.depths) + net.sigma(outputs).mean()
     assert isinstance(loss, Tensor)
     loss.backward()
@@ -208,7 +265,7 @@ def test_no_gradient_is_infinite(shaken: Compact, with_prior: bool) -> None:
 
 def test_untrained_inlier_weights_are_one() -> None:
     rgb, sparse = frame(64, 96, 100)
-    weights = Compact().inlier_weights(Points(sparse), rgb)
+    weights = weights_of(Compact(), sparse, rgb)
     assert torch.equal(weights, torch.ones_like(weights))
 
 
@@ -323,9 +380,9 @@ def test_the_shipped_inlier_weights_detect_outliers_on_a_slope() -> None:
     outlier = known & (torch.rand(ground_truth.shape, generator=generator) < 0.2)
     grey = torch.zeros(1, 3, 192, 256)
     with torch.no_grad():
-        clean = network.inlier_weights(Points(ground_truth * known), grey)
+        clean = weights_of(network, ground_truth * known, grey)
         with_outliers = ground_truth * known * torch.where(outlier, 2.0, 1.0)
-        mixed = network.inlier_weights(Points(with_outliers), grey)
+        mixed = weights_of(network, with_outliers, grey)
     assert float(clean[known].mean()) > 0.98
     assert float(mixed[known & ~outlier].mean()) > 0.95
     assert float(mixed[outlier].mean()) < 0.3

@@ -1,0 +1,81 @@
+"""A prior as log depth, the residuals of the points against it, and whether it is of use."""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from model_zoo_defs._compact.cloud import Cloud
+from model_zoo_defs._compact.points import Points
+
+# a prior further than this from the median, in log depth, is clamped
+PRIOR_RANGE = 4.0
+# A prior is used if it lowers the leave-one-out error at the points by at least 1 %.
+EXPLAINED = 0.99
+
+
+class Prior:
+    """A dense depth in the units of `Points`, 0 where unknown, and where it is known.
+
+    value, valid: (B, 1, H, W). A prior that does not explain the points of its image is unknown
+    everywhere.
+    """
+
+    def __init__(self, depth: Tensor, points: Points, cloud: Cloud):
+        known = (depth > 0) & torch.isfinite(depth)
+        log_depth = torch.log(torch.where(known, depth, 1.0).to(torch.float32)) - points.median
+        log_depth = log_depth.clamp(-PRIOR_RANGE, PRIOR_RANGE)
+        self.valid = known * explains(points.value - log_depth, known, points, cloud)
+        self.value = log_depth * self.valid
+        # residuals of the points against the prior, on the pixels where both are known
+        self.weight = points.weight * self.valid
+        self.residual = (points.value - self.value) * self.valid * points.mask
+        weighted = self.weight * self.residual
+        parts = [points.mask * self.valid, self.weight, weighted, weighted * self.residual]
+        self.moments = F.avg_pool2d(torch.cat(parts, dim=1), 2)
+
+    def at(self, stride: int) -> tuple[Tensor, Tensor]:
+        """Value and validity at the centre pixels of the cells of `stride` pixels."""
+        start = stride // 2
+        part = (..., slice(start, None, stride), slice(start, None, stride))
+        return self.value[part], self.valid[part]
+
+    def hints(self, before: Tensor, stride: int) -> Tensor:
+        """Value relative to `before`, validity, residual and std (B, 4, h, w) of a level."""
+        value, valid = self.at(stride)
+        sums = F.avg_pool2d(self.moments, stride // 2) if stride > 2 else self.moments
+        _, density, mean, square = sums.chunk(4, dim=1)
+        known = density.clamp(min=1e-6)
+        mean = mean / known
+        std = torch.sqrt((square / known - mean * mean).clamp(min=0.0) + 1e-6)
+        return torch.cat([(value - before) * valid, valid, mean, std], dim=1)
+
+
+@torch.no_grad()
+def explains(residual: Tensor, known: Tensor, points: Points, cloud: Cloud) -> Tensor:
+    """Whether a prior lowers the leave-one-out error at the points, 0 or 1 (B, 1, 1, 1).
+
+    Every point is predicted from its neighbours, as their mean with weights of 1 / squared distance
+    times inlier weight: once its log depth, once its residual against the prior. 1 for an image
+    without two neighbouring points.
+
+    Args:
+        residual: Log depth of the points minus that of the prior (B, 1, H, W).
+        known: Where the prior is known (B, 1, H, W).
+        points: The points.
+        cloud: The same points with their neighbours.
+    """
+    at = points.mask > 0
+    known, weight, near = known[at], points.weight[at], cloud.near
+    square = (cloud.position[near] - cloud.position.unsqueeze(1)).square().sum(2)
+    share = cloud.found * known[near] * weight[near] / (square + 0.1)
+    share = share / share.sum(1, keepdim=True).clamp(min=1e-6)
+    predicted = known * share.sum(1) * weight
+
+    def error(value: Tensor) -> Tensor:
+        per_point = predicted * (value - (share * value[near]).sum(1)).abs()
+        return torch.stack([image.sum() for image in torch.split(per_point, list(cloud.counts))])
+
+    explained = error(residual[at]) <= EXPLAINED * error(cloud.value)
+    return explained.to(torch.float32).view(-1, 1, 1, 1)
