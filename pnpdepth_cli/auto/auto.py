@@ -71,7 +71,7 @@ def refine_automatically(
     Raises:
         PnpDepthError: The user's network gives no depth.
     """
-    passes = FramePasses(opened, frame)
+    passes = FramePasses(opened)
     frame, depths, notes = _without_outliers(passes, competition, frame)
     folds = _folds(passes, competition, frame, depths.prediction, seed)
     scored = folds[: _enough(len(frame.points))]

@@ -115,37 +115,26 @@ class FramePasses:
 
     Args:
         opened: The networks.
-        frame: The image; its own points are not used.
     """
 
-    def __init__(self, opened: OpenNetworks, frame: Frame) -> None:
-        self._opened, self._frame = opened, frame
+    def __init__(self, opened: OpenNetworks) -> None:
+        self._opened = opened
         self._z0: dict[str, tuple[str, Tensor]] = {}  # layer and z_0 by network
         self._outputs: dict[str, Any] = {}  # of networks that take only the image
         self._encoded: dict[str, Any] = {}  # what encoders of the image returned, by network
 
-    def trajectory(
-        self,
-        config: RefinementConfig,
-        points: SparsePoints,
-        *,
-        prior: Tensor | None = None,
-        outliers: SparsePoints | None = None,
-    ) -> Trajectory:
-        """Returns the refinement of the frame with these points.
+    def trajectory(self, config: RefinementConfig, frame: Frame) -> Trajectory:
+        """Returns the refinement of the frame.
 
         Args:
             config: The network and how it is refined.
-            points: In the image frame.
-            prior: (H, W) metres, for a network that takes one.
-            outliers: Points that were left out, for a network that weighs its points.
+            frame: The image, the same in every call, and the points of this call.
 
         Raises:
             PnpDepthError: The refinement fails.
         """
         network = self._opened.networks[config.network]
         with out_of_memory_is_a_device_error(network.device):
-            frame = replace(self._frame, points=points, outliers=outliers, prior=prior)
             prepared = prepare(network, frame)
             if not len(prepared.points):
                 raise prepared.no_points_error()
@@ -302,7 +291,7 @@ class CandidateDepths:
         if key not in self._trajectories:
             try:
                 dense_prior = None if prior is None else self.dense(prior)
-                refined = self._pass(config, dense_prior)
+                refined = self._passes.trajectory(config, replace(self._frame, prior=dense_prior))
             except PnpDepthError as error:
                 self._trajectories[key] = error
                 raise
@@ -311,10 +300,6 @@ class CandidateDepths:
         if isinstance(known, PnpDepthError):
             raise known
         return known
-
-    def _pass(self, config: RefinementConfig, prior: Tensor | None = None) -> Trajectory:
-        frame = self._frame
-        return self._passes.trajectory(config, frame.points, prior=prior, outliers=frame.outliers)
 
     @property
     def points(self) -> SparsePoints:
@@ -389,7 +374,7 @@ class CandidateDepths:
                 if left_s <= 0:
                     return self.trajectory(config).after(0)
                 timed = moved.within(left_s)
-            refined = self._pass(timed)
+            refined = self._passes.trajectory(timed, self._frame)
             self._trajectories[moved, None] = refined
             self.kept_steps[config.network] = refined.frame.refinement.kept
         return self.trajectory(moved).after(moved.settings.iterations)

@@ -213,12 +213,12 @@ def test_one_refinement_gives_the_depth_after_every_number_of_updates(
 ) -> None:
     inputs = in_memory(frame)
     with OpenNetworks({"network": network}) as opened:
-        passes = FramePasses(opened, inputs)
+        passes = FramePasses(opened)
         twelve = replace(CONFIG, settings=replace(SETTINGS, iterations=12))
-        path = passes.trajectory(twelve, inputs.points)
+        path = passes.trajectory(twelve, inputs)
         for count in (0, 5, 10, 12):
             alone = replace(CONFIG, settings=replace(SETTINGS, iterations=count))
-            end = passes.trajectory(alone, inputs.points)
+            end = passes.trajectory(alone, inputs)
             assert torch.equal(path.after(count), torch.from_numpy(end.frame.after))
 
 
@@ -268,18 +268,18 @@ def test_the_front_runs_once_for_all_sets_of_points(
     frame: FrameOnDisk, network: Network, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     inputs = in_memory(frame)
-    sets = [inputs.points, inputs.points.select(torch.arange(60) < 40)]
+    frames = [inputs, inputs.with_points(inputs.points.select(torch.arange(60) < 40))]
     fronts: list[object] = []
     front = Split.front
     monkeypatch.setattr(
         Split, "front", lambda *arguments: fronts.append(arguments) or front(*arguments)
     )
     with OpenNetworks({"network": network}) as opened:
-        passes = FramePasses(opened, inputs)
-        together = [passes.trajectory(CONFIG, points) for points in sets]
+        passes = FramePasses(opened)
+        together = [passes.trajectory(CONFIG, each) for each in frames]
         assert len(fronts) == 1
-        for points, one in zip(sets, together, strict=True):
-            alone = FramePasses(opened, inputs).trajectory(CONFIG, points)
+        for each, one in zip(frames, together, strict=True):
+            alone = FramePasses(opened).trajectory(CONFIG, each)
             assert torch.equal(one.after(3), alone.after(3))
 
 

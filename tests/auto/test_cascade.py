@@ -74,7 +74,7 @@ def test_the_networks_that_take_a_prior_are_given_each_other_networks_depth() ->
 
 def test_the_prior_is_the_other_networks_depth(frame: Frame) -> None:
     with OpenNetworks(NETWORKS) as opened:
-        depths = CandidateDepths(FramePasses(opened, frame), frame, CONFIGS[0], CASCADE)
+        depths = CandidateDepths(FramePasses(opened), frame, CONFIGS[0], CASCADE)
         prior = depths.dense(Candidate(config=CONFIGS[0]))
         assert torch.equal(depths.dense(CASCADE), 2.0 * prior)
         assert bool((depths.dense(Candidate(config=CONFIGS[1])) == 5.0).all())
@@ -96,6 +96,6 @@ def test_the_embedded_network_predicts_differently_with_a_prior(frame: Frame) ->
     plain = Candidate(config=config)
     candidate = Candidate(config=config, prior=Candidate(config=CONFIGS[0]))
     with OpenNetworks({"brightness": BRIGHTNESS, "compact": compact}) as opened:
-        depths = CandidateDepths(FramePasses(opened, frame), frame, CONFIGS[0], plain)
+        depths = CandidateDepths(FramePasses(opened), frame, CONFIGS[0], plain)
         assert not torch.equal(depths.dense(candidate), depths.dense(plain))
         assert bool((depths.dense(candidate) > 0).all())

@@ -42,10 +42,10 @@ def test_its_trajectory_is_the_refinement_alone_and_the_network_stays(tmp_path: 
     with network.cut_at_points() as split:
         alone = refine_frame(network, split, MASKED.settings, frame)
     with OpenNetworks({"network": network}) as opened:
-        passes = FramePasses(opened, frame)
-        passes.trajectory(PLAIN, frame.points)
-        trajectory = passes.trajectory(MASKED, frame.points)
-        passes.trajectory(PLAIN, frame.points)
+        passes = FramePasses(opened)
+        passes.trajectory(PLAIN, frame)
+        trajectory = passes.trajectory(MASKED, frame)
+        passes.trajectory(PLAIN, frame)
     assert torch.equal(trajectory.after(0), torch.from_numpy(alone.before))
     assert torch.equal(trajectory.after(2), torch.from_numpy(alone.after))
     assert same(before, state_of(network.module))
