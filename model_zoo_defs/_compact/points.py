@@ -64,11 +64,16 @@ def residual_of(moments: Tensor, depth: Tensor, stride: int) -> Residual:
     squared = square - dense * (2.0 * value - dense * density)
     sums = F.avg_pool2d(torch.cat([count, density, difference, squared], dim=1), stride // 2)
     count, density, difference, squared = sums.chunk(4, dim=1)
-    known = density.clamp(min=1e-6)
-    mean = difference / known
-    std = torch.sqrt((squared / known - mean * mean).clamp(min=0.0) + 1e-6)
+    mean, std = mean_and_std(density, difference, squared)
     weight = torch.log((density / count.clamp(min=1e-6)).clamp(min=1e-6))
     return Residual(mean, std, density, torch.where(count > 0, weight, MASKED))
+
+
+def mean_and_std(weight: Tensor, value: Tensor, square: Tensor) -> tuple[Tensor, Tensor]:
+    """Mean and standard deviation, from sums of weights, weighted values and weighted squares."""
+    known = weight.clamp(min=1e-6)
+    mean = value / known
+    return mean, torch.sqrt((square / known - mean * mean).clamp(min=0.0) + 1e-6)
 
 
 def resize(x: Tensor, size: torch.Size | tuple[int, int]) -> Tensor:

@@ -7,7 +7,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from model_zoo_defs._compact.cloud import Cloud
-from model_zoo_defs._compact.points import Points
+from model_zoo_defs._compact.points import Points, mean_and_std
 
 # a prior further than this from the median, in log depth, is clamped
 PRIOR_RANGE = 4.0
@@ -45,11 +45,8 @@ class Prior:
         """Value relative to `before`, validity, residual and std (B, 4, h, w) of a level."""
         value, valid = self.at(stride)
         sums = F.avg_pool2d(self.moments, stride // 2) if stride > 2 else self.moments
-        _, density, mean, square = sums.chunk(4, dim=1)
-        known = density.clamp(min=1e-6)
-        mean = mean / known
-        std = torch.sqrt((square / known - mean * mean).clamp(min=0.0) + 1e-6)
-        return torch.cat([(value - before) * valid, valid, mean, std], dim=1)
+        _, *of_residuals = sums.chunk(4, dim=1)
+        return torch.cat([(value - before) * valid, valid, *mean_and_std(*of_residuals)], dim=1)
 
 
 @torch.no_grad()
