@@ -20,9 +20,7 @@ from numpy.typing import NDArray
 from benchmarks.frames import (
     SETS,
     EvalFrame,
-    frame_inputs,
-    frame_pixels,
-    points_on_grid,
+    drawn_inputs,
 )
 from pnpdepth_cli.completion.interpolation import linear
 from pnpdepth_cli.io.depth import write_depth
@@ -50,12 +48,6 @@ def write_folder(folder: Path, frames: Sequence[EvalFrame]) -> None:
         write_depth(folder / "gt" / f"f_{number:03}.png", frame.gt, scale=1000)
     rows = (f"rgb/f_{number:03}.png,gt/f_{number:03}.png\n" for number in range(len(frames)))
     (folder / "frames.csv").write_text("image,gt\n" + "".join(rows))
-
-
-def inputs_of(frame: EvalFrame, count: int, seed: int) -> Inputs:
-    """The frame with so many points."""
-    points = points_on_grid(*frame_pixels(frame, count, seed), frame.gt.shape)
-    return frame_inputs(frame.rgb, points, frame.gt)
 
 
 def mae(frames: Sequence[Inputs], checkpoint: Path | None) -> float:
@@ -103,7 +95,7 @@ def main() -> None:
                 steps=args.steps,
             )
             adapted = adapt(request, Progress(say=lambda _: None, step=lambda *_: None))
-            tested = [inputs_of(frame, args.points, seed) for frame in frames[1::2]]
+            tested = [drawn_inputs(frame, args.points, seed) for frame in frames[1::2]]
             before, after = mae(tested, None), mae(tested, weights)
             print(
                 f"| {seed} | {args.steps}, {adapted.kept} | {adapted.change:+.1%} |"

@@ -30,7 +30,7 @@ from benchmarks.frames import (
     REGISTRATIONS,
     SETS,
     EvalFrame,
-    frame_inputs,
+    drawn_inputs,
     frame_pixels,
     nyu,
     points_on_grid,
@@ -85,9 +85,8 @@ def measure_frame(
     network: Network, frame: EvalFrame, count: int | None, seed: int, settings: Settings
 ) -> dict[str, tuple[float, float]]:
     """(MAE, RMSE) of every method on one frame."""
-    rows, columns, depth = frame_pixels(frame, count, seed)
-    points = points_on_grid(rows, columns, depth, frame.gt.shape)
-    inputs = frame_inputs(frame.rgb, points, frame.gt)
+    inputs = drawn_inputs(frame, count, seed)
+    points = inputs.points
     method = MethodOptions(iterations=settings.iterations, lr=settings.lr, update=settings.update)
     result = refined(
         network,

@@ -28,9 +28,7 @@ from benchmarks.frames import (
     REGISTRATIONS,
     SETS,
     EvalFrame,
-    frame_inputs,
-    frame_pixels,
-    points_on_grid,
+    drawn_inputs,
     refined,
     registered,
     without_occluded,
@@ -63,8 +61,7 @@ def measure(network: Network, frame: EvalFrame, count: int | None, seed: int) ->
     """MAE and RMSE of every column on one frame, the choice, and its time."""
     if count is None:  # as the commands read a projected scan
         frame = without_occluded(frame)
-    points = points_on_grid(*frame_pixels(frame, count, seed), frame.gt.shape)
-    inputs = frame_inputs(frame.rgb, points, frame.gt)
+    inputs = drawn_inputs(frame, count, seed)
     refiner = refiner_of(RefineRequest(), [network], inputs)
     assert refiner.competition is not None
     start = time.process_time()

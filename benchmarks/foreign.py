@@ -20,10 +20,8 @@ import torch
 
 from benchmarks.frames import (
     EvalFrame,
-    frame_inputs,
-    frame_pixels,
+    drawn_inputs,
     kitti_dc,
-    points_on_grid,
     refined,
     seven_scenes,
 )
@@ -79,9 +77,7 @@ def error(
     network: Network, layer: str, settings: RefineSettings, frame: EvalFrame, count: int | None
 ) -> tuple[float, float, float, float]:
     """MAE and RMSE before and after, on all pixels with known ground truth."""
-    rows, columns, depth = frame_pixels(frame, count, seed=0)
-    points = points_on_grid(rows, columns, depth, frame.gt.shape)
-    result = refined(network, layer, settings, frame_inputs(frame.rgb, points, frame.gt))
+    result = refined(network, layer, settings, drawn_inputs(frame, count, seed=0))
     gt = torch.from_numpy(frame.gt)
     before, after = (score(torch.from_numpy(d), gt) for d in (result.before, result.after))
     return before.mae, before.rmse, after.mae, after.rmse

@@ -144,6 +144,12 @@ def frame_inputs(rgb: NDArray[np.float32], points: SparsePoints, gt: Depth) -> I
     return Inputs(rgb=rgb, points=points, gt=gt, sparse_scale=None, record={}, notes=())
 
 
+def drawn_inputs(frame: EvalFrame, count: int | None, seed: int) -> Inputs:
+    """The frame with points of its ground truth, or with all points of its LiDAR (None)."""
+    points = points_on_grid(*frame_pixels(frame, count, seed), frame.gt.shape)
+    return frame_inputs(frame.rgb, points, frame.gt)
+
+
 def refined(network: Network, layer: str, settings: RefineSettings, inputs: Inputs) -> RefinedFrame:
     """The refinement of a frame with all of its points."""
     with network.cut_at(layer) as split:

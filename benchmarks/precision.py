@@ -14,7 +14,7 @@ from pathlib import Path
 
 import torch
 
-from benchmarks.frames import SETS, frame_inputs, frame_pixels, points_on_grid
+from benchmarks.frames import SETS, drawn_inputs
 from benchmarks.frames import refined as refined_frame
 from pnpdepth_cli.core.metrics import score
 from pnpdepth_cli.models.network import load_network
@@ -48,8 +48,7 @@ def real(data: Path, name: str, count: int) -> Iterator[tuple[str, Inputs]]:
     """The first frames of a set."""
     number = None if name == "kitti_dc" else 500
     for frame in islice(SETS[name](data), count):
-        points = points_on_grid(*frame_pixels(frame, number, seed=0), frame.gt.shape)
-        yield frame.name, frame_inputs(frame.rgb, points, frame.gt)
+        yield frame.name, drawn_inputs(frame, number, seed=0)
 
 
 def main() -> None:

@@ -17,10 +17,8 @@ import torch
 from numpy.typing import NDArray
 
 from benchmarks.frames import (
-    frame_inputs,
-    frame_pixels,
+    drawn_inputs,
     kitti_dc,
-    points_on_grid,
     refined,
     without_occluded,
 )
@@ -121,9 +119,9 @@ def projected_maps(data: Path) -> None:
         ground_truth = torch.from_numpy(frame.gt)
         row = []
         for given in (frame, without_occluded(frame)):
-            points = points_on_grid(*frame_pixels(given, None, 0), frame.gt.shape)
-            result = refined(network, layer, settings, frame_inputs(frame.rgb, points, frame.gt))
-            for depth in (linear(points), torch.from_numpy(result.after)):
+            inputs = drawn_inputs(given, None, 0)
+            result = refined(network, layer, settings, inputs)
+            for depth in (linear(inputs.points), torch.from_numpy(result.after)):
                 row.append(score(depth, ground_truth).mae)
         errors["odd" if number % 2 else "even"].append(row)
     for half, rows in errors.items():

@@ -16,9 +16,7 @@ from benchmarks.accuracy import opened
 from benchmarks.frames import (
     SETS,
     EvalFrame,
-    frame_inputs,
-    frame_pixels,
-    points_on_grid,
+    drawn_inputs,
     without_occluded,
 )
 from pnpdepth_cli.auto.auto import refine_automatically
@@ -47,8 +45,7 @@ def coverage(
     """Fractions of the ground truth within ± 1, 2, 3 and 4 σ."""
     if count is None:
         frame = without_occluded(frame)
-    points = points_on_grid(*frame_pixels(frame, count, 0), frame.gt.shape)
-    inputs = frame_inputs(frame.rgb, points, frame.gt)
+    inputs = drawn_inputs(frame, count, 0)
     request = RefineRequest(method=MethodOptions(preset=preset), hold_out=HoldOut(uncertainty=True))
     refiner = refiner_of(request, [network], inputs)
     assert refiner.competition is not None

@@ -22,7 +22,7 @@ import torch
 from numpy.typing import NDArray
 
 from benchmarks.accuracy import opened
-from benchmarks.frames import SETS, frame_inputs, frame_pixels, points_on_grid
+from benchmarks.frames import SETS, drawn_inputs
 from benchmarks.sequences import inputs_of, split
 from pnpdepth_cli.frames.frame import Carried, Frame
 from pnpdepth_cli.frames.refine import refine_frame
@@ -65,9 +65,7 @@ def cases(data: Path, name: str, count: int, frames: int, seed: int, reach: int)
     """Yields consecutive frames of a set."""
     if name != KITTI:
         for each in list(SETS[name](data))[:frames]:
-            rows, columns, depth = frame_pixels(each, count, seed)
-            points = points_on_grid(rows, columns, depth, each.gt.shape)
-            yield Case(frame=frame_inputs(each.rgb, points, each.gt).frame(), gt=each.gt)
+            yield Case(frame=drawn_inputs(each, count, seed).frame(), gt=each.gt)
         return
     for inputs in inputs_of(data, reach)[:frames]:
         used, held = split(inputs.points, "points", seed)
