@@ -35,12 +35,11 @@ from benchmarks.frames import (
     refined,
 )
 from model_zoo_defs.training.learning.dataset import Frames
-from pnpdepth_cli.auto.auto import AutoRefined, refine_automatically
-from pnpdepth_cli.auto.predictions import OpenNetworks
-from pnpdepth_cli.auto.uncertainty import uncertainty
 from pnpdepth_cli.choices import BASELINES
 from pnpdepth_cli.core.metrics import score
 from pnpdepth_cli.core.refine import RefineSettings
+from pnpdepth_cli.frames.frame import RefinedFrame
+from pnpdepth_cli.frames.uncertainty import uncertainty
 from pnpdepth_cli.models.definition import Normalisation
 from pnpdepth_cli.models.network import Network, load_network
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs
@@ -123,7 +122,7 @@ def measure(
     outliers: float,
     with_sigma: bool = False,
 ) -> dict[str, object]:
-    """Errors of every variant on one frame, what the default chose, and what it cost."""
+    """Errors of every variant on one frame, and what the default cost."""
     rows, columns, depth = frame_pixels(frame, count, seed)
     points = points_on_grid(rows, columns, depth, frame.gt.shape)
     points, outlier = with_outliers(points, outliers, seed)
@@ -146,34 +145,32 @@ def measure(
     }
     depths |= {name: baseline.depth(points, prediction) for name, baseline in BASELINES.items()}
     start = time.perf_counter()
-    default = chosen(network, inputs)
+    default = by_default(network, inputs)
     default_s = time.perf_counter() - start
-    depths[DEFAULT] = torch.from_numpy(default.frame.after)
+    depths[DEFAULT] = torch.from_numpy(default.after)
     if bool(outlier.any()):
         right = points.select(~outlier)
         of_right = frame_inputs(frame.rgb, right, frame.gt)
-        inliers_only = chosen(network, of_right)
-        depths[INLIERS_ONLY] = torch.from_numpy(inliers_only.frame.after)
+        inliers_only = by_default(network, of_right)
+        depths[INLIERS_ONLY] = torch.from_numpy(inliers_only.after)
     within = {}
     if with_sigma:
-        sigma = uncertainty(default, default.frame.after).sigma
-        known = (frame.gt > 0) & (default.frame.after > 0)
-        inside = np.abs(frame.gt - default.frame.after)[known] <= sigma[known]
+        sigma = uncertainty(default).sigma
+        known = (frame.gt > 0) & (default.after > 0)
+        inside = np.abs(frame.gt - default.after)[known] <= sigma[known]
         within = {"within_sigma": float(inside.mean())}
     return within | {
         "errors": errors_of(depths, torch.from_numpy(frame.gt)),
-        "choice": str(default.choice),
         "plain_s": plain_s,
         "default_s": default_s,
     }
 
 
-def chosen(network: Network, inputs: Inputs) -> AutoRefined:
+def by_default(network: Network, inputs: Inputs, seed: int = 0) -> RefinedFrame:
     """The frame as `pnpdepth refine` gives it by default."""
-    refiner = refiner_of(RefineRequest(), [network], inputs)
-    assert refiner.competition is not None
-    with OpenNetworks(refiner.networks) as opened:
-        return refine_automatically(opened, refiner.competition, inputs.frame())
+    refiner = refiner_of(RefineRequest.from_fields(seed=seed), [network], inputs)
+    with refiner.opened() as opened:
+        return refiner.refine(opened, inputs)
 
 
 def errors_of(depths: dict[str, torch.Tensor], gt: torch.Tensor) -> Errors:
@@ -202,7 +199,6 @@ def summary(rows: list[dict[str, object]]) -> dict[str, object]:
         "default_s": float(np.median([row["default_s"] for row in rows])),
         "plain_s": float(np.median([row["plain_s"] for row in rows])),
         "within_sigma": float(np.mean([row.get("within_sigma", np.nan) for row in rows])),
-        "choices": [row["choice"] for row in rows],
     }
 
 

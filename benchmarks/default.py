@@ -1,11 +1,10 @@
 """What `pnpdepth refine` gives without options: `python -m benchmarks.default --data PATH`.
 
 For each network, set and number of points, means over frames and seeds of the MAE and the RMSE in
-metres: linear interpolation, the network's own refinement without any choice, the default, plain
-`compact`, and the candidate that is best of all single ones in the mean of the cell: the networks,
-their refinements, propagation of these, and the baselines. All are scored on the same pixels, those
-with ground truth. `worse` is the fraction of frames where the MAE of the default is above that of
-linear interpolation.
+metres: linear interpolation, the stages of the default method (the network aligned with the points,
+the networks fused, z updated, the residual propagated), and its result. All are scored on the same
+pixels, those with ground truth. `worse` is the fraction of frames where the MAE of the result is
+above that of linear interpolation, `moved` the fraction where the check moved it.
 
 Constants of the default were chosen on the even frames of each set (`--half even`); the odd ones
 are for reporting.
@@ -21,32 +20,26 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from torch import Tensor
 
-from benchmarks.accuracy import Case, Errors, errors_of, opened
+from benchmarks.accuracy import Case, Errors, by_default, errors_of, opened
 from benchmarks.frames import (
     REGISTRATIONS,
     SETS,
     EvalFrame,
     drawn_inputs,
-    refined,
     registered,
     without_occluded,
 )
-from pnpdepth_cli.auto.auto import AutoRefined, refine_automatically
-from pnpdepth_cli.auto.candidates import Candidate
-from pnpdepth_cli.auto.predictions import OpenNetworks
+from pnpdepth_cli.completion.interpolation import linear
 from pnpdepth_cli.models.network import Network
-from pnpdepth_cli.pipeline.refinement.load_refiner import refiner_of
-from pnpdepth_cli.pipeline.refinement.request import MethodOptions, RefineRequest
-from pnpdepth_cli.pipeline.refinement.resolve import resolve_settings
 
 ROOMS = ("7scenes", "icl_nuim")
 COUNTS = (20, 100, 500)
 OF_ROOMS = ("fastdepth", "compact", "fcrn-tiny", "eigen-tiny")
 OF_STREETS = ("fastdepth", "compact", "sparse2dense-tiny-kitti", "sfmlearner-tiny")
-BASELINES = ("linear", "linear-log", "idw", "local")
-"""Baselines among the single candidates; the others were nowhere the best."""
+REPORT_ONLY = ("tum_fr1_rpy", "tum_fr3_cabinet")
+OF_SENSORS = ("pncnn", "nconv")
+"""Networks trained for KITTI's scanner."""
 
 
 def cells() -> Iterator[Case]:
@@ -54,7 +47,10 @@ def cells() -> Iterator[Case]:
     for frames in ROOMS:
         for points in COUNTS:
             yield from (Case(network, frames, points) for network in OF_ROOMS)
-    yield from (Case(network, "kitti_dc", None) for network in OF_STREETS)
+    yield from (Case(network, "kitti_dc", None) for network in (*OF_STREETS, *OF_SENSORS))
+    for frames in REPORT_ONLY:
+        for points in COUNTS:
+            yield from (Case(network, frames, points) for network in ("fastdepth", "compact"))
 
 
 def measure(network: Network, frame: EvalFrame, count: int | None, seed: int) -> dict[str, object]:
@@ -62,33 +58,17 @@ def measure(network: Network, frame: EvalFrame, count: int | None, seed: int) ->
     if count is None:  # as the commands read a projected scan
         frame = without_occluded(frame)
     inputs = drawn_inputs(frame, count, seed)
-    refiner = refiner_of(RefineRequest(), [network], inputs)
-    assert refiner.competition is not None
     start = time.process_time()
-    with OpenNetworks(refiner.networks) as networks:
-        auto = refine_automatically(networks, refiner.competition, inputs.frame(), seed=seed)
-        seconds = time.process_time() - start
-        depths = dict(single_candidates(auto))
-    settings = resolve_settings(network.definition, MethodOptions())
-    plain = refined(network, refiner.layer, settings, inputs)
-    depths |= {
-        "unguarded": torch.from_numpy(plain.after),
-        "default": torch.from_numpy(auto.frame.after),
-    }
+    refined = by_default(network, inputs, seed)
+    seconds = time.process_time() - start
+    depths = {"linear": linear(inputs.points), "result": torch.from_numpy(refined.after)}
+    depths |= {name: torch.from_numpy(depth) for name, depth in refined.stages.items()}
+    moved = not np.array_equal(refined.after, refined.stages["propagated"])
     return {
         "errors": errors_of(depths, torch.from_numpy(frame.gt)),
-        "choice": str(auto.choice),
         "cpu_s": seconds,
+        "moved": moved,
     }
-
-
-def single_candidates(auto: AutoRefined) -> Iterator[tuple[str, Tensor]]:
-    """Depth (H, W) of the candidates that are no mean of several, from all points."""
-    for scored in auto.choice.scored:
-        candidate = scored.candidate
-        of_network = candidate.config is not None
-        if of_network or (candidate in {Candidate(baseline=name) for name in BASELINES}):
-            yield str(candidate), auto.depths.dense(candidate)
 
 
 def summary(rows: list[dict[str, object]]) -> dict[str, object]:
@@ -96,40 +76,31 @@ def summary(rows: list[dict[str, object]]) -> dict[str, object]:
     errors: list[Errors] = [row["errors"] for row in rows]  # type: ignore[misc]
     names = [name for name in errors[0] if all(name in each for each in errors)]
     mean = {n: tuple(float(np.mean([e[n][k] for e in errors])) for k in (0, 1)) for n in names}
-    singles = [name for name in names if name not in ("default", "unguarded")]
-    worse = [each["default"][0] > each["linear"][0] for each in errors]
+    worse = [each["result"][0] > each["linear"][0] for each in errors]
     return {
         "frames": len(rows),
         "mean": mean,
-        "best": min(singles, key=lambda name: mean[name][0]),
         "worse": float(np.mean(worse)),
+        "moved": float(np.mean([row["moved"] for row in rows])),
         "cpu_s": float(np.median([row["cpu_s"] for row in rows])),
-        "choices": [row["choice"] for row in rows],
     }
 
 
-HEAD = (
-    "network", "set, runs", "points", "linear", "unguarded", "`compact`", "best single candidate",
-    "default", "default / linear", "default / best", "worse",
-)  # fmt: skip
+STAGES = ("linear", "aligned", "fused", "updated", "propagated", "result")
+HEAD = ("network", "set, runs", "points", *STAGES, "result / linear", "worse", "moved", "CPU s")
 
 
 def table_row(cell: Case, measured: dict[str, object]) -> str:
     """A line of the table."""
     mean: dict[str, tuple[float, float]] = measured["mean"]  # type: ignore[assignment]
-    best = str(measured["best"])
-
-    def pair(name: str) -> str:
-        return f"{mean[name][0]:.4f} / {mean[name][1]:.3f}" if name in mean else "–"
-
-    short = best if len(best) < 40 else best.split("(")[0] + "…" + best.split(")")[-1]
+    values = [f"{mean[name][0]:.4f} / {mean[name][1]:.3f}" for name in STAGES]
+    values[-1] = f"**{values[-1]}**"
     cells_ = [
         *(cell.network, f"{cell.frames}, {measured['frames']}", str(cell.points or "LiDAR")),
-        *(pair("linear"), pair("unguarded"), pair("compact")),
-        f"{pair(best)} ({short})",
-        f"**{pair('default')}**",
-        *(f"{mean['default'][0] / mean[name][0]:.3f}" for name in ("linear", best)),
-        f"{measured['worse']:.0%}",
+        *values,
+        f"{mean['result'][0] / mean['linear'][0]:.3f}",
+        *(f"{measured[name]:.0%}" for name in ("worse", "moved")),
+        f"{measured['cpu_s']:.1f}",
     ]
     return "| " + " | ".join(cells_) + " |"
 

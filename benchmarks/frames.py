@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -70,7 +70,25 @@ def nyu(root: Path) -> Iterator[EvalFrame]:
         yield EvalFrame(path.stem, read_rgb(path).values, read_depth(depth, scale=1000).values)
 
 
-SETS = {"7scenes": seven_scenes, "icl_nuim": icl_nuim, "kitti_dc": kitti_dc}
+def rgbd(folder: str, scale: float) -> Callable[[Path], Iterator[EvalFrame]]:
+    """Returns the frames of a folder with `image/*.jpg` and `depth/*.png` of this scale."""
+
+    def frames(root: Path) -> Iterator[EvalFrame]:
+        for path in sorted((root / folder / "image").glob("*.jpg")):
+            depth = root / folder / "depth" / f"{path.stem}.png"
+            yield EvalFrame(path.stem, read_rgb(path).values, read_depth(depth, scale=scale).values)
+
+    return frames
+
+
+SETS = {
+    "7scenes": seven_scenes,
+    "icl_nuim": icl_nuim,
+    "kitti_dc": kitti_dc,
+    "tum_fr1_rpy": rgbd("tum_fr1_rpy", 5000),
+    "tum_fr3_cabinet": rgbd("tum_fr3_cabinet", 5000),
+    "realsense": rgbd("realsense_unregistered", 1000),
+}
 
 
 def sampled(gt: Depth, count: int, seed: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

@@ -31,12 +31,12 @@ from benchmarks.frames import (
     without_occluded,
 )
 from pnpdepth_cli.core.metrics import score
-from pnpdepth_cli.frames.frame import DepthMap
+from pnpdepth_cli.frames.frame import DepthMap, is_dense
 from pnpdepth_cli.frames.refine import refine_frame, with_propagation
 from pnpdepth_cli.models.network import Network
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs
 from pnpdepth_cli.pipeline.refinement.request import HoldOut, MethodOptions
-from pnpdepth_cli.pipeline.refinement.resolve import is_dense, resolve_layer, resolve_settings
+from pnpdepth_cli.pipeline.refinement.resolve import resolve_layer, resolve_settings
 
 _OUTLIER_FACTORS = (0.3, 3.0)
 """Range of the factor on the depth of outliers."""

@@ -13,6 +13,7 @@ from unittest.mock import patch
 
 import numpy as np
 import torch
+from pnpdepth_cli.auto import cross_validation
 from scipy.stats import kendalltau
 from torch import Tensor
 
@@ -24,7 +25,6 @@ from benchmarks.frames import (
     points_on_grid,
     without_occluded,
 )
-from pnpdepth_cli.auto import cross_validation
 from pnpdepth_cli.choices import BASELINES
 from pnpdepth_cli.completion.outliers import inlier_weights
 from pnpdepth_cli.frames.refine import refine_frame

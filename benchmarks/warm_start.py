@@ -24,14 +24,14 @@ from numpy.typing import NDArray
 from benchmarks.accuracy import opened
 from benchmarks.frames import SETS, drawn_inputs
 from benchmarks.sequences import inputs_of, split
-from pnpdepth_cli.frames.frame import Carried, Frame
+from pnpdepth_cli.frames.frame import Frame, WarmStart, is_dense
 from pnpdepth_cli.frames.refine import refine_frame
 from pnpdepth_cli.frames.warm_start import refine_next
 from pnpdepth_cli.models.network import Network
 from pnpdepth_cli.pipeline.evaluation.measured_frame import MeasuredFrame
 from pnpdepth_cli.pipeline.evaluation.measures.flicker import flicker
 from pnpdepth_cli.pipeline.refinement.request import HoldOut, MethodOptions
-from pnpdepth_cli.pipeline.refinement.resolve import is_dense, resolve_layer, resolve_settings
+from pnpdepth_cli.pipeline.refinement.resolve import resolve_layer, resolve_settings
 
 KITTI = "kitti_raw"
 Depth = NDArray[np.float32]
@@ -79,13 +79,13 @@ def refined(
     dense = is_dense(sequence[0].frame.points)
     settings = resolve_settings(network.definition, method, HoldOut(), dense=dense)
     layer = resolve_layer(network.definition, method.layer)
-    depths, seconds, taken, carried = [], [], 0, Carried()
+    depths, seconds, taken, carried = [], [], 0, WarmStart()
     with network.cut_at_points() if settings.masked else network.cut_at(layer) as split_:
         for case in sequence:
             start = time.process_time()
             if warm:
                 frame = refine_next(network, split_, settings, case.frame, carried)
-                carried, taken = frame.carried or Carried(), taken + frame.refinement.warm
+                carried, taken = frame.carried or WarmStart(), taken + frame.refinement.warm
             else:
                 frame = refine_frame(network, split_, settings, case.frame)
             seconds.append(time.process_time() - start)

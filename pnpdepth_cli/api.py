@@ -14,12 +14,11 @@ from numpy.typing import ArrayLike, NDArray
 from pnpdepth_cli.core.metrics import DELTA_THRESHOLDS, Scores
 from pnpdepth_cli.core.metrics import score as score_tensors
 from pnpdepth_cli.core.refine import RefineSettings
-from pnpdepth_cli.errors import DivergedError, InputError, NoPointsError, SizeError, UsageError
+from pnpdepth_cli.errors import DivergedError, InputError, NoPointsError, SizeError
 from pnpdepth_cli.models import network as networks
 from pnpdepth_cli.models.network import Network
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs, registration_of
 from pnpdepth_cli.pipeline.refinement.load_refiner import refiner_of
-from pnpdepth_cli.pipeline.refinement.method import needs_folds
 from pnpdepth_cli.pipeline.refinement.refiner import Opened
 from pnpdepth_cli.pipeline.refinement.refiner import Refiner as FrameRefiner
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest
@@ -84,18 +83,14 @@ class RefinerOptions(TypedDict, total=False):
     target: str
     """"given", or "masked" to update weights by points hidden from the network's input."""
     propagate: str | None
-    """Propagation of the residuals at the points: "none", "gp" or "diffusion". None is "none", or
-    with `auto` the best at held-out points."""
-    auto: bool | None
-    """Take the best candidate at held-out points, for each frame: the network, its refinement,
-    propagation, `compact`, every baseline, and blends. None: only if neither layer, settings,
-    propagate nor tile is given."""
+    """Propagation of the residuals at the points: "none", "gp" or "diffusion". None is "none" with
+    another option of the method, which is `layer`, `settings`, `target` or `tile`."""
     uncertainty: bool
     """Also estimate the standard deviation of the depth."""
     tile: int | None
     """Refine larger frames in tiles of this side length, pixels."""
     seed: int
-    """Of the random choices of `auto`, `uncertainty` and the masks."""
+    """Of the hidden points and the masks."""
     registration: str | tuple[float, float, float]
     """Whether the image is moved into the frame of the points: "auto", if their depth edges show
     that it is not registered; "off"; or by (zoom, right, down), pixels."""
@@ -113,7 +108,6 @@ class Refiner:
 
     Raises:
         TypeError: There is no option of this name.
-        UsageError: `tile` is combined with `auto` or `uncertainty`.
     """
 
     def __init__(self, network: Network, **options: Unpack[RefinerOptions]) -> None:
@@ -121,12 +115,9 @@ class Refiner:
             raise TypeError(f"a Refiner has no options {', '.join(sorted(unknown))}")
         self._network = network
         self._settings = options.pop("settings", None)
-        auto = options.pop("auto", None)
-        if not auto and (self._settings is not None or auto is False):
+        if self._settings is not None:
             options.setdefault("propagate", "none")  # an option of the method fixes it
-        self._request = RefineRequest.from_fields(auto=bool(auto), **options)
-        if options.get("tile") is not None and needs_folds(self._request):
-            raise UsageError("tile cannot be combined with auto and uncertainty")
+        self._request = RefineRequest.from_fields(**options)
         self._open = ExitStack()
         self._opened: tuple[FrameRefiner, Opened] | None = None
 

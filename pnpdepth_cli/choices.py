@@ -128,7 +128,7 @@ Align = Literal["none", "median", "scale", "affine", "auto"]
 ALIGNMENTS: tuple[Align, ...] = get_args(Align)
 """How the network's output is fitted to the sparse points."""
 
-PRESETS = ("paper", "fast")
+PRESETS = ("paper",)
 """Methods by one name: `pnpdepth_cli.pipeline.refinement.method.PRESETS`."""
 
 Space = Literal["depth", "inverse", "log"]

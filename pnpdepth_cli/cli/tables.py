@@ -42,12 +42,89 @@ def print_refinement(record: Mapping[str, Any]) -> None:
     """Prints the end of `pnpdepth refine`: notes, errors before and after, files, times."""
     console = Console(stderr=True, highlight=False)
     _print_notes(console, record["notes"])
-    settings, points = record["settings"], record["points"]
-    beside = record["linear"]
-    table = Table(title=escape(_title(record)))
+    settings, beside = record["settings"], record["linear"]
+    is_default = record["method"]["kind"] == "default"
+    console.print(_stages(record) if is_default else _before_and_after(record))
+    if beside["worse"]:
+        console.print(
+            "[yellow]warning: this depth is worse than linear interpolation of the points[/]"
+        )
+    if record["baselines"] is not None:
+        console.print(_baselines(record["baselines"], record["unit"]))
+    if record["improved_fraction"] is not None:
+        where = "pixels with ground truth" if record["scores"] else "points"
+        console.print(f"improved: {record['improved_fraction']:.1%} of the {where}")
+    seconds = record["seconds"]
+    updates = (
+        f"{settings['iterations']} updates ({settings['update']}, {settings['loss']}, step"
+        f" {settings['step']:.3g}) · "
+    )
+    console.print(
+        ("" if is_default else updates)
+        + ", ".join(f"{stage} {spent:.2f} s" for stage, spent in seconds.items())
+        + f" · peak {record['peak_memory_mb']['process']:,.0f} MB",
+        soft_wrap=True,
+    )
+    written = [path for path in record["outputs"].values() if path]
+    console.print("wrote " + escape("  ".join(written)), soft_wrap=True)
+
+
+_STAGES_OF_DEFAULT = {
+    "aligned": "{name} aligned",
+    "fused": "with points, fused",
+    "updated": "z updated",
+    "propagated": "residual propagated",
+    "result": "result",
+    "linear": "linear interpolation",
+}
+"""Rows of the default method, by the name of the stage."""
+_STAGE_SCORES = ("RMSE", "MAE", "MRE", "δ1")
+
+
+def _stages(record: Mapping[str, Any]) -> Table:
+    """The stages of the default method: scores on the ground truth, or errors at hidden points."""
+    beside, unit = record["linear"], record["unit"]
+    names = " + ".join(record["method"]["networks"])
+    table = Table(title=escape(names))
+    table.add_column("")
+    if record["stages"] is not None:
+        rows = {each["stage"]: each["scores"] for each in record["stages"]}
+        rows |= {"result": record["scores"]["after"], "linear": beside["scores"]}
+        known = rows["linear"]
+        columns = [(title, key, show) for title, key, show in _SCORES if title in _STAGE_SCORES]
+        table.caption = (
+            f"scored on {known['pixels']:,} pixels of ground truth"
+            f" ({known['coverage']:.1%} of those known)"
+        )
+    elif (check := beside["check"]) is not None:
+        rows = {name: {"mae": check[name]} for name in _STAGES_OF_DEFAULT if name in check}
+        columns = [("MAE", "mae", partial(_length, unit=unit))]
+        table.caption = f"at {check['points']:,} points that were hidden from the method"
+    else:
+        table.caption = "too few points to hide some and check the result"
+        return table
+    if len(record["method"]["networks"]) == 1:
+        rows.pop("fused", None)
+    if rows["result"]["mae"] == rows["propagated"]["mae"]:
+        del rows["result"]
+    for title, *_ in columns:
+        table.add_column(title, justify="right")
+    table.add_column("MAE vs linear", justify="right")
+    for name, scores in rows.items():
+        title = _STAGES_OF_DEFAULT[name].format(name=record["model"]["name"])
+        against = "" if name == "linear" else _change("mae", rows["linear"]["mae"], scores["mae"])
+        last = name == [row for row in rows if row != "linear"][-1]
+        cells = [show(scores[key]) for _, key, show in columns]
+        table.add_row(escape(title), *cells, against, style="bold" if last else None)
+    return table
+
+
+def _before_and_after(record: Mapping[str, Any]) -> Table:
+    """The errors of a fixed method before and after, beside linear interpolation."""
+    points, beside, unit = record["points"], record["linear"], record["unit"]
+    table = Table(title=escape(f"{record['model']['name']} cut at {record['settings']['layer']}"))
     for column in _COLUMNS:
         table.add_column(column, justify="left" if not column else "right")
-    unit = record["unit"]
     used = f"error at {points['used']:,} points used"
     _point_rows(table, used, record["sparse_error"], unit=unit)
     held_out = f"error at {points['held_out']:,} held-out points"
@@ -59,41 +136,10 @@ def print_refinement(record: Mapping[str, Any]) -> None:
             f"scored on {after['pixels']:,} pixels of ground truth"
             f" ({after['coverage']:.1%} of those known)"
         )
-    elif (folds := beside["folds"]) is not None:
-        _fold_row(table, f"error at {folds['points']:,} points in turn held out, MAE", folds, unit)
-    console.print(table)
-    if beside["worse"]:
-        console.print(
-            "[yellow]warning: this depth is worse than linear interpolation of the points[/]"
-        )
-    if record["baselines"] is not None:
-        console.print(_baselines(record["baselines"], unit))
-    if record["improved_fraction"] is not None:
-        where = "pixels with ground truth" if record["scores"] else "points"
-        console.print(f"improved: {record['improved_fraction']:.1%} of the {where}")
-    seconds = record["seconds"]
-    updates = (
-        f"{settings['iterations']} updates ({settings['update']}, {settings['loss']}, step"
-        f" {settings['step']:.3g}) · "
-    )
-    console.print(
-        (updates if record["auto"] is None else "")
-        + ", ".join(f"{stage} {spent:.2f} s" for stage, spent in seconds.items())
-        + f" · peak {record['peak_memory_mb']['process']:,.0f} MB",
-        soft_wrap=True,
-    )
-    written = [path for path in record["outputs"].values() if path]
-    console.print("wrote " + escape("  ".join(written)), soft_wrap=True)
-
-
-def _title(record: Mapping[str, Any]) -> str:
-    """What the depth comes from."""
-    name, choice = record["model"]["name"], record["auto"]
-    if choice is None:
-        return f"{name} cut at {record['settings']['layer']}"
-    if not choice["uses_network"]:
-        return f"best candidate at held-out points, without {name}"
-    return f"{name}, best candidate at held-out points"
+    elif (check := beside["check"]) is not None:
+        errors = {"before": check["aligned"], "after": check["result"], "linear": check["linear"]}
+        _check_row(table, f"error at {check['points']:,} hidden points, MAE", errors, unit)
+    return table
 
 
 def _baselines(rows: Mapping[str, Any], unit: str) -> Table:
@@ -136,9 +182,9 @@ def print_batch(summary: Mapping[str, Any]) -> None:
         if mean["scores"] is not None:
             _score_rows(table, mean["scores"], beside["scores"])
             table.caption = f"scored on the ground truth of {mean['scores']['frames']:,} frames"
-        elif mean["held_out_error"] is None and (folds := beside["folds"]) is not None:
-            title = f"error at points in turn held out, {folds['frames']:,} frames, MAE"
-            _fold_row(table, title, folds, unit)
+        elif mean["held_out_error"] is None and (check := beside["check"]) is not None:
+            title = f"error at hidden points, {check['frames']:,} frames, MAE"
+            _check_row(table, title, check, unit)
         console.print(table)
     if summary["baselines"]:
         rows = {
@@ -246,7 +292,7 @@ def _score_rows(table: Table, scores: Mapping[str, Any], linear: Mapping[str, An
         table.add_row(title, *_cells(key, show, values))
 
 
-def _fold_row(table: Table, title: str, errors: Mapping[str, float], unit: str) -> None:
+def _check_row(table: Table, title: str, errors: Mapping[str, float], unit: str) -> None:
     values = errors["before"], errors["after"], errors["linear"]
     table.add_row(title, *_cells("mae", partial(_length, unit=unit), values))
 

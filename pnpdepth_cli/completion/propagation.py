@@ -53,6 +53,8 @@ class Propagated:
     """(H, W) float32 metres, 0 = unknown."""
     sigma: Tensor | None = None
     """(H, W) float32 metres, standard deviation of the depth. None if it was not asked for."""
+    kernel: Kernel | None = None
+    """The kernel that fits the residual best. None with "none"."""
 
 
 def propagate(
@@ -71,7 +73,7 @@ def propagate(
         rgb: (3, H, W) in 0…1, or None.
         kind: A name in `choices.PROPAGATIONS`, or "none".
         sigma: Whether the standard deviation is wanted. It is estimated from the same points; where
-            these have been fitted before, `auto.uncertainty.calibration` says how much too small
+            these have been fitted before, `frames.uncertainty.calibration` says how much too small
             it is.
 
     Raises:
@@ -91,9 +93,8 @@ def propagate(
         residual, deviation = propagation.dense(field), None
     factor = _clamped(residual, field).exp().to(prediction.device)
     depth = torch.where(known, prediction * factor, 0.0).float()
-    if deviation is None:
-        return Propagated(depth=depth)
-    return Propagated(depth=depth, sigma=depth * deviation.to(depth.device))
+    sigma_m = None if deviation is None else depth * deviation.to(depth.device)
+    return Propagated(depth=depth, sigma=sigma_m, kernel=field.kernel)
 
 
 def propagate_at(
@@ -113,7 +114,7 @@ def propagate_at(
         rgb: (3, H, W) in 0…1, or None.
         xy: (M, 2) pixel coordinates.
         kind: As of `propagate`, which has the errors too.
-        kernel: What `fitted_kernel` gave. None: it is fitted.
+        kernel: Of an earlier propagation. None: it is fitted.
     """
     propagation = None if kind == NONE else PROPAGATIONS[kind]
     queries = SparsePoints(xy=xy, depth=torch.ones_like(xy[:, 0]), size=points.size)
@@ -129,15 +130,6 @@ def propagate_at(
     else:
         residual = propagation.at(field, queries)
     return (predicted * _clamped(residual, field).exp().to(predicted.device)).float()
-
-
-def fitted_kernel(
-    prediction: Tensor, points: SparsePoints, rgb: Tensor | None, kind: str
-) -> Kernel:
-    """Returns the kernel that fits the residual best; arguments and errors as of `propagate`."""
-    field = without_outliers(residual_field(prediction, points, rgb))
-    kernel: Kernel = PROPAGATIONS[kind].fit(field).kernel
-    return kernel
 
 
 def _clamped(residual: Tensor, field: ResidualField) -> Tensor:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import Any
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -15,6 +15,7 @@ from pnpdepth_cli.completion.image_registration import ImageRegistration
 from pnpdepth_cli.core.refine import Refinement
 from pnpdepth_cli.core.weights import MovingWeights
 from pnpdepth_cli.errors import DivergedError
+from pnpdepth_cli.models.definition import DENSE_SPACING
 from pnpdepth_cli.points import SparsePoints
 
 DepthMap = NDArray[np.float32]
@@ -52,7 +53,7 @@ class Frame:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Carried:
+class WarmStart:
     """What a frame of a window may take over from the frame before; the first has nothing."""
 
     change: Tensor | None = None
@@ -87,19 +88,69 @@ class RefinedFrame:
     """(H, W) metres, standard deviation of `after`. None if it was not asked for."""
     valid: NDArray[np.bool_] | None = None
     """(H, W), where points support `after`. None without `sigma`."""
-    choice: dict[str, Any] | None = None
-    """What was chosen by held-out points, for a record."""
-    interpolation: dict[str, Any] | None = None
-    """Mean absolute errors in metres of the network (before), of linear interpolation and of the
-    result (after) at points that were held out in turns, for a record."""
-    baselines: dict[str, dict[str, Any]] | None = None
-    """Scores of the baselines, for a record."""
+    stages: Mapping[str, DepthMap] = field(default_factory=dict)
+    """(H, W) metres after each stage of the default method, by its name."""
+    check: Check | None = None
+    """The method and its stages at hidden points. None for a fixed method, or with few points."""
+    steps: Mapping[str, int] = field(default_factory=dict)
+    """Kept steps by hidden points, by network."""
     registration: ImageRegistration | None = None
     """How the image was moved into the frame of the points. None: it was not."""
     in_window: bool = False
     """Whether it was refined as a frame of a window, which may begin where the one before ended."""
-    carried: Carried | None = None
+    carried: WarmStart | None = None
     """What the next frame of the window may begin with; dropped once that has begun."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Check:
+    """Depth at points that were hidden from the method.
+
+    The predictions are those of the default method, without updates of z in networks that take
+    points, from four fifths of the points.
+    """
+
+    hidden: SparsePoints
+    """The M hidden points."""
+    kept: SparsePoints
+    """The other points."""
+    network: Tensor
+    """(H, W) metres, 0 = unknown: the user's network, aligned with the kept points."""
+    weights: Tensor
+    """(M,) 0…1, how consistent each hidden point is with its neighbours."""
+    predicted: Mapping[str, Tensor]
+    """(M,) metres at the hidden points, by stage; also of linear interpolation and the result."""
+
+    def with_prediction(self, name: str, depth: Tensor) -> Check:
+        """Returns the same check with a prediction (M,) metres at the hidden points added."""
+        return replace(self, predicted={**self.predicted, name: depth})
+
+    def error(self, name: str) -> float:
+        """Returns the weighted mean absolute error of a prediction in metres.
+
+        A point without prediction counts as far off as a depth of 0 is.
+        """
+        error = (self.predicted[name] - self.hidden.depth).abs()
+        return float((error * self.weights).sum() / self.weights.sum())
+
+    def gain(self, name: str, other: str) -> float:
+        """Returns by how many standard errors one prediction is better than another, in log depth.
+
+        Negative where it is worse.
+        """
+        at = [self.predicted[n].clamp_min(1e-6).log() for n in (name, other)]
+        truth = self.hidden.depth.log()
+        gain = (at[1] - truth).abs() - (at[0] - truth).abs()
+        share = self.weights / self.weights.sum()
+        mean = (share * gain).sum()
+        deviation = (share.square() * (gain - mean).square()).sum().sqrt()
+        return float(mean / deviation.clamp_min(1e-12))
+
+
+def is_dense(points: SparsePoints) -> bool:
+    """Returns whether the mean spacing of the points is below `DENSE_SPACING` pixels."""
+    height, width = points.size
+    return height * width < DENSE_SPACING**2 * len(points)
 
 
 def no_points(points: SparsePoints) -> SparsePoints:

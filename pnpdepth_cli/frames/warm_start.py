@@ -17,7 +17,7 @@ from pnpdepth_cli.core.refine import Refinement, RefineSettings, refine_from, re
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.core.weights import MovingWeights
 from pnpdepth_cli.errors import DivergedError, PnpDepthError
-from pnpdepth_cli.frames.frame import Carried, Frame, RefinedFrame
+from pnpdepth_cli.frames.frame import Frame, RefinedFrame, WarmStart
 from pnpdepth_cli.frames.prepare import PreparedFrame, prepare
 from pnpdepth_cli.frames.refine import opened_frame, to_refined_frame
 from pnpdepth_cli.models.aligned import AlignedDepth
@@ -29,7 +29,7 @@ def refine_next(
     split: Split,
     settings: RefineSettings,
     frame: Frame,
-    carried: Carried,
+    carried: WarmStart,
     *,
     propagation: str = "none",
 ) -> RefinedFrame:
@@ -40,7 +40,7 @@ def refine_next(
         split: The network cut at a layer, or at its sparse depth; open.
         settings: What is updated and how.
         frame: The frame, in the image frame.
-        carried: Of the frame before; `Carried()` for the first of a window.
+        carried: Of the frame before; `WarmStart()` for the first of a window.
         propagation: As of `refine_frame`.
 
     Raises:
@@ -61,8 +61,8 @@ def refine_next(
 
 
 def _with_z(
-    split: Split, settings: RefineSettings, frame: PreparedFrame, carried: Carried
-) -> tuple[Refinement | PnpDepthError, AlignedDepth, Carried]:
+    split: Split, settings: RefineSettings, frame: PreparedFrame, carried: WarmStart
+) -> tuple[Refinement | PnpDepthError, AlignedDepth, WarmStart]:
     """The refinement by updates of z, what read its depth, and what the next frame may take."""
     reader = frame.depth_reader(settings)
     with torch.no_grad():
@@ -79,13 +79,13 @@ def _with_z(
     (result,) = refine_from(split, start, [frame.points], settings, depth_of=[reader])
     last = result.last_good if isinstance(result, DivergedError) else result
     if not isinstance(last, Refinement):
-        return result, reader, Carried()
+        return result, reader, WarmStart()
     last = replace(last, before=before, warm=warm)
     if isinstance(result, DivergedError):
         result.last_good = last
-        return result, reader, Carried()
+        return result, reader, WarmStart()
     assert last.z is not None
-    return last, reader, Carried(change=last.z - z0, alignment=reader.alignment)
+    return last, reader, WarmStart(change=last.z - z0, alignment=reader.alignment)
 
 
 def _loss(frame: PreparedFrame, settings: RefineSettings, depth: Tensor) -> float:
@@ -93,8 +93,8 @@ def _loss(frame: PreparedFrame, settings: RefineSettings, depth: Tensor) -> floa
 
 
 def _with_weights(
-    split: Split, settings: RefineSettings, frame: PreparedFrame, carried: Carried
-) -> tuple[Refinement | PnpDepthError, AlignedDepth, Carried]:
+    split: Split, settings: RefineSettings, frame: PreparedFrame, carried: WarmStart
+) -> tuple[Refinement | PnpDepthError, AlignedDepth, WarmStart]:
     """The same by updates of weights."""
     reader = frame.depth_reader(settings)
     weights = MovingWeights(frame.network.module, settings.parameters, settings.mask.seed)
@@ -102,6 +102,6 @@ def _with_weights(
         with opened_frame(split, frame, reader, settings.mask.scale) as seen:
             result = refine_weights(seen, weights, settings, carried=carried.weights)
     except PnpDepthError as error:
-        return error, reader, Carried()
+        return error, reader, WarmStart()
     used = carried.weights if result.warm else weights
-    return result, reader, Carried(weights=used)
+    return result, reader, WarmStart(weights=used)

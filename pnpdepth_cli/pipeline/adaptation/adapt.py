@@ -26,6 +26,7 @@ from pnpdepth_cli.core.update_rules import Update
 from pnpdepth_cli.core.weights import MovingWeights
 from pnpdepth_cli.core.weights_refinement import FrameOfPoints
 from pnpdepth_cli.errors import DivergedError, InputError, NoPointsError
+from pnpdepth_cli.frames.frame import is_dense
 from pnpdepth_cli.frames.prepare import PreparedFrame, prepare
 from pnpdepth_cli.frames.refine import opened_frame
 from pnpdepth_cli.io.layouts import list_frames
@@ -37,7 +38,6 @@ from pnpdepth_cli.pipeline.batch.request import BatchRequest
 from pnpdepth_cli.pipeline.refinement.inputs import read_inputs
 from pnpdepth_cli.pipeline.refinement.request import HoldOut, MethodOptions
 from pnpdepth_cli.pipeline.refinement.resolve import (
-    is_dense,
     resolve_definition,
     resolve_settings,
 )

@@ -281,7 +281,7 @@ def _summarise(
         "source": str(request.source),
         "output": str(request.output),
         "layout": batch.layout,
-        "method": {"kind": "chosen" if method.chosen else "fixed", "why": method.why},
+        "method": {"kind": "default" if method.is_default else "fixed", "reason": method.reason},
         "settings": settings_of(request.refine, state.model),
         "counts": {
             "frames": len(batch.frames),

@@ -20,10 +20,9 @@ from numpy.typing import NDArray
 from pnpdepth_cli.core.refine import RefineSettings
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.errors import DeviceError, NoPointsError, PnpDepthError, UsageError
-from pnpdepth_cli.frames.frame import Carried, RefinedFrame
-from pnpdepth_cli.pipeline.refinement.against_linear import needs_comparison
+from pnpdepth_cli.frames.frame import RefinedFrame, WarmStart
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs
-from pnpdepth_cli.pipeline.refinement.method import needs_folds
+from pnpdepth_cli.pipeline.refinement.method import needs_check, resolve_method
 from pnpdepth_cli.pipeline.refinement.refiner import Opened, Refiner
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest
 from pnpdepth_cli.pipeline.refinement.resolve import moves_weights
@@ -73,7 +72,7 @@ class FrameGroups:
         self._count: dict[tuple[int, int], int] = {}  # by size, how many go together
         self._limit: dict[tuple[int, int], int] = {}  # by size, how many fit into memory
         self._inexact: set[tuple[int, int]] = set()
-        self._carried: dict[str, Carried] = {}  # of the last frame, by the first of its window
+        self._carried: dict[str, WarmStart] = {}  # of the last frame, by the first of its window
         self._alone: list[_Alone] = []  # the last frames, of one size not tried yet
 
     @property
@@ -93,12 +92,6 @@ class FrameGroups:
                 return frames
         return [self._refined_alone(inputs) for inputs in group]
 
-    def compared(self, inputs: Inputs, frame: RefinedFrame) -> RefinedFrame:
-        """Returns the frame with its error beside that of linear interpolation, if it lacks one."""
-        if not needs_comparison(inputs, frame):
-            return frame
-        return self.refiner.compared(self._opened, inputs, frame)
-
     def try_out(self) -> None:
         """Decides for a size, once enough frames of it were refined one at a time."""
         if not self._alone:
@@ -117,13 +110,13 @@ class FrameGroups:
     def _refined_in_window(self, inputs: Inputs) -> RefinedFrame | Exception:
         """The frame, beginning where the one before in its window ended; alone if that failed."""
         first, begins = inputs.window[0], len(inputs.window) == 1
-        carried = Carried() if begins else self._carried.get(first, Carried())
+        carried = WarmStart() if begins else self._carried.get(first, WarmStart())
         self._carried = {}
         try:
             frame = self.refiner.refine_next(self._opened, inputs, carried)
         except Exception as error:  # concerns this frame only
             return error
-        self._carried = {first: frame.carried or Carried()}
+        self._carried = {first: frame.carried or WarmStart()}
         return replace(frame, carried=None)
 
     def _refined_alone(self, inputs: Inputs) -> RefinedFrame | Exception:
@@ -241,8 +234,8 @@ class FrameGroups:
 
 def _why_alone(request: RefineRequest) -> str | None:
     """Why each frame has to be refined by itself; None if it need not."""
-    if needs_folds(request):
-        return "held-out points choose the method for each frame alone"
+    if resolve_method(request).is_default or needs_check(request):
+        return "the default method refines each frame alone"
     if request.network.tile is not None:
         return "tiles go through the network one by one"
     if moves_weights(request.method):

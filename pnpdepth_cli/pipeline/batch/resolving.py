@@ -96,8 +96,10 @@ def refiner_on(
         say(note)
     if first.registration == "auto":
         refiner = _with_registration(refiner, map(readable, many), say)
-    if refiner.method.chosen:
-        return _with_shortlist(refiner, [first, *more()], say)
+    if refiner.method.is_default:
+        names = " and ".join(member.network.definition.name for member in refiner.members)
+        say(f"method: the default, with {names}")
+        return refiner
     s = refiner.settings
     say(
         f"network: {refiner.network.definition.name} cut at {refiner.layer}, {s.iterations}"
@@ -117,15 +119,4 @@ def _with_registration(
                 f"images of {width}×{height} are moved into the frame of the points by"
                 f" {registration}; --registration off leaves them"
             )
-    return refiner
-
-
-def _with_shortlist(
-    refiner: Refiner, frames: Sequence[Inputs], say: Callable[[str], None]
-) -> Refiner:
-    """The refiner with the candidates that are best on these frames."""
-    refiner = refiner.with_shortlist_of(frames)
-    assert refiner.competition is not None
-    names = "; ".join(str(candidate) for candidate in refiner.competition.shortlist or ())
-    say(f"choice: best on {len(frames)} frames, and to be checked on each: {names}")
     return refiner

@@ -216,11 +216,7 @@ def _refined(
     of_frames = iter(results)
     for task, read in group:
         if isinstance(read, ReadFrame):
-            result = next(of_frames)
-            if groups is not None and task.compared and isinstance(result, RefinedFrame):
-                with profile(NETWORK), read.watch("check"):
-                    result = groups.compared(read.inputs, result)
-            yield task, read, result
+            yield task, read, next(of_frames)
         else:
             yield task, None, read
 

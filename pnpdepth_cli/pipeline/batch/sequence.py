@@ -15,7 +15,7 @@ from pnpdepth_cli.io.dataset.frame import Frame, Neighbour
 from pnpdepth_cli.io.oxts import read_oxts_poses
 from pnpdepth_cli.io.poses import read_pose_of_each
 from pnpdepth_cli.pipeline.evaluation.dependence import groups_by_name
-from pnpdepth_cli.pipeline.refinement.method import needs_folds
+from pnpdepth_cli.pipeline.refinement.method import needs_check, resolve_method
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest
 
 Floats = NDArray[np.float64]
@@ -62,10 +62,10 @@ def in_windows(frames: Sequence[Frame]) -> list[list[Frame]]:
 
 def check_warm_start(request: RefineRequest) -> None:
     """Raises UsageError if the method cannot begin where the frame before ended."""
-    if needs_folds(request):
+    if resolve_method(request).is_default or needs_check(request):
         raise UsageError(
-            "--warm-start goes with a fixed method, not with the choice by held-out points; give"
-            " --preset fast, or another option of the method"
+            "--warm-start goes with a fixed method, not with the default one; give --propagate gp,"
+            " or another option of the method"
         )
     if request.network.tile is not None:
         raise UsageError("--warm-start does not go with --tile")

@@ -26,7 +26,7 @@ _MEASURED = {
     "scores": _SCORES,
 }
 _STAGES = ("before", "after")
-_FOLD_STAGES = (*_STAGES, "linear")
+_CHECKED = {"before": "aligned", "after": "result", "linear": "linear"}
 BASELINE_MEASURES = ("held_out_mae", "mae", "rmse")
 _EFFECTIVE = ("layer", "iterations", "lr", "step", "loss", "update", "align")
 
@@ -85,7 +85,7 @@ class Tally:
         self._units: set[str] = set()
         self._compared, self._worse = 0, 0
         self._linear: dict[tuple[str, str], tuple[int, float]] = {}
-        self._folds: dict[str, tuple[int, float]] = {}
+        self._checks: dict[str, tuple[int, float]] = {}
         self._sums: dict[tuple[str, str, str], tuple[int, float]] = {}
         self._baselines: dict[tuple[str, str], tuple[int, float]] = {}
 
@@ -103,9 +103,9 @@ class Tally:
         for kind in ("scores", "held_out_error"):
             for measure in _MEASURED[kind]:
                 _add(self._linear, (kind, measure), (linear.get(kind) or {}).get(measure))
-        if linear.get("worse") is not None and linear.get("folds"):
-            for stage in _FOLD_STAGES:
-                _add(self._folds, stage, linear["folds"][stage])
+        if linear.get("worse") is not None and linear.get("check"):
+            for stage, name in _CHECKED.items():
+                _add(self._checks, stage, linear["check"][name])
         for name, entry in (row.get("baselines") or {}).items():
             for measure, value in _baseline_measures(entry).items():
                 _add(self._baselines, (name, measure), value)
@@ -133,7 +133,7 @@ class Tally:
     def mean_linear(self) -> dict[str, Any]:
         """Returns the means of linear interpolation's scores, and how many frames are worse.
 
-        "folds" has the mean errors of all three at points that were held out in turns.
+        "check" has the mean errors of all three at the hidden points.
         """
         means: dict[str, Any] = {
             kind: {
@@ -143,11 +143,11 @@ class Tally:
             }
             for kind in ("scores", "held_out_error")
         }
-        folds = {stage: total / count for stage, (count, total) in self._folds.items() if count}
-        if folds:
-            folds["frames"] = max(count for count, _ in self._folds.values())
+        check = {stage: total / count for stage, (count, total) in self._checks.items() if count}
+        if check:
+            check["frames"] = max(count for count, _ in self._checks.values())
         return means | {
-            "folds": folds or None,
+            "check": check or None,
             "frames": self._compared,
             "worse": self._worse,
         }

@@ -9,8 +9,8 @@ import torch
 
 from pnpdepth_cli.completion.interpolation import linear
 from pnpdepth_cli.core.metrics import score
+from pnpdepth_cli.frames.default import LINEAR, RESULT
 from pnpdepth_cli.frames.frame import DepthMap, RefinedFrame
-from pnpdepth_cli.pipeline.refinement.inputs import Inputs
 from pnpdepth_cli.pipeline.refinement.points import point_error
 
 
@@ -23,11 +23,11 @@ def compared_with_linear(frame: RefinedFrame, gt: DepthMap | None) -> dict[str, 
 
     Returns:
         "scores" on the pixels of the ground truth where the result is known, "held_out_error" at
-        the points of `--holdout`, and "folds", the errors at points that were held out in turns;
-        each None without such pixels or points. "worse": whether the MAE of the result is above
-        that of linear interpolation, by the first of these that there is; None without any.
+        the points of `--holdout`, and "check", the MAE of each stage at the hidden points; each
+        None without such pixels or points. "worse": whether the MAE of the result is above that of
+        linear interpolation, by the first of these that there is; None without any.
     """
-    compared: dict[str, Any] = {"scores": None, "held_out_error": None, "folds": None}
+    compared: dict[str, Any] = {"scores": None, "held_out_error": None, "check": None}
     worse: list[bool] = []
     dense = None
     if gt is not None or len(frame.held_out):
@@ -44,12 +44,9 @@ def compared_with_linear(frame: RefinedFrame, gt: DepthMap | None) -> dict[str, 
         if error is not None and result is not None:
             compared["held_out_error"] = asdict(error)
             worse.append(result.mae > error.mae)
-    if frame.interpolation is not None:
-        compared["folds"] = frame.interpolation
-        worse.append(frame.interpolation["after"] > frame.interpolation["linear"])
+    if frame.check is not None:
+        check = frame.check
+        errors = {name: check.error(name) for name in check.predicted}
+        compared["check"] = {"points": len(check.hidden), **errors}
+        worse.append(errors[RESULT] > errors[LINEAR])
     return compared | {"worse": worse[0] if worse else None}
-
-
-def needs_comparison(inputs: Inputs, frame: RefinedFrame) -> bool:
-    """Returns whether nothing of the frame can be scored: no ground truth, no held-out points."""
-    return inputs.gt is None and not len(frame.held_out) and frame.interpolation is None

@@ -1,21 +1,21 @@
-"""From a request to a refiner: the networks, the layers to cut at, and what competes."""
+"""From a request to a refiner: the networks, the layers to cut at, and their settings."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 from pnpdepth_cli.core.refine import RefineSettings
 from pnpdepth_cli.errors import UsageError
-from pnpdepth_cli.frames.frame import Frame
+from pnpdepth_cli.frames.frame import Frame, is_dense
+from pnpdepth_cli.frames.fuse import Member
 from pnpdepth_cli.models.network import Network, load_network
 from pnpdepth_cli.models.rank_layers import default_layer
-from pnpdepth_cli.pipeline.refinement.held_out import competition_of
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs
-from pnpdepth_cli.pipeline.refinement.method import needs_folds, resolve_method
+from pnpdepth_cli.pipeline.refinement.method import needs_check, resolve_method
 from pnpdepth_cli.pipeline.refinement.refiner import Refiner
 from pnpdepth_cli.pipeline.refinement.request import MethodOptions, NetworkChoice, RefineRequest
 from pnpdepth_cli.pipeline.refinement.resolve import (
-    is_dense,
     moves_weights,
     resolve_definition,
     resolve_layer,
@@ -24,7 +24,11 @@ from pnpdepth_cli.pipeline.refinement.resolve import (
 from pnpdepth_cli.pipeline.sparse.colmap_options import METRES
 
 COMPANION = "compact"
-"""The network that competes beside the user's, where there is an image."""
+"""The network that is fused with the user's, where there is an image."""
+UPDATES = 5
+"""Most updates of z in the default method. More fit what propagation fits anyway."""
+HIDDEN_POINT_STEPS = 40
+"""Most steps by hidden points; of dense points the network's own number."""
 
 
 def load_refiner(
@@ -42,13 +46,13 @@ def load_refiner(
         ModelError: The network cannot be loaded.
     """
     choice, hold_out, method = request.network, request.hold_out, resolve_method(request)
-    timed = method.chosen or moves_weights(method.options)
+    timed = method.is_default or moves_weights(method.options)
     if hold_out.time_budget_s is not None and not timed:
-        raise UsageError(f"--time-budget caps the choice, but {method.why} fixes the method")
-    if choice.more_models and not method.chosen:
-        raise UsageError(f"several --model compete in the choice, but {method.why} fixes a method")
-    if choice.tile is not None and needs_folds(request):
-        raise UsageError("--tile goes with none of --auto, --baselines and --uncertainty")
+        raise UsageError(
+            f"--time-budget caps steps by hidden points, but {method.reason} makes none"
+        )
+    if choice.more_models and not method.is_default:
+        raise UsageError(f"several --model are fused, but {method.reason} fixes one network")
     frame, networks = first.frame(), []
 
     def more_frames() -> list[Frame]:
@@ -77,8 +81,8 @@ def refiner_of(
         first: The frame whose points decide the layers to cut at.
         settings: How z of the first network is updated. None: by the request.
     """
-    method, plans = resolve_method(request), []
-    if method.chosen:
+    method, members = resolve_method(request), list[Member]()
+    if method.is_default:
         networks = _with_companion(networks, request.network, first.frame())
     for number, network in enumerate(networks):
         definition = network.definition
@@ -95,26 +99,44 @@ def refiner_of(
         )
         if number == 0 and settings is not None:
             own = settings
-        plans.append((_name(networks, number), network, resolve_layer(definition, layer), own))
-    _, network, cut_at, own = plans[0]
-    folds = needs_folds(request)
-    if folds and own.moves_weights:
+        member = Member(network=network, layer=resolve_layer(definition, layer), settings=own)
+        members.append(_of_default(member, request, first) if method.is_default else member)
+    user = members[0]
+    if needs_check(request) and user.settings.moves_weights:
         raise UsageError(
-            "weights cannot be updated together with --auto, --baselines or --uncertainty; leave"
-            " out --target and --parameters"
+            "--baselines and --uncertainty go with updates of z; leave out --target and"
+            " --parameters"
         )
-    timed = request.hold_out.time_budget_s is not None
     return Refiner(
         request=request,
-        network=network,
-        layer=cut_at,
-        settings=own,
+        network=user.network,
+        layer=user.layer,
+        settings=user.settings,
         method=method,
-        networks={name: each for name, each, _, _ in plans},
-        competition=competition_of(method, plans, timed=timed, dense=is_dense(first.points))
-        if folds
-        else None,
+        members=tuple(members),
     )
+
+
+def _of_default(member: Member, request: RefineRequest, first: Inputs) -> Member:
+    """The network as the default method refines it.
+
+    A network whose output is metric is aligned too, where the points say that it should be. Of
+    networks that take the points, only those made for fusion, with a prior, are updated.
+    """
+    definition, settings = member.network.definition, member.settings
+    iterations = min(settings.iterations, UPDATES)
+    if not member.takes_points and settings.align == "none":
+        settings = replace(settings, align="auto")
+    if member.takes_points and not member.takes_prior:
+        iterations = 0
+    hidden_points = None
+    if request.hold_out.time_budget_s is not None and member.takes_points:
+        dense = is_dense(first.points)
+        hidden_points = resolve_settings(definition, MethodOptions(target="masked"), dense=dense)
+        if not dense:
+            hidden_points = replace(hidden_points, iterations=HIDDEN_POINT_STEPS)
+    settings = replace(settings, iterations=iterations)
+    return replace(member, settings=settings, hidden_points=hidden_points)
 
 
 def _with_companion(
@@ -128,11 +150,4 @@ def _with_companion(
 
 
 _PLAIN = NetworkChoice()
-"""Nothing is chosen of further networks: their definitions say all."""
-
-
-def _name(networks: Sequence[Network], number: int) -> str:
-    """The network's own name, numbered if a network before it has the same."""
-    name = networks[number].definition.name
-    same = sum(each.definition.name == name for each in networks[:number])
-    return f"{name} ({same + 1})" if same else name
+"""Of further networks, whose definitions decide everything."""

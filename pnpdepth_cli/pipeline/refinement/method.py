@@ -1,11 +1,10 @@
-"""Which method a request asks for: the choice by held-out points, or a method that is fixed.
+"""Which method a request asks for: the default one, or one that the request fixes.
 
 Decided here and nowhere else:
 
-1. `--auto` chooses by held-out points; options of the method then describe the candidates.
-2. A preset is fixed. Options of the method that are given with it win over its own.
-3. Any option of the method, or `--tile`, fixes the method.
-4. Otherwise the method is chosen by held-out points.
+1. A preset is fixed. Options of the method that are given with it win over its own.
+2. Any option of the method, or `--tile`, fixes the method.
+3. Otherwise it is the default method, `frames.default`.
 
 Imports neither numpy nor torch.
 """
@@ -32,7 +31,6 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
         "align": "none",
         "propagate": "none",
     },
-    "fast": {"propagate": "gp"},
 }
 """Options of the method by the name of their preset.
 
@@ -45,9 +43,9 @@ is cut where its definition says.
 class Method:
     """The method of a request."""
 
-    chosen: bool
-    """Whether held-out points choose among candidates. False: `options` are the method."""
-    why: str
+    is_default: bool
+    """Whether it is the default method. False: `options` are the method."""
+    reason: str
     """What decided this, for the record."""
     options: MethodOptions
     """The request's, and those of its preset that the request leaves open."""
@@ -59,31 +57,25 @@ def resolve_method(request: RefineRequest) -> Method:
     """Returns the method that the request asks for.
 
     Raises:
-        UsageError: The request combines options that exclude each other.
+        UsageError: There is no such preset.
     """
-    options, hold_out = request.method, request.hold_out
+    options = request.method
     flags = tuple(_given(options))
-    if options.preset is not None and hold_out.auto:
-        raise UsageError("--preset fixes the method and --auto chooses one; give one of the two")
-    if hold_out.auto:
-        return Method(chosen=True, why="--auto", options=options)
     if options.preset is not None:
-        why = " ".join((f"--preset {options.preset}", *flags))
         return Method(
-            chosen=False,
-            why=why,
+            is_default=False,
+            reason=" ".join((f"--preset {options.preset}", *flags)),
             options=with_preset(options),
             own_layer=options.preset == PAPER,
         )
     if flags or request.network.tile is not None:
-        return Method(chosen=False, why=" ".join(flags) or "--tile", options=options)
-    return Method(chosen=True, why="default", options=options)
+        return Method(is_default=False, reason=" ".join(flags) or "--tile", options=options)
+    return Method(is_default=True, reason="default", options=options)
 
 
-def needs_folds(request: RefineRequest) -> bool:
-    """Returns whether points are held out in turns, to choose, to compare or to calibrate."""
-    hold_out = request.hold_out
-    return resolve_method(request).chosen or hold_out.baselines or hold_out.uncertainty
+def needs_check(request: RefineRequest) -> bool:
+    """Returns whether the method is run again without some points: a table or σ needs them."""
+    return request.hold_out.baselines or request.hold_out.uncertainty
 
 
 def _given(options: MethodOptions) -> list[str]:

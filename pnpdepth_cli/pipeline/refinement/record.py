@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from pnpdepth_cli.core.metrics import Scores, score
 from pnpdepth_cli.frames.frame import RefinedFrame
 from pnpdepth_cli.pipeline.refinement.against_linear import compared_with_linear
+from pnpdepth_cli.pipeline.refinement.baseline_table import baseline_scores
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs
 from pnpdepth_cli.pipeline.refinement.points import PointError, point_error
 from pnpdepth_cli.pipeline.refinement.refiner import Refiner
@@ -32,15 +33,15 @@ def record_of(refiner: Refiner, inputs: Inputs, frame: RefinedFrame) -> dict[str
         "camera": None if inputs.camera is None else inputs.camera.record(),
         "model": refiner.model_record,
         "method": {
-            "kind": "chosen" if method.chosen else "fixed",
-            "why": method.why,
-            "networks": list(refiner.networks),
+            "kind": "default" if method.is_default else "fixed",
+            "reason": method.reason,
+            "networks": [member.network.definition.name for member in refiner.members],
         },
         "settings": {
             "layer": refiner.layer,
             **asdict(refiner.settings),
             "step": frame.refinement.step,
-            "propagate": propagate if method.chosen else propagate or "none",
+            "propagate": "gp" if method.is_default else propagate or "none",
             "output_kind": network.definition.output_kind,
             "normalise": normalisation_name(network.definition),
             "holdout": hold_out.holdout,
@@ -66,8 +67,9 @@ def record_of(refiner: Refiner, inputs: Inputs, frame: RefinedFrame) -> dict[str
         "held_out_error": _before_after(frame, lambda d: point_error(d, frame.held_out)),
         "scores": _before_after(frame, lambda d: _score(d, inputs.gt)),
         "linear": compared_with_linear(frame, inputs.gt),
-        "auto": frame.choice,
-        "baselines": frame.baselines,
+        "stages": _stages(frame, inputs),
+        "hidden_point_steps": dict(frame.steps) or None,
+        "baselines": baseline_scores(frame, inputs.gt) if hold_out.baselines else None,
         "diverged": str(frame.diverged) if frame.diverged else None,
         "notes": [note for note in (*inputs.notes, *_notes(refiner), *frame.notes) if note],
     }
@@ -81,7 +83,15 @@ def _moved_points(inputs: Inputs, frame: RefinedFrame) -> dict[str, int]:
 
 
 def _notes(refiner: Refiner) -> list[str]:
-    return [note for network in refiner.networks.values() for note in network.notes]
+    return [note for member in refiner.members for note in member.network.notes]
+
+
+def _stages(frame: RefinedFrame, inputs: Inputs) -> list[dict[str, Any]] | None:
+    """The scores of each stage of the default method; None for a fixed method, or without truth."""
+    if not frame.stages or inputs.gt is None:
+        return None
+    scores = {name: _score(depth, inputs.gt) for name, depth in frame.stages.items()}
+    return [{"stage": name, "scores": asdict(s)} for name, s in scores.items() if s is not None]
 
 
 def _score(depth: NDArray[np.float32], gt: NDArray[np.float32] | None) -> Scores | None:

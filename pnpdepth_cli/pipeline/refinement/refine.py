@@ -9,7 +9,6 @@ from typing import Any
 from pnpdepth_cli.errors import DivergedError
 from pnpdepth_cli.frames.frame import RefinedFrame
 from pnpdepth_cli.io.atomic import all_or_none
-from pnpdepth_cli.pipeline.refinement.against_linear import needs_comparison
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs, read_inputs
 from pnpdepth_cli.pipeline.refinement.load_refiner import load_refiner
 from pnpdepth_cli.pipeline.refinement.output_files import Outputs, plan_outputs
@@ -59,9 +58,6 @@ def refine_image(
             frame = refiner.refine(
                 opened, inputs, on_iteration=lambda done, loss: on_iteration(done, of, loss)
             )
-    if needs_comparison(inputs, frame):
-        with watch("check"), refiner.opened() as opened:
-            frame = refiner.compared(opened, inputs, frame)
     return write_refined(outputs, refiner, inputs, frame, watch)
 
 

@@ -3,46 +3,41 @@
 from __future__ import annotations
 
 import functools
+import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
 
-from pnpdepth_cli.auto.choice import Competition
-from pnpdepth_cli.auto.cross_validation import spatial_folds
-from pnpdepth_cli.auto.predictions import OpenNetworks
 from pnpdepth_cli.completion.image_registration import (
     Evidence,
     ImageRegistration,
     estimated,
     evidence,
 )
-from pnpdepth_cli.completion.interpolation import linear
 from pnpdepth_cli.core.refine import RefineSettings
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.errors import PnpDepthError
-from pnpdepth_cli.frames.frame import Carried, Frame, RefinedFrame
+from pnpdepth_cli.frames.default import check_fixed, refine_default, split_hidden
+from pnpdepth_cli.frames.frame import Frame, RefinedFrame, WarmStart
+from pnpdepth_cli.frames.fuse import Fusion, Member
 from pnpdepth_cli.frames.refine import OnIteration, refine_frame, refine_frames
 from pnpdepth_cli.frames.tiles import refine_tiled
+from pnpdepth_cli.frames.uncertainty import uncertainty
 from pnpdepth_cli.frames.warm_start import refine_next
 from pnpdepth_cli.io.record import sha256_of
 from pnpdepth_cli.models.network import Network
-from pnpdepth_cli.pipeline.refinement.held_out import best_candidates, refine_with_folds
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs
-from pnpdepth_cli.pipeline.refinement.method import Method
-from pnpdepth_cli.pipeline.refinement.points import point_error, split_points
+from pnpdepth_cli.pipeline.refinement.method import Method, needs_check
+from pnpdepth_cli.pipeline.refinement.points import split_points
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest
 from pnpdepth_cli.points import SparsePoints
 
-_COMPARED_FOLDS = 5
-"""One of so many folds is held out to compare a fixed method with linear interpolation."""
 _TRIED = 3
 """After so many frames that say nothing of the registration, no more are read."""
-_MIN_COMPARED = 5
-"""Fewer points do not compare a method with linear interpolation."""
 
-Opened = Split | OpenNetworks
+Opened = Split | Fusion
 """The networks of a refiner, open for any number of frames."""
 
 
@@ -59,19 +54,17 @@ class Refiner:
     settings: RefineSettings
     """How z is updated."""
     method: Method
-    """Whether the method is chosen or fixed, and why."""
-    networks: Mapping[str, Network]
-    """All networks that compete by name, the user's first; `network` alone for a fixed method."""
-    competition: Competition | None = None
-    """Which candidates compete, where points are held out in turns."""
+    """Whether it is the default method or a fixed one, and why."""
+    members: tuple[Member, ...]
+    """The networks of the default method, the user's first; the user's alone for a fixed one."""
     registrations: Mapping[tuple[int, int], ImageRegistration | None] = field(default_factory=dict)
     """How the images of one size are moved into the frame of the points, where many frames decide
     it. A frame of another size decides alone."""
 
     def opened(self) -> Opened:
         """Returns the networks, to be opened by `with` for all frames."""
-        if self.competition is not None:
-            return OpenNetworks(self.networks)
+        if self.method.is_default:
+            return Fusion(self.members)
         if self.settings.masked:
             return self.network.cut_at_points()
         return self.network.cut_at(self.layer)
@@ -88,25 +81,65 @@ class Refiner:
         Raises:
             PnpDepthError: The frame cannot be refined.
         """
-        torch.manual_seed(self.request.hold_out.seed)
+        hold_out = self.request.hold_out
+        torch.manual_seed(hold_out.seed)
         frame, held_out = self._split_frame(inputs)
-        if self.competition is not None and isinstance(opened, OpenNetworks):
-            refined = refine_with_folds(opened, self.competition, self.request, frame, inputs.gt)
-            return _finished(refined, frame, held_out)
-        assert isinstance(opened, Split)
+        if isinstance(opened, Fusion):
+            budget_s = hold_out.time_budget_s
+            refined = refine_default(
+                opened,
+                frame,
+                seed=hold_out.seed,
+                until=None if budget_s is None else time.monotonic() + budget_s,
+            )
+        else:
+            refined = self._fixed(opened, frame, on_iteration)
+            if needs_check(self.request):
+                refined = self._checked(opened, frame, refined)
+        return _finished(self._with_sigma(refined), frame, held_out)
+
+    def _fixed(
+        self, split: Split, frame: Frame, on_iteration: OnIteration = lambda done, loss: None
+    ) -> RefinedFrame:
+        """The frame refined by the fixed method."""
         network, settings, propagation = self.network, self.settings, self._propagation
         if side := self.request.network.tile:
-            refined = refine_tiled(
-                network, opened, settings, frame, side,
+            return refine_tiled(
+                network, split, settings, frame, side,
                 propagation=propagation, on_iteration=on_iteration,
             )  # fmt: skip
-        else:
-            refined = refine_frame(
-                network, opened, settings, frame, propagation=propagation, on_iteration=on_iteration
-            )
-        return _finished(refined, frame, held_out)
+        return refine_frame(
+            network, split, settings, frame, propagation=propagation, on_iteration=on_iteration
+        )
 
-    def refine_next(self, opened: Opened, inputs: Inputs, carried: Carried) -> RefinedFrame:
+    def _checked(self, split: Split, frame: Frame, refined: RefinedFrame) -> RefinedFrame:
+        """The refined frame with the fixed method's check, for which it is run again.
+
+        It is returned as it is where its points are too few or the method fails.
+        """
+        parts = split_hidden(frame.points, self.request.hold_out.seed)
+        if parts is None:
+            return refined
+        kept, hidden = parts
+        try:
+            again = self._fixed(split, frame.with_points(kept))
+        except PnpDepthError:
+            return refined
+        return replace(refined, check=check_fixed(refined, again, hidden, kept))
+
+    def _with_sigma(self, refined: RefinedFrame) -> RefinedFrame:
+        """The refined frame with its standard deviation, if that is asked for."""
+        if not self.request.hold_out.uncertainty:
+            return refined
+        estimate = uncertainty(refined)
+        return replace(
+            refined,
+            sigma=estimate.sigma,
+            valid=estimate.valid,
+            notes=(*refined.notes, estimate.note),
+        )
+
+    def refine_next(self, opened: Opened, inputs: Inputs, carried: WarmStart) -> RefinedFrame:
         """Returns one frame of a window, which may begin where the frame before ended.
 
         Raises:
@@ -119,35 +152,6 @@ class Refiner:
             self.network, opened, self.settings, frame, carried, propagation=self._propagation
         )
         return _finished(refined, frame, held_out)
-
-    def compared(self, opened: Opened, inputs: Inputs, frame: RefinedFrame) -> RefinedFrame:
-        """Returns the refined frame with its method's error at held-out points beside linear's.
-
-        For a fixed method without ground truth: it is run once more without a fifth of the points.
-        The frame is returned as it is where its points are too few or the method fails.
-        """
-        points = inputs.points
-        if len(points) < _MIN_COMPARED:
-            return frame
-        held = spatial_folds(points, _COMPARED_FOLDS, seed=self.request.hold_out.seed) == 0
-        kept, left = points.select(~held), points.select(held)
-        try:
-            again = self.refine(opened, replace(inputs, points=kept, gt=None))
-        except PnpDepthError:
-            return frame
-        before, after = point_error(again.before, left), point_error(again.after, left)
-        interpolated = (linear(kept, left.xy) - left.depth).abs()
-        if before is None or after is None:
-            return frame
-        return replace(
-            frame,
-            interpolation={
-                "points": len(left),
-                "before": before.mae,
-                "linear": float(interpolated.mean()),
-                "after": after.mae,
-            },
-        )
 
     def refine_together(
         self, split: Split, group: Sequence[Inputs], settings: RefineSettings
@@ -171,16 +175,6 @@ class Refiner:
             _finished(each, frame, points) if isinstance(each, RefinedFrame) else each
             for each, frame, points in zip(refined, frames, held_out, strict=True)
         ]
-
-    def with_shortlist_of(self, group: Sequence[Inputs]) -> Refiner:
-        """Returns the same refiner with the candidates that are best on these frames."""
-        assert self.competition is not None
-        frames = [self._split_frame(inputs)[0] for inputs in group]
-        with OpenNetworks(self.networks) as opened:
-            seed = self.request.hold_out.seed
-            choosing = replace(self.competition, hidden_points={})
-            best = best_candidates(opened, choosing, seed, frames)
-        return replace(self, competition=replace(self.competition, shortlist=best))
 
     def with_registration_of(self, group: Iterable[Inputs]) -> Refiner:
         """Returns the same refiner with the registration that the images of these frames share.

@@ -166,7 +166,7 @@ class NetworkChoice:
         show_default=True,
     )
     more_models: tuple[str, ...] = ()
-    """Further networks, with their own weights; they compete and are blended with the first."""
+    """Further networks, with their own weights, which are fused with the first."""
     checkpoint: Path | None = option(
         None,
         "Weights: a safetensors, torch, numpy or TensorFlow (.index) file, or a folder. No code in"
@@ -206,13 +206,13 @@ class NetworkChoice:
 class MethodOptions:
     """Where the network is cut, how z is updated, and what follows.
 
-    Without any of these, the method is chosen by held-out points; see `method.resolve_method`.
+    Without any of these, the default method is taken; see `method.resolve_method`.
     """
 
     preset: str | None = option(
         None,
-        "paper: the paper's setting and nothing else; fast: one refinement and propagation."
-        "  [default: the best candidate at held-out points]",
+        "paper: the paper's setting and nothing else.  [default: the networks refined, fused and"
+        " propagated]",
         choices=choices.PRESETS,
     )
     layer: str | None = option(
@@ -322,22 +322,17 @@ class MethodOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class HoldOut:
-    """Which points are held out, and what is decided or measured by them."""
+    """Which points are held out, and what is measured by them."""
 
-    auto: bool = option(
-        False,
-        "Choose by held-out points also where options of the method are given.",
-        hidden=True,
-    )
     time_budget_s: float | None = option(
         None,
-        "Cap on the time of the choice, such as 30s; in what is left, chosen networks that take"
-        " the points make steps by hidden points. No step begins that would not end in time.",
+        "Time of a frame, such as 30s: networks that take the points make steps by points hidden"
+        " from their input while it lasts. No step begins that would not end in time.",
         flag="--time-budget",
         metavar="SECONDS",
         parse=parse_seconds,
     )
-    baselines: bool = option(False, "Also score every baseline, such as linear interpolation.")
+    baselines: bool = option(False, "Also print every baseline, such as linear interpolation.")
     uncertainty: bool = option(
         False, "Write the depth's standard deviation and a mask of valid depth."
     )

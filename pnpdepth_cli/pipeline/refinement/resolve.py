@@ -17,7 +17,6 @@ from pnpdepth_cli.errors import ModelError, NoPointsError, UsageError
 from pnpdepth_cli.frames.frame import Frame
 from pnpdepth_cli.frames.prepare import prepare
 from pnpdepth_cli.models.definition import (
-    DENSE_SPACING,
     IMAGENET_MEAN,
     IMAGENET_STD,
     WEIGHTS_DEFAULTS,
@@ -28,7 +27,6 @@ from pnpdepth_cli.models.definition import (
 )
 from pnpdepth_cli.models.network import Network, out_of_memory_is_a_device_error
 from pnpdepth_cli.pipeline.refinement.request import HoldOut, MethodOptions, NetworkChoice
-from pnpdepth_cli.points import SparsePoints
 
 NORMALISATIONS = {
     "unit": Normalisation(),
@@ -188,12 +186,6 @@ def _defaults_of(
     if moves_weights(method):
         return WEIGHTS_DENSE_DEFAULTS if dense else WEIGHTS_DEFAULTS
     return definition.defaults
-
-
-def is_dense(points: SparsePoints) -> bool:
-    """Whether the mean spacing of the points is below `DENSE_SPACING` pixels."""
-    height, width = points.size
-    return height * width < DENSE_SPACING**2 * len(points)
 
 
 def moves_weights(method: MethodOptions) -> bool:

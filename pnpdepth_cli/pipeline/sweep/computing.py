@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 from itertools import groupby
 from typing import Any, TypeVar
 
-from pnpdepth_cli.auto.predictions import SplitCache
 from pnpdepth_cli.errors import DeviceError, PnpDepthError, StorageError
+from pnpdepth_cli.frames.opened import SplitCache
 from pnpdepth_cli.io.dataset.frame import Frame
 from pnpdepth_cli.pipeline.batch.frames import Task
 from pnpdepth_cli.pipeline.batch.reading import read_frame

@@ -10,7 +10,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from pnpdepth_cli.auto.predictions import SplitCache
 from pnpdepth_cli.completion.interpolation import linear
 from pnpdepth_cli.completion.propagation import propagate
 from pnpdepth_cli.core.metrics import score
@@ -18,6 +17,7 @@ from pnpdepth_cli.core.refine import Refinement, RefineSettings, refine
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.errors import DivergedError
 from pnpdepth_cli.frames.frame import RefinedFrame
+from pnpdepth_cli.frames.opened import SplitCache
 from pnpdepth_cli.frames.prepare import prepare
 from pnpdepth_cli.frames.refine import refine_frame
 from pnpdepth_cli.models.frame import FrameMap

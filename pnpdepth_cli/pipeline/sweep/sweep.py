@@ -8,12 +8,12 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from pnpdepth_cli.auto.predictions import SplitCache
 from pnpdepth_cli.errors import (
     InputError,
     PnpDepthError,
     UsageError,
 )
+from pnpdepth_cli.frames.opened import SplitCache
 from pnpdepth_cli.io.atomic import make_folder, remove_leftovers
 from pnpdepth_cli.io.dataset.frame import Frame
 from pnpdepth_cli.io.lock import locked_folder

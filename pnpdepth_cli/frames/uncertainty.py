@@ -25,10 +25,9 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pnpdepth_cli.auto.auto import AutoRefined
-from pnpdepth_cli.auto.predictions import CandidateDepths
 from pnpdepth_cli.completion.interpolation import in_hull, linear, nearest_points
-from pnpdepth_cli.frames.frame import DepthMap
+from pnpdepth_cli.frames.default import RESULT
+from pnpdepth_cli.frames.frame import Check, DepthMap, RefinedFrame
 from pnpdepth_cli.points import SparsePoints
 
 MIN_INLIER_WEIGHT = 0.05
@@ -63,27 +62,16 @@ class Uncertainty:
     """How it was calibrated."""
 
 
-def uncertainty(result: AutoRefined, depth: DepthMap) -> Uncertainty:
-    """Returns the standard deviation of a depth map.
-
-    Args:
-        result: The refined frame with its folds.
-        depth: (H, W) metres.
-    """
-    points = result.depths.points
-    shape = relative_shape(result.depths, torch.from_numpy(depth))
+def uncertainty(frame: RefinedFrame) -> Uncertainty:
+    """Returns the standard deviation of the depth of a refined frame with its check."""
+    points, depth = frame.used, frame.after
+    network = torch.from_numpy(frame.before)
+    shape = relative_shape(points, network, torch.from_numpy(depth))
     factor, note = 1.0, "uncertainty: too few points to calibrate it with"
-    if result.folds:
-        per_fold = []
-        for fold in result.folds:
-            predicted = fold.predicted(result.choice)
-            sigma = relative_shape(fold.depths, predicted, fold.held_out.xy)
-            good = (fold.inlier_weights > MIN_INLIER_WEIGHT) & (predicted > 0)
-            residual = fold.held_out.depth[good].log() - predicted[good].log()
-            per_fold.append(torch.stack([residual, sigma[good]]))
-        residual, sigma = torch.cat(per_fold, dim=1)
+    if frame.check is not None:
+        residual, sigma = _calibrating(frame.check)
         factor = calibration(residual, sigma)
-        note = f"uncertainty: calibrated with {len(residual):,} held-out points"
+        note = f"uncertainty: calibrated with {len(residual):,} hidden points"
     sigma_m = (factor * shape.numpy() * depth).astype(np.float32)
     valid = valid_depth(points, depth, sigma_m)
     if not valid.all():
@@ -91,17 +79,26 @@ def uncertainty(result: AutoRefined, depth: DepthMap) -> Uncertainty:
     return Uncertainty(sigma=sigma_m, valid=valid, note=note)
 
 
-def relative_shape(depths: CandidateDepths, depth: Tensor, xy: Tensor | None = None) -> Tensor:
+def _calibrating(check: Check) -> tuple[Tensor, Tensor]:
+    """Residual of log depth and uncalibrated standard deviation, (M,), at hidden points."""
+    predicted = check.predicted[RESULT]
+    sigma = relative_shape(check.kept, check.network, predicted, check.hidden.xy)
+    good = (check.weights > MIN_INLIER_WEIGHT) & (predicted > 0)
+    return check.hidden.depth[good].log() - predicted[good].log(), sigma[good]
+
+
+def relative_shape(
+    points: SparsePoints, network: Tensor, depth: Tensor, xy: Tensor | None = None
+) -> Tensor:
     """Returns the uncalibrated standard deviation (H, W), or (M,), of log depth.
 
     Args:
-        depths: The points and the network's own depth.
+        points: The points that the depth was fitted to.
+        network: (H, W) metres, the network's own depth, aligned with the points.
         depth: (H, W), or (M,), metres.
         xy: (M, 2) pixel coordinates of `depth`. None: every pixel.
     """
-    points = depths.points
     log_depth = depth.clamp_min(1e-6).log().double()
-    network = depths.prediction
     known = network > 0
     middle = network[known].median() if bool(known.any()) else network.new_tensor(1.0)
     own = torch.where(known, network, middle).log()[None, None]

@@ -1,0 +1,286 @@
+"""The default method for one frame, and the one check of it.
+
+A fifth of the points, whole scan lines of a LiDAR, is hidden once. The networks and linear
+interpolation predict them from the others, and what depends on the image alone is computed once
+for both passes. Only where this shows that the image does not help, the result moves to one that
+uses it less. The same points calibrate `frames.uncertainty`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from pnpdepth_cli.completion.folds import spatial_folds
+from pnpdepth_cli.completion.interpolation import linear
+from pnpdepth_cli.completion.outliers import inlier_weights
+from pnpdepth_cli.completion.propagation import propagate, propagate_at
+from pnpdepth_cli.completion.residual_field import Kernel
+from pnpdepth_cli.errors import PnpDepthError
+from pnpdepth_cli.frames.frame import Check, Frame, RefinedFrame
+from pnpdepth_cli.frames.fuse import Fused, Fusion, Member, weighted_mean
+from pnpdepth_cli.points import SparsePoints
+from pnpdepth_cli.scan_pattern import scan_lines
+
+ALIGNED, FUSED, UPDATED, PROPAGATED = "aligned", "fused", "updated", "propagated"
+"""The stages of the method."""
+LINEAR, RESULT = "linear", "result"
+"""Names in `Check.predicted` besides the stages."""
+FOLDS = 5
+"""One of so many folds is hidden."""
+MIN_POINTS = 5
+"""With fewer points none is hidden."""
+MOST_HIDDEN = 1000
+"""Of more hidden points a random part is predicted."""
+
+GAIN = 0.75
+"""Standard errors by which the method has to be better than linear interpolation at the hidden
+points. Else the image may not belong to the points, and half of the result leaves it out."""
+ENOUGH_FOR_GAIN = 60
+"""Fewer hidden points show no gain even where there is one."""
+LOSS = 2.0
+"""Standard errors by which it has to be worse for linear interpolation to be half of the result."""
+ENOUGH_FOR_LOSS = 20
+"""Fewer hidden points decide nothing."""
+GAP_FACTOR = 3.0
+"""A network that takes the points serves as a prior if its error at the hidden points is at most
+the other networks', or so many times that where whole scan lines are hidden: these are gaps that
+the sensor does not leave. On even KITTI frames pncnn has 1.9 to 2.5 times the error of `compact`
+there, and less with all points."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Hidden:
+    """The frame without its hidden points, refined."""
+
+    points: SparsePoints
+    weights: Tensor
+    frame: Frame
+    fused: Fused
+    rejected: tuple[Member, ...]
+
+
+def refine_default(
+    fusion: Fusion,
+    frame: Frame,
+    *,
+    propagation: str = "gp",
+    seed: int = 0,
+    until: float | None = None,
+) -> RefinedFrame:
+    """Returns the frame refined by the default method.
+
+    Args:
+        fusion: The networks, open.
+        frame: The frame, in the image frame.
+        propagation: How the residual is propagated, a name in `choices.PROPAGATIONS`.
+        seed: Of the hidden points.
+        until: As of `Fusion.fuse`.
+
+    Raises:
+        PnpDepthError: The user's network gives no depth.
+    """
+    fusion.next_image()
+    inliers, user = fusion.without_outliers(frame)
+    hidden = _hidden(fusion, inliers, torch.from_numpy(user.before), seed)
+    rejected = () if hidden is None else hidden.rejected
+    fused = fusion.fuse(inliers, user=user, rejected=rejected, until=until)
+    propagated = propagate(fused.after, inliers.points, inliers.rgb, kind=propagation)
+    depth, check, notes = propagated.depth, None, _notes_on_points(frame, inliers)
+    if hidden is not None:
+        check = _check(hidden, propagation, propagated.kernel)
+        depth, check, moved = _moved(fusion, inliers, hidden, depth, check, propagation)
+        notes += moved
+    if fused.steps:
+        steps = ", ".join(f"{count} with {name}" for name, count in fused.steps.items())
+        notes += (f"hidden points: steps made and kept: {steps}",)
+    stages = {ALIGNED: user.before, FUSED: fused.before.numpy(), UPDATED: fused.after.numpy()}
+    return replace(
+        fused.user,
+        after=depth.numpy(),
+        used=inliers.points,
+        stages=stages | {PROPAGATED: depth.numpy()},
+        check=check,
+        steps=fused.steps,
+        notes=(*fused.user.notes, *notes),
+    )
+
+
+def check_fixed(
+    refined: RefinedFrame, again: RefinedFrame, hidden: SparsePoints, kept: SparsePoints
+) -> Check:
+    """Returns the check of a fixed method, which was run again without the hidden points.
+
+    Args:
+        refined: The frame refined with all points.
+        again: The frame refined with the kept points.
+        hidden: The hidden points.
+        kept: The others.
+    """
+    before, after = (torch.from_numpy(depth) for depth in (again.before, again.after))
+    return Check(
+        hidden=hidden,
+        kept=kept,
+        network=before,
+        weights=_inlier_weights(hidden, torch.from_numpy(refined.after)),
+        predicted={
+            ALIGNED: hidden.sample(before),
+            LINEAR: linear(kept, hidden.xy),
+            RESULT: hidden.sample(after),
+        },
+    )
+
+
+def split_hidden(points: SparsePoints, seed: int) -> tuple[SparsePoints, SparsePoints] | None:
+    """Returns (kept points, hidden points); None where they are too few."""
+    if len(points) < MIN_POINTS:
+        return None
+    held = spatial_folds(points, FOLDS, seed=seed) == 0
+    if not 0 < int(held.sum()) < len(points):
+        return None
+    (numbers,) = held.nonzero(as_tuple=True)
+    drawn = torch.randperm(len(numbers), generator=torch.Generator().manual_seed(seed))
+    return points.select(~held), points.select(numbers[drawn[:MOST_HIDDEN]])
+
+
+def _hidden(fusion: Fusion, frame: Frame, prediction: Tensor, seed: int) -> _Hidden | None:
+    """The frame refined without its hidden points; None where they are too few or it fails."""
+    parts = split_hidden(frame.points, seed)
+    if parts is None:
+        return None
+    kept, points = parts
+    without = frame.with_points(kept)
+    completing = [m for m in fusion.members if m.takes_points and not m.takes_prior]
+    guided = any(member.takes_prior for member in fusion.members)
+    rejected: tuple[Member, ...] = ()
+    try:
+        fused = fusion.fuse(without, rejected=completing if guided else (), updates=False)
+        if completing and guided:
+            rejected = _rejected(fused, completing, frame.points, points)
+            if len(rejected) < len(completing):
+                fused = fusion.fuse(without, user=fused.user, rejected=rejected, updates=False)
+    except PnpDepthError:
+        return None
+    weights = _inlier_weights(points, prediction)
+    return _Hidden(points=points, weights=weights, frame=without, fused=fused, rejected=rejected)
+
+
+def _rejected(
+    fused: Fused, completing: list[Member], points: SparsePoints, hidden: SparsePoints
+) -> tuple[Member, ...]:
+    """The networks that take points whose depth serves as no prior."""
+    lines = scan_lines(points.xy.cpu().numpy(), points.size)
+    factor = 1.0 if lines is None else GAP_FACTOR
+
+    def error(depth: Tensor) -> float:
+        return float((hidden.sample(depth) - hidden.depth).abs().mean())
+
+    limit = factor * error(fused.after)
+    alone = fused.alone
+    return tuple(
+        member
+        for member in completing
+        if member not in alone or error(torch.from_numpy(alone[member].before)) > limit
+    )
+
+
+def _inlier_weights(points: SparsePoints, prediction: Tensor) -> Tensor:
+    """(N,) 0…1: the weight of each point in the check; outliers would decide it."""
+    at_points = points.sample(prediction)
+    residual = points.depth.double().log() - at_points.clamp_min(1e-6).double().log()
+    weights = torch.where(at_points > 0, inlier_weights(points, residual), 0.0).float()
+    return weights if bool(weights.any()) else torch.ones_like(weights)
+
+
+def _check(hidden: _Hidden, propagation: str, kernel: Kernel | None) -> Check:
+    points, frame, fused = hidden.points, hidden.frame, hidden.fused
+    propagated = propagate_at(
+        fused.after, frame.points, frame.rgb, points.xy, kind=propagation, kernel=kernel
+    )
+    network = torch.from_numpy(fused.user.before)
+    predicted = {
+        ALIGNED: points.sample(network),
+        FUSED: points.sample(fused.after),
+        PROPAGATED: propagated,
+        LINEAR: linear(frame.points, points.xy),
+        RESULT: propagated,
+    }
+    return Check(
+        hidden=points,
+        kept=frame.points,
+        network=network,
+        weights=hidden.weights,
+        predicted=predicted,
+    )
+
+
+def _moved(
+    fusion: Fusion,
+    frame: Frame,
+    hidden: _Hidden,
+    depth: Tensor,
+    check: Check,
+    propagation: str,
+) -> tuple[Tensor, Check, tuple[str, ...]]:
+    """The result (H, W), moved away from the image where the check says so, and why."""
+    count, gain = len(check.hidden), check.gain(PROPAGATED, LINEAR)
+    if count < ENOUGH_FOR_LOSS or gain >= (GAIN if count >= ENOUGH_FOR_GAIN else -LOSS):
+        return depth, check, ()
+    at_points, what = check.predicted[PROPAGATED], []
+    blind = _blind(fusion, frame, hidden, propagation)
+    if blind is not None:
+        depth = weighted_mean([(depth, 1.0), (blind[0], 1.0)])
+        at_points = weighted_mean([(at_points, 1.0), (blind[1], 1.0)])
+        what.append("half of the result leaves the image out")
+    if gain < -LOSS:
+        depth = weighted_mean([(depth, 1.0), (linear(frame.points), 1.0)])
+        at_points = weighted_mean([(at_points, 1.0), (check.predicted[LINEAR], 1.0)])
+        what.append("half is linear interpolation")
+    if not what:
+        return depth, check, ()
+    error, of_linear = check.error(PROPAGATED), check.error(LINEAR)
+    note = (
+        "warning: the image does not seem to belong to these points: with it the error at"
+        f" {count:,} hidden points is {error:.4f}, linear interpolation has {of_linear:.4f};"
+        f" {' and '.join(what)}; see --registration"
+    )
+    return depth, check.with_prediction(RESULT, at_points), (note,)
+
+
+def _blind(
+    fusion: Fusion, frame: Frame, hidden: _Hidden, propagation: str
+) -> tuple[Tensor, Tensor] | None:
+    """Depth of a grey image (H, W), and at the hidden points (M,), by a network with points."""
+    takers = [member for member in fusion.members if member.takes_prior]
+    if frame.rgb is None or not takers:
+        return None
+    fusion.next_image()
+    grey = torch.full_like(frame.rgb, 0.5)
+    results = []
+    try:
+        for points in (frame, hidden.frame):
+            without = replace(points, rgb=grey)
+            refined = fusion.refine_alone(takers[0], without)
+            results.append(torch.from_numpy(refined.after))
+    except PnpDepthError:
+        return None
+    finally:
+        fusion.next_image()
+    whole, part = results
+    kept, xy = hidden.frame.points, hidden.points.xy
+    return (
+        propagate(whole, frame.points, grey, kind=propagation).depth,
+        propagate_at(part, kept, grey, xy, kind=propagation),
+    )
+
+
+def _notes_on_points(frame: Frame, inliers: Frame) -> tuple[str, ...]:
+    count = len(frame.points) - len(inliers.points)
+    if not count:
+        return ()
+    return (
+        f"outliers: {count:,} of {len(frame.points):,} points left out, inconsistent with the"
+        " others",
+    )

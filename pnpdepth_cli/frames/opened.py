@@ -1,0 +1,169 @@
+"""Networks that stay cut from frame to frame and compute nothing twice for one image.
+
+For one image and several sets of points, the front of a network that takes the image alone runs
+once, and so does the image encoder that a definition names.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from pnpdepth_cli.choices import LOSSES
+from pnpdepth_cli.core.refine import Refinement, RefineSettings, refine_from
+from pnpdepth_cli.core.split import InputSplit, Split
+from pnpdepth_cli.core.split.user_code import wrap_user_errors
+from pnpdepth_cli.errors import PnpDepthError
+from pnpdepth_cli.frames.frame import Frame, RefinedFrame
+from pnpdepth_cli.frames.prepare import PreparedFrame, prepare
+from pnpdepth_cli.frames.refine import refine_frame_weights, to_refined_frame
+from pnpdepth_cli.models.aligned import AlignedDepth
+from pnpdepth_cli.models.network import Network, out_of_memory_is_a_device_error
+
+
+class SplitCache:
+    """Keeps a network cut while the layer stays the same, as a context manager."""
+
+    def __init__(self, network: Network) -> None:
+        self.network, self._open = network, ExitStack()
+        self._split: Split | None = None
+
+    def __enter__(self) -> SplitCache:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Restores the whole network until it is cut again."""
+        self._open.close()
+        self._split = None
+
+    def at(self, layer: str) -> Split:
+        """Returns the network cut at the layer, open."""
+        if self._split is None or self._split.layer != layer:
+            self.close()
+            self._split = self._open.enter_context(self.network.cut_at(layer))
+        return self._split
+
+    def at_points(self) -> InputSplit:
+        """Returns the network cut at its sparse depth, open."""
+        if not isinstance(self._split, InputSplit):
+            self.close()
+            self._split = self._open.enter_context(self.network.cut_at_points())
+        assert isinstance(self._split, InputSplit)
+        return self._split
+
+
+class OpenNetwork:
+    """A network that is cut when first refined, as a context manager.
+
+    Args:
+        network: The network.
+        layer: Layer to cut at.
+    """
+
+    def __init__(self, network: Network, layer: str) -> None:
+        self.network, self.layer = network, layer
+        self._of_image_only = network.definition.input_kind == "rgb"
+        self._open, self._cut = ExitStack(), SplitCache(network)
+        self._z0: Tensor | None = None
+        self._output: Any = None
+        self._encoded: Any = None
+
+    def __enter__(self) -> OpenNetwork:
+        if self.network.definition.image_encoder is not None:
+            encoder = self.network.module.get_submodule(self.network.definition.image_encoder)
+            self._open.enter_context(self._runs_once(encoder))
+        self._open.enter_context(self._cut)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._open.close()
+        self.next_image()
+
+    def next_image(self) -> None:
+        """Forgets what was computed for the last image."""
+        self._z0 = self._output = self._encoded = None
+
+    def refine(self, frame: Frame, settings: RefineSettings) -> RefinedFrame:
+        """Returns the frame refined by this network, its residual not propagated.
+
+        Args:
+            frame: The image, the same in all calls until `next_image`, and the points of this call.
+            settings: How z, or weights, are updated.
+
+        Raises:
+            PnpDepthError: The refinement fails.
+        """
+        with out_of_memory_is_a_device_error(self.network.device):
+            prepared = prepare(self.network, frame)
+            if not len(prepared.points):
+                raise prepared.no_points_error()
+            reader = prepared.depth_reader(settings)
+            if settings.moves_weights:
+                self._z0 = None
+                masked = settings.masked
+                split = self._cut.at_points() if masked else self._cut.at(self.layer)
+                result = refine_frame_weights(split, settings, prepared, reader)
+            elif settings.iterations:
+                result = self._updated(prepared, reader, settings)
+            else:
+                result = self._plain(prepared, reader, settings)
+        refined = to_refined_frame(prepared, reader, result)
+        if isinstance(refined, PnpDepthError):
+            raise refined
+        return refined
+
+    def _updated(
+        self, prepared: PreparedFrame, reader: AlignedDepth, settings: RefineSettings
+    ) -> Refinement | PnpDepthError:
+        split, z0 = self._cut.at(self.layer), self._z0
+        if z0 is None:
+            with torch.no_grad():
+                z0 = split.front(*prepared.arguments)
+        if self._of_image_only:
+            self._z0 = z0
+        (result,) = refine_from(split, z0, (prepared.points,), settings, depth_of=(reader,))
+        return result
+
+    def _plain(
+        self, prepared: PreparedFrame, reader: AlignedDepth, settings: RefineSettings
+    ) -> Refinement:
+        """The same without updates: a pass of the whole network, which need not be cut."""
+        output = self._output
+        if output is None and self._z0 is not None:
+            with torch.no_grad():
+                output = self._cut.at(self.layer).rear(self._z0)
+        elif output is None:
+            with torch.no_grad(), wrap_user_errors("the network's forward"):
+                output = self.network.module(*prepared.arguments)
+        if self._of_image_only:
+            self._output = output
+        depth = reader(output).detach()
+        at_points = prepared.points.sample(depth)
+        loss = float(LOSSES[settings.loss](at_points, prepared.points.depth))
+        return Refinement(before=depth, after=depth, losses=(loss,), step=0.0, kept=0)
+
+    @contextmanager
+    def _runs_once(self, encoder: nn.Module) -> Iterator[None]:
+        """Inside, the encoder returns for one image what it returned first."""
+        run, own = encoder.forward, encoder.__dict__.get("forward")
+
+        def forward(*inputs: Any, **options: Any) -> Any:
+            if self._encoded is None:
+                self._encoded = run(*inputs, **options)
+            return self._encoded
+
+        encoder.__dict__["forward"] = forward
+        try:
+            yield
+        finally:
+            if own is None:
+                encoder.__dict__.pop("forward", None)
+            else:
+                encoder.__dict__["forward"] = own
