@@ -8,6 +8,7 @@ uses it less. The same points calibrate `frames.uncertainty`.
 
 from __future__ import annotations
 
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -49,6 +50,9 @@ GAP_FACTOR = 3.0
 the other networks', or so many times that where whole scan lines are hidden: these are gaps that
 the sensor does not leave. On even KITTI frames pncnn has 1.9 to 2.5 times the error of `compact`
 there, and less with all points."""
+COMPLETION_WEIGHT = 0.75
+"""Weight of such a network's own depth in the result. On even KITTI frames this changes its MAE by
+−0.9 (pncnn) and −2.8 % (nconv), the RMSE by +1.4 and −0.2 %; without it by +2 and −3, +13 and 0."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,7 +92,8 @@ def refine_default(
     rejected = () if hidden is None else hidden.rejected
     fused = fusion.fuse(inliers, user=user, rejected=rejected, until=until)
     propagated = propagate(fused.after, inliers.points, inliers.rgb, kind=propagation)
-    depth, check, notes = propagated.depth, None, _notes_on_points(frame, inliers)
+    check, notes = None, _notes_on_points(frame, inliers)
+    depth = final = _with_completion(propagated.depth, _completion(fused, rejected))
     if hidden is not None:
         check = _check(hidden, propagation, propagated.kernel)
         depth, check, moved = _moved(fusion, inliers, hidden, depth, check, propagation)
@@ -101,7 +106,7 @@ def refine_default(
         fused.user,
         after=depth.numpy(),
         used=inliers.points,
-        stages=stages | {PROPAGATED: depth.numpy()},
+        stages=stages | {PROPAGATED: final.numpy()},
         check=check,
         steps=fused.steps,
         notes=(*fused.user.notes, *notes),
@@ -131,6 +136,25 @@ def check_fixed(
             RESULT: hidden.sample(after),
         },
     )
+
+
+def _completion(fused: Fused, rejected: Collection[Member]) -> list[Tensor]:
+    """The depths (H, W) of networks that take points and serve as priors."""
+    if not any(member.takes_prior for member in fused.members):
+        return []
+    return [
+        torch.from_numpy(refined.before)
+        for member, refined in fused.alone.items()
+        if member.takes_points and not member.takes_prior and member not in rejected
+    ]
+
+
+def _with_completion(depth: Tensor, completion: Sequence[Tensor]) -> Tensor:
+    """Depth (…) with the depths of completion networks."""
+    if not completion:
+        return depth
+    weight = COMPLETION_WEIGHT / len(completion)
+    return weighted_mean([(depth, 1 - COMPLETION_WEIGHT), *((own, weight) for own in completion)])
 
 
 def split_hidden(points: SparsePoints, seed: int) -> tuple[SparsePoints, SparsePoints] | None:
@@ -199,6 +223,8 @@ def _check(hidden: _Hidden, propagation: str, kernel: Kernel | None) -> Check:
     propagated = propagate_at(
         fused.after, frame.points, frame.rgb, points.xy, kind=propagation, kernel=kernel
     )
+    own = [points.sample(depth) for depth in _completion(fused, hidden.rejected)]
+    propagated = _with_completion(propagated, own)
     network = torch.from_numpy(fused.user.before)
     predicted = {
         ALIGNED: points.sample(network),

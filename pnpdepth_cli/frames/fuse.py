@@ -65,6 +65,7 @@ class Member:
 class Fused:
     """A frame refined by all networks and fused; the residual is not propagated."""
 
+    members: tuple[Member, ...]
     alone: Mapping[Member, RefinedFrame]
     """What the networks give without another one's prior, the user's first."""
     before: Tensor
@@ -171,6 +172,7 @@ class Fusion:
                 guided += one.values()
         parts = _weighted(alone, guided)
         return Fused(
+            members=self.members,
             alone=alone,
             before=weighted_mean([(torch.from_numpy(each.before), w) for each, w in parts]),
             after=weighted_mean([(torch.from_numpy(each.after), w) for each, w in parts]),
@@ -195,16 +197,30 @@ class Fusion:
     def _refined(
         self, member: Member, frame: Frame, *, updates: bool = True, until: float | None = None
     ) -> RefinedFrame:
+        moved = self._by_hidden_points(member, frame, until)
+        if moved is not None:
+            return moved
         settings = member.settings
-        left_s = 0.0 if until is None else until - time.monotonic()
-        if member.hidden_points is not None and left_s > 0:
-            settings = replace(member.hidden_points, time_budget_s=left_s)
-        elif not updates or (member.takes_points and not _updates_gain(frame.points)):
+        if not updates or (member.takes_points and not _updates_gain(frame.points)):
             settings = replace(settings, iterations=0)
-        refined = self._opened[member].refine(frame, settings)
-        if settings.moves_weights:
-            self._steps[member.network.definition.name] = refined.refinement.kept
-        return refined
+        return self._opened[member].refine(frame, settings)
+
+    def _by_hidden_points(
+        self, member: Member, frame: Frame, until: float | None
+    ) -> RefinedFrame | None:
+        """The frame after steps by hidden points; None where none are to be made or they fail."""
+        left_s = 0.0 if until is None else until - time.monotonic()
+        if member.hidden_points is None or left_s <= 0:
+            return None
+        settings = replace(member.hidden_points, time_budget_s=left_s)
+        try:
+            moved = self._opened[member].refine(frame, settings)
+        except PnpDepthError:
+            return None
+        if moved.diverged is not None:
+            return None
+        self._steps[member.network.definition.name] = moved.refinement.kept
+        return moved
 
 
 def weighted_mean(depths: Sequence[tuple[Tensor, float]]) -> Tensor:

@@ -135,7 +135,7 @@ class RefineDefaults:
     schedule: Schedule = "constant"
     """How the step size changes over the updates."""
     blur: float = 0.0
-    """Standard deviation, in elements of z, of the Gaussian that gradients are blurred by."""
+    """Standard deviation, in mean spacings of the points, of the blur of the gradient."""
     parameters: str = "elements"
     """What is updated: "elements" or "channels" of z, "weights", or "lora:R"."""
     mask: Mask = "points"

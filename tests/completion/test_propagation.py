@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from pnpdepth_cli.choices import PROPAGATIONS
-from pnpdepth_cli.completion.propagation import fitted_kernel, propagate, propagate_at
+from pnpdepth_cli.completion.propagation import propagate, propagate_at
 from pnpdepth_cli.errors import NoPointsError, UsageError
 from pnpdepth_cli.points import SparsePoints
 from tests.completion.scenes import SIZE, mean_log_error, random_points, scene
@@ -37,7 +37,7 @@ def test_a_prediction_that_drifts_is_put_right(kind: str, count: int, coloured: 
 def test_a_kernel_that_was_fitted_before_gives_the_same_depth(kind: str) -> None:
     gt, rgb, prediction = scene()
     points, xy = random_points(gt, 60), torch.tensor([[3.0, 4.0], [20.0, 11.0]])
-    kernel = fitted_kernel(prediction, points, rgb, kind)
+    kernel = propagate(prediction, points, rgb, kind=kind).kernel
     again = propagate_at(prediction, points, rgb, xy, kind=kind, kernel=kernel)
     assert torch.equal(again, propagate_at(prediction, points, rgb, xy, kind=kind))
 

@@ -13,15 +13,11 @@ from torch import nn
 
 from pnpdepth_cli.core.refine import RefineSettings
 from pnpdepth_cli.core.split import Split
-from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.frames.frame import Frame, RefinedFrame
 from pnpdepth_cli.frames.refine import refine_frame
 from pnpdepth_cli.frames.tiles import OVERLAP, refine_tiled, tiles_of
 from pnpdepth_cli.models.definition import ModelDefinition, Multiple
 from pnpdepth_cli.models.network import Network, load_network
-from pnpdepth_cli.pipeline.refinement.inputs import read_inputs
-from pnpdepth_cli.pipeline.refinement.load_refiner import load_refiner
-from pnpdepth_cli.pipeline.refinement.request import RefineRequest
 from pnpdepth_cli.points import SparsePoints
 from tests.pipeline.frames import frame_on_disk
 
@@ -170,13 +166,6 @@ def test_propagation_follows_once_over_all_tiles() -> None:
         float((one.points.sample(torch.from_numpy(refined.before)) - one.points.depth).abs().mean())
         > 0.2
     )
-
-
-def test_tiles_and_folds_do_not_go_together(tmp_path_factory: pytest.TempPathFactory) -> None:
-    frame = frame_on_disk(tmp_path_factory.mktemp("frame"))
-    request = RefineRequest.from_fields(image=frame.image, sparse=frame.sparse, tile=64, auto=True)
-    with pytest.raises(UsageError, match="--tile goes with none of --auto"):
-        load_refiner(request, read_inputs(request))
 
 
 def test_the_split_is_as_before_for_the_next_frame(

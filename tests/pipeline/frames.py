@@ -79,7 +79,7 @@ def frame_on_disk(folder: Path, height: int = 46, width: int = 62) -> FrameOnDis
 def run(frame: FrameOnDisk, **changes: Any) -> RefineOutcome:
     """What `pnpdepth refine` gives of the frame, with these changes of the request.
 
-    The method is the network's own refinement; `propagate=None` leaves it to the choice.
+    The method is the network's own refinement; `propagate=None` gives the default method.
     """
     request: dict[str, Any] = {
         "image": frame.image,
@@ -87,6 +87,6 @@ def run(frame: FrameOnDisk, **changes: Any) -> RefineOutcome:
         "output": frame.folder / "out",
         "model": str(frame.model),
         "checkpoint": frame.checkpoint,
-        "propagate": None if {"preset", "auto"} & changes.keys() else "none",
+        "propagate": None if "preset" in changes else "none",
     }
     return refine_image(RefineRequest.from_fields(**(request | changes)))

@@ -5,7 +5,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pnpdepth_cli.auto.cross_validation import spatial_folds
+from pnpdepth_cli.completion.folds import spatial_folds
 from pnpdepth_cli.completion.interpolation import nearest_points
 from pnpdepth_cli.points import SparsePoints
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from pnpdepth_cli.auto.uncertainty import calibration, valid_depth
+from pnpdepth_cli.frames.uncertainty import calibration, valid_depth
 from pnpdepth_cli.points import SparsePoints
 
 

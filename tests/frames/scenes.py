@@ -1,0 +1,91 @@
+"""Small frames in memory, and networks of a line, for tests of the default method."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from pnpdepth_cli.core.refine import RefineSettings
+from pnpdepth_cli.frames.frame import Frame
+from pnpdepth_cli.frames.fuse import Member
+from pnpdepth_cli.models.definition import ModelDefinition, Multiple
+from pnpdepth_cli.models.network import Network
+from pnpdepth_cli.points import SparsePoints
+
+SIZE = (96, 128)
+
+
+def depth_of_scene() -> Tensor:
+    """(H, W) metres: two slanted planes with a step between them."""
+    y, x = torch.meshgrid(*(torch.arange(float(n)) for n in SIZE), indexing="ij")
+    return 1.5 + x / SIZE[1] + 0.5 * (y > SIZE[0] // 2)
+
+
+def frame_in_memory(count: int = 60, seed: int = 1) -> Frame:
+    """The scene with so many points; the image is its depth in grey, with noise."""
+    rng, depth = np.random.default_rng(seed), depth_of_scene()
+    pixels = rng.permutation(depth.numel())[:count]
+    xy = torch.from_numpy(np.stack([pixels % SIZE[1], pixels // SIZE[1]], 1).astype(np.float32))
+    points = SparsePoints(xy=xy, depth=depth.flatten()[torch.from_numpy(pixels)], size=SIZE)
+    noise = torch.from_numpy(rng.random((3, *SIZE), dtype=np.float32))
+    return Frame(rgb=(0.9 * (depth - 1.5) / 1.5 + 0.1 * noise).clamp(0, 1), points=points)
+
+
+class Brightness(nn.Module):
+    """Depth is linear in the image's brightness; the layer can move it."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.layer = nn.Identity()
+
+    def forward(self, rgb: Tensor) -> Tensor:
+        return 1.0 + self.layer(rgb.mean(1, keepdim=True))
+
+
+class TwicePrior(nn.Module):
+    """Depth is twice the prior, or 5 m without one."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.layer = nn.Identity()
+
+    def forward(self, rgb: Tensor, sparse: Tensor, prior: Tensor | None = None) -> Tensor:
+        return self.layer(torch.full_like(sparse, 5.0) if prior is None else 2.0 * prior)
+
+
+class Nearest(nn.Module):
+    """Depth is the mean of the points, 3 m where there is none."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.layer = nn.Identity()
+
+    def forward(self, rgb: Tensor, sparse: Tensor) -> Tensor:
+        mean = sparse.sum() / (sparse > 0).sum().clamp(min=1)
+        return self.layer(torch.zeros_like(sparse) + mean)
+
+
+def member(
+    build: type[nn.Module], *, settings: RefineSettings | None = None, **of_definition: Any
+) -> Member:
+    """The network as a member of the default method, by default without updates and alignment."""
+    kind = "rgb" if build is Brightness else "rgb+sparse"
+    definition = ModelDefinition(
+        name=build.__name__.lower(),
+        build=build,
+        size=Multiple(4),
+        layers=("layer",),
+        input_kind=kind,
+        **({"takes_prior": build is TwicePrior} | of_definition),
+    )
+    network = Network(
+        definition=definition,
+        module=build().eval(),
+        device=torch.device("cpu"),
+        checkpoint=None,
+    )
+    settings = settings or RefineSettings(iterations=0, align="none")
+    return Member(network=network, layer="layer", settings=settings)
