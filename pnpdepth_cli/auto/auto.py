@@ -4,7 +4,7 @@
 2. Some of the other points are held out. Every candidate predicts them from the rest
    (`predictions`), and the best one, or mean of a few, is chosen (`choice`).
 3. The chosen candidates are given all points. If there is time, a chosen network that takes the
-   points first makes steps by points hidden from its input (`core.refine.refine_weights`).
+   points first makes steps by points hidden from its input (`core.weights_refinement`).
 
 The networks alone and every baseline are candidates, so that the result is never worse than they
 are at the held-out points.

@@ -26,7 +26,7 @@ from pnpdepth_cli.completion.propagation import fitted_kernel, propagate, propag
 from pnpdepth_cli.completion.residual_field import Kernel
 from pnpdepth_cli.core.refine import Refinement, refine_from
 from pnpdepth_cli.core.split import InputSplit, Split
-from pnpdepth_cli.core.split.user_code import wrap_user_errors
+from pnpdepth_cli.core.user_code import wrap_user_errors
 from pnpdepth_cli.errors import PnpDepthError
 from pnpdepth_cli.frames.frame import Frame, RefinedFrame
 from pnpdepth_cli.frames.prepare import PreparedFrame, prepare

@@ -9,8 +9,7 @@ from typing import Any
 from torch import Tensor
 
 from pnpdepth_cli.choices import LOSSES, PARAMETERS, UPDATES
-from pnpdepth_cli.core.losses import Loss
-from pnpdepth_cli.core.proximity import proximity_loss
+from pnpdepth_cli.core.losses import Loss, proximity_loss
 from pnpdepth_cli.core.step_sizes import SCHEDULES, Channels, blurred, step_size
 from pnpdepth_cli.core.update_rules import Update
 from pnpdepth_cli.errors import DivergedError, ModelError, PnpDepthError

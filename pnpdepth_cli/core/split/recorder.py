@@ -10,10 +10,8 @@ import torch
 from torch import Tensor, nn
 
 from pnpdepth_cli.core.split.cut_point import CutPoint
-from pnpdepth_cli.core.split.recording import RecordedCall, Recording, shapes_of
-from pnpdepth_cli.core.split.replay import CutReached, Replay
-from pnpdepth_cli.core.split.saved import SavedTensors
-from pnpdepth_cli.core.split.structure import tensors_in
+from pnpdepth_cli.core.split.replay import CutReached, RecordedCall, Recording, Replay, shapes_of
+from pnpdepth_cli.core.split.tensors import SavedTensors, tensors_in
 from pnpdepth_cli.core.split.watch import Watch
 
 

@@ -19,8 +19,7 @@ from torch import Tensor, nn, overrides
 from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from pnpdepth_cli.core.split.saved import SavedTensors
-from pnpdepth_cli.core.split.structure import is_transparent, map_tensors, tensors_in
+from pnpdepth_cli.core.split.tensors import SavedTensors, is_transparent, map_tensors, tensors_in
 
 _ESCAPES = (Tensor.numpy, Tensor.tolist, Tensor.__array__, Tensor.__dlpack__)
 """Methods that give values to Python and are no tensor operations."""
