@@ -267,9 +267,9 @@ class WeightsRefinement:
         steps, budget = len(self.losses), self._settings.time_budget_s
         if budget is None:
             return self._settings.iterations
-        each = (time.monotonic() - self._started) / steps
+        step_s = (time.monotonic() - self._started) / steps
         # The last prediction takes less than a step.
-        return max(steps, min(self._settings.iterations, int(budget / each) - 1))
+        return max(steps, min(self._settings.iterations, int(budget / step_s) - 1))
 
     def _start_rules(self, gradients: Sequence[Tensor | None]) -> None:
         """Begins with those weights that a gradient reaches."""

@@ -140,7 +140,7 @@ class Recorder:
     def _may_be_one(self, module: nn.Module) -> bool:
         """True if it ends before the cut, so that what is inside needs no record."""
         apart = (self._cut.containers, self._cut.around_hooks, self._uncacheable)
-        return self._replay.recording.cut is None and not any(module in each for each in apart)
+        return self._replay.recording.cut is None and not any(module in group for group in apart)
 
     def _release_unread(self) -> None:
         """Saved outputs that only go into other cached submodules lose their memory.

@@ -82,8 +82,8 @@ class Watch(TorchDispatchMode):
         self._stale: set[int] = set()  # the storage of one twin after the other was changed
         self._function_mode = _EscapeMode(self)
         self._sees_escapes = False
-        for each in saved:
-            self.protect(each)
+        for tensors in saved:
+            self.protect(tensors)
 
     def touch(self, tensor: Tensor) -> None:
         """Marks a tensor as depending on z."""
