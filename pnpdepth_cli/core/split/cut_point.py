@@ -20,7 +20,6 @@ class LayerName:
     """A layer: `module`, `module#2` for its second call, `module[key]` for one of its outputs."""
 
     module: str
-    """Name of the submodule."""
     call: int | None = None
     """Number of the call, from 1; None if there is one call."""
     key: tuple[str, ...] | None = None
@@ -49,9 +48,7 @@ class CutPoint:
     layer: str
     """The layer as the user named it."""
     name: LayerName
-    """The name in its parts."""
     module: nn.Module
-    """The layer's module."""
     modules: Mapping[str, nn.Module]
     """All submodules by name; one with several names comes several times."""
     containers: frozenset[nn.Module]

@@ -80,7 +80,6 @@ class RecordedCall:
     """One call of a submodule that every pass makes."""
 
     module: nn.Module
-    """The submodule."""
     cached: bool
     """Whether later passes return its saved output instead of running it."""
     copied: bool = False

@@ -76,7 +76,6 @@ class SavedTensors:
     """Tensors in nested containers, as they were when saved."""
 
     value: Any = None
-    """The tensors in their containers."""
     copied: bool = False
     """Whether the network changes them in place, so that `fresh` returns clones."""
 

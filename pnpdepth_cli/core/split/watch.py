@@ -37,7 +37,6 @@ class Moment:
     """A time in a watched pass, by the numbers of events before it."""
 
     operations: int
-    """Tensor operations."""
     touches: int
     """Results that depend on z."""
     writes: int
