@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import pytest
@@ -9,6 +10,8 @@ import torch
 
 from pnpdepth_cli import choices
 from pnpdepth_cli.choices import Table
+from pnpdepth_cli.completion import baselines, propagations
+from pnpdepth_cli.core import losses, update_rules
 from pnpdepth_cli.core.step_sizes import SCHEDULES
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.models.precision import dtype_of
@@ -56,11 +59,20 @@ def test_an_unknown_name_is_an_error_that_names_the_nearest(table: Table) -> Non
         table["pfmm"]
 
 
-def test_losses_and_update_rules_are_the_files_of_their_folders() -> None:
-    assert list(choices.LOSSES) == ["l1", "l2", "huber", "berhu", "inverse", "log", "cauchy"]
-    rules = ["sign", "sgd", "normalised", "momentum", "adam", "adam-short", "lbfgs"]
-    assert list(choices.UPDATES) == rules
-    assert all(callable(entry) for entry in (*choices.LOSSES.values(), *choices.UPDATES.values()))
+@pytest.mark.parametrize(
+    ("table", "implemented"),
+    [
+        (choices.LOSSES, losses.TABLE),
+        (choices.UPDATES, update_rules.TABLE),
+        (choices.BASELINES, baselines.TABLE),
+        (choices.PROPAGATIONS, propagations.TABLE),
+    ],
+)
+def test_a_table_lists_the_names_of_its_module_in_their_order(
+    table: Table, implemented: Mapping[str, object]
+) -> None:
+    assert list(table) == list(implemented)
+    assert list(table.values()) == list(implemented.values())
 
 
 def test_every_name_of_a_closed_list_is_implemented() -> None:

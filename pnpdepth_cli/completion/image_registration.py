@@ -142,11 +142,11 @@ def estimated(frames: Iterable[Evidence | None]) -> ImageRegistration | None:
     Args:
         frames: Their evidence; None of a frame that says nothing. The first decides the size.
     """
-    usable = [each for each in frames if each is not None]
+    usable = [frame for frame in frames if frame is not None]
     if not usable:
         return None
     size = usable[0].size
-    total = np.sum([each.log_likelihood for each in usable if each.size == size], axis=0)
+    total = np.sum([frame.log_likelihood for frame in usable if frame.size == size], axis=0)
     down, right = (_shifts(count, size) for count in total.shape[1:])
     prior = (
         (np.log(_ZOOMS) / _ZOOM_SIGMA)[:, None, None] ** 2

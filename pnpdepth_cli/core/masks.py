@@ -7,15 +7,12 @@ where the depth between a LiDAR's lines is wanted.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from pnpdepth_cli.points import SparsePoints
-
-if TYPE_CHECKING:
-    from pnpdepth_cli.core.refinement import MaskSettings
 
 BLOCKS = 8
 """Blocks along each side of the frame."""
@@ -28,7 +25,7 @@ Groups = Callable[[SparsePoints, torch.Generator], Tensor]
 """(N,) int64: the group of each point; a group is hidden or shown as a whole."""
 
 
-def _each(points: SparsePoints, generator: torch.Generator) -> Tensor:
+def _points(points: SparsePoints, generator: torch.Generator) -> Tensor:
     return torch.arange(len(points))
 
 
@@ -45,8 +42,24 @@ def _lines(points: SparsePoints, generator: torch.Generator) -> Tensor:
     return (points.xy.cpu()[:, 1] / points.size[0] * LINES + shift).long()
 
 
-MASKS: dict[str, Groups] = {"points": _each, "blocks": _blocks, "lines": _lines}
+MASKS: dict[str, Groups] = {"points": _points, "blocks": _blocks, "lines": _lines}
 """The kinds of mask; `choices.MASKS` lists their names."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class MaskSettings:
+    """Which points are hidden from the network's input, and which decide how many steps count."""
+
+    kind: str = "points"
+    """What is hidden as a whole, one of `choices.MASKS`."""
+    fraction: float = 0.5
+    """Fraction hidden at every step."""
+    set_aside: float = 0.1
+    """Fraction never shown during the steps; the step that is best there is taken."""
+    scale: float = 1.0
+    """Side of the image during the steps, as a fraction of the side that the network takes."""
+    seed: int = 0
+    """Of the masks, and of the random start of low-rank weights."""
 
 
 class Masks:

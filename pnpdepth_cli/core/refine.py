@@ -8,17 +8,8 @@ equations 2 and 3:
     depth   = f_rear(z_K)
 
 `refine_from` is that loop. L and D_s are those of `core.losses` and `points`, U one of
-`core.update_rules`, α and its schedule those of `core.step_sizes`.
-
-A network that is given the points as an input fits them before the first update, so that L says
-little. `refine_weights` hides some points m_k ⊂ D_s from the input and takes L at these, a new
-random m_k at every step, and moves the weights θ instead of z:
-
-    θ_{k+1} = θ_k − α·U(∂L(f_θ(x, D_s ∖ m_k), m_k) / ∂θ_k)
-    depth   = f_θ*(x, D_s)
-
-θ* is the last θ_k, unless another is better beyond chance at points never shown; k = 0 is among
-them. With target "given" nothing is hidden, and L is taken at all points, as in equation 3.
+`core.update_rules`, α and its schedule those of `core.step_sizes`. `core.weights_refinement` is the
+same for weights of the network.
 """
 
 from __future__ import annotations
@@ -29,24 +20,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from pnpdepth_cli.core.batch import frame_parts
 from pnpdepth_cli.core.refinement import DepthOf, FrameRefinement, Refinement, RefineSettings
 from pnpdepth_cli.core.split import Split, gradient_at
-from pnpdepth_cli.core.split.user_code import wrap_user_errors
-from pnpdepth_cli.core.weights import MovingWeights
-from pnpdepth_cli.core.weights_refinement import FrameOfPoints, WeightsRefinement
-from pnpdepth_cli.errors import LayerError, PnpDepthError
+from pnpdepth_cli.core.split.tensors import map_tensors, tensors_in
+from pnpdepth_cli.errors import BatchError, LayerError, PnpDepthError
 from pnpdepth_cli.points import SparsePoints
 
-__all__ = [
-    "DepthOf",
-    "RefineSettings",
-    "Refinement",
-    "refine",
-    "refine_batch",
-    "refine_from",
-    "refine_weights",
-]
+__all__ = ["DepthOf", "RefineSettings", "Refinement", "frame_parts", "refine", "refine_from"]
 
 _LOSS_SCALE = 1024.0
 """Factor on the loss where float16 is involved, whose smallest number exceeds many gradients."""
@@ -79,9 +59,11 @@ def refine(
         ModelError: The first prediction is not finite at the points.
         LayerError: The depth does not depend on z.
     """
-    (result,) = refine_batch(
+    with torch.no_grad():
+        z0 = split.front(*arguments)
+    (result,) = refine_from(
         split,
-        arguments,
+        z0,
         (points,),
         settings,
         depth_of=(depth_of,),
@@ -93,9 +75,9 @@ def refine(
     return result
 
 
-def refine_batch(
+def refine_from(
     split: Split,
-    arguments: Sequence[Tensor],
+    z: Tensor,
     points: Sequence[SparsePoints],
     settings: RefineSettings,
     *,
@@ -109,7 +91,7 @@ def refine_batch(
 
     Args:
         split: The network, cut and open.
-        arguments: Of the network, for all frames, stacked along axis 0.
+        z: z_0 of all frames, stacked along axis 0; the front has run.
         points: Of each frame.
         settings: Of all frames.
         depth_of: Of each frame; called with the frame's part of the network's output.
@@ -119,30 +101,6 @@ def refine_batch(
     Raises:
         BatchError: z or the output does not have one part per frame; refine them one at a time.
     """
-    with torch.no_grad():
-        z0 = split.front(*arguments)
-    return refine_from(
-        split,
-        z0,
-        points,
-        settings,
-        depth_of=depth_of,
-        keep_depths=keep_depths,
-        on_iteration=on_iteration,
-    )
-
-
-def refine_from(
-    split: Split,
-    z: Tensor,
-    points: Sequence[SparsePoints],
-    settings: RefineSettings,
-    *,
-    depth_of: Sequence[DepthOf],
-    keep_depths: Collection[int] = (),
-    on_iteration: Callable[[int, float], None] = lambda iteration, loss: None,
-) -> list[Refinement | PnpDepthError]:
-    """Returns the same from z_0 on, so that the front runs once for several sets of points."""
     frames = [
         FrameRefinement(settings, z0, at, read, keep_depths)
         for z0, at, read in zip(frame_parts(z, len(points)), points, depth_of, strict=True)
@@ -164,56 +122,31 @@ def refine_from(
     return [frame.result() if frame.error is None else frame.error for frame in frames]
 
 
-def refine_weights(
-    frame: FrameOfPoints,
-    weights: MovingWeights,
-    settings: RefineSettings,
-    *,
-    carried: MovingWeights | None = None,
-    on_iteration: Callable[[int, float], None] = lambda iteration, loss: None,
-) -> Refinement:
-    """Returns the depth of one frame after moving weights, which are back in place afterwards.
+def frame_parts(structure: Any, frames: int) -> list[Any]:
+    """Returns the part of each frame, with a batch axis of 1; for one frame the whole structure.
 
     Args:
-        frame: The frame, and how the network predicts it.
-        weights: The weights that move, θ_0.
-        settings: What is updated and how.
-        carried: θ* of the frame before, which moves instead where its L is lower than that of θ_0
-            at the points set aside.
-        on_iteration: Called after each step k with k and L(θ_k).
+        structure: A tensor, or tensors in nested containers, with the frames along axis 0.
+        frames: The number of frames.
 
     Raises:
-        DivergedError: As of `refine`.
-        ModelError: As of `refine`.
-        LayerError: The depth depends on no weight behind the cut.
+        BatchError: A tensor does not have one element per frame along axis 0.
     """
-    state = WeightsRefinement(frame, weights, settings)
-    state.begin()
-    if carried is not None and state.takes(carried):
-        weights = carried
-    for iteration in range(state.iterations):
-        shown, hidden = state.mask()
-        with torch.enable_grad(), weights.in_place(requires_grad=True) as theta:
-            loss = state.loss(frame.predict_in_steps(shown), hidden)
-            gradients = _gradients(loss, theta)
-        state.update(loss, gradients)
-        if state.error is not None:
-            break
-        on_iteration(iteration, state.losses[-1])
-        if state.finished():
-            break
-    if state.error is not None:
-        state.error.last_good = state.result()
-        raise state.error
-    return state.result()
+    if frames == 1:
+        return [structure]
+    for path, tensor in tensors_in(structure):
+        if tensor.shape[:1] != (frames,):
+            name = ".".join(path) or "the tensor"
+            raise BatchError(
+                f"{name} of shape {tuple(tensor.shape)}, at the cut or in the output, has not one"
+                f" part for each of {frames} frames; refine them one at a time"
+            )
+    parts = {path: tensor.tensor_split(frames) for path, tensor in tensors_in(structure)}
 
+    def of_frame(index: int) -> Any:
+        return map_tensors(structure, lambda path, _: parts[path][index])
 
-def _gradients(loss: Tensor, theta: Sequence[Tensor]) -> list[Tensor | None]:
-    """∂L/∂θ_k; None for what L does not depend on."""
-    if loss.requires_grad:
-        with wrap_user_errors("the gradient of the network"):
-            loss.backward()  # type: ignore[no-untyped-call]
-    return [value.grad for value in theta]
+    return [of_frame(index) for index in range(frames)]
 
 
 def _losses(frames: Sequence[FrameRefinement], output: Any) -> list[Tensor]:

@@ -9,8 +9,8 @@ from typing import Any
 from torch import Tensor
 
 from pnpdepth_cli.choices import LOSSES, PARAMETERS, UPDATES
-from pnpdepth_cli.core.losses import Loss
-from pnpdepth_cli.core.proximity import proximity_loss
+from pnpdepth_cli.core.losses import Loss, proximity_loss
+from pnpdepth_cli.core.masks import MaskSettings
 from pnpdepth_cli.core.step_sizes import SCHEDULES, Channels, blurred, step_size
 from pnpdepth_cli.core.update_rules import Update
 from pnpdepth_cli.errors import DivergedError, ModelError, PnpDepthError
@@ -18,22 +18,6 @@ from pnpdepth_cli.points import SparsePoints
 
 DepthOf = Callable[[Any], Tensor]
 """Turns the network's output for one frame into depth (1, 1, h, w) in metres, differentiably."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class MaskSettings:
-    """Which points are hidden from the network's input, and which decide how many steps count."""
-
-    kind: str = "points"
-    """What is hidden as a whole, one of `choices.MASKS`."""
-    fraction: float = 0.5
-    """Fraction hidden at every step."""
-    set_aside: float = 0.1
-    """Fraction never shown during the steps; the step that is best there is taken."""
-    scale: float = 1.0
-    """Side of the image during the steps, as a fraction of the side that the network takes."""
-    seed: int = 0
-    """Of the masks, and of the random start of low-rank weights."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,7 +40,7 @@ class RefineSettings:
     """What is updated: "elements" or "channels" of z, "weights", or "lora:R"."""
     target: str = "given"
     """Which points L is taken at, one of `choices.TARGETS`."""
-    mask: MaskSettings = MaskSettings()
+    mask: MaskSettings = field(default_factory=MaskSettings)
     """With target "masked": which points are hidden from the input."""
     time_budget_s: float | None = None
     """Seconds after which no update of weights begins; None sets no limit."""

@@ -95,8 +95,8 @@ class Channels:
 
     def gradient(self, gradient_at_z: Tensor) -> Tensor:
         """Returns the gradient at scale and shift, stacked along axis 0, per element of z."""
-        each = (gradient_at_z * self._standardised, gradient_at_z)
-        return torch.cat([one.mean(dim=self._dims, keepdim=True) for one in each])
+        gradients = (gradient_at_z * self._standardised, gradient_at_z)
+        return torch.cat([one.mean(dim=self._dims, keepdim=True) for one in gradients])
 
     def change_of_z(self, change: Tensor) -> Tensor:
         """Returns the change of z for a change of scale and shift, stacked along axis 0."""

@@ -1,4 +1,15 @@
-"""The refinement of one frame by moving weights: its state between steps, and its result."""
+"""The method on weights: they move until the prediction fits points that the network is not given.
+
+A network that is given the points as an input fits them before the first update, so that L says
+little. `refine_weights` hides some points m_k ⊂ D_s from the input and takes L at these, a new
+random m_k at every step, and moves the weights θ instead of z:
+
+    θ_{k+1} = θ_k − α·U(∂L(f_θ(x, D_s ∖ m_k), m_k) / ∂θ_k)
+    depth   = f_θ*(x, D_s)
+
+θ* is the last θ_k, unless another is better beyond chance at points never shown; k = 0 is among
+them. With target "given" nothing is hidden, and L is taken at all points, as in equation 3.
+"""
 
 from __future__ import annotations
 
@@ -16,6 +27,7 @@ from pnpdepth_cli.core.masks import Masks, set_aside
 from pnpdepth_cli.core.refinement import DepthOf, Refinement, RefineSettings, bad_prediction
 from pnpdepth_cli.core.step_sizes import SCHEDULES, step_size
 from pnpdepth_cli.core.update_rules import Update
+from pnpdepth_cli.core.user_code import wrap_user_errors
 from pnpdepth_cli.core.weights import MovingWeights
 from pnpdepth_cli.errors import DivergedError, LayerError
 from pnpdepth_cli.points import SparsePoints
@@ -47,6 +59,58 @@ class FrameOfPoints:
     """The same for the steps, perhaps from a smaller image of the same field of view."""
     depth_of: DepthOf
     """Turns that into depth (1, 1, h, w) in metres, differentiably."""
+
+
+def refine_weights(
+    frame: FrameOfPoints,
+    weights: MovingWeights,
+    settings: RefineSettings,
+    *,
+    carried: MovingWeights | None = None,
+    on_iteration: Callable[[int, float], None] = lambda iteration, loss: None,
+) -> Refinement:
+    """Returns the depth of one frame after moving weights, which are back in place afterwards.
+
+    Args:
+        frame: The frame, and how the network predicts it.
+        weights: The weights that move, θ_0.
+        settings: What is updated and how.
+        carried: θ* of the frame before, which moves instead where its L is lower than that of θ_0
+            at the points set aside.
+        on_iteration: Called after each step k with k and L(θ_k).
+
+    Raises:
+        DivergedError: As of `refine`.
+        ModelError: As of `refine`.
+        LayerError: The depth depends on no weight behind the cut.
+    """
+    state = WeightsRefinement(frame, weights, settings)
+    state.begin()
+    if carried is not None and state.takes(carried):
+        weights = carried
+    for iteration in range(state.iterations):
+        shown, hidden = state.mask()
+        with torch.enable_grad(), weights.in_place(requires_grad=True) as theta:
+            loss = state.loss(frame.predict_in_steps(shown), hidden)
+            gradients = _gradients(loss, theta)
+        state.update(loss, gradients)
+        if state.error is not None:
+            break
+        on_iteration(iteration, state.losses[-1])
+        if state.finished():
+            break
+    if state.error is not None:
+        state.error.last_good = state.result()
+        raise state.error
+    return state.result()
+
+
+def _gradients(loss: Tensor, theta: Sequence[Tensor]) -> list[Tensor | None]:
+    """∂L/∂θ_k; None for what L does not depend on."""
+    if loss.requires_grad:
+        with wrap_user_errors("the gradient of the network"):
+            loss.backward()  # type: ignore[no-untyped-call]
+    return [value.grad for value in theta]
 
 
 class WeightsRefinement:
@@ -203,9 +267,9 @@ class WeightsRefinement:
         steps, budget = len(self.losses), self._settings.time_budget_s
         if budget is None:
             return self._settings.iterations
-        each = (time.monotonic() - self._started) / steps
+        step_s = (time.monotonic() - self._started) / steps
         # The last prediction takes less than a step.
-        return max(steps, min(self._settings.iterations, int(budget / each) - 1))
+        return max(steps, min(self._settings.iterations, int(budget / step_s) - 1))
 
     def _start_rules(self, gradients: Sequence[Tensor | None]) -> None:
         """Begins with those weights that a gradient reaches."""

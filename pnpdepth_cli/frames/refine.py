@@ -12,10 +12,10 @@ from torch import Tensor
 
 from pnpdepth_cli.completion.outliers import outliers
 from pnpdepth_cli.completion.propagation import propagate
-from pnpdepth_cli.core.refine import Refinement, RefineSettings, refine_from, refine_weights
+from pnpdepth_cli.core.refine import Refinement, RefineSettings, refine_from
 from pnpdepth_cli.core.split import InputSplit, Split
 from pnpdepth_cli.core.weights import MovingWeights
-from pnpdepth_cli.core.weights_refinement import FrameOfPoints, Predict
+from pnpdepth_cli.core.weights_refinement import FrameOfPoints, Predict, refine_weights
 from pnpdepth_cli.errors import BatchError, DivergedError, PnpDepthError
 from pnpdepth_cli.frames.frame import DepthMap, Frame, RefinedFrame, no_points
 from pnpdepth_cli.frames.prepare import PreparedFrame, prepare

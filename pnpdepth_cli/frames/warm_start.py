@@ -13,9 +13,10 @@ import torch
 from torch import Tensor
 
 from pnpdepth_cli.choices import LOSSES
-from pnpdepth_cli.core.refine import Refinement, RefineSettings, refine_from, refine_weights
+from pnpdepth_cli.core.refine import Refinement, RefineSettings, refine_from
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.core.weights import MovingWeights
+from pnpdepth_cli.core.weights_refinement import refine_weights
 from pnpdepth_cli.errors import DivergedError, PnpDepthError
 from pnpdepth_cli.frames.frame import Frame, RefinedFrame, WarmStart
 from pnpdepth_cli.frames.prepare import PreparedFrame, prepare

@@ -12,8 +12,8 @@ import torch
 from torch import Tensor, nn
 
 from pnpdepth_cli.core.split import InputSplit, Split
-from pnpdepth_cli.core.split.structure import tensors_in
-from pnpdepth_cli.core.split.user_code import is_out_of_memory, wrap_user_errors
+from pnpdepth_cli.core.split.tensors import tensors_in
+from pnpdepth_cli.core.user_code import is_out_of_memory, wrap_user_errors
 from pnpdepth_cli.errors import CheckpointError, DeviceError, ModelError, UsageError
 from pnpdepth_cli.models.definition import Fixed, ModelDefinition, Normalisation
 from pnpdepth_cli.models.formats.python_file import importing_beside

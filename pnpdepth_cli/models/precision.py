@@ -9,7 +9,7 @@ import torch
 from torch import nn
 
 from pnpdepth_cli.choices import PRECISIONS
-from pnpdepth_cli.core.split.user_code import describe, is_out_of_memory
+from pnpdepth_cli.core.user_code import describe, is_out_of_memory
 from pnpdepth_cli.errors import DeviceError, ModelError, UsageError
 
 _DTYPES = {"fp32": None, "bf16": torch.bfloat16, "fp16": torch.float16}

@@ -19,7 +19,7 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from pnpdepth_cli.core.influence import influential_field
 from pnpdepth_cli.core.split import Split
-from pnpdepth_cli.core.split.layer_name import LayerName
+from pnpdepth_cli.core.split.cut_point import LayerName
 from pnpdepth_cli.errors import ModelError
 from pnpdepth_cli.models.frame import FrameMap
 from pnpdepth_cli.models.network import Network, out_of_memory_is_a_device_error

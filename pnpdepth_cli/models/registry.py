@@ -16,7 +16,7 @@ from pathlib import Path
 from types import ModuleType
 
 from pnpdepth_cli import choices
-from pnpdepth_cli.core.split.user_code import describe
+from pnpdepth_cli.core.user_code import describe
 from pnpdepth_cli.errors import ModelError, PnpDepthError
 from pnpdepth_cli.models.definition import ModelDefinition
 from pnpdepth_cli.models.formats.python_file import python_definition

@@ -9,8 +9,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from pnpdepth_cli.core.split.structure import map_tensors
-from pnpdepth_cli.core.split.user_code import wrap_user_errors
+from pnpdepth_cli.core.split.tensors import map_tensors
+from pnpdepth_cli.core.user_code import wrap_user_errors
 from pnpdepth_cli.errors import ModelError
 
 _SIMILAR_ASPECT = 1.3

@@ -95,11 +95,11 @@ def option(default: Any, help: str, **details: Any) -> Any:
 
 def options_of(group: type) -> Iterator[OptionField]:
     """Yields the fields of a dataclass that were made by `option`, in their order."""
-    for each in fields(group):
-        if _KEY in each.metadata:
+    for declared in fields(group):
+        if _KEY in declared.metadata:
             yield OptionField(
-                name=each.name,
-                type=str(each.type).removesuffix(" | None"),
-                default=each.default,
-                option=each.metadata[_KEY],
+                name=declared.name,
+                type=str(declared.type).removesuffix(" | None"),
+                default=declared.default,
+                option=declared.metadata[_KEY],
             )

@@ -11,8 +11,8 @@ from torch import Tensor, nn
 
 from pnpdepth_cli.choices import LOSSES, UPDATES
 from pnpdepth_cli.core.refine import RefineSettings
-from pnpdepth_cli.core.split.layer_name import LayerName
-from pnpdepth_cli.core.split.structure import map_tensors, tensors_in
+from pnpdepth_cli.core.split.cut_point import LayerName
+from pnpdepth_cli.core.split.tensors import map_tensors, tensors_in
 from pnpdepth_cli.points import SparsePoints
 
 

@@ -36,15 +36,23 @@ def step(size: tuple[int, int] = SIZE) -> Tensor:
     return log_depth
 
 
-def test_it_is_the_least_squares_solution_of_its_equation() -> None:
-    residuals = field([(1.0, 1.0), (6.0, 4.0), (2.0, 5.0)], [0.3, -0.2, 0.1], step())
+@pytest.mark.parametrize(
+    "xy",
+    [
+        [(1.0, 1.0), (6.0, 4.0), (2.0, 5.0)],
+        [(1.25, 1.0), (6.0, 3.5), (2.75, 4.125), (2.5, 4.75)],  # between nodes
+        [(-2.0, 0.5), (7.5, 5.5), (3.25, 9.0)],  # outside: moved to the outermost nodes
+    ],
+)
+def test_it_is_the_least_squares_solution_of_its_equation(xy: list[tuple[float, float]]) -> None:
+    residuals = field(xy, [0.3, -0.2, 0.1, -0.4][: len(xy)], step())
     u = residuals.features[2].double().numpy()
     number = np.arange(48).reshape(SIZE)
     lines, right = [], []
-    for (x, y), r in zip(
-        residuals.points.xy.int().tolist(), residuals.residual.tolist(), strict=True
-    ):
-        lines.append(np.eye(48)[number[y, x]])
+    for (x, y), r in zip(xy, residuals.residual.tolist(), strict=True):
+        across = np.clip(1 - abs(np.clip(x, 0, 7) - np.arange(8)), 0, 1)
+        down = np.clip(1 - abs(np.clip(y, 0, 5) - np.arange(6)), 0, 1)
+        lines.append(np.outer(down, across).ravel())
         right.append(r)
     for a, b in [
         *zip(number[:, :-1].flat, number[:, 1:].flat, strict=True),

@@ -13,7 +13,13 @@ from torch import Tensor
 
 from pnpdepth_cli.choices import SPACES
 from pnpdepth_cli.completion.alignment import from_space, to_space
-from pnpdepth_cli.completion.interpolation import inverse_distance, linear, morphological, nearest
+from pnpdepth_cli.completion.interpolation import (
+    in_hull,
+    inverse_distance,
+    linear,
+    morphological,
+    nearest,
+)
 from pnpdepth_cli.errors import NoPointsError
 from pnpdepth_cli.points import SparsePoints
 
@@ -146,6 +152,25 @@ def test_linear_of_points_in_a_row_is_the_nearest_point(step: tuple[float, float
     xy = [(2.0 + i * step[0], 3.0 + i * step[1]) for i in range(5)]
     points = points_at(xy, [1.0, 2.0, 3.0, 4.0, 5.0], (12, 16))
     assert torch.equal(linear(points), nearest(points))
+
+
+@pytest.mark.parametrize(
+    ("xy", "inside"),
+    [
+        ([(2.0, 1.0)], []),
+        ([(0.0, 0.0), (3.0, 2.0)], []),
+        ([(0.0, 0.0), (1.0, 1.0), (2.0, 2.0)], []),  # on one line
+        ([(0.0, 0.0), (2.0, 0.0), (0.0, 2.0)], [(0, 0), (1, 0), (2, 0), (0, 1), (1, 1), (0, 2)]),
+    ],
+)
+def test_the_hull_holds_the_pixels_between_three_points_and_none_of_fewer_or_of_a_line(
+    xy: list[tuple[float, float]], inside: list[tuple[int, int]]
+) -> None:
+    points = points_at(xy, [1.0] * len(xy), (3, 4))
+    expected = torch.tensor([[(x, y) in inside for x in range(4)] for y in range(3)])
+    assert torch.equal(in_hull(points), expected)
+    queries = torch.tensor([(1.0, 1.0), (3.0, 1.0)])
+    assert in_hull(points, queries).tolist() == [(1, 1) in inside, False]
 
 
 def test_inverse_distance_is_shepards_mean_of_the_nearest_points() -> None:

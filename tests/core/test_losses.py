@@ -8,10 +8,7 @@ import pytest
 import torch
 
 from pnpdepth_cli.choices import LOSSES
-from pnpdepth_cli.core.losses import MIN_DEPTH
-from pnpdepth_cli.core.losses.berhu import loss as berhu
-from pnpdepth_cli.core.losses.cauchy import MIN_SCALE
-from pnpdepth_cli.core.losses.cauchy import loss as cauchy
+from pnpdepth_cli.core.losses import MIN_CAUCHY_SCALE, MIN_DEPTH, berhu, cauchy, proximity_loss
 
 PREDICTED, TRUE = torch.tensor([1.0, 2.0, 4.0, 10.0]), torch.tensor([1.0, 2.5, 2.0, 5.0])
 # errors 0, ½, 2, 5; c of berhu = 1, so ½ is linear there and 2 and 5 are quadratic
@@ -100,5 +97,15 @@ def test_what_counts_as_gross_grows_with_the_errors_of_most_points() -> None:
         (gradient,) = torch.autograd.grad(cauchy(predicted, true), predicted)
         pulls.append((gradient * predicted).abs())
     assert float(pulls[0][4]) < float(pulls[0][1])
-    assert 8 * log(1.1) > MIN_SCALE
+    assert 8 * log(1.1) > MIN_CAUCHY_SCALE
     assert float(pulls[1][1]) > 3 * float(pulls[0][1]) / 4
+
+
+def test_proximity_is_the_mean_squared_change_of_log_depth() -> None:
+    loss = proximity_loss(torch.tensor([2.0, 3.0, 8.0]), torch.tensor([1.0, 3.0, 2.0]))
+    assert float(loss) == pytest.approx((log(2) ** 2 + log(4) ** 2) / 3)
+
+
+def test_depth_that_is_not_positive_is_read_as_the_least_depth() -> None:
+    loss = proximity_loss(torch.tensor([-1.0, 0.0]), torch.tensor([MIN_DEPTH, MIN_DEPTH / 2]))
+    assert float(loss) == 0

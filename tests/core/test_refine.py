@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from pnpdepth_cli.choices import LOSSES, UPDATES
-from pnpdepth_cli.core.refine import Refinement, RefineSettings, refine, refine_batch
+from pnpdepth_cli.core.refine import Refinement, RefineSettings, frame_parts, refine, refine_from
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.errors import (
     BatchError,
@@ -481,7 +481,9 @@ def refined_at_once(
 ) -> list[Refinement | PnpDepthError]:
     reads = read if isinstance(read, list) else [read] * 3
     with Split(network, layer) as split:
-        return refine_batch(split, (IMAGES,), OTHERS, settings, depth_of=reads, **more)
+        with torch.no_grad():
+            z0 = split.front(IMAGES)
+        return refine_from(split, z0, OTHERS, settings, depth_of=reads, **more)
 
 
 def refined_alone(
@@ -649,3 +651,21 @@ def test_a_refinement_does_not_import_the_compiler() -> None:
     )
     root = Path(__file__).parents[2]
     assert subprocess.run([sys.executable, "-c", code], cwd=root, check=False).returncode == 0
+
+
+def test_every_tensor_of_a_structure_is_split_along_its_first_axis() -> None:
+    x = torch.arange(6.0).reshape(2, 3)
+    parts = frame_parts({"a": x, "b": [x + 1, None]}, 2)
+    assert [part["a"].tolist() for part in parts] == [[[0, 1, 2]], [[3, 4, 5]]]
+    assert [part["b"][0].tolist() for part in parts] == [[[1, 2, 3]], [[4, 5, 6]]]
+    assert [part["b"][1] for part in parts] == [None, None]
+
+
+def test_for_one_frame_the_structure_is_its_own_part() -> None:
+    structure = {"a": torch.ones(5)}
+    assert frame_parts(structure, 1)[0] is structure
+
+
+def test_a_tensor_without_one_element_per_frame_is_named() -> None:
+    with pytest.raises(BatchError, match=r"deep\.0 of shape \(3, 1\)"):
+        frame_parts({"a": torch.ones(2, 1), "deep": [torch.ones(3, 1)]}, 2)

@@ -9,15 +9,17 @@ import torch
 from torch import Tensor
 
 from pnpdepth_cli.choices import UPDATES
-from pnpdepth_cli.core.update_rules import Update
-from pnpdepth_cli.core.update_rules import lbfgs as lbfgs_module
-from pnpdepth_cli.core.update_rules.adam import update_rule as adam
-from pnpdepth_cli.core.update_rules.adam_short import update_rule as adam_short
-from pnpdepth_cli.core.update_rules.lbfgs import update_rule as lbfgs
-from pnpdepth_cli.core.update_rules.momentum import update_rule as momentum
-from pnpdepth_cli.core.update_rules.normalised import update_rule as normalised
-from pnpdepth_cli.core.update_rules.sgd import update_rule as sgd
-from pnpdepth_cli.core.update_rules.sign import update_rule as sign
+from pnpdepth_cli.core import update_rules
+from pnpdepth_cli.core.update_rules import (
+    Update,
+    adam,
+    adam_short,
+    lbfgs,
+    momentum,
+    normalised,
+    sgd,
+    sign,
+)
 
 
 def stepped(update: Update, steps: int = 20, lr: float = 0.1) -> Tensor:
@@ -96,7 +98,7 @@ def test_a_normalised_gradient_keeps_its_direction_and_has_a_root_mean_square_of
 def test_l_bfgs_moves_as_dense_bfgs_does_whatever_the_step(
     alpha: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(lbfgs_module, "MAX_RMS", 1e6)
+    monkeypatch.setattr(update_rules, "MAX_RMS", 1e6)
     torch.manual_seed(0)
     curved = torch.randn(6, 6, dtype=torch.float64)
     curved = curved @ curved.T + torch.eye(6, dtype=torch.float64)

@@ -1,8 +1,9 @@
-"""The layer where a network is cut: found by name, with the errors of one that cannot be cut."""
+"""The layer where a network is cut: its notation, and the errors of one that cannot be cut."""
 
 from __future__ import annotations
 
 import difflib
+import re
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -10,9 +11,34 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from pnpdepth_cli.core.split.layer_name import LayerName
-from pnpdepth_cli.core.split.structure import tensors_in
+from pnpdepth_cli.core.split.tensors import tensors_in
 from pnpdepth_cli.errors import LayerError
+
+
+@dataclass(frozen=True)
+class LayerName:
+    """A layer: `module`, `module#2` for its second call, `module[key]` for one of its outputs."""
+
+    module: str
+    call: int | None = None
+    """Number of the call, from 1; None if there is one call."""
+    key: tuple[str, ...] | None = None
+    """Path of the output in nested containers; None if there is one."""
+
+    @classmethod
+    def parse(cls, text: str) -> LayerName:
+        """Returns the parts of a name. Raises LayerError if it is not of this form."""
+        match = re.fullmatch(
+            r"(?P<module>[^#\[\]]*)(?:#(?P<call>\d+))?(?P<keys>(?:\[[^\[\]]+\])*)", text
+        )
+        if match is None or match["call"] == "0":
+            raise LayerError(f"layer {text!r}: the form is NAME, NAME#CALL or NAME[OUTPUT]")
+        keys = tuple(re.findall(r"\[([^\[\]]+)\]", match["keys"]))
+        return cls(match["module"], int(match["call"]) if match["call"] else None, keys or None)
+
+    def of_output(self, path: tuple[str, ...]) -> str:
+        """Returns the name of the output of this module at a path."""
+        return self.module + "".join(f"[{key}]" for key in path)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -22,9 +48,7 @@ class CutPoint:
     layer: str
     """The layer as the user named it."""
     name: LayerName
-    """The name in its parts."""
     module: nn.Module
-    """The layer's module."""
     modules: Mapping[str, nn.Module]
     """All submodules by name; one with several names comes several times."""
     containers: frozenset[nn.Module]

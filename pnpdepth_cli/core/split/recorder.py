@@ -10,10 +10,8 @@ import torch
 from torch import Tensor, nn
 
 from pnpdepth_cli.core.split.cut_point import CutPoint
-from pnpdepth_cli.core.split.recording import RecordedCall, Recording, shapes_of
-from pnpdepth_cli.core.split.replay import CutReached, Replay
-from pnpdepth_cli.core.split.saved import SavedTensors
-from pnpdepth_cli.core.split.structure import tensors_in
+from pnpdepth_cli.core.split.replay import CutReached, RecordedCall, Recording, Replay, shapes_of
+from pnpdepth_cli.core.split.tensors import SavedTensors, tensors_in
 from pnpdepth_cli.core.split.watch import Watch
 
 
@@ -142,7 +140,7 @@ class Recorder:
     def _may_be_one(self, module: nn.Module) -> bool:
         """True if it ends before the cut, so that what is inside needs no record."""
         apart = (self._cut.containers, self._cut.around_hooks, self._uncacheable)
-        return self._replay.recording.cut is None and not any(module in each for each in apart)
+        return self._replay.recording.cut is None and not any(module in group for group in apart)
 
     def _release_unread(self) -> None:
         """Saved outputs that only go into other cached submodules lose their memory.

@@ -4,19 +4,144 @@ from __future__ import annotations
 
 import functools
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor, nn
 
 from pnpdepth_cli.core.split.cut_point import CutPoint
-from pnpdepth_cli.core.split.recording import Recording
-from pnpdepth_cli.core.split.saved import SavedTensors
-from pnpdepth_cli.core.split.structure import map_tensors, tensors_in
+from pnpdepth_cli.core.split.tensors import SavedTensors, map_tensors, tensors_in
 
 if TYPE_CHECKING:
     from pnpdepth_cli.core.split.recorder import Recorder
+
+
+Handler = Callable[[nn.Module, Any, Callable[[], Any]], Any]
+"""Called with a submodule, its inputs (args, kwargs) and a function that runs it."""
+
+
+class Interception:
+    """Replaces `forward` of chosen submodules, and puts their own back.
+
+    Args:
+        modules: All submodules that may be intercepted, each once.
+    """
+
+    def __init__(self, modules: Iterable[nn.Module]) -> None:
+        self._handler: Handler = _run_only
+        self._own = {module: module.__dict__.get("forward") for module in modules}
+        self._stand_ins = {module: self._stand_in(module, module.forward) for module in self._own}
+
+    def only(self, modules: Collection[nn.Module]) -> None:
+        """Intercepts the calls of these submodules and of no others."""
+        for module, own_forward in self._own.items():
+            if module in modules:
+                module.__dict__["forward"] = self._stand_ins[module]
+            elif own_forward is None:
+                module.__dict__.pop("forward", None)
+            else:
+                module.__dict__["forward"] = own_forward
+
+    def all(self) -> None:
+        """Intercepts the calls of all submodules."""
+        self.only(self._own)
+
+    def close(self) -> None:
+        """Gives every submodule its own forward back, and lets go of the handler."""
+        self.only(())
+        self._handler = _run_only
+
+    @contextmanager
+    def handled_by(self, during: Handler, afterwards: Handler) -> Iterator[None]:
+        """Sets the handler of intercepted calls during and after the block."""
+        self._handler = during
+        try:
+            yield
+        finally:
+            self._handler = afterwards
+
+    def _stand_in(self, module: nn.Module, original: Callable[..., Any]) -> Callable[..., Any]:
+        @functools.wraps(original)
+        def forward(*args: Any, **kwargs: Any) -> Any:
+            return self._handler(module, (args, kwargs), lambda: original(*args, **kwargs))
+
+        return forward
+
+
+def _run_only(module: nn.Module, inputs: Any, run: Callable[[], Any]) -> Any:
+    return run()
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RecordedCall:
+    """One call of a submodule that every pass makes."""
+
+    module: nn.Module
+    cached: bool
+    """Whether later passes return its saved output instead of running it."""
+    copied: bool = False
+    """Whether the network changes that output in place."""
+    unread: frozenset[tuple[str, ...]] = frozenset()
+    """Paths of the output's tensors whose values nobody reads; only their shapes are saved."""
+
+    def save(self, output: Any) -> SavedTensors:
+        """Returns the output as it is to be saved; of unread tensors only one number."""
+
+        def kept(path: tuple[str, ...], tensor: Tensor) -> Tensor:
+            if path in self.unread:
+                return tensor.new_empty(()).expand(tensor.shape)
+            return tensor.clone() if self.copied else tensor
+
+        return SavedTensors(map_tensors(output, kept), self.copied)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Recording:
+    """The calls of a pass in their order, up to the cut or to the end."""
+
+    calls: tuple[RecordedCall, ...] = ()
+    """The calls that are cached, or that contain the cut or calls of their own."""
+    cut: int | None = None
+    """Index of the call that is the cut; None before it was reached."""
+    path: tuple[str, ...] = ()
+    """Path of z in the output of that call."""
+    shapes: Any = None
+    """Shapes and other properties of the arguments for which this holds."""
+    static_graph: bool = False
+    """Whether it holds for all arguments of these shapes."""
+    complete: bool = False
+    """Whether the calls behind the cut are in it, too."""
+
+    def index(self, module: nn.Module, count: int) -> int | None:
+        """Returns the index of the module's call after `count` earlier ones of a pass."""
+        indices = self._indices.get(module, ())
+        return indices[count] if count < len(indices) else None
+
+    def holds_for(self, arguments: Sequence[Any]) -> bool:
+        """Whether a pass with these arguments makes the same calls."""
+        return self.complete and self.static_graph and self.shapes == shapes_of(arguments)
+
+    def intercepted(self) -> set[nn.Module]:
+        """Returns the submodules whose calls later passes must intercept."""
+        return {
+            call.module for index, call in enumerate(self.calls) if call.cached or index == self.cut
+        }
+
+    @functools.cached_property
+    def _indices(self) -> dict[nn.Module, list[int]]:
+        indices: dict[nn.Module, list[int]] = {}
+        for index, call in enumerate(self.calls):
+            indices.setdefault(call.module, []).append(index)
+        return indices
+
+
+def shapes_of(arguments: Sequence[Any]) -> Any:
+    """Returns what arguments must share for a network without branches to treat them alike."""
+    tensors = [(t.shape, t.dtype, t.device) for _, t in tensors_in(tuple(arguments))]
+    return tensors, repr(map_tensors(tuple(arguments), lambda _, t: t.new_empty(0)))
 
 
 class CutReached(BaseException):

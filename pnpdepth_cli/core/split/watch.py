@@ -19,8 +19,7 @@ from torch import Tensor, nn, overrides
 from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from pnpdepth_cli.core.split.saved import SavedTensors
-from pnpdepth_cli.core.split.structure import is_transparent, map_tensors, tensors_in
+from pnpdepth_cli.core.split.tensors import SavedTensors, is_transparent, map_tensors, tensors_in
 
 _ESCAPES = (Tensor.numpy, Tensor.tolist, Tensor.__array__, Tensor.__dlpack__)
 """Methods that give values to Python and are no tensor operations."""
@@ -38,7 +37,6 @@ class Moment:
     """A time in a watched pass, by the numbers of events before it."""
 
     operations: int
-    """Tensor operations."""
     touches: int
     """Results that depend on z."""
     writes: int
@@ -83,8 +81,8 @@ class Watch(TorchDispatchMode):
         self._stale: set[int] = set()  # the storage of one twin after the other was changed
         self._function_mode = _EscapeMode(self)
         self._sees_escapes = False
-        for each in saved:
-            self.protect(each)
+        for tensors in saved:
+            self.protect(tensors)
 
     def touch(self, tensor: Tensor) -> None:
         """Marks a tensor as depending on z."""

@@ -19,7 +19,7 @@ from torch import Tensor, nn
 
 from pnpdepth_cli.choices import OutputKind, OutputScale
 from pnpdepth_cli.completion.interpolation import linear
-from pnpdepth_cli.core.split.user_code import describe
+from pnpdepth_cli.core.user_code import describe
 from pnpdepth_cli.errors import CheckpointError, ModelError
 from pnpdepth_cli.models.definition import (
     UNTUNED_DEFAULTS,

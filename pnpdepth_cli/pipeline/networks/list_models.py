@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import torch
 
-from pnpdepth_cli.core.split.user_code import wrap_user_errors
+from pnpdepth_cli.core.user_code import wrap_user_errors
 from pnpdepth_cli.models.definition import Fixed, Multiple, Near
 from pnpdepth_cli.models.registry import (
     family_definitions,

@@ -10,8 +10,8 @@ import torch
 
 from pnpdepth_cli.choices import PARAMETERS, SPACES
 from pnpdepth_cli.completion.alignment import align
+from pnpdepth_cli.core.masks import MaskSettings
 from pnpdepth_cli.core.refine import RefineSettings
-from pnpdepth_cli.core.refinement import MaskSettings
 from pnpdepth_cli.core.weights import rank_of
 from pnpdepth_cli.errors import ModelError, NoPointsError, UsageError
 from pnpdepth_cli.frames.frame import Frame

@@ -15,7 +15,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from pnpdepth_cli.core.split import Split
-from pnpdepth_cli.core.split.structure import tensors_in
+from pnpdepth_cli.core.split.tensors import tensors_in
 from pnpdepth_cli.errors import LayerError, ModelError
 from tests.completion.naive import plain
 from tests.core.networks import (

@@ -12,7 +12,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from pnpdepth_cli.core.split import Split
-from pnpdepth_cli.core.split.saved import SavedTensors
+from pnpdepth_cli.core.split.tensors import SavedTensors
 from pnpdepth_cli.core.split.watch import Watch
 from tests.completion.naive import plain
 from tests.core.networks import Branching, Counting, build, conv, image

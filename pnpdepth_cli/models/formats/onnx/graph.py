@@ -17,7 +17,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from pnpdepth_cli.core.split.user_code import describe
+from pnpdepth_cli.core.user_code import describe
 from pnpdepth_cli.errors import ModelError
 from pnpdepth_cli.models.formats.onnx.folding import FoldingBudget
 from pnpdepth_cli.models.formats.onnx.operators import OPERATORS, Node, Unsupported

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from pnpdepth_cli.core.split.user_code import describe, is_out_of_memory, wrap_user_errors
+from pnpdepth_cli.core.user_code import describe, is_out_of_memory, wrap_user_errors
 from pnpdepth_cli.errors import LayerError, ModelError
 
 

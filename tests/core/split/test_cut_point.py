@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from pnpdepth_cli.core.split.layer_name import LayerName
+from pnpdepth_cli.core.split.cut_point import LayerName
 from pnpdepth_cli.errors import LayerError
 
 

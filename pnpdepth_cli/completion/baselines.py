@@ -1,6 +1,6 @@
-"""A baseline: dense depth without refinement, to measure a refined network against.
+"""Baselines: dense depth without refinement, to measure a refined network against.
 
-The baselines are a table, `choices.BASELINES`: one file per entry in `completion/baselines`.
+`pnpdepth_cli.choices.BASELINES` lists the names.
 """
 
 from __future__ import annotations
@@ -12,6 +12,8 @@ from functools import partial
 from torch import Tensor
 
 from pnpdepth_cli.completion.alignment import aligned
+from pnpdepth_cli.completion.interpolation import inverse_distance, linear, morphological, nearest
+from pnpdepth_cli.completion.local_alignment import locally_aligned
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.points import SparsePoints
 
@@ -59,6 +61,26 @@ class Baseline:
         return bound.depth(points, prediction)
 
 
-def alignment_baseline(title: str, kind: str, space: str) -> Baseline:
-    """Returns the baseline that aligns the prediction globally, in one of `choices.SPACES`."""
+def _points(title: str, depth: Callable[..., Tensor], *, pointwise: bool = True) -> Baseline:
+    return Baseline(title=title, of_points=depth, pointwise=pointwise)
+
+
+def _aligned(title: str, kind: str, space: str) -> Baseline:
     return Baseline(title=title, of_prediction=partial(aligned, kind=kind, space=space))
+
+
+TABLE = {
+    "nearest": _points("nearest point", nearest),
+    "linear": _points("linear between points (Delaunay)", linear),
+    "linear-log": _points("linear between points, in log depth", partial(linear, space="log")),
+    "idw": _points("inverse distance weighting", inverse_distance),
+    "morphological": _points("morphological fill (IP-Basic)", morphological, pointwise=False),
+    "median": _aligned("median of ratios", kind="median", space="depth"),
+    "scale": _aligned("scale", kind="scale", space="depth"),
+    "affine": _aligned("scale and shift", kind="affine", space="depth"),
+    "scale-disparity": _aligned("scale, in disparity", kind="scale", space="inverse"),
+    "affine-disparity": _aligned("scale and shift, in disparity", kind="affine", space="inverse"),
+    "local": Baseline(
+        title="scale and shift around each pixel", of_prediction=locally_aligned, pointwise=True
+    ),
+}

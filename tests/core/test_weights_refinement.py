@@ -13,12 +13,11 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from pnpdepth_cli.core import weights_refinement
-from pnpdepth_cli.core.masks import Masks, set_aside
-from pnpdepth_cli.core.refine import Refinement, RefineSettings, refine_weights
-from pnpdepth_cli.core.refinement import MaskSettings
+from pnpdepth_cli.core.masks import Masks, MaskSettings, set_aside
+from pnpdepth_cli.core.refine import Refinement, RefineSettings
 from pnpdepth_cli.core.split import InputSplit, Split
 from pnpdepth_cli.core.weights import MovingWeights, rank_of
-from pnpdepth_cli.core.weights_refinement import MIN_POINTS, FrameOfPoints
+from pnpdepth_cli.core.weights_refinement import MIN_POINTS, FrameOfPoints, refine_weights
 from pnpdepth_cli.errors import DivergedError, LayerError, UsageError
 from pnpdepth_cli.points import SparsePoints
 from tests.completion.naive import plain

@@ -1,1 +1,0 @@
-"""Baselines: each file defines `baseline`, a `Baseline`."""

@@ -1,1 +1,0 @@
-"""Propagations of the residual: each file defines `propagation`, a `Propagation`."""

@@ -1,0 +1,132 @@
+"""Tensors in nested containers, saved for later passes, and the state of a network."""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+from collections.abc import Callable, Iterator, Mapping, MutableMapping
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+
+def tensors_in(
+    structure: Any, path: tuple[str, ...] = ()
+) -> Iterator[tuple[tuple[str, ...], Tensor]]:
+    """Yields every tensor of a nested structure with its path, such as ("hidden_states", "0")."""
+    if isinstance(structure, Tensor):
+        yield path, structure
+        return
+    for key, child in _children(structure):
+        yield from tensors_in(child, (*path, key))
+
+
+def map_tensors(
+    structure: Any, change: Callable[[tuple[str, ...], Tensor], Tensor], path: tuple[str, ...] = ()
+) -> Any:
+    """Returns the structure with tensor t at path p replaced by change(p, t), in new containers."""
+    if isinstance(structure, Tensor):
+        return change(path, structure)
+    children = [map_tensors(child, change, (*path, key)) for key, child in _children(structure)]
+    if isinstance(structure, tuple):
+        named = hasattr(structure, "_fields")
+        return type(structure)(*children) if named else type(structure)(children)
+    if not _is_container(structure):
+        return structure
+    result: Any = copy.copy(structure)
+    if isinstance(structure, list):
+        result[:] = children
+    elif isinstance(structure, MutableMapping):
+        for key, child in zip(structure, children, strict=True):
+            result[key] = child
+    else:
+        for field, child in zip(dataclasses.fields(structure), children, strict=True):
+            object.__setattr__(result, field.name, child)  # the dataclass may be frozen
+    return result
+
+
+def is_transparent(structure: Any) -> bool:
+    """Whether `tensors_in` is sure to find every tensor of the structure."""
+    if structure is None or isinstance(structure, Tensor | int | float | str | bool):
+        return True
+    return _is_container(structure) and all(
+        is_transparent(child) for _, child in _children(structure)
+    )
+
+
+def _children(structure: Any) -> Iterator[tuple[str, Any]]:
+    if isinstance(structure, list | tuple):
+        yield from ((str(index), child) for index, child in enumerate(structure))
+    elif isinstance(structure, MutableMapping):
+        yield from ((str(key), child) for key, child in structure.items())
+    elif _is_container(structure):
+        yield from ((f.name, getattr(structure, f.name)) for f in dataclasses.fields(structure))
+
+
+def _is_container(structure: Any) -> bool:
+    return isinstance(structure, MutableMapping | list | tuple) or (
+        dataclasses.is_dataclass(structure) and not isinstance(structure, type)
+    )
+
+
+@dataclass(eq=False)
+class SavedTensors:
+    """Tensors in nested containers, as they were when saved."""
+
+    value: Any = None
+    copied: bool = False
+    """Whether the network changes them in place, so that `fresh` returns clones."""
+
+    def fresh(self) -> Any:
+        """Returns the tensors in new containers; whatever is done to them leaves `value` as is."""
+        return map_tensors(
+            self.value, lambda _, t: t.clone() if self.copied or t.is_inference() else t
+        )
+
+
+def _own(tensors: Mapping[str, Tensor | None]) -> list[Tensor]:
+    return [tensor for tensor in tensors.values() if tensor is not None]
+
+
+class NetworkState:
+    """Values, gradient flags and modes of a network at the time this object is created.
+
+    Attributes:
+        tensors: Its parameters and buffers; a `Watch` that protects them saves those that change.
+    """
+
+    def __init__(self, network: nn.Module) -> None:
+        modules = list(network.modules())  # going through a deep network takes a while: once
+        # Frozen torch scripts have neither a mode nor buffers that can be set.
+        plain = [m for m in modules if not isinstance(m, torch.jit.ScriptModule)]
+        parameters = list(dict.fromkeys(p for m in modules for p in _own(m._parameters)))
+        buffers = dict.fromkeys(b for m in modules for b in _own(m._buffers))
+        self.tensors = [SavedTensors(t) for t in (*parameters, *buffers)]
+        self._originals = [saved.value for saved in self.tensors]
+        self._learning = [(p, p.requires_grad) for p in parameters]
+        self._buffers = [(m, dict(m._buffers)) for m in plain if m._buffers]
+        self._modes = [(m, m.training) for m in modules if hasattr(m, "training")]
+
+    def freeze(self) -> None:
+        """Switches off the gradients of all parameters."""
+        for parameter, _ in self._learning:
+            parameter.requires_grad_(False)
+
+    def restore(self) -> None:
+        """Restores the values of parameters and buffers that the network has changed."""
+        for module, buffers in self._buffers:
+            module._buffers.update(buffers)
+        with torch.no_grad():
+            for original, saved in zip(self._originals, self.tensors, strict=True):
+                if saved.copied:
+                    original.copy_(saved.value)
+
+    def close(self) -> None:
+        """Restores everything."""
+        self.restore()
+        for parameter, requires_grad in self._learning:
+            parameter.requires_grad_(requires_grad)
+        for module, training in self._modes:
+            module.training = training

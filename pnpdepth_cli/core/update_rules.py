@@ -1,0 +1,165 @@
+"""U of equation 3: rules from the gradient at z to the direction of its update.
+
+A decorated function makes a new rule. A rule is called with the gradients of one refinement, in
+order, and returns a direction of the same shape; z moves by −α × direction.
+`pnpdepth_cli.choices.UPDATES` lists the names.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from typing import TypeVar
+
+import torch
+from torch import Tensor
+
+Update = Callable[[Tensor], Tensor]
+Rule = TypeVar("Rule", bound=Callable[..., Update])
+
+TABLE: dict[str, Callable[[], Update]] = {}
+"""Functions that make a rule, by name."""
+
+MAX_RMS = 10.0
+"""Largest root mean square of an L-BFGS direction; that of the first direction is 1."""
+
+
+def update_rule(name: str) -> Callable[[Rule], Rule]:
+    """Enters the decorated function in the table."""
+
+    def enter(function: Rule) -> Rule:
+        TABLE[name] = function
+        return function
+
+    return enter
+
+
+@update_rule("sign")
+def sign() -> Update:
+    """Returns the rule g → sign(g), the paper's (after Kurakin et al. 2017)."""
+    return torch.sign
+
+
+@update_rule("sgd")
+def sgd() -> Update:
+    """Returns the rule g → g: gradient descent."""
+    return lambda gradient: gradient
+
+
+@update_rule("normalised")
+def normalised() -> Update:
+    """Returns the rule g → g / rms(g); an all-zero gradient stays zero.
+
+    Like the sign, it makes the step independent of the loss's unit and of the number of points.
+    Unlike the sign, it keeps the relative sizes of the elements: those with little influence move
+    little.
+    """
+
+    def update(gradient: Tensor) -> Tensor:
+        # Divided by the largest element first: squares of tiny gradients would underflow.
+        largest = gradient.abs().max().clamp_min(torch.finfo(gradient.dtype).tiny)
+        gradient = gradient / largest
+        return gradient / gradient.square().mean().sqrt().clamp_min(torch.finfo().tiny)
+
+    return update
+
+
+@update_rule("momentum")
+def momentum(decay: float = 0.9) -> Update:
+    """Returns the rule v ← decay·v + g, whose direction is v.
+
+    Heavy-ball momentum (Polyak 1964), without damping, as in torch.optim.SGD.
+    """
+    velocity: Tensor | None = None
+
+    def update(gradient: Tensor) -> Tensor:
+        nonlocal velocity
+        velocity = gradient if velocity is None else decay * velocity + gradient
+        return velocity
+
+    return update
+
+
+@update_rule("adam")
+def adam(beta1: float = 0.9, beta2: float = 0.999, eps: float = 1e-12) -> Update:
+    """Returns Adam's rule with bias correction (Kingma & Ba 2014).
+
+    Elements whose gradient is always zero do not move.
+
+    Args:
+        beta1: Decay of the mean of the gradients.
+        beta2: Decay of the mean of their squares.
+        eps: Added to the denominator. Smaller than the common 1e-8, because the gradient of a mean
+            over many points is tiny at most elements of z and 1e-8 would suppress them.
+    """
+    first: Tensor | None = None
+    second: Tensor | None = None
+    step = 0
+
+    def update(gradient: Tensor) -> Tensor:
+        nonlocal first, second, step
+        step += 1
+        first = (1 - beta1) * gradient + (0 if first is None else beta1 * first)
+        second = (1 - beta2) * gradient.square() + (0 if second is None else beta2 * second)
+        return (first / (1 - beta1**step)) / ((second / (1 - beta2**step)).sqrt() + eps)
+
+    return update
+
+
+@update_rule("adam-short")
+def adam_short() -> Update:
+    """Returns Adam's rule with β1 = 0.8 and β2 = 0.95.
+
+    Its means reach back about 5 and 20 gradients instead of 10 and 1000. Eight to sixteen steps of
+    weights by hidden points gain more with them; see docs/guides/masked.md.
+    """
+    return adam(beta1=0.8, beta2=0.95)
+
+
+@update_rule("lbfgs")
+def lbfgs(memory: int = 10) -> Update:
+    """Returns limited-memory BFGS, the two-loop recursion (Nocedal & Wright 2006, algorithm 7.4).
+
+    Not torch.optim.LBFGS: its strong-Wolfe search evaluates loss and gradient several times per
+    step, whereas here each of the K updates has exactly one rear pass and one gradient. The first
+    direction is the normalised gradient.
+
+    After the first update, the displacement of z does not depend on α: the rule takes its last
+    direction for the displacement of z, which is too large by 1/α, so its inverse Hessian is too
+    large by 1/α and the step α cancels it. Pairs of negative curvature are skipped, and directions
+    are shortened to MAX_RMS.
+
+    Args:
+        memory: How many of the last pairs of displacement and gradient change are used.
+    """
+    pairs: deque[tuple[Tensor, Tensor]] = deque(maxlen=memory)  # of −direction and the change of g
+    last: tuple[Tensor, Tensor] | None = None  # gradient and direction
+    first = normalised()
+
+    def update(gradient: Tensor) -> Tensor:
+        nonlocal last
+        if last is not None:
+            step, change = -last[1], gradient - last[0]
+            if (step * change).sum() > 0:
+                pairs.append((step, change))
+        direction = _two_loops(gradient, pairs) if pairs else first(gradient)
+        last = gradient, direction
+        return direction
+
+    return update
+
+
+def _two_loops(gradient: Tensor, pairs: deque[tuple[Tensor, Tensor]]) -> Tensor:
+    """The product of the approximate inverse Hessian and the gradient, at most MAX_RMS long."""
+    direction, alphas = gradient, []
+    for step, change in reversed(pairs):
+        alpha = (step * direction).sum() / (step * change).sum()
+        alphas.append(alpha)
+        direction = direction - alpha * change
+    step, change = pairs[-1]
+    direction = direction * ((step * change).sum() / change.square().sum())
+    for (step, change), alpha in zip(pairs, reversed(alphas), strict=True):
+        beta = (change * direction).sum() / (step * change).sum()
+        direction = direction + (alpha - beta) * step
+    rms = direction.square().mean().sqrt()
+    return direction * (MAX_RMS / rms.clamp_min(MAX_RMS))
