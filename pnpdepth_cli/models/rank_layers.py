@@ -77,13 +77,15 @@ def best_layer(
     if not point_count:
         return None
     wanted = wanted_field(size, point_spacing(size, point_count))
+    # No field is wider than the image, and of equally wide ones the last layer is taken.
+    enough = min(wanted, *size)
     measured: list[MeasuredLayer] = []
     # From the last layer on, each has more of the network behind it: the first that reaches far
     # enough is the one of least cost, and those before it need not be measured.
     for name in reversed(network.definition.layers):
-        layer = _measure(network, name, arguments, size[0], None)
+        layer = _measure(network, name, arguments, size[0], enough=enough)
         measured.insert(0, layer)
-        if layer.field_in_output is not None and min(layer.field_in_output) >= wanted:
+        if layer.field_in_output is not None and min(layer.field_in_output) >= enough:
             return name
     return next((layer.name for layer in rank_layers(measured, wanted) if layer.rank == 1), None)
 
@@ -173,24 +175,32 @@ def measure_layers(
     with torch.no_grad(), FlopCounterMode(display=False) as whole:
         network.depth_of(network.module(*arguments))
     for done, name in enumerate(names, start=1):
-        measured.append(_measure(network, name, arguments, size[0], whole.get_total_flops()))
+        measured.append(
+            _measure(network, name, arguments, size[0], whole_flops=whole.get_total_flops())
+        )
         on_layer(done, len(names))
     return measured
 
 
 def _measure(
-    network: Network, name: str, arguments: tuple[Tensor, ...], rows: int, whole_flops: int | None
+    network: Network,
+    name: str,
+    arguments: tuple[Tensor, ...],
+    rows: int,
+    *,
+    whole_flops: int | None = None,
+    enough: float = math.inf,
 ) -> MeasuredLayer:
-    """The layer, its field alone without the operations of the whole network."""
+    """The layer; its cost only if the operations of the whole network are given."""
     try:
         with Split(network.module, name) as split, torch.no_grad():
             z = split.front(*arguments)
-            split.rear(z)
             cost, seconds = None, None
             if whole_flops is not None:
+                split.rear(z)  # the first pass learns the cut
                 cost, seconds = _cost_behind(split, z, whole_flops)
             # On the raw output: where inverse depth is clamped, depth does not change.
-            field = influential_field(split, z, network.raw_of)
+            field = influential_field(split, z, network.raw_of, enough)
     except ModelError as error:
         return MeasuredLayer(name=name, problem=str(error))
     return MeasuredLayer(
