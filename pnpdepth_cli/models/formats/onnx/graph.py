@@ -20,7 +20,7 @@ from torch import Tensor, nn
 from pnpdepth_cli.core.split.user_code import describe
 from pnpdepth_cli.errors import ModelError
 from pnpdepth_cli.models.formats.onnx.folding import FoldingBudget
-from pnpdepth_cli.models.formats.onnx.operators import OPERATORS, Node, Unsupported
+from pnpdepth_cli.models.formats.onnx.operators import HOST_INPUTS, OPERATORS, Node, Unsupported
 
 _STANDARD = ("", "ai.onnx")
 _TO_SHAPES = ("Shape", "Size")
@@ -43,24 +43,32 @@ class OnnxNode(nn.Module):
         super().__init__()
         self.node = node
         self._run = OPERATORS[node.op]
-        # Of each input the name of its buffer, "" if the call gives it, None if it is left out.
-        self._buffer_names: list[str | None] = []
+        host = HOST_INPUTS.get(node.op, ())
+        # Of each input the constant itself if it stays on the CPU, else the name of its buffer;
+        # "" if the call gives it, None if it is left out.
+        self._inputs: list[Tensor | str | None] = []
         for index, value in enumerate(inputs):
-            self._buffer_names.append(None if value is None else "")
-            if isinstance(value, Tensor):
-                self._buffer_names[-1] = f"input{index}"
+            name = f"input{index}"
+            if not isinstance(value, Tensor):
+                self._inputs.append(None if value is None else "")
+            elif index in host:
+                self._inputs.append(value)
+            else:
+                self._inputs.append(name)
                 if value.is_floating_point():
-                    constant = nn.Parameter(value, requires_grad=False)
-                    self.register_parameter(f"input{index}", constant)
+                    self.register_parameter(name, nn.Parameter(value, requires_grad=False))
                 else:
-                    self.register_buffer(f"input{index}", value)
+                    self.register_buffer(name, value)
+        self.handed_in_on_host = tuple(
+            index in host for index, value in enumerate(self._inputs) if value == ""
+        )
 
     def forward(self, *handed_in: Tensor) -> Tensor | tuple[Tensor, ...]:
         """Returns the node's output, or its outputs."""
         rest = iter(handed_in)
         inputs: list[Any] = [
-            None if name is None else getattr(self, name) if name else next(rest)
-            for name in self._buffer_names
+            value if not isinstance(value, str) else getattr(self, value) if value else next(rest)
+            for value in self._inputs
         ]
         try:
             return self._run(self.node, inputs)
@@ -157,7 +165,11 @@ class OnnxGraph(nn.Module):
         for step in self._steps:
             arguments = [values[name] for name in step.inputs]
             if not step.on_shapes:
-                arguments = [value.to(device) for value in arguments]
+                on_host = step.run.handed_in_on_host
+                arguments = [
+                    value.to("cpu" if host else device)
+                    for value, host in zip(arguments, on_host, strict=True)
+                ]
             result = step.run(*arguments)
             results = result if isinstance(result, tuple) else (result,)
             values.update(zip(step.outputs, results, strict=False))

@@ -14,6 +14,11 @@ from pnpdepth_cli.models.formats.onnx.operators import (  # noqa: F401  (each re
     resizing,
     shaping,
 )
-from pnpdepth_cli.models.formats.onnx.operators.table import OPERATORS, Node, Unsupported
+from pnpdepth_cli.models.formats.onnx.operators.table import (
+    HOST_INPUTS,
+    OPERATORS,
+    Node,
+    Unsupported,
+)
 
-__all__ = ["OPERATORS", "Node", "Unsupported"]
+__all__ = ["HOST_INPUTS", "OPERATORS", "Node", "Unsupported"]

@@ -226,7 +226,7 @@ def einsum(node: Node, inputs: Inputs) -> Tensor:
     return torch.einsum(node.get("equation"), *inputs)
 
 
-@operator("CumSum")
+@operator("CumSum", host=(1,))
 def cumsum(node: Node, inputs: Inputs) -> Tensor:
     x, axis = inputs[0], whole_numbers(inputs[1])[0]
     x = x.flip(axis) if node.get("reverse", 0) else x
@@ -255,7 +255,7 @@ def _product(x: Tensor, axes: list[int], keep: bool) -> Tensor:
     return x
 
 
-@operator(*_REDUCTIONS)
+@operator(*_REDUCTIONS, host=(1,))
 def reduce(node: Node, inputs: Inputs) -> Tensor:
     axes: Any = node.get("axes")
     if axes is None and optional(inputs, 1) is not None:

@@ -16,7 +16,7 @@ from pnpdepth_cli.models.formats.onnx.operators.table import (
 )
 
 
-@operator("Slice")
+@operator("Slice", host=(1, 2, 3, 4))
 def slice_(node: Node, inputs: Inputs) -> Tensor:
     x = inputs[0]
     if len(inputs) == 1:
@@ -82,7 +82,7 @@ def scatter_elements(node: Node, inputs: Inputs) -> Tensor:
     return x.scatter(axis, torch.where(index < 0, index + x.shape[axis], index), inputs[2])
 
 
-@operator("OneHot")
+@operator("OneHot", host=(1,))
 def one_hot(node: Node, inputs: Inputs) -> Tensor:
     index, count, values = inputs[0].long(), whole_numbers(inputs[1])[0], inputs[2]
     hot = F.one_hot(index.remainder(count), count).bool()
@@ -90,7 +90,7 @@ def one_hot(node: Node, inputs: Inputs) -> Tensor:
     return torch.where(hot, values[1], values[0]).movedim(-1, axis)
 
 
-@operator("TopK")
+@operator("TopK", host=(1,))
 def top_k(node: Node, inputs: Inputs) -> tuple[Tensor, ...]:
     k = node.get("k") if len(inputs) < 2 else whole_numbers(inputs[1])[0]
     largest = inputs[0].topk(

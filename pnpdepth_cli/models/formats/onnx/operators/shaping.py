@@ -41,7 +41,7 @@ def size(node: Node, inputs: Inputs) -> Tensor:
     return torch.tensor(inputs[0].numel())
 
 
-@operator("Reshape")
+@operator("Reshape", host=(1,))
 def reshape(node: Node, inputs: Inputs) -> Tensor:
     x = inputs[0]
     wanted = node.get("shape") if len(inputs) < 2 else whole_numbers(inputs[1])
@@ -64,13 +64,13 @@ def transpose(node: Node, inputs: Inputs) -> Tensor:
     return x.permute(node.get("perm", list(range(x.ndim))[::-1]))
 
 
-@operator("Squeeze")
+@operator("Squeeze", host=(1,))
 def squeeze(node: Node, inputs: Inputs) -> Tensor:
     axes = _axes(node, inputs)
     return inputs[0].squeeze() if axes is None else inputs[0].squeeze(axes)
 
 
-@operator("Unsqueeze")
+@operator("Unsqueeze", host=(1,))
 def unsqueeze(node: Node, inputs: Inputs) -> Tensor:
     x, axes = inputs[0], _axes(node, inputs)
     assert axes is not None
@@ -80,7 +80,7 @@ def unsqueeze(node: Node, inputs: Inputs) -> Tensor:
     return x
 
 
-@operator("Expand")
+@operator("Expand", host=(1,))
 def expand(node: Node, inputs: Inputs) -> Tensor:
     x = inputs[0]
     wanted = whole_numbers(inputs[1])
@@ -90,7 +90,7 @@ def expand(node: Node, inputs: Inputs) -> Tensor:
     return x.expand([n if w == 1 else w for n, w in zip(own, wanted, strict=True)])
 
 
-@operator("Tile")
+@operator("Tile", host=(1,))
 def tile(node: Node, inputs: Inputs) -> Tensor:
     return inputs[0].repeat(whole_numbers(inputs[1]))
 
@@ -100,7 +100,7 @@ def concat(node: Node, inputs: Inputs) -> Tensor:
     return torch.cat(inputs, node.get("axis", 1))
 
 
-@operator("Split")
+@operator("Split", host=(1,))
 def split(node: Node, inputs: Inputs) -> tuple[Tensor, ...]:
     x, axis = inputs[0], node.get("axis", 0)
     sizes = node.get("split")
@@ -113,7 +113,7 @@ def split(node: Node, inputs: Inputs) -> tuple[Tensor, ...]:
     return torch.split(x, sizes, axis)
 
 
-@operator("Pad")
+@operator("Pad", host=(1, 2, 3))
 def pad(node: Node, inputs: Inputs) -> Tensor:
     x = inputs[0]
     mode = node.get("mode", "constant")
@@ -194,19 +194,19 @@ def constant(node: Node, inputs: Inputs) -> Tensor:
     raise Unsupported("a constant of text or of a sparse tensor")
 
 
-@operator("ConstantOfShape")
+@operator("ConstantOfShape", host=(0,))
 def constant_of_shape(node: Node, inputs: Inputs) -> Tensor:
     value: Tensor = node.get("value", torch.zeros(1))
     return value.reshape(()).expand(whole_numbers(inputs[0])).clone()
 
 
-@operator("Range")
+@operator("Range", host=(0, 1, 2))
 def number_range(node: Node, inputs: Inputs) -> Tensor:
     start, limit, delta = (v.reshape(()).item() for v in inputs)
     return torch.arange(start, limit, delta, dtype=inputs[0].dtype, device=inputs[0].device)
 
 
-@operator("Trilu")
+@operator("Trilu", host=(1,))
 def trilu(node: Node, inputs: Inputs) -> Tensor:
     k = 0 if optional(inputs, 1) is None else whole_numbers(inputs[1])[0]
     return (torch.triu if node.get("upper", 1) else torch.tril)(inputs[0], k)

@@ -15,6 +15,9 @@ Operator = Callable[["Node", Inputs], "Tensor | tuple[Tensor, ...]"]
 
 OPERATORS: dict[str, Operator] = {}
 
+HOST_INPUTS: dict[str, tuple[int, ...]] = {}
+"""Indices of an operator's inputs that are read as Python numbers; they stay on the CPU."""
+
 
 class Unsupported(Exception):
     """An operator is used in a way that is not covered; the message says which."""
@@ -40,12 +43,12 @@ class Node:
         return self.attributes.get(name, default)
 
 
-def operator(*names: str) -> Callable[[Operator], Operator]:
-    """Registers the decorated function for these operators."""
+def operator(*names: str, host: tuple[int, ...] = ()) -> Callable[[Operator], Operator]:
+    """Registers the decorated function for these operators; `host` is as in `HOST_INPUTS`."""
 
     def enter(function: Operator) -> Operator:
         for name in names:
-            OPERATORS[name] = function
+            OPERATORS[name], HOST_INPUTS[name] = function, host
         return function
 
     return enter
