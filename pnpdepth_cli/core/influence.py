@@ -7,7 +7,6 @@ Both senses of the paper's term are measured: the patch of z that the gradient o
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -36,7 +35,7 @@ def influential_field(
     split: Split,
     z: Tensor,
     depth_of: Callable[[object], Tensor],
-    enough: float = math.inf,
+    enough: float | None = None,
 ) -> InfluentialField:
     """Returns the largest patches over a few points near the centre of the image.
 
@@ -46,8 +45,9 @@ def influential_field(
         split: The network, cut and open.
         z: z_0, as returned by `split.front`.
         depth_of: Turns the network's output into depth (1, 1, h, w).
-        enough: No further point is tried once the patch of the output has this many rows and
-            columns.
+        enough: Rows and columns that the patch of the output is compared with. No further point is
+            tried once it has as many, or, since points differ little, fewer than half. None
+            tries every point.
     """
     z = z.detach().requires_grad_(True)
     with torch.enable_grad():
@@ -62,7 +62,8 @@ def influential_field(
         in_output = _larger(in_output, _extent(changed))
         if z.ndim == 4:
             in_z = _larger(in_z, _extent(gradient != 0))
-        if min(in_output) >= enough:
+        width = min(in_output)
+        if enough is not None and (width >= enough or 0 < width < enough / 2):
             break
     return InfluentialField(in_z if z.ndim == 4 else None, in_output)
 

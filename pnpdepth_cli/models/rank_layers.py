@@ -76,18 +76,26 @@ def best_layer(
     """
     if not point_count:
         return None
-    wanted = wanted_field(size, point_spacing(size, point_count))
     # No field is wider than the image, and of equally wide ones the last layer is taken.
-    enough = min(wanted, *size)
-    measured: list[MeasuredLayer] = []
-    # From the last layer on, each has more of the network behind it: the first that reaches far
-    # enough is the one of least cost, and those before it need not be measured.
-    for name in reversed(network.definition.layers):
-        layer = _measure(network, name, arguments, size[0], enough=enough)
-        measured.insert(0, layer)
-        if layer.field_in_output is not None and min(layer.field_in_output) >= enough:
-            return name
-    return next((layer.name for layer in rank_layers(measured, wanted) if layer.rank == 1), None)
+    enough = min(wanted_field(size, point_spacing(size, point_count)), *size)
+    layers, measured = list(network.definition.layers), []
+    # The more of the network lies behind a layer, the wider is its field: bisection finds the last
+    # layer that reaches far enough, which is the one of least cost.
+    first, end = 0, len(layers)
+    while first < end:
+        middle = (first + end) // 2
+        layer = _measure(network, layers[middle], arguments, size[0], enough=enough)
+        if layer.field_in_output is None:
+            del layers[middle]
+            end -= 1
+            continue
+        measured.append(layer)
+        if min(layer.field_in_output) >= enough:
+            first = middle + 1
+        else:
+            end = middle
+    ranked = rank_layers(sorted(measured, key=lambda m: layers.index(m.name)), enough)
+    return next((layer.name for layer in ranked if layer.rank == 1), None)
 
 
 def default_layer(network: Network, size: tuple[int, int], point_count: int) -> str | None:
@@ -189,7 +197,7 @@ def _measure(
     rows: int,
     *,
     whole_flops: int | None = None,
-    enough: float = math.inf,
+    enough: float | None = None,
 ) -> MeasuredLayer:
     """The layer; its cost only if the operations of the whole network are given."""
     try:
