@@ -21,7 +21,7 @@ from torch.export.pt2_archive import PT2ArchiveReader
 
 from pnpdepth_cli.errors import ModelError
 from pnpdepth_cli.models.weights.pickle_reader import READ_ERRORS, BrokenFileError, brief
-from pnpdepth_cli.models.weights.tensor_pickle import read_tensors
+from pnpdepth_cli.models.weights.torch_file import read_tensors
 
 _MODEL = "models/model.json"
 _INPUTS = "data/sample_inputs/model.pt"

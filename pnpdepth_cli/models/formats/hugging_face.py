@@ -28,7 +28,7 @@ from pnpdepth_cli.models.definition import (
     Near,
     Normalisation,
 )
-from pnpdepth_cli.models.weights.file_size import size_problem
+from pnpdepth_cli.budget import size_problem
 from pnpdepth_cli.points import SparsePoints
 
 _MOST_JSON_BYTES = 1 << 24

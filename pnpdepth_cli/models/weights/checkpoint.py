@@ -1,7 +1,7 @@
 """Weights from files, without running anything that is in them.
 
 safetensors files hold tensors only, numpy files arrays, TensorFlow checkpoints variables. torch
-files are pickles, often with more in them (whole modules, optimisers, arguments); `tensor_pickle`
+files are pickles, often with more in them (whole modules, optimisers, arguments); `torch_file`
 takes the tensors out and runs nothing.
 """
 
@@ -20,18 +20,13 @@ from pnpdepth_cli.core.split.user_code import describe, wrap_user_errors
 from pnpdepth_cli.errors import CheckpointError, ModelError
 from pnpdepth_cli.models import registry
 from pnpdepth_cli.models.definition import ModelDefinition
-from pnpdepth_cli.models.weights.file_size import size_problem
+from pnpdepth_cli.budget import size_problem
 from pnpdepth_cli.models.weights.numpy_file import SUFFIXES as NUMPY_SUFFIXES
 from pnpdepth_cli.models.weights.numpy_file import read_numpy_file
 from pnpdepth_cli.models.weights.pickle_reader import StandIn
 from pnpdepth_cli.models.weights.tensor_bundle import SUFFIX as BUNDLE_SUFFIX
 from pnpdepth_cli.models.weights.tensor_bundle import read_tensor_bundle
-from pnpdepth_cli.models.weights.tensor_pickle import (
-    is_module,
-    module_state,
-    read_tensor_file,
-    unusual_tensor,
-)
+from pnpdepth_cli.models.weights.torch_file import is_module, module_state, read_tensor_file
 
 _STATE_KEYS = ("state_dict", "model_state_dict", "model_state", "model", "network", "net", "params")
 WEIGHT_SUFFIXES = (
@@ -313,34 +308,30 @@ def _training_notes(content: Any, path: Path) -> list[str]:
 
 
 def _state_in(content: Any, path: Path) -> dict[str, Tensor]:
-    if is_module(content):
-        return module_state(content)
-    if not isinstance(content, Mapping):
-        raise CheckpointError(f"checkpoint {path} holds a {_kind(content)}, not named tensors")
-    for mapping in (content, *(content.get(key) for key in _STATE_KEYS)):
-        if is_module(mapping):
-            return module_state(mapping)
-        if isinstance(mapping, Mapping) and mapping:
-            _refuse_unusual_tensors(mapping, path)
-            if _only_tensors(mapping):
-                return dict(mapping)
+    """The state dict in what a torch file holds."""
+    if not isinstance(content, Mapping) and not is_module(content):
+        kind = _short(content.path) if isinstance(content, StandIn) else type(content).__name__
+        raise CheckpointError(f"checkpoint {path} holds a {kind}, not named tensors")
+    below = [content.get(key) for key in _STATE_KEYS] if isinstance(content, Mapping) else []
+    for candidate in (content, *below):
+        if is_module(candidate):
+            return module_state(candidate)
+        if isinstance(candidate, Mapping) and candidate:
+            _refuse_unusual_tensors(candidate, path)
+            if _only_tensors(candidate):
+                return dict(candidate)
     names = ", ".join(_short(str(key)) for key in list(content)[:8]) or "nothing"
     raise CheckpointError(f"checkpoint {path} has no state dict; it holds {names}")
 
 
-def _refuse_unusual_tensors(mapping: Mapping[Any, Any], path: Path) -> None:
-    """CheckpointError for a state dict with a tensor that is sparse, quantised or the like."""
-    for name, value in mapping.items():
-        kind = unusual_tensor(value)
-        if kind is not None:
+def _refuse_unusual_tensors(state: Mapping[Any, Any], path: Path) -> None:
+    for name, value in state.items():
+        if isinstance(value, StandIn) and value.path.startswith("torch._utils._rebuild_"):
+            kind = value.path.removeprefix("torch._utils._rebuild_")
             raise CheckpointError(
-                f"checkpoint {path}: tensor {_short(str(name))} is {kind}; save its values as a"
-                " dense tensor of floats"
+                f"checkpoint {path}: {_short(str(name))} is no plain tensor ({_short(kind)}); save"
+                " its values as a dense tensor of floats"
             )
-
-
-def _kind(content: Any) -> str:
-    return _short(content.path) if isinstance(content, StandIn) else type(content).__name__
 
 
 def _only_tensors(mapping: Mapping[Any, Any]) -> bool:

@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 from pnpdepth_cli.errors import CheckpointError
 from pnpdepth_cli.models.weights.numpy_file import read_numpy_file
 from tests.models.weights.numpy_files import pickled, write_npy
-from tests.models.weights.test_tensor_pickle import Hostile, hostile
+from tests.models.weights.test_torch_file import Hostile, hostile
 
 WRITERS = ["python 2", "2", "3", "4"]
 HEADER = {"descr": "|O", "fortran_order": False, "shape": ()}
