@@ -17,6 +17,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from pnpdepth_cli.budget import size_problem
 from pnpdepth_cli.choices import OutputKind, OutputScale
 from pnpdepth_cli.completion.interpolation import linear
 from pnpdepth_cli.core.split.user_code import describe
@@ -28,7 +29,6 @@ from pnpdepth_cli.models.definition import (
     Near,
     Normalisation,
 )
-from pnpdepth_cli.budget import size_problem
 from pnpdepth_cli.points import SparsePoints
 
 _MOST_JSON_BYTES = 1 << 24

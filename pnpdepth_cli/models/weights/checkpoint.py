@@ -16,11 +16,11 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from pnpdepth_cli.budget import size_problem
 from pnpdepth_cli.core.split.user_code import describe, wrap_user_errors
 from pnpdepth_cli.errors import CheckpointError, ModelError
 from pnpdepth_cli.models import registry
 from pnpdepth_cli.models.definition import ModelDefinition
-from pnpdepth_cli.budget import size_problem
 from pnpdepth_cli.models.weights.numpy_file import SUFFIXES as NUMPY_SUFFIXES
 from pnpdepth_cli.models.weights.numpy_file import read_numpy_file
 from pnpdepth_cli.models.weights.pickle_reader import StandIn

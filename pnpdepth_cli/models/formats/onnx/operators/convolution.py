@@ -15,6 +15,7 @@ from pnpdepth_cli.models.formats.onnx.operators.table import (
     Unsupported,
     operator,
     optional,
+    register,
 )
 
 _CONV = {1: F.conv1d, 2: F.conv2d, 3: F.conv3d}
@@ -143,11 +144,9 @@ def average_pool(node: Node, inputs: Inputs) -> Tensor:
     return total / (F.avg_pool2d(F.pad(inside, _sides(padded)), kernel, stride) * area)
 
 
-@operator("GlobalAveragePool")
-def global_average_pool(node: Node, inputs: Inputs) -> Tensor:
-    return inputs[0].mean(list(range(2, inputs[0].ndim)), keepdim=True)
-
-
-@operator("GlobalMaxPool")
-def global_max_pool(node: Node, inputs: Inputs) -> Tensor:
-    return inputs[0].amax(list(range(2, inputs[0].ndim)), keepdim=True)
+register(
+    {
+        "GlobalAveragePool": lambda _, i: i[0].mean(list(range(2, i[0].ndim)), keepdim=True),
+        "GlobalMaxPool": lambda _, i: i[0].amax(list(range(2, i[0].ndim)), keepdim=True),
+    }
+)

@@ -12,6 +12,22 @@ from pnpdepth_cli.models.formats.onnx.operators.table import (
     Unsupported,
     operator,
     optional,
+    register,
+)
+
+register(
+    {
+        "InstanceNormalization": lambda node, i: F.instance_norm(
+            i[0], weight=i[1], bias=i[2], eps=node.get("epsilon", 1e-5)
+        ),
+        "LRN": lambda node, i: F.local_response_norm(
+            i[0],
+            node.get("size"),
+            node.get("alpha", 1e-4),
+            node.get("beta", 0.75),
+            node.get("bias", 1.0),
+        ),
+    }
 )
 
 
@@ -21,13 +37,6 @@ def batch_norm(node: Node, inputs: Inputs) -> Tensor:
         raise Unsupported("training_mode; export the network in eval mode")
     x, weight, bias, mean, variance = inputs[:5]
     return F.batch_norm(x, mean, variance, weight, bias, eps=node.get("epsilon", 1e-5))
-
-
-@operator("InstanceNormalization")
-def instance_norm(node: Node, inputs: Inputs) -> Tensor:
-    return F.instance_norm(
-        inputs[0], weight=inputs[1], bias=inputs[2], eps=node.get("epsilon", 1e-5)
-    )
 
 
 @operator("LayerNormalization")
@@ -54,17 +63,6 @@ def group_norm(node: Node, inputs: Inputs) -> Tensor:
     if node.opset < 21:  # one weight per group
         weight, bias = (v.repeat_interleave(x.shape[1] // groups) for v in (weight, bias))
     return F.group_norm(x, groups, weight, bias, node.get("epsilon", 1e-5))
-
-
-@operator("LRN")
-def local_response_norm(node: Node, inputs: Inputs) -> Tensor:
-    return F.local_response_norm(
-        inputs[0],
-        node.get("size"),
-        node.get("alpha", 1e-4),
-        node.get("beta", 0.75),
-        node.get("bias", 1.0),
-    )
 
 
 @operator("LpNormalization")

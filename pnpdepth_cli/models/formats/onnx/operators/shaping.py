@@ -14,6 +14,7 @@ from pnpdepth_cli.models.formats.onnx.operators.table import (
     Unsupported,
     operator,
     optional,
+    register,
     whole_numbers,
 )
 
@@ -31,14 +32,28 @@ def _axes(node: Node, inputs: Inputs) -> list[int] | None:
     return None if axes is None else list(axes)
 
 
-@operator("Shape")
-def shape(node: Node, inputs: Inputs) -> Tensor:
-    return torch.tensor(inputs[0].shape[node.get("start", 0) : node.get("end")], dtype=torch.int64)
-
-
-@operator("Size")
-def size(node: Node, inputs: Inputs) -> Tensor:
-    return torch.tensor(inputs[0].numel())
+register(
+    {
+        "Shape": lambda node, i: torch.tensor(
+            i[0].shape[node.get("start", 0) : node.get("end")], dtype=torch.int64
+        ),
+        "Size": lambda _, i: torch.tensor(i[0].numel()),
+        "Transpose": lambda node, i: i[0].permute(node.get("perm", [*range(i[0].ndim)][::-1])),
+        "Concat": lambda node, i: torch.cat(i, node.get("axis", 1)),
+        "CastLike": lambda _, i: i[0].to(i[1].dtype),
+        "Dropout": lambda _, i: i[0].clone(),
+    }
+)
+register(
+    {
+        "Tile": lambda _, i: i[0].repeat(whole_numbers(i[1])),
+        "Squeeze": lambda node, i: i[0].squeeze(_axes(node, i) or [*range(i[0].ndim)]),
+        "Trilu": lambda node, i: (torch.triu if node.get("upper", 1) else torch.tril)(
+            i[0], 0 if optional(i, 1) is None else whole_numbers(i[1])[0]
+        ),
+    },
+    host=(1,),
+)
 
 
 @operator("Reshape", host=(1,))
@@ -56,18 +71,6 @@ def flatten(node: Node, inputs: Inputs) -> Tensor:
     axis = node.get("axis", 1)
     axis = axis + x.ndim if axis < 0 else axis
     return x.reshape(math.prod(x.shape[:axis]), -1)
-
-
-@operator("Transpose")
-def transpose(node: Node, inputs: Inputs) -> Tensor:
-    x = inputs[0]
-    return x.permute(node.get("perm", list(range(x.ndim))[::-1]))
-
-
-@operator("Squeeze", host=(1,))
-def squeeze(node: Node, inputs: Inputs) -> Tensor:
-    axes = _axes(node, inputs)
-    return inputs[0].squeeze() if axes is None else inputs[0].squeeze(axes)
 
 
 @operator("Unsqueeze", host=(1,))
@@ -88,16 +91,6 @@ def expand(node: Node, inputs: Inputs) -> Tensor:
     own = [1] * (rank - x.ndim) + list(x.shape)
     wanted = [1] * (rank - len(wanted)) + wanted
     return x.expand([n if w == 1 else w for n, w in zip(own, wanted, strict=True)])
-
-
-@operator("Tile", host=(1,))
-def tile(node: Node, inputs: Inputs) -> Tensor:
-    return inputs[0].repeat(whole_numbers(inputs[1]))
-
-
-@operator("Concat")
-def concat(node: Node, inputs: Inputs) -> Tensor:
-    return torch.cat(inputs, node.get("axis", 1))
 
 
 @operator("Split", host=(1,))
@@ -175,16 +168,6 @@ def cast(node: Node, inputs: Inputs) -> Tensor:
     return inputs[0].to(TYPES[kind])
 
 
-@operator("CastLike")
-def cast_like(node: Node, inputs: Inputs) -> Tensor:
-    return inputs[0].to(inputs[1].dtype)
-
-
-@operator("Dropout")
-def dropout(node: Node, inputs: Inputs) -> Tensor:
-    return inputs[0].clone()
-
-
 @operator("Constant")
 def constant(node: Node, inputs: Inputs) -> Tensor:
     for name in ("value", "value_float", "value_floats", "value_int", "value_ints"):
@@ -204,9 +187,3 @@ def constant_of_shape(node: Node, inputs: Inputs) -> Tensor:
 def number_range(node: Node, inputs: Inputs) -> Tensor:
     start, limit, delta = (v.reshape(()).item() for v in inputs)
     return torch.arange(start, limit, delta, dtype=inputs[0].dtype, device=inputs[0].device)
-
-
-@operator("Trilu", host=(1,))
-def trilu(node: Node, inputs: Inputs) -> Tensor:
-    k = 0 if optional(inputs, 1) is None else whole_numbers(inputs[1])[0]
-    return (torch.triu if node.get("upper", 1) else torch.tril)(inputs[0], k)

@@ -25,18 +25,13 @@ class Unsupported(Exception):
 
 @dataclass(frozen=True, kw_only=True)
 class Node:
-    """A node of the graph."""
+    """A node of the graph; its name is unique there, and `outputs` counts those that are used."""
 
     name: str
-    """Unique in the graph."""
     op: str
-    """Name of the operator."""
     opset: int
-    """Version of the standard's set of operators."""
     outputs: int = 1
-    """Number of outputs that are used."""
     attributes: Mapping[str, Any] = field(default_factory=dict)
-    """Attributes as Python values."""
 
     def get(self, name: str, default: Any = None) -> Any:
         """Returns an attribute, or the standard's default for it."""
@@ -52,6 +47,12 @@ def operator(*names: str, host: tuple[int, ...] = ()) -> Callable[[Operator], Op
         return function
 
     return enter
+
+
+def register(functions: Mapping[str, Operator], host: tuple[int, ...] = ()) -> None:
+    """Registers operators whose function is one expression; `host` is as in `HOST_INPUTS`."""
+    for name, function in functions.items():
+        operator(name, host=host)(function)
 
 
 def optional(inputs: Inputs, index: int) -> Tensor | None:
