@@ -309,11 +309,12 @@ def _training_notes(content: Any, path: Path) -> list[str]:
 
 def _state_in(content: Any, path: Path) -> dict[str, Tensor]:
     """The state dict in what a torch file holds."""
-    if not isinstance(content, Mapping) and not is_module(content):
+    if is_module(content):
+        return module_state(content)
+    if not isinstance(content, Mapping):
         kind = _short(content.path) if isinstance(content, StandIn) else type(content).__name__
         raise CheckpointError(f"checkpoint {path} holds a {kind}, not named tensors")
-    below = [content.get(key) for key in _STATE_KEYS] if isinstance(content, Mapping) else []
-    for candidate in (content, *below):
+    for candidate in (content, *(content.get(key) for key in _STATE_KEYS)):
         if is_module(candidate):
             return module_state(candidate)
         if isinstance(candidate, Mapping) and candidate:

@@ -150,7 +150,8 @@ class PickleReader(pickle._Unpickler):
         elif path in _TENSORS:
             return _view(*arguments[:4])
         elif path == "torch._utils._rebuild_tensor_v3":  # of a dtype that storages do not name
-            return _view(*arguments[:4], dtype=arguments[6])
+            storage, offset, shape, stride = arguments[:4]
+            return _view(storage, offset, shape, stride, arguments[6])
         elif path == "torch._tensor._rebuild_from_type_v2":  # it has attributes of its own
             return self._call(arguments[0], arguments[2])
         elif path.startswith(_PARAMETERS):
@@ -281,7 +282,7 @@ _INHERITED = (
     *("SHORT_BINBYTES", "EMPTY_TUPLE", "TUPLE", "TUPLE1", "TUPLE2", "TUPLE3", "EMPTY_LIST", "LIST"),
     *("APPEND", "APPENDS", "EMPTY_DICT", "GLOBAL", "STACK_GLOBAL", "BINPERSID", "INST", "OBJ"),
 )
-_REPLACED: dict[str, Callable[[PickleReader], None]] = {
+_REPLACED: dict[str, Callable[[Any], None]] = {
     **dict.fromkeys(("REDUCE", "NEWOBJ"), PickleReader._load_call),
     "NEWOBJ_EX": PickleReader._load_call_with_keywords,
     "BUILD": PickleReader._load_build,
@@ -296,7 +297,7 @@ _REPLACED: dict[str, Callable[[PickleReader], None]] = {
 }
 
 
-def _counted(step: Callable[[Any], None]) -> Callable[[PickleReader], None]:
+def _counted(step: Callable[[Any], None]) -> Callable[[Any], None]:
     def run(reader: PickleReader) -> None:
         reader.charge(1)
         step(reader)
@@ -304,7 +305,7 @@ def _counted(step: Callable[[Any], None]) -> Callable[[PickleReader], None]:
     return run
 
 
-def _refused(opcode: int) -> Callable[[PickleReader], None]:
+def _refused(opcode: int) -> Callable[[Any], None]:
     def refuse(_: PickleReader) -> None:
         raise BrokenFileError(f"its pickle uses the opcode {bytes([opcode])!r}")
 

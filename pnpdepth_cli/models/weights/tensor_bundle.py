@@ -87,9 +87,10 @@ def _values(index: Path, shard: str) -> bytes:
 
 
 def _tensor(name: str, fields: _Fields, content: bytes) -> Tensor:
-    dtype = _TYPES.get(_number(fields, 1))
-    if dtype is None:
-        raise BrokenFileError(f"{name} is of TensorFlow's type {fields.get(1, 0)}, not of numbers")
+    kind = _number(fields, 1)
+    if kind not in _TYPES:
+        raise BrokenFileError(f"{name} is of TensorFlow's type {kind}, not of numbers")
+    dtype = _TYPES[kind]
     shape = fields.get(2, b"")
     sides = [*_fields(shape)] if isinstance(shape, bytes) else []
     if len(sides) > MAX_AXES:

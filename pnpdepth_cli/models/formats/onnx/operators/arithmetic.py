@@ -14,6 +14,7 @@ from torch import Tensor
 from pnpdepth_cli.models.formats.onnx.operators.table import (
     Inputs,
     Node,
+    Operator,
     Unsupported,
     operator,
     optional,
@@ -74,14 +75,21 @@ _FOLDED: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
 }
 
 
-register({op: lambda _, i, f=f: f(i[0]) for op, f in _UNARY.items()})
-register(
-    {
-        op: lambda node, i, f=f: f(i[0], _broadcast_as_before_7(node, i[0], i[1]))
-        for op, f in _BINARY.items()
-    }
-)
-register({op: lambda _, i, f=f: functools.reduce(f, i) for op, f in _FOLDED.items()})
+def _unary(function: Callable[[Tensor], Tensor]) -> Operator:
+    return lambda _, inputs: function(inputs[0])
+
+
+def _binary(function: Callable[[Tensor, Tensor], Tensor]) -> Operator:
+    return lambda node, i: function(i[0], _broadcast_as_before_7(node, i[0], i[1]))
+
+
+def _folded(function: Callable[[Tensor, Tensor], Tensor]) -> Operator:
+    return lambda _, inputs: functools.reduce(function, inputs)
+
+
+register({name: _unary(function) for name, function in _UNARY.items()})
+register({name: _binary(function) for name, function in _BINARY.items()})
+register({name: _folded(function) for name, function in _FOLDED.items()})
 register(
     {
         "Mean": lambda _, i: functools.reduce(torch.add, i) / len(i),
