@@ -23,7 +23,6 @@ from pnpdepth_cli.core.split.layer_name import LayerName
 from pnpdepth_cli.errors import ModelError
 from pnpdepth_cli.models.frame import FrameMap
 from pnpdepth_cli.models.network import Network, out_of_memory_is_a_device_error
-from pnpdepth_cli.models.synthetic_frame import synthetic_arguments
 
 GAPS = 6.0
 """Gaps between points that a field should span, and"""
@@ -35,29 +34,25 @@ and KITTI with 100 points to LiDAR."""
 
 @dataclass(frozen=True, kw_only=True)
 class MeasuredLayer:
-    """A layer and what a cut there costs and reaches; all but the name is None with a problem."""
+    """A layer and what a cut there costs and reaches; all but the name is None with a problem.
+
+    stride: network pixels per element of z; None if z has no two spatial axes. cost_behind:
+    fraction of the network's floating-point operations behind the cut, which every update repeats;
+    seconds_behind: time of one pass of that part. parameters: weights of the layer itself. Fields:
+    rows and columns that one point influences, see `InfluentialField`. rank: 1 for the layer to cut
+    at for the spacing of the points.
+    """
 
     name: str
-    """What `--layer` takes."""
     shape: tuple[int, ...] | None = None
-    """Shape of z, the layer's output."""
     stride: float | None = None
-    """Network pixels per element of z; None if z has no two spatial axes."""
     cost_behind: float | None = None
-    """Fraction of the network's floating-point operations behind the cut, which every update
-    repeats; None if the network has none that are counted."""
     seconds_behind: float | None = None
-    """Seconds that one pass of the part behind the cut took here."""
     parameters: int | None = None
-    """Number of weights of the layer itself."""
     field_in_z: tuple[int, int] | None = None
-    """Rows and columns of z that one point influences; see `InfluentialField`."""
     field_in_output: tuple[int, int] | None = None
-    """Rows and columns of the depth map that one point influences."""
     rank: int | None = None
-    """1 for the layer to cut at for the spacing of the points; None if that is not known."""
     problem: str | None = None
-    """Why the network cannot be cut here."""
 
 
 def best_layer(
@@ -114,7 +109,7 @@ def default_layer(network: Network, size: tuple[int, int], point_count: int) -> 
         return definition.default_layer
     frame = FrameMap.fit(definition.size, *size)
     with out_of_memory_is_a_device_error(network.device):
-        arguments = synthetic_arguments(network, frame)
+        arguments = network.synthetic_arguments(frame)
         return best_layer(network, arguments, frame.network, point_count) or definition.layers[0]
 
 

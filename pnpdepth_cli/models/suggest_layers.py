@@ -32,14 +32,15 @@ class _FeatureMap:
 
 @dataclass(frozen=True)
 class _Run:
-    """One pass of the network."""
+    """One pass of the network: its prediction, (1, 1, h, w), and the maps behind it.
+
+    maps: of the submodules that ran once, in the order in which they ran. copies: of submodules'
+    outputs, that gradients were made to reach.
+    """
 
     maps: list[_FeatureMap]
-    """Of the submodules that ran once, in the order in which they ran."""
     copies: list[Tensor]
-    """Copies of submodules' outputs that gradients were made to reach."""
     prediction: Tensor
-    """(1, 1, h, w)."""
 
 
 def suggest_layers(

@@ -330,8 +330,8 @@ def _refuse_unusual_tensors(state: Mapping[Any, Any], path: Path) -> None:
         if isinstance(value, StandIn) and value.path.startswith("torch._utils._rebuild_"):
             kind = value.path.removeprefix("torch._utils._rebuild_")
             raise CheckpointError(
-                f"checkpoint {path}: {_short(str(name))} is no plain tensor ({_short(kind)}); save"
-                " its values as a dense tensor of floats"
+                f"checkpoint {path}: {_short(str(name))} is not a plain tensor ({_short(kind)});"
+                " save its values as a dense tensor of floats"
             )
 
 

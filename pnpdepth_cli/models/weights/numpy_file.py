@@ -140,7 +140,7 @@ def _unpickled(value: Any, name: str, most: int) -> Tensor:
     """The tensor of a pickled array of at most so many bytes."""
     if not _is_array(value):
         kind = value.path if isinstance(value, StandIn) else type(value).__name__
-        raise BrokenFileError(f"{name} is no array but a {kind}")
+        raise BrokenFileError(f"{name} is a {kind}, not an array")
     _, shape, dtype, fortran, data = value.built
     if not isinstance(shape, tuple) or len(shape) > MAX_AXES:
         raise BrokenFileError(f"{name} is an array without a shape")

@@ -165,7 +165,7 @@ class PickleReader(pickle._Unpickler):
 
     def _call(self, function: Any, arguments: Any) -> Any:
         if not isinstance(arguments, tuple) or not isinstance(function, Name):
-            raise BrokenFileError("its pickle calls what is no function")
+            raise BrokenFileError("its pickle calls something other than a function")
         self.charge(len(arguments))
         return function(*arguments)
 

@@ -171,7 +171,7 @@ def _fields(message: int | bytes) -> Iterator[tuple[int, int | bytes]]:
         elif kind in (1, 5):
             at += 8 if kind == 1 else 4  # checksums
         else:
-            raise BrokenFileError("an entry that is no protocol buffer")
+            raise BrokenFileError("an entry is not a protocol buffer")
 
 
 def _varint(data: bytes, at: int) -> tuple[int, int]:

@@ -286,7 +286,7 @@ def test_settings_that_are_no_numbers_are_refused_in_one_line(
 @pytest.mark.parametrize("size", ["x", [1, 2], {"height": "x", "width": 3}, 10**9, None])
 def test_a_size_that_is_none_is_refused(size: Any, tmp_path: Path) -> None:
     folder = saved(tmp_path / "net", "dpt")
-    with pytest.raises(ModelError, match="is no height and width"):
+    with pytest.raises(ModelError, match="must be a height and a width"):
         hf_definition(changed(folder, "preprocessor_config.json", {"size": size}))
 
 

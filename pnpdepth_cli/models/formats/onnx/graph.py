@@ -19,7 +19,7 @@ from torch import Tensor, nn
 
 from pnpdepth_cli.core.split.user_code import describe
 from pnpdepth_cli.errors import ModelError
-from pnpdepth_cli.models.formats.onnx.folding import FoldingBudget
+from pnpdepth_cli.models.formats.onnx.limits import FoldingBudget
 from pnpdepth_cli.models.formats.onnx.operators import HOST_INPUTS, OPERATORS, Node, Unsupported
 
 _STANDARD = ("", "ai.onnx")
@@ -82,17 +82,17 @@ class OnnxNode(nn.Module):
 
 @dataclass(frozen=True)
 class _Step:
-    """One node in the order in which they run."""
+    """One node, in the order in which they run, and the names of the values around it.
+
+    last_read: values that no later step reads. on_shapes: True for arithmetic on the shapes of
+    tensors, which stays on the CPU.
+    """
 
     run: OnnxNode
     inputs: tuple[str, ...]
-    """Names of the values that it is called with."""
     outputs: tuple[str, ...]
-    """Names of the values that it returns."""
     last_read: tuple[str, ...]
-    """Values that no later step reads."""
     on_shapes: bool
-    """True for arithmetic on the shapes of tensors, which stays on the CPU."""
 
 
 class OnnxGraph(nn.Module):

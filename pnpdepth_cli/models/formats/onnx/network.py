@@ -16,9 +16,9 @@ from torch import Tensor, nn
 from pnpdepth_cli.core.split.user_code import describe
 from pnpdepth_cli.errors import ModelError
 from pnpdepth_cli.models.definition import UNTUNED_DEFAULTS, Fixed, ModelDefinition, Multiple
-from pnpdepth_cli.models.formats.onnx.functions import inlined
 from pnpdepth_cli.models.formats.onnx.graph import OnnxGraph, order_of_nodes
 from pnpdepth_cli.models.formats.onnx.input_range import stated_input_range
+from pnpdepth_cli.models.formats.onnx.limits import inlined
 
 MISMATCH = 1e-3
 """The largest deviation from onnxruntime's output, relative to that output's range."""
@@ -112,7 +112,7 @@ def _opset(model: Any) -> int:
 
 
 def _image_input_shape(model: Any, file: Path) -> list[int | str]:
-    """The shape of the only input. ModelError if that is no batch of one rgb image."""
+    """The shape of the only input. ModelError unless it is a batch of one rgb image."""
     constants = {tensor.name for tensor in model.graph.initializer}
     inputs = {i.name: _shape(i) for i in model.graph.input if i.name not in constants}
     listed = ", ".join(f"{name} {'×'.join(map(str, shape))}" for name, shape in inputs.items())

@@ -8,11 +8,9 @@ from __future__ import annotations
 
 from pnpdepth_cli.models.formats.onnx.operators import (  # noqa: F401  (each registers its operators)
     arithmetic,
-    convolution,
-    indexing,
-    normalisation,
+    layers,
     resizing,
-    shaping,
+    tensors,
 )
 from pnpdepth_cli.models.formats.onnx.operators.table import (
     HOST_INPUTS,
