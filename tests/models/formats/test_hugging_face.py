@@ -214,7 +214,7 @@ def test_incomplete_folders_are_refused_with_a_remedy(tmp_path: Path) -> None:
     with pytest.raises(CheckpointError, match="no model"):
         hf_definition(folder)
     (folder / "preprocessor_config.json").unlink()
-    with pytest.raises(ModelError, match=r"no preprocessor_config\.json"):
+    with pytest.raises(ModelError, match=r"preprocessor_config\.json is missing"):
         hf_definition(folder)
     (folder / "config.json").write_text(json.dumps({"model_type": "bert"}))
     with pytest.raises(ModelError, match="'bert' are not known"):
