@@ -7,6 +7,7 @@ network can be cut at it.
 
 from __future__ import annotations
 
+import graphlib
 import heapq
 from collections import Counter
 from collections.abc import Iterable, Sequence
@@ -272,22 +273,18 @@ def order_of_nodes(
             raise ModelError(f"ONNX file {path}: a node reads {absent[0]!r}, which nothing gives")
         reads[n] = {producer[name] for name in inputs}
         pending += reads[n]
-    readers: dict[int, list[int]] = {n: [] for n in reads}
-    for n, before in reads.items():
-        for m in before:
-            readers[m].append(n)
-    waiting = {n: len(before) for n, before in reads.items()}
-    ready = [n for n, count in waiting.items() if not count]
-    heapq.heapify(ready)
-    order = []
-    while ready:
+    sorter = graphlib.TopologicalSorter(reads)
+    try:
+        sorter.prepare()
+    except graphlib.CycleError:
+        raise ModelError(f"ONNX file {path}: its nodes read each other in a circle") from None
+    order: list[int] = []
+    ready: list[int] = []
+    while len(order) < len(reads):
+        for n in sorter.get_ready():
+            heapq.heappush(ready, n)
         order.append(heapq.heappop(ready))
-        for n in readers[order[-1]]:
-            waiting[n] -= 1
-            if not waiting[n]:
-                heapq.heappush(ready, n)
-    if len(order) < len(reads):
-        raise ModelError(f"ONNX file {path}: its nodes read each other in a circle")
+        sorter.done(order[-1])
     return order
 
 

@@ -7,6 +7,7 @@ few bytes into gigabytes; `FoldingBudget` knows the size of every result before 
 
 from __future__ import annotations
 
+import graphlib
 import math
 from collections.abc import Iterable
 from pathlib import Path
@@ -26,8 +27,6 @@ MAX_NODES = 100_000
 MAX_BYTES = 1 << 28
 """Bytes of them, without the weights that lie in the graph itself."""
 
-_Key = tuple[str, str, str]
-
 
 def inlined(model: Any, path: Path) -> Any:
     """Returns the model without functions of its own.
@@ -37,13 +36,23 @@ def inlined(model: Any, path: Path) -> Any:
     """
     if not model.functions:
         return model
-    functions = {_key(f.domain, f.name, f): f for f in model.functions}
-    sizes: dict[_Key, tuple[int, int]] = {}
-    for key in functions:
-        _measure(key, functions, sizes, path)
-    calls = [_key(node.domain, node.op_type, node) for node in _nodes(model.graph.node)]
-    nodes = sum(sizes[key][0] for key in calls if key in sizes)
-    size = sum(sizes[key][1] for key in calls if key in sizes)
+    functions = {(f.domain, f.name, getattr(f, "overload", "")): f for f in model.functions}
+    calls = {key: _calls(function) for key, function in functions.items()}
+    try:
+        order = [*graphlib.TopologicalSorter(calls).static_order()]
+    except graphlib.CycleError as error:
+        name = str(error.args[1][0][1])[:60]
+        raise ModelError(f"ONNX file {path}: its function {name!r} calls itself") from None
+    sizes: dict[Any, tuple[int, int]] = {}  # nodes and bytes when written out
+    for key in order:
+        if key in functions:
+            inner = [sizes[call] for call in calls[key] if call in functions]
+            sizes[key] = (
+                len(calls[key]) + sum(count for count, _ in inner),
+                functions[key].ByteSize() + sum(size for _, size in inner),
+            )
+    called = [sizes[call] for call in _calls(model.graph) if call in functions]
+    nodes, size = (sum(some[part] for some in called) for part in (0, 1))
     if nodes > MAX_NODES or size > MAX_BYTES:
         raise ModelError(
             f"ONNX file {path}: its functions, written out, are more than {MAX_NODES:,} nodes or"
@@ -54,33 +63,9 @@ def inlined(model: Any, path: Path) -> Any:
     return inliner.inline_local_functions(model)
 
 
-def _key(domain: str, name: str, proto: Any) -> _Key:
-    return domain, name, getattr(proto, "overload", "")
-
-
-def _measure(
-    first: _Key, functions: dict[_Key, Any], sizes: dict[_Key, tuple[int, int]], path: Path
-) -> None:
-    """Fills in nodes and bytes of a function, and of those it calls, when written out."""
-    open_calls: list[_Key] = [first]
-    while open_calls:
-        key = open_calls[-1]
-        if key in sizes:
-            open_calls.pop()
-            continue
-        nodes = list(_nodes(functions[key].node))
-        calls = [_key(node.domain, node.op_type, node) for node in nodes]
-        missing = {call for call in calls if call in functions and call not in sizes}
-        if missing & set(open_calls):
-            raise ModelError(f"ONNX file {path}: its function {key[1][:60]!r} calls itself")
-        if missing:
-            open_calls += missing
-            continue
-        inner = [sizes[call] for call in calls if call in sizes]
-        sizes[key] = (
-            len(nodes) + sum(count for count, _ in inner),
-            functions[key].ByteSize() + sum(size for _, size in inner),
-        )
+def _calls(graph: Any) -> list[tuple[str, str, str]]:
+    """What the nodes of a graph or function are, by which a function may be called."""
+    return [(n.domain, n.op_type, getattr(n, "overload", "")) for n in _nodes(graph.node)]
 
 
 def _nodes(nodes: Iterable[Any]) -> Iterable[Any]:
