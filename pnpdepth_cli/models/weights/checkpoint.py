@@ -26,7 +26,12 @@ from pnpdepth_cli.models.weights.numpy_file import read_numpy_file
 from pnpdepth_cli.models.weights.pickle_reader import StandIn
 from pnpdepth_cli.models.weights.tensor_bundle import SUFFIX as BUNDLE_SUFFIX
 from pnpdepth_cli.models.weights.tensor_bundle import read_tensor_bundle
-from pnpdepth_cli.models.weights.torch_file import is_module, module_state, read_tensor_file
+from pnpdepth_cli.models.weights.torch_file import (
+    TensorFile,
+    is_module,
+    module_state,
+    read_tensor_file,
+)
 
 _STATE_KEYS = ("state_dict", "model_state_dict", "model_state", "model", "network", "net", "params")
 WEIGHT_SUFFIXES = (
@@ -222,7 +227,9 @@ def _read(path: Path) -> tuple[dict[str, Tensor], list[str]]:
         index = path.with_name(path.name + BUNDLE_SUFFIX)
         hint = f"; {index.name} does, name that" if index.is_file() else ""
         raise CheckpointError(f"checkpoint {path} does not exist{hint}")
-    if _is_lfs_pointer(path):
+    with path.open("rb") as file:
+        is_lfs_pointer = file.read(len(_LFS_POINTER)) == _LFS_POINTER
+    if is_lfs_pointer:
         raise CheckpointError(
             f"checkpoint {path} is a Git LFS pointer, not the file it points to; `git lfs pull`"
             " fetches that"
@@ -235,13 +242,8 @@ def _read(path: Path) -> tuple[dict[str, Tensor], list[str]]:
         return read_numpy_file(path), []
     if path.suffix == BUNDLE_SUFFIX:
         return read_tensor_bundle(path), []
-    content, notes = _read_torch(path)
-    return _state_in(content, path), notes + _training_notes(content, path)
-
-
-def _is_lfs_pointer(path: Path) -> bool:
-    with path.open("rb") as file:
-        return file.read(len(_LFS_POINTER)) == _LFS_POINTER
+    torch_file = read_tensor_file(path)
+    return _state_in(torch_file.content, path), _notes_on(torch_file, path)
 
 
 def _read_folder(folder: Path) -> tuple[dict[str, Tensor], list[str]]:
@@ -276,35 +278,30 @@ def _read_safetensors(path: Path) -> dict[str, Tensor]:
         ) from None
 
 
-def _read_torch(path: Path) -> tuple[Any, list[str]]:
-    """What a torch file holds, and a note if that is more than tensors."""
-    file = read_tensor_file(path)
-    classes = [name for name in file.named if not name.startswith(_NOT_WORTH_A_NOTE)]
-    if not classes and not file.has_stand_ins:
-        return file.content, []
-    note = (
-        f"checkpoint {path.name}: its pickle names {_some(classes) or 'classes of torch'}; its"
-        " tensors were taken out, nothing of it was run"
-    )
-    return file.content, [note]
-
-
-def _training_notes(content: Any, path: Path) -> list[str]:
-    """What the arguments of the training say, if they are stored beside the weights.
+def _notes_on(file: TensorFile, path: Path) -> list[str]:
+    """What else a torch file holds, and what the arguments of the training say if it has them.
 
     Weights for other data, or for images of another size, may fit all the same.
     """
-    arguments = content.get("args") if isinstance(content, Mapping) else None
+    notes = []
+    classes = [name for name in file.named if not name.startswith(_NOT_WORTH_A_NOTE)]
+    if classes or file.has_stand_ins:
+        notes.append(
+            f"checkpoint {path.name}: its pickle names {_some(classes) or 'classes of torch'}; its"
+            " tensors were taken out, nothing of it was run"
+        )
+    arguments = file.content.get("args") if isinstance(file.content, Mapping) else None
     arguments = arguments.state if isinstance(arguments, StandIn) else arguments
-    if not isinstance(arguments, Mapping):
-        return []
-    values = {key: arguments.get(key) for key in _TRAINING_ARGUMENTS}
-    shown = [
-        f"{key} {_short(str(value))}"
-        for key, value in values.items()
-        if isinstance(value, str) or (isinstance(value, int) and abs(value) < _MAX_SIDE)
-    ]
-    return [f"checkpoint {path.name}: trained with {', '.join(shown)}"] if shown else []
+    if isinstance(arguments, Mapping):
+        values = {key: arguments.get(key) for key in _TRAINING_ARGUMENTS}
+        shown = [
+            f"{key} {_short(str(value))}"
+            for key, value in values.items()
+            if isinstance(value, str) or (isinstance(value, int) and abs(value) < _MAX_SIDE)
+        ]
+        if shown:
+            notes.append(f"checkpoint {path.name}: trained with {', '.join(shown)}")
+    return notes
 
 
 def _state_in(content: Any, path: Path) -> dict[str, Tensor]:

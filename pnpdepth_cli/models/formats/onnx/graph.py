@@ -10,7 +10,7 @@ from __future__ import annotations
 import graphlib
 import heapq
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -162,32 +162,33 @@ class OnnxGraph(nn.Module):
     def forward(self, *inputs: Tensor) -> Any:
         """Returns the output, or several outputs by name."""
         values: dict[str, Tensor] = dict(zip(self.input_names, inputs, strict=True))
-        device = inputs[0].device
-        for step in self._steps:
-            arguments = [values[name] for name in step.inputs]
-            if not step.on_shapes:
-                on_host = step.run.handed_in_on_host
-                arguments = [
-                    value.to("cpu" if host else device)
-                    for value, host in zip(arguments, on_host, strict=True)
-                ]
-            result = step.run(*arguments)
-            results = result if isinstance(result, tuple) else (result,)
-            values.update(zip(step.outputs, results, strict=False))
+        for step in self._run(values, inputs[0].device):
             for name in step.last_read:
                 del values[name]
         outputs = {n: values[n] if n in values else self._constants[n] for n in self.output_names}
         return outputs if len(outputs) > 1 else outputs[self.output_names[0]]
 
-    def every_value(self, *inputs: Tensor) -> Iterable[tuple[str, str, Tensor]]:
+    def every_value(self, *inputs: Tensor) -> Iterator[tuple[str, str, Tensor]]:
         """Yields (node, value's name, value) of all nodes in the order in which they run."""
         values: dict[str, Tensor] = dict(zip(self.input_names, inputs, strict=True))
+        for step in self._run(values, inputs[0].device):
+            for name in step.outputs:
+                if name in values:
+                    yield step.run.node.name, name, values[name]
+
+    def _run(self, values: dict[str, Tensor], device: torch.device) -> Iterator[_Step]:
+        """Yields the steps, each after its results were added to the values."""
         for step in self._steps:
-            result = step.run(*(values[name] for name in step.inputs))
+            arguments = [values[name] for name in step.inputs]
+            if not step.on_shapes:
+                arguments = [
+                    value.to("cpu" if on_host else device)
+                    for value, on_host in zip(arguments, step.run.handed_in_on_host, strict=True)
+                ]
+            result = step.run(*arguments)
             results = result if isinstance(result, tuple) else (result,)
             values.update(zip(step.outputs, results, strict=False))
-            for name, value in zip(step.outputs, results, strict=False):
-                yield step.run.node.name, name, value
+            yield step
 
 
 _QUANTISED = (
