@@ -223,7 +223,7 @@ def test_incomplete_folders_are_refused_with_a_remedy(tmp_path: Path) -> None:
     with pytest.raises(ModelError, match="is not JSON"):
         hf_definition(folder)
     (folder / "config.json").unlink()
-    with pytest.raises(ModelError, match=r"no config\.json"):
+    with pytest.raises(ModelError, match=r"config\.json is missing"):
         hf_definition(folder)
 
 
