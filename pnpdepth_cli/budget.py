@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass
+from pathlib import Path
 
 from pnpdepth_cli.errors import UsageError
 
@@ -46,6 +47,20 @@ class Budget:
 def budget() -> Budget:
     """The limits in force."""
     return _chosen or _of_this_machine()
+
+
+def size_problem(path: Path, most: int | None = None) -> str | None:
+    """Returns why an existing file is too large to be read, or None.
+
+    Args:
+        path: A file of a network or its weights.
+        most: Bytes that are allowed. None: `max_decoded_bytes`.
+    """
+    most = budget().max_decoded_bytes if most is None else most
+    size = path.stat().st_size
+    if size <= most:
+        return None
+    return f"has {size:,} bytes; at most {most:,} are read on this machine"
 
 
 def set_max_pixels(max_pixels: int | None) -> None:

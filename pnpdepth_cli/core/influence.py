@@ -13,7 +13,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from pnpdepth_cli.core.split import Split, gradient_at
+from pnpdepth_cli.core.split import Split
+from pnpdepth_cli.core.user_code import wrap_user_errors
 
 _POSITIONS = ((0.5, 0.5), (0.35, 0.4), (0.65, 0.6))
 """Where points are placed, as fractions of height and width; inactive units may hide a part at
@@ -31,7 +32,10 @@ class InfluentialField:
 
 
 def influential_field(
-    split: Split, z: Tensor, depth_of: Callable[[object], Tensor]
+    split: Split,
+    z: Tensor,
+    depth_of: Callable[[object], Tensor],
+    enough: float | None = None,
 ) -> InfluentialField:
     """Returns the largest patches over a few points near the centre of the image.
 
@@ -41,28 +45,39 @@ def influential_field(
         split: The network, cut and open.
         z: z_0, as returned by `split.front`.
         depth_of: Turns the network's output into depth (1, 1, h, w).
+        enough: Rows and columns that the patch of the output is compared with. No further point is
+            tried once it has as many, or, since points differ little, fewer than half. None
+            tries every point.
     """
-    fields = [_at(split, z, depth_of, position) for position in _POSITIONS]
-    patches = [field.in_z for field in fields if field.in_z is not None]
-    outputs = [field.in_output for field in fields]
-    return InfluentialField(_largest(patches) if patches else None, _largest(outputs))
-
-
-def _at(
-    split: Split, z: Tensor, depth_of: Callable[[object], Tensor], position: tuple[float, float]
-) -> InfluentialField:
     z = z.detach().requires_grad_(True)
     with torch.enable_grad():
         depth = depth_of(split.rear(z))
-        height, width = depth.shape[-2:]
-        point = depth[..., int(height * position[0]), int(width * position[1])].sum()
-        gradient = gradient_at(z, point)
-        if gradient is None:
-            gradient = torch.zeros_like(z)
-        # With gradients both times: without, torch may take a kernel that rounds differently.
+    in_z, in_output = (0, 0), (0, 0)
+    for position in _POSITIONS:
+        gradient = _gradient_of_point(z, depth, position)
         moved = z.detach() + z.detach().std(correction=0) * gradient.sign()
-        changed = depth_of(split.rear(moved.requires_grad_(True))).detach() != depth.detach()
-    return InfluentialField(_extent(gradient != 0) if z.ndim == 4 else None, _extent(changed))
+        # With gradients both times: without, torch may take a kernel that rounds differently.
+        with torch.enable_grad():
+            changed = depth_of(split.rear(moved.requires_grad_(True))).detach() != depth.detach()
+        in_output = _larger(in_output, _extent(changed))
+        if z.ndim == 4:
+            in_z = _larger(in_z, _extent(gradient != 0))
+        width = min(in_output)
+        if enough is not None and (width >= enough or 0 < width < enough / 2):
+            break
+    return InfluentialField(in_z if z.ndim == 4 else None, in_output)
+
+
+def _gradient_of_point(z: Tensor, depth: Tensor, position: tuple[float, float]) -> Tensor:
+    """∂depth/∂z at a position; the graph of `depth` is kept for the next one."""
+    height, width = depth.shape[-2:]
+    with torch.enable_grad():
+        point = depth[..., int(height * position[0]), int(width * position[1])].sum()
+    z.grad = None
+    if point.requires_grad:
+        with wrap_user_errors("the gradient of the network"):
+            point.backward(retain_graph=True)  # type: ignore[no-untyped-call]
+    return torch.zeros_like(z) if z.grad is None else z.grad
 
 
 def _extent(mask: Tensor) -> tuple[int, int]:
@@ -74,5 +89,5 @@ def _extent(mask: Tensor) -> tuple[int, int]:
     return int(rows[-1] - rows[0]) + 1, int(columns[-1] - columns[0]) + 1
 
 
-def _largest(patches: list[tuple[int, int]]) -> tuple[int, int]:
-    return max(height for height, _ in patches), max(width for _, width in patches)
+def _larger(patch: tuple[int, int], other: tuple[int, int]) -> tuple[int, int]:
+    return max(patch[0], other[0]), max(patch[1], other[1])

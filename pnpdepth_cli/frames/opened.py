@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from pnpdepth_cli.choices import LOSSES
 from pnpdepth_cli.core.refine import Refinement, RefineSettings, refine_from
 from pnpdepth_cli.core.split import InputSplit, Split
-from pnpdepth_cli.core.split.user_code import wrap_user_errors
+from pnpdepth_cli.core.user_code import wrap_user_errors
 from pnpdepth_cli.errors import PnpDepthError
 from pnpdepth_cli.frames.frame import Frame, RefinedFrame
 from pnpdepth_cli.frames.prepare import PreparedFrame, prepare

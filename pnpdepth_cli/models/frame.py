@@ -11,6 +11,7 @@ from torch import Tensor
 from pnpdepth_cli.models.definition import Fixed, Multiple, Near
 from pnpdepth_cli.points import SparsePoints
 
+_SYNTHETIC_POINTS = 500
 _ROUNDING = 1e-4  # of weights with a sum of 1
 
 
@@ -105,3 +106,21 @@ def _resize(depth: Tensor, size: tuple[int, int]) -> Tensor:
     if tuple(depth.shape[-2:]) == size:
         return depth
     return F.interpolate(depth, size, mode="bilinear", align_corners=False)
+
+
+def synthetic_frame(
+    size: tuple[int, int], count: int = _SYNTHETIC_POINTS
+) -> tuple[Tensor, SparsePoints]:
+    """A smooth random rgb image (1, 3, H, W), and points on a slanted plane; the seed is fixed."""
+    height, width = size
+    generator = torch.Generator().manual_seed(0)
+    coarse = torch.rand(1, 3, max(2, height // 8), max(2, width // 8), generator=generator)
+    rgb = F.interpolate(coarse, size, mode="bilinear")
+    pixels = torch.randperm(height * width, generator=generator)[:count]
+    y, x = pixels // width, pixels % width
+    points = SparsePoints(
+        xy=torch.stack([x, y], dim=1).float(),
+        depth=2 + 3 * y.float() / height + torch.rand(len(pixels), generator=generator),
+        size=size,
+    )
+    return rgb, points

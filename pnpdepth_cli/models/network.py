@@ -17,11 +17,10 @@ from pnpdepth_cli.core.user_code import is_out_of_memory, wrap_user_errors
 from pnpdepth_cli.errors import CheckpointError, DeviceError, ModelError, UsageError
 from pnpdepth_cli.models.definition import Fixed, ModelDefinition, Normalisation
 from pnpdepth_cli.models.formats.python_file import importing_beside
-from pnpdepth_cli.models.frame import FrameMap
+from pnpdepth_cli.models.frame import FrameMap, synthetic_frame
 from pnpdepth_cli.models.precision import dtype_of, lower
 from pnpdepth_cli.models.registry import find_definition
 from pnpdepth_cli.models.suggest_layers import suggest_layers
-from pnpdepth_cli.models.synthetic_frame import synthetic_arguments
 from pnpdepth_cli.models.weights.checkpoint import load_checkpoint
 from pnpdepth_cli.points import SparsePoints
 
@@ -31,20 +30,22 @@ FARTHEST_DEPTH = 1e4
 _SUGGESTION_SIDE = 128  # pixels of the synthetic frame that suggests layers
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, repr=False)
 class Network:
-    """A network with its weights on its device, in eval mode, its parameters without gradients."""
+    """A network with its weights on its device, in eval mode, its parameters without gradients.
+
+    notes: what was assumed or done when it was loaded, to be printed.
+    """
 
     definition: ModelDefinition
-    """What the program knows of it."""
     module: nn.Module
-    """The network itself."""
     device: torch.device
-    """Where it computes."""
     checkpoint: Path | None
-    """The file that the weights came from."""
     notes: tuple[str, ...] = ()
-    """What was assumed or done when it was loaded, to be printed."""
+
+    def __repr__(self) -> str:
+        count = sum(parameter.numel() for parameter in self.module.parameters())
+        return f"Network({self.definition.name!r}, {count:,} parameters, {str(self.device)!r})"
 
     def cut_at(self, layer: str) -> Split:
         """Returns the network cut at a layer, to be opened by `with`.
@@ -127,6 +128,11 @@ class Network:
                 f" {type(arguments).__name__}, where a tuple is expected"
             )
         return arguments if prior is None else (*arguments, prior)
+
+    def synthetic_arguments(self, frame: FrameMap) -> tuple[Tensor, ...]:
+        """Returns the arguments for a synthetic frame of this size."""
+        rgb, points = synthetic_frame(frame.image)
+        return self.arguments(frame, rgb, frame.points_to_network(points))
 
     def verified(self, arguments: tuple[Tensor, ...]) -> tuple[str, ...]:
         """Returns the notes of the definition's `verify` on the network's arguments for a frame.
@@ -283,7 +289,7 @@ def _with_suggested_layers(network: Network) -> Network:
     else:
         height = width = -(-_SUGGESTION_SIDE // size.of) * size.of
     with out_of_memory_is_a_device_error(network.device):
-        arguments = synthetic_arguments(network, FrameMap.fit(size, height, width))
+        arguments = network.synthetic_arguments(FrameMap.fit(size, height, width))
         layers = suggest_layers(network.module, arguments, network.raw_of)
     if not layers:
         return network

@@ -23,7 +23,6 @@ from pnpdepth_cli.core.split.cut_point import LayerName
 from pnpdepth_cli.errors import ModelError
 from pnpdepth_cli.models.frame import FrameMap
 from pnpdepth_cli.models.network import Network, out_of_memory_is_a_device_error
-from pnpdepth_cli.models.synthetic_frame import synthetic_arguments
 
 GAPS = 6.0
 """Gaps between points that a field should span, and"""
@@ -35,29 +34,25 @@ and KITTI with 100 points to LiDAR."""
 
 @dataclass(frozen=True, kw_only=True)
 class MeasuredLayer:
-    """A layer and what a cut there costs and reaches; all but the name is None with a problem."""
+    """A layer and what a cut there costs and reaches; all but the name is None with a problem.
+
+    stride: network pixels per element of z; None if z has no two spatial axes. cost_behind:
+    fraction of the network's floating-point operations behind the cut, which every update repeats;
+    seconds_behind: time of one pass of that part. parameters: weights of the layer itself. Fields:
+    rows and columns that one point influences, see `InfluentialField`. rank: 1 for the layer to cut
+    at for the spacing of the points.
+    """
 
     name: str
-    """What `--layer` takes."""
     shape: tuple[int, ...] | None = None
-    """Shape of z, the layer's output."""
     stride: float | None = None
-    """Network pixels per element of z; None if z has no two spatial axes."""
     cost_behind: float | None = None
-    """Fraction of the network's floating-point operations behind the cut, which every update
-    repeats; None if the network has none that are counted."""
     seconds_behind: float | None = None
-    """Seconds that one pass of the part behind the cut took here."""
     parameters: int | None = None
-    """Number of weights of the layer itself."""
     field_in_z: tuple[int, int] | None = None
-    """Rows and columns of z that one point influences; see `InfluentialField`."""
     field_in_output: tuple[int, int] | None = None
-    """Rows and columns of the depth map that one point influences."""
     rank: int | None = None
-    """1 for the layer to cut at for the spacing of the points; None if that is not known."""
     problem: str | None = None
-    """Why the network cannot be cut here."""
 
 
 def best_layer(
@@ -76,16 +71,26 @@ def best_layer(
     """
     if not point_count:
         return None
-    wanted = wanted_field(size, point_spacing(size, point_count))
-    measured: list[MeasuredLayer] = []
-    # From the last layer on, each has more of the network behind it: the first that reaches far
-    # enough is the one of least cost, and those before it need not be measured.
-    for name in reversed(network.definition.layers):
-        layer = _measure(network, name, arguments, size[0], None)
-        measured.insert(0, layer)
-        if layer.field_in_output is not None and min(layer.field_in_output) >= wanted:
-            return name
-    return next((layer.name for layer in rank_layers(measured, wanted) if layer.rank == 1), None)
+    # No field is wider than the image, and of equally wide ones the last layer is taken.
+    enough = min(wanted_field(size, point_spacing(size, point_count)), *size)
+    layers, measured = list(network.definition.layers), []
+    # The more of the network lies behind a layer, the wider is its field: bisection finds the last
+    # layer that reaches far enough, which is the one of least cost.
+    first, end = 0, len(layers)
+    while first < end:
+        middle = (first + end) // 2
+        layer = _measure(network, layers[middle], arguments, size[0], enough=enough)
+        if layer.field_in_output is None:
+            del layers[middle]
+            end -= 1
+            continue
+        measured.append(layer)
+        if min(layer.field_in_output) >= enough:
+            first = middle + 1
+        else:
+            end = middle
+    ranked = rank_layers(sorted(measured, key=lambda m: layers.index(m.name)), enough)
+    return next((layer.name for layer in ranked if layer.rank == 1), None)
 
 
 def default_layer(network: Network, size: tuple[int, int], point_count: int) -> str | None:
@@ -104,7 +109,7 @@ def default_layer(network: Network, size: tuple[int, int], point_count: int) -> 
         return definition.default_layer
     frame = FrameMap.fit(definition.size, *size)
     with out_of_memory_is_a_device_error(network.device):
-        arguments = synthetic_arguments(network, frame)
+        arguments = network.synthetic_arguments(frame)
         return best_layer(network, arguments, frame.network, point_count) or definition.layers[0]
 
 
@@ -173,24 +178,32 @@ def measure_layers(
     with torch.no_grad(), FlopCounterMode(display=False) as whole:
         network.depth_of(network.module(*arguments))
     for done, name in enumerate(names, start=1):
-        measured.append(_measure(network, name, arguments, size[0], whole.get_total_flops()))
+        measured.append(
+            _measure(network, name, arguments, size[0], whole_flops=whole.get_total_flops())
+        )
         on_layer(done, len(names))
     return measured
 
 
 def _measure(
-    network: Network, name: str, arguments: tuple[Tensor, ...], rows: int, whole_flops: int | None
+    network: Network,
+    name: str,
+    arguments: tuple[Tensor, ...],
+    rows: int,
+    *,
+    whole_flops: int | None = None,
+    enough: float | None = None,
 ) -> MeasuredLayer:
-    """The layer, its field alone without the operations of the whole network."""
+    """The layer; its cost only if the operations of the whole network are given."""
     try:
         with Split(network.module, name) as split, torch.no_grad():
             z = split.front(*arguments)
-            split.rear(z)
             cost, seconds = None, None
             if whole_flops is not None:
+                split.rear(z)  # the first pass learns the cut
                 cost, seconds = _cost_behind(split, z, whole_flops)
             # On the raw output: where inverse depth is clamped, depth does not change.
-            field = influential_field(split, z, network.raw_of)
+            field = influential_field(split, z, network.raw_of, enough)
     except ModelError as error:
         return MeasuredLayer(name=name, problem=str(error))
     return MeasuredLayer(

@@ -32,14 +32,15 @@ class _FeatureMap:
 
 @dataclass(frozen=True)
 class _Run:
-    """One pass of the network."""
+    """One pass of the network: its prediction, (1, 1, h, w), and the maps behind it.
+
+    maps: of the submodules that ran once, in the order in which they ran. copies: of submodules'
+    outputs, that gradients were made to reach.
+    """
 
     maps: list[_FeatureMap]
-    """Of the submodules that ran once, in the order in which they ran."""
     copies: list[Tensor]
-    """Copies of submodules' outputs that gradients were made to reach."""
     prediction: Tensor
-    """(1, 1, h, w)."""
 
 
 def suggest_layers(
@@ -78,19 +79,33 @@ def suggest_layers(
                 " numpy? take that out"
             )
     useful = [m for m in run.maps if m.area > 1 and _has_aspect_of(m.output, sides)]
-    used = [m for m in _with_gradient(run.prediction, useful) if m.output.shape[1] > 1]
-    chosen = _last_of_each_resolution(used)
+    reached = [m for m in _reached(run.prediction, useful) if m.output.shape[1] > 1]
+    chosen = _last_of_each_resolution(reached)
+    if len(_with_gradient(run.prediction, chosen)) < len(chosen):
+        # Something in between has a gradient of 0, as rounding has: ask for those of all maps.
+        chosen = _last_of_each_resolution(_with_gradient(run.prediction, reached))
     finest = run.prediction.shape[-2] * run.prediction.shape[-1]
     return tuple(m.name for m in chosen if m.area < finest or len(chosen) == 1)
 
 
+def _reached(prediction: Tensor, maps: list[_FeatureMap]) -> list[_FeatureMap]:
+    """The maps that lie on a path of torch's graph of gradients to the prediction."""
+    seen, pending = set(), [prediction.grad_fn]
+    while pending:
+        node = pending.pop()
+        if node is not None and node not in seen:
+            seen.add(node)
+            pending += [before for before, _ in node.next_functions]
+    return [m for m in maps if m.output.grad_fn in seen]
+
+
 def _with_gradient(prediction: Tensor, maps: list[_FeatureMap]) -> list[_FeatureMap]:
-    """The maps that the prediction depends on."""
+    """The maps whose gradient is not 0."""
     if not maps:
         return []
     with torch.enable_grad(), wrap_user_errors("the gradient of the network"):
         gradients = torch.autograd.grad(
-            prediction.sum(), [m.output for m in maps], allow_unused=True
+            prediction.sum(), [m.output for m in maps], allow_unused=True, retain_graph=True
         )
     return [
         m

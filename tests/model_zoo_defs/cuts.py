@@ -10,7 +10,6 @@ from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.models.definition import Fixed, ModelDefinition
 from pnpdepth_cli.models.frame import FrameMap
 from pnpdepth_cli.models.network import Network
-from pnpdepth_cli.models.synthetic_frame import synthetic_arguments
 from pnpdepth_cli.points import SparsePoints
 
 
@@ -40,7 +39,7 @@ def size_of(network: Network) -> tuple[int, int]:
 def frame_for(network: Network, size: tuple[int, int] | None = None) -> tuple[Tensor, ...]:
     """Arguments of the network for a synthetic image, of `size_of` by default."""
     height, width = size or size_of(network)
-    return synthetic_arguments(network, FrameMap.fit(Fixed(height, width), height, width))
+    return network.synthetic_arguments(FrameMap.fit(Fixed(height, width), height, width))
 
 
 POINTS = SparsePoints(

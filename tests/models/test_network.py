@@ -249,6 +249,10 @@ def test_a_missing_device_is_refused_with_a_remedy(name: str) -> None:
     assert "\n" not in str(error.value)
 
 
+def test_a_network_prints_one_line(file: Path) -> None:
+    assert repr(load_network(f"{file}:owned", None)) == "Network('mine', 2 parameters, 'cpu')"
+
+
 def test_the_cpu_is_always_there() -> None:
     assert find_device("cpu") == torch.device("cpu")
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -100,6 +101,28 @@ def test_few_points_want_a_deep_layer_and_many_a_late_one(
     assert best_layer(network, (IMAGE,), (64, 96), 20) == "deep"
     assert best_layer(network, (IMAGE,), (1, 1), 36) == "late"
     assert best_layer(network, (IMAGE,), (64, 96), 0) is None
+
+
+@pytest.mark.parametrize("count", [1, 4, 9, 25, 100, 400, 10_000])
+def test_the_best_of_eight_layers_is_found_by_measuring_few(
+    network: Network, monkeypatch: pytest.MonkeyPatch, count: int
+) -> None:
+    fields = {"a": 60, "b": 60, "broken": None, "c": 44, "d": 30, "e": 16, "f": 5, "g": 2}
+    measured: list[str] = []
+
+    def measure(network: Network, name: str, *_: object, **__: object) -> MeasuredLayer:
+        measured.append(name)
+        field = fields[name]
+        return MeasuredLayer(name=name, field_in_output=None if field is None else (field, field))
+
+    monkeypatch.setattr(rank, "_measure", measure)
+    network = replace(network, definition=replace(network.definition, layers=tuple(fields)))
+    wanted = min(wanted_field((64, 64), point_spacing((64, 64), count)), 64)
+    reaching = [name for name, field in fields.items() if field is not None and field >= wanted]
+    expected = reaching[-1] if reaching else "a"
+    best = best_layer(network, (IMAGE,), (64, 64), count)
+    assert fields[best or ""] == fields[expected]
+    assert len(measured) <= 5
 
 
 @pytest.mark.parametrize("count", [50, 500, 20_000])

@@ -21,7 +21,7 @@ from torch.export.pt2_archive import PT2ArchiveReader
 
 from pnpdepth_cli.errors import ModelError
 from pnpdepth_cli.models.weights.pickle_reader import READ_ERRORS, BrokenFileError, brief
-from pnpdepth_cli.models.weights.tensor_pickle import read_tensors
+from pnpdepth_cli.models.weights.torch_file import read_tensors
 
 _MODEL = "models/model.json"
 _INPUTS = "data/sample_inputs/model.pt"
@@ -108,7 +108,7 @@ def _check_inputs(content: bytes) -> None:
     try:
         inputs = read_tensors(io.BytesIO(content))
     except (BrokenFileError, zipfile.BadZipFile, *READ_ERRORS) as error:
-        raise _Refused(f"its example inputs are no tensors ({brief(error)[:60]})") from None
+        raise _Refused(f"its example inputs are not tensors ({brief(error)[:60]})") from None
     names = [name for name in inputs.named if not name.startswith(("torch.", "collections."))]
     if names or inputs.has_stand_ins:
         raise _Refused(f"its example inputs are more than tensors ({', '.join(names)[:60]})")
@@ -135,7 +135,7 @@ def _check_entry(key: str, value: Any) -> None:
         _expressions([value])
     elif key in ("in_spec", "out_spec") and isinstance(value, str):
         if not _TREE.fullmatch(value) or "\\u" in value or "__enum__" in value:
-            raise _Refused(f"its {key} is no nesting of plain containers")
+            raise _Refused(f"its {key} is not a nesting of plain containers")
     elif key == "target" and isinstance(value, str):
         called = _OPERATOR.fullmatch(value) and not _TOUCHES_FILES.match(value)
         if not called and not _ARITHMETIC.fullmatch(value):
@@ -147,7 +147,7 @@ def _check_entry(key: str, value: Any) -> None:
 
 def _word(text: str) -> None:
     if not _WORD.fullmatch(text):
-        raise _Refused(f"{text[:80]!r} is no name")
+        raise _Refused(f"{text[:80]!r} is not a name")
 
 
 def _expressions(texts: Iterable[str]) -> None:
@@ -157,7 +157,7 @@ def _expressions(texts: Iterable[str]) -> None:
         except (SyntaxError, ValueError, RecursionError, MemoryError):
             nodes = []
         if not nodes or not all(map(_is_arithmetic, nodes)):
-            raise _Refused(f"the size {text[:80]!r} is no arithmetic")
+            raise _Refused(f"the size {text[:80]!r} is not arithmetic")
         powers = [exponent for node in nodes for exponent in _exponents(node)]
         if len(powers) > _MAX_POWERS or any(not _is_small(power) for power in powers):
             raise _Refused(f"the size {text[:80]!r} has powers without end")

@@ -17,6 +17,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from pnpdepth_cli.budget import size_problem
 from pnpdepth_cli.choices import OutputKind, OutputScale
 from pnpdepth_cli.completion.interpolation import linear
 from pnpdepth_cli.core.user_code import describe
@@ -28,7 +29,6 @@ from pnpdepth_cli.models.definition import (
     Near,
     Normalisation,
 )
-from pnpdepth_cli.models.weights.file_size import size_problem
 from pnpdepth_cli.points import SparsePoints
 
 _MOST_JSON_BYTES = 1 << 24
@@ -42,14 +42,11 @@ _PLAIN_ATTENTION = ("eager", "sdpa")
 
 @dataclass(frozen=True)
 class _Family:
-    """What the networks of one model type predict."""
+    """What the networks of one model type predict, and what sides of images are multiples of."""
 
     kind: OutputKind
-    """See `ModelDefinition.output_kind`."""
     scale: OutputScale
-    """See `ModelDefinition.output_scale`."""
     of: int = 1
-    """The sides of the image must be multiples of this."""
 
 
 PROMPT_SIZE = (192, 256)
@@ -151,8 +148,8 @@ def _predicted_depth(output: Any) -> Tensor:
 def _json(file: Path, why: str) -> Mapping[str, Any]:
     if not file.is_file():
         raise ModelError(
-            f"{file.parent} is no Hugging Face folder: it has no {file.name}, and {why}; take it"
-            " from the network's page"
+            f"{file.parent} is not a Hugging Face folder: {file.name} is missing, and {why};"
+            " take it from the network's page"
         )
     if problem := size_problem(file, _MOST_JSON_BYTES):
         raise ModelError(f"{file} {problem}")
@@ -188,7 +185,8 @@ def _size(processing: Mapping[str, Any], of: int, folder: Path) -> Fixed | Near:
         height = width = size
     if not all(isinstance(side, int) and 1 <= side <= _MAX_SIDE for side in (height, width)):
         raise ModelError(
-            f"{folder / 'preprocessor_config.json'}: size {str(size)[:60]} is no height and width"
+            f"{folder / 'preprocessor_config.json'}: size must be a height and a width,"
+            f" got {str(size)[:60]}"
         )
     assert isinstance(height, int)
     assert isinstance(width, int)
@@ -204,8 +202,8 @@ def _side(processing: Mapping[str, Any], key: str, folder: Path) -> int:
     value = processing.get(key) or 1
     if not isinstance(value, int) or not 1 <= value <= _MAX_SIDE:
         raise ModelError(
-            f"{folder / 'preprocessor_config.json'}: {key} {str(value)[:60]!r} is no number of"
-            " pixels"
+            f"{folder / 'preprocessor_config.json'}: {key} must be a number of pixels,"
+            f" got {str(value)[:60]!r}"
         )
     return value
 

@@ -121,9 +121,9 @@ def _assumed_definition(build: Callable[..., Any], attribute: str, file: Path) -
         output_scale="unknown",
         build=build,
         defaults=UNTUNED_DEFAULTS,
-        assumed=f"{attribute!r} of {file.name} is no definition; assumed: one rgb image in, sides"
-        f" padded to multiples of {_ASSUMED_MULTIPLE}; what its numbers mean is decided from the"
-        " points",
+        assumed=f"{attribute!r} of {file.name} is not a definition; assumed: one rgb image in,"
+        f" sides padded to multiples of {_ASSUMED_MULTIPLE}; what its numbers mean is decided from"
+        " the points",
     )
 
 

@@ -15,11 +15,11 @@ from typing import Any
 import torch
 from torch import Tensor, fx, nn
 
+from pnpdepth_cli.budget import size_problem
 from pnpdepth_cli.core.user_code import describe
 from pnpdepth_cli.errors import ModelError
 from pnpdepth_cli.models.definition import UNTUNED_DEFAULTS, Fixed, ModelDefinition, Multiple
 from pnpdepth_cli.models.formats.export_archive import check_archive
-from pnpdepth_cli.models.weights.file_size import size_problem
 
 _ASSUMED_MULTIPLE = 32
 

@@ -1,7 +1,7 @@
 """Weights from files, without running anything that is in them.
 
 safetensors files hold tensors only, numpy files arrays, TensorFlow checkpoints variables. torch
-files are pickles, often with more in them (whole modules, optimisers, arguments); `tensor_pickle`
+files are pickles, often with more in them (whole modules, optimisers, arguments); `torch_file`
 takes the tensors out and runs nothing.
 """
 
@@ -16,21 +16,21 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from pnpdepth_cli.budget import size_problem
 from pnpdepth_cli.core.user_code import describe, wrap_user_errors
 from pnpdepth_cli.errors import CheckpointError, ModelError
 from pnpdepth_cli.models import registry
 from pnpdepth_cli.models.definition import ModelDefinition
-from pnpdepth_cli.models.weights.file_size import size_problem
 from pnpdepth_cli.models.weights.numpy_file import SUFFIXES as NUMPY_SUFFIXES
 from pnpdepth_cli.models.weights.numpy_file import read_numpy_file
 from pnpdepth_cli.models.weights.pickle_reader import StandIn
 from pnpdepth_cli.models.weights.tensor_bundle import SUFFIX as BUNDLE_SUFFIX
 from pnpdepth_cli.models.weights.tensor_bundle import read_tensor_bundle
-from pnpdepth_cli.models.weights.tensor_pickle import (
+from pnpdepth_cli.models.weights.torch_file import (
+    TensorFile,
     is_module,
     module_state,
     read_tensor_file,
-    unusual_tensor,
 )
 
 _STATE_KEYS = ("state_dict", "model_state_dict", "model_state", "model", "network", "net", "params")
@@ -227,7 +227,9 @@ def _read(path: Path) -> tuple[dict[str, Tensor], list[str]]:
         index = path.with_name(path.name + BUNDLE_SUFFIX)
         hint = f"; {index.name} does, name that" if index.is_file() else ""
         raise CheckpointError(f"checkpoint {path} does not exist{hint}")
-    if _is_lfs_pointer(path):
+    with path.open("rb") as file:
+        is_lfs_pointer = file.read(len(_LFS_POINTER)) == _LFS_POINTER
+    if is_lfs_pointer:
         raise CheckpointError(
             f"checkpoint {path} is a Git LFS pointer, not the file it points to; `git lfs pull`"
             " fetches that"
@@ -240,13 +242,8 @@ def _read(path: Path) -> tuple[dict[str, Tensor], list[str]]:
         return read_numpy_file(path), []
     if path.suffix == BUNDLE_SUFFIX:
         return read_tensor_bundle(path), []
-    content, notes = _read_torch(path)
-    return _state_in(content, path), notes + _training_notes(content, path)
-
-
-def _is_lfs_pointer(path: Path) -> bool:
-    with path.open("rb") as file:
-        return file.read(len(_LFS_POINTER)) == _LFS_POINTER
+    torch_file = read_tensor_file(path)
+    return _state_in(torch_file.content, path), _notes_on(torch_file, path)
 
 
 def _read_folder(folder: Path) -> tuple[dict[str, Tensor], list[str]]:
@@ -281,66 +278,58 @@ def _read_safetensors(path: Path) -> dict[str, Tensor]:
         ) from None
 
 
-def _read_torch(path: Path) -> tuple[Any, list[str]]:
-    """What a torch file holds, and a note if that is more than tensors."""
-    file = read_tensor_file(path)
-    classes = [name for name in file.named if not name.startswith(_NOT_WORTH_A_NOTE)]
-    if not classes and not file.has_stand_ins:
-        return file.content, []
-    note = (
-        f"checkpoint {path.name}: its pickle names {_some(classes) or 'classes of torch'}; its"
-        " tensors were taken out, nothing of it was run"
-    )
-    return file.content, [note]
-
-
-def _training_notes(content: Any, path: Path) -> list[str]:
-    """What the arguments of the training say, if they are stored beside the weights.
+def _notes_on(file: TensorFile, path: Path) -> list[str]:
+    """What else a torch file holds, and what the arguments of the training say if it has them.
 
     Weights for other data, or for images of another size, may fit all the same.
     """
-    arguments = content.get("args") if isinstance(content, Mapping) else None
+    notes = []
+    classes = [name for name in file.named if not name.startswith(_NOT_WORTH_A_NOTE)]
+    if classes or file.has_stand_ins:
+        notes.append(
+            f"checkpoint {path.name}: its pickle names {_some(classes) or 'classes of torch'}; its"
+            " tensors were taken out, nothing of it was run"
+        )
+    arguments = file.content.get("args") if isinstance(file.content, Mapping) else None
     arguments = arguments.state if isinstance(arguments, StandIn) else arguments
-    if not isinstance(arguments, Mapping):
-        return []
-    values = {key: arguments.get(key) for key in _TRAINING_ARGUMENTS}
-    shown = [
-        f"{key} {_short(str(value))}"
-        for key, value in values.items()
-        if isinstance(value, str) or (isinstance(value, int) and abs(value) < _MAX_SIDE)
-    ]
-    return [f"checkpoint {path.name}: trained with {', '.join(shown)}"] if shown else []
+    if isinstance(arguments, Mapping):
+        values = {key: arguments.get(key) for key in _TRAINING_ARGUMENTS}
+        shown = [
+            f"{key} {_short(str(value))}"
+            for key, value in values.items()
+            if isinstance(value, str) or (isinstance(value, int) and abs(value) < _MAX_SIDE)
+        ]
+        if shown:
+            notes.append(f"checkpoint {path.name}: trained with {', '.join(shown)}")
+    return notes
 
 
 def _state_in(content: Any, path: Path) -> dict[str, Tensor]:
+    """The state dict in what a torch file holds."""
     if is_module(content):
         return module_state(content)
     if not isinstance(content, Mapping):
-        raise CheckpointError(f"checkpoint {path} holds a {_kind(content)}, not named tensors")
-    for mapping in (content, *(content.get(key) for key in _STATE_KEYS)):
-        if is_module(mapping):
-            return module_state(mapping)
-        if isinstance(mapping, Mapping) and mapping:
-            _refuse_unusual_tensors(mapping, path)
-            if _only_tensors(mapping):
-                return dict(mapping)
+        kind = _short(content.path) if isinstance(content, StandIn) else type(content).__name__
+        raise CheckpointError(f"checkpoint {path} holds a {kind}, not named tensors")
+    for candidate in (content, *(content.get(key) for key in _STATE_KEYS)):
+        if is_module(candidate):
+            return module_state(candidate)
+        if isinstance(candidate, Mapping) and candidate:
+            _refuse_unusual_tensors(candidate, path)
+            if _only_tensors(candidate):
+                return dict(candidate)
     names = ", ".join(_short(str(key)) for key in list(content)[:8]) or "nothing"
     raise CheckpointError(f"checkpoint {path} has no state dict; it holds {names}")
 
 
-def _refuse_unusual_tensors(mapping: Mapping[Any, Any], path: Path) -> None:
-    """CheckpointError for a state dict with a tensor that is sparse, quantised or the like."""
-    for name, value in mapping.items():
-        kind = unusual_tensor(value)
-        if kind is not None:
+def _refuse_unusual_tensors(state: Mapping[Any, Any], path: Path) -> None:
+    for name, value in state.items():
+        if isinstance(value, StandIn) and value.path.startswith("torch._utils._rebuild_"):
+            kind = value.path.removeprefix("torch._utils._rebuild_")
             raise CheckpointError(
-                f"checkpoint {path}: tensor {_short(str(name))} is {kind}; save its values as a"
-                " dense tensor of floats"
+                f"checkpoint {path}: {_short(str(name))} is not a plain tensor ({_short(kind)});"
+                " save its values as a dense tensor of floats"
             )
-
-
-def _kind(content: Any) -> str:
-    return _short(content.path) if isinstance(content, StandIn) else type(content).__name__
 
 
 def _only_tensors(mapping: Mapping[Any, Any]) -> bool:

@@ -11,54 +11,31 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
+from pnpdepth_cli.budget import size_problem
 from pnpdepth_cli.errors import CheckpointError
-from pnpdepth_cli.models.weights.file_size import size_problem
-from pnpdepth_cli.models.weights.pickle_reader import READ_ERRORS, BrokenFileError, brief
+from pnpdepth_cli.models.weights.pickle_reader import MAX_AXES, READ_ERRORS, BrokenFileError, brief
 
 SUFFIX = ".index"
 
 _FOOTER, _MAGIC = 48, 0xDB4775248B80FB57
 _TYPES = {
-    1: torch.float32,
-    2: torch.float64,
-    3: torch.int32,
-    4: torch.uint8,
-    5: torch.int16,
-    6: torch.int8,
-    9: torch.int64,
-    10: torch.bool,
-    14: torch.bfloat16,
-    19: torch.float16,
-}
+    1: torch.float32, 2: torch.float64, 3: torch.int32, 4: torch.uint8, 5: torch.int16,
+    6: torch.int8, 9: torch.int64, 10: torch.bool, 14: torch.bfloat16, 19: torch.float16,
+}  # fmt: skip
 _TEXT = 7  # such as the graph of objects that TensorFlow 2 puts beside the variables
 _MAX_NAME = 1_000  # bytes of a variable's name
-_MAX_AXES = 64
 
-
-@dataclass(frozen=True, kw_only=True)
-class _Variable:
-    """Where the values of one variable lie."""
-
-    dtype: int
-    """TensorFlow's number of the type."""
-    shape: tuple[int, ...]
-    """Sides."""
-    shard: int
-    """Number of the file of values."""
-    offset: int
-    """Bytes from the beginning of that file."""
-    size: int
-    """Bytes."""
+_Fields = dict[int, int | bytes]
+"""The fields of a protocol buffer by number."""
 
 
 def read_tensor_bundle(index: Path) -> dict[str, Tensor]:
-    """Returns the variables by name, "layer/weights" as "layer.weights".
+    """Returns the variables by name, "layer/weights" as "layer.weights"; text is left out.
 
     Args:
         index: PREFIX.index; the files of values lie beside it.
@@ -67,7 +44,7 @@ def read_tensor_bundle(index: Path) -> dict[str, Tensor]:
         CheckpointError: A file is missing or broken.
     """
     try:
-        return _Bundle(index).read()
+        return _read(index)
     except (BrokenFileError, OSError, *READ_ERRORS) as error:
         reason = brief(error)
     raise CheckpointError(
@@ -75,89 +52,67 @@ def read_tensor_bundle(index: Path) -> dict[str, Tensor]:
     )
 
 
-class _Bundle:
-    """An index and the files of values beside it."""
-
-    def __init__(self, index: Path) -> None:
-        self._prefix = index.with_suffix("")
-        table = dict(_table(index.read_bytes()))
-        header = dict(_fields(table.pop(b"", b"")))
-        if header.get(2, 0) != 0:
-            raise BrokenFileError("it was written on a big-endian machine")
-        self._shards = _number(header.get(1, 0))
-        self._variables = {name.decode(): _variable(entry) for name, entry in table.items()}
-        self._contents: dict[int, bytes] = {}
-
-    def read(self) -> dict[str, Tensor]:
-        """Every variable but text."""
-        tensors: dict[str, Tensor] = {}
-        left = 0
-        for name, variable in self._variables.items():
-            if variable.dtype == _TEXT:
-                continue
-            if variable.shard not in self._contents:
-                self._contents[variable.shard] = self._content(variable.shard)
-                left += len(self._contents[variable.shard])
-            left -= variable.size
-            if left < 0:
-                raise BrokenFileError("its variables are larger than its files")
-            tensors[name.replace("/", ".")] = _tensor(
-                name, variable, self._contents[variable.shard]
-            )
-        return tensors
-
-    def _content(self, shard: int) -> bytes:
-        file = f"{self._prefix.name}.data-{shard:05d}-of-{self._shards:05d}"
-        path = self._prefix.with_name(file)
-        if not path.is_file():
-            raise BrokenFileError(f"{file} is not beside the index")
-        if problem := size_problem(path):
-            raise BrokenFileError(f"{file} {problem}")
-        return path.read_bytes()
+def _read(index: Path) -> dict[str, Tensor]:
+    table = dict(_table(index.read_bytes()))
+    header = dict(_fields(table.pop(b"", b"")))
+    if header.get(2, 0) != 0:
+        raise BrokenFileError("it was written on a big-endian machine")
+    shards: dict[int, bytes] = {}
+    tensors: dict[str, Tensor] = {}
+    left = 0
+    for key, entry in table.items():
+        name, fields = key.decode(), dict(_fields(entry))
+        if 7 in fields:
+            raise BrokenFileError("a variable is in slices")
+        if fields.get(1) == _TEXT:
+            continue
+        shard, size = _number(fields, 3), _number(fields, 5)
+        if shard not in shards:
+            shards[shard] = _values(index, f"{shard:05d}-of-{_number(header, 1):05d}")
+            left += len(shards[shard])
+        left -= size
+        if left < 0:
+            raise BrokenFileError("its variables are larger than its files")
+        tensors[name.replace("/", ".")] = _tensor(name, fields, shards[shard])
+    return tensors
 
 
-def _tensor(name: str, variable: _Variable, content: bytes) -> Tensor:
-    dtype = _TYPES.get(variable.dtype)
-    if dtype is None:
-        raise BrokenFileError(f"{name} is of TensorFlow's type {variable.dtype}, not of numbers")
-    count = math.prod(variable.shape)
-    if count * dtype.itemsize != variable.size or variable.offset + variable.size > len(content):
-        raise BrokenFileError(
-            f"{name} of shape {variable.shape} goes beyond its {variable.size} bytes"
-        )
-    part = bytearray(content[variable.offset : variable.offset + variable.size])
-    flat = torch.frombuffer(part, dtype=dtype) if part else torch.empty(0, dtype=dtype)
-    return flat.reshape(variable.shape)
+def _values(index: Path, shard: str) -> bytes:
+    path = index.with_name(f"{index.stem}.data-{shard}")
+    if not path.is_file():
+        raise BrokenFileError(f"{path.name} is not beside the index")
+    if problem := size_problem(path):
+        raise BrokenFileError(f"{path.name} {problem}")
+    return path.read_bytes()
 
 
-def _variable(entry: bytes) -> _Variable:
-    fields = dict(_fields(entry))
-    if 7 in fields:
-        raise BrokenFileError("a variable is in slices")
+def _tensor(name: str, fields: _Fields, content: bytes) -> Tensor:
+    kind = _number(fields, 1)
+    if kind not in _TYPES:
+        raise BrokenFileError(f"{name} is of TensorFlow's type {kind}, not of numbers")
+    dtype = _TYPES[kind]
     shape = fields.get(2, b"")
-    sides = list(_fields(shape)) if isinstance(shape, bytes) else []
-    if len(sides) > _MAX_AXES:
+    sides = [*_fields(shape)] if isinstance(shape, bytes) else []
+    if len(sides) > MAX_AXES:
         raise BrokenFileError(f"a variable of {len(sides)} axes")
-    return _Variable(
-        dtype=_number(fields.get(1, 0)),
-        shape=tuple(
-            _number(dict(_fields(side)).get(1, 0))
-            for number, side in sides
-            if number == 2 and isinstance(side, bytes)
-        ),
-        shard=_number(fields.get(3, 0)),
-        offset=_number(fields.get(4, 0)),
-        size=_number(fields.get(5, 0)),
-    )
+    lengths = [
+        _number(dict(_fields(side)), 1)
+        for number, side in sides
+        if number == 2 and isinstance(side, bytes)
+    ]
+    offset, size = _number(fields, 4), _number(fields, 5)
+    if math.prod(lengths) * dtype.itemsize != size or offset + size > len(content):
+        raise BrokenFileError(f"{name} of shape {tuple(lengths)} goes beyond its {size} bytes")
+    part = bytearray(content[offset : offset + size])
+    flat = torch.frombuffer(part, dtype=dtype) if part else torch.empty(0, dtype=dtype)
+    return flat.reshape(lengths)
 
 
-def _number(value: int | bytes) -> int:
+def _number(fields: _Fields, number: int) -> int:
+    value = fields.get(number, 0)
     if not isinstance(value, int) or value >= 1 << 63:
         raise BrokenFileError("a size is not a number")
     return value
-
-
-# ------------------------------------------------------------------ the table
 
 
 def _table(data: bytes) -> Iterator[tuple[bytes, bytes]]:
@@ -195,13 +150,13 @@ def _block(data: bytes, handle: bytes) -> Iterator[tuple[bytes, bytes]]:
         if shared + fresh > _MAX_NAME:
             raise BrokenFileError(f"it has a name of {shared + fresh:,} bytes")
         key = key[:shared] + data[at : at + fresh]
-        at += fresh
-        yield key, data[at : at + length]
-        at += length
+        yield key, data[at + fresh : at + fresh + length]
+        at += fresh + length
 
 
-def _fields(message: bytes) -> Iterator[tuple[int, int | bytes]]:
+def _fields(message: int | bytes) -> Iterator[tuple[int, int | bytes]]:
     """Numbers and values of a protocol buffer's fields."""
+    assert isinstance(message, bytes)
     at = 0
     while at < len(message):
         tag, at = _varint(message, at)
@@ -216,7 +171,7 @@ def _fields(message: bytes) -> Iterator[tuple[int, int | bytes]]:
         elif kind in (1, 5):
             at += 8 if kind == 1 else 4  # checksums
         else:
-            raise BrokenFileError("an entry that is no protocol buffer")
+            raise BrokenFileError("an entry is not a protocol buffer")
 
 
 def _varint(data: bytes, at: int) -> tuple[int, int]:

@@ -26,9 +26,9 @@ from pnpdepth_cli.frames.prepare import PreparedFrame, prepare
 from pnpdepth_cli.frames.refine import refine_frame
 from pnpdepth_cli.io.depth import write_depth
 from pnpdepth_cli.models.definition import Fixed
+from pnpdepth_cli.models.frame import synthetic_frame
 from pnpdepth_cli.models.network import Network, load_network, out_of_memory_is_a_device_error
 from pnpdepth_cli.models.rank_layers import default_layer
-from pnpdepth_cli.models.synthetic_frame import synthetic_frame
 from pnpdepth_cli.pipeline.bench.timing import Quartiles, Timed, in_turn, peak_mb
 from pnpdepth_cli.pipeline.refinement.inputs import read_inputs
 from pnpdepth_cli.pipeline.refinement.output_files import plan_outputs

@@ -16,8 +16,8 @@ from pnpdepth_cli.frames.frame import Frame
 from pnpdepth_cli.frames.prepare import prepare
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.models.definition import Fixed
+from pnpdepth_cli.models.frame import synthetic_frame
 from pnpdepth_cli.models.network import Network, load_network, out_of_memory_is_a_device_error
-from pnpdepth_cli.models.synthetic_frame import synthetic_frame
 from pnpdepth_cli.points import SparsePoints
 
 _SIZE = (240, 320)
@@ -25,26 +25,22 @@ _SIZE = (240, 320)
 
 @dataclass(frozen=True, kw_only=True)
 class CheckedModel:
-    """What a network is, what it returned, and how each of its layers can be cut."""
+    """What a network is, what it returned, and how its layers can be cut.
+
+    input, output: rows and columns. range: least and greatest value of the prediction as the
+    network returns it. layers: by name "ok", or why the network cannot be cut there. notes: what
+    was assumed, fitted or verified.
+    """
 
     name: str
-    """Name of its definition."""
     input: list[int]
-    """Rows and columns of the network's input."""
     output: list[int]
-    """Rows and columns of its prediction."""
     output_kind: str
-    """See `ModelDefinition.output_kind`."""
     output_scale: str
-    """See `ModelDefinition.output_scale`."""
     range: list[float]
-    """Least and greatest value of the prediction as the network returns it."""
     parameters: int
-    """Number of its weights."""
     layers: dict[str, str]
-    """For each layer of the definition "ok", or why the network cannot be cut there."""
     notes: list[str]
-    """What was assumed, fitted or verified."""
 
 
 def check_model(

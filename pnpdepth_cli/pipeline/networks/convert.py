@@ -23,16 +23,12 @@ _RESERVED_NAME = "__metadata__"  # of the safetensors format
 
 @dataclass(frozen=True, kw_only=True)
 class ConvertedCheckpoint:
-    """What was written."""
+    """What was read and written, and the numbers of tensors and of their elements."""
 
     source: str
-    """The checkpoint that was read."""
     output: str
-    """The safetensors file."""
     tensors: int
-    """Number of tensors in it."""
     values: int
-    """Number of elements of all of them."""
 
 
 def convert_checkpoint(

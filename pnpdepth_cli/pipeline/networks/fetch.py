@@ -24,16 +24,12 @@ RECORD = "fetched.json"
 
 @dataclass(frozen=True, kw_only=True)
 class FetchedModel:
-    """What was downloaded."""
+    """What was downloaded: of ORG/NAME at a commit, files in a folder, their hashes by name."""
 
     repository: str
-    """ORG/NAME."""
     revision: str | None
-    """The commit that was downloaded."""
     folder: str
-    """Where the files are."""
     sha256: dict[str, str]
-    """Hash of each file by its name."""
 
 
 def fetch_model(repo: str, revision: str | None = None, output: Path | None = None) -> FetchedModel:

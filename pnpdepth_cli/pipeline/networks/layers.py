@@ -11,6 +11,7 @@ from pnpdepth_cli.frames.frame import Frame
 from pnpdepth_cli.frames.prepare import prepare
 from pnpdepth_cli.io.depth import read_sparse
 from pnpdepth_cli.models.definition import Fixed
+from pnpdepth_cli.models.frame import synthetic_frame
 from pnpdepth_cli.models.network import load_network, out_of_memory_is_a_device_error
 from pnpdepth_cli.models.rank_layers import (
     MeasuredLayer,
@@ -19,7 +20,6 @@ from pnpdepth_cli.models.rank_layers import (
     rank_layers,
     wanted_field,
 )
-from pnpdepth_cli.models.synthetic_frame import synthetic_frame
 from pnpdepth_cli.pipeline.refinement.request import NetworkChoice
 from pnpdepth_cli.sensors import occluded_in_map
 
@@ -29,14 +29,14 @@ DEFAULT_SIZE = (240, 320)
 
 @dataclass(frozen=True, kw_only=True)
 class LayerList:
-    """The layers of a network."""
+    """The layers of a network, in the order of the definition, or of the network's submodules.
+
+    spacing: pixels of the network's frame between sparse points; None without sparse depth.
+    """
 
     rows: list[MeasuredLayer]
-    """In the order of the definition, or of the network's submodules."""
     spacing: float | None
-    """Pixels of the network's frame between sparse points; None without sparse depth."""
     notes: tuple[str, ...]
-    """What was assumed when the network was loaded."""
 
 
 def list_layers(

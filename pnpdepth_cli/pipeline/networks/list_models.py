@@ -18,42 +18,30 @@ from pnpdepth_cli.models.registry import (
 
 @dataclass(frozen=True, kw_only=True)
 class ListedModel:
-    """One network that can be named; see `ModelDefinition` and `RefineDefaults` for the values."""
+    """One network that can be named; see `ModelDefinition` and `RefineDefaults` for the values.
+
+    family: the file or entry point that defines it. variant: True if the family's name stands for
+    another network and no weights of this one ship. size: the image sizes it takes, in words.
+    checkpoint: the weights that ship with it. The last five are the defaults of refinement.
+    """
 
     name: str
-    """What `--model` takes."""
     family: str
-    """The file or entry point that defines it."""
     variant: bool
-    """True if the family's name stands for another network and no weights of this one ship."""
     summary: str
-    """One line."""
     paper: str
-    """Authors, title, venue and year."""
     licence: str
-    """Licence of its weights."""
     input_kind: str
-    """rgb, sparse or rgb+sparse."""
     size: str
-    """The image sizes it takes, in words."""
     output_kind: str
-    """depth, inverse, log or unknown."""
     parameters: int
-    """Number of its weights."""
     checkpoint: str | None
-    """Path of the weights that ship with it."""
     layers: tuple[str, ...]
-    """The layers worth cutting at."""
     layer: str | None
-    """Default layer of refinement."""
     iterations: int
-    """Default number of updates."""
     lr: float | str
-    """Default step size."""
     loss: str
-    """Default loss."""
     update: str
-    """Default update rule."""
 
 
 def list_models() -> list[ListedModel]:

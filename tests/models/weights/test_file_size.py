@@ -8,11 +8,11 @@ from pathlib import Path
 
 import pytest
 
+from pnpdepth_cli.budget import size_problem
 from pnpdepth_cli.errors import CheckpointError, ModelError
 from pnpdepth_cli.models.formats.hugging_face import hf_definition
 from pnpdepth_cli.models.formats.torch_export import exported_definition
 from pnpdepth_cli.models.weights.checkpoint import read_checkpoint
-from pnpdepth_cli.models.weights.file_size import size_problem
 from tests.models.weights.test_tensor_bundle import bundle, entry
 
 LARGE = 100 << 30

@@ -7,9 +7,10 @@ network can be cut at it.
 
 from __future__ import annotations
 
+import graphlib
 import heapq
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,8 +20,8 @@ from torch import Tensor, nn
 
 from pnpdepth_cli.core.user_code import describe
 from pnpdepth_cli.errors import ModelError
-from pnpdepth_cli.models.formats.onnx.folding import FoldingBudget
-from pnpdepth_cli.models.formats.onnx.operators import OPERATORS, Node, Unsupported
+from pnpdepth_cli.models.formats.onnx.limits import FoldingBudget
+from pnpdepth_cli.models.formats.onnx.operators import HOST_INPUTS, OPERATORS, Node, Unsupported
 
 _STANDARD = ("", "ai.onnx")
 _TO_SHAPES = ("Shape", "Size")
@@ -43,24 +44,32 @@ class OnnxNode(nn.Module):
         super().__init__()
         self.node = node
         self._run = OPERATORS[node.op]
-        # Of each input the name of its buffer, "" if the call gives it, None if it is left out.
-        self._buffer_names: list[str | None] = []
+        host = HOST_INPUTS.get(node.op, ())
+        # Of each input the constant itself if it stays on the CPU, else the name of its buffer;
+        # "" if the call gives it, None if it is left out.
+        self._inputs: list[Tensor | str | None] = []
         for index, value in enumerate(inputs):
-            self._buffer_names.append(None if value is None else "")
-            if isinstance(value, Tensor):
-                self._buffer_names[-1] = f"input{index}"
+            name = f"input{index}"
+            if not isinstance(value, Tensor):
+                self._inputs.append(None if value is None else "")
+            elif index in host:
+                self._inputs.append(value)
+            else:
+                self._inputs.append(name)
                 if value.is_floating_point():
-                    constant = nn.Parameter(value, requires_grad=False)
-                    self.register_parameter(f"input{index}", constant)
+                    self.register_parameter(name, nn.Parameter(value, requires_grad=False))
                 else:
-                    self.register_buffer(f"input{index}", value)
+                    self.register_buffer(name, value)
+        self.handed_in_on_host = tuple(
+            index in host for index, value in enumerate(self._inputs) if value == ""
+        )
 
     def forward(self, *handed_in: Tensor) -> Tensor | tuple[Tensor, ...]:
         """Returns the node's output, or its outputs."""
         rest = iter(handed_in)
         inputs: list[Any] = [
-            None if name is None else getattr(self, name) if name else next(rest)
-            for name in self._buffer_names
+            value if not isinstance(value, str) else getattr(self, value) if value else next(rest)
+            for value in self._inputs
         ]
         try:
             return self._run(self.node, inputs)
@@ -74,17 +83,17 @@ class OnnxNode(nn.Module):
 
 @dataclass(frozen=True)
 class _Step:
-    """One node in the order in which they run."""
+    """One node, in the order in which they run, and the names of the values around it.
+
+    last_read: values that no later step reads. on_shapes: True for arithmetic on the shapes of
+    tensors, which stays on the CPU.
+    """
 
     run: OnnxNode
     inputs: tuple[str, ...]
-    """Names of the values that it is called with."""
     outputs: tuple[str, ...]
-    """Names of the values that it returns."""
     last_read: tuple[str, ...]
-    """Values that no later step reads."""
     on_shapes: bool
-    """True for arithmetic on the shapes of tensors, which stays on the CPU."""
 
 
 class OnnxGraph(nn.Module):
@@ -153,28 +162,33 @@ class OnnxGraph(nn.Module):
     def forward(self, *inputs: Tensor) -> Any:
         """Returns the output, or several outputs by name."""
         values: dict[str, Tensor] = dict(zip(self.input_names, inputs, strict=True))
-        device = inputs[0].device
-        for step in self._steps:
-            arguments = [values[name] for name in step.inputs]
-            if not step.on_shapes:
-                arguments = [value.to(device) for value in arguments]
-            result = step.run(*arguments)
-            results = result if isinstance(result, tuple) else (result,)
-            values.update(zip(step.outputs, results, strict=False))
+        for step in self._run(values, inputs[0].device):
             for name in step.last_read:
                 del values[name]
         outputs = {n: values[n] if n in values else self._constants[n] for n in self.output_names}
         return outputs if len(outputs) > 1 else outputs[self.output_names[0]]
 
-    def every_value(self, *inputs: Tensor) -> Iterable[tuple[str, str, Tensor]]:
+    def every_value(self, *inputs: Tensor) -> Iterator[tuple[str, str, Tensor]]:
         """Yields (node, value's name, value) of all nodes in the order in which they run."""
         values: dict[str, Tensor] = dict(zip(self.input_names, inputs, strict=True))
+        for step in self._run(values, inputs[0].device):
+            for name in step.outputs:
+                if name in values:
+                    yield step.run.node.name, name, values[name]
+
+    def _run(self, values: dict[str, Tensor], device: torch.device) -> Iterator[_Step]:
+        """Yields the steps, each after its results were added to the values."""
         for step in self._steps:
-            result = step.run(*(values[name] for name in step.inputs))
+            arguments = [values[name] for name in step.inputs]
+            if not step.on_shapes:
+                arguments = [
+                    value.to("cpu" if on_host else device)
+                    for value, on_host in zip(arguments, step.run.handed_in_on_host, strict=True)
+                ]
+            result = step.run(*arguments)
             results = result if isinstance(result, tuple) else (result,)
             values.update(zip(step.outputs, results, strict=False))
-            for name, value in zip(step.outputs, results, strict=False):
-                yield step.run.node.name, name, value
+            yield step
 
 
 _QUANTISED = (
@@ -260,22 +274,18 @@ def order_of_nodes(
             raise ModelError(f"ONNX file {path}: a node reads {absent[0]!r}, which nothing gives")
         reads[n] = {producer[name] for name in inputs}
         pending += reads[n]
-    readers: dict[int, list[int]] = {n: [] for n in reads}
-    for n, before in reads.items():
-        for m in before:
-            readers[m].append(n)
-    waiting = {n: len(before) for n, before in reads.items()}
-    ready = [n for n, count in waiting.items() if not count]
-    heapq.heapify(ready)
-    order = []
-    while ready:
+    sorter = graphlib.TopologicalSorter(reads)
+    try:
+        sorter.prepare()
+    except graphlib.CycleError:
+        raise ModelError(f"ONNX file {path}: its nodes read each other in a circle") from None
+    order: list[int] = []
+    ready: list[int] = []
+    while len(order) < len(reads):
+        for n in sorter.get_ready():
+            heapq.heappush(ready, n)
         order.append(heapq.heappop(ready))
-        for n in readers[order[-1]]:
-            waiting[n] -= 1
-            if not waiting[n]:
-                heapq.heappush(ready, n)
-    if len(order) < len(reads):
-        raise ModelError(f"ONNX file {path}: its nodes read each other in a circle")
+        sorter.done(order[-1])
     return order
 
 

@@ -6,7 +6,7 @@ pnpdepth[onnx]`.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +16,9 @@ from torch import Tensor, nn
 from pnpdepth_cli.core.user_code import describe
 from pnpdepth_cli.errors import ModelError
 from pnpdepth_cli.models.definition import UNTUNED_DEFAULTS, Fixed, ModelDefinition, Multiple
-from pnpdepth_cli.models.formats.onnx.functions import inlined
 from pnpdepth_cli.models.formats.onnx.graph import OnnxGraph, order_of_nodes
 from pnpdepth_cli.models.formats.onnx.input_range import stated_input_range
+from pnpdepth_cli.models.formats.onnx.limits import inlined
 
 MISMATCH = 1e-3
 """The largest deviation from onnxruntime's output, relative to that output's range."""
@@ -62,7 +62,7 @@ def onnx_definition(file: Path, output: str | None = None) -> ModelDefinition:
         checkpoint=file,
         arguments=lambda rgb, _: (_as_input(rgb, channels_last),),
         output=_as_map,
-        verify=_FirstImageCheck(file, chosen),
+        verify=_FirstImageCheck(model, file, chosen),
         assumed=""
         if stated is None
         else f"rgb range {stated[1]}, which the graph normalises itself",
@@ -112,7 +112,7 @@ def _opset(model: Any) -> int:
 
 
 def _image_input_shape(model: Any, file: Path) -> list[int | str]:
-    """The shape of the only input. ModelError if that is no batch of one rgb image."""
+    """The shape of the only input. ModelError unless it is a batch of one rgb image."""
     constants = {tensor.name for tensor in model.graph.initializer}
     inputs = {i.name: _shape(i) for i in model.graph.input if i.name not in constants}
     listed = ", ".join(f"{name} {'×'.join(map(str, shape))}" for name, shape in inputs.items())
@@ -168,24 +168,22 @@ def _patch_size(model: Any) -> int | None:
 class _FirstImageCheck:
     """Compares the network with onnxruntime on the first image."""
 
-    def __init__(self, file: Path, output: str) -> None:
-        self._file, self._output, self._note = file, output, ""
+    def __init__(self, model: Any, file: Path, output: str) -> None:
+        self._model, self._file, self._output, self._note = model, file, output, ""
 
     def __call__(self, module: nn.Module, arguments: Sequence[Tensor]) -> str:
         """Returns how well they agree; compares only once. ModelError if they differ."""
         if self._note:
             return self._note
         assert isinstance(module, OnnxGraph)
-        model = _read(self._file)
-        _remove_nodes_not_needed(model, self._output, self._file)
-        inputs = [argument.detach().cpu() for argument in arguments]
-        expected = _run(model, [self._output], module.input_names, inputs, self._file)[0]
+        inputs = {n: a.detach().cpu() for n, a in zip(module.input_names, arguments, strict=True)}
+        (expected,) = self._outputs([self._output], inputs)
         with torch.no_grad():
             actual = module(*arguments).cpu()
-        limit = _HALF_MISMATCH if _is_half(model) else MISMATCH
+        limit = _HALF_MISMATCH if _is_half(self._model) else MISMATCH
         deviation = _deviation(actual, expected)
         if not deviation <= limit:
-            where = self._first_difference(model, module, inputs)
+            where = self._first_difference(module, inputs)
             raise ModelError(
                 f"ONNX file {self._file}: its reading by torch differs from onnxruntime's by"
                 f" {deviation:.2g} of the output's range{where}"
@@ -193,53 +191,59 @@ class _FirstImageCheck:
         self._note = f"ONNX: agrees with onnxruntime on this image to {deviation:.1g} of its range"
         return self._note
 
-    def _first_difference(self, model: Any, module: OnnxGraph, inputs: list[Tensor]) -> str:
-        import onnx
-
-        module = module.cpu()
+    def _first_difference(self, module: OnnxGraph, inputs: Mapping[str, Tensor]) -> str:
         with torch.no_grad():
-            actual = [v for v in module.every_value(*inputs) if v[1] and v[2].is_floating_point()]
-        known = {o.name for o in model.graph.output}
-        model.graph.output.extend(
-            onnx.ValueInfoProto(name=value) for _, value, _ in actual if value not in known
-        )
-        names = [value for _, value, _ in actual]
-        expected = _run(model, names, module.input_names, inputs, self._file)
+            every = module.cpu().every_value(*inputs.values())
+            actual = [value for value in every if value[1] and value[2].is_floating_point()]
+        expected = self._outputs([name for _, name, _ in actual], inputs)
         for (node, _, value), reference in zip(actual, expected, strict=True):
             if not _deviation(value, reference) <= MISMATCH:
                 return f"; the first node that differs is {node!r} ({module._modules[node]})"
         return "; no single node differs by as much"
 
+    def _outputs(self, names: list[str], inputs: Mapping[str, Tensor]) -> list[Tensor]:
+        """These values of the graph, from onnxruntime."""
+        import onnxruntime
 
-def _run(
-    model: Any, outputs: list[str], names: Sequence[str], inputs: Sequence[Tensor], file: Path
-) -> list[Tensor]:
-    import onnxruntime
+        options = onnxruntime.SessionOptions()
+        options.log_severity_level = 4
+        options.intra_op_num_threads = torch.get_num_threads()
+        try:
+            session = onnxruntime.InferenceSession(
+                self._graph_of(names), options, providers=["CPUExecutionProvider"]
+            )
+            halves = {i.name for i in session.get_inputs() if i.type == "tensor(float16)"}
+            feed = {
+                name: value.half().numpy() if name in halves else value.numpy()
+                for name, value in inputs.items()
+            }
+            return [torch.from_numpy(value).float() for value in session.run(names, feed)]
+        except Exception as error:  # onnxruntime has a type for each of its status codes
+            raise ModelError(
+                f"ONNX file {self._file} does not run in onnxruntime: {describe(error)}"
+            ) from None
 
-    options = onnxruntime.SessionOptions()
-    options.log_severity_level = 4
-    options.intra_op_num_threads = torch.get_num_threads()
-    on_disk = _read(file).graph
-    unchanged = (len(model.graph.output), len(model.graph.node)) == (
-        *(len(on_disk.output), len(on_disk.node)),
-    )
-    try:
-        # By its path if it is as on disk: weights may lie in files beside it.
-        session = onnxruntime.InferenceSession(
-            str(file) if unchanged else model.SerializeToString(),
-            options,
-            providers=["CPUExecutionProvider"],
-        )
-        halves = {i.name for i in session.get_inputs() if i.type == "tensor(float16)"}
-        feed = {
-            name: value.half().numpy() if name in halves else value.numpy()
-            for name, value in zip(names, inputs, strict=True)
-        }
-        return [torch.from_numpy(value).float() for value in session.run(outputs, feed)]
-    except Exception as error:  # onnxruntime has a type for each of its status codes
-        raise ModelError(
-            f"ONNX file {file} does not run in onnxruntime: {describe(error)}"
-        ) from None
+    def _graph_of(self, names: list[str]) -> str | bytes:
+        """The file if it is needed whole, else a model with these outputs and what they need.
+
+        onnxruntime would run every node; a small file may hold one that needs much memory. From the
+        file, it reads weights that lie beside it.
+        """
+        import onnx
+
+        graph = self._model.graph
+        known = {*(t.name for t in graph.initializer), *(i.name for i in graph.input)}
+        needed = order_of_nodes(graph.node, known, names, self._file)
+        outputs = {output.name: output for output in graph.output}
+        if len(needed) == len(graph.node) and outputs.keys() >= set(names):
+            return str(self._file)
+        part = onnx.ModelProto()
+        part.CopyFrom(self._model)
+        del part.graph.node[:], part.graph.output[:]
+        part.graph.node.extend(graph.node[n] for n in needed)
+        part.graph.output.extend(outputs.get(n) or onnx.ValueInfoProto(name=n) for n in names)
+        content: bytes = part.SerializeToString()
+        return content
 
 
 def _is_half(model: Any) -> bool:
@@ -257,18 +261,3 @@ def _deviation(actual: Tensor, expected: Tensor) -> float:
     largest = float(expected.abs().max())
     difference = float((actual.float() - expected).abs().max())
     return difference / largest if largest else difference
-
-
-def _remove_nodes_not_needed(model: Any, output: str, file: Path) -> None:
-    """onnxruntime would run every node; a small file may hold one that needs much memory."""
-    graph = model.graph
-    known = {*(t.name for t in graph.initializer), *(i.name for i in graph.input)}
-    needed = order_of_nodes(graph.node, known, [output], file)
-    if len(needed) == len(graph.node):
-        return
-    nodes = [graph.node[n] for n in needed]
-    others = [o for o in graph.output if o.name != output]
-    for other in others:
-        graph.output.remove(other)
-    del graph.node[:]
-    graph.node.extend(nodes)

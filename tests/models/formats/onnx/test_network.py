@@ -49,6 +49,11 @@ def test_layers_are_the_graphs_nodes_and_the_bottleneck_comes_first(tmp_path: Pa
     assert network.checkpoint == tmp_path / "net.onnx"
 
 
+def test_numbers_that_python_reads_are_no_weights_and_stay_on_the_cpu(tmp_path: Path) -> None:
+    module = load_network(str(write_network(tmp_path / "net.onnx")), None).module
+    assert all(p.ndim != 1 or "up" not in name for name, p in module.named_parameters())
+
+
 @pytest.mark.parametrize("channels_last", [False, True])
 def test_a_cut_at_any_node_gives_the_network_bit_for_bit(
     tmp_path: Path, channels_last: bool

@@ -8,12 +8,15 @@ from __future__ import annotations
 
 from pnpdepth_cli.models.formats.onnx.operators import (  # noqa: F401  (each registers its operators)
     arithmetic,
-    convolution,
-    indexing,
-    normalisation,
+    layers,
     resizing,
-    shaping,
+    tensors,
 )
-from pnpdepth_cli.models.formats.onnx.operators.table import OPERATORS, Node, Unsupported
+from pnpdepth_cli.models.formats.onnx.operators.table import (
+    HOST_INPUTS,
+    OPERATORS,
+    Node,
+    Unsupported,
+)
 
-__all__ = ["OPERATORS", "Node", "Unsupported"]
+__all__ = ["HOST_INPUTS", "OPERATORS", "Node", "Unsupported"]

@@ -12,12 +12,13 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from pnpdepth_cli.models.formats.onnx.operators.table import (
-    OPERATORS,
     Inputs,
     Node,
+    Operator,
     Unsupported,
     operator,
     optional,
+    register,
     whole_numbers,
 )
 
@@ -74,23 +75,42 @@ _FOLDED: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
 }
 
 
-def _unary(function: Callable[[Tensor], Tensor]) -> Callable[[Node, Inputs], Tensor]:
-    return lambda node, inputs: function(inputs[0])
+def _unary(function: Callable[[Tensor], Tensor]) -> Operator:
+    return lambda _, inputs: function(inputs[0])
 
 
-def _binary(function: Callable[[Tensor, Tensor], Tensor]) -> Callable[[Node, Inputs], Tensor]:
-    return lambda node, inputs: function(
-        inputs[0], _broadcast_as_before_7(node, inputs[0], inputs[1])
-    )
+def _binary(function: Callable[[Tensor, Tensor], Tensor]) -> Operator:
+    return lambda node, i: function(i[0], _broadcast_as_before_7(node, i[0], i[1]))
 
 
-def _folded(function: Callable[[Tensor, Tensor], Tensor]) -> Callable[[Node, Inputs], Tensor]:
-    return lambda node, inputs: functools.reduce(function, inputs)
+def _folded(function: Callable[[Tensor, Tensor], Tensor]) -> Operator:
+    return lambda _, inputs: functools.reduce(function, inputs)
 
 
-OPERATORS.update({name: _unary(f) for name, f in _UNARY.items()})
-OPERATORS.update({name: _binary(f) for name, f in _BINARY.items()})
-OPERATORS.update({name: _folded(f) for name, f in _FOLDED.items()})
+register({name: _unary(function) for name, function in _UNARY.items()})
+register({name: _binary(function) for name, function in _BINARY.items()})
+register({name: _folded(function) for name, function in _FOLDED.items()})
+register(
+    {
+        "Mean": lambda _, i: functools.reduce(torch.add, i) / len(i),
+        "Mod": lambda node, i: (torch.fmod if node.get("fmod", 0) else torch.remainder)(i[0], i[1]),
+        "Where": lambda _, i: torch.where(i[0], i[1], i[2]),
+        "LeakyRelu": lambda node, i: F.leaky_relu(i[0], node.get("alpha", 0.01)),
+        "Elu": lambda node, i: F.elu(i[0], node.get("alpha", 1.0)),
+        "Celu": lambda node, i: F.celu(i[0], node.get("alpha", 1.0)),
+        "Selu": lambda node, i: torch.mul(
+            F.elu(i[0], node.get("alpha", 1.6732632423543772)),
+            node.get("gamma", 1.0507009873554805),
+        ),
+        "ThresholdedRelu": lambda node, i: F.threshold(i[0], node.get("alpha", 1.0), 0.0),
+        "HardSigmoid": lambda node, i: torch.add(
+            torch.mul(i[0], node.get("alpha", 0.2)), node.get("beta", 0.5)
+        ).clamp(0, 1),
+        "Gelu": lambda node, i: F.gelu(i[0], approximate=node.get("approximate", "none")),
+        "MatMul": lambda _, i: torch.matmul(i[0], i[1]),
+        "Einsum": lambda node, i: torch.einsum(node.get("equation"), *i),
+    }
+)
 
 
 def _broadcast_as_before_7(node: Node, a: Tensor, b: Tensor) -> Tensor:
@@ -109,26 +129,10 @@ def div(node: Node, inputs: Inputs) -> Tensor:
     return torch.div(a, b, rounding_mode="trunc") if whole else a / b
 
 
-@operator("Mean")
-def mean(node: Node, inputs: Inputs) -> Tensor:
-    total: Tensor = functools.reduce(torch.add, inputs)
-    return total / len(inputs)
-
-
-@operator("Mod")
-def mod(node: Node, inputs: Inputs) -> Tensor:
-    return (torch.fmod if node.get("fmod", 0) else torch.remainder)(inputs[0], inputs[1])
-
-
 @operator("Pow")
 def power(node: Node, inputs: Inputs) -> Tensor:
     base, exponent = inputs[0], _broadcast_as_before_7(node, inputs[0], inputs[1])
     return torch.pow(base, exponent).to(base.dtype)
-
-
-@operator("Where")
-def where(node: Node, inputs: Inputs) -> Tensor:
-    return torch.where(inputs[0], inputs[1], inputs[2])
 
 
 @operator("IsInf")
@@ -151,49 +155,12 @@ def clip(node: Node, inputs: Inputs) -> Tensor:
     return torch.minimum(x, torch.as_tensor(high, dtype=x.dtype, device=x.device))
 
 
-@operator("LeakyRelu")
-def leaky_relu(node: Node, inputs: Inputs) -> Tensor:
-    return F.leaky_relu(inputs[0], node.get("alpha", 0.01))
-
-
 @operator("PRelu")
 def prelu(node: Node, inputs: Inputs) -> Tensor:
     x, slope = inputs
     if node.opset < 7 and slope.ndim == 1 and len(slope) > 1:
         slope = slope.reshape(-1, *[1] * (x.ndim - 2))
     return torch.where(x < 0, x * slope, x)
-
-
-@operator("Elu")
-def elu(node: Node, inputs: Inputs) -> Tensor:
-    return F.elu(inputs[0], node.get("alpha", 1.0))
-
-
-@operator("Celu")
-def celu(node: Node, inputs: Inputs) -> Tensor:
-    return F.celu(inputs[0], node.get("alpha", 1.0))
-
-
-@operator("Selu")
-def selu(node: Node, inputs: Inputs) -> Tensor:
-    alpha, gamma = node.get("alpha", 1.6732632423543772), node.get("gamma", 1.0507009873554805)
-    return torch.mul(F.elu(inputs[0], alpha), gamma)
-
-
-@operator("ThresholdedRelu")
-def thresholded_relu(node: Node, inputs: Inputs) -> Tensor:
-    return F.threshold(inputs[0], node.get("alpha", 1.0), 0.0)
-
-
-@operator("HardSigmoid")
-def hard_sigmoid(node: Node, inputs: Inputs) -> Tensor:
-    line = torch.add(torch.mul(inputs[0], node.get("alpha", 0.2)), node.get("beta", 0.5))
-    return line.clamp(0, 1)
-
-
-@operator("Gelu")
-def gelu(node: Node, inputs: Inputs) -> Tensor:
-    return F.gelu(inputs[0], approximate=node.get("approximate", "none"))
 
 
 @operator("Softmax", "LogSoftmax")
@@ -207,11 +174,6 @@ def softmax(node: Node, inputs: Inputs) -> Tensor:
     return function(x.reshape(rows, -1), 1).reshape(x.shape)
 
 
-@operator("MatMul")
-def matmul(node: Node, inputs: Inputs) -> Tensor:
-    return torch.matmul(inputs[0], inputs[1])
-
-
 @operator("Gemm")
 def gemm(node: Node, inputs: Inputs) -> Tensor:
     a, b, c = inputs[0], inputs[1], optional(inputs, 2)
@@ -221,12 +183,7 @@ def gemm(node: Node, inputs: Inputs) -> Tensor:
     return product if c is None else product + node.get("beta", 1.0) * c
 
 
-@operator("Einsum")
-def einsum(node: Node, inputs: Inputs) -> Tensor:
-    return torch.einsum(node.get("equation"), *inputs)
-
-
-@operator("CumSum")
+@operator("CumSum", host=(1,))
 def cumsum(node: Node, inputs: Inputs) -> Tensor:
     x, axis = inputs[0], whole_numbers(inputs[1])[0]
     x = x.flip(axis) if node.get("reverse", 0) else x
@@ -255,7 +212,7 @@ def _product(x: Tensor, axes: list[int], keep: bool) -> Tensor:
     return x
 
 
-@operator(*_REDUCTIONS)
+@operator(*_REDUCTIONS, host=(1,))
 def reduce(node: Node, inputs: Inputs) -> Tensor:
     axes: Any = node.get("axes")
     if axes is None and optional(inputs, 1) is not None:

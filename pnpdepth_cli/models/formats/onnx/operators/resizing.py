@@ -23,7 +23,7 @@ from pnpdepth_cli.models.formats.onnx.operators.table import (
 )
 
 
-@operator("Upsample")
+@operator("Upsample", host=(1,))
 def upsample(node: Node, inputs: Inputs) -> Tensor:
     x = inputs[0]
     scales = node.get("scales") if len(inputs) < 2 else inputs[1].tolist()
@@ -33,7 +33,7 @@ def upsample(node: Node, inputs: Inputs) -> Tensor:
     return _resized(x, _Plan(mode=mode, coordinates="asymmetric", nearest="simple"), scales, None)
 
 
-@operator("Resize")
+@operator("Resize", host=(1, 2, 3))
 def resize(node: Node, inputs: Inputs) -> Tensor:
     x = inputs[0]
     if node.opset < 11:

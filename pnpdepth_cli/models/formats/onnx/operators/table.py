@@ -15,6 +15,9 @@ Operator = Callable[["Node", Inputs], "Tensor | tuple[Tensor, ...]"]
 
 OPERATORS: dict[str, Operator] = {}
 
+HOST_INPUTS: dict[str, tuple[int, ...]] = {}
+"""Indices of an operator's inputs that are read as Python numbers; they stay on the CPU."""
+
 
 class Unsupported(Exception):
     """An operator is used in a way that is not covered; the message says which."""
@@ -22,33 +25,34 @@ class Unsupported(Exception):
 
 @dataclass(frozen=True, kw_only=True)
 class Node:
-    """A node of the graph."""
+    """A node of the graph; its name is unique there, and `outputs` counts those that are used."""
 
     name: str
-    """Unique in the graph."""
     op: str
-    """Name of the operator."""
     opset: int
-    """Version of the standard's set of operators."""
     outputs: int = 1
-    """Number of outputs that are used."""
     attributes: Mapping[str, Any] = field(default_factory=dict)
-    """Attributes as Python values."""
 
     def get(self, name: str, default: Any = None) -> Any:
         """Returns an attribute, or the standard's default for it."""
         return self.attributes.get(name, default)
 
 
-def operator(*names: str) -> Callable[[Operator], Operator]:
-    """Registers the decorated function for these operators."""
+def operator(*names: str, host: tuple[int, ...] = ()) -> Callable[[Operator], Operator]:
+    """Registers the decorated function for these operators; `host` is as in `HOST_INPUTS`."""
 
     def enter(function: Operator) -> Operator:
         for name in names:
-            OPERATORS[name] = function
+            OPERATORS[name], HOST_INPUTS[name] = function, host
         return function
 
     return enter
+
+
+def register(functions: Mapping[str, Operator], host: tuple[int, ...] = ()) -> None:
+    """Registers operators whose function is one expression; `host` is as in `HOST_INPUTS`."""
+    for name, function in functions.items():
+        operator(name, host=host)(function)
 
 
 def optional(inputs: Inputs, index: int) -> Tensor | None:

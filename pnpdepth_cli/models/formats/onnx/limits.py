@@ -1,12 +1,16 @@
-"""Keeps the constants that a small ONNX file makes as small as the constants of a network are.
+"""Keeps what a small ONNX file makes as small as a network is.
 
+The functions that a model defines itself may call each other and, written out, become endless.
 ConstantOfShape, Range, Expand, Concat of a value with itself and many other operators can turn a
-few bytes into gigabytes. `FoldingBudget` knows the size of every result before it is allocated.
+few bytes into gigabytes; `FoldingBudget` knows the size of every result before it is allocated.
 """
 
 from __future__ import annotations
 
+import graphlib
 import math
+from collections.abc import Iterable
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -14,7 +18,64 @@ from torch import Tensor
 from torch.overrides import TorchFunctionMode
 from torch.utils._pytree import tree_flatten, tree_map_only
 
+from pnpdepth_cli.errors import ModelError
 from pnpdepth_cli.models.formats.onnx.operators import Unsupported
+
+MAX_NODES = 100_000
+"""Nodes of the graph with all functions written out. Depth networks have up to 10,000."""
+
+MAX_BYTES = 1 << 28
+"""Bytes of them, without the weights that lie in the graph itself."""
+
+
+def inlined(model: Any, path: Path) -> Any:
+    """Returns the model without functions of its own.
+
+    Raises:
+        ModelError: Functions call themselves, or become too large when they are written out.
+    """
+    if not model.functions:
+        return model
+    functions = {(f.domain, f.name, getattr(f, "overload", "")): f for f in model.functions}
+    calls = {key: _calls(function) for key, function in functions.items()}
+    try:
+        order = [*graphlib.TopologicalSorter(calls).static_order()]
+    except graphlib.CycleError as error:
+        name = str(error.args[1][0][1])[:60]
+        raise ModelError(f"ONNX file {path}: its function {name!r} calls itself") from None
+    sizes: dict[Any, tuple[int, int]] = {}  # nodes and bytes when written out
+    for key in order:
+        if key in functions:
+            inner = [sizes[call] for call in calls[key] if call in functions]
+            sizes[key] = (
+                len(calls[key]) + sum(count for count, _ in inner),
+                functions[key].ByteSize() + sum(size for _, size in inner),
+            )
+    called = [sizes[call] for call in _calls(model.graph) if call in functions]
+    nodes, size = (sum(some[part] for some in called) for part in (0, 1))
+    if nodes > MAX_NODES or size > MAX_BYTES:
+        raise ModelError(
+            f"ONNX file {path}: its functions, written out, are more than {MAX_NODES:,} nodes or"
+            f" {MAX_BYTES / 1e6:,.0f} MB"
+        )
+    from onnx import inliner
+
+    return inliner.inline_local_functions(model)
+
+
+def _calls(graph: Any) -> list[tuple[str, str, str]]:
+    """What the nodes of a graph or function are, by which a function may be called."""
+    return [(n.domain, n.op_type, getattr(n, "overload", "")) for n in _nodes(graph.node)]
+
+
+def _nodes(nodes: Iterable[Any]) -> Iterable[Any]:
+    """The nodes, and those in the graphs that are their attributes."""
+    for node in nodes:
+        yield node
+        for attribute in node.attribute:
+            for graph in (*attribute.graphs, attribute.g):
+                yield from _nodes(graph.node)
+
 
 _ALWAYS_ALLOWED = 1 << 24
 """Elements of one constant."""

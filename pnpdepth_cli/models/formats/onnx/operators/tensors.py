@@ -1,4 +1,4 @@
-"""Operators that change the shape, type or order of elements, or make constants."""
+"""Operators on the elements of tensors: shape, type, order, parts, and constants."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from pnpdepth_cli.models.formats.onnx.operators.table import (
     Unsupported,
     operator,
     optional,
+    register,
     whole_numbers,
 )
 
@@ -31,17 +32,31 @@ def _axes(node: Node, inputs: Inputs) -> list[int] | None:
     return None if axes is None else list(axes)
 
 
-@operator("Shape")
-def shape(node: Node, inputs: Inputs) -> Tensor:
-    return torch.tensor(inputs[0].shape[node.get("start", 0) : node.get("end")], dtype=torch.int64)
+register(
+    {
+        "Shape": lambda node, i: torch.tensor(
+            i[0].shape[node.get("start", 0) : node.get("end")], dtype=torch.int64
+        ),
+        "Size": lambda _, i: torch.tensor(i[0].numel()),
+        "Transpose": lambda node, i: i[0].permute(node.get("perm", [*range(i[0].ndim)][::-1])),
+        "Concat": lambda node, i: torch.cat(i, node.get("axis", 1)),
+        "CastLike": lambda _, i: i[0].to(i[1].dtype),
+        "Dropout": lambda _, i: i[0].clone(),
+    }
+)
+register(
+    {
+        "Tile": lambda _, i: i[0].repeat(whole_numbers(i[1])),
+        "Squeeze": lambda node, i: i[0].squeeze(_axes(node, i) or [*range(i[0].ndim)]),
+        "Trilu": lambda node, i: (torch.triu if node.get("upper", 1) else torch.tril)(
+            i[0], 0 if optional(i, 1) is None else whole_numbers(i[1])[0]
+        ),
+    },
+    host=(1,),
+)
 
 
-@operator("Size")
-def size(node: Node, inputs: Inputs) -> Tensor:
-    return torch.tensor(inputs[0].numel())
-
-
-@operator("Reshape")
+@operator("Reshape", host=(1,))
 def reshape(node: Node, inputs: Inputs) -> Tensor:
     x = inputs[0]
     wanted = node.get("shape") if len(inputs) < 2 else whole_numbers(inputs[1])
@@ -58,19 +73,7 @@ def flatten(node: Node, inputs: Inputs) -> Tensor:
     return x.reshape(math.prod(x.shape[:axis]), -1)
 
 
-@operator("Transpose")
-def transpose(node: Node, inputs: Inputs) -> Tensor:
-    x = inputs[0]
-    return x.permute(node.get("perm", list(range(x.ndim))[::-1]))
-
-
-@operator("Squeeze")
-def squeeze(node: Node, inputs: Inputs) -> Tensor:
-    axes = _axes(node, inputs)
-    return inputs[0].squeeze() if axes is None else inputs[0].squeeze(axes)
-
-
-@operator("Unsqueeze")
+@operator("Unsqueeze", host=(1,))
 def unsqueeze(node: Node, inputs: Inputs) -> Tensor:
     x, axes = inputs[0], _axes(node, inputs)
     assert axes is not None
@@ -80,7 +83,7 @@ def unsqueeze(node: Node, inputs: Inputs) -> Tensor:
     return x
 
 
-@operator("Expand")
+@operator("Expand", host=(1,))
 def expand(node: Node, inputs: Inputs) -> Tensor:
     x = inputs[0]
     wanted = whole_numbers(inputs[1])
@@ -90,17 +93,7 @@ def expand(node: Node, inputs: Inputs) -> Tensor:
     return x.expand([n if w == 1 else w for n, w in zip(own, wanted, strict=True)])
 
 
-@operator("Tile")
-def tile(node: Node, inputs: Inputs) -> Tensor:
-    return inputs[0].repeat(whole_numbers(inputs[1]))
-
-
-@operator("Concat")
-def concat(node: Node, inputs: Inputs) -> Tensor:
-    return torch.cat(inputs, node.get("axis", 1))
-
-
-@operator("Split")
+@operator("Split", host=(1,))
 def split(node: Node, inputs: Inputs) -> tuple[Tensor, ...]:
     x, axis = inputs[0], node.get("axis", 0)
     sizes = node.get("split")
@@ -113,7 +106,7 @@ def split(node: Node, inputs: Inputs) -> tuple[Tensor, ...]:
     return torch.split(x, sizes, axis)
 
 
-@operator("Pad")
+@operator("Pad", host=(1, 2, 3))
 def pad(node: Node, inputs: Inputs) -> Tensor:
     x = inputs[0]
     mode = node.get("mode", "constant")
@@ -175,16 +168,6 @@ def cast(node: Node, inputs: Inputs) -> Tensor:
     return inputs[0].to(TYPES[kind])
 
 
-@operator("CastLike")
-def cast_like(node: Node, inputs: Inputs) -> Tensor:
-    return inputs[0].to(inputs[1].dtype)
-
-
-@operator("Dropout")
-def dropout(node: Node, inputs: Inputs) -> Tensor:
-    return inputs[0].clone()
-
-
 @operator("Constant")
 def constant(node: Node, inputs: Inputs) -> Tensor:
     for name in ("value", "value_float", "value_floats", "value_int", "value_ints"):
@@ -194,19 +177,108 @@ def constant(node: Node, inputs: Inputs) -> Tensor:
     raise Unsupported("a constant of text or of a sparse tensor")
 
 
-@operator("ConstantOfShape")
+@operator("ConstantOfShape", host=(0,))
 def constant_of_shape(node: Node, inputs: Inputs) -> Tensor:
     value: Tensor = node.get("value", torch.zeros(1))
     return value.reshape(()).expand(whole_numbers(inputs[0])).clone()
 
 
-@operator("Range")
+@operator("Range", host=(0, 1, 2))
 def number_range(node: Node, inputs: Inputs) -> Tensor:
     start, limit, delta = (v.reshape(()).item() for v in inputs)
     return torch.arange(start, limit, delta, dtype=inputs[0].dtype, device=inputs[0].device)
 
 
-@operator("Trilu")
-def trilu(node: Node, inputs: Inputs) -> Tensor:
-    k = 0 if optional(inputs, 1) is None else whole_numbers(inputs[1])[0]
-    return (torch.triu if node.get("upper", 1) else torch.tril)(inputs[0], k)
+@operator("Slice", host=(1, 2, 3, 4))
+def slice_(node: Node, inputs: Inputs) -> Tensor:
+    x = inputs[0]
+    if len(inputs) == 1:
+        starts, ends, axes, steps = node.get("starts"), node.get("ends"), node.get("axes"), None
+    else:
+        starts, ends = whole_numbers(inputs[1]), whole_numbers(inputs[2])
+        axes, steps = (
+            None if optional(inputs, n) is None else whole_numbers(inputs[n]) for n in (3, 4)
+        )
+    axes = axes if axes is not None else range(len(starts))
+    steps = steps if steps is not None else [1] * len(starts)
+    for start, end, axis, step in zip(starts, ends, axes, steps, strict=True):
+        size = x.shape[axis]
+        kept = range(*slice(start, _backwards_end(end, size, step), step).indices(size))
+        if step > 0:
+            x = x[(slice(None),) * (axis % x.ndim) + (slice(kept.start, kept.stop, step),)]
+        else:
+            x = x.index_select(axis, torch.tensor(list(kept), dtype=torch.long, device=x.device))
+    return x
+
+
+def _backwards_end(end: int, size: int, step: int) -> int | None:
+    """With a negative step, an end before the first element includes that element."""
+    return None if step < 0 and end < -size else end
+
+
+@operator("Gather")
+def gather(node: Node, inputs: Inputs) -> Tensor:
+    x, index = inputs[0], inputs[1].long()
+    axis = node.get("axis", 0) % x.ndim
+    size = x.shape[axis]
+    flat = torch.where(index < 0, index + size, index).reshape(-1).to(x.device)
+    picked = x.index_select(axis, flat)
+    return picked.reshape((*x.shape[:axis], *index.shape, *x.shape[axis + 1 :]))
+
+
+@operator("GatherElements")
+def gather_elements(node: Node, inputs: Inputs) -> Tensor:
+    x, index, axis = inputs[0], inputs[1].long(), node.get("axis", 0)
+    return x.gather(axis, torch.where(index < 0, index + x.shape[axis], index))
+
+
+@operator("GatherND")
+def gather_nd(node: Node, inputs: Inputs) -> Tensor:
+    if node.get("batch_dims", 0):
+        raise Unsupported("batch_dims")
+    return inputs[0][tuple(inputs[1].long().unbind(-1))]
+
+
+@operator("ScatterND")
+def scatter_nd(node: Node, inputs: Inputs) -> Tensor:
+    if node.get("reduction", "none") not in ("none", "add"):
+        raise Unsupported(f"reduction {node.get('reduction')}")
+    index = tuple(inputs[1].long().unbind(-1))
+    return inputs[0].index_put(index, inputs[2], accumulate=node.get("reduction") == "add")
+
+
+@operator("ScatterElements")
+def scatter_elements(node: Node, inputs: Inputs) -> Tensor:
+    if node.get("reduction", "none") != "none":
+        raise Unsupported(f"reduction {node.get('reduction')}")
+    x, index, axis = inputs[0], inputs[1].long(), node.get("axis", 0)
+    return x.scatter(axis, torch.where(index < 0, index + x.shape[axis], index), inputs[2])
+
+
+@operator("OneHot", host=(1,))
+def one_hot(node: Node, inputs: Inputs) -> Tensor:
+    index, count, values = inputs[0].long(), whole_numbers(inputs[1])[0], inputs[2]
+    hot = F.one_hot(index.remainder(count), count).bool()
+    axis = node.get("axis", -1)
+    return torch.where(hot, values[1], values[0]).movedim(-1, axis)
+
+
+@operator("TopK", host=(1,))
+def top_k(node: Node, inputs: Inputs) -> tuple[Tensor, ...]:
+    k = node.get("k") if len(inputs) < 2 else whole_numbers(inputs[1])[0]
+    largest = inputs[0].topk(
+        k, node.get("axis", -1), bool(node.get("largest", 1)), bool(node.get("sorted", 1))
+    )
+    return largest.values, largest.indices
+
+
+@operator("GridSample")
+def grid_sample(node: Node, inputs: Inputs) -> Tensor:
+    mode = {"linear": "bilinear", "cubic": "bicubic"}.get(node.get("mode", "bilinear"))
+    return F.grid_sample(
+        inputs[0],
+        inputs[1],
+        mode=mode or node.get("mode", "bilinear"),
+        padding_mode=node.get("padding_mode", "zeros"),
+        align_corners=bool(node.get("align_corners", 0)),
+    )

@@ -26,7 +26,7 @@ from torch import nn
 from pnpdepth_cli.errors import CheckpointError
 from pnpdepth_cli.models.weights.checkpoint import read_checkpoint
 from pnpdepth_cli.models.weights.pickle_reader import StandIn
-from pnpdepth_cli.models.weights.tensor_pickle import is_module, module_state, read_tensor_file
+from pnpdepth_cli.models.weights.torch_file import is_module, module_state, read_tensor_file
 
 LAYOUTS = [True, False]
 
