@@ -10,9 +10,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from pnpdepth_cli.choices import LENSES
-from pnpdepth_cli.sensors import lens as lenses
-from pnpdepth_cli.sensors.camera import Camera
-from pnpdepth_cli.sensors.lens import distort, largest_radius, undistort
+from pnpdepth_cli.sensors.camera import LENS_MODELS, Camera, distort, largest_radius, undistort
 
 K = np.array([[420.0, 0, 320], [0, 410, 240], [0, 0, 1]])
 small = st.floats(-0.05, 0.05)
@@ -34,7 +32,7 @@ def directions(seed: int, widest: float = 0.9) -> NDArray[np.float64]:
 
 
 def test_every_lens_of_the_list_is_implemented() -> None:
-    assert tuple(lenses._LENSES) == LENSES == tuple(EXAMPLES)
+    assert tuple(LENS_MODELS) == LENSES == tuple(EXAMPLES)
 
 
 @settings(max_examples=60)

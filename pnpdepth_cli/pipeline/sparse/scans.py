@@ -19,9 +19,9 @@ from pnpdepth_cli.pipeline.sparse.scan_options import ScanOptions
 from pnpdepth_cli.points import in_frame
 from pnpdepth_cli.sensors import (
     Camera,
-    OcclusionFilter,
     ProjectedScan,
     ProjectionSettings,
+    describe_dropped,
     project_velodyne,
 )
 
@@ -102,14 +102,14 @@ def read_scan_points(
         euclidean=options.euclidean,
         min_range=options.min_range,
         max_range=np.inf if options.max_range is None else options.max_range,
-        occlusion=None if options.keep_occluded else OcclusionFilter(),
+        keep_occluded=options.keep_occluded,
     )
     camera = camera_of(calibration)
     if not calibration.source.startswith(_ONE_DIRECTION):
         warnings += check_direction(scan.points, camera, size)
     points = project_velodyne(scan.points, camera, size, settings)
     source = f"{scan.source} of {len(scan.points):,} points, {calibration.source}"
-    lost = ", ".join(f"{count:,} {why}" for why, count in points.dropped.items() if count)
+    lost = describe_dropped(points.dropped)
     notes = [f"sparse: {describe_range(points.depth, source)}"]
     notes += [f"sparse: dropped {lost}"] if lost else []
     return ScanPoints(
