@@ -232,7 +232,7 @@ def _thin_prism_fisheye(plane: Floats, coefficients: Coefficients) -> Floats:
     radial = _fisheye(plane, (k1, k2, k3, k4))
     angles = _fisheye(plane, ())
     prism = _square(angles)[:, None] * np.array([sx1, sy1])
-    return radial + _tangential(angles, (p2, p1)) + prism
+    return np.asarray(radial + _tangential(angles, (p2, p1)) + prism)
 
 
 @_lens("rad-tan-thin-prism-fisheye", by_angle=True, radial=(0, 1, 2, 3, 4, 5))
@@ -247,7 +247,8 @@ def _rad_tan_thin_prism_fisheye(plane: Floats, coefficients: Coefficients) -> Fl
 
 
 def _tangential(plane: Floats, p: tuple[float, ...]) -> Floats:
-    return 2 * (plane @ np.array(p))[:, None] * plane + _square(plane)[:, None] * np.array(p)
+    along, square = plane @ np.array(p), _square(plane)
+    return np.asarray(2 * along[:, None] * plane + square[:, None] * np.array(p))
 
 
 @_lens("division", by_angle=False)

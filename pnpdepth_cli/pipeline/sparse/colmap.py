@@ -14,7 +14,7 @@ from pnpdepth_cli.io.colmap.model import find_model, model_files, name_in_model,
 from pnpdepth_cli.io.colmap.parts import ColmapCamera, ColmapImage, ColmapModel
 from pnpdepth_cli.io.depth import describe_range
 from pnpdepth_cli.io.fingerprint import fingerprint
-from pnpdepth_cli.pipeline.sparse.colmap_options import METRES, MODEL_UNITS, ColmapOptions
+from pnpdepth_cli.pipeline.sparse.options import METRES, MODEL_UNITS, ColmapOptions
 from pnpdepth_cli.sensors import Camera, Points
 from pnpdepth_cli.sensors.sparse import DropCounter, describe_dropped
 

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from pnpdepth_cli.errors import InputError, OutputError
 from pnpdepth_cli.io.atomic import atomic_path, make_folder
@@ -22,13 +23,20 @@ from pnpdepth_cli.io.bags.calibration import (
 )
 from pnpdepth_cli.io.bags.messages import cloud_points, image_file, seconds_of
 from pnpdepth_cli.io.bags.pairing import Stamped, nearest_pairs
+from pnpdepth_cli.io.bags.poses import camera_trajectory, poses_topics
 from pnpdepth_cli.io.calibration import Calibration
 from pnpdepth_cli.io.record import plain, read_json, write_json
-from pnpdepth_cli.pipeline.sparse.bag_options import BagOptions
-from pnpdepth_cli.pipeline.sparse.frame_poses import POSES, write_poses
+from pnpdepth_cli.io.trajectory import Trajectory
+from pnpdepth_cli.pipeline.sparse.options import BagOptions
+
+POSES = "poses.txt"
+"""Rows as of the TUM RGB-D benchmark, one for each frame in the order of their names."""
 
 RECORD = "frames.json"
 _FOLDERS = ("rgb", "sparse")
+
+_LONGEST_GAP_S = 0.5
+"""Between two poses that one is interpolated from."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,7 +93,7 @@ def write_frames(request: FramesRequest, say: Callable[[str], None]) -> dict[str
             if len(times) == request.limit:
                 break
         if camera is not None:
-            poses = write_poses(request.output, bag, options.poses_topic, camera, times, say)
+            poses = _write_poses(request.output, bag, options.poses_topic, camera, times, say)
     if lost:
         say(f"warning: {lost:,} images have no scan within {options.tolerance:g} s")
     if not times:
@@ -217,3 +225,55 @@ def _calibration_text(calibration: Calibration) -> str:
         fields["size"] = [calibration.size[1], calibration.size[0]]
     lines = [f"{name}: {json.dumps(value)}\n" for name, value in fields.items()]
     return "".join([*lines, f"lens: {calibration.lens}\n"])
+
+
+def _write_poses(
+    folder: Path,
+    bag: Bag,
+    wanted: str | None,
+    camera: str,
+    times: Sequence[float],
+    say: Callable[[str], None],
+) -> str | None:
+    """Writes poses.txt if the bag has a pose for every frame; returns the topic, None without one.
+
+    Args:
+        folder: Of the frames.
+        bag: An open bag.
+        wanted: The topic of the poses. None: the only one.
+        camera: Name of the camera's frame.
+        times: Of the frames, seconds.
+        say: Receives what is used, or why there are no poses.
+
+    Raises:
+        UsageError: The topic is not there.
+    """
+    topics = poses_topics(bag, wanted)
+    if len(topics) != 1:
+        if topics:
+            say(f"poses: none, as several topics give some; --poses-topic {' | '.join(topics)}")
+        return None
+    (topic,) = topics
+    trajectory = camera_trajectory(bag, topic, camera)
+    if trajectory is None:
+        say(f"warning: no transforms tie the camera's frame {camera} to the poses of {topic}")
+        return None
+    rows = [row for time_s in times if (row := _row(trajectory, time_s)) is not None]
+    if len(rows) < len(times):
+        say(
+            f"warning: {len(times) - len(rows):,} of {len(times):,} images have no pose in {topic}"
+            f" within {_LONGEST_GAP_S:g} s, so poses.txt is not written"
+        )
+        return None
+    with atomic_path(folder / POSES) as temporary:
+        temporary.write_text("".join(rows))
+    say(f"poses: of {topic}")
+    return topic
+
+
+def _row(trajectory: Trajectory, time_s: float) -> str | None:
+    pose = trajectory.at(time_s, _LONGEST_GAP_S)
+    if pose is None:
+        return None
+    quaternion = Rotation.from_matrix(pose[:, :3]).as_quat()
+    return " ".join(map(str, [f"{time_s:.6f}", *pose[:, 3], *quaternion])) + "\n"

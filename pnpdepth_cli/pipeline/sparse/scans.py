@@ -15,7 +15,7 @@ from pnpdepth_cli.io.depth import describe_range
 from pnpdepth_cli.io.extrinsics import inverse, read_extrinsics
 from pnpdepth_cli.io.record import sha256_of
 from pnpdepth_cli.io.scans import read_scan
-from pnpdepth_cli.pipeline.sparse.scan_options import ScanOptions
+from pnpdepth_cli.pipeline.sparse.options import ScanOptions
 from pnpdepth_cli.points import in_frame
 from pnpdepth_cli.sensors import (
     Camera,

@@ -15,7 +15,7 @@ from pnpdepth_cli.errors import InputError, NoPointsError, SizeError, UsageError
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.io.layouts import list_frames
 from pnpdepth_cli.pipeline.sparse.colmap import read_colmap_points
-from pnpdepth_cli.pipeline.sparse.colmap_options import ColmapOptions
+from pnpdepth_cli.pipeline.sparse.options import ColmapOptions
 from tests.colmap_models import HEIGHT, WIDTH, write_text_model
 from tests.pipeline.frames import FrameOnDisk, frame_on_disk, run
 
