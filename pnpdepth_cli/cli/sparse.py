@@ -221,10 +221,17 @@ def simulate(as_json: bool, **values: Any) -> None:
 @click.argument("bag", type=options.FILE)
 @click.option("-o", "--output", type=options.FILE, required=True, help="Output folder.")
 @options.options_of_groups(BagOptions)
+@click.option(
+    "--calib",
+    type=options.FILE,
+    metavar="FILE|FOLDER",
+    help="Calibration of the camera, instead of camera_info.",
+)
+@options.camera
 @click.option("--limit", type=click.IntRange(1), metavar="N", help="Only the first N frames.")
 @options.overwrite
 @options.as_json
-def frames(bag: Path, output: Path, limit: int | None, as_json: bool, **values: Any) -> None:
+def frames(bag: Path, output: Path, as_json: bool, **values: Any) -> None:
     """Write the images of a BAG and the scans nearest in time as files.
 
     \b
@@ -238,9 +245,7 @@ def frames(bag: Path, output: Path, limit: int | None, as_json: bool, **values: 
     from pnpdepth_cli.pipeline.sparse.frames import FramesRequest, write_frames
 
     bag_options = BagOptions(**options.taken(BagOptions, values))
-    request = FramesRequest(
-        bag=bag, output=output, options=bag_options, limit=limit, overwrite=values["overwrite"]
-    )
+    request = FramesRequest(bag=bag, output=output, options=bag_options, **values)
     record = write_frames(request, lambda text: click.echo(printable(text), err=True))
     if as_json:
         click.echo(json.dumps(record, indent=2))

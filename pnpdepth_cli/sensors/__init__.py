@@ -14,6 +14,7 @@ from pnpdepth_cli.sensors.lidar import FORWARD_LEFT_UP, LIDARS, Lidar
 from pnpdepth_cli.sensors.projection import (
     ProjectedScan,
     ProjectionSettings,
+    edge_agreement,
     occluded_in_map,
     project_velodyne,
 )
@@ -43,6 +44,7 @@ __all__ = [
     "accumulated",
     "as_depth_image",
     "describe_dropped",
+    "edge_agreement",
     "occluded_in_map",
     "project_velodyne",
     "sample_points",

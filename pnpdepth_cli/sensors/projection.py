@@ -21,7 +21,14 @@ from numpy.typing import NDArray
 from pnpdepth_cli.errors import NoPointsError, UsageError
 from pnpdepth_cli.scan_pattern import scan_pattern
 from pnpdepth_cli.sensors.camera import Camera
-from pnpdepth_cli.sensors.sparse import DropCounter, Floats, Mask, Points, as_depth_image
+from pnpdepth_cli.sensors.sparse import (
+    DropCounter,
+    Floats,
+    Mask,
+    Points,
+    as_depth_image,
+    pixel_index,
+)
 
 Indices = NDArray[np.intp]
 
@@ -34,6 +41,10 @@ between scan lines, as foreground is measured only on them."""
 
 _STRETCH = 1.5  # multiple of half the parallax that is added to the margin
 _REACH_DEG = 0.8  # to each side, in which foreground is searched
+
+_JUMP = 1.3  # ratio of depths across an edge,
+_JUMP_NEIGHBOURS = 6  # looked for among so many nearest points,
+_BESIDE_PX = 3  # and compared with the image's gradient in a square of this side
 
 MIN_POINTS = 1000
 """Maps with fewer points are not filtered: each point matters."""
@@ -118,6 +129,30 @@ def project_velodyne(
         size=size,
         dropped=drops.dropped,
     )
+
+
+def edge_agreement(points: Points, rgb: NDArray[np.float32]) -> float:
+    """Returns how much stronger the image's edges are at jumps of depth than elsewhere, −1 to 1.
+
+    That is the mean rank of the gradient beside the points at the near side of a jump, less that
+    at all points. It tells calibrations of the same scan apart. 0 for points without a jump.
+
+    Args:
+        points: A projected scan.
+        rgb: (H, W, 3) in 0..1, of the same size.
+    """
+    from scipy.spatial import cKDTree
+
+    if len(points) <= _JUMP_NEIGHBOURS:
+        return 0.0
+    grey = cv2.GaussianBlur(rgb.mean(axis=2), (0, 0), 1.0)
+    gradient = np.hypot(cv2.Sobel(grey, cv2.CV_32F, 1, 0), cv2.Sobel(grey, cv2.CV_32F, 0, 1))
+    beside = cv2.dilate(gradient, np.ones((_BESIDE_PX, _BESIDE_PX), np.uint8)).ravel()
+    at_points = beside[pixel_index(points.xy, points.size)]
+    rank = np.searchsorted(np.sort(beside), at_points) / beside.size
+    _, near = cKDTree(points.xy).query(points.xy, k=_JUMP_NEIGHBOURS)
+    jumps = points.depth[near].max(axis=1) > _JUMP * points.depth
+    return float(rank[jumps].mean() - rank.mean()) if jumps.any() else 0.0
 
 
 def hidden_points(

@@ -34,6 +34,12 @@ _THIN = 0.5
 _NEXT_TO_NONE = 0.05
 """Fraction of them; fewer points with the extrinsics themselves are an error."""
 
+_AHEAD_DEG = 15.0
+"""Largest angle to the camera's axis of points that are expected in the image,"""
+
+_MOST_OUTSIDE = 1 / 3
+"""of which a larger fraction outside gives a warning."""
+
 _OFF_CENTRE = 0.15
 """Fraction of the image's side by which a principal point may be off centre without warning."""
 
@@ -108,6 +114,7 @@ def read_scan_points(
     if not calibration.source.startswith(_ONE_DIRECTION):
         warnings += check_direction(scan.points, camera, size)
     points = project_velodyne(scan.points, camera, size, settings)
+    warnings += check_field_of_view(scan.points, camera, size)
     source = f"{scan.source} of {len(scan.points):,} points, {calibration.source}"
     lost = describe_dropped(points.dropped)
     notes = [f"sparse: {describe_range(points.depth, source)}"]
@@ -176,6 +183,29 @@ def check_direction(scan: NDArray[np.floating], camera: Camera, size: tuple[int,
     if inside < _NEXT_TO_NONE * inverted:
         raise UsageError(text)
     return [f"warning: {text}"]
+
+
+def check_field_of_view(
+    scan: NDArray[np.floating], camera: Camera, size: tuple[int, int]
+) -> list[str]:
+    """Returns a warning if many points straight ahead of the camera are outside the image.
+
+    Args:
+        scan: (N, 3) metres in the scanner's frame.
+        camera: With the pose.
+        size: (H, W) of the image.
+    """
+    seen = camera.from_scanner(scan)
+    off_axis = np.hypot(seen[:, 0], seen[:, 1])
+    ahead = seen[off_axis < np.tan(np.radians(_AHEAD_DEG)) * seen[:, 2]]
+    outside = len(ahead) - int(np.count_nonzero(in_frame(camera.pixels_of(ahead), size)))
+    if outside <= _MOST_OUTSIDE * len(ahead):
+        return []
+    return [
+        f"warning: {outside:,} of the {len(ahead):,} scan points within {_AHEAD_DEG:g}° of the"
+        " camera's axis fall outside the image; check that the intrinsics belong to this image,"
+        " such as those of a rectified one"
+    ]
 
 
 def _is_upright(scan: NDArray[np.floating], camera: Camera) -> bool | None:
