@@ -79,3 +79,35 @@ def test_a_fisheye_that_turns_back_shows_nothing_beyond() -> None:
     beyond = distort(np.array([[4.0, 0.0], [1.0, 0.0]]), "fisheye", turns_back)
     assert np.isnan(beyond[0]).all()
     assert np.isfinite(beyond[1]).all()
+
+
+def test_undoing_a_lens_iterates_where_its_radial_part_is_a_poor_start() -> None:
+    decentred = (-0.15, 0.03, 0.04, -0.03)
+    plane = directions(1, 0.6)
+    shown = distort(plane, "radial-tangential", decentred)
+    radial_only = undistort(shown, "radial-tangential", (*decentred[:2], 0.0, 0.0))
+    assert np.abs(radial_only - plane).max() > 0.05
+    found = undistort(shown, "radial-tangential", decentred)
+    np.testing.assert_allclose(found, plane, atol=1e-12)
+
+
+def test_undoing_a_lens_converges_as_newtons_method(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pnpdepth_cli.sensors.camera._NEWTON_STEPS", 5)
+    decentred, plane = (-0.15, 0.03, 0.04, -0.03), directions(1, 0.6)
+    shown = distort(plane, "radial-tangential", decentred)
+    found = undistort(shown, "radial-tangential", decentred)
+    np.testing.assert_allclose(found, plane, atol=1e-10)
+
+
+def test_a_point_that_the_lens_shows_nothing_at_has_no_direction() -> None:
+    barrel = (-0.4, 0.0, 0.0, 0.0)  # r − 0.4 r³ has its maximum of 0.61 at 0.91
+    plane = undistort(np.array([[0.7, 0.0], [0.5, 0.3]]), "radial-tangential", barrel)
+    assert np.isnan(plane[0]).all()
+    np.testing.assert_allclose(distort(plane[1:], "radial-tangential", barrel), [[0.5, 0.3]])
+
+
+@pytest.mark.parametrize("lens", LENSES)
+def test_no_points_are_shown_and_undone_as_none(lens: str) -> None:
+    nothing = np.zeros((0, 2))
+    assert distort(nothing, lens, EXAMPLES[lens]).shape == (0, 2)
+    assert undistort(nothing, lens, EXAMPLES[lens]).shape == (0, 2)
