@@ -25,7 +25,6 @@ class ResultFrame:
     name: str
     """Path below the folder of the results, without the ending."""
     depth: Path
-    """The depth file."""
     sigma: Path | None = None
     """Standard deviation of the depth."""
     valid: Path | None = None

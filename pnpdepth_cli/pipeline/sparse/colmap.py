@@ -30,22 +30,16 @@ class ColmapPointsOfImage:
 
     points: Points
     """In the frame of the image, depth in `unit`."""
-
     camera: Camera
     """In pixels of the image."""
-
     pose: NDArray[np.float64]
     """(3, 4) from the camera's frame to the model's, in `unit`."""
-
     unit: str
     """METRES or MODEL_UNITS."""
-
     scale: float | None
     """Codes per unit of a 16-bit output in model units; None for metres."""
-
     record: dict[str, Any]
     """What a record keeps of it."""
-
     notes: tuple[str, ...]
     """Lines for a person."""
 

@@ -43,7 +43,6 @@ _MOST_OUTSIDE = 1 / 3
 _OFF_CENTRE = 0.15
 """Fraction of the image's side by which a principal point may be off centre without warning."""
 
-
 _ONE_DIRECTION = ("KITTI", "nuScenes", "DDAD")
 """Sources of calibrations whose files give the pose in one direction."""
 
@@ -53,14 +52,10 @@ class ScanPoints:
     """A projected scan."""
 
     points: ProjectedScan
-    """The points that the camera sees."""
-
     camera: Camera
-    """The camera, with the pose of the scanner."""
-
+    """With the pose of the scanner."""
     record: dict[str, Any]
     """What a record keeps of it."""
-
     notes: tuple[str, ...]
     """Lines for a person."""
 
