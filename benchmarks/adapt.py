@@ -24,8 +24,8 @@ from benchmarks.frames import (
 )
 from pnpdepth_cli.completion.interpolation import linear
 from pnpdepth_cli.io.depth import write_depth
-from pnpdepth_cli.pipeline.adaptation.adapt import Progress, adapt
-from pnpdepth_cli.pipeline.adaptation.request import AdaptRequest
+from pnpdepth_cli.pipeline.adapt import Progress, adapt
+from pnpdepth_cli.pipeline.adapt_request import AdaptRequest
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs
 from pnpdepth_cli.pipeline.refinement.load_refiner import load_refiner
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest

@@ -35,15 +35,14 @@ from pnpdepth_cli.sensors import (
     FORWARD_LEFT_UP,
     LIDARS,
     Camera,
-    OcclusionFilter,
     ProjectionSettings,
     project_velodyne,
     simulate_lidar,
 )
-from pnpdepth_cli.sensors.occlusion import hidden_points
+from pnpdepth_cli.sensors.projection import hidden_points
 
 STREET = Path(__file__).parent.parent / "samples" / "street"
-KEEP_ALL = ProjectionSettings(occlusion=None)
+KEEP_ALL = ProjectionSettings(keep_occluded=True)
 
 # Wang et al. 2019, table on LiDAR types: per cent of the pixels of a SYNTHIA frame.
 PAPER_PERCENT = {"vlp-16": 5.3, "vlp-32c": 28.8, "hdl-32e": 10.3, "hdl-64e": 18.7}
@@ -101,7 +100,6 @@ def kitti(data: Path) -> None:
                 (raw.shape[0], raw.shape[1]),
                 focal_px=float(calibration.intrinsics[0, 0]),
                 scanner=calibration.intrinsics @ calibration.translation,
-                settings=OcclusionFilter(),
             )
         )
     joined = [np.concatenate(x) for x in (hidden, depth, gt)]

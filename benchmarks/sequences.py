@@ -36,8 +36,8 @@ from pnpdepth_cli.pipeline.refinement.request import RefineRequest
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.scan_pattern import scan_lines
 from pnpdepth_cli.sensors import Points
+from pnpdepth_cli.sensors.accumulation import registered, surface_of
 from pnpdepth_cli.sensors.motion import motion_of_scans
-from pnpdepth_cli.sensors.registration import registered, surface_of
 
 DRIVE = Path("kitti_raw/2011_09_26/2011_09_26_drive_0023_sync")
 HELD_OUT = 0.2

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,21 @@ HEIGHT, WIDTH, FOCAL_PX = 48, 64, 60.0
 IMAGES, POINTS = "/front/image_raw", "/lidar/points"
 
 
+@dataclass(frozen=True, kw_only=True)
+class View:
+    """What camera and LiDAR see, the same in every frame, and the camera's camera_info."""
+
+    pixels: np.ndarray
+    """(H, W, 3) uint8."""
+    points: np.ndarray
+    """(N, 3) metres in the LiDAR's frame."""
+    k: np.ndarray
+    d: np.ndarray
+    r: np.ndarray
+    p: np.ndarray
+    topic: str = IMAGES
+
+
 def write_bag(
     path: Path,
     *,
@@ -24,12 +40,14 @@ def write_bag(
     info: bool = True,
     poses: str = "",
     compression: Any = None,
+    view: View | None = None,
 ) -> Path:
     """A bag of ROS 1 (.bag), ROS 2 with MCAP (.mcap) or SQLite (a folder), by the path's suffix.
 
     Images have 30 ms between them, and each a scan 4 ms later; the scans are of a wall 5 m ahead.
     With `poses`, base moves 0.3 m along x from one image to the next: "odometry" or "tf", or the
-    camera does: "pose". `compression` is rosbags' of the chunks.
+    camera does: "pose". `compression` is rosbags' of the chunks. `view` replaces image, scan and
+    camera_info.
     """
     ros1 = path.suffix == ".bag"
     store = message_types(ros1=ros1)
@@ -38,7 +56,7 @@ def write_bag(
         opened.set_compression(compression)
     with opened as writer:
         connections: dict[str, Any] = {}
-        messages = _messages(store.types, ros1, frames, compressed, static, info, poses)
+        messages = _messages(store.types, ros1, frames, compressed, static, info, poses, view)
         for topic, time_ns, message in messages:
             kind = message.__msgtype__
             if topic not in connections:
@@ -65,7 +83,14 @@ def _writer(path: Path) -> Any:
 
 
 def _messages(
-    types: Any, ros1: bool, frames: int, compressed: bool, static: bool, info: bool, poses: str
+    types: Any,
+    ros1: bool,
+    frames: int,
+    compressed: bool,
+    static: bool,
+    info: bool,
+    poses: str,
+    view: View | None,
 ) -> Iterator[tuple[str, int, Any]]:
     def header(time_ns: int, frame: str) -> Any:
         stamp = types["builtin_interfaces/msg/Time"](sec=time_ns // 10**9, nanosec=time_ns % 10**9)
@@ -81,14 +106,16 @@ def _messages(
             yield (
                 "/front/camera_info",
                 time_ns,
-                _camera_info(types, header(time_ns, "camera"), ros1),
+                _camera_info(types, header(time_ns, "camera"), ros1, view),
             )
         if poses:
             yield _moved(types, header(time_ns - 15_000_000, "odom"), 0.3 * number - 0.15, poses)
         pixels = np.full((HEIGHT, WIDTH, 3), 40 + number % 200, np.uint8)
         pixels[:, : WIDTH // 2, 0] = 200
-        yield _image(types, header(time_ns, "camera"), pixels, time_ns, compressed)
-        cloud = _cloud(types, header(time_ns + 4_000_000, "lidar"))
+        pixels = pixels if view is None else view.pixels
+        topic = IMAGES if view is None else view.topic
+        yield _image(types, header(time_ns, "camera"), pixels, time_ns, topic, compressed)
+        cloud = _cloud(types, header(time_ns + 4_000_000, "lidar"), view)
         yield POINTS, time_ns + 5_000_000, cloud
     if poses:
         last = start + 30_000_000 * frames - 15_000_000
@@ -145,7 +172,7 @@ def _transforms(types: Any, header: Any) -> Any:
     return types["tf2_msgs/msg/TFMessage"](transforms=[camera, lidar])
 
 
-def _camera_info(types: Any, header: Any, ros1: bool) -> Any:
+def _camera_info(types: Any, header: Any, ros1: bool, view: View | None) -> Any:
     matrix = [FOCAL_PX, 0, 31.5, 0, FOCAL_PX, 23.5, 0, 0, 1.0]
     values = {
         "d": np.zeros(5),
@@ -153,10 +180,13 @@ def _camera_info(types: Any, header: Any, ros1: bool) -> Any:
         "r": np.eye(3).ravel(),
         "p": np.zeros(12),
     }
+    if view is not None:
+        values = {name: getattr(view, name).ravel().astype(float) for name in "dkrp"}
+    height, width = (HEIGHT, WIDTH) if view is None else view.pixels.shape[:2]
     return types["sensor_msgs/msg/CameraInfo"](
         header=header,
-        height=HEIGHT,
-        width=WIDTH,
+        height=height,
+        width=width,
         distortion_model="plumb_bob",
         binning_x=0,
         binning_y=0,
@@ -168,27 +198,28 @@ def _camera_info(types: Any, header: Any, ros1: bool) -> Any:
 
 
 def _image(
-    types: Any, header: Any, pixels: np.ndarray, time_ns: int, compressed: bool
+    types: Any, header: Any, pixels: np.ndarray, time_ns: int, topic: str, compressed: bool
 ) -> tuple[str, int, Any]:
     if compressed:
         data = cv2.imencode(".jpg", pixels[:, :, ::-1])[1].ravel()
         message = types["sensor_msgs/msg/CompressedImage"](header=header, format="jpeg", data=data)
-        return f"{IMAGES}/compressed", time_ns, message
-    padded = np.zeros((HEIGHT, WIDTH * 3 + 8), np.uint8)  # rows may be longer than their pixels
-    padded[:, : WIDTH * 3] = pixels.reshape(HEIGHT, -1)
+        return f"{topic}/compressed", time_ns, message
+    height, width = pixels.shape[:2]
+    padded = np.zeros((height, width * 3 + 8), np.uint8)  # rows may be longer than their pixels
+    padded[:, : width * 3] = pixels.reshape(height, -1)
     message = types["sensor_msgs/msg/Image"](
         header=header,
-        height=HEIGHT,
-        width=WIDTH,
+        height=height,
+        width=width,
         encoding="rgb8",
         is_bigendian=0,
         step=padded.shape[1],
         data=padded.ravel(),
     )
-    return IMAGES, time_ns, message
+    return topic, time_ns, message
 
 
-def _cloud(types: Any, header: Any) -> Any:
+def _cloud(types: Any, header: Any, view: View | None) -> Any:
     """Fields that are not x y z, and not in this order; one point without return."""
     layout = np.dtype(
         {
@@ -202,6 +233,9 @@ def _cloud(types: Any, header: Any) -> Any:
     points = np.zeros(151, layout)
     points["x"], points["y"][:150], points["z"][:150] = 5.0, y.ravel(), z.ravel()
     points["x"][150] = np.nan
+    if view is not None:
+        points = np.zeros(len(view.points), layout)
+        points["x"], points["y"], points["z"] = view.points.T
     kinds = {"ring": 4, "z": 7, "y": 7, "x": 8}
     fields = [
         types["sensor_msgs/msg/PointField"](

@@ -22,7 +22,7 @@ from pnpdepth_cli.pipeline.batch.request import BatchRequest
 from pnpdepth_cli.pipeline.batch.sequence_options import SequenceOptions
 from pnpdepth_cli.pipeline.cluster.options import ClusterOptions
 from pnpdepth_cli.pipeline.refinement.request import parse_sample
-from pnpdepth_cli.pipeline.sparse.bag_options import BagOptions
+from pnpdepth_cli.pipeline.sparse.options import BagOptions
 
 _STOPPING = b"\nfinishing the current frame; press Ctrl-C again to stop at once\n"
 

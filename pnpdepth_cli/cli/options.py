@@ -21,11 +21,10 @@ from pnpdepth_cli.pipeline.refinement.request import (
     OutputOptions,
     RefineRequest,
 )
-from pnpdepth_cli.pipeline.sparse.colmap_options import ColmapOptions
-from pnpdepth_cli.pipeline.sparse.scan_options import ScanOptions
+from pnpdepth_cli.pipeline.sparse.options import ColmapOptions, ScanOptions
 
 if TYPE_CHECKING:
-    from pnpdepth_cli.pipeline.sparse.outputs import SparseTarget
+    from pnpdepth_cli.pipeline.sparse.make import SparseTarget
 
 FILE = click.Path(path_type=Path)
 SEED = click.IntRange(0, LARGEST_SEED)
@@ -238,7 +237,7 @@ def request_of(values: dict[str, Any], **others: Any) -> RefineRequest:
 
 def sparse_target(values: dict[str, Any]) -> SparseTarget:
     """Returns where sparse depth is written; its options are removed from `values`."""
-    from pnpdepth_cli.pipeline.sparse.outputs import SparseTarget
+    from pnpdepth_cli.pipeline.sparse.make import SparseTarget
 
     return SparseTarget(
         output=values.pop("output"),

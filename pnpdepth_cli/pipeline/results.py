@@ -12,7 +12,7 @@ from pnpdepth_cli.io.dataset.find_files import find_files
 from pnpdepth_cli.io.depth import DEPTH_SUFFIXES
 from pnpdepth_cli.io.record import read_json
 from pnpdepth_cli.pipeline.refinement.frame_camera import FrameCamera
-from pnpdepth_cli.pipeline.sparse.colmap_options import METRES
+from pnpdepth_cli.pipeline.sparse.options import METRES
 
 DEPTH_ENDING = "_depth"
 """End of the stem of a depth file."""
@@ -25,7 +25,6 @@ class ResultFrame:
     name: str
     """Path below the folder of the results, without the ending."""
     depth: Path
-    """The depth file."""
     sigma: Path | None = None
     """Standard deviation of the depth."""
     valid: Path | None = None

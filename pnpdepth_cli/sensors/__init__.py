@@ -3,7 +3,7 @@
     from pnpdepth_cli.sensors import LIDARS, Camera, project_velodyne, sample_points, simulate_lidar
 
 All return `SparsePoints` of numpy arrays: N depths in metres at pixel coordinates of one image,
-x right, y down, whole numbers at pixel centres. numpy only; nothing here reads a file.
+x right, y down, whole numbers at pixel centres. Nothing here reads a file.
 """
 
 from __future__ import annotations
@@ -11,8 +11,13 @@ from __future__ import annotations
 from pnpdepth_cli.sensors.accumulation import NeighbourScan, accumulated
 from pnpdepth_cli.sensors.camera import Camera
 from pnpdepth_cli.sensors.lidar import FORWARD_LEFT_UP, LIDARS, Lidar
-from pnpdepth_cli.sensors.occlusion import OcclusionFilter
-from pnpdepth_cli.sensors.projected_map import occluded_in_map
+from pnpdepth_cli.sensors.projection import (
+    ProjectedScan,
+    ProjectionSettings,
+    edge_agreement,
+    occluded_in_map,
+    project_velodyne,
+)
 from pnpdepth_cli.sensors.samplers import (
     PATTERNS,
     SampleNoise,
@@ -21,8 +26,7 @@ from pnpdepth_cli.sensors.samplers import (
     with_noise,
 )
 from pnpdepth_cli.sensors.simulate import SimulationSettings, simulate_lidar
-from pnpdepth_cli.sensors.sparse import Points, as_depth_image
-from pnpdepth_cli.sensors.velodyne import ProjectedScan, ProjectionSettings, project_velodyne
+from pnpdepth_cli.sensors.sparse import Points, as_depth_image, describe_dropped
 
 __all__ = [
     "FORWARD_LEFT_UP",
@@ -31,7 +35,6 @@ __all__ = [
     "Camera",
     "Lidar",
     "NeighbourScan",
-    "OcclusionFilter",
     "Points",
     "ProjectedScan",
     "ProjectionSettings",
@@ -40,6 +43,8 @@ __all__ = [
     "SimulationSettings",
     "accumulated",
     "as_depth_image",
+    "describe_dropped",
+    "edge_agreement",
     "occluded_in_map",
     "project_velodyne",
     "sample_points",

@@ -1,5 +1,10 @@
 """Points of neighbouring scans, moved into a frame by the camera's motion.
 
+The motion is corrected until the surfaces of both scans coincide, by point-to-plane registration
+(Chen and Medioni, "Object modelling by registration of multiple range images", 1992) with the
+weights of Geman and McClure. Distances are fractions of the depth, as errors of the sensor and of
+the pose are.
+
 A moved point is kept where the measured point of the frame nearest to it, or two of the nearest
 four, have about the same depth, and where no measured point close by contradicts it. So a point of
 something that has moved since is dropped, and one that is occluded in the frame or that the frame's
@@ -11,27 +16,37 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli.points import in_frame
 from pnpdepth_cli.sensors.camera import Camera
-from pnpdepth_cli.sensors.registration import Surface, registered, surface_of
-from pnpdepth_cli.sensors.sparse import DropCounter, Mask, Points
+from pnpdepth_cli.sensors.sparse import DropCounter, Floats, Mask, Points
 
-Floats = NDArray[np.float64]
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
 
-TOLERANCE = 0.05
+_TOLERANCE = 0.05
 """Difference of log depth to a measured point; chosen on frames 2 and 4 of a KITTI drive."""
-CONTRADICTION = 0.1
-"""Difference of log depth that contradicts; chosen, as `CLOSE`, on frames 0, 2, 4, 6 of it."""
-CLOSE = (0.55, 0.37)
+_CONTRADICTION = 0.1
+"""Difference of log depth that contradicts; chosen, as `_CLOSE`, on frames 0, 2, 4, 6 of it."""
+_CLOSE = (0.55, 0.37)
 """Mean spacings of the measured points, across and down, within which one contradicts. Down is
 less, as the next scan line of a LiDAR lies at another depth."""
 
 _COMPARED, _AGREEING = 4, 2  # measured points beside a moved one, of which so many agree
 _CONTRADICTING = 12  # nearest measured points, of which none contradicts
+
+_MIN_PLANES = 200  # pairs of a point and a plane; with fewer the motion is not corrected
+_STEPS = 8
+_NEIGHBOURS = 8  # points that a plane is fitted to,
+_NEAR = 0.1  # whose depth differs by this fraction at most,
+_FLAT = 0.02  # and whose smallest variance is below this fraction of the next
+_REACH = 1.2  # mean spacings of the points, between a point and the one it is compared with
+_LEAST_ERROR = 2e-4  # typical distance, fraction of the depth
+_NORMAL_MEDIAN = 1.4826  # standard deviation over median of |x|, normal errors
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,6 +61,27 @@ class NeighbourScan:
     """Frames between the two, at least 1."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class Surface:
+    """Points of a scan with the planes through their neighbours."""
+
+    points: Points
+    xyz: Floats
+    """(N, 3) metres in the camera's frame."""
+    normal: Floats
+    """(N, 3) unit normals."""
+    flat: Mask
+    """(N,) true where the neighbours lie on a plane."""
+    tree: cKDTree
+    """Of the pixel coordinates."""
+
+    @property
+    def spacing_px(self) -> float:
+        """Side of the square that each point has in the mean, in pixels."""
+        height, width = self.points.size
+        return float(np.sqrt(height * width / len(self.points)))
+
+
 def accumulated(points: Points, neighbours: Sequence[NeighbourScan], camera: Camera) -> Points:
     """Returns the frame's own points followed by those of its neighbours that agree with them.
 
@@ -55,12 +91,12 @@ def accumulated(points: Points, neighbours: Sequence[NeighbourScan], camera: Cam
         camera: Its intrinsics and distortion.
     """
     surface, result = surface_of(points, camera), points
-    for apart in sorted({each.apart for each in neighbours}):
+    for apart in sorted({scan.apart for scan in neighbours}):
         moved = []
-        for each in neighbours:
-            if each.apart == apart:
-                xyz = camera.unproject(each.points.xy, each.points.depth)
-                motion = registered(surface, xyz, each.motion, camera)
+        for scan in neighbours:
+            if scan.apart == apart:
+                xyz = camera.unproject(scan.points.xy, scan.points.depth)
+                motion = registered(surface, xyz, scan.motion, camera)
                 moved.append(xyz @ motion[:, :3].T + motion[:, 3])
         result = _added(result, np.concatenate(moved), surface, camera, apart)
     return result
@@ -79,15 +115,12 @@ def _added(known: Points, xyz: Floats, surface: Surface, camera: Camera, apart: 
     xy, depth = xy[agrees], depth[agrees]
     distance, _ = cKDTree(known.xy).query(xy)
     free = drops.keep(distance >= apart, "beside a point nearer in time")
-    dropped = {
-        why: known.dropped.get(why, 0) + drops.dropped.get(why, 0)
-        for why in (*known.dropped, *(why for why in drops.dropped if why not in known.dropped))
-    }
+    counts = {why: known.dropped.get(why, 0) + count for why, count in drops.dropped.items()}
     return Points(
         xy=np.concatenate([known.xy, xy[free].astype(np.float32)]),
         depth=np.concatenate([known.depth, depth[free].astype(np.float32)]),
         size=known.size,
-        dropped=dropped,
+        dropped={**known.dropped, **counts},
     )
 
 
@@ -97,8 +130,65 @@ def _agrees(xy: Floats, depth: Floats, surface: Surface) -> Mask:
     _, near = surface.tree.query(xy, k=min(_CONTRADICTING, len(measured)))
     near = near.reshape(len(xy), -1)
     apart = np.abs(np.log(depth[:, None] / measured.depth[near]))
-    alike = apart[:, :_COMPARED] <= TOLERANCE
+    alike = apart[:, :_COMPARED] <= _TOLERANCE
     offset = np.abs(measured.xy[near] - xy[:, None]) / surface.spacing_px
-    contradicted = ((offset <= CLOSE).all(axis=2) & (apart > CONTRADICTION)).any(axis=1)
+    contradicted = ((offset <= _CLOSE).all(axis=2) & (apart > _CONTRADICTION)).any(axis=1)
     agrees: Mask = (alike[:, 0] | (alike.sum(axis=1) >= _AGREEING)) & ~contradicted
     return agrees
+
+
+def surface_of(points: Points, camera: Camera) -> Surface:
+    """Returns the points with a plane through the neighbours of each."""
+    from scipy.spatial import cKDTree
+
+    tree = cKDTree(points.xy)
+    _, near = tree.query(points.xy, k=min(_NEIGHBOURS, len(points)))
+    near = near.reshape(len(points), -1)
+    xyz = camera.unproject(points.xy, points.depth)
+    around = xyz[near] - xyz[near].mean(axis=1, keepdims=True)
+    variance, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", around, around))
+    jump = np.abs(np.log(points.depth[near] / points.depth[:, None])).max(axis=1)
+    flat = (variance[:, 0] < _FLAT * variance[:, 1]) & (jump < _NEAR)
+    return Surface(points=points, xyz=xyz, normal=axes[:, :, 0], flat=flat, tree=tree)
+
+
+def registered(surface: Surface, xyz: Floats, motion: Floats, camera: Camera) -> Floats:
+    """Returns the motion (3, 4) that puts points on a surface; the given one if that fails.
+
+    Args:
+        surface: Of the frame.
+        xyz: (M, 3) points, metres in the other camera's frame.
+        motion: (3, 4) about from the other camera's frame to this one's.
+        camera: Intrinsics of both.
+    """
+    from scipy.spatial.transform import Rotation
+
+    best, least = motion, np.inf
+    for _ in range(_STEPS + 1):
+        moved, index = _pairs(surface, xyz @ motion[:, :3].T + motion[:, 3], camera)
+        if len(index) < _MIN_PLANES:
+            return best
+        normal, depth = surface.normal[index], surface.xyz[index, 2]
+        distance = np.einsum("ij,ij->i", moved - surface.xyz[index], normal) / depth
+        typical = max(_NORMAL_MEDIAN * float(np.median(np.abs(distance))), _LEAST_ERROR)
+        if typical < least:
+            best, least = motion, typical
+        weight = (1 + (distance / (2 * typical)) ** 2) ** -2
+        slope = np.column_stack([np.cross(moved, normal), normal]) / depth[:, None]
+        weighted = slope * weight[:, None]
+        step = -np.linalg.lstsq(weighted.T @ slope, weighted.T @ distance, rcond=None)[0]
+        motion = Rotation.from_rotvec(step[:3]).as_matrix() @ motion
+        motion[:, 3] += step[3:]
+    return best
+
+
+def _pairs(surface: Surface, moved: Floats, camera: Camera) -> tuple[Floats, NDArray[np.intp]]:
+    """The points in the image with a plane beside them, and the index of that plane."""
+    moved = moved[moved[:, 2] > 0]
+    xy = camera.pixels_of(moved)
+    inside = in_frame(xy, surface.points.size)
+    moved, xy = moved[inside], xy[inside]
+    distance, index = surface.tree.query(xy, distance_upper_bound=_REACH * surface.spacing_px)
+    near = np.isfinite(distance)
+    near[near] &= surface.flat[index[near]]
+    return moved[near], index[near]

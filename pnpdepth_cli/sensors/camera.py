@@ -1,15 +1,33 @@
-"""Camera with lens distortion, and its pose relative to a scanner."""
+"""Camera with lens distortion, and its pose relative to a scanner.
+
+A lens is a name of `choices.LENSES` and its coefficients. It maps the direction of a ray, x / z and
+y / z, to the point on the image plane z = 1 where it is seen, so all lenses here cover less than
+180 degrees. `radial-tangential` and `fisheye` are OpenCV's; all others are as in COLMAP
+(`src/colmap/sensor/models.h`).
+"""
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pnpdepth_cli.sensors.lens import distort, undistort
-
 Floats = NDArray[np.float64]
+Coefficients = tuple[float, ...]
+
+_WIDEST_PLANE = 10.0
+"""Tangent of the largest angle to the axis at which a lens without angles of its own is checked."""
+
+_WIDEST_ANGLE = 1.569
+"""Radians; the same for a lens that is defined by angles."""
+
+_SAMPLES = 8192
+_NEWTON_STEPS = 12
+_NEWTON_STEP = 1e-7
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -21,16 +39,11 @@ class Camera:
 
     intrinsics: Floats
     """(3, 3), last row 0 0 1, in pixels."""
-
     rotation: Floats = field(default_factory=lambda: np.eye(3))
     """(3, 3), from the scanner's frame to the camera's."""
-
     translation: Floats = field(default_factory=lambda: np.zeros(3))
     """(3,) metres, the scanner's origin in the camera's frame."""
-
-    distortion: tuple[float, ...] = ()
-    """Coefficients of the lens, or none."""
-
+    distortion: Coefficients = ()
     lens: str = "radial-tangential"
     """One of `choices.LENSES`: what the coefficients are."""
 
@@ -73,3 +86,180 @@ class Camera:
             plane = undistort(plane, self.lens, self.distortion)
         rays = np.column_stack([plane, np.ones(len(plane))])
         return rays * np.asarray(depth, np.float64)[:, None]
+
+
+def distort(plane: Floats, lens: str, coefficients: Coefficients) -> Floats:
+    """Returns (N, 2) points on the image plane, z = 1, as the lens shows them.
+
+    NaN beyond the angle at which the distortion turns back on itself: there the model would show
+    directions from outside the field of view inside it.
+
+    Args:
+        plane: (N, 2) directions x / z and y / z.
+        lens: One of `choices.LENSES`.
+        coefficients: Of the lens.
+    """
+    with np.errstate(all="ignore"):
+        shown = _shown(plane, lens, coefficients)
+        shown[_square(plane) > largest_radius(lens, coefficients) ** 2] = np.nan
+    return shown
+
+
+def undistort(shown: Floats, lens: str, coefficients: Coefficients) -> Floats:
+    """Returns the (N, 2) directions that the lens shows at points on the image plane.
+
+    Newton's method from the inverse of the radial part; NaN where the lens shows nothing.
+
+    Args:
+        shown: (N, 2) points on the image plane.
+        lens: One of `choices.LENSES`.
+        coefficients: Of the lens.
+    """
+    radius, seen = _radial_curve(lens, coefficients)
+    last = int(np.searchsorted(radius, largest_radius(lens, coefficients), side="right"))
+    distance = np.hypot(shown[:, 0], shown[:, 1])
+    with np.errstate(all="ignore"):
+        inverse = np.interp(distance, seen[:last], radius[:last])
+        plane = shown * np.where(distance > 0, inverse / distance, 1.0)[:, None]
+        for _ in range(_NEWTON_STEPS):
+            plane = plane - _newton_step(plane, shown, lens, coefficients)
+        plane[~(np.hypot(*(distort(plane, lens, coefficients) - shown).T) < 1e-6)] = np.nan
+    return plane
+
+
+@functools.lru_cache(maxsize=64)
+def largest_radius(lens: str, coefficients: Coefficients) -> float:
+    """Returns the tangent of the angle to the axis up to which the distortion is monotonic."""
+    radius, seen = _radial_curve(lens, coefficients)
+    turning = np.flatnonzero(~(np.diff(seen) > 0))
+    return float(radius[turning[0]]) if turning.size else np.inf
+
+
+def _newton_step(plane: Floats, shown: Floats, lens: str, coefficients: Coefficients) -> Floats:
+    """How far (N, 2) the directions are from those shown there, by central differences."""
+    columns = []
+    for axis in np.eye(2) * _NEWTON_STEP:
+        ahead, behind = (_shown(plane + sign * axis, lens, coefficients) for sign in (1, -1))
+        columns.append((ahead - behind) / (2 * _NEWTON_STEP))
+    (a, c), (b, d) = columns[0].T, columns[1].T
+    x, y = (_shown(plane, lens, coefficients) - shown).T
+    return np.asarray(np.column_stack([d * x - b * y, a * y - c * x]) / (a * d - b * c)[:, None])
+
+
+def _radial_curve(lens: str, coefficients: Coefficients) -> tuple[Floats, Floats]:
+    """Radius before and after the lens, without its tangential and prism parts."""
+    model = LENS_MODELS[lens]
+    if model.by_angle:
+        radius = np.tan(np.linspace(0, _WIDEST_ANGLE, _SAMPLES))
+    else:
+        radius = np.linspace(0, _WIDEST_PLANE, _SAMPLES)
+    kept = range(len(coefficients)) if model.radial is None else model.radial
+    radial_only = tuple(c if i in kept else 0.0 for i, c in enumerate(coefficients))
+    with np.errstate(all="ignore"):
+        seen = _shown(np.column_stack([radius, 0 * radius]), lens, radial_only)
+    return radius, seen[:, 0]
+
+
+def _shown(plane: Floats, lens: str, coefficients: Coefficients) -> Floats:
+    """The points (N, 2) as the lens model has them, also beyond where it turns back."""
+    return LENS_MODELS[lens].shown(plane, coefficients) if len(plane) else plane.copy()
+
+
+def _square(plane: Floats) -> Floats:
+    return np.asarray(np.einsum("ij,ij->i", plane, plane))
+
+
+@dataclass(frozen=True, kw_only=True)
+class LensModel:
+    """A lens distortion."""
+
+    shown: Callable[[Floats, Coefficients], Floats]
+    """From (N, 2) directions and the coefficients to (N, 2) points on the image plane."""
+    by_angle: bool
+    """Whether it is defined by the angle to the axis, not by the tangent of it."""
+    radial: tuple[int, ...] | None
+    """Which coefficients are radial. None: all."""
+
+
+LENS_MODELS: dict[str, LensModel] = {}
+"""By name, as in `choices.LENSES`."""
+
+
+def _lens(
+    name: str, *, by_angle: bool, radial: tuple[int, ...] | None = None
+) -> Callable[[Callable[..., Floats]], Callable[..., Floats]]:
+    """Returns a decorator that adds a lens model."""
+
+    def add(shown: Callable[..., Floats]) -> Callable[..., Floats]:
+        LENS_MODELS[name] = LensModel(shown=shown, by_angle=by_angle, radial=radial)
+        return shown
+
+    return add
+
+
+@_lens("radial-tangential", by_angle=False, radial=(0, 1, 4, 5, 6, 7))
+def _radial_tangential(plane: Floats, coefficients: Coefficients) -> Floats:
+    """OpenCV's k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4 [tau_x tau_y]]]]."""
+    points = np.column_stack([plane, np.ones(len(plane))])
+    padded = np.array((*coefficients, *[0.0] * 14)[:14])
+    shown, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), np.eye(3), padded)
+    return np.asarray(shown[:, 0], np.float64)
+
+
+@_lens("fisheye", by_angle=True)
+def _fisheye(plane: Floats, coefficients: Coefficients) -> Floats:
+    """OpenCV's equidistant k1 k2 k3 k4; without them the angle is the distance to the centre."""
+    padded = np.array((*coefficients, *[0.0] * 4)[:4])
+    return np.asarray(cv2.fisheye.distortPoints(plane[:, None], np.eye(3), padded)[:, 0])
+
+
+@_lens("fov", by_angle=True)
+def _fov(plane: Floats, coefficients: Coefficients) -> Floats:
+    """One angle omega (Devernay and Faugeras, 2001)."""
+    (omega,) = coefficients
+    radius = np.hypot(plane[:, 0], plane[:, 1])
+    if omega == 0:
+        return plane.copy()
+    wide = 2 * np.tan(omega / 2)
+    factor = np.where(radius > 1e-8, np.arctan(radius * wide) / (radius * omega), wide / omega)
+    return np.asarray(plane * factor[:, None])
+
+
+@_lens("thin-prism-fisheye", by_angle=True, radial=(0, 1, 4, 5))
+def _thin_prism_fisheye(plane: Floats, coefficients: Coefficients) -> Floats:
+    """k1 k2 p1 p2 k3 k4 sx1 sy1 on the equidistant plane."""
+    k1, k2, p1, p2, k3, k4, sx1, sy1 = coefficients
+    radial = _fisheye(plane, (k1, k2, k3, k4))
+    angles = _fisheye(plane, ())
+    prism = _square(angles)[:, None] * np.array([sx1, sy1])
+    return np.asarray(radial + _tangential(angles, (p2, p1)) + prism)
+
+
+@_lens("rad-tan-thin-prism-fisheye", by_angle=True, radial=(0, 1, 2, 3, 4, 5))
+def _rad_tan_thin_prism_fisheye(plane: Floats, coefficients: Coefficients) -> Floats:
+    """k0 … k5 p0 p1 s0 … s3, as of Project Aria."""
+    k, p, s = coefficients[:6], coefficients[6:8], coefficients[8:]
+    angles = _fisheye(plane, ())
+    seen = angles * np.polynomial.polynomial.polyval(_square(angles), (1.0, *k))[:, None]
+    square = _square(seen)
+    prism = [square * (s[i] + square * s[i + 1]) for i in (0, 2)]
+    return np.asarray(seen + _tangential(seen, p) + np.column_stack(prism))
+
+
+def _tangential(plane: Floats, p: tuple[float, ...]) -> Floats:
+    along, square = plane @ np.array(p), _square(plane)
+    return np.asarray(2 * along[:, None] * plane + square[:, None] * np.array(p))
+
+
+@_lens("division", by_angle=False)
+def _division(plane: Floats, coefficients: Coefficients) -> Floats:
+    """One k: direction = seen / (1 + k seen²) (Fitzgibbon, 2001)."""
+    (k,) = coefficients
+    return np.asarray(plane * (2 / (1 + np.sqrt(1 - 4 * k * _square(plane))))[:, None])
+
+
+@_lens("eucm", by_angle=True)
+def _eucm(plane: Floats, coefficients: Coefficients) -> Floats:
+    """Alpha and beta of the enhanced unified camera model (Khomutenko et al., 2016)."""
+    alpha, beta = coefficients
+    return np.asarray(plane / (alpha * np.sqrt(beta * _square(plane) + 1) + 1 - alpha)[:, None])

@@ -9,16 +9,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pnpdepth_cli.choices import SENSORS
 from pnpdepth_cli.errors import UsageError
-
-Floats = NDArray[np.float64]
+from pnpdepth_cli.sensors.sparse import Floats
 
 FORWARD_LEFT_UP: Floats = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 """The rotation from a scanner's frame to that of a camera facing the same way."""
-
 
 _MOST_RAYS = 1 << 23
 """Points of one revolution, so that simulating them fits into memory; 128 beams give 460,000."""
@@ -29,20 +26,14 @@ class Lidar:
     """A rotating LiDAR."""
 
     name: str
-    """As users and records call it."""
-
     elevations_deg: tuple[float, ...]
     """Elevation of each beam, −90° to 90°."""
-
     azimuth_step_deg: float
     """Angle between firings."""
-
     max_range: float
     """Metres; may be infinite."""
-
     range_noise: float = 0.0
     """Standard deviation of a range, metres."""
-
     angle_noise_deg: float = 0.0
     """Standard deviation of the direction of each measurement, in elevation and in azimuth."""
 
@@ -99,36 +90,13 @@ _VLP_32C_DEG = (
     -1.0, -1.333, -1.667, -2.0, -2.333, -2.667, -3.0, -3.333, -3.667, -4.0, -4.667, -5.333, -6.148,
     -7.254, -8.843, -11.31, -15.639, -25.0,
 )  # fmt: skip
-_SHEETS = (
-    Lidar(
-        name="vlp-16",
-        elevations_deg=evenly_spaced(15, 2, 16),
-        azimuth_step_deg=0.2,
-        max_range=100,
-        range_noise=0.03,
-    ),
-    Lidar(
-        name="vlp-32c",
-        elevations_deg=_VLP_32C_DEG,
-        azimuth_step_deg=0.2,
-        max_range=200,
-        range_noise=0.03,
-    ),
-    Lidar(
-        name="hdl-32e",
-        elevations_deg=evenly_spaced(10 + 2 / 3, 4 / 3, 32),
-        azimuth_step_deg=0.166,
-        max_range=100,
-        range_noise=0.02,
-    ),
-    Lidar(
-        name="hdl-64e",
-        elevations_deg=evenly_spaced(2, 1 / 3, 32) + evenly_spaced(-8.83, 0.5, 32),
-        azimuth_step_deg=0.1728,
-        max_range=120,
-        range_noise=0.02,
-    ),
-)
+_SHEETS = {
+    "vlp-16": (evenly_spaced(15, 2, 16), 0.2, 100, 0.03),
+    "vlp-32c": (_VLP_32C_DEG, 0.2, 200, 0.03),
+    "hdl-32e": (evenly_spaced(10 + 2 / 3, 4 / 3, 32), 0.166, 100, 0.02),
+    "hdl-64e": (evenly_spaced(2, 1 / 3, 32) + evenly_spaced(-8.83, 0.5, 32), 0.1728, 120, 0.02),
+}
+"""Elevations and azimuth step, degrees; range and its noise, metres."""
 
 # Wang et al. 2019, table on LiDAR types: field of view and vertical resolution, beams evenly
 # spaced. The table gives no elevation of the top beam, which is the data sheet's here. It gives no
@@ -145,6 +113,17 @@ _PAPER_AZIMUTH_STEP_DEG = 0.19
 _PAPER_ANGLE_NOISE_DEG = 0.4
 
 
+def _by_sheet(name: str) -> Lidar:
+    elevations_deg, step_deg, max_range, range_noise = _SHEETS[name]
+    return Lidar(
+        name=name,
+        elevations_deg=elevations_deg,
+        azimuth_step_deg=step_deg,
+        max_range=max_range,
+        range_noise=range_noise,
+    )
+
+
 def _paper(name: str) -> Lidar:
     fov_deg, step_deg, top_deg = _PAPER_FOV[name]
     return Lidar(
@@ -157,6 +136,6 @@ def _paper(name: str) -> Lidar:
 
 
 LIDARS: dict[str, Lidar] = {
-    sensor.name: sensor for sensor in (*_SHEETS, *(_paper(name) for name in SENSORS))
+    sensor.name: sensor for make in (_by_sheet, _paper) for sensor in map(make, SENSORS)
 }
 """The scanners that can be named; `choices.SENSORS` lists those by data sheet."""

@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import NoPointsError, SizeError, UsageError
-from pnpdepth_cli.points import SparsePoints, in_frame
+from pnpdepth_cli.points import in_frame
 from pnpdepth_cli.sensors.sparse import FARTHEST_M, DropCounter, Points
 
-Depth = NDArray[np.float32]
 Image = NDArray[np.float32]
 Pixels = NDArray[np.intp]
 
@@ -23,13 +23,10 @@ class SamplePattern:
 
     kind: str = "uniform"
     """One of `choices.PATTERNS`."""
-
     count: int | None = None
     """Number of points, or of lines for `lines`; None with a fraction."""
-
     fraction: float | None = None
     """Fraction of the known pixels, 0 to 1; None with a count."""
-
     region: tuple[int, int, int, int] | None = None
     """x, y, width and height in pixels, for `region` alone."""
 
@@ -63,13 +60,10 @@ class SampleNoise:
 
     metres: float = 0.0
     """Standard deviation of the depth, metres."""
-
     relative: float = 0.0
     """Standard deviation of the depth as a fraction of it."""
-
     outliers: float = 0.0
     """Fraction of points whose depth is redrawn between the smallest and the largest."""
-
     jitter_px: float = 0.0
     """Standard deviation of the pixel coordinates, in x and in y."""
 
@@ -81,8 +75,27 @@ class SampleNoise:
             )
 
 
+@dataclass(frozen=True, kw_only=True)
+class Scene:
+    """A dense depth map that is sampled."""
+
+    known: Pixels
+    """Row-major indices of the pixels with known depth."""
+    size: tuple[int, int]
+    """(H, W)."""
+    image: Image | None
+    """(H, W, 3) in 0..1 of the same view."""
+
+    def grey(self, pattern: SamplePattern) -> NDArray[np.uint8]:
+        """Returns the image in grey. Raises UsageError if there is none."""
+        if self.image is None:
+            raise UsageError(f"pattern {pattern.kind!r} needs the image that the depth belongs to")
+        grey = self.image @ np.array([0.299, 0.587, 0.114], np.float32)
+        return np.rint(255 * np.clip(grey, 0, 1)).astype(np.uint8)
+
+
 def sample_points(
-    depth: Depth,
+    depth: NDArray[np.float32],
     pattern: SamplePattern,
     seed: int,
     *,
@@ -103,157 +116,108 @@ def sample_points(
         UsageError: More points are asked for than are known.
         SizeError: Image and depth differ in size.
     """
-    if image is not None and image.shape[:2] != depth.shape:
+    size = (depth.shape[0], depth.shape[1])
+    if image is not None and image.shape[:2] != size:
         raise SizeError(
-            f"the image is {image.shape[1]}×{image.shape[0]} but the depth is"
-            f" {depth.shape[1]}×{depth.shape[0]}"
+            f"the image is {image.shape[1]}×{image.shape[0]} but the depth is {size[1]}×{size[0]}"
         )
     rng = np.random.default_rng(seed)
     known = np.flatnonzero(np.isfinite(depth) & (depth > 0))
     if not known.size:
         raise NoPointsError("the depth map has no pixel with known depth to sample from")
-    chosen = np.sort(PATTERNS[pattern.kind](depth, known, pattern, image, rng))
+    chosen = np.sort(
+        PATTERNS[pattern.kind](Scene(known=known, size=size, image=image), pattern, rng)
+    )
     if not chosen.size:
         raise NoPointsError(f"pattern {pattern.kind!r} leaves no point; ask for more")
-    row, column = np.divmod(chosen, depth.shape[1])
-    points = SparsePoints(
+    row, column = np.divmod(chosen, size[1])
+    points = Points(
         xy=np.stack([column, row], axis=1).astype(np.float32),
         depth=depth.ravel()[chosen].astype(np.float32),
-        size=(depth.shape[0], depth.shape[1]),
+        size=size,
     )
     return with_noise(points, noise or SampleNoise(), rng)
 
 
-def _uniform(
-    depth: Depth,
-    known: Pixels,
-    pattern: SamplePattern,
-    image: Image | None,
-    rng: np.random.Generator,
-) -> Pixels:
+def _uniform(scene: Scene, pattern: SamplePattern, rng: np.random.Generator) -> Pixels:
+    return _choice(scene.known, pattern, rng)
+
+
+def _choice(known: Pixels, pattern: SamplePattern, rng: np.random.Generator) -> Pixels:
     count = pattern.wanted(known.size)
     if count > known.size:
         raise UsageError(f"{count:,} points of {known.size:,} known pixels; ask for fewer")
     return rng.choice(known, count, replace=False)
 
 
-def _bernoulli(
-    depth: Depth,
-    known: Pixels,
-    pattern: SamplePattern,
-    image: Image | None,
-    rng: np.random.Generator,
-) -> Pixels:
+def _bernoulli(scene: Scene, pattern: SamplePattern, rng: np.random.Generator) -> Pixels:
     """Each known pixel with the same probability; the count is only the expected one."""
-    return known[rng.random(known.size) < pattern.wanted(known.size) / known.size]
+    count = scene.known.size
+    return scene.known[rng.random(count) < pattern.wanted(count) / count]
 
 
-def _grid(
-    depth: Depth,
-    known: Pixels,
-    pattern: SamplePattern,
-    image: Image | None,
-    rng: np.random.Generator,
-) -> Pixels:
+def _grid(scene: Scene, pattern: SamplePattern, rng: np.random.Generator) -> Pixels:
     """Known pixels of a square grid whose spacing gives a full map the wanted count."""
-    height, width = depth.shape
+    height, width = scene.size
     if pattern.fraction is not None:
         spacing = pattern.fraction**-0.5
     else:
-        spacing = max(1.0, (height * width / pattern.wanted(known.size)) ** 0.5)
+        spacing = max(1.0, (height * width / pattern.wanted(scene.known.size)) ** 0.5)
     rows, columns = (
         (np.floor((np.arange(max(1, round(side / spacing))) + 0.5) * spacing)).astype(np.intp)
         for side in (height, width)
     )
     nodes = np.minimum(rows, height - 1)[:, None] * width + np.minimum(columns, width - 1)
-    return np.intersect1d(nodes, known)
+    return np.intersect1d(nodes, scene.known)
 
 
-def _lines(
-    depth: Depth,
-    known: Pixels,
-    pattern: SamplePattern,
-    image: Image | None,
-    rng: np.random.Generator,
-) -> Pixels:
+def _lines(scene: Scene, pattern: SamplePattern, rng: np.random.Generator) -> Pixels:
     """All known pixels of evenly spaced rows."""
-    height, width = depth.shape
+    height, width = scene.size
     count = pattern.wanted(height)
     if count > height:
         raise UsageError(f"{count:,} lines do not fit {height:,} rows; ask for fewer")
     rows = np.floor((np.arange(count) + 0.5) * height / count).astype(np.intp)
-    return known[np.isin(known // width, rows)]
+    return scene.known[np.isin(scene.known // width, rows)]
 
 
-def _region(
-    depth: Depth,
-    known: Pixels,
-    pattern: SamplePattern,
-    image: Image | None,
-    rng: np.random.Generator,
-) -> Pixels:
+def _region(scene: Scene, pattern: SamplePattern, rng: np.random.Generator) -> Pixels:
     """Known pixels of a rectangle: all, or a random choice of the wanted count."""
     left, top, width, height = pattern.region or (0, 0, 0, 0)
-    row, column = np.divmod(known, depth.shape[1])
+    row, column = np.divmod(scene.known, scene.size[1])
     inside = (column >= left) & (column < left + width) & (row >= top) & (row < top + height)
     if not inside.any():
         raise NoPointsError(
             f"region {left},{top},{width},{height} holds no pixel with known depth of the"
-            f" {depth.shape[1]}×{depth.shape[0]} image"
+            f" {scene.size[1]}×{scene.size[0]} image"
         )
-    return _uniform(depth, known[inside], pattern, image, rng)
+    return _choice(scene.known[inside], pattern, rng)
 
 
-def _features(
-    depth: Depth,
-    known: Pixels,
-    pattern: SamplePattern,
-    image: Image | None,
-    rng: np.random.Generator,
-) -> Pixels:
+def _features(scene: Scene, pattern: SamplePattern, rng: np.random.Generator) -> Pixels:
     """The strongest ORB corners with known depth, as structure from motion has its points."""
-    import cv2
-
     # Corners of several pyramid levels share pixels; three times as many leave enough when merged.
-    wanted = pattern.wanted(known.size)
+    wanted = pattern.wanted(scene.known.size)
     detector = cv2.ORB_create(nfeatures=3 * wanted + 100, edgeThreshold=4, fastThreshold=5)  # type: ignore[attr-defined]
-    corners = detector.detect(_grey_bytes(pattern, image))
-    corners = sorted(corners, key=lambda corner: -corner.response)
+    corners = sorted(detector.detect(scene.grey(pattern)), key=lambda corner: -corner.response)
     xy = np.array([corner.pt for corner in corners], np.float64).reshape(-1, 2)
     column, row = np.rint(xy).astype(np.intp).T
-    pixels = row * depth.shape[1] + column
+    pixels = row * scene.size[1] + column
     _, first = np.unique(pixels, return_index=True)
     strongest = pixels[np.sort(first)]
-    kept: Pixels = strongest[np.isin(strongest, known)][:wanted]
+    kept: Pixels = strongest[np.isin(strongest, scene.known)][:wanted]
     return kept
 
 
-def _edges(
-    depth: Depth,
-    known: Pixels,
-    pattern: SamplePattern,
-    image: Image | None,
-    rng: np.random.Generator,
-) -> Pixels:
+def _edges(scene: Scene, pattern: SamplePattern, rng: np.random.Generator) -> Pixels:
     """Known pixels on the image's edges (Canny), a random choice of the wanted count."""
-    import cv2
-
-    grey = cv2.GaussianBlur(_grey_bytes(pattern, image), (5, 5), 0)
-    on_edge = np.flatnonzero(cv2.Canny(grey, 30, 90))
-    candidates = np.intersect1d(on_edge, known)
-    count = min(pattern.wanted(known.size), candidates.size)
+    grey = cv2.GaussianBlur(scene.grey(pattern), (5, 5), 0)
+    candidates = np.intersect1d(np.flatnonzero(cv2.Canny(grey, 30, 90)), scene.known)
+    count = min(pattern.wanted(scene.known.size), candidates.size)
     return rng.choice(candidates, count, replace=False)
 
 
-def _grey_bytes(pattern: SamplePattern, image: Image | None) -> NDArray[np.uint8]:
-    if image is None:
-        raise UsageError(f"pattern {pattern.kind!r} needs the image that the depth belongs to")
-    grey = image @ np.array([0.299, 0.587, 0.114], np.float32)
-    return np.rint(255 * np.clip(grey, 0, 1)).astype(np.uint8)
-
-
-Sampler = Callable[[Depth, Pixels, SamplePattern, "Image | None", np.random.Generator], Pixels]
-PATTERNS: dict[str, Sampler] = {
+PATTERNS: dict[str, Callable[[Scene, SamplePattern, np.random.Generator], Pixels]] = {
     "uniform": _uniform,
     "bernoulli": _bernoulli,
     "grid": _grid,
@@ -277,7 +241,6 @@ def with_noise(points: Points, noise: SampleNoise, rng: np.random.Generator) -> 
         NoPointsError: No point is left.
     """
     xy, values = points.xy.astype(np.float64), points.depth.astype(np.float64)
-    height, width = points.size
     low, high = values.min(), values.max()
     with np.errstate(over="ignore", invalid="ignore"):
         if noise.metres > 0:
@@ -295,12 +258,12 @@ def with_noise(points: Points, noise: SampleNoise, rng: np.random.Generator) -> 
         xy, values = xy[near], values[near]
     positive = drops.keep(values.astype(np.float32) > 0, "noise left no depth")
     xy, values = xy[positive], values[positive]
-    inside = drops.keep(in_frame(xy, (height, width)), "outside the image")
+    inside = drops.keep(in_frame(xy, points.size), "outside the image")
     if not inside.any():
         raise NoPointsError(f"noise leaves no point ({drops}); make it smaller")
-    return SparsePoints(
+    return Points(
         xy=xy[inside].astype(np.float32),
         depth=values[inside].astype(np.float32),
-        size=(height, width),
+        size=points.size,
         dropped={why: count for why, count in drops.dropped.items() if count},
     )

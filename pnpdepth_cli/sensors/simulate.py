@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import NoPointsError, UsageError
-from pnpdepth_cli.points import SparsePoints, in_frame
+from pnpdepth_cli.points import in_frame
 from pnpdepth_cli.sensors.camera import Camera
 from pnpdepth_cli.sensors.lidar import Lidar
 from pnpdepth_cli.sensors.sparse import (
@@ -17,7 +17,6 @@ from pnpdepth_cli.sensors.sparse import (
     Floats,
     Mask,
     Points,
-    nearest_in_pixel,
     pixel_index,
 )
 
@@ -37,19 +36,14 @@ class SimulationSettings:
 
     rotation_noise_deg: float = 0.0
     """Standard deviation of a rotation of the whole scanner about each axis."""
-
     angle_noise_deg: float | None = None
     """Standard deviation of the direction of each measurement."""
-
     range_noise: float | None = None
     """Standard deviation of a range, metres."""
-
     dropout: float = 0.0
     """Fraction of beams without return."""
-
     max_range: float | None = None
     """Metres from the scanner."""
-
     euclidean: bool = False
     """Depth is the distance from the camera's centre instead of z."""
 
@@ -80,7 +74,9 @@ def simulate_lidar(
         NoPointsError: No beam hits anything that the camera sees.
     """
     settings = settings or SimulationSettings()
-    sensor = _with_settings(sensor, settings)
+    names = ("angle_noise_deg", "range_noise", "max_range")
+    given = {name: getattr(settings, name) for name in names}
+    sensor = replace(sensor, **{name: value for name, value in given.items() if value is not None})
     size = (depth.shape[0], depth.shape[1])
     rng = np.random.default_rng(seed)
     turned = _rotated(camera, settings.rotation_noise_deg, rng)
@@ -100,18 +96,14 @@ def simulate_lidar(
     near = np.abs(points).max(axis=1, initial=0) < FARTHEST_M
     if not near.all():
         points = points[drops.keep(near, "noise put it too far")]
-    xy = camera.pixels_of(points)
-    inside = drops.keep(in_frame(xy, size), "outside the image")
-    points, xy = points[inside], xy[inside]
-    front = drops.keep(nearest_in_pixel(xy, points[:, 2], size), "behind another in their pixel")
-    points, xy = points[front], xy[front]
+    points, xy = drops.keep_seen(points, camera.pixels_of(points), size)
     if not len(xy):
         raise NoPointsError(
             f"no beam of {sensor.name} gives a point in the image ({drops}); check depth,"
             " intrinsics and where the scanner stands"
         )
     values = np.linalg.norm(points, axis=1) if settings.euclidean else points[:, 2]
-    return SparsePoints(
+    return Points(
         xy=xy.astype(np.float32),
         depth=values.astype(np.float32),
         size=size,
@@ -119,28 +111,14 @@ def simulate_lidar(
     )
 
 
-def _with_settings(sensor: Lidar, settings: SimulationSettings) -> Lidar:
-    return replace(
-        sensor,
-        angle_noise_deg=_first(settings.angle_noise_deg, sensor.angle_noise_deg),
-        range_noise=_first(settings.range_noise, sensor.range_noise),
-        max_range=_first(settings.max_range, sensor.max_range),
-    )
-
-
-def _first(wanted: float | None, otherwise: float) -> float:
-    return otherwise if wanted is None else wanted
-
-
 def _rotated(camera: Camera, std_deg: float, rng: np.random.Generator) -> Camera:
     """The camera with the scanner rotated at random about its own origin."""
     if std_deg == 0:
         return camera
-    x, y, z = np.radians(rng.normal(0, std_deg, 3))
-    about_x = np.array([[1, 0, 0], [0, np.cos(x), -np.sin(x)], [0, np.sin(x), np.cos(x)]])
-    about_y = np.array([[np.cos(y), 0, np.sin(y)], [0, 1, 0], [-np.sin(y), 0, np.cos(y)]])
-    about_z = np.array([[np.cos(z), -np.sin(z), 0], [np.sin(z), np.cos(z), 0], [0, 0, 1]])
-    return replace(camera, rotation=camera.rotation @ about_z @ about_y @ about_x)
+    from scipy.spatial.transform import Rotation
+
+    turn = Rotation.from_euler("xyz", rng.normal(0, std_deg, 3), degrees=True)
+    return replace(camera, rotation=camera.rotation @ turn.as_matrix())
 
 
 def _depth_at_first_hit(depth: Floats, camera: Camera, directions: Floats) -> Floats:
@@ -166,8 +144,7 @@ def _depth_at_first_hit(depth: Floats, camera: Camera, directions: Floats) -> Fl
     been_inside = np.zeros(len(forward), bool)
     walking = np.arange(len(forward))
     for z in depths_z:
-        reached = start + beams[walking] * ((z - start[2]) / beams[walking, 2])[:, None]
-        ahead, inside = _map_at(depth, camera, reached)
+        ahead, inside = _map_at(depth, camera, _reached(start, beams[walking], z))
         met = (ahead > 0) & (z >= ahead)
         same = before_map[walking] <= _SAME_SURFACE * ahead
         straight_on = met & (before_z <= ahead)
@@ -188,8 +165,7 @@ def _on_their_surface(hit: Floats, depth: Floats, camera: Camera, beams: Floats)
     """The hits whose own pixel shows that surface; NaN for one that grazed an edge by a pixel."""
     index = np.flatnonzero(np.isfinite(hit))
     z, start = hit[index], camera.translation
-    reached = start + beams[index] * ((z - start[2]) / beams[index, 2])[:, None]
-    shown, _ = _map_at(depth, camera, reached)
+    shown, _ = _map_at(depth, camera, _reached(start, beams[index], z))
     same = (z <= _SAME_SURFACE * shown) & (shown <= _SAME_SURFACE * z)
     checked = hit.copy()
     checked[index[~same]] = np.nan
@@ -198,16 +174,19 @@ def _on_their_surface(hit: Floats, depth: Floats, camera: Camera, beams: Floats)
 
 def _walk_length(camera: Camera, beams: Floats, near: float, far: float, depth: Floats) -> int:
     """The number of steps in which no beam in the image moves by more than a pixel."""
-    ends = []
-    for z in (near, far):
-        reached = camera.translation + beams * ((z - camera.translation[2]) / beams[:, 2])[:, None]
-        ends.append(camera.pixels_of(reached))
+    start = camera.translation
+    ends = [camera.pixels_of(_reached(start, beams, z)) for z in (near, far)]
     size = (depth.shape[0], depth.shape[1])
     seen = in_frame(ends[0], size) | in_frame(ends[1], size)
     if not seen.any():
         return 1
     moved = np.hypot(*(ends[1] - ends[0])[seen].T)
     return int(min(max(1, np.ceil(np.nanmax(moved, initial=0))), _LONGEST_WALK))
+
+
+def _reached(start: Floats, beams: Floats, z: float | Floats) -> Floats:
+    """The points (M, 3) at which beams from a point have the depth z."""
+    return np.asarray(start + beams * ((z - start[2]) / beams[:, 2])[:, None])
 
 
 def _map_at(depth: Floats, camera: Camera, points: Floats) -> tuple[Floats, Mask]:

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 from numpy.typing import NDArray
 
-from pnpdepth_cli.points import SparsePoints
+from pnpdepth_cli.points import SparsePoints, in_frame
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 FARTHEST_M = 1e9
 """Metres; what noise moves farther is no measurement, and would overflow float32 in products."""
-
 
 Points = SparsePoints[NDArray[np.float32]]
 """Sparse depth in numpy arrays."""
@@ -30,19 +31,6 @@ def pixel_index(xy: NDArray[np.floating], size: tuple[int, int]) -> NDArray[np.i
     column, row = np.floor(np.asarray(xy, np.float64) + 0.5).astype(np.intp).T
     index: NDArray[np.intp] = row * size[1] + column
     return index
-
-
-def nearest_in_pixel(
-    xy: NDArray[np.floating], depth: NDArray[np.floating], size: tuple[int, int]
-) -> Mask:
-    """Returns (N,) true for the nearest point of each pixel, the first of equal ones."""
-    pixel = pixel_index(xy, size)
-    order = np.lexsort((depth, pixel))
-    first = np.ones(len(order), bool)
-    first[1:] = np.diff(pixel[order]) > 0
-    mask = np.zeros(len(order), bool)
-    mask[order[first]] = True
-    return mask
 
 
 class DropCounter:
@@ -63,5 +51,27 @@ class DropCounter:
         self.index = self.index[mask]
         return mask
 
+    def keep_seen(self, xyz: Floats, xy: Floats, size: tuple[int, int]) -> tuple[Floats, Floats]:
+        """Keeps the points in an image that are the nearest of their pixel, and returns them.
+
+        Args:
+            xyz: (N, 3) in the camera's frame.
+            xy: (N, 2) their pixel coordinates; NaN for points that the lens does not show.
+            size: (H, W) of the image.
+        """
+        inside = self.keep(in_frame(xy, size), "outside the image")
+        xyz, xy = xyz[inside], xy[inside]
+        pixel = pixel_index(xy, size)
+        order = np.lexsort((xyz[:, 2], pixel))
+        nearest = np.zeros(len(xy), bool)
+        nearest[order[np.diff(pixel[order], prepend=-1) > 0]] = True  # the first of equal ones
+        self.keep(nearest, "behind another in their pixel")
+        return xyz[nearest], xy[nearest]
+
     def __str__(self) -> str:
-        return ", ".join(f"{count:,} {why}" for why, count in self.dropped.items() if count)
+        return describe_dropped(self.dropped)
+
+
+def describe_dropped(dropped: Mapping[str, int]) -> str:
+    """Returns the counts above 0 with their reasons, for a person."""
+    return ", ".join(f"{count:,} {why}" for why, count in dropped.items() if count)

@@ -140,7 +140,7 @@ def test_the_layer_of_the_default_is_the_one_that_layers_ranks_first(
 
 
 def test_occluded_points_of_a_projected_scan_do_not_count(tmp_path: Path, network: Network) -> None:
-    points = boards_before_a_wall(None)
+    points = boards_before_a_wall()
     hidden = occluded_in_map(points)
     assert hidden is not None
     write_depth(tmp_path / "s.png", as_depth_image(points), scale=256)

@@ -16,7 +16,7 @@ from pnpdepth_cli.io.depth import write_depth
 from pnpdepth_cli.pipeline.export import ExportRequest, export_results
 from pnpdepth_cli.pipeline.refinement.frame_camera import FrameCamera
 from pnpdepth_cli.pipeline.sparse.colmap import read_colmap_points
-from pnpdepth_cli.pipeline.sparse.colmap_options import ColmapOptions
+from pnpdepth_cli.pipeline.sparse.options import ColmapOptions
 from tests.colmap_models import HEIGHT, WIDTH, write_text_model
 
 DEPTH = (3.6 + 0.01 * np.mgrid[:HEIGHT, :WIDTH][1]).astype(np.float32)

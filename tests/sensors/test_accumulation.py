@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from pnpdepth_cli.completion.interpolation import linear
 from pnpdepth_cli.sensors import Camera, NeighbourScan, Points, accumulated
-from pnpdepth_cli.sensors.registration import registered, surface_of
+from pnpdepth_cli.sensors.accumulation import registered, surface_of
 
 SIZE = (120, 160)
 CAMERA = Camera(intrinsics=np.array([[150.0, 0, 79.5], [0, 150.0, 59.5], [0, 0, 1]]))

@@ -8,18 +8,16 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.io.calibration import read_calibration
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.io.scans import read_scan
 from pnpdepth_cli.sensors import (
     FORWARD_LEFT_UP,
     Camera,
-    OcclusionFilter,
     ProjectionSettings,
     project_velodyne,
 )
-from pnpdepth_cli.sensors.occlusion import hidden_points
+from pnpdepth_cli.sensors.projection import hidden_points
 
 STREET = Path(__file__).resolve().parents[2] / "samples" / "street"
 K = np.array([[700.0, 0, 320], [0, 700, 240], [0, 0, 1]])
@@ -50,7 +48,7 @@ def test_wall_seen_past_a_board_is_hidden_and_little_else(left_m: float) -> None
     camera = Camera(
         intrinsics=K, rotation=FORWARD_LEFT_UP, translation=np.array([-left_m, 0.0, 0.0])
     )
-    everything = project_velodyne(scan, camera, SIZE, ProjectionSettings(occlusion=None)).index
+    everything = project_velodyne(scan, camera, SIZE, ProjectionSettings(keep_occluded=True)).index
     kept = project_velodyne(scan, camera, SIZE).index
     removed = np.setdiff1d(everything, kept)
     truly_hidden = np.intersect1d(everything, np.flatnonzero(hidden))
@@ -89,18 +87,9 @@ def test_ground_at_a_grazing_angle_hides_no_ground() -> None:
 def test_the_scanner_in_front_of_the_camera_needs_no_parallax_to_be_defined() -> None:
     xy = np.array([[100.0, 100.0], [101.0, 100.0], [109.0, 100.0], [300.0, 200.0]])
     depth = np.array([1.0, 5.0, 5.0, 5.0])
-    hidden = hidden_points(
-        xy, depth, SIZE, focal_px=700.0, scanner=np.array([640.0, 480.0, 2.0]),
-        settings=OcclusionFilter(),
-    )  # fmt: skip
+    scanner = np.array([640.0, 480.0, 2.0])
+    hidden = hidden_points(xy, depth, SIZE, focal_px=700.0, scanner=scanner)
     assert hidden.tolist() == [False, True, False, False]
-
-
-def test_settings_that_mean_nothing_are_refused() -> None:
-    with pytest.raises(UsageError):
-        OcclusionFilter(nearer=0)
-    with pytest.raises(UsageError):
-        OcclusionFilter(margin_deg=-1)
 
 
 def kept_and_removed(
@@ -122,7 +111,7 @@ def test_on_the_rendered_street_most_points_that_contradict_the_ground_truth_go(
     )
     gt = read_depth(STREET / "gt.png").values
     scan = read_scan(STREET / "000000.bin").points
-    points = project_velodyne(scan, camera, gt.shape, ProjectionSettings(occlusion=None))
+    points = project_velodyne(scan, camera, gt.shape, ProjectionSettings(keep_occluded=True))
     column, row = np.floor(points.xy + 0.5).astype(int).T
     kept_rows = project_velodyne(scan, camera, gt.shape).index
     hidden = ~np.isin(points.index, kept_rows)
@@ -145,7 +134,7 @@ def test_on_kitti_most_points_that_contradict_the_ground_truth_go(shared_data: P
         hidden.append(
             hidden_points(
                 xy, depth[-1], raw.shape, focal_px=float(calibration.intrinsics[0, 0]),
-                scanner=scanner, settings=OcclusionFilter(),
+                scanner=scanner,
             )
         )  # fmt: skip
     kept, removed = kept_and_removed(*(np.concatenate(x) for x in (hidden, depth, gt)))

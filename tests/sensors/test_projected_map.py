@@ -14,12 +14,11 @@ from pnpdepth_cli.io.depth import read_depth, write_depth
 from pnpdepth_cli.io.scans import read_scan
 from pnpdepth_cli.pipeline.refinement.inputs import read_inputs
 from pnpdepth_cli.pipeline.refinement.request import FrameFiles, MethodOptions, RefineRequest
-from pnpdepth_cli.pipeline.sparse.scan_options import ScanOptions
+from pnpdepth_cli.pipeline.sparse.options import ScanOptions
 from pnpdepth_cli.pipeline.sparse.scans import camera_of
 from pnpdepth_cli.sensors import (
     FORWARD_LEFT_UP,
     Camera,
-    OcclusionFilter,
     Points,
     ProjectionSettings,
     SamplePattern,
@@ -28,7 +27,7 @@ from pnpdepth_cli.sensors import (
     project_velodyne,
     sample_points,
 )
-from pnpdepth_cli.sensors.projected_map import interleaved
+from pnpdepth_cli.sensors.projection import interleaved
 
 SIZE = (240, 640)
 INTRINSICS = np.array([[700.0, 0, 320], [0, 700, 120], [0, 0, 1]])
@@ -43,7 +42,7 @@ def points_of(depth: NDArray[np.floating]) -> Points:
     )
 
 
-def boards_before_a_wall(occlusion: OcclusionFilter | None) -> Points:
+def boards_before_a_wall(*, keep_occluded: bool = True) -> Points:
     """A map of boards at 5 m and a wall at 20 m, seen by a scanner above and beside the camera."""
     elevation, azimuth = np.meshgrid(
         np.radians(np.arange(-9, 9, 0.4)), np.radians(np.arange(-24, 24, 0.2)), indexing="ij"
@@ -57,24 +56,27 @@ def boards_before_a_wall(occlusion: OcclusionFilter | None) -> Points:
         translation=np.array([0.06, -0.08, -0.27]),
     )
     scan = project_velodyne(
-        np.column_stack([x, x * y, x * z]), camera, SIZE, ProjectionSettings(occlusion=occlusion)
+        np.column_stack([x, x * y, x * z]),
+        camera,
+        SIZE,
+        ProjectionSettings(keep_occluded=keep_occluded),
     )
     return points_of(as_depth_image(scan))
 
 
 def test_points_of_the_wall_within_the_boards_are_occluded() -> None:
-    points = boards_before_a_wall(None)
+    points = boards_before_a_wall()
     hidden = occluded_in_map(points)
     assert hidden is not None
     assert points.depth[hidden].min() > 19  # the foreground itself stays
-    between = interleaved(as_depth_image(points), 0.08)
+    between = interleaved(as_depth_image(points))
     column, row = points.xy.astype(int).T
     assert hidden[between[row, column]].mean() > 0.8
     assert hidden.mean() < 2.5 * between.sum() / len(points)
 
 
 def test_a_map_without_its_occluded_points_is_left_alone() -> None:
-    assert occluded_in_map(boards_before_a_wall(OcclusionFilter())) is None
+    assert occluded_in_map(boards_before_a_wall(keep_occluded=False)) is None
 
 
 @pytest.mark.parametrize("kind", ["uniform", "grid"])
@@ -85,14 +87,14 @@ def test_sampled_points_are_no_projected_scan(kind: str) -> None:
 
 
 def test_points_between_pixels_and_a_few_points_are_left_alone() -> None:
-    points = boards_before_a_wall(None)
+    points = boards_before_a_wall()
     off_grid = Points(xy=points.xy + np.float32(0.25), depth=points.depth, size=points.size)
     assert occluded_in_map(off_grid) is None
     assert occluded_in_map(points.select(np.arange(len(points)) < 900)) is None
 
 
 def test_a_frame_is_read_without_occluded_points_unless_they_are_kept(tmp_path: Path) -> None:
-    points = boards_before_a_wall(None)
+    points = boards_before_a_wall()
     write_depth(tmp_path / "sparse.png", as_depth_image(points), scale=256)
     files = FrameFiles(sparse=tmp_path / "sparse.png")
     read = read_inputs(RefineRequest(files=files))

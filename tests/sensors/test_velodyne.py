@@ -17,7 +17,7 @@ from pnpdepth_cli.sensors import (
 
 K = np.array([[100.0, 0, 50], [0, 100, 40], [0, 0, 1]])
 SIZE = (80, 101)
-ALL = ProjectionSettings(occlusion=None)
+ALL = ProjectionSettings(keep_occluded=True)
 
 
 def camera(**fields: object) -> Camera:
@@ -77,7 +77,7 @@ def test_of_two_points_on_a_pixel_the_nearer_wins_and_keeps_its_subpixel_positio
 
 def test_minimum_and_maximum_range_are_distances_from_the_scanner() -> None:
     scan = np.array([[3.0, 0, 0], [5.0, 0.5, 0], [9.0, 2.0, 0]])
-    limits = ProjectionSettings(min_range=4, max_range=9, occlusion=None)
+    limits = ProjectionSettings(min_range=4, max_range=9, keep_occluded=True)
     got = project_velodyne(scan, camera(translation=np.array([0, 0, 1.0])), SIZE, limits)
     assert got.index.tolist() == [1]  # the last is 9.2 m away
     assert got.dropped["out of range"] == 2

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -55,6 +56,41 @@ def camera_of_bag(bag: Bag, topic: str) -> tuple[Calibration, str] | None:
         )
         return calibration, frame_of(message)
     return None
+
+
+def rectified_cameras(bag: Bag, topic: str, raw: Calibration) -> dict[str, Calibration]:
+    """Returns the cameras of a rectified image of a camera_info topic, by what they are made of.
+
+    None has distortion. Whether the transforms lead to the rectified camera (kitti2bag) or to the
+    raw one, to which R and the last column of P then lead, no message says. The first is as the
+    definition of CameraInfo has it. Empty without P, or where P describes the raw image.
+
+    Args:
+        bag: An open bag.
+        topic: Of camera_info.
+        raw: The camera of the raw image, without a pose.
+    """
+    _, _, message = next(iter(bag.messages([topic])))
+    p, r = (np.array(getattr(message, n, getattr(message, n.upper(), ())), float) for n in "pr")
+    if p.size != 12 or not (p[0] > 0 and p[5] > 0 and np.isfinite(p).all()):
+        return {}
+    projection = p.reshape(3, 4)
+    intrinsics = projection[:, :3]
+    turn = r.reshape(3, 3) if r.size == 9 and np.isfinite(r).all() and r.any() else np.eye(3)
+    offset = np.linalg.solve(intrinsics, projection[:, 3])
+    plain = replace(
+        raw, intrinsics=intrinsics, distortion=(), lens="radial-tangential", source=topic
+    )
+    turned = replace(plain, rotation=turn, translation=offset)
+    same = np.allclose(intrinsics, raw.intrinsics, atol=1e-3) and not any(raw.distortion)
+    unturned = np.allclose(turn, np.eye(3), atol=1e-9)
+    cameras = {"P": plain}
+    if not unturned:
+        cameras = {"P and R": replace(turned, translation=np.zeros(3))} | cameras
+    if np.abs(offset).max() > 1e-9:
+        name = "P with its offset" if unturned else "P with its offset, and R"
+        cameras = {name: turned} | cameras
+    return {} if same and len(cameras) == 1 else cameras
 
 
 def frame_of(message: Any) -> str:

@@ -8,7 +8,7 @@ from dataclasses import replace
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.io.bags.bag import is_bag
 from pnpdepth_cli.pipeline.batch.request import BatchRequest
-from pnpdepth_cli.pipeline.sparse.bag_options import BagOptions
+from pnpdepth_cli.pipeline.sparse.options import BagOptions
 
 
 def unpacked(
@@ -39,8 +39,12 @@ def unpacked(
                 " --tolerance do not apply"
             )
         return request
-    from pnpdepth_cli.pipeline.sparse.frame_poses import POSES
-    from pnpdepth_cli.pipeline.sparse.frames import FramesRequest, write_frames, written_before
+    from pnpdepth_cli.pipeline.sparse.frames import (
+        POSES,
+        FramesRequest,
+        write_frames,
+        written_before,
+    )
 
     folder = request.output.with_name(f"{request.output.name}_frames")
     frames = FramesRequest(

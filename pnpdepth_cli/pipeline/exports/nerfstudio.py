@@ -21,7 +21,7 @@ from pnpdepth_cli.io.depth import write_depth
 from pnpdepth_cli.io.formats.png import LARGEST_CODE
 from pnpdepth_cli.io.record import write_json
 from pnpdepth_cli.pipeline.exports import Export, ExportFrame
-from pnpdepth_cli.pipeline.sparse.colmap_options import METRES
+from pnpdepth_cli.pipeline.sparse.options import METRES
 
 _CODES_PER_UNIT = 1000.0
 _BEYOND_POINTS = 1.5  # depths up to this multiple of the farthest point fit

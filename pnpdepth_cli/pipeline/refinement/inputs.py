@@ -36,8 +36,7 @@ from pnpdepth_cli.pipeline.refinement.neighbours import (
 from pnpdepth_cli.pipeline.refinement.points import split_points
 from pnpdepth_cli.pipeline.refinement.request import FrameFiles, RefineRequest
 from pnpdepth_cli.pipeline.sparse.colmap import read_colmap_points
-from pnpdepth_cli.pipeline.sparse.colmap_options import METRES, ColmapOptions
-from pnpdepth_cli.pipeline.sparse.scan_options import ScanOptions
+from pnpdepth_cli.pipeline.sparse.options import METRES, ColmapOptions, ScanOptions
 from pnpdepth_cli.pipeline.sparse.scans import read_scan_points
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.sensors import (

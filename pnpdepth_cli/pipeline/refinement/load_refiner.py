@@ -21,7 +21,7 @@ from pnpdepth_cli.pipeline.refinement.resolve import (
     resolve_layer,
     resolve_settings,
 )
-from pnpdepth_cli.pipeline.sparse.colmap_options import METRES
+from pnpdepth_cli.pipeline.sparse.options import METRES
 
 COMPANION = "compact"
 """The network that is fused with the user's, where there is an image."""

@@ -14,8 +14,7 @@ from typing import TYPE_CHECKING, Any
 from pnpdepth_cli import choices
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.pipeline.options import Axis, option
-from pnpdepth_cli.pipeline.sparse.colmap_options import ColmapOptions
-from pnpdepth_cli.pipeline.sparse.scan_options import ScanOptions
+from pnpdepth_cli.pipeline.sparse.options import ColmapOptions, ScanOptions
 
 if TYPE_CHECKING:
     from pnpdepth_cli.io.calibration import Calibration

@@ -14,10 +14,9 @@ from pnpdepth_cli.io.colmap.model import find_model, model_files, name_in_model,
 from pnpdepth_cli.io.colmap.parts import ColmapCamera, ColmapImage, ColmapModel
 from pnpdepth_cli.io.depth import describe_range
 from pnpdepth_cli.io.fingerprint import fingerprint
-from pnpdepth_cli.pipeline.sparse.colmap_options import METRES, MODEL_UNITS, ColmapOptions
-from pnpdepth_cli.points import SparsePoints, in_frame
+from pnpdepth_cli.pipeline.sparse.options import METRES, MODEL_UNITS, ColmapOptions
 from pnpdepth_cli.sensors import Camera, Points
-from pnpdepth_cli.sensors.sparse import DropCounter, nearest_in_pixel
+from pnpdepth_cli.sensors.sparse import DropCounter, describe_dropped
 
 _SIZES_IN_RANGE = 8.0
 """A 16-bit file in model units holds depths up to at least so many times the model's extent."""
@@ -31,22 +30,16 @@ class ColmapPointsOfImage:
 
     points: Points
     """In the frame of the image, depth in `unit`."""
-
     camera: Camera
     """In pixels of the image."""
-
     pose: NDArray[np.float64]
     """(3, 4) from the camera's frame to the model's, in `unit`."""
-
     unit: str
     """METRES or MODEL_UNITS."""
-
     scale: float | None
     """Codes per unit of a 16-bit output in model units; None for metres."""
-
     record: dict[str, Any]
     """What a record keeps of it."""
-
     notes: tuple[str, ...]
     """Lines for a person."""
 
@@ -85,7 +78,7 @@ def read_colmap_points(
     notes = [f"sparse: {describe_range(points.depth, source, unit=unit)}"]
     if _eye(camera).has_lens:
         notes.append("sparse: lens distortion is applied to the points; the image stays distorted")
-    lost = ", ".join(f"{count:,} {why}" for why, count in points.dropped.items() if count)
+    lost = describe_dropped(points.dropped)
     notes += [f"sparse: dropped {lost}"] if lost else []
     if unit == MODEL_UNITS:
         notes.append("unit: depth is in model units; --unit-scale gives metres per unit")
@@ -134,28 +127,17 @@ def _observed(model: ColmapModel, name: str, options: ColmapOptions) -> Points:
             " model is damaged, or its poses are inverted"
         )
     seen = seen[front]
-    xy = _eye(camera).pixels_of(seen)
-    inside = drops.keep(in_frame(xy, camera.size), "outside the image")
-    seen, xy = seen[inside], xy[inside]
-    nearest = drops.keep(
-        nearest_in_pixel(xy, seen[:, 2], camera.size), "behind another in their pixel"
-    )
-    depth = seen[nearest, 2] * (options.unit_scale or 1.0)
+    seen, xy = drops.keep_seen(seen, _eye(camera).pixels_of(seen), camera.size)
+    depth = seen[:, 2] * (options.unit_scale or 1.0)
     if not len(depth):
         raise NoPointsError(
             f"none of the {len(known):,} points of {name!r} in {model.folder} is left ({drops});"
             " relax --min-track or --max-reprojection"
         )
-    return _points(xy[nearest], depth, camera.size, drops)
-
-
-def _points(
-    xy: NDArray[np.float64], depth: NDArray[np.float64], size: tuple[int, int], drops: DropCounter
-) -> Points:
-    return SparsePoints(
+    return Points(
         xy=xy.astype(np.float32),
         depth=depth.astype(np.float32),
-        size=size,
+        size=camera.size,
         dropped=drops.dropped,
     )
 

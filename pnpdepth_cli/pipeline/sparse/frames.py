@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from pnpdepth_cli.errors import InputError, OutputError
 from pnpdepth_cli.io.atomic import atomic_path, make_folder
@@ -18,17 +19,26 @@ from pnpdepth_cli.io.bags.calibration import (
     camera_info_topic,
     camera_of_bag,
     frame_of,
+    rectified_cameras,
     static_pose,
 )
 from pnpdepth_cli.io.bags.messages import cloud_points, image_file, seconds_of
 from pnpdepth_cli.io.bags.pairing import Stamped, nearest_pairs
-from pnpdepth_cli.io.calibration import Calibration
+from pnpdepth_cli.io.bags.poses import camera_trajectory, poses_topics
+from pnpdepth_cli.io.calibration import Calibration, read_calibration
 from pnpdepth_cli.io.record import plain, read_json, write_json
-from pnpdepth_cli.pipeline.sparse.bag_options import BagOptions
-from pnpdepth_cli.pipeline.sparse.frame_poses import POSES, write_poses
+from pnpdepth_cli.io.trajectory import Trajectory
+from pnpdepth_cli.pipeline.sparse.options import BagOptions
+from pnpdepth_cli.pipeline.sparse.rectified import chosen_camera
+
+POSES = "poses.txt"
+"""Rows as of the TUM RGB-D benchmark, one for each frame in the order of their names."""
 
 RECORD = "frames.json"
 _FOLDERS = ("rgb", "sparse")
+
+_LONGEST_GAP_S = 0.5
+"""Between two poses that one is interpolated from."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,18 +47,16 @@ class FramesRequest:
 
     bag: Path
     """A file or a folder."""
-
     output: Path
     """The folder for rgb/, sparse/, calib.txt, poses.txt and frames.json."""
-
     options: BagOptions = field(default_factory=BagOptions)
-    """Which messages make a frame."""
-
     limit: int | None = None
     """Only the first frames; None for all."""
-
     overwrite: bool = False
-    """Existing files are replaced."""
+    calib: Path | None = None
+    """The camera's calibration instead of that of the bag."""
+    camera: int | None = None
+    """Which camera of `calib`."""
 
 
 def write_frames(request: FramesRequest, say: Callable[[str], None]) -> dict[str, Any]:
@@ -72,20 +80,21 @@ def write_frames(request: FramesRequest, say: Callable[[str], None]) -> dict[str
         )
         say(f"topics: images of {topics[0]}, points of {topics[1]}")
         _clear(request)
-        lost, times, camera, poses = 0, list[float](), None, None
+        lost, times, poses = 0, list[float](), None
+        frames = "", ""
         pairs = nearest_pairs(_stream(bag, *topics), options.tolerance)
         for image, scan in pairs:
             if scan is None:
                 lost += 1
                 continue
-            if camera is None:
-                camera = _write_calibration(request.output, bag, topics[0], image, scan, say)
+            frames = frames if times else (frame_of(image.message), frame_of(scan.message))
             _write_frame(request.output, topics, image, scan)
             times.append(image.time_s)
             if len(times) == request.limit:
                 break
-        if camera is not None:
-            poses = write_poses(request.output, bag, options.poses_topic, camera, times, say)
+        if times:
+            camera = _write_calibration(request, bag, topics[0], frames, say)
+            poses = _write_poses(request.output, bag, options.poses_topic, camera, times, say)
     if lost:
         say(f"warning: {lost:,} images have no scan within {options.tolerance:g} s")
     if not times:
@@ -144,6 +153,8 @@ def _identity(request: FramesRequest) -> dict[str, Any]:
         "bag_files": files,
         "options": asdict(request.options),
         "limit": request.limit,
+        "calib": None if request.calib is None else str(request.calib),
+        "camera": request.camera,
     }
 
 
@@ -172,34 +183,50 @@ def _ply(points: NDArray[np.float32]) -> bytes:
 
 
 def _write_calibration(
-    folder: Path,
+    request: FramesRequest,
     bag: Bag,
     image_topic: str,
-    image: Stamped,
-    scan: Stamped,
+    frames: tuple[str, str],
     say: Callable[[str], None],
 ) -> str:
-    """Writes calib.txt as far as the bag holds a calibration; says what is missing.
+    """Writes calib.txt as far as there is a calibration; says what is missing.
 
-    Returns the name of the camera's frame.
+    Args:
+        request: With the folder, in which the frames are written already.
+        bag: An open bag.
+        image_topic: Of the images.
+        frames: Names of the frames in the headers of an image and a scan.
+        say: Receives what is used, and warnings.
+
+    Returns:
+        The name of the camera's frame.
     """
     topic = camera_info_topic(bag, image_topic)
-    camera = None if topic is None else camera_of_bag(bag, topic)
-    if camera is None:
+    of_bag = None if topic is None else camera_of_bag(bag, topic)
+    names = (of_bag[1] if of_bag else "") or frames[0], frames[1]
+    if request.calib is not None:
+        calibration, source = read_calibration(request.calib, request.camera), str(request.calib)
+    elif topic is None or of_bag is None:
         say(f"warning: {bag.path} has no camera_info of {image_topic}; refine with --calib")
-        return frame_of(image.message)
-    calibration, frame = camera
-    names = frame or frame_of(image.message), frame_of(scan.message)
-    pose = static_pose(bag, *names)
-    if pose is None:
+        return frames[0]
+    else:
+        calibration, source = of_bag[0], topic
+    pose = None if calibration.has_pose else static_pose(bag, *names)
+    if pose is not None:
+        source += f", and /tf_static from {names[0]} to {names[1]}"
+        calibration = replace(calibration, rotation=pose[0], translation=pose[1], has_pose=True)
+    if not calibration.has_pose:
         say(
             f"warning: {bag.path} has no static transform from {names[0]} to {names[1]}; refine"
             " with --extrinsics"
         )
     else:
-        say(f"calibration: {topic}, and /tf_static from {names[0]} to {names[1]}")
-        calibration = replace(calibration, rotation=pose[0], translation=pose[1], has_pose=True)
-    with atomic_path(folder / "calib.txt") as temporary:
+        say(f"calibration: {source}")
+    if request.calib is None and topic is not None and of_bag is not None:
+        rectified = rectified_cameras(bag, topic, of_bag[0])
+        if rectified:
+            calibration = chosen_camera(request.output, image_topic, calibration, rectified, say)
+    with atomic_path(request.output / "calib.txt") as temporary:
         temporary.write_text(_calibration_text(calibration))
     return names[0]
 
@@ -217,3 +244,55 @@ def _calibration_text(calibration: Calibration) -> str:
         fields["size"] = [calibration.size[1], calibration.size[0]]
     lines = [f"{name}: {json.dumps(value)}\n" for name, value in fields.items()]
     return "".join([*lines, f"lens: {calibration.lens}\n"])
+
+
+def _write_poses(
+    folder: Path,
+    bag: Bag,
+    wanted: str | None,
+    camera: str,
+    times: Sequence[float],
+    say: Callable[[str], None],
+) -> str | None:
+    """Writes poses.txt if the bag has a pose for every frame; returns the topic, None without one.
+
+    Args:
+        folder: Of the frames.
+        bag: An open bag.
+        wanted: The topic of the poses. None: the only one.
+        camera: Name of the camera's frame.
+        times: Of the frames, seconds.
+        say: Receives what is used, or why there are no poses.
+
+    Raises:
+        UsageError: The topic is not there.
+    """
+    topics = poses_topics(bag, wanted)
+    if len(topics) != 1:
+        if topics:
+            say(f"poses: none, as several topics give some; --poses-topic {' | '.join(topics)}")
+        return None
+    (topic,) = topics
+    trajectory = camera_trajectory(bag, topic, camera)
+    if trajectory is None:
+        say(f"warning: no transforms tie the camera's frame {camera} to the poses of {topic}")
+        return None
+    rows = [row for time_s in times if (row := _row(trajectory, time_s)) is not None]
+    if len(rows) < len(times):
+        say(
+            f"warning: {len(times) - len(rows):,} of {len(times):,} images have no pose in {topic}"
+            f" within {_LONGEST_GAP_S:g} s, so poses.txt is not written"
+        )
+        return None
+    with atomic_path(folder / POSES) as temporary:
+        temporary.write_text("".join(rows))
+    say(f"poses: of {topic}")
+    return topic
+
+
+def _row(trajectory: Trajectory, time_s: float) -> str | None:
+    pose = trajectory.at(time_s, _LONGEST_GAP_S)
+    if pose is None:
+        return None
+    quaternion = Rotation.from_matrix(pose[:, :3]).as_quat()
+    return " ".join(map(str, [f"{time_s:.6f}", *pose[:, 3], *quaternion])) + "\n"

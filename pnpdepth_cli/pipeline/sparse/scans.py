@@ -15,13 +15,13 @@ from pnpdepth_cli.io.depth import describe_range
 from pnpdepth_cli.io.extrinsics import inverse, read_extrinsics
 from pnpdepth_cli.io.record import sha256_of
 from pnpdepth_cli.io.scans import read_scan
-from pnpdepth_cli.pipeline.sparse.scan_options import ScanOptions
+from pnpdepth_cli.pipeline.sparse.options import ScanOptions
 from pnpdepth_cli.points import in_frame
 from pnpdepth_cli.sensors import (
     Camera,
-    OcclusionFilter,
     ProjectedScan,
     ProjectionSettings,
+    describe_dropped,
     project_velodyne,
 )
 
@@ -34,9 +34,14 @@ _THIN = 0.5
 _NEXT_TO_NONE = 0.05
 """Fraction of them; fewer points with the extrinsics themselves are an error."""
 
+_AHEAD_DEG = 15.0
+"""Largest angle to the camera's axis of points that are expected in the image,"""
+
+_MOST_OUTSIDE = 1 / 3
+"""of which a larger fraction outside gives a warning."""
+
 _OFF_CENTRE = 0.15
 """Fraction of the image's side by which a principal point may be off centre without warning."""
-
 
 _ONE_DIRECTION = ("KITTI", "nuScenes", "DDAD")
 """Sources of calibrations whose files give the pose in one direction."""
@@ -47,14 +52,10 @@ class ScanPoints:
     """A projected scan."""
 
     points: ProjectedScan
-    """The points that the camera sees."""
-
     camera: Camera
-    """The camera, with the pose of the scanner."""
-
+    """With the pose of the scanner."""
     record: dict[str, Any]
     """What a record keeps of it."""
-
     notes: tuple[str, ...]
     """Lines for a person."""
 
@@ -102,14 +103,15 @@ def read_scan_points(
         euclidean=options.euclidean,
         min_range=options.min_range,
         max_range=np.inf if options.max_range is None else options.max_range,
-        occlusion=None if options.keep_occluded else OcclusionFilter(),
+        keep_occluded=options.keep_occluded,
     )
     camera = camera_of(calibration)
     if not calibration.source.startswith(_ONE_DIRECTION):
         warnings += check_direction(scan.points, camera, size)
     points = project_velodyne(scan.points, camera, size, settings)
+    warnings += check_field_of_view(scan.points, camera, size)
     source = f"{scan.source} of {len(scan.points):,} points, {calibration.source}"
-    lost = ", ".join(f"{count:,} {why}" for why, count in points.dropped.items() if count)
+    lost = describe_dropped(points.dropped)
     notes = [f"sparse: {describe_range(points.depth, source)}"]
     notes += [f"sparse: dropped {lost}"] if lost else []
     return ScanPoints(
@@ -176,6 +178,29 @@ def check_direction(scan: NDArray[np.floating], camera: Camera, size: tuple[int,
     if inside < _NEXT_TO_NONE * inverted:
         raise UsageError(text)
     return [f"warning: {text}"]
+
+
+def check_field_of_view(
+    scan: NDArray[np.floating], camera: Camera, size: tuple[int, int]
+) -> list[str]:
+    """Returns a warning if many points straight ahead of the camera are outside the image.
+
+    Args:
+        scan: (N, 3) metres in the scanner's frame.
+        camera: With the pose.
+        size: (H, W) of the image.
+    """
+    seen = camera.from_scanner(scan)
+    off_axis = np.hypot(seen[:, 0], seen[:, 1])
+    ahead = seen[off_axis < np.tan(np.radians(_AHEAD_DEG)) * seen[:, 2]]
+    outside = len(ahead) - int(np.count_nonzero(in_frame(camera.pixels_of(ahead), size)))
+    if outside <= _MOST_OUTSIDE * len(ahead):
+        return []
+    return [
+        f"warning: {outside:,} of the {len(ahead):,} scan points within {_AHEAD_DEG:g}° of the"
+        " camera's axis fall outside the image; check that the intrinsics belong to this image,"
+        " such as those of a rectified one"
+    ]
 
 
 def _is_upright(scan: NDArray[np.floating], camera: Camera) -> bool | None:

@@ -13,8 +13,8 @@ from pnpdepth_cli.io.calibration import read_calibration
 from pnpdepth_cli.io.dataset.frame import Frame
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest, count_or_fraction
+from pnpdepth_cli.pipeline.sparse.make import find_sensor
 from pnpdepth_cli.pipeline.sparse.scans import camera_of, check_size
-from pnpdepth_cli.pipeline.sparse.simulate import find_sensor
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.sensors import (
     FORWARD_LEFT_UP,

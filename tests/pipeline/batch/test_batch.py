@@ -27,7 +27,7 @@ from pnpdepth_cli.pipeline.refinement.inputs import read_inputs
 from pnpdepth_cli.pipeline.refinement.refine import refine_image
 from pnpdepth_cli.pipeline.refinement.refiner import Refiner
 from pnpdepth_cli.pipeline.report.batch import BatchReport
-from pnpdepth_cli.pipeline.sparse.scan_options import ScanOptions
+from pnpdepth_cli.pipeline.sparse.options import ScanOptions
 from pnpdepth_cli.sensors import SamplePattern
 from tests.pipeline.batches import (
     NAMES,

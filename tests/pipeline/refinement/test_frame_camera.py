@@ -16,7 +16,7 @@ from pnpdepth_cli.io.dataset.protocols import Protocol
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.io.scans import read_scan
 from pnpdepth_cli.pipeline.refinement.frame_camera import FrameCamera, camera_of_fov
-from pnpdepth_cli.pipeline.sparse.scan_options import ScanOptions
+from pnpdepth_cli.pipeline.sparse.options import ScanOptions
 from pnpdepth_cli.sensors.camera import Camera
 from pnpdepth_cli.sensors.cloud import depth_edges
 from tests.colmap_models import HEIGHT, WIDTH, write_text_model

@@ -18,7 +18,7 @@ from pnpdepth_cli.pipeline.batch.bags import unpacked
 from pnpdepth_cli.pipeline.batch.request import BatchRequest
 from pnpdepth_cli.pipeline.batch.sequence_options import SequenceOptions
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest
-from pnpdepth_cli.pipeline.sparse.bag_options import BagOptions
+from pnpdepth_cli.pipeline.sparse.options import BagOptions
 from tests.bags import write_bag
 from tests.pipeline.sparse.test_bags import KINDS, written
 

@@ -17,9 +17,8 @@ from pnpdepth_cli.io.calibration import read_calibration
 from pnpdepth_cli.io.layouts import read_frames
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.io.scans import read_scan
-from pnpdepth_cli.pipeline.sparse.bag_options import BagOptions
 from pnpdepth_cli.pipeline.sparse.frames import FramesRequest, write_frames
-from pnpdepth_cli.pipeline.sparse.scan_options import ScanOptions
+from pnpdepth_cli.pipeline.sparse.options import BagOptions, ScanOptions
 from pnpdepth_cli.pipeline.sparse.scans import read_scan_points
 from tests.bags import HEIGHT, IMAGES, POINTS, WIDTH, write_bag
 from tests.pipeline.frames import frame_on_disk

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 from pnpdepth_cli.cli.main import main
-from pnpdepth_cli.errors import InputError, NoPointsError, SizeError, UsageError
+from pnpdepth_cli.errors import FileFormatError, InputError, NoPointsError, SizeError, UsageError
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.io.layouts import list_frames
 from pnpdepth_cli.pipeline.sparse.colmap import read_colmap_points
-from pnpdepth_cli.pipeline.sparse.colmap_options import ColmapOptions
+from pnpdepth_cli.pipeline.sparse.options import ColmapOptions
 from tests.colmap_models import HEIGHT, WIDTH, write_text_model
 from tests.pipeline.frames import FrameOnDisk, frame_on_disk, run
 
@@ -137,6 +137,15 @@ def test_points_behind_the_camera_are_counted_and_a_model_of_nothing_else_refuse
     assert read(project).points.dropped["behind the camera"] == 1
     change(project, "images.txt", "1 1 0 0 0 0.0 0 0 1", "1 1 0 0 0 0.0 0 -9 1")
     with pytest.raises(InputError, match=r"all 40 points of 'a\.png' .* are behind its camera"):
+        read(project)
+
+
+@pytest.mark.parametrize("position", range(7))
+def test_a_pose_with_one_number_that_is_none_is_refused(project: Path, position: int) -> None:
+    pose = ["1", "0", "0", "0", "0.0", "0", "0"]
+    damaged = " ".join([*pose[:position], "nan", *pose[position + 1 :]])
+    change(project, "images.txt", f"1 {' '.join(pose)} 1 a.png", f"1 {damaged} 1 a.png")
+    with pytest.raises(FileFormatError, match=r"the pose of 'a\.png' is not made of finite"):
         read(project)
 
 

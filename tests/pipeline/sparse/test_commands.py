@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -21,12 +22,19 @@ from pnpdepth_cli.errors import (
 )
 from pnpdepth_cli.io.calibration import read_calibration
 from pnpdepth_cli.io.depth import DEPTH_SUFFIXES, read_depth, read_sparse
-from pnpdepth_cli.pipeline.sparse.outputs import SparseTarget
-from pnpdepth_cli.pipeline.sparse.project import ProjectRequest, project_scan
-from pnpdepth_cli.pipeline.sparse.sample import SampleRequest, sample_depth
-from pnpdepth_cli.pipeline.sparse.scan_options import ScanOptions
+from pnpdepth_cli.pipeline.sparse.make import (
+    SampleNoise,
+    SamplePattern,
+    SampleRequest,
+    SimulateRequest,
+    SparseTarget,
+    find_sensor,
+    project_scan,
+    sample_depth,
+    simulate_scan,
+)
+from pnpdepth_cli.pipeline.sparse.options import ScanOptions
 from pnpdepth_cli.pipeline.sparse.scans import camera_of, read_scan_points
-from pnpdepth_cli.pipeline.sparse.simulate import SimulateRequest, find_sensor, simulate_scan
 from tests.pipeline.scan_frames import ScanOnDisk, scan_on_disk
 
 
@@ -35,15 +43,14 @@ def frame(tmp_path: Path) -> ScanOnDisk:
     return scan_on_disk(tmp_path)
 
 
-def projecting(frame: ScanOnDisk, output: str = "sparse.csv", **more: object) -> ProjectRequest:
-    scan = ScanOptions(calib=frame.calib)
+def projected(frame: ScanOnDisk, output: str = "sparse.csv", **more: Any) -> dict[str, Any]:
     target = SparseTarget(output=frame.folder / output)
-    request = ProjectRequest(scan=frame.scan, options=scan, target=target, image=frame.image)
-    return replace(request, **more)  # type: ignore[arg-type]
+    standard = {"options": ScanOptions(calib=frame.calib), "target": target, "image": frame.image}
+    return project_scan(**({"scan": frame.scan} | standard | more))
 
 
 def test_a_projected_scan_lands_where_it_was_made_to(frame: ScanOnDisk) -> None:
-    record = project_scan(projecting(frame))
+    record = projected(frame)
     got = read_sparse(frame.folder / "sparse.csv", size=(60, 100)).points
     np.testing.assert_allclose(got.xy, frame.xy, atol=1e-3)
     np.testing.assert_allclose(got.depth, frame.depth, atol=1e-4)
@@ -53,7 +60,7 @@ def test_a_projected_scan_lands_where_it_was_made_to(frame: ScanOnDisk) -> None:
 
 @pytest.mark.parametrize("suffix", DEPTH_SUFFIXES)
 def test_every_depth_format_holds_the_same_points(frame: ScanOnDisk, suffix: str) -> None:
-    project_scan(projecting(frame, f"sparse{suffix}"))
+    projected(frame, f"sparse{suffix}")
     got = read_depth(frame.folder / f"sparse{suffix}").values
     column, row = np.floor(frame.xy + 0.5).astype(int).T
     want = np.zeros((48, 64))
@@ -63,26 +70,26 @@ def test_every_depth_format_holds_the_same_points(frame: ScanOnDisk, suffix: str
 
 def test_the_overlay_is_written_beside(frame: ScanOnDisk) -> None:
     target = SparseTarget(output=frame.folder / "s.png", overlay=frame.folder / "o" / "over.png")
-    project_scan(projecting(frame, target=target))
+    projected(frame, target=target)
     assert cv2.imread(str(frame.folder / "o" / "over.png")).shape[1] > 300
     again = replace(target, overwrite=True)
     with pytest.raises(UsageError, match="needs the image"):
-        project_scan(projecting(frame, target=again, image=None, size=(48, 64)))
+        projected(frame, target=again, image=None, size=(48, 64))
 
 
 def test_the_size_comes_from_image_option_or_calibration(frame: ScanOnDisk) -> None:
     with pytest.raises(SizeError, match="does not give the image's size"):
-        project_scan(projecting(frame, image=None))
-    by_option = project_scan(projecting(frame, image=None, size=(48, 64)))
+        projected(frame, image=None)
+    by_option = projected(frame, image=None, size=(48, 64))
     frame.calib.write_text(frame.calib.read_text() + "size: [64, 48]\n")
-    by_file = project_scan(projecting(frame, "other.csv", image=None))
+    by_file = projected(frame, "other.csv", image=None)
     assert by_option["points"] == by_file["points"]
 
 
 def refused(frame: ScanOnDisk, error: type[PnpDepthError], message: str, **more: object) -> None:
     before = sorted(frame.folder.rglob("*"))
     with pytest.raises(error) as caught:
-        project_scan(projecting(frame, **more))  # type: ignore[arg-type]
+        projected(frame, **more)  # type: ignore[arg-type]
     assert message in str(caught.value)
     assert "\n" not in str(caught.value)
     assert sorted(frame.folder.rglob("*")) == before
@@ -110,7 +117,7 @@ def test_an_image_of_another_camera_is_an_error_or_gets_a_warning(frame: ScanOnD
     refused(frame, SizeError, "small.png is 20×15, which does not contain", image=small)
     wide = frame.folder / "wide.png"
     Image.new("RGB", (128, 48)).save(wide)
-    record = project_scan(projecting(frame, image=wide))
+    record = projected(frame, image=wide)
     assert any(note.startswith("warning: the principal point") for note in record["notes"])
     frame.calib.write_text(frame.calib.read_text() + "size: [64, 48]\n")
     target = SparseTarget(output=frame.folder / "b.csv")
@@ -123,10 +130,10 @@ def test_a_calibration_without_a_scanner_is_refused(frame: ScanOnDisk) -> None:
 
 
 def test_results_are_replaced_only_with_overwrite(frame: ScanOnDisk) -> None:
-    project_scan(projecting(frame))
+    projected(frame)
     refused(frame, OutputError, "exists; --overwrite")
     target = SparseTarget(output=frame.folder / "sparse.csv", overwrite=True)
-    project_scan(projecting(frame, target=target))
+    projected(frame, target=target)
     into = SparseTarget(output=frame.folder / "calib.csv", overwrite=True)
     calib = frame.folder / "calib.json"
     calib.write_text('{"K": [60, 0, 31.5, 0, 60, 23.5, 0, 0, 1]}')
@@ -148,9 +155,10 @@ def test_options_of_a_scan_are_refused_for_anything_else(frame: ScanOnDisk) -> N
     assert not ScanOptions(keep_occluded=True).describes(frame.gt)
 
 
-def sampling(frame: ScanOnDisk, output: str, **more: object) -> SampleRequest:
+def sampling(frame: ScanOnDisk, output: str, **more: Any) -> SampleRequest:
+    pattern = {name: more.pop(name) for name in ("kind", "count", "fraction") if name in more}
     target = SparseTarget(output=frame.folder / output)
-    return replace(SampleRequest(depth=frame.gt, target=target), **more)  # type: ignore[arg-type]
+    return SampleRequest(depth=frame.gt, target=target, pattern=SamplePattern(**pattern), **more)
 
 
 def test_the_seed_is_in_the_png_and_in_the_record(frame: ScanOnDisk) -> None:
@@ -165,12 +173,14 @@ def test_the_seed_is_in_the_png_and_in_the_record(frame: ScanOnDisk) -> None:
 
 def test_the_same_seed_gives_the_same_bytes(frame: ScanOnDisk) -> None:
     for name in ("a", "b"):
-        sample_depth(sampling(frame, f"{name}.png", fraction=0.1, noise={"metres": 0.1}, seed=2))
+        sample_depth(
+            sampling(frame, f"{name}.png", fraction=0.1, noise=SampleNoise(metres=0.1), seed=2)
+        )
     assert (frame.folder / "a.png").read_bytes() == (frame.folder / "b.png").read_bytes()
 
 
 def test_fewer_edges_than_requested_are_reported(frame: ScanOnDisk) -> None:
-    request = sampling(frame, "e.png", pattern="edges", count=3000, image=frame.image)
+    request = sampling(frame, "e.png", kind="edges", count=3000, image=frame.image)
     image = np.zeros((48, 64, 3), np.uint8)
     image[:, 30:] = 255
     cv2.imwrite(str(frame.image), image)
@@ -215,12 +225,10 @@ def test_kittis_frames_project_to_the_density_of_the_data_sets_own(
     folder = shared_data / "kitti_object"
     for image in sorted((folder / "image_2").glob("*.png")):
         record = project_scan(
-            ProjectRequest(
-                scan=folder / "velodyne" / f"{image.stem}.bin",
-                options=ScanOptions(calib=folder / "calib" / f"{image.stem}.txt"),
-                target=SparseTarget(output=tmp_path / f"{image.stem}.png"),
-                image=image,
-            )
+            scan=folder / "velodyne" / f"{image.stem}.bin",
+            options=ScanOptions(calib=folder / "calib" / f"{image.stem}.txt"),
+            target=SparseTarget(output=tmp_path / f"{image.stem}.png"),
+            image=image,
         )
         assert 0.033 < record["points"]["fraction_of_pixels"] < 0.045
 
@@ -238,12 +246,10 @@ def test_kittis_own_projected_scan_comes_back_from_the_scanners_frame(
     scan = tmp_path / "scan.bin"
     np.column_stack([points, np.zeros(len(points))]).astype("<f4").tofile(scan)
     project_scan(
-        ProjectRequest(
-            scan=scan,
-            options=ScanOptions(calib=folder, camera=2, keep_occluded=True),
-            target=SparseTarget(output=tmp_path / "sparse.png"),
-            image=folder / "image" / "0000000005.jpg",
-        )
+        scan=scan,
+        options=ScanOptions(calib=folder, camera=2, keep_occluded=True),
+        target=SparseTarget(output=tmp_path / "sparse.png"),
+        image=folder / "image" / "0000000005.jpg",
     )
     ours = cv2.imread(str(tmp_path / "sparse.png"), cv2.IMREAD_UNCHANGED)
     assert np.array_equal(ours, theirs)

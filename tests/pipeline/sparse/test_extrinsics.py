@@ -13,9 +13,8 @@ from pnpdepth_cli.io.calibration import read_calibration
 from pnpdepth_cli.io.extrinsics import inverse
 from pnpdepth_cli.io.record import read_json
 from pnpdepth_cli.io.scans import read_scan
-from pnpdepth_cli.pipeline.sparse.outputs import SparseTarget
-from pnpdepth_cli.pipeline.sparse.project import ProjectRequest, project_scan
-from pnpdepth_cli.pipeline.sparse.scan_options import ScanOptions
+from pnpdepth_cli.pipeline.sparse.make import SparseTarget, project_scan
+from pnpdepth_cli.pipeline.sparse.options import ScanOptions
 from pnpdepth_cli.pipeline.sparse.scans import camera_of, check_direction, read_scan_points
 from tests.pipeline.scan_frames import CALIBRATION, HEIGHT, WIDTH, ScanOnDisk, scan_on_disk
 
@@ -46,12 +45,10 @@ def test_projecting_with_extrinsics_records_their_path(scene: ScanOnDisk) -> Non
     options = ScanOptions(calib=scene.calib, extrinsics=scene.folder / "pose.txt")
     for name in ("out.png", "out.csv"):
         record = project_scan(
-            ProjectRequest(
-                scan=scene.scan,
-                options=options,
-                target=SparseTarget(output=scene.folder / name, overwrite=True),
-                size=(HEIGHT, WIDTH),
-            )
+            scene.scan,
+            options,
+            SparseTarget(output=scene.folder / name, overwrite=True),
+            size=(HEIGHT, WIDTH),
         )
         assert record["extrinsics"] == str(options.extrinsics)
         assert read_json(scene.folder / "out.json") == record
@@ -60,14 +57,10 @@ def test_projecting_with_extrinsics_records_their_path(scene: ScanOnDisk) -> Non
 def test_the_extrinsics_are_not_replaced_by_the_output(scene: ScanOnDisk) -> None:
     pose = scene.folder / "pose.json"
     pose.write_text((scene.folder / "pose.txt").read_text())
-    request = ProjectRequest(
-        scan=scene.scan,
-        options=ScanOptions(calib=scene.calib, extrinsics=pose),
-        target=SparseTarget(output=scene.folder / "pose.png", overwrite=True),
-        size=(HEIGHT, WIDTH),
-    )
+    options = ScanOptions(calib=scene.calib, extrinsics=pose)
+    target = SparseTarget(output=scene.folder / "pose.png", overwrite=True)
     with pytest.raises(OutputError, match=r"pose\.json is an input"):
-        project_scan(request)
+        project_scan(scene.scan, options, target, size=(HEIGHT, WIDTH))
 
 
 def test_extrinsics_of_the_wrong_direction_are_recognised(scene: ScanOnDisk) -> None:

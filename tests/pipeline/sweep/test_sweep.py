@@ -31,7 +31,7 @@ from pnpdepth_cli.pipeline.refinement.inputs import Inputs, read_inputs
 from pnpdepth_cli.pipeline.refinement.load_refiner import load_refiner
 from pnpdepth_cli.pipeline.refinement.refine import refine_image
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest
-from pnpdepth_cli.pipeline.sparse.scan_options import ScanOptions
+from pnpdepth_cli.pipeline.sparse.options import ScanOptions
 from pnpdepth_cli.pipeline.sweep import plots as sweep_plots
 from pnpdepth_cli.pipeline.sweep.axes import PARAMETERS, read_axis, studies_of
 from pnpdepth_cli.pipeline.sweep.plan import Method

@@ -7,15 +7,17 @@ weights with the smallest loss at its hidden points are written, the first among
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
 import torch
-from torch import Tensor
+from safetensors.torch import save_file
+from torch import Tensor, nn
 
+from pnpdepth_cli import __version__
 from pnpdepth_cli.choices import LOSSES, UPDATES
 from pnpdepth_cli.core.losses import Loss
 from pnpdepth_cli.core.masks import Masks
@@ -29,10 +31,10 @@ from pnpdepth_cli.errors import DivergedError, InputError, NoPointsError
 from pnpdepth_cli.frames.frame import is_dense
 from pnpdepth_cli.frames.prepare import PreparedFrame, prepare
 from pnpdepth_cli.frames.refine import opened_frame
+from pnpdepth_cli.io.atomic import all_or_none, atomic_path
 from pnpdepth_cli.io.layouts import list_frames
 from pnpdepth_cli.models.network import Network, load_network
-from pnpdepth_cli.pipeline.adaptation.request import AdaptRequest
-from pnpdepth_cli.pipeline.adaptation.weights_file import Adapted, write_adapted
+from pnpdepth_cli.pipeline.adapt_request import AdaptRequest
 from pnpdepth_cli.pipeline.batch.frames import Task, task_of
 from pnpdepth_cli.pipeline.batch.request import BatchRequest
 from pnpdepth_cli.pipeline.refinement.inputs import read_inputs
@@ -54,6 +56,36 @@ _IN_MEMORY = 64
 
 OnStep = Callable[[int, int, str], None]
 """Called with (updates made, of, text)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Adapted:
+    """What was learnt, and from what."""
+
+    network: str
+    checkpoint: str | None
+    """The weights it began with. None: its own."""
+    source: str
+    output: str
+    training_frames: int
+    validation_frames: int
+    """Frames that decided which weights are written."""
+    steps: int
+    kept: int
+    """Updates after which the weights are those written; 0 leaves them as they were."""
+    lr: float
+    seed: int
+    """Of masks and order."""
+    loss: str
+    hidden: float
+    """Fraction of the points that was hidden at every update."""
+    losses: dict[int, float]
+    """Loss at hidden points of the validation frames by the number of updates."""
+
+    @property
+    def change(self) -> float:
+        """Loss of the written weights over that of the first, minus 1."""
+        return self.losses[self.kept] / self.losses[0] - 1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -114,7 +146,7 @@ def adapt(request: AdaptRequest, progress: Progress) -> Adapted:
         hidden=settings.mask.fraction,
         losses=losses,
     )
-    write_adapted(request, adapted, network.module, adaptation.best.values())
+    _write(request, adapted, network.module, adaptation.best.values())
     return adapted
 
 
@@ -243,3 +275,51 @@ def _prepared(network: Network, task: Task) -> PreparedFrame:
     if len(frame.points) < 2:
         raise NoPointsError(f"{task.name}: {len(frame.points)} points; hiding some needs 2")
     return frame
+
+
+def _write(
+    request: AdaptRequest,
+    adapted: Adapted,
+    module: nn.Module,
+    moved: Mapping[nn.Parameter, Tensor],
+) -> None:
+    """Writes all tensors of the network with those that moved, and the card; both or none.
+
+    Raises:
+        OutputError: A file cannot be written.
+    """
+    state = dict(module.state_dict())
+    for name, parameter in module.named_parameters(remove_duplicate=False):
+        if parameter in moved:
+            state[name] = moved[parameter]
+    copies = {name: value.detach().cpu().clone().contiguous() for name, value in state.items()}
+    with all_or_none((request.output, request.card)):
+        with atomic_path(request.output) as path:
+            save_file(copies, path)
+        with atomic_path(request.card) as path:
+            path.write_text(card_of(adapted, request.output.name), encoding="utf-8")
+
+
+def card_of(adapted: Adapted, file: str) -> str:
+    """Returns the model card in Markdown."""
+    rows = "\n".join(f"| {updates} | {loss:.5f} |" for updates, loss in adapted.losses.items())
+    return f"""# {file}
+
+Weights of `{adapted.network}`, adapted to the frames of `{adapted.source}` by
+`pnpdepth adapt` {__version__}. Use: `--model {adapted.network} --checkpoint {file}`.
+
+- **Start**: {adapted.checkpoint or "the network's own weights"}.
+- **Data**: frames to learn from: {adapted.training_frames}; for validation:
+  {adapted.validation_frames}; images and sparse depth, no ground truth.
+- **Method**: {adapted.hidden:.0%} of the points of a frame are hidden from the input, and the
+  loss (`{adapted.loss}`) is taken at these. {adapted.steps} updates, step size {adapted.lr:g},
+  seed {adapted.seed}.
+- **Written**: the weights after {adapted.kept} updates, whose validation loss is the smallest:
+  {adapted.change:+.1%} against the start.
+- **Limits**: adapted to this camera, sensor and scene; others may get worse. The licence of the
+  start and that of the frames apply.
+
+| updates | loss at hidden points of the validation frames |
+|---|---|
+{rows}
+"""

@@ -1,0 +1,335 @@
+"""The commands that make sparse depth: `pnpdepth project`, `sample` and `simulate`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pnpdepth_cli import __version__
+from pnpdepth_cli.errors import OutputError, SizeError, UsageError
+from pnpdepth_cli.io.atomic import make_folder
+from pnpdepth_cli.io.calibration import Calibration, read_calibration
+from pnpdepth_cli.io.depth import DepthImage, describe_range, implausible, read_depth
+from pnpdepth_cli.io.overlay import overlay
+from pnpdepth_cli.io.record import plain, sha256_of, write_json
+from pnpdepth_cli.io.rgb import read_rgb
+from pnpdepth_cli.io.sensor_file import read_sensor
+from pnpdepth_cli.io.sparse_writing import SPARSE_SUFFIXES, write_sparse
+from pnpdepth_cli.pipeline.sparse.options import ScanOptions
+from pnpdepth_cli.pipeline.sparse.scans import camera_of, check_size, read_scan_points
+from pnpdepth_cli.sensors import (
+    FORWARD_LEFT_UP,
+    LIDARS,
+    Camera,
+    Lidar,
+    Points,
+    SampleNoise,
+    SamplePattern,
+    SimulationSettings,
+    as_depth_image,
+    sample_points,
+    simulate_lidar,
+)
+
+__all__ = [
+    "SampleNoise",
+    "SamplePattern",
+    "SampleRequest",
+    "SimulateRequest",
+    "SimulationSettings",
+    "SparseTarget",
+    "find_sensor",
+    "project_scan",
+    "sample_depth",
+    "simulate_scan",
+]
+
+
+@dataclass(frozen=True, kw_only=True)
+class SparseTarget:
+    """Where sparse depth is written."""
+
+    output: Path
+    """The sparse depth; its suffix is one of `SPARSE_SUFFIXES`."""
+    overlay: Path | None = None
+    """A PNG of the points on the image; None for none."""
+    depth_scale: float = 256.0
+    """Codes per metre of a PNG."""
+    overwrite: bool = False
+
+    @property
+    def record(self) -> Path:
+        """The JSON beside the output, with everything it was made from."""
+        return self.output.with_suffix(".json")
+
+    def check(self, inputs: Iterable[Path | None]) -> None:
+        """Raises OutputError for files that cannot be written, before any work is done.
+
+        Args:
+            inputs: Files that are read, which must not be replaced.
+        """
+        if self.output.suffix.lower() not in SPARSE_SUFFIXES:
+            raise OutputError(
+                f"{self.output}: sparse depth is written as one of {', '.join(SPARSE_SUFFIXES)}"
+            )
+        if not 0 < self.depth_scale < np.inf:
+            raise UsageError(f"--output-scale must be a number above 0, not {self.depth_scale:g}")
+        if self.overlay is not None and self.overlay.suffix.lower() != ".png":
+            raise OutputError(f"{self.overlay}: the overlay is a PNG; name it so")
+        taken = {p.resolve() for p in inputs if p is not None}
+        for path in filter(None, (self.output, self.record, self.overlay)):
+            if path.resolve() in taken:
+                raise OutputError(f"{path} is an input or named twice; give another output")
+            if path.exists() and not self.overwrite:
+                raise OutputError(f"{path} exists; --overwrite replaces it, -o names another path")
+            taken.add(path.resolve())
+
+    def write(
+        self,
+        points: Points,
+        settings: dict[str, Any],
+        *,
+        inputs: dict[str, Any],
+        notes: Sequence[str],
+        rgb: NDArray[np.float32] | None = None,
+    ) -> dict[str, Any]:
+        """Writes the sparse depth, its record and the overlay, and returns the record.
+
+        Args:
+            points: The sparse depth.
+            settings: The command and its settings, seed included; a PNG or CSV keeps them too.
+            inputs: Input files, for the record.
+            notes: What was assumed, and warnings.
+            rgb: (H, W, 3) in 0..1, the image of the overlay.
+
+        Raises:
+            OutputError: A file cannot be written.
+        """
+        provenance = {"command": settings["command"], "version": __version__, **settings}
+        for path in filter(None, (self.output, self.overlay)):
+            make_folder(path.parent)
+        write_sparse(
+            self.output,
+            points.xy,
+            points.depth,
+            as_depth_image(points),
+            provenance=provenance,
+            scale=self.depth_scale,
+        )
+        if self.overlay is not None and rgb is not None:
+            overlay(rgb, points.xy, points.depth, self.overlay)
+        height, width = points.size
+        record = {
+            **provenance,
+            "inputs": inputs,
+            "points": {
+                "count": len(points.depth),
+                "fraction_of_pixels": len(points.depth) / (height * width),
+                "nearest": float(points.depth.min()),
+                "farthest": float(points.depth.max()),
+                "dropped": dict(points.dropped),
+            },
+            "size": [width, height],
+            "notes": list(notes),
+            "outputs": {
+                "sparse": str(self.output),
+                "overlay": str(self.overlay) if self.overlay else None,
+                "record": str(self.record),
+            },
+        }
+        write_json(self.record, record)
+        return record
+
+
+def project_scan(
+    scan: Path,
+    options: ScanOptions,
+    target: SparseTarget,
+    *,
+    image: Path | None = None,
+    size: tuple[int, int] | None = None,
+) -> dict[str, Any]:
+    """Writes the scan's points that the camera sees, and returns the record.
+
+    Args:
+        scan: Its file.
+        options: Calibration and limits.
+        target: Files to write.
+        image: The camera's image, which gives the size and the ground of an overlay.
+        size: (H, W) of the image, where there is no file of it.
+
+    Raises:
+        PnpDepthError: An input or output is at fault; then nothing is written.
+    """
+    target.check((scan, image, options.calib, options.extrinsics))
+    if target.overlay is not None and image is None:
+        raise UsageError("an overlay needs the image; give --image")
+    rgb = None if image is None else read_rgb(image).values
+    if rgb is not None:
+        if size not in (None, rgb.shape[:2]):
+            raise SizeError(f"{image} is {rgb.shape[1]}×{rgb.shape[0]}, not of the size given")
+        size = (rgb.shape[0], rgb.shape[1])
+    projected = read_scan_points(scan, options, size, image)
+    settings = {"command": "project", **plain(asdict(options))}
+    if options.point_fields is None:
+        del settings["point_fields"]
+    return target.write(
+        projected.points,
+        settings,
+        inputs=_files(image=image) | {"scan": projected.record},
+        notes=projected.notes,
+        rgb=rgb,
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class DenseDepth:
+    """Dense depth that sparse points are made from, and where to."""
+
+    depth: Path
+    target: SparseTarget
+    seed: int = 0
+    """Of all noise and random choices."""
+    depth_scale: float | None = None
+    """Codes per metre of an integer depth file; None for the file's own."""
+    channel: str | None = None
+    """The EXR channel or NPZ array with the depth."""
+
+    def read(self) -> tuple[DepthImage, list[str]]:
+        """Returns the dense depth, and lines for a person."""
+        dense = read_depth(self.depth, scale=self.depth_scale, channel=self.channel)
+        text = describe_range(
+            dense.values, dense.source, assumed_scale=dense.assumed_scale, noun="pixels"
+        )
+        unlikely = implausible(dense.values, dense.scale)
+        return dense, [f"depth: {text}", *([f"warning: {unlikely}"] if unlikely else [])]
+
+
+@dataclass(frozen=True, kw_only=True)
+class SampleRequest(DenseDepth):
+    """What to sample, and where to."""
+
+    pattern: SamplePattern
+    noise: SampleNoise = field(default_factory=SampleNoise)
+    image: Path | None = None
+    """For the patterns that need one and for an overlay."""
+
+
+def sample_depth(request: SampleRequest) -> dict[str, Any]:
+    """Writes points of the depth map, and returns the record.
+
+    Raises:
+        PnpDepthError: An input or output is at fault; then nothing is written.
+    """
+    request.target.check((request.depth, request.image))
+    pattern, noise, seed = request.pattern, request.noise, request.seed
+    dense, notes = request.read()
+    rgb = None if request.image is None else read_rgb(request.image).values
+    points = sample_points(dense.values, pattern, seed, image=rgb, noise=noise)
+    wanted = pattern.wanted(int(np.count_nonzero(dense.values)))
+    sampled = len(points.depth) + sum(points.dropped.values())
+    if pattern.kind in ("features", "edges") and sampled < wanted:
+        notes.append(f"warning: the image has {sampled:,} of the {wanted:,} points asked for")
+    notes.append(f"sparse: {describe_range(points.depth, f'{pattern.kind}, seed {seed}')}")
+    return request.target.write(
+        points,
+        {
+            "command": "sample",
+            "pattern": asdict(pattern),
+            "noise": asdict(noise),
+            "seed": seed,
+        },
+        inputs=_files(depth=request.depth, image=request.image),
+        notes=notes,
+        rgb=rgb,
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class SimulateRequest(DenseDepth):
+    """What to simulate, and where to."""
+
+    calib: Path
+    sensor: str = "hdl-64e"
+    """One of `LIDARS`, or a TOML file."""
+    camera: int | None = None
+    """One of KITTI's four, 0 to 3; None for the left colour camera."""
+    offset: tuple[float, float, float] | None = None
+    """Position of the scanner: metres to the right of, below and in front of the camera."""
+    at_scanner: bool = False
+    """The scanner has the pose that the calibration gives."""
+    settings: SimulationSettings = field(default_factory=SimulationSettings)
+
+
+def simulate_scan(request: SimulateRequest) -> dict[str, Any]:
+    """Writes the simulated sensor's points, and returns the record.
+
+    Raises:
+        PnpDepthError: An input or output is at fault; then nothing is written.
+    """
+    sensor = find_sensor(request.sensor)
+    request.target.check((request.depth, request.calib, Path(request.sensor)))
+    dense, notes = request.read()
+    calibration = read_calibration(request.calib, request.camera)
+    height, width = dense.values.shape
+    notes += check_size(request.calib, calibration, (height, width), request.depth)
+    camera = _camera(request, calibration)
+    points = simulate_lidar(dense.values, camera, sensor, request.seed, request.settings)
+    source = f"{sensor.name}, seed {request.seed}"
+    notes.append(f"sparse: {describe_range(points.depth, source)}")
+    max_range = sensor.max_range if np.isfinite(sensor.max_range) else None  # JSON lacks infinity
+    return request.target.write(
+        points,
+        {
+            "command": "simulate",
+            "sensor": asdict(sensor) | {"max_range": max_range},
+            **asdict(request.settings),
+            "rotation": camera.rotation.tolist(),
+            "translation": camera.translation.tolist(),
+            "seed": request.seed,
+        },
+        inputs=_files(depth=request.depth)
+        | {"calibration": {"path": str(request.calib), "read_as": calibration.source}},
+        notes=notes,
+    )
+
+
+def find_sensor(spec: str) -> Lidar:
+    """Returns the named sensor, or the one that a TOML file describes.
+
+    Raises:
+        UsageError: There is no sensor of this name, or it is described wrongly.
+        InputError: The file cannot be read.
+    """
+    if spec in LIDARS:
+        return LIDARS[spec]
+    if Path(spec).suffix.lower() == ".toml":
+        return Lidar(**asdict(read_sensor(Path(spec))))
+    raise UsageError(f"no sensor {spec!r}; --sensor is a TOML file or one of: {', '.join(LIDARS)}")
+
+
+def _camera(request: SimulateRequest, calibration: Calibration) -> Camera:
+    """The camera, with the scanner at the position that is asked for."""
+    if request.at_scanner and request.offset is not None:
+        raise UsageError("--at-scanner takes the position from the calibration; leave out --offset")
+    camera = camera_of(calibration)
+    if request.at_scanner:
+        if not calibration.has_pose:
+            raise UsageError(f"{request.calib} has no pose of the scanner; add R and t")
+        return camera
+    position = np.array(request.offset or (0.0, 0.0, 0.0))
+    return replace(camera, rotation=FORWARD_LEFT_UP, translation=position)
+
+
+def _files(**paths: Path | None) -> dict[str, Any]:
+    """Path and digest of the files that are given."""
+    return {
+        name: {"path": str(path), "sha256": sha256_of(path)}
+        for name, path in paths.items()
+        if path is not None
+    }

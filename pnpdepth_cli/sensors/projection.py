@@ -1,0 +1,271 @@
+"""LiDAR scans in a camera's image, and which of their points the camera cannot see.
+
+Scanner and camera are at different positions, so the scanner sees past edges that occlude the
+camera's view. A point behind such an edge projects onto the foreground. Its beam passed the
+foreground's depth at another pixel, displaced by the parallax between the two depths. An occluded
+point therefore has foreground near the segment between these two pixels.
+
+A depth map that holds a projected scan, such as KITTI's `velodyne_raw`, comes without calibration
+and mostly with the occluded points. It is recognised by its pattern: points are close together
+along a scan line and farther apart across, and some lie between points of a nearer surface.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from pnpdepth_cli.errors import NoPointsError, UsageError
+from pnpdepth_cli.scan_pattern import scan_pattern
+from pnpdepth_cli.sensors.camera import Camera
+from pnpdepth_cli.sensors.sparse import (
+    DropCounter,
+    Floats,
+    Mask,
+    Points,
+    as_depth_image,
+    pixel_index,
+)
+
+Indices = NDArray[np.intp]
+
+NEARER = 0.08
+"""Foreground is nearer by more than this fraction of the point's depth."""
+
+_MARGIN_DEG = 0.24
+"""Largest distance of the foreground from the middle of the parallax segment: about half the gap
+between scan lines, as foreground is measured only on them."""
+
+_STRETCH = 1.5  # multiple of half the parallax that is added to the margin
+_REACH_DEG = 0.8  # to each side, in which foreground is searched
+
+_JUMP = 1.3  # ratio of depths across an edge,
+_JUMP_NEIGHBOURS = 6  # looked for among so many nearest points,
+_BESIDE_PX = 3  # and compared with the image's gradient in a square of this side
+
+MIN_POINTS = 1000
+"""Maps with fewer points are not filtered: each point matters."""
+
+_MARGIN_IN_LINES = 0.57
+"""Margin over the spacing of scan lines in a map, chosen on three KITTI frames."""
+
+_LINE_SPACING_PX = (3.0, 8.0)  # farther apart, lines say little of what is between them
+_INTERLEAVED = 0.003  # least fraction of points that lie between points of a nearer surface
+_INTERLEAVED_REACH = (4, 2)  # pixels to each side, and half the width, of the area compared
+
+
+@dataclass(frozen=True, kw_only=True)
+class ProjectionSettings:
+    """How a scan becomes sparse depth."""
+
+    euclidean: bool = False
+    """Depth is the distance from the camera's centre instead of z, along its axis."""
+    min_range: float = 0.0
+    """Metres from the scanner; nearer points are dropped."""
+    max_range: float = np.inf
+    """Metres from the scanner; farther points are dropped."""
+    keep_occluded: bool = False
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.min_range < self.max_range:
+            raise UsageError(
+                f"range {self.min_range:g} to {self.max_range:g} m is empty; give"
+                " 0 ≤ minimum < maximum"
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
+class ProjectedScan(Points):
+    """The points of a scan that the camera sees, in the scan's order."""
+
+    index: Indices
+    """(N,) row of each point in the scan."""
+
+
+def project_velodyne(
+    points: NDArray[np.floating],
+    camera: Camera,
+    size: tuple[int, int],
+    settings: ProjectionSettings | None = None,
+) -> ProjectedScan:
+    """Returns the scan as sparse depth in an image.
+
+    Args:
+        points: (N, 3) or more columns, x y z in metres in the scanner's frame.
+        camera: Intrinsics and the scanner's pose.
+        size: (H, W) of the image.
+        settings: Ranges and occlusion; None for the defaults.
+
+    Raises:
+        NoPointsError: No point is visible in the image.
+    """
+    settings = settings or ProjectionSettings()
+    xyz = np.asarray(points)[:, :3]
+    drops = DropCounter(len(xyz))
+    distance = np.sqrt(np.einsum("ij,ij->i", xyz, xyz))
+    in_range = (distance >= settings.min_range) & (distance <= settings.max_range)
+    seen = camera.from_scanner(xyz[drops.keep(in_range, "out of range")])
+    seen = seen[drops.keep(seen[:, 2] > 0, "behind the camera")]
+    seen, xy = drops.keep_seen(seen, camera.pixels_of(seen), size)
+    if not settings.keep_occluded:
+        focal_px = float(camera.intrinsics[0, 0])
+        scanner = np.asarray(camera.intrinsics @ camera.translation)
+        hidden = hidden_points(xy, seen[:, 2], size, focal_px=focal_px, scanner=scanner)
+        visible = drops.keep(~hidden, "hidden by foreground")
+        seen, xy = seen[visible], xy[visible]
+    if not len(xy):
+        raise NoPointsError(
+            f"none of the scan's {len(xyz):,} points lies in the image ({drops}); check that"
+            " scan and calibration belong to this camera"
+        )
+    depth = np.linalg.norm(seen, axis=1) if settings.euclidean else seen[:, 2]
+    return ProjectedScan(
+        xy=xy.astype(np.float32),
+        depth=depth.astype(np.float32),
+        index=drops.index,
+        size=size,
+        dropped=drops.dropped,
+    )
+
+
+def edge_agreement(points: Points, rgb: NDArray[np.float32]) -> float:
+    """Returns how much stronger the image's edges are at jumps of depth than elsewhere, −1 to 1.
+
+    That is the mean rank of the gradient beside the points at the near side of a jump, less that
+    at all points. It tells calibrations of the same scan apart. 0 for points without a jump.
+
+    Args:
+        points: A projected scan.
+        rgb: (H, W, 3) in 0..1, of the same size.
+    """
+    from scipy.spatial import cKDTree
+
+    if len(points) <= _JUMP_NEIGHBOURS:
+        return 0.0
+    grey = cv2.GaussianBlur(rgb.mean(axis=2), (0, 0), 1.0)
+    gradient = np.hypot(cv2.Sobel(grey, cv2.CV_32F, 1, 0), cv2.Sobel(grey, cv2.CV_32F, 0, 1))
+    beside = cv2.dilate(gradient, np.ones((_BESIDE_PX, _BESIDE_PX), np.uint8)).ravel()
+    at_points = beside[pixel_index(points.xy, points.size)]
+    rank = np.searchsorted(np.sort(beside), at_points) / beside.size
+    _, near = cKDTree(points.xy).query(points.xy, k=_JUMP_NEIGHBOURS)
+    jumps = points.depth[near].max(axis=1) > _JUMP * points.depth
+    return float(rank[jumps].mean() - rank.mean()) if jumps.any() else 0.0
+
+
+def hidden_points(
+    xy: Floats, depth: Floats, size: tuple[int, int], *, focal_px: float, scanner: Floats
+) -> Mask:
+    """Returns (N,) true for the points that are occluded by something nearer.
+
+    Args:
+        xy: (N, 2) pixel coordinates inside the image, at most one point per pixel.
+        depth: (N,) z in metres.
+        size: (H, W) of the image.
+        focal_px: Focal length in pixels.
+        scanner: (3,) the scanner's origin in homogeneous pixel coordinates, u·z v·z z.
+    """
+    reach = max(1, round(np.radians(_REACH_DEG) * focal_px))
+    margin = np.radians(_MARGIN_DEG) * focal_px
+    columns, rows = np.floor(xy + 0.5).astype(np.intp).T + reach
+    grid = np.full((size[0] + 2 * reach, size[1] + 2 * reach), np.inf, np.float32)
+    grid[rows, columns] = depth
+    limit = depth * (1 - NEARER)
+    window = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
+    nearest = cv2.erode(grid, window)[rows, columns].astype(np.float64)
+    suspects = np.flatnonzero(nearest < limit)
+    beam = _beam_at(nearest[suspects], xy[suspects], depth[suspects], scanner) - xy[suspects]
+    farthest = margin + 0.5 * (1 + _STRETCH) * np.hypot(beam[:, 0], beam[:, 1])
+    sides = np.minimum(np.ceil(farthest), reach).astype(np.intp)
+    which, cell = _neighbours(grid, rows[suspects] * grid.shape[1] + columns[suspects], sides)
+    near = grid.ravel()[cell].astype(np.float64)
+    nearer = near < limit[suspects[which]]
+    point, near, cell = suspects[which[nearer]], near[nearer], cell[nearer]
+    beam = _beam_at(near, xy[point], depth[point], scanner) - xy[point]
+    down, right = np.divmod(cell, grid.shape[1])
+    away = np.hypot(
+        right - columns[point] - 0.5 * beam[:, 0], down - rows[point] - 0.5 * beam[:, 1]
+    )
+    hides = away <= margin + _STRETCH * 0.5 * np.hypot(beam[:, 0], beam[:, 1])
+    hidden = np.zeros(len(depth), bool)
+    hidden[point[hides]] = True
+    return hidden
+
+
+def _neighbours(
+    grid: NDArray[np.float32], cells: Indices, sides: Indices
+) -> tuple[Indices, Indices]:
+    """Pairs of a position in `cells` and a finite cell at most `sides` (N,) rows and columns away.
+
+    The cell itself is among them.
+    """
+    known = np.isfinite(grid).ravel()
+    before = np.concatenate([[0], np.cumsum(known)])  # known cells before each, row by row
+    line_of, line = _ranges(-sides, 2 * sides + 1)
+    left = cells[line_of] + line * grid.shape[1] - sides[line_of]
+    first = before[left]
+    span, position = _ranges(first, before[left + 2 * sides[line_of] + 1] - first)
+    return line_of[span], np.flatnonzero(known)[position]
+
+
+def _ranges(first: Indices, count: Indices) -> tuple[Indices, Indices]:
+    """The values of the ranges first … first + count − 1, and the index of each one's range."""
+    which = np.repeat(np.arange(len(count)), count)
+    return which, np.arange(len(which)) + np.repeat(first - np.cumsum(count) + count, count)
+
+
+def _beam_at(near: Floats, xy: Floats, depth: Floats, scanner: Floats) -> Floats:
+    """(M, 2) pixel coordinates at which the beam to each point passes the depth `near` (M,).
+
+    The point's own where the beam starts beyond that depth.
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        fraction = (near - scanner[2]) / (depth - scanner[2])
+        passed = (fraction > 0) & (fraction < 1)
+        at = (1 - fraction)[:, None] * scanner[:2] + (fraction * depth)[:, None] * xy
+        return np.where(passed[:, None], at / near[:, None], xy)
+
+
+def occluded_in_map(points: Points) -> Mask | None:
+    """Returns (N,) true for points of a projected scan that are occluded by something nearer.
+
+    A point is occluded if a point nearer by more than `NEARER` lies within a fraction of the
+    spacing of scan lines. Scanner and focal length are unknown.
+
+    Args:
+        points: Points of a depth map, on whole pixel coordinates.
+
+    Returns:
+        The mask; None for points that are no projected scan, or whose occluded points are removed
+        already.
+    """
+    if len(points) < MIN_POINTS or bool((points.xy != np.floor(points.xy)).any()):
+        return None
+    pattern = scan_pattern(points.xy, points.size)
+    low, high = _LINE_SPACING_PX
+    if not (pattern.has_scan_lines and low <= pattern.across_px <= high):
+        return None
+    if interleaved(as_depth_image(points)).sum() < _INTERLEAVED * len(points):
+        return None
+    xy, depth = points.xy.astype(np.float64), points.depth.astype(np.float64)
+    focal_px = _MARGIN_IN_LINES * pattern.across_px / np.radians(_MARGIN_DEG)
+    # no parallax is known; the margin stands for it
+    return hidden_points(xy, depth, points.size, focal_px=focal_px, scanner=np.zeros(3))
+
+
+def interleaved(depth: NDArray[np.float32]) -> Mask:
+    """Returns (H, W) true for points of a map with nearer points on two opposite sides.
+
+    Args:
+        depth: (H, W) metres, 0 = unknown.
+    """
+    known = np.where(depth > 0, depth, np.float32(np.inf))
+    limit = np.where(depth > 0, depth * np.float32(1 - NEARER), 0)
+    reach, half = _INTERLEAVED_REACH
+    above = np.zeros((2 * reach + 1, 2 * reach + 1), np.uint8)
+    above[:reach, reach - half : reach + half + 1] = 1
+    up, left, down, right = (cv2.erode(known, np.rot90(above, k)) < limit for k in range(4))
+    opposite: Mask = (up & down) | (left & right)
+    return opposite
