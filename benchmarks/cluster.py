@@ -33,6 +33,7 @@ from typing import Any
 
 import numpy as np
 import psutil
+from pnpdepth_cli.pipeline.batch.spread import DoneFrame
 
 from benchmarks.batch import make_frames
 from pnpdepth_cli.io.fingerprint import fingerprint
@@ -40,7 +41,6 @@ from pnpdepth_cli.io.journal import EncodedLine, Journal
 from pnpdepth_cli.pipeline.batch.batch import run_batch
 from pnpdepth_cli.pipeline.batch.frames import COMPARED_EVERY
 from pnpdepth_cli.pipeline.batch.request import BatchRequest
-from pnpdepth_cli.pipeline.batch.spread import DoneFrame
 from pnpdepth_cli.pipeline.cluster.options import LOCAL, ClusterOptions, spread_of
 from pnpdepth_cli.pipeline.cluster.pool import worker_pool
 from pnpdepth_cli.pipeline.cluster.worker import Done, Work
