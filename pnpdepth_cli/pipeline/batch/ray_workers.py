@@ -6,9 +6,9 @@ import os
 import platform
 import socket
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -34,6 +34,8 @@ _FRAMES_OF_A_CALL = 8
 """So many are read and written beside the network; fewer at the end, to balance the workers."""
 _NO_WORKER_S = 300.0
 """How long a cluster may take to start a worker, such as on a machine that it starts first."""
+_RESTARTS = 100
+"""How often Ray starts a worker again that dies."""
 _THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 _LIBRARIES = ("torch", "numpy", "opencv-python-headless")
 
@@ -45,6 +47,23 @@ def software() -> dict[str, str]:
         "python": platform.python_version(),
         **{name: metadata.version(name) for name in _LIBRARIES},
     }
+
+
+def check_node(versions: Mapping[str, str], shared: Sequence[Path]) -> None:
+    """Raises ClusterError if this machine has other versions, or does not see the shared files."""
+    node, own = socket.gethostname(), software()
+    for name, version in versions.items():
+        if own.get(name) != version:
+            raise ClusterError(
+                f"node {node} has {name} {own.get(name)}, and the driver has {version}; install the"
+                " same version on all nodes"
+            )
+    for path in shared:
+        if not path.exists():
+            what = "the output folder" if path.match(LOCKS) else str(path)
+            raise ClusterError(
+                f"node {node} does not see {what}; name a folder that all nodes share"
+            )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -91,19 +110,7 @@ class Worker:
 
     def ready(self) -> None:
         """Raises ClusterError if this node differs from the driver's."""
-        node, own = socket.gethostname(), software()
-        for name, version in self._job.versions.items():
-            if own.get(name) != version:
-                raise ClusterError(
-                    f"node {node} has {name} {own.get(name)}, and the driver {version}; install the"
-                    " same version on all nodes"
-                )
-        for path in self._job.shared:
-            if not path.exists():
-                what = "the output folder" if path.match(LOCKS) else str(path)
-                raise ClusterError(
-                    f"node {node} does not see {what}; name a folder that all nodes share"
-                )
+        check_node(self._job.versions, self._job.shared)
 
     def refine(self, frames: Sequence[Frame], settings_worked: bool) -> tuple[list[Row], list[str]]:
         """Returns the rows of the frames, and notes, after their results are written."""
@@ -123,30 +130,6 @@ class Worker:
         )  # fmt: skip
         notes, self._notes = self._notes, []
         return rows, notes
-
-
-@dataclass(kw_only=True)
-class _Call:
-    """Frames that a worker refines; none while it starts."""
-
-    actor: Any
-    frames: Sequence[Frame] = ()
-    deaths: int = 0
-    """How often a worker died of this frame, if it is a single one."""
-
-
-@dataclass(kw_only=True)
-class _Calls:
-    """The calls that run, and what is to be handed out."""
-
-    waiting: deque[_Call] = field(default_factory=deque)
-    """Calls that are to be repeated."""
-    running: dict[Any, _Call] = field(default_factory=dict)
-    """By their references."""
-    idle: list[Any] = field(default_factory=list)
-    """Workers that wait for frames."""
-    doubtful: list[tuple[_Call, PnpDepthError]] = field(default_factory=list)
-    """Calls that failed by an error of the settings, if no frame has been refined yet."""
 
 
 def rows_of_workers(
@@ -190,14 +173,16 @@ def rows_of_workers(
     with connected(workers) as cluster:
         ray, count = cluster.ray, cluster.workers
         say(f"Ray workers: starting {count:,}, each with {workers.each}")
-        options = {"scheduling_strategy": "SPREAD", "max_restarts": -1, **cluster.resources}
+        options = {"scheduling_strategy": "SPREAD", "max_restarts": _RESTARTS, **cluster.resources}
         actor, reference = ray.remote(Worker).options(**options), ray.put(job)
         actors = [actor.remote(reference) for _ in range(count)]
         try:
-            yield from _rows_of(
-                ray, actors, to_do, request, state, workers.options.retries,
-                worked=settings_worked, say=say, stopped=stopped,
-            )  # fmt: skip
+            driver = _Driver(ray, actors, to_do, settings_worked, say)
+            for result in driver.results(stopped, workers.options.retries):
+                if isinstance(result, _Lost):
+                    yield state.fail(task_of(request, result.frame), result.message)
+                else:
+                    yield result
         finally:
             for each in actors:
                 ray.kill(each)
@@ -205,91 +190,142 @@ def rows_of_workers(
         remove_all_leftovers(request.output)  # of workers that died
 
 
-def _rows_of(
-    ray: Any,
-    actors: Sequence[Any],
-    to_do: Sequence[Frame],
-    request: BatchRequest,
-    state: BatchState,
-    retries: int,
-    *,
-    worked: bool,
-    say: Callable[[str], None],
-    stopped: Callable[[], bool],
-) -> Iterator[Row]:
-    calls, handed_out, said = _Calls(), 0, set[str]()
-    for actor in actors:
-        calls.running[_ready(actor)] = _Call(actor=actor)
-    while True:
-        while calls.idle and not calls.doubtful and not stopped():
-            if calls.waiting:
-                call = calls.waiting.popleft()
+@dataclass(kw_only=True)
+class _Call:
+    """Frames that go to a worker together; none while it starts."""
+
+    frames: Sequence[Frame] = ()
+    deaths: int = 0
+    """How often a worker died of this frame, if it is a single one."""
+    actor: Any = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Lost:
+    """A frame whose worker died each time."""
+
+    frame: Frame
+    message: str
+
+
+class _Driver:
+    """Hands out frames, a call at a time for each worker, and again those whose worker died.
+
+    Args:
+        ray: Ray, connected.
+        actors: The workers.
+        to_do: The frames.
+        settings_worked: True if a frame was refined with these settings before.
+        say: Receives notes.
+    """
+
+    def __init__(
+        self,
+        ray: Any,
+        actors: Sequence[Any],
+        to_do: Sequence[Frame],
+        settings_worked: bool,
+        say: Callable[[str], None],
+    ) -> None:
+        self._ray, self._to_do, self._say = ray, to_do, say
+        self._workers, self._next, self._worked = len(actors), 0, settings_worked
+        self._idle: list[Any] = []
+        self._again: deque[_Call] = deque()
+        self._unproven: list[tuple[_Call, PnpDepthError]] = []  # failed before any frame succeeded
+        self._running: dict[Any, _Call] = {}  # by reference
+        self._said: set[str] = set()
+        for actor in actors:
+            self._start(actor)
+
+    def results(self, stopped: Callable[[], bool], retries: int) -> Iterator[Row | _Lost]:
+        """Yields a row for each frame as it is done, or that it is lost.
+
+        Args:
+            stopped: True if nothing more is to be handed out.
+            retries: How often a single frame is tried again.
+        """
+        while True:
+            if not stopped():
+                self._hand_out()
+            busy = any(call.frames for call in self._running.values())
+            if not busy and stopped():
+                return
+            if not busy and self._unproven:
+                raise self._unproven[0][1]
+            if not busy and not self._again and self._next == len(self._to_do):
+                return
+            timeout = None if busy else _NO_WORKER_S
+            ended, _ = self._ray.wait(list(self._running), timeout=timeout)
+            if not ended:
+                raise ClusterError(
+                    f"no worker has started for {_NO_WORKER_S:.0f} s; check the cluster with `ray"
+                    " status`, and run the same command to continue"
+                )
+            yield from self._result(ended[0], retries)
+
+    def _start(self, actor: Any) -> None:
+        ready = actor.ready.options(max_task_retries=-1).remote()  # until it has started
+        self._running[ready] = _Call(actor=actor)
+
+    def _hand_out(self) -> None:
+        while self._idle and not self._unproven:
+            if self._again:
+                call = self._again.popleft()
             else:
-                left = len(to_do) - handed_out
-                size = max(1, min(_FRAMES_OF_A_CALL, left // (2 * len(actors))))
-                call = _Call(actor=None, frames=to_do[handed_out : handed_out + size])
-                handed_out += len(call.frames)
+                left = len(self._to_do) - self._next
+                size = max(1, min(_FRAMES_OF_A_CALL, left // (2 * self._workers)))
+                call = _Call(frames=self._to_do[self._next : self._next + size])
+                self._next += len(call.frames)
             if not call.frames:
-                break
-            call.actor = calls.idle.pop()
-            calls.running[call.actor.refine.remote(call.frames, worked)] = call
-        busy = any(call.frames for call in calls.running.values())
-        if not busy and (stopped() or (not calls.waiting and handed_out == len(to_do))):
-            if calls.doubtful and not stopped():
-                raise calls.doubtful[0][1]
-            return
-        if not busy and calls.doubtful:
-            raise calls.doubtful[0][1]
-        ended, _ = ray.wait(list(calls.running), timeout=None if busy else _NO_WORKER_S)
-        if not ended:
-            raise ClusterError(
-                f"no worker has started for {_NO_WORKER_S:.0f} s; check the cluster with `ray"
-                " status`, and run the same command to continue"
-            )
-        call = calls.running.pop(ended[0])
+                return
+            call.actor = self._idle.pop()
+            self._running[call.actor.refine.remote(call.frames, self._worked)] = call
+
+    def _result(self, reference: Any, retries: int) -> Iterator[Row | _Lost]:
+        call, exceptions = self._running.pop(reference), self._ray.exceptions
         try:
-            result = ray.get(ended[0])
-        except ray.exceptions.RayTaskError as error:
-            cause = error.cause
-            of_settings = isinstance(cause, ModelError) or type(cause) is UsageError
-            if not call.frames or not of_settings:
-                raise cause if isinstance(cause, Exception) else error from None
-            calls.idle.append(call.actor)
-            if worked:
-                calls.waiting.append(call)
-            else:
-                calls.doubtful.append((call, cause))
-        except ray.exceptions.RayError as error:
-            reason = reason_of(error)
-            if not call.frames:
-                raise ClusterError(f"workers die when they start: {reason}") from None
-            say(f"warning: a worker died ({reason}); Ray starts another one")
-            calls.running[_ready(call.actor)] = _Call(actor=call.actor)
-            deaths = call.deaths + (len(call.frames) == 1)
-            if deaths > retries:
-                (frame,) = call.frames
-                message = f"its worker died {deaths} times: {reason}"
-                yield state.fail(task_of(request, frame), message)
-            else:
-                alone = [_Call(actor=None, frames=[f], deaths=deaths) for f in call.frames]
-                calls.waiting.extendleft(reversed(alone))
+            result = self._ray.get(reference)
+        except exceptions.RayTaskError as error:
+            self._failed(call, error)
+            return
+        except exceptions.RayError as error:
+            yield from self._died(call, reason_of(error), retries)
+            return
+        self._idle.append(call.actor)
+        rows, notes = result or ((), ())
+        for note in notes:
+            if note not in self._said:
+                self._said.add(note)
+                self._say(note)
+        if any(row["status"] != "failed" for row in rows):
+            self._worked = True
+            self._again.extend(call for call, _ in self._unproven)
+            self._unproven.clear()
+        yield from rows
+
+    def _failed(self, call: _Call, error: Any) -> None:
+        """Raises what a worker raised, unless other settings of the same run worked."""
+        cause = error.cause
+        of_settings = isinstance(cause, ModelError) or type(cause) is UsageError
+        if not call.frames or not of_settings:
+            raise cause if isinstance(cause, Exception) else error from None
+        self._idle.append(call.actor)
+        if self._worked:
+            self._again.append(call)
         else:
-            calls.idle.append(call.actor)
-            rows, notes = result or ((), ())
-            for note in notes:
-                if note not in said:
-                    said.add(note)
-                    say(note)
-            if any(row["status"] != "failed" for row in rows):
-                worked = True
-                calls.waiting.extend(replace(call, actor=None) for call, _ in calls.doubtful)
-                calls.doubtful.clear()
-            yield from rows
+            self._unproven.append((call, cause))
 
-
-def _ready(actor: Any) -> Any:
-    """The reference of a call that ends when the worker has started, also again."""
-    return actor.ready.options(max_task_retries=3).remote()
+    def _died(self, call: _Call, reason: str, retries: int) -> Iterator[_Lost]:
+        """Hands out the frames of a dead worker again, one by one; gives up a single one."""
+        if not call.frames:
+            raise ClusterError(f"a worker died {_RESTARTS} times: {reason}")
+        self._say(f"warning: a worker died ({reason}); Ray starts another one")
+        self._start(call.actor)
+        deaths = call.deaths + (len(call.frames) == 1)
+        if deaths > retries:
+            yield _Lost(frame=call.frames[0], message=f"its worker died {deaths} times: {reason}")
+        else:
+            self._again.extend(_Call(frames=[frame], deaths=deaths) for frame in call.frames)
 
 
 def reason_of(error: Exception) -> str:
