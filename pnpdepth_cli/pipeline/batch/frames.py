@@ -165,7 +165,9 @@ def task_of(request: BatchRequest, frame: Frame) -> Task:
         )
         for each in frame.neighbours
     )
-    files = replace(files, neighbours=neighbours, window=tuple(each.name for each in frame.window))
+    if neighbours or frame.window:
+        window = tuple(each.name for each in frame.window)
+        files = replace(files, neighbours=neighbours, window=window)
     return Task(
         name=frame.name,
         request=replace(refine, files=files),
@@ -183,7 +185,9 @@ def _files_of(request: BatchRequest, frame: Frame, *, needs_camera: bool) -> Fra
     gt = frame.gt
     if base.sample is not None and gt is None and _is_scan_file(frame.sparse):
         gt = frame.sparse  # points are sampled from the projected scan
-    is_scan = _reads_scan(replace(base, calibration=frame.calibration), sparse, gt)
+    if frame.calibration is not None:
+        base = replace(base, calibration=frame.calibration)
+    is_scan = _reads_scan(base, sparse, gt)
     scan = base.scan
     if is_scan:
         camera = frame.camera if scan.camera is None else scan.camera
@@ -193,7 +197,6 @@ def _files_of(request: BatchRequest, frame: Frame, *, needs_camera: bool) -> Fra
         image=frame.image,
         sparse=sparse,
         gt=gt,
-        calibration=frame.calibration,
         camera_file=frame.calib if needs_camera and not is_scan else None,
         camera_number=frame.camera if scan.camera is None else scan.camera,
         gt_masks=frame.masks,
