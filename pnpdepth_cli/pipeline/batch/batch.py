@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import tempfile
 import time
 from collections import Counter
@@ -11,7 +12,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
-from pnpdepth_cli.errors import UsageError
+from pnpdepth_cli.errors import FileFormatError, UsageError
 from pnpdepth_cli.io.atomic import make_folder
 from pnpdepth_cli.io.dataset.frame import Frame
 from pnpdepth_cli.io.lock import in_turn, locked_folder
@@ -294,22 +295,51 @@ def _summarise(
     profile: dict[str, Any],
 ) -> dict[str, Any]:
     """Writes summary.csv, summary.json and the report; returns the summary without its frames."""
-    model = model_identity(request.refine)
-    state = BatchState(request.output, model)
+    model, tally = model_identity(request.refine), Tally()
+    with tempfile.TemporaryFile("w+", dir=local, encoding="utf-8") as file:
+        for row in _known_rows(request, batch, BatchState(request.output, model)):
+            try:
+                tally.add(row)
+            except (AttributeError, KeyError, TypeError) as error:
+                raise FileFormatError(
+                    f"the record of frame {row['name']} in {request.output} is damaged; remove it,"
+                    " and run again"
+                ) from error
+            file.write(json.dumps(row) + "\n")
+        summary = _head_of(request, batch, model, tally)
+        if request.profile:
+            summary["profile"] = profile
 
-    def rows() -> Iterator[Row]:
-        def of_part(start: int) -> list[Row | None]:
-            part = batch.frames[start : start + _PART]
-            return [state.row(task_of(request, frame)) for frame in part]
+        def rows() -> Iterator[Row]:
+            file.seek(0)
+            return map(json.loads, file)
 
-        for part in in_order(of_part, range(0, len(batch.frames), _PART), _READERS):
-            yield from (row for row in part if row is not None)
+        write_summaries(local, summary, rows(), tally.baseline_names)
+        if report is not None:
+            report.write(summary, rows)
+    if isinstance(request.output, RemotePath):
+        for name in (CSV, JSON):
+            upload(local / name, request.output / name)
+    return summary
 
-    tally = Tally()
-    for row in rows():
-        tally.add(row)
+
+def _known_rows(request: BatchRequest, batch: BatchFrames, state: BatchState) -> Iterator[Row]:
+    """The rows of all frames that are done, or have failed, with the present settings."""
+
+    def of_part(start: int) -> list[Row | None]:
+        part = batch.frames[start : start + _PART]
+        return [state.row(task_of(request, frame)) for frame in part]
+
+    for part in in_order(of_part, range(0, len(batch.frames), _PART), _READERS):
+        yield from (row for row in part if row is not None)
+
+
+def _head_of(
+    request: BatchRequest, batch: BatchFrames, model: dict[str, Any], tally: Tally
+) -> dict[str, Any]:
+    """The summary without its frames."""
     known, method = sum(tally.counts.values()), resolve_method(request.refine)
-    summary = {
+    head = {
         "command": "batch",
         "source": str(request.source),
         "output": str(request.output),
@@ -329,16 +359,8 @@ def _summarise(
         "unmatched": [str(each) for each in batch.unmatched],
     }
     if request.sequence != SequenceOptions():
-        summary["sequence"] = plain(asdict(request.sequence))
-    if request.profile:
-        summary["profile"] = profile
-    write_summaries(local, summary, rows(), tally.baseline_names)
-    if isinstance(request.output, RemotePath):
-        for name in (CSV, JSON):
-            upload(local / name, request.output / name)
-    if report is not None:
-        report.write(summary, rows)
-    return summary
+        head["sequence"] = plain(asdict(request.sequence))
+    return head
 
 
 def _notes_of(request: BatchRequest, batch: BatchFrames) -> Iterator[str]:

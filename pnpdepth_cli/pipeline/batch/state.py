@@ -17,7 +17,7 @@ from fnmatch import fnmatch
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pnpdepth_cli.errors import OutputError
+from pnpdepth_cli.errors import FileFormatError, OutputError
 from pnpdepth_cli.io.atomic import cannot_write, make_folder, remove_leftovers
 from pnpdepth_cli.io.fingerprint import Fingerprint, is_unchanged
 from pnpdepth_cli.io.lock import LOCKS
@@ -83,7 +83,11 @@ class BatchState:
         if entry["inputs"].keys() != task.inputs.keys():
             return "other input files"
         for part, path in task.inputs.items():
-            if not is_unchanged(path, Fingerprint(**entry["inputs"][part]), self._listing):
+            try:
+                known = Fingerprint(**entry["inputs"][part])
+            except TypeError:
+                return "record damaged"
+            if not is_unchanged(path, known, self._listing):
                 return f"input changed: {part}"
         may_lack = task.outputs.optional()
         for kind, path in task.outputs.by_kind().items():
@@ -116,7 +120,10 @@ class BatchState:
         entry = _entry(record)
         if record is None or entry is None or entry["settings"] != self._digests.of(task.request):
             return None
-        return _row(task, record, entry)
+        try:
+            return _row(task, record, entry)
+        except (AttributeError, IndexError, KeyError, TypeError) as error:
+            raise FileFormatError(f"{task.record} is damaged; remove it, and run again") from error
 
     def write(
         self,
@@ -190,9 +197,11 @@ def _paths(task: Task) -> dict[str, str]:
 
 def _entry(record: Mapping[str, Any] | None) -> dict[str, Any] | None:
     """What a batch says in a record; None if none wrote it."""
-    entry = None if record is None else record.get(_ENTRY)
+    entry: Any = None if record is None else record.get(_ENTRY)
     keys = entry.keys() if isinstance(entry, dict) else ()
-    whole = "settings" in keys and ("failed" in keys or {"inputs", "outputs"} <= {*keys})
+    whole = "settings" in keys and (
+        "failed" in keys or all(isinstance(entry.get(k), dict) for k in ("inputs", "outputs"))
+    )
     return entry if whole else None
 
 
