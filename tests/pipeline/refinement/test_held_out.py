@@ -20,7 +20,7 @@ from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.models.definition import InputKind
 from pnpdepth_cli.models.network import Network, load_network
 from pnpdepth_cli.pipeline.refinement import held_out
-from tests.pipeline.batches import NAMES, RecordingListener, batch, pairs_on_disk, results, times
+from tests.pipeline.batches import NAMES, batch, pairs_on_disk, results
 from tests.pipeline.frames import FrameOnDisk, run
 
 CONFIG = RefinementConfig(layer="middle", settings=RefineSettings(iterations=3))
@@ -204,22 +204,6 @@ def test_propagation_follows_refinement(frame: FrameOnDisk) -> None:
     spread = run(frame, format="npy", output=frame.folder / "gp", propagate="gp")
     errors = [each.record["sparse_error"]["after"]["mae"] for each in (plain, spread)]
     assert errors[1] < errors[0]
-
-
-def test_a_batch_finds_its_ways_on_a_few_frames_and_checks_them_on_each(tmp_path: Path) -> None:
-    root = pairs_on_disk(tmp_path / "drive")
-    listener = RecordingListener()
-    batch(root, listener, refine={"auto": True})
-    (note,) = [text for text in listener.messages if text.startswith("choice: ")]
-    candidates = note.partition(": best on ")[2].partition(": ")[2].split("; ")
-    for name in NAMES:
-        choice = json.loads((root / "out" / f"{name}.json").read_text())["auto"]
-        tried = {each["candidate"] for each in choice["tried"]}
-        assert set(candidates) <= tried
-        assert {*BASELINES, "tiny aligned (auto)"} <= tried
-    before = times(root / "out")
-    batch(root, refine={"auto": True})
-    assert times(root / "out") == before
 
 
 def test_a_frame_that_no_way_can_be_found_on_does_not_stop_a_batch(
