@@ -15,12 +15,12 @@ from pnpdepth_cli.auto.candidates import Candidate, RefinementConfig
 from pnpdepth_cli.auto.choice import Choice, ScoredCandidate
 from pnpdepth_cli.choices import BASELINES
 from pnpdepth_cli.core.refine import RefineSettings
-from pnpdepth_cli.errors import ModelError, UsageError
+from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.models.definition import InputKind
 from pnpdepth_cli.models.network import Network, load_network
 from pnpdepth_cli.pipeline.refinement import held_out
-from tests.pipeline.batches import NAMES, batch, pairs_on_disk, results
+from tests.pipeline.batches import batch, pairs_on_disk, results
 from tests.pipeline.frames import FrameOnDisk, run
 
 CONFIG = RefinementConfig(layer="middle", settings=RefineSettings(iterations=3))
@@ -204,23 +204,6 @@ def test_propagation_follows_refinement(frame: FrameOnDisk) -> None:
     spread = run(frame, format="npy", output=frame.folder / "gp", propagate="gp")
     errors = [each.record["sparse_error"]["after"]["mae"] for each in (plain, spread)]
     assert errors[1] < errors[0]
-
-
-def test_a_frame_that_no_way_can_be_found_on_does_not_stop_a_batch(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    root = pairs_on_disk(tmp_path / "drive")
-    whole, calls = held_out.refine_automatically, []
-
-    def failing_first(*arguments: Any, **options: Any) -> Any:
-        calls.append(None)
-        if len(calls) == 1:
-            raise ModelError("no way")
-        return whole(*arguments, **options)
-
-    monkeypatch.setattr(held_out, "refine_automatically", failing_first)
-    batch(root, refine={"auto": True})
-    assert all((root / "out" / f"{name}.json").exists() for name in NAMES)
 
 
 def test_shards_find_the_same_ways(tmp_path: Path) -> None:
