@@ -72,9 +72,7 @@ def make_frames(root: Path, count: int, height: int, width: int) -> None:
         write_depth(root / "gt" / f"{number:06}.png", depth, scale=1000)
 
 
-def measure(
-    root: Path, workers: int, model: str, batch_size: int | None, html: bool
-) -> dict[str, Any]:
+def measure(root: Path, workers: int, model: str, batch_size: int, html: bool) -> dict[str, Any]:
     """The figures of one batch over the folder, and of a second run."""
     request = BatchRequest(
         source=root,
@@ -108,7 +106,7 @@ def main() -> None:
     parser.add_argument("--size", default="48x64", help="HxW")
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--model", default="compact")
-    parser.add_argument("--batch-size", type=int, help="default: auto")
+    parser.add_argument("--batch-size", type=int, default=1)
     parser.add_argument("--html", action="store_true", help="with a report")
     parser.add_argument("--json", action="store_true")
     args = parser.parse_args()

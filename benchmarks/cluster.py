@@ -1,17 +1,14 @@
 """Plan, resume and summary of many frames, and what a Ray cluster costs.
 
-`python -m benchmarks.cluster entries --count 1000000` makes a list of so many frames and a manifest
-that says they are done, with a hard link for each result, and prints CPU seconds and peak memory of
-planning, of a run that has nothing to do, and of its summary.
+`python -m benchmarks.cluster entries --count 1000000` makes a list of so many frames, a record for
+each that says it is done, and hard links for its other results, and prints CPU seconds and peak
+memory of planning, and of a run that has nothing to do, with its summary.
 
 `… overhead FOLDER --frames 60` refines frames of a data set with and without a Ray worker, compares
 the results, and prints the CPU seconds of all processes between the first frame and the last.
 
 `… nodes FOLDER --frames 60` refines them on a cluster of three nodes on loopback, one of which is
 lost after a third of the frames, and compares the results with those of one process.
-
-`… scaling --workers 16` gives 1 and 16 workers frames whose stand-in network only waits, and prints
-frames a second, and the driver's CPU time with the manifest's lines of such frames written.
 """
 
 from __future__ import annotations
@@ -25,9 +22,6 @@ import subprocess
 import sys
 import tempfile
 import time
-import zlib
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -35,15 +29,9 @@ import numpy as np
 import psutil
 
 from benchmarks.batch import make_frames
-from pnpdepth_cli.io.fingerprint import fingerprint
-from pnpdepth_cli.io.journal import EncodedLine, Journal
 from pnpdepth_cli.pipeline.batch.batch import run_batch
-from pnpdepth_cli.pipeline.batch.frames import COMPARED_EVERY
 from pnpdepth_cli.pipeline.batch.request import BatchRequest
-from pnpdepth_cli.pipeline.batch.spread import DoneFrame
-from pnpdepth_cli.pipeline.cluster.options import LOCAL, ClusterOptions, spread_of
-from pnpdepth_cli.pipeline.cluster.pool import worker_pool
-from pnpdepth_cli.pipeline.cluster.worker import Done, Work
+from pnpdepth_cli.pipeline.cluster.options import LOCAL, ClusterOptions
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest
 from pnpdepth_cli.sensors import SamplePattern
 
@@ -51,8 +39,6 @@ LINKS = 50_000
 """Hard links of a file; ext4 allows 65,000."""
 FOLDER = 1000
 """Frames of a folder."""
-LINES = 1000
-"""Lines of the manifest written at once."""
 
 
 class Quiet:
@@ -74,58 +60,34 @@ def request_of(root: Path) -> BatchRequest:
 
 
 def make_entries(root: Path, count: int) -> None:
-    """A list of frames that share one image, and a manifest that says they are done."""
+    """A list of frames that share one image, and records that say they are done."""
     make_frames(root, 1, 48, 64)
     with (root / "list.csv").open("w") as file:
         file.write("name,image,sparse,gt\n")
         for number in range(count):
             file.write(f"{name_of(number)},rgb/000000.png,sparse/000000.png,gt/000000.png\n")
-    lines = (root / "list.csv").read_text().splitlines()[:3]
-    (root / "two.csv").write_text("\n".join(lines) + "\n")
+    lines = (root / "list.csv").read_text().splitlines()[:2]
+    (root / "one.csv").write_text("\n".join(lines) + "\n")
     refine = RefineRequest.from_fields(preset="fast")
-    two = BatchRequest(source=root / "two.csv", output=root / "first", refine=refine)
-    run_batch(two, Quiet())  # the first has other settings: it is compared
-    journal = Journal(root / "first" / "batch.jsonl", "frame")
-    first = [line for n in (0, 1) if (line := journal.newest(name_of(n))) is not None]
-    made = Journal(root / "out" / "batch.jsonl", "frame")
-    for start in range(0, count, LINKS):
-        numbers = range(start, min(start + LINKS, count))
-        lines_of = [linked(root, line, n, numbers) for n, line in enumerate(first)]
-        for block in range(start, numbers.stop, LINES):
-            made.append(
-                *(
-                    renamed(lines_of[bool(n % COMPARED_EVERY)], n)
-                    for n in range(block, min(block + LINES, numbers.stop))
-                )
-            )
+    run_batch(BatchRequest(source=root / "one.csv", output=root / "out", refine=refine), Quiet())
+    first = name_of(0)
+    record = (root / "out" / f"{first}.json").read_text()
+    others = [path for path in (root / "out" / first).parent.iterdir() if path.suffix != ".json"]
+    source: dict[Path, Path] = {}
+    for number in range(1, count):
+        target = root / "out" / name_of(number)
+        if number % FOLDER in (0, 1):
+            target.parent.mkdir(parents=True, exist_ok=True)
+        target.with_suffix(".json").write_text(record.replace(first, name_of(number)))
+        for path in others:
+            if number % LINKS == 1:
+                source[path] = root / f"{number}{path.name}"
+                shutil.copy(path, source[path])
+            os.link(source[path], target.parent / path.name.replace(Path(first).name, target.name))
 
 
 def name_of(number: int) -> str:
     return f"d{number // FOLDER:05}/f{number:07}"
-
-
-def linked(root: Path, line: dict[str, Any], kind: int, numbers: range) -> bytes:
-    """Links the results of one of the two frames for others of its kind; returns their line."""
-    old, known = name_of(kind), {}
-    mine = [n for n in numbers if bool(n % COMPARED_EVERY) == kind]
-    for path in line["outputs"]:
-        source = root / f"{numbers.start}{path.replace('/', '')}"
-        shutil.copy(root / "first" / path, source)
-        for number in mine:
-            target = root / "out" / path.replace(old, name_of(number))
-            if number % FOLDER in (0, 1):
-                target.parent.mkdir(parents=True, exist_ok=True)
-            os.link(source, target)
-        known[path] = fingerprint(source).as_record()
-    return EncodedLine.of(line | {"outputs": known}, "frame").data.replace(old.encode(), b"%s")
-
-
-def renamed(line: bytes, number: int) -> EncodedLine:
-    """The line with the name of another frame."""
-    name = name_of(number)
-    rest = line[len(b'{"crc32": "00000000", ') : -1].replace(b"%s", name.encode())
-    data = b'{"crc32": "%08x", ' % zlib.crc32(rest) + rest + b"\n"
-    return EncodedLine(key=name, data=data)
 
 
 def measured(program: str, *arguments: str) -> dict[str, float]:
@@ -170,7 +132,6 @@ def entries(count: int, folder: Path | None) -> dict[str, Any]:
         make_entries(root, count)
         return {
             "entries": count,
-            "manifest_mb": round((root / "out" / "batch.jsonl").stat().st_size / 1e6),
             "plan": measured(PLAN, temporary),
             "resume and summary": measured(RESUME, temporary),
         }
@@ -283,85 +244,9 @@ def contents(folder: Path) -> dict[str, bytes]:
         results[name] = path.read_bytes()
         if path.suffix == ".json":
             record = json.loads(results[name])
-            del record["seconds"], record["peak_memory_mb"]
+            del record["seconds"], record["peak_memory_mb"], record["batch"]
             results[name] = json.dumps(record).encode()
     return results
-
-
-@dataclass(frozen=True, kw_only=True)
-class WaitingJob:
-    """Waits as if for a GPU, and returns a line of a manifest for each frame."""
-
-    line: dict[str, Any]
-    """Of a frame that was refined."""
-    wait_s: float
-    """For each frame."""
-
-    @contextlib.contextmanager
-    def opened(self) -> Iterator[Work]:
-        """Yields the function of a piece."""
-
-        def work(names: Sequence[str], checked: bool, finish: bool) -> Done:
-            time.sleep(self.wait_s * len(names))
-            lines = (self.line | {"frame": name} for name in names)
-            return Done(results=[DoneFrame.of(line, whole=False) for line in lines])
-
-        yield work
-
-
-def scaling(workers: int, rate: float, seconds: float) -> dict[str, Any]:
-    os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
-    import ray
-
-    with tempfile.TemporaryDirectory() as temporary:
-        root = Path(temporary)
-        line = one_line_of(root)
-        wait_s = workers / rate
-        ray.init(num_cpus=workers, include_dashboard=False, log_to_driver=False)
-        speeds = {
-            f"{count} workers": waited(root, count, WaitingJob(line=line, wait_s=wait_s), seconds)
-            for count in (1, workers)
-        }
-        ray.shutdown()
-    one, many = (each["frames_a_second"] for each in speeds.values())
-    return {"wait_s": wait_s, **speeds, "speedup": round(many / one, 2)}
-
-
-def waited(root: Path, workers: int, job: WaitingJob, seconds: float) -> dict[str, float]:
-    """Frames a second and the driver's CPU time, once all workers have begun."""
-    spread = spread_of("cpu", ClusterOptions(ray=LOCAL, ray_workers=workers))
-    assert spread is not None
-    journal = Journal(root / f"{workers}.jsonl", "frame")
-    names = [f"f{number:07}" for number in range(int(seconds * workers / job.wait_s))]
-
-    def begin(begun: Sequence[str]) -> None:
-        journal.append(*({"frame": name, "state": "begun"} for name in begun))
-
-    with worker_pool(spread, print, inputs=[root]) as pool:
-        while sum(1 for _ in pool.figures()) < workers:
-            pool.call(time.sleep, 0.1)
-            list(pool.results(job, names[:1]))
-        start, cpu = time.perf_counter(), time.process_time()
-        for part in pool.results(job, names, begin=begin):
-            journal.append(*(done.line for _, done in part))
-        wall = time.perf_counter() - start
-    return {
-        "frames": len(names),
-        "frames_a_second": round(len(names) / wall, 2),
-        "driver_cpu": round((time.process_time() - cpu) / wall, 4),
-    }
-
-
-def one_line_of(root: Path) -> dict[str, Any]:
-    """A line of the manifest of a frame that was refined."""
-    make_frames(root, 1, 48, 64)
-    request = BatchRequest(
-        source=root, output=root / "out", refine=RefineRequest.from_fields(preset="fast")
-    )
-    run_batch(request, Quiet())
-    line = Journal(root / "out" / "batch.jsonl", "frame").newest("000000")
-    assert line is not None
-    return line
 
 
 def main() -> None:
@@ -378,19 +263,13 @@ def main() -> None:
     of_nodes.add_argument("source", type=Path)
     of_nodes.add_argument("--frames", type=int, default=60)
     of_nodes.add_argument("--model", default="compact")
-    of_scaling = commands.add_parser("scaling")
-    of_scaling.add_argument("--workers", type=int, default=16)
-    of_scaling.add_argument("--rate", type=float, default=200.0, help="frames a second of all")
-    of_scaling.add_argument("--seconds", type=float, default=30.0)
     args = parser.parse_args()
     if args.command == "entries":
         result = entries(args.count, args.folder)
     elif args.command == "overhead":
         result = overhead(args.source, args.frames, args.model)
-    elif args.command == "nodes":
-        result = nodes(args.source, args.frames, args.model)
     else:
-        result = scaling(args.workers, args.rate, args.seconds)
+        result = nodes(args.source, args.frames, args.model)
     print(json.dumps(result, indent=2))
 
 

@@ -18,8 +18,7 @@ from pnpdepth_cli.cli import grouped_help, options
 from pnpdepth_cli.cli.exit_codes import INTERRUPTED
 from pnpdepth_cli.cli.printable import printable
 from pnpdepth_cli.errors import FramesFailedError, StorageError
-from pnpdepth_cli.pipeline.batch.request import BatchRequest
-from pnpdepth_cli.pipeline.batch.sequence_options import SequenceOptions
+from pnpdepth_cli.pipeline.batch.request import BatchRequest, SequenceOptions
 from pnpdepth_cli.pipeline.cluster.options import ClusterOptions
 from pnpdepth_cli.pipeline.refinement.request import parse_sample
 from pnpdepth_cli.pipeline.sparse.options import BagOptions
@@ -92,7 +91,7 @@ def batch(
     Each frame gets the files that `pnpdepth refine` writes. A frame that cannot be refined is
     reported and skipped (exit code 7). The same command run again refines only frames that are
     missing or whose settings or files have changed. OUTPUT/summary.json and OUTPUT/summary.csv list
-    all frames; OUTPUT/batch.jsonl is the journal of the run.
+    all frames; the record NAME.json beside a result says how it was made.
     """
     from pnpdepth_cli.pipeline.batch.bags import unpacked
     from pnpdepth_cli.pipeline.batch.batch import plan_batch

@@ -26,12 +26,11 @@ _SCORES: tuple[tuple[str, str, Callable[[float], str]], ...] = (
 )
 
 
-_WAITING = ("waiting_for_reader", "waiting_for_writer")
 _STAGES = {
-    "waiting_for_reader": "waiting for a frame to be read",
-    "waiting_for_writer": "waiting for a frame to be written",
-    "reading": "beside it: reading and decoding",
-    "writing": "beside it: scoring, encoding and writing",
+    "read": "reading and decoding, beside the network",
+    "refine": "network",
+    "write": "scoring, encoding and writing, beside the network",
+    "wall": "wall",
 }
 
 
@@ -207,7 +206,7 @@ def print_batch(summary: Mapping[str, Any]) -> None:
 
 
 def print_profile(profile: Mapping[str, Any]) -> None:
-    """Prints the time of each stage of a batch, in the thread of the network and beside it."""
+    """Prints the time of each stage of a batch."""
     console = Console(stderr=True, highlight=False)
     seconds, frames = profile["seconds"], profile["frames"]
     if not frames:
@@ -216,20 +215,13 @@ def print_profile(profile: Mapping[str, Any]) -> None:
     table = Table(title="where the time went")
     for column in ("", "seconds", "ms a frame", "of the time"):
         table.add_column(column, justify="left" if not column else "right")
-    wall = seconds["wall"]
-    main = {stage: seconds[stage] for stage in ("network", *_WAITING)}
-    main["other"] = wall - sum(main.values())
-    for stage, spent in [*main.items(), ("wall", wall)]:
+    for stage, spent in seconds.items():
         table.add_row(
-            _STAGES.get(stage, stage),
+            _STAGES[stage],
             f"{spent:.2f}",
             f"{1000 * spent / frames:.1f}",
-            f"{spent / wall:.1%}",
+            f"{spent / seconds['wall']:.1%}",
         )
-    table.add_section()
-    for stage in ("reading", "writing"):
-        spent = seconds[stage]
-        table.add_row(_STAGES[stage], f"{spent:.2f}", f"{1000 * spent / frames:.1f}", "")
     table.caption = f"{frames:,} frames, {profile['frames_per_second']:.2f} a second"
     console.print(table)
 

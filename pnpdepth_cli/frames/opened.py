@@ -16,6 +16,7 @@ from torch import Tensor, nn
 from pnpdepth_cli.choices import LOSSES
 from pnpdepth_cli.core.refine import Refinement, RefineSettings, refine_from
 from pnpdepth_cli.core.split import InputSplit, Split
+from pnpdepth_cli.core.split.tensors import tensors_in
 from pnpdepth_cli.core.user_code import wrap_user_errors
 from pnpdepth_cli.errors import PnpDepthError
 from pnpdepth_cli.frames.frame import Frame, RefinedFrame
@@ -73,7 +74,7 @@ class OpenNetwork:
         self._open, self._cut = ExitStack(), SplitCache(network)
         self._z0: Tensor | None = None
         self._output: Any = None
-        self._encoded: Any = None
+        self._encoded: dict[tuple[torch.Size, ...], Any] = {}
 
     def __enter__(self) -> OpenNetwork:
         if self.network.definition.image_encoder is not None:
@@ -88,7 +89,8 @@ class OpenNetwork:
 
     def next_image(self) -> None:
         """Forgets what was computed for the last image."""
-        self._z0 = self._output = self._encoded = None
+        self._z0 = self._output = None
+        self._encoded = {}
 
     def refine(self, frame: Frame, settings: RefineSettings) -> RefinedFrame:
         """Returns the frame refined by this network, its residual not propagated.
@@ -151,13 +153,15 @@ class OpenNetwork:
 
     @contextmanager
     def _runs_once(self, encoder: nn.Module) -> Iterator[None]:
-        """Inside, the encoder returns for one image what it returned first."""
+        """Inside, the encoder runs once for an image of one size."""
         run, own = encoder.forward, encoder.__dict__.get("forward")
 
         def forward(*inputs: Any, **options: Any) -> Any:
-            if self._encoded is None:
-                self._encoded = run(*inputs, **options)
-            return self._encoded
+            # steps by hidden points also see the image reduced
+            size = tuple(tensor.shape for _, tensor in tensors_in((inputs, options)))
+            if size not in self._encoded:
+                self._encoded[size] = run(*inputs, **options)
+            return self._encoded[size]
 
         encoder.__dict__["forward"] = forward
         try:

@@ -1,15 +1,13 @@
 """One run at a time in an output folder, or the shards of one run.
 
-The locks are files of the folder that the operating system locks: they end with the process that
-holds them, however it ends. A whole run holds `.batch.lock` until its end. Each shard holds a lock
-of its own number, and `.batch.lock` only while it starts.
+A run holds the lock file `.batch.lock`, a shard `.batch.2of8.lock`. The operating system locks it,
+so that it ends with the process, however that ends.
 """
 
 from __future__ import annotations
 
 import errno
 import os
-import re
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -19,36 +17,39 @@ from filelock import FileLock, Timeout
 from pnpdepth_cli.errors import OutputError
 from pnpdepth_cli.io.atomic import cannot_write
 
-_SHARD_LOCK = re.compile(r"\.batch\.(\d+)of(\d+)\.lock")
-_START_S = 3.0
-"""How long a shard waits for another one that is starting, and may be cleaning up."""
+LOCKS = ".batch*.lock"
+"""Pattern of the names of all lock files."""
+_WHOLE = ".batch.lock"
+_TRIED_S = 0.2
+"""Another process that looks for running shards may hold a lock for a moment."""
 
 
 @contextmanager
 def locked_folder(
-    folder: Path, shard: tuple[int, int] | None, when_alone: Callable[[], None]
+    folder: Path,
+    shard: tuple[int, int] | None = None,
+    when_alone: Callable[[], None] = lambda: None,
 ) -> Iterator[None]:
-    """No other process runs the same frames in the folder while inside.
+    """Holds the lock of a run or of a shard until the end of the block.
 
     Args:
         folder: The output folder.
-        shard: (i, n) of the i-th of n shards; None for a run of all frames.
-        when_alone: Called first if no other process runs in the folder.
+        shard: (i, n) for one of n that run at once; None for all frames.
+        when_alone: Called first in a run that is no shard.
 
     Raises:
-        OutputError: Another process does, or the folder cannot be locked.
+        OutputError: Another run writes there, or the folder cannot be written to.
     """
+    own = _WHOLE if shard is None else f".batch.{shard[0]}of{shard[1]}.lock"
     with ExitStack() as held:
-        start = _lock(folder, ".batch.lock")
+        if not _acquired(folder / own, held, _TRIED_S):
+            raise _in_use(folder)
+        for other in sorted(folder.glob(LOCKS)) if shard is None else [folder / _WHOLE]:
+            with ExitStack() as tried:
+                if other.name != own and other.exists() and not _acquired(other, tried, _TRIED_S):
+                    raise _in_use(folder)
         if shard is None:
-            if not _acquire(start, held) or _running_shards(folder):
-                raise _refusal(folder, "another batch writes there")
             when_alone()
-        else:
-            with ExitStack() as starting:
-                if not _acquire(start, starting, timeout_s=_START_S):
-                    raise _refusal(folder, "another batch, one without --shard, writes there")
-                _start_shard(folder, shard, held, when_alone)
         yield
 
 
@@ -56,47 +57,16 @@ def locked_folder(
 def in_turn(folder: Path) -> Iterator[None]:
     """No other shard is inside at the same time; each waits for the one before."""
     with ExitStack() as held:
-        _acquire(_lock(folder, ".batch.turn.lock"), held, timeout_s=-1)
+        _acquired(folder / ".batch.summary.lock", held, timeout_s=-1)
         yield
 
 
-def _start_shard(
-    folder: Path, shard: tuple[int, int], held: ExitStack, when_alone: Callable[[], None]
-) -> None:
-    number, count = shard
-    if not _acquire(_lock(folder, f".batch.{number}of{count}.lock"), held):
-        raise _refusal(folder, f"shard {number}/{count} is being done by another process")
-    others = _running_shards(folder, but=shard)
-    for other, other_count in others:
-        if other_count != count:
-            raise _refusal(folder, f"shard {other}/{other_count} of another division writes there")
-    if not others:
-        when_alone()
-
-
-def _running_shards(folder: Path, but: tuple[int, int] | None = None) -> list[tuple[int, int]]:
-    """The shards that other processes run; to be called by the holder of `.batch.lock`."""
-    running = []
-    for path in sorted(folder.iterdir()):
-        name = _SHARD_LOCK.fullmatch(path.name)
-        if name is None or (int(name[1]), int(name[2])) == but:
-            continue
-        with ExitStack() as tried:
-            if not _acquire(_lock(folder, path.name), tried):
-                running.append((int(name[1]), int(name[2])))
-    return running
-
-
-def _lock(folder: Path, name: str) -> FileLock:
-    if not folder.is_dir():  # filelock would make it
-        raise cannot_write(folder, FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT)))
-    return FileLock(folder / name)
-
-
-def _acquire(lock: FileLock, held: ExitStack, *, timeout_s: float = 0) -> bool:
+def _acquired(path: Path, held: ExitStack, timeout_s: float) -> bool:
     """True if the lock is held until `held` ends; a negative timeout waits for ever."""
+    if not path.parent.is_dir():  # filelock would make it
+        raise cannot_write(path.parent, FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT)))
     try:
-        held.enter_context(lock.acquire(timeout=timeout_s))
+        held.enter_context(FileLock(path).acquire(timeout=timeout_s))
     except Timeout:
         return False
     except NotImplementedError as error:
@@ -104,9 +74,11 @@ def _acquire(lock: FileLock, held: ExitStack, *, timeout_s: float = 0) -> bool:
             "files in the output folder cannot be locked; choose another folder"
         ) from error
     except OSError as error:
-        raise cannot_write(Path(lock.lock_file), error) from error
+        raise cannot_write(path, error) from error
     return True
 
 
-def _refusal(folder: Path, fact: str) -> OutputError:
-    return OutputError(f"{folder}: {fact}; wait for it to end, or choose another output folder")
+def _in_use(folder: Path) -> OutputError:
+    return OutputError(
+        f"{folder}: another batch writes there; wait for it to end, or choose another output folder"
+    )

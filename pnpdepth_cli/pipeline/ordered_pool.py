@@ -28,7 +28,7 @@ def in_order(
         try:
             for item in items:
                 waiting.append(pool.submit(work, item))
-                while waiting and (waiting[0].done() or len(waiting) > workers):
+                if waiting[0].done() or len(waiting) > workers:
                     yield waiting.popleft().result()
             while waiting:
                 yield waiting.popleft().result()

@@ -100,7 +100,7 @@ def refine_one_by_one(root: Path, names: tuple[str, ...], **changes: Any) -> Non
 
 
 def results(folder: Path) -> dict[str, bytes | dict[str, Any]]:
-    """Every result below a folder: bytes, and records without what depends on time and machine."""
+    """Every result below a folder: bytes, and records without times and what a batch adds."""
     contents: dict[str, bytes | dict[str, Any]] = {}
     for path in sorted(folder.rglob("*")):
         name = path.relative_to(folder).as_posix()
@@ -108,7 +108,8 @@ def results(folder: Path) -> dict[str, bytes | dict[str, Any]]:
             continue
         if path.suffix == ".json" and not path.name.startswith("."):  # those need not be whole
             record = json.loads(path.read_text())
-            del record["seconds"], record["peak_memory_mb"]
+            for key in ("seconds", "peak_memory_mb", "batch"):
+                record.pop(key, None)
             contents[name] = record
         else:
             contents[name] = path.read_bytes()

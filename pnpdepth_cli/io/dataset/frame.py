@@ -113,9 +113,6 @@ class Frame:
     window: tuple[Frame, ...] = ()
     """The frames of its window up to and with this one; empty outside of windows."""
 
-    compared: bool = False
-    """Whether a fixed method without ground truth is compared with linear interpolation here."""
-
     masks: tuple[Path, ...] = ()
     """Images or arrays of the ground truth's size; where one is 0, the ground truth is unknown."""
 

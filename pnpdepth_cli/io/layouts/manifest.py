@@ -17,19 +17,17 @@ from array import array
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from itertools import islice
 from pathlib import Path
 from typing import Any, TextIO
 
 from pnpdepth_cli.errors import FileFormatError, UsageError
 from pnpdepth_cli.io.dataset.frame import Frame, Listing, Unmatched
-from pnpdepth_cli.io.dataset.frame_list import FrameList
 from pnpdepth_cli.io.dataset.frame_names import normalised_name, portable_name_problem
 from pnpdepth_cli.io.dataset.protocols import WHOLE, find_protocol
 from pnpdepth_cli.io.file_bytes import cannot_read, check_size, one_line
 from pnpdepth_cli.io.layouts import Layout
 from pnpdepth_cli.io.remote.address import RemotePath, joined
-from pnpdepth_cli.io.remote.copies import local_files
+from pnpdepth_cli.io.remote.store import local_files
 
 _PATHS = ("image", "sparse", "gt", "calib", "mask")
 _NUMBERS = {"camera": int, "sparse_scale": float, "gt_scale": float}
@@ -48,7 +46,7 @@ def listing(root: Path) -> Listing:
     Raises:
         FileFormatError: A line is invalid, or two frames would share the files of their results.
     """
-    frames, lines = FrameList(), array("q")
+    frames, lines = list[Frame](), array("q")
     broken: list[Unmatched] = []
     with local_files([root]) as local, _text_of(root, local.get(root, root)) as file:
         rows = _csv_rows(root, file) if root.suffix.lower() == ".csv" else _json_rows(root, file)
@@ -87,18 +85,18 @@ def _text_of(root: Path, copy: Path) -> Iterator[TextIO]:
         raise cannot_read(root, error) from error
 
 
-def _check_names(root: Path, frames: FrameList, lines: Sequence[int]) -> None:
+def _check_names(root: Path, frames: Sequence[Frame], lines: Sequence[int]) -> None:
     """Raises FileFormatError if two frames would share the files of their results."""
     hashes: set[int] = set()
-    for count, name in enumerate(frames.names()):
-        key = hash(name.casefold())
+    for count, frame in enumerate(frames):
+        key = hash(frame.name.casefold())
         if key in hashes:
             _check_earlier(root, frames, lines, count)
         hashes.add(key)
 
 
-def _check_earlier(root: Path, frames: FrameList, lines: Sequence[int], count: int) -> None:
-    *earlier, name = islice(frames.names(), count + 1)
+def _check_earlier(root: Path, frames: Sequence[Frame], lines: Sequence[int], count: int) -> None:
+    *earlier, name = (frame.name for frame in frames[: count + 1])
     for other in earlier:
         if other.casefold() == name.casefold():
             hint = "" if other == name else f", which some disks take for {other!r}"
@@ -117,9 +115,9 @@ def _is_missing(file: Path) -> bool:
     return not isinstance(file, RemotePath) and not file.exists()
 
 
-def _name(frames: FrameList) -> None:
+def _name(frames: list[Frame]) -> None:
     """Names those without a name: by the stem, or by the path if stems are not unique."""
-    unnamed = [number for number, name in enumerate(frames.names()) if not name]
+    unnamed = [number for number, frame in enumerate(frames) if not frame.name]
     paths = [_first_file(frames[number]) for number in unnamed]
     if len({path.stem for path in paths}) == len(paths):
         names = [path.stem for path in paths]
@@ -128,7 +126,7 @@ def _name(frames: FrameList) -> None:
         below = (path.absolute().relative_to(folder) for path in paths)
         names = [path.with_suffix("").as_posix() for path in below]
     for number, name in zip(unnamed, names, strict=True):
-        frames.set(number, replace(frames[number], name=name))
+        frames[number] = replace(frames[number], name=name)
 
 
 def _first_file(frame: Frame) -> Path:

@@ -23,7 +23,7 @@ class RemotePath(_Path):
     """A file in a store; made by `path_of`.
 
     Its names, parents and joins are those of any path. Its content is read through a local copy
-    (`io.remote.copies`); `str` gives the address without its query.
+    (`io.remote.store`); `str` gives the address without its query.
 
     Attributes:
         query: Of a presigned address, with its question mark. Joins and parents do not have it.
@@ -94,9 +94,10 @@ def path_of(text: str) -> Path:
         return _local(text)
     if scheme not in STORES:
         raise UsageError(f"{scheme}:// is no known store; stores are {', '.join(STORES)}")
-    rest, mark, query = text[match.end() :].partition("?") if scheme in _WITH_QUERY else (
-        text[match.end() :], "", "",
-    )  # fmt: skip
+    rest, query = text[match.end() :], ""
+    if scheme in _WITH_QUERY and "?" in rest:
+        query = rest[rest.index("?") :]
+        rest = rest.removesuffix(query)
     parts = rest.rstrip("/").split("/")
     if "@" in parts[0]:
         raise UsageError(
@@ -107,7 +108,7 @@ def path_of(text: str) -> Path:
         raise UsageError(
             f"{scheme}://{rest[:100]} has an empty or relative part; give SCHEME://BUCKET/KEY"
         )
-    return _with_query(f"{scheme}://{'/'.join(parts)}", mark + query)
+    return _with_query(f"{scheme}://{'/'.join(parts)}", query)
 
 
 def joined(folder: Path, text: str) -> Path:

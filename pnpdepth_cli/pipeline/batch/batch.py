@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
-import sys
-from array import array
+import json
+import tempfile
+import time
 from collections import Counter
 from collections.abc import Callable, Generator, Iterator
-from contextlib import closing
+from contextlib import ExitStack, closing
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
-from pnpdepth_cli.errors import UsageError
-from pnpdepth_cli.io.dataset.frame_list import FrameList
+from pnpdepth_cli.errors import FileFormatError, UsageError
+from pnpdepth_cli.io.atomic import make_folder
+from pnpdepth_cli.io.dataset.frame import Frame
 from pnpdepth_cli.io.lock import in_turn, locked_folder
 from pnpdepth_cli.io.record import plain
 from pnpdepth_cli.io.remote.address import RemotePath
+from pnpdepth_cli.io.remote.store import upload
 from pnpdepth_cli.io.report import remove_report_leftovers
 from pnpdepth_cli.pipeline.batch.frames import (
     BatchFrames,
@@ -24,16 +27,12 @@ from pnpdepth_cli.pipeline.batch.frames import (
     source_files,
     task_of,
 )
-from pnpdepth_cli.pipeline.batch.output_folder import opened_output
-from pnpdepth_cli.pipeline.batch.profile import BatchProfile
-from pnpdepth_cli.pipeline.batch.request import BatchRequest
-from pnpdepth_cli.pipeline.batch.run import BatchRun
+from pnpdepth_cli.pipeline.batch.request import BatchRequest, SequenceOptions
 from pnpdepth_cli.pipeline.batch.sequence import in_windows, note_of_poses
-from pnpdepth_cli.pipeline.batch.sequence_options import SequenceOptions
 from pnpdepth_cli.pipeline.batch.settings import model_identity, settings_of
-from pnpdepth_cli.pipeline.batch.spread import spread_request, spread_rows
-from pnpdepth_cli.pipeline.batch.state import NEW, BatchState, remove_all_leftovers
-from pnpdepth_cli.pipeline.batch.summary import CSV, JSON, Tally, write_summary, write_table
+from pnpdepth_cli.pipeline.batch.state import BatchState, Row, remove_all_leftovers
+from pnpdepth_cli.pipeline.batch.summary import CSV, JSON, Tally, profile_of, write_summaries
+from pnpdepth_cli.pipeline.cluster.options import RayWorkers, ray_workers_of
 from pnpdepth_cli.pipeline.ordered_pool import in_order
 from pnpdepth_cli.pipeline.refinement.method import resolve_method
 
@@ -42,6 +41,10 @@ if TYPE_CHECKING:
 
 _MAX_LISTED = 5
 """Files named in messages; the rest is counted, and summary.json lists all."""
+_READERS = 8
+"""Threads that read records, whose time on network storage is waiting."""
+_PART = 256
+"""Records that a thread reads at once."""
 
 
 class Listener(Protocol):
@@ -53,11 +56,8 @@ class Listener(Protocol):
     def begin(self, to_do: int) -> None:
         """Called once the network is loaded, with the number of frames to do."""
 
-    def frame(self, row: dict[str, Any]) -> None:
-        """Called with the summary's row of each frame that is done or has failed.
-
-        With workers of a cluster it has only name, status and message.
-        """
+    def frame(self, row: Row) -> None:
+        """Called with the summary's row of each frame that is done or has failed."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,8 +94,8 @@ def run_batch(
         PnpDepthError: For what concerns all frames, such as a network that cannot be loaded, or a
             full disk.
     """
-    request, spread = spread_request(request)
-    if spread is not None and request.sequence.warm_start:
+    request, workers = _request_of_workers(request)
+    if workers is not None and request.sequence.warm_start:
         raise UsageError(
             "--warm-start refines frames in order, in one process; give each process a --shard of"
             " the windows instead of --ray"
@@ -104,115 +104,150 @@ def run_batch(
     report = _report_of(request, batch)
     for note in _notes_of(request, batch):
         listener.say(note)
-
-    with (
-        opened_output(request.output) as folder,
-        locked_folder(
-            folder.local, request.shard, lambda: _clean(folder.local, report, listener.say)
-        ),
-    ):
-        state = BatchState(folder, request.shard, model_identity(request.refine))
-        for note in state.notes():
-            listener.say(note)
+    state = BatchState(request.output, model_identity(request.refine))
+    with ExitStack() as stack:
+        local = _opened_output(request, stack, report, listener.say)
         to_do, reasons = _to_do(request, batch, state)
         done = len(batch.chosen) - len(to_do)
         listener.say(_plan_text(len(batch.chosen), done, reasons))
-        began, profile = 0, BatchProfile()
+        state.mark()
         if report is not None:
             report.begin()
+        began, refined_frames, start = 0, 0, time.perf_counter()
+        seconds = Counter[str]()
         if to_do:
-            state.announce(to_do.names())
-            run = BatchRun(
-                state=state, profile=profile, say=listener.say, stopped=stopped,
-                workers=request.workers, batch_size=request.batch_size,
-            )  # fmt: skip
-            proven = len(to_do) < len(batch.chosen)
-            if spread is None:
-                refined = _rows(request, batch, to_do, run, proven=proven)
-            else:
-                refined = spread_rows(request, spread, batch.frames, to_do, run, proven=proven)
-            with (
-                closing(state),
-                closing(refined if report is None else _drawn(report, refined)) as rows,
-            ):
-                listener.begin(len(to_do))
-                for row in rows:
-                    began += 1
+            refined = _rows(request, batch, to_do, state, workers, listener, stopped)
+            with closing(refined if report is None else _drawn(report, refined)) as refined:
+                for row in refined:
                     listener.frame(row)
-        with in_turn(folder.local):  # so the summary of the shard that ends last stays
-            state.read_others()
-            summary = _summarise(request, batch, state, report, profile)
+                    began += 1
+                    refined_frames += row["status"] != "failed"
+                    seconds.update(row.get("seconds") or {})
+        profile = profile_of(seconds, refined_frames, time.perf_counter() - start)
+        with in_turn(local):  # so the summary of the shard that ends last stays
+            summary = _summarise(request, batch, local, report, profile)
     return BatchOutcome(summary=summary, stopped=began < len(to_do))
-
-
-def _clean(folder: Path, report: BatchReport | None, say: Callable[[str], None]) -> None:
-    """Removes what a killed run left half-written."""
-    leftovers = remove_all_leftovers(folder)
-    leftovers += 0 if report is None else remove_report_leftovers(report.folder)
-    if leftovers:
-        say(f"removed {leftovers:,} half-written files of a run that was killed")
 
 
 def plan_batch(request: BatchRequest, say: Callable[[str], None]) -> list[Planned]:
     """Returns the frames that `run_batch` would do, and why; nothing is written."""
-    request, _ = spread_request(request)
+    request, _ = _request_of_workers(request)
     batch = find_frames(request)
     _report_of(request, batch)
     for note in _notes_of(request, batch):
         say(note)
-    planned = []
-    with opened_output(request.output, create=False) as folder:
-        state = BatchState(folder, request.shard, model_identity(request.refine))
-        for frame in batch.chosen:
-            why = state.why_to_do(task_of(request, frame))
-            if why is not None:
-                planned.append(Planned(name=frame.name, why=why))
+    state = BatchState(request.output, model_identity(request.refine))
+    planned = [
+        Planned(name=batch.chosen[number].name, why=why)
+        for number, why in _reasons(request, batch, state, check=False)
+    ]
     reasons = Counter(each.why for each in planned)
     say(_plan_text(len(batch.chosen), len(batch.chosen) - len(planned), reasons))
     return planned
 
 
+def _request_of_workers(request: BatchRequest) -> tuple[BatchRequest, RayWorkers | None]:
+    """The request of each worker, and the Ray workers; None for this process alone."""
+    workers = ray_workers_of(request.refine.network.device, request.cluster)
+    if workers is None:
+        return request, None
+    return replace(request, refine=request.refine.with_fields(device=workers.device)), workers
+
+
+def _opened_output(
+    request: BatchRequest,
+    stack: ExitStack,
+    report: BatchReport | None,
+    say: Callable[[str], None],
+) -> Path:
+    """The output folder, locked; of one in a store, a local folder for the summaries."""
+    if isinstance(request.output, RemotePath):
+        return Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="pnpdepth-")))
+
+    def clean() -> None:
+        leftovers = remove_all_leftovers(request.output)
+        leftovers += 0 if report is None else remove_report_leftovers(report.folder)
+        if leftovers:
+            say(f"removed {leftovers:,} half-written files of a run that was killed")
+
+    make_folder(request.output)
+    stack.enter_context(locked_folder(request.output, request.shard, clean))
+    return request.output
+
+
 def _to_do(
     request: BatchRequest, batch: BatchFrames, state: BatchState
-) -> tuple[FrameList, Counter[str]]:
+) -> tuple[list[Frame], Counter[str]]:
     """The frames that are to be done, and how many for which reason.
 
     OutputError if one would replace a file that no batch wrote, unless --overwrite is set.
     """
-    numbers, reasons = array("q"), Counter[str]()
-    if state.fresh and not request.refine.outputs.overwrite:
-        state.check_foreign(request.output / name for name in (CSV, JSON))
-    for number, frame in enumerate(batch.chosen):
-        task = task_of(request, frame)
-        why = state.why_to_do(task)
-        if why is None:
-            continue
-        if why == NEW and not request.refine.outputs.overwrite:
-            state.check_foreign(task.outputs.paths())
-        numbers.append(number)
-        reasons[why] += 1
-    return batch.chosen.taken(numbers), reasons
+    check = not request.refine.outputs.overwrite
+    if check:
+        state.check_replaceable(request.output / name for name in (CSV, JSON))
+    planned = list(_reasons(request, batch, state, check=check))
+    return [batch.chosen[number] for number, _ in planned], Counter(why for _, why in planned)
+
+
+def _reasons(
+    request: BatchRequest, batch: BatchFrames, state: BatchState, *, check: bool
+) -> Iterator[tuple[int, str]]:
+    """The numbers of the frames that are to be done, and why.
+
+    OutputError, if `check`, where one would replace a file that no batch wrote.
+    """
+
+    def of_part(start: int) -> list[tuple[int, str]]:
+        reasons = []
+        for number in range(start, min(start + _PART, len(batch.chosen))):
+            task = task_of(request, batch.chosen[number])
+            why = state.reason_to_refine(task)
+            if why is not None:
+                if check:
+                    state.check_replaceable(task.outputs.paths(), task.record)
+                reasons.append((number, why))
+        return reasons
+
+    for part in in_order(of_part, range(0, len(batch.chosen), _PART), _READERS):
+        yield from part
 
 
 def _rows(
-    request: BatchRequest, batch: BatchFrames, to_do: FrameList, run: BatchRun, *, proven: bool
-) -> Generator[dict[str, Any], None, None]:
-    """A row for each frame as it is done; the network is loaded before the first is taken."""
+    request: BatchRequest,
+    batch: BatchFrames,
+    to_do: list[Frame],
+    state: BatchState,
+    workers: RayWorkers | None,
+    listener: Listener,
+    stopped: Callable[[], bool],
+) -> Generator[Row, None, None]:
+    """A row for each frame as it is done, in this process or on Ray workers."""
     # these import torch, which a run with nothing to do does not need
-    from pnpdepth_cli.pipeline.batch.resolving import opened_groups, resolve_refiner
-    from pnpdepth_cli.pipeline.batch.running import run_tasks
+    from pnpdepth_cli.pipeline.batch.ray_workers import rows_of_workers
+    from pnpdepth_cli.pipeline.batch.resolving import load_batch_refiner, references_of
+    from pnpdepth_cli.pipeline.batch.running import opened_network, refine_tasks
 
-    refiner = resolve_refiner(request, batch.frames, run.say)
-    tasks = _tasks(request, batch, to_do)
+    references = references_of(request, batch.frames)
+    worked = len(to_do) < len(batch.chosen)
+    if workers is not None:
+        listener.begin(len(to_do))
+        yield from rows_of_workers(
+            request, workers, references, to_do, state,
+            settings_worked=worked, say=listener.say, stopped=stopped,
+        )  # fmt: skip
+        return
+    refiner = None
+    if references is not None:
+        refiner = load_batch_refiner(request, references, listener.say)
+    listener.begin(len(to_do))
+    with opened_network(refiner, request.batch_size, listener.say) as network:
+        yield from refine_tasks(
+            _tasks(request, batch, to_do), network, state,
+            threads=request.workers, settings_worked=worked, stopped=stopped,
+        )  # fmt: skip
 
-    def rows() -> Generator[dict[str, Any], None, None]:
-        with opened_groups(refiner, run.batch_size, run.say) as groups:
-            yield from run_tasks(tasks, groups, run, proven=proven)
 
-    return rows()
-
-
-def _tasks(request: BatchRequest, batch: BatchFrames, to_do: FrameList) -> Iterator[Task]:
+def _tasks(request: BatchRequest, batch: BatchFrames, to_do: list[Frame]) -> Iterator[Task]:
     """The frames to refine in their order, and within windows those that they begin with."""
     if not request.sequence.warm_start:
         yield from (task_of(request, frame) for frame in to_do)
@@ -246,9 +281,7 @@ def _report_of(request: BatchRequest, batch: BatchFrames) -> BatchReport | None:
     return report
 
 
-def _drawn(
-    report: BatchReport, rows: Generator[dict[str, Any], None, None]
-) -> Generator[dict[str, Any], None, None]:
+def _drawn(report: BatchReport, rows: Generator[Row, None, None]) -> Generator[Row, None, None]:
     """The rows, each after the report's images of its frame are written."""
     with closing(rows):
         yield from in_order(report.drawn, rows, report.workers)
@@ -257,32 +290,62 @@ def _drawn(
 def _summarise(
     request: BatchRequest,
     batch: BatchFrames,
-    state: BatchState,
+    local: Path,
     report: BatchReport | None,
-    profile: BatchProfile,
+    profile: dict[str, Any],
 ) -> dict[str, Any]:
     """Writes summary.csv, summary.json and the report; returns the summary without its frames."""
+    model, tally = model_identity(request.refine), Tally()
+    with tempfile.TemporaryFile("w+", dir=local, encoding="utf-8") as file:
+        for row in _known_rows(request, batch, BatchState(request.output, model)):
+            try:
+                tally.add(row)
+            except (AttributeError, KeyError, TypeError) as error:
+                raise FileFormatError(
+                    f"the record of frame {row['name']} in {request.output} is damaged; remove it,"
+                    " and run again"
+                ) from error
+            file.write(json.dumps(row) + "\n")
+        summary = _head_of(request, batch, model, tally)
+        if request.profile:
+            summary["profile"] = profile
 
-    digests = [sys.intern(state.settings(task_of(request, frame))) for frame in batch.frames]
+        def rows() -> Iterator[Row]:
+            file.seek(0)
+            return map(json.loads, file)
 
-    def rows() -> Iterator[dict[str, Any]]:
-        for name, digest in zip(batch.frames.names(), digests, strict=True):
-            line = state.result_of(name, digest)
-            if line is not None:
-                yield line["row"]
+        write_summaries(local, summary, rows(), tally.baseline_names)
+        if report is not None:
+            report.write(summary, rows)
+    if isinstance(request.output, RemotePath):
+        for name in (CSV, JSON):
+            upload(local / name, request.output / name)
+    return summary
 
-    tally = Tally()
-    for row in rows():
-        tally.add(row)
-    write_table(state.folder.local / CSV, rows(), tally.baseline_names)
+
+def _known_rows(request: BatchRequest, batch: BatchFrames, state: BatchState) -> Iterator[Row]:
+    """The rows of all frames that are done, or have failed, with the present settings."""
+
+    def of_part(start: int) -> list[Row | None]:
+        part = batch.frames[start : start + _PART]
+        return [state.row(task_of(request, frame)) for frame in part]
+
+    for part in in_order(of_part, range(0, len(batch.frames), _PART), _READERS):
+        yield from (row for row in part if row is not None)
+
+
+def _head_of(
+    request: BatchRequest, batch: BatchFrames, model: dict[str, Any], tally: Tally
+) -> dict[str, Any]:
+    """The summary without its frames."""
     known, method = sum(tally.counts.values()), resolve_method(request.refine)
-    summary = {
+    head = {
         "command": "batch",
         "source": str(request.source),
         "output": str(request.output),
         "layout": batch.layout,
         "method": {"kind": "default" if method.is_default else "fixed", "reason": method.reason},
-        "settings": settings_of(request.refine, state.model),
+        "settings": settings_of(request.refine, model),
         "counts": {
             "frames": len(batch.frames),
             **tally.counts,
@@ -296,29 +359,23 @@ def _summarise(
         "unmatched": [str(each) for each in batch.unmatched],
     }
     if request.sequence != SequenceOptions():
-        summary["sequence"] = plain(asdict(request.sequence))
-    if request.profile:
-        summary["profile"] = profile.summary()
-    write_summary(state.folder.local / JSON, summary, rows())
-    state.folder.publish([CSV, JSON])
-    if report is not None:
-        report.write(summary, rows)
-    return summary
+        head["sequence"] = plain(asdict(request.sequence))
+    return head
 
 
 def _notes_of(request: BatchRequest, batch: BatchFrames) -> Iterator[str]:
     """What was assumed, and warnings of files that are in no frame."""
-    patterns = list(batch.frames.patterns())
-    with_gt = batch.frames.count_of("gt")
+    frames = batch.frames
+    with_gt = sum(frame.gt is not None for frame in frames)
     guessed = " (guessed; --layout names another)" if request.layout is None else ""
     yield (
-        f"layout: {batch.layout}{guessed}: {_count(len(batch.frames), 'frame')},"
+        f"layout: {batch.layout}{guessed}: {_count(len(frames), 'frame')},"
         f" {with_gt:,} with ground truth"
     )
-    cut = sorted({f.protocol.name for f in patterns if f.protocol.halved or f.protocol.crop})
+    cut = sorted({f.protocol.name for f in frames if f.protocol.halved or f.protocol.crop})
     if cut and request.protocol is None:
         yield f"protocol: {', '.join(cut)} cuts the frames; --protocol whole keeps all of them"
-    poses = note_of_poses(patterns)
+    poses = note_of_poses(frames)
     if poses is not None:
         yield poses
     if request.limit is not None:

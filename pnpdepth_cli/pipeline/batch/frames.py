@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-from array import array
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,7 +17,6 @@ from pnpdepth_cli.io.dataset.frame import (
     Unmatched,
     file_of,
 )
-from pnpdepth_cli.io.dataset.frame_list import FrameList
 from pnpdepth_cli.io.dataset.frame_names import name_problem
 from pnpdepth_cli.io.file_bytes import one_line
 from pnpdepth_cli.io.layouts import LAYOUTS, find_protocol, list_frames
@@ -38,8 +36,6 @@ from pnpdepth_cli.pipeline.refinement.request import (
 )
 
 Item = TypeVar("Item")
-COMPARED_EVERY = 20
-"""One frame of so many is refined again without a fifth of its points, for the comparison."""
 REGISTERING = 16
 """Frames that decide together how images are moved into the frame of the points."""
 
@@ -53,9 +49,9 @@ class BatchFrames:
 
     layout: str
     """Name of the layout."""
-    frames: FrameList
+    frames: Sequence[Frame]
     """All frames of the source."""
-    chosen: FrameList
+    chosen: Sequence[Frame]
     """Those within the limit and the shard."""
     unmatched: tuple[Unmatched, ...]
     """Files that are in no frame, and why."""
@@ -75,8 +71,12 @@ class Task:
     """The files that are written for it."""
     written: bool = True
     """False for a frame that is refined only because another begins where it ends."""
-    compared: bool = False
-    """Whether a fixed method is compared with linear interpolation without ground truth."""
+
+    @property
+    def record(self) -> Path:
+        """The record of the results, which is the last file that is written."""
+        assert self.outputs.record is not None
+        return self.outputs.record
 
 
 def find_frames(request: BatchRequest) -> BatchFrames:
@@ -93,7 +93,7 @@ def find_frames(request: BatchRequest) -> BatchFrames:
     if request.source.is_dir() and _is_inside(request.source, request.output):
         raise _holds_the_frames(request.output)
     layout, listing = list_frames(request.source, request.layout)
-    frames, unmatched = _usable(request.output, FrameList.of(listing.frames))
+    frames, unmatched = _usable(request.output, listing.frames)
     lost = [*listing.broken, *listing.spare]
     unmatched += [each for each in lost if not _is_inside(each.path, request.output)]
     if not frames:
@@ -102,19 +102,17 @@ def find_frames(request: BatchRequest) -> BatchFrames:
             f"{request.source} looks like {layout!r} but has no frame in it{first};"
             f" layouts are {', '.join(LAYOUTS)}"
         )
-    if request.refine.files.sample is None and not frames.count_of("sparse"):
+    if request.refine.files.sample is None and all(frame.sparse is None for frame in frames):
         raise UsageError(
             f"{request.source} looks like {layout!r}, which has no sparse depth; --sample 500"
             " draws so many points from the ground truth"
         )
     sequence = request.sequence
     if sequence.accumulate:
-        frames = FrameList(with_neighbours(frames, sequence.accumulate, sequence.poses))
+        frames = with_neighbours(frames, sequence.accumulate, sequence.poses)
     if sequence.warm_start:
         check_warm_start(request.refine)
-        frames = FrameList(with_windows(frames, sequence.warm_start))
-    for number in range(0, len(frames), COMPARED_EVERY):
-        frames.set(number, replace(frames[number], compared=True))
+        frames = with_windows(frames, sequence.warm_start)
     return BatchFrames(
         layout=layout,
         frames=frames,
@@ -136,13 +134,13 @@ def _check_stored(source: Path) -> None:
         raise InputError(f"{source}: no such object; check the address")
 
 
-def _chosen(request: BatchRequest, frames: FrameList) -> FrameList:
+def _chosen(request: BatchRequest, frames: list[Frame]) -> list[Frame]:
     """The frames of the shard: every N-th, or every N-th window."""
     number, of = request.shard or (1, 1)
     if not request.sequence.warm_start:
         return frames[number - 1 :: of]
     windows = in_windows(frames)[number - 1 :: of]
-    return FrameList(frame for window in windows for frame in window)
+    return [frame for window in windows for frame in window]
 
 
 def task_of(request: BatchRequest, frame: Frame) -> Task:
@@ -161,13 +159,14 @@ def task_of(request: BatchRequest, frame: Frame) -> Task:
         )
         for each in frame.neighbours
     )
-    files = replace(files, neighbours=neighbours, window=tuple(each.name for each in frame.window))
+    if neighbours or frame.window:
+        window = tuple(each.name for each in frame.window)
+        files = replace(files, neighbours=neighbours, window=window)
     return Task(
         name=frame.name,
         request=replace(refine, files=files),
         inputs=dict(_earlier_files(frame)) | dict(_input_files(files)),
         outputs=Outputs.in_folder(request.output, frame.name, refine),
-        compared=frame.compared,
     )
 
 
@@ -179,7 +178,9 @@ def _files_of(request: BatchRequest, frame: Frame, *, needs_camera: bool) -> Fra
     gt = frame.gt
     if base.sample is not None and gt is None and _is_scan_file(frame.sparse):
         gt = frame.sparse  # points are sampled from the projected scan
-    is_scan = _reads_scan(replace(base, calibration=frame.calibration), sparse, gt)
+    if frame.calibration is not None:
+        base = replace(base, calibration=frame.calibration)
+    is_scan = _reads_scan(base, sparse, gt)
     scan = base.scan
     if is_scan:
         camera = frame.camera if scan.camera is None else scan.camera
@@ -189,7 +190,6 @@ def _files_of(request: BatchRequest, frame: Frame, *, needs_camera: bool) -> Fra
         image=frame.image,
         sparse=sparse,
         gt=gt,
-        calibration=frame.calibration,
         camera_file=frame.calib if needs_camera and not is_scan else None,
         camera_number=frame.camera if scan.camera is None else scan.camera,
         gt_masks=frame.masks,
@@ -202,11 +202,8 @@ def _files_of(request: BatchRequest, frame: Frame, *, needs_camera: bool) -> Fra
     )
 
 
-def deciding(frames: Sequence[Item], first: int) -> list[Item]:
-    """Returns the frames behind the first readable one that decide together with it.
-
-    On these, candidates are compared, and input ranges where the network states none.
-    """
+def reference_frames(frames: Sequence[Item], first: int) -> list[Item]:
+    """Returns the frames behind the first readable one that decide input ranges with it."""
     count = len(frames) - first - 1
     return [frames[first + 1 + i] for i in sorted({count // 2, count - 1})] if count else []
 
@@ -295,24 +292,23 @@ def _holds_the_frames(output: Path) -> OutputError:
     )
 
 
-def _usable(output: Path, frames: FrameList) -> tuple[FrameList, list[Unmatched]]:
+def _usable(output: Path, frames: Sequence[Frame]) -> tuple[list[Frame], list[Unmatched]]:
     """The frames outside of the output folder whose name is fit for results, and the others."""
-    kept, ignored = array("q"), []
+    kept, ignored = list[Frame](), list[Unmatched]()
     inside, names, within = _finder(output), set[str](), 0
-    for number, name in enumerate(frames.names()):
-        path = None if inside is None else inside(frames[number])
+    for frame in frames:
+        path = None if inside is None else inside(frame)
         within += path is not None
-        why = _problem_of_name(name, names) if path is None else _IN_OUTPUT
+        why = _problem_of_name(frame.name, names) if path is None else _IN_OUTPUT
         if why is None:
-            names.add(name)
-            kept.append(number)
+            names.add(frame.name)
+            kept.append(frame)
         else:
-            frame = frames[number]
-            file = file_of(frame.image or frame.sparse or Path(name))
+            file = file_of(frame.image or frame.sparse or Path(frame.name))
             ignored.append(Unmatched(path=path or file, why=why))
     if frames and within == len(frames):
         raise _holds_the_frames(output)
-    return (frames.taken(kept) if ignored else frames), ignored
+    return kept, ignored
 
 
 def _finder(output: Path) -> Callable[[Frame], Path | None] | None:

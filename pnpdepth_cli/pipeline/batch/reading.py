@@ -10,7 +10,7 @@ from typing import Any
 from pnpdepth_cli.errors import PnpDepthError
 from pnpdepth_cli.io.fingerprint import Fingerprint, fingerprint
 from pnpdepth_cli.io.remote.address import RemotePath
-from pnpdepth_cli.io.remote.copies import local_files, renamed
+from pnpdepth_cli.io.remote.store import local_files, renamed
 from pnpdepth_cli.pipeline.batch.frames import Task
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs, read_inputs
 
@@ -23,21 +23,27 @@ def read_task(task: Task) -> tuple[Inputs, dict[str, Fingerprint]]:
     Raises:
         PnpDepthError: As of `read_inputs` and `local_files`.
     """
-    with local_files(task.inputs.values()):  # so that a copy is of the content that is compared
-        fingerprints = {part: fingerprint(path) for part, path in task.inputs.items()}
-        return read_frame(task), fingerprints
+    with local_files(task.inputs.values()) as copies:
+        fingerprints = {
+            part: fingerprint(path, copies.get(path)) for part, path in task.inputs.items()
+        }
+        return _read(task, copies), fingerprints
 
 
 def read_frame(task: Task) -> Inputs:
     """Returns what `read_task` does, without fingerprints."""
-    if not any(isinstance(path, RemotePath) for path in task.inputs.values()):
-        return read_inputs(task.request)
     with local_files(task.inputs.values()) as copies:
-        names = {str(copy): str(path) for path, copy in copies.items()}
-        try:
-            inputs = read_inputs(_with_copies(task.request, copies))
-        except PnpDepthError as error:
-            raise type(error)(renamed(str(error), names)) from error
+        return _read(task, copies)
+
+
+def _read(task: Task, copies: Mapping[Path, Path]) -> Inputs:
+    if not copies:
+        return read_inputs(task.request)
+    names = {str(copy): str(path) for path, copy in copies.items()}
+    try:
+        inputs = read_inputs(_with_copies(task.request, copies))
+    except PnpDepthError as error:
+        raise type(error)(renamed(str(error), names)) from error
     return replace(inputs, record=renamed(inputs.record, names), notes=renamed(inputs.notes, names))
 
 

@@ -7,17 +7,9 @@ from pathlib import Path
 
 from pnpdepth_cli.choices import FRAME_PROTOCOLS, LAYOUTS
 from pnpdepth_cli.errors import UsageError
-from pnpdepth_cli.pipeline.batch.sequence_options import SequenceOptions
 from pnpdepth_cli.pipeline.cluster.options import ClusterOptions
 from pnpdepth_cli.pipeline.options import option
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest
-
-
-def parse_batch_size(text: str) -> int | None:
-    """Returns the number of frames, None for `auto`. Raises UsageError for any other text."""
-    if text != "auto" and not text.isdecimal():
-        raise UsageError(f"batch size {text!r} is neither auto nor a number of frames such as 8")
-    return None if text == "auto" else int(text)
 
 
 def parse_shard(text: str) -> tuple[int, int]:
@@ -50,6 +42,37 @@ class FrameSelection:
 
 
 @dataclass(frozen=True, kw_only=True)
+class SequenceOptions:
+    """What a frame takes over from its neighbours."""
+
+    accumulate: int = option(
+        0,
+        "Add the points of the N frames before and after, moved by the camera's poses or, without"
+        " poses, by its motion as estimated from images or scans.",
+        metavar="N",
+    )
+    poses: Path | None = option(
+        None,
+        "Camera poses of the frames in their order (KITTI or TUM rows).  [default: the layout's,"
+        " else estimated]",
+        metavar="FILE",
+    )
+    warm_start: int = option(
+        0,
+        "Refine windows of N frames in order, each frame from where the one before ended.",
+        metavar="N",
+    )
+
+    def __post_init__(self) -> None:
+        if self.accumulate < 0:
+            raise UsageError(f"--accumulate {self.accumulate}: give a number of frames, 0 or more")
+        if self.warm_start < 0 or self.warm_start == 1:
+            raise UsageError(f"--warm-start {self.warm_start}: give a window of 2 frames or more")
+        if self.poses is not None and not self.accumulate:
+            raise UsageError("--poses is for --accumulate; give --accumulate 2, say")
+
+
+@dataclass(frozen=True, kw_only=True)
 class BatchRequest(FrameSelection):
     """Which frames to refine, and how."""
 
@@ -69,12 +92,12 @@ class BatchRequest(FrameSelection):
         "With --html: also show every frame as a point cloud, before, after and ground truth; adds"
         " up to 2.5 MB a frame.",
     )
-    batch_size: int | None = option(
-        None,
-        "Number of frames per forward pass. auto: as many as save time without changing a bit of"
-        " the results.  [default: auto]",
-        metavar="auto|N",
-        parse=parse_batch_size,
+    batch_size: int = option(
+        1,
+        "Frames of one size that go through a fixed network together; more than 1 changes the last"
+        " bits of the results.",
+        metavar="N",
+        show_default=True,
     )
     shard: tuple[int, int] | None = option(
         None, "Every N-th frame, starting at the I-th.", metavar="I/N", parse=parse_shard
@@ -92,8 +115,8 @@ class BatchRequest(FrameSelection):
             raise UsageError("--html-3d adds to the report; name its folder with --html")
         if self.workers < 1:
             raise UsageError(f"workers {self.workers}: at least one thread has to read")
-        if self.batch_size is not None and self.batch_size < 1:
-            raise UsageError(f"batch size {self.batch_size}: give 1 or more frames, or auto")
+        if self.batch_size < 1:
+            raise UsageError(f"batch size {self.batch_size}: give 1 or more frames")
         if self.limit is not None and self.limit < 1:
             raise UsageError(f"limit {self.limit}: give the number of frames to do, 1 or more")
         if self.shard is not None and not 1 <= self.shard[0] <= self.shard[1]:

@@ -1,4 +1,4 @@
-"""Runs a batch: threads read frames in advance, the network refines, other threads write.
+"""Refines frames: threads read them in advance, the network refines, other threads write.
 
 The network runs only in the calling thread, as it is patched while it is cut. The queues between
 the threads are bounded, so memory does not grow with the number of frames.
@@ -8,259 +8,257 @@ from __future__ import annotations
 
 import time
 import traceback
-from collections import deque
-from collections.abc import Generator, Iterable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import closing
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from contextlib import closing, contextmanager
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
+import numpy as np
+
+from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.errors import (
+    BatchError,
     InputError,
     ModelError,
     PnpDepthError,
     StorageError,
     UsageError,
 )
-from pnpdepth_cli.frames.frame import RefinedFrame
+from pnpdepth_cli.frames.frame import RefinedFrame, WarmStart
 from pnpdepth_cli.io.fingerprint import Fingerprint
 from pnpdepth_cli.pipeline.batch.frames import Task
-from pnpdepth_cli.pipeline.batch.groups import FrameGroups
-from pnpdepth_cli.pipeline.batch.output_folder import published, staged
-from pnpdepth_cli.pipeline.batch.profile import (
-    NETWORK,
-    READING,
-    WAITING_TO_READ,
-    WAITING_TO_WRITE,
-    WRITING,
-    BatchProfile,
-)
 from pnpdepth_cli.pipeline.batch.reading import read_task
-from pnpdepth_cli.pipeline.batch.run import BatchRun
-from pnpdepth_cli.pipeline.batch.state import Fingerprints, FrameRecorder, Status
-from pnpdepth_cli.pipeline.batch.summary import failed_row, row_of
+from pnpdepth_cli.pipeline.batch.state import BatchState, Row
+from pnpdepth_cli.pipeline.ordered_pool import in_order
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs
 from pnpdepth_cli.pipeline.refinement.refine import write_refined
-from pnpdepth_cli.pipeline.refinement.refiner import Refiner
+from pnpdepth_cli.pipeline.refinement.refiner import Opened, Refiner
 from pnpdepth_cli.pipeline.stopwatch import Stopwatch
 
-Row = dict[str, Any]
+_ROUNDING = 1e-3
+"""A larger relative difference of plain predictions is more than rounding."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class ReadFrame:
-    """A frame in memory."""
+@dataclass(kw_only=True)
+class FrameInMemory:
+    """A frame on its way through the network."""
 
-    inputs: Inputs
-    """Its contents."""
-    fingerprints: dict[str, Fingerprint]
-    """Of its files when they were read, by part."""
-    watch: Stopwatch
-    """With the seconds of reading."""
+    task: Task
+    inputs: Inputs | None = None
+    fingerprints: dict[str, Fingerprint] = field(default_factory=dict)
+    watch: Stopwatch = field(default_factory=Stopwatch)
+    result: RefinedFrame | Exception | None = None
+    """An error that occurred while it was read or refined. None before."""
 
 
-def run_tasks(
-    tasks: Iterable[Task], groups: FrameGroups | None, run: BatchRun, *, proven: bool
+def refine_tasks(
+    tasks: Iterable[Task],
+    network: OpenRefiner | None,
+    state: BatchState,
+    *,
+    threads: int,
+    settings_worked: bool,
+    stopped: Callable[[], bool] = lambda: False,
 ) -> Generator[Row, None, None]:
-    """Refines and records each task; yields a row for each, in their order.
+    """Refines and writes each task; yields the summary's row of each, in their order.
 
     Args:
         tasks: The frames to refine.
-        groups: The network, open; None if no frame could be read.
-        run: What the frames share.
-        proven: True if a frame was refined with these settings before.
+        network: The network, open; None if no frame could be read.
+        state: Writes the results.
+        threads: Number of threads that read, and of threads that write.
+        settings_worked: True if a frame was refined with these settings before.
+        stopped: True if no further frame is to be begun.
 
     Raises:
         StorageError: When nothing more can be written.
         ModelError: For an error of the network before any frame was refined.
         UsageError: For an error of the settings before any frame was refined.
     """
-    with closing(run_arriving(tasks, groups, run, proven=proven)) as rows:
-        yield from (row for row in rows if row is not None)
 
+    def refined(reading: Iterable[FrameInMemory]) -> Iterator[FrameInMemory]:
+        worked = settings_worked
+        for group in _groups(reading, lambda: 1 if network is None else network.batch_size):
+            if stopped():
+                return
+            _refine(group, network)
+            for frame in group:
+                worked |= isinstance(frame.result, RefinedFrame)
+                fatal = StorageError if worked else (StorageError, ModelError, UsageError)
+                if isinstance(frame.result, fatal):
+                    raise frame.result
+                if frame.task.written:
+                    yield frame
 
-def run_arriving(
-    tasks: Iterable[Task | None], groups: FrameGroups | None, run: BatchRun, *, proven: bool
-) -> Generator[Row | None, None, None]:
-    """Does what `run_tasks` does, with tasks that arrive in the meantime.
-
-    A None among the tasks says that the next one has not arrived. It yields None, so that the
-    caller can fetch more; threads go on reading and writing the frames before it.
-    """
-    profile, workers = run.profile, run.workers
-    writing: deque[Future[Row]] = deque()
-
-    def written() -> Row:
-        with profile(WAITING_TO_WRITE):
-            return writing.popleft().result()
+    def written(frame: FrameInMemory) -> Row:
+        return _write(frame, network, state)
 
     with (
-        profile.wall(),
-        ThreadPoolExecutor(workers) as readers,
-        ThreadPoolExecutor(workers) as writers,
+        closing(in_order(_read, tasks, threads)) as reading,
+        closing(in_order(written, refined(reading), threads)) as rows,
     ):
-        reading = _read_ahead(tasks, readers, workers, groups, profile)
-        try:
-            for group in _gathered(reading, groups, profile):
-                if run.stopped():
-                    break
-                if group is None:
-                    yield None
-                    continue
-                for task, read, result in _refined(groups, group, profile):
-                    if not task.written:
-                        continue
-                    if isinstance(result, Exception):
-                        of_all = not proven and isinstance(result, ModelError | UsageError)
-                        if of_all or isinstance(result, StorageError):
-                            raise result
-                        writing.append(writers.submit(_failed, run.state, task, result))
-                    else:
-                        proven = True
-                        assert read is not None
-                        assert groups is not None
-                        arguments = (run, task, read, groups.refiner, result)
-                        writing.append(writers.submit(_write, *arguments))
-                # frames not yet written are lost if the process is killed, so there are few
-                while writing and (writing[0].done() or len(writing) >= workers + len(group)):
-                    yield written()
-            while writing:
-                yield written()
-        finally:
-            reading.close()
-            for future in writing:  # after a full disk they would fail too
-                future.cancel()
+        yield from rows
 
 
-def _read_ahead(
-    tasks: Iterable[Task | None],
-    readers: ThreadPoolExecutor,
-    workers: int,
-    groups: FrameGroups | None,
-    profile: BatchProfile,
-) -> Generator[tuple[Task, Future[ReadFrame]] | None, None, None]:
-    waiting: deque[tuple[Task, Future[ReadFrame]]] = deque()
-    try:
-        for task in tasks:
-            if task is None:
-                yield None
-                continue
-            waiting.append((task, readers.submit(_read, task, profile)))
-            if len(waiting) > 2 * workers + (groups.largest - 1 if groups else 0):
-                yield waiting.popleft()
-        while waiting:
-            yield waiting.popleft()
-    finally:
-        for _, future in waiting:
-            future.cancel()
+def _groups(
+    frames: Iterable[FrameInMemory], size: Callable[[], int]
+) -> Iterator[list[FrameInMemory]]:
+    """The frames in their order, in groups of at most so many of one shape.
 
-
-def _gathered(
-    reading: Iterable[tuple[Task, Future[ReadFrame]] | None],
-    groups: FrameGroups | None,
-    profile: BatchProfile,
-) -> Generator[list[tuple[Task, ReadFrame | Exception]] | None, None, None]:
-    """The frames in their order, in groups of one size that go together.
-
-    One that could not be read keeps its position and does not count. A None stays one.
+    A frame that could not be read is in the group of those before it.
     """
-    group: list[tuple[Task, ReadFrame | Exception]] = []
-    size: tuple[int, int] | None = None
-    for each in reading:
-        if each is None:
-            yield None
-            continue
-        task, future = each
-        with profile(WAITING_TO_READ):
-            read = _outcome(future)
-        if isinstance(read, ReadFrame):
-            if size not in (None, read.inputs.size):
+    group: list[FrameInMemory] = []
+    shape = None
+    for frame in frames:
+        if frame.inputs is not None:
+            if shape not in (None, frame.inputs.size):
                 yield group
                 group = []
-            size = read.inputs.size
-        group.append((task, read))
-        wanted = 1 if size is None or groups is None else groups.of_size(size)
-        if sum(isinstance(read, ReadFrame) for _, read in group) >= wanted or size is None:
+            shape = frame.inputs.size
+        group.append(frame)
+        if len(group) >= size():
             yield group
-            group, size = [], None
+            group, shape = [], None
     if group:
         yield group
 
 
-def _outcome(future: Future[ReadFrame]) -> ReadFrame | Exception:
+def _refine(group: Sequence[FrameInMemory], network: OpenRefiner | None) -> None:
+    """Sets the results of the frames that were read."""
+    frames = [frame for frame in group if frame.inputs is not None]
+    if network is None:
+        for frame in frames:
+            frame.result = InputError("no frame could be read when the batch began; run it again")
+        return
+    if not frames:
+        return
+    start = time.perf_counter()
+    results = network.refine([frame.inputs for frame in frames if frame.inputs is not None])
+    seconds = (time.perf_counter() - start) / len(frames)
+    for frame, result in zip(frames, results, strict=True):
+        frame.watch.add("refine", seconds)
+        frame.result = result
+
+
+class OpenRefiner:
+    """Refines frames of one size, several together where the user asks for it.
+
+    Args:
+        refiner: The network and its settings.
+        opened: The refiner's networks, open.
+        batch_size: How many frames go together.
+        say: Receives notes.
+    """
+
+    def __init__(
+        self, refiner: Refiner, opened: Opened, batch_size: int, say: Callable[[str], None]
+    ) -> None:
+        self.refiner, self._opened, self._say = refiner, opened, say
+        self._carried: dict[str, WarmStart] = {}  # of the last frame, by the first of its window
+        fixed = (
+            isinstance(opened, Split)
+            and not refiner.settings.moves_weights
+            and refiner.request.network.tile is None
+        )
+        if batch_size > 1 and not fixed:
+            say("batch size: 1; only frames of a fixed network without tiles go together")
+        self.batch_size = batch_size if fixed else 1
+        self._checked = False
+
+    def refine(self, group: Sequence[Inputs]) -> Sequence[RefinedFrame | Exception]:
+        """Returns the refined frames, all of one size; for one that fails, its error."""
+        if len(group) > 1 and not any(inputs.window for inputs in group):
+            together = self._together(group)
+            if together is not None:
+                return together
+        return [self._alone(inputs) for inputs in group]
+
+    def _together(self, group: Sequence[Inputs]) -> list[RefinedFrame | Exception] | None:
+        """The frames refined in one pass; None if the network does not take them together."""
+        assert isinstance(self._opened, Split)
+        refiner = self.refiner
+        try:
+            frames = refiner.refine_together(self._opened, group, refiner.settings)
+            if not self._checked:
+                self._check_independent(group[0], frames[0])
+        except PnpDepthError as error:
+            self._say(f"{len(group)} frames are refined one at a time; together: {error}")
+            if isinstance(error, BatchError):
+                self.batch_size = 1
+            return None
+        note = f"refined together with {len(group) - 1} others, which alters the last bits"
+        return [
+            replace(frame, notes=(*frame.notes, note)) if isinstance(frame, RefinedFrame) else frame
+            for frame in frames
+        ]
+
+    def _check_independent(self, inputs: Inputs, together: RefinedFrame | PnpDepthError) -> None:
+        """Raises BatchError if the frames of a group influence each other."""
+        alone = self._alone(inputs)
+        if not isinstance(alone, RefinedFrame) or not isinstance(together, RefinedFrame):
+            return
+        self._checked = True
+        assert isinstance(self._opened, Split)
+        if not self._opened.static_graph:
+            raise BatchError("the network's control flow depends on image values")
+        if not np.allclose(alone.before, together.before, rtol=_ROUNDING, atol=0):
+            raise BatchError("frames that go together influence each other")
+
+    def _alone(self, inputs: Inputs) -> RefinedFrame | Exception:
+        try:
+            if not inputs.window:
+                return self.refiner.refine(self._opened, inputs)
+            first = inputs.window[0]
+            carried = (
+                WarmStart() if len(inputs.window) == 1 else self._carried.pop(first, WarmStart())
+            )
+            frame = self.refiner.refine_next(self._opened, inputs, carried)
+        except Exception as error:  # concerns this frame only
+            return error
+        self._carried = {first: frame.carried or WarmStart()}
+        return replace(frame, carried=None)
+
+
+@contextmanager
+def opened_network(
+    refiner: Refiner | None, batch_size: int, say: Callable[[str], None]
+) -> Iterator[OpenRefiner | None]:
+    """Yields the network, open for any number of frames; None for None."""
+    if refiner is None:
+        yield None
+        return
+    with refiner.opened() as opened:
+        yield OpenRefiner(refiner, opened, batch_size, say)
+
+
+def _read(task: Task) -> FrameInMemory:
+    frame = FrameInMemory(task=task)
     try:
-        return future.result()
-    except Exception as error:  # this frame's own matter
-        return error
+        with frame.watch("read"):
+            frame.inputs, frame.fingerprints = read_task(task)
+    except Exception as error:  # concerns this frame only
+        frame.result = error
+    return frame
 
 
-def _refined(
-    groups: FrameGroups | None,
-    group: Sequence[tuple[Task, ReadFrame | Exception]],
-    profile: BatchProfile,
-) -> Iterator[tuple[Task, ReadFrame | None, RefinedFrame | Exception]]:
-    """Each frame with its inputs and its result or error; or None, and why it was not read."""
-    frames = [read for _, read in group if isinstance(read, ReadFrame)]
-    results: list[RefinedFrame | Exception] = []
-    if groups is None:
-        missing = InputError("no frame could be read when the batch began; run it again")
-        results = [missing for _ in frames]
-    elif frames:
-        with profile(NETWORK):
-            start = time.perf_counter()
-            results = groups.refine([frame.inputs for frame in frames])
-            for frame in frames:
-                frame.watch.add("refine", (time.perf_counter() - start) / len(frames))
-            groups.try_out()
-    of_frames = iter(results)
-    for task, read in group:
-        if isinstance(read, ReadFrame):
-            yield task, read, next(of_frames)
-        else:
-            yield task, None, read
-
-
-def _read(task: Task, profile: BatchProfile) -> ReadFrame:
-    watch = Stopwatch()
-    with watch("read"), profile(READING):
-        inputs, fingerprints = read_task(task)
-    return ReadFrame(inputs=inputs, fingerprints=fingerprints, watch=watch)
-
-
-def _write(
-    run: BatchRun, task: Task, read: ReadFrame, refiner: Refiner, frame: RefinedFrame
-) -> Row:
-    state = run.state
+def _write(frame: FrameInMemory, network: OpenRefiner | None, state: BatchState) -> Row:
+    """Writes a frame's results, or why there are none; returns the summary's row."""
+    task, inputs, result = frame.task, frame.inputs, frame.result
+    if not isinstance(result, RefinedFrame):
+        assert result is not None
+        return state.fail(task, _message(result))
+    assert network is not None
+    assert inputs is not None
     try:
-        with run.profile(WRITING), staged(task.outputs, state.output) as stage:
-            state.begin(task)
-            outcome = write_refined(stage, refiner, read.inputs, frame, read.watch)
-            outputs, known = published(outcome.outputs, task.outputs, stage, state.output)
-            task = replace(task, outputs=outputs)
-            written = {
-                kind: path.relative_to(state.output).as_posix()
-                for kind, path in task.outputs.by_kind().items()
-            }
-            row = row_of(task.name, _paths(task), outcome.record, written)
-            status: Status = "diverged" if outcome.diverged else "done"
-            state.finish(task, status, row, Fingerprints(read=read.fingerprints, written=known))
+        return state.write(
+            task,
+            frame.fingerprints,
+            lambda outputs: write_refined(outputs, network.refiner, inputs, result, frame.watch),
+        )
     except StorageError:
         raise
     except Exception as error:
-        return _failed(state, task, error)
-    run.profile.count()
-    return row
-
-
-def _failed(state: FrameRecorder, task: Task, error: Exception) -> Row:
-    row = failed_row(task.name, _paths(task), _message(error))
-    state.fail(task, row)
-    return row
-
-
-def _paths(task: Task) -> dict[str, str]:
-    return {part: str(path) for part, path in task.inputs.items()}
+        return state.fail(task, _message(error))
 
 
 def _message(error: Exception) -> str:

@@ -74,9 +74,10 @@ class SettingsDigests:
             camera_file=None, camera_number=None,
         )  # fmt: skip
         key = (alike, request.network, request.method, request.hold_out, request.outputs)
-        if self._last is None or self._last[0] != key:
-            self._last = key, settings_digest(request, self._model)
-        return self._last[1]
+        last = self._last  # several threads may ask
+        if last is None or last[0] != key:
+            last = self._last = key, settings_digest(request, self._model)
+        return last[1]
 
 
 def model_identity(request: RefineRequest) -> dict[str, Any]:

@@ -1,264 +1,256 @@
-"""The run manifests of an output folder: which frames are done, and whether they are up to date.
+"""The record beside a result is the state of a batch: how the result was made, and of which files.
 
-`batch.jsonl`, or `batch.2of8.jsonl` of a shard, gets a line before a frame's files are written
-("begun") and one after ("done", "diverged" or "failed"). A line holds the digest of the settings,
-and size, time and digest of every file that was read and written. So a later run recognises what is
-missing, outdated or interrupted.
+`NAME.json` is written last, by rename, and removed before the files of `NAME` are written again.
+Its entry `batch` holds the digest of the settings, what identifies the inputs, and the files
+written; or why the frame failed.
 """
 
 from __future__ import annotations
 
+import json
 import os
-import re
-from collections.abc import Iterable
-from dataclasses import dataclass
-from itertools import islice
+import tempfile
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import replace
+from fnmatch import fnmatch
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import TYPE_CHECKING, Any
 
-from pnpdepth_cli.errors import OutputError
-from pnpdepth_cli.io.atomic import cannot_write, remove_leftovers
+from pnpdepth_cli.errors import FileFormatError, OutputError
+from pnpdepth_cli.io.atomic import cannot_write, make_folder, remove_leftovers
 from pnpdepth_cli.io.fingerprint import Fingerprint, is_unchanged
-from pnpdepth_cli.io.journal import EncodedLine, Journal
+from pnpdepth_cli.io.lock import LOCKS
+from pnpdepth_cli.io.record import write_json
 from pnpdepth_cli.io.remote.address import RemotePath
-from pnpdepth_cli.io.remote.segments import SegmentedJournal
-from pnpdepth_cli.io.remote.store import StatusIndex
+from pnpdepth_cli.io.remote.store import Listing, read_object, remove, renamed, upload
 from pnpdepth_cli.pipeline.batch.frames import Task
-from pnpdepth_cli.pipeline.batch.output_folder import OutputFolder
-from pnpdepth_cli.pipeline.batch.settings import SettingsDigests, settings_digest
+from pnpdepth_cli.pipeline.batch.settings import SettingsDigests
+from pnpdepth_cli.pipeline.batch.summary import JSON, failed_row, row_of
+from pnpdepth_cli.pipeline.refinement.output_files import Outputs
 
-Status = Literal["done", "diverged", "failed"]
+if TYPE_CHECKING:
+    from pnpdepth_cli.pipeline.refinement.refine import RefineOutcome
 
-Line = dict[str, Any]
-"""A line of a run manifest."""
-KEY = "frame"
-"""Identifies a line, by the name of its frame."""
+Row = dict[str, Any]
 NEW = "new"
-_LINES_AT_ONCE = 1000
-_MANIFEST = re.compile(r"batch(\.\d+of\d+)?\.jsonl")
-
-
-@dataclass(frozen=True, kw_only=True)
-class Fingerprints:
-    """What identifies the files of a frame that is done."""
-
-    read: dict[str, Fingerprint]
-    """Of its inputs when they were read, by part."""
-    written: dict[Path, Fingerprint]
-    """Of its results."""
-
-
-class FrameRecorder(Protocol):
-    """Records what is done, in the manifest or for it."""
-
-    @property
-    def output(self) -> Path:
-        """The output folder."""
-
-    @property
-    def model(self) -> dict[str, Any]:
-        """The network's `model_identity`."""
-
-    def begin(self, task: Task) -> None:
-        """Records that files of this frame may exist from now on."""
-
-    def finish(self, task: Task, status: Status, row: dict[str, Any], known: Fingerprints) -> None:
-        """Records that the frame is done, with the fingerprints of its files."""
-
-    def fail(self, task: Task, row: dict[str, Any]) -> None:
-        """Records why the frame failed."""
+_ENTRY = "batch"
+_START = b'{\n  "batch": '
+"""How a record of a batch begins; parsing the rest of it takes five times as long."""
+_OWN_SUMMARY = b'{\n  "command": "batch"'
+_LOCK = ".batch.lock"
 
 
 class BatchState:
-    """The run manifests of an output folder; this run writes its own and reads all of them.
+    """What an output folder holds of a batch.
 
     Args:
-        folder: The folder that is written to.
-        shard: (i, n) of this run; None for all frames.
+        output: The folder.
         model: The network's `model_identity`.
     """
 
-    def __init__(
-        self, folder: OutputFolder, shard: tuple[int, int] | None, model: dict[str, Any]
-    ) -> None:
-        self.output = folder.output
-        self.model = model
-        self.folder = folder
+    def __init__(self, output: Path, model: dict[str, Any]) -> None:
+        self.output, self.model = output, model
         self._digests = SettingsDigests(model)
-        self._index = StatusIndex()
-        self._announced = False
-        self._start = f"{folder.output}/"
-        part = "" if shard is None else f".{shard[0]}of{shard[1]}"
-        own = folder.local / f"batch{part}.jsonl"
-        existed = own.exists()
-        self._own = folder.journal(own, KEY)
-        self.read_others()
-        self.fresh = not existed and not self._others
-        """True if no batch wrote to the folder before."""
+        self._listing = Listing()
+        names = self._listing.names(output)
+        self._is_ours = any(fnmatch(name, LOCKS) for name in names) or (
+            JSON in names and (_content(output / JSON) or b"").startswith(_OWN_SUMMARY)
+        )
 
-    def read_others(self) -> None:
-        """Reads what the other shards have done up to now."""
-        paths = sorted(self.folder.local.iterdir()) if self.folder.local.is_dir() else []
-        self._others = [
-            Journal(path, KEY)
-            for path in paths
-            if _MANIFEST.fullmatch(path.name) and path.name != self._own.path.name
-        ]
+    def mark(self) -> None:
+        """Marks a folder in a store as a batch's own; a lock does so on a disk."""
+        if isinstance(self.output, RemotePath) and not self._is_ours:
+            with tempfile.NamedTemporaryFile() as empty:
+                upload(Path(empty.name), self.output / _LOCK)
 
-    def notes(self) -> list[str]:
-        """Returns a warning for each damaged manifest."""
-        return [
-            f"warning: {journal.lost} lines of {journal.path} are damaged; their frames are refined"
-            " again"
-            for journal in (self._own, *self._others)
-            if journal.lost
-        ]
-
-    def why_to_do(self, task: Task) -> str | None:
-        """Returns why the frame is to be done; None if it is done with these settings and files.
+    def reason_to_refine(self, task: Task) -> str | None:
+        """Returns why a frame is to be refined; None if it is done with its settings and files.
 
         The reason is a word or two, with details after a colon.
         """
-        lines = self._lines(task.name, before="row")
-        if not lines:
+        names = self._listing.names(task.record.parent)
+        if task.record.name not in names:
+            there = any(path.name in names for path in task.outputs.paths())
+            return "interrupted" if there else NEW
+        entry = _entry(_record(task.record, entry_only=True))
+        if entry is None:
             return NEW
-        digest = self.settings(task)
-        reasons = [self._why_not(line, task, digest) for line in lines]
-        return None if None in reasons else reasons[0]
+        if "failed" in entry:
+            return "failed before"
+        if entry["settings"] != self._digests.of(task.request):
+            return "other settings"
+        if entry["inputs"].keys() != task.inputs.keys():
+            return "other input files"
+        for part, path in task.inputs.items():
+            try:
+                known = Fingerprint(**entry["inputs"][part])
+            except TypeError:
+                return "record damaged"
+            if not is_unchanged(path, known, self._listing):
+                return f"input changed: {part}"
+        may_lack = task.outputs.optional()
+        for kind, path in task.outputs.by_kind().items():
+            wanted = kind in entry["outputs"] or path not in may_lack
+            if wanted and path.name not in names:
+                return f"result missing: {path.name}"
+        return None
 
-    def result_of(self, name: str, digest: str) -> Line | None:
-        """Returns the line of a frame with these settings, of this run or before; or None.
+    def check_replaceable(self, paths: Iterable[Path], record: Path | None = None) -> None:
+        """Raises OutputError if one of the files exists, and no batch wrote it.
 
         Args:
-            name: Of the frame.
-            digest: As `settings` returns it.
+            paths: Files that are to be written.
+            record: The record among them. Without one, the others are of an interrupted run if the
+                folder is a batch's own.
         """
-        lines = [line for line in self._lines(name) if line.get("settings") == digest]
-        lines.sort(key=lambda line: line["state"] == "failed")
-        return lines[0] if lines else None
-
-    def check_foreign(self, paths: Iterable[Path]) -> None:
-        """Raises OutputError if one of the files exists, and no batch wrote it."""
         for path in paths:
-            if self._exists(path):
+            if path.name not in self._listing.names(path.parent):
+                continue
+            by_batch = _entry(_record(path)) is not None if path == record else self._is_ours
+            if not by_batch:
                 raise OutputError(
                     f"{path} exists, and no batch wrote it; --overwrite replaces such files, -o"
                     " names another folder"
                 )
 
-    def _exists(self, path: Path) -> bool:
-        if isinstance(path, RemotePath):
-            return self._index.status(path) is not None
-        return path.exists()
+    def row(self, task: Task) -> Row | None:
+        """Returns the summary's row of a frame with its present settings; None if there is none."""
+        record = _record(task.record)
+        entry = _entry(record)
+        if record is None or entry is None or entry["settings"] != self._digests.of(task.request):
+            return None
+        try:
+            return _row(task, record, entry)
+        except (AttributeError, IndexError, KeyError, TypeError) as error:
+            raise FileFormatError(f"{task.record} is damaged; remove it, and run again") from error
 
-    def announce(self, names: Iterable[str]) -> None:
-        """Records that files of all these frames may exist, where a line for each is too slow."""
-        if isinstance(self._own, SegmentedJournal):
-            self._announced = True
-            remaining = iter(names)
-            while some := [begun_line(name) for name in islice(remaining, _LINES_AT_ONCE)]:
-                self._own.append(*some)
-            self._own.publish()
+    def write(
+        self,
+        task: Task,
+        inputs: Mapping[str, Fingerprint],
+        write: Callable[[Outputs], RefineOutcome],
+    ) -> Row:
+        """Writes the results of a frame, the record last; returns the summary's row.
 
-    def close(self) -> None:
-        """Puts the lines of this run into the store, if the output is there."""
-        if isinstance(self._own, SegmentedJournal):
-            self._own.publish()
+        Args:
+            task: The frame.
+            inputs: What identifies its files, by part.
+            write: Writes all but the record to the paths that it is given.
 
-    def begin_all(self, names: Iterable[str]) -> None:
-        """Records that files of these frames may exist from now on."""
-        if not self._announced:
-            self.record(*(begun_line(name) for name in names))
+        Raises:
+            OutputError: A file cannot be written.
+        """
+        with _staged(task.outputs, self.output) as stage:
+            _remove(task.record)
+            outcome = write(replace(stage, record=None))
+            written = {**outcome.outputs.by_kind(), "record": _record_of(stage)}
+            planned = task.outputs.by_kind()
+            entry = {
+                "settings": self._digests.of(task.request),
+                "inputs": {part: each.as_record() for part, each in inputs.items()},
+                "outputs": {
+                    kind: planned[kind].relative_to(self.output).as_posix() for kind in written
+                },
+            }
+            record = {_ENTRY: entry} | outcome.record
+            if isinstance(self.output, RemotePath):
+                names = {str(stage.by_kind()[kind]): str(path) for kind, path in planned.items()}
+                record = renamed(record, names)
+                for path in task.outputs.optional():
+                    _remove(path)
+            write_json(_record_of(stage), record)
+            for kind, file in written.items():
+                target = planned[kind]
+                if isinstance(target, RemotePath):
+                    upload(file, target)
+        return _row(task, record, entry)
 
-    def begin(self, task: Task) -> None:
-        """Records that files of this frame may exist from now on."""
-        self.begin_all([task.name])
-
-    def finish(self, task: Task, status: Status, row: dict[str, Any], known: Fingerprints) -> None:
-        """Records that the frame is done, with the fingerprints of its files."""
-        self.record(finished_line(self, task, status, row, known))
-
-    def fail(self, task: Task, row: dict[str, Any]) -> None:
-        """Records why the frame failed; the next run tries it again."""
-        self.record(failed_line(self, task, row))
-
-    def record(self, *lines: Line | EncodedLine) -> None:
-        """Appends lines to the manifest of this run."""
-        self._own.append(*lines)
-
-    def settings(self, task: Task) -> str:
-        """Returns the digest of the settings of a frame."""
-        return self._digests.of(task.request)
-
-    def _lines(self, name: str, before: str | None = None) -> list[dict[str, Any]]:
-        lines = [journal.newest(name, before) for journal in (self._own, *self._others)]
-        return [line for line in lines if line is not None]
-
-    def _relative(self, path: Path) -> str:
-        """The path below the output folder; `Path.relative_to` takes ten times as long."""
-        text = str(path)
-        if os.sep == "/" and text.startswith(self._start):
-            return text[len(self._start) :]
-        return path.relative_to(self.output).as_posix()
-
-    def _why_not(self, line: dict[str, Any], task: Task, digest: str) -> str | None:
-        if line["state"] == "begun":
-            return "interrupted"
-        if line["state"] == "failed":
-            return "failed before"
-        if line.get("settings") != digest:
-            return "other settings"
-        read, written = line["inputs"], line["outputs"]
-        if read.keys() != task.inputs.keys():
-            return "other input files"
-        for part, path in task.inputs.items():
-            if not is_unchanged(path, Fingerprint(**read[part]), self._index):
-                return f"input changed: {part}"
-        for path in task.outputs.paths():
-            known = written.get(self._relative(path))
-            if known is None and path in task.outputs.optional():
-                continue
-            if known is None or not is_unchanged(path, Fingerprint(**known), self._index):
-                return f"result {'changed' if self._exists(path) else 'missing'}: {path.name}"
-        return None
-
-
-def begun_line(name: str) -> Line:
-    """Returns the line before the files of a frame are written."""
-    return {"frame": name, "state": "begun"}
-
-
-def finished_line(
-    recorder: FrameRecorder,
-    task: Task,
-    status: Status,
-    row: dict[str, Any],
-    known: Fingerprints,
-) -> Line:
-    """Returns the line of a frame whose files are written."""
-    return {
-        "frame": task.name,
-        "state": status,
-        "settings": settings_digest(task.request, recorder.model),
-        "inputs": {part: each.as_record() for part, each in known.read.items()},
-        "outputs": {
-            path.relative_to(recorder.output).as_posix(): each.as_record()
-            for path, each in known.written.items()
-        },
-        "row": row,
-    }
-
-
-def failed_line(recorder: FrameRecorder, task: Task, row: dict[str, Any]) -> Line:
-    """Returns the line of a frame that could not be refined."""
-    digest = settings_digest(task.request, recorder.model)
-    return {"frame": task.name, "state": "failed", "settings": digest, "row": row}
+    def fail(self, task: Task, message: str) -> Row:
+        """Writes a record that says why a frame failed; returns the summary's row."""
+        entry = {"settings": self._digests.of(task.request), "failed": message}
+        with _staged(task.outputs, self.output) as stage:
+            make_folder(_record_of(stage).parent)
+            write_json(_record_of(stage), {_ENTRY: entry})
+            if isinstance(task.record, RemotePath):
+                upload(_record_of(stage), task.record)
+        return failed_row(task.name, _paths(task), message)
 
 
 def remove_all_leftovers(output: Path) -> int:
     """Removes the half-written files of a killed run below the folder; returns how many."""
-    folders = [Path(folder) for folder, _, _ in os.walk(output)]
     try:
-        return sum(remove_leftovers(folder) for folder in folders)
+        return sum(remove_leftovers(Path(folder)) for folder, _, _ in os.walk(output))
     except OSError as error:
         raise cannot_write(output, error) from error
+
+
+def _row(task: Task, record: Mapping[str, Any], entry: Mapping[str, Any]) -> Row:
+    if "failed" in entry:
+        return failed_row(task.name, _paths(task), entry["failed"])
+    return row_of(task.name, _paths(task), record, entry["outputs"])
+
+
+def _paths(task: Task) -> dict[str, str]:
+    return {part: str(path) for part, path in task.inputs.items()}
+
+
+def _entry(record: Mapping[str, Any] | None) -> dict[str, Any] | None:
+    """What a batch says in a record; None if none wrote it."""
+    entry: Any = None if record is None else record.get(_ENTRY)
+    keys = entry.keys() if isinstance(entry, dict) else ()
+    whole = "settings" in keys and (
+        "failed" in keys or all(isinstance(entry.get(k), dict) for k in ("inputs", "outputs"))
+    )
+    return entry if whole else None
+
+
+def _record(path: Path, *, entry_only: bool = False) -> dict[str, Any] | None:
+    """The content of a record, or only its first entry; None if there is none, or another file."""
+    data = _content(path)
+    try:
+        if entry_only and data is not None and data.startswith(_START):
+            return {_ENTRY: json.JSONDecoder().raw_decode(data.decode(), len(_START))[0]}
+        record = None if data is None else json.loads(data)
+    except (ValueError, RecursionError):
+        return None
+    return record if isinstance(record, dict) else None
+
+
+def _content(path: Path) -> bytes | None:
+    if isinstance(path, RemotePath):
+        return read_object(path)
+    try:
+        return path.read_bytes()
+    except OSError:
+        return None
+
+
+def _record_of(outputs: Outputs) -> Path:
+    assert outputs.record is not None
+    return outputs.record
+
+
+def _remove(path: Path) -> None:
+    if isinstance(path, RemotePath):
+        remove(path)
+        return
+    try:
+        with suppress(FileNotFoundError):
+            path.unlink()
+    except OSError as error:
+        raise cannot_write(path, error) from error
+
+
+@contextmanager
+def _staged(outputs: Outputs, output: Path) -> Iterator[Outputs]:
+    """Yields where the results of a frame are written: their own paths, or local ones."""
+    if not isinstance(output, RemotePath):
+        yield outputs
+        return
+    with tempfile.TemporaryDirectory(prefix="pnpdepth-") as folder:
+        paths: dict[str, Any] = {
+            kind: Path(folder) / path.relative_to(output)
+            for kind, path in outputs.by_kind().items()
+        }
+        yield replace(outputs, **paths)

@@ -185,26 +185,38 @@ def _add(sums: dict[Any, tuple[int, float]], key: Any, value: float | None) -> N
         sums[key] = (count + 1, total + value)
 
 
-def write_summary(path: Path, head: Mapping[str, Any], rows: Iterable[Mapping[str, Any]]) -> None:
-    """Writes the head as JSON, with the rows, of JSON's own types, as its list `frames`."""
-    text = json.dumps(plain(head), indent=2, ensure_ascii=False, allow_nan=False)
-    with atomic_path(path) as temporary, _text_file(temporary) as file:
-        file.write(text.removesuffix("\n}") + ',\n  "frames": [')
-        for number, row in enumerate(rows):
-            line = json.dumps(row, ensure_ascii=False, allow_nan=False)
-            file.write(f"{',' if number else ''}\n    {line}")
-        file.write("\n  ]\n}\n")
+def profile_of(seconds: Mapping[str, float], frames: int, wall_s: float) -> dict[str, Any]:
+    """Returns where the time of a run went: {"frames": 24, "seconds": {"read": …, "wall": …}, …}.
 
-
-def write_table(
-    path: Path, rows: Iterable[Mapping[str, Any]], baselines: Sequence[str] = ()
-) -> None:
-    """Writes a CSV line for each row: its status, its errors, its seconds.
+    Reading and writing run beside the network, so their seconds do not add up to the wall time.
 
     Args:
-        path: The file.
-        rows: The rows.
-        baselines: Names of baselines, whose errors make the last columns.
+        seconds: Of all refined frames, by stage.
+        frames: Their number.
+        wall_s: From the first frame's start to the end of the last.
+    """
+    stages = {stage: round(seconds.get(stage, 0.0), 4) for stage in ("read", "refine", "write")}
+    return {
+        "frames": frames,
+        "seconds": stages | {"wall": round(wall_s, 4)},
+        "frames_per_second": round(frames / wall_s, 4),
+        "network_busy": round(stages["refine"] / wall_s, 4),
+    }
+
+
+def write_summaries(
+    folder: Path,
+    head: Mapping[str, Any],
+    rows: Iterable[Mapping[str, Any]],
+    baselines: Sequence[str],
+) -> None:
+    """Writes `summary.json`, the head with the rows as its list `frames`, and `summary.csv`.
+
+    Args:
+        folder: Where they are written.
+        head: The summary without its frames.
+        rows: The rows, of JSON's own types.
+        baselines: Names of baselines, whose errors make the last columns of the table.
     """
     header = [
         *("name", "status", "message", "points", "held_out_points", "improved_fraction"),
@@ -217,8 +229,23 @@ def write_table(
         *("warnings", "seconds_read", "seconds_refine", "seconds_write"),
         *(f"baseline_{name}_{measure}" for name in baselines for measure in BASELINE_MEASURES),
     ]
-    with atomic_path(path) as temporary, _text_file(temporary) as file:
-        write_csv(file, header, (_table_row(row, baselines) for row in rows))
+    text = json.dumps(plain(head), indent=2, ensure_ascii=False, allow_nan=False)
+    with (
+        atomic_path(folder / JSON) as json_path,
+        atomic_path(folder / CSV) as csv_path,
+        _text_file(json_path) as file,
+        _text_file(csv_path) as table,
+    ):
+        file.write(text.removesuffix("\n}") + ',\n  "frames": [')
+
+        def table_rows() -> Iterator[list[Any]]:
+            for number, row in enumerate(rows):
+                line = json.dumps(row, ensure_ascii=False, allow_nan=False)
+                file.write(f"{',' if number else ''}\n    {line}")
+                yield _table_row(row, baselines)
+
+        write_csv(table, header, table_rows())
+        file.write("\n  ]\n}\n")
 
 
 def _table_row(row: Mapping[str, Any], baselines: Sequence[str]) -> list[Any]:

@@ -12,14 +12,11 @@ from typing import Any
 
 from pnpdepth_cli.errors import ClusterError, UsageError
 from pnpdepth_cli.io.file_bytes import one_line
-from pnpdepth_cli.pipeline.cluster.options import LOCAL, Spread
+from pnpdepth_cli.pipeline.cluster.options import LOCAL, RayWorkers
 
 _CONNECT_S = 5.0
 _OBJECT_STORE_BYTES = 100 * 2**20
 """Of a local cluster: only rows of frames go through it."""
-_HTTP2_PREFACE = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + bytes(3) + b"\x04" + bytes(5)
-"""How a gRPC client begins, with empty settings: RFC 9113, section 3.4."""
-_SETTINGS_FRAME = 4
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,7 +32,7 @@ class Cluster:
 
 
 @contextmanager
-def connected(spread: Spread) -> Iterator[Cluster]:
+def connected(workers: RayWorkers) -> Iterator[Cluster]:
     """Yields a connection to the cluster; a local one ends with it.
 
     Raises:
@@ -49,18 +46,18 @@ def connected(spread: Spread) -> Iterator[Cluster]:
         raise UsageError("--ray needs Ray: pip install 'pnpdepth[ray]'") from None
     ours = not ray.is_initialized()
     if ours:
-        _connect(ray, spread)
+        _connect(ray, workers)
     try:
-        yield _planned(ray, spread)
+        yield _planned(ray, workers)
     finally:
         if ours:
             ray.shutdown()
 
 
-def _connect(ray: ModuleType, spread: Spread) -> None:
+def _connect(ray: ModuleType, workers: RayWorkers) -> None:
     quiet = {"log_to_driver": False, "logging_level": "ERROR"}
-    if spread.address == LOCAL:
-        _choose_gpus(spread.indices)
+    if workers.address == LOCAL:
+        _choose_gpus(workers.indices)
         ray.init(
             address=LOCAL,
             num_cpus=os.cpu_count(),
@@ -69,37 +66,29 @@ def _connect(ray: ModuleType, spread: Spread) -> None:
             **quiet,
         )
         return
-    if spread.address != "auto":
-        _check_answers(spread.address)
+    if workers.address != "auto":
+        _check_answers(workers.address)
     try:
-        ray.init(address=spread.address, **quiet)
+        ray.init(address=workers.address, **quiet)
     except (Exception, SystemExit) as error:
         reason = one_line(str(error)).split(". ")[0][:200]
         raise ClusterError(
-            f"Ray cluster {spread.address!r} cannot be used: {reason}; start it with `ray start"
+            f"Ray cluster {workers.address!r} cannot be used: {reason}; start it with `ray start"
             " --head`, or leave the address out"
         ) from None
 
 
 def _check_answers(address: str) -> None:
-    """Raises ClusterError if no gRPC server answers there, which Ray takes minutes to find out."""
+    """Raises ClusterError if nothing answers there, which Ray takes minutes to find out."""
     host, _, port = address.removeprefix("ray://").rpartition(":")
     try:
-        with socket.create_connection((host, int(port)), timeout=_CONNECT_S) as server:
-            server.sendall(_HTTP2_PREFACE)
-            with server.makefile("rb") as answer:
-                frame = answer.read(9)
+        socket.create_connection((host, int(port)), timeout=_CONNECT_S).close()
     except (OSError, OverflowError) as error:
         reason = one_line(getattr(error, "strerror", None) or error).lower()
         raise ClusterError(
             f"Ray cluster {address!r} cannot be reached ({reason}); check the address and that the"
             " head node runs"
         ) from None
-    if len(frame) < 9 or frame[3] != _SETTINGS_FRAME:
-        raise ClusterError(
-            f"{address!r} is another server than a Ray cluster; the head node prints its address"
-            " when it starts"
-        )
 
 
 def _choose_gpus(indices: tuple[int, ...]) -> None:
@@ -111,21 +100,21 @@ def _choose_gpus(indices: tuple[int, ...]) -> None:
         os.environ["CUDA_VISIBLE_DEVICES"] = ",".join(chosen)
 
 
-def _planned(ray: ModuleType, spread: Spread) -> Cluster:
+def _planned(ray: ModuleType, workers: RayWorkers) -> Cluster:
     """The workers that the devices of the cluster allow."""
-    options, cpus = spread.options, spread.options.cpus_per_worker
-    if spread.device == "cuda":
+    options, cpus = workers.options, workers.options.cpus_per_worker
+    if workers.device == "cuda":
         there = int(ray.cluster_resources().get("GPU", 0))
         resources = {"num_gpus": 1, "num_cpus": cpus}
     else:
         nodes = [node["Resources"].get("CPU", 0) for node in ray.nodes() if node["Alive"]]
         there = sum(int(count) // cpus for count in nodes)
         resources = {"num_cpus": cpus}
-    wanted = options.ray_workers or len(spread.indices) or there
+    wanted = options.ray_workers or len(workers.indices) or there
     if wanted > there or not there:
-        where = "this machine" if spread.address == LOCAL else f"Ray cluster {spread.address!r}"
+        where = "this machine" if workers.address == LOCAL else f"Ray cluster {workers.address!r}"
         raise ClusterError(
-            f"{where} has devices for {there} Ray workers with {spread.each} each, and"
+            f"{where} has devices for {there} Ray workers with {workers.each} each, and"
             f" {max(1, wanted)} asked for; change --device, --ray-workers or --cpus-per-worker"
         )
     return Cluster(ray=ray, workers=wanted, resources=resources)

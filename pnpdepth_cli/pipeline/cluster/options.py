@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
+from typing import TypeAlias
 
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.pipeline.options import option
@@ -55,7 +56,7 @@ class ClusterOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Spread:
+class RayWorkers:
     """The workers that a command asks for."""
 
     address: str
@@ -74,7 +75,7 @@ class Spread:
         return "one GPU" if self.device == "cuda" else f"{cpus} CPU core{'s' if cpus > 1 else ''}"
 
 
-def spread_of(device: str, options: ClusterOptions) -> Spread | None:
+def ray_workers_of(device: str, options: ClusterOptions) -> RayWorkers | None:
     """Returns the workers asked for; None for this process alone.
 
     Args:
@@ -104,4 +105,8 @@ def spread_of(device: str, options: ClusterOptions) -> Spread | None:
             f"device {device!r}: GPUs of a cluster have no numbers; take --device cuda, and"
             f" --ray-workers {len(indices)}"
         )
-    return Spread(address=address, device=kind, indices=indices, options=options)
+    return RayWorkers(address=address, device=kind, indices=indices, options=options)
+
+
+Spread: TypeAlias = RayWorkers  # until `eval` and `sweep` take results instead
+spread_of = ray_workers_of

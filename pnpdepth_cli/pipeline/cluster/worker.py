@@ -15,7 +15,6 @@ from typing import Any, Protocol
 
 from pnpdepth_cli import __version__
 from pnpdepth_cli.budget import set_max_pixels
-from pnpdepth_cli.io.remote.copies import remove_copies
 
 _THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 _LIBRARIES = ("torch", "numpy", "opencv-python-headless")
@@ -123,9 +122,8 @@ class Worker:
         self._work = self._open.enter_context(job.opened())
 
     def close(self) -> None:
-        """Ends the job, and removes copies of files in a store."""
+        """Ends the job."""
         self._open.close()
-        remove_copies()
 
     def run(self, items: Sequence[Any], checked: bool, finish: bool) -> Done:
         """Does a piece of the job; `finish` also all that is left of those before."""

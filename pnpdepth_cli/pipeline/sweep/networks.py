@@ -11,7 +11,7 @@ from pnpdepth_cli.errors import InputError, UsageError
 from pnpdepth_cli.io.dataset.frame import Frame
 from pnpdepth_cli.models.definition import ModelDefinition
 from pnpdepth_cli.pipeline.batch.batch import Listener
-from pnpdepth_cli.pipeline.batch.frames import Task, deciding
+from pnpdepth_cli.pipeline.batch.frames import Task, reference_frames
 from pnpdepth_cli.pipeline.batch.settings import model_identity
 from pnpdepth_cli.pipeline.refinement.method import with_preset
 from pnpdepth_cli.pipeline.refinement.refiner import Refiner
@@ -109,7 +109,7 @@ def _resolved(
             frame=frame,
             seed=request.refine.hold_out.seed,
             layer=_some_layer(request),
-            others=tuple(deciding(tasks, number)),
+            others=tuple(reference_frames(tasks, number)),
         )
         try:
             inputs = first.read()

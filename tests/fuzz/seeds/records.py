@@ -30,13 +30,14 @@ def _scores(folder: Path) -> list[Seed]:
 
 
 def _journals(folder: Path) -> list[Seed]:
-    """A finished batch and a finished sweep, which go on where their journals end."""
+    """A finished batch and a finished sweep, which go on where they ended."""
     batch = ("batch", "frames.csv", *_NETWORK, "--iterations", "1", "-o", "finished")
     sweep = ("sweep", "frames.csv", *_NETWORK, "--vary", "iterations=0,1", "-o", "swept")
     _output_of(batch)
     _output_of(sweep)
+    (record,) = {*Path("finished").glob("*.json")} - {Path("finished/summary.json")}
     return [
-        Seed(file="finished/batch.jsonl", command=batch),
+        Seed(file=record.as_posix(), command=batch),
         Seed(
             file="finished/summary.json",
             command=("compare", "finished/summary.json:before", "finished/summary.json"),

@@ -13,8 +13,7 @@ import pytest
 from pnpdepth_cli.errors import FileFormatError
 from pnpdepth_cli.io.layouts import find_layout, list_frames
 from pnpdepth_cli.pipeline.batch.frames import find_frames, task_of
-from pnpdepth_cli.pipeline.batch.request import BatchRequest
-from pnpdepth_cli.pipeline.batch.sequence_options import SequenceOptions
+from pnpdepth_cli.pipeline.batch.request import BatchRequest, SequenceOptions
 from pnpdepth_cli.pipeline.refinement.inputs import read_inputs
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest
 

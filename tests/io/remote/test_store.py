@@ -1,18 +1,16 @@
 from __future__ import annotations
 
 import errno
-import threading
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from pnpdepth_cli.budget import set_max_pixels
-from pnpdepth_cli.errors import FileFormatError, InputError, PnpDepthError, StorageError
+from pnpdepth_cli.errors import InputError, PnpDepthError, StorageError
 from pnpdepth_cli.io.remote import store
 from pnpdepth_cli.io.remote.address import RemotePath, path_of
-from pnpdepth_cli.io.remote.copies import Copies
-from pnpdepth_cli.io.remote.store import StatusIndex, create, listed, status_of, upload
+from pnpdepth_cli.io.remote.store import Listing, local_files, status_of, upload
 
 pytest.importorskip("fsspec")
 
@@ -41,7 +39,7 @@ class FakeStore:
         data = self.objects[path]
         return {"name": path, "size": len(data), "type": "file", "ETag": str(hash(data))}
 
-    def ls(self, path: str, detail: bool) -> list[dict[str, Any]]:
+    def ls(self, path: str, *, detail: bool) -> list[dict[str, Any]]:
         self._called("ls")
         return [self.info(name) for name in self.objects if name.startswith(path)]
 
@@ -52,12 +50,6 @@ class FakeStore:
     def put_file(self, file: str, path: str) -> None:
         self._called("put_file")
         self.objects[path] = Path(file).read_bytes()
-
-    def pipe_file(self, path: str, data: bytes, mode: str) -> None:
-        self._called("pipe_file")
-        if path in self.objects and mode == "create":
-            raise FileExistsError(path)
-        self.objects[path] = data
 
 
 @pytest.fixture
@@ -98,78 +90,57 @@ def test_what_may_not_be_written_stops_the_batch(fake: FakeStore, tmp_path: Path
         upload(tmp_path / "x", remote("x"))
 
 
-def test_an_object_is_created_once(fake: FakeStore) -> None:
-    assert create(remote("x"), b"one")
-    assert not create(remote("x"), b"two")
-    assert fake.objects == {"s3://b/x": b"one"}
-    assert listed(remote("x").parent)["x"].size == 3
-
-
-def test_many_objects_of_a_folder_are_listed_and_not_asked_for_one_by_one(fake: FakeStore) -> None:
+def test_a_folder_is_listed_once(fake: FakeStore) -> None:
     fake.objects = {f"s3://b/d/{number}": b"x" for number in range(100)}
-    index = StatusIndex()
-    assert all(index.status(remote(f"d/{number}")) for number in range(100))
-    assert index.status(remote("d/100")) is None
+    listing = Listing()
+    assert all(listing.status(remote(f"d/{number}")) for number in range(100))
+    assert listing.status(remote("d/100")) is None
     assert fake.calls.count("ls") == 1
 
 
-def test_copies_are_kept_within_their_limit_and_while_they_are_read(
-    fake: FakeStore, tmp_path: Path
+def test_the_names_in_a_folder_on_disk_are_listed_too(tmp_path: Path) -> None:
+    (tmp_path / "a").touch()
+    listing = Listing()
+    assert list(listing.names(tmp_path)) == ["a"]
+    assert not listing.names(tmp_path / "no")
+
+
+def test_copies_have_the_names_of_their_objects_and_end_with_the_block(fake: FakeStore) -> None:
+    fake.objects = {"s3://b/1/a.png": b"one", "s3://b/2/a.png": b"two"}
+    paths = [remote("1/a.png"), remote("2/a.png"), Path("local.png")]
+    with local_files(paths) as copies:
+        assert [copies[path].read_bytes() for path in paths[:2]] == [b"one", b"two"]
+        assert [copies[path].name for path in paths[:2]] == ["a.png", "a.png"]
+        assert len(copies) == 2
+    assert not any(copy.exists() for copy in copies.values())
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        (None, "no such object; check"),
+        (b"x" * (2 << 20), "has 2,097,152 bytes, more than 1,048,57"),
+    ],
+)
+def test_an_object_that_is_missing_or_beyond_the_budget_is_not_copied(
+    fake: FakeStore, data: bytes | None, message: str
 ) -> None:
-    fake.objects = {f"s3://b/{name}": b"x" * 10 for name in "abcd"}
-    copies = Copies(tmp_path, max_bytes=20)
-    with copies.held(remote("a")) as (first, _):
-        for name in "bcd":
-            with copies.held(remote(name)) as (file, status):
-                assert (file.name, status.size) == (name, 10)
-        assert first.read_bytes() == b"x" * 10
-        assert sorted(path.name for path in tmp_path.rglob("?") if path.is_file()) == [*"acd"]
-    assert sorted(path.name for path in tmp_path.rglob("?") if path.is_file()) == [*"cd"]
-    assert fake.calls.count("get_file") == 4
-    with copies.held(remote("d")):
-        pass
-    assert fake.calls.count("get_file") == 4
-
-
-def test_two_threads_make_one_copy(fake: FakeStore, tmp_path: Path) -> None:
-    fake.objects = {"s3://b/a": b"x"}
-    copies = Copies(tmp_path)
-
-    def read() -> None:
-        with copies.held(remote("a")) as (file, _):
-            assert file.read_bytes() == b"x"
-
-    threads = [threading.Thread(target=read) for _ in range(8)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert fake.calls.count("get_file") == 1
-
-
-def test_an_object_beyond_the_budget_is_not_copied(fake: FakeStore, tmp_path: Path) -> None:
-    fake.objects = {"s3://b/a": b"x" * (2 << 20)}
+    fake.objects = {} if data is None else {"s3://b/a": data}
     set_max_pixels(1000)
     try:
-        with (
-            pytest.raises(FileFormatError, match="has 2,097,152 bytes, more than 1,048,576; make"),
-            Copies(tmp_path).held(remote("a")),
-        ):
+        with pytest.raises(InputError, match=message), local_files([remote("a")]):
             pass
     finally:
         set_max_pixels(None)
     assert "get_file" not in fake.calls
 
 
-def test_a_full_disk_is_named_and_leaves_no_copy(
-    fake: FakeStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_full_disk_is_named(fake: FakeStore, monkeypatch: pytest.MonkeyPatch) -> None:
     fake.objects = {"s3://b/a": b"x"}
     full = OSError(errno.ENOSPC, "No space left on device")
     monkeypatch.setattr(fake, "get_file", lambda *_: (_ for _ in ()).throw(full))
     with (
         pytest.raises(StorageError, match="set TMPDIR to a larger disk"),
-        Copies(tmp_path).held(remote("a")),
+        local_files([remote("a")]),
     ):
         pass
-    assert not list(tmp_path.iterdir())

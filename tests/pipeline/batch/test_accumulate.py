@@ -14,8 +14,8 @@ import pytest
 from pnpdepth_cli.cli.main import run
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.io.dataset.frame import Frame
+from pnpdepth_cli.pipeline.batch.request import SequenceOptions
 from pnpdepth_cli.pipeline.batch.sequence import note_of_poses, with_neighbours
-from pnpdepth_cli.pipeline.batch.sequence_options import SequenceOptions
 from pnpdepth_cli.sensors import SamplePattern
 from tests.pipeline.batches import RecordingListener, batch
 from tests.pipeline.drives import drive_on_disk, without_results

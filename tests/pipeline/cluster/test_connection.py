@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import socket
 import sys
-import threading
 
 import pytest
 
@@ -12,14 +11,14 @@ from pnpdepth_cli.pipeline.cluster.options import (
     LOCAL,
     ClusterOptions,
     parse_address,
-    spread_of,
+    ray_workers_of,
 )
 
 
 def connect(address: str) -> None:
-    spread = spread_of("cpu", ClusterOptions(ray=address))
-    assert spread is not None
-    with connected(spread):
+    workers = ray_workers_of("cpu", ClusterOptions(ray=address))
+    assert workers is not None
+    with connected(workers):
         raise AssertionError("there is no cluster")
 
 
@@ -39,22 +38,6 @@ def test_an_address_where_nothing_answers_is_an_error_at_once(scheme: str) -> No
             connect(f"{scheme}127.0.0.1:{port}")
 
 
-@pytest.mark.parametrize("answer", [b"HTTP/1.1 400 Bad Request\r\n\r\n", b""])
-def test_another_server_is_not_taken_for_a_cluster(answer: bytes) -> None:
-    pytest.importorskip("ray")
-    with socket.create_server(("127.0.0.1", 0)) as server:
-
-        def serve() -> None:
-            client, _ = server.accept()
-            with client:
-                client.recv(100)
-                client.sendall(answer)
-
-        threading.Thread(target=serve, daemon=True).start()
-        with pytest.raises(ClusterError, match="is another server than a Ray cluster"):
-            connect(f"127.0.0.1:{server.getsockname()[1]}")
-
-
 @pytest.mark.parametrize("text", ["frames/", "out", "host", "ray://host", "a/b:1"])
 def test_a_folder_after_ray_is_not_taken_for_an_address(text: str) -> None:
     with pytest.raises(UsageError, match="is no address of a Ray cluster"):
@@ -67,18 +50,18 @@ def test_addresses_of_clusters(text: str) -> None:
 
 
 def test_one_device_needs_no_cluster() -> None:
-    assert spread_of("cuda:1", ClusterOptions()) is None
+    assert ray_workers_of("cuda:1", ClusterOptions()) is None
     with pytest.raises(UsageError, match="are of Ray workers; add --ray"):
-        spread_of("cuda:1", ClusterOptions(ray_workers=2))
+        ray_workers_of("cuda:1", ClusterOptions(ray_workers=2))
 
 
 def test_several_devices_are_a_local_cluster() -> None:
-    spread = spread_of("cuda:0,cuda:2", ClusterOptions())
-    assert spread is not None
-    assert (spread.address, spread.device, spread.indices) == (LOCAL, "cuda", (0, 2))
-    spread = spread_of("all", ClusterOptions())
-    assert spread is not None
-    assert (spread.address, spread.device, spread.indices) == (LOCAL, "cuda", ())
+    workers = ray_workers_of("cuda:0,cuda:2", ClusterOptions())
+    assert workers is not None
+    assert (workers.address, workers.device, workers.indices) == (LOCAL, "cuda", (0, 2))
+    workers = ray_workers_of("all", ClusterOptions())
+    assert workers is not None
+    assert (workers.address, workers.device, workers.indices) == (LOCAL, "cuda", ())
 
 
 @pytest.mark.parametrize(
@@ -86,9 +69,9 @@ def test_several_devices_are_a_local_cluster() -> None:
 )
 def test_devices_that_cannot_be_spread_over_are_refused(device: str) -> None:
     with pytest.raises(UsageError, match=f"device '{device}'"):
-        spread_of(device, ClusterOptions())
+        ray_workers_of(device, ClusterOptions())
 
 
 def test_gpus_of_a_cluster_have_no_numbers() -> None:
     with pytest.raises(UsageError, match="take --device cuda, and --ray-workers 2"):
-        spread_of("cuda:0,cuda:1", ClusterOptions(ray="auto"))
+        ray_workers_of("cuda:0,cuda:1", ClusterOptions(ray="auto"))

@@ -15,8 +15,7 @@ from pnpdepth_cli.io.bags.poses import camera_trajectory
 from pnpdepth_cli.io.poses import read_poses
 from pnpdepth_cli.io.record import read_json
 from pnpdepth_cli.pipeline.batch.bags import unpacked
-from pnpdepth_cli.pipeline.batch.request import BatchRequest
-from pnpdepth_cli.pipeline.batch.sequence_options import SequenceOptions
+from pnpdepth_cli.pipeline.batch.request import BatchRequest, SequenceOptions
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest
 from pnpdepth_cli.pipeline.sparse.options import BagOptions
 from tests.bags import write_bag
