@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli.io.file_bytes import damaged
+from pnpdepth_cli.io.own_output import quiet_libraries
 from pnpdepth_cli.io.shared_context import SharedContext
 
 
@@ -29,7 +30,7 @@ def decode_with_opencv(path: Path, data: bytes, kind: str) -> NDArray[Any]:
 
     buffer = np.frombuffer(data, dtype=np.uint8)
     try:
-        with _SILENT_OPENCV:
+        with _SILENT_OPENCV, quiet_libraries():
             pixels = cv2.imdecode(buffer, cv2.IMREAD_UNCHANGED)
     except cv2.error as error:
         raise damaged(path, kind, f"cannot be decoded ({error})") from error

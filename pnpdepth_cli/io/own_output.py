@@ -1,10 +1,12 @@
-"""Silences what the calling thread prints to sys.stdout, and no other thread.
+"""Silences what libraries print about damaged files, and not what other threads say.
 
-OpenEXR's binding prints its warnings there, where data of a command belongs.
+OpenEXR's binding prints to sys.stdout, where data of a command belongs, and OpenEXR, libpng and
+libtiff to the standard error of the process.
 """
 
 from __future__ import annotations
 
+import os
 import sys
 import threading
 from collections.abc import Iterator
@@ -34,13 +36,37 @@ class _OthersOnly:
 
 @contextmanager
 def silent_thread() -> Iterator[None]:
-    """Drops what this thread prints to sys.stdout inside the block; blocks must not be nested."""
-    with _REPLACED:
+    """Drops what this thread prints to sys.stdout inside the block; blocks must not be nested.
+
+    What libraries print to standard error is dropped as well while no other thread runs, because
+    theirs would be lost too.
+    """
+    with _REPLACED, quiet_libraries():
         _SILENT.add(threading.get_ident())
         try:
             yield
         finally:
             _SILENT.discard(threading.get_ident())
+
+
+@contextmanager
+def quiet_libraries() -> Iterator[None]:
+    """Drops what libraries print to standard error inside the block, if no other thread runs."""
+    if threading.active_count() > 1:
+        yield
+        return
+    try:
+        kept, nothing = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    except OSError:  # standard error is closed
+        yield
+        return
+    try:
+        os.dup2(nothing, 2)
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(nothing)
 
 
 @contextmanager
