@@ -1,7 +1,7 @@
 """Every list of names that a user can choose from. Imports nothing heavy.
 
-Open lists are `Table`s: one file in a folder of this package adds one entry, and an entry point of
-an installed package adds another. Closed lists are tuples.
+Open lists are `Table`s: one function, or one file in a folder, adds one entry, and an entry point
+of an installed package adds another. Closed lists are tuples.
 """
 
 from __future__ import annotations
@@ -21,38 +21,44 @@ from pnpdepth_cli.errors import UsageError
 class Table(Mapping[str, Any]):
     """The entries of an open list by name; listing the names imports none of them.
 
-    An entry is the object `attribute` of the module `folder/<name>.py` ("-" in a name is "_" in the
-    file), or an entry point `<name>` in the group `pnpdepth.<group>`. Subpackages and modules whose
-    name starts with "_" are no entries. The package's own entries win over entry points of the same
-    name.
+    An entry of this package is the object `attribute` of the module `path/<name>.py` ("-" in a name
+    is "_" in the file); subpackages and modules whose name starts with "_" are no entries. With
+    `names` it is `TABLE[name]` of the module `path.py`. An entry of another package is its entry
+    point `<name>` in the group `pnpdepth.<group>`. The package's own entries win over entry points
+    of the same name.
 
     Args:
-        folder: Path of the modules relative to `package`, such as "core/losses".
+        path: Path of the folder or the module relative to `package`, such as "io/formats".
         attribute: Name of the object in each module; None makes the entry the module itself.
         group: Last part of the entry point group.
         noun: What one entry is called in messages.
+        names: All names in the module's table, in the order of their listing.
         first: Names listed before the others, which follow in alphabetical order.
-        package: The package that the folder belongs to.
+        package: The package that `path` belongs to.
     """
 
     def __init__(
         self,
-        folder: str,
-        attribute: str | None,
+        path: str,
+        attribute: str | None = None,
         *,
         group: str,
         noun: str,
+        names: tuple[str, ...] = (),
         first: tuple[str, ...] = (),
         package: str = "pnpdepth_cli",
     ) -> None:
-        self.folder, self.attribute, self.group, self.noun = folder, attribute, group, noun
-        self._first, self._package = first, package
+        self.group, self.noun = group, noun
+        self._path, self._attribute, self._package = path, attribute, package
+        self._names, self._first = names, names or first
 
     def __getitem__(self, name: str) -> Any:
         """Returns the entry. Raises UsageError, with near matches, for an unknown name."""
         if name in self._modules:
             module = importlib.import_module(self._modules[name])
-            return module if self.attribute is None else getattr(module, self.attribute)
+            if self._names:
+                return module.TABLE[name]
+            return module if self._attribute is None else getattr(module, self._attribute)
         if name in self._entry_points:
             return self._entry_points[name].load()
         near = difflib.get_close_matches(name, list(self), n=1)
@@ -72,9 +78,11 @@ class Table(Mapping[str, Any]):
 
     @functools.cached_property
     def _modules(self) -> dict[str, str]:
-        package = ".".join((self._package, *filter(None, self.folder.split("/"))))
+        package = ".".join((self._package, *filter(None, self._path.split("/"))))
+        if self._names:
+            return dict.fromkeys(self._names, package)
         roots = importlib.import_module(self._package).__path__
-        modules = pkgutil.iter_modules([str(Path(root, self.folder)) for root in roots])
+        modules = pkgutil.iter_modules([str(Path(root, self._path)) for root in roots])
         return {
             module.name.replace("_", "-"): f"{package}.{module.name}"
             for module in modules
@@ -208,10 +216,9 @@ BASELINES = Table(
 
 LAYOUTS = Table(
     "io/layouts",
-    "LAYOUT",
     group="layouts",
     noun="layout",
-    first=(
+    names=(
         *("manifest", "nyu-mat", "kitti-odometry", "kitti-object", "kitti-depth", "kitti-raw"),
         *("tum", "7scenes", "synthia", "colmap", "void", "diode", "ibims", "scannet"),
         *("arkitscenes", "hypersim", "nuscenes", "ddad", "pairs", "nyu-h5"),

@@ -67,7 +67,8 @@ def opened_image(path: Path, data: bytes, kind: str) -> Iterator[PIL.Image.Image
 
 def raw_mode(image: PIL.Image.Image) -> str:
     """Returns how a file that is not yet decoded stores its pixels, such as "RGB;16B"."""
-    arguments = image.tile[0].args if image.tile else ""
+    tiles = getattr(image, "tile", [])
+    arguments = tiles[0].args if tiles else ""
     return str(arguments[0] if isinstance(arguments, tuple) else arguments)
 
 

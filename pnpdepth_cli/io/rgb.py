@@ -96,7 +96,8 @@ def _decode_16_bit(path: Path, data: bytes, kind: str) -> NDArray[np.float32]:
     if pixels.shape[2] in (1, 2):
         pixels = np.repeat(pixels[:, :, :1], 3, axis=2)
     largest = np.float32(np.iinfo(pixels.dtype).max)
-    return np.divide(pixels[:, :, 2::-1], largest, dtype=np.float32)  # OpenCV has blue first
+    rgb = pixels[:, :, 2::-1]  # OpenCV has blue first
+    return np.asarray(np.divide(rgb, largest, dtype=np.float32))
 
 
 def _turn_upright(values: NDArray[np.float32], orientation: int) -> NDArray[np.float32]:

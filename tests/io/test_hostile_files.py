@@ -35,7 +35,7 @@ def test_an_image_beyond_64_megapixels_is_refused_by_its_header(
 ) -> None:
     path = png(tmp_path / "zeros.png", (16383, 16383), bits, colour, bytes(600_000))
     for read in (read_rgb, read_depth):
-        with pytest.raises(FileFormatError, match="pixels, more than|8-bit PNG"):
+        with pytest.raises(FileFormatError, match=r"pixels, more than|8-bit PNG"):
             read(path)
 
 
@@ -52,9 +52,7 @@ def test_pixels_that_do_not_decode_are_one_line_and_libraries_say_nothing(
 
 def test_tags_that_share_their_bytes_are_refused(tmp_path: Path) -> None:
     count = 3000
-    table = b"".join(
-        struct.pack("<HHII", 256 + number, 2, 90_000, 8) for number in range(count)
-    )
+    table = b"".join(struct.pack("<HHII", 256 + number, 2, 90_000, 8) for number in range(count))
     head = b"II*\0" + struct.pack("<I", 100_000) + bytes(99_992)
     path = tmp_path / "tags.tif"
     path.write_bytes(head + struct.pack("<H", count) + table + bytes(4))
@@ -69,15 +67,13 @@ def test_tags_that_share_their_bytes_are_refused(tmp_path: Path) -> None:
 def test_a_header_of_npy_that_is_no_header_is_damaged(tmp_path: Path, shape: str) -> None:
     header = f"{{'descr': '<f4', 'fortran_order': False, 'shape': {shape}, }}\n".encode()
     path = tmp_path / "a.npy"
-    path.write_bytes(
-        b"\x93NUMPY\1\0" + struct.pack("<H", len(header)) + header + bytes(4 * 6 * 8)
-    )
+    path.write_bytes(b"\x93NUMPY\1\0" + struct.pack("<H", len(header)) + header + bytes(4 * 6 * 8))
     with pytest.raises(FileFormatError, match="NPY cannot be read") as caught:
         read_depth(path)
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("descr", ["<f", "f999", "<q8", ",", "i4, i4", "M8[x]", "\x00f4"])
+@pytest.mark.parametrize("descr", ["f999", "<q8", ",", "i4, i4", "M8[x]", "\x00f4"])
 def test_a_dtype_of_npy_that_is_none_is_an_input_error(tmp_path: Path, descr: str) -> None:
     header = f"{{'descr': '{descr}', 'fortran_order': False, 'shape': (2, 2), }}".encode()
     path = tmp_path / "a.npy"
@@ -108,9 +104,9 @@ def test_yaml_has_plain_texts_and_numbers_only() -> None:
 
 @pytest.mark.parametrize("change", ["name", "filename", "height", "huge", "rotation", "rows"])
 def test_odd_values_in_the_tables_of_nuscenes_are_one_line(tmp_path: Path, change: str) -> None:
-    from tests.io.layouts.test_nuscenes import write_nuscenes
+    from tests.io.layouts.test_nuscenes import write
 
-    write_nuscenes(tmp_path)
+    write(tmp_path)
     tables = {path.stem: path for path in tmp_path.glob("v1.0-*/*.json")}
     values = {
         "name": ("scene", "name", None), "filename": ("sample_data", "filename", None),
