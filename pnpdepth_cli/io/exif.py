@@ -8,8 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pnpdepth_cli.io.pillow import QUIET_PILLOW
-from pnpdepth_cli.io.tiff_tags import read_tags
+from pnpdepth_cli.io.decoding import QUIET_PILLOW, read_tags
 
 _EXIF_FOLDER = 0x8769
 _FOCAL_LENGTH, _FOCAL_LENGTH_35MM = 0x920A, 0xA405

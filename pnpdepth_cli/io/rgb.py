@@ -10,11 +10,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import FileFormatError
+from pnpdepth_cli.io.decoding import (
+    QUIET_PILLOW,
+    decode_with_opencv,
+    opened_image,
+    orientation_of,
+    raw_mode,
+)
 from pnpdepth_cli.io.file_bytes import read_bytes
 from pnpdepth_cli.io.file_kind import kind_of
 from pnpdepth_cli.io.formats.tiff import read_tiff_facts
-from pnpdepth_cli.io.opencv import decode_with_opencv
-from pnpdepth_cli.io.pillow import QUIET_PILLOW, opened_image, orientation_of, raw_mode
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -7,7 +7,7 @@ import threading
 
 import pytest
 
-from pnpdepth_cli.io.own_output import silent_thread
+from pnpdepth_cli.io.quiet import silent_thread
 
 
 def test_only_the_thread_inside_is_silent(capsys: pytest.CaptureFixture[str]) -> None:

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 
 import pytest
 
-from pnpdepth_cli.io.shared_context import SharedContext
+from pnpdepth_cli.io.quiet import SharedContext
 
 
 def test_the_first_enters_and_the_last_leaves_whatever_the_order() -> None:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pnpdepth_cli.errors import FileFormatError, UsageError
 from pnpdepth_cli.io.file_bytes import check_pixel_count, damaged
 from pnpdepth_cli.io.formats import DepthFormat, StoredArray, WriteOptions
-from pnpdepth_cli.io.own_output import silent_thread
+from pnpdepth_cli.io.quiet import silent_thread
 
 _DEPTH_NAMES = frozenset({"z", "depth"})
 

@@ -9,10 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import FileFormatError, OutputError
+from pnpdepth_cli.io.decoding import decode_with_opencv, opened_image, raw_mode
 from pnpdepth_cli.io.depth_scale import SATURATED_CODE, SCALE_KEY, check_scale, scale_in_text
 from pnpdepth_cli.io.formats import DepthFormat, StoredArray, WriteOptions
-from pnpdepth_cli.io.opencv import decode_with_opencv
-from pnpdepth_cli.io.pillow import opened_image, raw_mode
 
 LARGEST_CODE = SATURATED_CODE - 1
 """The largest code that is written."""

@@ -10,12 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import FileFormatError
+from pnpdepth_cli.io.decoding import decode_with_opencv, read_tags
 from pnpdepth_cli.io.depth_scale import scale_in_text
 from pnpdepth_cli.io.file_bytes import check_pixel_count, damaged
 from pnpdepth_cli.io.formats import DepthFormat, StoredArray, WriteOptions
 from pnpdepth_cli.io.formats.png import eight_bits
-from pnpdepth_cli.io.opencv import decode_with_opencv
-from pnpdepth_cli.io.tiff_tags import read_tags
 
 _WIDTH, _HEIGHT, _BITS, _DESCRIPTION, _SAMPLES, _FORMAT = 256, 257, 258, 270, 277, 339
 _BLOCK_TAGS = ((273, 279), (324, 325))  # offsets and byte counts, of strips or of tiles

@@ -1,21 +1,64 @@
-"""Images opened by Pillow, after what they claim is checked."""
+"""Images opened by Pillow or decoded by OpenCV, after what they claim is checked."""
 
 from __future__ import annotations
 
 import io
+import struct
 import warnings
+from collections import defaultdict
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import FileFormatError
 from pnpdepth_cli.io.file_bytes import check_pixel_count, damaged, one_line
-from pnpdepth_cli.io.shared_context import SharedContext
-from pnpdepth_cli.io.tiff_tags import read_tags
+from pnpdepth_cli.io.quiet import SharedContext, quiet_libraries
 
 if TYPE_CHECKING:
     import PIL.Image
+
+_LETTER_OF_TYPE = {1: "B", 2: "B", 3: "H", 4: "I", 5: "Q", 7: "B", 10: "q", 11: "f", 12: "d"}
+
+_BASELINE_TAGS = range(254, 340)
+_MOST_NUMBERS = 1 << 20
+"""Of a tag; 64 megapixels have fewer strips or tiles."""
+
+
+def read_tags(data: bytes) -> defaultdict[int, tuple[int, ...]]:
+    """Returns the numbers of the first page's baseline tags; none for one that is absent.
+
+    Thousands of tags can share the same bytes, which libraries copy for each.
+
+    Raises:
+        ValueError: The tags together claim more bytes than there are, or one has too many numbers.
+        struct.error: A tag points outside the data.
+    """
+    order = "<" if data[:2] == b"II" else ">"
+    (start,) = struct.unpack_from(f"{order}I", data, 4)
+    (count,) = struct.unpack_from(f"{order}H", data, start)
+    end = start + 2 + 12 * count
+    struct.unpack_from(f"{order}I", data, end)  # where the next page is: the list is complete
+    tags: defaultdict[int, tuple[int, ...]] = defaultdict(tuple)
+    claimed = 0
+    for entry in range(start + 2, end, 12):
+        tag, kind, number = struct.unpack_from(f"{order}HHI", data, entry)
+        layout = f"{order}{number}{_LETTER_OF_TYPE.get(kind, 'B')}"
+        size = struct.calcsize(layout)
+        claimed += size
+        if claimed > len(data):
+            raise ValueError(f"its tags claim more than {len(data):,} bytes")
+        if not _BASELINE_TAGS.start <= tag < _BASELINE_TAGS.stop:
+            continue
+        if number > _MOST_NUMBERS:
+            raise ValueError(f"tag {tag} has {number:,} numbers")
+        (where,) = (entry + 8,) if size <= 4 else struct.unpack_from(f"{order}I", data, entry + 8)
+        tags[tag] = struct.unpack_from(layout, data, where)
+    return tags
+
 
 _EXIF_ORIENTATION = 0x0112
 _END_OF_PNG = b"\xaeB`\x82"
@@ -105,3 +148,42 @@ def _quiet_pillow() -> Iterator[None]:
 
 QUIET_PILLOW = SharedContext(_quiet_pillow)
 """While it is open, in any number of threads, Pillow does not warn."""
+
+
+def decode_with_opencv(path: Path, data: bytes, kind: str) -> NDArray[Any]:
+    """Returns the pixels in the file's own type, (H, W) or (H, W, C) with blue first.
+
+    Args:
+        path: Named in messages.
+        data: Content of the file.
+        kind: The kind of file that messages name.
+
+    Raises:
+        FileFormatError: OpenCV cannot decode it.
+    """
+    import cv2
+
+    buffer = np.frombuffer(data, dtype=np.uint8)
+    try:
+        with _SILENT_OPENCV, quiet_libraries():
+            pixels = cv2.imdecode(buffer, cv2.IMREAD_UNCHANGED)
+    except cv2.error as error:
+        raise damaged(path, kind, f"cannot be decoded ({error})") from error
+    if pixels is None:
+        raise damaged(path, kind, "cannot be decoded")
+    return pixels
+
+
+@contextmanager
+def _silent_opencv() -> Iterator[None]:
+    """OpenCV does not print several lines of its own about a damaged file."""
+    import cv2
+
+    level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    try:
+        yield
+    finally:
+        cv2.utils.logging.setLogLevel(level)
+
+
+_SILENT_OPENCV = SharedContext(_silent_opencv)
