@@ -16,7 +16,7 @@ _MOST_PIXELS = 64_000_000
 
 _MOST_FILE_BYTES = 1 << 30
 _DECODED_BYTES_PER_PIXEL = 8
-"""Of an image as its file stores it, so that 64 megapixels take 512 MB: four channels of 16 bits."""
+"""Of an image as its file stores it: four channels of 16 bits, so 64 megapixels take 512 MB."""
 
 _BYTES_PER_PIXEL = 64
 """Memory that reading and drawing one pixel takes at most; fewer pixels than memory / 64 fit."""

@@ -18,7 +18,7 @@ from pnpdepth_cli.io.decoding import (
     raw_mode,
 )
 from pnpdepth_cli.io.file_bytes import read_bytes
-from pnpdepth_cli.io.file_kind import kind_of
+from pnpdepth_cli.io.formats import kind_of
 from pnpdepth_cli.io.formats.tiff import read_tiff_facts
 
 

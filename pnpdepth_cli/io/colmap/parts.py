@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import FileFormatError
+from pnpdepth_cli.io.extrinsics import rotation_of
 from pnpdepth_cli.io.file_bytes import check_pixel_count, one_line
-from pnpdepth_cli.io.rotation import rotation_of
 
 Floats = NDArray[np.float64]
 

@@ -10,8 +10,15 @@ from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import FileFormatError, OutputError
 from pnpdepth_cli.io.decoding import decode_with_opencv, opened_image, raw_mode
-from pnpdepth_cli.io.depth_scale import SATURATED_CODE, SCALE_KEY, check_scale, scale_in_text
-from pnpdepth_cli.io.formats import DepthFormat, StoredArray, WriteOptions
+from pnpdepth_cli.io.formats import (
+    SATURATED_CODE,
+    SCALE_KEY,
+    DepthFormat,
+    StoredArray,
+    WriteOptions,
+    check_scale,
+    scale_in_text,
+)
 
 LARGEST_CODE = SATURATED_CODE - 1
 """The largest code that is written."""

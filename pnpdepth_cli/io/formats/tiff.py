@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import FileFormatError
 from pnpdepth_cli.io.decoding import decode_with_opencv, read_tags
-from pnpdepth_cli.io.depth_scale import scale_in_text
 from pnpdepth_cli.io.file_bytes import check_pixel_count, damaged
-from pnpdepth_cli.io.formats import DepthFormat, StoredArray, WriteOptions
+from pnpdepth_cli.io.formats import DepthFormat, StoredArray, WriteOptions, scale_in_text
 from pnpdepth_cli.io.formats.png import eight_bits
 
 _WIDTH, _HEIGHT, _BITS, _DESCRIPTION, _SAMPLES, _FORMAT = 256, 257, 258, 270, 277, 339

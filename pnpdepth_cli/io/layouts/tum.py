@@ -16,7 +16,7 @@ from pnpdepth_cli.errors import FileFormatError
 from pnpdepth_cli.io.dataset.frame import Frame, Listing, Pose, Unmatched
 from pnpdepth_cli.io.file_bytes import check_value_count, one_line, read_bytes
 from pnpdepth_cli.io.layouts.layout import Layout
-from pnpdepth_cli.io.trajectory import read_trajectory
+from pnpdepth_cli.io.poses import read_trajectory
 
 _SCALE = 5000.0
 _ASSOCIATIONS = "associations.txt"

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from pnpdepth_cli.io.atomic import atomic_path
 from pnpdepth_cli.io.bags.bag import Bag
 from pnpdepth_cli.io.bags.poses import camera_trajectory, poses_topics
-from pnpdepth_cli.io.trajectory import Trajectory
+from pnpdepth_cli.io.poses import Trajectory
 
 POSES = "poses.txt"
 """Rows as of the TUM RGB-D benchmark, one for each frame in the order of their names."""
