@@ -96,7 +96,7 @@ def opened_image(path: Path, data: bytes, kind: str) -> Iterator[PIL.Image.Image
                 wide = ";16" in raw_mode(image)
                 check_pixel_count(
                     path, width, height, channels=channels, value_bytes=1 + wide,
-                    file_bytes=len(data) * channels,
+                    file_bytes=len(data),
                 )  # fmt: skip
                 yield image
     except FileFormatError:

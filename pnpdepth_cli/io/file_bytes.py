@@ -132,7 +132,7 @@ def _check_claim(
             f"{path} has {what} in {decoded:,} bytes, more than {budget().max_image_bytes:,};"
             f" {allow}"
         )
-    if file_bytes is not None and count * channels > budget().max_values_from(file_bytes):
+    if file_bytes is not None and count > budget().max_values_from(file_bytes):
         raise FileFormatError(
             f"{path} claims {what} in {file_bytes:,} bytes, which cannot be true; create it again"
         )

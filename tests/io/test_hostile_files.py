@@ -13,6 +13,7 @@ import pytest
 from pnpdepth_cli.errors import FileFormatError, InputError
 from pnpdepth_cli.io.calibration import read_calibration
 from pnpdepth_cli.io.depth import read_depth
+from pnpdepth_cli.io.file_bytes import check_pixel_count
 from pnpdepth_cli.io.layouts import list_frames
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.io.yaml_file import parse_yaml
@@ -128,3 +129,9 @@ def test_a_depth_image_of_zeros_is_decoded_once(tmp_path: Path) -> None:
     rows = b"".join(b"\0" + bytes(2 * 64) for _ in range(48))
     path = png(tmp_path / "zeros.png", (64, 48), 16, 0, zlib.compress(rows))
     assert np.array_equal(read_depth(path).values, np.zeros((48, 64), np.float32))
+
+
+def test_colours_of_a_common_camera_are_within_the_budget() -> None:
+    check_pixel_count(Path("a.jpg"), 9000, 7000, channels=4, value_bytes=2, file_bytes=1 << 20)
+    with pytest.raises(FileFormatError, match="in 756,000,000 bytes, more than 512,000,000"):
+        check_pixel_count(Path("a.exr"), 9000, 7000, channels=3, value_bytes=4)
