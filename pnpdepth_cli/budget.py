@@ -12,7 +12,13 @@ from pathlib import Path
 
 from pnpdepth_cli.errors import UsageError
 
-_MOST_PIXELS = 1 << 28
+_MOST_PIXELS = 64_000_000
+"""Pixels of the largest common cameras."""
+
+_MOST_FILE_BYTES = 1 << 30
+_DECODED_BYTES_PER_PIXEL = 8
+"""Of an image as its file stores it: four channels of 16 bits, so 64 megapixels take 512 MB."""
+
 _BYTES_PER_PIXEL = 64
 """Memory that reading and drawing one pixel takes at most; fewer pixels than memory / 64 fit."""
 
@@ -35,6 +41,11 @@ class Budget:
 
     max_decoded_bytes: int
     """Bytes that one file's decoded content may take, such as the tensors of a checkpoint."""
+
+    @property
+    def max_image_bytes(self) -> int:
+        """Bytes that an image or array takes as its file stores it, decoded."""
+        return max(_DECODED_BYTES_PER_PIXEL * self.max_pixels, 1 << 20)
 
     def max_values_from(self, file_bytes: int) -> int:
         """Returns the most values that a file of this size may claim, at most max_pixels.
@@ -98,6 +109,6 @@ def _of_this_machine() -> Budget:
     max_pixels = min(_MOST_PIXELS, memory // _BYTES_PER_PIXEL)
     return Budget(
         max_pixels=max_pixels,
-        max_file_bytes=_FILE_BYTES_PER_PIXEL * max_pixels,
+        max_file_bytes=max(_MOST_FILE_BYTES, _FILE_BYTES_PER_PIXEL * max_pixels),
         max_decoded_bytes=int(_MEMORY_FRACTION * memory),
     )

@@ -212,10 +212,9 @@ BASELINES = Table(
 
 LAYOUTS = Table(
     "io/layouts",
-    "LAYOUT",
     group="layouts",
     noun="layout",
-    first=(
+    names=(
         *("manifest", "nyu-mat", "kitti-odometry", "kitti-object", "kitti-depth", "kitti-raw"),
         *("tum", "7scenes", "synthia", "colmap", "void", "diode", "ibims", "scannet"),
         *("arkitscenes", "hypersim", "nuscenes", "ddad", "pairs", "nyu-h5"),

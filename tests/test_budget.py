@@ -16,16 +16,17 @@ def default_afterwards() -> Iterator[None]:
     set_max_pixels(None)
 
 
-def test_the_default_follows_from_the_machines_memory_and_has_an_upper_limit() -> None:
-    assert 1 << 20 < budget().max_pixels <= 1 << 28
-    assert budget().max_file_bytes == 4 * budget().max_pixels
+def test_the_default_is_64_megapixels_or_less_on_a_small_machine() -> None:
+    assert 1 << 20 < budget().max_pixels <= 64_000_000
+    assert budget().max_file_bytes == 1 << 30
+    assert budget().max_image_bytes == 8 * budget().max_pixels
 
 
 def test_max_pixels_replaces_the_default_and_files_grow_with_it() -> None:
     set_max_pixels(1 << 30)
     assert (budget().max_pixels, budget().max_file_bytes) == (1 << 30, 1 << 32)
     set_max_pixels(None)
-    assert budget().max_pixels <= 1 << 28
+    assert budget().max_pixels <= 64_000_000
 
 
 @pytest.mark.parametrize("number", [0, -1])

@@ -18,7 +18,6 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -26,9 +25,11 @@ from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import FileFormatError, InputError, UsageError
 from pnpdepth_cli.io.file_bytes import check_pixel_count, one_line, read_bytes
-from pnpdepth_cli.io.file_kind import kind_of
-from pnpdepth_cli.io.robot_calibration import camera_in_yaml, is_robot_calibration
+from pnpdepth_cli.io.formats import kind_of
+from pnpdepth_cli.io.robot_calibration import Calibration, camera_in_yaml, is_robot_calibration
 from pnpdepth_cli.io.yaml_file import parse_yaml
+
+__all__ = ["CAMERA", "Calibration", "Floats", "read_calibration", "read_rigid_motion"]
 
 CAMERA = 2
 """KITTI's left colour camera, whose images the benchmarks have."""
@@ -43,35 +44,6 @@ _LARGEST = 1e9
 """Of the numbers of a calibration, in pixels or metres; beyond it, products overflow."""
 
 Floats = NDArray[np.float64]
-
-
-@dataclass(frozen=True, kw_only=True)
-class Calibration:
-    """A camera and a scanner: x_camera = rotation · x_scanner + translation."""
-
-    intrinsics: Floats
-    """(3, 3), last row 0 0 1, in pixels."""
-
-    rotation: Floats
-    """(3, 3), from the scanner's frame to the camera's."""
-
-    translation: Floats
-    """(3,) metres, the scanner's origin in the camera's frame."""
-
-    distortion: tuple[float, ...]
-    """Coefficients of the lens, or none."""
-
-    size: tuple[int, int] | None
-    """(H, W) of the images; None if the file does not give it."""
-
-    has_pose: bool
-    """False if the file has no pose of a scanner; rotation and translation are then identity."""
-
-    source: str
-    """What was read, for a person."""
-
-    lens: str = "radial-tangential"
-    """One of `choices.LENSES`."""
 
 
 def read_calibration(path: Path, camera: int | None = None) -> Calibration:
@@ -91,7 +63,9 @@ def read_calibration(path: Path, camera: int | None = None) -> Calibration:
         return _kitti_raw(path if path.is_dir() else path.parent, camera)
     text = _text(path)
     if is_robot_calibration(text):
-        return _robot(path, text, camera)
+        calibration = camera_in_yaml(path, parse_yaml(path, text), camera)
+        _check_intrinsics(path, calibration.intrinsics)
+        return calibration
     if text.lstrip().startswith("{"):
         return _plain(path, _json_fields(path, text), camera)
     if not re.search(r"[A-Za-z_]\w*\s*:", text):
@@ -113,23 +87,6 @@ def read_rigid_motion(path: Path) -> tuple[Floats, Floats]:
     rotation = _matrix(path, fields, "R", (3, 3))
     _check_rotation(path, "R", rotation)
     return rotation, _matrix(path, fields, "T", (3,))
-
-
-def _robot(path: Path, text: str, camera: int | None) -> Calibration:
-    """OpenCV's, ROS's or Kalibr's."""
-    yaml_camera = camera_in_yaml(path, parse_yaml(path, text), camera)
-    _check_intrinsics(path, yaml_camera.intrinsics)
-    rotation, translation = yaml_camera.pose or (np.eye(3), np.zeros(3))
-    return Calibration(
-        intrinsics=yaml_camera.intrinsics,
-        rotation=rotation,
-        translation=translation,
-        distortion=yaml_camera.distortion,
-        size=yaml_camera.size,
-        has_pose=yaml_camera.pose is not None,
-        source=yaml_camera.source,
-        lens=yaml_camera.lens,
-    )
 
 
 def _kitti(path: Path, fields: dict[str, str], camera: int | None) -> Calibration:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pnpdepth_cli.io.depth_scale import KITTI_SCALE
+from pnpdepth_cli.io.formats import KITTI_SCALE
 
 _SHORTEST_M, _LONGEST_M = 0.02, 1000.0
 _COMMON_M = (0.2, 200.0)

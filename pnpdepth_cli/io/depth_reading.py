@@ -10,10 +10,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import FileFormatError
-from pnpdepth_cli.io.depth_scale import KITTI_SCALE, SATURATED_CODE, check_scale
 from pnpdepth_cli.io.file_bytes import check_pixel_count, read_bytes
-from pnpdepth_cli.io.file_kind import kind_of
-from pnpdepth_cli.io.formats import StoredArray, depth_formats, format_of_content
+from pnpdepth_cli.io.formats import (
+    KITTI_SCALE,
+    SATURATED_CODE,
+    StoredArray,
+    check_scale,
+    depth_formats,
+    format_of_content,
+    kind_of,
+)
 from pnpdepth_cli.io.formats.png import eight_bits
 
 

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from pnpdepth_cli.errors import OutputError, SizeError
 from pnpdepth_cli.io.atomic import atomic_path
 from pnpdepth_cli.io.depth_reading import known_metres
-from pnpdepth_cli.io.depth_scale import KITTI_SCALE
-from pnpdepth_cli.io.formats import DEPTH_SUFFIXES, WriteOptions, format_of_suffix
+from pnpdepth_cli.io.formats import DEPTH_SUFFIXES, KITTI_SCALE, WriteOptions, format_of_suffix
 
 
 def write_depth(

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pnpdepth_cli.io.rgb import QUIET_PILLOW
+from pnpdepth_cli.io.decoding import QUIET_PILLOW, read_tags
 
 _EXIF_FOLDER = 0x8769
 _FOCAL_LENGTH, _FOCAL_LENGTH_35MM = 0x920A, 0xA405
@@ -73,6 +73,8 @@ def _tags(path: Path) -> dict[int, float]:
 
     try:
         with QUIET_PILLOW, Image.open(path) as image:
+            if exif := image.info.get("exif"):
+                read_tags(exif.removeprefix(b"Exif\0\0") + bytes(4))  # without a next page
             folder: Mapping[int, Any] = image.getexif().get_ifd(_EXIF_FOLDER)
     except Exception:  # Pillow raises many kinds; damaged EXIF gives no focal length
         return {}

@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import FileFormatError
 from pnpdepth_cli.io.file_bytes import one_line, read_bytes
-from pnpdepth_cli.io.rotation import rotation_of
 from pnpdepth_cli.io.yaml_file import parse_yaml
 
 Floats = NDArray[np.float64]
@@ -141,3 +140,16 @@ def _check_translation(path: Path, translation: Floats) -> None:
         raise FileFormatError(
             f"{path}: a translation of {one_line(translation)} m is none of a sensor; correct it"
         )
+
+
+def rotation_of(wxyz: Floats) -> Floats:
+    """Returns the (3, 3) rotation of a quaternion w x y z of any length but 0, which gives NaN."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        w, x, y, z = wxyz / float(np.linalg.norm(wxyz))
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )

@@ -80,48 +80,59 @@ def one_line(text: object) -> str:
 
 
 def check_pixel_count(
-    path: Path, width: int, height: int, *, channels: int = 1, file_bytes: int | None = None
+    path: Path,
+    width: int,
+    height: int,
+    *,
+    channels: int = 1,
+    value_bytes: int = 1,
+    file_bytes: int | None = None,
 ) -> None:
     """Raises FileFormatError for an image without pixels, or with more than the budget.
+
+    To be called with what the header of a file claims, before the file is decoded.
 
     Args:
         path: Named in messages.
         width: Pixels.
         height: Pixels.
         channels: Values of a pixel that are decoded.
+        value_bytes: Bytes of a value that is decoded.
         file_bytes: Size of the file, where the format allows a few bytes to claim any size.
     """
     if width < 1 or height < 1:
         raise FileFormatError(f"{path} has no pixels ({width}x{height}); create it again")
-    limit = budget().max_pixels
-    if width * height > limit:
-        raise FileFormatError(
-            f"{path} is {width}x{height} pixels, more than {limit:,}; make it smaller, or allow"
-            " more with --max-pixels"
-        )
-    if file_bytes is not None and width * height * channels > budget().max_values_from(file_bytes):
-        raise FileFormatError(
-            f"{path} claims {width}x{height} pixels in {file_bytes:,} bytes, which cannot be true;"
-            " create it again"
-        )
+    pixels = width * height
+    _check_claim(path, pixels, channels, value_bytes, file_bytes, f"{width}x{height} pixels")
 
 
-def check_value_count(path: Path, count: int, file_bytes: int | None = None) -> None:
+def check_value_count(
+    path: Path, count: int, file_bytes: int | None = None, *, value_bytes: int = 1
+) -> None:
     """Raises FileFormatError for an array of more values than the budget.
 
     Args:
         path: Named in messages.
         count: Values of the array.
         file_bytes: Size of the file, where a few bytes can claim any count.
+        value_bytes: Bytes of a value that is decoded.
     """
-    limit = budget().max_pixels
-    if count > limit:
+    _check_claim(path, count, 1, value_bytes, file_bytes, f"{count:,} values")
+
+
+def _check_claim(
+    path: Path, count: int, channels: int, value_bytes: int, file_bytes: int | None, what: str
+) -> None:
+    allow = "make it smaller, or allow more with --max-pixels"
+    if count > budget().max_pixels:
+        raise FileFormatError(f"{path} has {what}, more than {budget().max_pixels:,}; {allow}")
+    decoded = count * channels * value_bytes
+    if decoded > budget().max_image_bytes:
         raise FileFormatError(
-            f"{path} holds {count:,} values, more than {limit:,}; make it smaller, or allow more"
-            " with --max-pixels"
+            f"{path} has {what} in {decoded:,} bytes, more than {budget().max_image_bytes:,};"
+            f" {allow}"
         )
     if file_bytes is not None and count > budget().max_values_from(file_bytes):
         raise FileFormatError(
-            f"{path} claims {count:,} values in {file_bytes:,} bytes, which cannot be true;"
-            " create it again"
+            f"{path} claims {what} in {file_bytes:,} bytes, which cannot be true; create it again"
         )

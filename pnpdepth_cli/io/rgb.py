@@ -2,29 +2,24 @@
 
 from __future__ import annotations
 
-import io
-import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import FileFormatError
-from pnpdepth_cli.io.file_bytes import check_pixel_count, damaged, one_line, read_bytes
-from pnpdepth_cli.io.file_kind import kind_of
-from pnpdepth_cli.io.formats.png import read_png_facts
+from pnpdepth_cli.io.decoding import (
+    QUIET_PILLOW,
+    decode_with_opencv,
+    opened_image,
+    orientation_of,
+    raw_mode,
+)
+from pnpdepth_cli.io.file_bytes import read_bytes
+from pnpdepth_cli.io.formats import kind_of
 from pnpdepth_cli.io.formats.tiff import read_tiff_facts
-from pnpdepth_cli.io.opencv import decode_with_opencv
-from pnpdepth_cli.io.shared_context import SharedContext
-
-if TYPE_CHECKING:
-    import PIL.Image
-
-_EXIF_ORIENTATION = 0x0112
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,11 +48,30 @@ def read_rgb(path: Path) -> RgbImage:
         return _from_linear_light(path, data)
     if kind not in ("PNG", "JPEG", "TIFF", "WEBP"):
         raise FileFormatError(f"{path} is not an image; give a PNG, JPEG, TIFF, WebP or EXR file")
-    if _is_16_bit(path, data, kind):
-        values, orientation = _decode_16_bit(path, data, kind)
-        note = None
-    else:
-        values, orientation, note = _decode_8_bit(path, data, kind)
+    if kind == "TIFF":
+        facts = read_tiff_facts(path, data)
+        if facts.number != "uint" or facts.bits > 16:
+            raise FileFormatError(
+                f"{path} is a {facts.bits}-bit {facts.number} TIFF; save the image with 8 or 16"
+                " bits"
+            )
+    note = None
+    with opened_image(path, data, kind) as image:
+        wide = ";16" in raw_mode(image)  # until the EXIF of a PNG is asked for, which decodes it
+        if not wide:
+            image.load()  # which applies the orientation of a TIFF
+        orientation = orientation_of(image)
+        if wide:
+            values = _decode_16_bit(path, data, kind)
+            if kind == "TIFF":  # OpenCV applies the orientation of a TIFF, not that of a PNG
+                orientation = 1
+        else:
+            # Only a JPEG's previews are further images that are not worth a note.
+            frames = 1 if kind == "JPEG" else getattr(image, "n_frames", 1)
+            note = f"first of {frames} images" if frames > 1 else None
+            image.seek(0)
+            pixels = np.asarray(image if image.mode == "RGB" else image.convert("RGB"))
+            values = np.divide(pixels, np.float32(255), dtype=np.float32)
     upright = _turn_upright(values, orientation)
     return RgbImage(values=np.ascontiguousarray(upright), note=note)
 
@@ -73,90 +87,22 @@ def upright_size(path: Path) -> tuple[int, int]:
     try:
         with QUIET_PILLOW, Image.open(path) as image:
             width, height = image.size
-            return (width, height) if _orientation(image) >= 5 else (height, width)
+            return (width, height) if orientation_of(image) >= 5 else (height, width)
     except OSError:
         shape = read_rgb(path).values.shape
         return shape[0], shape[1]
 
 
-def _is_16_bit(path: Path, data: bytes, kind: str) -> bool:
-    if kind == "PNG":
-        return read_png_facts(path, data).bit_depth == 16
-    if kind != "TIFF":
-        return False
-    facts = read_tiff_facts(path, data)
-    if facts.number != "uint" or facts.bits > 16:
-        raise FileFormatError(
-            f"{path} is a {facts.bits}-bit {facts.number} TIFF; save the image with 8 or 16 bits"
-        )
-    return facts.bits == 16
-
-
-def _decode_8_bit(
-    path: Path, data: bytes, kind: str
-) -> tuple[NDArray[np.float32], int, str | None]:
-    from PIL import Image
-
-    try:
-        with QUIET_PILLOW, Image.open(io.BytesIO(data), formats=[kind]) as image:
-            check_pixel_count(path, *image.size, file_bytes=len(data))
-            image.load()
-            frames = getattr(image, "n_frames", 1)
-            orientation = _orientation(image)
-            pixels = np.asarray(image.convert("RGB"), dtype=np.uint8)
-    except FileFormatError:
-        raise
-    except Exception as error:  # Pillow's plugins raise many kinds on damaged files
-        fact = "is cut short" if "truncated" in str(error).lower() else "cannot be decoded"
-        raise damaged(path, kind, f"{fact} ({_reason(error)})") from error
-    # A camera's JPEG may carry a preview as a second frame, which is not worth a note.
-    note = f"first of {frames} images" if frames > 1 and kind != "JPEG" else None
-    values = pixels.astype(np.float32)
-    values /= np.float32(255)
-    return values, orientation, note
-
-
-def _decode_16_bit(path: Path, data: bytes, kind: str) -> tuple[NDArray[np.float32], int]:
+def _decode_16_bit(path: Path, data: bytes, kind: str) -> NDArray[np.float32]:
+    """(H, W, 3) in 0..1, decoded by OpenCV because Pillow cuts colours to 8 bits."""
     pixels = decode_with_opencv(path, data, kind)
-    values = pixels.astype(np.float32)
-    values /= np.float32(np.iinfo(pixels.dtype).max)
-    if values.ndim == 2:
-        values = values[:, :, None]
-    if values.shape[2] in (1, 2):
-        values = np.repeat(values[:, :, :1], 3, axis=2)
-    values = values[:, :, 2::-1]  # OpenCV returns blue first
-    # OpenCV applies the orientation of a TIFF, not that of a PNG.
-    if kind != "PNG":
-        return values, 1
-    from PIL import Image
-
-    with QUIET_PILLOW, Image.open(io.BytesIO(data), formats=["PNG"]) as image:
-        return values, _orientation(image)
-
-
-def _orientation(image: PIL.Image.Image) -> int:
-    try:
-        return int(image.getexif().get(_EXIF_ORIENTATION, 1))
-    except Exception:  # unreadable EXIF in a valid image says nothing of its rotation
-        return 1
-
-
-@contextmanager
-def _quiet_pillow() -> Iterator[None]:
-    """Pillow neither warns of damaged EXIF nor refuses large images, which the budget does."""
-    from PIL import Image
-
-    limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            yield
-    finally:
-        Image.MAX_IMAGE_PIXELS = limit
-
-
-QUIET_PILLOW = SharedContext(_quiet_pillow)
-"""While it is open, in any number of threads, Pillow does not warn."""
+    if pixels.ndim == 2:
+        pixels = pixels[:, :, None]
+    if pixels.shape[2] in (1, 2):
+        pixels = np.repeat(pixels[:, :, :1], 3, axis=2)
+    largest = np.float32(np.iinfo(pixels.dtype).max)
+    rgb = pixels[:, :, 2::-1]  # OpenCV has blue first
+    return np.asarray(np.divide(rgb, largest, dtype=np.float32))
 
 
 def _turn_upright(values: NDArray[np.float32], orientation: int) -> NDArray[np.float32]:
@@ -203,9 +149,3 @@ def _colour_of(path: Path, channels: dict[str, NDArray[Any]]) -> NDArray[Any]:
     raise FileFormatError(
         f"{path} has no single image in its channels ({listing}); export R, G and B"
     )
-
-
-def _reason(error: Exception) -> str:
-    text = one_line(error)
-    # Pillow names the in-memory buffer, which means nothing to a reader.
-    return "unknown content" if "BytesIO" in text else text or type(error).__name__

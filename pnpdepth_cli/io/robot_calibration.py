@@ -42,26 +42,32 @@ _LARGEST = 1e9
 
 
 @dataclass(frozen=True, kw_only=True)
-class CameraInYaml:
-    """A camera of a calibration file."""
+class Calibration:
+    """A camera and a scanner: x_camera = rotation · x_scanner + translation."""
 
     intrinsics: Floats
-    """(3, 3)."""
+    """(3, 3), last row 0 0 1, in pixels."""
 
-    lens: str
-    """One of `choices.LENSES`."""
+    rotation: Floats
+    """(3, 3), from the scanner's frame to the camera's."""
+
+    translation: Floats
+    """(3,) metres, the scanner's origin in the camera's frame."""
 
     distortion: tuple[float, ...]
-    """Coefficients of the lens."""
+    """Coefficients of the lens, or none."""
 
     size: tuple[int, int] | None
-    """(H, W); None if the file does not give it."""
+    """(H, W) of the images; None if the file does not give it."""
 
-    pose: tuple[Floats, Floats] | None
-    """(rotation, translation) from the scanner's frame to the camera's; None without one."""
+    has_pose: bool
+    """False if the file has no pose of a scanner; rotation and translation are then identity."""
 
     source: str
     """What was read, for a person."""
+
+    lens: str = "radial-tangential"
+    """One of `choices.LENSES`."""
 
 
 def is_robot_calibration(text: str) -> bool:
@@ -72,7 +78,7 @@ def is_robot_calibration(text: str) -> bool:
     return any(mark in text for mark in marks)
 
 
-def camera_in_yaml(path: Path, content: Any, camera: int | None) -> CameraInYaml:
+def camera_in_yaml(path: Path, content: Any, camera: int | None) -> Calibration:
     """Returns a camera of the file.
 
     Args:
@@ -101,7 +107,7 @@ def _is_cam(value: Any) -> bool:
     return isinstance(value, Mapping) and "intrinsics" in value
 
 
-def _kalibr(path: Path, name: str, fields: Mapping[str, Any]) -> CameraInYaml:
+def _kalibr(path: Path, name: str, fields: Mapping[str, Any]) -> Calibration:
     model = str(fields.get("camera_model", "pinhole"))
     values = _numbers(path, f"{name}: intrinsics", fields["intrinsics"])
     coefficients = _numbers(path, f"{name}: distortion_coeffs", fields.get("distortion_coeffs", []))
@@ -126,7 +132,7 @@ def _kalibr(path: Path, name: str, fields: Mapping[str, Any]) -> CameraInYaml:
     )
 
 
-def _opencv_or_ros(path: Path, fields: Mapping[str, Any]) -> CameraInYaml:
+def _opencv_or_ros(path: Path, fields: Mapping[str, Any]) -> Calibration:
     matrix = next((fields[name] for name in _MATRICES if name in fields), None)
     if matrix is None:
         raise FileFormatError(f"{path} has no {_MATRICES[0]}; this calibration is incomplete")
@@ -160,7 +166,7 @@ def _checked(
     size: tuple[int, int] | None,
     pose: tuple[Floats, Floats] | None,
     source: str,
-) -> CameraInYaml:
+) -> Calibration:
     coefficients = tuple(distortion)
     if lens == "radial-tangential" and not any(coefficients):
         coefficients = ()
@@ -171,13 +177,16 @@ def _checked(
         )
     if size is not None and min(size) < 1:
         raise FileFormatError(f"{path}: images of {size[1]}×{size[0]} pixels are none; correct it")
-    return CameraInYaml(
+    rotation, translation = pose or (np.eye(3), np.zeros(3))
+    return Calibration(
         intrinsics=matrix,
-        lens=lens,
+        rotation=rotation,
+        translation=translation,
         distortion=coefficients,
         size=size,
-        pose=pose,
+        has_pose=pose is not None,
         source=f"{source}, {lens} lens" if coefficients else source,
+        lens=lens,
     )
 
 

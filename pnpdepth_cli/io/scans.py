@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import FileFormatError, NoPointsError
 from pnpdepth_cli.io.file_bytes import read_bytes
-from pnpdepth_cli.io.file_kind import kind_of
+from pnpdepth_cli.io.formats import kind_of
 from pnpdepth_cli.io.formats.npy import parse_npy
 from pnpdepth_cli.io.formats.npz import parse_npz
 from pnpdepth_cli.io.point_files import parse_pcd, parse_ply

@@ -82,8 +82,8 @@ def test_an_npz_whose_array_promises_more_than_the_file_can_hold_is_refused(
     tmp_path: Path,
 ) -> None:
     path = tmp_path / "lie.npz"
-    npz(path, npy_header((40_000, 5_000)) + bytes(1000), zipfile.ZIP_DEFLATED)
-    with pytest.raises(FileFormatError, match="claims 200,000,000 values in"):
+    npz(path, npy_header((10_000, 5_000)) + bytes(1000), zipfile.ZIP_DEFLATED)
+    with pytest.raises(FileFormatError, match="claims 50,000,000 values in"):
         read_depth(path)
 
 
@@ -147,12 +147,12 @@ def test_an_image_of_more_pixels_than_the_budget_is_refused(tmp_path: Path, suff
 
 def test_an_exr_of_a_few_bytes_with_a_vast_display_window_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "window.exr"
-    window = (np.array([0, 0], np.int32), np.array([16383, 16383], np.int32))
+    window = (np.array([0, 0], np.int32), np.array([7999, 7989], np.int32))
     header = {"type": OpenEXR.scanlineimage, "displayWindow": window}
     with OpenEXR.File(header, {"Z": DEPTH}) as file:
         file.write(str(path))
     for read in (read_depth, read_rgb):
-        with pytest.raises(FileFormatError, match=r"claims 16384x16384 pixels in .* bytes"):
+        with pytest.raises(FileFormatError, match=r"claims 8000x7990 pixels in .* bytes"):
             read(path)
 
 

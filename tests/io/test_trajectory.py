@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pnpdepth_cli.errors import FileFormatError
-from pnpdepth_cli.io.trajectory import Trajectory, read_trajectory
+from pnpdepth_cli.io.poses import Trajectory, read_trajectory
 
 HALF = float(np.sqrt(0.5))
 

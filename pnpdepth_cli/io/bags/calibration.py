@@ -43,18 +43,8 @@ def camera_of_bag(bag: Bag, topic: str) -> tuple[Calibration, str] | None:
             "width": int(message.width),
             "height": int(message.height),
         }
-        camera = camera_in_yaml(bag.path, content, None)
-        calibration = Calibration(
-            intrinsics=camera.intrinsics,
-            rotation=np.eye(3),
-            translation=np.zeros(3),
-            distortion=camera.distortion,
-            size=camera.size,
-            has_pose=False,
-            source=topic,
-            lens=camera.lens,
-        )
-        return calibration, frame_of(message)
+        calibration = camera_in_yaml(bag.path, content, None)
+        return replace(calibration, source=topic), frame_of(message)
     return None
 
 

@@ -19,7 +19,7 @@ from pnpdepth_cli.io.bags.calibration import (
 )
 from pnpdepth_cli.io.bags.messages import seconds_of
 from pnpdepth_cli.io.extrinsics import Extrinsics
-from pnpdepth_cli.io.trajectory import Trajectory, trajectory_of
+from pnpdepth_cli.io.poses import Trajectory, trajectory_of
 
 ODOMETRY = ("nav_msgs/msg/Odometry",)
 POSES = ("geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped")

@@ -8,9 +8,16 @@ from pathlib import Path
 import numpy as np
 
 from pnpdepth_cli.errors import FileFormatError
-from pnpdepth_cli.io.colmap.cameras import NAME_OF_NUMBER, camera_of, parameter_count
-from pnpdepth_cli.io.colmap.parts import ColmapCamera, ColmapImage, ColmapPoints
-from pnpdepth_cli.io.colmap.poses import image_of, points_of
+from pnpdepth_cli.io.colmap.parts import (
+    NAME_OF_NUMBER,
+    ColmapCamera,
+    ColmapImage,
+    ColmapPoints,
+    camera_of,
+    image_of,
+    parameter_count,
+    points_of,
+)
 from pnpdepth_cli.io.file_bytes import damaged, read_bytes
 
 _COUNT = struct.Struct("<Q")

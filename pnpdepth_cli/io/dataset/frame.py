@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from pnpdepth_cli.errors import FileFormatError, InputError
+from pnpdepth_cli.errors import FileFormatError
 from pnpdepth_cli.io.calibration import Calibration
 from pnpdepth_cli.io.dataset.protocols import WHOLE, Protocol
 
@@ -167,34 +167,3 @@ def _check_no_nul(path: Path) -> None:
     if "\0" in str(path):
         name = str(path).replace("\0", "\\0")
         raise FileFormatError(f"{name}: a file name holds a NUL character; correct the file's list")
-
-
-def by_stem(folder: Path, suffixes: Iterable[str]) -> dict[str, Path]:
-    """Returns the files of a folder with one of these suffixes by their stem, sorted.
-
-    Args:
-        folder: Need not exist.
-        suffixes: In lower case.
-
-    Raises:
-        InputError: Two files have the same stem.
-    """
-    wanted = set(suffixes)
-    files: dict[str, Path] = {}
-    for path in sorted(folder.iterdir() if folder.is_dir() else ()):
-        if path.suffix.lower() in wanted and path.is_file():
-            if path.stem in files:
-                raise InputError(f"{path} and {files[path.stem].name} are one frame; keep one")
-            files[path.stem] = path
-    return files
-
-
-def without_partner(
-    files: Mapping[str, Path], others: Mapping[str, Path], folder: Path
-) -> tuple[Unmatched, ...]:
-    """Returns the files whose stem is not among the others, which `folder` holds."""
-    return tuple(
-        Unmatched(path=path, why=f"has no partner {stem}.* in {folder}; add or remove one")
-        for stem, path in files.items()
-        if stem not in others
-    )

@@ -6,6 +6,8 @@ holds a `DepthFormat` called `FORMAT`.
 
 from __future__ import annotations
 
+import math
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +17,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli.choices import FORMATS
+from pnpdepth_cli.errors import FileFormatError, UsageError
+
+KITTI_SCALE = 256.0
+"""Codes per metre in the KITTI depth files, assumed for integers that do not say their own."""
+
+SCALE_KEY = "pnpdepth:scale"
+"""Key under which our own 16-bit files keep their codes per metre."""
+
+SATURATED_CODE = 65535
+"""The largest 16-bit code: what a sensor gives beyond its range, so never a measurement."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,6 +96,46 @@ def format_of_content(data: bytes) -> DepthFormat | None:
 def format_of_suffix(suffix: str) -> DepthFormat | None:
     """The format that is written for a suffix in any case; None for an unknown one."""
     return next((each for each in depth_formats() if suffix.lower() in each.suffixes), None)
+
+
+def kind_of(data: bytes) -> str | None:
+    """Returns "PNG", "JPEG", "TIFF", "WEBP" or the name of another depth format; None if unknown.
+
+    Args:
+        data: Content of the file, or at least its first 16 bytes.
+    """
+    if data.startswith(b"\xff\xd8\xff"):
+        return "JPEG"
+    if data[:4] == b"RIFF" and data[8:12] == b"WEBP":
+        return "WEBP"
+    depth_format = format_of_content(data)
+    return None if depth_format is None else depth_format.name
+
+
+def check_scale(scale: float | None) -> None:
+    """Raises UsageError unless the scale is None or a finite number above 0."""
+    if scale is not None and not (math.isfinite(scale) and scale > 0):
+        raise UsageError(f"--depth-scale must be a finite number above 0, not {scale:g}")
+
+
+def scale_in_text(path: Path, text: str) -> float | None:
+    """Returns the codes per metre in a text such as "pnpdepth:scale=256", None without one.
+
+    Raises:
+        FileFormatError: The text names a scale that is not a finite number above 0.
+    """
+    match = re.search(re.escape(SCALE_KEY) + r"=(\S+)", text)
+    if match is None:
+        return None
+    try:
+        scale = float(match[1])
+    except ValueError:
+        scale = math.nan
+    if not (math.isfinite(scale) and scale > 0):
+        raise FileFormatError(
+            f"{path} says {SCALE_KEY}={match[1][:40]}, which is no scale; write the file again"
+        )
+    return scale
 
 
 DEPTH_SUFFIXES: tuple[str, ...] = tuple(s for each in depth_formats() for s in each.suffixes)

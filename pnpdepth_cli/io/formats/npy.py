@@ -4,46 +4,56 @@ from __future__ import annotations
 
 import io
 import math
+import re
+import struct
 import threading
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.lib import format as npy_format
 from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import FileFormatError
 from pnpdepth_cli.io.file_bytes import check_value_count, damaged
 from pnpdepth_cli.io.formats import DepthFormat, StoredArray, WriteOptions
 
+LONGEST_HEADER = 1 << 14
+_DTYPE = re.compile(r"['\"]descr['\"]\s*:\s*['\"]([^'\"]{1,20})['\"]")
+_FORTRAN = re.compile(r"['\"]fortran_order['\"]\s*:\s*(True|False)\b")
+_SHAPE = re.compile(r"['\"]shape['\"]\s*:\s*\(\s*((?:\d{1,18}\s*,\s*)*(?:\d{1,18}\s*)?)\)")
+"""The fields of a header. NumPy evaluates it as Python, which raises many kinds on damaged ones."""
+
 HEADER_LOCK = threading.Lock()
-"""Held while numpy parses a header as Python: CPython 3.11 mixes up the recursion depths of threads
-that do so at once, and raises SystemError for a good file."""
+"""To be held while NumPy parses a header: CPython 3.11 mixes up the recursion depths of threads
+that evaluate at once, and raises SystemError for a good file."""
 
 
-def parse_npy(path: Path, data: bytes) -> NDArray[Any]:
+def parse_npy(path: Path, data: bytes, kind: str = "NPY") -> NDArray[Any]:
     """Returns the array of an NPY file, of any shape; numbers only, never pickled objects.
 
     Args:
         path: Named in messages.
         data: Content of the file.
+        kind: The kind of file that messages name.
 
     Raises:
         FileFormatError: The content is damaged, too large, or not made of numbers.
     """
-    shape, fortran_order, dtype, start = read_npy_header(path, data)
-    needed = math.prod(shape) * dtype.itemsize
-    if len(data) - start < needed:
-        fact = f"cannot be read ({len(data) - start:,} bytes of data instead of {needed:,})"
-        raise damaged(path, "NPY", fact)
-    values = np.frombuffer(data, dtype, count=math.prod(shape), offset=start)
-    return values.reshape(shape, order="F" if fortran_order else "C")
+    shape, order, dtype, start = read_npy_header(path, data, kind)
+    count = math.prod(shape)
+    if len(data) - start < count * dtype.itemsize:
+        fact = (
+            f"cannot be read ({len(data) - start:,} bytes of data instead of"
+            f" {count * dtype.itemsize:,})"
+        )
+        raise damaged(path, kind, fact)
+    return np.frombuffer(data, dtype, count=count, offset=start).reshape(shape, order=order)
 
 
 def read_npy_header(
     path: Path, data: bytes, kind: str = "NPY"
-) -> tuple[tuple[int, ...], bool, np.dtype[Any], int]:
-    """Returns shape, Fortran order, dtype, and the position of the data.
+) -> tuple[tuple[int, ...], Any, np.dtype[Any], int]:
+    """Returns shape, order ("C" or "F"), dtype, and the position of the data.
 
     Args:
         path: Named in messages.
@@ -51,30 +61,29 @@ def read_npy_header(
         kind: The kind of file that messages name.
 
     Raises:
-        FileFormatError: The header is damaged, or its array is too large or not made of numbers.
+        FileFormatError: The header is damaged, or its array is not made of numbers.
     """
-    stream = io.BytesIO(data)
-    try:
-        version = npy_format.read_magic(stream)
-        with HEADER_LOCK:
-            if version == (1, 0):
-                shape, fortran_order, dtype = npy_format.read_array_header_1_0(stream)
-            elif version == (2, 0):
-                shape, fortran_order, dtype = npy_format.read_array_header_2_0(stream)
-            else:
-                raise ValueError(f"version {version[0]}.{version[1]} of the format")
-    except Exception as error:  # numpy parses the header as Python, which raises many kinds
-        raise damaged(path, kind, f"cannot be read ({error})") from error
-    if dtype.hasobject:
+    length = "<H" if data[6:8] == b"\1\0" else "<I"
+    start = 8 + struct.calcsize(length)
+    end = start + (struct.unpack_from(length, data, 8)[0] if len(data) >= start else 0)
+    text = data[start : min(end, start + LONGEST_HEADER)].decode("latin-1")
+    descr, fortran, sides = (field.search(text) for field in (_DTYPE, _FORTRAN, _SHAPE))
+    known = data[6:8] in (b"\1\0", b"\2\0") and end <= len(data)
+    if not (known and descr and fortran and sides):
+        raise damaged(path, kind, "cannot be read (its header is damaged or of another version)")
+    if "O" in descr[1]:
         raise FileFormatError(
             f"{path} holds pickled Python objects, which are never loaded; save numbers, with"
             " allow_pickle=False"
         )
+    try:
+        dtype = np.dtype(descr[1])
+    except (TypeError, ValueError, SyntaxError) as error:
+        raise damaged(path, kind, f"cannot be read ({error})") from error
     if dtype.kind not in "fiu":
         raise FileFormatError(f"{path} holds {dtype} values; depth is float or integer, save it so")
-    if min(shape, default=0) < 0:
-        raise damaged(path, kind, f"cannot be read (its shape is {shape})")
-    return shape, fortran_order, dtype, stream.tell()
+    shape = tuple(int(length) for length in re.findall(r"\d+", sides[1]))
+    return shape, "F" if fortran[1] == "True" else "C", dtype, end
 
 
 def npy_bytes(array: NDArray[Any]) -> bytes:

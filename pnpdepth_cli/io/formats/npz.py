@@ -14,11 +14,15 @@ from numpy.typing import NDArray
 from pnpdepth_cli.errors import FileFormatError, UsageError
 from pnpdepth_cli.io.file_bytes import check_value_count, damaged, one_line
 from pnpdepth_cli.io.formats import DepthFormat, StoredArray, WriteOptions
-from pnpdepth_cli.io.formats.npy import npy_bytes, read_npy_header
+from pnpdepth_cli.io.formats.npy import (
+    LONGEST_HEADER,
+    npy_bytes,
+    parse_npy,
+    read_npy_header,
+)
 
 # A fixed time in the archive: the same depth gives the same bytes.
 _EPOCH = (1980, 1, 1, 0, 0, 0)
-_LONGEST_HEADER = 1 << 14
 _COMPRESSIONS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 """Those that numpy writes. Python decompresses bz2 and LZMA without a bound on memory."""
 
@@ -64,20 +68,16 @@ def npz_bytes(name: str, array: NDArray[Any]) -> bytes:
 
 
 def _array(path: Path, name: str, member: IO[bytes], file_bytes: int) -> NDArray[Any]:
-    beginning = member.read(_LONGEST_HEADER)
+    """The array of a member, after its claimed size is checked."""
+    beginning = member.read(LONGEST_HEADER)
     if not beginning.startswith(b"\x93NUMPY"):
         raise FileFormatError(f"{path}: {name} is not an array; save it with numpy.savez")
-    shape, fortran_order, dtype, start = read_npy_header(path, beginning, "NPZ")
-    count = math.prod(shape)
-    check_value_count(path, count, file_bytes)
-    needed = start + count * dtype.itemsize
+    shape, _, dtype, start = read_npy_header(path, beginning, "NPZ")
+    check_value_count(path, math.prod(shape), file_bytes, value_bytes=dtype.itemsize)
+    needed = start + math.prod(shape) * dtype.itemsize
     content = beginning + member.read(max(0, needed - len(beginning)))
-    if len(content) < needed:
-        fact = f"cannot be read ({name} has {len(content):,} bytes instead of {needed:,})"
-        raise damaged(path, "NPZ", fact)
     member.read(1)  # at the end of the member, its checksum is compared
-    values = np.frombuffer(content, dtype, count=count, offset=start)
-    return values.reshape(shape, order="F" if fortran_order else "C")
+    return parse_npy(path, content, "NPZ")
 
 
 def _choose(path: Path, keys: list[str], key: str | None) -> str:

@@ -1,17 +1,16 @@
-"""Data set layouts: which one a folder is, and its frames; one file each in `choices.LAYOUTS`.
+"""Data set layouts: which one a folder is, and its frames; `TABLE` has them by name.
 
     frames = read_frames(Path("KITTI/object"))            # layout guessed
     frames = read_frames(Path("frames"), "pairs")         # layout named
 
-A new layout is one new file in this folder, or an entry point of the group `pnpdepth.layouts`, that
-holds a `Layout` called `LAYOUT`.
+A new layout is one entry of `TABLE`, a row of `folders` or a `Layout`, with its name in
+`choices.LAYOUTS`; or an entry point of the group `pnpdepth.layouts`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 from pnpdepth_cli.choices import LAYOUTS
@@ -19,6 +18,20 @@ from pnpdepth_cli.errors import InputError, UsageError
 from pnpdepth_cli.io.dataset.frame import Frame, Hdf5Array, Listing, Source, Unmatched
 from pnpdepth_cli.io.dataset.protocols import PROTOCOLS, Protocol, find_protocol
 from pnpdepth_cli.io.dataset.reading import read_frame_ground_truth, read_frame_image
+from pnpdepth_cli.io.layouts.layout import Layout, merged  # isort: split
+
+# after Layout, which the manifest's module imports from here
+from pnpdepth_cli.io.layouts import (
+    colmap,
+    driving,
+    folders,
+    hdf5_files,
+    kitti,
+    manifest,
+    pairs,
+    synthia,
+    tum,
+)
 
 __all__ = [
     "LAYOUTS",
@@ -39,18 +52,23 @@ __all__ = [
 ]
 
 
-@dataclass(frozen=True, kw_only=True)
-class Layout:
-    """How the files of a data set lie on disk."""
-
-    matches: Callable[[Path], bool]
-    """Whether a folder or file is of this layout."""
-
-    listing: Callable[[Path], Listing]
-    """The frames of a folder or file that matches, and what is in no frame."""
-
-    needs: tuple[str, ...] = ()
-    """Patterns of what the folder holds, for the message of an unknown folder."""
+TABLE: dict[str, Layout] = {
+    **folders.ROWS,
+    "manifest": manifest.LAYOUT,
+    "nyu-mat": hdf5_files.NYU_MAT,
+    "kitti-odometry": kitti.ODOMETRY,
+    "kitti-depth": kitti.DEPTH,
+    "kitti-raw": kitti.RAW,
+    "tum": tum.TUM,
+    "synthia": synthia.SYNTHIA,
+    "colmap": colmap.COLMAP,
+    "hypersim": hdf5_files.HYPERSIM,
+    "nuscenes": driving.NUSCENES,
+    "ddad": driving.DDAD,
+    "pairs": pairs.PAIRS,
+    "nyu-h5": hdf5_files.NYU_H5,
+}
+"""The layouts of this package, which `choices.LAYOUTS` lists in the order of guessing."""
 
 
 def find_layout(root: Path, name: str | None = None) -> str:
@@ -113,19 +131,16 @@ def list_frames(root: Path, name: str | None = None) -> tuple[str, Listing]:
         layout = parts[0][1]
         if parts[0][0] == root:
             return layout, LAYOUTS[layout].listing(root)
-        listings = [(folder.name, LAYOUTS[layout].listing(folder)) for folder, _ in parts]
+        listings = [_prefixed(LAYOUTS[layout].listing(folder), folder) for folder, _ in parts]
     except OSError as error:
         reason = (error.strerror or str(error)).lower()
         raise InputError(f"{error.filename or root} cannot be read ({reason}); check it") from error
-    return layout, Listing(
-        frames=[
-            replace(frame, name=f"{prefix}/{frame.name}")
-            for prefix, part in listings
-            for frame in part.frames
-        ],
-        broken=tuple(each for _, part in listings for each in part.broken),
-        spare=tuple(each for _, part in listings for each in part.spare),
-    )
+    return layout, merged(listings)
+
+
+def _prefixed(listing: Listing, folder: Path) -> Listing:
+    frames = [replace(frame, name=f"{folder.name}/{frame.name}") for frame in listing.frames]
+    return replace(listing, frames=frames)
 
 
 def _data_sets(root: Path, name: str | None) -> list[tuple[Path, str]]:

@@ -14,7 +14,7 @@ from pnpdepth_cli.io.colmap.model import model_files, read_model
 from pnpdepth_cli.io.colmap.parts import ColmapImage
 from pnpdepth_cli.io.dataset.find_files import find_files
 from pnpdepth_cli.io.dataset.frame import IMAGE_SUFFIXES, Frame, Listing, Pose, Unmatched
-from pnpdepth_cli.io.layouts import Layout
+from pnpdepth_cli.io.layouts.layout import Layout
 
 
 def matches(root: Path) -> bool:
@@ -74,4 +74,4 @@ def _pose(image: ColmapImage) -> Pose:
     return tuple(tuple(float(value) for value in row) for row in rows)
 
 
-LAYOUT = Layout(matches=matches, listing=listing, needs=("images", "sparse/*/cameras.*"))
+COLMAP = Layout(matches=matches, listing=listing, needs=("images", "sparse/*/cameras.*"))

@@ -212,4 +212,4 @@ def _given_name(where: str, values: dict[str, str]) -> dict[str, str]:
     return {"name": normalised_name(values["name"])}
 
 
-LAYOUT = Layout(matches=matches, listing=listing)
+LAYOUT: Layout = Layout(matches=matches, listing=listing)

@@ -6,6 +6,7 @@ one file per frame; a calib.txt beside the folders applies to all.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 from pnpdepth_cli.io.dataset.find_files import find_files
@@ -14,53 +15,36 @@ from pnpdepth_cli.io.dataset.frame import (
     SCAN_ONLY_SUFFIXES,
     Frame,
     Listing,
-    without_partner,
 )
 from pnpdepth_cli.io.formats import DEPTH_SUFFIXES
-from pnpdepth_cli.io.layouts import Layout
+from pnpdepth_cli.io.layouts.layout import Layout, joined
 
-_SPARSE_SUFFIXES = (*DEPTH_SUFFIXES, *SCAN_ONLY_SUFFIXES, ".csv")
-_CALIBRATIONS = (".txt", ".json", ".yaml", ".yml")
+_FOLDERS = {
+    "image": ("rgb", IMAGE_SUFFIXES),
+    "sparse": ("sparse", (*DEPTH_SUFFIXES, *SCAN_ONLY_SUFFIXES, ".csv")),
+    "gt": ("gt", DEPTH_SUFFIXES),
+    "calib": ("calib", (".txt", ".json", ".yaml", ".yml")),
+}
 
 
-def matches(root: Path) -> bool:
-    """Returns whether the folder has rgb/ and sparse/."""
-    return (root / "rgb").is_dir() and (root / "sparse").is_dir()
-
-
-def listing(root: Path) -> Listing:
-    """Returns one frame for each image with sparse depth."""
-    images, lost_images = find_files(root / "rgb", IMAGE_SUFFIXES)
-    sparse, lost_sparse = find_files(root / "sparse", _SPARSE_SUFFIXES)
-    gt, lost_gt = find_files(root / "gt", DEPTH_SUFFIXES)
-    calib, lost_calib = find_files(root / "calib", _CALIBRATIONS)
-    shared = root / "calib.txt"
-    frames = [
-        Frame(
-            name=name,
-            image=image,
-            sparse=sparse[name],
-            gt=gt.get(name),
-            calib=calib.get(name, shared if shared.is_file() else None),
-        )
-        for name, image in images.items()
-        if name in sparse
-    ]
-    return Listing(
-        frames=frames,
-        broken=(
-            *lost_images,
-            *lost_sparse,
-            *lost_gt,
-            *lost_calib,
-            *without_partner(images, sparse, root / "sparse"),
-        ),
-        spare=tuple(
-            each
-            for others in (sparse, gt, calib)
-            for each in without_partner(others, images, root / "rgb")
-        ),
+def _listing(root: Path) -> Listing:
+    """One frame for each image with sparse depth."""
+    folders = {part: root / folder for part, (folder, _) in _FOLDERS.items()}
+    found = {part: find_files(folders[part], kinds) for part, (_, kinds) in _FOLDERS.items()}
+    shared = {"calib": root / "calib.txt"} if (root / "calib.txt").is_file() else {}
+    listing = joined(
+        folders,
+        {part: files for part, (files, _) in found.items()},
+        lambda stem, files: Frame(name=stem, **{**shared, **files}),
+        optional=("gt", "calib"),
+        spare=("sparse", "gt", "calib"),
     )
+    lost = tuple(each for _, unreadable in found.values() for each in unreadable)
+    return replace(listing, broken=lost + listing.broken)
 
 
-LAYOUT = Layout(matches=matches, listing=listing, needs=("rgb", "sparse"))
+PAIRS = Layout(
+    matches=lambda root: (root / "rgb").is_dir() and (root / "sparse").is_dir(),
+    listing=_listing,
+    needs=("rgb", "sparse"),
+)

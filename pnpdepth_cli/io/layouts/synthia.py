@@ -19,36 +19,24 @@ import struct
 from collections.abc import Iterator
 from pathlib import Path
 
-from pnpdepth_cli.io.dataset.frame import Frame, Listing, Unmatched, by_stem, without_partner
-from pnpdepth_cli.io.layouts import Layout
+from pnpdepth_cli.io.dataset.frame import Frame, Listing
+from pnpdepth_cli.io.layouts.layout import PNG, Layout, files_in, joined, merged
 
-_PNG = (".png",)
 _SCALE = 100.0
 _SIZE = (1280, 760)
 _CAMERAS = "Stereo_*/Omni_*"
 _RANDOM_STEM = re.compile(r"\d{7}")
 
 
-def matches(root: Path) -> bool:
-    """Returns whether the folder, or one in it, is a video sequence or the random set."""
-    return any(True for _ in _cameras(root))
-
-
-def listing(root: Path) -> Listing:
-    """Returns one frame for each image of each camera with depth."""
-    frames: list[Frame] = []
-    broken: list[Unmatched] = []
-    spare: list[Unmatched] = []
-    for prefix, rgb, folder in _cameras(root):
-        images, depths = by_stem(rgb, _PNG), by_stem(folder, _PNG)
-        frames += [
-            Frame(name="_".join([*prefix, stem]), image=image, gt=depths[stem], gt_scale=_SCALE)
-            for stem, image in images.items()
-            if stem in depths
-        ]
-        broken += without_partner(images, depths, folder)
-        spare += without_partner(depths, images, rgb)
-    return Listing(frames=frames, broken=tuple(broken), spare=tuple(spare))
+def _of_camera(prefix: list[str], rgb: Path, depth: Path) -> Listing:
+    """One frame for each image with depth."""
+    folders = {"image": rgb, "gt": depth}
+    return joined(
+        folders,
+        {part: files_in(folder, PNG) for part, folder in folders.items()},
+        lambda stem, files: Frame(name="_".join([*prefix, stem]), gt_scale=_SCALE, **files),
+        spare=("gt",),
+    )
 
 
 def _has_synthias_size(image: Path) -> bool:
@@ -79,4 +67,8 @@ def _cameras(root: Path) -> Iterator[tuple[list[str], Path, Path]]:
             yield prefix, rgb, nested if nested.is_dir() else depth
 
 
-LAYOUT = Layout(matches=matches, listing=listing, needs=("RGB", "Depth"))
+SYNTHIA = Layout(
+    matches=lambda root: any(True for _ in _cameras(root)),
+    listing=lambda root: merged(_of_camera(*each) for each in _cameras(root)),
+    needs=("RGB", "Depth"),
+)

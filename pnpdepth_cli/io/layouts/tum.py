@@ -15,8 +15,8 @@ import numpy as np
 from pnpdepth_cli.errors import FileFormatError
 from pnpdepth_cli.io.dataset.frame import Frame, Listing, Pose, Unmatched
 from pnpdepth_cli.io.file_bytes import check_value_count, one_line, read_bytes
-from pnpdepth_cli.io.layouts import Layout
-from pnpdepth_cli.io.trajectory import read_trajectory
+from pnpdepth_cli.io.layouts.layout import Layout
+from pnpdepth_cli.io.poses import read_trajectory
 
 _SCALE = 5000.0
 _ASSOCIATIONS = "associations.txt"
@@ -153,4 +153,4 @@ def _listed(path: Path) -> list[tuple[float, Path]]:
     return sorted(entries)
 
 
-LAYOUT = Layout(matches=matches, listing=listing, needs=("rgb.txt", "depth.txt"))
+TUM = Layout(matches=matches, listing=listing, needs=("rgb.txt", "depth.txt"))

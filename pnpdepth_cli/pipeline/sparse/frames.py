@@ -26,8 +26,8 @@ from pnpdepth_cli.io.bags.messages import cloud_points, image_file, seconds_of
 from pnpdepth_cli.io.bags.pairing import Stamped, nearest_pairs
 from pnpdepth_cli.io.bags.poses import camera_trajectory, poses_topics
 from pnpdepth_cli.io.calibration import Calibration, read_calibration
+from pnpdepth_cli.io.poses import Trajectory
 from pnpdepth_cli.io.record import plain, read_json, write_json
-from pnpdepth_cli.io.trajectory import Trajectory
 from pnpdepth_cli.pipeline.sparse.options import BagOptions
 from pnpdepth_cli.pipeline.sparse.rectified import chosen_camera
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from pnpdepth_cli.errors import FileFormatError
-from pnpdepth_cli.io.bags import bounds
+from pnpdepth_cli.io.bags import bag as bounds
 from pnpdepth_cli.io.bags.bag import open_bag
 from tests.bags import write_bag
 

@@ -1,0 +1,137 @@
+"""Small files that claim much, and headers that evaluate to nothing: one line, little memory."""
+
+from __future__ import annotations
+
+import json
+import struct
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pnpdepth_cli.errors import FileFormatError, InputError
+from pnpdepth_cli.io.calibration import read_calibration
+from pnpdepth_cli.io.depth import read_depth
+from pnpdepth_cli.io.file_bytes import check_pixel_count
+from pnpdepth_cli.io.layouts import list_frames
+from pnpdepth_cli.io.rgb import read_rgb
+from pnpdepth_cli.io.yaml_file import parse_yaml
+
+
+def png(path: Path, size: tuple[int, int], bits: int, colour: int, body: bytes) -> Path:
+    """A PNG with right checksums around this compressed body."""
+    chunks = [(b"IHDR", struct.pack(">IIBBBBB", *size, bits, colour, 0, 0, 0)), (b"IDAT", body)]
+    content = b"\x89PNG\r\n\x1a\n"
+    for kind, data in [*chunks, (b"IEND", b"")]:
+        content += struct.pack(">I", len(data)) + kind + data
+        content += struct.pack(">I", zlib.crc32(kind + data))
+    path.write_bytes(content)
+    return path
+
+
+@pytest.mark.parametrize(("bits", "colour"), [(8, 0), (16, 0), (16, 2)])
+def test_an_image_beyond_64_megapixels_is_refused_by_its_header(
+    tmp_path: Path, bits: int, colour: int
+) -> None:
+    path = png(tmp_path / "zeros.png", (16383, 16383), bits, colour, bytes(600_000))
+    for read in (read_rgb, read_depth):
+        with pytest.raises(FileFormatError, match=r"pixels, more than|8-bit PNG"):
+            read(path)
+
+
+@pytest.mark.parametrize("colour", [0, 2])
+def test_pixels_that_do_not_decode_are_one_line_and_libraries_say_nothing(
+    tmp_path: Path, colour: int, capfd: pytest.CaptureFixture[str]
+) -> None:
+    path = png(tmp_path / "broken.png", (64, 64), 16, colour, zlib.compress(b"x" * 9)[:-6])
+    for read in (read_rgb, read_depth):
+        with pytest.raises(FileFormatError, match=r"broken\.png: PNG"):
+            read(path)
+    assert capfd.readouterr() == ("", "")
+
+
+def test_tags_that_share_their_bytes_are_refused(tmp_path: Path) -> None:
+    count = 3000
+    table = b"".join(struct.pack("<HHII", 256 + number, 2, 90_000, 8) for number in range(count))
+    head = b"II*\0" + struct.pack("<I", 100_000) + bytes(99_992)
+    path = tmp_path / "tags.tif"
+    path.write_bytes(head + struct.pack("<H", count) + table + bytes(4))
+    for read in (read_rgb, read_depth):
+        with pytest.raises(FileFormatError, match="its tags claim more than"):
+            read(path)
+
+
+@pytest.mark.parametrize(
+    "shape", ["(\n", "(6, 8", "(True, 5)", "(2L, 3)", "(-1, 8)", "[6, 8]", "(6, 8.0)", "(1" * 900]
+)
+def test_a_header_of_npy_that_is_no_header_is_damaged(tmp_path: Path, shape: str) -> None:
+    header = f"{{'descr': '<f4', 'fortran_order': False, 'shape': {shape}, }}\n".encode()
+    path = tmp_path / "a.npy"
+    path.write_bytes(b"\x93NUMPY\1\0" + struct.pack("<H", len(header)) + header + bytes(4 * 6 * 8))
+    with pytest.raises(FileFormatError, match="NPY cannot be read") as caught:
+        read_depth(path)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("descr", ["f999", "<q8", ",", "i4, i4", "M8[x]", "\x00f4"])
+def test_a_dtype_of_npy_that_is_none_is_an_input_error(tmp_path: Path, descr: str) -> None:
+    header = f"{{'descr': '{descr}', 'fortran_order': False, 'shape': (2, 2), }}".encode()
+    path = tmp_path / "a.npy"
+    path.write_bytes(b"\x93NUMPY\1\0" + struct.pack("<H", len(header)) + header + bytes(64))
+    with pytest.raises(InputError):
+        read_depth(path)
+
+
+@pytest.mark.parametrize(
+    "value", ["!!int ''", "!!bool x", "!!timestamp x", "!!binary é", "!!float z", "{? [] : 1}",
+              "!!python/name:os.system ''", "1e999", "9" * 5000],
+)  # fmt: skip
+def test_tags_and_odd_values_of_yaml_are_no_crash(tmp_path: Path, value: str) -> None:
+    path = tmp_path / "camera.yaml"
+    path.write_text(f"camera_matrix: {value}\ndistortion_model: plumb_bob\n", encoding="utf-8")
+    with pytest.raises(FileFormatError) as caught:
+        read_calibration(path)
+    assert "\n" not in str(caught.value)
+
+
+def test_yaml_has_plain_texts_and_numbers_only() -> None:
+    text = "a: 1\nb: 1.\nc: 1e-3\nd: '5'\ne: yes\nf: true\ng: ~\nh: 2020-01-01\ni: [.5, -3]\n"
+    assert parse_yaml(Path("a"), text) == {
+        "a": 1, "b": 1.0, "c": 0.001, "d": "5", "e": "yes", "f": True, "g": None,
+        "h": "2020-01-01", "i": [0.5, -3],
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("change", ["name", "filename", "height", "huge", "rotation", "rows"])
+def test_odd_values_in_the_tables_of_nuscenes_are_one_line(tmp_path: Path, change: str) -> None:
+    from tests.io.layouts.test_nuscenes import write
+
+    write(tmp_path)
+    tables = {path.stem: path for path in tmp_path.glob("v1.0-*/*.json")}
+    values = {
+        "name": ("scene", "name", None), "filename": ("sample_data", "filename", None),
+        "height": ("sample_data", "height", "x"), "huge": ("sample_data", "height", 10**400),
+        "rotation": ("ego_pose", "rotation", [10**400, 0, 0, 0]),
+    }  # fmt: skip
+    if change == "rows":
+        tables["scene"].write_text("[null, 3]")
+    else:
+        table, key, value = values[change]
+        rows = json.loads(tables[table].read_text())
+        tables[table].write_text(json.dumps([{**row, key: value} for row in rows]))
+    with pytest.raises(FileFormatError) as caught:
+        list_frames(tmp_path)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_depth_image_of_zeros_is_decoded_once(tmp_path: Path) -> None:
+    rows = b"".join(b"\0" + bytes(2 * 64) for _ in range(48))
+    path = png(tmp_path / "zeros.png", (64, 48), 16, 0, zlib.compress(rows))
+    assert np.array_equal(read_depth(path).values, np.zeros((48, 64), np.float32))
+
+
+def test_colours_of_a_common_camera_are_within_the_budget() -> None:
+    check_pixel_count(Path("a.jpg"), 9000, 7000, channels=4, value_bytes=2, file_bytes=1 << 20)
+    with pytest.raises(FileFormatError, match="in 756,000,000 bytes, more than 512,000,000"):
+        check_pixel_count(Path("a.exr"), 9000, 7000, channels=3, value_bytes=4)
