@@ -11,6 +11,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from pnpdepth_cli.io.report_images import save_images
 from selenium import webdriver
 from selenium.webdriver import Keys
 from selenium.webdriver.common.by import By
@@ -18,7 +19,6 @@ from selenium.webdriver.remote.webelement import WebElement
 from selenium.webdriver.support.ui import WebDriverWait
 
 from pnpdepth_cli.io.report import begin_report, image_key, write_report
-from pnpdepth_cli.io.report_images import save_images
 from tests.pipeline.batches import add_frame, batch, pairs_on_disk
 from tests.pipeline.report_pages import frames_of, page_data
 

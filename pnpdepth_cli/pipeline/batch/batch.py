@@ -34,7 +34,6 @@ from pnpdepth_cli.pipeline.batch.settings import model_identity, settings_of
 from pnpdepth_cli.pipeline.batch.spread import spread_request, spread_rows
 from pnpdepth_cli.pipeline.batch.state import NEW, BatchState, remove_all_leftovers
 from pnpdepth_cli.pipeline.batch.summary import CSV, JSON, Tally, write_summary, write_table
-from pnpdepth_cli.pipeline.ordered_pool import in_order
 from pnpdepth_cli.pipeline.refinement.method import resolve_method
 
 if TYPE_CHECKING:
@@ -131,10 +130,7 @@ def run_batch(
                 refined = _rows(request, batch, to_do, run, proven=proven)
             else:
                 refined = spread_rows(request, spread, batch.frames, to_do, run, proven=proven)
-            with (
-                closing(state),
-                closing(refined if report is None else _drawn(report, refined)) as rows,
-            ):
+            with closing(state), closing(refined) as rows:
                 listener.begin(len(to_do))
                 for row in rows:
                     began += 1
@@ -236,7 +232,6 @@ def _report_of(request: BatchRequest, batch: BatchFrames) -> BatchReport | None:
     report = BatchReport(
         folder=request.html,
         output=request.output,
-        workers=request.workers,
         view_3d=request.html_3d,
         colors=request.refine.outputs.colors,
     )
@@ -244,14 +239,6 @@ def _report_of(request: BatchRequest, batch: BatchFrames) -> BatchReport | None:
     inputs = [request.source, *(files if request.html.exists() else ())]
     report.check(inputs, overwrite=request.refine.outputs.overwrite)
     return report
-
-
-def _drawn(
-    report: BatchReport, rows: Generator[dict[str, Any], None, None]
-) -> Generator[dict[str, Any], None, None]:
-    """The rows, each after the report's images of its frame are written."""
-    with closing(rows):
-        yield from in_order(report.drawn, rows, report.workers)
 
 
 def _summarise(

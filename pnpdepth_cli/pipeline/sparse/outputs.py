@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from pnpdepth_cli import __version__
 from pnpdepth_cli.errors import OutputError, UsageError
 from pnpdepth_cli.io.atomic import make_folder
-from pnpdepth_cli.io.overlay import overlay
 from pnpdepth_cli.io.record import write_json
 from pnpdepth_cli.io.sparse_writing import SPARSE_SUFFIXES, write_sparse
+from pnpdepth_cli.io.visualisation import overlay
 from pnpdepth_cli.sensors import Points, as_depth_image
 
 

@@ -11,12 +11,12 @@ import cv2
 import numpy as np
 import pytest
 from PIL import Image
+from pnpdepth_cli.io.page import open_page
 
 from pnpdepth_cli.choices import COLORS
 from pnpdepth_cli.errors import OutputError, StorageError
 from pnpdepth_cli.io.colours import paint_gain
 from pnpdepth_cli.io.depth import read_depth
-from pnpdepth_cli.io.page import open_page
 from pnpdepth_cli.pipeline.batch.batch import plan_batch
 from pnpdepth_cli.pipeline.batch.request import BatchRequest
 from pnpdepth_cli.pipeline.report import batch as report_batch
