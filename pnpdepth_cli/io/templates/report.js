@@ -99,7 +99,7 @@ function drawChart() {
   const figure = byId("chart");
   if (!values.length) return figure.replaceChildren(make("p", { text: "No frame has it." }));
   const { bins, median } = binned(values);
-  const W = Math.min(Math.max(figure.clientWidth, 280), 640); // so that letters keep their size
+  const W = Math.min(Math.max(figure.clientWidth, 280), 600); // so that letters keep their size
   const [H, left, right, top, bottom] = [240, 40, 14, 12, 40];
   const most = Math.max(...bins.map((bin) => bin.frames));
   const step = Math.max(1, roundStep(most / 4));
