@@ -133,6 +133,11 @@ def paint_error(strength: NDArray[np.floating], light: NDArray[np.floating]) -> 
     return _between(strength, light, _ORANGE, _BLUE)
 
 
+def swatches(colours: Pixels) -> list[str]:
+    """Returns (N, 3) colours as #rrggbb."""
+    return [f"#{red:02x}{green:02x}{blue:02x}" for red, green, blue in colours.tolist()]
+
+
 def _between(
     strength: NDArray[np.floating],
     light: NDArray[np.floating],

@@ -5,13 +5,21 @@ from __future__ import annotations
 import base64
 import hashlib
 import json
+import os
 import re
+import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
+import jinja2
+import numpy as np
+from markupsafe import Markup
+
+from pnpdepth_cli import __version__
 from pnpdepth_cli.errors import FileFormatError, InputError, OutputError
 from pnpdepth_cli.io.atomic import (
     atomic_folder,
@@ -20,15 +28,86 @@ from pnpdepth_cli.io.atomic import (
     make_folder,
     remove_leftovers,
 )
+from pnpdepth_cli.io.colours import LOGARITHMIC_FROM, DepthScale, Pixels, swatches
+from pnpdepth_cli.io.figure import resized
 from pnpdepth_cli.io.record import plain, read_json, write_json
-from pnpdepth_cli.io.report_view import VIEWER, save_viewer
 
 PAGE = "index.html"
 IMAGES = "images"
-_OLD_IMAGES = "pictures"
-"""Its earlier name; images there are removed when such a report is replaced."""
+VIEWER = "viewer.js"
 _MADE_OF = "report.json"
-_IMAGE = re.compile(r"[0-9a-f]{20}_[a-z_]+\.(?:jpg|js)")
+_IMAGE = re.compile(r"([0-9a-f]{20})_[a-z_]+\.(?:jpg|png|js)")
+_INVISIBLE = re.compile(r"[\x00-\x1f\x7f-\x9f\u200b-\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
+_VIEW_SIZE = 960  # of the longer side, at most
+_SMALL = 480  # smaller views are enlarged by a whole number, so that their pixels stay square
+_QUALITY = 85
+
+
+@dataclass(frozen=True, kw_only=True)
+class Column:
+    """A value of each frame, and how the page shows it."""
+
+    key: str
+    """Unique name."""
+    title: str
+    unit: str = ""
+    """Unit of value × factor."""
+    decimals: int = 4
+    factor: float = 1.0
+    percent: bool = False
+    """True to show the value in per cent."""
+    higher_is_better: bool = False
+    signed: bool = False
+    """True if values above 0 are better and below 0 worse."""
+    listed: bool = True
+    """True to show it in the list of frames, not only in a frame's own view."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Table:
+    """A table of text; the first cell of each row is its title."""
+
+    caption: str
+    header: Sequence[str]
+    rows: Sequence[Sequence[str]]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Chart:
+    """Lines over fractions from 0 to 1."""
+
+    caption: str
+    x_title: str
+    y_title: str
+    lines: Mapping[str, Sequence[tuple[float, float]]]
+    """(x, y) by the name of the line; the last line is dashed."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Head:
+    """What a page shows of all frames together."""
+
+    kind: str
+    title: str
+    tiles: Sequence[tuple[str, str, str]] = ()
+    """Label, value and remark of the figures that are shown large."""
+    facts: Sequence[tuple[str, str]] = ()
+    notes: Sequence[str] = ()
+    tables: Sequence[Table] = ()
+    charts: Sequence[Chart] = ()
+    without_title: str = ""
+    without: Sequence[tuple[str, str]] = ()
+    """Name and reason of each frame that has no result."""
+    columns: Sequence[Column] = ()
+    sort_by: str = ""
+    """Key of the column that the page is sorted by at first."""
+    labels: Mapping[str, str]
+    """Titles of the views: `first` and `second` of the slider, `map`, and the others."""
+    thumb: str = "first"
+    """The view in the list of a frame that has no `image`."""
+    map_colours: Sequence[str] = ()
+    unit: str = "m"
+    """Unit of depth."""
 
 
 def check_report_folder(
@@ -91,10 +170,7 @@ def whole_report(folder: Path) -> Iterator[Path]:
         yield temporary
         images = {path.name for path in (temporary / IMAGES).iterdir()}
         viewer = (temporary / VIEWER).exists()
-    if not viewer:
-        _remove_viewer(folder)
-    _remove_images(folder / IMAGES, lambda name: name not in images)
-    _remove_old_images(folder)
+    _remove_unused(folder, lambda name, key: name not in images, viewer=viewer)
 
 
 def remove_report_leftovers(folder: Path) -> int:
@@ -102,32 +178,32 @@ def remove_report_leftovers(folder: Path) -> int:
 
     To be called only while nobody writes to the report.
     """
-    folders = (folder, folder / IMAGES, folder / _OLD_IMAGES)
     try:
-        return sum(remove_leftovers(each) for each in folders if each.is_dir())
+        return sum(remove_leftovers(each) for each in (folder, folder / IMAGES) if each.is_dir())
     except OSError as error:
         raise cannot_write(folder, error) from error
 
 
-def image_key(*parts: str) -> str:
-    """Returns the start of a frame's image names: fit for a file, and different for other parts."""
-    text = "\0".join(parts)
-    return hashlib.sha256(text.encode("utf-8", "surrogateescape")).hexdigest()[:20]
+def image_key(name: str) -> str:
+    """Returns the start of a frame's image names: fit for a file, and of this name alone."""
+    return hashlib.sha256(name.encode("utf-8", "surrogateescape")).hexdigest()[:20]
+
+
+def visible(text: str) -> str:
+    r"""Returns the text with invisible characters, such as a new line in a name, as \\uXXXX."""
+    return _INVISIBLE.sub(lambda found: f"\\u{ord(found[0]):04x}", text)
 
 
 def write_report(
-    folder: Path,
-    head: Mapping[str, Any],
-    frames: Iterable[Mapping[str, Any]],
-    *,
-    viewer: bool = False,
+    folder: Path, head: Head, frames: Iterable[Mapping[str, Any]], *, viewer: bool = False
 ) -> int:
     """Writes the page, removes images of frames that it does not have, and returns its size.
 
     Args:
         folder: The report's folder.
-        head: What report_page.js shows of all frames.
-        frames: A mapping per frame, taken one by one; its `key` is that of its images, or None.
+        head: What the page shows of all frames.
+        frames: A mapping per frame, taken one by one, as report.js shows it; its `key` is that of
+            its images, or None.
         viewer: Whether frames have 3D views, so that the page may run scripts of its folder.
 
     Returns:
@@ -137,52 +213,121 @@ def write_report(
         OutputError: The page cannot be written.
     """
     keys: set[str] = set()
-    start, end = _page(viewer=viewer).split("@DATA@")
+
+    def shown() -> Iterator[Any]:
+        for frame in frames:
+            keys.add(frame["key"])
+            yield plain(frame)
+
+    style, script = (_source(f"report.{kind}") for kind in ("css", "js"))
+    data = {
+        "columns": [asdict(column) for column in head.columns],
+        "sort_by": next((n for n, c in enumerate(head.columns) if c.key == head.sort_by), 0),
+        "labels": head.labels,
+        "thumb": head.thumb,
+        "unit": head.unit,
+        "map_colours": head.map_colours,
+        "depth_colours": swatches(DepthScale(low_m=1.0, high_m=2.0).paint(np.linspace(1, 2, 17))),
+        "logarithmic_from": LOGARITHMIC_FROM,
+    }
     page = folder / PAGE
+    parts = _environment().get_template("report.html").generate(
+        head=head, data=plain(data), frames=shown(), style=Markup(style), script=Markup(script),
+        policy=_policy(style, script, viewer=viewer), version=__version__,
+    )  # fmt: skip
     with (
         atomic_path(page) as temporary,
         temporary.open("w", encoding="utf-8", newline="\n") as file,
     ):
-        file.write(start)
-        file.write(_embedded(head).removesuffix("}") + ',"frames":[')
-        for number, frame in enumerate(frames):
-            file.write((",\n" if number else "\n") + _embedded(frame))
-            keys.add(frame["key"])
-        file.write("\n]}")
-        file.write(end)
+        file.writelines(parts)
     if viewer:
-        save_viewer(folder)
-    else:
-        _remove_viewer(folder)
-    _remove_images(folder / IMAGES, lambda name: name.partition("_")[0] not in keys)
-    _remove_old_images(folder)
+        text = "\n".join(_source(name) for name in ("../three/three.min.js", VIEWER))
+        _write_text(folder / VIEWER, text)
+    _remove_unused(folder, lambda name, key: key not in keys, viewer=viewer)
     return page.stat().st_size
 
 
-def _remove_viewer(folder: Path) -> None:
+def save_views(images: Path, key: str, views: Mapping[str, Pixels]) -> dict[str, dict[str, Any]]:
+    """Writes a JPEG of each view, at most 960 pixels long, and returns the page's entries of them.
+
+    Args:
+        images: The report's folder for images.
+        key: Start of their names.
+        views: (H, W, 3) by the name of the view.
+
+    Raises:
+        OutputError: A file cannot be written.
+    """
+    from PIL import Image
+
+    for name, pixels in views.items():
+        longest = max(pixels.shape[:2])
+        fit = _VIEW_SIZE // longest if longest < _SMALL else min(1.0, _VIEW_SIZE / longest)
+        with atomic_path(images / f"{key}_{name}.jpg") as temporary:
+            # Without chroma subsampling, which blurs edges between colours.
+            image = Image.fromarray(np.ascontiguousarray(resized(pixels, fit)))
+            image.save(temporary, "JPEG", quality=_QUALITY, subsampling=0)
+    return {name: {"src": f"{IMAGES}/{key}_{name}.jpg"} for name in views}
+
+
+def link_image(source: Path, target: Path) -> None:
+    """Makes `target` the same file as `source`, or a copy of it on another file system.
+
+    Raises:
+        OutputError: The file cannot be written.
+    """
     try:
-        (folder / VIEWER).unlink(missing_ok=True)
+        if target.exists() and _looks_same(source.stat(), target.stat()):
+            return
     except OSError as error:
-        raise cannot_write(folder, error) from error
+        raise cannot_write(target, error) from error
+    with atomic_path(target) as temporary:
+        temporary.unlink()
+        try:
+            os.link(source, temporary)
+        except OSError:
+            shutil.copy2(source, temporary)
 
 
-def _remove_old_images(folder: Path) -> None:
-    """Removes images of an earlier version's report, and their folder if it is then empty."""
-    old = folder / _OLD_IMAGES
-    if old.is_dir():
-        _remove_images(old, lambda name: True)
-        with suppress(OSError):
-            old.rmdir()  # fails where files of others are in it
+def save_view_3d(source: Path, target: Path) -> float:
+    """Writes a frame's 3D view as a script, which a page opened from disk can load.
+
+    Args:
+        source: As `write_view` of `pipeline.refinement.view_3d` wrote it.
+        target: The script.
+
+    Returns:
+        Its size in MB, rounded to 0.1 and at least that.
+
+    Raises:
+        InputError: The source cannot be read.
+        OutputError: The script cannot be written.
+    """
+    text = json.dumps(read_json(source), allow_nan=False, separators=(",", ":"))
+    _write_text(target, f"pnpdepthView({text});\n")
+    return max(0.1, round(target.stat().st_size / 1e6, 1))
 
 
-def _remove_images(images: Path, unused: Callable[[str], bool]) -> None:
-    """Removes images of a report, and no other file, by their names."""
+def _write_text(path: Path, text: str) -> None:
+    with atomic_path(path) as temporary:
+        temporary.write_text(text, encoding="utf-8", newline="\n")
+
+
+def _looks_same(source: os.stat_result, target: os.stat_result) -> bool:
+    return (source.st_mtime_ns, source.st_size) == (target.st_mtime_ns, target.st_size)
+
+
+def _remove_unused(folder: Path, unused: Callable[[str, str], bool], *, viewer: bool) -> None:
+    """Removes images of a report, and no other file, by their names and keys."""
     try:
-        for path in images.iterdir():
-            if _IMAGE.fullmatch(path.name) and unused(path.name):
+        if not viewer:
+            (folder / VIEWER).unlink(missing_ok=True)
+        for path in (folder / IMAGES).iterdir():
+            name = _IMAGE.fullmatch(path.name)
+            if name and (unused(path.name, name[1]) or (path.suffix == ".js" and not viewer)):
                 path.unlink(missing_ok=True)
     except OSError as error:
-        raise cannot_write(images, error) from error
+        raise cannot_write(folder, error) from error
 
 
 def _is_of(folder: Path, made_of: Mapping[str, Any] | None) -> bool:
@@ -192,32 +337,34 @@ def _is_of(folder: Path, made_of: Mapping[str, Any] | None) -> bool:
         return False
 
 
-def _page(*, viewer: bool) -> str:
-    """The page with style and script in it; its policy allows no request beyond its folder.
-
-    It allows no other script either, but for a report with 3D views those beside it.
-    """
-    html, style, script = (_template(kind) for kind in ("html", "css", "js"))
-    policy = (
-        f"default-src 'none'; img-src 'self' file: data:; style-src {_digest(style)};"
-        f" script-src {_digest(script)}{' file:' if viewer else ''}"
+def _environment() -> jinja2.Environment:
+    """Templates whose values are escaped: names of frames and files are untrusted text."""
+    environment = jinja2.Environment(
+        autoescape=True,
+        loader=jinja2.PackageLoader("pnpdepth_cli.io"),
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        finalize=lambda each: visible(each) if type(each) is str else each,
     )
-    parts = {"@POLICY@": policy, "@STYLE@": style, "@SCRIPT@": script}
-    for mark, text in parts.items():
-        html = html.replace(mark, text)
-    return html
+    environment.policies["json.dumps_kwargs"] = {"allow_nan": False, "separators": (",", ":")}
+    return environment
 
 
-def _template(kind: str) -> str:
-    return files(__package__).joinpath(f"report_page.{kind}").read_text(encoding="utf-8")
+def _source(name: str) -> str:
+    return files(__package__).joinpath("templates", name).read_text(encoding="utf-8")
 
 
-def _digest(text: str) -> str:
-    digest = hashlib.sha256(text.encode()).digest()
-    return f"'sha256-{base64.b64encode(digest).decode('ascii')}'"
+def _policy(style: str, script: str, *, viewer: bool) -> Markup:
+    """A policy that allows no request beyond the page's folder, and no script but its own.
 
-
-def _embedded(mapping: Mapping[str, Any]) -> str:
-    """JSON in ASCII that an HTML page can hold: frame names are untrusted text."""
-    text = json.dumps(plain(mapping), allow_nan=False, separators=(",", ":"))
-    return text.replace("<", "\\u003c")
+    A report with 3D views may also run the scripts beside it.
+    """
+    style, script = (
+        base64.b64encode(hashlib.sha256(text.encode()).digest()).decode("ascii")
+        for text in (style, script)
+    )
+    return Markup(
+        "default-src 'none'; img-src 'self' file: data:;"
+        f" style-src 'sha256-{style}'; script-src 'sha256-{script}'{' file:' if viewer else ''}"
+    )

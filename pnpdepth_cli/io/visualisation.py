@@ -1,8 +1,9 @@
-"""PNGs for people: inputs and depth before and after, and where refinement helped."""
+"""PNGs for people: inputs, depth before and after, its uncertainty, and where refinement helped."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -11,24 +12,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import InputError, NoPointsError, SizeError
+from pnpdepth_cli.io.atomic import atomic_path
 from pnpdepth_cli.io.colours import (
     DepthScale,
+    Pixels,
     depth_scale,
     dimmed,
     grey_of,
     paint_change,
+    paint_error,
     paint_gain,
 )
-from pnpdepth_cli.io.page import (
+from pnpdepth_cli.io.figure import (
     Panel,
-    depth_page,
+    depth_figure,
     draw_discs,
-    gain_page,
+    gain_figure,
+    hatched,
     magnification,
     resized,
-    save_page,
+    save_figure,
 )
-from pnpdepth_cli.io.uncertainty_images import hatched
 
 Depth = NDArray[np.float32]
 
@@ -51,11 +55,12 @@ def preview(
     unit: str = "m",
     *,
     valid: NDArray[np.bool_] | None = None,
+    linear: Depth | None = None,
 ) -> None:
     """Writes a PNG of image, sparse depth, depth before and after, and what changed.
 
     All depth panels have one colour scale. The last two show the signed change, and a close-up of
-    before and after where the change is largest.
+    before, linear if given, and after where the depth after differs most from the others.
 
     Args:
         rgb: (H, W, 3) in 0..1; None for a network without image.
@@ -66,12 +71,13 @@ def preview(
         path: The PNG.
         unit: Name of the unit of all depths, for the legend.
         valid: (H, W); the depth after is hatched where false. None: all is valid.
+        linear: (H, W) in `unit`, linear interpolation of the points; 0 where unknown.
 
     Raises:
         SizeError: Image and depth differ in size.
         OutputError: The file cannot be written.
     """
-    _check_same_size(before, after=after, image=rgb, mask=valid)
+    _check_same_size(before, after=after, image=rgb, mask=valid, linear=linear)
     height, width = before.shape
     columns = 1 if width > _WIDE * height else 2
     factor = magnification(before.shape, columns=columns, legend=True)
@@ -79,74 +85,164 @@ def preview(
     # Without an image, the depth in grey is the ground of the points.
     grey = grey_of(rgb) if rgb is not None else (1 - scale.position(after)).astype(np.float32)
     first = rgb if rgb is not None else np.repeat(0.25 + 0.65 * grey[:, :, None], 3, axis=2)
-    ground = resized(dimmed(grey), factor, smooth=True)
-    far_first = np.argsort(-sparse_depth, kind="stable")
-    discs = draw_discs(ground, sparse_xy, scale.paint(sparse_depth), factor, far_first)
-    count = f"{len(sparse_depth):,} point{'' if len(sparse_depth) == 1 else 's'}"
+    depths = {"before": before} | ({} if linear is None else {"linear": linear}) | {"after": after}
+    zoom = _zoom(depths, _area(sparse_xy))
     panels = [
         Panel(
             title="Image" if rgb is not None else "No image",
             pixels=resized(_bytes(first), factor, smooth=True),
             remark="" if rgb is not None else "depth in grey",
         ),
-        Panel(title="Sparse depth", pixels=discs, remark=count),
+        _points_panel(grey, sparse_xy, sparse_depth, scale, factor),
         Panel(title="Depth before", pixels=resized(scale.paint(before), factor)),
         Panel(
             title="Depth after",
             pixels=hatched(resized(scale.paint(after), factor), valid),
             remark="" if valid is None or valid.all() else "hatched: not valid",
         ),
-        *_change_panels(before, after, scale, grey, _area(sparse_xy)),
+        _change_panel(before, after, grey, factor, zoom),
+        _zoom_panel(depths, scale, zoom, panel_size=_size_of(before, factor)),
     ]
-    save_page(depth_page(panels, columns, scale, unit), path)
+    save_figure(depth_figure(panels, columns, scale, unit), path)
 
 
-def _change_panels(
+def overlay(
+    rgb: NDArray[np.float32], xy: NDArray[np.float32], depth: NDArray[np.float32], path: Path
+) -> None:
+    """Writes a PNG with N points in the colours of their depth on the grey image, nearest on top.
+
+    Args:
+        rgb: (H, W, 3) in 0..1.
+        xy: (N, 2) pixel coordinates.
+        depth: (N,) metres.
+        path: The PNG.
+
+    Raises:
+        OutputError: The file cannot be written.
+    """
+    scale = depth_scale(depth)
+    factor = magnification(rgb.shape, columns=1, legend=True)
+    panel = _points_panel(grey_of(rgb), xy, depth, scale, factor)
+    save_figure(depth_figure([panel], 1, scale), path)
+
+
+def sigma_preview(
+    sigma: Depth, valid: NDArray[np.bool_] | None, path: Path, unit: str = "m"
+) -> None:
+    """Writes a PNG of a standard deviation, hatched where depth is not valid.
+
+    Args:
+        sigma: (H, W) metres.
+        valid: (H, W). None: all is valid.
+        path: The PNG.
+        unit: Of sigma, where it is not the metre.
+
+    Raises:
+        OutputError: The file cannot be written.
+    """
+    scale = replace(depth_scale(sigma), warm_is_far=True)
+    factor = magnification(sigma.shape, columns=1, legend=True)
+    panel = Panel(
+        title="Standard deviation",
+        pixels=hatched(resized(scale.paint(sigma), factor), valid),
+        remark="of the depth" if valid is None or valid.all() else "hatched: not valid",
+    )
+    save_figure(depth_figure([panel], 1, scale, unit), path)
+
+
+def write_mask(path: Path, mask: NDArray[np.bool_]) -> None:
+    """Writes an 8-bit PNG, 255 where the mask (H, W) is true and 0 elsewhere."""
+    from PIL import Image
+
+    with atomic_path(path) as temporary:
+        Image.fromarray(np.where(mask, np.uint8(255), np.uint8(0))).save(temporary, "PNG")
+
+
+def error_map(
+    prediction: Depth, ground_truth: Depth, grey: NDArray[np.float32] | None
+) -> tuple[Pixels, float]:
+    """Returns a map of where the prediction is too far or too near, and its error of full colour.
+
+    Args:
+        prediction: (H, W) metres, 0 where there is none.
+        ground_truth: (H, W) metres, 0 where it is unknown or does not count.
+        grey: (H, W) in 0..1, the ground of the map; None for a uniform one.
+
+    Returns:
+        (H, W, 3) colours, and metres.
+    """
+    both = (prediction > 0) & (ground_truth > 0)
+    error = prediction[both].astype(np.float64) - ground_truth[both]
+    strongest = _strongest(error)
+    ground = np.full(ground_truth.shape, 0.3, np.float32) if grey is None else grey
+    pixels = dimmed(np.asarray(0.6 * ground, np.float32))
+    pixels[both] = paint_error(error / strongest, 0.66 + 0.3 * ground[both])
+    return pixels, strongest
+
+
+def _points_panel(
+    grey: NDArray[np.float32],
+    xy: NDArray[np.float32],
+    depth: Depth,
+    scale: DepthScale,
+    factor: float,
+) -> Panel:
+    """The points in the colours of their depth on the grey image, nearest on top."""
+    ground = resized(dimmed(grey), factor, smooth=True)
+    far_first = np.argsort(-depth, kind="stable")
+    discs = draw_discs(ground, xy, scale.paint(depth), factor, far_first)
+    count = f"{len(depth):,} point{'' if len(depth) == 1 else 's'}"
+    return Panel(title="Sparse depth", pixels=discs, remark=count)
+
+
+def _change_panel(
     before: Depth,
     after: Depth,
-    scale: DepthScale,
     grey: NDArray[np.float32],
-    of_points: tuple[slice, slice],
-) -> list[Panel]:
-    """The signed change in metres, and before and after side by side where most changed.
-
-    Only the rows and columns with points count for the zoom: elsewhere, such as in the sky, the
-    depth has nothing to follow.
-    """
-    columns = 1 if before.shape[1] > _WIDE * before.shape[0] else 2
-    factor = magnification(before.shape, columns=columns, legend=True)
+    factor: float,
+    zoom: tuple[int, int, int, int],
+) -> Panel:
+    """The signed change in metres, with a frame around the zoom."""
     both = (before > 0) & (after > 0) & np.isfinite(before) & np.isfinite(after)
     change = np.where(both, np.nan_to_num(after) - np.nan_to_num(before), 0).astype(np.float64)
     strongest = _strongest(change[both])
     pixels = dimmed(0.6 * grey)
     pixels[both] = paint_change(change[both] / strongest, 0.66 + 0.3 * grey[both])
-    relative = np.zeros_like(change)
-    relative[of_points] = (np.abs(change) / np.where(both, after, 1))[of_points]
-    top, left, height, width = _most_changed(relative)
     shown = resized(pixels, factor)
+    top, left, height, width = zoom
     low = (round(left * factor), round(top * factor))
     high = (round((left + width) * factor) - 1, round((top + height) * factor) - 1)
     cv2.rectangle(shown, low, high, _FRAME, 2)
-    area = np.s_[top : top + height, left : left + width]
-    size = (shown.shape[1] // 2, shown.shape[0])
-    halves = [
-        cv2.resize(scale.paint(depth[area]), size, interpolation=cv2.INTER_NEAREST)
-        if min(size) > 0
-        else shown[:, :0]
-        for depth in (before, after)
-    ]
-    zoom = np.full_like(shown, 255)
-    zoom[:, : size[0]] = halves[0]
-    zoom[:, shown.shape[1] - size[0] :] = halves[1]
-    zoom[:, size[0] - 1 : shown.shape[1] - size[0] + 1] = 255
-    return [
-        Panel(
-            title="Change",
-            pixels=shown,
-            remark=f"after - before: teal farther, purple nearer, full at {strongest:.3g}",
-        ),
-        Panel(title="Zoom", pixels=zoom, remark="before | after, where most changed (frame)"),
-    ]
+    remark = f"after - before: teal farther, purple nearer, full at {strongest:.3g}"
+    return Panel(title="Change", pixels=shown, remark=remark)
+
+
+def _zoom_panel(
+    depths: dict[str, Depth],
+    scale: DepthScale,
+    zoom: tuple[int, int, int, int],
+    panel_size: tuple[int, int],
+) -> Panel:
+    """The window of each depth, side by side."""
+    y, x, height, width = zoom
+    area = np.s_[y : y + height, x : x + width]
+    columns, rows = panel_size
+    part = columns // len(depths)
+    pixels = np.full((rows, columns, 3), 255, np.uint8)
+    starts = np.linspace(0, columns - part, len(depths)).round().astype(int)
+    for start, depth in zip(starts, depths.values(), strict=True) if part else ():
+        shown = cv2.resize(scale.paint(depth[area]), (part, rows), interpolation=cv2.INTER_NEAREST)
+        pixels[:, start : start + part] = shown
+    for left, right in pairwise(starts):
+        pixels[:, max(left + part - 1, 0) : right + 1] = 255
+    most = "where most changed" if "linear" not in depths else "where after differs most"
+    return Panel(title="Zoom", pixels=pixels, remark=f"{' | '.join(depths)}, {most} (frame)")
+
+
+def _size_of(depth: Depth, factor: float) -> tuple[int, int]:
+    """Width and height of the image resized by the factor."""
+    height, width = depth.shape
+    return max(1, round(width * factor)), max(1, round(height * factor))
 
 
 def _area(xy: NDArray[np.float32]) -> tuple[slice, slice]:
@@ -157,15 +253,24 @@ def _area(xy: NDArray[np.float32]) -> tuple[slice, slice]:
     return slice(max(top, 0), bottom + 1), slice(max(left, 0), right + 1)
 
 
-def _most_changed(relative: NDArray[np.float64]) -> tuple[int, int, int, int]:
-    """Top, left, height and width of the window with the largest mean relative change.
+def _zoom(depths: dict[str, Depth], of_points: tuple[slice, slice]) -> tuple[int, int, int, int]:
+    """Top, left, height and width of the window where the last depth differs most from the others.
 
-    Its width is halved, because two windows stand side by side.
+    The mean relative difference over the window counts, and only in rows and columns with points:
+    elsewhere, such as in the sky, the depth has nothing to follow. The window is as many times
+    narrower as there are depths, because they stand side by side.
     """
-    rows, columns = relative.shape
-    height, width = max(1, rows // _ZOOM), max(1, columns // (2 * _ZOOM))
-    bounded = np.minimum(relative, _strongest(relative))
-    total = cv2.integral(bounded)
+    *others, after = depths.values()
+    rows, columns = after.shape
+    height, width = max(1, rows // _ZOOM), max(1, columns // (len(depths) * _ZOOM))
+    relative = np.zeros((rows, columns))
+    for other in others:
+        both = (other > 0) & (after > 0) & np.isfinite(other) & np.isfinite(after)
+        difference = np.where(both, np.nan_to_num(after) - np.nan_to_num(other), 0)
+        relative += np.abs(difference.astype(np.float64)) / np.where(both, after, 1)
+    inside = np.zeros_like(relative)
+    inside[of_points] = np.minimum(relative, _strongest(relative[of_points]))[of_points]
+    total = cv2.integral(inside)
     window = (total[height:, width:] - total[:-height, width:] - total[height:, :-width]) + total[
         :-height, :-width
     ]
@@ -213,14 +318,11 @@ def improvement(
     pixels = dimmed(0.6 * grey)
     pixels[known] = paint_gain(gain[known] / strongest, 0.66 + 0.3 * grey[known], colors)
     factor = magnification(gt.shape, columns=1, legend=False)
-    swatch = None if known.all() else ((52, 52, 52), "no ground truth")
     panel = Panel(title="Change of error", pixels=resized(pixels, factor), remark=_GAIN)
     return _save_gain(
-        panel,
-        gain[known],
-        _GainKey(amount=f"{strongest:.3g} m or more", swatch=swatch, noun="pixels", colors=colors),
-        path,
-    )
+        panel, gain[known], path, amount=f"{strongest:.3g} m", noun="pixels", colors=colors,
+        unknown=None if known.all() else "no ground truth",
+    )  # fmt: skip
 
 
 def improvement_at_points(
@@ -267,16 +369,14 @@ def improvement_at_points(
     colours = paint_gain(gain / strongest, np.full(len(gain), 0.92), colors)
     weakest_first = np.argsort(np.abs(gain), kind="stable")
     discs = draw_discs(ground, xy, colours, factor, weakest_first)
-    remark = (
-        f"at {len(gain):,} held-out points"
-        if held_out
-        else (f"at the {len(gain):,} sparse points used")
+    remark = f"at {len(gain):,} held-out points"
+    panel = Panel(
+        title="Change of error",
+        pixels=discs,
+        remark=remark if held_out else f"at the {len(gain):,} sparse points used",
     )
-    panel = Panel(title="Change of error", pixels=discs, remark=remark)
     noun = "held-out points" if held_out else "points used"
-    amount = f"{strongest:.3g} {unit} or more"
-    key = _GainKey(amount=amount, swatch=None, noun=noun, colors=colors)
-    return _save_gain(panel, gain, key, path)
+    return _save_gain(panel, gain, path, amount=f"{strongest:.3g} {unit}", noun=noun, colors=colors)
 
 
 def _gain(before: Depth, after: Depth, gt: Depth) -> NDArray[np.float64]:
@@ -295,29 +395,36 @@ def _strongest(gain: NDArray[np.float64]) -> float:
     return float(np.percentile(changed, _STRONGEST_PERCENTILE)) if changed.size else 1.0
 
 
-@dataclass(frozen=True, kw_only=True)
-class _GainKey:
-    """What the colours of a map of gains mean."""
+def _save_gain(
+    panel: Panel,
+    gain: NDArray[np.float64],
+    path: Path,
+    *,
+    amount: str,
+    noun: str,
+    colors: str,
+    unknown: str | None = None,
+) -> float:
+    """Writes the panel with a colour bar and a footer.
 
-    amount: str
-    """Change of full colour."""
-    swatch: tuple[tuple[int, int, int], str] | None
-    """A colour outside the bar and its meaning."""
-    noun: str
-    """What is counted."""
-    colors: str
-    """One of `choices.COLORS`."""
+    Args:
+        panel: The map.
+        gain: (N,) gains.
+        path: The PNG.
+        amount: Change of full colour.
+        noun: What is counted.
+        colors: One of `choices.COLORS`.
+        unknown: Meaning of the dark pixels; None where there are none.
 
-
-def _save_gain(panel: Panel, gain: NDArray[np.float64], key: _GainKey, path: Path) -> float:
-    """Writes the panel with a colour bar and a footer. Returns the fraction with a gain above 0."""
+    Returns:
+        The fraction with a gain above 0.
+    """
     improved, worse = float((gain > 0).mean()), float((gain < 0).mean())
-    strength = np.linspace(-1, 1, 220)
-    bar = np.repeat(paint_gain(strength, np.full(220, 0.88), key.colors)[None], 18, axis=0)
-    counted = f"{gain.size:,} {key.noun}"
-    footer = f"{100 * improved:.1f} % of {counted} improved, {100 * worse:.1f} % worse"
-    ends = (f"worse by {key.amount}", f"better by {key.amount}")
-    save_page(gain_page(panel, bar, ends, key.swatch, footer), path)
+    bar = np.repeat(paint_gain(np.linspace(-1, 1, 220), np.full(220, 0.88), colors)[None], 18, 0)
+    swatch = None if unknown is None else ((52, 52, 52), unknown)
+    footer = f"{100 * improved:.1f} % of {gain.size:,} {noun} improved, {100 * worse:.1f} % worse"
+    ends = (f"worse by {amount} or more", f"better by {amount} or more")
+    save_figure(gain_figure(panel, bar, ends, swatch, footer), path)
     return improved
 
 

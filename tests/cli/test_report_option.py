@@ -28,7 +28,7 @@ def test_a_batch_and_its_evaluation_each_have_a_report(
     assert out.startswith("{")
     assert "wrote scores/index.html" in err
     frame = frames_of(Path("scores"))["b"]
-    assert frame["views"] == ["first", "second", "map", "image"]  # the record names the image
+    assert list(frame["views"]) == ["first", "second", "map", "image"]  # the record names the image
 
 
 def test_an_evaluation_replaces_a_report_only_if_asked(

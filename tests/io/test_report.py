@@ -1,8 +1,11 @@
 from __future__ import annotations
 
 import base64
+import errno
 import hashlib
+import os
 import re
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -12,18 +15,21 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pnpdepth_cli.errors import OutputError
+from pnpdepth_cli.io.atomic import atomic_path
 from pnpdepth_cli.io.report import (
-    _embedded,
+    Head,
     begin_report,
     check_report_folder,
     image_key,
+    link_image,
     remove_report_leftovers,
-    whole_report,
+    visible,
     write_report,
 )
 from tests.pipeline.report_pages import page_data
 
-HEAD = {"title": "a report"}
+LABELS = {"first": "Before", "second": "After", "map": "Change"}
+HEAD = Head(kind="Test", title="a report", labels=LABELS)
 NAMES = [
     "</script><script>alert(1)</script>",
     "<!-- \"'&amp; -->",
@@ -40,18 +46,25 @@ def frame(name: str, key: str | None = None) -> dict[str, Any]:
 
 def test_names_are_data_whatever_they_say(tmp_path: Path) -> None:
     begin_report(tmp_path, {"command": "eval"})
-    write_report(tmp_path, {"title": NAMES[0]}, (frame(name) for name in NAMES))
+    head = Head(kind="Test", title=NAMES[0], without=[(n, n) for n in NAMES], labels=LABELS)
+    write_report(tmp_path, head, (frame(name) for name in NAMES))
     data = page_data(tmp_path)
     assert data["title"] == NAMES[0]
     assert [each["name"] for each in data["frames"]] == NAMES
+    assert [name for name, _ in data["without"]] == [visible(name) for name in NAMES]
     text = (tmp_path / "index.html").read_text()
     assert text.count("<script") == text.count("</script>") == 2
 
 
 @given(st.text(st.characters(codec=None)))
-def test_embedded_json_ends_no_element_and_opens_none(text: str) -> None:
-    assert "<" not in _embedded({"text": text})
-    assert _embedded({"text": text}).isascii()
+def test_text_ends_no_element_and_opens_none(text: str) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        begin_report(Path(folder), {})
+        head = Head(kind=text, title="t", facts=[("a", text)], notes=[text], labels={"map": text})
+        write_report(Path(folder), head, [frame(text)])
+        page = (Path(folder) / "index.html").read_bytes()
+    ends = (f"</{each}>".encode() for each in ("script", "li", "dt", "dd", "h1", "td"))
+    assert [page.count(each) for each in ends] == [2, 1, 1, 1, 1, 0]
 
 
 def test_the_page_names_no_address_and_lets_nothing_run_but_itself(tmp_path: Path) -> None:
@@ -94,32 +107,37 @@ def test_images_of_no_frame_are_removed_and_nothing_else(tmp_path: Path) -> None
     assert left == {f"{kept}_map.jpg", "mine.jpg", f"{stale}.txt"}
 
 
-def test_a_report_of_an_earlier_version_is_replaced_with_its_images(tmp_path: Path) -> None:
-    begin_report(tmp_path, {"command": "batch"})
-    old, image = tmp_path / "pictures", f"{image_key('a')}_map.jpg"
-    old.mkdir()
-    (old / image).write_bytes(b"x")
-    (old / ".0123456789ab.jpg").write_bytes(b"half")
-    check_report_folder(tmp_path, [], made_of={"command": "batch"}, overwrite=False)
-    assert remove_report_leftovers(tmp_path) == 1
-    write_report(tmp_path, HEAD, [frame("a", image_key("a"))])
-    assert not old.exists()
-    old.mkdir()
-    for name in (image, "mine.jpg"):
-        (old / name).write_bytes(b"x")
-    with whole_report(tmp_path) as folder:
-        begin_report(folder, {"command": "eval"})
-    assert [path.name for path in old.iterdir()] == ["mine.jpg"]
+def test_keys_of_different_names_differ() -> None:
+    assert len({image_key(name) for name in ("a", "ab", "\udcff")}) == 3
 
 
-def test_keys_of_different_parts_differ() -> None:
-    keys = {
-        image_key("a", "bc"),
-        image_key("ab", "c"),
-        image_key("abc"),
-        image_key("\udcff"),
-    }
-    assert len(keys) == 4
+def test_a_linked_image_is_the_file_itself_until_that_changes(tmp_path: Path) -> None:
+    source, target = tmp_path / "source.png", tmp_path / "linked.png"
+    source.write_bytes(b"first")
+    for _ in range(2):
+        link_image(source, target)
+        assert target.samefile(source)
+    with atomic_path(source) as temporary:
+        temporary.write_bytes(b"second one")
+    assert target.read_bytes() == b"first"
+    link_image(source, target)
+    assert target.read_bytes() == b"second one"
+
+
+def test_an_image_on_another_file_system_is_copied(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: object) -> None:
+        raise OSError(errno.EXDEV, "Invalid cross-device link")
+
+    monkeypatch.setattr(os, "link", refuse)
+    source, target = tmp_path / "source.png", tmp_path / "copy.png"
+    source.write_bytes(b"image")
+    link_image(source, target)
+    written = target.stat().st_ino
+    link_image(source, target)
+    assert target.read_bytes() == b"image"
+    assert target.stat().st_ino == written != source.stat().st_ino
 
 
 def test_what_a_killed_writer_left_is_removed(tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from selenium.webdriver.common.by import By
 from selenium.webdriver.support.ui import WebDriverWait
 
 from pnpdepth_cli.errors import UsageError
-from pnpdepth_cli.io.report_view import VIEWER
+from pnpdepth_cli.io.report import VIEWER
 from tests.pipeline.batches import batch, pairs_on_disk
 from tests.pipeline.report_pages import page_data
 

@@ -8,7 +8,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from pnpdepth_cli.errors import InputError, NoPointsError, OutputError, SizeError
+from pnpdepth_cli.errors import (
+    FileFormatError,
+    InputError,
+    NoPointsError,
+    OutputError,
+    SizeError,
+)
 from pnpdepth_cli.io.colours import (
     UNKNOWN,
     DepthScale,
@@ -17,13 +23,14 @@ from pnpdepth_cli.io.colours import (
     round_steps,
 )
 from pnpdepth_cli.io.depth import read_depth, read_sparse
-from pnpdepth_cli.io.page import draw_discs, magnification, open_page
+from pnpdepth_cli.io.figure import draw_discs, figure_content, magnification
 from pnpdepth_cli.io.rgb import read_rgb
-from pnpdepth_cli.io.uncertainty_images import sigma_preview
 from pnpdepth_cli.io.visualisation import (
+    error_map,
     improvement,
     improvement_at_points,
     preview,
+    sigma_preview,
 )
 
 RED, GREEN = [214, 26, 30], [16, 140, 52]
@@ -34,6 +41,13 @@ def pixels_of(path: Path) -> np.ndarray:
     with Image.open(path) as image:
         image.load()
         return np.asarray(image)
+
+
+def panels_of(path: Path) -> dict[str, np.ndarray]:
+    """The panels of a figure by title, where it says that they are."""
+    pixels = pixels_of(path)
+    boxes = {panel["title"]: panel["box"] for panel in figure_content(path)["panels"]}
+    return {title: pixels[y : y + h, x : x + w] for title, (x, y, w, h) in boxes.items()}
 
 
 def scene(height: int, width: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -165,7 +179,7 @@ def test_the_preview_shows_the_signed_change_and_zooms_to_it(tmp_path: Path) -> 
     after[60:70, 90:100] = 5
     no_xy, no_depth = np.zeros((0, 2), np.float32), np.zeros(0, np.float32)
     preview(None, no_xy, no_depth, before, after, tmp_path / "p.png")
-    panels = open_page(tmp_path / "p.png").panels()
+    panels = panels_of(tmp_path / "p.png")
     assert list(panels)[4:] == ["Change", "Zoom"]
     change, zoom = panels["Change"], panels["Zoom"]
     factor = change.shape[0] // 80
@@ -177,18 +191,37 @@ def test_the_preview_shows_the_signed_change_and_zooms_to_it(tmp_path: Path) -> 
     assert len(np.unique(zoom[:, half + 2 :].reshape(-1, 3), axis=0)) == 2
 
 
+def test_the_zoom_shows_where_the_result_differs_most_from_linear_too(tmp_path: Path) -> None:
+    before, linear = np.full((80, 120), 4, np.float32), np.full((80, 120), 4, np.float32)
+    after = before.copy()
+    after[60:70, 90:100] = 4.5  # network and linear agree, and the result is another
+    linear[5:15, 10:20] = 4.4
+    no_xy, no_depth = np.zeros((0, 2), np.float32), np.zeros(0, np.float32)
+
+    def colours(**others: np.ndarray) -> list[int]:
+        preview(None, no_xy, no_depth, before, after, tmp_path / "p.png", **others)
+        zoom = panels_of(tmp_path / "p.png")["Zoom"]
+        parts = np.array_split(zoom, 2 + len(others), axis=1)
+        return [len(np.unique(part[:, 3:-3].reshape(-1, 3), axis=0)) for part in parts]
+
+    assert colours() == [1, 2]
+    assert colours(linear=linear) == [1, 1, 2]
+    after[:] = before
+    assert colours(linear=linear) == [1, 2, 1]
+
+
 def test_depth_that_is_not_valid_is_hatched(tmp_path: Path) -> None:
     rgb, depth, xy = scene(60, 80)
     valid = np.ones((60, 80), bool)
     valid[:20] = False
     preview(rgb, xy, at(depth, xy), depth, depth, tmp_path / "p.png", valid=valid)
-    panels = open_page(tmp_path / "p.png").panels()
+    panels = panels_of(tmp_path / "p.png")
     before, after = panels["Depth before"], panels["Depth after"]
     factor = before.shape[0] // 60
     assert np.array_equal(before[20 * factor :], after[20 * factor :])
     assert (after[: 20 * factor].astype(int) > before[: 20 * factor]).any(axis=2).all()
     sigma_preview(0.1 * depth, valid, tmp_path / "s.png")
-    assert list(open_page(tmp_path / "s.png").panels()) == ["Standard deviation"]
+    assert list(panels_of(tmp_path / "s.png")) == ["Standard deviation"]
 
 
 def test_nothing_changed_is_nothing_improved(tmp_path: Path) -> None:
@@ -315,3 +348,55 @@ def test_previews_of_real_frames_are_written(shared_data: Path, tmp_path: Path, 
     assert improvement(dense * 1.2, dense, gt, tmp_path / "i.png", rgb=rgb) == 1
     assert pixels_of(tmp_path / "p.png").shape[1] <= 1600
     assert pixels_of(tmp_path / "i.png").shape[1] <= 1600
+
+
+def test_the_error_map_has_different_colours_for_too_far_and_too_near() -> None:
+    truth = np.full((1, 4), 2, np.float32)
+    prediction = np.array([[3, 1, 2, 0]], np.float32)
+    pixels, strongest_m = error_map(prediction, truth, None)
+    assert strongest_m == 1
+    assert pixels[0, 0].tolist() == ORANGE
+    assert pixels[0, 1].tolist() == BLUE
+    right, none = pixels[0, 2], pixels[0, 3]
+    assert len(set(right.tolist())) == len(set(none.tolist())) == 1
+    assert right[0] > 150 > 80 > none[0]
+
+
+def test_an_error_map_without_any_error_is_grey() -> None:
+    depth = np.ones((3, 4), np.float32)
+    pixels, _ = error_map(depth, depth, np.full((3, 4), 0.5, np.float32))
+    assert (pixels == pixels[0, 0, 0]).all()
+
+
+def test_a_figure_says_where_its_panels_are(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    rgb = rng.random((480, 640, 3), dtype=np.float32)
+    depth = np.linspace(2, 6, rgb[..., 0].size, dtype=np.float32).reshape(480, 640)
+    xy = np.array([[5, 6]], np.float32)
+    path = tmp_path / "p.png"
+    preview(rgb, xy, np.array([3], np.float32), depth, depth + 1, path)
+    content, panels = figure_content(path), panels_of(path)
+    assert (content["low_m"], content["high_m"]) == pytest.approx((2, 7), abs=0.2)
+    assert content["size"] == pixels_of(path).shape[1::-1]
+    titles = ["Image", "Sparse depth", "Depth before", "Depth after", "Change", "Zoom"]
+    assert list(panels) == titles
+    assert np.array_equal(panels["Image"], np.rint(255 * rgb).astype(np.uint8))
+    assert panels["Depth before"].shape == (480, 640, 3)
+    improvement(depth, depth + 1, depth, tmp_path / "i.png")
+    content = figure_content(tmp_path / "i.png")
+    assert content["ends"] == ["worse by 1 m or more", "better by 1 m or more"]
+    assert content["footer"] == "0.0 % of 307,200 pixels improved, 100.0 % worse"
+    assert content["unknown"] is None
+    assert panels_of(tmp_path / "i.png")["Change of error"].shape == (960, 1280, 3)
+
+
+def test_what_is_no_figure_is_an_input_error(tmp_path: Path) -> None:
+    path = tmp_path / "p.png"
+    with pytest.raises(InputError, match="cannot be read"):
+        figure_content(path)
+    path.write_bytes(b"text")
+    with pytest.raises(InputError, match="cannot be read"):
+        figure_content(path)
+    Image.new("RGB", (4, 4)).save(path)
+    with pytest.raises(FileFormatError, match="no figure of this program"):
+        figure_content(path)

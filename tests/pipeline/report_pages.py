@@ -1,19 +1,56 @@
-"""The data in a report's page, for tests."""
+"""What a report's page shows, for tests."""
 
 from __future__ import annotations
 
 import json
+import re
+from html import unescape
 from pathlib import Path
 from typing import Any
 
-_BEFORE = '<script type="application/json" id="data">'
+_DATA = re.compile(r'(?s)<script type="application/json" id="data">(.*?)</script>')
 
 
 def page_data(folder: Path) -> dict[str, Any]:
-    """What the page in the folder is given to show."""
+    """The data of the page's script, and the text of its head."""
     text = (folder / "index.html").read_text()
-    data: dict[str, Any] = json.loads(text.split(_BEFORE)[1].split("</script>")[0])
-    return data
+    found = _DATA.search(text)
+    assert found
+    data: dict[str, Any] = json.loads(found[1])
+    head = text[: found.start()]
+
+    def pairs(element: str, first: str, second: str) -> list[tuple[str, ...]]:
+        (part,) = re.findall(f'(?s)id="{element}">(.*?)</[du]l>', head) or [""]
+        return _found(f"<{first}>(.*?)</{first}><{second}>(.*?)</{second}>", part)
+
+    (tiles,) = re.findall('(?s)id="tiles">(.*?)</dl>', head)
+    return {
+        **data["head"],
+        "frames": data["frames"],
+        "title": unescape(re.findall('id="title">(.*?)<', head)[0]),
+        "tiles": _found('<dt>(.*?)</dt><dd>(.*?)</dd><dd class="remark">(.*?)</dd>', tiles),
+        "facts": pairs("facts", "dt", "dd"),
+        "without": pairs("reasons", "strong", "span"),
+        "notes": re.findall("<li[^>]*>(.*?)</li>", head.split('id="notes">')[1].split("</ul>")[0]),
+        "tables": [
+            _table(each) for each in re.findall('(?s)<table class="means">(.*?)</table>', head)
+        ],
+        "charts": re.findall('<figure class="lines">', head),
+    }
+
+
+def _found(pattern: str, text: str) -> list[tuple[str, ...]]:
+    return [tuple(map(unescape, each)) for each in re.findall(pattern, text)]
+
+
+def _table(text: str) -> dict[str, Any]:
+    header, *rows = (
+        [unescape(cell) for cell in re.findall("<t[hd][^>]*>(.*?)</t[hd]>", row)]
+        for row in re.findall("(?s)<tr>(.*?)</tr>", text)
+    )
+    return {
+        "caption": unescape(re.findall("<caption>(.*?)<", text)[0]), "header": header, "rows": rows
+    }  # fmt: skip
 
 
 def frames_of(folder: Path) -> dict[str, dict[str, Any]]:

@@ -117,8 +117,8 @@ def run_batch(
         seconds = Counter[str]()
         if to_do:
             refined = _rows(request, batch, to_do, state, workers, listener, stopped)
-            with closing(refined if report is None else _drawn(report, refined)) as refined:
-                for row in refined:
+            with closing(refined) as rows:
+                for row in rows:
                     listener.frame(row)
                     began += 1
                     refined_frames += row["status"] != "failed"
@@ -271,7 +271,6 @@ def _report_of(request: BatchRequest, batch: BatchFrames) -> BatchReport | None:
     report = BatchReport(
         folder=request.html,
         output=request.output,
-        workers=request.workers,
         view_3d=request.html_3d,
         colors=request.refine.outputs.colors,
     )
@@ -279,12 +278,6 @@ def _report_of(request: BatchRequest, batch: BatchFrames) -> BatchReport | None:
     inputs = [request.source, *(files if request.html.exists() else ())]
     report.check(inputs, overwrite=request.refine.outputs.overwrite)
     return report
-
-
-def _drawn(report: BatchReport, rows: Generator[Row, None, None]) -> Generator[Row, None, None]:
-    """The rows, each after the report's images of its frame are written."""
-    with closing(rows):
-        yield from in_order(report.drawn, rows, report.workers)
 
 
 def _summarise(

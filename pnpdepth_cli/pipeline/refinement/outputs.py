@@ -12,8 +12,13 @@ from pnpdepth_cli.frames.frame import RefinedFrame
 from pnpdepth_cli.io.atomic import make_folder
 from pnpdepth_cli.io.cloud_files import write_cloud
 from pnpdepth_cli.io.depth import write_depth
-from pnpdepth_cli.io.uncertainty_images import sigma_preview, write_mask
-from pnpdepth_cli.io.visualisation import improvement, improvement_at_points, preview
+from pnpdepth_cli.io.visualisation import (
+    improvement,
+    improvement_at_points,
+    preview,
+    sigma_preview,
+    write_mask,
+)
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs
 from pnpdepth_cli.pipeline.refinement.output_files import Outputs
 from pnpdepth_cli.pipeline.refinement.output_range import output_scale

@@ -1,41 +1,38 @@
 """`pnpdepth batch --html`: each frame before and after refinement, with a map of the change.
 
 Everything is read from the results on disk: scores from the rows of the summary, images from the
-panels of the previews and the improvement maps. So a report also has the frames of earlier runs. An
-image is named after the files it is made of, so that it is made once.
+previews and the improvement maps, which the report links as they were written. So a report also has
+the frames of earlier runs.
 """
 
 from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from pnpdepth_cli.core.metrics import MEASURES, Measure
 from pnpdepth_cli.errors import InputError, OutputError
-from pnpdepth_cli.io.fingerprint import fingerprint
-from pnpdepth_cli.io.page import SavedPage, open_page
+from pnpdepth_cli.io.colours import paint_gain, swatches
+from pnpdepth_cli.io.figure import figure_content
 from pnpdepth_cli.io.report import (
     IMAGES,
+    Column,
+    Head,
+    Table,
     begin_report,
     check_report_folder,
     image_key,
+    link_image,
+    save_view_3d,
     write_report,
 )
-from pnpdepth_cli.io.report_images import gain_colours, image_paths, save_images
-from pnpdepth_cli.io.report_view import megabytes, save_view, view_path
 from pnpdepth_cli.pipeline.evaluation.score_files import column_title, format_value
-from pnpdepth_cli.pipeline.ordered_pool import in_order
-from pnpdepth_cli.pipeline.report.columns import (
-    Column,
-    column_of,
-    figures,
-    frames_text,
-    table,
-    tile,
-)
+from pnpdepth_cli.pipeline.report.evaluation import column_of, frames_text
 
 Row = dict[str, Any]
 
@@ -64,8 +61,6 @@ class BatchReport:
     """Where the report is written."""
     output: Path
     """The folder of the results."""
-    workers: int
-    """Threads that draw."""
     view_3d: bool = False
     """Whether the frames have 3D views."""
     colors: str = "blue-orange"
@@ -86,108 +81,79 @@ class BatchReport:
         """Creates the folder, marked so that the next run may replace it."""
         begin_report(self.folder, self._source())
 
-    def drawn(self, row: Row) -> Row:
-        """Writes the images of the row's frame, if it has results; returns the row."""
-        if row["outputs"]:
-            self._draw(row)
-        return row
-
     def write(self, summary: Mapping[str, Any], rows: Callable[[], Iterable[Row]]) -> None:
-        """Writes the page.
+        """Writes the page, and links the images of all frames.
 
         Args:
             summary: The batch's summary without its frames.
             rows: Gives the summary's rows, each time anew.
         """
-        overview = _Overview.of(rows())
         measured = any(summary["mean"][basis] for basis in (_GT, _HELD_OUT))
-        columns = _columns(measured)
-
-        def entry(row: Row) -> dict[str, Any]:
-            return self._entry(row, columns, measured, mixed=len(overview.bases) > 1)
-
-        results = (row for row in rows() if row["outputs"])
-        entries = in_order(entry, results, self.workers)
-        head = _head(summary, overview, columns, measured)
-        head["map_colours"] = gain_colours(self.colors)
+        bases, failed, first = set[str | None](), [], None
+        for row in rows():
+            if row["outputs"]:
+                first = first or row
+                bases.add(_basis(row))
+            else:
+                failed.append((row["name"], row["message"]))
+        head = _head(summary, first, failed, measured, self.colors)
+        mixed = len(bases - {None}) > 1
+        entries = (
+            self._entry(row, head.columns, measured, mixed=mixed)
+            for row in rows()
+            if row["outputs"]
+        )
         write_report(self.folder, head, entries, viewer=self.view_3d)
 
     def _source(self) -> dict[str, Any]:
         folder, output = self.folder.resolve(), self.output.resolve()
         return {"command": "batch", "output": os.path.relpath(output, folder)}
 
-    def _draw(self, row: Row) -> dict[str, Any]:
-        """As `drawn`; returns the page's entry of the images."""
-        files = [row["outputs"].get(kind) for kind in ("preview", "improvement")]
-        if None in files:
-            return {"key": None}
-        paths = [self.output / name for name in files]
-        try:
-            view = self._view_of(row)
-            made_of = [*paths, *([] if view is None else [view])]
-            key = image_key(*(fingerprint(path).sha256 for path in made_of))
-            preview, improvement = (open_page(path) for path in paths)
-            views = _views(preview, improvement)
-            images = self.folder / IMAGES
-            if not all(path.exists() for path in image_paths(images, key, views)):
-                panels = preview.panels() | improvement.panels()
-                named = {_PANELS[title]: panels[title] for title in panels if title in _PANELS}
-                thumb = "image" if "image" in views else "second"
-                save_images(images, key, named, thumb=thumb)
-            script = view_path(images, key)
-            if view is not None and not script.exists():
-                save_view(view, script)
-        except InputError:  # a result has gone or changed; the next run refines it again
-            return {"key": None}
-        return {
-            "key": key,
-            "views": views,
-            "view_mb": None if view is None else megabytes(script),
-            "scale_m": [preview.content["low_m"], preview.content["high_m"]],
-            "map": {name: improvement.content[name] for name in ("ends", "unknown", "footer")},
-        }
-
-    def _view_of(self, row: Row) -> Path | None:
-        """The 3D view of the row's frame."""
-        name = row["outputs"].get("view") if self.view_3d else None
-        return None if name is None else self.output / name
-
     def _entry(
-        self, row: Row, columns: list[Column], measured: bool, *, mixed: bool
+        self, row: Row, columns: Sequence[Column], measured: bool, *, mixed: bool
     ) -> dict[str, Any]:
         basis = _basis(row)
         values = _values(row, basis, measured)
         tag = _BASES[basis] if mixed and basis else ""
+        try:
+            views = self._views(row)
+        except InputError:  # a result has gone or changed; the next run refines it again
+            views = {"key": None}
         return {
             "name": row["name"],
             "values": [values.get(column.key) for column in columns],
             "notes": list(_notes(row, basis)),
             "tag": "diverged" if row["status"] == "diverged" else tag,
-            **self._draw(row),
+            **views,
         }
 
-
-@dataclass(frozen=True, kw_only=True)
-class _Overview:
-    """What all rows together say."""
-
-    bases: frozenset[str]
-    """What the frames' errors are measured on, keys of _BASES."""
-    first: Row | None
-    """The first row with results."""
-    failed: list[dict[str, str]]
-    """Name and reason of each frame without results."""
-
-    @classmethod
-    def of(cls, rows: Iterable[Row]) -> _Overview:
-        bases, failed, first = set[str](), [], None
-        for row in rows:
-            if row["outputs"]:
-                first = first or row
-                bases.add(_basis(row) or "")
-            else:
-                failed.append({"name": row["name"], "reason": row["message"]})
-        return cls(bases=frozenset(bases - {""}), first=first, failed=failed)
+    def _views(self, row: Row) -> dict[str, Any]:
+        """Links the images of the row's frame; returns the page's entry of them."""
+        files = {kind: row["outputs"].get(kind) for kind in ("preview", "improvement", "view")}
+        if not (files["preview"] and files["improvement"]):
+            return {"key": None}
+        key, views = image_key(row["name"]), {}
+        preview, improvement = (
+            figure_content(self.output / files[kind]) for kind in ("preview", "improvement")
+        )
+        for kind, figure in (("preview", preview), ("improvement", improvement)):
+            name = f"{IMAGES}/{key}_{kind}.png"
+            link_image(self.output / files[kind], self.folder / name)
+            for panel in figure["panels"]:
+                if panel["title"] in _PANELS:
+                    place = {"src": name, "box": panel["box"], "size": figure["size"]}
+                    views[_PANELS[panel["title"]]] = place
+        view_mb = None
+        if self.view_3d and files["view"]:
+            script = self.folder / IMAGES / f"{key}_view.js"
+            view_mb = save_view_3d(self.output / files["view"], script)
+        return {
+            "key": key,
+            "views": views,
+            "view_mb": view_mb,
+            "scale_m": [preview["low_m"], preview["high_m"]],
+            "map": {name: improvement[name] for name in ("ends", "unknown", "footer")},
+        }
 
 
 def _holds_results(path: Path, output: Path, folder: Path) -> bool:
@@ -195,16 +161,11 @@ def _holds_results(path: Path, output: Path, folder: Path) -> bool:
     return folder.is_relative_to(output) and output.is_relative_to(path.resolve())
 
 
-def _views(preview: SavedPage, improvement: SavedPage) -> list[str]:
-    titles = [panel["title"] for page in (preview, improvement) for panel in page.content["panels"]]
-    return [view for title, view in _PANELS.items() if title in titles]
-
-
 def _basis(row: Row) -> str | None:
     return next((basis for basis in _BASES if row[basis]), None)
 
 
-def _columns(measured: bool) -> list[Column]:
+def _columns(measured: bool, unit: str) -> list[Column]:
     """Errors before and after; with gains if any frame has ground truth or held-out points."""
     columns = []
     for key, measure in _ERRORS.items():
@@ -218,7 +179,7 @@ def _columns(measured: bool) -> list[Column]:
             )  # fmt: skip
         for stage in ("before", "after"):
             title, name = f"{measure.title} {stage}", f"{key}_{stage}"
-            columns.append(column_of(measure, title=title, key=name, listed=True))
+            columns.append(column_of(in_unit(measure, unit), title=title, key=name, listed=True))
     improved = Column(
         key="improved", title="Improved", decimals=1, percent=True, higher_is_better=True
     )
@@ -255,25 +216,38 @@ def _notes(row: Row, basis: str | None) -> Iterator[str]:
 
 
 def _head(
-    summary: Mapping[str, Any], overview: _Overview, columns: list[Column], measured: bool
-) -> dict[str, Any]:
+    summary: Mapping[str, Any],
+    first: Row | None,
+    failed: list[tuple[str, str]],
+    measured: bool,
+    colors: str,
+) -> Head:
     unmatched = len(summary["unmatched"])
-    return {
-        "kind": "Batch refinement",
-        "title": summary["output"],
-        "tiles": _tiles(summary, measured),
-        "facts": _facts(summary, overview.first),
-        "notes": [f"warning: {unmatched:,} files are in no frame; summary.json has them"]
-        if unmatched
-        else [],
-        "tables": [
-            each
-            for basis in _BASES
-            if summary["mean"][basis]
-            for each in [_means(basis, summary["mean"][basis])]
-        ]
-        + _baselines(summary.get("baselines"), summary["unit"]),
-        "labels": {
+    notes = [f"warning: {unmatched:,} files are in no frame; summary.json has them"]
+    unit = summary["unit"]
+    means = {basis: summary["mean"][basis] for basis in _BASES if summary["mean"][basis]}
+    return Head(
+        kind="Batch refinement",
+        title=summary["output"],
+        tiles=_tiles(summary, measured),
+        facts=_facts(summary, first),
+        notes=[
+            *(notes if unmatched else []),
+            *(
+                ["Without ground truth or --holdout, no error is measured."]
+                if means and not measured
+                else []
+            ),
+        ],
+        tables=[
+            *(_means(basis, mean, unit) for basis, mean in means.items()),
+            *_baselines(summary.get("baselines"), unit),
+        ],
+        without_title=f"Not refined: {len(failed):,}",
+        without=failed,
+        columns=_columns(measured, unit),
+        sort_by="rmse_gain" if measured else "rmse_after",
+        labels={
             "first": "Before",
             "second": "After",
             "map": "Change of error",
@@ -281,94 +255,98 @@ def _head(
             "sparse": "Sparse depth",
             "gt": "Ground truth",
         },
-        "without_title": f"Not refined: {len(overview.failed):,}",
-        "without": overview.failed,
-        **figures(columns, "rmse_gain" if measured else "rmse_after"),
-    }
+        thumb="second",
+        map_colours=swatches(paint_gain(np.linspace(-1, 1, 9), np.full(9, 0.88), colors)),
+        unit=unit,
+    )
 
 
-def _tiles(summary: Mapping[str, Any], measured: bool) -> list[dict[str, str]]:
+def _tiles(summary: Mapping[str, Any], measured: bool) -> list[tuple[str, str, str]]:
+    """The number of frames, and errors that were not measured at the points used."""
     counts = summary["counts"]
     refined = counts["done"] + counts["diverged"]
     others = [
         f"{counts[kind]:,} {kind}" for kind in ("diverged", "failed", "pending") if counts[kind]
     ]
-    tiles = [tile("Frames refined", f"{refined:,} of {counts['frames']:,}", ", ".join(others))]
-    for basis in (_GT, _HELD_OUT) if measured else (_USED,):
+    tiles = [("Frames refined", f"{refined:,} of {counts['frames']:,}", ", ".join(others))]
+    for basis in (_GT, _HELD_OUT):
         mean = summary["mean"][basis]
         for key, measure in _ERRORS.items() if mean else ():
             before, after = (mean[stage].get(key) for stage in ("before", "after"))
             change = f"{format_value(measure, before)} → {format_value(measure, after)}"
             gain = _gain(before, after)
-            gain_text = ""
-            if gain is not None and basis != _USED:
-                gain_text = f"gain {_signed(100 * gain, 1, '%')} "
-            tiles.append(
-                tile(f"{measure.title} [{summary['unit']}]", change, f"{gain_text}{_BASES[basis]}")
-            )
+            gain_text = "" if gain is None else f"gain {_signed(100 * gain, 1, '%')} "
+            label = f"{measure.title} [{summary['unit']}]"
+            tiles.append((label, change, f"{gain_text}{_BASES[basis]}"))
     return tiles
 
 
-def _facts(summary: Mapping[str, Any], first: Row | None) -> list[list[str]]:
+def _facts(summary: Mapping[str, Any], first: Row | None) -> list[tuple[str, str]]:
     settings = summary["settings"]
     facts = [
-        ["Frames of", f"{summary['source']} (layout {summary['layout']})"],
-        ["Results in", summary["output"]],
-        ["Network", str(settings["model"])],
+        ("Frames of", f"{summary['source']} (layout {summary['layout']})"),
+        ("Results in", summary["output"]),
+        ("Network", str(settings["model"])),
     ]
     if summary["method"]["kind"] == "chosen":
-        facts.append(["Refinement", "each frame by its best candidate at held-out points"])
+        facts.append(("Refinement", "each frame by its best candidate at held-out points"))
     elif first is not None:
         used = first["settings"]
         refined = f"{used['iterations']} updates of z at {used['layer']}"
         facts.append(
-            ["Refinement", f"{refined} ({used['update']}, {used['loss']}, step {used['lr']})"]
+            ("Refinement", f"{refined} ({used['update']}, {used['loss']}, step {used['lr']})")
         )
-        facts.append(["Alignment", str(used["align"])])
+        facts.append(("Alignment", str(used["align"])))
     if settings["propagate"]:
-        facts.append(["Propagation", settings["propagate"]])
+        facts.append(("Propagation", settings["propagate"]))
     if settings["holdout"]:
-        facts.append(
-            ["Held out", f"{settings['holdout']:.0%} of the points, seed {settings['seed']}"]
-        )
+        held_out = f"{settings['holdout']:.0%} of the points, seed {settings['seed']}"
+        facts.append(("Held out", held_out))
     if summary["counts"]["with_warnings"]:
-        facts.append(["Warnings", f"in {frames_text(summary['counts']['with_warnings'])}"])
+        facts.append(("Warnings", f"in {frames_text(summary['counts']['with_warnings'])}"))
     return facts
 
 
-def _means(basis: str, mean: Mapping[str, Any]) -> dict[str, Any]:
+def _means(basis: str, mean: Mapping[str, Any], unit: str) -> Table:
     measures: Iterable[Measure] = MEASURES if basis == _GT else _ERRORS.values()
-    header = ["", "before", "after", *([] if basis == _USED else ["gain"])]
     rows = []
     for measure in measures:
         before, after = (mean[stage].get(measure.key) for stage in ("before", "after"))
-        row = [column_title(measure), format_value(measure, before), format_value(measure, after)]
-        if basis != _USED:
-            row.append(_gain_text(measure, before, after))
-        rows.append(row)
+        title = column_title(in_unit(measure, unit))
+        values = [format_value(measure, before), format_value(measure, after)]
+        rows.append([title, *values, _gain_text(measure, before, after)])
     if basis == _GT:
-        rows.append(
-            [
-                "coverage",
-                *(_percent(mean[stage].get("coverage")) for stage in ("before", "after")),
-                "",
-            ]
-        )
-    return table(f"Means over {frames_text(mean['frames'])}, {_BASES[basis]}", header, rows)
+        coverage = [_percent(mean[stage].get("coverage")) for stage in ("before", "after")]
+        rows.append(["coverage", *coverage, ""])
+    shown = 3 if basis == _USED else 4  # a gain at the points used means nothing
+    return Table(
+        caption=f"Means over {frames_text(mean['frames'])}, {_BASES[basis]}",
+        header=["", "before", "after", "gain"][:shown],
+        rows=[row[:shown] for row in rows],
+    )
 
 
-def _baselines(mean: Mapping[str, Mapping[str, Any]] | None, unit: str) -> list[dict[str, Any]]:
+def _baselines(mean: Mapping[str, Mapping[str, Any]] | None, unit: str) -> list[Table]:
     """A table of the simple baselines, the network and the result; empty without --baselines."""
     if not mean:
         return []
     mae = _ERRORS["mae"]
-    header = ["", f"MAE at held-out points [{unit}]", "MAE [m]", "RMSE [m]", "frames"]
+    errors = {
+        "held_out_mae": f"MAE at held-out points [{unit}]",
+        "mae": f"MAE [{unit}]",
+        "rmse": f"RMSE [{unit}]",
+    }
     rows = [
-        [name, *(format_value(mae, row[key]) for key in ("held_out_mae", "mae", "rmse")),
-         f"{row['frames']:,}"]
+        [name, *(format_value(mae, row[key]) for key in errors), f"{row['frames']:,}"]
         for name, row in mean.items()
-    ]  # fmt: skip
-    return [table("Simple baselines: means over frames", header, rows)]
+    ]
+    header = ["", *errors.values(), "frames"]
+    return [Table(caption="Simple baselines: means over frames", header=header, rows=rows)]
+
+
+def in_unit(measure: Measure, unit: str) -> Measure:
+    """Returns the measure of depths whose unit is not the metre, such as a model's."""
+    return replace(measure, unit=unit) if measure.unit == "m" else measure
 
 
 def _percent(value: float | None) -> str:

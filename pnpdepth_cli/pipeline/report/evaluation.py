@@ -2,26 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pnpdepth_cli.core.metrics import Measure
 from pnpdepth_cli.errors import InputError, PnpDepthError
-from pnpdepth_cli.io.colours import depth_scale, grey_of
+from pnpdepth_cli.io.colours import depth_scale, grey_of, paint_error, swatches
 from pnpdepth_cli.io.dataset.hdf5 import rgb_of
 from pnpdepth_cli.io.layouts import Hdf5Array
 from pnpdepth_cli.io.report import (
+    Chart,
+    Column,
+    Head,
+    Table,
     begin_report,
     check_report_folder,
     image_key,
+    save_views,
     whole_report,
     write_report,
 )
-from pnpdepth_cli.io.report_images import error_colours, error_map, save_images
 from pnpdepth_cli.io.rgb import read_rgb
+from pnpdepth_cli.io.visualisation import error_map
 from pnpdepth_cli.pipeline.evaluation.frame_reading import Depth, load_frame
 from pnpdepth_cli.pipeline.evaluation.frame_scoring import FrameScores
 from pnpdepth_cli.pipeline.evaluation.kitti_devkit import fill_background
@@ -32,16 +38,9 @@ from pnpdepth_cli.pipeline.evaluation.score_files import (
     column_title,
     format_value,
     interval_text,
+    unit_of,
 )
 from pnpdepth_cli.pipeline.ordered_pool import in_order
-from pnpdepth_cli.pipeline.report.columns import (
-    Column,
-    column_of,
-    figures,
-    frames_text,
-    table,
-    tile,
-)
 
 _SOURCE = {"command": "eval"}
 _LISTED = ("rmse", "mae", "mre", "irmse", "delta1")
@@ -86,6 +85,25 @@ def write_eval_report(
         write_report(temporary, _head(evaluation, columns), entries(images))
 
 
+def column_of(measure: Measure, *, title: str = "", key: str = "", listed: bool) -> Column:
+    """Returns the column of a measure, with its own title and key or other ones."""
+    return Column(
+        key=key or measure.key,
+        title=title or measure.title,
+        unit=unit_of(measure),
+        decimals=measure.decimals,
+        factor=measure.shown_factor,
+        percent=measure.percent,
+        higher_is_better=measure.higher_is_better,
+        listed=listed,
+    )
+
+
+def frames_text(count: int) -> str:
+    """Returns text such as `12 frames`."""
+    return f"{count:,} frame{'' if count == 1 else 's'}"
+
+
 def _columns(evaluation: Evaluation) -> list[Column]:
     measures = evaluation.protocol.measures
     keys = {measure.key for measure in measures}
@@ -96,63 +114,60 @@ def _columns(evaluation: Evaluation) -> list[Column]:
     ]
 
 
-def _head(evaluation: Evaluation, columns: list[Column]) -> dict[str, Any]:
+def _head(evaluation: Evaluation, columns: list[Column]) -> Head:
     request = evaluation.request
-    without = [frame for frame in evaluation.frames if not frame.scored]
+    without = [(frame.name, frame.error or "") for frame in evaluation.frames if not frame.scored]
     filled = " (filled in)" if evaluation.protocol.is_devkit else ""
-    return {
-        "kind": "Depth evaluation",
-        "title": str(request.prediction),
-        "tiles": _tiles(evaluation),
-        "facts": [
-            ["Prediction", str(request.prediction)],
-            ["Ground truth", str(request.ground_truth)],
-            *([["Sparse depth", str(request.sparse)]] if request.sparse else []),
-            ["Protocol", evaluation.protocol.describe()],
-            ["Pixels scored", f"{sum(frame.pixels for frame in evaluation.frames):,}"],
+    return Head(
+        kind="Depth evaluation",
+        title=str(request.prediction),
+        tiles=_tiles(evaluation),
+        facts=[
+            ("Prediction", str(request.prediction)),
+            ("Ground truth", str(request.ground_truth)),
+            *([("Sparse depth", str(request.sparse))] if request.sparse else []),
+            ("Protocol", evaluation.protocol.describe()),
+            ("Pixels scored", f"{sum(frame.pixels for frame in evaluation.frames):,}"),
         ],
-        "notes": list(evaluation.notes),
-        "tables": [
+        notes=evaluation.notes,
+        tables=[
             _means(evaluation),
             *_uncertainty(evaluation),
             *_bins("By distance to the nearest sparse point", "px", evaluation.by_distance),
             *_bins("By depth of the ground truth", "m", evaluation.by_depth),
         ],
-        "charts": _charts(evaluation),
-        "labels": {
+        charts=_charts(evaluation),
+        without_title=f"Not scored: {len(without):,}",
+        without=without,
+        columns=columns,
+        sort_by="rmse",
+        labels={
             "first": f"Prediction{filled}", "second": "Ground truth", "map": "Error",
             "image": "Image",
         },
-        "map_colours": error_colours(),
-        "without_title": f"Not scored: {len(without):,}",
-        "without": [{"name": frame.name, "reason": frame.error} for frame in without],
-        **figures(columns, "rmse"),
-    }  # fmt: skip
+        map_colours=swatches(paint_error(np.linspace(-1, 1, 9), np.full(9, 0.88))),
+    )  # fmt: skip
 
 
-def _tiles(evaluation: Evaluation) -> list[dict[str, str]]:
+def _tiles(evaluation: Evaluation) -> list[tuple[str, str, str]]:
     frames, scored = len(evaluation.frames), len(evaluation.scored)
-    unscored = [
-        f"{len(some):,} {reason}"
-        for some, reason in (
-            (evaluation.missing, "without prediction"),
-            (evaluation.failed, "with a faulty file"),
-        )
-        if some
-    ]
-    means = [
-        tile(measure.title, f"{format_value(measure, evaluation.mean[measure.key], unit=True)}")
-        for measure in evaluation.protocol.measures
-        if measure.key in ("rmse", "mae", "delta1")
-    ]
-    coverage = tile(
-        "Coverage", f"{evaluation.coverage:.2%}", "of the ground truth has a prediction"
-    )
+    missing, failed = len(evaluation.missing), len(evaluation.failed)
+    unscored = [f"{missing:,} without prediction"] if missing else []
+    unscored += [f"{failed:,} with a faulty file"] if failed else []
     of = f"{scored:,} of {frames:,}" if scored != frames else f"{frames:,}"
-    return [tile("Frames scored", of, ", ".join(unscored)), *means, coverage]
+    coverage = f"{evaluation.coverage:.2%}"
+    return [
+        ("Frames scored", of, ", ".join(unscored)),
+        *(
+            (measure.title, format_value(measure, evaluation.mean[measure.key], unit=True), "")
+            for measure in evaluation.protocol.measures
+            if measure.key in ("rmse", "mae", "delta1")
+        ),
+        ("Coverage", coverage, "of the ground truth has a prediction"),
+    ]
 
 
-def _means(evaluation: Evaluation) -> dict[str, Any]:
+def _means(evaluation: Evaluation) -> Table:
     measures, interval = evaluation.protocol.measures, evaluation.interval
     header, rows = ["", "mean"], []
     for measure in measures:
@@ -166,94 +181,73 @@ def _means(evaluation: Evaluation) -> dict[str, Any]:
     if interval is not None:
         header.append("95 %")
         caption += f"; {evaluation.describe_interval()}"
-    return table(caption, header, rows)
+    return Table(caption=caption, header=header, rows=rows)
 
 
-def _uncertainty(evaluation: Evaluation) -> list[dict[str, Any]]:
+def _uncertainty(evaluation: Evaluation) -> list[Table]:
     """Calibration and sparsification of the predicted standard deviation, if there is one."""
-    uncertainty = evaluation.uncertainty
-    if uncertainty is None:
+    found = evaluation.uncertainty
+    if found is None:
         return []
-    calibration = [
-        [f"{expected:.1%}", f"{observed:.1%}"]
-        for expected, observed in zip(uncertainty.expected, uncertainty.observed, strict=True)
-    ]
-    sparsification = [
-        [f"{removed:.0%}", f"{error:.4f}", f"{best:.4f}"]
-        for removed, error, best in zip(
-            uncertainty.removed, uncertainty.sparsification, uncertainty.oracle, strict=True
-        )
-    ]
-    frames = frames_text(uncertainty.frames)
+    calibration = zip(found.expected, found.observed, strict=True)
+    sparsification = zip(found.removed, found.sparsification, found.oracle, strict=True)
+    frames = frames_text(found.frames)
     return [
-        table(
-            f"Calibration of the standard deviation, {frames}: {uncertainty.within_1_sigma:.1%}"
-            f" within 1σ, {uncertainty.within_2_sigma:.1%} within 2σ",
-            ["normal distribution", "observed"],
-            calibration,
+        Table(
+            caption=f"Calibration of the standard deviation, {frames}: {found.within_1_sigma:.1%}"
+            f" within 1σ, {found.within_2_sigma:.1%} within 2σ",
+            header=["normal distribution", "observed"],
+            rows=[[f"{expected:.1%}", f"{observed:.1%}"] for expected, observed in calibration],
         ),
-        table(
-            f"Sparsification, {frames}: AUSE {uncertainty.ause:.4f} of the MAE",
-            ["removed", "MAE by σ [m]", "MAE by error [m]"],
-            sparsification,
+        Table(
+            caption=f"Sparsification, {frames}: AUSE {found.ause:.4f} of the MAE",
+            header=["removed", "MAE by σ [m]", "MAE by error [m]"],
+            rows=[
+                [f"{part:.0%}", f"{mae:.4f}", f"{best:.4f}"] for part, mae, best in sparsification
+            ],
         ),
     ]
 
 
-def _charts(evaluation: Evaluation) -> list[dict[str, Any]]:
+def _charts(evaluation: Evaluation) -> list[Chart]:
     """The calibration plot and the sparsification curve of the predicted standard deviation."""
-    uncertainty = evaluation.uncertainty
-    if uncertainty is None:
+    found = evaluation.uncertainty
+    if found is None:
         return []
-    frames = frames_text(uncertainty.frames)
-    observed = _line("observed", uncertainty.expected, uncertainty.observed)
+    frames = frames_text(found.frames)
     charts = [
-        _chart(
-            f"Calibration, {frames}",
-            ("errors within the interval if normal", "observed"),
-            [observed, _line("normal", (0, 1), (0, 1), dashed=True)],
+        Chart(
+            caption=f"Calibration, {frames}",
+            x_title="errors within the interval if normal",
+            y_title="observed",
+            lines={
+                "observed": list(zip(found.expected, found.observed, strict=True)),
+                "normal": [(0, 0), (1, 1)],
+            },
         )
     ]
-    whole = uncertainty.sparsification[0]
-    if whole:
-        curves = (
-            [value / whole for value in curve]
-            for curve in (uncertainty.sparsification, uncertainty.oracle)
+    if whole := found.sparsification[0]:
+        by_sigma, by_error = (
+            [(part, mae / whole) for part, mae in zip(found.removed, curve, strict=True)]
+            for curve in (found.sparsification, found.oracle)
         )
-        by_sigma, by_error = curves
         charts.append(
-            _chart(
-                f"Sparsification, {frames}: AUSE {uncertainty.ause:.4f}",
-                ("pixels removed", "MAE of the others"),
-                [
-                    _line("by σ", uncertainty.removed, by_sigma),
-                    _line("by error (oracle)", uncertainty.removed, by_error, dashed=True),
-                ],
+            Chart(
+                caption=f"Sparsification, {frames}: AUSE {found.ause:.4f}",
+                x_title="pixels removed",
+                y_title="MAE of the others",
+                lines={"by σ": by_sigma, "by error (oracle)": by_error},
             )
         )
     return charts
 
 
-def _chart(caption: str, titles: tuple[str, str], lines: list[dict[str, Any]]) -> dict[str, Any]:
-    """Lines over fractions from 0 to 1, upwards to 1 or to the highest value."""
-    top = max(1.0, *(y for line in lines for _, y in line["points"]))
-    x_title, y_title = titles
-    return {
-        "caption": caption, "x_title": x_title, "y_title": y_title, "top": top, "lines": lines,
-    }  # fmt: skip
-
-
-def _line(
-    label: str, x: Sequence[float], y: Sequence[float], *, dashed: bool = False
-) -> dict[str, Any]:
-    return {"label": label, "points": list(zip(x, y, strict=True)), "dashed": dashed}
-
-
-def _bins(caption: str, unit: str, bins: tuple[ErrorBin, ...]) -> list[dict[str, Any]]:
+def _bins(caption: str, unit: str, bins: tuple[ErrorBin, ...]) -> list[Table]:
     if not bins:
         return []
     header = [f"[{unit}]", "of the ground truth", "RMSE [m]", "MAE [m]", "MRE", "coverage"]
-    return [table(f"{caption}, all pixels together", header, bin_rows(bins))]
+    caption = f"{caption}, all pixels together"
+    return [Table(caption=caption, header=header, rows=bin_rows(bins))]
 
 
 def _entry(
@@ -290,17 +284,16 @@ def _drawn(frame: FrameScores, evaluation: Evaluation, images: Path) -> dict[str
     if protocol.is_devkit:
         depth = np.maximum(fill_background(depth), np.float32(0))
     image = _image(frame.pair, gt)
-    errors = error_map(depth, gt, None if image is None else grey_of(image))
+    errors, strongest_m = error_map(depth, gt, None if image is None else grey_of(image))
     scale = depth_scale(depth, gt)
-    views = {"first": scale.paint(depth), "second": scale.paint(gt), "map": errors.pixels}
+    views = {"first": scale.paint(depth), "second": scale.paint(gt), "map": errors}
     if image is not None:
         views["image"] = np.asarray(np.rint(255 * np.clip(image, 0, 1)), np.uint8)
     key = image_key(frame.name)
-    save_images(images, key, views, thumb="first" if image is None else "image")
-    amount = f"by {errors.strongest_m:.3g} m or more"
+    amount = f"by {strongest_m:.3g} m or more"
     return {
         "key": key,
-        "views": list(views),
+        "views": save_views(images, key, views),
         "scale_m": [scale.low_m, scale.high_m],
         "map": {
             "ends": [f"too near {amount}", f"too far {amount}"],

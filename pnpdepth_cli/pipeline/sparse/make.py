@@ -15,11 +15,11 @@ from pnpdepth_cli.errors import OutputError, SizeError, UsageError
 from pnpdepth_cli.io.atomic import make_folder
 from pnpdepth_cli.io.calibration import Calibration, read_calibration
 from pnpdepth_cli.io.depth import DepthImage, describe_range, implausible, read_depth
-from pnpdepth_cli.io.overlay import overlay
 from pnpdepth_cli.io.record import plain, sha256_of, write_json
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.io.sensor_file import read_sensor
 from pnpdepth_cli.io.sparse_writing import SPARSE_SUFFIXES, write_sparse
+from pnpdepth_cli.io.visualisation import overlay
 from pnpdepth_cli.pipeline.sparse.options import ScanOptions
 from pnpdepth_cli.pipeline.sparse.scans import camera_of, check_size, read_scan_points
 from pnpdepth_cli.sensors import (

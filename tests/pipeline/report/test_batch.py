@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import shutil
 from pathlib import Path
 from typing import Any
@@ -10,13 +9,13 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from PIL import Image
 
 from pnpdepth_cli.choices import COLORS
 from pnpdepth_cli.errors import OutputError, StorageError
 from pnpdepth_cli.io.colours import paint_gain
 from pnpdepth_cli.io.depth import read_depth
-from pnpdepth_cli.io.page import open_page
+from pnpdepth_cli.io.figure import figure_content
+from pnpdepth_cli.io.report import link_image
 from pnpdepth_cli.pipeline.batch.batch import plan_batch
 from pnpdepth_cli.pipeline.batch.request import BatchRequest
 from pnpdepth_cli.pipeline.report import batch as report_batch
@@ -30,7 +29,8 @@ from tests.pipeline.batches import (
 )
 from tests.pipeline.report_pages import everything, frames_of, images_of, page_data
 
-_VIEWS = {"first", "second", "map", "image", "sparse", "thumb", "map_thumb"}
+_VIEWS = {"first", "second", "map", "image", "sparse"}
+_FILES = {"preview.png", "improvement.png"}
 
 
 @pytest.fixture
@@ -49,10 +49,10 @@ def test_every_frame_is_on_the_page_with_its_images(root: Path, report: Path) ->
     assert tuple(frames) == NAMES
     images = images_of(report)
     for frame in frames.values():
-        assert {n.partition("_")[2][:-4] for n in images if n.startswith(frame["key"])} == _VIEWS
-        assert {*frame["views"], "thumb", "map_thumb"} == _VIEWS
-    assert len(images) == len(NAMES) * len(_VIEWS)
-    assert all(each[:3] == b"\xff\xd8\xff" for each in images.values())
+        assert {n.partition("_")[2] for n in images if n.startswith(frame["key"])} == _FILES
+        assert set(frame["views"]) == _VIEWS
+        assert {Path(view["src"]).name for view in frame["views"].values()} <= set(images)
+    assert len(images) == len(NAMES) * len(_FILES)
 
 
 def test_gains_are_those_of_depth_against_ground_truth(root: Path, report: Path) -> None:
@@ -73,21 +73,21 @@ def test_gains_are_those_of_depth_against_ground_truth(root: Path, report: Path)
 
 def test_the_images_are_the_panels_of_the_files_on_disk(root: Path, report: Path) -> None:
     batch(root, html=report)
-    frame, images = frames_of(report)["c"], images_of(report)
-    preview, improvement = (
-        open_page(root / f"out/c_{kind}.png") for kind in ("preview", "improvement")
-    )
-    for view, panel in (
-        ("first", preview.panels()["Depth before"]),
-        ("second", preview.panels()["Depth after"]),
-        ("image", preview.panels()["Image"]),
-        ("map", improvement.panels()["Change of error"]),
+    frame = frames_of(report)["c"]
+    for view, kind, title in (
+        ("first", "preview", "Depth before"),
+        ("second", "preview", "Depth after"),
+        ("image", "preview", "Image"),
+        ("map", "improvement", "Change of error"),
     ):
-        shown = np.asarray(Image.open(io.BytesIO(images[f"{frame['key']}_{view}.jpg"])))
-        scaled = cv2.resize(panel, shown.shape[1::-1], interpolation=cv2.INTER_AREA)
-        assert np.abs(shown.astype(int) - scaled).mean() < 6, view
-    assert frame["scale_m"] == [preview.content["low_m"], preview.content["high_m"]]
-    assert frame["map"]["footer"] == improvement.content["footer"]
+        result = root / f"out/c_{kind}.png"
+        figure, shown = figure_content(result), frame["views"][view]
+        assert (report / shown["src"]).samefile(result)
+        assert shown["box"] in [p["box"] for p in figure["panels"] if p["title"] == title]
+        assert shown["size"] == list(figure["size"])
+    preview = figure_content(root / "out/c_preview.png")
+    assert frame["scale_m"] == [preview["low_m"], preview["high_m"]]
+    assert frame["map"]["footer"] == figure["footer"]
 
 
 def test_frames_of_an_earlier_run_without_a_report_are_in_it(root: Path, report: Path) -> None:
@@ -102,7 +102,7 @@ def test_frames_of_an_earlier_run_without_a_report_are_in_it(root: Path, report:
     assert resumed == everything(report)
 
 
-def test_a_second_run_writes_the_same_page_and_draws_nothing(root: Path, report: Path) -> None:
+def test_a_second_run_writes_the_same_page_and_no_image(root: Path, report: Path) -> None:
     batch(root, html=report)
     before = everything(report)
     drawn = {p: p.stat().st_mtime_ns for p in (report / "images").iterdir()}
@@ -111,23 +111,24 @@ def test_a_second_run_writes_the_same_page_and_draws_nothing(root: Path, report:
     assert drawn == {p: p.stat().st_mtime_ns for p in (report / "images").iterdir()}
 
 
-def test_a_frame_that_is_redone_has_new_images_and_the_old_ones_go(
+def test_a_frame_that_is_redone_has_new_images_and_one_that_is_gone_has_none(
     root: Path, report: Path
 ) -> None:
     batch(root, html=report)
-    before = frames_of(report)
+    before, key = images_of(report), {n: f["key"] for n, f in frames_of(report).items()}
     cv2.imwrite(str(root / "rgb/a.png"), cv2.imread(str(root / "rgb/a.png"))[:, ::-1])
+    (root / "rgb/d.png").unlink()
     batch(root, html=report)
-    after = frames_of(report)
-    assert {name for name in NAMES if before[name]["key"] != after[name]["key"]} == {"a"}
-    assert not [name for name in images_of(report) if name.startswith(before["a"]["key"])]
-    assert len(images_of(report)) == len(NAMES) * len(_VIEWS)
+    after = images_of(report)
+    changed = {name.partition("_")[0] for name in after if before[name] != after[name]}
+    assert changed == {key["a"]}
+    assert {name.partition("_")[0] for name in before.keys() - after.keys()} == {key["d"]}
 
 
-def test_a_image_that_is_missing_is_drawn_again(root: Path, report: Path) -> None:
+def test_an_image_that_is_missing_is_linked_again(root: Path, report: Path) -> None:
     batch(root, html=report)
     before = everything(report)
-    (report / "images" / f"{frames_of(report)['b']['key']}_map.jpg").unlink()
+    (report / "images" / f"{frames_of(report)['b']['key']}_preview.png").unlink()
     batch(root, html=report)
     assert before == everything(report)
 
@@ -138,11 +139,9 @@ def test_a_failed_frame_is_listed_with_its_reason(root: Path, report: Path) -> N
     data = page_data(report)
     assert [frame["name"] for frame in data["frames"]] == ["a", "c", "d"]
     (failed,) = data["without"]
-    assert failed["name"] == "b"
-    assert "b.png" in failed["reason"]
-    assert data["tiles"][0] == {
-        "label": "Frames refined", "value": "3 of 4", "remark": "1 failed"
-    }  # fmt: skip
+    assert failed[0] == "b"
+    assert "b.png" in failed[1]
+    assert data["tiles"][0] == ("Frames refined", "3 of 4", "1 failed")
 
 
 def test_a_batch_of_nothing_but_failures_has_a_report_too(root: Path, report: Path) -> None:
@@ -157,7 +156,7 @@ def test_a_batch_that_is_stopped_has_a_report_of_what_is_done(root: Path, report
     answers = iter([False, True, True, True])
     batch(root, html=report, stopped=lambda: next(answers))
     assert list(frames_of(report)) == ["a"]
-    assert page_data(report)["tiles"][0]["remark"] == "3 pending"
+    assert page_data(report)["tiles"][0][2] == "3 pending"
 
 
 def test_the_page_states_the_refinement_and_that_it_may_differ_per_frame(
@@ -198,6 +197,8 @@ def test_with_neither_ground_truth_nor_held_out_points_there_is_no_gain(
     data = page_data(report)
     assert data["columns"][data["sort_by"]]["key"] == "rmse_after"
     assert data["tables"][0]["header"] == ["", "before", "after"]
+    assert [label for label, *_ in data["tiles"]] == ["Frames refined"]
+    assert "no error is measured" in data["notes"][0]
     assert any("proves nothing" in note for note in frames_of(report)["a"]["notes"])
 
 
@@ -221,7 +222,7 @@ def test_the_shard_that_ends_last_reports_all_frames(root: Path, report: Path) -
     assert list(frames_of(report)) == ["a", "c"]
     batch(root, html=report, shard=(2, 2))
     assert tuple(frames_of(report)) == NAMES
-    assert len(images_of(report)) == len(NAMES) * len(_VIEWS)
+    assert len(images_of(report)) == len(NAMES) * len(_FILES)
 
 
 def test_unusual_frame_names_reach_the_page_unchanged(root: Path, report: Path) -> None:
@@ -285,23 +286,23 @@ def test_a_preview_that_went_missing_costs_one_frame_its_images(root: Path, repo
     assert frames["b"]["values"]["rmse_gain"] is not None
 
 
-def test_a_disk_that_is_full_while_drawing_ends_the_run_and_the_next_one_goes_on(
+def test_a_disk_that_is_full_while_linking_ends_the_run_and_the_next_one_goes_on(
     root: Path, report: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    drawn: list[str] = []
-    save = report_batch.save_images
+    linked: list[Path] = []
 
-    def full_at_the_second(folder: Path, key: str, *views: Any, **others: Any) -> None:
-        drawn.append(key)
-        if len(drawn) == 2:
+    def full_at_the_second(source: Path, target: Path) -> None:
+        linked.append(target)
+        if len(linked) == 2:
             raise StorageError("the disk is full")
-        save(folder, key, *views, **others)
+        link_image(source, target)
 
-    monkeypatch.setattr(report_batch, "save_images", full_at_the_second)
-    with pytest.raises(StorageError):
-        batch(root, html=report)
+    with monkeypatch.context() as patch:
+        patch.setattr(report_batch, "link_image", full_at_the_second)
+        with pytest.raises(StorageError):
+            batch(root, html=report)
     assert not (report / "index.html").exists()
-    (report / "images" / ".0123456789ab.jpg").write_bytes(b"half")
+    (report / "images" / ".0123456789ab.png").write_bytes(b"half")
     listener = RecordingListener()
     batch(root, listener, html=report)
     assert listener.messages[1].startswith("removed 1 half-written files")
@@ -309,6 +310,15 @@ def test_a_disk_that_is_full_while_drawing_ends_the_run_and_the_next_one_goes_on
     shutil.rmtree(report)
     batch(root, html=report)
     assert resumed == everything(report)
+
+
+@pytest.mark.parametrize(("unit", "shown"), [("m", "RMSE [m]"), ("units", "RMSE [units]")])
+def test_errors_have_the_unit_of_the_depths(unit: str, shown: str) -> None:
+    mean = {stage: {"rmse": 0.5, "irmse": 2.0} for stage in ("before", "after")} | {"frames": 1}
+    rows = report_batch._means("scores", mean, unit).rows
+    titles = [row[0] for row in rows]
+    assert f"{shown} ↓" in titles
+    assert "iRMSE [1/km] ↓" in titles
 
 
 @pytest.mark.parametrize("colors", COLORS)

@@ -16,7 +16,7 @@ from pnpdepth_cli.errors import StorageError
 from pnpdepth_cli.io.depth import write_depth
 from pnpdepth_cli.pipeline.evaluation.evaluate import evaluate
 from pnpdepth_cli.pipeline.evaluation.result import EvalRequest, Evaluation
-from pnpdepth_cli.pipeline.report.evaluation import write_eval_report
+from pnpdepth_cli.pipeline.report.evaluation import _charts, write_eval_report
 from tests.io.test_atomic import no_room_on_disk
 from tests.pipeline.report_pages import everything, frames_of, images_of, page_data
 
@@ -65,10 +65,10 @@ def test_unscored_frames_are_listed_with_their_reason(root: Path) -> None:
     (root / "out/b <i>.npy").write_bytes(b"broken")
     reported(root)
     data = page_data(root / "report")
-    assert [each["name"] for each in data["without"]] == ["a", "b <i>"]
-    assert data["without"][0]["reason"] == "there is no prediction"
-    assert data["tiles"][0]["value"] == "1 of 3"
-    assert data["tiles"][0]["remark"] == "1 without prediction, 1 with a faulty file"
+    assert [name for name, _ in data["without"]] == ["a", "b <i>"]
+    assert data["without"][0][1] == "there is no prediction"
+    remark = "1 without prediction, 1 with a faulty file"
+    assert data["tiles"][0] == ("Frames scored", "1 of 3", remark)
     assert list(frames_of(root / "report")) == ["c\nd"]
 
 
@@ -145,10 +145,11 @@ def test_a_standard_deviation_has_a_calibration_plot_and_a_sparsification_curve(
         np.save(root / "out" / f"{name}_sigma.npy", sigma)
     result = reported(root)
     assert result.uncertainty is not None
-    calibration, sparsification = page_data(root / "report")["charts"]
-    observed = calibration["lines"][0]["points"]
-    assert observed == [[x, pytest.approx(x, abs=0.02)] for x, _ in observed]
-    by_sigma, by_error = (dict(line["points"]) for line in sparsification["lines"])
+    assert len(page_data(root / "report")["charts"]) == 2
+    calibration, sparsification = _charts(result)
+    observed = calibration.lines["observed"]
+    assert observed == [(x, pytest.approx(x, abs=0.02)) for x, _ in observed]
+    by_sigma, by_error = map(dict, sparsification.lines.values())
     assert by_sigma[0] == by_error[0] == 1
     assert 1 > by_sigma[0.5] > by_error[0.5] > 0
     area = np.trapezoid([by_sigma[x] - by_error[x] for x in by_sigma], list(by_sigma))

@@ -1,5 +1,5 @@
 "use strict";
-// The 3D view of a frame, drawn with three.js. report_page.js loads this file when a view is opened,
+// The 3D view of a frame, drawn with three.js. report.js loads this file when a view is opened,
 // then a file of the frame, which calls pnpdepthView with what view_3d.py wrote.
 
 const pnpdepthViewer = (() => {

@@ -1,7 +1,7 @@
-"""A white page with titled panels and a colour bar: the frame of every PNG for people.
+"""A white figure with titled panels and a colour bar: the frame of every PNG for people.
 
-The PNG's text says where its panels are, so that a report can show frames of earlier runs too: the
-depth before refinement is in no other file.
+The PNG's text says where its panels are, so that a report can show each by itself: the depth before
+refinement is in no other file.
 """
 
 from __future__ import annotations
@@ -20,13 +20,12 @@ from numpy.typing import NDArray
 from pnpdepth_cli.errors import FileFormatError, InputError
 from pnpdepth_cli.io.atomic import atomic_path
 from pnpdepth_cli.io.colours import DepthScale, Pixels
-from pnpdepth_cli.io.file_bytes import damaged
 
 if TYPE_CHECKING:
     import PIL.Image
     import PIL.ImageDraw
 
-PAGE_WIDTH = 1600
+FIGURE_WIDTH = 1600
 MARGIN = 24
 GAP = 20
 _TITLE_HEIGHT = 34
@@ -36,11 +35,13 @@ _MAX_PANEL_HEIGHT = 1100
 _GAIN_LEGEND = (900, 84)  # width its text needs, height
 _FONT_SIZE = 19
 _SMALL_FONT_SIZE = 17
+_HATCH_SPACING, _HATCH_WIDTH = 12, 3  # pixels of the figure
+_HATCH_FADED, _HATCH_LINE = 0.45, 0.8  # fractions of white
 _INK = (32, 33, 36)
 _FAINT_INK = (95, 99, 104)
 _LINE = (200, 202, 206)
 _FAST = 2  # zlib's level: a third of the time of its default 6, files a tenth larger
-_CONTENT_KEY = "pnpdepth"  # of the PNG text that describes the page
+_CONTENT_KEY = "pnpdepth"  # of the PNG text that describes the figure
 
 Ink = tuple[int, int, int]
 
@@ -50,8 +51,6 @@ class Panel:
     """An image with a title above it."""
 
     title: str
-    """Above the image."""
-
     pixels: Pixels
     """(H, W, 3)."""
 
@@ -64,11 +63,11 @@ def magnification(shape: tuple[int, ...], *, columns: int, legend: bool) -> floa
 
     Args:
         shape: (H, W, ...) of the image.
-        columns: Columns of the page.
-        legend: Whether the page has a colour bar beside the columns.
+        columns: Columns of the figure.
+        legend: Whether the figure has a colour bar beside the columns.
     """
     height, width = shape[:2]
-    room = PAGE_WIDTH - 2 * MARGIN - (columns - 1) * GAP - (_LEGEND_WIDTH if legend else 0)
+    room = FIGURE_WIDTH - 2 * MARGIN - (columns - 1) * GAP - (_LEGEND_WIDTH if legend else 0)
     fit = min(room / columns / width, _MAX_PANEL_HEIGHT / height)
     return math.floor(fit) if fit >= 1 else fit
 
@@ -80,6 +79,25 @@ def resized(pixels: NDArray[Any], factor: float, *, smooth: bool = False) -> NDA
     enlarging = cv2.INTER_CUBIC if smooth else cv2.INTER_NEAREST
     method = cv2.INTER_AREA if factor < 1 else enlarging
     return np.asarray(cv2.resize(pixels, size, interpolation=method))
+
+
+def hatched(pixels: Pixels, valid: NDArray[np.bool_] | None) -> Pixels:
+    """Returns an image faded and with diagonal lines where its depth is not valid.
+
+    Args:
+        pixels: (H', W', 3).
+        valid: (H, W), of any size. None: all is valid.
+    """
+    if valid is None or valid.all():
+        return pixels
+    height, width = pixels.shape[:2]
+    mask = cv2.resize(valid.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST) == 0
+    y, x = np.ogrid[:height, :width]
+    lines = (x + y) % _HATCH_SPACING < _HATCH_WIDTH
+    white = np.where(lines, _HATCH_LINE, _HATCH_FADED)[mask][:, None]
+    image = pixels.copy()
+    image[mask] = np.rint((1 - white) * pixels[mask] + white * 255).astype(np.uint8)
+    return image
 
 
 def draw_discs(
@@ -116,14 +134,14 @@ def draw_discs(
     return canvas
 
 
-def depth_page(
+def depth_figure(
     panels: list[Panel], columns: int, scale: DepthScale, unit: str = "m"
 ) -> PIL.Image.Image:
-    """Returns a page of panels, `columns` to a row, with a bar of depth colours to their right."""
-    page, draw = _lay_out(panels, columns, legend_width=_LEGEND_WIDTH)
-    page.info[_CONTENT_KEY] |= {"low_m": scale.low_m, "high_m": scale.high_m}
-    left = page.width - MARGIN - _LEGEND_WIDTH + GAP
-    top, bottom = MARGIN + _TITLE_HEIGHT, page.height - MARGIN
+    """Returns a figure of panels, `columns` to a row, beside a bar of depth colours."""
+    figure, draw = _lay_out(panels, columns, legend_width=_LEGEND_WIDTH)
+    figure.info[_CONTENT_KEY] |= {"low_m": scale.low_m, "high_m": scale.high_m}
+    left = figure.width - MARGIN - _LEGEND_WIDTH + GAP
+    top, bottom = MARGIN + _TITLE_HEIGHT, figure.height - MARGIN
     draw.text(
         (left, MARGIN + 5), "metres" if unit == "m" else unit, font=_font(_FONT_SIZE), fill=_INK
     )
@@ -134,20 +152,20 @@ def depth_page(
     else:
         metres = scale.low_m + (scale.high_m - scale.low_m) * depths
     bar = np.repeat(scale.paint(metres)[:, None], _BAR_WIDTH, axis=1)
-    _paste(page, bar, left, top)
+    _paste(figure, bar, left, top)
     draw.rectangle((left - 1, top - 1, left + _BAR_WIDTH, bottom), outline=_LINE)
     for tick, label in _labels(scale.ticks()):
         y = bottom - 1 - float(scale.position(np.array(tick))) * (bottom - top - 1)
         right = left + _BAR_WIDTH
         draw.line((right, y, right + 6, y), fill=_INK, width=1)
         draw.text((right + 11, y), label, font=_font(_SMALL_FONT_SIZE), fill=_INK, anchor="lm")
-    return page
+    return figure
 
 
-def gain_page(
+def gain_figure(
     panel: Panel, bar: Pixels, ends: tuple[str, str], swatch: tuple[Ink, str] | None, footer: str
 ) -> PIL.Image.Image:
-    """Returns a page of one panel with a colour bar, a swatch and a footer under it.
+    """Returns a figure of one panel with a colour bar, a swatch and a footer under it.
 
     Args:
         panel: The image.
@@ -156,15 +174,15 @@ def gain_page(
         swatch: A colour outside the bar and its meaning; None for none.
         footer: The last line.
     """
-    page, draw = _lay_out([panel], 1, least_width=_GAIN_LEGEND[0], legend_height=_GAIN_LEGEND[1])
+    figure, draw = _lay_out([panel], 1, least_width=_GAIN_LEGEND[0], legend_height=_GAIN_LEGEND[1])
     unknown = swatch[1] if swatch is not None else None
-    page.info[_CONTENT_KEY] |= {"ends": ends, "unknown": unknown, "footer": footer}
+    figure.info[_CONTENT_KEY] |= {"ends": ends, "unknown": unknown, "footer": footer}
     font, small = _font(_FONT_SIZE), _font(_SMALL_FONT_SIZE)
-    y = page.height - MARGIN - 56
+    y = figure.height - MARGIN - 56
     x = float(MARGIN)
     draw.text((x, y), ends[0], font=small, fill=_INK, anchor="lm")
     x += draw.textlength(ends[0], font=small) + 12
-    _paste(page, bar, round(x), y - bar.shape[0] // 2)
+    _paste(figure, bar, round(x), y - bar.shape[0] // 2)
     x += bar.shape[1] + 12
     draw.text((x, y), ends[1], font=small, fill=_INK, anchor="lm")
     x += draw.textlength(ends[1], font=small) + 2 * GAP
@@ -173,11 +191,11 @@ def gain_page(
         draw.rectangle((x, y - 9, x + 18, y + 9), fill=colour)
         draw.text((x + 28, y), meaning, font=small, fill=_INK, anchor="lm")
     draw.text((MARGIN, y + 40), footer, font=font, fill=_INK, anchor="lm")
-    return page
+    return figure
 
 
-def save_page(page: PIL.Image.Image, path: Path) -> None:
-    """Writes the page as a PNG, whatever the suffix, from which `open_page` reads its panels.
+def save_figure(figure: PIL.Image.Image, path: Path) -> None:
+    """Writes the figure as a PNG, whatever the suffix, of which `figure_content` reads the panels.
 
     Raises:
         OutputError: The file cannot be written.
@@ -185,57 +203,31 @@ def save_page(page: PIL.Image.Image, path: Path) -> None:
     from PIL.PngImagePlugin import PngInfo
 
     text = PngInfo()
-    text.add_text(_CONTENT_KEY, json.dumps(page.info[_CONTENT_KEY]))
+    text.add_text(_CONTENT_KEY, json.dumps(figure.info[_CONTENT_KEY]))
     with atomic_path(path) as temporary:
-        page.save(temporary, "PNG", pnginfo=text, compress_level=_FAST)
+        figure.save(temporary, "PNG", pnginfo=text, compress_level=_FAST)
 
 
-@dataclass(frozen=True, kw_only=True)
-class SavedPage:
-    """A page on disk."""
+def figure_content(path: Path) -> dict[str, Any]:
+    """Returns what a file of `save_figure` shows; only its first bytes are read.
 
-    path: Path
-    """The PNG."""
-
-    content: dict[str, Any]
-    """`panels` with title and box; low_m and high_m of depth colours, or ends, unknown, footer."""
-
-    def panels(self) -> dict[str, Pixels]:
-        """Returns (H, W, 3) of the panels by title. Raises InputError for an unreadable file."""
-        try:
-            with _opened(self.path) as page:
-                pixels = np.asarray(page.convert("RGB"))
-        except (OSError, SyntaxError) as error:
-            raise damaged(self.path, "PNG", str(error)) from error
-        return {
-            each["title"]: pixels[y : y + height, x : x + width]
-            for each in self.content["panels"]
-            for x, y, width, height in [each["box"]]
-        }
-
-
-def open_page(path: Path) -> SavedPage:
-    """Returns the content of a file of `save_page`, of which only the first bytes are read.
+    `size` is (width, height), `panels` have title and box (left, top, width, height). A figure of
+    depth has low_m and high_m of its colours, one of gains ends, unknown and footer.
 
     Raises:
         InputError: There is no such file.
         FileFormatError: It is another image.
     """
-    try:
-        with _opened(path) as page:
-            return SavedPage(path=path, content=json.loads(page.info[_CONTENT_KEY]))
-    except (SyntaxError, KeyError, ValueError) as error:
-        raise FileFormatError(f"{path} is no page of this program's; create it again") from error
-
-
-def _opened(path: Path) -> PIL.Image.Image:
     from PIL import Image
 
     try:
-        return Image.open(path, formats=["PNG"])
+        with Image.open(path, formats=["PNG"]) as image:
+            return {"size": image.size, **json.loads(image.info[_CONTENT_KEY])}
     except OSError as error:
         fact = (error.strerror or "is no PNG").lower()
         raise InputError(f"{path} cannot be read ({fact}); create it again") from error
+    except (SyntaxError, KeyError, ValueError) as error:
+        raise FileFormatError(f"{path} is no figure of this program; create it again") from error
 
 
 def _lay_out(
@@ -251,11 +243,11 @@ def _lay_out(
     height, width = panels[0].pixels.shape[:2]
     rows = -(-len(panels) // columns)
     used = columns * width + (columns - 1) * GAP + legend_width
-    page_width = max(used + 2 * MARGIN, least_width)
+    width_px = max(used + 2 * MARGIN, least_width)
     row_height = _TITLE_HEIGHT + height
-    page_height = 2 * MARGIN + rows * row_height + (rows - 1) * (GAP // 2) + legend_height
-    page = Image.new("RGB", (page_width, page_height), "white")
-    draw = ImageDraw.Draw(page)
+    height_px = 2 * MARGIN + rows * row_height + (rows - 1) * (GAP // 2) + legend_height
+    figure = Image.new("RGB", (width_px, height_px), "white")
+    draw = ImageDraw.Draw(figure)
     placed = []
     for index, panel in enumerate(panels):
         row, column = divmod(index, columns)
@@ -265,10 +257,10 @@ def _lay_out(
         draw.text((x, y + 4), panel.title, font=font, fill=_INK)
         indent = draw.textlength(panel.title, font=font) + 14
         draw.text((x + indent, y + 5), panel.remark, font=_font(_SMALL_FONT_SIZE), fill=_FAINT_INK)
-        _paste(page, panel.pixels, x, y + _TITLE_HEIGHT)
+        _paste(figure, panel.pixels, x, y + _TITLE_HEIGHT)
         placed.append({"title": panel.title, "box": (x, y + _TITLE_HEIGHT, width, height)})
-    page.info[_CONTENT_KEY] = {"panels": placed}
-    return page, draw
+    figure.info[_CONTENT_KEY] = {"panels": placed}
+    return figure, draw
 
 
 def _labels(ticks: list[float]) -> list[tuple[float, str]]:
@@ -285,10 +277,10 @@ def _disc(
     cv2.circle(canvas, centre, sixteenths, colour, -1, cv2.LINE_AA, fraction)
 
 
-def _paste(page: PIL.Image.Image, pixels: Pixels, x: int, y: int) -> None:
+def _paste(figure: PIL.Image.Image, pixels: Pixels, x: int, y: int) -> None:
     from PIL import Image
 
-    page.paste(Image.fromarray(np.ascontiguousarray(pixels)), (x, y))
+    figure.paste(Image.fromarray(np.ascontiguousarray(pixels)), (x, y))
 
 
 def _font(size: int) -> Any:

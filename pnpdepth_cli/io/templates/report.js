@@ -1,8 +1,9 @@
 "use strict";
-// All that is shown comes from the JSON in #data, and goes onto the page as text, never as markup.
+// The list of frames, the histogram and the view of a frame. All that is shown comes from the JSON in
+// #data, and goes onto the page as text, never as markup.
 
-const data = JSON.parse(document.getElementById("data").textContent);
-const { columns, frames } = data;
+const { head: data, frames } = JSON.parse(document.getElementById("data").textContent);
+const { columns } = data;
 const NAME = -1; // the "column" of the names
 const PAGE = 1000; // rows that are made at once
 const BINS = 24;
@@ -38,46 +39,23 @@ function shown(column, value) {
 }
 
 const titled = (column) => column.title + (column.unit ? ` [${column.unit}]` : "");
-const imageOf = (frame, view) => `images/${frame.key}_${view}.jpg`;
-
-// ---- the head of the page ----
-
-function fillHead() {
-  document.title = `${visible(data.title)} – ${data.kind}`;
-  byId("kind").textContent = data.kind;
-  byId("title").textContent = visible(data.title);
-  for (const tile of data.tiles) {
-    byId("tiles").append(make("div", {},
-      make("dt", { text: tile.label }), make("dd", { text: tile.value }),
-      make("dd", { class: "remark", text: tile.remark })));
-  }
-  for (const table of data.tables) byId("summary").append(summaryTable(table));
-  for (const chart of data.charts ?? []) byId("summary").append(lineChart(chart));
-  for (const [label, text] of data.facts) {
-    byId("facts").append(make("dt", { text: label }), make("dd", { text: visible(text) }));
-  }
-  byId("notes").append(...data.notes.map(noted));
-  byId("foot").textContent = data.foot;
-  if (data.without.length) {
-    byId("without").hidden = false;
-    byId("without-title").textContent = data.without_title;
-    for (const { name, reason } of data.without) {
-      byId("reasons").append(make("li", {},
-        make("strong", { text: visible(name) }), make("span", { text: visible(reason) })));
-    }
-  }
-}
 
 const noted = (note) =>
   make("li", { class: note.startsWith("warning") ? "warning" : "", text: visible(note) });
 
-function summaryTable(table) {
-  const head = make("tr", {}, ...table.header.map((text) => make("th", { scope: "col", text })));
-  const rows = table.rows.map(([first, ...rest]) => make("tr", {},
-    make("th", { scope: "row", text: first }), ...rest.map((text) => make("td", { text }))));
-  return make("table", { class: "means" },
-    make("caption", { text: table.caption }),
-    make("thead", {}, head), make("tbody", {}, ...rows));
+// A view of a frame: its own file, or a panel (left, top, width, height) of a figure.
+function picture(frame, view, attributes, ratio) {
+  const { src, box, size } = frame.views[view];
+  const image = make("img", { ...attributes, src }); // src last: nothing is read before it is in view
+  if (!box) return image;
+  let [x, y, w, h] = box;
+  if (ratio && w > h * ratio) [x, w] = [x + (w - h * ratio) / 2, h * ratio];
+  else if (ratio) [y, h] = [y + (h - w / ratio) / 2, w / ratio];
+  Object.assign(image.style, { width: `${100 * size[0] / w}%`, left: `${-100 * x / w}%`,
+    top: `${-100 * y / h}%` });
+  const panel = make("span", { class: "panel" }, image);
+  panel.style.aspectRatio = `${w} / ${h}`;
+  return panel;
 }
 
 // ---- the histogram ----
@@ -88,33 +66,6 @@ function svg(tag, attributes, text) {
   if (text !== undefined) element.textContent = text;
   return element;
 }
-
-// Lines from (0, 0) up to (1, top), with their names at the right.
-function lineChart({ caption, x_title: xTitle, y_title: yTitle, top, lines }) {
-  const [W, H, left, right, above, below] = [480, 250, 44, 120, 12, 40];
-  const x = (value) => left + value * (W - left - right);
-  const y = (value) => H - below - (value / top) * (H - above - below);
-  const chart = svg("svg", { viewBox: `0 0 ${W} ${H}`, role: "img", "aria-label": caption });
-  for (let n = 0; n <= 4; n += 1) {
-    const part = n / 4;
-    chart.append(
-      svg("line", { x1: left, x2: W - right, y1: y(part * top), y2: y(part * top), class: "grid" }),
-      svg("text", { x: left - 8, y: y(part * top) + 4, class: "left" }, percent(part * top)),
-      svg("text", { x: x(part), y: H - below + 17 }, percent(part)));
-  }
-  lines.forEach(({ label, points, dashed }, i) => {
-    const path = points.map(([a, b]) => `${x(a).toFixed(1)},${y(b).toFixed(1)}`).join(" ");
-    const kind = dashed ? "line reference" : "line";
-    const at = above + 6 + 18 * i;
-    chart.append(svg("polyline", { points: path, class: kind }),
-      svg("line", { x1: W - right + 8, x2: W - right + 28, y1: at, y2: at, class: kind }),
-      svg("text", { x: W - right + 34, y: at + 4, class: "right" }, label));
-  });
-  chart.append(svg("text", { x: (left + W - right) / 2, y: H - 3 }, `${xTitle}; upwards: ${yTitle}`));
-  return make("figure", { class: "lines" }, chart, make("figcaption", { text: caption }));
-}
-
-const percent = (fraction) => `${Math.round(100 * fraction)} %`;
 
 function roundStep(rough) {
   const power = 10 ** Math.floor(Math.log10(rough));
@@ -148,7 +99,7 @@ function drawChart() {
   const figure = byId("chart");
   if (!values.length) return figure.replaceChildren(make("p", { text: "No frame has it." }));
   const { bins, median } = binned(values);
-  const W = Math.min(Math.max(figure.clientWidth, 280), 640); // so that letters keep their size
+  const W = Math.min(Math.max(figure.clientWidth, 280), 600); // so that letters keep their size
   const [H, left, right, top, bottom] = [240, 40, 14, 12, 40];
   const most = Math.max(...bins.map((bin) => bin.frames));
   const step = Math.max(1, roundStep(most / 4));
@@ -255,9 +206,8 @@ function makeRow(index) {
   const frame = frames[index];
   const name = visible(frame.name);
   const thumbs = make("span", { class: "thumbs" });
-  for (const view of frame.key ? ["thumb", "map_thumb"] : []) {
-    thumbs.append(make("img", { loading: "lazy", decoding: "async", width: "96", height: "72",
-      alt: "", src: imageOf(frame, view) })); // src last: nothing is read before it is in view
+  for (const view of frame.key ? ["image" in frame.views ? "image" : data.thumb, "map"] : []) {
+    thumbs.append(picture(frame, view, { loading: "lazy", decoding: "async", alt: "" }, 4 / 3));
   }
   const button = make("button", { type: "button", class: "open", text: name,
     "aria-label": `Open frame ${name}`, "aria-haspopup": "dialog" });
@@ -289,7 +239,7 @@ function fillHeader() {
   const choices = () => columns.map((c, i) => make("option", { value: String(i), text: titled(c) }));
   byId("sort-column").append(...choices(), make("option", { value: String(NAME), text: "Name" }));
   byId("chart-column").append(...choices());
-  byId("chart-column").value = String(data.sort_by === NAME ? 0 : data.sort_by);
+  byId("chart-column").value = String(data.sort_by);
 }
 
 function moveTo(position) {
@@ -353,14 +303,14 @@ function viewsOf(frame) {
   if (!frame.key) return [make("p", { text: "There are no images of this frame." })];
   const views = [slider(frame), mapView(frame)];
   for (const view of ["image", "sparse"]) {
-    if (frame.views.includes(view)) views.push(plainView(frame, view));
+    if (view in frame.views) views.push(plainView(frame, view));
   }
   if (frame.view_mb) views.push(spaceView(frame));
   return views;
 }
 
 function bigPicture(frame, view) {
-  return make("img", { src: imageOf(frame, view), draggable: "false",
+  return picture(frame, view, { draggable: "false",
     alt: `${data.labels[view]} of ${visible(frame.name)}` });
 }
 
@@ -388,7 +338,7 @@ function slider(frame) {
   };
   range.addEventListener("input", move);
   move();
-  const metres = (value) => `${Number(value.toPrecision(3))} m`;
+  const metres = (value) => `${Number(value.toPrecision(3))} ${data.unit}`;
   const [low, high] = frame.scale_m;
   const caption = make("figcaption", {}, ...legend(data.depth_colours, metres(low), metres(high),
     high / low > data.logarithmic_from ? "Logarithmic colours, the same on both sides." : ""));
@@ -500,7 +450,6 @@ function listenToFrame() {
   });
 }
 
-fillHead();
 fillHeader();
 listenToList();
 listenToFrame();
