@@ -16,13 +16,12 @@ from pnpdepth_cli.core.metrics import MEASURES
 from pnpdepth_cli.io.atomic import atomic_path
 from pnpdepth_cli.io.csv_text import write_csv
 from pnpdepth_cli.io.record import plain, write_json
-from pnpdepth_cli.pipeline.evaluation.averages import Floats, FrameTable
 from pnpdepth_cli.pipeline.evaluation.dependence import (
     MIN_CLUSTERS,
     find_clusters,
     groups_by_name,
 )
-from pnpdepth_cli.pipeline.evaluation.resampling import studentised_interval
+from pnpdepth_cli.pipeline.evaluation.resampling import Floats, FrameTable, studentised_interval
 from pnpdepth_cli.pipeline.evaluation.score_files import latex_text
 
 METHODS = ("plain", "linear", "refined")
