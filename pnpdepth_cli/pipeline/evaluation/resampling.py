@@ -1,6 +1,6 @@
 """How sure means over clusters of frames are: the bootstrap, permutations, and Holm's correction.
 
-Permutations are those of scipy.stats. Its bootstrap has no studentised interval, which small numbers
+Permutations are those of scipy.stats. Its bootstrap has no studentised interval, which few values
 of skewed errors need, and it adjusts p-values only for the false discovery rate; both are here.
 """
 

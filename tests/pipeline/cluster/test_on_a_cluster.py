@@ -1,4 +1,4 @@
-"""Batches, evaluations and sweeps on a real Ray cluster of three nodes."""
+"""Batches on a real Ray cluster of three nodes."""
 
 from __future__ import annotations
 
@@ -20,18 +20,11 @@ from pnpdepth_cli.errors import ClusterError
 from pnpdepth_cli.pipeline.batch.state import remove_all_leftovers
 from pnpdepth_cli.pipeline.cluster import failures
 from pnpdepth_cli.pipeline.cluster.options import ClusterOptions
-from pnpdepth_cli.pipeline.evaluation.evaluate import evaluate
-from pnpdepth_cli.pipeline.evaluation.result import EvalRequest
-from pnpdepth_cli.pipeline.sweep.axes import read_axis, studies_of
-from pnpdepth_cli.pipeline.sweep.points import read_sampling
-from pnpdepth_cli.pipeline.sweep.request import SweepRequest
-from pnpdepth_cli.pipeline.sweep.sweep import run_sweep
 from tests.pipeline.batches import (
     RecordingListener,
     add_frame,
     batch,
     pairs_on_disk,
-    refinement,
     results,
 )
 from tests.pipeline.cluster.nodes import three_nodes
@@ -191,34 +184,3 @@ def test_a_stopped_batch_ends_with_the_pieces_that_are_begun(cluster: Any, root:
     begun = states(root / "out")
     assert set(begun) == set(listener.names)
     assert set(begun.values()) == {"done"}
-
-
-def test_an_evaluation_equals_that_of_one_process(cluster: Any, root: Path) -> None:
-    request = EvalRequest(
-        prediction=root / "plain", ground_truth=root / "gt",
-        changes={"groups": ("flicker", "edges")},
-    )  # fmt: skip
-    here = evaluate(request).as_record()
-    options = ClusterOptions(ray=cluster.address, ray_workers=2)
-    shown: list[tuple[int, int]] = []
-    there = evaluate(
-        replace(request, cluster=options), on_frame=lambda done, of: shown.append((done, of))
-    )
-    assert there.as_record() == here
-    assert shown[-1] == (len(NAMES), len(NAMES))
-
-
-def test_a_sweep_equals_that_of_one_process(cluster: Any, root: Path) -> None:
-    studies = studies_of([read_axis("iterations=0,2"), read_axis("points=20,50")], one_by_one=True)
-    request = SweepRequest(
-        source=root, output=root / "out", refine=refinement(root), studies=studies,
-        sampling=read_sampling("40"), plots=False, limit=4,
-    )  # fmt: skip
-    tables = []
-    for options in (ClusterOptions(), ClusterOptions(ray=cluster.address, ray_workers=2)):
-        listener = RecordingListener()
-        run_sweep(replace(request, cluster=options), listener)
-        assert len(listener.rows) == listener.to_do > 0
-        tables.append([(root / "out" / name).read_bytes() for name in TABLES])
-        shutil.rmtree(root / "out")
-    assert tables[0] == tables[1]

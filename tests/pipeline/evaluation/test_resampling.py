@@ -153,7 +153,11 @@ def test_measures_are_known_of_the_same_frames_or_apart() -> None:
         ([False, True, True], [1]),
         ([True, True, True], [0, 2]),
     ]
-    assert clusters_among(np.array([2, 0, 2, 3]), np.array([1, 0, 1, 1], bool)).tolist() == [0, 0, 1]
+    assert clusters_among(np.array([2, 0, 2, 3]), np.array([1, 0, 1, 1], bool)).tolist() == [
+        0,
+        0,
+        1,
+    ]
 
 
 def test_holm_multiplies_the_smallest_most_and_keeps_the_order() -> None:
