@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -167,7 +168,7 @@ def run_bench(
             todo[MASKED] = _masked(prepared, resolve_settings(network.definition, masked))
         spent = in_turn(todo, request.repeats, network.device, on_round=on_round)
         peaks = {
-            name: peak_mb(lambda timed=timed: timed.run(timed.prepare()), network.device)
+            name: peak_mb(partial(_once, timed), network.device)
             for name, timed in todo.items()
             if name in _WITH_PEAK
         }
@@ -272,6 +273,10 @@ def _limit(front: float, rear: float, iterations: int) -> float | None:
 
 
 # measuring
+
+
+def _once(timed: Timed) -> None:
+    timed.run(timed.prepare())
 
 
 @dataclass(frozen=True, kw_only=True)

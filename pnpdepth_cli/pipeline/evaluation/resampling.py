@@ -183,7 +183,8 @@ def sign_flip_p_values(
 
     def differs_as_much(flips: Floats, _: Floats, axis: int) -> Floats:
         # rounding must not make an equal difference look smaller than the observed one
-        return (np.abs(difference(np.atleast_2d(flips))) >= observed * (1 - 1e-9)).astype(float)
+        as_much = np.abs(difference(np.atleast_2d(flips))) >= observed * (1 - 1e-9)
+        return np.asarray(as_much, np.float64)
 
     exact = clusters < 60 and 2**clusters <= resamples
     result = stats.permutation_test(

@@ -99,7 +99,7 @@ def run_sweep(request: SweepRequest, listener: Listener) -> dict[str, Any]:
         need_matplotlib()
     sampling, tasks = _frames(request, listener)
     make_folder(request.output)
-    with locked_folder(request.output, None, lambda: remove_leftovers(request.output)):
+    with locked_folder(request.output, None, lambda: _clean(request.output)):
         state = SweepState(request.output)
         for note in state.notes:
             listener.say(note)
@@ -120,6 +120,10 @@ def run_sweep(request: SweepRequest, listener: Listener) -> dict[str, Any]:
             for run, result in results(to_do[model], each.refiner.network):
                 listener.frame(_recorded(run, result, state))
         return _write(request, sampling, networks, [task.name for task, _ in tasks], state)
+
+
+def _clean(output: Path) -> None:
+    remove_leftovers(output)
 
 
 def _frames(request: SweepRequest, listener: Listener) -> tuple[Sampling, list[tuple[Task, Frame]]]:
