@@ -25,7 +25,7 @@ from benchmarks.engine import CPU, loop, output_points, print_rows, setup
 from benchmarks.hand_cuts import ZOO
 from benchmarks.networks import Case
 from pnpdepth_cli.models.precision import lower
-from pnpdepth_cli.pipeline.bench.timing import Timed, in_turn
+from pnpdepth_cli.pipeline.bench import Timed, in_turn
 
 
 def refined(

@@ -31,7 +31,7 @@ from benchmarks.networks import CASES, Case
 from pnpdepth_cli.core.refine import RefineSettings, refine
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.models.precision import lower
-from pnpdepth_cli.pipeline.bench.timing import Timed, in_turn, peak_mb
+from pnpdepth_cli.pipeline.bench import Timed, in_turn, peak_mb
 from pnpdepth_cli.points import SparsePoints
 
 ITERATIONS, STEP, POINTS = 5, 0.01, 500

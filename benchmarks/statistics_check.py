@@ -18,9 +18,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-from pnpdepth_cli.pipeline.evaluation.averages import FrameTable
 from pnpdepth_cli.pipeline.evaluation.dependence import find_clusters, independent_frames
-from pnpdepth_cli.pipeline.evaluation.resampling import sign_flip_p_values, studentised_interval
+from pnpdepth_cli.pipeline.evaluation.resampling import (
+    FrameTable,
+    sign_flip_p_values,
+    studentised_interval,
+)
 
 Floats = NDArray[np.float64]
 Draw = Callable[[np.random.Generator, int, int], Floats]

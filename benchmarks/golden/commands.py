@@ -371,7 +371,7 @@ def _of_many_frames() -> Iterator[Group]:
         "eval",
         ("predict", f"{SMALL} -o out --iterations 1"),
         ("file", "eval out/rgb_depth.png ../in/small/gt.png --markdown - --delta 1.01"),
-        ("nyu", "eval ../in/indoor/gt.png ../in/indoor/gt.png --protocol nyu --csv -"),
+        ("nyu", "eval ../in/indoor/gt.png ../in/indoor/gt.png --protocol nyu-eigen --csv -"),
         ("kitti", "eval ../in/street/sparse.png ../in/street/gt.png --protocol kitti --latex -"),
         ("devkit", "eval ../in/street/sparse.png ../in/street/gt.png --protocol kitti-devkit"),
         ("eigen", "eval ../in/street/sparse.png ../in/street/gt.png --protocol eigen --json"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -13,8 +14,7 @@ from pnpdepth_cli.cli.progress import progress_bar
 from pnpdepth_cli.errors import UsageError
 
 if TYPE_CHECKING:
-    from pnpdepth_cli.pipeline.bench.bench import Bench, BenchPart
-    from pnpdepth_cli.pipeline.bench.table import TableRow
+    from pnpdepth_cli.pipeline.bench import Bench, BenchPart, PaperTime
 
 
 @click.command(
@@ -78,7 +78,7 @@ def bench(size: str | None, repeats: int, table: bool, as_json: bool, **values: 
             )
         _table(repeats, values["precision"], values["device"], as_json)
         return
-    from pnpdepth_cli.pipeline.bench.bench import BenchRequest, run_bench
+    from pnpdepth_cli.pipeline.bench import BenchRequest, run_bench
 
     request = BenchRequest(
         size=options.height_and_width(size) if size else None, repeats=repeats, **values
@@ -86,7 +86,7 @@ def bench(size: str | None, repeats: int, table: bool, as_json: bool, **values: 
     with progress_bar("bench", "round") as show:
         result = run_bench(request, on_round=show)
     if as_json:
-        click.echo(json.dumps(result.record(), indent=2))
+        click.echo(json.dumps(asdict(result), indent=2))
         return
     _print(result)
 
@@ -125,17 +125,17 @@ def _cells(part: BenchPart) -> tuple[str, ...]:
 
 
 def _table(repeats: int, precision: str, device: str, as_json: bool) -> None:
-    from pnpdepth_cli.pipeline.bench.table import bench_table
+    from pnpdepth_cli.pipeline.bench import bench_table, table_record
 
     with progress_bar("bench", "network") as show:
         rows = bench_table(repeats=repeats, precision=precision, device=device, on_network=show)
     if as_json:
-        click.echo(json.dumps([row.record() for row in rows], indent=2))
+        click.echo(json.dumps(table_record(rows), indent=2))
         return
     from pnpdepth_cli.cli.tables import print_rows
 
     print_rows(
-        f"Table IV: random weights, K = 5, {precision}, {device}, {rows[0].bench.threads} threads,"
+        f"Table IV: random weights, K = 5, {precision}, {device}, {rows[0][1].threads} threads,"
         f" medians of {repeats}; beside the paper's figures",
         (
             "network",
@@ -151,12 +151,11 @@ def _table(repeats: int, precision: str, device: str, as_json: bool) -> None:
             "paper,\nrefinement",
             "paper,\n×",
         ),
-        [_row_cells(row) for row in rows],
+        [_row_cells(paper, bench) for paper, bench in rows],
     )
 
 
-def _row_cells(row: TableRow) -> tuple[str, ...]:
-    bench, paper = row.bench, row.paper
+def _row_cells(paper: PaperTime, bench: Bench) -> tuple[str, ...]:
     refinement, forward = bench.part("refinement"), bench.part("forward")
     flops, memory = bench.limit_by_flops, refinement.peak_mb
     printed = (paper.before, paper.after)

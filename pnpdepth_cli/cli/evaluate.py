@@ -23,13 +23,9 @@ from pnpdepth_cli.cli import grouped_help, options
 from pnpdepth_cli.cli.printable import printable
 from pnpdepth_cli.cli.progress import progress_bar
 from pnpdepth_cli.errors import FramesFailedError, UsageError
-from pnpdepth_cli.pipeline.cluster.options import ClusterOptions
 
 if TYPE_CHECKING:
-    _Choice = click.Choice[str]
     from pnpdepth_cli.pipeline.evaluation.result import EvalRequest
-else:
-    _Choice = click.Choice  # not generic before click 8.2
 
 _REQUEST_OPTIONS = (
     "sparse",
@@ -48,13 +44,6 @@ _SCALE_OPTIONS = {
     "channel": "channel",
 }
 """Options by the field of `Scales` that they set."""
-
-
-class _ProtocolName(_Choice):
-    """A protocol; `nyu`, the former name of `nyu-eigen`, is accepted."""
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
-        return super().convert("nyu-eigen" if value == "nyu" else value, param, ctx)
 
 
 @click.command(
@@ -87,14 +76,13 @@ class _ProtocolName(_Choice):
             *("--no-groups", "--seed", "--measures"),
         ),
         "Output": ("--csv", "--markdown", "--latex", "--html", "--overwrite", "--json"),
-        "Cluster": grouped_help.CLUSTER,
     },
 )
 @click.argument("prediction", type=options.FILE, metavar="PRED")
 @click.argument("ground_truth", type=options.FILE, metavar="GT")
 @click.option(
     "--protocol",
-    type=_ProtocolName(EVAL_PROTOCOLS),
+    type=click.Choice(EVAL_PROTOCOLS),
     default="paper",
     show_default=True,
     help="Preset of the options below.",
@@ -193,7 +181,6 @@ class _ProtocolName(_Choice):
     help="Number of frames read at once.",
 )
 @options.no_groups
-@options.options_of_groups(ClusterOptions)
 @options.table_files(
     csv="Write a row per frame.",
     markdown="Write a table of the means.",
@@ -269,7 +256,6 @@ def _request(prediction: Path, ground_truth: Path, values: dict[str, Any]) -> Ev
     from pnpdepth_cli.pipeline.evaluation.result import EvalRequest
 
     own = {name: values.pop(name) for name in _REQUEST_OPTIONS}
-    own["cluster"] = ClusterOptions(**options.taken(ClusterOptions, values))
     scales = {field: values.pop(name) for field, name in _SCALE_OPTIONS.items()}
     grouped = not values.pop("no_groups")
     groups = values.pop("measures")

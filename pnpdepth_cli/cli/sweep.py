@@ -15,7 +15,6 @@ from pnpdepth_cli.cli.exit_codes import INTERRUPTED
 from pnpdepth_cli.cli.progress import BatchProgress
 from pnpdepth_cli.errors import FramesFailedError, StorageError
 from pnpdepth_cli.pipeline.batch.request import FrameSelection
-from pnpdepth_cli.pipeline.cluster.options import ClusterOptions
 from pnpdepth_cli.pipeline.refinement.request import FrameFiles, MethodOptions, NetworkChoice
 
 
@@ -35,7 +34,6 @@ from pnpdepth_cli.pipeline.refinement.request import FrameFiles, MethodOptions, 
         "Network": grouped_help.NETWORK,
         "Method": tuple(name for name in grouped_help.METHOD if name != "--seed"),
         "Output": ("--output", "--plots", "--plot-format", "--cost", "--json"),
-        "Cluster": grouped_help.CLUSTER,
     },
 )
 @click.argument("source", type=options.FILE, metavar="FOLDER|LIST")
@@ -65,7 +63,7 @@ from pnpdepth_cli.pipeline.refinement.request import FrameFiles, MethodOptions, 
     metavar="N",
     help="Number of random draws of the points; the first uses --seed.",
 )
-@options.options_of_groups(FrameSelection, ClusterOptions)
+@options.options_of_groups(FrameSelection)
 @click.option("--plots/--no-plots", default=True, help="Draw plots, or write tables only.")
 @click.option(
     "--plot-format",
@@ -130,8 +128,7 @@ def sweep(
     """
     from pnpdepth_cli.pipeline.sweep.axes import read_axis, studies_of
     from pnpdepth_cli.pipeline.sweep.points import read_sampling
-    from pnpdepth_cli.pipeline.sweep.request import SweepRequest
-    from pnpdepth_cli.pipeline.sweep.sweep import run_sweep
+    from pnpdepth_cli.pipeline.sweep.sweep import SweepRequest, run_sweep
 
     own = options.taken(FrameSelection, values)
     request = SweepRequest(
@@ -143,7 +140,6 @@ def sweep(
         plots=values.pop("plots"),
         plot_format=values.pop("plot_format"),
         cost=values.pop("cost"),
-        cluster=ClusterOptions(**options.taken(ClusterOptions, values)),
         refine=options.request_of(values),
         **own,
     )

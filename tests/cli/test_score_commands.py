@@ -148,7 +148,7 @@ EXITS = [
     (["eval", "out", "gt", "--delta", "fast"], 2, "--delta"),
     (["eval", "out", "gt/a.npy"], 2, "two files or two folders"),
     (["eval", "out", "nowhere"], 3, "nowhere"),
-    (["eval", "out", "gt", "--protocol", "nyu"], 3, "640×480"),
+    (["eval", "out", "gt", "--protocol", "nyu-eigen"], 3, "640×480"),
     (["eval", "out", "gt", "--sparse", "nowhere"], 3, "nowhere"),
     (["compare", "a.json"], 2, "two runs"),
     (["compare", "a.json", "b.json"], 3, "a.json"),

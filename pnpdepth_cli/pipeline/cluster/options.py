@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
-from typing import TypeAlias
 
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.pipeline.options import option
@@ -106,7 +105,3 @@ def ray_workers_of(device: str, options: ClusterOptions) -> RayWorkers | None:
             f" --ray-workers {len(indices)}"
         )
     return RayWorkers(address=address, device=kind, indices=indices, options=options)
-
-
-Spread: TypeAlias = RayWorkers  # until `eval` and `sweep` take results instead
-spread_of = ray_workers_of

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, replace
 from pathlib import PurePath
 from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from pnpdepth_cli.core.metrics import MEASURES, Measure
 from pnpdepth_cli.errors import InputError, UsageError
 from pnpdepth_cli.io.record import plain
-from pnpdepth_cli.pipeline.evaluation.averages import Floats, FrameTable
 from pnpdepth_cli.pipeline.evaluation.dependence import (
     MIN_CLUSTERS,
     Clusters,
@@ -25,7 +25,11 @@ from pnpdepth_cli.pipeline.evaluation.dependence import (
 from pnpdepth_cli.pipeline.evaluation.pairing import some_names
 from pnpdepth_cli.pipeline.evaluation.resampling import (
     LEVEL,
+    Floats,
+    FrameTable,
+    clusters_among,
     holm,
+    known_together,
     sign_flip_p_values,
     studentised_interval,
 )
@@ -45,17 +49,16 @@ class Gain:
     Values are NaN where there is none, as for a single frame.
     """
 
-    percent: float
+    percent: float = math.nan
     """Of the first run's mean."""
-    low_percent: float
+    low_percent: float = math.nan
     """Lower end of its 95 % interval, a studentised bootstrap over the clusters of frames."""
-    high_percent: float
-    """Upper end."""
-    difference: float
+    high_percent: float = math.nan
+    difference: float = math.nan
     """This run's mean minus the first run's, in the measure's unit."""
-    p_value: float
+    p_value: float = math.nan
     """Two-sided, of no difference, by swapping the runs cluster by cluster."""
-    p_adjusted: float
+    p_adjusted: float = math.nan
     """The same, adjusted for the number of measures (Holm 1979)."""
 
 
@@ -64,11 +67,8 @@ class RunMean:
     """A run's means over the frames that all runs have."""
 
     label: str
-    """The run's name in tables."""
     path: str
-    """Its file, as the user gave it."""
     mean: dict[str, float]
-    """By the measure's key."""
     coverage: float | None = None
     """Fraction of the ground truth's pixels that is scored; None where files do not say."""
 
@@ -92,11 +92,8 @@ class Comparison:
     exact: bool
     """True if the p-values are of all swaps, not of random ones."""
     resamples: int
-    """Bootstrap samples, and the most swaps."""
     seed: int
-    """Of the random numbers."""
-    notes: tuple[str, ...] = field(default=())
-    """Warnings, one line each."""
+    notes: tuple[str, ...] = ()
 
     def as_record(self) -> dict[str, Any]:
         """Returns what `--json` prints; NaN is null."""
@@ -127,7 +124,6 @@ class CompareRequest:
     resamples: int = 10_000
     """Bootstrap samples, and the most swaps of the permutation test."""
     seed: int = 0
-    """Of both."""
     grouped: bool = True
     """False if every frame counts as independent."""
     all_measures: bool = False
@@ -136,6 +132,8 @@ class CompareRequest:
 
 def compare(request: CompareRequest) -> Comparison:
     """Returns the runs on the frames that all of them scored, compared with the first.
+
+    A measure that a frame lacks in one of the runs is averaged and tested over the other frames.
 
     Raises:
         UsageError: For fewer than two runs.
@@ -156,29 +154,48 @@ def compare(request: CompareRequest) -> Comparison:
     common = [measure for measure in runs[0].measures if measure.key in shared]
     main = [measure for measure in common if measure.key in MAIN_MEASURES]
     measures = tuple(common if request.all_measures or not main else main)
-    keys = [measure.key for measure in measures]
-    tables = [_table(run, names, keys) for run in runs]
-    clusters = _clusters(runs, names, keys, grouped=request.grouped)
-    tests = [_gains(tables[0], table, measures, clusters, request) for table in tables[1:]]
+    values = np.array([_values(run, names, measures) for run in runs])
+    known = np.isfinite(values).all(axis=0) | runs[0].pooled
+    clusters = independent_frames(len(names))
+    if request.grouped:
+        differences = np.concatenate(list(values[1:] - values[0]), axis=1)
+        clusters = find_clusters([runs[0].frames[name].group for name in names], differences)
+    means = [dict.fromkeys((m.key for m in measures), math.nan) for _ in runs]
+    gains = [dict.fromkeys((m.key for m in measures), Gain()) for _ in runs[1:]]
+    exact = True
+    for frames, columns in known_together(known):
+        if not frames.any():
+            continue
+        tested = [measures[column] for column in columns]
+        tables = [
+            _table(run, names, frames, of_run[frames][:, columns], tested)
+            for run, of_run in zip(runs, values, strict=True)
+        ]
+        ids = clusters_among(clusters.ids, frames)
+        for mean, table in zip(means, tables, strict=True):
+            mean |= zip((m.key for m in tested), table.mean().tolist(), strict=True)
+        for gain, table in zip(gains, tables[1:], strict=True):
+            of_table, all_swaps = _gains(tables[0], table, tested, ids, request)
+            gain |= of_table
+            exact &= all_swaps
     return Comparison(
         names=names,
         measures=measures,
         scoring=runs[0].scoring,
         runs=tuple(
-            RunMean(
-                label=label,
-                path=run.path,
-                mean=dict(zip(keys, table.mean().tolist(), strict=True)),
-                coverage=_coverage(run, names),
-            )
-            for label, run, table in zip(_labels(runs), runs, tables, strict=True)
+            RunMean(label=label, path=run.path, mean=mean, coverage=_coverage(run, names))
+            for label, run, mean in zip(_labels(runs), runs, means, strict=True)
         ),
-        gains=tuple(gains for gains, _ in tests),
+        gains=tuple(_adjusted(gain) for gain in gains),
         clusters=clusters,
-        exact=all(exact for _, exact in tests),
+        exact=exact,
         resamples=request.resamples,
         seed=request.seed,
-        notes=(*_notes(runs, names), *_cluster_notes(clusters, len(names), len(measures))),
+        notes=(
+            *_notes(runs, names),
+            *_lacking(names, measures, known),
+            *_cluster_notes(clusters, len(names), len(measures)),
+        ),
     )
 
 
@@ -196,41 +213,38 @@ def _check_rules(first: Run, other: Run) -> None:
         )
 
 
-def _values(run: Run, names: Sequence[str], keys: Sequence[str]) -> Floats:
-    """(N, M) the measures of the frames."""
+def _values(run: Run, names: Sequence[str], measures: Sequence[Measure]) -> Floats:
+    """(N, M) the measures of the frames; NaN where a frame lacks one."""
     frames = [run.frames[name] for name in names]
-    return np.array([[frame.values.get(key, math.nan) for key in keys] for frame in frames])
+    return np.array([[frame.values.get(m.key, math.nan) for m in measures] for frame in frames])
 
 
-def _table(run: Run, names: Sequence[str], keys: Sequence[str]) -> FrameTable:
-    if run.pooled:
-        kept = tuple(n for n, measure in enumerate(MEASURES) if measure.key in keys)
-        sums = np.array([run.frames[name].sums for name in names])
-        return FrameTable(rows=sums, pooled=True, kept=kept)
-    return FrameTable(rows=_values(run, names, keys))
-
-
-def _clusters(
-    runs: Sequence[Run], names: Sequence[str], keys: Sequence[str], *, grouped: bool
-) -> Clusters:
-    if not grouped:
-        return independent_frames(len(names))
-    first, *others = (_values(run, names, keys) for run in runs)
-    differences = np.concatenate([other - first for other in others], axis=1)
-    return find_clusters([runs[0].frames[name].group for name in names], differences)
+def _table(
+    run: Run,
+    names: Sequence[str],
+    frames: NDArray[np.bool_],
+    values: Floats,
+    measures: Sequence[Measure],
+) -> FrameTable:
+    if not run.pooled:
+        return FrameTable(rows=values)
+    keys = [measure.key for measure in measures]
+    kept = tuple(n for n, measure in enumerate(MEASURES) if measure.key in keys)
+    sums = np.array([run.frames[name].sums for name, of in zip(names, frames, strict=True) if of])
+    return FrameTable(rows=sums, pooled=True, kept=kept)
 
 
 def _gains(
     first: FrameTable,
     other: FrameTable,
     measures: Sequence[Measure],
-    clusters: Clusters,
+    ids: NDArray[np.int64],
     request: CompareRequest,
 ) -> tuple[dict[str, Gain], bool]:
-    """The gains of a run by measure, and whether their p-values are exact."""
+    """The gains of a run by measure, not adjusted; and whether their p-values are exact."""
     better = torch.tensor([1.0 if m.higher_is_better else -1.0 for m in measures]).double()
-    first_totals, other_totals = (table.cluster_totals(clusters.ids) for table in (first, other))
-    columns = first_totals.shape[1]
+    first_totals, other_totals = (table.cluster_totals(ids) for table in (first, other))
+    clusters, columns = first_totals.shape
 
     def percent(a: Tensor, b: Tensor) -> Tensor:
         change = torch.where(a == b, torch.zeros_like(a), 100 * better * (b - a) / a.abs())
@@ -248,20 +262,45 @@ def _gains(
     totals = np.concatenate([first_totals, other_totals], axis=1)
     none = np.full(len(measures), math.nan)
     low, high, p_values, exact = none, none, none, True
-    if clusters.count >= MIN_CLUSTERS:
+    if clusters >= MIN_CLUSTERS:
         low, high = studentised_interval(percent_of, totals, request.resamples, request.seed)
-    if clusters.count > 1:
+    if clusters > 1:
         p_values, exact = sign_flip_p_values(
-            swapped_difference, clusters.count, request.resamples, request.seed
+            swapped_difference, clusters, request.resamples, request.seed
         )
     first_mean, other_mean = first.mean(), other.mean()
     gains = percent(torch.from_numpy(first_mean), torch.from_numpy(other_mean)).numpy()
-    rows = zip(gains, low, high, other_mean - first_mean, p_values, holm(p_values), strict=True)
-    names = ("percent", "low_percent", "high_percent", "difference", "p_value", "p_adjusted")
+    rows = zip(gains, low, high, other_mean - first_mean, p_values, strict=True)
+    names = ("percent", "low_percent", "high_percent", "difference", "p_value")
     return {
         measure.key: Gain(**dict(zip(names, map(float, row), strict=True)))
         for measure, row in zip(measures, rows, strict=True)
     }, exact
+
+
+def _adjusted(gains: dict[str, Gain]) -> dict[str, Gain]:
+    """The gains with p-values adjusted for their number."""
+    adjusted = holm(np.array([gain.p_value for gain in gains.values()]))
+    return {
+        key: replace(gain, p_adjusted=float(p_value))
+        for (key, gain), p_value in zip(gains.items(), adjusted, strict=True)
+    }
+
+
+def _lacking(
+    names: Sequence[str], measures: Sequence[Measure], known: NDArray[np.bool_]
+) -> list[str]:
+    """A line for each set of measures that some frames lack."""
+    lines = []
+    for frames, columns in known_together(known):
+        lacking = [name for name, has in zip(names, frames, strict=True) if not has]
+        if lacking:
+            titles = ", ".join(measures[column].title for column in columns)
+            lines.append(
+                f"{titles}: over {len(names) - len(lacking):,} frames; {len(lacking):,} lack it in"
+                f" a run: {some_names(lacking)}"
+            )
+    return lines
 
 
 def _coverage(run: Run, names: Sequence[str]) -> float | None:

@@ -10,8 +10,6 @@ import torch
 
 from pnpdepth_cli.core.metrics import MEASURES, SUMS, measures_of
 from pnpdepth_cli.errors import InputError, UsageError
-from pnpdepth_cli.pipeline.cluster.options import spread_of
-from pnpdepth_cli.pipeline.evaluation.averages import Floats, FrameTable
 from pnpdepth_cli.pipeline.evaluation.dependence import (
     MIN_CLUSTERS,
     Clusters,
@@ -30,9 +28,14 @@ from pnpdepth_cli.pipeline.evaluation.frame_scoring import (
 from pnpdepth_cli.pipeline.evaluation.kitti_devkit import devkit_mean
 from pnpdepth_cli.pipeline.evaluation.pairing import FramePair, in_sequences, pair_frames
 from pnpdepth_cli.pipeline.evaluation.protocols import EvalProtocol, choose_protocol
-from pnpdepth_cli.pipeline.evaluation.resampling import studentised_interval
+from pnpdepth_cli.pipeline.evaluation.resampling import (
+    Floats,
+    FrameTable,
+    clusters_among,
+    known_together,
+    studentised_interval,
+)
 from pnpdepth_cli.pipeline.evaluation.result import ErrorBin, EvalRequest, Evaluation, Interval
-from pnpdepth_cli.pipeline.evaluation.spread import spread_scores
 from pnpdepth_cli.pipeline.evaluation.uncertainty import summarise_uncertainty
 from pnpdepth_cli.pipeline.ordered_pool import in_order
 
@@ -70,12 +73,7 @@ def evaluate(
     frames = pairs.frames
     if any(group.in_sequences for group in protocol.measure_groups):
         frames = in_sequences(frames)
-    spread, messages = spread_of("cpu", request.cluster), list[str]()
-    if spread is None or pairs.single:
-        scored_frames = _scored(frames, protocol, request, raising=pairs.single)
-    else:
-        scored_frames = spread_scores(frames, protocol, request, spread, messages.append)
-    for scored in scored_frames:
+    for scored in _scored(frames, protocol, request, raising=pairs.single):
         rows.append(scored.row)
         kinds.add(scored)
         if scored.uncertainty is not None:
@@ -89,23 +87,21 @@ def evaluate(
         raise InputError(f"no frame could be scored; the first: {rows[0].error}")
     keys = [measure.key for measure in protocol.measures]
     values = np.array([[row.values[key] for key in keys] for row in scored_rows])
-    table = FrameTable(rows=values, gaps=bool(protocol.groups))
-    if protocol.average == "pooled":
-        table = FrameTable(rows=np.array([row.sums for row in scored_rows]), pooled=True)
-    mean = devkit_mean(values) if protocol.is_devkit else table.mean()
-    clusters = _clusters(scored_rows, values, request)
+    clusters = independent_frames(len(scored_rows))
+    if request.grouped:
+        clusters = find_clusters([row.pair.group for row in scored_rows], values)
+    mean, interval = _mean_and_interval(scored_rows, values, clusters, protocol, request)
     return Evaluation(
         request=request,
         protocol=protocol,
         frames=tuple(rows),
         mean=_by_key(keys, mean),
-        interval=_interval(table, clusters, protocol, request),
+        interval=interval,
         clusters=clusters,
         uncertainty=summarise_uncertainty(uncertainties),
         by_distance=_bins(by_distance, DISTANCE_EDGES_PX),
         by_depth=_bins(by_depth, DEPTH_EDGES_M),
         notes=(
-            *(note for note in messages if note.startswith("warning")),
             *pairs.notes,
             *kinds.notes(),
             *diagnose(rows, protocol, kinds),
@@ -145,25 +141,39 @@ def _scored(
     return in_order(scored, frames, request.workers)
 
 
-def _clusters(rows: Sequence[FrameScores], values: Floats, request: EvalRequest) -> Clusters:
-    if not request.grouped:
-        return independent_frames(len(rows))
-    return find_clusters([row.pair.group for row in rows], values)
+def _mean_and_interval(
+    rows: Sequence[FrameScores],
+    values: Floats,
+    clusters: Clusters,
+    protocol: EvalProtocol,
+    request: EvalRequest,
+) -> tuple[Floats, Interval | None]:
+    """(M,) the means of (N, M) values, and their intervals inside the range of each measure.
 
-
-def _interval(
-    table: FrameTable, clusters: Clusters, protocol: EvalProtocol, request: EvalRequest
-) -> Interval | None:
-    """The interval of each mean, inside the range that the measure can have."""
+    A measure that a frame lacks is averaged over the other frames.
+    """
+    pooled = protocol.average == "pooled"
+    has_gaps = bool(protocol.groups)  # only additional measures may be lacking
+    mean, low, high = (np.full(values.shape[1], math.nan) for _ in range(3))
+    known = ~np.isnan(values) if has_gaps else np.ones(values.shape, bool)
+    for frames, columns in known_together(known):
+        if not frames.any():
+            continue
+        table = FrameTable(rows=values[frames][:, columns])
+        if pooled:
+            table = FrameTable(rows=np.array([row.sums for row in rows]), pooled=True)
+        mean[columns] = devkit_mean(values) if protocol.is_devkit else table.mean()
+        totals = table.cluster_totals(clusters_among(clusters.ids, frames))
+        if len(totals) >= MIN_CLUSTERS and request.resamples:
+            low[columns], high[columns] = studentised_interval(
+                table.means_of, totals, request.resamples, request.seed
+            )
     if clusters.count < MIN_CLUSTERS or not request.resamples:
-        return None
-    totals = table.cluster_totals(clusters.ids)
-    low, high = studentised_interval(table.means_of, totals, request.resamples, request.seed)
+        return mean, None
     highest = [1.0 if measure.percent else math.inf for measure in protocol.measures]
     keys = [measure.key for measure in protocol.measures]
-    return Interval(
-        low=_by_key(keys, np.maximum(low, 0.0)), high=_by_key(keys, np.minimum(high, highest))
-    )
+    low, high = np.maximum(low, 0.0), np.minimum(high, highest)
+    return mean, Interval(low=_by_key(keys, low), high=_by_key(keys, high))
 
 
 def _interval_notes(clusters: Clusters, frames: int, request: EvalRequest) -> list[str]:

@@ -23,9 +23,6 @@ from pnpdepth_cli.pipeline.evaluation.measured_frame import MeasureGroup
 
 KITTI_DEVKIT = "kitti-devkit"
 
-FORMER_NAMES = {"nyu": "nyu-eigen"}
-"""Present names of protocols by former ones, which are still accepted."""
-
 # (top, bottom, left, right) as fractions of the height and the width, cut to whole pixels.
 # Garg et al. 2016 for KITTI; and what Godard et al. (monodepth, utils/evaluate_kitti.py) found by
 # trial to reproduce Eigen et al. 2014. Nearly all later evaluations use these two.
@@ -257,7 +254,6 @@ def choose_protocol(name: str, **changes: Any) -> EvalProtocol:
     Raises:
         UsageError: For an unknown name or a setting out of its range.
     """
-    name = FORMER_NAMES.get(name, name)
     if name not in PROTOCOLS:
         raise UsageError(f"no protocol {name!r}; there are {', '.join(PROTOCOLS)}")
     changed = {field: value for field, value in changes.items() if value is not None}

@@ -1,14 +1,14 @@
 """How sure means over clusters of frames are: the bootstrap, permutations, and Holm's correction.
 
-scipy.stats offers a bootstrap and permutations of samples, but no studentised interval, which is
-what small numbers of skewed errors need, and none of nonlinear functions of pooled sums. Tests
-compare with it where both apply.
+Permutations are those of scipy.stats. Its bootstrap has no studentised interval, which few values
+of skewed errors need, and it adjusts p-values only for the false discovery rate; both are here.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -16,13 +16,66 @@ from numpy.typing import NDArray
 from scipy import stats
 from torch import Tensor
 
-from pnpdepth_cli.pipeline.evaluation.averages import Floats
+from pnpdepth_cli.core.metrics import measures_of
+
+Floats = NDArray[np.float64]
 
 LEVEL = 0.95
 _STEP = 1e-5
 """Of the numerical derivative, relative to the totals of a cluster; its error is near 1e-10."""
 _CELLS = 1 << 21
 """Weights held at once, so that memory stays bounded for any number of clusters."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrameTable:
+    """The scores of N frames, from which the means of any weighting of the frames follow."""
+
+    rows: Floats
+    """(N, M) measures of each frame; where pixels are pooled, (N, len(SUMS)) sums over pixels."""
+    pooled: bool = False
+    """True if the mean is over the pixels of all frames."""
+    kept: tuple[int, ...] | None = None
+    """Of a pooled table: which of core.metrics.MEASURES the means are; None for all."""
+
+    def mean(self) -> Floats:
+        """Returns (M,) the means over all frames."""
+        totals = self.cluster_totals(np.zeros(len(self.rows), np.int64))[0]
+        return np.asarray(self.means_of(torch.from_numpy(totals)).numpy())
+
+    def cluster_totals(self, clusters: NDArray[np.int64]) -> Floats:
+        """Returns (G, C) the sums of the rows of each cluster, and in the last column its frames.
+
+        Args:
+            clusters: (N,) the cluster of each frame, from 0 to G − 1.
+        """
+        rows = np.column_stack([self.rows, np.ones(len(self.rows))])
+        totals = np.zeros((int(clusters.max()) + 1, rows.shape[1]))
+        np.add.at(totals, clusters, rows)
+        return totals
+
+    def means_of(self, totals: Tensor) -> Tensor:
+        """Returns (…, M) the means of frames whose `cluster_totals` add up to (…, C)."""
+        if not self.pooled:
+            return totals[..., :-1] / totals[..., -1:]
+        means = measures_of(totals[..., :-1])
+        return means if self.kept is None else means[..., list(self.kept)]
+
+
+def known_together(known: NDArray[np.bool_]) -> Iterator[tuple[NDArray[np.bool_], list[int]]]:
+    """Yields (N,) frames and the measures that exactly these frames have.
+
+    Args:
+        known: (N, M) whether a frame has a measure.
+    """
+    patterns, pattern_of = np.unique(known, axis=1, return_inverse=True)
+    for number, frames in enumerate(patterns.T):
+        yield frames, np.flatnonzero(pattern_of.ravel() == number).tolist()
+
+
+def clusters_among(ids: NDArray[np.int64], frames: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Returns the clusters of some of the frames, numbered from 0 without a gap."""
+    return np.unique(ids[frames], return_inverse=True)[1].astype(np.int64)
 
 
 def studentised_interval(
@@ -75,9 +128,8 @@ class _Moments:
         self._upper = np.triu_indices(columns)
         self._products = self._centred[:, self._upper[0]] * self._centred[:, self._upper[1]]
         # central differences: a backward pass would carry the NaN of one measure into the others
-        self._steps = torch.diag(
-            _STEP * torch.from_numpy(totals).abs().mean(dim=0).clamp_min(1e-300)
-        )
+        steps = _STEP * torch.from_numpy(totals).abs().mean(dim=0).clamp_min(1e-300)
+        self._steps = torch.diag(steps.nan_to_num(1.0))
 
     def linearised(self, counts: Floats) -> tuple[Floats, Floats]:
         """Returns (B, M) the statistic where clusters count as (B, G), and (B, M) its errors."""
@@ -90,7 +142,7 @@ class _Moments:
         variances = torch.einsum(
             "bmc,bcd,bmd->bm", slopes, torch.from_numpy(self._covariances(counts)), slopes
         )
-        return values.numpy(), variances.nan_to_num(0.0).clamp_min(0).sqrt().numpy()
+        return values.numpy(), variances.clamp_min(0).sqrt().numpy()
 
     def _covariances(self, counts: Floats) -> Floats:
         """(B, C, C) sums over the clusters of products of totals, centred in each resample."""
@@ -100,7 +152,8 @@ class _Moments:
         covariances = np.empty((len(counts), sums.shape[1], sums.shape[1]))
         covariances[:, rows, columns] = centred
         covariances[:, columns, rows] = centred
-        return covariances
+        # a column with NaN is of a measure that is NaN; it must not reach the other measures
+        return np.nan_to_num(covariances, nan=0.0)
 
 
 def _counts(drawn: NDArray[np.int32]) -> Floats:
@@ -126,31 +179,30 @@ def sign_flip_p_values(
         resamples: How many swaps are tried at most.
         seed: Of the random swaps.
     """
-    observed = np.abs(difference(np.zeros((1, clusters))))
+    observed = np.abs(difference(np.zeros((1, clusters)))[0])
+
+    def differs_as_much(flips: Floats, _: Floats, axis: int) -> Floats:
+        # rounding must not make an equal difference look smaller than the observed one
+        as_much = np.abs(difference(np.atleast_2d(flips))) >= observed * (1 - 1e-9)
+        return np.asarray(as_much, np.float64)
+
     exact = clusters < 60 and 2**clusters <= resamples
-    generator = np.random.default_rng(seed)
-    total = 2**clusters if exact else resamples
-    # rounding must not make an equal difference look smaller than the observed one
-    threshold = observed * (1 - 1e-9)
-    as_large = np.zeros(observed.shape[1])
-    done = 0
-    for size in _batches(total, clusters):
-        if exact:
-            numbers = np.arange(done, done + size)
-            flips = (numbers[:, None] >> np.arange(clusters)) & 1
-        else:
-            flips = generator.integers(0, 2, size=(size, clusters))
-        as_large += (np.abs(difference(flips.astype(np.float64))) >= threshold).sum(axis=0)
-        done += size
-    p_values = as_large / total if exact else (as_large + 1) / (total + 1)
-    return np.where(np.isfinite(observed[0]), p_values, np.nan), exact
+    result = stats.permutation_test(
+        (np.zeros(clusters), np.ones(clusters)),
+        differs_as_much,
+        permutation_type="samples",
+        vectorized=True,
+        n_resamples=np.inf if exact else resamples,
+        batch=max(1, _CELLS // clusters),
+        alternative="greater",
+        axis=-1,
+        random_state=np.random.default_rng(seed),
+    )
+    return np.where(np.isfinite(observed), np.ravel(result.pvalue), np.nan), exact
 
 
 def holm(p_values: Floats) -> Floats:
-    """Returns (M,) p-values adjusted for testing M hypotheses (Holm 1979); NaN stays NaN.
-
-    scipy.stats adjusts only for the false discovery rate.
-    """
+    """Returns (M,) p-values adjusted for testing M hypotheses (Holm 1979); NaN stays NaN."""
     adjusted = np.full(len(p_values), math.nan)
     order = [index for index in np.argsort(p_values) if np.isfinite(p_values[index])]
     largest = 0.0

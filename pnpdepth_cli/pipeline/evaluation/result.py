@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 from pnpdepth_cli.io.record import plain
-from pnpdepth_cli.pipeline.cluster.options import ClusterOptions
 from pnpdepth_cli.pipeline.evaluation.dependence import Clusters
 from pnpdepth_cli.pipeline.evaluation.frame_reading import Scales
 from pnpdepth_cli.pipeline.evaluation.frame_scoring import FrameScores
@@ -46,8 +45,6 @@ class EvalRequest:
     """False if every frame counts as independent."""
     workers: int = 2
     """Frames read at once."""
-    cluster: ClusterOptions = field(default_factory=ClusterOptions)
-    """The Ray workers, if any."""
 
 
 @dataclass(frozen=True, kw_only=True)

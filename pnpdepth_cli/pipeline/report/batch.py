@@ -288,8 +288,8 @@ def _facts(summary: Mapping[str, Any], first: Row | None) -> list[tuple[str, str
         ("Results in", summary["output"]),
         ("Network", str(settings["model"])),
     ]
-    if summary["method"]["kind"] == "chosen":
-        facts.append(("Refinement", "each frame by its best candidate at held-out points"))
+    if summary["method"]["kind"] == "default":
+        facts.append(("Refinement", "networks refined, fused and propagated (the default method)"))
     elif first is not None:
         used = first["settings"]
         refined = f"{used['iterations']} updates of z at {used['layer']}"

@@ -26,13 +26,11 @@ class Parameter:
     """A parameter that can be varied."""
 
     title: str
-    """Title of a plot's axis."""
     value: Callable[[str], Any]
     """Parses a text; raises ValueError or UsageError."""
     of_percent: str = ""
     """Title where the values are in per cent."""
     log: bool = False
-    """True for a logarithmic axis."""
     of_points: bool = False
     """True if it concerns the points, not the update."""
 
@@ -48,7 +46,7 @@ class Axis:
 
     @property
     def parameter(self) -> Parameter:
-        """The parameter that is varied."""
+        """What is varied."""
         return PARAMETERS[self.name]
 
     def numbers(self) -> list[float] | None:
@@ -88,7 +86,6 @@ class Study:
 def read_axis(text: str) -> Axis:
     """Returns the axis of a text such as `points=20,100,500`. Raises UsageError for any other."""
     name, equals, listed = text.partition("=")
-    name = FORMER_NAMES.get(name, name)
     if name not in PARAMETERS:
         raise UsageError(f"no parameter {name!r} to vary; there are {', '.join(PARAMETERS)}")
     values = tuple(value.strip() for value in listed.split(","))
@@ -234,10 +231,3 @@ PARAMETERS: Mapping[str, Parameter] = {
     "seed": Parameter(title="seed of the points", value=_seed),
 }
 """All parameters that can be varied, in the order of the help."""
-
-FORMER_NAMES = {
-    each.option.alias.removeprefix("--"): each.name
-    for each in options_of(MethodOptions)
-    if each.option.alias is not None
-}
-"""Present names of parameters by their former ones, which are still accepted."""

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
-from typing import Any
+from itertools import groupby
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
@@ -15,15 +17,20 @@ from pnpdepth_cli.completion.propagation import propagate
 from pnpdepth_cli.core.metrics import score
 from pnpdepth_cli.core.refine import Refinement, RefineSettings, refine
 from pnpdepth_cli.core.split import Split
-from pnpdepth_cli.errors import DivergedError
+from pnpdepth_cli.errors import DeviceError, DivergedError, PnpDepthError, StorageError
 from pnpdepth_cli.frames.frame import RefinedFrame
-from pnpdepth_cli.frames.opened import SplitCache
 from pnpdepth_cli.frames.prepare import prepare
 from pnpdepth_cli.frames.refine import refine_frame
 from pnpdepth_cli.models.frame import FrameMap
 from pnpdepth_cli.models.network import Network, out_of_memory_is_a_device_error
+from pnpdepth_cli.pipeline.batch.reading import read_frame
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs
 from pnpdepth_cli.pipeline.sweep.plan import Method, Run
+from pnpdepth_cli.pipeline.sweep.points import frame_points
+
+T = TypeVar("T")
+Result = dict[str, Any] | PnpDepthError
+"""What the journal has of a run, or why it failed."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,29 +51,90 @@ class Curve:
     """Why it diverged; None if it did not."""
 
 
-def result_of(run: Run, inputs: Inputs, cache: SplitCache) -> dict[str, Any]:
-    """Returns the result of a run as the journal has it.
+def results(runs: Sequence[Run], network: Network) -> Iterator[tuple[Run, Result]]:
+    """Yields the runs with their results; each frame is read once.
 
     Args:
-        run: What to compute.
-        inputs: The frame with the run's points.
-        cache: Keeps the network cut at the last layer.
+        runs: Those of a frame follow each other, and among these those with the same points.
+        network: The network of all runs.
     """
+    with _Cuts(network) as cuts:
+        for _, of_frame in groupby(runs, key=lambda run: run.frame.name):
+            inputs: Inputs | PnpDepthError | None = None
+            for _, of_points in groupby(of_frame, key=lambda run: (run.sampling, run.seed)):
+                same_points = list(of_points)
+                if inputs is None:
+                    inputs = _result_or_error(read_frame, same_points[0].task)
+                drawn = inputs
+                if not isinstance(inputs, PnpDepthError):
+                    drawn = _result_or_error(_drawn, same_points[0], inputs)
+                for run in same_points:
+                    if isinstance(drawn, PnpDepthError):
+                        yield run, drawn
+                    else:
+                        yield run, _result_or_error(_result_of, run, drawn, cuts)
+
+
+def _result_or_error(read: Callable[..., T], *arguments: Any) -> T | PnpDepthError:
+    """The result, or the error of a frame that cannot be used."""
+    try:
+        return read(*arguments)
+    except (StorageError, DeviceError):
+        raise
+    except PnpDepthError as error:
+        return error
+
+
+def _drawn(run: Run, inputs: Inputs) -> Inputs:
+    """The frame with the run's points."""
+    points = frame_points(run.sampling, run.seed, inputs, run.task.request, run.frame)
+    return replace(inputs, points=points)
+
+
+class _Cuts:
+    """Keeps the network cut while the layer stays the same, so that it is recorded once."""
+
+    def __init__(self, network: Network) -> None:
+        self.network, self._open = network, ExitStack()
+        self._layer: str | None = None
+        self._split: Split | None = None
+
+    def __enter__(self) -> _Cuts:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Restores the whole network until it is cut again."""
+        self._open.close()
+        self._split = self._layer = None
+
+    def at(self, layer: str) -> Split:
+        """Returns the network cut at the layer, open."""
+        if self._split is None or self._layer != layer:
+            self.close()
+            self._split, self._layer = self._open.enter_context(self.network.cut_at(layer)), layer
+        return self._split
+
+
+def _result_of(run: Run, inputs: Inputs, cuts: _Cuts) -> dict[str, Any]:
+    """The result of a run as the journal has it, of the frame with the run's points."""
     done = {"state": "done", "points": len(inputs.points)}
     if run.method is None:
-        return done | {"scores": {"linear": interpolated(cache.network, inputs)}}
+        return done | {"scores": {"linear": interpolated(cuts.network, inputs)}}
     torch.manual_seed(run.seed)
     try:
         if run.method.settings.moves_weights:
-            cache.close()
+            cuts.close()
             curve = weights_curve(
-                cache.network, _seeded(run.method, run.seed), inputs, run.iterations
+                cuts.network, _seeded(run.method, run.seed), inputs, run.iterations
             )
         else:
-            split = cache.at(run.method.layer)
-            curve = refined_curve(cache.network, split, run.method, inputs, run.iterations)
+            split = cuts.at(run.method.layer)
+            curve = refined_curve(cuts.network, split, run.method, inputs, run.iterations)
     except BaseException:
-        cache.close()
+        cuts.close()
         raise
     return done | {
         "plain": curve.plain,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,21 +11,24 @@ from typing import Any
 
 import numpy as np
 import torch
+from scipy import stats
 from torch import Tensor
 
 from pnpdepth_cli.core.metrics import MEASURES
 from pnpdepth_cli.io.atomic import atomic_path
 from pnpdepth_cli.io.csv_text import write_csv
 from pnpdepth_cli.io.record import plain, write_json
-from pnpdepth_cli.pipeline.evaluation.averages import Floats, FrameTable
 from pnpdepth_cli.pipeline.evaluation.dependence import (
     MIN_CLUSTERS,
     find_clusters,
     groups_by_name,
 )
-from pnpdepth_cli.pipeline.evaluation.resampling import studentised_interval
+from pnpdepth_cli.pipeline.evaluation.resampling import Floats, FrameTable, studentised_interval
 from pnpdepth_cli.pipeline.evaluation.score_files import latex_text
 
+CONFIDENCE = 0.95
+MIN_SEEDS = 3
+"""An interval of fewer draws says nothing: of two it is 13 standard errors wide."""
 METHODS = ("plain", "linear", "refined")
 SWEPT = tuple(m for m in MEASURES if m.key in ("mae", "rmse", "mre", "delta1"))
 """The measures of a sweep."""
@@ -174,6 +178,43 @@ def _by_measure(mean: Floats, low: Floats, high: Floats) -> dict[str, dict[str, 
         }
         for m, measure in enumerate(SWEPT)
     }
+
+
+def over_seeds(cells: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Returns the MAE over the seeds of the points, for each setting of the other parameters.
+
+    Every figure has a mean and the ends of its 95 % interval (Student's t over the draws, of each
+    of which the mean over all frames is taken). The interval covers the choice of the points, not
+    that of the frames.
+
+    Args:
+        cells: Of one study; those without a parameter `seed`, or without scores, are left out.
+    """
+    groups: dict[tuple[tuple[str, str], ...], list[Mapping[str, float]]] = {}
+    for cell in cells:
+        parameters, measures = cell["parameters"], cell["measures"]
+        if "seed" in parameters and measures is not None:
+            others = tuple((name, value) for name, value in parameters.items() if name != "seed")
+            groups.setdefault(others, []).append(measures["mae"])
+    return [
+        {
+            "parameters": dict(others),
+            "seeds": len(drawn),
+            "mae": {
+                name: _over_draws([each[name] for each in drawn]) for name in (*METHODS, "gain")
+            },
+        }
+        for others, drawn in groups.items()
+        if len(drawn) >= MIN_SEEDS
+    ]
+
+
+def _over_draws(values: Sequence[float | None]) -> dict[str, float | None]:
+    """The mean and the ends of its interval; None where a value is missing."""
+    numbers = np.array([math.nan if value is None else value for value in values])
+    half = stats.t.ppf((1 + CONFIDENCE) / 2, len(numbers) - 1) * stats.sem(numbers)
+    ends = {"mean": numbers.mean(), "low": numbers.mean() - half, "high": numbers.mean() + half}
+    return {name: float(end) if math.isfinite(end) else None for name, end in ends.items()}
 
 
 def write_sweep(folder: Path, record: Mapping[str, Any]) -> None:

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from pnpdepth_cli.core.metrics import error_sums, score
-from pnpdepth_cli.pipeline.evaluation.averages import FrameTable
+from pnpdepth_cli.pipeline.evaluation.resampling import FrameTable
 
 
 def test_the_mean_of_frames_counts_each_alike() -> None:

@@ -143,6 +143,32 @@ def test_six_frames_have_an_interval_around_the_gain(tmp_path: Path) -> None:
     assert (equal.low_percent, equal.high_percent) == pytest.approx((50, 50))
 
 
+FLICKER = {"changes": {"groups": ("flicker",)}}
+
+
+def test_a_measure_that_a_frame_lacks_is_compared_over_the_other_frames(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    first = {f"{n:04}": rng.uniform(1, 2, 4).tolist() for n in range(9)}
+    second = {name: (np.array(row) * rng.uniform(0.4, 0.6)).tolist() for name, row in first.items()}
+    plain = [run(tmp_path, name, errors) for name, errors in (("a", first), ("b", second))]
+    paths = [run(tmp_path, f"{n}", e, **FLICKER) for n, e in (("c", first), ("d", second))]
+    comparison = compare(paths, all_measures=True, grouped=False)
+    (gains,) = comparison.gains
+    (mae,) = (g["mae"] for g in compare(plain, all_measures=True, grouped=False).gains)
+    for name in ("percent", "low_percent", "high_percent", "difference", "p_value"):
+        assert getattr(gains["mae"], name) == pytest.approx(getattr(mae, name), rel=1e-9)
+    assert mae.high_percent - mae.low_percent > 1
+    # the first frame of a sequence has no flicker
+    saved = [json.loads(Path(path).read_text())["frames"][1:] for path in paths]
+    one, two = (np.array([frame["values"]["flicker"] for frame in of]) for of in saved)
+    flicker = gains["flicker"]
+    assert comparison.runs[0].mean["flicker"] == pytest.approx(one.mean())
+    assert flicker.percent == pytest.approx(100 * (1 - two.mean() / one.mean()))
+    assert flicker.low_percent < flicker.percent < flicker.high_percent
+    assert flicker.p_value == 2 / 2**8
+    assert any("flicker" in note and "1 lack it" in note for note in comparison.notes)
+
+
 def test_p_values_are_adjusted_for_the_number_of_measures(tmp_path: Path) -> None:
     better = scaled(SIX, [0.5, 0.8, 0.6, 0.7, 0.9, 0.55])
     comparison = compare(

@@ -174,10 +174,10 @@ def test_a_published_protocol_is_what_plain_numpy_makes_of_its_definition(
         pairs = zip(depth, gt, strict=True)
         return means([brute(p, g, inside & (g > 1e-3) & (g < 10)) for p, g in pairs])
 
-    assert scored(root, protocol="nyu").mean == expected(clipped)
-    skipped = scored(root, protocol="nyu", missing="skip")
+    assert scored(root, protocol="nyu-eigen").mean == expected(clipped)
+    skipped = scored(root, protocol="nyu-eigen", missing="skip")
     assert skipped.mean == expected(np.where(prediction > 0, clipped, 0))
-    assert skipped.coverage == scored(root, protocol="nyu").coverage < 1
+    assert skipped.coverage == scored(root, protocol="nyu-eigen").coverage < 1
 
 
 def test_crop_bounds_and_mask_can_each_be_set_alone(
@@ -301,10 +301,10 @@ def test_integer_files_are_read_by_option_then_by_themselves_then_by_protocol(
     assert scored(tmp_path).mean["rmse"] == 0
     by_option = scored(tmp_path, scales=Scales(prediction=1000.0))
     assert by_option.frames[0].ratio == pytest.approx(0.256)
-    nyu = scored(tmp_path, protocol="nyu", crop="none")
+    nyu = scored(tmp_path, protocol="nyu-eigen", crop="none")
     assert any("÷ 1000; --gt-scale to change" in note for note in nyu.notes)
     depth_file(tmp_path / "out" / "a.png", [[1, 2]], scale=100)
-    own = scored(tmp_path, protocol="nyu", crop="none")
+    own = scored(tmp_path, protocol="nyu-eigen", crop="none")
     assert own.mean["rmse"] == 0
     assert any("÷ 100 (from the file)" in note for note in own.notes)
 
@@ -495,7 +495,7 @@ def test_nyus_own_file_is_scored_at_its_whole_size_with_eigens_crop(tmp_path: Pa
     error = (predictions - depths)[:, 45:471, 41:601].astype(np.float64)
     expected = np.sqrt((error**2).mean(axis=(1, 2))).mean()
     assert result.mean["rmse"] == pytest.approx(expected, rel=1e-6)
-    assert scored(tmp_path, protocol="nyu", layout_protocol="whole").mean == result.mean
+    assert scored(tmp_path, protocol="nyu-eigen", layout_protocol="whole").mean == result.mean
     with pytest.raises(InputError, match=r"no frame could be scored; the first: .*304×228"):
         scored(tmp_path, protocol="nyu-eigen")
 

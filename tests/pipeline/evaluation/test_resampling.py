@@ -12,9 +12,11 @@ from scipy import stats
 
 from benchmarks.statistics_check import interval_coverage, skewed
 from pnpdepth_cli.core.metrics import SUMS
-from pnpdepth_cli.pipeline.evaluation.averages import FrameTable
 from pnpdepth_cli.pipeline.evaluation.resampling import (
+    FrameTable,
+    clusters_among,
     holm,
+    known_together,
     sign_flip_p_values,
     studentised_interval,
 )
@@ -132,12 +134,30 @@ def test_the_sampled_p_value_is_near_the_exact_one_and_never_zero() -> None:
 
 
 def test_a_measure_without_a_number_has_no_interval_and_no_p_value() -> None:
-    rows = np.array([[1.0, np.nan], [2.0, 3.0], [4.0, 1.0]])
+    rows = np.array([[1.0, np.nan], [2.0, 3.0], [4.0, 1.0], [3.0, 2.0], [7.0, 5.0]])
     low, high = interval(rows, 50)
-    assert np.isfinite(low[0])
     assert np.isnan([low[1], high[1]]).all()
-    p_values, _ = sign_flip_p_values(lambda flips: flips @ rows + rows[0], 3, 50, seed=0)
+    alone = np.ravel(interval(rows[:, :1], 50))
+    assert [low[0], high[0]] == pytest.approx(alone, rel=1e-12)
+    assert low[0] < rows[:, 0].mean() < high[0]
+    p_values, _ = sign_flip_p_values(lambda flips: (1 - 2 * flips) @ rows, 5, 50, seed=0)
+    assert p_values[0] == 2 / 32  # all differences have one sign
     assert np.isnan(p_values[1])
+
+
+def test_measures_are_known_of_the_same_frames_or_apart() -> None:
+    known = np.array([[1, 0, 1, 0], [1, 1, 1, 0], [1, 1, 1, 0]], bool)
+    groups = [(frames.tolist(), columns) for frames, columns in known_together(known)]
+    assert groups == [
+        ([False, False, False], [3]),
+        ([False, True, True], [1]),
+        ([True, True, True], [0, 2]),
+    ]
+    assert clusters_among(np.array([2, 0, 2, 3]), np.array([1, 0, 1, 1], bool)).tolist() == [
+        0,
+        0,
+        1,
+    ]
 
 
 def test_holm_multiplies_the_smallest_most_and_keeps_the_order() -> None:

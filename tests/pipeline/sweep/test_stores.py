@@ -13,8 +13,7 @@ from pnpdepth_cli.pipeline.evaluation.evaluate import evaluate
 from pnpdepth_cli.pipeline.evaluation.result import EvalRequest
 from pnpdepth_cli.pipeline.sweep.axes import read_axis, studies_of
 from pnpdepth_cli.pipeline.sweep.points import read_sampling
-from pnpdepth_cli.pipeline.sweep.request import SweepRequest
-from pnpdepth_cli.pipeline.sweep.sweep import run_sweep
+from pnpdepth_cli.pipeline.sweep.sweep import SweepRequest, run_sweep
 from tests.pipeline.batches import RecordingListener, pairs_on_disk, refinement
 from tests.stores import Bucket, s3_server
 

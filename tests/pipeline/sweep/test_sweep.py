@@ -36,10 +36,9 @@ from pnpdepth_cli.pipeline.sweep import plots as sweep_plots
 from pnpdepth_cli.pipeline.sweep.axes import PARAMETERS, read_axis, studies_of
 from pnpdepth_cli.pipeline.sweep.plan import Method
 from pnpdepth_cli.pipeline.sweep.points import Sampling, frame_points, read_sampling
-from pnpdepth_cli.pipeline.sweep.request import SweepRequest
 from pnpdepth_cli.pipeline.sweep.running import refined_curve
 from pnpdepth_cli.pipeline.sweep.summary import FrameFigures, summarise
-from pnpdepth_cli.pipeline.sweep.sweep import run_sweep
+from pnpdepth_cli.pipeline.sweep.sweep import SweepRequest, run_sweep
 from pnpdepth_cli.sensors import (
     FORWARD_LEFT_UP,
     LIDARS,
@@ -520,7 +519,7 @@ BAD = [
     ("update=newton", "sign"),
     ("outliers=2", "1 at most"),
     ("noise=-1", "0 or more"),
-    ("spread=inf", "0 or more"),
+    ("blur=inf", "0 or more"),
     ("noise=nan", "0 or more"),
     ("sensor=vlp-17", "no sensor 'vlp-17'"),
     ("sensor=gird:40", "no sensor 'gird:40'"),
