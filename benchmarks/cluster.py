@@ -55,7 +55,7 @@ class Quiet:
 
 
 def request_of(root: Path) -> BatchRequest:
-    refine = RefineRequest.from_fields(preset="fast")
+    refine = RefineRequest.from_fields(propagate="gp")
     return BatchRequest(source=root / "list.csv", output=root / "out", refine=refine)
 
 
@@ -68,7 +68,7 @@ def make_entries(root: Path, count: int) -> None:
             file.write(f"{name_of(number)},rgb/000000.png,sparse/000000.png,gt/000000.png\n")
     lines = (root / "list.csv").read_text().splitlines()[:2]
     (root / "one.csv").write_text("\n".join(lines) + "\n")
-    refine = RefineRequest.from_fields(preset="fast")
+    refine = RefineRequest.from_fields(propagate="gp")
     run_batch(BatchRequest(source=root / "one.csv", output=root / "out", refine=refine), Quiet())
     first = name_of(0)
     record = (root / "out" / f"{first}.json").read_text()

@@ -23,6 +23,7 @@ import torch
 
 from benchmarks.accuracy import Case, Errors, by_default, errors_of, opened
 from benchmarks.frames import (
+    MORE_SETS,
     REGISTRATIONS,
     SETS,
     EvalFrame,
@@ -107,7 +108,7 @@ def table_row(cell: Case, measured: dict[str, object]) -> str:
 
 def frames_of(name: str, data: Path, half: str, count: int) -> list[EvalFrame]:
     """`count` evenly spaced frames of one half of a set."""
-    frames = list(SETS[name](data))[{"even": 0, "odd": 1}[half] :: 2]
+    frames = list((SETS | MORE_SETS)[name](data))[{"even": 0, "odd": 1}[half] :: 2]
     return [frames[round(i)] for i in np.linspace(0, len(frames) - 1, min(count, len(frames)))]
 
 

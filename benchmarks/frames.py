@@ -85,10 +85,13 @@ SETS = {
     "7scenes": seven_scenes,
     "icl_nuim": icl_nuim,
     "kitti_dc": kitti_dc,
+}
+MORE_SETS = {
     "tum_fr1_rpy": rgbd("tum_fr1_rpy", 5000),
     "tum_fr3_cabinet": rgbd("tum_fr3_cabinet", 5000),
     "realsense": rgbd("realsense_unregistered", 1000),
 }
+"""Sets on which nothing was chosen."""
 
 
 def sampled(gt: Depth, count: int, seed: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

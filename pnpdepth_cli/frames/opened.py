@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -130,8 +131,17 @@ class OpenNetwork:
                 z0 = split.front(*prepared.arguments)
         if self._of_image_only:
             self._z0 = z0
-        (result,) = refine_from(split, z0, (prepared.points,), settings, depth_of=(reader,))
-        return result
+        coarse, points = self.network.definition.coarse, (prepared.points,)
+        if coarse is None:
+            return refine_from(split, z0, points, settings, depth_of=(reader,))[0]
+        with torch.no_grad():
+            before = reader(split.rear(z0))
+        with coarse(self.network.module):
+            (result,) = refine_from(split, z0, points, settings, depth_of=(reader,))
+        if not isinstance(result, Refinement) or result.z is None:
+            return result
+        with torch.no_grad():
+            return replace(result, before=before, after=reader(split.rear(result.z)))
 
     def _plain(
         self, prepared: PreparedFrame, reader: AlignedDepth, settings: RefineSettings

@@ -31,6 +31,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -256,6 +257,9 @@ class ModelDefinition:
     image_encoder: str | None = None
     """Name of a submodule whose output depends on the image alone. It runs once for several sets of
     points of one image."""
+    coarse: Callable[[Any], AbstractContextManager[None]] | None = None
+    """Called with the network; while it is open, forward returns a smaller depth of the same field
+    of view, sooner. The default method takes the gradient of its updates of z there."""
     takes_prior: bool = False
     """True if forward takes one more argument, which may be left out: a dense prior (1, 1, H, W) in
     metres with 0 = unknown, such as another network's depth aligned with the points."""
@@ -305,7 +309,7 @@ class ModelDefinition:
             validity.instance(self, "image_encoder", str, "the name of a submodule")
         if self.checkpoint is not None:
             validity.instance(self, "checkpoint", Path, "a pathlib.Path")
-        for hook in ("read_checkpoint", "arguments", "output", "verify"):
+        for hook in ("read_checkpoint", "arguments", "output", "verify", "coarse"):
             if getattr(self, hook) is not None:
                 validity.function(self, hook)
 

@@ -11,7 +11,6 @@ import pytest
 from pnpdepth_cli.cli.main import main
 from pnpdepth_cli.cli.options import request_of
 from pnpdepth_cli.cli.refine import refine as refine_command
-from pnpdepth_cli.cli.tables import print_refinement
 from tests.pipeline.frames import FrameOnDisk
 
 
@@ -163,17 +162,6 @@ def test_the_installed_command_runs_and_ends_without_a_traceback(tmp_path: Path)
     assert not list(tmp_path.iterdir())
 
 
-def test_with_auto_the_table_does_not_claim_updates_that_may_not_be_in_the_result(
-    frame: FrameOnDisk, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert code_of(refine(frame, "--auto")) == 0
-    err = capsys.readouterr().err
-    assert "best candidate at held-out points" in " ".join(err.split())
-    assert "updates (sign" not in err
-    assert code_of(refine(frame, "--overwrite")) == 0
-    assert "5 updates (sign" in capsys.readouterr().err
-
-
 @pytest.mark.parametrize("command", ["sample", "simulate", "compare"])
 @pytest.mark.parametrize("seed", ["-1", "99999999999999999999"])
 def test_a_seed_that_no_generator_takes_is_refused(
@@ -263,13 +251,20 @@ def test_a_depth_worse_than_linear_interpolation_is_named_so(
     assert "this depth is worse than linear interpolation" in capsys.readouterr().err
 
 
-def test_the_title_states_that_the_network_is_not_used(
+def test_the_default_method_prints_its_stages_beside_linear_interpolation(
     frame: FrameOnDisk, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert code_of([*refine(frame, "--auto", "--json")]) == 0
-    record = json.loads(capsys.readouterr().out)
-    print_refinement(record | {"auto": record["auto"] | {"uses_network": False}})
-    assert "without tiny" in " ".join(capsys.readouterr().err.split())
+    options = ["--model", str(frame.model), "--checkpoint", str(frame.checkpoint)]
+    command = ["refine", str(frame.image), "--sparse", str(frame.sparse), *options]
+    assert code_of([*command, "--gt", str(frame.gt), "-o", str(frame.folder / "gt")]) == 0
+    rows = capsys.readouterr().err
+    order = ["tiny aligned", "with points, fused", "z updated", "residual propagated", "linear"]
+    assert sorted(order, key=rows.index) == order
+    assert "updates (sign" not in rows
+    assert code_of([*command, "-o", str(frame.folder / "no")]) == 0
+    rows = capsys.readouterr().err
+    assert "at 12 points that were hidden from the method" in " ".join(rows.split())
+    assert "z updated" not in rows
 
 
 def test_several_models_are_the_first_and_more() -> None:

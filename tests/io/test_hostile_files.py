@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import struct
+import subprocess
+import sys
 import zlib
 from pathlib import Path
 
@@ -42,13 +44,24 @@ def test_an_image_beyond_64_megapixels_is_refused_by_its_header(
 
 @pytest.mark.parametrize("colour", [0, 2])
 def test_pixels_that_do_not_decode_are_one_line_and_libraries_say_nothing(
-    tmp_path: Path, colour: int, capfd: pytest.CaptureFixture[str]
+    tmp_path: Path, colour: int
 ) -> None:
     path = png(tmp_path / "broken.png", (64, 64), 16, colour, zlib.compress(b"x" * 9)[:-6])
-    for read in (read_rgb, read_depth):
-        with pytest.raises(FileFormatError, match=r"broken\.png: PNG"):
-            read(path)
-    assert capfd.readouterr() == ("", "")
+    program = (
+        "import sys\nfrom pathlib import Path\n"
+        "from pnpdepth_cli.errors import FileFormatError\n"
+        "from pnpdepth_cli.io.depth import read_depth\nfrom pnpdepth_cli.io.rgb import read_rgb\n"
+        "for read in (read_rgb, read_depth):\n"
+        "    try:\n        read(Path(sys.argv[1]))\n"
+        "    except FileFormatError as error:\n        print(error)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program, str(path)], capture_output=True, text=True, check=True
+    )
+    assert done.stderr == ""
+    lines = done.stdout.splitlines()
+    assert len(lines) == 2
+    assert all("broken.png: PNG" in line for line in lines)
 
 
 def test_tags_that_share_their_bytes_are_refused(tmp_path: Path) -> None:

@@ -189,7 +189,7 @@ def test_a_prior_that_does_not_explain_the_points_is_unknown_everywhere(useless:
     rgb, sparse = frame(96, 128, 200)
     points = Points(sparse)
     prior = torch.full_like(sparse, 3.0) if useless == "constant" else shuffled(sparse)
-    assert not bool(Prior(prior, points, Cloud.of(points, rgb)).valid.any())
+    assert not bool(Prior.of(prior, points, Cloud.of(points, rgb)).valid.any())
 
 
 def test_each_image_of_a_batch_keeps_or_loses_its_own_prior() -> None:
@@ -197,7 +197,7 @@ def test_each_image_of_a_batch_keeps_or_loses_its_own_prior() -> None:
     rgb, sparse = (torch.cat(pair) for pair in zip(one, other, strict=True))
     points = Points(sparse)
     priors = torch.cat([prior_of(sparse[:1]), shuffled(sparse[1:])])
-    valid = Prior(priors, points, Cloud.of(points, rgb)).valid
+    valid = Prior.of(priors, points, Cloud.of(points, rgb)).valid
     assert torch.equal(valid[0] > 0, priors[0] > 0)
     assert not bool(valid[1].any())
 
@@ -208,16 +208,16 @@ def test_outliers_among_the_points_do_not_hide_that_a_prior_explains_the_others(
     outlier.view(-1)[torch.nonzero(sparse.view(-1)).squeeze(1)[::4]] = 1.0
     prior = torch.where(outlier > 0, 80.0, prior)
     cloud = Cloud.of(points, rgb)
-    assert not bool(Prior(prior, points, cloud).valid.any())
+    assert not bool(Prior.of(prior, points, cloud).valid.any())
     points.weigh(1.0 - outlier)
-    assert bool(Prior(prior, points, cloud).valid.any())
+    assert bool(Prior.of(prior, points, cloud).valid.any())
 
 
 @pytest.mark.parametrize("count", [0, 1])
 def test_a_prior_is_used_where_no_two_points_can_tell(count: int) -> None:
     rgb, sparse = frame(64, 96, count)
     points, prior = Points(sparse), torch.full((1, 1, 64, 96), 2.0)
-    assert bool(Prior(prior, points, Cloud.of(points, rgb)).valid.all())
+    assert bool(Prior.of(prior, points, Cloud.of(points, rgb)).valid.all())
 
 
 def test_an_exact_prior_lets_the_untrained_network_know_what_no_point_shows() -> None:

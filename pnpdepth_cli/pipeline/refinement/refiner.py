@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -93,26 +93,27 @@ class Refiner:
                 until=None if budget_s is None else time.monotonic() + budget_s,
             )
         else:
-            refined = self._fixed(opened, frame, on_iteration)
+            fixed = self._fixed(opened, on_iteration)
+            refined = fixed(frame)
             if needs_check(self.request):
-                refined = self._checked(opened, frame, refined)
+                refined = self._checked(fixed, frame, refined)
         return _finished(self._with_sigma(refined), frame, held_out)
 
-    def _fixed(
-        self, split: Split, frame: Frame, on_iteration: OnIteration = lambda done, loss: None
-    ) -> RefinedFrame:
-        """The frame refined by the fixed method."""
-        network, settings, propagation = self.network, self.settings, self._propagation
+    def _fixed(self, split: Split, on_iteration: OnIteration) -> Callable[[Frame], RefinedFrame]:
+        """The fixed method."""
+        options: dict[str, Any] = {
+            "propagation": self._propagation,
+            "on_iteration": on_iteration,
+        }
         if side := self.request.network.tile:
-            return refine_tiled(
-                network, split, settings, frame, side,
-                propagation=propagation, on_iteration=on_iteration,
-            )  # fmt: skip
-        return refine_frame(
-            network, split, settings, frame, propagation=propagation, on_iteration=on_iteration
-        )
+            return lambda frame: refine_tiled(
+                self.network, split, self.settings, frame, side, **options
+            )
+        return functools.partial(refine_frame, self.network, split, self.settings, **options)
 
-    def _checked(self, split: Split, frame: Frame, refined: RefinedFrame) -> RefinedFrame:
+    def _checked(
+        self, fixed: Callable[[Frame], RefinedFrame], frame: Frame, refined: RefinedFrame
+    ) -> RefinedFrame:
         """The refined frame with the fixed method's check, for which it is run again.
 
         It is returned as it is where its points are too few or the method fails.
@@ -122,7 +123,7 @@ class Refiner:
             return refined
         kept, hidden = parts
         try:
-            again = self._fixed(split, frame.with_points(kept))
+            again = fixed(frame.with_points(kept))
         except PnpDepthError:
             return refined
         return replace(refined, check=check_fixed(refined, again, hidden, kept))

@@ -12,6 +12,7 @@ from pnpdepth_cli.errors import OutputError
 from pnpdepth_cli.io.atomic import atomic_path, cannot_write
 from pnpdepth_cli.io.fingerprint import Fingerprint, fingerprint, is_unchanged
 from pnpdepth_cli.io.record import plain
+from pnpdepth_cli.io.remote.store import local_files
 from pnpdepth_cli.pipeline.sweep.plan import Run
 from pnpdepth_cli.pipeline.sweep.points import OWN, calibration_file
 
@@ -73,6 +74,9 @@ class SweepState:
         before = self._still_good(run)
         if before is not None and "scores" in result:
             result = result | {"scores": before["scores"] | result["scores"]}
+        files = _files(run)
+        with local_files(files.values()) as copies:
+            inputs = {n: fingerprint(p, copies.get(p)).as_record() for n, p in files.items()}
         self._append(
             {
                 "run": run.key,
@@ -80,7 +84,7 @@ class SweepState:
                 "seed": run.seed,
                 "sampling": asdict(run.sampling),
                 "method": None if run.method is None else run.method.record(),
-                "inputs": {name: fingerprint(p).as_record() for name, p in _files(run).items()},
+                "inputs": inputs,
                 **result,
             }
         )

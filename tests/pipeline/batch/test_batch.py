@@ -589,7 +589,7 @@ def test_a_plain_prediction_without_scores_ends_no_batch(
     capsys.readouterr()
     print_batch(summary | {"mean": mean})
     assert "–" in capsys.readouterr().err
-    report = BatchReport(folder=tmp_path / "report", output=root / "out", workers=1)
+    report = BatchReport(folder=tmp_path / "report", output=root / "out")
     report.write(summary | {"mean": mean}, lambda: summary["frames"])
     assert frames_of(tmp_path / "report")["a"]["values"]["rmse_before"] is None
 
@@ -641,21 +641,3 @@ def test_digests_of_consecutive_frames_are_those_of_each_alone(root: Path) -> No
     known = [digests.of(each) for each in requests]
     assert known == [settings_digest(each, {"model": "m"}) for each in requests]
     assert len(set(known)) == 5
-
-
-def test_a_fixed_method_without_ground_truth_is_compared_with_linear_on_every_20th_frame(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("COLUMNS", "200")
-    root = pairs_on_disk(tmp_path / "drive", tuple(f"{i:02}" for i in range(21)), gt=False)
-    batch(root)
-    written = summary(root)
-    compared = [row["name"] for row in written["frames"] if row["linear"]["folds"]]
-    assert compared == ["00", "20"]
-    folds = [row["linear"]["folds"] for row in written["frames"] if row["linear"]["folds"]]
-    mean = written["linear"]["folds"]
-    assert mean["frames"] == written["linear"]["frames"] == 2
-    for stage in ("before", "after", "linear"):
-        assert mean[stage] == pytest.approx(np.mean([each[stage] for each in folds]))
-    print_batch(written)
-    assert "error at points in turn held out, 2 frames, MAE" in capsys.readouterr().err

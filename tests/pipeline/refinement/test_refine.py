@@ -244,7 +244,7 @@ BAD = [
     ({"device": "tpu"}, PnpDepthError, "--device cpu"),
     ({"format": "jpg"}, UsageError, "not one of"),
     ({"depth_scale": -1.0}, UsageError, "scale"),
-    ({"time_budget_s": 5.0}, UsageError, "--propagate fixes the method"),
+    ({"time_budget_s": 5.0}, UsageError, "--propagate makes none"),
 ]
 
 

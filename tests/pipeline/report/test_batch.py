@@ -166,9 +166,9 @@ def test_the_page_states_the_refinement_and_that_it_may_differ_per_frame(
     facts = dict(page_data(report)["facts"])
     assert facts["Refinement"] == "5 updates of z at middle (sign, l1, step 0.01)"
     assert (facts["Alignment"], facts["Propagation"]) == ("none", "gp")
-    batch(root, output=root / "auto", html=tmp_path / "auto", refine={"auto": True})
+    batch(root, output=root / "auto", html=tmp_path / "auto", refine={"propagate": None})
     facts = dict(page_data(tmp_path / "auto")["facts"])
-    assert facts["Refinement"].endswith("best candidate at held-out points")
+    assert facts["Refinement"].endswith("(the default method)")
     assert "Alignment" not in facts
 
 
