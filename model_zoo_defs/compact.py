@@ -82,15 +82,13 @@ class Outputs(NamedTuple):
 
 @dataclass(frozen=True)
 class Start:
-    """What is computed before the decoder.
+    """What the decoder starts from.
 
-    median (B, 1, 1, 1) and moments of the points, image features by level, the fits through the
-    points, and the prior.
+    median (B, 1, 1, 1) and moments of the points, the fits through the points, and the prior.
     """
 
     median: Tensor
     moments: Tensor
-    image: dict[str, Tensor]
     fit: Fit
     guide: Prior | None
 
@@ -181,8 +179,9 @@ class Compact(nn.Module):
 
     def outputs(self, rgb: Tensor, sparse: Tensor, prior: Tensor | None = None) -> Outputs:
         """The depths of all levels and what the other outputs are computed from."""
-        start = self.start(self._started, rgb, sparse, prior)
-        moments, image, fit, guide = start.moments, start.image, start.fit, start.guide
+        image = self.encoder(rgb)
+        start = self.start(self._started, rgb, sparse, prior, image["s16"], image["s32"])
+        moments, fit, guide = start.moments, start.fit, start.guide
         features = self.decoder["s32"](image["s32"])
         depth = fit.estimates.mean(1, keepdim=True)
         extra = [fit.estimates - depth, fit.distance]
@@ -219,14 +218,14 @@ class Compact(nn.Module):
         metres = [torch.exp(depth + start.median) for depth in depths]
         return Outputs(metres, features, torch.cat(hints, 1))
 
-    def _started(self, rgb: Tensor, sparse: Tensor, prior: Tensor | None) -> Start:
+    def _started(
+        self, rgb: Tensor, sparse: Tensor, prior: Tensor | None, near: Tensor, far: Tensor
+    ) -> Start:
         points = Points(sparse)
         cloud = Cloud.of(points, rgb)
         points.weigh(self.inlier_weights(points, cloud))
         guide = None if prior is None else Prior.of(prior, points, cloud)
-        image = self.encoder(rgb)
-        fit = self.fit(image["s16"], image["s32"], points, guide)
-        return Start(points.median, points.moments(), image, fit, guide)
+        return Start(points.median, points.moments(), self.fit(near, far, points, guide), guide)
 
     def _enlarge(
         self, features: Tensor, depth: Tensor, prior: Prior | None, fit: PriorFit | None

@@ -93,11 +93,13 @@ def refine_default(
     fused = fusion.fuse(inliers, user=user, rejected=rejected, until=until)
     propagated = propagate(fused.after, inliers.points, inliers.rgb, kind=propagation)
     check, notes = None, _notes_on_points(frame, inliers)
-    depth = final = _with_completion(propagated.depth, _completion(fused, rejected))
+    completion = _completion(fused, rejected)
+    depth = final = _with_completion(propagated.depth, completion)
     if hidden is not None:
         check = _check(hidden, propagation, propagated.kernel)
-        depth, check, moved = _moved(fusion, inliers, hidden, depth, check, propagation)
-        notes += moved
+        if not completion:  # which the gaps of hidden points wrong
+            depth, check, moved = _moved(fusion, inliers, hidden, depth, check, propagation)
+            notes += moved
     if fused.steps:
         steps = ", ".join(f"{count} with {name}" for name, count in fused.steps.items())
         notes += (f"hidden points: steps made and kept: {steps}",)

@@ -258,7 +258,13 @@ def test_the_default_method_prints_its_stages_beside_linear_interpolation(
     command = ["refine", str(frame.image), "--sparse", str(frame.sparse), *options]
     assert code_of([*command, "--gt", str(frame.gt), "-o", str(frame.folder / "gt")]) == 0
     rows = capsys.readouterr().err
-    order = ["tiny aligned", "with points, fused", "z updated", "residual propagated", "linear"]
+    order = [
+        "tiny aligned",
+        "with points, fused",
+        "z updated",
+        "residual propagated",
+        "linear interpolation",
+    ]
     assert sorted(order, key=rows.index) == order
     assert "updates (sign" not in rows
     assert code_of([*command, "-o", str(frame.folder / "no")]) == 0

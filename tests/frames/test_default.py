@@ -186,7 +186,6 @@ def test_a_completion_network_that_serves_as_a_prior_has_most_of_the_result(
 ) -> None:
     frame, poor = frame_in_memory(60), member(Nearest)
     monkeypatch.setattr(default, "_rejected", lambda *_: ())
-    monkeypatch.setattr(default, "_moved", lambda *args: (args[3], args[4], ()))
     result = refined(frame, poor, compact())
     updated = torch.from_numpy(result.stages["updated"])
     rest = propagate(updated, frame.points, frame.rgb, kind="gp").depth

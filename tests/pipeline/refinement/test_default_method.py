@@ -154,7 +154,7 @@ def test_a_time_budget_is_spent_on_steps_by_hidden_points(frame: FrameOnDisk) ->
             assert made.keys() == {"compact"}
             assert 0 <= made["compact"] <= HIDDEN_POINT_STEPS
     with pytest.raises(UsageError, match="--time-budget caps steps by hidden points"):
-        run(frame, time_budget_s=1.0)
+        run(frame, time_budget_s=1.0, overwrite=True)
 
 
 def test_networks_of_the_default_method_are_aligned_and_updated_a_few_times(
