@@ -108,7 +108,7 @@ def _of_shared_data() -> Iterator[Group]:
     )
     yield group_of(
         "fastdepth-auto",
-        ("auto", f"{SMALL} {onnx} --auto --baselines {GT} -o out --format npy"),
+        ("auto", f"{SMALL} {onnx} --baselines {GT} -o out --format npy"),
         shared=True,
     )
     yield group_of(
@@ -152,17 +152,17 @@ def _of_refinement() -> Iterator[Group]:
     )
     yield from single_steps(
         "auto",
-        ("auto", f"{SMALL} {GT} --auto --baselines --uncertainty -o best/"),
-        ("no-time", f"{SMALL} {GT} --auto --time-budget 0.000001s -o best/ --json"),
-        ("few-points", "refine ../in/small/rgb.png --sparse ../in/few.csv --auto -o best/"),
-        ("eigen", f"{SMALL} {GT} --auto --model eigen-tiny --uncertainty -o best/"),
+        ("auto", f"{SMALL} {GT} --baselines --uncertainty -o best/"),
+        ("no-time", f"{SMALL} {GT} --time-budget 0.000001s -o best/ --json"),
+        ("few-points", "refine ../in/small/rgb.png --sparse ../in/few.csv -o best/"),
+        ("eigen", f"{SMALL} {GT} --model eigen-tiny --uncertainty -o best/"),
         (
             "gp",
-            f"{SMALL} {GT} --auto --propagate gp --layer decoder.s4 --seed 3 -o best/",
+            f"{SMALL} {GT} --propagate gp --layer decoder.s4 --seed 3 -o best/",
         ),
         (
             "lines",
-            "refine ../in/street_small/rgb.png --sparse ../in/street_small/sparse.png --auto"
+            "refine ../in/street_small/rgb.png --sparse ../in/street_small/sparse.png"
             " --model sparse2dense-tiny --gt ../in/street_small/gt.png -o best/",
         ),
     )
@@ -330,7 +330,7 @@ def _of_many_frames() -> Iterator[Group]:
         "batch-auto",
         (
             "auto",
-            "batch ../in/many -o out --workers 1 --batch-size 1 --limit 2 --auto --uncertainty"
+            "batch ../in/many -o out --workers 1 --batch-size 1 --limit 2 --uncertainty"
             " --html report",
         ),
         unordered=True,
@@ -565,7 +565,7 @@ def _of_errors() -> Iterator[Group]:
         ("unknown-loss", f"{SMALL} --loss l3 {out}"),
         ("negative", f"{SMALL} --iterations -2 {out}"),
         ("bad-lr", f"{SMALL} --lr fast {out}"),
-        ("bad-budget", f"{SMALL} --auto --time-budget soon {out}"),
+        ("bad-budget", f"{SMALL} --time-budget soon {out}"),
         ("budget-alone", f"{SMALL} --time-budget 3s {out}"),
         ("bad-spread", f"{SMALL} --spread nan {out}"),
         ("bad-anchor", f"{SMALL} --anchor -1 {out}"),

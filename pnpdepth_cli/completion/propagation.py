@@ -3,9 +3,9 @@
 With r the residual in log depth, the result is exp(r) · prediction, so that it is positive
 everywhere. r stays within its values at the points. Outliers are removed first.
 
-How r is predicted is a table, `choices.PROPAGATIONS`: one file per entry in
-`completion/propagations`. A prediction of 0, or not finite, is unknown and stays 0; points there
-and points outside the frame have no effect. Of points at the same coordinates the nearest counts.
+How r is predicted is a table, `choices.PROPAGATIONS`: the entries of `completion/propagations`. A
+prediction of 0, or not finite, is unknown and stays 0; points there and points outside the frame
+have no effect. Of points at the same coordinates the nearest counts.
 """
 
 from __future__ import annotations
