@@ -119,13 +119,16 @@ class Fusion:
         """
         points, user = frame.points, self.members[0]
         suspected = outliers(torch.ones(points.size), points, frame.rgb)
-        inliers = frame.without(suspected) if bool(suspected.any()) else frame
-        refined = self._refined(user, inliers)
+        any_suspected = bool(suspected.any())
+        consistent = frame.with_points(points.select(~suspected)) if any_suspected else frame
+        # A network that weighs its points is given the outliers too, but not before they are known.
+        again = any_suspected and user.network.definition.weighs_points
+        refined = self._refined(user, consistent, updates=not again)
         outlying = outliers(torch.from_numpy(refined.before), points, frame.rgb)
         if len(points) >= FEW_POINTS:
             outlying = outlying | suspected
-        if not torch.equal(outlying, suspected):
-            inliers = frame.without(outlying) if bool(outlying.any()) else frame
+        inliers = frame.without(outlying) if bool(outlying.any()) else frame
+        if again or not torch.equal(outlying, suspected):
             refined = self._refined(user, inliers)
         return inliers, refined
 

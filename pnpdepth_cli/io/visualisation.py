@@ -40,6 +40,7 @@ Depth = NDArray[np.float32]
 _WIDE = 2.0
 _STRONGEST_PERCENTILE = 95.0
 _ZOOM = 4  # the zoom shows this fraction of the image's sides
+_FARTHEST = 0.1  # weight of the difference to all others in the choice of the zoom
 _FEW = 20  # points
 _FRAME = (230, 30, 30)
 _GAIN = "|before - ground truth| - |after - ground truth|"
@@ -256,18 +257,19 @@ def _area(xy: NDArray[np.float32]) -> tuple[slice, slice]:
 def _zoom(depths: dict[str, Depth], of_points: tuple[slice, slice]) -> tuple[int, int, int, int]:
     """Top, left, height and width of the window where the last depth differs most from the others.
 
-    The mean relative difference over the window counts, and only in rows and columns with points:
+    The relative difference to the nearest of the others counts most, where there are points:
     elsewhere, such as in the sky, the depth has nothing to follow. The window is as many times
     narrower as there are depths, because they stand side by side.
     """
     *others, after = depths.values()
     rows, columns = after.shape
     height, width = max(1, rows // _ZOOM), max(1, columns // (len(depths) * _ZOOM))
-    relative = np.zeros((rows, columns))
+    apart = []
     for other in others:
         both = (other > 0) & (after > 0) & np.isfinite(other) & np.isfinite(after)
         difference = np.where(both, np.nan_to_num(after) - np.nan_to_num(other), 0)
-        relative += np.abs(difference.astype(np.float64)) / np.where(both, after, 1)
+        apart.append(np.abs(difference.astype(np.float64)) / np.where(both, after, 1))
+    relative = np.min(apart, axis=0) + _FARTHEST * np.sum(apart, axis=0)
     inside = np.zeros_like(relative)
     inside[of_points] = np.minimum(relative, _strongest(relative[of_points]))[of_points]
     total = cv2.integral(inside)
