@@ -97,7 +97,7 @@ def test_it_holds_at_every_layer_of_compact() -> None:
     x, sparse = image(32, 32), torch.zeros(1, 1, 32, 32)
     sparse[..., ::5, ::3] = 1 + 4 * torch.rand(sparse[..., ::5, ::3].shape)
     arguments = (x, sparse, 1 + 4 * torch.rand(1, 1, 32, 32))
-    several = {"encoder", "fit"}  # return several tensors
+    several = {"encoder", "fit", "start"}  # return several tensors
     network.eval()
     with torch.no_grad():
         whole = network(*arguments)
