@@ -97,7 +97,7 @@ def refine_default(
     depth = final = _with_completion(propagated.depth, completion)
     if hidden is not None:
         check = _check(hidden, propagation, propagated.kernel)
-        if not completion:  # which the gaps of hidden points wrong
+        if not completion:  # hidden lines are gaps that such a network was not trained with
             depth, check, moved = _moved(fusion, inliers, hidden, depth, check, propagation)
             notes += moved
     if fused.steps:

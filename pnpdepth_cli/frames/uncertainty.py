@@ -1,4 +1,4 @@
-"""The standard deviation of a depth map, calibrated by held-out points (`--uncertainty`).
+"""The standard deviation of a depth map, calibrated by hidden points (`--uncertainty`).
 
 Errors of depth have heavy tails: they are small within a surface and as large as the step at a
 depth edge. One standard deviation for all pixels would hold too many errors within ± σ or too few

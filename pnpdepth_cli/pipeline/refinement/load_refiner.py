@@ -77,7 +77,7 @@ def refiner_of(
 
     Args:
         request: What is asked for.
-        networks: The user's. Where the method is chosen, the companion competes beside them.
+        networks: The user's. In the default method the companion is fused with them.
         first: The frame whose points decide the layers to cut at.
         settings: How z of the first network is updated. None: by the request.
     """
