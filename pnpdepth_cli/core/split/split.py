@@ -141,7 +141,9 @@ class Split:
         self._interception.all()
         while True:
             replay = Replay(self._cut, arguments)
-            watch = Watch((replay.arguments, *self._state.tensors))
+            watch = Watch(
+                (replay.arguments, *self._state.tensors), escapes=not self._promised_static
+            )
             recorder = Recorder(self._cut, watch, replay, self._uncacheable)
             uncacheable = len(self._uncacheable)
             try:
@@ -157,7 +159,8 @@ class Split:
         """A watched pass; what depends on z, or on these tensors, is not cached."""
         assert self._interception is not None
         saved = [output for output in replay.outputs if output is not None]
-        watch = Watch((replay.arguments, *saved, *self._state.tensors), reads=True)
+        tensors = (replay.arguments, *saved, *self._state.tensors)
+        watch = Watch(tensors, reads=True, escapes=not self._promised_static)
         for tensor in varying:
             watch.touch(tensor)
         recorder = Recorder(self._cut, watch, replay, self._uncacheable)

@@ -67,8 +67,16 @@ class Watch(TorchDispatchMode):
         # the whole compiler, a second in every run of the program.
         return False
 
-    def __init__(self, saved: Iterable[SavedTensors], *, reads: bool = False) -> None:
-        """Begins with all counts at 0; sets and keys below are numbers of storages."""
+    def __init__(
+        self, saved: Iterable[SavedTensors], *, reads: bool = False, escapes: bool = True
+    ) -> None:
+        """Begins with all counts at 0; sets and keys below are numbers of storages.
+
+        Args:
+            saved: Tensors to protect from in-place operations.
+            reads: Whether reads of tensors are noted.
+            escapes: Whether values that reach Python are noted, which takes time.
+        """
         super().__init__()  # type: ignore[no-untyped-call]
         self.data_dependent = self.escaped = self.torn = False
         self._operations = self._touches = 0
@@ -80,7 +88,7 @@ class Watch(TorchDispatchMode):
         self._twins: tuple[Tensor, ...] = ()  # z, and the tensor of the network it stands for
         self._stale: set[int] = set()  # the storage of one twin after the other was changed
         self._function_mode = _EscapeMode(self)
-        self._sees_escapes = False
+        self._sees_escapes, self._notes_escapes = False, escapes
         for tensors in saved:
             self.protect(tensors)
 
@@ -129,6 +137,9 @@ class Watch(TorchDispatchMode):
     @contextmanager
     def seeing_escapes(self) -> Iterator[None]:
         """Watches the methods that give values to Python, too."""
+        if not self._notes_escapes:
+            yield
+            return
         self._sees_escapes = True
         try:
             with self._function_mode:
@@ -139,6 +150,9 @@ class Watch(TorchDispatchMode):
     @contextmanager
     def seeing_escapes_of(self, module: nn.Module) -> Iterator[None]:
         """The same while this submodule runs, unless it is one of torch's fused layers."""
+        if not self._notes_escapes:
+            yield
+            return
         outer = self._sees_escapes
         self._sees_escapes = getattr(type(module), "forward", None) not in _FUSED
         try:
