@@ -9,7 +9,7 @@ from typing import Any
 import torch
 
 from pnpdepth_cli.completion.interpolation import linear
-from pnpdepth_cli.frames.frame import RefinedFrame
+from pnpdepth_cli.frames.frame import RefinedFrame, is_dense
 from pnpdepth_cli.io.atomic import make_folder
 from pnpdepth_cli.io.cloud_files import write_cloud
 from pnpdepth_cli.io.depth import write_depth
@@ -49,7 +49,7 @@ def write_outputs(outputs: Outputs, inputs: Inputs, frame: RefinedFrame) -> dict
             outputs.preview,
             inputs.unit,
             valid=frame.valid,
-            linear=linear(frame.used).numpy(),
+            linear=None if is_dense(frame.used) else linear(frame.used).numpy(),
         )
     if outputs.improvement is not None:
         record["improved_fraction"] = _write_improvement(
