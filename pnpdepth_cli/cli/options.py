@@ -127,7 +127,7 @@ models = click.option(
     multiple=True,
     default=(_MODEL.default,),
     metavar=_MODEL.option.metavar,
-    help=f"{_MODEL.option.help} Given several times, all compete.  [default: {_MODEL.default}]",
+    help=f"{_MODEL.option.help} Given several times, all are fused.  [default: {_MODEL.default}]",
 )
 checkpoint = _only(NetworkChoice, "checkpoint")
 precision = _only(NetworkChoice, "precision")
