@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
 from itertools import groupby
 from typing import Any, TypeVar
@@ -19,6 +18,7 @@ from pnpdepth_cli.core.refine import Refinement, RefineSettings, refine
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.errors import DeviceError, DivergedError, PnpDepthError, StorageError
 from pnpdepth_cli.frames.frame import RefinedFrame
+from pnpdepth_cli.frames.opened import SplitCache
 from pnpdepth_cli.frames.prepare import prepare
 from pnpdepth_cli.frames.refine import refine_frame
 from pnpdepth_cli.models.frame import FrameMap
@@ -58,7 +58,7 @@ def results(runs: Sequence[Run], network: Network) -> Iterator[tuple[Run, Result
         runs: Those of a frame follow each other, and among these those with the same points.
         network: The network of all runs.
     """
-    with _Cuts(network) as cuts:
+    with SplitCache(network) as cuts:
         for _, of_frame in groupby(runs, key=lambda run: run.frame.name):
             inputs: Inputs | PnpDepthError | None = None
             for _, of_points in groupby(of_frame, key=lambda run: (run.sampling, run.seed)):
@@ -91,34 +91,7 @@ def _drawn(run: Run, inputs: Inputs) -> Inputs:
     return replace(inputs, points=points)
 
 
-class _Cuts:
-    """Keeps the network cut while the layer stays the same, so that it is recorded once."""
-
-    def __init__(self, network: Network) -> None:
-        self.network, self._open = network, ExitStack()
-        self._layer: str | None = None
-        self._split: Split | None = None
-
-    def __enter__(self) -> _Cuts:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-    def close(self) -> None:
-        """Restores the whole network until it is cut again."""
-        self._open.close()
-        self._split = self._layer = None
-
-    def at(self, layer: str) -> Split:
-        """Returns the network cut at the layer, open."""
-        if self._split is None or self._layer != layer:
-            self.close()
-            self._split, self._layer = self._open.enter_context(self.network.cut_at(layer)), layer
-        return self._split
-
-
-def _result_of(run: Run, inputs: Inputs, cuts: _Cuts) -> dict[str, Any]:
+def _result_of(run: Run, inputs: Inputs, cuts: SplitCache) -> dict[str, Any]:
     """The result of a run as the journal has it, of the frame with the run's points."""
     done = {"state": "done", "points": len(inputs.points)}
     if run.method is None:
