@@ -93,10 +93,10 @@ def refine_default(
     fused = fusion.fuse(inliers, user=user, rejected=rejected, until=until)
     propagated = propagate(fused.after, inliers.points, inliers.rgb, kind=propagation)
     check, notes = None, _notes_on_points(frame, inliers)
-    completion = _completion(fused, rejected)
+    completion = _completion(fusion, fused, rejected)
     depth = final = _with_completion(propagated.depth, completion)
     if hidden is not None:
-        check = _check(hidden, propagation, propagated.kernel)
+        check = _check(fusion, hidden, propagation, propagated.kernel)
         if not completion:  # hidden lines are gaps that such a network was not trained with
             depth, check, moved = _moved(fusion, inliers, hidden, depth, check, propagation)
             notes += moved
@@ -140,14 +140,12 @@ def check_fixed(
     )
 
 
-def _completion(fused: Fused, rejected: Collection[Member]) -> list[Tensor]:
+def _completion(fusion: Fusion, fused: Fused, rejected: Collection[Member]) -> list[Tensor]:
     """The depths (H, W) of networks that take points and serve as priors."""
-    if not any(member.takes_prior for member in fused.members):
-        return []
     return [
-        torch.from_numpy(refined.before)
-        for member, refined in fused.alone.items()
-        if member.takes_points and not member.takes_prior and member not in rejected
+        torch.from_numpy(fused.alone[member].before)
+        for member in fusion.completing
+        if member in fused.alone and member not in rejected
     ]
 
 
@@ -178,12 +176,11 @@ def _hidden(fusion: Fusion, frame: Frame, prediction: Tensor, seed: int) -> _Hid
         return None
     kept, points = parts
     without = frame.with_points(kept)
-    completing = [m for m in fusion.members if m.takes_points and not m.takes_prior]
-    guided = any(member.takes_prior for member in fusion.members)
+    completing = fusion.completing
     rejected: tuple[Member, ...] = ()
     try:
-        fused = fusion.fuse(without, rejected=completing if guided else (), updates=False)
-        if completing and guided:
+        fused = fusion.fuse(without, rejected=completing, updates=False)
+        if completing:
             rejected = _rejected(fused, completing, frame.points, points)
             if len(rejected) < len(completing):
                 fused = fusion.fuse(without, user=fused.user, rejected=rejected, updates=False)
@@ -220,12 +217,12 @@ def _inlier_weights(points: SparsePoints, prediction: Tensor) -> Tensor:
     return weights if bool(weights.any()) else torch.ones_like(weights)
 
 
-def _check(hidden: _Hidden, propagation: str, kernel: Kernel | None) -> Check:
+def _check(fusion: Fusion, hidden: _Hidden, propagation: str, kernel: Kernel | None) -> Check:
     points, frame, fused = hidden.points, hidden.frame, hidden.fused
     propagated = propagate_at(
         fused.after, frame.points, frame.rgb, points.xy, kind=propagation, kernel=kernel
     )
-    own = [points.sample(depth) for depth in _completion(fused, hidden.rejected)]
+    own = [points.sample(depth) for depth in _completion(fusion, fused, hidden.rejected)]
     propagated = _with_completion(propagated, own)
     network = torch.from_numpy(fused.user.before)
     predicted = {

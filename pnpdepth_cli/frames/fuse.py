@@ -65,7 +65,6 @@ class Member:
 class Fused:
     """A frame refined by all networks and fused; the residual is not propagated."""
 
-    members: tuple[Member, ...]
     alone: Mapping[Member, RefinedFrame]
     """What the networks give without another one's prior, the user's first."""
     before: Tensor
@@ -101,6 +100,13 @@ class Fusion:
 
     def __exit__(self, *_: object) -> None:
         self._stack.close()
+
+    @property
+    def completing(self) -> list[Member]:
+        """Networks that take points and no prior, beside one that takes theirs as a prior."""
+        if not any(member.takes_prior for member in self.members):
+            return []
+        return [m for m in self.members if m.takes_points and not m.takes_prior]
 
     def next_image(self) -> None:
         """Forgets what was computed for the last image."""
@@ -175,7 +181,6 @@ class Fusion:
                 guided += one.values()
         parts = _weighted(alone, guided)
         return Fused(
-            members=self.members,
             alone=alone,
             before=weighted_mean([(torch.from_numpy(each.before), w) for each, w in parts]),
             after=weighted_mean([(torch.from_numpy(each.after), w) for each, w in parts]),
