@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import cast
 
+import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
@@ -45,8 +46,8 @@ class InvertedBottleneck(nn.Module):
         self.residual = stride == 1 and channels == out
 
     def forward(self, x: Tensor) -> Tensor:
-        y = x if self.expand is None else F.relu6(self.expand(x))
-        y = cast(Tensor, self.project(F.relu6(self.depthwise(y))))
+        y = x if self.expand is None else F.relu6(self.expand(x), inplace=True)
+        y = cast(Tensor, self.project(F.relu6(self.depthwise(y), inplace=True)))
         return x + y if self.residual else y
 
 
@@ -69,9 +70,10 @@ class Encoder(nn.Module):
         return blocks
 
     def forward(self, rgb: Tensor) -> dict[str, Tensor]:
-        x = F.relu6(self.stem(rgb))
+        # channels last is the faster layout for these convolutions, and slower for the decoder's
+        x = F.relu6(self.stem(rgb.contiguous(memory_format=torch.channels_last)), inplace=True)
         features = {}
         for level, stage in self.stages.items():
             x = stage(x)
-            features[level] = x * FEATURE_SCALE
+            features[level] = (x * FEATURE_SCALE).contiguous()
         return features

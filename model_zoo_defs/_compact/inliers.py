@@ -54,8 +54,9 @@ class InlierWeights(nn.Module):
         """Log odds (n,) of being an inlier."""
         known = cloud.found.float().mean(1)
         state = F.relu(self.enter(torch.stack([known, cloud.log_spacing / 3], 1)))
+        pairs = [_pairs(cloud, some) for some in chunks(cloud)]
         for messages in self.rounds:
-            state = messages(state, cloud)
+            state = messages(state, cloud, pairs)
         return cast(Tensor, self.leave(F.relu(self.score(state))).squeeze(1))
 
     @staticmethod
@@ -85,31 +86,21 @@ class Messages(nn.Module):
         self.change = ExactLinear(2 * WIDTH, WIDTH)
         nn.init.zeros_(self.change.weight)
 
-    def forward(self, state: Tensor, cloud: Cloud) -> Tensor:
+    def forward(self, state: Tensor, cloud: Cloud, pairs: list[Tensor]) -> Tensor:
         sent = self.neighbour(state) + self.bias
-        chunks = [
-            self._received(sent, cloud, slice(first, first + CHUNK))
-            for first in range(0, len(state), CHUNK)
-        ]
-        received = torch.cat(chunks) if chunks else state.new_zeros((0, 2 * WIDTH))
+        parts = zip(chunks(cloud), pairs, strict=True)
+        messages = [self._received(sent, cloud, some, part) for some, part in parts]
+        received = torch.cat(messages) if messages else state.new_zeros((0, 2 * WIDTH))
         each = torch.split(state, list(cloud.counts))
         images = [states.mean(0, keepdim=True).expand_as(states) for states in each]
         hidden = self.update(torch.cat([state, received, torch.cat(images)], 1))
         return state + cast(Tensor, self.change(F.relu(hidden)))
 
-    def _received(self, sent: Tensor, cloud: Cloud, some: slice) -> Tensor:
+    def _received(self, sent: Tensor, cloud: Cloud, some: slice, pairs: Tensor) -> Tensor:
         """Weighted mean and maximum (m, 2 WIDTH) of the messages to some of the points."""
         near, found = cloud.near[some], cloud.found[some].unsqueeze(2)
-        table = torch.cat([cloud.value.unsqueeze(1), cloud.position, cloud.colour], 1)
-        relative = F.embedding(near, table) - table[some].unsqueeze(1)
-        difference, shift, colour = relative[..., 0], relative[..., 1:3], relative[..., 3:]
-        distance = shift.square().sum(2, keepdim=True).sqrt()
-        spacing = cloud.log_spacing[some].view(-1, 1, 1).expand_as(distance)
-        place = [shift / 2, distance / 2, 1 / (distance + 0.3), spacing / 3]
-        pairs = torch.cat([_agreement(difference), _similarity(colour), *place], 2) * found
-        hidden = F.linear(pairs, self.pair) + F.embedding(near, sent)
-        hidden = F.relu(hidden)
-        message = F.relu(F.linear(hidden, self.message, self.message_bias)) * found
+        hidden = F.relu(F.linear(pairs, self.pair).add_(F.embedding(near, sent)), inplace=True)
+        message = F.relu(F.linear(hidden, self.message, self.message_bias), inplace=True) * found
         attention = F.linear(hidden, self.attention).masked_fill(~found, -1e4).softmax(1)
         per_head = message.view(*message.shape[:2], HEADS, -1)
         mean = (attention.unsqueeze(3) * per_head).sum(1).flatten(1)
@@ -118,6 +109,23 @@ class Messages(nn.Module):
 
 class ExactLinear(nn.Linear):
     """A linear layer that stays in float32 at any precision: only plain `nn.Linear` is cast."""
+
+
+def chunks(cloud: Cloud) -> list[slice]:
+    """The points in parts, which bounds the memory."""
+    return [slice(first, first + CHUNK) for first in range(0, len(cloud.value), CHUNK)]
+
+
+def _pairs(cloud: Cloud, some: slice) -> Tensor:
+    """What is known of some points and their neighbours (m, NEIGHBOURS, 17), 0 without one."""
+    near, found = cloud.near[some], cloud.found[some].unsqueeze(2)
+    table = torch.cat([cloud.value.unsqueeze(1), cloud.position, cloud.colour], 1)
+    relative = F.embedding(near, table) - table[some].unsqueeze(1)
+    difference, shift, colour = relative[..., 0], relative[..., 1:3], relative[..., 3:]
+    distance = shift.square().sum(2, keepdim=True).sqrt()
+    spacing = cloud.log_spacing[some].view(-1, 1, 1).expand_as(distance)
+    place = [shift / 2, distance / 2, 1 / (distance + 0.3), spacing / 3]
+    return torch.cat([_agreement(difference), _similarity(colour), *place], 2) * found
 
 
 def _agreement(difference: Tensor) -> Tensor:
