@@ -33,6 +33,7 @@ from torch import Tensor
 from pnpdepth_cli.completion.interpolation import nearest_points
 from pnpdepth_cli.completion.residual_field import Kernel, ResidualField
 from pnpdepth_cli.points import SparsePoints
+from pnpdepth_cli.scan_pattern import scan_pattern
 
 CONSTANT, SLOPE = 100.0, 1.0
 """Variances of β₀ and β₁, in units of the variance of f."""
@@ -59,6 +60,7 @@ _IN_BLOCK = 3  # a block contains at most 1/3 of the points that predict it,
 _MIN_BLOCK = 8  # pixels, a block's side
 _WORTH_A_GRID = 1 << 16  # pixels; for fewer, every pixel is predicted
 _NODES_BETWEEN = 6  # nodes of the grid between two points,
+_NODES_BETWEEN_LINES = 2  # or rows of nodes between two scan lines,
 _MAX_STEP = 4  # and most pixels between two nodes: on real frames as good as every pixel
 _CROWDED = 0.05  # except for this fraction of all points
 _MIN_SCORED_WEIGHT = 1e-6  # the weight of a point that predicts nothing
@@ -156,22 +158,26 @@ def _predict(field: ResidualField, *, sigma: bool) -> Tensor:
     The residual is smooth where the prediction is not, so that it is predicted on a coarser grid.
     """
     size = field.points.size
-    step = _step(field.points)
-    if step == 1:
+    rows, columns = _steps(field.points)
+    if rows == columns == 1:
         return _predict_grid(field, sigma=sigma)
-    coarse = (max(1, round(size[0] / step)), max(1, round(size[1] / step)))
+    coarse = (max(1, round(size[0] / rows)), max(1, round(size[1] / columns)))
     features = F.interpolate(torch.stack(field.features)[None], coarse, mode="area")[0]
     grid = replace(field, features=features.unbind(), points=field.points.resized(*coarse))
     values = _predict_grid(grid, sigma=sigma)[None]
     return F.interpolate(values, size, mode="bilinear", align_corners=False)[0]
 
 
-def _step(points: SparsePoints) -> int:
-    """Pixels between the nodes of the grid on which the residual is predicted."""
+def _steps(points: SparsePoints) -> tuple[int, int]:
+    """Rows and columns between the nodes of the grid on which the residual is predicted."""
     if points.size[0] * points.size[1] < _WORTH_A_GRID:
-        return 1
+        return 1, 1
     spacing = math.sqrt(points.size[0] * points.size[1] / len(points))
-    return min(_MAX_STEP, max(1, int(spacing / _NODES_BETWEEN)))
+    step = min(_MAX_STEP, max(1, int(spacing / _NODES_BETWEEN)))
+    pattern = scan_pattern(points.xy.numpy(), points.size)
+    if not pattern.has_scan_lines:
+        return step, step
+    return min(_MAX_STEP, max(step, int(pattern.across_px / _NODES_BETWEEN_LINES))), step
 
 
 def _predict_grid(field: ResidualField, *, sigma: bool) -> Tensor:
