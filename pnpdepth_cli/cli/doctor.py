@@ -1,0 +1,27 @@
+"""`pnpdepth doctor`."""
+
+from __future__ import annotations
+
+import json
+
+import click
+
+
+@click.command(short_help="Show versions, devices and extras, and test the installation.")
+@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+def doctor(as_json: bool) -> None:
+    """Show versions, devices, memory and extras, and refine a small frame.
+
+    Paste the output into a bug report. It contains no names of files or users.
+    """
+    from pnpdepth_cli.pipeline.doctor import examine
+
+    report = examine()
+    if as_json:
+        click.echo(json.dumps(report, indent=2))
+    else:
+        for name, value in report.items():
+            for number, line in enumerate(value if isinstance(value, list) else [value]):
+                click.echo(f"{'' if number else name:<12}{line}")
+    if str(report["self-test"]).startswith("FAILED"):
+        click.get_current_context().exit(1)
