@@ -7,9 +7,9 @@ The residual r in log depth is a random field observed at the points,
 β₀ and β₁ normal with variances 100 and 1, u the predicted log depth. φ holds the position in the
 image, u, and the colour in CIELAB, each divided by a length scale: pixels that are near, look alike
 and are predicted alike have about the same residual, and an edge of the image or of the prediction
-stops it. The mean and variance of r anywhere, given the points, are
+stops it. The mean of r anywhere, given the points, is
 
-    mean = k·α,   α = (K + N)⁻¹ r,    variance = k(p, p) − k·(K + N)⁻¹·k,
+    mean = k·α,   α = (K + N)⁻¹ r,
 
 K of all covariances among the points, k of those with p, N diagonal of the noise (Rasmussen and
 Williams, "Gaussian Processes for Machine Learning", 2006, sections 2.2 and 2.7; universal kriging
@@ -47,8 +47,6 @@ NEIGHBOURS = 48
 """Points that predict a block, or a single pixel, where there are many points."""
 MIN_POINTS = 5
 """Fewer points do not determine the length scales."""
-DEFAULT_SCALE = 0.2
-"""Standard deviation of f with fewer points: typical relative errors of networks."""
 
 _MAX_EXACT = 128  # points up to which all of them predict every pixel,
 _MAX_EXACT_SMALL = 256  # and up to which they do where the image is small:
@@ -64,42 +62,43 @@ _NODES_BETWEEN_LINES = 2  # or rows of nodes between two scan lines,
 _MAX_STEP = 4  # and most pixels between two nodes: on real frames as good as every pixel
 _CROWDED = 0.05  # except for this fraction of all points
 _MIN_SCORED_WEIGHT = 1e-6  # the weight of a point that predicts nothing
-_WITHIN = 0.68  # fraction within ± one standard deviation
 
 
 def fit(field: ResidualField) -> ResidualField:
-    """Returns the field with the kernel of smallest leave-one-out error, and its scale.
+    """Returns the field with the kernel of smallest leave-one-out error.
 
     The length scales are chosen first, then the noise: on rendered frames as good as all together.
-    With fewer than 5 points the kernel stays and the scale is a default.
+    With fewer than 5 points the kernel stays.
     """
     if len(field.points) < MIN_POINTS:
-        return replace(field, scale=DEFAULT_SCALE)
+        return field
     near = neighbourhoods(field, _MAX_EXACT)
 
-    def score(kernel: Kernel) -> tuple[float, float, Kernel]:
-        error, variance = leave_one_out(replace(field, kernel=kernel), near)
-        scale = (error.abs() / variance.sqrt()).flatten().quantile(_WITHIN)
-        return float(error.abs().mean()), float(scale), kernel
+    def error(kernel: Kernel) -> float:
+        errors, _ = leave_one_out(replace(field, kernel=kernel), near)
+        return float(errors.abs().mean())
 
     colours = LENGTHS_COLOUR if field.at.shape[1] > 3 else LENGTHS_COLOUR[:1]
-    lengths = product(LENGTHS_DEPTH, colours)
-    best = min((score(Kernel(depth=d, colour=c)) for d, c in lengths), key=lambda one: one[0])
-    others = [noise for noise in NOISES if noise != best[2].noise]
-    noises = (score(replace(best[2], noise=noise)) for noise in others)
-    _, scale, kernel = min([best, *noises], key=lambda one: one[0])
-    return replace(field, kernel=kernel, scale=scale)
+    lengths = [Kernel(depth=d, colour=c) for d, c in product(LENGTHS_DEPTH, colours)]
+    best = min(lengths, key=error)
+    noises = [replace(best, noise=noise) for noise in NOISES if noise != best.noise]
+    return replace(field, kernel=min([best, *noises], key=error))
 
 
 def predict(field: ResidualField) -> Tensor:
-    """Returns the mean residual (H, W) float32 at every pixel."""
-    return _predict(field, sigma=False)[0]
+    """Returns the mean residual (H, W) float32 at every pixel.
 
-
-def predict_with_sigma(field: ResidualField) -> tuple[Tensor, Tensor]:
-    """Returns the mean residual and its standard deviation, (H, W) float32 each."""
-    mean, variance = _predict(field, sigma=True)
-    return mean, variance.clamp_min(0).sqrt() * field.scale
+    It is smooth where the prediction is not, so that it is predicted on a coarser grid.
+    """
+    size = field.points.size
+    rows, columns = _steps(field.points)
+    if rows == columns == 1:
+        return _predict_grid(field)
+    coarse = (max(1, round(size[0] / rows)), max(1, round(size[1] / columns)))
+    features = F.interpolate(torch.stack(field.features)[None], coarse, mode="area")[0]
+    grid = replace(field, features=features.unbind(), points=field.points.resized(*coarse))
+    values = _predict_grid(grid)[None, None]
+    return F.interpolate(values, size, mode="bilinear", align_corners=False)[0, 0]
 
 
 def predict_at(field: ResidualField, xy: Tensor, features: Tensor) -> Tensor:
@@ -111,9 +110,9 @@ def predict_at(field: ResidualField, xy: Tensor, features: Tensor) -> Tensor:
         features: (M, 3 or 6), the features there.
     """
     if _is_exact(field) or len(field.points) <= NEIGHBOURS:
-        return _solve(field, _all_points(field), features[None])[0, 0]
+        return _solve(field, _all_points(field), features[None])[0]
     _, near = nearest_points(field.points, xy.double(), NEIGHBOURS)
-    return _solve(field, near, features[:, None])[0, :, 0]
+    return _solve(field, near, features[:, None])[:, 0]
 
 
 def leave_one_out(
@@ -152,22 +151,6 @@ def neighbourhoods(field: ResidualField, max_exact: int) -> Tensor:
     return near
 
 
-def _predict(field: ResidualField, *, sigma: bool) -> Tensor:
-    """(1 or 2, H, W): mean and, if wanted, variance in units of the scale.
-
-    The residual is smooth where the prediction is not, so that it is predicted on a coarser grid.
-    """
-    size = field.points.size
-    rows, columns = _steps(field.points)
-    if rows == columns == 1:
-        return _predict_grid(field, sigma=sigma)
-    coarse = (max(1, round(size[0] / rows)), max(1, round(size[1] / columns)))
-    features = F.interpolate(torch.stack(field.features)[None], coarse, mode="area")[0]
-    grid = replace(field, features=features.unbind(), points=field.points.resized(*coarse))
-    values = _predict_grid(grid, sigma=sigma)[None]
-    return F.interpolate(values, size, mode="bilinear", align_corners=False)[0]
-
-
 def _steps(points: SparsePoints) -> tuple[int, int]:
     """Rows and columns between the nodes of the grid on which the residual is predicted."""
     if points.size[0] * points.size[1] < _WORTH_A_GRID:
@@ -180,23 +163,22 @@ def _steps(points: SparsePoints) -> tuple[int, int]:
     return min(_MAX_STEP, max(step, int(pattern.across_px / _NODES_BETWEEN_LINES))), step
 
 
-def _predict_grid(field: ResidualField, *, sigma: bool) -> Tensor:
+def _predict_grid(field: ResidualField) -> Tensor:
     """The same, predicted at every pixel of the field's features."""
     height, width = field.points.size
     if _is_exact(field):
         queries = torch.stack(field.features, dim=-1).reshape(1, height * width, -1)
-        return _solve(field, _all_points(field), queries, sigma).reshape(-1, height, width)
+        return _solve(field, _all_points(field), queries).reshape(height, width)
     side = _block_side(field.points)
-    layers = [_predict_blocks(field, side, shift, sigma) for shift in (0, side // 2)]
+    layers = [_predict_blocks(field, side, shift) for shift in (0, side // 2)]
     total = layers[0][1] + layers[1][1]
-    blended = torch.stack([values * (weight / total) for values, weight in layers])
-    return blended.sum(dim=0)
+    return sum((values * (weight / total) for values, weight in layers), torch.zeros(()))
 
 
-def _solve(field: ResidualField, near: Tensor, queries: Tensor, sigma: bool = False) -> Tensor:
-    """(1 or 2, B, Q) float32: mean and variance at B × Q features, from points near (B, k)."""
+def _solve(field: ResidualField, near: Tensor, queries: Tensor) -> Tensor:
+    """(B, Q) float32: the mean at B × Q features, from points near (B, k)."""
     (blocks, count), per_block = near.shape, queries.shape[1]
-    result = queries.new_empty(1 + sigma, blocks, per_block)
+    result = queries.new_empty(blocks, per_block)
     many = max(1, _AT_ONCE // (per_block * count))
     step = max(1, _AT_ONCE // (many * count))
     for first in range(0, blocks, many):
@@ -205,17 +187,11 @@ def _solve(field: ResidualField, near: Tensor, queries: Tensor, sigma: bool = Fa
         factor = torch.linalg.cholesky(system + _trend(u))
         alpha = torch.cholesky_solve(field.residual[near[some]][..., None], factor)
         beta = torch.stack([CONSTANT * alpha[..., 0].sum(1), SLOPE * (u * alpha[..., 0]).sum(1)])
-        if sigma:
-            root = torch.linalg.cholesky(system)
         for start in range(0, per_block, step):
             part = queries[some, start : start + step]
-            v = part[..., 2]
             k = _covariance(field.kernel.scaled(part), at.float())
             mean = (k @ alpha.float())[..., 0] + beta.float()[0, :, None]
-            result[0, some, start : start + step] = mean + beta.float()[1, :, None] * v
-            if sigma:
-                variance = _variance(root, u, k, v) + field.kernel.noise
-                result[1, some, start : start + step] = variance
+            result[some, start : start + step] = mean + beta.float()[1, :, None] * part[..., 2]
     return result
 
 
@@ -231,24 +207,6 @@ def _trend(u: Tensor) -> Tensor:
     """Covariances (B, k, k) of β₀ + β₁·u."""
     trend: Tensor = CONSTANT + SLOPE * u[:, :, None] * u[:, None, :]
     return trend
-
-
-def _variance(root: Tensor, u: Tensor, k: Tensor, v: Tensor) -> Tensor:
-    """(B, Q) of r without its noise (Rasmussen and Williams, eq. 2.42, the trend apart from f:
-
-    the large variance of β₀ then cancels nowhere). root: Cholesky factor of f's and the noise's.
-    """
-    lines = torch.stack([torch.ones_like(u), u], dim=2)
-    lines = torch.linalg.solve_triangular(root, lines, upper=False)
-    prior = torch.diag(torch.tensor([1 / CONSTANT, 1 / SLOPE], dtype=u.dtype))
-    rest = torch.linalg.inv(prior + lines.transpose(1, 2) @ lines).float()
-    inverse = torch.linalg.solve_triangular(
-        root, torch.eye(u.shape[1], dtype=u.dtype).expand_as(root), upper=False
-    )
-    explained = inverse.float() @ k.transpose(1, 2)
-    left = torch.stack([torch.ones_like(v), v], dim=1) - lines.float().transpose(1, 2) @ explained
-    variance: Tensor = 1 - explained.square().sum(dim=1) + (left * (rest @ left)).sum(dim=1)
-    return variance
 
 
 def _covariance(a: Tensor, b: Tensor) -> Tensor:
@@ -272,10 +230,8 @@ def _is_exact(field: ResidualField) -> bool:
     return small or count <= _MAX_EXACT
 
 
-def _predict_blocks(
-    field: ResidualField, side: int, shift: int, sigma: bool
-) -> tuple[Tensor, Tensor]:
-    """(1 or 2, H, W) mean and variance, predicted block by block, and the pixels' weights (H, W).
+def _predict_blocks(field: ResidualField, side: int, shift: int) -> tuple[Tensor, Tensor]:
+    """(H, W): the mean, predicted block by block, and the pixels' weights.
 
     Blocks of side × side pixels, the first of which begins `shift` pixels before the image. A
     pixel's weight is its distance to the edge of its block.
@@ -287,14 +243,14 @@ def _predict_blocks(
     blocks = padded.reshape(-1, rows, side, columns, side).permute(1, 3, 2, 4, 0)
     middles = torch.cartesian_prod(torch.arange(rows), torch.arange(columns)).flip(1).double()
     _, near = nearest_points(field.points, (middles + 0.5) * side - 0.5 - shift, NEIGHBOURS)
-    values = _solve(field, near, blocks.reshape(rows * columns, side * side, -1), sigma)
-    values = values.reshape(-1, rows, columns, side, side).permute(0, 1, 3, 2, 4)
-    values = values.reshape(-1, rows * side, columns * side)
+    values = _solve(field, near, blocks.reshape(rows * columns, side * side, -1))
+    values = values.reshape(rows, columns, side, side).permute(0, 2, 1, 3)
+    values = values.reshape(rows * side, columns * side)
     position = torch.arange(float(side)) + 0.5
     inside = torch.minimum(position, side - position)
     y, x = (inside.repeat(n)[shift:] for n in (rows, columns))
     weight = torch.minimum(y[:height, None], x[None, :width])
-    return values[:, shift : shift + height, shift : shift + width], weight
+    return values[shift : shift + height, shift : shift + width], weight
 
 
 def _block_side(points: SparsePoints) -> int:

@@ -19,7 +19,6 @@ from torch import Tensor
 from pnpdepth_cli.choices import PROPAGATIONS
 from pnpdepth_cli.completion.outliers import without_outliers
 from pnpdepth_cli.completion.residual_field import Kernel, ResidualField, residual_field
-from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.points import SparsePoints
 
 NONE = "none"
@@ -30,7 +29,7 @@ NONE = "none"
 class Propagation:
     """A method that predicts the residual away from the points.
 
-    `dense`, `at` and `with_sigma` take a field whose kernel `fit` has chosen.
+    `dense` and `at` take a field whose kernel `fit` has chosen.
     """
 
     title: str
@@ -41,8 +40,6 @@ class Propagation:
     """Residual (H, W) float32 at every pixel."""
     at: Callable[[ResidualField, SparsePoints], Tensor] | None = None
     """Residual (M,) at the coordinates of M points. None: it is sampled from `dense`."""
-    with_sigma: Callable[[ResidualField], tuple[Tensor, Tensor]] | None = None
-    """Residual and its standard deviation, (H, W) each. None: it has no standard deviation."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,8 +48,6 @@ class Propagated:
 
     depth: Tensor
     """(H, W) float32 metres, 0 = unknown."""
-    sigma: Tensor | None = None
-    """(H, W) float32 metres, standard deviation of the depth. None if it was not asked for."""
     kernel: Kernel | None = None
     """The kernel that fits the residual best. None with "none"."""
 
@@ -63,7 +58,6 @@ def propagate(
     rgb: Tensor | None,
     *,
     kind: str = "gp",
-    sigma: bool = False,
 ) -> Propagated:
     """Returns the prediction with its residual at the points propagated.
 
@@ -72,29 +66,18 @@ def propagate(
         points: Sparse depth in the same frame.
         rgb: (3, H, W) in 0…1, or None.
         kind: A name in `choices.PROPAGATIONS`, or "none".
-        sigma: Whether the standard deviation is wanted. It is estimated from the same points; where
-            these have been fitted before, `frames.uncertainty.calibration` says how much too small
-            it is.
 
     Raises:
-        UsageError: There is no such propagation, or it has no standard deviation.
         NoPointsError: No point has a prediction, except with "none".
     """
     propagation = None if kind == NONE else PROPAGATIONS[kind]
-    if sigma and (propagation is None or propagation.with_sigma is None):
-        raise UsageError(f"propagation {kind!r} has no standard deviation; take 'gp'")
     known = prediction.isfinite() & (prediction > 0)
     if propagation is None:
         return Propagated(depth=torch.where(known, prediction, 0.0).float())
     field = propagation.fit(without_outliers(residual_field(prediction, points, rgb)))
-    if sigma:
-        residual, deviation = propagation.with_sigma(field)
-    else:
-        residual, deviation = propagation.dense(field), None
-    factor = _clamped(residual, field).exp().to(prediction.device)
+    factor = _clamped(propagation.dense(field), field).exp().to(prediction.device)
     depth = torch.where(known, prediction * factor, 0.0).float()
-    sigma_m = None if deviation is None else depth * deviation.to(depth.device)
-    return Propagated(depth=depth, sigma=sigma_m, kernel=field.kernel)
+    return Propagated(depth=depth, kernel=field.kernel)
 
 
 def propagate_at(

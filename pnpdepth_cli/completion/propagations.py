@@ -22,7 +22,6 @@ TABLE = {
         fit=gaussian_process.fit,
         dense=gaussian_process.predict,
         at=_gp_at,
-        with_sigma=gaussian_process.predict_with_sigma,
     ),
     "diffusion": Propagation(title="edge-aware diffusion", dense=diffuse),
 }

@@ -55,8 +55,6 @@ class ResidualField:
     """(N,) float64, log measured − log predicted depth."""
     kernel: Kernel = Kernel()
     """Covariance; `gaussian_process.fit` chooses it."""
-    scale: float = 1.0
-    """Standard deviation of the field; `gaussian_process.fit` chooses it."""
 
     def features_at(self, queries: SparsePoints) -> Tensor:
         """Returns the features (M, 3 or 6) at the coordinates of M points."""
