@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
@@ -17,9 +18,10 @@ from pnpdepth_cli.frames.opened import OpenNetwork, SplitCache
 from pnpdepth_cli.frames.refine import refine_frame
 from pnpdepth_cli.models.network import load_network
 from tests.core.split.test_split import same, state_of
-from tests.frames.scenes import Brightness, Nearest, TwicePrior, frame_in_memory, member
+from tests.frames.scenes import SIZE, Brightness, Nearest, TwicePrior, frame_in_memory, member
 
 UPDATES = RefineSettings(iterations=3, lr="5%", update="sign", align="none")
+ALIGNED = RefineSettings(iterations=0, align="affine")
 HIDDEN = RefineSettings(
     iterations=2, lr=1e-4, loss="log", update="adam", parameters="weights", target="masked"
 )
@@ -36,7 +38,7 @@ def test_the_weighted_mean_is_geometric_and_skips_unknown_depth() -> None:
 
 def test_a_network_that_takes_a_prior_is_given_the_others_aligned_depth() -> None:
     frame = frame_in_memory(60)
-    with Fusion([member(Brightness), member(TwicePrior)]) as fusion:
+    with Fusion([member(Brightness, settings=ALIGNED), member(TwicePrior)]) as fusion:
         fused = fusion.fuse(frame)
     own = torch.from_numpy(fused.user.before)
     expected = weighted_mean([(own, IMAGE_WEIGHT), (2 * own, 1 - IMAGE_WEIGHT)])
@@ -45,7 +47,7 @@ def test_a_network_that_takes_a_prior_is_given_the_others_aligned_depth() -> Non
 
 def test_with_few_points_the_depth_without_a_prior_is_fused_too() -> None:
     frame = frame_in_memory(FEW_POINTS - 1)
-    with Fusion([member(Brightness), member(TwicePrior)]) as fusion:
+    with Fusion([member(Brightness, settings=ALIGNED), member(TwicePrior)]) as fusion:
         fused = fusion.fuse(frame)
     own, rest = torch.from_numpy(fused.user.before), 1 - IMAGE_WEIGHT
     parts = [
@@ -195,3 +197,16 @@ def test_steps_that_fail_leave_the_networks_own_depth() -> None:
         failed = fusion.fuse(frame, until=time.monotonic() + 1e6)
     assert torch.equal(failed.after, plain.after)
     assert failed.user.diverged is None
+
+
+def test_a_network_that_explains_nothing_at_the_points_has_no_say() -> None:
+    frame = frame_in_memory(60)
+    noise = torch.from_numpy(np.random.default_rng(5).random((3, *SIZE), dtype=np.float32))
+    unrelated = replace(frame, rgb=noise)
+    with Fusion([member(Brightness, settings=ALIGNED), member(TwicePrior)]) as fusion:
+        says = fusion.fuse(frame)
+        fusion.next_image()
+        silent = fusion.fuse(unrelated)
+    assert not bool((says.after == 5.0).any())
+    assert bool((silent.after == 5.0).all())
+    assert not bool((torch.from_numpy(silent.user.before) == 5.0).any())
