@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
@@ -20,30 +20,34 @@ from pnpdepth_cli.choices import (
     SCALINGS,
 )
 from pnpdepth_cli.cli import grouped_help, options
+from pnpdepth_cli.cli.compare import columns
 from pnpdepth_cli.cli.printable import printable
 from pnpdepth_cli.cli.progress import progress_bar
 from pnpdepth_cli.errors import FramesFailedError, UsageError
 
-if TYPE_CHECKING:
-    from pnpdepth_cli.pipeline.evaluation.result import EvalRequest
-
 _REQUEST_OPTIONS = (
-    "sparse",
-    "protocol",
-    "layout_protocol",
-    "calib",
-    "resamples",
-    "seed",
-    "workers",
+    *("sparse", "protocol", "layout_protocol", "calib", "resamples", "seed", "workers"),
 )
-"""Options that are fields of `EvalRequest`."""
+"""Options that are fields of `EvalRequest`; those without an own field change the protocol."""
 _SCALE_OPTIONS = {
     "prediction": "pred_scale",
-    "ground_truth": "gt_scale",
+    "truth": "gt_scale",
     "sparse": "sparse_scale",
     "channel": "channel",
 }
 """Options by the field of `Scales` that they set."""
+
+
+def _thresholds(text: str) -> tuple[float, float, float]:
+    """Returns the thresholds of δ1…δ3 from one number, which is raised to powers, or from three."""
+    try:
+        first, *others = (float(word) for word in text.split(","))
+        second, third = others or (first**2, first**3)
+    except (ValueError, OverflowError):
+        raise UsageError(
+            f"--delta {text!r} is neither one number such as 1.25 nor three numbers"
+        ) from None
+    return first, second, third
 
 
 @click.command(
@@ -51,31 +55,26 @@ _SCALE_OPTIONS = {
     short_help="Score depth files against ground truth.",
     cls=grouped_help.GroupedCommand,
     common=frozenset(
-        {
+        (
             *("--protocol", "--min-depth", "--max-depth", "--crop", "--average", "--gt-scale"),
             *("--pred-scale", "--sparse", "--csv", "--markdown", "--latex", "--html", "--json"),
             *("--overwrite", "--resize"),
-        }
+        )
     ),
     groups={
         "Input": (
             *("--pred-scale", "--gt-scale", "--pred-kind", "--channel", "--resize", "--pred-crop"),
-            *(
-                "--mask",
-                "--calib",
-                "--layout-protocol",
-                "--sparse",
-                "--sparse-scale",
-                "--workers",
-                "--max-pixels",
-            ),
+            *("--mask", "--calib", "--layout-protocol", "--sparse", "--sparse-scale", "--workers"),
+            "--max-pixels",
         ),
         "Protocol": (
             *("--protocol", "--min-depth", "--max-depth", "--clip", "--crop", "--average"),
             *("--delta", "--exclude-sparse", "--missing", "--scale-by", "--bootstrap"),
             *("--no-groups", "--seed", "--measures"),
         ),
-        "Output": ("--csv", "--markdown", "--latex", "--html", "--overwrite", "--json"),
+        "Output": (
+            *("--csv", "--markdown", "--latex", "--columns", "--html", "--overwrite", "--json"),
+        ),
     },
 )
 @click.argument("prediction", type=options.FILE, metavar="PRED")
@@ -99,6 +98,8 @@ _SCALE_OPTIONS = {
 )
 @click.option(
     "--delta",
+    "thresholds",
+    type=_thresholds,
     metavar="D|D1,D2,D3",
     help="Thresholds of δ1…δ3: D, D², D³, or D1, D2, D3. The paper's KITTI rows use 1.01."
     "  [default: 1.25]",
@@ -122,6 +123,8 @@ _SCALE_OPTIONS = {
 )
 @click.option(
     "--measures",
+    "groups",
+    type=lambda text: tuple(dict.fromkeys(text.split(","))),
     metavar="GROUP,…",
     help=f"Additional measures: {', '.join(MEASURE_GROUPS)}.",
 )
@@ -161,7 +164,9 @@ _SCALE_OPTIONS = {
 @click.option(
     "--sparse-scale", type=float, metavar="S", help="Integer --sparse files hold metres × S."
 )
-@click.option("--exclude-sparse", is_flag=True, help="Leave out pixels that have a sparse point.")
+@click.option(
+    "--exclude-sparse", is_flag=True, default=None, help="Leave out pixels with a sparse point."
+)
 @click.option(
     "--bootstrap",
     "resamples",
@@ -186,6 +191,7 @@ _SCALE_OPTIONS = {
     markdown="Write a table of the means.",
     latex="Write a tabular of the means.",
 )
+@columns
 @click.option(
     "--html",
     type=options.FILE,
@@ -212,35 +218,41 @@ def evaluate(prediction: Path, ground_truth: Path, html: Path | None, **values: 
     kitti-devkit  figures of KITTI's development kit: missing depth filled in, metres, 1/m
     eigen, garg   0.001–80 m, predictions clipped to it, Eigen's or Garg's crop
     """
-    from pnpdepth_cli.cli import score_tables
-    from pnpdepth_cli.pipeline.evaluation import score_files
+    from pnpdepth_cli.cli.tables import TableFiles, print_notes, print_table
+    from pnpdepth_cli.pipeline.evaluation import tables
+    from pnpdepth_cli.pipeline.evaluation.evaluate import EvalRequest
     from pnpdepth_cli.pipeline.evaluation.evaluate import evaluate as run_evaluation
+    from pnpdepth_cli.pipeline.evaluation.frame_reading import Scales
     from pnpdepth_cli.pipeline.report import evaluation as report_eval
 
-    names = [each.name for each in fields(score_tables.TableFiles)]
-    tables = score_tables.TableFiles(**{name: values.pop(name) for name in names})
-    tables.check((prediction, ground_truth))
+    files = TableFiles(**{each.name: values.pop(each.name) for each in fields(TableFiles)})
+    files.check((prediction, ground_truth))
+    keys = values.pop("columns")
     if html is not None:
-        inputs = [
-            p for p in (prediction, ground_truth, values["sparse"], values["mask"]) if p is not None
-        ]
-        report_eval.check_eval_report(html, inputs, overwrite=tables.overwrite)
-    request = _request(prediction, ground_truth, values)
+        inputs = [prediction, ground_truth, values["sparse"], values["mask"]]
+        report_eval.check_eval_report(
+            html, [path for path in inputs if path is not None], overwrite=files.overwrite
+        )
+    scales = {field: values.pop(name) for field, name in _SCALE_OPTIONS.items()}
+    request = EvalRequest(
+        prediction=prediction,
+        ground_truth=ground_truth,
+        grouped=not values.pop("no_groups"),
+        scales=Scales(**scales),
+        **{name: values.pop(name) for name in _REQUEST_OPTIONS},
+        changes=values,
+    )
     with progress_bar("eval", "frame") as show:
         evaluation = run_evaluation(request, on_frame=show)
-    protocol = evaluation.protocol.describe()
-    score_tables.print_notes([f"protocol {protocol}", *evaluation.notes])
+    print_notes([f"protocol {evaluation.protocol.describe()}", *evaluation.notes])
     name = prediction.stem if prediction.is_file() else prediction.resolve().name
-    table = score_files.means_table(evaluation, name)
-    to_stdout = tables.write(
-        score_files.frames_csv(evaluation),
-        score_files.markdown_text(*table, protocol),
-        score_files.latex_text(*table, protocol),
-    )
-    if tables.as_json:
+    means = tables.means_row(evaluation, name, keys)
+    to_stdout = files.write(csv=tables.frames_csv(evaluation), markdown=means, latex=means)
+    if files.as_json:
         click.echo(json.dumps(evaluation.as_record(), indent=2))
     elif not to_stdout:
-        score_tables.print_evaluation(evaluation)
+        for table in tables.text_tables(evaluation):
+            print_table(table)
     if html is not None:
         with progress_bar("report", "frame") as show:
             report_eval.write_eval_report(html, evaluation, on_frame=show)
@@ -248,41 +260,3 @@ def evaluate(prediction: Path, ground_truth: Path, html: Path | None, **values: 
     unscored = evaluation.unscored()
     if unscored is not None:
         raise FramesFailedError(unscored)
-
-
-def _request(prediction: Path, ground_truth: Path, values: dict[str, Any]) -> EvalRequest:
-    """Returns the request of the other options; those without an own field change the protocol."""
-    from pnpdepth_cli.pipeline.evaluation.frame_reading import Scales
-    from pnpdepth_cli.pipeline.evaluation.result import EvalRequest
-
-    own = {name: values.pop(name) for name in _REQUEST_OPTIONS}
-    scales = {field: values.pop(name) for field, name in _SCALE_OPTIONS.items()}
-    grouped = not values.pop("no_groups")
-    groups = values.pop("measures")
-    derived = {
-        "groups": None if groups is None else tuple(dict.fromkeys(groups.split(","))),
-        "thresholds": _thresholds(values.pop("delta")),
-        "exclude_sparse": values.pop("exclude_sparse") or None,
-    }
-    return EvalRequest(
-        prediction=prediction,
-        ground_truth=ground_truth,
-        grouped=grouped,
-        scales=Scales(**scales),
-        changes=values | derived,
-        **own,
-    )
-
-
-def _thresholds(text: str | None) -> tuple[float, float, float] | None:
-    """Returns the thresholds of δ1…δ3 from one number, which is raised to powers, or from three."""
-    if text is None:
-        return None
-    try:
-        first, *others = (float(word) for word in text.split(","))
-        second, third = others or (first**2, first**3)
-    except (ValueError, OverflowError):
-        raise UsageError(
-            f"--delta {text!r} is neither one number such as 1.25 nor three numbers"
-        ) from None
-    return first, second, third

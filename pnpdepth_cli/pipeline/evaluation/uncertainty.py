@@ -19,10 +19,8 @@ Floats = NDArray[np.float64]
 
 ONE_SIGMA, TWO_SIGMA = (float(2 * norm.cdf(k) - 1) for k in (1, 2))
 LEVELS = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, ONE_SIGMA, 0.8, 0.9, TWO_SIGMA, 0.99)
-"""Probabilities of the calibration curve, the last but one of two standard deviations."""
-
 REMOVED = tuple(n / 20 for n in range(20))
-"""Fractions of the pixels that are removed, of the sparsification curve."""
+"""Fractions of the pixels."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,9 +42,7 @@ class Uncertainty:
     """Calibration over the pixels of all frames, and the mean sparsification of the frames."""
 
     frames: int
-    """Frames with a standard deviation."""
     pixels: int
-    """Their pixels with prediction, ground truth and standard deviation."""
     within_1_sigma: float
     """Fraction of errors within one standard deviation; 0.683 if calibrated."""
     within_2_sigma: float
@@ -54,15 +50,13 @@ class Uncertainty:
     ause: float
     """Area between sparsification and oracle, in units of the error of all pixels; 0 is best."""
     expected: tuple[float, ...]
-    """Probabilities of the calibration curve."""
+    """LEVELS, the calibration curve's."""
     observed: tuple[float, ...]
     """Fraction of errors within the interval of each."""
     removed: tuple[float, ...]
-    """Fractions of the sparsification curve."""
+    """REMOVED, the sparsification curve's."""
     sparsification: tuple[float, ...]
-    """Mean absolute error without the most uncertain pixels, metres."""
     oracle: tuple[float, ...]
-    """Mean absolute error without the pixels of largest error, metres."""
 
 
 def frame_uncertainty(depth: Depth, gt: Depth, sigma: Depth) -> FrameUncertainty | None:

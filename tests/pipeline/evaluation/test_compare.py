@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from pnpdepth_cli.pipeline.evaluation.result import EvalRequest
 
 from pnpdepth_cli.errors import FileFormatError, InputError, UsageError
 from pnpdepth_cli.io.depth import write_depth
@@ -15,7 +16,6 @@ from pnpdepth_cli.io.record import write_json
 from pnpdepth_cli.pipeline.evaluation.compare import CompareRequest, Comparison
 from pnpdepth_cli.pipeline.evaluation.compare import compare as compare_runs
 from pnpdepth_cli.pipeline.evaluation.evaluate import evaluate
-from pnpdepth_cli.pipeline.evaluation.result import EvalRequest
 
 
 def compare(paths: list[str], **settings: Any) -> Comparison:

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from pnpdepth_cli.pipeline.evaluation.result import EvalRequest
 
 from pnpdepth_cli.errors import InputError
 from pnpdepth_cli.io.formats.npy import HEADER_LOCK
 from pnpdepth_cli.pipeline.evaluation.evaluate import evaluate
-from pnpdepth_cli.pipeline.evaluation.result import EvalRequest
 from pnpdepth_cli.pipeline.evaluation.stacks import load_stacked, stack_size
 
 

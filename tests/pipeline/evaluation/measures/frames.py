@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-
 from pnpdepth_cli.pipeline.evaluation.measured_frame import MeasuredFrame
 
 K = np.array([[50.0, 0, 20.0], [0, 60.0, 15.0], [0, 0, 1]])

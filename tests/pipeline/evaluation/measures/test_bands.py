@@ -7,10 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-
 from pnpdepth_cli.pipeline.evaluation.measures.area import area_errors
 from pnpdepth_cli.pipeline.evaluation.measures.distance import distance_errors
 from pnpdepth_cli.pipeline.evaluation.measures.flicker import flicker
+
 from tests.pipeline.evaluation.measures.frames import random_frame
 
 FRAME = random_frame(0)

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy.spatial.distance import cdist
-
 from pnpdepth_cli.pipeline.evaluation.measured_frame import MeasuredFrame
 from pnpdepth_cli.pipeline.evaluation.measures.cloud import cloud_errors
+from scipy.spatial.distance import cdist
+
 from tests.pipeline.evaluation.measures.frames import K, random_frame
 
 

@@ -5,10 +5,9 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
-from scipy.spatial.distance import cdist
-
 from pnpdepth_cli.pipeline.evaluation.measured_frame import MeasuredFrame
 from pnpdepth_cli.pipeline.evaluation.measures.edges import boundary_errors, edges_of
+from scipy.spatial.distance import cdist
 
 
 def step(column: int) -> np.ndarray:

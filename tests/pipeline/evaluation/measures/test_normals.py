@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-
 from pnpdepth_cli.pipeline.evaluation.measured_frame import MeasuredFrame
 from pnpdepth_cli.pipeline.evaluation.measures.normals import normals_of, surface_errors
+
 from tests.pipeline.evaluation.measures.frames import K, plane
 
 

@@ -1,0 +1,242 @@
+"""The tables of an evaluation and of a comparison."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from pnpdepth_cli.core.metrics import Measure
+from pnpdepth_cli.errors import UsageError
+from pnpdepth_cli.pipeline.evaluation.compare import ALPHA, Comparison
+from pnpdepth_cli.pipeline.evaluation.diagnostics import kinds_of
+from pnpdepth_cli.pipeline.evaluation.evaluate import Evaluation, frame_record
+from pnpdepth_cli.pipeline.evaluation.frame_scoring import FrameScores
+from pnpdepth_cli.pipeline.evaluation.uncertainty import Uncertainty
+from pnpdepth_cli.pipeline.tables import Cell, Table, column_title, format_value
+
+_ALL_FRAMES_SHOWN = 12
+_WORST_SHOWN = 5
+_FRAME_COLUMNS = 6
+_STARS = (0.05, 0.01, 0.001)
+_BIN_TITLES = {
+    "distance_px": ("By distance to the nearest sparse point", "px"),
+    "depth_m": ("By depth of the ground truth", "m"),
+}
+
+
+def chosen_measures(measures: Sequence[Measure], keys: Sequence[str] | None) -> list[Measure]:
+    """Returns the measures with these keys, in their order; all for None.
+
+    Raises:
+        UsageError: If one is unknown.
+    """
+    by_key = {measure.key: measure for measure in measures}
+    for key in keys or ():
+        if key not in by_key:
+            raise UsageError(f"--columns {key} is not one of {', '.join(by_key)}")
+    return [by_key[key] for key in (by_key if keys is None else keys)]
+
+
+def text_tables(evaluation: Evaluation) -> list[Table]:
+    """Returns what the terminal shows: the means, the frames or the worst of them, and details."""
+    frames = [frames_table(evaluation)] if len(evaluation.frames) > 1 else []
+    return [means_by_measure(evaluation), *frames, *detail_tables(evaluation)]
+
+
+def detail_tables(evaluation: Evaluation) -> list[Table]:
+    """Returns the calibration of the standard deviation, and the errors by distance and depth."""
+    found = evaluation.uncertainty
+    return [*([] if found is None else [_calibration(found)]), *_bin_tables(evaluation)]
+
+
+def means_by_measure(evaluation: Evaluation) -> Table:
+    """Returns a row for each measure: its mean and the interval of it."""
+    count = len(evaluation.scored)
+    of = f"{count:,} frame{'' if count == 1 else 's'}"
+    pooled = evaluation.protocol.average == "pooled"
+    caption = f"Over all pixels of {of} together" if pooled else f"Means over {of}"
+    header, has_interval = ["", "mean"], evaluation.interval is not None
+    if has_interval:
+        header.append("95 %")
+        caption += f"; 95 % interval: studentised bootstrap over {evaluation.clusters.describe()}"
+    rows = []
+    for measure in evaluation.protocol.measures:
+        interval = [_interval(evaluation, measure)] if has_interval else []
+        mean = format_value(measure, evaluation.mean[measure.key])
+        rows.append([column_title(measure), mean, *interval])
+    coverage = ["coverage ↑", f"{evaluation.coverage:.2%}", *[""] * has_interval]
+    return Table(header=header, rows=[*rows, coverage], caption=caption)
+
+
+def means_row(evaluation: Evaluation, name: str, columns: Sequence[str] | None) -> Table:
+    """Returns one row: the chosen means with their intervals, the frames and the coverage."""
+    measures = chosen_measures(evaluation.protocol.measures, columns)
+    cells = [format_value(measure, evaluation.mean[measure.key]) for measure in measures]
+    if evaluation.interval is not None:
+        ends = [_interval(evaluation, measure) for measure in measures]
+        cells = [f"{cell} ({end})" for cell, end in zip(cells, ends, strict=True)]
+    scored = f"{len(evaluation.scored):,} of {len(evaluation.frames):,}"
+    assumed = {
+        f"{side}: {kind.source}, assumed"
+        for side, kinds in kinds_of(evaluation.frames).items()
+        for kind, _ in kinds
+        if kind.assumed
+    }
+    return Table(
+        header=["", *map(column_title, measures), "frames", "coverage"],
+        rows=[[name, *cells, scored, f"{evaluation.coverage:.2%}"]],
+        caption="; ".join([evaluation.protocol.describe(), *sorted(assumed)]),
+    )
+
+
+def _interval(evaluation: Evaluation, measure: Measure) -> str:
+    ends = (evaluation.interval or {}).get(measure.key, ())
+    return " … ".join(format_value(measure, end) for end in ends)
+
+
+def frames_csv(evaluation: Evaluation) -> Table:
+    """Returns a row for each frame: its files, its counts, and its measures as stored."""
+    keys = [measure.key for measure in evaluation.protocol.measures]
+    records = [frame_record(frame) for frame in evaluation.frames]
+    columns = [name for name in records[0] if name not in ("values", "error")]
+    rows = [
+        [*(r[name] for name in columns), *(r["values"].get(key) for key in keys), r["error"]]
+        for r in records
+    ]
+    return Table(
+        header=[*columns, *keys, "error"],
+        rows=[["" if _is_nothing(each) else str(each) for each in row] for row in rows],
+    )
+
+
+def _is_nothing(value: object) -> bool:
+    return value is None or (isinstance(value, float) and math.isnan(value))
+
+
+def frames_table(evaluation: Evaluation) -> Table:
+    """Returns the first measures of each frame, or of the worst of many."""
+    measures = evaluation.protocol.measures[:_FRAME_COLUMNS]
+    everything = len(evaluation.frames) <= _ALL_FRAMES_SHOWN
+    frames = evaluation.frames if everything else worst(evaluation, "rmse")[:_WORST_SHOWN]
+    return Table(
+        caption="Frames" if everything else f"The {len(frames)} worst by RMSE; --csv has all",
+        header=["frame", *map(column_title, measures), "coverage"],
+        rows=[
+            [frame.name, *(format_value(m, frame.values.get(m.key)) for m in measures),
+             _coverage(frame)]
+            for frame in frames
+        ],
+    )  # fmt: skip
+
+
+def worst(evaluation: Evaluation, key: str) -> list[FrameScores]:
+    """Returns the scored frames by one measure, worst first, those with NaN at the very end."""
+    (measure,) = (m for m in evaluation.protocol.measures if m.key == key)
+    sign = 1 if measure.higher_is_better else -1
+    values = ((frame, frame.values[key]) for frame in evaluation.scored)
+    ordered = sorted(values, key=lambda of: (math.isnan(of[1]), sign * of[1]))
+    return [frame for frame, _ in ordered]
+
+
+def _coverage(frame: FrameScores) -> str:
+    if frame.missing:
+        return Cell("missing", "bad")
+    return f"{frame.coverage:.2%}" if frame.scored else Cell("not scored", "bad")
+
+
+def _calibration(found: Uncertainty) -> Table:
+    return Table(
+        caption=f"Standard deviation of {found.frames:,} frame{'' if found.frames == 1 else 's'}",
+        header=["", "observed", "calibrated"],
+        rows=[
+            ["errors within 1σ", f"{found.within_1_sigma:.1%}", "68.3%"],
+            ["errors within 2σ", f"{found.within_2_sigma:.1%}", "95.4%"],
+            ["AUSE (MAE, normalised)", f"{found.ause:.4f}", "0"],
+        ],
+    )
+
+
+def _bin_tables(evaluation: Evaluation) -> list[Table]:
+    """Tables of the errors by distance and by depth: edges, fraction, errors and coverage."""
+    tables = []
+    for name, bins in evaluation.bins.items():
+        (title, unit), total = _BIN_TITLES[name], sum(each["known"] for each in bins)
+        rows = []
+        for each in bins:
+            low, high = f"{each['low']:g}", f"{each['high']:g}"
+            errors = (each[key] for key in ("rmse", "mae", "mre"))
+            rows.append([
+                f"{low} or more" if high == "inf" else f"{low} to {high}",
+                f"{each['known'] / total:.1%}",
+                *("–" if math.isnan(error) else f"{error:.4f}" for error in errors),
+                f"{each['pixels'] / each['known']:.2%}",
+            ])  # fmt: skip
+        header = [f"[{unit}]", "of the ground truth", "RMSE [m]", "MAE [m]", "MRE", "coverage"]
+        tables.append(Table(caption=f"{title}, all pixels together", header=header, rows=rows))
+    return tables
+
+
+def comparison_table(comparison: Comparison) -> Table:
+    """Returns a row for each measure and run; all runs but the first have gain and p."""
+    base, *others = comparison.runs
+    rows = []
+    for measure in comparison.measures:
+        title, mean = column_title(measure), format_value(measure, base.mean[measure.key])
+        rows.append([title, base.label, mean, *["–"] * 4])
+        for run, gains in zip(others, comparison.gains, strict=True):
+            gain = gains[measure.key]
+            significant = gain.p_adjusted < ALPHA
+            percent = Cell(
+                _signed(gain.percent),
+                ("good" if gain.percent > 0 else "bad") if significant else "dim",
+            )
+            rows.append([
+                title,
+                run.label,
+                format_value(measure, run.mean[measure.key]),
+                percent,
+                *(_signed(end) for end in (gain.low_percent, gain.high_percent)),
+                "–" if math.isnan(gain.p_adjusted) else f"{gain.p_adjusted:.4f}",
+            ])  # fmt: skip
+    return Table(
+        header=["measure", "run", "mean", "gain [%]", "low", "high", "p"],
+        rows=rows,
+        caption=(
+            f"{len(comparison.names):,} shared frames; gains in per cent of the error of"
+            f" {base.label}, positive is better; intervals (95 %) and p-values, from"
+            f" {'all' if comparison.exact else f'{comparison.resamples:,} random'} swaps, over"
+            f" {comparison.clusters.describe()}, p adjusted for {len(comparison.measures)} measures"
+            " (Holm)"
+        ),
+    )
+
+
+def _signed(value: float) -> str:
+    return "–" if math.isnan(value) else f"{value:+.2f}"
+
+
+def methods_table(comparison: Comparison) -> Table:
+    """Returns a row for each run and a column for each measure, the best of a column in bold.
+
+    Stars mark where a run differs from the first significantly.
+    """
+    rows: list[list[str]] = [[run.label] for run in comparison.runs]
+    for measure in comparison.measures:
+        means = [run.mean[measure.key] for run in comparison.runs]
+        pick = max if measure.higher_is_better else min
+        best = pick((mean for mean in means if not math.isnan(mean)), default=None)
+        p_values = [1.0, *(gains[measure.key].p_adjusted for gains in comparison.gains)]
+        for row, mean, p in zip(rows, means, p_values, strict=True):
+            text, stars = format_value(measure, mean), "*" * sum(p < limit for limit in _STARS)
+            is_best = best is not None and text == format_value(measure, best)
+            row.append(Cell(text + stars, "bold" if is_best else ""))
+    return Table(
+        header=["", *map(column_title, comparison.measures)],
+        rows=rows,
+        caption=(
+            f"means over {len(comparison.names):,} frames, the best in bold; *, **, ***: differs"
+            f" from {comparison.runs[0].label} with p < 0.05, 0.01, 0.001 over"
+            f" {comparison.clusters.describe()}, adjusted for {len(comparison.measures)} measures"
+            " (Holm)"
+        ),
+    )
