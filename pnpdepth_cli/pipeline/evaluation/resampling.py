@@ -149,9 +149,8 @@ def studentised_interval(
 
     generator = np.random.default_rng(seed)
     value, error = (row[0] for row in linearised(np.ones((1, clusters))))
-    error = np.where(
-        error > 1e-9 * np.maximum(np.abs(value), 1.0), error, 0.0
-    )  # all clusters are alike
+    rounding = 1e-9 * np.maximum(np.abs(value), 1.0)
+    error = np.where(error > rounding, error, 0.0)
     size = max(1, _CELLS // max(clusters * measures, measures * parts * parts))
     ratios = []
     for start in range(0, resamples, size):

@@ -52,9 +52,10 @@ def detail_tables(evaluation: Evaluation) -> list[Table]:
 def means_by_measure(evaluation: Evaluation) -> Table:
     """Returns a row for each measure: its mean and the interval of it."""
     count = len(evaluation.scored)
-    of = f"{count:,} frame{'' if count == 1 else 's'}"
+    pixels = sum(frame.pixels for frame in evaluation.frames)
+    of = f"{count:,} frame{'' if count == 1 else 's'}, {pixels:,} pixels"
     pooled = evaluation.protocol.average == "pooled"
-    caption = f"Over all pixels of {of} together" if pooled else f"Means over {of}"
+    caption = f"Over the pixels of {of}, together" if pooled else f"Means over {of}"
     header, has_interval = ["", "mean"], evaluation.interval is not None
     if has_interval:
         header.append("95 %")
