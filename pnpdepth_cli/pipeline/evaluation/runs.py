@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from pnpdepth_cli.choices import MEASURE_GROUPS
 from pnpdepth_cli.core.metrics import MEASURES, Measure
 from pnpdepth_cli.errors import FileFormatError, UsageError
 from pnpdepth_cli.io.file_bytes import one_line
@@ -16,8 +17,6 @@ from pnpdepth_cli.pipeline.evaluation.dependence import groups_by_name
 from pnpdepth_cli.pipeline.evaluation.protocols import PROTOCOLS
 
 _STAGES = ("before", "after")
-_MOST_DECIMALS = 15
-_LARGEST_FACTOR = 1e6
 _MOST_PIXELS = 1 << 53
 
 
@@ -95,7 +94,7 @@ def _eval_run(text: str, label: str, record: Mapping[str, Any]) -> Run:
     return Run(
         label=label,
         path=text,
-        measures=tuple(_measure(fields) for fields in record["measures"]),
+        measures=_measures(record),
         scoring=dict(record["protocol"]["scoring"]),
         frames={
             str(frame["name"]): RunFrame(
@@ -110,18 +109,14 @@ def _eval_run(text: str, label: str, record: Mapping[str, Any]) -> Run:
     )
 
 
-def _measure(fields: Mapping[str, Any]) -> Measure:
-    """The measure of a record. Raises TypeError or ValueError for what no table can show."""
-    measure = Measure(**fields)
-    for name, like in asdict(Measure(key="", title="")).items():
-        value = getattr(measure, name)
-        if type(value) is not type(like):
-            raise TypeError(f"{name} of a measure is {one_line(value)!r}")
-    if not 0 <= measure.decimals <= _MOST_DECIMALS:
-        raise ValueError(f"a measure with {one_line(measure.decimals)} decimals")
-    if not 0 < measure.shown_factor <= _LARGEST_FACTOR:
-        raise ValueError(f"a measure shown × {measure.shown_factor:g}")
-    return measure
+def _measures(record: Mapping[str, Any]) -> tuple[Measure, ...]:
+    """The measures of a record, as its protocol shows them; those unknown here are left out."""
+    keys = [each["key"] for each in record["measures"]]
+    known = {measure.key: measure for measure in PROTOCOLS[record["protocol"]["name"]].measures}
+    if any(key not in known for key in keys):
+        groups = MEASURE_GROUPS.values()
+        known = {measure.key: measure for group in groups for measure in group.measures} | known
+    return tuple(known[key] for key in keys if key in known)
 
 
 def _count(value: Any) -> int:

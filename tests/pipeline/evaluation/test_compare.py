@@ -8,14 +8,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from pnpdepth_cli.pipeline.evaluation.result import EvalRequest
 
 from pnpdepth_cli.errors import FileFormatError, InputError, UsageError
 from pnpdepth_cli.io.depth import write_depth
 from pnpdepth_cli.io.record import write_json
 from pnpdepth_cli.pipeline.evaluation.compare import CompareRequest, Comparison
 from pnpdepth_cli.pipeline.evaluation.compare import compare as compare_runs
-from pnpdepth_cli.pipeline.evaluation.evaluate import evaluate
+from pnpdepth_cli.pipeline.evaluation.evaluate import EvalRequest, evaluate
 
 
 def compare(paths: list[str], **settings: Any) -> Comparison:
@@ -300,7 +299,7 @@ def test_before_is_only_for_what_has_one_and_one_run_is_none_to_compare(tmp_path
         compare([one, f"{one}:before"])
     with pytest.raises(UsageError, match="two runs"):
         compare([one])
-    with pytest.raises(UsageError, match="--bootstrap 0"):
+    with pytest.raises(UsageError, match="--bootstrap must be >= 1, got 0"):
         compare([one, one], resamples=0)
 
 

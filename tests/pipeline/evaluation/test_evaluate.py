@@ -11,12 +11,11 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from pnpdepth_cli.pipeline.evaluation.result import EvalRequest, Evaluation
 
 from pnpdepth_cli.errors import InputError, SizeError, UsageError
 from pnpdepth_cli.io.depth import write_depth
 from pnpdepth_cli.io.layouts import PROTOCOLS as LAYOUT_PROTOCOLS
-from pnpdepth_cli.pipeline.evaluation.evaluate import evaluate
+from pnpdepth_cli.pipeline.evaluation.evaluate import EvalRequest, Evaluation, evaluate
 from pnpdepth_cli.pipeline.evaluation.frame_reading import Scales
 from pnpdepth_cli.pipeline.evaluation.tables import worst
 from pnpdepth_cli.sensors import SamplePattern, sample_points

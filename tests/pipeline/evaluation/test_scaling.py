@@ -78,4 +78,4 @@ def test_a_constant_prediction_and_too_few_pixels_are_refused() -> None:
     with pytest.raises(InputError, match="constant"):
         scaled(np.ones_like(GT), GT, "depth", "affine")
     with pytest.raises(InputError, match="needs 2 pixels"):
-        scaled(GT, GT, np.zeros(GT.shape, bool), "depth", "median")
+        scaled(GT, np.zeros_like(GT), "depth", "median")

@@ -7,10 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pnpdepth_cli.pipeline.evaluation.result import EvalRequest
 
 from pnpdepth_cli.errors import InputError
-from pnpdepth_cli.pipeline.evaluation.evaluate import evaluate
+from pnpdepth_cli.pipeline.evaluation.evaluate import EvalRequest, evaluate
 from pnpdepth_cli.pipeline.evaluation.stacks import load_stacked, stack_size
 
 

@@ -6,10 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pnpdepth_cli.pipeline.evaluation.result import EvalRequest
 
 from pnpdepth_cli.io.depth import write_depth
-from pnpdepth_cli.pipeline.evaluation.evaluate import evaluate
+from pnpdepth_cli.pipeline.evaluation.evaluate import EvalRequest, evaluate
 from pnpdepth_cli.pipeline.evaluation.uncertainty import (
     FrameUncertainty,
     frame_uncertainty,

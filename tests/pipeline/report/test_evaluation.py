@@ -11,11 +11,10 @@ import cv2
 import numpy as np
 import pytest
 from PIL import Image
-from pnpdepth_cli.pipeline.evaluation.result import EvalRequest, Evaluation
 
 from pnpdepth_cli.errors import StorageError
 from pnpdepth_cli.io.depth import write_depth
-from pnpdepth_cli.pipeline.evaluation.evaluate import evaluate
+from pnpdepth_cli.pipeline.evaluation.evaluate import EvalRequest, Evaluation, evaluate
 from pnpdepth_cli.pipeline.report.evaluation import _charts, write_eval_report
 from tests.io.test_atomic import no_room_on_disk
 from tests.pipeline.report_pages import everything, frames_of, images_of, page_data
