@@ -12,9 +12,16 @@ import click
 from pnpdepth_cli.cli import options
 
 _LABEL_LETTERS = 36
+
+
+def names_in(text: str) -> tuple[str, ...]:
+    """Returns the names in a text such as `rmse,mae`."""
+    return tuple(dict.fromkeys(text.split(",")))
+
+
 columns = click.option(
     "--columns",
-    type=lambda text: tuple(dict.fromkeys(text.split(","))),
+    type=names_in,
     metavar="KEY,…",
     help="Measures of the tables, in this order, such as rmse,mae,delta1.",
 )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable, Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,7 @@ from pnpdepth_cli.choices import (
     SCALINGS,
 )
 from pnpdepth_cli.cli import grouped_help, options
-from pnpdepth_cli.cli.compare import columns
+from pnpdepth_cli.cli.compare import columns, names_in
 from pnpdepth_cli.cli.printable import printable
 from pnpdepth_cli.cli.progress import progress_bar
 from pnpdepth_cli.errors import FramesFailedError, UsageError
@@ -48,6 +49,11 @@ def _thresholds(text: str) -> tuple[float, float, float]:
             f"--delta {text!r} is neither one number such as 1.25 nor three numbers"
         ) from None
     return first, second, third
+
+
+def _choice(flag: str, names: Sequence[str], text: str) -> Callable[[Any], Any]:
+    field = "prediction_kind" if flag == "--pred-kind" else flag[2:].replace("-", "_")
+    return click.option(flag, field, type=click.Choice(names), help=text)
 
 
 @click.command(
@@ -91,11 +97,7 @@ def _thresholds(text: str) -> tuple[float, float, float]:
 @click.option("--clip/--no-clip", default=None, help="Clip predictions to these bounds.")
 @click.option("--crop", metavar="NAME|X,Y,W,H", help="none, nyu, eigen, garg, or a rectangle.")
 @click.option("--mask", type=options.FILE, help="Mask image, or folder with a mask per frame.")
-@click.option(
-    "--average",
-    type=click.Choice(AVERAGES),
-    help="Mean over images, or over all pixels of all images.",
-)
+@_choice("--average", AVERAGES, "Mean over images, or over all pixels of all images.")
 @click.option(
     "--delta",
     "thresholds",
@@ -104,27 +106,22 @@ def _thresholds(text: str) -> tuple[float, float, float]:
     help="Thresholds of δ1…δ3: D, D², D³, or D1, D2, D3. The paper's KITTI rows use 1.01."
     "  [default: 1.25]",
 )
-@click.option(
+@_choice(
     "--missing",
-    type=click.Choice(MISSING),
-    help="Empty predictions: not scored, scored as --min-depth or --max-depth, or an error."
+    MISSING,
+    "Empty predictions: not scored, scored as --min-depth or --max-depth, or an error."
     "  [default: the protocol's]",
 )
-@click.option(
+@_choice(
     "--scale-by",
-    type=click.Choice(SCALINGS),
-    help="Scale each image to its ground truth, for relative predictions.  [default: none]",
+    SCALINGS,
+    "Scale each image to its ground truth, for relative predictions.  [default: none]",
 )
-@click.option(
-    "--pred-kind",
-    "prediction_kind",
-    type=click.Choice(PREDICTION_KINDS),
-    help="What predictions are.  [default: depth]",
-)
+@_choice("--pred-kind", PREDICTION_KINDS, "What predictions are.  [default: depth]")
 @click.option(
     "--measures",
     "groups",
-    type=lambda text: tuple(dict.fromkeys(text.split(","))),
+    type=names_in,
     metavar="GROUP,…",
     help=f"Additional measures: {', '.join(MEASURE_GROUPS)}.",
 )
@@ -138,28 +135,23 @@ def _thresholds(text: str) -> tuple[float, float, float]:
 @click.option("--gt-scale", type=float, metavar="S", help="Integer ground truth holds metres × S.")
 @options.channel
 @options.max_pixels
-@click.option(
-    "--resize",
-    type=click.Choice(RESIZES),
-    help="Resize predictions to the size of the ground truth.",
-)
+@_choice("--resize", RESIZES, "Resize predictions to the size of the ground truth.")
 @click.option(
     "--pred-crop",
     "prediction_crop",
     metavar="kb|X,Y,W,H",
     help="Part of the frame that predictions show, such as the 1216×352 of KITTI's benchmark.",
 )
-@click.option(
+@_choice(
     "--layout-protocol",
-    type=click.Choice(FRAME_PROTOCOLS),
-    help="Crop of the frames of a data set GT, as in batch.  [default: the layout's own]",
+    FRAME_PROTOCOLS,
+    "Crop of the frames of a data set GT, as in batch.  [default: the layout's own]",
 )
 @click.option(
     "--sparse",
     type=options.FILE,
     metavar="FILE|FOLDER",
-    help="Sparse depth the networks had: adds errors by distance to the points and by depth, and"
-    " reports points that are part of the ground truth.",
+    help="Sparse depth the networks had: points that are part of the ground truth are reported.",
 )
 @click.option(
     "--sparse-scale", type=float, metavar="S", help="Integer --sparse files hold metres × S."

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Literal
 
 from pnpdepth_cli.core.metrics import Measure
+from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.io.atomic import atomic_path
 from pnpdepth_cli.io.csv_text import write_csv
 
@@ -95,6 +96,18 @@ def write_text(path: Path, text: str) -> None:
     """Writes the text whole or not at all; characters of a name that is not UTF-8 as escapes."""
     with atomic_path(path) as temporary:
         temporary.write_bytes(text.encode("utf-8", "backslashreplace"))
+
+
+def chosen_measures(measures: Sequence[Measure], keys: Sequence[str] | None) -> tuple[Measure, ...]:
+    """Returns the measures with these keys, in their order; all for None.
+
+    Raises:
+        UsageError: If one is unknown.
+    """
+    by_key = {measure.key: measure for measure in measures}
+    if unknown := [key for key in keys or () if key not in by_key]:
+        raise UsageError(f"--columns {unknown[0]} is not one of {', '.join(by_key)}")
+    return tuple(by_key[key] for key in (by_key if keys is None else keys))
 
 
 def format_value(measure: Measure, value: float | None, *, unit: bool = False) -> str:

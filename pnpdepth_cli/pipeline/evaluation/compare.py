@@ -25,6 +25,7 @@ from pnpdepth_cli.pipeline.evaluation.resampling import (
     swap_p_values,
 )
 from pnpdepth_cli.pipeline.evaluation.runs import Run, read_run
+from pnpdepth_cli.pipeline.tables import chosen_measures
 
 ALPHA = 0.05
 MAIN_MEASURES = ("rmse", "mae", "mre", "delta1", "inverse_rmse", "inverse_mae")
@@ -202,13 +203,11 @@ def _check_rules(first: Run, other: Run) -> None:
 def _measures(runs: Sequence[Run], request: CompareRequest) -> tuple[Measure, ...]:
     """Those of all runs that the user chose, or the main ones."""
     shared = set.intersection(*({m.key for m in run.measures} for run in runs))
-    common = {measure.key: measure for measure in runs[0].measures if measure.key in shared}
-    if request.columns is not None:
-        if unknown := [key for key in request.columns if key not in common]:
-            raise UsageError(f"--columns {unknown[0]} is not one of {', '.join(common)}")
-        return tuple(common[key] for key in request.columns)
-    main = tuple(common[key] for key in common if key in MAIN_MEASURES)
-    return tuple(common.values()) if request.all_measures or not main else main
+    common = [measure for measure in runs[0].measures if measure.key in shared]
+    main = tuple(measure for measure in common if measure.key in MAIN_MEASURES)
+    if request.columns is None and main and not request.all_measures:
+        return main
+    return chosen_measures(common, request.columns)
 
 
 def _gains(

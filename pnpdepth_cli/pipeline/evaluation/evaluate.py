@@ -9,15 +9,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
-from pnpdepth_cli.core.metrics import MEASURES, SUMS, measures_of
 from pnpdepth_cli.errors import InputError, PnpDepthError, UsageError
 from pnpdepth_cli.io.record import plain
 from pnpdepth_cli.pipeline.evaluation.dependence import MIN_CLUSTERS, Clusters, find_clusters
 from pnpdepth_cli.pipeline.evaluation.diagnostics import kind_notes, warnings_of
 from pnpdepth_cli.pipeline.evaluation.frame_reading import Scales
-from pnpdepth_cli.pipeline.evaluation.frame_scoring import BIN_EDGES, FrameScores, Sums, score_pair
+from pnpdepth_cli.pipeline.evaluation.frame_scoring import FrameScores, score_pair
 from pnpdepth_cli.pipeline.evaluation.kitti_devkit import devkit_mean
 from pnpdepth_cli.pipeline.evaluation.pairing import FramePair, pair_frames
 from pnpdepth_cli.pipeline.evaluation.protocols import EvalProtocol, choose_protocol
@@ -76,9 +74,6 @@ class Evaluation:
     """What the bootstrap resamples as a whole."""
     uncertainty: Uncertainty | None
     """Whether predicted standard deviations are right; None without any."""
-    bins: dict[str, list[dict[str, Any]]]
-    """Errors over the pixels of all frames, for the bins of each of BIN_EDGES that hold any: low,
-    high, pixels, known, rmse, mae, mre; empty without --sparse."""
     notes: tuple[str, ...]
     """What was assumed, and warnings; one line each."""
 
@@ -158,7 +153,6 @@ class Evaluation:
             "mean": self.mean,
             "interval": interval,
             "uncertainty": None if self.uncertainty is None else asdict(self.uncertainty),
-            **{f"by_{name}": self.bins.get(name, []) for name in BIN_EDGES},
             "frames": [
                 frame_record(frame) | ({"sums": frame.sums} if pooled else {})
                 for frame in self.frames
@@ -248,11 +242,6 @@ def evaluate(
         interval=interval,
         clusters=clusters,
         uncertainty=summarise_uncertainty(uncertainties),
-        bins={
-            name: _bins(np.sum([row.bins[name] for row in scored if row.bins], axis=0), edges)
-            for name, edges in BIN_EDGES.items()
-            if any(row.bins for row in scored)
-        },
         notes=(
             *pairs.notes,
             *kind_notes(rows),
@@ -291,7 +280,7 @@ def _mean_and_interval(
     measures = protocol.measures
     if protocol.average == "pooled":
         table = FrameTable.of_pixels(
-            np.array([row.sums for row in rows]), [m.key for m in MEASURES]
+            np.array([row.sums for row in rows]), [m.key for m in measures]
         )
     else:
         table = FrameTable.of_frames(values)
@@ -312,18 +301,3 @@ def _interval_notes(clusters: Clusters, frames: int, request: EvalRequest) -> li
         f"no interval: {clusters.describe()} are too few to tell how sure the means are;"
         f" {MIN_CLUSTERS} are needed"
     ]
-
-
-def _bins(sums: Sums, edges: tuple[float, ...]) -> list[dict[str, Any]]:
-    keys = [measure.key for measure in MEASURES]
-    bins = []
-    for low, high, row in zip(edges, edges[1:], sums, strict=False):
-        counts = dict(zip(SUMS, row.tolist(), strict=True))
-        errors = dict(zip(keys, measures_of(torch.from_numpy(row)).tolist(), strict=True))
-        if counts["known"]:
-            bins.append(
-                {"low": low, "high": high}
-                | {name: int(counts[name]) for name in ("pixels", "known")}
-                | {key: errors[key] for key in ("rmse", "mae", "mre")}
-            )
-    return bins

@@ -7,7 +7,6 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from pnpdepth_cli.core.metrics import MEASURES, error_sums, measures_of
 from pnpdepth_cli.errors import InputError
@@ -18,20 +17,11 @@ from pnpdepth_cli.pipeline.evaluation.frame_reading import (
     load_frame,
 )
 from pnpdepth_cli.pipeline.evaluation.kitti_devkit import devkit_errors, fill_background
-from pnpdepth_cli.pipeline.evaluation.measures import Depth, distance_px
+from pnpdepth_cli.pipeline.evaluation.measures import Depth
 from pnpdepth_cli.pipeline.evaluation.pairing import FramePair
 from pnpdepth_cli.pipeline.evaluation.protocols import EvalProtocol
 from pnpdepth_cli.pipeline.evaluation.scaling import Fit
 from pnpdepth_cli.pipeline.evaluation.uncertainty import FrameUncertainty, frame_uncertainty
-
-BIN_EDGES = {
-    "distance_px": (0.0, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0, math.inf),
-    "depth_m": (0.0, 1.0, 2.0, 3.0, 5.0, 10.0, 20.0, 40.0, 80.0, math.inf),
-}
-"""Of pixels by distance to the nearest sparse point, and by ground truth; lower edges inside."""
-
-Sums = NDArray[np.float64]
-"""(bins, len(SUMS)) sums over pixels, in the order of core.metrics.SUMS."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,8 +52,6 @@ class FrameScores:
     kinds: dict[str, DepthKind] = field(default_factory=dict)
     """Of the files by "prediction", "gt" and "sparse"."""
     uncertainty: FrameUncertainty | None = field(default=None, compare=False)
-    bins: dict[str, Sums] = field(default_factory=dict, compare=False)
-    """By the name of BIN_EDGES; empty unless the user named sparse depth."""
 
     @property
     def name(self) -> str:
@@ -130,11 +118,7 @@ def score_pair(pair: FramePair, protocol: EvalProtocol, scales: Scales) -> Frame
         equal = np.abs(frame.sparse - gt) <= frame.tolerance + 1e-6 * gt
         leaked = int(np.count_nonzero(given & equal))
         if pair.sparse_named:
-            row = replace(
-                row,
-                sparse_ratio=_median_ratio(frame.sparse, gt),
-                bins=_binned_sums(frame, frame.sparse, protocol),
-            )
+            row = replace(row, sparse_ratio=_median_ratio(frame.sparse, gt))
     return replace(row, leaked=leaked)
 
 
@@ -163,21 +147,6 @@ def _additional(
         found = group.values(replace(frame, previous=previous))
         values |= zip((measure.key for measure in group.measures), found, strict=True)
     return values
-
-
-def _binned_sums(frame: LoadedFrame, sparse: Depth, protocol: EvalProtocol) -> dict[str, Sums]:
-    depth = filled(frame.depth) if protocol.is_devkit else frame.depth
-    quantities = {"distance_px": distance_px(sparse > 0), "depth_m": frame.gt}
-    return {
-        name: error_sums(
-            torch.from_numpy(depth),
-            torch.from_numpy(frame.gt),
-            protocol.thresholds,
-            torch.from_numpy(np.digitize(quantity, BIN_EDGES[name][1:-1])),
-            len(BIN_EDGES[name]) - 1,
-        ).numpy()
-        for name, quantity in quantities.items()
-    }
 
 
 def filled(depth: Depth) -> Depth:

@@ -6,47 +6,27 @@ import math
 from collections.abc import Sequence
 
 from pnpdepth_cli.core.metrics import Measure
-from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.pipeline.evaluation.compare import ALPHA, Comparison
 from pnpdepth_cli.pipeline.evaluation.diagnostics import kinds_of
 from pnpdepth_cli.pipeline.evaluation.evaluate import Evaluation, frame_record
 from pnpdepth_cli.pipeline.evaluation.frame_scoring import FrameScores
-from pnpdepth_cli.pipeline.evaluation.uncertainty import Uncertainty
-from pnpdepth_cli.pipeline.tables import Cell, Table, column_title, format_value
+from pnpdepth_cli.pipeline.tables import (
+    Cell,
+    Table,
+    chosen_measures,
+    column_title,
+    format_value,
+)
 
-_ALL_FRAMES_SHOWN = 12
-_WORST_SHOWN = 5
+_FRAMES_SHOWN = 12
 _FRAME_COLUMNS = 6
 _STARS = (0.05, 0.01, 0.001)
-_BIN_TITLES = {
-    "distance_px": ("By distance to the nearest sparse point", "px"),
-    "depth_m": ("By depth of the ground truth", "m"),
-}
-
-
-def chosen_measures(measures: Sequence[Measure], keys: Sequence[str] | None) -> list[Measure]:
-    """Returns the measures with these keys, in their order; all for None.
-
-    Raises:
-        UsageError: If one is unknown.
-    """
-    by_key = {measure.key: measure for measure in measures}
-    for key in keys or ():
-        if key not in by_key:
-            raise UsageError(f"--columns {key} is not one of {', '.join(by_key)}")
-    return [by_key[key] for key in (by_key if keys is None else keys)]
 
 
 def text_tables(evaluation: Evaluation) -> list[Table]:
     """Returns what the terminal shows: the means, the frames or the worst of them, and details."""
     frames = [frames_table(evaluation)] if len(evaluation.frames) > 1 else []
-    return [means_by_measure(evaluation), *frames, *detail_tables(evaluation)]
-
-
-def detail_tables(evaluation: Evaluation) -> list[Table]:
-    """Returns the calibration of the standard deviation, and the errors by distance and depth."""
-    found = evaluation.uncertainty
-    return [*([] if found is None else [_calibration(found)]), *_bin_tables(evaluation)]
+    return [means_by_measure(evaluation), *frames, *calibration_tables(evaluation)]
 
 
 def means_by_measure(evaluation: Evaluation) -> Table:
@@ -117,8 +97,8 @@ def _is_nothing(value: object) -> bool:
 def frames_table(evaluation: Evaluation) -> Table:
     """Returns the first measures of each frame, or of the worst of many."""
     measures = evaluation.protocol.measures[:_FRAME_COLUMNS]
-    everything = len(evaluation.frames) <= _ALL_FRAMES_SHOWN
-    frames = evaluation.frames if everything else worst(evaluation, "rmse")[:_WORST_SHOWN]
+    everything = len(evaluation.frames) <= _FRAMES_SHOWN
+    frames = evaluation.frames if everything else worst(evaluation, "rmse")[:_FRAMES_SHOWN]
     return Table(
         caption="Frames" if everything else f"The {len(frames)} worst by RMSE; --csv has all",
         header=["frame", *map(column_title, measures), "coverage"],
@@ -145,36 +125,18 @@ def _coverage(frame: FrameScores) -> str:
     return f"{frame.coverage:.2%}" if frame.scored else Cell("not scored", "bad")
 
 
-def _calibration(found: Uncertainty) -> Table:
-    return Table(
-        caption=f"Standard deviation of {found.frames:,} frame{'' if found.frames == 1 else 's'}",
-        header=["", "observed", "calibrated"],
-        rows=[
-            ["errors within 1σ", f"{found.within_1_sigma:.1%}", "68.3%"],
-            ["errors within 2σ", f"{found.within_2_sigma:.1%}", "95.4%"],
-            ["AUSE (MAE, normalised)", f"{found.ause:.4f}", "0"],
-        ],
-    )
-
-
-def _bin_tables(evaluation: Evaluation) -> list[Table]:
-    """Tables of the errors by distance and by depth: edges, fraction, errors and coverage."""
-    tables = []
-    for name, bins in evaluation.bins.items():
-        (title, unit), total = _BIN_TITLES[name], sum(each["known"] for each in bins)
-        rows = []
-        for each in bins:
-            low, high = f"{each['low']:g}", f"{each['high']:g}"
-            errors = (each[key] for key in ("rmse", "mae", "mre"))
-            rows.append([
-                f"{low} or more" if high == "inf" else f"{low} to {high}",
-                f"{each['known'] / total:.1%}",
-                *("–" if math.isnan(error) else f"{error:.4f}" for error in errors),
-                f"{each['pixels'] / each['known']:.2%}",
-            ])  # fmt: skip
-        header = [f"[{unit}]", "of the ground truth", "RMSE [m]", "MAE [m]", "MRE", "coverage"]
-        tables.append(Table(caption=f"{title}, all pixels together", header=header, rows=rows))
-    return tables
+def calibration_tables(evaluation: Evaluation) -> list[Table]:
+    """Returns how right the predicted standard deviation is, if there is one."""
+    found = evaluation.uncertainty
+    if found is None:
+        return []
+    rows = [
+        ["errors within 1σ", f"{found.within_1_sigma:.1%}", "68.3%"],
+        ["errors within 2σ", f"{found.within_2_sigma:.1%}", "95.4%"],
+        ["AUSE (MAE, normalised)", f"{found.ause:.4f}", "0"],
+    ]
+    caption = f"Standard deviation of {found.frames:,} frame{'' if found.frames == 1 else 's'}"
+    return [Table(caption=caption, header=["", "observed", "calibrated"], rows=rows)]
 
 
 def comparison_table(comparison: Comparison) -> Table:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,12 +24,11 @@ REMOVED = tuple(n / 20 for n in range(20))
 """Fractions of the pixels."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class FrameUncertainty:
+class FrameUncertainty(NamedTuple):
     """What one frame contributes."""
 
     pixels: int
-    """Pixels with prediction, ground truth and standard deviation."""
+    """With prediction, ground truth and standard deviation."""
     within: Floats
     """(LEVELS,) how many errors lie within the interval of each probability."""
     sparsification: Floats
@@ -86,17 +86,14 @@ def summarise_uncertainty(frames: Sequence[FrameUncertainty]) -> Uncertainty | N
     """Returns the calibration and sparsification of all frames; None without any."""
     if not frames:
         return None
-    pixels = sum(frame.pixels for frame in frames)
-    observed = np.sum([frame.within for frame in frames], axis=0) / pixels
-    sparsification, oracle = (
-        np.mean([getattr(frame, name) for frame in frames], axis=0)
-        for name in ("sparsification", "oracle")
-    )
+    pixels, within, by_sigma, by_error = zip(*frames, strict=True)
+    observed = np.sum(within, axis=0) / sum(pixels)
+    sparsification, oracle = np.mean(by_sigma, axis=0), np.mean(by_error, axis=0)
     area = float(np.trapezoid(sparsification - oracle, REMOVED))
     by_level = dict(zip(LEVELS, observed.tolist(), strict=True))
     return Uncertainty(
         frames=len(frames),
-        pixels=pixels,
+        pixels=sum(pixels),
         within_1_sigma=by_level[ONE_SIGMA],
         within_2_sigma=by_level[TWO_SIGMA],
         ause=area / float(sparsification[0]) if sparsification[0] else 0.0,

@@ -27,7 +27,7 @@ from pnpdepth_cli.io.visualisation import error_map
 from pnpdepth_cli.pipeline.evaluation.evaluate import Evaluation
 from pnpdepth_cli.pipeline.evaluation.frame_reading import image_of, load_frame
 from pnpdepth_cli.pipeline.evaluation.frame_scoring import FrameScores, filled
-from pnpdepth_cli.pipeline.evaluation.tables import detail_tables, means_by_measure
+from pnpdepth_cli.pipeline.evaluation.tables import calibration_tables, means_by_measure
 from pnpdepth_cli.pipeline.ordered_pool import in_order
 from pnpdepth_cli.pipeline.tables import format_value, unit_of
 
@@ -121,7 +121,7 @@ def _head(evaluation: Evaluation, columns: list[Column]) -> Head:
         notes=evaluation.notes,
         tables=[
             Table(caption=table.caption, header=table.header, rows=table.rows)
-            for table in (means_by_measure(evaluation), *detail_tables(evaluation))
+            for table in (means_by_measure(evaluation), *calibration_tables(evaluation))
         ],
         charts=_charts(evaluation),
         without_title=f"Not scored: {len(without):,}",

@@ -386,7 +386,6 @@ def test_the_record_beside_a_prediction_is_enough_to_find_the_leak(two: Path) ->
     (two / "out" / "a.json").write_text(json.dumps(record))
     result = scored(two)
     assert [f.leaked for f in result.frames] == [1, None]
-    assert result.bins == {}
     sampled = {"inputs": {"sparse": {"sampled_from": "gt"}}, "points": {"used": 2}}
     (two / "out" / "a.json").write_text(json.dumps(sampled))
     assert scored(two).frames[0].leaked == 2
@@ -402,32 +401,6 @@ def test_a_sparse_file_that_the_record_names_but_is_spoilt_does_no_harm(two: Pat
     (two / "out" / "a.json").write_text(json.dumps(record))
     assert [f.leaked for f in scored(two).scored] == [None, None]
     assert scored(two, sparse=two / "out").frames[0].leaked == 0
-
-
-def test_the_parts_by_distance_and_by_depth_are_plain_numpy(tmp_path: Path) -> None:
-    rng = np.random.default_rng(0)
-    gt = rng.uniform(0.5, 30, (40, 50)).astype(np.float32)
-    prediction = (gt * rng.uniform(0.8, 1.2, gt.shape)).astype(np.float32)
-    prediction[:3] = 0
-    points = np.zeros_like(gt)
-    pixels = [(5, 5), (30, 44), (39, 0)]
-    for v, u in pixels:
-        points[v, u] = 2
-    for folder, depth in (("out", prediction), ("gt", gt)):
-        depth_file(tmp_path / folder / "a.npy", depth)
-        depth_file(tmp_path / folder / "b.npy", depth)
-    result = scored(tmp_path, sparse=depth_file(tmp_path / "s.npy", points))
-    v, u = np.mgrid[:40, :50]
-    distance = np.min([np.hypot(v - y, u - x) for y, x in pixels], axis=0)
-    for name, quantity in (("distance_px", distance), ("depth_m", gt)):
-        assert sum(part["known"] for part in result.bins[name]) == 2 * gt.size
-        for part in result.bins[name]:
-            inside = (quantity >= part["low"]) & (quantity < part["high"])
-            assert part["known"] == 2 * inside.sum()
-            assert part["pixels"] == 2 * (inside & (prediction > 0)).sum()
-            expected = brute(prediction, gt, inside)
-            for key in ("rmse", "mae", "mre"):
-                assert part[key] == pytest.approx(expected[key], rel=1e-9), part
 
 
 def test_a_smaller_prediction_is_resized_only_on_request(tmp_path: Path) -> None:

@@ -119,18 +119,6 @@ def test_the_image_is_shown_where_the_predictions_record_names_one(root: Path) -
     assert panel(root, "a", "image").mean((0, 1)) == pytest.approx([255, 0, 0], abs=3)
 
 
-def test_with_sparse_points_the_errors_by_distance_and_depth_are_on_the_page(root: Path) -> None:
-    points = np.zeros((60, 80), np.float32)
-    points[30, 40] = 5
-    write_depth(root / "points.npy", points)
-    reported(root, sparse=root / "points.npy")
-    captions = [table["caption"] for table in page_data(root / "report")["tables"]]
-    assert captions[1:] == [
-        "By distance to the nearest sparse point, all pixels together",
-        "By depth of the ground truth, all pixels together",
-    ]
-
-
 def test_a_standard_deviation_has_a_calibration_plot_and_a_sparsification_curve(
     root: Path,
 ) -> None:
