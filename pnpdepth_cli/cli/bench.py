@@ -127,7 +127,7 @@ def _table(as_json: bool, **values: Any) -> None:
             each = {**values, "model": paper.model, "size": paper.size, "iterations": 5}
             results.append((paper, run_bench(BenchRequest(**each))))
     if as_json:
-        records = [{"paper": asdict(paper), "bench": asdict(ours)} for paper, ours in results]
+        records = [{"paper": paper._asdict(), "bench": asdict(ours)} for paper, ours in results]
         click.echo(json.dumps(records, indent=2))
         return
     rows = []

@@ -231,7 +231,8 @@ def _before_and_after(record: Mapping[str, Any]) -> RichTable:
         table.caption = _scored_on(record["scores"]["after"])
     elif (check := beside["check"]) is not None:
         errors = {"before": check["aligned"], "after": check["result"], "linear": check["linear"]}
-        _check_row(table, f"error at {check['points']:,} hidden points, MAE", errors, unit)
+        title = f"error at {check['points']:,} hidden points, MAE"
+        _add_row(table, title, "mae", partial(_length, unit=unit), errors)
     return table
 
 
@@ -271,7 +272,7 @@ def print_batch(summary: Mapping[str, Any]) -> None:
             table.caption = f"scored on the ground truth of {mean['scores']['frames']:,} frames"
         elif held_out is None and (check := beside["check"]) is not None:
             title = f"error at hidden points, {check['frames']:,} frames, MAE"
-            _check_row(table, title, check, unit)
+            _add_row(table, title, "mae", partial(_length, unit=unit), check)
         console.print(table)
     if summary["baselines"]:
         rows = {
@@ -341,10 +342,6 @@ def _score_rows(
         errors = {**scores, "linear": linear or {}}
         values = {name: errors[name].get(key) for name in ("before", "after", "linear")}
         _add_row(table, title, key, show, values)
-
-
-def _check_row(table: RichTable, title: str, errors: Mapping[str, float], unit: str) -> None:
-    _add_row(table, title, "mae", partial(_length, unit=unit), errors)
 
 
 def _add_row(

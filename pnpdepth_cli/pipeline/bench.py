@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -263,8 +264,7 @@ def _kilobytes(name: str) -> int:
     return next(int(line.split()[1]) for line in lines if line.startswith(f"{name}:"))
 
 
-@dataclass(frozen=True, kw_only=True)
-class PaperTime:
+class PaperTime(NamedTuple):
     """A network of the paper's Table IV, and the seconds that the paper prints."""
 
     name: str
@@ -279,17 +279,13 @@ class PaperTime:
     after: float | None = None
 
 
-_NYU, _KITTI = (228, 304), (352, 1216)
-PAPER_TIMES = tuple(
-    PaperTime(name=name, model=model, data=data, size=size, before=before, after=after)
-    for name, model, data, size, before, after in (
-        ("Eigen", "eigen", "NYU", _NYU, None, None),
-        ("FCRN", "fcrn", "NYU", _NYU, None, None),
-        ("Zhou", "sfmlearner", "KITTI", (128, 416), None, None),
-        ("Uhrig", "sparseconv", "KITTI", _KITTI, 0.0311, 0.1614),
-        ("Chodosh", "adnn", "KITTI", _KITTI, 0.0320, 0.0447),
-        ("Ma", "sparse2dense-r18-deconv3", "NYU", _NYU, 0.0046, 0.0233),
-        ("Jaritz", "latefusion", "NYU", (224, 320), 0.0484, 0.1593),
-    )
+PAPER_TIMES = (
+    PaperTime("Eigen", "eigen", "NYU", (228, 304)),
+    PaperTime("FCRN", "fcrn", "NYU", (228, 304)),
+    PaperTime("Zhou", "sfmlearner", "KITTI", (128, 416)),
+    PaperTime("Uhrig", "sparseconv", "KITTI", (352, 1216), 0.0311, 0.1614),
+    PaperTime("Chodosh", "adnn", "KITTI", (352, 1216), 0.0320, 0.0447),
+    PaperTime("Ma", "sparse2dense-r18-deconv3", "NYU", (228, 304), 0.0046, 0.0233),
+    PaperTime("Jaritz", "latefusion", "NYU", (224, 320), 0.0484, 0.1593),
 )
 """Wang et al. (ICRA 2019), Table IV, and the three networks that it leaves out."""

@@ -67,8 +67,8 @@ class RunMean:
 class Comparison:
     """Runs on the frames they share."""
 
-    names: tuple[str, ...]
-    """The shared frames."""
+    frames: tuple[str, ...]
+    """Names of the shared ones."""
     measures: tuple[Measure, ...]
     """Those compared; p-values are adjusted for their number."""
     scoring: dict[str, Any]
@@ -79,29 +79,17 @@ class Comparison:
     """Of each run but the first, by the measure's key."""
     clusters: Clusters
     """What is resampled and swapped as a whole."""
-    exact: bool
-    """True if the p-values are of all swaps, not of random ones."""
+    exact_p_values: bool
+    """True if they are of all swaps, not of random ones."""
     resamples: int
     seed: int
     notes: tuple[str, ...]
 
     def as_record(self) -> dict[str, Any]:
         """Returns what `--json` prints; NaN is null."""
-        record = {
-            "command": "compare",
-            "frames": list(self.names),
-            "scoring": self.scoring,
-            "measures": [asdict(measure) for measure in self.measures],
-            "runs": [asdict(run) for run in self.runs],
-            "gains": [{key: asdict(gain) for key, gain in gains.items()} for gains in self.gains],
-            "level": LEVEL,
-            "clusters": {"count": self.clusters.count, "unit": self.clusters.unit},
-            "resamples": self.resamples,
-            "seed": self.seed,
-            "exact_p_values": self.exact,
-            "notes": list(self.notes),
-        }
-        result: dict[str, Any] = plain(record)
+        clusters = {"count": self.clusters.count, "unit": self.clusters.unit}
+        own = {"command": "compare", "level": LEVEL, "clusters": clusters}
+        result: dict[str, Any] = plain(asdict(self) | own)
         return result
 
 
@@ -161,7 +149,7 @@ def compare(request: CompareRequest) -> Comparison:
         rows, exact = _gains(tables[0], table, measures, clusters, request)
         gains.append(dict(zip(keys, rows, strict=True)))
     return Comparison(
-        names=names,
+        frames=names,
         measures=measures,
         scoring=runs[0].scoring,
         runs=tuple(
@@ -175,7 +163,7 @@ def compare(request: CompareRequest) -> Comparison:
         ),
         gains=tuple(gains),
         clusters=clusters,
-        exact=exact,
+        exact_p_values=exact,
         resamples=request.resamples,
         seed=request.seed,
         notes=(

@@ -145,11 +145,12 @@ def _read_sigma(path: Path | None, size: Size, protocol: EvalProtocol) -> Depth 
         values = depth_from_stored(path, load_stored(path, None), None).values
     except InputError:
         return None
-    top, bottom, left, right = protocol.prediction_window(size)
-    if values.shape != (bottom - top, right - left):
-        return None
     placed = np.zeros(size, np.float32)
-    placed[top:bottom, left:right] = values
+    top, bottom, left, right = protocol.prediction_window(size)
+    shown = placed[top:bottom, left:right]
+    if values.shape != shown.shape:
+        return None
+    shown[:] = values
     return placed
 
 

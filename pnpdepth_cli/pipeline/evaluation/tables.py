@@ -165,9 +165,9 @@ def comparison_table(comparison: Comparison) -> Table:
         header=["measure", "run", "mean", "gain [%]", "low", "high", "p"],
         rows=rows,
         caption=(
-            f"{len(comparison.names):,} shared frames; gains in per cent of the error of"
+            f"{len(comparison.frames):,} shared frames; gains in per cent of the error of"
             f" {base.label}, positive is better; intervals (95 %) and p-values, from"
-            f" {'all' if comparison.exact else f'{comparison.resamples:,} random'} swaps, over"
+            f" {'all' if comparison.exact_p_values else f'{comparison.resamples:,} random'} swaps, over"
             f" {comparison.clusters.describe()}, p adjusted for {len(comparison.measures)} measures"
             " (Holm)"
         ),
@@ -197,7 +197,7 @@ def methods_table(comparison: Comparison) -> Table:
         header=["", *map(column_title, comparison.measures)],
         rows=rows,
         caption=(
-            f"means over {len(comparison.names):,} frames, the best in bold; *, **, ***: differs"
+            f"means over {len(comparison.frames):,} frames, the best in bold; *, **, ***: differs"
             f" from {comparison.runs[0].label} with p < 0.05, 0.01, 0.001 over"
             f" {comparison.clusters.describe()}, adjusted for {len(comparison.measures)} measures"
             " (Holm)"

@@ -59,12 +59,6 @@ def test_sparsification_is_by_definition() -> None:
     assert none.ause == pytest.approx(0)
 
 
-def test_pixels_without_a_deviation_do_not_count() -> None:
-    gt = np.full((1, 2), 2, np.float32)
-    assert frame_uncertainty(gt, gt, np.zeros_like(gt)) is None
-    assert summarise_uncertainty([]) is None
-
-
 def test_the_sigma_beside_a_prediction_is_evaluated(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     gt = rng.uniform(2, 6, (50, 60)).astype(np.float32)
