@@ -161,14 +161,14 @@ def comparison_table(comparison: Comparison) -> Table:
                 *(_signed(end) for end in (gain.low_percent, gain.high_percent)),
                 "–" if math.isnan(gain.p_adjusted) else f"{gain.p_adjusted:.4f}",
             ])  # fmt: skip
+    swaps = "all" if comparison.exact_p_values else f"{comparison.resamples:,} random"
     return Table(
         header=["measure", "run", "mean", "gain [%]", "low", "high", "p"],
         rows=rows,
         caption=(
             f"{len(comparison.frames):,} shared frames; gains in per cent of the error of"
-            f" {base.label}, positive is better; intervals (95 %) and p-values, from"
-            f" {'all' if comparison.exact_p_values else f'{comparison.resamples:,} random'} swaps, over"
-            f" {comparison.clusters.describe()}, p adjusted for {len(comparison.measures)} measures"
+            f" {base.label}, positive is better; intervals (95 %) and p-values, from {swaps} swaps,"
+            f" over {comparison.clusters.describe()}, p adjusted for {len(comparison.measures)} measures"
             " (Holm)"
         ),
     )
