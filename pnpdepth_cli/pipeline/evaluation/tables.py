@@ -168,10 +168,14 @@ def comparison_table(comparison: Comparison) -> Table:
         caption=(
             f"{len(comparison.frames):,} shared frames; gains in per cent of the error of"
             f" {base.label}, positive is better; intervals (95 %) and p-values, from {swaps} swaps,"
-            f" over {comparison.clusters.describe()}, p adjusted for {len(comparison.measures)} measures"
-            " (Holm)"
+            f" {_tested(comparison)}"
         ),
     )
+
+
+def _tested(comparison: Comparison) -> str:
+    clusters, count = comparison.clusters.describe(), len(comparison.measures)
+    return f"over {clusters}, p adjusted for {count} measures (Holm)"
 
 
 def _signed(value: float) -> str:
@@ -198,8 +202,6 @@ def methods_table(comparison: Comparison) -> Table:
         rows=rows,
         caption=(
             f"means over {len(comparison.frames):,} frames, the best in bold; *, **, ***: differs"
-            f" from {comparison.runs[0].label} with p < 0.05, 0.01, 0.001 over"
-            f" {comparison.clusters.describe()}, adjusted for {len(comparison.measures)} measures"
-            " (Holm)"
+            f" from {comparison.runs[0].label} with p < 0.05, 0.01, 0.001 {_tested(comparison)}"
         ),
     )
