@@ -176,7 +176,7 @@ def _parts(
     reader, loss_of = prepared.depth_reader(settings), LOSSES[settings.loss]
     z = no_grad(split.front)(*arguments)
 
-    def rear_and_gradient() -> Tensor:
+    def rear_and_gradient() -> Tensor | None:
         leaf = z.clone().requires_grad_(True)
         with torch.enable_grad():
             depth = network.depth_of(split.rear(leaf))
