@@ -26,10 +26,6 @@ from pnpdepth_cli.cli.printable import printable
 from pnpdepth_cli.cli.progress import progress_bar
 from pnpdepth_cli.errors import FramesFailedError, UsageError
 
-_REQUEST_OPTIONS = (
-    *("sparse", "protocol", "layout_protocol", "calib", "resamples", "seed", "workers"),
-)
-"""Options that are fields of `EvalRequest`; those without an own field change the protocol."""
 _SCALE_OPTIONS = {
     "prediction": "pred_scale",
     "truth": "gt_scale",
@@ -215,7 +211,9 @@ def evaluate(prediction: Path, ground_truth: Path, html: Path | None, **values: 
     from pnpdepth_cli.pipeline.evaluation.evaluate import EvalRequest
     from pnpdepth_cli.pipeline.evaluation.evaluate import evaluate as run_evaluation
     from pnpdepth_cli.pipeline.evaluation.frame_reading import Scales
+    from pnpdepth_cli.pipeline.evaluation.protocols import choose_protocol
     from pnpdepth_cli.pipeline.report import evaluation as report_eval
+    from pnpdepth_cli.pipeline.tables import chosen_measures
 
     files = TableFiles(**{each.name: values.pop(each.name) for each in fields(TableFiles)})
     files.check((prediction, ground_truth))
@@ -231,9 +229,10 @@ def evaluate(prediction: Path, ground_truth: Path, html: Path | None, **values: 
         ground_truth=ground_truth,
         grouped=not values.pop("no_groups"),
         scales=Scales(**scales),
-        **{name: values.pop(name) for name in _REQUEST_OPTIONS},
+        **{each.name: values.pop(each.name) for each in fields(EvalRequest) if each.name in values},
         changes=values,
     )
+    chosen_measures(choose_protocol(request.protocol, **values).measures, keys)
     with progress_bar("eval", "frame") as show:
         evaluation = run_evaluation(request, on_frame=show)
     print_notes([f"protocol {evaluation.protocol.describe()}", *evaluation.notes])
@@ -243,7 +242,7 @@ def evaluate(prediction: Path, ground_truth: Path, html: Path | None, **values: 
     if files.as_json:
         click.echo(json.dumps(evaluation.as_record(), indent=2))
     elif not to_stdout:
-        for table in tables.text_tables(evaluation):
+        for table in tables.text_tables(evaluation, keys):
             print_table(table)
     if html is not None:
         with progress_bar("report", "frame") as show:

@@ -138,6 +138,10 @@ def test_columns_choose_measures_and_latex_has_no_thousands_separators(
     assert row[1] == r"100.00\%"
     assert float(row[2]) > 1000
     assert "," in Path("t.md").read_text().splitlines()[2]
+    assert code_of("eval", "out", "gt", *options) == 0
+    text = capsys.readouterr().out
+    assert "MAE" not in text
+    assert text.index("δ1") < text.index("RMSE")
     assert code_of("eval", "out", "gt", "--columns", "rmse,none", "--latex", "-") == 2
     assert "--columns none is not one of rmse, mae" in capsys.readouterr().err
 

@@ -23,13 +23,13 @@ _FRAME_COLUMNS = 6
 _STARS = (0.05, 0.01, 0.001)
 
 
-def text_tables(evaluation: Evaluation) -> list[Table]:
-    """Returns what the terminal shows: the means, the frames or the worst of them, and details."""
-    frames = [frames_table(evaluation)] if len(evaluation.frames) > 1 else []
-    return [means_by_measure(evaluation), *frames, *calibration_tables(evaluation)]
+def text_tables(evaluation: Evaluation, columns: Sequence[str] | None) -> list[Table]:
+    """Returns what the terminal shows: the means, the frames or the worst of them, calibration."""
+    frames = [frames_table(evaluation, columns)] if len(evaluation.frames) > 1 else []
+    return [means_by_measure(evaluation, columns), *frames, *calibration_tables(evaluation)]
 
 
-def means_by_measure(evaluation: Evaluation) -> Table:
+def means_by_measure(evaluation: Evaluation, columns: Sequence[str] | None = None) -> Table:
     """Returns a row for each measure: its mean and the interval of it."""
     count = len(evaluation.scored)
     pixels = sum(frame.pixels for frame in evaluation.frames)
@@ -41,7 +41,7 @@ def means_by_measure(evaluation: Evaluation) -> Table:
         header.append("95 %")
         caption += f"; 95 % interval: studentised bootstrap over {evaluation.clusters.describe()}"
     rows = []
-    for measure in evaluation.protocol.measures:
+    for measure in chosen_measures(evaluation.protocol.measures, columns):
         interval = [_interval(evaluation, measure)] if has_interval else []
         mean = format_value(measure, evaluation.mean[measure.key])
         rows.append([column_title(measure), mean, *interval])
@@ -94,9 +94,10 @@ def _is_nothing(value: object) -> bool:
     return value is None or (isinstance(value, float) and math.isnan(value))
 
 
-def frames_table(evaluation: Evaluation) -> Table:
-    """Returns the first measures of each frame, or of the worst of many."""
-    measures = evaluation.protocol.measures[:_FRAME_COLUMNS]
+def frames_table(evaluation: Evaluation, columns: Sequence[str] | None) -> Table:
+    """Returns the chosen or first measures of each frame, or of the worst of many."""
+    measures = chosen_measures(evaluation.protocol.measures, columns)
+    measures = measures if columns else measures[:_FRAME_COLUMNS]
     everything = len(evaluation.frames) <= _FRAMES_SHOWN
     frames = evaluation.frames if everything else worst(evaluation, "rmse")[:_FRAMES_SHOWN]
     return Table(
