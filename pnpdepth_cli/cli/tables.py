@@ -116,7 +116,9 @@ def print_notes(notes: Sequence[str]) -> None:
         console.print(escape(printable(note)), style=style, soft_wrap=True)
 
 
-_SCORES: tuple[tuple[str, str, Callable[[float], str]], ...] = (
+_Row = tuple[str, str, Callable[[float], str]]
+"""Title, key and text of an error."""
+_SCORES: tuple[_Row, ...] = (
     ("RMSE", "rmse", "{:.4f} m".format),
     ("MAE", "mae", "{:.4f} m".format),
     ("MRE", "mre", "{:.4f}".format),
@@ -126,6 +128,8 @@ _SCORES: tuple[tuple[str, str, Callable[[float], str]], ...] = (
     ("δ2", "delta2", "{:.2%}".format),
     ("δ3", "delta3", "{:.2%}".format),
 )
+_CHECKED = {"before": "aligned", "after": "result", "linear": "linear"}
+"""Columns of a fixed method, by what the check at hidden points calls them."""
 _COLUMNS = ("", "before", "after", "change", "linear", "vs linear")
 _STAGES_OF_DEFAULT = {
     "aligned": "{name} aligned",
@@ -222,17 +226,18 @@ def _before_and_after(record: Mapping[str, Any]) -> RichTable:
     """The errors of a fixed method before and after, beside linear interpolation."""
     points, beside, unit = record["points"], record["linear"], record["unit"]
     table = _empty(f"{record['model']['name']} cut at {record['settings']['layer']}", _COLUMNS)
-    used = f"error at {points['used']:,} points used"
-    _point_rows(table, used, record["sparse_error"], unit=unit)
-    held_out = f"error at {points['held_out']:,} held-out points"
-    _point_rows(table, held_out, record["held_out_error"], beside["held_out_error"], unit=unit)
+    used = _of_points(f"error at {points['used']:,} points used", unit)
+    _add_rows(table, used, record["sparse_error"])
+    held_out = _of_points(f"error at {points['held_out']:,} held-out points", unit)
+    _add_rows(table, held_out, record["held_out_error"], beside["held_out_error"])
     if record["scores"] is not None:
-        _score_rows(table, record["scores"], beside["scores"])
+        table.add_section()
+        _add_rows(table, _SCORES, record["scores"], beside["scores"])
         table.caption = _scored_on(record["scores"]["after"])
     elif (check := beside["check"]) is not None:
-        errors = {"before": check["aligned"], "after": check["result"], "linear": check["linear"]}
-        title = f"error at {check['points']:,} hidden points, MAE"
-        _add_row(table, title, "mae", partial(_length, unit=unit), errors)
+        title = f"error at {check['points']:,} hidden points"
+        errors = {name: {"mae": check[of]} for name, of in _CHECKED.items()}
+        _add_rows(table, _of_points(title, unit, "mae"), errors, errors["linear"])
     return table
 
 
@@ -264,15 +269,17 @@ def print_batch(summary: Mapping[str, Any]) -> None:
     beside = summary["linear"]
     if any(mean.values()):
         table = _empty("means over frames", _COLUMNS)
-        _point_rows(table, "error at points used", mean["sparse_error"], unit=unit)
+        _add_rows(table, _of_points("error at points used", unit), mean["sparse_error"])
         held_out, linear = mean["held_out_error"], beside["held_out_error"]
-        _point_rows(table, "error at held-out points", held_out, linear, unit=unit)
+        _add_rows(table, _of_points("error at held-out points", unit), held_out, linear)
         if mean["scores"] is not None:
-            _score_rows(table, mean["scores"], beside["scores"])
+            table.add_section()
+            _add_rows(table, _SCORES, mean["scores"], beside["scores"])
             table.caption = f"scored on the ground truth of {mean['scores']['frames']:,} frames"
         elif held_out is None and (check := beside["check"]) is not None:
-            title = f"error at hidden points, {check['frames']:,} frames, MAE"
-            _add_row(table, title, "mae", partial(_length, unit=unit), check)
+            title = f"error at hidden points, {check['frames']:,} frames"
+            errors = {name: {"mae": check[name]} for name in _CHECKED}
+            _add_rows(table, _of_points(title, unit, "mae"), errors, errors["linear"])
         console.print(table)
     if summary["baselines"]:
         rows = {
@@ -320,42 +327,24 @@ def print_sparse(record: Mapping[str, Any]) -> None:
     _print_written(Console(stderr=True, highlight=False), start, record)
 
 
-def _point_rows(
+def _of_points(title: str, unit: str, *keys: str) -> list[_Row]:
+    show = partial(_length, unit=unit)
+    return [(f"{title}, {key.upper()}", key, show) for key in keys or ("mae", "rmse")]
+
+
+def _add_rows(
     table: RichTable,
-    title: str,
-    error: Mapping[str, Any] | None,
+    rows: Sequence[_Row],
+    errors: Mapping[str, Any] | None,
     linear: Mapping[str, Any] | None = None,
-    *,
-    unit: str,
 ) -> None:
-    for key in ("mae", "rmse") if error is not None else ():
-        errors = {**(error or {}), "linear": linear or {}}
-        values = {name: errors[name].get(key) for name in ("before", "after", "linear")}
-        _add_row(table, f"{title}, {key.upper()}", key, partial(_length, unit=unit), values)
-
-
-def _score_rows(
-    table: RichTable, scores: Mapping[str, Any], linear: Mapping[str, Any] | None
-) -> None:
-    table.add_section()
-    for title, key, show in _SCORES:
-        errors = {**scores, "linear": linear or {}}
-        values = {name: errors[name].get(key) for name in ("before", "after", "linear")}
-        _add_row(table, title, key, show, values)
-
-
-def _add_row(
-    table: RichTable,
-    title: str,
-    key: str,
-    show: Callable[[float], str],
-    errors: Mapping[str, float | None],
-) -> None:
-    """Adds before, after, change, linear interpolation, and the change against it."""
-    before, after, linear = (errors[name] for name in ("before", "after", "linear"))
-    shown = ["–" if v is None or math.isnan(v) else show(v) for v in (before, after, linear)]
-    changes = _change(key, before, after), _change(key, linear, after)
-    table.add_row(title, *shown[:2], changes[0], shown[2], changes[1])
+    """Adds rows of before, after, change, linear interpolation, and the change against it."""
+    for title, key, show in rows if errors is not None else ():
+        sides = (errors or {})["before"], (errors or {})["after"], linear or {}
+        before, after, beside = (side.get(key) for side in sides)
+        shown = ["–" if v is None or math.isnan(v) else show(v) for v in (before, after, beside)]
+        changes = _change(key, before, after), _change(key, beside, after)
+        table.add_row(title, *shown[:2], changes[0], shown[2], changes[1])
 
 
 def _length(value: float | None, unit: str) -> str:
