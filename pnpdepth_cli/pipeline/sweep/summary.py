@@ -144,8 +144,9 @@ def _mean_and_interval(
     ends += [gain_interval(before, refined, _BETTER, *drawing) for before in (plain, linear)]
     means = table.mean(axis=0)
     gains = [gain(before, means[2], _BETTER) for before in means[:2]]
-    low, high = np.stack(ends, axis=1)
-    return np.concatenate([means, gains]), low, high
+    mean = np.concatenate([means, gains])
+    low, high = np.where(np.isnan(mean), math.nan, np.stack(ends, axis=1))
+    return mean, low, high
 
 
 def _by_measure(mean: Floats, low: Floats, high: Floats) -> dict[str, dict[str, float]]:
