@@ -25,7 +25,7 @@ from benchmarks.engine import CPU, loop, output_points, print_rows, setup
 from benchmarks.hand_cuts import ZOO
 from benchmarks.networks import Case
 from pnpdepth_cli.models.precision import lower
-from pnpdepth_cli.pipeline.bench import Timed, in_turn
+from pnpdepth_cli.pipeline.bench import in_turn
 
 
 def refined(
@@ -64,8 +64,8 @@ def measure(case: Case, precision: str, batch: int, runs: int) -> dict[str, obje
     compiling = time.perf_counter() - began
     spent = in_turn(
         {
-            "eager": Timed(run=lambda _: eager()),
-            "compiled": Timed(run=lambda _: compiled()),
+            "eager": eager,
+            "compiled": compiled,
         },
         runs,
         CPU,

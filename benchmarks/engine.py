@@ -31,7 +31,7 @@ from benchmarks.networks import CASES, Case
 from pnpdepth_cli.core.refine import RefineSettings, refine
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.models.precision import lower
-from pnpdepth_cli.pipeline.bench import Timed, in_turn, peak_mb
+from pnpdepth_cli.pipeline.bench import in_turn, peak_mb
 from pnpdepth_cli.points import SparsePoints
 
 ITERATIONS, STEP, POINTS = 5, 0.01, 500
@@ -177,7 +177,7 @@ def measure(case: Case, runs: int, *, memory: bool) -> dict[str, float | str]:
         results = [todo[name]() for name in COMPARED]
         for name, result in zip(COMPARED, results, strict=True):
             assert torch.equal(results[0], result), f"{case.name}: {name} differs"
-        spent = in_turn({n: Timed(run=lambda _, n=n: todo[n]()) for n in todo}, runs, CPU)
+        spent = in_turn(todo, runs, CPU)
     median = {name: statistics.median(times) for name, times in spent.items()}
     limit = (median["front"] + (2 * ITERATIONS + 1) * median["rear"]) / (
         median["front"] + median["rear"]

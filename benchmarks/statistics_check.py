@@ -18,11 +18,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-from pnpdepth_cli.pipeline.evaluation.dependence import find_clusters, independent_frames
+from pnpdepth_cli.pipeline.evaluation.dependence import find_clusters
 from pnpdepth_cli.pipeline.evaluation.resampling import (
     FrameTable,
+    mean_interval,
     sign_flip_p_values,
-    studentised_interval,
 )
 
 Floats = NDArray[np.float64]
@@ -99,7 +99,7 @@ def type_1_error(
     changes = runs[1] - runs[0]
     rejected = testable = 0
     for part, (ids, columns) in enumerate(_by_clusters(changes, names, grouped=grouped)):
-        totals = FrameTable(rows=changes[columns].T).cluster_totals(ids)[:, :-1]
+        totals = FrameTable.of_frames(changes[columns].T).cluster_totals(ids)[..., 0]
         p_values, _ = sign_flip_p_values(
             lambda flips, totals=totals: (1 - 2 * flips) @ totals, len(totals), SWAPS, seed=part
         )
@@ -115,10 +115,8 @@ def _by_clusters(
     by_count: dict[int, list[int]] = defaultdict(list)
     ids_of = {}
     for trial, change in enumerate(changes):
-        if not grouped:
-            clusters = independent_frames(len(names))
-        elif trial == 0 or len(set(names)) == 1:
-            clusters = find_clusters(names, change[:, None])
+        if trial == 0 or len(set(names)) == 1:
+            clusters = find_clusters(names, change[:, None], grouped=grouped)
         by_count[clusters.count].append(trial)
         ids_of[clusters.count] = clusters.ids
     for count, members in by_count.items():
@@ -143,9 +141,8 @@ def interval_coverage(
     covered = 0
     for start in range(0, trials, _INTERVAL_COLUMNS):
         columns = min(_INTERVAL_COLUMNS, trials - start)
-        table = FrameTable(rows=draw(rng, columns, frames).T)
-        totals = table.cluster_totals(np.arange(frames))
-        low, high = studentised_interval(table.means_of, totals, resamples, seed=start)
+        table = FrameTable.of_frames(draw(rng, columns, frames).T)
+        low, high = mean_interval(table, np.arange(frames), resamples, seed=start)
         covered += int(((low <= mean) & (mean <= high)).sum())
     return covered / trials
 

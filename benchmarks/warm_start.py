@@ -28,8 +28,7 @@ from pnpdepth_cli.frames.frame import Frame, WarmStart, is_dense
 from pnpdepth_cli.frames.refine import refine_frame
 from pnpdepth_cli.frames.warm_start import refine_next
 from pnpdepth_cli.models.network import Network
-from pnpdepth_cli.pipeline.evaluation.measured_frame import MeasuredFrame
-from pnpdepth_cli.pipeline.evaluation.measures.flicker import flicker
+from pnpdepth_cli.pipeline.evaluation.measures import MeasuredFrame, flicker
 from pnpdepth_cli.pipeline.refinement.request import HoldOut, MethodOptions
 from pnpdepth_cli.pipeline.refinement.resolve import resolve_layer, resolve_settings
 
@@ -95,7 +94,7 @@ def refined(
     ]
     errors = [float(np.abs(m.depth - m.gt)[m.both].mean()) for m in measured[1:]]
     changes = [
-        flicker(replace(after, previous=before))["flicker"]
+        flicker(replace(after, previous=before))[0]
         for before, after in itertools.pairwise(measured)
     ]
     return Row(

@@ -261,9 +261,9 @@ PLOT_FORMATS = ("png", "svg", "pdf")
 
 MEASURE_GROUPS = Table(
     "pipeline/evaluation/measures",
-    "GROUP",
     group="measures",
     noun="group of measures",
+    names=("area", "cloud", "distance", "edges", "flicker", "normals"),
 )
 """Measures that `eval` computes only on request."""
 

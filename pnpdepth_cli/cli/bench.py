@@ -14,7 +14,7 @@ from pnpdepth_cli.cli.progress import progress_bar
 from pnpdepth_cli.errors import UsageError
 
 if TYPE_CHECKING:
-    from pnpdepth_cli.pipeline.bench import Bench, BenchPart, PaperTime
+    from pnpdepth_cli.pipeline.bench import Bench
 
 
 @click.command(
@@ -38,7 +38,6 @@ if TYPE_CHECKING:
     "--points", type=int, default=500, show_default=True, metavar="N", help="Number of points."
 )
 @click.option("--iterations", type=int, metavar="K", help="Number of updates of z.")
-@options.target
 @options.precision
 @options.device
 @click.option(
@@ -50,7 +49,7 @@ if TYPE_CHECKING:
     help="Measure the paper's seven networks, beside its Table IV.",
 )
 @options.as_json
-def bench(size: str | None, repeats: int, table: bool, as_json: bool, **values: Any) -> None:
+def bench(size: str | None, table: bool, as_json: bool, **values: Any) -> None:
     """Measure the run time of a refinement on this machine, by part and in forward passes.
 
     \b
@@ -64,121 +63,104 @@ def bench(size: str | None, repeats: int, table: bool, as_json: bool, **values: 
     updates: (front + (2K+1) rear) / (front + rear). Memory is the peak of a part beyond the memory
     in use before it.
     """
-    if repeats < 1:
-        raise UsageError(f"repeats {repeats}: there must be at least one")
+    if values["repeats"] < 1:
+        raise UsageError(f"--repeats must be >= 1, got {values['repeats']}")
     if table:
-        if values["target"] != "given":
-            raise UsageError("--table measures the paper's updates and not --target masked")
         refused = {"--size": size} | {
-            f"--{name}": values[name] for name in ("checkpoint", "layer", "iterations")
+            f"--{name}": values.pop(name) for name in ("checkpoint", "layer", "iterations")
         }
         if clash := [name for name, value in refused.items() if value is not None]:
             raise UsageError(
                 f"--table measures the paper's networks and cannot be combined with {clash[0]}"
             )
-        _table(repeats, values["precision"], values["device"], as_json)
+        _table(as_json, **values)
         return
     from pnpdepth_cli.pipeline.bench import BenchRequest, run_bench
 
-    request = BenchRequest(
-        size=options.height_and_width(size) if size else None, repeats=repeats, **values
-    )
+    request = BenchRequest(size=options.height_and_width(size) if size else None, **values)
     with progress_bar("bench", "round") as show:
         result = run_bench(request, on_round=show)
     if as_json:
         click.echo(json.dumps(asdict(result), indent=2))
-        return
-    _print(result)
+    else:
+        _print(result)
 
 
 def _print(result: Bench) -> None:
     from pnpdepth_cli.cli.tables import print_rows
 
-    _print_notes(result)
+    threads = f"{result.threads} thread{'' if result.threads == 1 else 's'}"
+    click.echo(f"{result.device}, {threads}, torch {result.versions['torch']}", err=True)
+    for note in result.notes:
+        click.echo(printable(note), err=True)
     height, width = result.size
     print_rows(
         f"{result.model} cut at {result.layer}, {width}×{height}, {result.points:,} points,"
         f" K = {result.iterations}, {result.precision}",
         ("", "median", "quartiles", "× forward", "memory"),
-        [_cells(part) for part in result.parts],
+        [
+            (
+                part.name,
+                _ms(part.median_s),
+                f"{1000 * part.lower_s:,.1f}–{_ms(part.upper_s)}",
+                f"{part.forwards:.2f}",
+                "" if part.peak_mb is None else f"{part.peak_mb:,.0f} MB",
+            )
+            for part in result.parts
+        ],
     )
-    limits = [f"{result.limit_measured:.2f} by the times of front and rear"]
-    if result.limit_by_flops is not None:
-        limits.append(f"{result.limit_by_flops:.2f} by counts of operations")
-    refinement = result.part("refinement").forwards
     click.echo(
-        f"a refinement takes {refinement:.2f} forward passes; the limit is {', '.join(limits)}"
-    )
-    if result.depth_change is not None:
-        click.echo(f"depth differs from fp32 by {result.depth_change:.3%} on average")
-
-
-def _cells(part: BenchPart) -> tuple[str, ...]:
-    seconds = part.seconds
-    return (
-        part.name,
-        _ms(seconds.median),
-        f"{1000 * seconds.lower:,.1f}–{_ms(seconds.upper)}",
-        f"{part.forwards:.2f}",
-        "" if part.peak_mb is None else f"{part.peak_mb:,.0f} MB",
+        f"a refinement takes {result.part('refinement').forwards:.2f} forward passes; the limit is"
+        f" {result.limit:.2f}"
     )
 
 
-def _table(repeats: int, precision: str, device: str, as_json: bool) -> None:
-    from pnpdepth_cli.pipeline.bench import bench_table, table_record
-
-    with progress_bar("bench", "network") as show:
-        rows = bench_table(repeats=repeats, precision=precision, device=device, on_network=show)
-    if as_json:
-        click.echo(json.dumps(table_record(rows), indent=2))
-        return
+def _table(as_json: bool, **values: Any) -> None:
+    """Prints the times of the paper's networks: full size, random weights, K = 5."""
     from pnpdepth_cli.cli.tables import print_rows
+    from pnpdepth_cli.pipeline.bench import PAPER_TIMES, BenchRequest, run_bench
 
+    results = []
+    with progress_bar("bench", "network") as show:
+        for number, paper in enumerate(PAPER_TIMES):
+            show(number, len(PAPER_TIMES), paper.model)
+            each = {**values, "model": paper.model, "size": paper.size, "iterations": 5}
+            results.append((paper, run_bench(BenchRequest(**each))))
+    if as_json:
+        records = [{"paper": paper._asdict(), "bench": asdict(ours)} for paper, ours in results]
+        click.echo(json.dumps(records, indent=2))
+        return
+    rows = []
+    for paper, ours in results:
+        forward, refinement = ours.part("forward"), ours.part("refinement")
+        memory = refinement.peak_mb
+        printed = ["–"] * 3
+        if paper.before is not None and paper.after is not None:
+            ratio = f"{paper.after / paper.before:.2f}"
+            printed = [_ms(paper.before), _ms(paper.after), ratio]
+        rows.append(
+            [
+                paper.model,
+                f"{paper.name}, {paper.data}",
+                f"{paper.size[1]}×{paper.size[0]}",
+                _ms(forward.median_s),
+                _ms(refinement.median_s),
+                f"{refinement.forwards:.2f}",
+                f"{ours.limit:.2f}",
+                "–" if memory is None else f"{memory:,.0f} MB",
+                *printed,
+            ]
+        )
     print_rows(
-        f"Table IV: random weights, K = 5, {precision}, {device}, {rows[0][1].threads} threads,"
-        f" medians of {repeats}; beside the paper's figures",
+        f"Table IV: random weights, K = 5, {values['precision']}, {values['device']},"
+        f" {results[0][1].threads} threads, medians of {values['repeats']}; beside the paper's"
+        " figures",
         (
-            "network",
-            "paper's\nname",
-            "size",
-            "forward",
-            "refinement",
-            "×",
-            "limit\n(times)",
-            "limit\n(counts)",
-            "memory",
-            "paper,\nforward",
-            "paper,\nrefinement",
-            "paper,\n×",
+            *("network", "paper's\nname", "size", "forward", "refinement", "×", "limit", "memory"),
+            *("paper,\nforward", "paper,\nrefinement", "paper,\n×"),
         ),
-        [_row_cells(paper, bench) for paper, bench in rows],
+        rows,
     )
-
-
-def _row_cells(paper: PaperTime, bench: Bench) -> tuple[str, ...]:
-    refinement, forward = bench.part("refinement"), bench.part("forward")
-    flops, memory = bench.limit_by_flops, refinement.peak_mb
-    printed = (paper.before, paper.after)
-    return (
-        paper.model,
-        f"{paper.name}, {paper.data}",
-        f"{paper.size[1]}×{paper.size[0]}",
-        _ms(forward.seconds.median),
-        _ms(refinement.seconds.median),
-        f"{refinement.forwards:.2f}",
-        f"{bench.limit_measured:.2f}",
-        "–" if flops is None else f"{flops:.2f}",
-        "–" if memory is None else f"{memory:,.0f} MB",
-        *("–" if seconds is None else _ms(seconds) for seconds in printed),
-        "–" if paper.forwards is None else f"{paper.forwards:.2f}",
-    )
-
-
-def _print_notes(bench: Bench) -> None:
-    threads = f"{bench.threads} thread{'' if bench.threads == 1 else 's'}"
-    click.echo(f"{bench.device}, {threads}, torch {bench.versions['torch']}", err=True)
-    for note in bench.notes:
-        click.echo(printable(note), err=True)
 
 
 def _ms(seconds: float) -> str:

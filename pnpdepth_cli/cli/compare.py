@@ -3,12 +3,28 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import click
 
 from pnpdepth_cli.cli import options
+
+_LABEL_LETTERS = 36
+
+
+def names_in(text: str) -> tuple[str, ...]:
+    """Returns the names in a text such as `rmse,mae`."""
+    return tuple(dict.fromkeys(text.split(",")))
+
+
+columns = click.option(
+    "--columns",
+    type=names_in,
+    metavar="KEY,…",
+    help="Measures of the tables, in this order, such as rmse,mae,delta1.",
+)
 
 
 @click.command(short_help="Compare runs that eval or batch scored.")
@@ -27,13 +43,14 @@ from pnpdepth_cli.cli import options
 @options.table_files(
     csv="Write the table as CSV.",
     markdown="Write the table as Markdown.",
-    latex="Write it as a tabular.",
+    latex="Write a tabular of runs × measures: the best in bold, * where p < 0.05.",
 )
+@columns
 @click.option(
     "--all",
     "all_measures",
     is_flag=True,
-    help="Compare all measures, not only RMSE, MAE, MRE and δ1.",
+    help="Compare all measures, not only RMSE, MAE, MRE and δ1, or --columns.",
 )
 def compare(
     runs: tuple[str, ...],
@@ -41,6 +58,7 @@ def compare(
     seed: int,
     no_groups: bool,
     all_measures: bool,
+    columns: tuple[str, ...] | None,
     **table_files: Any,
 ) -> None:
     """Compare RUNs with the first of them, on the frames that all of them scored.
@@ -56,13 +74,13 @@ def compare(
     sequence over blocks as long as its errors are correlated, adjusted for the number of measures
     (Holm); it is exact for few groups, else with N random permutations.
     """
-    from pnpdepth_cli.cli import score_tables
-    from pnpdepth_cli.pipeline.evaluation import score_files
+    from pnpdepth_cli.cli.tables import TableFiles, print_notes, print_table
     from pnpdepth_cli.pipeline.evaluation.compare import CompareRequest
     from pnpdepth_cli.pipeline.evaluation.compare import compare as compare_runs
+    from pnpdepth_cli.pipeline.evaluation.tables import comparison_table, methods_table
 
-    tables = score_tables.TableFiles(**table_files)
-    tables.check([Path(run) for run in runs])
+    files = TableFiles(**table_files)
+    files.check([Path(run) for run in runs])
     comparison = compare_runs(
         CompareRequest(
             paths=runs,
@@ -70,17 +88,19 @@ def compare(
             seed=seed,
             grouped=not no_groups,
             all_measures=all_measures,
+            columns=columns,
         )
     )
-    score_tables.print_notes(comparison.notes)
-    table = score_files.comparison_table(comparison)
-    caption = score_files.comparison_caption(comparison)
-    to_stdout = tables.write(
-        score_files.csv_text(*table),
-        score_files.markdown_text(*table, caption),
-        score_files.latex_text(*table, caption),
-    )
-    if tables.as_json:
+    print_notes(comparison.notes)
+    table = comparison_table(comparison)
+    to_stdout = files.write(csv=table, markdown=table, latex=methods_table(comparison))
+    if files.as_json:
         click.echo(json.dumps(comparison.as_record(), indent=2))
     elif not to_stdout:
-        score_tables.print_comparison(comparison)
+        # a long label would make the table wider than a terminal
+        rows = [[title, _short(label), *cells] for title, label, *cells in table.rows]
+        print_table(replace(table, rows=rows))
+
+
+def _short(label: str) -> str:
+    return label if len(label) <= _LABEL_LETTERS else f"…{label[1 - _LABEL_LETTERS :]}"

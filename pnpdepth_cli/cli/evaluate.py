@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable, Sequence
 from dataclasses import fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
@@ -20,30 +21,35 @@ from pnpdepth_cli.choices import (
     SCALINGS,
 )
 from pnpdepth_cli.cli import grouped_help, options
+from pnpdepth_cli.cli.compare import columns, names_in
 from pnpdepth_cli.cli.printable import printable
 from pnpdepth_cli.cli.progress import progress_bar
 from pnpdepth_cli.errors import FramesFailedError, UsageError
 
-if TYPE_CHECKING:
-    from pnpdepth_cli.pipeline.evaluation.result import EvalRequest
-
-_REQUEST_OPTIONS = (
-    "sparse",
-    "protocol",
-    "layout_protocol",
-    "calib",
-    "resamples",
-    "seed",
-    "workers",
-)
-"""Options that are fields of `EvalRequest`."""
 _SCALE_OPTIONS = {
     "prediction": "pred_scale",
-    "ground_truth": "gt_scale",
+    "truth": "gt_scale",
     "sparse": "sparse_scale",
     "channel": "channel",
 }
 """Options by the field of `Scales` that they set."""
+
+
+def _thresholds(text: str) -> tuple[float, float, float]:
+    """Returns the thresholds of δ1…δ3 from one number, which is raised to powers, or from three."""
+    try:
+        first, *others = (float(word) for word in text.split(","))
+        second, third = others or (first**2, first**3)
+    except (ValueError, OverflowError):
+        raise UsageError(
+            f"--delta {text!r} is neither one number such as 1.25 nor three numbers"
+        ) from None
+    return first, second, third
+
+
+def _choice(flag: str, names: Sequence[str], text: str) -> Callable[[Any], Any]:
+    field = "prediction_kind" if flag == "--pred-kind" else flag[2:].replace("-", "_")
+    return click.option(flag, field, type=click.Choice(names), help=text)
 
 
 @click.command(
@@ -51,31 +57,26 @@ _SCALE_OPTIONS = {
     short_help="Score depth files against ground truth.",
     cls=grouped_help.GroupedCommand,
     common=frozenset(
-        {
+        (
             *("--protocol", "--min-depth", "--max-depth", "--crop", "--average", "--gt-scale"),
             *("--pred-scale", "--sparse", "--csv", "--markdown", "--latex", "--html", "--json"),
             *("--overwrite", "--resize"),
-        }
+        )
     ),
     groups={
         "Input": (
             *("--pred-scale", "--gt-scale", "--pred-kind", "--channel", "--resize", "--pred-crop"),
-            *(
-                "--mask",
-                "--calib",
-                "--layout-protocol",
-                "--sparse",
-                "--sparse-scale",
-                "--workers",
-                "--max-pixels",
-            ),
+            *("--mask", "--calib", "--layout-protocol", "--sparse", "--sparse-scale", "--workers"),
+            "--max-pixels",
         ),
         "Protocol": (
             *("--protocol", "--min-depth", "--max-depth", "--clip", "--crop", "--average"),
             *("--delta", "--exclude-sparse", "--missing", "--scale-by", "--bootstrap"),
             *("--no-groups", "--seed", "--measures"),
         ),
-        "Output": ("--csv", "--markdown", "--latex", "--html", "--overwrite", "--json"),
+        "Output": (
+            *("--csv", "--markdown", "--latex", "--columns", "--html", "--overwrite", "--json"),
+        ),
     },
 )
 @click.argument("prediction", type=options.FILE, metavar="PRED")
@@ -92,36 +93,31 @@ _SCALE_OPTIONS = {
 @click.option("--clip/--no-clip", default=None, help="Clip predictions to these bounds.")
 @click.option("--crop", metavar="NAME|X,Y,W,H", help="none, nyu, eigen, garg, or a rectangle.")
 @click.option("--mask", type=options.FILE, help="Mask image, or folder with a mask per frame.")
-@click.option(
-    "--average",
-    type=click.Choice(AVERAGES),
-    help="Mean over images, or over all pixels of all images.",
-)
+@_choice("--average", AVERAGES, "Mean over images, or over all pixels of all images.")
 @click.option(
     "--delta",
+    "thresholds",
+    type=_thresholds,
     metavar="D|D1,D2,D3",
     help="Thresholds of δ1…δ3: D, D², D³, or D1, D2, D3. The paper's KITTI rows use 1.01."
     "  [default: 1.25]",
 )
-@click.option(
+@_choice(
     "--missing",
-    type=click.Choice(MISSING),
-    help="Empty predictions: not scored, scored as --min-depth or --max-depth, or an error."
+    MISSING,
+    "Empty predictions: not scored, scored as --min-depth or --max-depth, or an error."
     "  [default: the protocol's]",
 )
-@click.option(
+@_choice(
     "--scale-by",
-    type=click.Choice(SCALINGS),
-    help="Scale each image to its ground truth, for relative predictions.  [default: none]",
+    SCALINGS,
+    "Scale each image to its ground truth, for relative predictions.  [default: none]",
 )
-@click.option(
-    "--pred-kind",
-    "prediction_kind",
-    type=click.Choice(PREDICTION_KINDS),
-    help="What predictions are.  [default: depth]",
-)
+@_choice("--pred-kind", PREDICTION_KINDS, "What predictions are.  [default: depth]")
 @click.option(
     "--measures",
+    "groups",
+    type=names_in,
     metavar="GROUP,…",
     help=f"Additional measures: {', '.join(MEASURE_GROUPS)}.",
 )
@@ -135,33 +131,30 @@ _SCALE_OPTIONS = {
 @click.option("--gt-scale", type=float, metavar="S", help="Integer ground truth holds metres × S.")
 @options.channel
 @options.max_pixels
-@click.option(
-    "--resize",
-    type=click.Choice(RESIZES),
-    help="Resize predictions to the size of the ground truth.",
-)
+@_choice("--resize", RESIZES, "Resize predictions to the size of the ground truth.")
 @click.option(
     "--pred-crop",
     "prediction_crop",
     metavar="kb|X,Y,W,H",
     help="Part of the frame that predictions show, such as the 1216×352 of KITTI's benchmark.",
 )
-@click.option(
+@_choice(
     "--layout-protocol",
-    type=click.Choice(FRAME_PROTOCOLS),
-    help="Crop of the frames of a data set GT, as in batch.  [default: the layout's own]",
+    FRAME_PROTOCOLS,
+    "Crop of the frames of a data set GT, as in batch.  [default: the layout's own]",
 )
 @click.option(
     "--sparse",
     type=options.FILE,
     metavar="FILE|FOLDER",
-    help="Sparse depth the networks had: adds errors by distance to the points and by depth, and"
-    " reports points that are part of the ground truth.",
+    help="Sparse depth the networks had: points that are part of the ground truth are reported.",
 )
 @click.option(
     "--sparse-scale", type=float, metavar="S", help="Integer --sparse files hold metres × S."
 )
-@click.option("--exclude-sparse", is_flag=True, help="Leave out pixels that have a sparse point.")
+@click.option(
+    "--exclude-sparse", is_flag=True, default=None, help="Leave out pixels with a sparse point."
+)
 @click.option(
     "--bootstrap",
     "resamples",
@@ -186,6 +179,7 @@ _SCALE_OPTIONS = {
     markdown="Write a table of the means.",
     latex="Write a tabular of the means.",
 )
+@columns
 @click.option(
     "--html",
     type=options.FILE,
@@ -212,35 +206,44 @@ def evaluate(prediction: Path, ground_truth: Path, html: Path | None, **values: 
     kitti-devkit  figures of KITTI's development kit: missing depth filled in, metres, 1/m
     eigen, garg   0.001–80 m, predictions clipped to it, Eigen's or Garg's crop
     """
-    from pnpdepth_cli.cli import score_tables
-    from pnpdepth_cli.pipeline.evaluation import score_files
+    from pnpdepth_cli.cli.tables import TableFiles, print_notes, print_table
+    from pnpdepth_cli.pipeline.evaluation import tables
+    from pnpdepth_cli.pipeline.evaluation.evaluate import EvalRequest
     from pnpdepth_cli.pipeline.evaluation.evaluate import evaluate as run_evaluation
+    from pnpdepth_cli.pipeline.evaluation.frame_reading import Scales
+    from pnpdepth_cli.pipeline.evaluation.protocols import choose_protocol
     from pnpdepth_cli.pipeline.report import evaluation as report_eval
+    from pnpdepth_cli.pipeline.tables import chosen_measures
 
-    names = [each.name for each in fields(score_tables.TableFiles)]
-    tables = score_tables.TableFiles(**{name: values.pop(name) for name in names})
-    tables.check((prediction, ground_truth))
+    files = TableFiles(**{each.name: values.pop(each.name) for each in fields(TableFiles)})
+    files.check((prediction, ground_truth))
+    keys = values.pop("columns")
     if html is not None:
-        inputs = [
-            p for p in (prediction, ground_truth, values["sparse"], values["mask"]) if p is not None
-        ]
-        report_eval.check_eval_report(html, inputs, overwrite=tables.overwrite)
-    request = _request(prediction, ground_truth, values)
+        inputs = [prediction, ground_truth, values["sparse"], values["mask"]]
+        report_eval.check_eval_report(
+            html, [path for path in inputs if path is not None], overwrite=files.overwrite
+        )
+    scales = {field: values.pop(name) for field, name in _SCALE_OPTIONS.items()}
+    request = EvalRequest(
+        prediction=prediction,
+        ground_truth=ground_truth,
+        grouped=not values.pop("no_groups"),
+        scales=Scales(**scales),
+        **{each.name: values.pop(each.name) for each in fields(EvalRequest) if each.name in values},
+        changes=values,
+    )
+    chosen_measures(choose_protocol(request.protocol, **values).measures, keys)
     with progress_bar("eval", "frame") as show:
         evaluation = run_evaluation(request, on_frame=show)
-    protocol = evaluation.protocol.describe()
-    score_tables.print_notes([f"protocol {protocol}", *evaluation.notes])
+    print_notes([f"protocol {evaluation.protocol.describe()}", *evaluation.notes])
     name = prediction.stem if prediction.is_file() else prediction.resolve().name
-    table = score_files.means_table(evaluation, name)
-    to_stdout = tables.write(
-        score_files.frames_csv(evaluation),
-        score_files.markdown_text(*table, protocol),
-        score_files.latex_text(*table, protocol),
-    )
-    if tables.as_json:
+    means = tables.means_row(evaluation, name, keys)
+    to_stdout = files.write(csv=tables.frames_csv(evaluation), markdown=means, latex=means)
+    if files.as_json:
         click.echo(json.dumps(evaluation.as_record(), indent=2))
     elif not to_stdout:
-        score_tables.print_evaluation(evaluation)
+        for table in tables.text_tables(evaluation, keys):
+            print_table(table)
     if html is not None:
         with progress_bar("report", "frame") as show:
             report_eval.write_eval_report(html, evaluation, on_frame=show)
@@ -248,41 +251,3 @@ def evaluate(prediction: Path, ground_truth: Path, html: Path | None, **values: 
     unscored = evaluation.unscored()
     if unscored is not None:
         raise FramesFailedError(unscored)
-
-
-def _request(prediction: Path, ground_truth: Path, values: dict[str, Any]) -> EvalRequest:
-    """Returns the request of the other options; those without an own field change the protocol."""
-    from pnpdepth_cli.pipeline.evaluation.frame_reading import Scales
-    from pnpdepth_cli.pipeline.evaluation.result import EvalRequest
-
-    own = {name: values.pop(name) for name in _REQUEST_OPTIONS}
-    scales = {field: values.pop(name) for field, name in _SCALE_OPTIONS.items()}
-    grouped = not values.pop("no_groups")
-    groups = values.pop("measures")
-    derived = {
-        "groups": None if groups is None else tuple(dict.fromkeys(groups.split(","))),
-        "thresholds": _thresholds(values.pop("delta")),
-        "exclude_sparse": values.pop("exclude_sparse") or None,
-    }
-    return EvalRequest(
-        prediction=prediction,
-        ground_truth=ground_truth,
-        grouped=grouped,
-        scales=Scales(**scales),
-        changes=values | derived,
-        **own,
-    )
-
-
-def _thresholds(text: str | None) -> tuple[float, float, float] | None:
-    """Returns the thresholds of δ1…δ3 from one number, which is raised to powers, or from three."""
-    if text is None:
-        return None
-    try:
-        first, *others = (float(word) for word in text.split(","))
-        second, third = others or (first**2, first**3)
-    except (ValueError, OverflowError):
-        raise UsageError(
-            f"--delta {text!r} is neither one number such as 1.25 nor three numbers"
-        ) from None
-    return first, second, third

@@ -188,7 +188,7 @@ sparse_output = click.option(
 
 
 def table_files(*, csv: str, markdown: str, latex: str) -> Callable[[Any], Any]:
-    """Returns a decorator that adds the options of `score_tables.TableFiles`.
+    """Returns a decorator that adds the options of `tables.TableFiles`.
 
     Args:
         csv: Help text of `--csv`.

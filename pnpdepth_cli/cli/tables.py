@@ -1,73 +1,136 @@
-"""Results as tables on stderr."""
+"""Tables: results of commands on stdout and stderr, and the files they are written to."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from typing import Any
 
+import click
 from rich.box import SIMPLE_HEAD
-from rich.console import Console, JustifyMethod
+from rich.console import Console
 from rich.markup import escape
-from rich.table import Table
+from rich.table import Table as RichTable
 
 from pnpdepth_cli.cli.printable import printable
+from pnpdepth_cli.errors import OutputError, UsageError
+from pnpdepth_cli.pipeline.tables import Cell, Table, write_text
 
-_SCORES: tuple[tuple[str, str, Callable[[float], str]], ...] = (
-    ("RMSE", "rmse", lambda v: f"{v:.4f} m"),
-    ("MAE", "mae", lambda v: f"{v:.4f} m"),
-    ("MRE", "mre", lambda v: f"{v:.4f}"),
-    ("iRMSE", "irmse", lambda v: f"{v:.2f} 1/km"),
-    ("SILog", "silog", lambda v: f"{v:.2f}"),
-    ("δ1", "delta1", lambda v: f"{v:.2%}"),
-    ("δ2", "delta2", lambda v: f"{v:.2%}"),
-    ("δ3", "delta3", lambda v: f"{v:.2%}"),
-)
+_COLOURS = {"": "", "bold": "bold", "dim": "dim", "good": "green", "bad": "red"}
 
 
-_STAGES = {
-    "read": "reading and decoding, beside the network",
-    "refine": "network",
-    "write": "scoring, encoding and writing, beside the network",
-    "wall": "wall",
-}
+@dataclass(frozen=True, kw_only=True)
+class TableFiles:
+    """Where the tables of a command are written; `-` is stdout."""
 
+    csv: Path | None
+    markdown: Path | None
+    latex: Path | None
+    overwrite: bool
+    """Whether existing files are replaced."""
+    as_json: bool
+    """Whether the result goes to stdout as JSON."""
 
-_COLUMNS = ("", "before", "after", "change", "linear", "vs linear")
+    def check(self, inputs: Sequence[Path]) -> None:
+        """Checks the files before the work.
 
+        Raises:
+            UsageError: Two outputs go to one file or to stdout.
+            OutputError: A file is an input, or exists and is not to be replaced.
+        """
+        named = {"--csv": self.csv, "--markdown": self.markdown, "--latex": self.latex}
+        if sum(str(path) == "-" for path in named.values()) + self.as_json > 1:
+            raise UsageError(
+                "only one of --json, --csv -, --markdown - and --latex - can go to stdout"
+            )
+        options: dict[Path, str] = {}
+        for option, path in named.items():
+            if path is None or str(path) == "-":
+                continue
+            first = options.setdefault(path.resolve(), option)
+            if first != option:
+                raise UsageError(f"{first} and {option} are the same file {path}; name two files")
+            if path.resolve() in {source.resolve() for source in inputs}:
+                raise OutputError(f"{path} is one of the inputs; name another output")
+            if path.exists() and not self.overwrite:
+                raise OutputError(f"{path} exists; --overwrite replaces it")
+            if not path.parent.is_dir():
+                raise OutputError(f"{path}: its folder does not exist; create it first")
 
-def print_refinement(record: Mapping[str, Any]) -> None:
-    """Prints the end of `pnpdepth refine`: notes, errors before and after, files, times."""
-    console = Console(stderr=True, highlight=False)
-    _print_notes(console, record["notes"])
-    settings, beside = record["settings"], record["linear"]
-    is_default = record["method"]["kind"] == "default"
-    console.print(_stages(record) if is_default else _before_and_after(record))
-    if beside["worse"]:
-        console.print(
-            "[yellow]warning: this depth is worse than linear interpolation of the points[/]"
+    def write(self, *, csv: Table, markdown: Table, latex: Table) -> bool:
+        """Writes the files that were named. Returns whether a text went to stdout."""
+        targets = (
+            (self.csv, csv.csv),
+            (self.markdown, markdown.markdown),
+            (self.latex, latex.latex),
         )
-    if record["baselines"] is not None:
-        console.print(_baselines(record["baselines"], record["unit"]))
-    if record["improved_fraction"] is not None:
-        where = "pixels with ground truth" if record["scores"] else "points"
-        console.print(f"improved: {record['improved_fraction']:.1%} of the {where}")
-    seconds = record["seconds"]
-    updates = (
-        f"{settings['iterations']} updates ({settings['update']}, {settings['loss']}, step"
-        f" {settings['step']:.3g}) · "
-    )
-    console.print(
-        ("" if is_default else updates)
-        + ", ".join(f"{stage} {spent:.2f} s" for stage, spent in seconds.items())
-        + f" · peak {record['peak_memory_mb']['process']:,.0f} MB",
-        soft_wrap=True,
-    )
-    written = [path for path in record["outputs"].values() if path]
-    console.print("wrote " + escape("  ".join(written)), soft_wrap=True)
+        for path, text in targets:
+            if str(path) == "-":
+                click.echo(text().encode("utf-8", "backslashreplace"), nl=False)
+            elif path is not None:
+                write_text(path, text())
+        return any(str(path) == "-" for path, _ in targets)
 
 
+def print_table(table: Table) -> None:
+    """Prints a table on stdout, as wide as needed unless stdout is a terminal."""
+    console = Console(highlight=False)
+    shown = RichTable(
+        title=escape(printable(table.caption)),
+        title_justify="left",
+        box=SIMPLE_HEAD,
+        pad_edge=False,
+    )
+    for number, column in enumerate(table.header):
+        first = number == 0
+        shown.add_column(
+            escape(column), overflow="fold", justify="left" if first else "right", no_wrap=first
+        )
+    for row in table.rows:
+        shown.add_row(*map(_markup, row))
+    if not console.is_terminal:
+        wide = console.options.update(max_width=1000)
+        console.width = max(console.width, console.measure(shown, options=wide).maximum)
+    console.print(shown)
+
+
+def print_rows(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+    """Prints a table on stdout; its arguments are those of `Table`."""
+    print_table(Table(caption=title, header=columns, rows=rows))
+
+
+def _markup(cell: str) -> str:
+    text = escape(printable(cell))
+    colour = _COLOURS[cell.style] if isinstance(cell, Cell) else ""
+    return f"[{colour}]{text}[/]" if colour else text
+
+
+def print_notes(notes: Sequence[str]) -> None:
+    """Prints a line for each on stderr, warnings in a colour."""
+    console = Console(stderr=True, highlight=False)
+    for note in notes:
+        style = "yellow" if note.startswith("warning") else "dim"
+        console.print(escape(printable(note)), style=style, soft_wrap=True)
+
+
+_Row = tuple[str, str, Callable[[float], str]]
+"""Title, key and text of an error."""
+_SCORES: tuple[_Row, ...] = (
+    ("RMSE", "rmse", "{:.4f} m".format),
+    ("MAE", "mae", "{:.4f} m".format),
+    ("MRE", "mre", "{:.4f}".format),
+    ("iRMSE", "irmse", "{:.2f} 1/km".format),
+    ("SILog", "silog", "{:.2f}".format),
+    ("δ1", "delta1", "{:.2%}".format),
+    ("δ2", "delta2", "{:.2%}".format),
+    ("δ3", "delta3", "{:.2%}".format),
+)
+_CHECKED = {"before": "aligned", "after": "result", "linear": "linear"}
+"""Columns of a fixed method, by what the check at hidden points calls them."""
+_COLUMNS = ("", "before", "after", "change", "linear", "vs linear")
 _STAGES_OF_DEFAULT = {
     "aligned": "{name} aligned",
     "fused": "with points, fused",
@@ -78,85 +141,123 @@ _STAGES_OF_DEFAULT = {
 }
 """Rows of the default method, by the name of the stage."""
 _STAGE_SCORES = ("RMSE", "MAE", "MRE", "δ1")
+_STAGES = {
+    "read": "reading and decoding, beside the network",
+    "refine": "network",
+    "write": "scoring, encoding and writing, beside the network",
+    "wall": "wall",
+}
 
 
-def _stages(record: Mapping[str, Any]) -> Table:
+def print_refinement(record: Mapping[str, Any]) -> None:
+    """Prints the end of `pnpdepth refine`: notes, errors before and after, files, times."""
+    console = Console(stderr=True, highlight=False)
+    print_notes(record["notes"])
+    settings = record["settings"]
+    is_default = record["method"]["kind"] == "default"
+    console.print(_stages(record) if is_default else _before_and_after(record))
+    if record["linear"]["worse"]:
+        console.print(
+            "[yellow]warning: this depth is worse than linear interpolation of the points[/]"
+        )
+    if record["baselines"] is not None:
+        console.print(_baselines(record["baselines"], record["unit"]))
+    if record["improved_fraction"] is not None:
+        where = "pixels with ground truth" if record["scores"] else "points"
+        console.print(f"improved: {record['improved_fraction']:.1%} of the {where}")
+    updates = (
+        f"{settings['iterations']} updates ({settings['update']}, {settings['loss']}, step"
+        f" {settings['step']:.3g}) · "
+    )
+    console.print(
+        ("" if is_default else updates)
+        + ", ".join(f"{stage} {spent:.2f} s" for stage, spent in record["seconds"].items())
+        + f" · peak {record['peak_memory_mb']['process']:,.0f} MB",
+        soft_wrap=True,
+    )
+    _print_written(console, "wrote", record)
+
+
+def _print_written(console: Console, start: str, record: Mapping[str, Any]) -> None:
+    written = [path for path in record["outputs"].values() if path]
+    console.print(f"{start} {escape('  '.join(written))}", soft_wrap=True)
+
+
+def _empty(title: str, columns: Sequence[str]) -> RichTable:
+    table = RichTable(title=escape(title))
+    for column in columns:
+        table.add_column(column, justify="right" if column else "left")
+    return table
+
+
+def _stages(record: Mapping[str, Any]) -> RichTable:
     """The stages of the default method: scores on the ground truth, or errors at hidden points."""
-    beside, unit = record["linear"], record["unit"]
-    names = " + ".join(record["method"]["networks"])
-    table = Table(title=escape(names))
-    table.add_column("")
+    beside, names = record["linear"], record["method"]["networks"]
     if record["stages"] is not None:
         rows = {each["stage"]: each["scores"] for each in record["stages"]}
         rows |= {"result": record["scores"]["after"], "linear": beside["scores"]}
-        known = rows["linear"]
         columns = [(title, key, show) for title, key, show in _SCORES if title in _STAGE_SCORES]
-        table.caption = (
-            f"scored on {known['pixels']:,} pixels of ground truth"
-            f" ({known['coverage']:.1%} of those known)"
-        )
+        caption = _scored_on(rows["linear"])
     elif (check := beside["check"]) is not None:
         rows = {name: {"mae": check[name]} for name in _STAGES_OF_DEFAULT if name in check}
-        columns = [("MAE", "mae", partial(_length, unit=unit))]
-        table.caption = f"at {check['points']:,} points that were hidden from the method"
+        columns = [("MAE", "mae", partial(_length, unit=record["unit"]))]
+        caption = f"at {check['points']:,} points that were hidden from the method"
     else:
-        table.caption = "too few points to hide some and check the result"
-        return table
-    if len(record["method"]["networks"]) == 1:
+        rows, columns = {}, []
+        caption = "too few points to hide some and check the result"
+    table = _empty(
+        " + ".join(names), ["", *(title for title, *_ in columns), *["MAE vs linear"] * bool(rows)]
+    )
+    table.caption = caption
+    if len(names) == 1:
         rows.pop("fused", None)
-    if rows["result"]["mae"] == rows["propagated"]["mae"]:
+    if rows and rows["result"]["mae"] == rows["propagated"]["mae"]:
         del rows["result"]
-    for title, *_ in columns:
-        table.add_column(title, justify="right")
-    table.add_column("MAE vs linear", justify="right")
+    last = [name for name in rows if name != "linear"][-1:]
     for name, scores in rows.items():
         title = _STAGES_OF_DEFAULT[name].format(name=record["model"]["name"])
         against = "" if name == "linear" else _change("mae", rows["linear"]["mae"], scores["mae"])
-        last = name == [row for row in rows if row != "linear"][-1]
         cells = [show(scores[key]) for _, key, show in columns]
-        table.add_row(escape(title), *cells, against, style="bold" if last else None)
+        table.add_row(escape(title), *cells, against, style="bold" if [name] == last else None)
     return table
 
 
-def _before_and_after(record: Mapping[str, Any]) -> Table:
+def _before_and_after(record: Mapping[str, Any]) -> RichTable:
     """The errors of a fixed method before and after, beside linear interpolation."""
     points, beside, unit = record["points"], record["linear"], record["unit"]
-    table = Table(title=escape(f"{record['model']['name']} cut at {record['settings']['layer']}"))
-    for column in _COLUMNS:
-        table.add_column(column, justify="left" if not column else "right")
-    used = f"error at {points['used']:,} points used"
-    _point_rows(table, used, record["sparse_error"], unit=unit)
-    held_out = f"error at {points['held_out']:,} held-out points"
-    _point_rows(table, held_out, record["held_out_error"], beside["held_out_error"], unit=unit)
+    table = _empty(f"{record['model']['name']} cut at {record['settings']['layer']}", _COLUMNS)
+    used = _of_points(f"error at {points['used']:,} points used", unit)
+    _add_rows(table, used, record["sparse_error"])
+    held_out = _of_points(f"error at {points['held_out']:,} held-out points", unit)
+    _add_rows(table, held_out, record["held_out_error"], beside["held_out_error"])
     if record["scores"] is not None:
-        after = record["scores"]["after"]
-        _score_rows(table, record["scores"], beside["scores"])
-        table.caption = (
-            f"scored on {after['pixels']:,} pixels of ground truth"
-            f" ({after['coverage']:.1%} of those known)"
-        )
+        table.add_section()
+        _add_rows(table, _SCORES, record["scores"], beside["scores"])
+        table.caption = _scored_on(record["scores"]["after"])
     elif (check := beside["check"]) is not None:
-        errors = {"before": check["aligned"], "after": check["result"], "linear": check["linear"]}
-        _check_row(table, f"error at {check['points']:,} hidden points, MAE", errors, unit)
+        title = f"error at {check['points']:,} hidden points"
+        errors = {name: {"mae": check[of]} for name, of in _CHECKED.items()}
+        _add_rows(table, _of_points(title, unit, "mae"), errors, errors["linear"])
     return table
 
 
-def _baselines(rows: Mapping[str, Any], unit: str) -> Table:
+def _scored_on(scores: Mapping[str, Any]) -> str:
+    return (
+        f"scored on {scores['pixels']:,} pixels of ground truth"
+        f" ({scores['coverage']:.1%} of those known)"
+    )
+
+
+def _baselines(rows: Mapping[str, Any], unit: str) -> RichTable:
     """Returns the baselines, the network and the result, best first at the held-out points."""
-    with_gt = any(row["scores"] for row in rows.values())
-    table = Table(title="against every simple baseline")
-    of_gt = ["MAE, ground truth", "RMSE, ground truth"] if with_gt else []
-    columns = ["", "MAE, held-out points", *of_gt]
-    for column in columns:
-        table.add_column(column, justify="left" if not column else "right")
+    keys = ("mae", "rmse") if any(row["scores"] for row in rows.values()) else ()
+    columns = ["", "MAE, held-out points", *(f"{key.upper()}, ground truth" for key in keys)]
+    table = _empty("against every simple baseline", columns)
     known = {name: row for name, row in rows.items() if row["held_out_mae"] is not None}
-    order = sorted(known, key=lambda name: known[name]["held_out_mae"]) or list(rows)
-    for name in order:
+    for name in sorted(known, key=lambda name: known[name]["held_out_mae"]) or list(rows):
         row = rows[name]
-        cells = [_length(row["held_out_mae"], unit)]
-        if with_gt:
-            scores = row["scores"] or {}
-            cells += [_length(scores.get(key), unit) for key in ("mae", "rmse")]
+        values = [row["held_out_mae"], *((row["scores"] or {}).get(key) for key in keys)]
+        cells = [_length(value, unit) for value in values]
         table.add_row(name, *cells, style="bold" if name == "result" else None)
     return table
 
@@ -165,25 +266,20 @@ def print_batch(summary: Mapping[str, Any]) -> None:
     """Prints the end of `pnpdepth batch`: mean errors before and after, counts, files."""
     console = Console(stderr=True, highlight=False)
     mean, counts, unit = summary["mean"], summary["counts"], summary["unit"]
+    beside = summary["linear"]
     if any(mean.values()):
-        table = Table(title="means over frames")
-        for column in _COLUMNS:
-            table.add_column(column, justify="left" if not column else "right")
-        beside = summary["linear"]
-        _point_rows(table, "error at points used", mean["sparse_error"], unit=unit)
-        _point_rows(
-            table,
-            "error at held-out points",
-            mean["held_out_error"],
-            beside["held_out_error"],
-            unit=unit,
-        )
+        table = _empty("means over frames", _COLUMNS)
+        _add_rows(table, _of_points("error at points used", unit), mean["sparse_error"])
+        held_out, linear = mean["held_out_error"], beside["held_out_error"]
+        _add_rows(table, _of_points("error at held-out points", unit), held_out, linear)
         if mean["scores"] is not None:
-            _score_rows(table, mean["scores"], beside["scores"])
+            table.add_section()
+            _add_rows(table, _SCORES, mean["scores"], beside["scores"])
             table.caption = f"scored on the ground truth of {mean['scores']['frames']:,} frames"
-        elif mean["held_out_error"] is None and (check := beside["check"]) is not None:
-            title = f"error at hidden points, {check['frames']:,} frames, MAE"
-            _check_row(table, title, check, unit)
+        elif held_out is None and (check := beside["check"]) is not None:
+            title = f"error at hidden points, {check['frames']:,} frames"
+            errors = {name: {"mae": check[name]} for name in _CHECKED}
+            _add_rows(table, _of_points(title, unit, "mae"), errors, errors["linear"])
         console.print(table)
     if summary["baselines"]:
         rows = {
@@ -195,11 +291,11 @@ def print_batch(summary: Mapping[str, Any]) -> None:
     parts += [
         f"{counts[kind]:,} {kind}" for kind in ("diverged", "failed", "pending") if counts[kind]
     ]
-    parts += [f"{counts['with_warnings']:,} with warnings"] if counts["with_warnings"] else []
-    if (compared := summary["linear"])["frames"]:
-        parts += [
-            f"{compared['worse']:,} of {compared['frames']:,} worse than linear interpolation"
-        ]
+    if counts["with_warnings"]:
+        parts.append(f"{counts['with_warnings']:,} with warnings")
+    if beside["frames"]:
+        worse = f"{beside['worse']:,} of {beside['frames']:,}"
+        parts.append(f"{worse} worse than linear interpolation")
     console.print(", ".join(parts))
     output = summary["output"]
     console.print("wrote " + escape(f"{output}/summary.json  {output}/summary.csv"), soft_wrap=True)
@@ -212,92 +308,43 @@ def print_profile(profile: Mapping[str, Any]) -> None:
     if not frames:
         console.print("no frame was refined; there are no times")
         return
-    table = Table(title="where the time went")
-    for column in ("", "seconds", "ms a frame", "of the time"):
-        table.add_column(column, justify="left" if not column else "right")
+    table = _empty("where the time went", ("", "seconds", "ms a frame", "of the time"))
     for stage, spent in seconds.items():
-        table.add_row(
-            _STAGES[stage],
-            f"{spent:.2f}",
-            f"{1000 * spent / frames:.1f}",
-            f"{spent / seconds['wall']:.1%}",
-        )
+        cells = (f"{spent:.2f}", f"{1000 * spent / frames:.1f}", f"{spent / seconds['wall']:.1%}")
+        table.add_row(_STAGES[stage], *cells)
     table.caption = f"{frames:,} frames, {profile['frames_per_second']:.2f} a second"
     console.print(table)
 
 
 def print_sparse(record: Mapping[str, Any]) -> None:
     """Prints the end of `pnpdepth project`, `sample` and `simulate`: notes, points, files."""
-    console = Console(stderr=True, highlight=False)
-    _print_notes(console, record["notes"])
+    print_notes(record["notes"])
     points, (width, height) = record["points"], record["size"]
-    written = [path for path in record["outputs"].values() if path]
-    console.print(
+    start = (
         f"wrote {points['count']:,} points, {points['fraction_of_pixels']:.2%} of {width}×{height}"
-        f" pixels: {escape('  '.join(written))}",
-        soft_wrap=True,
+        " pixels:"
     )
+    _print_written(Console(stderr=True, highlight=False), start, record)
 
 
-def print_rows(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    """Prints a table on stdout, as wide as needed unless stdout is a terminal."""
-    console = Console(highlight=False)
-    table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
-    for number, column in enumerate(columns):
-        first = number == 0
-        justify: JustifyMethod = "left" if first else "right"
-        table.add_column(column, overflow="fold", justify=justify, no_wrap=first)
-    for row in rows:
-        table.add_row(*(escape(cell) for cell in row))
-    if not console.is_terminal:
-        wide = console.options.update(max_width=1000)
-        console.width = max(console.width, console.measure(table, options=wide).maximum)
-    console.print(table)
+def _of_points(title: str, unit: str, *keys: str) -> list[_Row]:
+    show = partial(_length, unit=unit)
+    return [(f"{title}, {key.upper()}", key, show) for key in keys or ("mae", "rmse")]
 
 
-def _print_notes(console: Console, notes: Sequence[str]) -> None:
-    for note in notes:
-        style = "yellow" if note.startswith("warning") else "dim"
-        console.print(escape(printable(note)), style=style, soft_wrap=True)
-
-
-def _point_rows(
-    table: Table,
-    title: str,
-    error: Mapping[str, Any] | None,
+def _add_rows(
+    table: RichTable,
+    rows: Sequence[_Row],
+    errors: Mapping[str, Any] | None,
     linear: Mapping[str, Any] | None = None,
-    *,
-    unit: str,
 ) -> None:
-    if error is not None:
-        before, after = error["before"], error["after"]
-        for name, key in (("MAE", "mae"), ("RMSE", "rmse")):
-            values = before.get(key), after.get(key), (linear or {}).get(key)
-            table.add_row(f"{title}, {name}", *_cells(key, partial(_length, unit=unit), values))
-
-
-def _score_rows(table: Table, scores: Mapping[str, Any], linear: Mapping[str, Any] | None) -> None:
-    before, after = scores["before"], scores["after"]
-    table.add_section()
-    for title, key, show in _SCORES:
-        values = before.get(key), after.get(key), (linear or {}).get(key)
-        table.add_row(title, *_cells(key, show, values))
-
-
-def _check_row(table: Table, title: str, errors: Mapping[str, float], unit: str) -> None:
-    values = errors["before"], errors["after"], errors["linear"]
-    table.add_row(title, *_cells("mae", partial(_length, unit=unit), values))
-
-
-def _cells(
-    key: str,
-    show: Callable[[float], str],
-    values: tuple[float | None, float | None, float | None],
-) -> list[str]:
-    """Before, after, change, linear interpolation, and the change against it."""
-    before, after, linear = values
-    shown = ["–" if v is None or math.isnan(v) else show(v) for v in values]
-    return [*shown[:2], _change(key, before, after), shown[2], _change(key, linear, after)]
+    """Adds rows of before, after, change, linear interpolation, and the change against it."""
+    for title, key, show in rows if errors is not None else ():
+        sides = (errors or {})["before"], (errors or {})["after"], linear or {}
+        before, after, beside = (side.get(key) for side in sides)
+        shown = ["–" if v is None or math.isnan(v) else show(v) for v in (before, after, beside)]
+        changes = _change(key, before, after), _change(key, beside, after)
+        table.add_row(title, *shown[:2], changes[0], shown[2], changes[1])
 
 
 def _length(value: float | None, unit: str) -> str:
@@ -308,11 +355,10 @@ def _change(key: str, before: float | None, after: float | None) -> str:
     if before is None or after is None or math.isnan(before) or math.isnan(after):
         return "[dim]–[/]"
     if key.startswith("delta"):
-        points = 100 * (after - before)
-        colour = "green" if points > 0 else "red" if points < 0 else "dim"
-        return f"[{colour}]{points:+.2f} pt[/]"
-    if before == 0:
+        change, text = after - before, f"{100 * (after - before):+.2f} pt"
+    elif before == 0:
         return "[dim]–[/]"
-    change = after / before - 1
-    colour = "green" if change < 0 else "red" if change > 0 else "dim"
-    return f"[{colour}]{change:+.1%}[/]"
+    else:
+        change, text = 1 - after / before, f"{after / before - 1:+.1%}"
+    colour = "green" if change > 0 else "red" if change < 0 else "dim"
+    return f"[{colour}]{text}[/]"

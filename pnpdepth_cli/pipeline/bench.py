@@ -5,16 +5,14 @@ from __future__ import annotations
 import ctypes
 import statistics
 import time
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
-from torch.utils.flop_counter import FlopCounterMode
 
 from pnpdepth_cli.choices import LOSSES
 from pnpdepth_cli.core.refine import RefineSettings, refine
@@ -22,19 +20,17 @@ from pnpdepth_cli.core.split import Split, gradient_at
 from pnpdepth_cli.errors import NoPointsError, UsageError
 from pnpdepth_cli.frames.frame import Frame
 from pnpdepth_cli.frames.prepare import PreparedFrame, prepare
-from pnpdepth_cli.frames.refine import refine_frame
 from pnpdepth_cli.models.definition import Fixed
 from pnpdepth_cli.models.frame import synthetic_frame
-from pnpdepth_cli.models.network import Network, load_network, out_of_memory_is_a_device_error
+from pnpdepth_cli.models.network import load_network, out_of_memory_is_a_device_error
 from pnpdepth_cli.models.rank_layers import default_layer
 from pnpdepth_cli.pipeline.refinement.request import MethodOptions
 from pnpdepth_cli.pipeline.refinement.resolve import resolve_layer, resolve_settings
 from pnpdepth_cli.pipeline.stopwatch import versions
 
 DEFAULT_SIZE = (480, 640)
-FIRST_FRAME, FULL = "refinement, first frame", "refinement, fp32"
-MASKED = "refinement, hidden points"
-_WITH_PEAK = ("forward", "refinement", FIRST_FRAME, FULL, MASKED)
+FIRST_FRAME = "refinement, first frame"
+_WITH_PEAK = ("forward", "refinement", FIRST_FRAME)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,8 +44,6 @@ class BenchRequest:
     """(H, W) of the synthetic frame."""
     points: int = 500
     iterations: int | None = None
-    target: str = "given"
-    """"masked" times refinement by hidden points as well, with the network's defaults."""
     precision: str = "fp32"
     device: str = "cpu"
     repeats: int = 10
@@ -57,28 +51,13 @@ class BenchRequest:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Quartiles:
-    """Quartiles of the seconds of several runs."""
-
-    median: float
-    lower: float
-    upper: float
-    runs: int
-
-    @classmethod
-    def of(cls, seconds: Sequence[float]) -> Quartiles:
-        """Returns the quartiles of at least one run."""
-        many = list(seconds) if len(seconds) > 1 else [*seconds] * 2
-        lower, median, upper = statistics.quantiles(many, n=4, method="inclusive")
-        return cls(median=median, lower=lower, upper=upper, runs=len(seconds))
-
-
-@dataclass(frozen=True, kw_only=True)
 class BenchPart:
-    """One timed part."""
+    """One timed part: quartiles of the seconds of its runs."""
 
     name: str
-    seconds: Quartiles
+    median_s: float
+    lower_s: float
+    upper_s: float
     forwards: float
     """Its median in forward passes."""
     peak_mb: float | None
@@ -87,11 +66,7 @@ class BenchPart:
 
 @dataclass(frozen=True, kw_only=True)
 class Bench:
-    """The result of `run_bench`.
-
-    The limit, (front + (2K + 1)·rear) / (front + rear) forward passes, is what K updates cost at
-    least.
-    """
+    """The result of `run_bench`."""
 
     model: str
     checkpoint: str | None
@@ -110,12 +85,8 @@ class Bench:
     """Of torch on the CPU."""
     versions: dict[str, str]
     parts: tuple[BenchPart, ...]
-    limit_by_flops: float | None
-    """The limit by counts of operations; None if none can be counted."""
-    limit_measured: float
-    """The limit by the times of front and rear."""
-    depth_change: float | None
-    """Mean |d − d'| / d', d' refined in fp32; None if the precision is fp32."""
+    limit: float
+    """(front + (2K + 1)·rear) / (front + rear) forward passes: what K updates cost at least."""
     notes: tuple[str, ...]
 
     def part(self, name: str) -> BenchPart:
@@ -138,7 +109,14 @@ def run_bench(
         raise UsageError(
             f"repeats {request.repeats}, points {request.points}: there must be at least one"
         )
-    network = _network(request, request.precision)
+    torch.manual_seed(0)  # the same random weights each time
+    network = load_network(
+        request.model,
+        request.checkpoint,
+        request.device,
+        precision=request.precision,
+        untrained=True,
+    )
     policy = network.definition.size
     own = (policy.height, policy.width) if isinstance(policy, Fixed) else DEFAULT_SIZE
     rgb, points = synthetic_frame(request.size or own, request.points)
@@ -153,30 +131,25 @@ def run_bench(
     prepared = prepare(network, Frame(rgb=rgb[0], points=points))
     if not len(prepared.points):
         raise NoPointsError(f"none of {len(points)} points lies in the network's view; take more")
-    with out_of_memory_is_a_device_error(network.device), ExitStack() as stack:
-        split = stack.enter_context(network.cut_at(layer))
+    with out_of_memory_is_a_device_error(network.device), network.cut_at(layer) as split:
         todo = _parts(split, layer, prepared, settings)
-        change = None
-        if request.precision != "fp32":
-            full = replace(prepared, network=_network(request, "fp32"))
-            full_split = stack.enter_context(full.network.cut_at(layer))
-            todo[FULL] = Timed(run=lambda _: _refined(full_split, full, settings))
-            depth, exact = _refined(split, prepared, settings), todo[FULL].run(None)
-            change = float(((depth - exact).abs() / exact)[exact > 0].mean())
-        if request.target == "masked":
-            masked = replace(method, target="masked", iterations=None)
-            todo[MASKED] = _masked(prepared, resolve_settings(network.definition, masked))
         spent = in_turn(todo, request.repeats, network.device, on_round=on_round)
-        peaks = {
-            name: peak_mb(partial(_once, timed), network.device)
-            for name, timed in todo.items()
-            if name in _WITH_PEAK
-        }
-        operations = _operations(split, prepared)
-    seconds = {name: Quartiles.of(each) for name, each in spent.items()}
-    front, rear = seconds["front"].median, seconds["rear"].median
-    measured = _limit(front, rear, settings.iterations)
-    assert measured is not None
+        peaks = {name: peak_mb(todo[name], network.device) for name in _WITH_PEAK}
+    forward, front, rear = (statistics.median(spent[name]) for name in ("forward", "front", "rear"))
+    parts = []
+    for name, seconds in spent.items():
+        many = seconds if len(seconds) > 1 else seconds * 2
+        lower, median, upper = statistics.quantiles(many, n=4, method="inclusive")
+        parts.append(
+            BenchPart(
+                name=name,
+                median_s=median,
+                lower_s=lower,
+                upper_s=upper,
+                forwards=median / forward,
+                peak_mb=peaks.get(name),
+            )
+        )
     return Bench(
         model=request.model,
         checkpoint=str(network.checkpoint) if network.checkpoint else None,
@@ -189,108 +162,46 @@ def run_bench(
         device=str(network.device),
         threads=torch.get_num_threads(),
         versions=versions(),
-        parts=tuple(
-            BenchPart(
-                name=name,
-                seconds=each,
-                forwards=each.median / seconds["forward"].median,
-                peak_mb=peaks.get(name),
-            )
-            for name, each in seconds.items()
-        ),
-        limit_by_flops=_limit(*operations, settings.iterations),
-        limit_measured=measured,
-        depth_change=change,
+        parts=tuple(parts),
+        limit=(front + (2 * settings.iterations + 1) * rear) / (front + rear),
         notes=tuple(network.notes),
-    )
-
-
-def _network(request: BenchRequest, precision: str) -> Network:
-    """The network of the request, with the same random weights each time if it has none."""
-    torch.manual_seed(0)
-    return load_network(
-        request.model, request.checkpoint, request.device, precision=precision, untrained=True
     )
 
 
 def _parts(
     split: Split, layer: str, prepared: PreparedFrame, settings: RefineSettings
-) -> dict[str, Timed]:
+) -> dict[str, Callable[[], object]]:
     """The network, its front and rear, and the refinement; tensors in, tensors out."""
     network, arguments, no_grad = prepared.network, prepared.arguments, torch.no_grad()
-    loss_of = LOSSES[settings.loss]
+    reader, loss_of = prepared.depth_reader(settings), LOSSES[settings.loss]
     z = no_grad(split.front)(*arguments)
 
-    def loss() -> tuple[Tensor, Tensor]:
+    def rear_and_gradient() -> Tensor | None:
         leaf = z.clone().requires_grad_(True)
         with torch.enable_grad():
             depth = network.depth_of(split.rear(leaf))
-            return leaf, loss_of(prepared.points.sample(depth), prepared.points.depth)
+            loss = loss_of(prepared.points.sample(depth), prepared.points.depth)
+            return gradient_at(leaf, loss)
 
-    def first_frame(_: object) -> None:
+    def refined(cut: Split) -> Tensor:
+        return refine(cut, arguments, prepared.points, settings, depth_of=reader).after
+
+    def first_frame() -> Tensor:
         with network.cut_at(layer) as fresh:
-            _refined(fresh, prepared, settings)
+            return refined(fresh)
 
     return {
-        "forward": Timed(run=no_grad(lambda _: network.module(*arguments))),
-        "front": Timed(run=no_grad(lambda _: split.front(*arguments))),
-        "rear": Timed(run=no_grad(lambda _: split.rear(z))),
-        "rear backward": Timed(run=lambda started: gradient_at(*started), prepare=loss),
-        "refinement": Timed(run=lambda _: _refined(split, prepared, settings)),
-        FIRST_FRAME: Timed(run=first_frame),
+        "forward": no_grad(partial(network.module, *arguments)),
+        "front": no_grad(partial(split.front, *arguments)),
+        "rear": no_grad(partial(split.rear, z)),
+        "rear and gradient": rear_and_gradient,
+        "refinement": partial(refined, split),
+        FIRST_FRAME: first_frame,
     }
 
 
-def _masked(prepared: PreparedFrame, settings: RefineSettings) -> Timed:
-    """A refinement by hidden points, the cut included."""
-
-    def run(_: object) -> None:
-        with prepared.network.cut_at_points() as split:
-            refine_frame(prepared.network, split, settings, prepared.frame)
-
-    return Timed(run=run)
-
-
-def _refined(split: Split, prepared: PreparedFrame, settings: RefineSettings) -> Tensor:
-    reader = prepared.depth_reader(settings)
-    return refine(split, prepared.arguments, prepared.points, settings, depth_of=reader).after
-
-
-@torch.no_grad()
-def _operations(split: Split, prepared: PreparedFrame) -> tuple[float, float]:
-    """Floating-point operations of the front and of the rear."""
-    z = split.front(*prepared.arguments)
-    with FlopCounterMode(display=False) as whole:
-        prepared.network.module(*prepared.arguments)
-    with FlopCounterMode(display=False) as behind:
-        split.rear(z)
-    rear = behind.get_total_flops()
-    return max(0, whole.get_total_flops() - rear), rear
-
-
-def _limit(front: float, rear: float, iterations: int) -> float | None:
-    return (front + (2 * iterations + 1) * rear) / (front + rear) if front + rear else None
-
-
-# measuring
-
-
-def _once(timed: Timed) -> None:
-    timed.run(timed.prepare())
-
-
-@dataclass(frozen=True, kw_only=True)
-class Timed:
-    """A function to time."""
-
-    run: Callable[[Any], Any]
-    """Takes the result of `prepare`; timed."""
-    prepare: Callable[[], Any] = lambda: None
-    """Called before each run; not timed."""
-
-
 def in_turn(
-    todo: Mapping[str, Timed],
+    todo: Mapping[str, Callable[[], object]],
     repeats: int,
     device: torch.device,
     *,
@@ -308,11 +219,10 @@ def in_turn(
     """
     spent: dict[str, list[float]] = {name: [] for name in todo}
     for number in range(-1, repeats):
-        for name, timed in todo.items():
-            prepared = timed.prepare()
+        for name, run in todo.items():
             _synchronise(device)
             start = time.perf_counter()
-            timed.run(prepared)
+            run()
             _synchronise(device)
             if number >= 0:
                 spent[name].append(time.perf_counter() - start)
@@ -321,7 +231,6 @@ def in_turn(
 
 
 def _synchronise(device: torch.device) -> None:
-    """Waits until the device has finished its work."""
     if device.type != "cpu":
         torch.get_device_module(device).synchronize()
 
@@ -355,12 +264,8 @@ def _kilobytes(name: str) -> int:
     return next(int(line.split()[1]) for line in lines if line.startswith(f"{name}:"))
 
 
-# the paper's table IV
-
-
-@dataclass(frozen=True, kw_only=True)
-class PaperTime:
-    """A network of the paper, and the seconds that the paper prints; None if not printed."""
+class PaperTime(NamedTuple):
+    """A network of the paper's Table IV, and the seconds that the paper prints."""
 
     name: str
     """The paper's name of it."""
@@ -370,61 +275,17 @@ class PaperTime:
     size: tuple[int, int]
     """(H, W) of its frames."""
     before: float | None = None
-    """The network alone, on a GPU that the paper does not name."""
+    """The network alone, on a GPU that the paper does not name; None if not printed."""
     after: float | None = None
 
-    @property
-    def forwards(self) -> float | None:
-        """The paper's refinement in forward passes."""
-        return None if self.before is None or self.after is None else self.after / self.before
 
-
-_NYU, _KITTI = (228, 304), (352, 1216)
-PAPER_TIMES = tuple(
-    PaperTime(name=name, model=model, data=data, size=size, before=before, after=after)
-    for name, model, data, size, before, after in (
-        ("Eigen", "eigen", "NYU", _NYU, None, None),
-        ("FCRN", "fcrn", "NYU", _NYU, None, None),
-        ("Zhou", "sfmlearner", "KITTI", (128, 416), None, None),
-        ("Uhrig", "sparseconv", "KITTI", _KITTI, 0.0311, 0.1614),
-        ("Chodosh", "adnn", "KITTI", _KITTI, 0.0320, 0.0447),
-        ("Ma", "sparse2dense-r18-deconv3", "NYU", _NYU, 0.0046, 0.0233),
-        ("Jaritz", "latefusion", "NYU", (224, 320), 0.0484, 0.1593),
-    )
+PAPER_TIMES = (
+    PaperTime("Eigen", "eigen", "NYU", (228, 304)),
+    PaperTime("FCRN", "fcrn", "NYU", (228, 304)),
+    PaperTime("Zhou", "sfmlearner", "KITTI", (128, 416)),
+    PaperTime("Uhrig", "sparseconv", "KITTI", (352, 1216), 0.0311, 0.1614),
+    PaperTime("Chodosh", "adnn", "KITTI", (352, 1216), 0.0320, 0.0447),
+    PaperTime("Ma", "sparse2dense-r18-deconv3", "NYU", (228, 304), 0.0046, 0.0233),
+    PaperTime("Jaritz", "latefusion", "NYU", (224, 320), 0.0484, 0.1593),
 )
 """Wang et al. (ICRA 2019), Table IV, and the three networks that it leaves out."""
-
-
-def bench_table(
-    *,
-    repeats: int,
-    precision: str,
-    device: str,
-    on_network: Callable[[int, int, str], None] = lambda done, of, name: None,
-) -> list[tuple[PaperTime, Bench]]:
-    """Returns the times of the paper's networks beside ours: full size, random weights, K = 5.
-
-    Args:
-        repeats: Measured runs of each part.
-        precision: Of convolutions and matrix products.
-        device: Torch's name of the device.
-        on_network: Called with (done, of, name) before each network.
-    """
-    rows = []
-    for number, paper in enumerate(PAPER_TIMES):
-        on_network(number, len(PAPER_TIMES), paper.model)
-        request = BenchRequest(
-            model=paper.model,
-            size=paper.size,
-            iterations=5,
-            precision=precision,
-            device=device,
-            repeats=repeats,
-        )
-        rows.append((paper, run_bench(request)))
-    return rows
-
-
-def table_record(rows: Sequence[tuple[PaperTime, Bench]]) -> list[dict[str, Any]]:
-    """Returns the table in JSON's own types."""
-    return [{"paper": asdict(paper), "bench": asdict(bench)} for paper, bench in rows]

@@ -4,42 +4,32 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import PurePath
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
-from pnpdepth_cli.core.metrics import MEASURES, Measure
+from pnpdepth_cli.core.metrics import Measure
 from pnpdepth_cli.errors import InputError, UsageError
 from pnpdepth_cli.io.record import plain
-from pnpdepth_cli.pipeline.evaluation.dependence import (
-    MIN_CLUSTERS,
-    Clusters,
-    find_clusters,
-    independent_frames,
-)
+from pnpdepth_cli.pipeline.evaluation.dependence import MIN_CLUSTERS, Clusters, find_clusters
 from pnpdepth_cli.pipeline.evaluation.pairing import some_names
 from pnpdepth_cli.pipeline.evaluation.resampling import (
     LEVEL,
-    Floats,
     FrameTable,
-    clusters_among,
+    gain,
+    gain_interval,
     holm,
-    known_together,
-    sign_flip_p_values,
-    studentised_interval,
+    swap_p_values,
 )
 from pnpdepth_cli.pipeline.evaluation.runs import Run, read_run
+from pnpdepth_cli.pipeline.tables import chosen_measures
 
 ALPHA = 0.05
 MAIN_MEASURES = ("rmse", "mae", "mre", "delta1", "inverse_rmse", "inverse_mae")
-"""Keys of the measures that are compared unless all are asked for; the last two are the kit's."""
-_LEAST_COVERAGE_DIFFERENCE = 0.001
-"""Runs whose scored fractions of the ground truth differ by more are not ranked silently."""
+"""Keys of the measures that are compared by default; the last two are the kit's."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,16 +39,16 @@ class Gain:
     Values are NaN where there is none, as for a single frame.
     """
 
-    percent: float = math.nan
+    percent: float
     """Of the first run's mean."""
-    low_percent: float = math.nan
+    low_percent: float
     """Lower end of its 95 % interval, a studentised bootstrap over the clusters of frames."""
-    high_percent: float = math.nan
-    difference: float = math.nan
+    high_percent: float
+    difference: float
     """This run's mean minus the first run's, in the measure's unit."""
-    p_value: float = math.nan
+    p_value: float
     """Two-sided, of no difference, by swapping the runs cluster by cluster."""
-    p_adjusted: float = math.nan
+    p_adjusted: float
     """The same, adjusted for the number of measures (Holm 1979)."""
 
 
@@ -69,7 +59,7 @@ class RunMean:
     label: str
     path: str
     mean: dict[str, float]
-    coverage: float | None = None
+    coverage: float | None
     """Fraction of the ground truth's pixels that is scored; None where files do not say."""
 
 
@@ -77,8 +67,8 @@ class RunMean:
 class Comparison:
     """Runs on the frames they share."""
 
-    names: tuple[str, ...]
-    """The shared frames."""
+    frames: tuple[str, ...]
+    """Names of the shared ones."""
     measures: tuple[Measure, ...]
     """Those compared; p-values are adjusted for their number."""
     scoring: dict[str, Any]
@@ -89,29 +79,17 @@ class Comparison:
     """Of each run but the first, by the measure's key."""
     clusters: Clusters
     """What is resampled and swapped as a whole."""
-    exact: bool
-    """True if the p-values are of all swaps, not of random ones."""
+    exact_p_values: bool
+    """True if they are of all swaps, not of random ones."""
     resamples: int
     seed: int
-    notes: tuple[str, ...] = ()
+    notes: tuple[str, ...]
 
     def as_record(self) -> dict[str, Any]:
         """Returns what `--json` prints; NaN is null."""
-        record = {
-            "command": "compare",
-            "frames": list(self.names),
-            "scoring": self.scoring,
-            "measures": [asdict(measure) for measure in self.measures],
-            "runs": [asdict(run) for run in self.runs],
-            "gains": [{key: asdict(gain) for key, gain in gains.items()} for gains in self.gains],
-            "level": LEVEL,
-            "clusters": {"count": self.clusters.count, "unit": self.clusters.unit},
-            "resamples": self.resamples,
-            "seed": self.seed,
-            "exact_p_values": self.exact,
-            "notes": list(self.notes),
-        }
-        result: dict[str, Any] = plain(record)
+        clusters = {"count": self.clusters.count, "unit": self.clusters.unit}
+        own = {"command": "compare", "level": LEVEL, "clusters": clusters}
+        result: dict[str, Any] = plain(asdict(self) | own)
         return result
 
 
@@ -128,6 +106,8 @@ class CompareRequest:
     """False if every frame counts as independent."""
     all_measures: bool = False
     """True to compare by every measure that all runs have, not only by MAIN_MEASURES."""
+    columns: Sequence[str] | None = None
+    """Keys of the measures to compare by, instead."""
 
 
 def compare(request: CompareRequest) -> Comparison:
@@ -142,7 +122,7 @@ def compare(request: CompareRequest) -> Comparison:
     if len(request.paths) < 2:
         raise UsageError("two runs at least are needed to compare")
     if request.resamples < 1:
-        raise UsageError(f"--bootstrap {request.resamples}: at least one resample is needed")
+        raise UsageError(f"--bootstrap must be >= 1, got {request.resamples}")
     runs = [read_run(path) for path in request.paths]
     for run in runs[1:]:
         _check_rules(runs[0], run)
@@ -150,50 +130,45 @@ def compare(request: CompareRequest) -> Comparison:
     if not names:
         first, other = (some_names(run.frames) or "none" for run in (runs[0], runs[-1]))
         raise InputError(f"the runs have no scored frame in common: {first}; and {other}")
-    shared = set.intersection(*({m.key for m in run.measures} for run in runs))
-    common = [measure for measure in runs[0].measures if measure.key in shared]
-    main = [measure for measure in common if measure.key in MAIN_MEASURES]
-    measures = tuple(common if request.all_measures or not main else main)
-    values = np.array([_values(run, names, measures) for run in runs])
-    known = np.isfinite(values).all(axis=0) | runs[0].pooled
-    clusters = independent_frames(len(names))
-    if request.grouped:
-        differences = np.concatenate(list(values[1:] - values[0]), axis=1)
-        clusters = find_clusters([runs[0].frames[name].group for name in names], differences)
-    means = [dict.fromkeys((m.key for m in measures), math.nan) for _ in runs]
-    gains = [dict.fromkeys((m.key for m in measures), Gain()) for _ in runs[1:]]
-    exact = True
-    for frames, columns in known_together(known):
-        if not frames.any():
-            continue
-        tested = [measures[column] for column in columns]
-        tables = [
-            _table(run, names, frames, of_run[frames][:, columns], tested)
-            for run, of_run in zip(runs, values, strict=True)
-        ]
-        ids = clusters_among(clusters.ids, frames)
-        for mean, table in zip(means, tables, strict=True):
-            mean |= zip((m.key for m in tested), table.mean().tolist(), strict=True)
-        for gain, table in zip(gains, tables[1:], strict=True):
-            of_table, all_swaps = _gains(tables[0], table, tested, ids, request)
-            gain |= of_table
-            exact &= all_swaps
+    measures = _measures(runs, request)
+    keys = [measure.key for measure in measures]
+    values = np.array(
+        [[[run.frames[n].values.get(k, math.nan) for k in keys] for n in names] for run in runs]
+    )
+    known = np.isfinite(values).all(axis=0)
+    differences = np.concatenate(list(values[1:] - values[0]), axis=1)
+    groups = [runs[0].frames[name].group for name in names]
+    clusters = find_clusters(groups, differences, grouped=request.grouped)
+    if runs[0].pooled:
+        sums = (np.array([run.frames[name].sums for name in names]) for run in runs)
+        tables = [FrameTable.of_pixels(of_run, keys) for of_run in sums]
+    else:
+        tables = [FrameTable.of_frames(np.where(known, of_run, math.nan)) for of_run in values]
+    gains, exact = [], True
+    for table in tables[1:]:
+        rows, exact = _gains(tables[0], table, measures, clusters, request)
+        gains.append(dict(zip(keys, rows, strict=True)))
     return Comparison(
-        names=names,
+        frames=names,
         measures=measures,
         scoring=runs[0].scoring,
         runs=tuple(
-            RunMean(label=label, path=run.path, mean=mean, coverage=_coverage(run, names))
-            for label, run, mean in zip(_labels(runs), runs, means, strict=True)
+            RunMean(
+                label=label,
+                path=run.path,
+                mean=dict(zip(keys, table.mean().tolist(), strict=True)),
+                coverage=_coverage(run, names),
+            )
+            for label, run, table in zip(_labels(runs), runs, tables, strict=True)
         ),
-        gains=tuple(_adjusted(gain) for gain in gains),
+        gains=tuple(gains),
         clusters=clusters,
-        exact=exact,
+        exact_p_values=exact,
         resamples=request.resamples,
         seed=request.seed,
         notes=(
             *_notes(runs, names),
-            *_lacking(names, measures, known),
+            *([] if runs[0].pooled else _lacking(names, measures, known)),
             *_cluster_notes(clusters, len(names), len(measures)),
         ),
     )
@@ -213,94 +188,50 @@ def _check_rules(first: Run, other: Run) -> None:
         )
 
 
-def _values(run: Run, names: Sequence[str], measures: Sequence[Measure]) -> Floats:
-    """(N, M) the measures of the frames; NaN where a frame lacks one."""
-    frames = [run.frames[name] for name in names]
-    return np.array([[frame.values.get(m.key, math.nan) for m in measures] for frame in frames])
-
-
-def _table(
-    run: Run,
-    names: Sequence[str],
-    frames: NDArray[np.bool_],
-    values: Floats,
-    measures: Sequence[Measure],
-) -> FrameTable:
-    if not run.pooled:
-        return FrameTable(rows=values)
-    keys = [measure.key for measure in measures]
-    kept = tuple(n for n, measure in enumerate(MEASURES) if measure.key in keys)
-    sums = np.array([run.frames[name].sums for name, of in zip(names, frames, strict=True) if of])
-    return FrameTable(rows=sums, pooled=True, kept=kept)
+def _measures(runs: Sequence[Run], request: CompareRequest) -> tuple[Measure, ...]:
+    """Those of all runs that the user chose, or the main ones."""
+    shared = set.intersection(*({m.key for m in run.measures} for run in runs))
+    common = [measure for measure in runs[0].measures if measure.key in shared]
+    main = tuple(measure for measure in common if measure.key in MAIN_MEASURES)
+    if request.columns is None and main and not request.all_measures:
+        return main
+    return chosen_measures(common, request.columns)
 
 
 def _gains(
     first: FrameTable,
     other: FrameTable,
     measures: Sequence[Measure],
-    ids: NDArray[np.int64],
+    clusters: Clusters,
     request: CompareRequest,
-) -> tuple[dict[str, Gain], bool]:
-    """The gains of a run by measure, not adjusted; and whether their p-values are exact."""
-    better = torch.tensor([1.0 if m.higher_is_better else -1.0 for m in measures]).double()
-    first_totals, other_totals = (table.cluster_totals(ids) for table in (first, other))
-    clusters, columns = first_totals.shape
-
-    def percent(a: Tensor, b: Tensor) -> Tensor:
-        change = torch.where(a == b, torch.zeros_like(a), 100 * better * (b - a) / a.abs())
-        return torch.where(change.isfinite(), change, torch.full_like(change, math.nan))
-
-    def percent_of(totals: Tensor) -> Tensor:
-        return percent(first.means_of(totals[..., :columns]), other.means_of(totals[..., columns:]))
-
-    def swapped_difference(flips: Floats) -> Floats:
-        moved = torch.from_numpy(flips @ (other_totals - first_totals))
-        a = first.means_of(torch.from_numpy(first_totals.sum(axis=0)) + moved)
-        b = other.means_of(torch.from_numpy(other_totals.sum(axis=0)) - moved)
-        return np.asarray((b - a).numpy())
-
-    totals = np.concatenate([first_totals, other_totals], axis=1)
-    none = np.full(len(measures), math.nan)
-    low, high, p_values, exact = none, none, none, True
-    if clusters >= MIN_CLUSTERS:
-        low, high = studentised_interval(percent_of, totals, request.resamples, request.seed)
-    if clusters > 1:
-        p_values, exact = sign_flip_p_values(
-            swapped_difference, clusters, request.resamples, request.seed
-        )
-    first_mean, other_mean = first.mean(), other.mean()
-    gains = percent(torch.from_numpy(first_mean), torch.from_numpy(other_mean)).numpy()
-    rows = zip(gains, low, high, other_mean - first_mean, p_values, strict=True)
-    names = ("percent", "low_percent", "high_percent", "difference", "p_value")
-    return {
-        measure.key: Gain(**dict(zip(names, map(float, row), strict=True)))
-        for measure, row in zip(measures, rows, strict=True)
-    }, exact
-
-
-def _adjusted(gains: dict[str, Gain]) -> dict[str, Gain]:
-    """The gains with p-values adjusted for their number."""
-    adjusted = holm(np.array([gain.p_value for gain in gains.values()]))
-    return {
-        key: replace(gain, p_adjusted=float(p_value))
-        for (key, gain), p_value in zip(gains.items(), adjusted, strict=True)
-    }
+) -> tuple[list[Gain], bool]:
+    """The gain of a run in each measure, and whether their p-values are exact."""
+    better = np.array([1.0 if m.higher_is_better else -1.0 for m in measures])
+    drawing = clusters.ids, request.resamples, request.seed
+    low, high = gain_interval(first, other, better, *drawing)
+    p_values, exact = swap_p_values(first, other, *drawing)
+    before, after = first.mean(), other.mean()
+    rows = (gain(before, after, better), low, high, after - before, p_values, holm(p_values))
+    names = ("percent", "low_percent", "high_percent", "difference", "p_value", "p_adjusted")
+    return [
+        Gain(**dict(zip(names, row, strict=True))) for row in np.stack(rows, axis=1).tolist()
+    ], exact
 
 
 def _lacking(
     names: Sequence[str], measures: Sequence[Measure], known: NDArray[np.bool_]
 ) -> list[str]:
     """A line for each set of measures that some frames lack."""
-    lines = []
-    for frames, columns in known_together(known):
-        lacking = [name for name, has in zip(names, frames, strict=True) if not has]
-        if lacking:
-            titles = ", ".join(measures[column].title for column in columns)
-            lines.append(
-                f"{titles}: over {len(names) - len(lacking):,} frames; {len(lacking):,} lack it in"
-                f" a run: {some_names(lacking)}"
-            )
-    return lines
+    titles: dict[tuple[str, ...], list[str]] = {}
+    for measure, has in zip(measures, known.T, strict=True):
+        lacking = tuple(name for name, known_in in zip(names, has, strict=True) if not known_in)
+        titles.setdefault(lacking, []).append(measure.title)
+    return [
+        f"{', '.join(of)}: over {len(names) - len(lacking):,} frames; {len(lacking):,} lack it in"
+        f" a run: {some_names(lacking)}"
+        for lacking, of in titles.items()
+        if lacking
+    ]
 
 
 def _coverage(run: Run, names: Sequence[str]) -> float | None:
@@ -324,9 +255,8 @@ def _labels(runs: Sequence[Run]) -> list[str]:
 def _notes(runs: Sequence[Run], names: Sequence[str]) -> list[str]:
     """Warnings of frames and pixels that not all runs scored."""
     lines = []
-    shared = set(names)
     for run in runs:
-        unshared = [name for name in run.frames if name not in shared]
+        unshared = [name for name in run.frames if name not in set(names)]
         if unshared:
             lines.append(
                 f"warning: {len(unshared):,} frames of {run.path} are not scored in all runs and"
@@ -334,33 +264,25 @@ def _notes(runs: Sequence[Run], names: Sequence[str]) -> list[str]:
             )
     frames = {name: [run.frames[name] for run in runs] for name in names}
     other_truth = [n for n, of in frames.items() if len({f.known for f in of} - {None}) > 1]
-    other_pixels = [n for n, of in frames.items() if len({frame.pixels for frame in of}) > 1]
     if other_truth:
         lines.append(
             f"warning: {len(other_truth):,} frames have another number of pixels with ground truth"
             f" in another run, so the runs were not scored on the same: {some_names(other_truth)}"
         )
-    elif other_pixels:
-        lines.append(_coverage_warning(runs, names))
-    return lines
-
-
-def _coverage_warning(runs: Sequence[Run], names: Sequence[str]) -> str:
-    coverages = [_coverage(run, names) for run in runs]
-    known = [coverage for coverage in coverages if coverage is not None]
-    if len(known) == len(runs) and max(known) - min(known) > _LEAST_COVERAGE_DIFFERENCE:
-        listed = ", ".join(f"{c:.2%} in {run.path}" for c, run in zip(known, runs, strict=True))
-        return (
+    elif any(len({frame.pixels for frame in of}) > 1 for of in frames.values()):
+        shares = (
+            (_coverage(run, names), sum(run.frames[name].pixels for name in names), run.path)
+            for run in runs
+        )
+        listed = ", ".join(
+            f"{f'{pixels:,} pixels' if share is None else f'{share:.2%}'} in {path}"
+            for share, pixels, path in shares
+        )
+        lines.append(
             f"warning: coverage differs ({listed}), and a run that leaves hard pixels empty looks"
             " better; this is no ranking. Score with --missing max, or with one --mask"
         )
-    pixels = ", ".join(
-        f"{sum(run.frames[name].pixels for name in names):,} in {run.path}" for run in runs
-    )
-    return (
-        f"warning: predictions do not cover the same pixels ({pixels}), and errors are over what"
-        " each covers; score them with --missing max, or with one --mask"
-    )
+    return lines
 
 
 def _cluster_notes(clusters: Clusters, frames: int, measures: int) -> list[str]:

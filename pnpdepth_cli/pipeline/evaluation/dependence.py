@@ -61,33 +61,30 @@ def groups_by_name(names: Sequence[str]) -> list[str]:
     return [name.rpartition("/")[0] for name in names]
 
 
-def find_clusters(groups: Sequence[str], series: Floats) -> Clusters:
+def find_clusters(groups: Sequence[str], series: Floats, *, grouped: bool = True) -> Clusters:
     """Returns the groups; for a single group with correlated errors, blocks of it.
 
     Args:
         groups: The sequence of each of N frames.
         series: (N, M) what is averaged, in the order of the frames; its autocorrelation decides
             the length of the blocks. NaN columns are ignored.
+        grouped: False makes every frame a cluster.
     """
     names = list(dict.fromkeys(groups))
     frames = len(groups)
-    if len(names) > 1:
-        ids = np.array([names.index(group) for group in groups])
-        return Clusters(ids=ids, unit="frames" if len(names) == frames else "groups of frames")
-    length = block_length(series)
+    if grouped and 1 < len(names) < frames:
+        return Clusters(
+            ids=np.array([names.index(group) for group in groups]), unit="groups of frames"
+        )
+    length = block_length(series) if grouped and len(names) == 1 else 1
     if length == 1:
-        return independent_frames(frames)
+        return Clusters(ids=np.arange(frames), unit="frames")
     blocks = max(1, min(MAX_BLOCKS, frames // length))
     return Clusters(
         ids=np.arange(frames) * blocks // frames,
         unit=f"blocks of about {round(frames / blocks):,} consecutive frames of one sequence,"
         " as their errors are correlated",
     )
-
-
-def independent_frames(frames: int) -> Clusters:
-    """Returns a cluster for each frame."""
-    return Clusters(ids=np.arange(frames), unit="frames")
 
 
 def block_length(series: Floats) -> int:

@@ -19,16 +19,19 @@ from numpy.typing import NDArray
 
 from pnpdepth_cli.core.metrics import Measure
 
-DEVKIT_MEASURES = (
-    Measure(key="mae", title="MAE", unit="m", decimals=6),
-    Measure(key="rmse", title="RMSE", unit="m", decimals=6),
-    Measure(key="inverse_mae", title="inverse MAE", unit="1/m", decimals=6),
-    Measure(key="inverse_rmse", title="inverse RMSE", unit="1/m", decimals=6),
-    Measure(key="log_mae", title="log MAE", decimals=6),
-    Measure(key="log_rmse", title="log RMSE", decimals=6),
-    Measure(key="scale_invariant_log", title="scale invariant log", decimals=6),
-    Measure(key="abs_relative", title="abs relative", decimals=6),
-    Measure(key="squared_relative", title="squared relative", decimals=6),
+DEVKIT_MEASURES = tuple(
+    Measure(key=key, title=title, unit=unit, decimals=6)
+    for key, title, unit in (
+        ("mae", "MAE", "m"),
+        ("rmse", "RMSE", "m"),
+        ("inverse_mae", "inverse MAE", "1/m"),
+        ("inverse_rmse", "inverse RMSE", "1/m"),
+        ("log_mae", "log MAE", ""),
+        ("log_rmse", "log RMSE", ""),
+        ("scale_invariant_log", "scale invariant log", ""),
+        ("abs_relative", "abs relative", ""),
+        ("squared_relative", "squared relative", ""),
+    )
 )
 """In the kit's order and with its six decimals. Its squared relative is (p − g)²/g²."""
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -30,12 +30,11 @@ _LISTED = 5
 
 @dataclass(frozen=True, kw_only=True)
 class FramePair:
-    """The files of one frame to score."""
+    """The files of one frame to score; parts that it does not have are None."""
 
     name: str
     """By which runs are compared."""
     prediction: Path | None
-    """None where there is none."""
     frame: Frame
     """The ground truth's frame; it has `gt`."""
     group: str = ""
@@ -43,15 +42,13 @@ class FramePair:
     sparse: Path | None = None
     """The network's sparse input: the user's, the run's record's or the data set's."""
     sparse_named: bool = False
-    """True if the user named the sparse input."""
+    """Whether the user named the sparse input."""
     sigma: Path | None = None
     """The standard deviation that a refinement wrote beside its depth."""
     index: int | None = None
-    """Of the prediction in a file of several frames; None in a file of one."""
-    gt_index: int | None = None
-    """Of the ground truth in a file of several frames."""
+    """Of the frame, in files of several frames."""
     previous: FramePair | None = None
-    """The frame before in the same sequence, without its own previous one."""
+    """The frame before in the same sequence."""
     sampling: dict[str, Any] | None = None
     """How the sparse input was sampled from the ground truth, by the run's record."""
     sampled: int = 0
@@ -59,18 +56,15 @@ class FramePair:
     image: Source | None = None
     """The image, if the record or the data set names it."""
     mask: Path | None = None
-    """The frame's mask."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Pairs:
-    """All frames of the ground truth."""
+    """All frames of the ground truth, in its order."""
 
     frames: tuple[FramePair, ...]
-    """In the ground truth's order."""
     notes: tuple[str, ...]
-    """What was assumed, and warnings; one line each."""
-    single: bool
+    single: bool = False
     """True for two files rather than two folders."""
 
 
@@ -83,7 +77,7 @@ def pair_frames(
     layout_protocol: str | None = None,
     calib: Path | None = None,
 ) -> Pairs:
-    """Returns the frames of two files, or of two folders by name.
+    """Returns the frames of two files, or of two folders by name, each with the one before.
 
     Args:
         prediction: A depth file, or a folder of them.
@@ -102,15 +96,36 @@ def pair_frames(
         _check_local(path)
         if not path.exists():
             raise InputError(f"{path}: no such file or folder; check the path")
-    pairs = _found_pairs(prediction, ground_truth, sparse, mask, layout_protocol)
-    for frame in (pair.frame for pair in pairs.frames):
+    layout = _layout_of(ground_truth)
+    if layout is None:
+        if layout_protocol is not None:
+            raise UsageError(
+                f"--layout-protocol {layout_protocol} is for data sets, and {ground_truth} is in no"
+                " known layout; leave it out"
+            )
+        if prediction.is_dir() != ground_truth.is_dir():
+            raise UsageError(
+                f"give two files or two folders, not one of each: {prediction}, {ground_truth}"
+            )
+    elif prediction.is_file():
+        raise UsageError(f"{ground_truth} is a data set but {prediction} one file; give a folder")
+    notes: list[str] = []
+    if prediction.is_file():
+        if (count := stack_size(prediction)) is not None:
+            return _stacked_pairs(prediction, ground_truth, count)
+        name = frame_name(prediction.stem)
+        frames, predictions = [Frame(name=name, gt=ground_truth)], {name: prediction}
+    else:
+        predictions, notes = depth_files(prediction)
+        frames, more_notes = _true_frames(ground_truth, layout, layout_protocol)
+        notes += more_notes
+    for frame in frames:
         for part in (frame.image, frame.sparse, frame.gt):
             if part is not None:
                 _check_local(file_of(part))
-    if calib is None:
-        return pairs
-    frames = (replace(each, frame=replace(each.frame, calib=calib)) for each in pairs.frames)
-    return replace(pairs, frames=tuple(frames))
+    if calib is not None:
+        frames = [replace(frame, calib=calib) for frame in frames]
+    return _pairs(frames, predictions, sparse, mask, notes, single=prediction.is_file())
 
 
 def _check_local(path: Path) -> None:
@@ -118,56 +133,32 @@ def _check_local(path: Path) -> None:
         raise UsageError(f"{path}: eval reads local files; copy the frames from the store first")
 
 
-def _found_pairs(
-    prediction: Path,
-    ground_truth: Path,
-    sparse: Path | None,
-    mask: Path | None,
-    layout_protocol: str | None,
-) -> Pairs:
-    """`pair_frames` of paths that exist."""
-    layout = _layout_of(ground_truth)
-    if layout is None and layout_protocol is not None:
-        raise UsageError(
-            f"--layout-protocol {layout_protocol} is for data sets, and {ground_truth} is in no"
-            " known layout; leave it out"
-        )
-    if layout is None and prediction.is_dir() != ground_truth.is_dir():
-        both = (prediction, ground_truth)
-        folder, file = both if prediction.is_dir() else reversed(both)
-        raise UsageError(f"{folder} is a folder but {file} a file; give two files or two folders")
-    if prediction.is_file():
-        if layout is not None:
-            raise UsageError(
-                f"{ground_truth} is a data set but {prediction} one file; give a folder"
-            )
-        frames_in_file = stack_size(prediction)
-        if frames_in_file is not None and ground_truth.is_file():
-            return _stacked_pairs(prediction, ground_truth, frames_in_file)
-        name = frame_name(prediction.stem)
-        frame = Frame(name=name, gt=ground_truth)
-        return _pairs([frame], {name: prediction}, sparse, mask, notes=[], single=True)
-    predictions, notes = depth_files(prediction)
+def _layout_of(ground_truth: Path) -> str | None:
+    """The layout that the ground truth is a data set of; None for files and folders of files."""
+    try:
+        return find_layout(ground_truth)
+    except (InputError, OSError):
+        return None
+
+
+def _true_frames(
+    folder: Path, layout: str | None, layout_protocol: str | None
+) -> tuple[list[Frame], list[str]]:
+    """The frames with ground truth of a folder of files or a data set, and notes."""
     if layout is None:
-        files, more_notes = depth_files(ground_truth)
-        frames = [Frame(name=name, gt=path) for name, path in files.items()]
-        notes += more_notes
-    else:
-        listed = list_frames(ground_truth, layout)[1].frames
-        frames = [frame for frame in listed if frame.gt is not None]
-        if layout_protocol is not None:
-            cut = find_protocol(layout_protocol)
-            frames = [replace(frame, protocol=cut) for frame in frames]
-        cuts = ", ".join(sorted({frame.protocol.name for frame in frames} - {"whole"}))
-        notes.append(
-            f"gt: layout {layout}; frames with ground truth: {len(frames):,}"
-            + (f", cut by layout protocol {cuts}; --layout-protocol to change" if cuts else "")
-        )
-        if not frames:
-            raise InputError(
-                f"{ground_truth} looks like {layout!r}, and no frame in it has ground truth"
-            )
-    return _pairs(frames, predictions, sparse, mask, notes=notes, single=False)
+        files, notes = depth_files(folder)
+        return [Frame(name=name, gt=path) for name, path in files.items()], notes
+    frames = [frame for frame in list_frames(folder, layout)[1].frames if frame.gt is not None]
+    if not frames:
+        raise InputError(f"{folder} looks like {layout!r}, and no frame in it has ground truth")
+    if layout_protocol is not None:
+        cut = find_protocol(layout_protocol)
+        frames = [replace(frame, protocol=cut) for frame in frames]
+    cuts = ", ".join(sorted({frame.protocol.name for frame in frames} - {"whole"}))
+    note = f"gt: layout {layout}; frames with ground truth: {len(frames):,}"
+    return frames, [
+        note + (f", cut by layout protocol {cuts}; --layout-protocol to change" if cuts else "")
+    ]
 
 
 def _stacked_pairs(prediction: Path, ground_truth: Path, count: int) -> Pairs:
@@ -176,38 +167,113 @@ def _stacked_pairs(prediction: Path, ground_truth: Path, count: int) -> Pairs:
     if others != count:
         stored = "a single map" if others is None else f"{others:,} frames"
         raise InputError(f"{prediction} holds {count:,} frames but {ground_truth} {stored}")
-    frame = Frame(name="", gt=ground_truth)
+    frames = (Frame(name=f"{index:04}", gt=ground_truth) for index in range(count))
     return Pairs(
         frames=tuple(
-            FramePair(
-                name=f"{index:04}",
-                prediction=prediction,
-                frame=replace(frame, name=f"{index:04}"),
-                index=index,
-                gt_index=index,
-            )
-            for index in range(count)
+            FramePair(name=frame.name, prediction=prediction, frame=frame, index=index)
+            for index, frame in enumerate(frames)
         ),
         notes=(f"{count:,} frames in each of the two files",),
-        single=False,
     )
 
 
-def in_sequences(frames: Sequence[FramePair]) -> tuple[FramePair, ...]:
-    """Returns the frames, each with the one before in its sequence."""
+def _pairs(
+    frames: Sequence[Frame],
+    predictions: Mapping[str, Path],
+    sparse: Path | None,
+    mask: Path | None,
+    notes: list[str],
+    *,
+    single: bool,
+) -> Pairs:
+    names = {frame.name for frame in frames}
+    if names.isdisjoint(predictions):
+        raise InputError(
+            "no prediction has the name of a ground truth file: predictions are"
+            f" {some_names(predictions)}; ground truth is {some_names(sorted(names))}"
+        )
+    if extra := sorted(set(predictions) - names):
+        notes.append(
+            f"warning: {len(extra):,} of {len(predictions):,} predictions have no ground truth"
+            f" and are not scored: {some_names(extra)}"
+        )
+    points = _by_frame(sparse, _POINTS, names)
+    masks = _by_frame(mask, (*DEPTH_SUFFIXES, *IMAGE_SUFFIXES), names)
+    pairs: list[FramePair] = []
     last: dict[str, FramePair] = {}
-    linked = []
-    for frame in frames:
-        linked.append(replace(frame, previous=last.get(frame.group)))
-        last[frame.group] = frame
-    return tuple(linked)
+    for frame, group in zip(frames, groups_by_name([f.name for f in frames]), strict=True):
+        pair = replace(
+            _pair(frame, predictions.get(frame.name), points.get(frame.name)),
+            group=group if frame.group is None else frame.group,
+            mask=masks.get(frame.name),
+        )
+        pairs.append(replace(pair, previous=last.get(pair.group)))
+        last[pair.group] = pair
+    return Pairs(frames=tuple(pairs), notes=tuple(notes), single=single)
+
+
+def _by_frame(path: Path | None, suffixes: Sequence[str], names: Iterable[str]) -> dict[str, Path]:
+    """The file of each frame: the one for all, or those of the folder."""
+    if path is None:
+        return {}
+    return _depth_files(path, suffixes)[0] if path.is_dir() else dict.fromkeys(names, path)
+
+
+def _pair(frame: Frame, prediction: Path | None, sparse: Path | None) -> FramePair:
+    """The frame with what the record of a refinement, beside its depth, says of its inputs."""
+    record, sigma = {}, None
+    if prediction is not None:
+        name = _base(prediction.stem, _DEPTH_MARKS) or prediction.stem
+        record = _record(prediction.with_name(f"{name}.json"))
+        sigmas = (prediction.with_name(f"{name}_sigma{suffix}") for suffix in _SIGMA_SUFFIXES)
+        sigma = next((file for file in sigmas if file.is_file()), None)
+    inputs = _dict(record.get("inputs"))
+    used = _dict(record.get("points")).get("used")
+    sampling = _dict(inputs.get("sparse"))
+    is_sampled = "sampled_from" in sampling
+    known = frame.sparse
+    if known is not None and known.suffix.lower() not in DEPTH_SUFFIXES:
+        known = None
+    return FramePair(
+        name=frame.name,
+        prediction=prediction,
+        frame=frame,
+        sparse=sparse or _input(inputs, "sparse") or known,
+        sparse_named=sparse is not None,
+        sigma=sigma,
+        sampling=sampling if is_sampled else None,
+        sampled=used if is_sampled and isinstance(used, int) else 0,
+        image=_input(inputs, "image") or frame.image,
+    )
+
+
+def _record(path: Path) -> dict[str, Any]:
+    try:
+        return read_json(path) if path.is_file() else {}
+    except PnpDepthError:
+        return {}
+
+
+def _input(inputs: Mapping[str, Any], part: str) -> Path | None:
+    """A file of a record's inputs, if it still exists.
+
+    None for a scan, as the file does not say which of its points the network saw.
+    """
+    entry = _dict(inputs.get(part))
+    path = entry.get("path")
+    if not isinstance(path, str) or "calibration" in entry or not Path(path).is_file():
+        return None
+    return Path(path)
+
+
+def _dict(value: Any) -> dict[str, Any]:
+    return value if isinstance(value, dict) else {}
 
 
 def frame_name(stem: str) -> str:
     """Returns the frame of a file with this stem: without `_depth` and KITTI's file kind."""
     name = _KITTI_KIND.sub("_sync_", stem)
-    mark = next((mark for mark in _DEPTH_MARKS if name.endswith(mark)), "")
-    return name.removesuffix(mark) or name
+    return _base(name, _DEPTH_MARKS) or name
 
 
 def depth_files(folder: Path) -> tuple[dict[str, Path], list[str]]:
@@ -223,22 +289,6 @@ def depth_files(folder: Path) -> tuple[dict[str, Path], list[str]]:
         suffixes = " ".join(DEPTH_SUFFIXES)
         raise InputError(f"{folder} holds no depth file ({suffixes}); check the path")
     return files, notes
-
-
-def some_names(names: Iterable[str]) -> str:
-    """Returns a few of the names on one line, and how many more there are."""
-    listed = list(names)
-    text = ", ".join(one_line(name) for name in listed[:_LISTED])
-    more = len(listed) - _LISTED
-    return f"{text} and {more:,} more" if more > 0 else text
-
-
-def _layout_of(ground_truth: Path) -> str | None:
-    """The layout that the ground truth is a data set of; None for files and folders of files."""
-    try:
-        return find_layout(ground_truth)
-    except (InputError, OSError):
-        return None
 
 
 def _depth_files(folder: Path, suffixes: Sequence[str]) -> tuple[dict[str, Path], list[str]]:
@@ -274,115 +324,9 @@ def _base(stem: str, marks: Sequence[str]) -> str | None:
     return next((stem.removesuffix(m) for m in marks if stem.endswith(m) and stem != m), None)
 
 
-def _pairs(
-    frames: list[Frame],
-    predictions: dict[str, Path],
-    sparse: Path | None,
-    mask: Path | None,
-    *,
-    notes: list[str],
-    single: bool,
-) -> Pairs:
-    names = {frame.name for frame in frames}
-    if names.isdisjoint(predictions):
-        raise InputError(
-            "no prediction has the name of a ground truth file: predictions are"
-            f" {some_names(predictions)}; ground truth is {some_names(sorted(names))}"
-        )
-    extra = sorted(set(predictions) - names)
-    if extra:
-        notes.append(
-            f"warning: {len(extra):,} of {len(predictions):,} predictions have no ground truth"
-            f" and are not scored: {some_names(extra)}"
-        )
-    points = _by_frame(sparse, _POINTS, names)
-    masks = _by_frame(mask, (*DEPTH_SUFFIXES, *IMAGE_SUFFIXES), names)
-    groups = groups_by_name([frame.name for frame in frames])
-    return Pairs(
-        frames=tuple(
-            replace(
-                _pair(frame, predictions.get(frame.name), points.get(frame.name)),
-                group=group if frame.group is None else frame.group,
-                mask=masks.get(frame.name),
-            )
-            for frame, group in zip(frames, groups, strict=True)
-        ),
-        notes=tuple(notes),
-        single=single,
-    )
-
-
-def _by_frame(path: Path | None, suffixes: Sequence[str], names: Iterable[str]) -> dict[str, Path]:
-    """The file of each frame: the one for all, or those of the folder."""
-    if path is None:
-        return {}
-    return _depth_files(path, suffixes)[0] if path.is_dir() else dict.fromkeys(names, path)
-
-
-def _pair(frame: Frame, prediction: Path | None, sparse: Path | None) -> FramePair:
-    record = _record_of(prediction)
-    return FramePair(
-        name=frame.name,
-        prediction=prediction,
-        frame=frame,
-        sparse=sparse or _input(record, "sparse") or _depth_file(frame.sparse),
-        sparse_named=sparse is not None,
-        sigma=_sigma_of(prediction),
-        sampling=_sampling(record),
-        sampled=_sampled(record),
-        image=_input(record, "image") or frame.image,
-    )
-
-
-def _record_of(prediction: Path | None) -> dict[str, Any]:
-    """The record that a refinement wrote beside its depth; empty if there is none."""
-    if prediction is None:
-        return {}
-    name = _base(prediction.stem, _DEPTH_MARKS) or prediction.stem
-    record = prediction.with_name(f"{name}.json")
-    try:
-        return read_json(record) if record.is_file() else {}
-    except PnpDepthError:
-        return {}
-
-
-def _sigma_of(prediction: Path | None) -> Path | None:
-    if prediction is None:
-        return None
-    name = _base(prediction.stem, _DEPTH_MARKS) or prediction.stem
-    files = (prediction.with_name(f"{name}_sigma{suffix}") for suffix in _SIGMA_SUFFIXES)
-    return next((file for file in files if file.is_file()), None)
-
-
-def _input(record: dict[str, Any], part: str) -> Path | None:
-    """The image or the sparse depth file of a record, if it still exists.
-
-    None for a scan, as the file does not say which of its points the network saw.
-    """
-    entry = _dict(_dict(record.get("inputs")).get(part))
-    path = entry.get("path")
-    if not isinstance(path, str) or "calibration" in entry or not Path(path).is_file():
-        return None
-    return Path(path)
-
-
-def _sampling(record: dict[str, Any]) -> dict[str, Any] | None:
-    """How points were sampled from the ground truth; None if they were not."""
-    entry = _dict(_dict(record.get("inputs")).get("sparse"))
-    return entry if "sampled_from" in entry else None
-
-
-def _sampled(record: dict[str, Any]) -> int:
-    """How many points of the ground truth were the sparse depth."""
-    if _sampling(record) is None:
-        return 0
-    used = _dict(record.get("points")).get("used")
-    return used if isinstance(used, int) else 0
-
-
-def _dict(value: Any) -> dict[str, Any]:
-    return value if isinstance(value, dict) else {}
-
-
-def _depth_file(path: Path | None) -> Path | None:
-    return path if path is not None and path.suffix.lower() in DEPTH_SUFFIXES else None
+def some_names(names: Iterable[str]) -> str:
+    """Returns a few of the names on one line, and how many more there are."""
+    listed = list(names)
+    text = ", ".join(one_line(name) for name in listed[:_LISTED])
+    more = len(listed) - _LISTED
+    return f"{text} and {more:,} more" if more > 0 else text

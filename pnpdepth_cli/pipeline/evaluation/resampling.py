@@ -1,167 +1,196 @@
 """How sure means over clusters of frames are: the bootstrap, permutations, and Holm's correction.
 
 Permutations are those of scipy.stats. Its bootstrap has no studentised interval, which few values
-of skewed errors need, and it adjusts p-values only for the false discovery rate; both are here.
+of skewed errors need (coverage in docs/guides/evaluation.md), so that one is here.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from scipy import stats
-from torch import Tensor
 
-from pnpdepth_cli.core.metrics import measures_of
+from pnpdepth_cli.core.metrics import MEASURES, measures_of
+from pnpdepth_cli.pipeline.evaluation.dependence import MIN_CLUSTERS
 
 Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
 
 LEVEL = 0.95
 _STEP = 1e-5
-"""Of the numerical derivative, relative to the totals of a cluster; its error is near 1e-10."""
+"""Of the numerical derivative, relative to the sums; its error is near 1e-10."""
 _CELLS = 1 << 21
-"""Weights held at once, so that memory stays bounded for any number of clusters."""
+"""Numbers held at once, so that memory stays bounded for any number of clusters."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class FrameTable:
-    """The scores of N frames, from which the means of any weighting of the frames follow."""
+    """The scores of N frames as sums, from which the means of any weighting of them follow."""
 
     rows: Floats
-    """(N, M) measures of each frame; where pixels are pooled, (N, len(SUMS)) sums over pixels."""
-    pooled: bool = False
-    """True if the mean is over the pixels of all frames."""
-    kept: tuple[int, ...] | None = None
-    """Of a pooled table: which of core.metrics.MEASURES the means are; None for all."""
+    """(N, M, K): K summands of each of M measures."""
+    mean_of: Callable[[Floats], Floats]
+    """From sums (…, M, K) to means (…, M); unchanged where the sums are multiplied."""
+
+    @classmethod
+    def of_frames(cls, values: Floats) -> FrameTable:
+        """Every frame counts alike; (N, M) with NaN where a frame lacks a measure."""
+        known = np.isfinite(values)
+        rows = np.stack([np.where(known, values, 0.0), known.astype(np.float64)], axis=-1)
+        return cls(rows=rows, mean_of=_ratio)
+
+    @classmethod
+    def of_pixels(cls, sums: Floats, keys: Sequence[str]) -> FrameTable:
+        """Every pixel counts alike; (N, len(SUMS)), and the measures of MEASURES that are meant."""
+        kept = [number for number, measure in enumerate(MEASURES) if measure.key in keys]
+
+        def mean_of(rows: Floats) -> Floats:
+            values = measures_of(torch.from_numpy(rows)).numpy()[..., kept]
+            return np.asarray(np.diagonal(values, axis1=-2, axis2=-1))
+
+        rows = np.repeat(sums[:, None], len(kept), axis=1)
+        return cls(rows=rows, mean_of=mean_of)
 
     def mean(self) -> Floats:
-        """Returns (M,) the means over all frames."""
-        totals = self.cluster_totals(np.zeros(len(self.rows), np.int64))[0]
-        return np.asarray(self.means_of(torch.from_numpy(totals)).numpy())
+        """Returns (M,) the means over all frames; NaN for a measure that none has."""
+        return self.mean_of(self.rows.sum(axis=0))
 
-    def cluster_totals(self, clusters: NDArray[np.int64]) -> Floats:
-        """Returns (G, C) the sums of the rows of each cluster, and in the last column its frames.
-
-        Args:
-            clusters: (N,) the cluster of each frame, from 0 to G − 1.
-        """
-        rows = np.column_stack([self.rows, np.ones(len(self.rows))])
-        totals = np.zeros((int(clusters.max()) + 1, rows.shape[1]))
-        np.add.at(totals, clusters, rows)
+    def cluster_totals(self, clusters: Ints) -> Floats:
+        """Returns (G, M, K) the sums of each cluster; clusters are (N,) from 0 to G − 1."""
+        totals = np.zeros((int(clusters.max()) + 1, *self.rows.shape[1:]))
+        np.add.at(totals, clusters, self.rows)
         return totals
 
-    def means_of(self, totals: Tensor) -> Tensor:
-        """Returns (…, M) the means of frames whose `cluster_totals` add up to (…, C)."""
-        if not self.pooled:
-            return totals[..., :-1] / totals[..., -1:]
-        means = measures_of(totals[..., :-1])
-        return means if self.kept is None else means[..., list(self.kept)]
+
+def _ratio(sums: Floats) -> Floats:
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(sums[..., 0] / sums[..., 1])
 
 
-def known_together(known: NDArray[np.bool_]) -> Iterator[tuple[NDArray[np.bool_], list[int]]]:
-    """Yields (N,) frames and the measures that exactly these frames have.
+def mean_interval(
+    table: FrameTable, clusters: Ints, resamples: int, seed: int
+) -> tuple[Floats, Floats]:
+    """Returns (M,), (M,): the ends of the 95 % interval of the table's means."""
+    return studentised_interval(table.mean_of, table.cluster_totals(clusters), resamples, seed)
+
+
+def gain(before: Floats, after: Floats, better: Floats) -> Floats:
+    """Returns the change in per cent of `before`; NaN where that is no number.
 
     Args:
-        known: (N, M) whether a frame has a measure.
+        before: (…, M)
+        after: (…, M)
+        better: (M,) 1 for measures of which higher is better, else −1.
     """
-    patterns, pattern_of = np.unique(known, axis=1, return_inverse=True)
-    for number, frames in enumerate(patterns.T):
-        yield frames, np.flatnonzero(pattern_of.ravel() == number).tolist()
+    with np.errstate(divide="ignore", invalid="ignore"):
+        change = np.where(before == after, 0.0, 100 * better * (after - before) / np.abs(before))
+    return np.where(np.isfinite(change), change, math.nan)
 
 
-def clusters_among(ids: NDArray[np.int64], frames: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Returns the clusters of some of the frames, numbered from 0 without a gap."""
-    return np.unique(ids[frames], return_inverse=True)[1].astype(np.int64)
+def gain_interval(
+    first: FrameTable,
+    other: FrameTable,
+    better: Floats,
+    clusters: Ints,
+    resamples: int,
+    seed: int,
+) -> tuple[Floats, Floats]:
+    """Returns (M,), (M,): the ends of the 95 % interval of `gain` of paired tables."""
+    parts = first.rows.shape[-1]
+    totals = np.concatenate([t.cluster_totals(clusters) for t in (first, other)], axis=-1)
+    return studentised_interval(
+        lambda sums: gain(
+            first.mean_of(sums[..., :parts]), other.mean_of(sums[..., parts:]), better
+        ),
+        totals,
+        resamples,
+        seed,
+    )
 
 
 def studentised_interval(
-    statistic: Callable[[Tensor], Tensor], totals: Floats, resamples: int, seed: int
+    statistic: Callable[[Floats], Floats], totals: Floats, resamples: int, seed: int
 ) -> tuple[Floats, Floats]:
     """Returns (M,), (M,): the ends of the 95 % interval of statistic(totals.sum(0)).
 
     Each end is that of the bootstrap-t (Efron and Tibshirani 1993, section 12.5) or of Student's t,
     whichever is farther out: the first follows the skewness of the errors, the second the error of
     a standard error from few clusters. Standard errors are linearised in the totals (infinitesimal
-    jackknife). NaN where the statistic is NaN.
+    jackknife). NaN for a measure that fewer than MIN_CLUSTERS clusters have.
 
     Args:
-        statistic: From totals (…, C) to (…, M); differentiable, and unchanged where the totals are
-            multiplied.
-        totals: (G, C) of each cluster; clusters are resampled whole.
+        statistic: From sums (…, M, K) to (…, M), each measure of its own K sums; differentiable,
+            and unchanged where the sums are multiplied.
+        totals: (G, M, K) of each cluster; clusters are resampled whole.
         resamples: How many bootstrap samples are drawn.
         seed: Of the drawing.
     """
-    clusters = len(totals)
-    moments = _Moments(statistic, totals)
+    clusters, measures, parts = totals.shape
+    held = (totals != 0).any(axis=-1).sum(axis=0)
+    if clusters < MIN_CLUSTERS:
+        return np.full(measures, math.nan), np.full(measures, math.nan)
+    flat, by_measure = totals.reshape(clusters, -1), totals.transpose(1, 2, 0)
+    steps = np.maximum(_STEP * np.abs(totals).sum(axis=0), 1e-300)
+    one_each = np.eye(parts)[:, None] * steps  # (K, M, K)
+
+    def linearised(counts: Floats) -> tuple[Floats, Floats]:
+        """(B, M) the statistic where clusters count as (B, G), and (B, M) its standard errors."""
+        sums = (counts @ flat).reshape(-1, measures, parts)
+        ahead, behind = (statistic(sums[:, None] + sign * one_each) for sign in (1, -1))
+        slopes = (ahead - behind) / (2 * steps.T)  # (B, K, M)
+        with np.errstate(invalid="ignore"):
+            influence = slopes.transpose(2, 0, 1) @ by_measure  # (M, B, G)
+            return statistic(sums), np.sqrt(np.einsum("bg,mbg->bm", counts, influence**2))
+
     generator = np.random.default_rng(seed)
-    value, error = (row[0] for row in moments.linearised(np.ones((1, clusters))))
+    value, error = (row[0] for row in linearised(np.ones((1, clusters))))
+    rounding = 1e-9 * np.maximum(np.abs(value), 1.0)
+    error = np.where(error > rounding, error, 0.0)
+    size = max(1, _CELLS // max(clusters * measures, measures * parts * parts))
     ratios = []
-    for size in _batches(resamples, clusters):
-        drawn = generator.integers(0, clusters, (size, clusters), dtype=np.int32)
-        values, errors = moments.linearised(_counts(drawn))
+    for start in range(0, resamples, size):
+        drawn = generator.integers(
+            0, clusters, (min(size, resamples - start), clusters), dtype=np.int32
+        )
+        values, errors = linearised(_counts(drawn))
         with np.errstate(divide="ignore", invalid="ignore"):
             # a resample without variance says nothing of the ratio's distribution
-            ratios.append(np.where(errors > 1e-6 * error, (values - value) / errors, np.nan))
-    tail = (1 - LEVEL) / 2
+            ratios.append(np.where(errors > 1e-6 * error, (values - value) / errors, math.nan))
     all_ratios = np.concatenate(ratios)
-    none = np.isnan(all_ratios).all(axis=0)  # all clusters are alike: nothing varies
-    all_ratios[:, none] = 0.0
-    low_ratio, high_ratio = np.nanquantile(all_ratios, [tail, 1 - tail], axis=0)
-    student = stats.t.ppf(1 - tail, clusters - 1) * math.sqrt(clusters / (clusters - 1))
-    low, high = np.minimum(low_ratio, -student), np.maximum(high_ratio, student)
-    return value - high * error, value - low * error
-
-
-class _Moments:
-    """The statistic and its standard error, from first and second moments of the clusters."""
-
-    def __init__(self, statistic: Callable[[Tensor], Tensor], totals: Floats) -> None:
-        self._statistic = statistic
-        self._totals = totals
-        # centred, so that little cancels in the second moments
-        self._centred = totals - totals.mean(axis=0)
-        columns = totals.shape[1]
-        self._upper = np.triu_indices(columns)
-        self._products = self._centred[:, self._upper[0]] * self._centred[:, self._upper[1]]
-        # central differences: a backward pass would carry the NaN of one measure into the others
-        steps = _STEP * torch.from_numpy(totals).abs().mean(dim=0).clamp_min(1e-300)
-        self._steps = torch.diag(steps.nan_to_num(1.0))
-
-    def linearised(self, counts: Floats) -> tuple[Floats, Floats]:
-        """Returns (B, M) the statistic where clusters count as (B, G), and (B, M) its errors."""
-        resampled = torch.from_numpy(counts @ self._totals)
-        values = self._statistic(resampled)
-        ahead, behind = (
-            self._statistic(resampled[:, None] + sign * self._steps) for sign in (1, -1)
-        )
-        slopes = ((ahead - behind) / (2 * self._steps.diagonal()[:, None])).transpose(-1, -2)
-        variances = torch.einsum(
-            "bmc,bcd,bmd->bm", slopes, torch.from_numpy(self._covariances(counts)), slopes
-        )
-        return values.numpy(), variances.clamp_min(0).sqrt().numpy()
-
-    def _covariances(self, counts: Floats) -> Floats:
-        """(B, C, C) sums over the clusters of products of totals, centred in each resample."""
-        rows, columns = self._upper
-        sums = counts @ self._centred
-        centred = counts @ self._products - sums[:, rows] * sums[:, columns] / len(self._totals)
-        covariances = np.empty((len(counts), sums.shape[1], sums.shape[1]))
-        covariances[:, rows, columns] = centred
-        covariances[:, columns, rows] = centred
-        # a column with NaN is of a measure that is NaN; it must not reach the other measures
-        return np.nan_to_num(covariances, nan=0.0)
+    all_ratios[:, np.isnan(all_ratios).all(axis=0)] = 0.0
+    tail = (1 - LEVEL) / 2
+    low, high = np.nanquantile(all_ratios, [tail, 1 - tail], axis=0)
+    dof = np.maximum(held - 1, 1)
+    student = stats.t.ppf(1 - tail, dof) * np.sqrt((dof + 1) / dof)
+    error = np.where(held >= MIN_CLUSTERS, error, math.nan)
+    return value - np.maximum(high, student) * error, value - np.minimum(low, -student) * error
 
 
 def _counts(drawn: NDArray[np.int32]) -> Floats:
     """(B, G) how often each of G clusters is among (B, G) drawn ones."""
     batch, clusters = drawn.shape
-    drawn += np.arange(0, batch * clusters, clusters, dtype=np.int32)[:, None]
-    counts = np.bincount(drawn.ravel(), minlength=batch * clusters)
+    offset = np.arange(0, batch * clusters, clusters, dtype=np.int64)[:, None]
+    counts = np.bincount((drawn + offset).ravel(), minlength=batch * clusters)
     return counts.reshape(batch, clusters).astype(np.float64)
+
+
+def swap_p_values(
+    first: FrameTable, other: FrameTable, clusters: Ints, resamples: int, seed: int
+) -> tuple[Floats, bool]:
+    """Returns `sign_flip_p_values` of the means of paired tables."""
+    a, b = (table.cluster_totals(clusters) for table in (first, other))
+    moves, shape = (b - a).reshape(len(a), -1), a.shape[1:]
+
+    def difference(flips: Floats) -> Floats:
+        moved = (flips @ moves).reshape(-1, *shape)
+        return other.mean_of(b.sum(axis=0) - moved) - first.mean_of(a.sum(axis=0) + moved)
+
+    return sign_flip_p_values(difference, len(a), resamples, seed)
 
 
 def sign_flip_p_values(
@@ -187,6 +216,8 @@ def sign_flip_p_values(
         return np.asarray(as_much, np.float64)
 
     exact = clusters < 60 and 2**clusters <= resamples
+    if clusters < 2:
+        return np.full(len(observed), math.nan), exact
     result = stats.permutation_test(
         (np.zeros(clusters), np.ones(clusters)),
         differs_as_much,
@@ -198,21 +229,14 @@ def sign_flip_p_values(
         axis=-1,
         random_state=np.random.default_rng(seed),
     )
-    return np.where(np.isfinite(observed), np.ravel(result.pvalue), np.nan), exact
+    return np.where(np.isfinite(observed), np.ravel(result.pvalue), math.nan), exact
 
 
 def holm(p_values: Floats) -> Floats:
     """Returns (M,) p-values adjusted for testing M hypotheses (Holm 1979); NaN stays NaN."""
+    order = np.argsort(p_values)
+    order = order[np.isfinite(p_values[order])]
     adjusted = np.full(len(p_values), math.nan)
-    order = [index for index in np.argsort(p_values) if np.isfinite(p_values[index])]
-    largest = 0.0
-    for rank, index in enumerate(order):
-        largest = max(largest, min(1.0, (len(order) - rank) * float(p_values[index])))
-        adjusted[index] = largest
+    steps = p_values[order] * np.arange(len(order), 0, -1)
+    adjusted[order] = np.minimum(np.maximum.accumulate(steps), 1.0)
     return adjusted
-
-
-def _batches(total: int, clusters: int) -> Iterator[int]:
-    size = max(1, _CELLS // clusters)
-    for start in range(0, total, size):
-        yield min(size, total - start)

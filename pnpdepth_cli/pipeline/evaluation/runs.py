@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from pnpdepth_cli.choices import MEASURE_GROUPS
 from pnpdepth_cli.core.metrics import MEASURES, Measure
 from pnpdepth_cli.errors import FileFormatError, UsageError
 from pnpdepth_cli.io.file_bytes import one_line
@@ -16,8 +17,6 @@ from pnpdepth_cli.pipeline.evaluation.dependence import groups_by_name
 from pnpdepth_cli.pipeline.evaluation.protocols import PROTOCOLS
 
 _STAGES = ("before", "after")
-_MOST_DECIMALS = 15
-_LARGEST_FACTOR = 1e6
 _MOST_PIXELS = 1 << 53
 
 
@@ -76,66 +75,48 @@ def read_run(text: str) -> Run:
     if path.is_dir():
         path = path / "summary.json"
     record = read_json(path)
+    label = f"{path.stem}:before" if stage == "before" else path.stem
     try:
-        if record.get("command") == "eval":
-            if stage == "before":
-                raise UsageError(f"{path} is of eval, which has no before; leave out :before")
-            return _eval_run(text, path.stem, record)
-        frames = _refinement_frames(path, record, stage)
+        if record.get("command") != "eval":
+            return _refinement_run(text, label, path, record, stage)
+        if stage == "before":
+            raise UsageError(f"{path} is of eval, which has no before; leave out :before")
+        return _eval_run(text, label, record)
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
         fact = one_line(repr(error))
         raise FileFormatError(
             f"{path} does not hold scores as pnpdepth writes them ({fact}); create it again"
         ) from error
-    if not frames:
-        raise FileFormatError(
-            f"{path} holds no scores; give what eval --json printed, or the summary of a batch or"
-            " the record of a refinement with ground truth"
-        )
-    keys = set.intersection(*(set(frame.values) for frame in frames.values()))
-    return Run(
-        label=f"{path.stem}:before" if stage == "before" else path.stem,
-        path=text,
-        measures=tuple(measure for measure in MEASURES if measure.key in keys),
-        scoring=PROTOCOLS["paper"].scoring(),
-        frames=frames,
-    )
 
 
 def _eval_run(text: str, label: str, record: Mapping[str, Any]) -> Run:
     scored = [frame for frame in record["frames"] if frame["error"] is None]
-    groups = groups_by_name([frame["name"] for frame in scored])
     return Run(
         label=label,
         path=text,
-        measures=tuple(_measure(fields) for fields in record["measures"]),
-        # records of earlier versions lack rules that did not exist
-        scoring=PROTOCOLS["paper"].scoring() | record["protocol"]["scoring"],
+        measures=_measures(record),
+        scoring=dict(record["protocol"]["scoring"]),
         frames={
             str(frame["name"]): RunFrame(
                 values=_numbers(frame["values"]),
                 pixels=_count(frame["pixels"]),
-                group=str(frame.get("group", group)),
+                group=str(frame["group"]),
                 known=None if frame["known"] is None else _count(frame["known"]),
                 sums=tuple(float(each) for each in frame.get("sums", ())),
             )
-            for frame, group in zip(scored, groups, strict=True)
+            for frame in scored
         },
     )
 
 
-def _measure(fields: Mapping[str, Any]) -> Measure:
-    """The measure of a record. Raises TypeError or ValueError for what no table can show."""
-    measure = Measure(**fields)
-    for name, like in asdict(Measure(key="", title="")).items():
-        value = getattr(measure, name)
-        if type(value) is not type(like):
-            raise TypeError(f"{name} of a measure is {one_line(value)!r}")
-    if not 0 <= measure.decimals <= _MOST_DECIMALS:
-        raise ValueError(f"a measure with {one_line(measure.decimals)} decimals")
-    if not 0 < measure.shown_factor <= _LARGEST_FACTOR:
-        raise ValueError(f"a measure shown × {measure.shown_factor:g}")
-    return measure
+def _measures(record: Mapping[str, Any]) -> tuple[Measure, ...]:
+    """The measures of a record, as its protocol shows them; those unknown here are left out."""
+    keys = [each["key"] for each in record["measures"]]
+    known = {measure.key: measure for measure in PROTOCOLS[record["protocol"]["name"]].measures}
+    if any(key not in known for key in keys):
+        groups = MEASURE_GROUPS.values()
+        known = {measure.key: measure for group in groups for measure in group.measures} | known
+    return tuple(known[key] for key in keys if key in known)
 
 
 def _count(value: Any) -> int:
@@ -144,22 +125,36 @@ def _count(value: Any) -> int:
     return value
 
 
-def _refinement_frames(path: Path, record: Mapping[str, Any], stage: str) -> dict[str, RunFrame]:
-    """The frames of a batch's summary, or the one frame of a record."""
+def _refinement_run(
+    text: str, label: str, path: Path, record: Mapping[str, Any], stage: str
+) -> Run:
+    """The run in a batch's summary, or of the one frame of a record."""
     if isinstance(record.get("frames"), list):
         scores = {entry["name"]: entry.get("scores") for entry in record["frames"]}
     else:
         scores = {path.stem: record.get("scores")}
     values = {name: _numbers(each[stage]) for name, each in scores.items() if each is not None}
-    return {
-        name: RunFrame(
-            values=each,
-            pixels=round(each["pixels"]),
-            group=group,
-            known=round(each["pixels"] / each["coverage"]) if each["coverage"] else None,
+    if not values:
+        raise FileFormatError(
+            f"{path} holds no scores; give what eval --json printed, or the summary of a batch or"
+            " the record of a refinement with ground truth"
         )
-        for (name, each), group in zip(values.items(), groups_by_name(list(values)), strict=True)
-    }
+    groups = groups_by_name(list(values))
+    return Run(
+        label=label,
+        path=text,
+        measures=tuple(m for m in MEASURES if all(m.key in each for each in values.values())),
+        scoring=PROTOCOLS["paper"].scoring(),
+        frames={
+            name: RunFrame(
+                values=each,
+                pixels=round(each["pixels"]),
+                group=group,
+                known=round(each["pixels"] / each["coverage"]) if each["coverage"] else None,
+            )
+            for (name, each), group in zip(values.items(), groups, strict=True)
+        },
+    )
 
 
 def _numbers(values: Mapping[str, Any]) -> dict[str, float]:

@@ -11,7 +11,7 @@ to the ground truth of each image before they score:
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,56 +19,35 @@ from numpy.typing import NDArray
 from pnpdepth_cli.errors import InputError
 
 Depth = NDArray[np.float32]
-Mask = NDArray[np.bool_]
-
-_MIN_PIXELS = 2
 
 
-@dataclass(frozen=True, kw_only=True)
-class Fit:
+class Fit(NamedTuple):
     """depth = factor · predicted + shift, or the same in disparity (1/m)."""
 
     factor: float
-    """Multiplies the prediction."""
     shift: float = 0.0
-    """Metres, or 1/m; 0 for median and log."""
 
 
-def depth_of_kind(values: Depth, kind: str) -> Depth:
-    """Returns depth from predictions of a kind; 0 stays unknown.
-
-    Args:
-        values: (H, W) predictions, 0 where unknown.
-        kind: One of choices.PREDICTION_KINDS.
-    """
-    return _inverse(values) if kind == "disparity" else values
-
-
-def scaled(
-    values: Depth, gt: Depth, where: Mask, kind: str, scale_by: str
-) -> tuple[Depth, Fit | None]:
+def scaled(values: Depth, gt: Depth, kind: str, scale_by: str) -> tuple[Depth, Fit | None]:
     """Returns the prediction in metres, fitted to the ground truth of its image, and the fit.
 
     A fitted depth or disparity that is not above 0 becomes unknown (0).
 
     Args:
         values: (H, W) predictions of the kind, 0 where unknown.
-        gt: (H, W) ground truth in metres.
-        where: (H, W) true where the protocol scores the ground truth.
+        gt: (H, W) ground truth in metres, 0 where it is not scored.
         kind: One of choices.PREDICTION_KINDS.
         scale_by: One of choices.SCALINGS.
 
     Raises:
         InputError: If fewer than two pixels have both, or the prediction is constant.
     """
-    depth = depth_of_kind(values, kind)
+    depth = _inverse(values) if kind == "disparity" else values
     if scale_by == "none":
         return depth, None
-    both = where & (gt > 0) & (depth > 0)
-    if np.count_nonzero(both) < _MIN_PIXELS:
-        raise InputError(
-            f"--scale-by {scale_by} needs {_MIN_PIXELS} pixels with ground truth and prediction"
-        )
+    both = (gt > 0) & (depth > 0)
+    if np.count_nonzero(both) < 2:
+        raise InputError(f"--scale-by {scale_by} needs 2 pixels with ground truth and prediction")
     g = gt[both].astype(np.float64)
     if scale_by == "median":
         fit = Fit(factor=float(np.median(g) / np.median(depth[both].astype(np.float64))))

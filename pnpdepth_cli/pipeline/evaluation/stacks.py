@@ -1,8 +1,4 @@
-"""Reads frames from one array of many: `(N, H, W)` NPY, and NPZ such as monodepth2's `gt_depths`.
-
-monodepth2 stores images of different sizes as an object array, which NumPy pickles. It is read with
-an unpickler that creates NumPy arrays and nothing else.
-"""
+"""Reads frames from one array of many: `(N, H, W)` NPY, or NPZ as monodepth2's `gt_depths`."""
 
 from __future__ import annotations
 
@@ -12,31 +8,26 @@ import pickle
 import zipfile
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import FileFormatError
 from pnpdepth_cli.io.formats import StoredArray
-from pnpdepth_cli.io.formats.npy import HEADER_LOCK
 
-STACK_SUFFIXES = (".npy", ".npz")
 _ARRAY_PARTS = {
-    (module, name)
-    for module in ("numpy.core.multiarray", "numpy._core.multiarray")
-    for name in ("_reconstruct", "scalar")
-} | {("numpy", "ndarray"), ("numpy", "dtype")}
+    *((f"numpy.{core}.multiarray", part) for core in ("core", "_core")
+      for part in ("_reconstruct", "scalar")),
+    *(("numpy", part) for part in ("ndarray", "dtype")),
+}  # fmt: skip
 
 
 def stack_size(path: Path) -> int | None:
     """Returns how many frames a file stacks; None for a single depth map or an unreadable file."""
-    if path.suffix.lower() not in STACK_SUFFIXES:
+    if path.suffix.lower() not in (".npy", ".npz"):
         return None
-    try:
-        stack = _stack(path)
-    except FileFormatError:  # the reader of single maps reports it
-        return None
+    stack = _stack(path)
     return None if stack is None else len(stack)
 
 
@@ -53,41 +44,36 @@ def load_stacked(path: Path, index: int) -> StoredArray:
 
 @functools.lru_cache(maxsize=4)
 def _stack(path: Path) -> Sequence[NDArray[Any]] | NDArray[Any] | None:
-    """The stack in a file; None if it holds a single map."""
+    """The stack in a file; None for anything else, which the reader of single maps reports."""
     try:
-        if path.suffix.lower() == ".npy":
-            array = _member(path.open("rb"), path)
-        else:
-            with zipfile.ZipFile(path) as archive:
-                names = archive.namelist()
-                if len(names) != 1:
-                    return None
-                array = _member(io.BytesIO(archive.read(names[0])), path)
-    except FileFormatError:
-        raise
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile, pickle.UnpicklingError) as error:
-        raise FileFormatError(f"{path} is not a NumPy file: {error}") from error
+        with _opened(path) as file:
+            array = _array_in(file)
+    except Exception:  # NumPy evaluates the header, which raises many kinds where it is damaged
+        return None
     if array.dtype == object:
         return [np.asarray(each) for each in array.ravel()]
     return array if array.ndim == 3 and 1 not in (array.shape[0], array.shape[2]) else None
 
 
-def _member(file: Any, path: Path) -> NDArray[Any]:
-    with file, HEADER_LOCK:
-        version = np.lib.format.read_magic(file)
-        read = {
-            (1, 0): np.lib.format.read_array_header_1_0,
-            (2, 0): np.lib.format.read_array_header_2_0,
-        }.get(version)
-        if read is None:
-            raise FileFormatError(f"{path}: NPY version {version} is unknown")
-        shape, _, dtype = read(file)
-        if not dtype.hasobject:
-            file.seek(0)
-            return np.asarray(np.lib.format.read_array(file, allow_pickle=False))
+def _opened(path: Path) -> IO[bytes]:
+    """The NPY file, or the one in an NPZ."""
+    if path.suffix.lower() == ".npy":
+        return path.open("rb")
+    with zipfile.ZipFile(path) as archive:
+        (name,) = archive.namelist()
+        return io.BytesIO(archive.read(name))
+
+
+def _array_in(file: IO[bytes]) -> NDArray[Any]:
+    try:
+        return np.asarray(np.load(file, allow_pickle=False))
+    except ValueError:  # monodepth2 stores images of different sizes as an object array, a pickle
+        file.seek(6)
+        long = file.read(2)[0] > 1
+        file.seek(int.from_bytes(file.read(4 if long else 2), "little"), io.SEEK_CUR)
         array = _ArrayUnpickler(file).load()
-        if not isinstance(array, np.ndarray) or array.shape != shape:
-            raise FileFormatError(f"{path}: its object array does not fit its header")
+        if not isinstance(array, np.ndarray):
+            raise
         return array
 
 

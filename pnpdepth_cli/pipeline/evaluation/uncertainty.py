@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,18 +20,15 @@ Floats = NDArray[np.float64]
 
 ONE_SIGMA, TWO_SIGMA = (float(2 * norm.cdf(k) - 1) for k in (1, 2))
 LEVELS = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, ONE_SIGMA, 0.8, 0.9, TWO_SIGMA, 0.99)
-"""Probabilities of the calibration curve, the last but one of two standard deviations."""
-
 REMOVED = tuple(n / 20 for n in range(20))
-"""Fractions of the pixels that are removed, of the sparsification curve."""
+"""Fractions of the pixels."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class FrameUncertainty:
+class FrameUncertainty(NamedTuple):
     """What one frame contributes."""
 
     pixels: int
-    """Pixels with prediction, ground truth and standard deviation."""
+    """With prediction, ground truth and standard deviation."""
     within: Floats
     """(LEVELS,) how many errors lie within the interval of each probability."""
     sparsification: Floats
@@ -44,9 +42,7 @@ class Uncertainty:
     """Calibration over the pixels of all frames, and the mean sparsification of the frames."""
 
     frames: int
-    """Frames with a standard deviation."""
     pixels: int
-    """Their pixels with prediction, ground truth and standard deviation."""
     within_1_sigma: float
     """Fraction of errors within one standard deviation; 0.683 if calibrated."""
     within_2_sigma: float
@@ -54,15 +50,13 @@ class Uncertainty:
     ause: float
     """Area between sparsification and oracle, in units of the error of all pixels; 0 is best."""
     expected: tuple[float, ...]
-    """Probabilities of the calibration curve."""
+    """LEVELS, the calibration curve's."""
     observed: tuple[float, ...]
     """Fraction of errors within the interval of each."""
     removed: tuple[float, ...]
-    """Fractions of the sparsification curve."""
+    """REMOVED, the sparsification curve's."""
     sparsification: tuple[float, ...]
-    """Mean absolute error without the most uncertain pixels, metres."""
     oracle: tuple[float, ...]
-    """Mean absolute error without the pixels of largest error, metres."""
 
 
 def frame_uncertainty(depth: Depth, gt: Depth, sigma: Depth) -> FrameUncertainty | None:
@@ -92,17 +86,14 @@ def summarise_uncertainty(frames: Sequence[FrameUncertainty]) -> Uncertainty | N
     """Returns the calibration and sparsification of all frames; None without any."""
     if not frames:
         return None
-    pixels = sum(frame.pixels for frame in frames)
-    observed = np.sum([frame.within for frame in frames], axis=0) / pixels
-    sparsification, oracle = (
-        np.mean([getattr(frame, name) for frame in frames], axis=0)
-        for name in ("sparsification", "oracle")
-    )
+    pixels, within, by_sigma, by_error = zip(*frames, strict=True)
+    observed = np.sum(within, axis=0) / sum(pixels)
+    sparsification, oracle = np.mean(by_sigma, axis=0), np.mean(by_error, axis=0)
     area = float(np.trapezoid(sparsification - oracle, REMOVED))
     by_level = dict(zip(LEVELS, observed.tolist(), strict=True))
     return Uncertainty(
         frames=len(frames),
-        pixels=pixels,
+        pixels=sum(pixels),
         within_1_sigma=by_level[ONE_SIGMA],
         within_2_sigma=by_level[TWO_SIGMA],
         ause=area / float(sparsification[0]) if sparsification[0] else 0.0,

@@ -31,8 +31,8 @@ from pnpdepth_cli.io.report import (
     save_view_3d,
     write_report,
 )
-from pnpdepth_cli.pipeline.evaluation.score_files import column_title, format_value
 from pnpdepth_cli.pipeline.report.evaluation import column_of, frames_text
+from pnpdepth_cli.pipeline.tables import column_title, format_value
 
 Row = dict[str, Any]
 

@@ -7,13 +7,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pnpdepth_cli.core.metrics import Measure
 from pnpdepth_cli.errors import InputError, PnpDepthError
 from pnpdepth_cli.io.colours import depth_scale, grey_of, paint_error, swatches
-from pnpdepth_cli.io.dataset.hdf5 import rgb_of
-from pnpdepth_cli.io.layouts import Hdf5Array
 from pnpdepth_cli.io.report import (
     Chart,
     Column,
@@ -26,21 +23,13 @@ from pnpdepth_cli.io.report import (
     whole_report,
     write_report,
 )
-from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.io.visualisation import error_map
-from pnpdepth_cli.pipeline.evaluation.frame_reading import Depth, load_frame
-from pnpdepth_cli.pipeline.evaluation.frame_scoring import FrameScores
-from pnpdepth_cli.pipeline.evaluation.kitti_devkit import fill_background
-from pnpdepth_cli.pipeline.evaluation.pairing import FramePair
-from pnpdepth_cli.pipeline.evaluation.result import ErrorBin, Evaluation
-from pnpdepth_cli.pipeline.evaluation.score_files import (
-    bin_rows,
-    column_title,
-    format_value,
-    interval_text,
-    unit_of,
-)
+from pnpdepth_cli.pipeline.evaluation.evaluate import Evaluation
+from pnpdepth_cli.pipeline.evaluation.frame_reading import image_of, load_frame
+from pnpdepth_cli.pipeline.evaluation.frame_scoring import FrameScores, filled
+from pnpdepth_cli.pipeline.evaluation.tables import calibration_tables, means_by_measure
 from pnpdepth_cli.pipeline.ordered_pool import in_order
+from pnpdepth_cli.pipeline.tables import format_value, unit_of
 
 _SOURCE = {"command": "eval"}
 _LISTED = ("rmse", "mae", "mre", "irmse", "delta1")
@@ -117,7 +106,7 @@ def _columns(evaluation: Evaluation) -> list[Column]:
 def _head(evaluation: Evaluation, columns: list[Column]) -> Head:
     request = evaluation.request
     without = [(frame.name, frame.error or "") for frame in evaluation.frames if not frame.scored]
-    filled = " (filled in)" if evaluation.protocol.is_devkit else ""
+    fill = " (filled in)" if evaluation.protocol.is_devkit else ""
     return Head(
         kind="Depth evaluation",
         title=str(request.prediction),
@@ -131,10 +120,8 @@ def _head(evaluation: Evaluation, columns: list[Column]) -> Head:
         ],
         notes=evaluation.notes,
         tables=[
-            _means(evaluation),
-            *_uncertainty(evaluation),
-            *_bins("By distance to the nearest sparse point", "px", evaluation.by_distance),
-            *_bins("By depth of the ground truth", "m", evaluation.by_depth),
+            Table(caption=table.caption, header=table.header, rows=table.rows)
+            for table in (means_by_measure(evaluation), *calibration_tables(evaluation))
         ],
         charts=_charts(evaluation),
         without_title=f"Not scored: {len(without):,}",
@@ -142,7 +129,7 @@ def _head(evaluation: Evaluation, columns: list[Column]) -> Head:
         columns=columns,
         sort_by="rmse",
         labels={
-            "first": f"Prediction{filled}", "second": "Ground truth", "map": "Error",
+            "first": f"Prediction{fill}", "second": "Ground truth", "map": "Error",
             "image": "Image",
         },
         map_colours=swatches(paint_error(np.linspace(-1, 1, 9), np.full(9, 0.88))),
@@ -164,48 +151,6 @@ def _tiles(evaluation: Evaluation) -> list[tuple[str, str, str]]:
             if measure.key in ("rmse", "mae", "delta1")
         ),
         ("Coverage", coverage, "of the ground truth has a prediction"),
-    ]
-
-
-def _means(evaluation: Evaluation) -> Table:
-    measures, interval = evaluation.protocol.measures, evaluation.interval
-    header, rows = ["", "mean"], []
-    for measure in measures:
-        rows.append([column_title(measure), format_value(measure, evaluation.mean[measure.key])])
-        if interval is not None:
-            rows[-1].append(interval_text(evaluation, measure))
-    of = frames_text(len(evaluation.scored))
-    caption = f"Means over {of}"
-    if evaluation.protocol.average == "pooled":
-        caption = f"Over all pixels of {of} together"
-    if interval is not None:
-        header.append("95 %")
-        caption += f"; {evaluation.describe_interval()}"
-    return Table(caption=caption, header=header, rows=rows)
-
-
-def _uncertainty(evaluation: Evaluation) -> list[Table]:
-    """Calibration and sparsification of the predicted standard deviation, if there is one."""
-    found = evaluation.uncertainty
-    if found is None:
-        return []
-    calibration = zip(found.expected, found.observed, strict=True)
-    sparsification = zip(found.removed, found.sparsification, found.oracle, strict=True)
-    frames = frames_text(found.frames)
-    return [
-        Table(
-            caption=f"Calibration of the standard deviation, {frames}: {found.within_1_sigma:.1%}"
-            f" within 1σ, {found.within_2_sigma:.1%} within 2σ",
-            header=["normal distribution", "observed"],
-            rows=[[f"{expected:.1%}", f"{observed:.1%}"] for expected, observed in calibration],
-        ),
-        Table(
-            caption=f"Sparsification, {frames}: AUSE {found.ause:.4f} of the MAE",
-            header=["removed", "MAE by σ [m]", "MAE by error [m]"],
-            rows=[
-                [f"{part:.0%}", f"{mae:.4f}", f"{best:.4f}"] for part, mae, best in sparsification
-            ],
-        ),
     ]
 
 
@@ -242,14 +187,6 @@ def _charts(evaluation: Evaluation) -> list[Chart]:
     return charts
 
 
-def _bins(caption: str, unit: str, bins: tuple[ErrorBin, ...]) -> list[Table]:
-    if not bins:
-        return []
-    header = [f"[{unit}]", "of the ground truth", "RMSE [m]", "MAE [m]", "MRE", "coverage"]
-    caption = f"{caption}, all pixels together"
-    return [Table(caption=caption, header=header, rows=bin_rows(bins))]
-
-
 def _entry(
     frame: FrameScores, evaluation: Evaluation, columns: list[Column], images: Path
 ) -> dict[str, Any]:
@@ -275,15 +212,15 @@ def _entry(
 
 def _drawn(frame: FrameScores, evaluation: Evaluation, images: Path) -> dict[str, Any]:
     """Writes the images of a frame and returns the page's entry of them."""
-    protocol = evaluation.protocol
-    loaded = load_frame(frame.pair, protocol, evaluation.request.scales)
-    gt = loaded.ground_truth.values
-    if loaded.prediction is None:
-        return {"key": None}
-    depth = loaded.prediction.values
+    protocol, pair = evaluation.protocol, frame.pair
+    loaded = load_frame(pair, protocol, evaluation.request.scales)
+    gt, depth = loaded.gt, loaded.depth
     if protocol.is_devkit:
-        depth = np.maximum(fill_background(depth), np.float32(0))
-    image = _image(frame.pair, gt)
+        depth = filled(depth)
+    try:
+        image = image_of(pair, gt.shape)
+    except PnpDepthError:
+        image = None
     errors, strongest_m = error_map(depth, gt, None if image is None else grey_of(image))
     scale = depth_scale(depth, gt)
     views = {"first": scale.paint(depth), "second": scale.paint(gt), "map": errors}
@@ -301,18 +238,3 @@ def _drawn(frame: FrameScores, evaluation: Evaluation, images: Path) -> dict[str
             "footer": "prediction against ground truth",
         },
     }
-
-
-def _image(pair: FramePair, gt: Depth) -> NDArray[np.float32] | None:
-    """The frame's image (H, W, 3) in 0…1, if one is known, can be read and fits the depth."""
-    if pair.image is None:
-        return None
-    try:
-        rgb = (
-            rgb_of(pair.image) if isinstance(pair.image, Hdf5Array) else read_rgb(pair.image).values
-        )
-    except PnpDepthError:
-        return None
-    if rgb.shape[:2] != gt.shape:
-        rgb = pair.frame.protocol.apply(rgb)
-    return rgb if rgb.shape[:2] == gt.shape else None

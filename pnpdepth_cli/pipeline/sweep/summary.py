@@ -10,21 +10,21 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from scipy import stats
-from torch import Tensor
 
 from pnpdepth_cli.core.metrics import MEASURES
 from pnpdepth_cli.io.atomic import atomic_path
 from pnpdepth_cli.io.csv_text import write_csv
 from pnpdepth_cli.io.record import plain, write_json
-from pnpdepth_cli.pipeline.evaluation.dependence import (
-    MIN_CLUSTERS,
-    find_clusters,
-    groups_by_name,
+from pnpdepth_cli.pipeline.evaluation.dependence import find_clusters, groups_by_name
+from pnpdepth_cli.pipeline.evaluation.resampling import (
+    Floats,
+    FrameTable,
+    gain,
+    gain_interval,
+    mean_interval,
 )
-from pnpdepth_cli.pipeline.evaluation.resampling import Floats, FrameTable, studentised_interval
-from pnpdepth_cli.pipeline.evaluation.score_files import latex_text
+from pnpdepth_cli.pipeline.tables import Table
 
 CONFIDENCE = 0.95
 MIN_SEEDS = 3
@@ -33,7 +33,7 @@ METHODS = ("plain", "linear", "refined")
 SWEPT = tuple(m for m in MEASURES if m.key in ("mae", "rmse", "mre", "delta1"))
 """The measures of a sweep."""
 
-_BETTER = torch.tensor([1.0 if m.higher_is_better else -1.0 for m in SWEPT]).double()
+_BETTER = np.array([1.0 if m.higher_is_better else -1.0 for m in SWEPT])
 _MEASURE_COLUMNS = (
     *(*METHODS, "refined_low", "refined_high"),
     *("gain", "gain_low", "gain_high", "gain_over_linear"),
@@ -137,32 +137,16 @@ def _mean_and_interval(
     table: Floats, names: Sequence[str], resamples: int
 ) -> tuple[Floats, Floats, Floats]:
     """(5, measures) each, of a table (frames, methods, measures): means and gains, their ends."""
-    frames = FrameTable(rows=table.reshape(len(table), -1))
-    clusters = find_clusters(groups_by_name(names), frames.rows)
-    shape = (len(METHODS) + 2, len(SWEPT))
-
-    def statistic(totals: Tensor) -> Tensor:
-        means = frames.means_of(totals)
-        means = means.reshape(*means.shape[:-1], *table.shape[1:])
-        return _with_gains(means).flatten(-2)
-
-    mean = _with_gains(torch.from_numpy(table.mean(axis=0)))
-    low = high = np.full(shape, np.nan)
-    if clusters.count >= MIN_CLUSTERS:
-        totals = frames.cluster_totals(clusters.ids)
-        low, high = (
-            end.reshape(shape) for end in studentised_interval(statistic, totals, resamples, seed=0)
-        )
-    return np.asarray(mean.numpy()), low, high
-
-
-def _with_gains(means: Tensor) -> Tensor:
-    """(…, 5, measures) of means (…, methods, measures): these, and the gains over the others."""
-    before, refined = means[..., :2, :], means[..., 2:, :]
-    change = 100 * _BETTER * (refined - before) / before.abs()
-    gains = torch.where(before == refined, torch.zeros_like(change), change)
-    gains = torch.where(gains.isfinite(), gains, torch.full_like(gains, torch.nan))
-    return torch.cat([means, gains], dim=-2)
+    plain, linear, refined = tables = [FrameTable.of_frames(table[:, m]) for m in range(3)]
+    clusters = find_clusters(groups_by_name(names), table.reshape(len(table), -1))
+    drawing = clusters.ids, resamples, 0
+    ends = [mean_interval(each, *drawing) for each in tables]
+    ends += [gain_interval(before, refined, _BETTER, *drawing) for before in (plain, linear)]
+    means = table.mean(axis=0)
+    gains = [gain(before, means[2], _BETTER) for before in means[:2]]
+    mean = np.concatenate([means, gains])
+    low, high = np.where(np.isnan(mean), math.nan, np.stack(ends, axis=1))
+    return mean, low, high
 
 
 def _by_measure(mean: Floats, low: Floats, high: Floats) -> dict[str, dict[str, float]]:
@@ -263,7 +247,7 @@ def _latex(study: Mapping[str, Any], record: Mapping[str, Any]) -> str:
         f"means over {len(record['frames']):,} frames, {record['seeds']} draws of the points each;"
         " gain: in per cent of the plain network's MAE; interval: 95 %, over sequences of frames"
     )
-    return latex_text(header, rows, caption)
+    return Table(header=header, rows=rows, caption=caption).latex()
 
 
 def write_frames(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:

@@ -14,8 +14,7 @@ from pnpdepth_cli.io.depth import write_depth
 from pnpdepth_cli.io.record import write_json
 from pnpdepth_cli.pipeline.evaluation.compare import CompareRequest, Comparison
 from pnpdepth_cli.pipeline.evaluation.compare import compare as compare_runs
-from pnpdepth_cli.pipeline.evaluation.evaluate import evaluate
-from pnpdepth_cli.pipeline.evaluation.result import EvalRequest
+from pnpdepth_cli.pipeline.evaluation.evaluate import EvalRequest, evaluate
 
 
 def compare(paths: list[str], **settings: Any) -> Comparison:
@@ -45,7 +44,7 @@ def test_a_lower_error_is_a_positive_gain(tmp_path: Path) -> None:
     assert gain.difference == pytest.approx(-2.5 / 3)
     assert gain.p_value == 2 / 8  # all three got better: two of the eight swaps differ as much
     assert np.isnan([gain.low_percent, gain.high_percent]).all()  # three frames are too few
-    assert comparison.exact
+    assert comparison.exact_p_values
     assert [r.label for r in comparison.runs] == ["one", "two"]
     assert comparison.runs[0].mean["mae"] == pytest.approx(7 / 3)
     (note,) = comparison.notes
@@ -77,7 +76,7 @@ def test_frames_are_paired_by_name_and_the_others_reported(tmp_path: Path) -> No
     (tmp_path / "gt" / "only one.npy").unlink()
     two = run(tmp_path, "two", {"b": [2.0], "a": [1.0]})
     comparison = compare([one, two])
-    assert comparison.names == ("a", "b")
+    assert comparison.frames == ("a", "b")
     assert comparison.runs[0].mean["mae"] == pytest.approx(3)
     note = comparison.notes[0]
     assert "1 frames of" in note
@@ -102,20 +101,13 @@ def test_pooled_runs_are_compared_over_their_pixels(tmp_path: Path) -> None:
     assert comparison.gains[0]["mae"].p_value == 1  # only a differs: any swap is as large
 
 
-def test_three_runs_are_each_compared_with_the_first(tmp_path: Path) -> None:
-    paths = [run(tmp_path, name, errors) for name, errors in
-             (("one", FIRST), ("two", BETTER), ("three", FIRST))]  # fmt: skip
-    comparison = compare(paths)
-    assert [gains["mae"].percent > 0 for gains in comparison.gains] == [True, False]
-
-
 def test_many_frames_are_tested_with_random_swaps_of_the_seed(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     first = {f"{n:02}": [float(rng.uniform(1, 2))] for n in range(20)}
     second = {name: [error[0] * float(rng.uniform(0.7, 1.2))] for name, error in first.items()}
     paths = [run(tmp_path, "one", first), run(tmp_path, "two", second)]
     comparison = compare(paths, resamples=500, seed=1, grouped=False)
-    assert not comparison.exact
+    assert not comparison.exact_p_values
     assert (
         comparison.as_record() == compare(paths, resamples=500, seed=1, grouped=False).as_record()
     )
@@ -164,7 +156,7 @@ def test_a_measure_that_a_frame_lacks_is_compared_over_the_other_frames(tmp_path
     flicker = gains["flicker"]
     assert comparison.runs[0].mean["flicker"] == pytest.approx(one.mean())
     assert flicker.percent == pytest.approx(100 * (1 - two.mean() / one.mean()))
-    assert flicker.low_percent < flicker.percent < flicker.high_percent
+    assert flicker.low_percent < flicker.percent - 1 < flicker.percent + 1 < flicker.high_percent
     assert flicker.p_value == 2 / 2**8
     assert any("flicker" in note and "1 lack it" in note for note in comparison.notes)
 
@@ -220,11 +212,6 @@ def test_different_rules_are_refused_and_named(tmp_path: Path) -> None:
         compare([one, devkit])
 
 
-def test_rules_of_another_name_that_score_alike_are_compared(tmp_path: Path) -> None:
-    one, two = run(tmp_path, "one", FIRST), run(tmp_path, "two", FIRST, protocol="kitti")
-    assert compare([one, two]).gains[0]["rmse"].percent == 0
-
-
 def test_runs_without_a_common_frame_are_refused(tmp_path: Path) -> None:
     one = run(tmp_path, "one", {"a": [1.0]})
     (tmp_path / "gt" / "a.npy").unlink()
@@ -259,7 +246,7 @@ def test_a_batch_is_compared_with_what_it_started_from(tmp_path: Path) -> None:
     (tmp_path / "summary.json").write_text(json.dumps({"counts": {}, "frames": frames}))
     for result in (tmp_path, tmp_path / "summary.json"):
         comparison = compare([f"{tmp_path}/summary.json:before", str(result)])
-        assert comparison.names == ("drive/1", "drive/2")
+        assert comparison.frames == ("drive/1", "drive/2")
         assert [m.key for m in comparison.measures] == ["rmse", "mae", "delta1"]
         assert comparison.gains[0]["rmse"].percent == 50
         assert comparison.gains[0]["delta1"].percent == pytest.approx(20)
@@ -270,7 +257,7 @@ def test_a_refinement_can_be_compared_with_an_evaluation(tmp_path: Path) -> None
     (tmp_path / "a.json").write_text(json.dumps({"settings": {}, "scores": SCORES}))
     one = run(tmp_path, "one", {"a": [1.0] * 90})
     comparison = compare([one, str(tmp_path / "a.json")])
-    assert comparison.names == ("a",)
+    assert comparison.frames == ("a",)
     assert [m.key for m in comparison.measures] == ["rmse", "mae", "delta1"]
 
 
@@ -300,7 +287,7 @@ def test_before_is_only_for_what_has_one_and_one_run_is_none_to_compare(tmp_path
         compare([one, f"{one}:before"])
     with pytest.raises(UsageError, match="two runs"):
         compare([one])
-    with pytest.raises(UsageError, match="--bootstrap 0"):
+    with pytest.raises(UsageError, match="--bootstrap must be >= 1, got 0"):
         compare([one, one], resamples=0)
 
 

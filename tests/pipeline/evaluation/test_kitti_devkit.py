@@ -105,34 +105,12 @@ def test_the_errors_are_those_of_the_loops_digit_for_digit(
     )
 
 
-def test_the_nearer_of_two_neighbours_fills_a_gap_and_the_outermost_goes_to_the_border() -> None:
-    depth = np.array([[0, 0, 0, 0, 0], [0, 7, 0, 0, 3], [0, 0, 5, 0, 0], [0, 0, 0, 0, 0]], F)
-    expected = [[7, 7, 3, 3, 3], [7, 7, 3, 3, 3], [5, 5, 5, 5, 5], [5, 5, 5, 5, 5]]
-    np.testing.assert_array_equal(fill_background(depth), np.array(expected, F))
-
-
 def test_an_empty_row_between_others_is_left_out_of_the_fill() -> None:
     depth = np.array([[2, 2], [0, 0], [4, 4]], F)
     assert fill_background(depth)[1].tolist() == [-1, -1]
     errors = devkit_errors(depth, np.full((3, 2), 2, F))
     assert errors["mae"] == pytest.approx((0 + 3 + 2) / 3)
     assert math.isnan(errors["log_mae"])
-
-
-def test_nothing_at_all_stays_missing() -> None:
-    assert (fill_background(np.zeros((2, 3), F)) == -1).all()
-
-
-def test_two_pixels_by_hand() -> None:
-    errors = devkit_errors(np.array([[2, 3]], F), np.array([[1, 4]], F))
-    a, b = math.log(1 / 2), math.log(4 / 3)
-    expected = {
-        "mae": 1, "rmse": 1, "inverse_mae": (1 / 2 + 1 / 12) / 2,
-        "inverse_rmse": math.sqrt((1 / 4 + 1 / 144) / 2), "log_mae": (b - a) / 2,
-        "log_rmse": math.sqrt((a * a + b * b) / 2), "scale_invariant_log": (b - a) / 2,
-        "abs_relative": (1 + 1 / 4) / 2, "squared_relative": (1 + 1 / 16) / 2,
-    }  # fmt: skip
-    assert errors == pytest.approx(expected, rel=1e-6)
 
 
 def test_the_figures_are_those_of_the_official_program() -> None:

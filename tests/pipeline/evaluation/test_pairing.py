@@ -11,7 +11,7 @@ import pytest
 
 from pnpdepth_cli.errors import InputError, UsageError
 from pnpdepth_cli.io.depth import write_depth
-from pnpdepth_cli.pipeline.evaluation.pairing import Pairs, frame_name, pair_frames, some_names
+from pnpdepth_cli.pipeline.evaluation.pairing import Pairs, frame_name, pair_frames
 
 DEPTH = np.full((3, 4), 2, np.float32)
 
@@ -63,11 +63,6 @@ def test_the_files_of_a_refinement_are_paired_with_ground_truth_without_images(
     assert matched(pairs) == {"b": "b_depth.png", "ä ö": "ä ö_depth.exr"}
     assert not pairs.single
     assert pairs.notes == (f"{out}: ignored, as there is a _depth of each: b.png",)
-
-
-def test_a_preview_without_a_depth_beside_it_is_a_frame(tmp_path: Path) -> None:
-    out, gt = folders(tmp_path, ["a_preview.png"], ["a_preview.png"])
-    assert matched(pair_frames(out, gt)) == {"a_preview": "a_preview.png"}
 
 
 def test_frames_in_folders_of_their_own_are_matched_with_the_folder(tmp_path: Path) -> None:
@@ -182,7 +177,3 @@ def test_the_ground_truth_can_be_a_data_set_of_a_known_layout(tmp_path: Path) ->
     assert matched(pairs) == {"a": "a_depth.png"}
     assert pairs.notes[0] == "gt: layout pairs; frames with ground truth: 1"
     assert pairs.frames[0].sparse == data / "sparse" / "a.png"
-
-
-def test_long_lists_of_names_are_cut_and_stay_on_one_line() -> None:
-    assert some_names(["a\nb", *"cdefgh"]) == "a b, c, d, e, f and 2 more"

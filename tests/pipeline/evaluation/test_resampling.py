@@ -6,28 +6,48 @@ from itertools import product
 
 import numpy as np
 import pytest
+import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
 from benchmarks.statistics_check import interval_coverage, skewed
-from pnpdepth_cli.core.metrics import SUMS
+from pnpdepth_cli.core.metrics import SUMS, error_sums, score
 from pnpdepth_cli.pipeline.evaluation.resampling import (
     FrameTable,
-    clusters_among,
+    gain,
+    gain_interval,
     holm,
-    known_together,
+    mean_interval,
     sign_flip_p_values,
-    studentised_interval,
+    swap_p_values,
 )
 
 
 def interval(
     rows: np.ndarray, resamples: int, seed: int = 0, clusters: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    table = FrameTable(rows=rows)
     ids = np.arange(len(rows)) if clusters is None else clusters
-    return studentised_interval(table.means_of, table.cluster_totals(ids), resamples, seed)
+    return mean_interval(FrameTable.of_frames(rows), ids, resamples, seed)
+
+
+def test_the_mean_of_frames_counts_each_alike_among_those_that_have_the_measure() -> None:
+    table = FrameTable.of_frames(np.array([[1.0, 10.0, np.nan], [3.0, np.nan, np.nan]]))
+    assert table.mean() == pytest.approx([2, 10, np.nan], nan_ok=True)
+    totals = FrameTable.of_frames(np.array([[1.0], [3.0], [6.0]])).cluster_totals(
+        np.array([1, 0, 1])
+    )
+    assert totals.tolist() == [[[3, 1]], [[7, 2]]]
+
+
+def test_the_pooled_mean_counts_each_pixel_alike() -> None:
+    generator = torch.Generator().manual_seed(0)
+    frames = [torch.rand(2, n, generator=generator) + 1 for n in (3, 50)]
+    sums = np.array([error_sums(p, g)[0].tolist() for p, g in frames])
+    together = torch.cat(frames, dim=1)
+    expected = score(together[0], together[1])
+    mean = FrameTable.of_pixels(sums, ["rmse", "delta1"]).mean()
+    assert mean == pytest.approx([expected.rmse, expected.delta1], rel=1e-12)
 
 
 def test_the_interval_is_the_textbooks_for_many_frames() -> None:
@@ -56,8 +76,7 @@ def test_each_end_is_the_farther_one_of_bootstrap_t_and_students_t() -> None:
 
 def test_the_standard_error_of_a_pooled_measure_is_the_delta_methods() -> None:
     sums = np.random.default_rng(3).uniform(1, 2, (300, len(SUMS)))
-    table = FrameTable(rows=sums, pooled=True)
-    low, high = studentised_interval(table.means_of, table.cluster_totals(np.arange(300)), 4000, 0)
+    low, high = mean_interval(FrameTable.of_pixels(sums, ["rmse"]), np.arange(300), 4000, 0)
     squared, pixels = sums[:, SUMS.index("squared")], sums[:, SUMS.index("pixels")]
     mean = squared.sum() / pixels.sum()
     error = np.sqrt(((squared - mean * pixels) ** 2).sum()) / pixels.sum() / (2 * np.sqrt(mean))
@@ -90,7 +109,22 @@ def test_the_interval_is_of_the_seed_and_the_same_in_any_batches(
 
 
 def test_equal_frames_have_an_interval_of_no_width() -> None:
-    assert np.ravel(interval(np.full((6, 1), 2.5), 50)).tolist() == [2.5, 2.5]
+    assert np.ravel(interval(np.full((6, 1), 2.5), 50)) == pytest.approx([2.5, 2.5], abs=1e-12)
+
+
+def test_the_gain_is_in_per_cent_of_the_first_and_its_interval_narrows_with_equal_gains() -> None:
+    before = np.random.default_rng(0).lognormal(0, 1, (9, 2))
+    first, half = (FrameTable.of_frames(rows) for rows in (before, before / 2))
+    better = np.array([-1.0, 1.0])
+    assert gain(first.mean(), half.mean(), better).tolist() == [50, -50]
+    bounds = gain_interval(first, half, better, np.arange(9), 100, 0)
+    assert np.stack(bounds) == pytest.approx(np.array([[50, -50], [50, -50]]), abs=1e-6)
+    noisy = FrameTable.of_frames(before * np.random.default_rng(1).uniform(0.3, 0.7, before.shape))
+    low, high = gain_interval(first, noisy, better, np.arange(9), 500, 0)
+    value = gain(first.mean(), noisy.mean(), better)
+    assert (low < value - 1).all()
+    assert (value + 1 < high).all()
+    assert np.isnan(gain(np.zeros(2), np.array([1.0, np.nan]), better)).all()
 
 
 def difference_of(changes: np.ndarray):  # type: ignore[no-untyped-def]
@@ -109,20 +143,6 @@ def test_the_exact_p_value_is_the_fraction_of_all_swaps_that_differ_as_much(
     assert p_value == expected
 
 
-def test_the_exact_p_value_is_that_of_scipys_paired_permutations() -> None:
-    first = np.random.default_rng(0).lognormal(0, 1, 10)
-    second = first * np.random.default_rng(1).lognormal(0.2, 0.3, 10)
-    (p_value,), _ = sign_flip_p_values(difference_of(second - first), 10, 2000, seed=0)
-    expected = stats.permutation_test(
-        (second, first),
-        lambda a, b, axis: np.mean(a - b, axis=axis),
-        permutation_type="samples",
-        vectorized=True,
-        n_resamples=np.inf,
-    )
-    assert p_value == pytest.approx(expected.pvalue, rel=1e-12)
-
-
 def test_the_sampled_p_value_is_near_the_exact_one_and_never_zero() -> None:
     values = np.random.default_rng(0).normal(0.4, 1, 12)
     (exact_p,), exact = sign_flip_p_values(difference_of(values), 12, 4096, seed=0)
@@ -133,31 +153,26 @@ def test_the_sampled_p_value_is_near_the_exact_one_and_never_zero() -> None:
     assert smallest == 1 / 1000
 
 
-def test_a_measure_without_a_number_has_no_interval_and_no_p_value() -> None:
-    rows = np.array([[1.0, np.nan], [2.0, 3.0], [4.0, 1.0], [3.0, 2.0], [7.0, 5.0]])
-    low, high = interval(rows, 50)
-    assert np.isnan([low[1], high[1]]).all()
-    alone = np.ravel(interval(rows[:, :1], 50))
-    assert [low[0], high[0]] == pytest.approx(alone, rel=1e-12)
-    assert low[0] < rows[:, 0].mean() < high[0]
-    p_values, _ = sign_flip_p_values(lambda flips: (1 - 2 * flips) @ rows, 5, 50, seed=0)
-    assert p_values[0] == 2 / 32  # all differences have one sign
-    assert np.isnan(p_values[1])
-
-
-def test_measures_are_known_of_the_same_frames_or_apart() -> None:
-    known = np.array([[1, 0, 1, 0], [1, 1, 1, 0], [1, 1, 1, 0]], bool)
-    groups = [(frames.tolist(), columns) for frames, columns in known_together(known)]
-    assert groups == [
-        ([False, False, False], [3]),
-        ([False, True, True], [1]),
-        ([True, True, True], [0, 2]),
-    ]
-    assert clusters_among(np.array([2, 0, 2, 3]), np.array([1, 0, 1, 1], bool)).tolist() == [
-        0,
-        0,
-        1,
-    ]
+def test_a_measure_that_some_frames_lack_has_the_interval_of_the_others() -> None:
+    rows = np.random.default_rng(0).lognormal(0, 0.5, (12, 3))
+    rows[:4, 1] = np.nan
+    rows[:8, 2] = np.nan  # four frames are too few
+    low, high = interval(rows, 4000)
+    for column, frames in ((0, rows[:, :1]), (1, rows[4:, 1:2])):
+        alone_low, alone_high = np.ravel(interval(frames, 4000))
+        width = alone_high - alone_low
+        assert [low[column], high[column]] == pytest.approx(
+            [alone_low, alone_high], abs=(0.2 if column else 1e-9) * width
+        )
+        assert low[column] < frames.mean() - width / 10
+        assert high[column] > frames.mean() + width / 10
+    assert np.isnan([low[2], high[2]]).all()
+    other = FrameTable.of_frames(rows * 1.5)
+    p_values, exact = swap_p_values(FrameTable.of_frames(rows), other, np.arange(12), 4096, 0)
+    assert exact
+    assert p_values == pytest.approx([2 / 2**12, 2 / 2**8, 2 / 2**4])  # all got worse
+    nothing, _ = sign_flip_p_values(lambda flips: np.full((len(flips), 1), np.nan), 5, 50, seed=0)
+    assert np.isnan(nothing).all()
 
 
 def test_holm_multiplies_the_smallest_most_and_keeps_the_order() -> None:

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import os
-from concurrent.futures import ThreadPoolExecutor, wait
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from pnpdepth_cli.errors import InputError
-from pnpdepth_cli.io.formats.npy import HEADER_LOCK
-from pnpdepth_cli.pipeline.evaluation.evaluate import evaluate
-from pnpdepth_cli.pipeline.evaluation.result import EvalRequest
+from pnpdepth_cli.pipeline.evaluation.evaluate import EvalRequest, evaluate
 from pnpdepth_cli.pipeline.evaluation.stacks import load_stacked, stack_size
 
 
@@ -92,12 +89,3 @@ def test_single_maps_are_no_stack_and_numbers_of_frames_must_agree(tmp_path: Pat
     assert stack_size(tmp_path / "two.npy") == 2
     with pytest.raises(InputError, match=r"holds 3 frames but .* 2 frames"):
         evaluate(EvalRequest(prediction=tmp_path / "three.npy", ground_truth=tmp_path / "two.npy"))
-
-
-def test_a_header_is_parsed_while_no_other_thread_parses_one(tmp_path: Path) -> None:
-    np.save(tmp_path / "stack.npy", np.ones((3, 4, 5), np.float32))
-    with ThreadPoolExecutor(1) as pool:
-        with HEADER_LOCK:
-            size = pool.submit(stack_size, tmp_path / "stack.npy")
-            assert not wait([size], timeout=0.3).done
-        assert size.result() == 3

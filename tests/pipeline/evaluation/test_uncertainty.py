@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from pnpdepth_cli.io.depth import write_depth
-from pnpdepth_cli.pipeline.evaluation.evaluate import evaluate
-from pnpdepth_cli.pipeline.evaluation.result import EvalRequest
+from pnpdepth_cli.pipeline.evaluation.evaluate import EvalRequest, evaluate
 from pnpdepth_cli.pipeline.evaluation.uncertainty import (
     FrameUncertainty,
     frame_uncertainty,
@@ -58,12 +57,6 @@ def test_sparsification_is_by_definition() -> None:
     area = np.trapezoid(worst.sparsification - worst.oracle, np.arange(20) / 20)
     assert total.ause == pytest.approx(area / error.mean())
     assert none.ause == pytest.approx(0)
-
-
-def test_pixels_without_a_deviation_do_not_count() -> None:
-    gt = np.full((1, 2), 2, np.float32)
-    assert frame_uncertainty(gt, gt, np.zeros_like(gt)) is None
-    assert summarise_uncertainty([]) is None
 
 
 def test_the_sigma_beside_a_prediction_is_evaluated(tmp_path: Path) -> None:

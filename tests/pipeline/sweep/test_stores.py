@@ -9,8 +9,7 @@ import pytest
 
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.io.remote.address import path_of
-from pnpdepth_cli.pipeline.evaluation.evaluate import evaluate
-from pnpdepth_cli.pipeline.evaluation.result import EvalRequest
+from pnpdepth_cli.pipeline.evaluation.evaluate import EvalRequest, evaluate
 from pnpdepth_cli.pipeline.sweep.axes import read_axis, studies_of
 from pnpdepth_cli.pipeline.sweep.points import read_sampling
 from pnpdepth_cli.pipeline.sweep.sweep import SweepRequest, run_sweep

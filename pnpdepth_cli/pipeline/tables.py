@@ -1,0 +1,131 @@
+"""One table for every place it goes to: the terminal, CSV, Markdown and LaTeX."""
+
+from __future__ import annotations
+
+import io
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from pnpdepth_cli.core.metrics import Measure
+from pnpdepth_cli.errors import UsageError
+from pnpdepth_cli.io.atomic import atomic_path
+from pnpdepth_cli.io.csv_text import write_csv
+
+Style = Literal["", "bold", "dim", "good", "bad"]
+
+_LATEX = str.maketrans(
+    {
+        "\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_",
+        "{": r"\{", "}": r"\}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}",
+        "δ": r"$\delta$", "±": r"$\pm$", "↓": r"$\downarrow$", "↑": r"$\uparrow$", "−": "$-$",
+        "·": r"$\cdot$", "×": r"$\times$", "°": r"$^\circ$", "<": "$<$", "–": "--",
+        "…": r"\ldots{}", "\n": " ",
+    }
+)  # fmt: skip
+_THOUSANDS = re.compile(r"(?<=\d),(?=\d{3}(?!\d))")
+
+
+class Cell(str):
+    """A cell with a style: Markdown and LaTeX show "bold", the terminal all."""
+
+    style: Style
+
+    def __new__(cls, text: str, style: Style = "") -> Cell:
+        """Returns the text with the style."""
+        cell = super().__new__(cls, text)
+        cell.style = style
+        return cell
+
+
+@dataclass(frozen=True, kw_only=True)
+class Table:
+    """Rows of text; the first column is left-aligned, the others, of numbers, right-aligned."""
+
+    header: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    caption: str = ""
+
+    def csv(self) -> str:
+        """Returns the table as `write_csv` writes it."""
+        buffer = io.StringIO()
+        write_csv(buffer, self.header, [[str(cell) for cell in row] for row in self.rows])
+        return buffer.getvalue()
+
+    def markdown(self) -> str:
+        """Returns the table in GitHub's Markdown, and its caption below."""
+        rule = ["---", *["---:"] * (len(self.header) - 1)]
+        lines = [self.header, rule, *self.rows]
+        body = "".join(f"| {' | '.join(map(_in_markdown, line))} |\n" for line in lines)
+        return f"{body}\n{self.caption}\n"
+
+    def latex(self) -> str:
+        """Returns a tabular with rules of the package booktabs; its caption is a comment above."""
+        header, *rows = (
+            " & ".join(map(_in_latex, line)) + r" \\" for line in (self.header, *self.rows)
+        )
+        return "\n".join(
+            (
+                f"% {' '.join(self.caption.split())}",
+                rf"\begin{{tabular}}{{l{'r' * (len(self.header) - 1)}}}",
+                r"\toprule",
+                header,
+                r"\midrule",
+                *rows,
+                r"\bottomrule",
+                r"\end{tabular}",
+                "",
+            )
+        )
+
+
+def _in_markdown(cell: str) -> str:
+    text = " ".join(cell.split()).replace("|", r"\|")
+    return f"**{text}**" if getattr(cell, "style", "") == "bold" else text
+
+
+def _in_latex(cell: str) -> str:
+    text = _THOUSANDS.sub("", cell).translate(_LATEX)
+    return rf"\textbf{{{text}}}" if getattr(cell, "style", "") == "bold" else text
+
+
+def write_text(path: Path, text: str) -> None:
+    """Writes the text whole or not at all; characters of a name that is not UTF-8 as escapes."""
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(text.encode("utf-8", "backslashreplace"))
+
+
+def chosen_measures(measures: Sequence[Measure], keys: Sequence[str] | None) -> tuple[Measure, ...]:
+    """Returns the measures with these keys, in their order; all for None.
+
+    Raises:
+        UsageError: If one is unknown.
+    """
+    by_key = {measure.key: measure for measure in measures}
+    if unknown := [key for key in keys or () if key not in by_key]:
+        raise UsageError(f"--columns {unknown[0]} is not one of {', '.join(by_key)}")
+    return tuple(by_key[key] for key in (by_key if keys is None else keys))
+
+
+def format_value(measure: Measure, value: float | None, *, unit: bool = False) -> str:
+    """Returns the value as text in the measure's shown unit; – for NaN and None."""
+    if value is None or math.isnan(value):
+        return "–"
+    if measure.percent:
+        return f"{value:.{measure.decimals}%}"
+    text = f"{value * measure.shown_factor:,.{measure.decimals}f}"
+    return f"{text} {unit_of(measure)}".rstrip() if unit else text
+
+
+def unit_of(measure: Measure) -> str:
+    """Returns the unit of `format_value`; empty for ratios and percentages."""
+    return measure.shown_unit or measure.unit
+
+
+def column_title(measure: Measure) -> str:
+    """Returns a title such as `RMSE [m] ↓`."""
+    unit = "" if not unit_of(measure) else f" [{unit_of(measure)}]"
+    return f"{measure.title}{unit} {'↑' if measure.higher_is_better else '↓'}"
