@@ -14,38 +14,13 @@ import click
 from pnpdepth_cli.cli import options
 from pnpdepth_cli.cli.printable import printable
 
-_OLD_FLAGS = {"--check": 1, "--convert": 2, "--fetch": 1}
-"""Flags of version 0.1 that became subcommands, with their numbers of values."""
-
 
 class _Models(click.Group):
-    """Lists the networks where no subcommand is named, and takes the flags of version 0.1."""
+    """Lists the networks where no subcommand is named."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        return super().parse_args(ctx, _with_subcommand(args))
-
-
-def _with_subcommand(args: list[str]) -> list[str]:
-    """Returns the arguments, beginning with a subcommand unless they ask for help."""
-    if args and (not args[0].startswith("-") or args[0] in ("-h", "--help")):
-        return args
-    words = [part for word in args for part in _split_flag(word)]
-    for flag, count in _OLD_FLAGS.items():
-        if flag in words:
-            start = words.index(flag)
-            values = words[start + 1 : start + 1 + count]
-            name = flag.removeprefix("--")
-            click.echo(
-                f"pnpdepth: `models {flag}` is now `models {name}`; the old form will be removed",
-                err=True,
-            )
-            return [name, *words[:start], *words[start + 1 + count :], "--", *values]
-    return ["list", *args]
-
-
-def _split_flag(word: str) -> list[str]:
-    flag, equals, value = word.partition("=")
-    return [flag, value] if equals and flag in _OLD_FLAGS else [word]
+        named = args and (not args[0].startswith("-") or args[0] in ("-h", "--help"))
+        return super().parse_args(ctx, args if named else ["list", *args])
 
 
 @click.group(short_help="List, check, convert or fetch networks.", cls=_Models)

@@ -27,7 +27,7 @@ from pnpdepth_cli.errors import CheckpointError
 from pnpdepth_cli.models.network import load_network
 from pnpdepth_cli.models.weights.checkpoint import load_checkpoint
 from tests.model_zoo_defs.cuts import assert_the_cut_changes_nothing_and_a_step_does, built
-from tests.models.weights.numpy_files import write_npy
+from tests.models.weights.files import write_npy
 
 Arrays = dict[str, dict[str, NDArray[np.float32]]]
 Fill = Callable[[tuple[int, ...]], NDArray[np.float32]]

@@ -43,7 +43,7 @@ _ARITHMETIC = re.compile(
 _TREE = re.compile(r'[\w\s.,:{}\[\]"\\-]*')
 
 _FUNCTIONS = frozenset(
-    {
+    (
         *("Symbol", "Integer", "Float", "Rational", "Add", "Mul", "Pow", "Max", "Min", "Abs"),
         *("Eq", "Equality", "Ne", "Unequality", "Lt", "StrictLessThan", "Le", "LessThan"),
         *("Gt", "StrictGreaterThan", "Ge", "GreaterThan", "And", "Or", "Not", "floor", "ceiling"),
@@ -51,7 +51,7 @@ _FUNCTIONS = frozenset(
         *("CeilToInt", "FloorToInt", "TruncToInt", "TruncToFloat", "RoundToInt", "RoundDecimal"),
         *("ToFloat", "IntTrueDiv", "FloatTrueDiv", "PowByNatural", "FloatPow", "LShift", "RShift"),
         *("Identity", "IsNonOverlappingAndDenseIndicator"),
-    }
+    )
 )
 _POWERS = frozenset({"Pow", "PowByNatural", "FloatPow", "LShift"})
 _MAX_EXPONENT = 8
@@ -85,8 +85,11 @@ def check_archive(file: Path) -> None:
                 raise _Refused("it holds other files for one reader than for another")
             if any(info.compress_type != zipfile.ZIP_STORED for info in archive.infolist()):
                 raise _Refused("it is compressed, which torch never does")
-        for name in _CONFIGS:
-            _check_tensors(json.loads(reader.read_bytes(name)))
+        for config in _CONFIGS:
+            for name, meta in json.loads(reader.read_bytes(config))["config"].items():
+                _word(name)
+                if meta["use_pickle"] or not _WORD.fullmatch(meta["path_name"]):
+                    raise _Refused(f"{name[:80]!r} is pickled")
         _check_inputs(reader.read_bytes(_INPUTS))
         _check(json.loads(reader.read_bytes(_MODEL)))
     except _Refused as refused:
@@ -94,13 +97,6 @@ def check_archive(file: Path) -> None:
             f"exported program {file} is not read: {refused}, and only plain tensors and operators"
             " of torch are taken from such a file; export the network again, or to ONNX"
         ) from None
-
-
-def _check_tensors(config: Any) -> None:
-    for name, meta in config["config"].items():
-        if meta["use_pickle"] or not _WORD.fullmatch(meta["path_name"]):
-            raise _Refused(f"{name[:80]!r} is pickled")
-        _word(name)
 
 
 def _check_inputs(content: bytes) -> None:
@@ -118,17 +114,15 @@ def _check(value: Any) -> None:
     """Checks everything in the program that is called, evaluated or written as source code."""
     if isinstance(value, str):
         _word(value)
-    elif isinstance(value, list):
-        for one in value:
-            _check(one)
-    elif isinstance(value, dict):
-        for key, one in value.items():
+    for one in value if isinstance(value, list) else ():
+        _check(one)
+    for key, one in value.items() if isinstance(value, dict) else ():
+        # The others are for people, or not evaluated (see `exported_definition`), or quoted.
+        if key not in ("metadata", "guards_code", "as_string", "as_strings"):
             _check_entry(key, one)
 
 
 def _check_entry(key: str, value: Any) -> None:
-    if key in ("metadata", "guards_code", "as_string", "as_strings"):
-        return  # for people, or not evaluated (see `exported_definition`), or quoted
     if key == "range_constraints":
         _expressions(value)
     elif key == "expr_str":

@@ -112,14 +112,12 @@ def _with_operations_as_modules(exported: Any) -> nn.Module:
         if node.op == "get_attr":
             name = str(node.target).replace(".", "_")
             if name not in taken:
-                _hold(root, name, _attribute(exported, str(node.target)))
+                _hold(root, name, operator.attrgetter(str(node.target))(exported))
             taken.add(name)
             copy.target = name
         elif _is_layer(node):
             name = node.name
-            while hasattr(
-                root, name
-            ):  # every module has a method `to`; a graph may have such a node
+            while hasattr(root, name):  # as a node named `to`, a method of every module
                 name += "_"
             root.add_module(name, ExportedOperation(node.target))
             copy.op, copy.target = "call_module", name
@@ -138,9 +136,3 @@ def _hold(root: nn.Module, name: str, value: Tensor | nn.Module) -> None:
         root.register_parameter(name, nn.Parameter(value.detach(), requires_grad=False))
     else:
         root.register_buffer(name, value)
-
-
-def _attribute(module: Any, path: str) -> Any:
-    for part in path.split("."):
-        module = getattr(module, part)
-    return module

@@ -203,9 +203,15 @@ def _read(path: Path) -> tuple[dict[str, Tensor], list[str]]:
     if isinstance(content, dict):
         return content, []
     content, named = content
-    others = [name for name in named if not PLAIN_NAMES.fullmatch(name)]
-    note = f"checkpoint {path.name}: its pickle names {_some(others)}; nothing of it was run"
-    return _state_in(content, path), [note] if others else []
+    notes = []
+    if others := [name for name in named if not PLAIN_NAMES.fullmatch(name)]:
+        notes = [f"checkpoint {path.name}: its pickle names {_some(others)}; nothing of it was run"]
+    arguments = content.get("args") if isinstance(content, Mapping) else None
+    arguments = getattr(arguments, "state", arguments)
+    if isinstance(arguments, Mapping) and isinstance(data := arguments.get("data"), str):
+        # Weights for other data may fit all the same.
+        notes.append(f"checkpoint {path.name}: trained with data {_short(data)}")
+    return _state_in(content, path), notes
 
 
 def _read_folder(folder: Path) -> tuple[dict[str, Tensor], list[str]]:
@@ -239,12 +245,13 @@ def _state_in(content: Any, path: Path) -> dict[str, Tensor]:
         if is_module(candidate):
             return module_state(candidate)
         if isinstance(candidate, Mapping) and candidate:
-            unusual = [n for n, v in candidate.items() if "._rebuild_" in getattr(v, "path", "")]
-            if unusual:
-                raise CheckpointError(
-                    f"checkpoint {path}: {_short(str(unusual[0]))} is sparse, quantised or"
-                    " nested; save its values as a dense tensor of floats"
-                )
+            for name, value in candidate.items():
+                _, is_tensor, kind = getattr(value, "path", "").partition("torch._utils._rebuild_")
+                if is_tensor:
+                    raise CheckpointError(
+                        f"checkpoint {path}: {_short(str(name))} is not a plain tensor"
+                        f" ({_short(kind)}); save its values as a dense tensor of floats"
+                    )
             if _only_tensors(candidate):
                 return dict(candidate)
     names = ", ".join(_short(str(key)) for key in list(content)[:8]) or "nothing"

@@ -26,6 +26,7 @@ from pnpdepth_cli.models.weights.pickle_reader import (
     StandIn,
 )
 
+TORCHSCRIPT = "it is a TorchScript archive"
 _MAGIC = 0x1950A86A20F9469CFC6C
 _MAX_DEPTH = 100
 _MAX_MODULES = 100_000
@@ -93,9 +94,7 @@ def _read_archive(file: IO[bytes], size: int) -> tuple[Any, list[str]]:
     with zipfile.ZipFile(file) as archive:
         entries = {info.filename: info for info in archive.infolist()}
         if any("/code/" in name for name in entries):
-            raise BrokenFileError(
-                "it is a TorchScript archive; save the state_dict() of its module instead"
-            )
+            raise BrokenFileError(f"{TORCHSCRIPT}; save the state_dict() of its module instead")
         if any(info.compress_type != zipfile.ZIP_STORED for info in entries.values()):
             raise BrokenFileError("it is compressed, which torch never does")
         pickles = [name for name in entries if name == "data.pkl" or name.endswith("/data.pkl")]

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from pnpdepth_cli.core.split import Split, gradient_at
 from pnpdepth_cli.errors import ModelError
@@ -71,10 +69,7 @@ def check_model(
         notes = [*network.notes, *network.verified(arguments)]
         with torch.no_grad():
             raw = network.raw_of(network.module(*arguments))
-        layers = {
-            name: _check_layer(network.module, name, arguments, network.raw_of, raw)
-            for name in definition.layers
-        }
+        layers = {name: _check_layer(network, name, arguments, raw) for name in definition.layers}
     return CheckedModel(
         name=definition.name,
         input=list(prepared.map.network),
@@ -101,20 +96,14 @@ def _read(image: Path) -> Frame:
     return Frame(rgb=rgb, points=no_points)
 
 
-def _check_layer(
-    module: nn.Module,
-    name: str,
-    arguments: tuple[Tensor, ...],
-    raw_of: Callable[[Any], Tensor],
-    whole: Tensor,
-) -> str:
+def _check_layer(network: Network, name: str, arguments: tuple[Tensor, ...], whole: Tensor) -> str:
     """ "ok", or why the network cannot be cut at the layer."""
     try:
-        with Split(module, name) as split:
+        with Split(network.module, name) as split:
             with torch.no_grad():
                 z = split.front(*arguments)
             z.requires_grad_(True)
-            raw = raw_of(split.rear(z))
+            raw = network.raw_of(split.rear(z))
             if not torch.equal(raw.detach(), whole):
                 return "the cut network gives something else than the whole one"
             gradient = gradient_at(z, raw.sum())

@@ -7,13 +7,8 @@ from dataclasses import dataclass
 import torch
 
 from pnpdepth_cli.core.user_code import wrap_user_errors
-from pnpdepth_cli.models.definition import Fixed, Multiple, Near
-from pnpdepth_cli.models.registry import (
-    family_definitions,
-    family_of,
-    find_definition,
-    names,
-)
+from pnpdepth_cli.models.definition import Fixed, ModelDefinition, Multiple, Near
+from pnpdepth_cli.models.registry import families
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,19 +41,26 @@ class ListedModel:
 
 def list_models() -> list[ListedModel]:
     """Returns every network that can be named, in the order of `registry.names`."""
-    return [_listed(name) for name in names()]
+    listed: dict[str, ListedModel] = {}
+    for family, definitions in families().items():
+        default = definitions.get(family)
+        for definition in definitions.values():
+            if definition.name not in listed:
+                is_default = default is None or default.name == definition.name
+                variant = not is_default and definition.checkpoint is None
+                listed[definition.name] = _listed(definition, family, variant)
+    return list(listed.values())
 
 
-def _listed(name: str) -> ListedModel:
-    definition = find_definition(name)
+def _listed(definition: ModelDefinition, family: str, variant: bool) -> ListedModel:
     # On the meta device counting needs no memory.
-    with wrap_user_errors(f"build of network {name!r}"), torch.device("meta"):
+    with wrap_user_errors(f"build of network {definition.name!r}"), torch.device("meta"):
         module = definition.build()
-    defaults, family = definition.defaults, family_of(name)
+    defaults = definition.defaults
     return ListedModel(
         name=definition.name,
         family=family,
-        variant=definition.checkpoint is None and _other_default(family, name),
+        variant=variant,
         summary=definition.summary,
         paper=definition.paper,
         licence=definition.licence,
@@ -74,12 +76,6 @@ def _listed(name: str) -> ListedModel:
         loss=defaults.loss,
         update=defaults.update,
     )
-
-
-def _other_default(family: str, name: str) -> bool:
-    """True if the family's own name stands for another of its networks."""
-    default = family_definitions(family).get(family)
-    return default is not None and default.name != name
 
 
 def _size(size: Fixed | Multiple | Near) -> str:

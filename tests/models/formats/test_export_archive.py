@@ -184,7 +184,9 @@ def test_example_inputs_that_ask_for_memory_are_refused(archive: Path) -> None:
             return bytearray, (10**12,)
 
     greedy = rewritten(archive, INPUTS, lambda _: saved((Allocates(),)))
-    with pytest.raises(ModelError, match=r"example inputs are more than tensors \(builtins.bytearray"):
+    with pytest.raises(
+        ModelError, match=r"example inputs are more than tensors \(builtins.bytearray"
+    ):
         find_definition(str(greedy))
 
 

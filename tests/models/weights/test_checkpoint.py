@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import zipfile
 from collections import OrderedDict
 from collections.abc import Callable, Mapping
@@ -172,6 +173,13 @@ def test_a_definition_may_rename_what_a_published_file_holds(tmp_path: Path) -> 
     assert equal(loaded(tmp_path / "w.pth", **rename)[0], weights())
 
 
+def test_the_data_of_the_training_is_reported(tmp_path: Path) -> None:
+    for data, shown in (("kitti", "kitti"), ("a" * 10**5, "a" * 60 + "…")):
+        args = argparse.Namespace(data=data, lr=0.1, secret="x")
+        torch.save({"args": args, "state_dict": weights()}, tmp_path / "w.pth")
+        assert loaded(tmp_path / "w.pth")[1][-1] == f"checkpoint w.pth: trained with data {shown}"
+
+
 # ------------------------------------------------------------------ files that do not fit
 
 
@@ -319,7 +327,7 @@ def test_a_zip_that_is_no_checkpoint_is_refused(tmp_path: Path) -> None:
 
 def test_a_sparse_tensor_is_refused_by_name(tmp_path: Path) -> None:
     torch.save({"a": torch.ones(1), "w": torch.eye(3).to_sparse()}, tmp_path / "w.pth")
-    assert "w is sparse, quantised or nested" in refused(tmp_path / "w.pth")
+    assert "w is not a plain tensor (sparse" in refused(tmp_path / "w.pth")
 
 
 @pytest.mark.parametrize("save", SAVES)

@@ -255,14 +255,6 @@ def scatter_elements(node: Node, inputs: Inputs) -> Tensor:
     return x.scatter(axis, torch.where(index < 0, index + x.shape[axis], index), inputs[2])
 
 
-@operator("OneHot", host=(1,))
-def one_hot(node: Node, inputs: Inputs) -> Tensor:
-    index, count, values = inputs[0].long(), whole_numbers(inputs[1])[0], inputs[2]
-    hot = F.one_hot(index.remainder(count), count).bool()
-    axis = node.get("axis", -1)
-    return torch.where(hot, values[1], values[0]).movedim(-1, axis)
-
-
 @operator("TopK", host=(1,))
 def top_k(node: Node, inputs: Inputs) -> tuple[Tensor, ...]:
     k = node.get("k") if len(inputs) < 2 else whole_numbers(inputs[1])[0]
