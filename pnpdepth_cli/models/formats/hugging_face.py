@@ -41,7 +41,7 @@ _PICKLED = ("pytorch_model.bin", "pytorch_model.bin.index.json")
 
 
 _MAX_SIDE = 1 << 16  # pixels
-_LARGEST_NUMBER = 1e7  # in a config.json; more parts than that no network has
+_LARGEST_NUMBER = 1e6  # in a config.json; no network has more of any part
 _PLAIN_ATTENTION = ("eager", "sdpa")
 _IMAGENET = {"image_mean": IMAGENET_MEAN, "image_std": IMAGENET_STD}
 
@@ -277,7 +277,8 @@ def _build(folder: Path) -> nn.Module:
     try:
         config = transformers.AutoConfig.from_pretrained(str(folder), local_files_only=True)
         with _fewer_parameters_than_bytes(folder), torch.device("meta"):
-            transformers.AutoModelForDepthEstimation.from_config(config)
+            networks: Any = transformers.AutoModelForDepthEstimation
+            networks.from_config(config)
         module, info = transformers.AutoModelForDepthEstimation.from_pretrained(
             str(folder),
             local_files_only=True,

@@ -109,8 +109,8 @@ def _unpickled(value: Any, name: str, most: int) -> Tensor:
         raise BrokenFileError("its arrays are larger than the file")
     if not isinstance(code, str) or not isinstance(order, str):
         raise BrokenFileError("an array without a type")
-    kind = np.dtype(f"{order[:1]}{code[:8]}")
-    array = np.frombuffer(data, kind) if data else np.empty(0, kind)
+    number = np.dtype(f"{order[:1]}{code[:8]}")
+    array = np.frombuffer(data, number) if data else np.empty(0, number)
     return _tensor(array.reshape(shape, order="F" if fortran else "C"), name)
 
 

@@ -132,9 +132,10 @@ class PickleReader(pickle._Unpickler):
             case "copyreg._reconstructor":
                 return StandIn(getattr(first, "path", "?"))
             case "torch._utils._rebuild_tensor" | "torch._utils._rebuild_tensor_v2":
-                return _view(*arguments[:4])
+                return view_of(*arguments[:4])
             case "torch._utils._rebuild_tensor_v3":  # of a dtype that storages do not name
-                return _view(*arguments[:4], arguments[6])
+                storage, offset, shape, stride = arguments[:4]
+                return view_of(storage, offset, shape, stride, arguments[6])
             case "torch._tensor._rebuild_from_type_v2":  # it has attributes of its own
                 return self._call(first, arguments[2])
             case _ if path.startswith("torch._utils._rebuild_parameter"):
@@ -199,8 +200,12 @@ def _key(key: Any) -> Any:
     return key if small or isinstance(key, str | float | None) else type(key).__name__
 
 
-def _view(storage: Any, offset: Any, shape: Any, stride: Any, dtype: Any = None) -> Tensor:
-    """A tensor over a storage, as torch.as_strided makes it, if it lies within the storage."""
+def view_of(storage: Any, offset: Any, shape: Any, stride: Any, dtype: Any = None) -> Tensor:
+    """Returns a tensor over a flat one, as torch.as_strided makes it, if it lies within it.
+
+    Raises:
+        BrokenFileError: It lies beyond, or has more elements than the strides may repeat.
+    """
     if dtype is not None:
         storage = storage.view(_DTYPES[dtype.path])
     if max(len(shape), len(stride)) > MAX_AXES:

@@ -30,7 +30,7 @@ TORCHSCRIPT = "it is a TorchScript archive"
 _MAGIC = 0x1950A86A20F9469CFC6C
 _MAX_DEPTH = 100
 _MAX_MODULES = 100_000
-_DTYPES = {
+_DTYPES: dict[str, torch.dtype] = {
     f"{name}Storage": getattr(torch, dtype)
     for name, dtype in {
         "Float": "float32", "Double": "float64", "Half": "float16", "BFloat16": "bfloat16",

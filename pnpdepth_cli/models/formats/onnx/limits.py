@@ -37,7 +37,7 @@ def inlined(model: Any, path: Path) -> Any:
 
     @functools.cache
     def written_out(key: tuple[str, str, str]) -> int:
-        return functions[key].ByteSize() + size(functions[key])
+        return int(functions[key].ByteSize()) + size(functions[key])
 
     def size(graph: Any) -> int:
         calls = [(n.domain, n.op_type, getattr(n, "overload", "")) for n in _nodes(graph.node)]

@@ -35,7 +35,11 @@ _BINARY: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
     "And": torch.logical_and, "Or": torch.logical_or, "Xor": torch.logical_xor,
 }  # fmt: skip
 
-_FOLDED = {"Max": torch.maximum, "Min": torch.minimum, "Sum": torch.add}
+_FOLDED: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
+    "Max": torch.maximum,
+    "Min": torch.minimum,
+    "Sum": torch.add,
+}
 
 
 def _unary(name: str) -> Operator:
