@@ -33,7 +33,7 @@ class Net(nn.Module):
 
     def forward(self, rgb: torch.Tensor) -> torch.Tensor:
         z = torch.relu(self.middle(self.encode(rgb)))
-        up = nn.functional.interpolate(self.decode(z), scale_factor=4, mode="bilinear")
+        up = nn.functional.interpolate(self.decode(z), scale_factor=4.0, mode="bilinear")
         return 1 + 2 * torch.sigmoid(up)
 
 

@@ -345,19 +345,15 @@ ACTIVATION_BOMBS = {
         helper.make_node("Sigmoid", ["wide"], ["big"]),
     ],
     "Resize": [
-        constant("by", [1.0, 1.0, 1e3, 1e3]), constant("s", np.float32([1, 1, 1000, 1000])),
+        constant("s", np.float32([1, 1, 1000, 1000])),
         helper.make_node("Resize", ["depth", "", "s"], ["big"], mode="linear"),
     ],
     "MatMul": [
-        constant("n", [-1, 1]), constant("m", [1, -1]), size_of(1, 1, 1, 20),
-        helper.make_node("Tile", ["depth", "k"], ["long"]), constant("k", [1, 1, 1, 20]),
+        constant("n", [-1, 1]), constant("m", [1, -1]), constant("k", [1, 1, 1, 20]),
+        helper.make_node("Tile", ["depth", "k"], ["long"]),
         helper.make_node("Reshape", ["long", "n"], ["a1"]),
         helper.make_node("Reshape", ["long", "m"], ["a2"]),
         helper.make_node("MatMul", ["a1", "a2"], ["big"]),
-    ],
-    "Concat": [
-        helper.make_node("Identity", ["depth"], ["d0"]), *DOUBLING,
-        helper.make_node("Identity", ["d34"], ["big"]),
     ],
 }  # fmt: skip
 
@@ -391,13 +387,8 @@ def test_activations_that_are_needed_at_a_time_are_bounded_together(tmp_path: Pa
     path = write_network(tmp_path / "x.onnx", nodes=(*tiles, last), outputs=("out",))
     network = OnnxGraph(onnx.load(path), path)
     assert network.input_names == ("rgb",)
-    with torch.device("meta"):  # nothing is allocated
-        message = ""
-        try:
-            network.to("meta")(image(1, 3, 32, 48).to("meta"))
-        except ModelError as error:
-            message = str(error)
-    assert "elements are needed at a time" in message
+    with pytest.raises(ModelError, match="elements are needed at a time"):
+        network.to("meta")(image(1, 3, 32, 48).to("meta"))  # where nothing is allocated
 
 
 def with_functions(path: Path, calls: Callable[[int], list[str]], count: int) -> Path:
