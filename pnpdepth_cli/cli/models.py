@@ -42,7 +42,7 @@ def list_command(every: bool, as_json: bool) -> None:
     """List the networks that --model takes by name, with their inputs, outputs and defaults."""
     from pnpdepth_cli.pipeline.networks.list_models import list_models
 
-    listed = [asdict(model) for model in list_models()]
+    listed = list_models()
     hidden = Counter(model["family"] for model in listed if model["variant"] and not every)
     if as_json:
         click.echo(json.dumps(listed, indent=2))
@@ -98,7 +98,7 @@ def convert(source: Path, target: Path, overwrite: bool, as_json: bool) -> None:
     """Write the tensors of the checkpoint IN to OUT.safetensors. No code in IN is run."""
     from pnpdepth_cli.pipeline.networks.convert import convert_checkpoint
 
-    _print(asdict(convert_checkpoint(source, target, overwrite=overwrite)), as_json)
+    _print(convert_checkpoint(source, target, overwrite=overwrite), as_json)
 
 
 @models.command(short_help="Download a network from Hugging Face.")
@@ -110,7 +110,7 @@ def fetch(repository: str, revision: str | None, output: Path | None, as_json: b
     """Download a network from Hugging Face. No other command uses the internet."""
     from pnpdepth_cli.pipeline.networks.fetch import fetch_model
 
-    _print(asdict(fetch_model(repository, revision, output)), as_json)
+    _print(fetch_model(repository, revision, output), as_json)
 
 
 def _print(record: Mapping[str, Any], as_json: bool) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import re
 import shutil
-from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -22,21 +21,14 @@ _WANTED = re.compile(
 RECORD = "fetched.json"
 
 
-@dataclass(frozen=True, kw_only=True)
-class FetchedModel:
-    """What was downloaded: of ORG/NAME at a commit, files in a folder, their hashes by name."""
-
-    repository: str
-    revision: str | None
-    folder: str
-    sha256: dict[str, str]
-
-
-def fetch_model(repo: str, revision: str | None = None, output: Path | None = None) -> FetchedModel:
+def fetch_model(
+    repo: str, revision: str | None = None, output: Path | None = None
+) -> dict[str, Any]:
     """Downloads the settings and safetensors weights of a Hugging Face repository to a folder.
 
-    What was downloaded is returned, and stored as `fetched.json` in the folder. Nothing stays there
-    unless every file has the digest that the repository states.
+    What was downloaded is returned (repository, revision, folder, and sha256 by file), and stored
+    as `fetched.json` in the folder. Nothing stays there unless every file has the digest that the
+    repository states.
 
     Args:
         repo: ORG/NAME.
@@ -77,13 +69,11 @@ def fetch_model(repo: str, revision: str | None = None, output: Path | None = No
         shutil.rmtree(temporary / ".cache", ignore_errors=True)  # of huggingface_hub
         for file in files:
             _check_content(repo, temporary / file.rfilename, file)
-        fetched = FetchedModel(
-            repository=repo,
-            revision=info.sha,
-            folder=str(folder),
-            sha256={file.rfilename: sha256_of(temporary / file.rfilename) for file in files},
-        )
-        write_json(temporary / RECORD, asdict(fetched))
+        digests = {file.rfilename: sha256_of(temporary / file.rfilename) for file in files}
+        fetched = {
+            "repository": repo, "revision": info.sha, "folder": str(folder), "sha256": digests
+        }  # fmt: skip
+        write_json(temporary / RECORD, fetched)
     return fetched
 
 

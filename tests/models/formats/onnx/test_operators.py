@@ -384,7 +384,7 @@ def test_picking_and_putting_back() -> None:
 def test_every_operator_in_the_table_is_tested_here() -> None:
     source = Path(__file__).read_text()
     untested = {op for op in OPERATORS if f'"{op}"' not in source} - set(REDUCTIONS)
-    assert untested == set()
+    assert not untested  # "Constant" has no input; networks have it
 
 
 def test_an_operator_that_is_not_covered_is_named() -> None:
