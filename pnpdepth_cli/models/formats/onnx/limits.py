@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -98,15 +98,22 @@ class SizeLimit(TorchFunctionMode):
 def _elements_at_most(func: Any, args: Any, kwargs: dict[str, Any], largest: int) -> float:
     """An upper bound on the elements of the result.
 
-    The product of all sizes and numbers bounds most results; each factor is at least 2, so that it
-    bounds sums too, as of concatenation: a + b ≤ a·b for a, b ≥ 2. If it exceeds `largest`, the
-    shape is inferred on the meta device instead, where nothing is allocated.
+    For most functions it is known. Elsewhere the product of all sizes and numbers bounds the
+    result; each factor is at least 2, so that it bounds sums too. If that exceeds `largest`, the
+    shape is inferred on the meta device, where nothing is allocated (its import takes a second).
     """
+    name = getattr(func, "__name__", "")
     leaves = tree_flatten((args, kwargs))[0]
-    bound: float = math.prod(max(2, leaf.numel()) for leaf in leaves if isinstance(leaf, Tensor))
+    shapes = [leaf.shape for leaf in leaves if isinstance(leaf, Tensor)]
+    known = _KNOWN.get(name)
+    if shapes and (known is not None or name in _ELEMENTWISE):
+        return known(*args, **kwargs) if known is not None else _broadcast(shapes)
+    if shapes and name in _NO_LARGER:
+        return shapes[0].numel()
+    bound: float = math.prod(max(2, shape.numel()) for shape in shapes)
     bound *= math.prod(2 + abs(leaf) for leaf in leaves if isinstance(leaf, int | float))
     # The result of arange is larger the smaller its step.
-    if bound <= largest and getattr(func, "__name__", "") != "arange":
+    if bound <= largest and name != "arange":
         return bound
     args, kwargs = tree_map_only(Tensor, _without_values, (args, kwargs))
     if kwargs.get("device") is not None:
@@ -117,6 +124,75 @@ def _elements_at_most(func: Any, args: Any, kwargs: dict[str, Any], largest: int
     except (RuntimeError, NotImplementedError):  # its size depends on values; it makes few of them
         return 0
     return max((part.numel() for part in _tensors_in(result)), default=0)
+
+
+_ELEMENTWISE = frozenset(
+    {
+        *("add", "sub", "rsub", "mul", "div", "true_divide", "floor_divide", "pow", "remainder"),
+        *("__add__", "__sub__", "__mul__", "__truediv__", "__pow__", "maximum", "minimum", "where"),
+        *("__radd__", "__rsub__", "__rmul__", "__rtruediv__", "fmod", "eq", "gt", "lt", "ge", "le"),
+    }
+)
+"""Functions whose result has the elements of their tensors broadcast together."""
+
+_NO_LARGER = frozenset(
+    {
+        *("relu", "sigmoid", "tanh", "erf", "exp", "log", "sqrt", "neg", "abs", "clamp", "softmax"),
+        *("leaky_relu", "elu", "hardswish", "gelu", "softplus", "batch_norm", "layer_norm"),
+        *("instance_norm", "group_norm", "mean", "sum", "amax", "amin", "square", "clone", "to"),
+        *("float", "long", "contiguous", "reshape", "view", "permute", "transpose", "squeeze"),
+        *(
+            "unsqueeze",
+            "movedim",
+            "split",
+            "pixel_shuffle",
+            "max_pool2d",
+            "max_pool2d_with_indices",
+        ),
+        *("boolean_dispatch", "_max_pool2d", "avg_pool2d", "detach", "cpu"),
+    }
+)
+"""Functions whose result is no larger than their first tensor."""
+
+
+def _broadcast(shapes: list[torch.Size]) -> int:
+    axes = max(map(len, shapes))
+    padded = [(*(1 for _ in range(axes - len(shape))), *shape) for shape in shapes]
+    return math.prod(map(max, *padded)) if len(padded) > 1 else math.prod(padded[0])
+
+
+def _of_convolution(
+    x: Tensor, weight: Tensor, bias: Any, stride: Any, padding: list[int], *_: Any
+) -> int:
+    sides = [n + 2 * p for n, p in zip(x.shape[2:], padding, strict=True)]
+    return len(x) * len(weight) * math.prod(sides)
+
+
+def _of_transposed(x: Tensor, weight: Tensor, bias: Any, stride: list[int], *rest: Any) -> int:
+    *_, groups, dilation = rest
+    parts = zip(x.shape[2:], stride, weight.shape[2:], dilation, strict=True)
+    return len(x) * weight.shape[1] * groups * math.prod(n * s + k * d for n, s, k, d in parts)
+
+
+def _of_product(a: Tensor, b: Tensor) -> int:
+    if min(a.ndim, b.ndim) < 2:
+        return max(a.numel(), b.numel())
+    return _broadcast([a.shape[:-2], b.shape[:-2]]) * a.shape[-2] * b.shape[-1]
+
+
+_KNOWN: dict[str, Callable[..., int]] = {
+    **{f"conv{axes}d": _of_convolution for axes in (1, 2, 3)},
+    **{f"conv_transpose{axes}d": _of_transposed for axes in (1, 2, 3)},
+    **dict.fromkeys(("matmul", "__matmul__"), _of_product),
+    "interpolate": lambda x, size, **_: x.shape[:2].numel() * math.prod(size),
+    **dict.fromkeys(("cat", "stack"), lambda tensors, *_, **__: sum(map(torch.numel, tensors))),
+    "index_select": lambda x, axis, at: x.numel() // max(1, x.shape[axis]) * at.numel(),
+    "expand": lambda _, *sizes: math.prod(sizes[0] if len(sizes) == 1 else sizes),
+    "pad": lambda x, pads, **_: math.prod(
+        n + sum(pads[2 * at : 2 * at + 2]) for at, n in enumerate(reversed(x.shape))
+    ),
+}
+"""Elements of the results of functions that may be far larger than their tensors."""
 
 
 def _tensors_in(value: Any) -> list[Tensor]:
