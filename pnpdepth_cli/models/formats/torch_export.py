@@ -103,7 +103,7 @@ class ExportedGraph(nn.Module):
         ]
         self._steps = list(self._steps_of(module["graph"]))
         last = {name: at for at, step in enumerate(self._steps) for name in _names_in(step)}
-        self._ends: list[list[str | None]] = [[] for _ in self._steps]
+        self._ends: list[list[str]] = [[] for _ in self._steps]
         for name in last.keys() - {*self._outputs}:
             self._ends[last[name]].append(name)
 
@@ -302,12 +302,12 @@ def _outputs_in(stated: Mapping[str, Any]) -> list[str | None]:
     return [name]
 
 
-def _names_in(step: _Step) -> set[str | None]:
+def _names_in(step: _Step) -> set[str]:
     """The values that a step reads or gives."""
     read = [*step.arguments, *step.keywords.values()]
     read += [one for value in read if isinstance(value, list) for one in value]
     given = [step.outputs] if isinstance(step.outputs, str) else step.outputs
-    return {*given, *(one.name for one in read if isinstance(one, _Value))}
+    return {*filter(None, given), *(one.name for one in read if isinstance(one, _Value))}
 
 
 def _resolved(value: Any, values: Mapping[str, Any]) -> Any:

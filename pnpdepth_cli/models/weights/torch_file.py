@@ -117,7 +117,11 @@ def _read_row_of_pickles(file: IO[bytes], size: int) -> tuple[Any, list[str]]:
 
     The content comes before the storages, which are filled afterwards.
     """
-    if PickleReader(file).load() != _MAGIC:
+    try:
+        begins = PickleReader(file).load()
+    except Exception:  # of another kind of file
+        begins = None
+    if begins != _MAGIC:
         raise BrokenFileError("it begins as no torch file does")
     for _ in ("protocol", "system"):
         PickleReader(file).load()

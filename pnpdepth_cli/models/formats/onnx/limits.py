@@ -158,7 +158,8 @@ _NO_LARGER = frozenset(
 def _broadcast(shapes: list[torch.Size]) -> int:
     axes = max(map(len, shapes))
     padded = [(*(1 for _ in range(axes - len(shape))), *shape) for shape in shapes]
-    return math.prod(map(max, *padded)) if len(padded) > 1 else math.prod(padded[0])
+    sides: list[int] = [max(along) for along in zip(*padded, strict=True)]
+    return math.prod(sides)
 
 
 def _of_convolution(
@@ -171,7 +172,8 @@ def _of_convolution(
 def _of_transposed(x: Tensor, weight: Tensor, bias: Any, stride: list[int], *rest: Any) -> int:
     *_, groups, dilation = rest
     parts = zip(x.shape[2:], stride, weight.shape[2:], dilation, strict=True)
-    return len(x) * weight.shape[1] * groups * math.prod(n * s + k * d for n, s, k, d in parts)
+    sides = [int(n * s + k * d) for n, s, k, d in parts]
+    return len(x) * weight.shape[1] * int(groups) * math.prod(sides)
 
 
 def _of_product(a: Tensor, b: Tensor) -> int:
