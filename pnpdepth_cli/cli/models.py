@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -86,7 +85,7 @@ def check(
     """
     from pnpdepth_cli.pipeline.networks.check import check_model
 
-    _print(asdict(check_model(network, checkpoint, image, device)), as_json)
+    _print(check_model(network, checkpoint, image, device), as_json)
 
 
 @models.command(short_help="Extract the tensors of a checkpoint.")
