@@ -29,7 +29,7 @@ from pnpdepth_cli.models.weights.pickle_reader import BrokenFileError, view_of
 
 _ASSUMED_MULTIPLE = 32
 _OPERATOR = re.compile(r"torch\.ops\.(aten|prims?|torchvision|quantized)\.(\w+)\.(\w+)")
-_TOUCHES_FILES = ("from_file", "save", "load", "_load")
+_TOUCHES_FILES = re.compile("file|save|load|read|write|video|decode")
 _ARITHMETIC = re.compile(
     r"_operator\.(add|sub|mul|truediv|floordiv|mod|neg|pos|abs|eq|ne|lt|le|gt|ge|and_|or_|not_"
     r"|getitem)|math\.(ceil|floor|trunc|sqrt)|torch\.(_?sym_\w+)"
@@ -247,7 +247,7 @@ def _tensor(content: bytearray, meta: Mapping[str, Any]) -> Tensor:
 def _function(target: str) -> Callable[..., Any]:
     """The operator or arithmetic of this name, and nothing else."""
     found = _OPERATOR.fullmatch(target)
-    if found is not None and found[2] not in _TOUCHES_FILES:
+    if found is not None and not _TOUCHES_FILES.search(found[2]):
         function: Callable[..., Any] = getattr(
             getattr(getattr(torch.ops, found[1]), found[2]), found[3]
         )

@@ -155,7 +155,8 @@ HOSTILE: dict[str, tuple[str, Change, str]] = {
         target: (MODEL, call(target), f"it calls '{target}'")
         for target in (
             "torch.os.system", "torch.ops.load_library", "torch.ops.aten.from_file.default",
-            "torch.ops.aten.save.default", "_operator.methodcaller", "math.__loader__",
+            "torch.ops.aten.save.default", "torch.ops.torchvision.write_file.default",
+            "_operator.methodcaller", "math.__loader__",
             "torch.load", "os.system", "torch.ops.higher_order.run_const_graph",
         )
     },
