@@ -248,10 +248,11 @@ def _function(target: str) -> Callable[..., Any]:
     """The operator or arithmetic of this name, and nothing else."""
     found = _OPERATOR.fullmatch(target)
     if found is not None and not _TOUCHES_FILES.search(found[2]):
-        function: Callable[..., Any] = getattr(
-            getattr(getattr(torch.ops, found[1]), found[2]), found[3]
-        )
-        return function
+        called: Any = torch.ops
+        for part in found.groups():
+            called = getattr(called, part)
+        if isinstance(called, torch._ops.OpOverload):  # and no other attribute on the way
+            return called
     found = _ARITHMETIC.fullmatch(target)
     if found is None:
         raise BrokenFileError(f"it calls {target[:80]!r}, which is no operator of torch")

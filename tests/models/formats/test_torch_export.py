@@ -157,6 +157,7 @@ HOSTILE: dict[str, tuple[str, Change, str]] = {
             "torch.os.system", "torch.ops.load_library", "torch.ops.aten.from_file.default",
             "torch.ops.aten.save.default", "torch.ops.torchvision.write_file.default",
             "_operator.methodcaller", "math.__loader__",
+            "torch.ops.aten.__class__.mro", "torch.ops.aten.add.__call__",
             "torch.load", "os.system", "torch.ops.higher_order.run_const_graph",
         )
     },
