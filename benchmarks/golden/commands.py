@@ -76,7 +76,7 @@ def _of_shared_data() -> Iterator[Group]:
         ("refine", f"refine {crop} {gt} {nconv}/CNN_ep0003.pth.tar -o out --json"),
         ("module", f"refine {crop} {gt} {nconv}/whole_module.pth -o depth.npy"),
         ("eval", f"eval depth.npy {KITTI}/groundtruth/0000000005.png --protocol kitti-devkit"),
-        ("convert", f"models --convert {data}/weights/nconv/whole_module.pth nconv.safetensors"),
+        ("convert", f"models convert {data}/weights/nconv/whole_module.pth nconv.safetensors"),
         ("converted", f"refine {crop} --model nconv --checkpoint nconv.safetensors -o d.exr"),
         shared=True,
     )
@@ -101,7 +101,7 @@ def _of_shared_data() -> Iterator[Group]:
             f"{SMALL} {onnx} --layer Relu_322 --update adam --lr 3% --iterations 5 --align auto"
             f" {GT} --holdout 0.25 -o few --format tiff",
         ),
-        ("check", f"models --check {data}/weights/fastdepth_nyu.onnx --image ../in/small/rgb.png"),
+        ("check", f"models check {data}/weights/fastdepth_nyu.onnx --image ../in/small/rgb.png"),
         Step(name="fastdepth/layers", line=f"layers {onnx} --sparse ../in/small/sparse.png --json"),
         ("no-layer", f"{SMALL} {onnx} --layer Relu_9999 -o none"),
         shared=True,
@@ -473,18 +473,18 @@ def _of_networks() -> Iterator[Group]:
         "models",
         ("list", "models"),
         ("json", "models --json"),
-        ("check-compact", "models --check compact --image ../in/small/rgb.png"),
+        ("check-compact", "models check compact --image ../in/small/rgb.png"),
         (
             "check-user",
-            "models --check ../in/my_net.py:MyNet --checkpoint ../in/my_net.safetensors",
+            "models check ../in/my_net.py:MyNet --checkpoint ../in/my_net.safetensors",
         ),
-        ("check-json", "models --check eigen-tiny --json"),
-        ("check-none", "models --check ../in/none.onnx"),
-        ("convert", "models --convert ../in/my_net.pt weights.safetensors"),
-        ("convert-json", "models --convert ../in/my_net.pt other.safetensors --json"),
-        ("convert-exists", "models --convert ../in/my_net.pt weights.safetensors"),
-        ("convert-picture", "models --convert ../in/small/rgb.png none.safetensors"),
-        ("fetch-nonsense", "models --fetch nonsense"),
+        ("check-json", "models check eigen-tiny --json"),
+        ("check-none", "models check ../in/none.onnx"),
+        ("convert", "models convert ../in/my_net.pt weights.safetensors"),
+        ("convert-json", "models convert ../in/my_net.pt other.safetensors --json"),
+        ("convert-exists", "models convert ../in/my_net.pt weights.safetensors"),
+        ("convert-picture", "models convert ../in/small/rgb.png none.safetensors"),
+        ("fetch-nonsense", "models fetch nonsense"),
     )
     yield group_of(
         "users-network",
@@ -521,7 +521,7 @@ def _of_networks() -> Iterator[Group]:
     yield group_of(
         "hugging-face",
         ("refine", f"{SMALL} {GT} --model ../in/depth_anything -o out/ --format npy"),
-        ("check", "models --check ../in/depth_anything --image ../in/small/rgb.png"),
+        ("check", "models check ../in/depth_anything --image ../in/small/rgb.png"),
     )
     yield group_of(
         "layers",

@@ -52,36 +52,19 @@ def layers(
         return
     from pnpdepth_cli.cli.tables import print_rows
 
+    fields = ("field\nin z", "field\nin depth")
     spacing = "" if result.spacing is None else f", points {result.spacing:.3g} pixels apart"
     print_rows(
         f"layers of {choice.model}{spacing}",
-        (
-            "layer",
-            "z",
-            "stride",
-            "params",
-            "cost\nbehind",
-            "time\nbehind",
-            "field\nin z",
-            "field\nin depth",
-            "rank",
-        ),
+        ("layer", "z", "stride", "params", "cost\nbehind", "time\nbehind", *fields, "rank"),
         [_cells(asdict(row)) for row in result.rows],
     )
 
 
 def _cells(row: dict[str, Any]) -> tuple[str, ...]:
     if row["problem"]:
-        return (
-            row["name"],
-            "–",
-            "",
-            "",
-            "",
-            "",
-            "",
-            row["problem"].partition(": ")[2] or row["problem"],
-        )
+        reason = row["problem"].partition(": ")[2] or row["problem"]
+        return (row["name"], "–", *[""] * 5, reason)
     return (
         row["name"],
         "×".join(str(n) for n in row["shape"]),

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -14,38 +13,13 @@ import click
 from pnpdepth_cli.cli import options
 from pnpdepth_cli.cli.printable import printable
 
-_OLD_FLAGS = {"--check": 1, "--convert": 2, "--fetch": 1}
-"""Flags of version 0.1 that became subcommands, with their numbers of values."""
-
 
 class _Models(click.Group):
-    """Lists the networks where no subcommand is named, and takes the flags of version 0.1."""
+    """Lists the networks where no subcommand is named."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        return super().parse_args(ctx, _with_subcommand(args))
-
-
-def _with_subcommand(args: list[str]) -> list[str]:
-    """Returns the arguments, beginning with a subcommand unless they ask for help."""
-    if args and (not args[0].startswith("-") or args[0] in ("-h", "--help")):
-        return args
-    words = [part for word in args for part in _split_flag(word)]
-    for flag, count in _OLD_FLAGS.items():
-        if flag in words:
-            start = words.index(flag)
-            values = words[start + 1 : start + 1 + count]
-            name = flag.removeprefix("--")
-            click.echo(
-                f"pnpdepth: `models {flag}` is now `models {name}`; the old form will be removed",
-                err=True,
-            )
-            return [name, *words[:start], *words[start + 1 + count :], "--", *values]
-    return ["list", *args]
-
-
-def _split_flag(word: str) -> list[str]:
-    flag, equals, value = word.partition("=")
-    return [flag, value] if equals and flag in _OLD_FLAGS else [word]
+        named = args and (not args[0].startswith("-") or args[0] in ("-h", "--help"))
+        return super().parse_args(ctx, args if named else ["list", *args])
 
 
 @click.group(short_help="List, check, convert or fetch networks.", cls=_Models)
@@ -67,7 +41,7 @@ def list_command(every: bool, as_json: bool) -> None:
     """List the networks that --model takes by name, with their inputs, outputs and defaults."""
     from pnpdepth_cli.pipeline.networks.list_models import list_models
 
-    listed = [asdict(model) for model in list_models()]
+    listed = list_models()
     hidden = Counter(model["family"] for model in listed if model["variant"] and not every)
     if as_json:
         click.echo(json.dumps(listed, indent=2))
@@ -111,7 +85,7 @@ def check(
     """
     from pnpdepth_cli.pipeline.networks.check import check_model
 
-    _print(asdict(check_model(network, checkpoint, image, device)), as_json)
+    _print(check_model(network, checkpoint, image, device), as_json)
 
 
 @models.command(short_help="Extract the tensors of a checkpoint.")
@@ -123,7 +97,7 @@ def convert(source: Path, target: Path, overwrite: bool, as_json: bool) -> None:
     """Write the tensors of the checkpoint IN to OUT.safetensors. No code in IN is run."""
     from pnpdepth_cli.pipeline.networks.convert import convert_checkpoint
 
-    _print(asdict(convert_checkpoint(source, target, overwrite=overwrite)), as_json)
+    _print(convert_checkpoint(source, target, overwrite=overwrite), as_json)
 
 
 @models.command(short_help="Download a network from Hugging Face.")
@@ -135,7 +109,7 @@ def fetch(repository: str, revision: str | None, output: Path | None, as_json: b
     """Download a network from Hugging Face. No other command uses the internet."""
     from pnpdepth_cli.pipeline.networks.fetch import fetch_model
 
-    _print(asdict(fetch_model(repository, revision, output)), as_json)
+    _print(fetch_model(repository, revision, output), as_json)
 
 
 def _print(record: Mapping[str, Any], as_json: bool) -> None:

@@ -22,10 +22,6 @@ _CAST_ONCE = (nn.Linear, nn.Conv1d, nn.Conv3d, nn.ConvTranspose1d, nn.ConvTransp
 def dtype_of(precision: str, device: torch.device) -> torch.dtype | None:
     """Returns the type that convolutions and matrix products compute in; None leaves float32.
 
-    Args:
-        precision: One of `choices.PRECISIONS`.
-        device: Where the network computes.
-
     Raises:
         UsageError: There is no such precision.
         DeviceError: fp16 on a CPU. Hardly any CPU computes in it, and those that do have bf16 too.
@@ -40,13 +36,9 @@ def dtype_of(precision: str, device: torch.device) -> torch.dtype | None:
 def lower(module: nn.Module, dtype: torch.dtype, device: torch.device) -> None:
     """Makes the convolutions and matrix products of a module compute in a lower precision.
 
-    torch's autocast decides which operations stay in float32. Weights are cast once, and laid out
-    channels last, the fastest layout in low precision. Depth and gradients come out in float32.
-
-    Args:
-        module: Changed in place.
-        dtype: torch.bfloat16 or torch.float16.
-        device: Where the module computes.
+    The module is changed in place. torch's autocast decides which operations stay in float32.
+    Weights are cast once, and laid out channels last, the fastest layout in low precision. Depth
+    and gradients come out in float32.
     """
     for part in module.modules():
         if type(part) in _CAST_ONCE:

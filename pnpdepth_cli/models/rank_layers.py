@@ -25,11 +25,10 @@ from pnpdepth_cli.models.frame import FrameMap
 from pnpdepth_cli.models.network import Network, out_of_memory_is_a_device_error
 
 GAPS = 6.0
-"""Gaps between points that a field should span, and"""
+"""Gaps between points that a field should span."""
 LEAST_FRACTION = 0.5
-"""fraction of the image's shorter side that it should span in any case. Of the factors 1, 3 and 6,
-and of no least fraction, 1/4 and 1/2, the best for FastDepth on even frames of ICL-NUIM, 7-Scenes
-and KITTI with 100 points to LiDAR."""
+"""Fraction of the image's shorter side that a field should span in any case. Both are the best of
+several for FastDepth on even frames of ICL-NUIM, 7-Scenes and KITTI, 100 points to LiDAR."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,7 +72,7 @@ def best_layer(
         return None
     # No field is wider than the image, and of equally wide ones the last layer is taken.
     enough = min(wanted_field(size, point_spacing(size, point_count)), *size)
-    layers, measured = list(network.definition.layers), []
+    layers, measured = list(network.definition.layers), {}
     # The more of the network lies behind a layer, the wider is its field: bisection finds the last
     # layer that reaches far enough, which is the one of least cost.
     first, end = 0, len(layers)
@@ -84,25 +83,20 @@ def best_layer(
             del layers[middle]
             end -= 1
             continue
-        measured.append(layer)
+        measured[layer.name] = layer
         if min(layer.field_in_output) >= enough:
             first = middle + 1
         else:
             end = middle
-    ranked = rank_layers(sorted(measured, key=lambda m: layers.index(m.name)), enough)
+    ranked = rank_layers([measured[name] for name in layers if name in measured], enough)
     return next((layer.name for layer in ranked if layer.rank == 1), None)
 
 
 def default_layer(network: Network, size: tuple[int, int], point_count: int) -> str | None:
     """Returns the layer whose output z is updated if no option names one.
 
-    It is the definition's, else the one ranked first for the spacing of the points. The ranking
-    runs the network on a synthetic frame. None if the definition has no layers.
-
-    Args:
-        network: The network.
-        size: Rows and columns of the image frame.
-        point_count: Sparse points in the frame.
+    It is the definition's, else the one ranked first for so many points in an image of this size
+    (rows, columns), measured on a synthetic frame. None if the definition has no layers.
     """
     definition = network.definition
     if definition.defaults.layer is not None or len(definition.layers) < 2:
@@ -114,22 +108,12 @@ def default_layer(network: Network, size: tuple[int, int], point_count: int) -> 
 
 
 def point_spacing(size: tuple[int, int], point_count: int) -> float:
-    """Returns the distance, in pixels, between evenly spread points: √(area / number).
-
-    Args:
-        size: Rows and columns of the frame.
-        point_count: Number of points in it, at least 1.
-    """
+    """Returns the distance, in pixels, between evenly spread points: √(area / number)."""
     return math.sqrt(size[0] * size[1] / point_count)
 
 
 def wanted_field(size: tuple[int, int], spacing: float) -> float:
-    """Returns how wide an influential field should be, in pixels.
-
-    Args:
-        size: Rows and columns of the frame.
-        spacing: Pixels between neighbouring points; see `point_spacing`.
-    """
+    """Returns how wide an influential field should be, in pixels, for a spacing of the points."""
     return max(GAPS * spacing, LEAST_FRACTION * min(size))
 
 
@@ -142,14 +126,13 @@ def rank_layers(layers: Iterable[MeasuredLayer], wanted: float) -> list[Measured
 
     Args:
         layers: As measured.
-        wanted: Pixels of the network's frame; see `wanted_field`.
+        wanted: Pixels of the network's frame.
     """
 
     def by_preference(layer: MeasuredLayer) -> tuple[bool, float]:
         assert layer.field_in_output is not None
         field = min(layer.field_in_output)
-        reaches = field >= wanted
-        return (not reaches, (layer.cost_behind or 0.0) if reaches else -float(field))
+        return (False, layer.cost_behind or 0.0) if field >= wanted else (True, -float(field))
 
     layers = list(layers)
     usable = [layer for layer in reversed(layers) if layer.problem is None]
@@ -201,33 +184,24 @@ def _measure(
             cost, seconds = None, None
             if whole_flops is not None:
                 split.rear(z)  # the first pass learns the cut
-                cost, seconds = _cost_behind(split, z, whole_flops)
+                with FlopCounterMode(display=False) as behind:
+                    split.rear(z)
+                start = time.perf_counter()
+                split.rear(z)
+                seconds = time.perf_counter() - start
+                cost = behind.get_total_flops() / whole_flops if whole_flops else None
             # On the raw output: where inverse depth is clamped, depth does not change.
             field = influential_field(split, z, network.raw_of, enough)
     except ModelError as error:
         return MeasuredLayer(name=name, problem=str(error))
+    module = dict(network.module.named_modules())[LayerName.parse(name).module]
     return MeasuredLayer(
         name=name,
         shape=tuple(z.shape),
         stride=rows / z.shape[-2] if z.ndim == 4 else None,
         cost_behind=cost,
         seconds_behind=seconds,
-        parameters=_parameter_count(network, name),
+        parameters=sum(parameter.numel() for parameter in module.parameters()),
         field_in_z=field.in_z,
         field_in_output=field.in_output,
     )
-
-
-def _cost_behind(split: Split, z: Tensor, whole_flops: int) -> tuple[float | None, float]:
-    """Fraction of the operations behind the cut, and the seconds that one pass of them takes."""
-    with FlopCounterMode(display=False) as behind:
-        split.rear(z)
-    start = time.perf_counter()
-    split.rear(z)
-    seconds = time.perf_counter() - start
-    return (behind.get_total_flops() / whole_flops if whole_flops else None), seconds
-
-
-def _parameter_count(network: Network, name: str) -> int:
-    module = dict(network.module.named_modules())[LayerName.parse(name).module]
-    return sum(parameter.numel() for parameter in module.parameters())

@@ -11,7 +11,9 @@ entry point, also the object itself) with one of
 from __future__ import annotations
 
 import difflib
+import re
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from types import ModuleType
 
@@ -34,31 +36,21 @@ def names() -> list[str]:
 
     A family of another package that cannot be loaded is left out; `find_definition` says why.
     """
-    definitions = (one for some in _loadable_families().values() for one in some.values())
+    definitions = (one for some in families().values() for one in some.values())
     return list(dict.fromkeys(definition.name for definition in definitions))
 
 
-def family_of(name: str) -> str:
-    """Returns the family (the file or entry point) that defines the network of this name.
-
-    Raises:
-        ModelError: No family defines it.
-    """
-    for family in _families_by_prefix(name):
-        if name in family_definitions(family):
-            return family
-    for family, definitions in _loadable_families().items():
-        if name in definitions:
-            return family
-    raise ModelError(f"no network is named {name!r}; {_near_names(name)}")
+def families() -> dict[str, Mapping[str, ModelDefinition]]:
+    """Returns the definitions of all families that can be loaded, by the names they go by."""
+    loadable = {}
+    for family in choices.NETWORKS:
+        with suppress(ModelError):
+            loadable[family] = _definitions_of(family)
+    return loadable
 
 
-def family_definitions(family: str) -> Mapping[str, ModelDefinition]:
-    """Returns the definitions of one family by the names they can be called by.
-
-    Raises:
-        ModelError: Its file or entry point cannot be loaded, or holds no definitions.
-    """
+def _definitions_of(family: str) -> Mapping[str, ModelDefinition]:
+    """The definitions of one family. ModelError if it cannot be loaded, or holds none."""
     try:
         entry = choices.NETWORKS[family]
     except PnpDepthError:
@@ -89,35 +81,19 @@ def find_definition(spec: str) -> ModelDefinition:
     Raises:
         ModelError: There is no such name or file, or it does not define a network.
     """
-    for family in _families_by_prefix(spec):
-        definitions = family_definitions(family)
-        if spec in definitions:
+    by_prefix = [f for f in choices.NETWORKS if spec == f or spec.startswith(f"{f}-")]
+    for family in sorted(by_prefix, key=len, reverse=True):
+        if spec in (definitions := _definitions_of(family)):
             return definitions[spec]
     from_file = _from_file(spec)
     if from_file is not None:
         return from_file
-    for definitions in _loadable_families().values():
+    for definitions in families().values():
         if spec in definitions:
             return definitions[spec]
     raise ModelError(
         f"model {spec!r} is neither a known name nor a Python file; {_near_names(spec)}"
     )
-
-
-def _families_by_prefix(name: str) -> list[str]:
-    """The families whose name the network's name begins with, longest first."""
-    families = [f for f in choices.NETWORKS if name == f or name.startswith(f"{f}-")]
-    return sorted(families, key=len, reverse=True)
-
-
-def _loadable_families() -> dict[str, Mapping[str, ModelDefinition]]:
-    loadable = {}
-    for family in choices.NETWORKS:
-        try:
-            loadable[family] = family_definitions(family)
-        except ModelError:
-            continue
-    return loadable
 
 
 def _near_names(name: str) -> str:
@@ -127,28 +103,49 @@ def _near_names(name: str) -> str:
 
 def _from_file(spec: str) -> ModelDefinition | None:
     """The definition of a file or folder; None if `spec` looks like neither."""
-    file, colon, attribute = spec.rpartition(":")
-    if spec.endswith(".py"):
-        return python_definition(Path(spec))
-    if colon and file.endswith(".py"):
-        return python_definition(Path(file), attribute)
-    if spec.endswith(".onnx") or (colon and file.endswith(".onnx")):
+    file, part = spec, None
+    if (found := re.fullmatch(r"(.*\.(?:py|onnx)):([^:]*)", spec, re.DOTALL)) is not None:
+        file, part = found.groups()
+    if file.endswith(".py"):
+        return python_definition(Path(file), part)
+    if file.endswith(".onnx"):
         from pnpdepth_cli.models.formats.onnx.network import onnx_definition
 
-        whole = spec.endswith(".onnx")
-        return onnx_definition(Path(spec)) if whole else onnx_definition(Path(file), attribute)
+        return onnx_definition(Path(file), part)
     if spec.endswith(".pt2"):
         from pnpdepth_cli.models.formats.torch_export import exported_definition
 
         return exported_definition(Path(spec))
     if spec.endswith(_WEIGHTS_ONLY):
-        raise ModelError(
-            f"model {spec} is a file of weights or a TorchScript archive, which cannot be cut; name"
-            " the network's Python file with --model and this file with --checkpoint, or export it"
-            " by torch.export (.pt2) or to ONNX"
-        )
+        raise ModelError(_why_weights_are_no_network(Path(spec)))
     if Path(spec).is_dir():
         from pnpdepth_cli.models.formats.hugging_face import hf_definition
 
         return hf_definition(Path(spec))
     return None
+
+
+def _why_weights_are_no_network(file: Path) -> str:
+    """What the file is, and the lines that make a network of it."""
+    from pnpdepth_cli.models.weights.torch_file import TORCHSCRIPT, is_module, read_torch_file
+
+    what, load = "is a file of weights", None
+    if file.is_file() and file.suffix not in (".safetensors", ".npy", ".npz", ".index"):
+        try:
+            if is_module(read_torch_file(file)[0]):
+                what, load = "is a whole pickled module", "torch.load({!r}, weights_only=False)"
+        except Exception as error:  # another file of weights, or none
+            if TORCHSCRIPT in str(error):
+                what, load = "is a TorchScript archive", "torch.jit.load({!r})"
+    if load is None:
+        return (
+            f"model {file} {what}, which cannot be cut; name the network's Python file with --model"
+            " and this file with --checkpoint, or export the network by torch.export (.pt2) or to"
+            " ONNX"
+        )
+    return (
+        f"model {file} {what}, which is not run; where you trust it, export it to ONNX (with the"
+        f" size of your images): net = {load.format(file.name)}.eval();"
+        f" torch.onnx.export(net, torch.zeros(1, 3, 480, 640), {file.stem + '.onnx'!r},"
+        " dynamo=False)"
+    )

@@ -27,7 +27,7 @@ class _FeatureMap:
     @property
     def area(self) -> int:
         """Rows times columns."""
-        return self.output.shape[2] * self.output.shape[3]
+        return self.output[0, 0].numel()
 
 
 @dataclass(frozen=True)
@@ -101,17 +101,16 @@ def _reached(prediction: Tensor, maps: list[_FeatureMap]) -> list[_FeatureMap]:
 
 def _with_gradient(prediction: Tensor, maps: list[_FeatureMap]) -> list[_FeatureMap]:
     """The maps whose gradient is not 0."""
-    if not maps:
-        return []
+    gradients = _gradients(prediction, [m.output for m in maps])
+    return [m for m, g in zip(maps, gradients, strict=True) if g is not None and bool(g.any())]
+
+
+def _gradients(prediction: Tensor, tensors: list[Tensor]) -> tuple[Tensor | None, ...]:
+    """Of the prediction's sum; None for a tensor that it does not depend on."""
+    if not tensors or not prediction.requires_grad:
+        return (None,) * len(tensors)
     with torch.enable_grad(), wrap_user_errors("the gradient of the network"):
-        gradients = torch.autograd.grad(
-            prediction.sum(), [m.output for m in maps], allow_unused=True, retain_graph=True
-        )
-    return [
-        m
-        for m, gradient in zip(maps, gradients, strict=True)
-        if gradient is not None and bool((gradient != 0).any())
-    ]
+        return torch.autograd.grad(prediction.sum(), tensors, allow_unused=True, retain_graph=True)
 
 
 def _last_of_each_resolution(maps: list[_FeatureMap]) -> list[_FeatureMap]:
@@ -182,13 +181,7 @@ def _reaches_features(run: _Run) -> bool:
     features = [
         t for t in run.copies if t.ndim > 2 and t.shape[1] > 1 and t.squeeze().shape != depth
     ]
-    if not features or not run.prediction.requires_grad:
-        return False
-    with torch.enable_grad(), wrap_user_errors("the gradient of the network"):
-        gradients = torch.autograd.grad(
-            run.prediction.sum(), features, allow_unused=True, retain_graph=True
-        )
-    return any(gradient is not None for gradient in gradients)
+    return any(gradient is not None for gradient in _gradients(run.prediction, features))
 
 
 def _has_aspect_of(output: Tensor, sides: tuple[int, ...]) -> bool:

@@ -15,7 +15,6 @@ from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.errors import CheckpointError
 from pnpdepth_cli.models.network import load_network
 from tests.model_zoo_defs.cuts import (
-    assert_the_cut_changes_nothing_and_a_step_does,
     built,
     frame_for,
 )
@@ -170,23 +169,9 @@ def test_a_variable_left_over_is_named(tmp_path: Path) -> None:
 # ------------------------------------------------------------------ the cut
 
 
-def test_z_is_the_codes_of_the_last_layer() -> None:
-    network = built(definitions["adnn"])
-    assert network.definition.default_layer == "solve"
-    assert network.definition.default_alignment == "none"
-    z = assert_the_cut_changes_nothing_and_a_step_does(network, "solve")
-    assert z.shape == (1, 32, 8, 12)
-
-
 def test_behind_the_codes_depth_is_linear_in_them() -> None:
     network = built(definitions["adnn"])
     with torch.no_grad(), Split(network.module, "solve") as split:
         z = split.front(*frame_for(network))
         depth: Tensor = split.rear(z)
         torch.testing.assert_close(split.rear(3 * z), 3 * depth)
-
-
-@pytest.mark.parametrize("layer", definitions["adnn"].layers)
-def test_every_layer_can_be_cut_at_and_a_step_there_changes_depth(layer: str) -> None:
-    network = built(definitions["adnn"])
-    assert_the_cut_changes_nothing_and_a_step_does(network, layer)

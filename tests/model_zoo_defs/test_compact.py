@@ -37,30 +37,26 @@ def frame(height: int, width: int, count: int, seed: int = 0) -> tuple[Tensor, T
     return rgb, sparse.view(1, 1, height, width)
 
 
-@pytest.mark.parametrize("count", [0, 1, 2, 5, 500, 20_000])
-def test_depth_is_finite_and_positive_for_any_number_of_points(
-    network: Compact, count: int
+PATTERNS = {
+    "row": (slice(40, 41), slice(None)),
+    "column": (slice(None), slice(3, 4)),
+    "corner": (slice(9), slice(9)),
+}
+
+
+@pytest.mark.parametrize("points", [0, 1, 2, 5, 500, 20_000, *PATTERNS, "one depth"])
+def test_depth_is_positive_and_repeatable_wherever_the_points_lie(
+    network: Compact, points: int | str
 ) -> None:
-    rgb, sparse = frame(128, 160, count)
-    depth = network(rgb, sparse)
+    rgb, sparse = frame(128, 160, points if isinstance(points, int) else 128 * 160)
+    if isinstance(points, str):
+        full, sparse = sparse, torch.zeros_like(sparse)
+        rows, columns = PATTERNS.get(points, (slice(None, None, 7), slice(None, None, 7)))
+        sparse[..., rows, columns] = full[..., rows, columns] if points in PATTERNS else 2.0
+    with torch.no_grad():
+        depth = network(rgb, sparse)
+        assert torch.equal(network(rgb, sparse), depth)
     assert depth.shape == (1, 1, 128, 160)
-    assert bool(torch.isfinite(depth).all())
-    assert bool((depth > 0).all())
-
-
-@pytest.mark.parametrize("pattern", ["row", "column", "corner", "one depth"])
-def test_depth_is_finite_where_the_points_lie_oddly(network: Compact, pattern: str) -> None:
-    rgb, full = frame(96, 128, 96 * 128)
-    sparse = torch.zeros_like(full)
-    if pattern == "row":
-        sparse[..., 40, :] = full[..., 40, :]
-    elif pattern == "column":
-        sparse[..., :, 3] = full[..., :, 3]
-    elif pattern == "corner":
-        sparse[..., :9, :9] = full[..., :9, :9]
-    else:
-        sparse[..., ::7, ::7] = 2.0
-    depth = network(rgb, sparse)
     assert bool(torch.isfinite(depth).all())
     assert bool((depth > 0).all())
 
@@ -70,30 +66,28 @@ def test_any_multiple_of_32_is_taken(network: Compact, size: tuple[int, int]) ->
     assert network(*frame(*size, 40)).shape == (1, 1, *size)
 
 
+@pytest.mark.parametrize("with_prior", [False, True])
 @pytest.mark.parametrize("factor", [0.1, 10.0])
-def test_points_ten_times_as_far_give_depth_ten_times_as_far(
-    network: Compact, factor: float
+def test_inputs_ten_times_as_far_give_depth_ten_times_as_far(
+    shaken: Compact, factor: float, with_prior: bool
 ) -> None:
     rgb, sparse = frame(96, 128, 300)
+    depths = (sparse, prior_of(sparse)) if with_prior else (sparse,)
     with torch.no_grad():
-        expected = network(rgb, sparse) * factor
-        depth = network(rgb, sparse * factor)
+        expected = shaken(rgb, *depths) * factor
+        depth = shaken(rgb, *(one * factor for one in depths))
     torch.testing.assert_close(depth, expected, rtol=1e-3, atol=0.0)
 
 
-def test_samples_of_a_batch_do_not_see_each_other(network: Compact) -> None:
+@pytest.mark.parametrize("with_prior", [False, True])
+def test_samples_of_a_batch_do_not_see_each_other(shaken: Compact, with_prior: bool) -> None:
     one, other = frame(64, 96, 30, seed=1), frame(64, 96, 700, seed=2)
     batch = [torch.cat(pair) for pair in zip(one, other, strict=True)]
+    priors = [torch.cat([prior_of(one[1]), torch.zeros(1, 1, 64, 96)])] if with_prior else []
     with torch.no_grad():
-        together = network(*batch)
-        apart = torch.cat([network(*one), network(*other)])
+        together = shaken(*batch, *priors)
+        apart = torch.cat([shaken(*one, *(p[:1] for p in priors)), shaken(*other)])
     torch.testing.assert_close(together, apart, rtol=1e-3, atol=1e-4)
-
-
-def test_the_same_input_gives_the_same_bytes(network: Compact) -> None:
-    inputs = frame(96, 128, 200)
-    with torch.no_grad():
-        assert torch.equal(network(*inputs), network(*inputs))
 
 
 def test_a_plane_seen_at_some_points_is_continued_as_a_plane(network: Compact) -> None:
@@ -163,25 +157,6 @@ def test_a_prior_changes_the_depth_and_leaves_it_finite(shaken: Compact) -> None
             assert not torch.equal(depth, shaken(rgb, sparse))
         assert bool(torch.isfinite(depth).all())
         assert bool((depth > 0).all())
-
-
-def test_prior_and_points_ten_times_as_far_give_depth_ten_times_as_far(shaken: Compact) -> None:
-    rgb, sparse = frame(96, 128, 300)
-    prior = prior_of(sparse)
-    with torch.no_grad():
-        expected = shaken(rgb, sparse, prior) * 10.0
-        depth = shaken(rgb, sparse * 10.0, prior * 10.0)
-    torch.testing.assert_close(depth, expected, rtol=1e-3, atol=0.0)
-
-
-def test_samples_with_and_without_a_prior_can_be_in_one_batch(shaken: Compact) -> None:
-    one, other = frame(64, 96, 30, seed=1), frame(64, 96, 700, seed=2)
-    batch = [torch.cat(pair) for pair in zip(one, other, strict=True)]
-    priors = torch.cat([prior_of(one[1]), torch.zeros(1, 1, 64, 96)])
-    with torch.no_grad():
-        together = shaken(*batch, priors)
-        apart = torch.cat([shaken(*one, priors[:1]), shaken(*other)])
-    torch.testing.assert_close(together, apart, rtol=1e-3, atol=1e-4)
 
 
 @pytest.mark.parametrize("useless", ["constant", "shuffled"])

@@ -12,7 +12,6 @@ from torch import Tensor
 from model_zoo_defs.eigen import definitions, read_two_files
 from pnpdepth_cli.errors import CheckpointError
 from pnpdepth_cli.models.network import load_network
-from tests.model_zoo_defs.cuts import assert_the_cut_changes_nothing_and_a_step_does, built
 
 COARSE = {
     "conv1": (96, 3, 11, 11),
@@ -116,21 +115,3 @@ def test_the_output_is_as_large_as_the_fine_features_at_both_sizes() -> None:
             definition = definitions[name]
             rgb = torch.empty(1, 3, definition.size.height, definition.size.width)
             assert definition.build()(rgb).shape == (1, 1, *size)
-
-
-def test_z_is_inside_the_coarse_network() -> None:
-    network = built(definitions["eigen-tiny"])
-    assert network.definition.default_layer == "coarse.conv5"
-    assert network.definition.default_alignment == "none"
-    assert assert_the_cut_changes_nothing_and_a_step_does(network, "coarse.conv5").shape == (
-        1,
-        64,
-        6,
-        8,
-    )
-
-
-@pytest.mark.parametrize("layer", definitions["eigen-tiny"].layers)
-def test_every_layer_can_be_cut_at_and_a_step_there_changes_depth(layer: str) -> None:
-    network = built(definitions["eigen-tiny"])
-    assert_the_cut_changes_nothing_and_a_step_does(network, layer)

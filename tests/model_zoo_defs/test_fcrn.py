@@ -26,8 +26,8 @@ from model_zoo_defs.fcrn import (
 from pnpdepth_cli.errors import CheckpointError
 from pnpdepth_cli.models.network import load_network
 from pnpdepth_cli.models.weights.checkpoint import load_checkpoint
-from tests.model_zoo_defs.cuts import assert_the_cut_changes_nothing_and_a_step_does, built
-from tests.models.weights.numpy_files import write_npy
+from tests.model_zoo_defs.cuts import built
+from tests.models.weights.files import write_npy
 
 Arrays = dict[str, dict[str, NDArray[np.float32]]]
 Fill = Callable[[tuple[int, ...]], NDArray[np.float32]]
@@ -327,24 +327,6 @@ def test_a_stride_leaves_out_rows_before_anything_else_looks_at_them() -> None:
     x = torch.randn(1, 8, 7, 10)
     with torch.no_grad():
         assert torch.allclose(strided(x), plain(x[..., ::2, ::2]), atol=1e-6)
-
-
-# ------------------------------------------------------------------ the cut
-
-
-def test_z_is_what_goes_into_the_first_up_projection() -> None:
-    network = built(definitions["fcrn"])
-    assert network.definition.default_layer == "layer1_BN"
-    assert network.definition.default_alignment == "none"
-    z = assert_the_cut_changes_nothing_and_a_step_does(network, "layer1_BN")
-    assert z.shape == (1, 1024, 8, 10)
-    assert float(z.min()) < 0  # no non-linearity behind it
-
-
-@pytest.mark.parametrize("layer", definitions["fcrn-tiny"].layers)
-def test_every_layer_can_be_cut_at_and_a_step_there_changes_depth(layer: str) -> None:
-    network = built(definitions["fcrn-tiny"])
-    assert_the_cut_changes_nothing_and_a_step_does(network, layer, (64, 96))
 
 
 def test_depth_is_never_negative_and_rgb_goes_in_as_bytes() -> None:

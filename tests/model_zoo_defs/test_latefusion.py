@@ -14,7 +14,6 @@ from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.errors import CheckpointError
 from pnpdepth_cli.models.network import load_network
 from tests.model_zoo_defs.cuts import (
-    assert_the_cut_changes_nothing_and_a_step_does,
     built,
     frame_for,
 )
@@ -91,20 +90,6 @@ def test_weights_load_whole_and_those_of_the_other_size_name_it(tmp_path: Path) 
     assert all(torch.equal(own[name], tensor) for name, tensor in state.items())
     with pytest.raises(CheckpointError, match="this is latefusion-tiny; use --model"):
         load_network("latefusion", tmp_path / "w.safetensors")
-
-
-def test_z_is_the_decoders_feature_map_at_an_eighth() -> None:
-    network = built(TINY)
-    assert network.definition.default_layer == "decoder.s8"
-    assert network.definition.default_alignment == "none"
-    z = assert_the_cut_changes_nothing_and_a_step_does(network, "decoder.s8")
-    assert z.shape == (1, 32, 8, 12)
-
-
-@pytest.mark.parametrize("layer", TINY.layers)
-def test_every_layer_can_be_cut_at_and_a_step_there_changes_depth(layer: str) -> None:
-    network = built(TINY)
-    assert_the_cut_changes_nothing_and_a_step_does(network, layer)
 
 
 def test_the_full_network_is_cut_at_the_same_layer() -> None:

@@ -12,7 +12,7 @@ from torch import Tensor
 from model_zoo_defs.sfmlearner import DispNet, definitions
 from pnpdepth_cli.errors import CheckpointError
 from pnpdepth_cli.models.network import load_network
-from tests.model_zoo_defs.cuts import assert_the_cut_changes_nothing_and_a_step_does, built
+from tests.model_zoo_defs.cuts import built
 
 # (kernel, channels in, channels out) of dispnet_model_best.pth.tar
 DOWN = [(7, 3, 32), (5, 32, 64), (3, 64, 128), (3, 128, 256), (3, 256, 512), (3, 512, 512)]
@@ -119,20 +119,6 @@ def test_disparity_is_inverse_depth_between_its_bounds_at_four_sizes() -> None:
         assert float(disparity.min()) >= 0.01 - 1e-6
         assert float(disparity.max()) <= 10.01 + 1e-6
     assert float(network.depth_of(torch.full((1, 1, 2, 2), 0.01)).max()) == pytest.approx(100)
-
-
-def test_z_is_the_bottleneck_and_the_features_beside_the_decoder_stay() -> None:
-    network = built(definitions["sfmlearner"])
-    z = assert_the_cut_changes_nothing_and_a_step_does(network, "conv7")
-    assert z.shape == (1, 512, 1, 4)
-    assert network.definition.default_layer == "conv7"
-    assert network.definition.default_alignment == "auto"
-
-
-@pytest.mark.parametrize("layer", definitions["sfmlearner-tiny"].layers)
-def test_every_layer_can_be_cut_at_and_a_step_there_changes_depth(layer: str) -> None:
-    network = built(definitions["sfmlearner-tiny"])
-    assert_the_cut_changes_nothing_and_a_step_does(network, layer)
 
 
 def test_the_published_pose_network_is_refused_by_name(tmp_path: Path) -> None:

@@ -337,25 +337,6 @@ def test_weights_of_another_variant_name_the_right_one(
         load_network(wanted, tmp_path / "w.pth")
 
 
-# ------------------------------------------------------------------ the cut
-
-
-@pytest.mark.parametrize("name", ["sparse2dense-tiny", "sparse2dense-tiny-kitti"])
-def test_z_is_behind_the_batch_norm_of_the_bottleneck(name: str) -> None:
-    network = built(definitions[name])
-    assert network.definition.default_layer == "bn2"
-    assert network.definition.default_alignment == "none"
-    z = assert_the_cut_changes_nothing_and_a_step_does(network, "bn2")
-    assert z.shape[1:3] == (64, 8)
-    assert bool((z < 0).any())  # no ReLU
-
-
-@pytest.mark.parametrize("layer", definitions["sparse2dense-tiny"].layers)
-def test_every_layer_can_be_cut_at_and_a_step_there_changes_depth(layer: str) -> None:
-    network = built(definitions["sparse2dense-tiny"])
-    assert_the_cut_changes_nothing_and_a_step_does(network, layer)
-
-
 # ------------------------------------------------------------------ the self-supervised network
 
 

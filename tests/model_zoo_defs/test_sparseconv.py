@@ -14,7 +14,7 @@ from model_zoo_defs.sparseconv import SparseConv, SparseConvNet, definitions
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.errors import CheckpointError
 from pnpdepth_cli.models.network import load_network
-from tests.model_zoo_defs.cuts import assert_the_cut_changes_nothing_and_a_step_does, built
+from tests.model_zoo_defs.cuts import built
 
 KERNELS = (11, 7, 5, 3, 3)
 
@@ -206,10 +206,3 @@ def test_z_is_the_features_behind_the_first_layer_and_the_mask_stays() -> None:
         assert not torch.equal(split.rear(z + known), moved)
     assert z.shape == (1, 16, 64, 96)
     assert bool((z >= 0).all())
-
-
-@pytest.mark.parametrize("name", ["sparseconv", "sparseconv-nomask"])
-@pytest.mark.parametrize("layer", definitions["sparseconv"].layers)
-def test_every_layer_can_be_cut_at_and_a_step_there_changes_depth(name: str, layer: str) -> None:
-    network = built(definitions[name])
-    assert_the_cut_changes_nothing_and_a_step_does(network, layer)

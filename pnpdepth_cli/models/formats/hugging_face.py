@@ -2,20 +2,22 @@
 
 Needs `pip install pnpdepth[hf]`. The network is a class of transformers, with code from that
 package only; nothing is downloaded. The image is resized and normalised as preprocessor_config.json
-says, by this program's own code, so torchvision is not needed.
+says, or as networks of the type usually are, by this program's own code.
 """
 
 from __future__ import annotations
 
 import json
 import os
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.nn.modules.module import register_module_parameter_registration_hook
 
 from pnpdepth_cli.budget import size_problem
 from pnpdepth_cli.choices import OutputKind, OutputScale
@@ -23,6 +25,8 @@ from pnpdepth_cli.completion.interpolation import linear
 from pnpdepth_cli.core.user_code import describe
 from pnpdepth_cli.errors import CheckpointError, ModelError
 from pnpdepth_cli.models.definition import (
+    IMAGENET_MEAN,
+    IMAGENET_STD,
     UNTUNED_DEFAULTS,
     Fixed,
     ModelDefinition,
@@ -37,31 +41,51 @@ _PICKLED = ("pytorch_model.bin", "pytorch_model.bin.index.json")
 
 
 _MAX_SIDE = 1 << 16  # pixels
+_LARGEST_NUMBER = 1e6  # in a config.json; no network has more of any part
 _PLAIN_ATTENTION = ("eager", "sdpa")
+_IMAGENET = {"image_mean": IMAGENET_MEAN, "image_std": IMAGENET_STD}
 
 
 @dataclass(frozen=True)
 class _Family:
-    """What the networks of one model type predict, and what sides of images are multiples of."""
+    """What the networks of one model type predict, and how their image is prepared.
+
+    of: what sides of images are multiples of. size, keeps_aspect, statistics: as transformers
+    prepares the image by default.
+    """
 
     kind: OutputKind
     scale: OutputScale
     of: int = 1
+    size: tuple[int, int] | None = None
+    keeps_aspect: bool = True
+    statistics: Mapping[str, Any] = field(default_factory=dict)
+
+    def processing(self) -> Mapping[str, Any]:
+        """Returns the settings that a preprocessor_config.json would have."""
+        if self.size is None:
+            return {"size_divisor": self.of}
+        size = dict(zip(("height", "width"), self.size, strict=True))
+        return {
+            "size": size,
+            "keep_aspect_ratio": self.keeps_aspect,
+            "do_normalize": True,
+            **self.statistics,
+        }
 
 
 PROMPT_SIZE = (192, 256)
 """Rows and columns of the depth that Prompt Depth Anything was trained with, a phone's LiDAR."""
 
-
 _FAMILIES = {
-    "depth_anything": _Family("inverse", "affine", 14),
-    "prompt_depth_anything": _Family("depth", "metric", 14),
+    "depth_anything": _Family("inverse", "affine", 14, (518, 518), statistics=_IMAGENET),
+    "prompt_depth_anything": _Family("depth", "metric", 14, (756, 756), statistics=_IMAGENET),
     # Intel's DPT give inverse depth, Meta's on DINOv2 give depth; their configurations do not say.
-    "dpt": _Family("unknown", "affine", 16),
-    "zoedepth": _Family("depth", "metric", 32),
+    "dpt": _Family("unknown", "affine", 16, (384, 384), keeps_aspect=False),
+    "zoedepth": _Family("depth", "metric", 32, (384, 512)),
     "glpn": _Family("depth", "metric", 32),
     # Inverse depth for a canonical camera: a factor away from metres.
-    "depth_pro": _Family("inverse", "scale"),
+    "depth_pro": _Family("inverse", "scale", size=(1536, 1536), keeps_aspect=False),
 }
 
 
@@ -69,7 +93,7 @@ def hf_definition(folder: Path) -> ModelDefinition:
     """Returns the definition of a depth network in a Hugging Face folder.
 
     Args:
-        folder: Has config.json, preprocessor_config.json and model.safetensors, as downloaded.
+        folder: Has config.json and model.safetensors, and preprocessor_config.json if it was saved.
 
     Raises:
         ModelError: A file is missing or wrong, or the type of network is not known.
@@ -82,11 +106,20 @@ def hf_definition(folder: Path) -> ModelDefinition:
             f"{folder}: networks of type {str(kind)[:60]!r} are not known; known:"
             f" {', '.join(_FAMILIES)}"
         )
-    _refuse_foreign_attention(config, folder)
-    family = _FAMILIES[kind]
+    _check_settings(config, folder / "config.json")
+    family, assumed = _FAMILIES[kind], ""
     if config.get("depth_estimation_type") == "metric":
-        family = _Family("depth", "metric", family.of)
-    processing = _json(folder / "preprocessor_config.json", "it says how the image is prepared")
+        family = replace(family, kind="depth", scale="metric")
+    if (folder / "preprocessor_config.json").is_file():
+        processing = _json(folder / "preprocessor_config.json", "it says how images are prepared")
+    else:
+        processing = family.processing()
+        size = "×".join(map(str, family.size or ("its own",)))
+        mean = "ImageNet's mean and deviation" if family.statistics else "rgb in −1…1"
+        assumed = (
+            f"{folder.name} has no preprocessor_config.json; assumed, as usual for {kind}: size"
+            f" {size}, {mean if family.size else 'rgb in 0…1'}"
+        )
     weights, prompted = _weights(folder), kind == "prompt_depth_anything"
     return ModelDefinition(
         name=folder.resolve().name,
@@ -102,29 +135,27 @@ def hf_definition(folder: Path) -> ModelDefinition:
         arguments=_with_prompt if prompted else None,
         output=_predicted_depth,
         defaults=UNTUNED_DEFAULTS,
+        assumed=assumed,
     )
 
 
-def _refuse_foreign_attention(config: Mapping[str, Any], folder: Path) -> None:
-    """ModelError if the settings name an attention that transformers may download and run."""
+def _check_settings(config: Mapping[str, Any], file: Path) -> None:
+    """ModelError for a huge number, or an attention that transformers may fetch and run."""
     pending: list[Any] = [config]
     while pending:
         value = pending.pop()
-        if isinstance(value, list):
-            pending += value
-        if not isinstance(value, Mapping):
-            continue
-        for key, setting in value.items():
-            if "attn_implementation" in key and isinstance(setting, str):
-                if setting not in _PLAIN_ATTENTION:
+        if isinstance(value, int | float) and not abs(value) <= _LARGEST_NUMBER:
+            raise ModelError(f"{file}: {str(value)[:20]} is larger than any part of a network")
+        for key, setting in value.items() if isinstance(value, Mapping) else ():
+            names = setting.values() if isinstance(setting, Mapping) else (setting,)
+            for name in names if "attn_implementation" in key else ():
+                if isinstance(name, str) and name not in _PLAIN_ATTENTION:
                     raise ModelError(
-                        f"{folder / 'config.json'}: {key} {setting[:60]!r} may fetch and run code;"
-                        f" only {' and '.join(_PLAIN_ATTENTION)} are taken, remove the entry"
+                        f"{file}: {key} {name[:60]!r} may fetch and run code; only"
+                        f" {' and '.join(_PLAIN_ATTENTION)} are taken, remove the entry"
                     )
-            elif "attn_implementation" in key and isinstance(setting, Mapping):
-                pending += [{key: one} for one in setting.values()]
-            else:
-                pending.append(setting)
+            pending.append(setting)
+        pending += value if isinstance(value, list) else []
 
 
 def _with_prompt(rgb: Tensor | None, sparse: Tensor | None) -> tuple[Tensor, ...]:
@@ -200,6 +231,8 @@ def _size(processing: Mapping[str, Any], of: int, folder: Path) -> Fixed | Near:
 def _side(processing: Mapping[str, Any], key: str, folder: Path) -> int:
     """A number of pixels; 1 if there is none."""
     value = processing.get(key) or 1
+    if isinstance(value, float) and 1 / _MAX_SIDE <= value < 1:  # as ZoeDepth's folders have 1/32
+        value = round(1 / value)
     if not isinstance(value, int) or not 1 <= value <= _MAX_SIDE:
         raise ModelError(
             f"{folder / 'preprocessor_config.json'}: {key} must be a number of pixels,"
@@ -242,6 +275,10 @@ def _build(folder: Path) -> nn.Module:
     logging.set_verbosity_error()
     logging.disable_progress_bar()
     try:
+        config = transformers.AutoConfig.from_pretrained(str(folder), local_files_only=True)
+        with _fewer_parameters_than_bytes(folder), torch.device("meta"):
+            networks: Any = transformers.AutoModelForDepthEstimation
+            networks.from_config(config)
         module, info = transformers.AutoModelForDepthEstimation.from_pretrained(
             str(folder),
             local_files_only=True,
@@ -249,6 +286,8 @@ def _build(folder: Path) -> nn.Module:
             trust_remote_code=False,
             output_loading_info=True,
         )
+    except ModelError:
+        raise
     except Exception as error:  # transformers raises what its parts raise
         raise ModelError(f"{folder}: transformers cannot load it: {describe(error)}") from None
     missing = [*info["missing_keys"], *(str(key) for key in info["mismatched_keys"])]
@@ -259,3 +298,21 @@ def _build(folder: Path) -> nn.Module:
         )
     network: nn.Module = module.float()
     return network
+
+
+@contextmanager
+def _fewer_parameters_than_bytes(folder: Path) -> Iterator[None]:
+    """Inside, a network of more parameters than its weights have bytes raises ModelError."""
+    left = sum(file.stat().st_size for file in folder.glob("*.safetensors"))
+
+    def count(module: nn.Module, name: str, parameter: nn.Parameter | None) -> None:
+        nonlocal left
+        left -= 0 if parameter is None else max(1, parameter.numel())
+        if left < 0:
+            raise ModelError(f"{folder}: config.json describes a larger network than its weights")
+
+    handle = register_module_parameter_registration_hook(count)
+    try:
+        yield
+    finally:
+        handle.remove()

@@ -19,34 +19,33 @@ from pnpdepth_cli.core.user_code import describe
 from pnpdepth_cli.errors import ModelError, PnpDepthError
 from pnpdepth_cli.models.definition import UNTUNED_DEFAULTS, ModelDefinition, Multiple
 
-DEFAULT_ATTRIBUTE = "definition"
-
 _ASSUMED_MULTIPLE = 32
 """Image sides are padded to multiples of this where no definition says otherwise."""
 
 
-def python_definition(file: Path, attribute: str = DEFAULT_ATTRIBUTE) -> ModelDefinition:
+def python_definition(file: Path, attribute: str | None = None) -> ModelDefinition:
     """Returns the definition in a Python file, or one assumed for the network class in it.
 
     Args:
         file: The Python file; it may import modules beside it.
         attribute: The name of a ModelDefinition, of a network class, or of a function that returns
-            a network. If the default name is missing, the file's only network class is taken.
+            a network. None takes `definition`, or else the file's only network class.
 
     Raises:
         ModelError: The file is missing or raises, or the attribute is missing or something else.
     """
     module = _run(file)
-    value = getattr(module, attribute, None)
-    if value is None and attribute == DEFAULT_ATTRIBUTE:
-        attribute, value = _only_network_class(module) or (attribute, None)
+    named = attribute or "definition"
+    value = getattr(module, named, None)
+    if value is None and attribute is None:
+        named, value = _only_network_class(module) or (named, None)
     if value is None:
-        raise ModelError(f"model file {file} defines no {attribute!r}; name it as {file}:ATTRIBUTE")
+        raise ModelError(f"model file {file} defines no {named!r}; name it as {file}:ATTRIBUTE")
     if callable(value) and not isinstance(value, ModelDefinition):
-        return _assumed_definition(value, attribute, file)
+        return _assumed_definition(value, named, file)
     if not isinstance(value, ModelDefinition):
         raise ModelError(
-            f"{attribute!r} in model file {file} is a {type(value).__name__}, not a ModelDefinition"
+            f"{named!r} in model file {file} is a {type(value).__name__}, not a ModelDefinition"
         )
     return value
 

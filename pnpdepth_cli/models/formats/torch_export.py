@@ -1,33 +1,55 @@
 """A torch.export archive (.pt2) as a definition; the nodes of its graph are the layers.
 
-The archive is checked before torch reads it, and the source code of its guards is never run.
+`torch.export.load` trusts its file: it unpickles inputs, evaluates expressions of sizes and the
+code of guards, and finds functions by dotted names. Here the graph is read from its JSON, tensors
+are plain bytes, and nothing but operators of torch and small arithmetic is called. Whatever else
+lies in the archive is left alone (layout and schema: torch/_export/serde/schema.py).
 """
 
 from __future__ import annotations
 
-import contextlib
-import logging
+import json
+import math
 import operator
-from collections.abc import Iterator, Sequence
+import re
+import zipfile
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor, fx, nn
+from torch import Tensor, nn
 
 from pnpdepth_cli.budget import size_problem
 from pnpdepth_cli.core.user_code import describe
 from pnpdepth_cli.errors import ModelError
 from pnpdepth_cli.models.definition import UNTUNED_DEFAULTS, Fixed, ModelDefinition, Multiple
-from pnpdepth_cli.models.formats.export_archive import check_archive
+from pnpdepth_cli.models.weights.pickle_reader import BrokenFileError, view_of
 
 _ASSUMED_MULTIPLE = 32
+_OPERATOR = re.compile(r"torch\.ops\.(aten|prims?|torchvision|quantized)\.(\w+)\.(\w+)")
+_TOUCHES_FILES = re.compile("file|save|load|read|write|video|decode")
+_ARITHMETIC = re.compile(
+    r"_operator\.(add|sub|mul|truediv|floordiv|mod|neg|pos|abs|eq|ne|lt|le|gt|ge|and_|or_|not_"
+    r"|getitem)|math\.(ceil|floor|trunc|sqrt)|torch\.(_?sym_\w+)"
+)
+_WITHOUT_GRADIENT = "torch.ops.higher_order.wrap_with_set_grad_enabled"
+_DTYPES = {
+    1: torch.uint8, 2: torch.int8, 3: torch.int16, 4: torch.int32, 5: torch.int64,
+    6: torch.float16, 7: torch.float32, 8: torch.float64, 12: torch.bool, 13: torch.bfloat16,
+}  # fmt: skip
+_MEMORY_FORMATS = {
+    1: torch.contiguous_format, 2: torch.channels_last, 3: torch.channels_last_3d,
+    4: torch.preserve_format,
+}  # fmt: skip
+_STRIDED = 7
 
 
 class ExportedOperation(nn.Module):
     """One operation of the exported graph."""
 
-    def __init__(self, operation: Any) -> None:
+    def __init__(self, operation: Callable[..., Any]) -> None:
         super().__init__()
         self._operation = operation
 
@@ -35,9 +57,117 @@ class ExportedOperation(nn.Module):
         """Returns the operation's result."""
         return self._operation(*args, **kwargs)
 
-    def extra_repr(self) -> str:
-        """Returns the operation, for `print(network)`."""
-        return str(self._operation)
+
+@dataclass(frozen=True)
+class _Value:
+    """Stands for a value of the graph among the arguments of a step."""
+
+    name: str
+
+
+@dataclass(frozen=True)
+class _Step:
+    """One call; outputs: names of its result's parts, or of the result itself as a text."""
+
+    run: Callable[..., Any]
+    arguments: list[Any]
+    keywords: dict[str, Any]
+    outputs: str | list[str | None]
+
+
+class ExportedGraph(nn.Module):
+    """The graph of an exported program as a module of one image; every operation is a submodule.
+
+    Args:
+        program: The content of models/model.json.
+        tensors: Weights, buffers and constants by name.
+    """
+
+    def __init__(self, program: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> None:
+        super().__init__()
+        module = program["graph_module"]
+        self.held: dict[str, str] = {}  # the attribute for a value of the graph
+        self.inputs: list[str] = []
+        for spec in module["signature"]["input_specs"]:
+            ((kind, value),) = spec.items()
+            if kind == "user_input":
+                self.inputs.append(value["arg"]["as_tensor"]["name"])
+            elif kind in ("parameter", "buffer", "tensor_constant"):
+                self._hold(value["arg"]["name"], tensors[value[f"{kind}_name"]])
+            else:
+                raise BrokenFileError(f"its input is a {str(kind)[:40]!r}")
+        self._outputs = [
+            spec["user_output"]["arg"]["as_tensor"]["name"]
+            for spec in module["signature"]["output_specs"]
+            if "user_output" in spec
+        ]
+        self._steps = list(self._steps_of(module["graph"]))
+        last = {name: at for at, step in enumerate(self._steps) for name in _names_in(step)}
+        self._ends: list[list[str]] = [[] for _ in self._steps]
+        for name in last.keys() - {*self._outputs}:
+            self._ends[last[name]].append(name)
+
+    def forward(self, *inputs: Tensor) -> Any:
+        """Returns the output, or a tuple of several."""
+        values: dict[str, Any] = dict(zip(self.inputs, inputs, strict=True))
+        values |= {name: getattr(self, attribute) for name, attribute in self.held.items()}
+        for step, ends in zip(self._steps, self._ends, strict=True):
+            keywords = {name: _resolved(value, values) for name, value in step.keywords.items()}
+            result = step.run(*(_resolved(value, values) for value in step.arguments), **keywords)
+            if isinstance(step.outputs, str):
+                values[step.outputs] = result
+            else:
+                values.update((n, r) for n, r in zip(step.outputs, result, strict=False) if n)
+            for name in ends:
+                values.pop(name, None)
+        outputs = tuple(values[name] for name in self._outputs)
+        return outputs if len(outputs) > 1 else outputs[0]
+
+    def _hold(self, name: str, value: Tensor) -> None:
+        self.held[name] = f"tensor{len(self.held)}"
+        if value.is_floating_point():
+            self.register_parameter(self.held[name], nn.Parameter(value, requires_grad=False))
+        else:
+            self.register_buffer(self.held[name], value)
+
+    def _steps_of(self, graph: Mapping[str, Any]) -> Iterator[_Step]:
+        for node in graph["nodes"]:
+            target, outputs = node["target"], node["outputs"]
+            if target == _WITHOUT_GRADIENT:
+                enabled, body, *given = (argument["arg"] for argument in node["inputs"])
+                yield from self._inlined(body["as_graph"]["graph"], given, outputs, **enabled)
+            elif outputs:  # the others only check what the exporter saw
+                yield self._step(target, node["inputs"], outputs)
+
+    def _step(self, target: str, inputs: list[Any], outputs: list[Any]) -> _Step:
+        run = _function(target)
+        named = [one for output in outputs for one in _outputs_in(output)]
+        alone = len(outputs) == 1 and "as_tensors" not in outputs[0]
+        if any(kind in output for output in outputs for kind in ("as_tensor", "as_tensors")):
+            run = ExportedOperation(run)
+            name = str(named[0] if alone else target.split(".")[-2]).replace(".", "_")
+            while hasattr(self, name):  # as a node named `to`, a method of every module
+                name += "_"
+            self._modules[name] = run
+        return _Step(
+            run=run,
+            arguments=[_argument(one["arg"]) for one in inputs if one.get("kind") != 2],
+            keywords={one["name"]: _argument(one["arg"]) for one in inputs if one.get("kind") == 2},
+            outputs=str(named[0]) if alone else named,
+        )
+
+    def _inlined(
+        self, body: Mapping[str, Any], given: list[Any], outputs: list[Any], *, as_bool: bool
+    ) -> Iterator[_Step]:
+        """A graph in the graph, whose result has no gradient unless `as_bool` says so."""
+        before = [one for value in body["inputs"] for one in _outputs_in(value)]
+        for name, value in zip(before, given, strict=True):
+            yield _Step(_same, [_argument(value)], {}, str(name))
+        yield from self._steps_of(body)
+        results = [one for value in body["outputs"] for one in _outputs_in(value)]
+        names = [one for output in outputs for one in _outputs_in(output)]
+        for name, result in zip(names, results, strict=True):
+            yield _Step(_same if as_bool else torch.detach, [_Value(str(result))], {}, str(name))
 
 
 def exported_definition(file: Path) -> ModelDefinition:
@@ -54,93 +184,138 @@ def exported_definition(file: Path) -> ModelDefinition:
     if problem := size_problem(file):
         raise ModelError(f"exported program {file} {problem}")
     try:
-        check_archive(file)
-        with _without_logs_of_torch():
-            graph = torch.export.load(file).module(check_guards=False)
-    except ModelError:
-        raise
-    except Exception as error:  # every part of torch.export has its own way to fail
+        program, tensors = _read(file)
+        graph = ExportedGraph(program, tensors)
+        values = program["graph_module"]["graph"]["tensor_values"]
+        shapes = [[s.get("as_int") for s in values[name]["sizes"]] for name in graph.inputs]
+    except Exception as error:  # nothing but the file decides what is raised
+        reason = str(error) if isinstance(error, BrokenFileError) else describe(error)
         raise ModelError(
-            f"exported program {file} cannot be read: {describe(error)[:160]}; it must be written"
-            f" by torch.export.save of about this version of torch ({torch.__version__})"
+            f"exported program {file} cannot be read: {reason[:160]}; it must be written by"
+            f" torch.export.save of about this version of torch ({torch.__version__})"
         ) from None
-    shapes = [
-        tuple(node.meta["val"].shape)
-        for node in graph.graph.nodes
-        if node.op == "placeholder" and isinstance(node.meta.get("val"), Tensor)
-    ]
     if len(shapes) != 1 or len(shapes[0]) != 4 or shapes[0][1] != 3:
         raise ModelError(
-            f"exported program {file} takes inputs {shapes}; one rgb image 1×3×H×W is expected"
+            f"exported program {file} takes inputs {str(shapes)[:80]}; one rgb image 1×3×H×W is"
+            " expected"
         )
     height, width = shapes[0][2:]
-    fixed = isinstance(height, int) and isinstance(width, int)
     return ModelDefinition(
         name=file.stem,
         summary="torch.export archive",
         input_kind="rgb",
-        size=Fixed(height, width) if fixed else Multiple(_ASSUMED_MULTIPLE),
+        size=Fixed(height, width) if height and width else Multiple(_ASSUMED_MULTIPLE),
         normalisation=None,
         output_kind="unknown",
         output_scale="unknown",
-        build=lambda: _with_operations_as_modules(graph),
+        build=lambda: ExportedGraph(program, tensors),
         complete=True,
         checkpoint=file,
         defaults=UNTUNED_DEFAULTS,
     )
 
 
-@contextlib.contextmanager
-def _without_logs_of_torch() -> Iterator[None]:
-    """torch.export logs the traceback of each attempt to read a damaged file; the error says it."""
-    before = logging.root.manager.disable
-    logging.disable(logging.CRITICAL)
-    try:
-        yield
-    finally:
-        logging.disable(before)
+def _read(file: Path) -> tuple[Mapping[str, Any], dict[str, Tensor]]:
+    """The program, and its tensors by name."""
+    with zipfile.ZipFile(file) as archive:
+        entries = {info.filename.partition("/")[2]: info for info in archive.infolist()}
+        if any(info.compress_type != zipfile.ZIP_STORED for info in entries.values()):
+            raise BrokenFileError("it is compressed, which torch never does")
+        if sum(info.file_size for info in entries.values()) > file.stat().st_size:
+            raise BrokenFileError("its entries are larger than the file")
+        program = json.loads(archive.read(entries["models/model.json"]))
+        tensors, storages = {}, {}
+        for folder, kind in (("weights", "model_weights"), ("constants", "model_constants")):
+            config = json.loads(archive.read(entries[f"data/{folder}/{kind}_config.json"]))
+            for name, stated in config["config"].items():
+                if stated["use_pickle"]:
+                    raise BrokenFileError(f"{name[:80]!r} is pickled, and no pickle is run")
+                path = f"data/{folder}/{stated['path_name']}"
+                if path not in storages:
+                    storages[path] = bytearray(archive.read(entries[path]))
+                tensors[name] = _tensor(storages[path], stated["tensor_meta"])
+    return program, tensors
 
 
-def _with_operations_as_modules(exported: Any) -> nn.Module:
-    """The same graph, with every operation on tensors as a submodule under its node's name."""
-    root, graph = nn.Module(), fx.Graph()
-    copies: dict[fx.Node, Any] = {}
-    taken: set[str] = set()
-    for node in exported.graph.nodes:
-        copy = graph.node_copy(node, lambda n: copies[n])
-        copies[node] = copy
-        if node.op == "get_attr":
-            name = str(node.target).replace(".", "_")
-            if name not in taken:
-                _hold(root, name, _attribute(exported, str(node.target)))
-            taken.add(name)
-            copy.target = name
-        elif _is_layer(node):
-            name = node.name
-            while hasattr(
-                root, name
-            ):  # every module has a method `to`; a graph may have such a node
-                name += "_"
-            root.add_module(name, ExportedOperation(node.target))
-            copy.op, copy.target = "call_module", name
-    return fx.GraphModule(root, graph)
+def _tensor(content: bytearray, meta: Mapping[str, Any]) -> Tensor:
+    dtype = _DTYPES[meta["dtype"]]
+    flat = torch.frombuffer(content, dtype=dtype) if content else torch.empty(0, dtype=dtype)
+    shape, stride = ([one["as_int"] for one in meta[key]] for key in ("sizes", "strides"))
+    return view_of(flat, meta["storage_offset"]["as_int"], shape, stride)
 
 
-def _is_layer(node: fx.Node) -> bool:
-    gives_tensors = isinstance(node.meta.get("val"), Tensor | Sequence)
-    return node.op == "call_function" and gives_tensors and node.target is not operator.getitem
+def _function(target: str) -> Callable[..., Any]:
+    """The operator or arithmetic of this name, and nothing else."""
+    found = _OPERATOR.fullmatch(target)
+    if found is not None and not _TOUCHES_FILES.search(found[2]):
+        called: Any = torch.ops
+        for part in found.groups():
+            called = getattr(called, part)
+        if isinstance(called, torch._ops.OpOverload):  # and no other attribute on the way
+            return called
+    found = _ARITHMETIC.fullmatch(target)
+    if found is None:
+        raise BrokenFileError(f"it calls {target[:80]!r}, which is no operator of torch")
+    place: Any = {"_": operator, "m": math, "t": torch}[target[0]]
+    arithmetic: Callable[..., Any] = getattr(place, found[1] or found[2] or found[3])
+    return arithmetic
 
 
-def _hold(root: nn.Module, name: str, value: Tensor | nn.Module) -> None:
-    if isinstance(value, nn.Module):
-        root.add_module(name, value)  # a nested graph, such as one without gradients
-    elif value.is_floating_point():
-        root.register_parameter(name, nn.Parameter(value.detach(), requires_grad=False))
-    else:
-        root.register_buffer(name, value)
+def _argument(stated: Mapping[str, Any]) -> Any:
+    """An argument of a call, with `_Value` for what the graph computes."""
+    ((kind, value),) = stated.items()
+    match kind.removeprefix("as_").replace("optional_", "").replace("sym_", ""):
+        case "none":
+            return None
+        case "name":
+            return _Value(value)
+        case "tensor" if "name" in value:
+            return _Value(value["name"])
+        case "float" if not isinstance(value, Mapping):
+            return float(value)  # JSON has a text for an infinite one
+        case "tensor" | "int" | "float" | "bool" | "string":
+            return _argument(value) if isinstance(value, Mapping) else value
+        case "tensors" | "ints" | "floats" | "bools":
+            kind = kind.removesuffix("s")
+            whole = [isinstance(one, Mapping) and "name" not in one for one in value]
+            return [_argument(v if w else {kind: v}) for v, w in zip(value, whole, strict=True)]
+        case "scalar_type":
+            return _DTYPES[value]
+        case "memory_format":
+            return _MEMORY_FORMATS[value]
+        case "device":
+            return torch.device(value["type"])
+        case "layout" if value == _STRIDED:
+            return torch.strided
+    raise BrokenFileError(f"it has an argument {str(kind)[:40]!r}")
 
 
-def _attribute(module: Any, path: str) -> Any:
-    for part in path.split("."):
-        module = getattr(module, part)
-    return module
+def _outputs_in(stated: Mapping[str, Any]) -> list[str | None]:
+    """The names that a stated output gives to values; None for a part without one."""
+    ((kind, value),) = stated.items()
+    if kind == "as_tensors":
+        return [one["name"] for one in value]
+    if kind == "as_none":
+        return [None]
+    name = value.get("name", value.get("as_name")) if isinstance(value, Mapping) else None
+    if not isinstance(name, str):
+        raise BrokenFileError(f"it has an output {str(kind)[:40]!r}")
+    return [name]
+
+
+def _names_in(step: _Step) -> set[str]:
+    """The values that a step reads or gives."""
+    read = [*step.arguments, *step.keywords.values()]
+    read += [one for value in read if isinstance(value, list) for one in value]
+    given = [step.outputs] if isinstance(step.outputs, str) else step.outputs
+    return {*filter(None, given), *(one.name for one in read if isinstance(one, _Value))}
+
+
+def _resolved(value: Any, values: Mapping[str, Any]) -> Any:
+    if isinstance(value, list):
+        return [_resolved(one, values) for one in value]
+    return values[value.name] if isinstance(value, _Value) else value
+
+
+def _same(value: Any) -> Any:
+    return value

@@ -7,46 +7,41 @@ takes the tensors out and runs nothing.
 
 from __future__ import annotations
 
-import functools
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import torch
+from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from pnpdepth_cli.budget import size_problem
-from pnpdepth_cli.core.user_code import describe, wrap_user_errors
+from pnpdepth_cli.core.user_code import describe
 from pnpdepth_cli.errors import CheckpointError, ModelError
 from pnpdepth_cli.models import registry
 from pnpdepth_cli.models.definition import ModelDefinition
-from pnpdepth_cli.models.weights.numpy_file import SUFFIXES as NUMPY_SUFFIXES
 from pnpdepth_cli.models.weights.numpy_file import read_numpy_file
-from pnpdepth_cli.models.weights.pickle_reader import StandIn
-from pnpdepth_cli.models.weights.tensor_bundle import SUFFIX as BUNDLE_SUFFIX
+from pnpdepth_cli.models.weights.pickle_reader import PLAIN_NAMES, StandIn, brief
 from pnpdepth_cli.models.weights.tensor_bundle import read_tensor_bundle
-from pnpdepth_cli.models.weights.torch_file import (
-    TensorFile,
-    is_module,
-    module_state,
-    read_tensor_file,
-)
+from pnpdepth_cli.models.weights.torch_file import is_module, module_state, read_torch_file
 
 _STATE_KEYS = ("state_dict", "model_state_dict", "model_state", "model", "network", "net", "params")
-WEIGHT_SUFFIXES = (
-    *(".safetensors", ".pth", ".pt", ".bin", ".ckpt", ".tar"), *NUMPY_SUFFIXES, BUNDLE_SUFFIX
-)  # fmt: skip
+_INDEX = ".index"  # of a TensorFlow checkpoint
+_READERS: dict[str, tuple[str, Callable[[Path], Any]]] = {
+    ".safetensors": ("safetensors file", load_file),
+    ".npy": ("numpy file", read_numpy_file),
+    ".npz": ("numpy file", read_numpy_file),
+    _INDEX: ("TensorFlow checkpoint", read_tensor_bundle),
+}
+"""By suffix; any other file is one of torch."""
+
+WEIGHT_SUFFIXES = (*_READERS, ".pth", ".pt", ".bin", ".ckpt", ".tar")
+
 _COUNTER = "num_batches_tracked"
 _LFS_POINTER = b"version https://git-lfs"
-_TRAINING_ARGUMENTS = ("data", "dataset", "arch", "decoder", "modality", "height", "width")
 _SHOWN_NAMES = 4
-_MAX_SIDE = 1 << 20  # pixels of an image that training may have seen
 _MAX_WORD = 60  # characters of a word out of a file that are shown
-_NOT_WORTH_A_NOTE = (
-    *("torch.", "collections.", "_codecs.encode", "builtins.set", "__builtin__.set"),
-    *("builtins.bytearray", "__builtin__.bytearray", "builtins.complex", "__builtin__.complex"),
-)
 
 
 def read_checkpoint(path: Path) -> dict[str, Tensor]:
@@ -115,21 +110,18 @@ def _fitted(
     path: Path,
 ) -> Mapping[str, Tensor]:
     """The state dict that replaces the network's own. CheckpointError if it does not fit."""
-    state = stored if definition.read_checkpoint is None else _converted(definition, stored, path)
-    problems = [
-        *_listed("missing", [n for n in own if n not in state and not n.endswith(_COUNTER)]),
-        *_listed("unexpected", [name for name in state if name not in own]),
-        *_listed(
-            "of another shape",
-            [
-                f"{name} {tuple(state[name].shape)} for {tuple(own[name].shape)}"
-                for name in own
-                if name in state and state[name].shape != own[name].shape
-            ],
-        ),
-    ]
-    if problems:
-        raise _misfit(path, definition, "; ".join(problems))
+    state = _converted(definition, stored, path)
+    differing = [n for n in own if n in state and state[n].shape != own[n].shape]
+    problems = {
+        "missing": [n for n in own if n not in state and not n.endswith(_COUNTER)],
+        "unexpected": [name for name in state if name not in own],
+        "of another shape": [
+            f"{n} {tuple(state[n].shape)} for {tuple(own[n].shape)}" for n in differing
+        ],
+    }
+    listed = [f"{len(some)} {what} ({_some(some)})" for what, some in problems.items() if some]
+    if listed:
+        raise _misfit(path, definition, "; ".join(listed))
     return state
 
 
@@ -138,49 +130,18 @@ def _networks_it_fits(stored: Mapping[str, Tensor], path: Path, wanted: str) -> 
 
     Tensor names and shapes decide, so variants for other image sizes (`-kitti`) fit too.
     """
-    by_class: dict[Any, list[str]] = {}
+    fitting = []
     for name in registry.names():
-        build = registry.find_definition(name).build
-        by_class.setdefault(getattr(build, "func", build), []).append(name)
-    fitting = [
-        name
-        for names in by_class.values()
-        if any(_shares_names(name, names[0], stored, path) for name in names)
-        for name in names
-        if _fits(name, stored, path)
-    ]
+        definition = registry.find_definition(name)
+        try:
+            with torch.device("meta"):
+                own = definition.build().state_dict()
+            _fitted(definition, own, stored, path)
+        except Exception:  # of another package; such a network is none that fits
+            continue
+        fitting.append(name)
     ending = wanted.rpartition("-")[2]
     return sorted(fitting, key=lambda name: name.rpartition("-")[2] != ending)
-
-
-def _shares_names(name: str, built: str, stored: Mapping[str, Tensor], path: Path) -> bool:
-    """True if tensors, as the network `name` reads them, have names of the network `built`.
-
-    Building every network would take seconds.
-    """
-    definition = registry.find_definition(name)
-    try:
-        state = (
-            stored if definition.read_checkpoint is None else _converted(definition, stored, path)
-        )
-        return not _shapes_of(built).keys().isdisjoint(state)
-    except ModelError:
-        return False
-
-
-def _fits(name: str, stored: Mapping[str, Tensor], path: Path) -> bool:
-    try:
-        _fitted(registry.find_definition(name), _shapes_of(name), stored, path)
-    except ModelError:
-        return False
-    return True
-
-
-@functools.cache
-def _shapes_of(name: str) -> dict[str, Tensor]:
-    """The state dict of a network that can be named, without its values."""
-    with wrap_user_errors(f"build of network {name!r}"), torch.device("meta"):
-        return registry.find_definition(name).build().state_dict()
 
 
 def _misfit(path: Path, definition: ModelDefinition, why: str) -> CheckpointError:
@@ -205,10 +166,6 @@ def _is_finite(tensor: Tensor) -> bool:
     return not tensor.is_floating_point() or math.isfinite(tensor.sum(dtype=torch.float64).item())
 
 
-def _listed(what: str, names: list[str]) -> list[str]:
-    return [f"{len(names)} {what} ({_some(names)})"] if names else []
-
-
 def _some(names: list[str], between: str = ", ") -> str:
     """The first few of the names, and how many more there are."""
     more = f" and {len(names) - _SHOWN_NAMES} more" if len(names) > _SHOWN_NAMES else ""
@@ -224,7 +181,7 @@ def _read(path: Path) -> tuple[dict[str, Tensor], list[str]]:
     if path.is_dir():
         return _read_folder(path)
     if not path.is_file():
-        index = path.with_name(path.name + BUNDLE_SUFFIX)
+        index = path.with_name(path.name + _INDEX)
         hint = f"; {index.name} does, name that" if index.is_file() else ""
         raise CheckpointError(f"checkpoint {path} does not exist{hint}")
     with path.open("rb") as file:
@@ -236,14 +193,25 @@ def _read(path: Path) -> tuple[dict[str, Tensor], list[str]]:
         )
     if problem := size_problem(path):
         raise CheckpointError(f"checkpoint {path} {problem}")
-    if path.suffix == ".safetensors":
-        return _read_safetensors(path), []
-    if path.suffix in NUMPY_SUFFIXES:
-        return read_numpy_file(path), []
-    if path.suffix == BUNDLE_SUFFIX:
-        return read_tensor_bundle(path), []
-    torch_file = read_tensor_file(path)
-    return _state_in(torch_file.content, path), _notes_on(torch_file, path)
+    kind, read = _READERS.get(path.suffix, ("torch file", read_torch_file))
+    try:
+        content = read(path)
+    except Exception as error:  # nothing but the file decides what its readers raise
+        raise CheckpointError(
+            f"checkpoint {path} cannot be read as a {kind} ({brief(error)})"
+        ) from None
+    if isinstance(content, dict):
+        return content, []
+    content, named = content
+    notes = []
+    if others := [name for name in named if not PLAIN_NAMES.fullmatch(name)]:
+        notes = [f"checkpoint {path.name}: its pickle names {_some(others)}; nothing of it was run"]
+    arguments = content.get("args") if isinstance(content, Mapping) else None
+    arguments = getattr(arguments, "state", arguments)
+    if isinstance(arguments, Mapping) and isinstance(data := arguments.get("data"), str):
+        # Weights for other data may fit all the same.
+        notes.append(f"checkpoint {path.name}: trained with data {_short(data)}")
+    return _state_in(content, path), notes
 
 
 def _read_folder(folder: Path) -> tuple[dict[str, Tensor], list[str]]:
@@ -266,44 +234,6 @@ def _read_folder(folder: Path) -> tuple[dict[str, Tensor], list[str]]:
     return state, notes
 
 
-def _read_safetensors(path: Path) -> dict[str, Tensor]:
-    from safetensors import SafetensorError
-    from safetensors.torch import load_file
-
-    try:
-        return dict(load_file(path))
-    except (SafetensorError, OSError, ValueError) as error:
-        raise CheckpointError(
-            f"checkpoint {path} is not a whole safetensors file: {error}"
-        ) from None
-
-
-def _notes_on(file: TensorFile, path: Path) -> list[str]:
-    """What else a torch file holds, and what the arguments of the training say if it has them.
-
-    Weights for other data, or for images of another size, may fit all the same.
-    """
-    notes = []
-    classes = [name for name in file.named if not name.startswith(_NOT_WORTH_A_NOTE)]
-    if classes or file.has_stand_ins:
-        notes.append(
-            f"checkpoint {path.name}: its pickle names {_some(classes) or 'classes of torch'}; its"
-            " tensors were taken out, nothing of it was run"
-        )
-    arguments = file.content.get("args") if isinstance(file.content, Mapping) else None
-    arguments = arguments.state if isinstance(arguments, StandIn) else arguments
-    if isinstance(arguments, Mapping):
-        values = {key: arguments.get(key) for key in _TRAINING_ARGUMENTS}
-        shown = [
-            f"{key} {_short(str(value))}"
-            for key, value in values.items()
-            if isinstance(value, str) or (isinstance(value, int) and abs(value) < _MAX_SIDE)
-        ]
-        if shown:
-            notes.append(f"checkpoint {path.name}: trained with {', '.join(shown)}")
-    return notes
-
-
 def _state_in(content: Any, path: Path) -> dict[str, Tensor]:
     """The state dict in what a torch file holds."""
     if is_module(content):
@@ -315,21 +245,17 @@ def _state_in(content: Any, path: Path) -> dict[str, Tensor]:
         if is_module(candidate):
             return module_state(candidate)
         if isinstance(candidate, Mapping) and candidate:
-            _refuse_unusual_tensors(candidate, path)
+            for name, value in candidate.items():
+                _, is_tensor, kind = getattr(value, "path", "").partition("torch._utils._rebuild_")
+                if is_tensor:
+                    raise CheckpointError(
+                        f"checkpoint {path}: {_short(str(name))} is not a plain tensor"
+                        f" ({_short(kind)}); save its values as a dense tensor of floats"
+                    )
             if _only_tensors(candidate):
                 return dict(candidate)
     names = ", ".join(_short(str(key)) for key in list(content)[:8]) or "nothing"
     raise CheckpointError(f"checkpoint {path} has no state dict; it holds {names}")
-
-
-def _refuse_unusual_tensors(state: Mapping[Any, Any], path: Path) -> None:
-    for name, value in state.items():
-        if isinstance(value, StandIn) and value.path.startswith("torch._utils._rebuild_"):
-            kind = value.path.removeprefix("torch._utils._rebuild_")
-            raise CheckpointError(
-                f"checkpoint {path}: {_short(str(name))} is not a plain tensor ({_short(kind)});"
-                " save its values as a dense tensor of floats"
-            )
 
 
 def _only_tensors(mapping: Mapping[Any, Any]) -> bool:
@@ -339,7 +265,9 @@ def _only_tensors(mapping: Mapping[Any, Any]) -> bool:
 def _converted(
     definition: ModelDefinition, state: Mapping[str, Tensor], path: Path
 ) -> Mapping[str, Tensor]:
-    assert definition.read_checkpoint is not None
+    """The tensors as the definition reads them from a published file."""
+    if definition.read_checkpoint is None:
+        return state
     try:
         converted = definition.read_checkpoint(state)
     except Exception as error:  # what a definition raises at a layout it does not know is its own

@@ -1,53 +1,43 @@
 """Reads a pickle without calling anything that it names.
 
 A pickle is a program that may call any function. `PickleReader` is the standard library's unpickler
-in pure Python with an allow-list of its opcodes. Names are never imported: a call of one gives a
-tensor, a plain container or an inert `StandIn`. Opcodes that call, set attributes or hash values of
-the file are replaced; one that is not on the list is an error.
+in pure Python. Names are never imported: a call of one gives a tensor, a plain container or an
+inert `StandIn`. Opcodes that call, set attributes or hash values of the file are replaced.
 
-Time and memory are bounded: a pickle has at most `MAX_STEPS` opcodes, where an opcode that copies n
-values counts as n, and no opcode reads more bytes than the file has. torch.load(weights_only=True)
-is not used: it allocates what a pickle asks for, hashes what it holds, and refuses whole modules.
+Time and memory are bounded by the file and by `MAX_STEPS`. torch.load(weights_only=True) is not
+used: it believes the sizes that a file states, hashes what the file holds, and refuses whole
+modules.
 """
 
 from __future__ import annotations
 
-import lzma
 import math
 import pickle
-import struct
-import zlib
+import re
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, cast
 
 import torch
 from torch import Tensor
 
-MAX_STEPS = 3_000_000
-"""Opcodes, and values copied by them. A checkpoint of 2,000 tensors has about 100,000."""
+MAX_STEPS = 6_000_000
+"""Reads from the file, about two per opcode, and values copied; 2,000 tensors take 200,000."""
 
 MAX_NAME = 1_000
 """Characters of a name in a pickle."""
 
 MAX_AXES = 64
 
-_MAX_BYTES = 1 << 28  # of a pickle beside its storages; real ones are far smaller
-_MAX_EXPANDED = 1 << 28  # elements of a tensor with strides of 0; nothing is allocated for them
-_MAPPINGS = (
-    *("collections.OrderedDict", "collections.defaultdict"),
-    *("builtins.dict", "__builtin__.dict"),
+PLAIN_NAMES = re.compile(
+    r"torch\.(\w+Storage|Size|device|storage\.UntypedStorage|b?float\d+|u?int\d+|bool|complex\d+"
+    r"|_utils\._rebuild_(tensor(_v[23])?|parameter(_with_state)?)|nn\.parameter\.Parameter"
+    r"|_tensor\._rebuild_from_type_v2|Tensor)|collections\.(OrderedDict|defaultdict)"
 )
-_TENSORS = ("torch._utils._rebuild_tensor", "torch._utils._rebuild_tensor_v2")
-_PARAMETERS = ("torch._utils._rebuild_parameter", "torch.nn.parameter.Parameter")
-_DTYPES = {str(value): value for value in vars(torch).values() if isinstance(value, torch.dtype)}
+"""What files of nothing but tensors name."""
 
-READ_ERRORS = (
-    *(ValueError, TypeError, KeyError, IndexError, AttributeError, RuntimeError, AssertionError),
-    *(OverflowError, MemoryError, EOFError, struct.error),
-    *(pickle.UnpicklingError, zlib.error, lzma.LZMAError),
-)
-"""What reading a file that makes no sense raises; MemoryError at a length that no file has."""
+_MAX_EXPANDED = 1 << 28  # elements of a tensor with strides of 0; nothing is allocated for them
+_DTYPES = {str(value): value for value in vars(torch).values() if isinstance(value, torch.dtype)}
 
 
 class BrokenFileError(Exception):
@@ -68,16 +58,11 @@ class Name:
 
 @dataclass(eq=False, repr=False)
 class StandIn:
-    """Stands for what a call would have returned.
-
-    path: dotted name of what would have been called, with these arguments. state: the attributes
-    that the result would have been given; built: the same as pickled.
-    """
+    """Stands for what a call of `path` would have returned; `state` is its state as pickled."""
 
     path: str
     arguments: tuple[Any, ...] = ()
-    state: dict[str, Any] = field(default_factory=dict)
-    built: Any = None
+    state: Any = None
 
     def append(self, value: Any) -> None:
         """Does nothing, as for a subclass of list."""
@@ -85,20 +70,21 @@ class StandIn:
     extend = append
 
 
-def brief(reason: object) -> str:
-    """Returns the reason on one line of at most 160 characters; parts may come out of the file."""
-    text = f"{type(reason).__name__}: {reason}" if type(reason) in READ_ERRORS else str(reason)
-    return " ".join(text[:1000].split())[:160]
+def brief(error: Exception) -> str:
+    """Returns the error on one line of at most 160 characters; parts may come out of the file."""
+    kind = "" if isinstance(error, BrokenFileError) else f"{type(error).__name__}: "
+    return " ".join(f"{kind}{error}"[:1000].split())[:160]
 
 
 class PickleReader(pickle._Unpickler):
-    """Reads one pickle by `load()`, which raises BrokenFileError or another of READ_ERRORS.
+    """Reads one pickle by `load()`, which raises BrokenFileError or what its parts raise.
+
+    named: afterwards all functions and classes that the pickle names.
 
     Args:
         file: Stands at the first opcode; afterwards behind the last.
         load_storage: Returns the flat tensor for a persistent id
-            ("storage", type, key, location, elements, ...).
-        max_bytes: The most bytes that the pickle may have.
+            ("storage", type, key, location, elements, ...); None refuses one.
     """
 
     stack: list[Any]  # left out by the stubs of the standard library, like the next two
@@ -106,57 +92,56 @@ class PickleReader(pickle._Unpickler):
     pop_mark: Callable[[], list[Any]]
 
     def __init__(
-        self,
-        file: Any,
-        load_storage: Callable[[tuple[Any, ...]], Tensor],
-        max_bytes: int = _MAX_BYTES,
+        self, file: Any, load_storage: Callable[[tuple[Any, ...]], Tensor] | None = None
     ) -> None:
-        super().__init__(_BoundedFile(file, max_bytes), encoding="latin-1")
-        self._load_storage, self._steps = load_storage, MAX_STEPS
+        self._meter = _Meter(file)
+        super().__init__(self._meter, encoding="latin-1")
+        self._load_storage = load_storage
         self.named: dict[str, None] = {}
-        self.has_stand_ins = False
-
-    def charge(self, steps: int) -> None:
-        """Counts the steps; raises BrokenFileError after too many."""
-        self._steps -= steps
-        if self._steps < 0:
-            raise BrokenFileError(f"its pickle takes more than {MAX_STEPS:,} steps")
 
     def find_class(self, module: str, name: str) -> Name:
-        """Returns the name itself; nothing is imported."""
+        """Returns the name itself, that of Python 3; nothing is imported."""
         if len(module) + len(name) > MAX_NAME:
             raise BrokenFileError("its pickle has a name without end")
+        module = {"__builtin__": "builtins", "copy_reg": "copyreg"}.get(module, module)
         self.named.setdefault(f"{module}.{name}")
         return Name(f"{module}.{name}", self._called)
 
     def persistent_load(self, pid: Any) -> Any:
         """Returns the storage, or the class without its source text, that the id stands for."""
-        if isinstance(pid, tuple) and len(pid) > 1 and pid[0] == "module":
+        kind = pid[0] if isinstance(pid, tuple) and len(pid) >= 4 else None
+        if kind == "module":
             return pid[1]
-        if isinstance(pid, tuple) and len(pid) >= 5 and pid[0] == "storage":
-            return self._load_storage(pid)
-        raise BrokenFileError("its pickle refers to something outside it")
+        if kind != "storage" or self._load_storage is None:
+            raise BrokenFileError("its pickle refers to something outside it")
+        return self._load_storage(pid)
 
     def _called(self, path: str, arguments: tuple[Any, ...]) -> Any:
         """What stands for a call's result; only tensors and plain containers are made."""
-        if path in _MAPPINGS:
-            pairs = arguments[0] if arguments and isinstance(arguments[0], list) else []
-            self.charge(len(pairs))
-            return _mapping([value for pair in pairs for value in _two(pair)])
-        if path == "torch.Size":
-            return arguments[0] if arguments else ()
-        if path in ("copyreg._reconstructor", "copy_reg._reconstructor"):
-            path, arguments = getattr(arguments[0], "path", "?"), ()
-        elif path in _TENSORS:
-            return _view(*arguments[:4])
-        elif path == "torch._utils._rebuild_tensor_v3":  # of a dtype that storages do not name
-            storage, offset, shape, stride = arguments[:4]
-            return _view(storage, offset, shape, stride, arguments[6])
-        elif path == "torch._tensor._rebuild_from_type_v2":  # it has attributes of its own
-            return self._call(arguments[0], arguments[2])
-        elif path.startswith(_PARAMETERS):
-            return arguments[0]
-        self.has_stand_ins = True
+        first = arguments[0] if arguments else None
+        match path:
+            case "collections.OrderedDict" | "collections.defaultdict" | "builtins.dict":
+                pairs = first if isinstance(first, list) else []
+                return self._mapping([value for key, one in pairs for value in (key, one)])
+            case "builtins.set" | "builtins.frozenset":
+                return first if isinstance(first, list) else []
+            case "_codecs.encode" | "builtins.bytes" | "builtins.bytearray":
+                return "" if first is None else first  # text of Latin-1
+            case "torch.Size":
+                return first or ()
+            case "copyreg._reconstructor":
+                return StandIn(getattr(first, "path", "?"))
+            case "torch._utils._rebuild_tensor" | "torch._utils._rebuild_tensor_v2":
+                return view_of(*arguments[:4])
+            case "torch._utils._rebuild_tensor_v3":  # of a dtype that storages do not name
+                storage, offset, shape, stride = arguments[:4]
+                return view_of(storage, offset, shape, stride, arguments[6])
+            case "torch._tensor._rebuild_from_type_v2":  # it has attributes of its own
+                return self._call(first, arguments[2])
+            case _ if path.startswith("torch._utils._rebuild_parameter"):
+                return first
+            case "torch.nn.parameter.Parameter":
+                return first
         return StandIn(path, arguments)
 
     def _load_call(self) -> None:
@@ -166,98 +151,61 @@ class PickleReader(pickle._Unpickler):
     def _call(self, function: Any, arguments: Any) -> Any:
         if not isinstance(arguments, tuple) or not isinstance(function, Name):
             raise BrokenFileError("its pickle calls something other than a function")
-        self.charge(len(arguments))
+        self._meter.charge(len(arguments))
         return function(*arguments)
 
-    def _load_call_with_keywords(self) -> None:
-        self.stack.pop()
-        self._load_call()
-
     def _load_build(self) -> None:
-        """Gives a stand-in its state; nothing else is changed."""
         state, target = self.stack.pop(), self.stack[-1]
-        if not isinstance(target, StandIn):
-            return
-        target.built = state
-        for part in state if isinstance(state, tuple) else (state,):
-            self.charge(1)
-            if isinstance(part, dict):
-                self.charge(len(part))
-                target.state.update(part)
+        if isinstance(target, StandIn):
+            target.state = state
 
-    def _load_setitem(self) -> None:
-        value, key = self.stack.pop(), self.stack.pop()
-        self._set([key, value])
-
-    def _load_setitems(self) -> None:
-        self._set(self.pop_mark())
-
-    def _set(self, values: list[Any]) -> None:
+    def _set_items(self, values: list[Any]) -> None:
         if isinstance(self.stack[-1], dict):
-            self.stack[-1].update(_mapping(values))
+            self.stack[-1].update(self._mapping(values))
 
-    def _load_dict(self) -> None:
-        self.stack.append(_mapping(self.pop_mark()))
-
-    def _load_empty_set(self) -> None:
-        """A set is a list inside a stand-in, since its elements would have to be hashed."""
-        self.stack.append(StandIn("builtins.set", ([],)))
-
-    def _load_additems(self) -> None:
-        values, target = self.pop_mark(), self.stack[-1]
-        if isinstance(target, StandIn) and target.path == "builtins.set":
-            target.arguments[0].extend(values)
-
-    def _load_frozenset(self) -> None:
-        self.stack.append(StandIn("builtins.frozenset", (self.pop_mark(),)))
-
-    def _load_frame(self) -> None:
-        self.read(8)  # only a hint how much to read ahead
+    def _mapping(self, values: list[Any]) -> dict[Any, Any]:
+        """Keys and values in turn as a dict; a key that may be costly to hash becomes its type."""
+        self._meter.charge(len(values))
+        return dict(zip(map(_key, values[::2]), values[1::2], strict=True))
 
 
-class _BoundedFile:
-    """A file of which no more than so many bytes can be read; each must be there."""
+class _Meter:
+    """A file that is read in so many steps at most; what is asked for must be there."""
 
-    def __init__(self, file: Any, max_bytes: int) -> None:
-        self._file, self._left = file, max_bytes
+    def __init__(self, file: Any) -> None:
+        self._file, self._left = file, MAX_STEPS
+
+    def charge(self, steps: int) -> None:
+        self._left -= steps
+        if self._left < 0:
+            raise BrokenFileError(f"its pickle takes more than {MAX_STEPS:,} steps")
 
     def read(self, count: int) -> bytes:
-        content: bytes = self._file.read(count) if 0 <= count <= self._left else b""
-        if len(content) < count or count < 0:
+        self.charge(1)
+        content: bytes = self._file.read(count)
+        if len(content) != count:
             raise BrokenFileError("its pickle does not end")
-        self._left -= count
         return content
 
     def readline(self) -> bytes:
-        line: bytes = self._file.readline(min(self._left, MAX_NAME + (1 << 20)))
-        if not line.endswith(b"\n"):
-            raise BrokenFileError("its pickle does not end")
-        self._left -= len(line)
+        self.charge(1)
+        line: bytes = self._file.readline(1 << 20)
         return line
 
 
-def _two(pair: Any) -> tuple[Any, Any]:
-    if not isinstance(pair, list | tuple) or len(pair) != 2:
-        raise BrokenFileError("its pickle has a dict of other than pairs")
-    return pair[0], pair[1]
-
-
-def _mapping(values: list[Any]) -> dict[Any, Any]:
-    """Keys and values in turn as a dict; a key that may be costly to hash stands under its type."""
-    return dict(zip(map(_key, values[::2]), values[1::2], strict=True))
-
-
 def _key(key: Any) -> Any:
-    if isinstance(key, str):
-        if len(key) > MAX_NAME:
-            raise BrokenFileError(f"it has a name of {len(key):,} characters")
-        return key
+    if isinstance(key, str) and len(key) > MAX_NAME:
+        raise BrokenFileError(f"it has a name of {len(key):,} characters")
     small = isinstance(key, int) and abs(key) < 1 << 63
-    return key if small or isinstance(key, float | None) else type(key).__name__
+    return key if small or isinstance(key, str | float | None) else type(key).__name__
 
 
-def _view(storage: Any, offset: Any, shape: Any, stride: Any, dtype: Any = None) -> Tensor:
-    """A tensor over a storage, as torch.as_strided makes it, if it lies within the storage."""
+def view_of(storage: Any, offset: Any, shape: Any, stride: Any, dtype: Any = None) -> Tensor:
+    """Returns a tensor over a flat one, as torch.as_strided makes it, if it lies within it.
+
+    Raises:
+        BrokenFileError: It lies beyond, or has more elements than the strides may repeat.
+    """
     if dtype is not None:
         storage = storage.view(_DTYPES[dtype.path])
     if max(len(shape), len(stride)) > MAX_AXES:
@@ -274,47 +222,29 @@ def _view(storage: Any, offset: Any, shape: Any, stride: Any, dtype: Any = None)
     return cast(Tensor, storage.as_strided(shape, stride, offset if count else 0))
 
 
-_INHERITED = (
-    *("PROTO", "STOP", "MARK", "POP", "POP_MARK", "DUP", "MEMOIZE", "PUT", "BINPUT", "LONG_BINPUT"),
-    *("GET", "BINGET", "LONG_BINGET", "NONE", "NEWTRUE", "NEWFALSE", "INT", "BININT", "BININT1"),
-    *("BININT2", "LONG", "LONG1", "LONG4", "FLOAT", "BINFLOAT", "STRING", "BINSTRING", "BINBYTES"),
-    *("SHORT_BINSTRING", "UNICODE", "BINUNICODE", "SHORT_BINUNICODE", "BINUNICODE8", "BINBYTES8"),
-    *("SHORT_BINBYTES", "EMPTY_TUPLE", "TUPLE", "TUPLE1", "TUPLE2", "TUPLE3", "EMPTY_LIST", "LIST"),
-    *("APPEND", "APPENDS", "EMPTY_DICT", "GLOBAL", "STACK_GLOBAL", "BINPERSID", "INST", "OBJ"),
-)
-_REPLACED: dict[str, Callable[[Any], None]] = {
-    **dict.fromkeys(("REDUCE", "NEWOBJ"), PickleReader._load_call),
-    "NEWOBJ_EX": PickleReader._load_call_with_keywords,
-    "BUILD": PickleReader._load_build,
-    "SETITEM": PickleReader._load_setitem,
-    "SETITEMS": PickleReader._load_setitems,
-    "DICT": PickleReader._load_dict,
-    "EMPTY_SET": PickleReader._load_empty_set,
-    "ADDITEMS": PickleReader._load_additems,
-    "FROZENSET": PickleReader._load_frozenset,
-    "FRAME": PickleReader._load_frame,
-    "BYTEARRAY8": pickle._Unpickler.dispatch[pickle.BINBYTES8[0]],  # plain bytes will do
-}
+def _opcodes() -> dict[int, Callable[[Any], Any]]:
+    """Those of protocol 5, but none of extensions, which are imported, or of outside buffers."""
+    inherited = pickle._Unpickler.dispatch
+    own = {code: step for code, step in inherited.items() if code <= pickle.BYTEARRAY8[0]}
+    for extension in (pickle.EXT1, pickle.EXT2, pickle.EXT4):
+        del own[extension[0]]
+    replaced: dict[bytes, Callable[[Any], Any]] = {
+        **dict.fromkeys((pickle.REDUCE, pickle.NEWOBJ), PickleReader._load_call),
+        pickle.NEWOBJ_EX: lambda reader: (reader.stack.pop(), reader._load_call()),
+        pickle.BUILD: PickleReader._load_build,
+        pickle.SETITEM: lambda reader: reader._set_items(
+            [reader.stack.pop(-2), reader.stack.pop()]
+        ),
+        pickle.SETITEMS: lambda reader: reader._set_items(reader.pop_mark()),
+        pickle.DICT: lambda reader: reader.stack.append(reader._mapping(reader.pop_mark())),
+        pickle.FRAME: lambda reader: reader.read(8),  # only a hint how much to read ahead
+        # A set is a list, since its elements would have to be hashed; bytes will do for bytearray.
+        pickle.EMPTY_SET: inherited[pickle.EMPTY_LIST[0]],
+        pickle.ADDITEMS: inherited[pickle.APPENDS[0]],
+        pickle.FROZENSET: inherited[pickle.LIST[0]],
+        pickle.BYTEARRAY8: inherited[pickle.BINBYTES8[0]],
+    }
+    return own | {code[0]: step for code, step in replaced.items()}
 
 
-def _counted(step: Callable[[Any], None]) -> Callable[[Any], None]:
-    def run(reader: PickleReader) -> None:
-        reader.charge(1)
-        step(reader)
-
-    return run
-
-
-def _refused(opcode: int) -> Callable[[Any], None]:
-    def refuse(_: PickleReader) -> None:
-        raise BrokenFileError(f"its pickle uses the opcode {bytes([opcode])!r}")
-
-    return refuse
-
-
-PickleReader.dispatch = {code: _refused(code) for code in range(256)} | {
-    ord(getattr(pickle, name)): _counted(
-        _REPLACED.get(name) or pickle._Unpickler.dispatch[ord(getattr(pickle, name))]
-    )
-    for name in (*_INHERITED, *_REPLACED)
-}
+PickleReader.dispatch = _opcodes()

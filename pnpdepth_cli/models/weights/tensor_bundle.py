@@ -12,15 +12,13 @@ import math
 import struct
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from pnpdepth_cli.budget import size_problem
-from pnpdepth_cli.errors import CheckpointError
-from pnpdepth_cli.models.weights.pickle_reader import MAX_AXES, READ_ERRORS, BrokenFileError, brief
-
-SUFFIX = ".index"
+from pnpdepth_cli.models.weights.pickle_reader import MAX_AXES, BrokenFileError
 
 _FOOTER, _MAGIC = 48, 0xDB4775248B80FB57
 _TYPES = {
@@ -30,47 +28,33 @@ _TYPES = {
 _TEXT = 7  # such as the graph of objects that TensorFlow 2 puts beside the variables
 _MAX_NAME = 1_000  # bytes of a variable's name
 
-_Fields = dict[int, int | bytes]
-"""The fields of a protocol buffer by number."""
+_Fields = dict[int, list[Any]]
+"""The values of a protocol buffer's fields by number."""
 
 
 def read_tensor_bundle(index: Path) -> dict[str, Tensor]:
     """Returns the variables by name, "layer/weights" as "layer.weights"; text is left out.
 
-    Args:
-        index: PREFIX.index; the files of values lie beside it.
-
-    Raises:
-        CheckpointError: A file is missing or broken.
+    The files of values lie beside PREFIX.index. A broken file raises whatever its parts do.
     """
-    try:
-        return _read(index)
-    except (BrokenFileError, OSError, *READ_ERRORS) as error:
-        reason = brief(error)
-    raise CheckpointError(
-        f"checkpoint {index} cannot be read as a TensorFlow checkpoint ({reason})"
-    )
-
-
-def _read(index: Path) -> dict[str, Tensor]:
     table = dict(_table(index.read_bytes()))
-    header = dict(_fields(table.pop(b"", b"")))
-    if header.get(2, 0) != 0:
+    header = _message(table.pop(b"", b""))
+    if _last(header, 2) != 0:
         raise BrokenFileError("it was written on a big-endian machine")
     shards: dict[int, bytes] = {}
     tensors: dict[str, Tensor] = {}
     left = 0
     for key, entry in table.items():
-        name, fields = key.decode(), dict(_fields(entry))
+        name, fields = key.decode(), _message(entry)
         if 7 in fields:
             raise BrokenFileError("a variable is in slices")
-        if fields.get(1) == _TEXT:
+        if _last(fields, 1) == _TEXT:
             continue
-        shard, size = _number(fields, 3), _number(fields, 5)
+        shard = _last(fields, 3)
         if shard not in shards:
-            shards[shard] = _values(index, f"{shard:05d}-of-{_number(header, 1):05d}")
+            shards[shard] = _values(index, f"{shard:05d}-of-{_last(header, 1):05d}")
             left += len(shards[shard])
-        left -= size
+        left -= _last(fields, 5)
         if left < 0:
             raise BrokenFileError("its variables are larger than its files")
         tensors[name.replace("/", ".")] = _tensor(name, fields, shards[shard])
@@ -87,32 +71,20 @@ def _values(index: Path, shard: str) -> bytes:
 
 
 def _tensor(name: str, fields: _Fields, content: bytes) -> Tensor:
-    kind = _number(fields, 1)
+    kind, offset, size = (_last(fields, number) for number in (1, 4, 5))
     if kind not in _TYPES:
         raise BrokenFileError(f"{name} is of TensorFlow's type {kind}, not of numbers")
-    dtype = _TYPES[kind]
-    shape = fields.get(2, b"")
-    sides = [*_fields(shape)] if isinstance(shape, bytes) else []
-    if len(sides) > MAX_AXES:
-        raise BrokenFileError(f"a variable of {len(sides)} axes")
-    lengths = [
-        _number(dict(_fields(side)), 1)
-        for number, side in sides
-        if number == 2 and isinstance(side, bytes)
-    ]
-    offset, size = _number(fields, 4), _number(fields, 5)
-    if math.prod(lengths) * dtype.itemsize != size or offset + size > len(content):
-        raise BrokenFileError(f"{name} of shape {tuple(lengths)} goes beyond its {size} bytes")
+    sides = _message(fields[2][-1]).get(2, []) if 2 in fields else []
+    shape = [_last(_message(side), 1) for side in sides[: MAX_AXES + 1]]
+    stored = math.prod(shape) * _TYPES[kind].itemsize
+    if stored != size or offset + size > len(content) or len(shape) > MAX_AXES:
+        raise BrokenFileError(f"{name} of shape {str(shape)[:80]} goes beyond its {size} bytes")
     part = bytearray(content[offset : offset + size])
-    flat = torch.frombuffer(part, dtype=dtype) if part else torch.empty(0, dtype=dtype)
-    return flat.reshape(lengths)
-
-
-def _number(fields: _Fields, number: int) -> int:
-    value = fields.get(number, 0)
-    if not isinstance(value, int) or value >= 1 << 63:
-        raise BrokenFileError("a size is not a number")
-    return value
+    return (
+        torch.frombuffer(part, dtype=_TYPES[kind]).reshape(shape)
+        if part
+        else (torch.empty(shape, dtype=_TYPES[kind]))
+    )
 
 
 def _table(data: bytes) -> Iterator[tuple[bytes, bytes]]:
@@ -154,33 +126,40 @@ def _block(data: bytes, handle: bytes) -> Iterator[tuple[bytes, bytes]]:
         at += fresh + length
 
 
-def _fields(message: int | bytes) -> Iterator[tuple[int, int | bytes]]:
-    """Numbers and values of a protocol buffer's fields."""
-    assert isinstance(message, bytes)
+def _message(data: bytes) -> _Fields:
+    fields: _Fields = {}
     at = 0
-    while at < len(message):
-        tag, at = _varint(message, at)
-        number, kind = tag >> 3, tag & 7
-        if kind == 0:
-            value, at = _varint(message, at)
-            yield number, value
-        elif kind == 2:
-            length, at = _varint(message, at)
-            yield number, message[at : at + length]
+    while at < len(data):
+        value: Any = None
+        tag, at = _varint(data, at)
+        if tag & 7 == 0:
+            value, at = _varint(data, at)
+        elif tag & 7 == 2:
+            length, at = _varint(data, at)
+            value = data[at : at + length]
             at += length
-        elif kind in (1, 5):
-            at += 8 if kind == 1 else 4  # checksums
+        elif tag & 7 in (1, 5):
+            at += 8 if tag & 7 == 1 else 4  # checksums
         else:
             raise BrokenFileError("an entry is not a protocol buffer")
+        fields.setdefault(tag >> 3, []).append(value)
+    return fields
+
+
+def _last(fields: _Fields, number: int) -> int:
+    """A number; 0 if it is absent."""
+    value = fields.get(number, [0])[-1]
+    if not isinstance(value, int) or value >= 1 << 63:
+        raise BrokenFileError("a size is not a number")
+    return value
 
 
 def _varint(data: bytes, at: int) -> tuple[int, int]:
     """The number that begins here, seven bits a byte, and where it ends."""
     value = 0
     for shift in range(0, 70, 7):
-        byte = data[at]
+        value |= (data[at] & 127) << shift
         at += 1
-        value |= (byte & 127) << shift
-        if byte < 128:
+        if data[at - 1] < 128:
             return value, at
     raise BrokenFileError("a number without end")

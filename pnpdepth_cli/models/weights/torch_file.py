@@ -11,7 +11,6 @@ import io
 import itertools
 import zipfile
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any, TypeGuard
 
@@ -21,67 +20,39 @@ from torch import Tensor
 from pnpdepth_cli.errors import CheckpointError
 from pnpdepth_cli.models.weights.pickle_reader import (
     MAX_NAME,
-    READ_ERRORS,
     BrokenFileError,
     Name,
     PickleReader,
     StandIn,
-    brief,
 )
 
+TORCHSCRIPT = "it is a TorchScript archive"
 _MAGIC = 0x1950A86A20F9469CFC6C
 _MAX_DEPTH = 100
 _MAX_MODULES = 100_000
-_DTYPES = {
-    "FloatStorage": torch.float32,
-    "DoubleStorage": torch.float64,
-    "HalfStorage": torch.float16,
-    "BFloat16Storage": torch.bfloat16,
-    "LongStorage": torch.int64,
-    "IntStorage": torch.int32,
-    "ShortStorage": torch.int16,
-    "CharStorage": torch.int8,
-    "ByteStorage": torch.uint8,
-    "BoolStorage": torch.bool,
-    "ComplexFloatStorage": torch.complex64,
-    "ComplexDoubleStorage": torch.complex128,
-    "UntypedStorage": torch.uint8,
-}
+_DTYPES: dict[str, torch.dtype] = {
+    f"{name}Storage": getattr(torch, dtype)
+    for name, dtype in {
+        "Float": "float32", "Double": "float64", "Half": "float16", "BFloat16": "bfloat16",
+        "Long": "int64", "Int": "int32", "Short": "int16", "Char": "int8", "Byte": "uint8",
+        "Bool": "bool", "ComplexFloat": "complex64", "ComplexDouble": "complex128",
+        "Untyped": "uint8",
+    }.items()
+}  # fmt: skip
 
 
-@dataclass(frozen=True, kw_only=True)
-class TensorFile:
-    """What a torch file holds: tensors in plain containers, and a `StandIn` for all else.
+def read_torch_file(path: Path) -> tuple[Any, list[str]]:
+    """Returns the content of a torch file, and the functions and classes that its pickle names.
 
-    named: the functions and classes that its pickle names, none of which was run.
+    The content is tensors in plain containers, and a `StandIn` for all else; no name was run. A
+    broken file raises whatever its parts do.
     """
-
-    content: Any
-    named: tuple[str, ...]
-    has_stand_ins: bool
+    with path.open("rb") as file:
+        return read_tensors(file)
 
 
-def read_tensor_file(path: Path) -> TensorFile:
-    """Returns the content of a torch file.
-
-    Raises:
-        CheckpointError: The file is broken, or is not one of torch.
-    """
-    try:
-        with path.open("rb") as file:
-            return read_tensors(file)
-    except (BrokenFileError, zipfile.BadZipFile, OSError, *READ_ERRORS) as error:
-        reason = brief(error)
-    raise CheckpointError(f"checkpoint {path} cannot be read as a torch file ({reason})")
-
-
-def read_tensors(file: IO[bytes]) -> TensorFile:
-    """Returns the content of an open torch file.
-
-    Raises:
-        BrokenFileError: The file is broken, or is not one of torch.
-        Exception: Another of READ_ERRORS, BadZipFile or OSError.
-    """
+def read_tensors(file: IO[bytes]) -> tuple[Any, list[str]]:
+    """Returns what `read_torch_file` does, for an open file."""
     size = file.seek(0, io.SEEK_END)
     is_archive = zipfile.is_zipfile(file)
     file.seek(0)
@@ -90,7 +61,8 @@ def read_tensors(file: IO[bytes]) -> TensorFile:
 
 def is_module(value: Any) -> TypeGuard[StandIn]:
     """Returns True for a stand-in of a torch module."""
-    return isinstance(value, StandIn) and "_parameters" in value.state
+    is_state = isinstance(value, StandIn) and isinstance(value.state, Mapping)
+    return is_state and "_parameters" in value.state
 
 
 def module_state(module: StandIn) -> dict[str, Tensor]:
@@ -107,7 +79,6 @@ def _walk(module: StandIn, prefix: str, visited: Iterator[int]) -> Iterator[tupl
     if endless or len(prefix) > MAX_NAME:
         raise CheckpointError("the checkpoint's modules contain each other without end")
     fleeting = module.state.get("_non_persistent_buffers_set")
-    fleeting = fleeting.arguments[0] if isinstance(fleeting, StandIn) else None
     # Not a set, in which other elements may take for ever to hash.
     left_out = [n for n in fleeting if isinstance(n, str)] if isinstance(fleeting, list) else []
     for kind in ("_parameters", "_buffers", "_modules"):
@@ -119,13 +90,11 @@ def _walk(module: StandIn, prefix: str, visited: Iterator[int]) -> Iterator[tupl
                 yield f"{prefix}{name}", value
 
 
-def _read_archive(file: IO[bytes], size: int) -> TensorFile:
+def _read_archive(file: IO[bytes], size: int) -> tuple[Any, list[str]]:
     with zipfile.ZipFile(file) as archive:
         entries = {info.filename: info for info in archive.infolist()}
         if any("/code/" in name for name in entries):
-            raise BrokenFileError(
-                "it is a TorchScript archive; save the state_dict() of its module instead"
-            )
+            raise BrokenFileError(f"{TORCHSCRIPT}; save the state_dict() of its module instead")
         if any(info.compress_type != zipfile.ZIP_STORED for info in entries.values()):
             raise BrokenFileError("it is compressed, which torch never does")
         pickles = [name for name in entries if name == "data.pkl" or name.endswith("/data.pkl")]
@@ -139,22 +108,23 @@ def _read_archive(file: IO[bytes], size: int) -> TensorFile:
             raise BrokenFileError("it was written on a big-endian machine")
         storages = _Storages(lambda key, _: bytearray(archive.read(entries[f"{folder}data/{key}"])))
         with archive.open(pickles[0]) as pickled:
-            return _read_pickle(pickled, storages)
+            reader = PickleReader(pickled, storages.load)
+            return reader.load(), list(reader.named)
 
 
-def _read_row_of_pickles(file: IO[bytes], size: int) -> TensorFile:
+def _read_row_of_pickles(file: IO[bytes], size: int) -> tuple[Any, list[str]]:
     """magic, protocol, system, content, keys of the storages; then each storage's length and bytes.
 
     The content comes before the storages, which are filled afterwards.
     """
-
-    def no_storage(_: Any) -> Tensor:
-        raise BrokenFileError("it begins as no torch file does")
-
-    if PickleReader(file, no_storage).load() != _MAGIC:
+    try:
+        begins = PickleReader(file).load()
+    except Exception:  # of another kind of file
+        begins = None
+    if begins != _MAGIC:
         raise BrokenFileError("it begins as no torch file does")
     for _ in ("protocol", "system"):
-        PickleReader(file, no_storage).load()
+        PickleReader(file).load()
     promised = 0
 
     def room_for(key: str, count: int) -> bytearray:
@@ -165,25 +135,18 @@ def _read_row_of_pickles(file: IO[bytes], size: int) -> TensorFile:
         return bytearray(count)
 
     storages = _Storages(room_for)
-    content = _read_pickle(file, storages)
-    keys = PickleReader(file, no_storage).load()
+    reader = PickleReader(file, storages.load)
+    content = reader.load()
+    keys = PickleReader(file).load()
     plain = isinstance(keys, list) and all(isinstance(key, str | int) for key in keys)
     if not plain or {*map(str, keys)} != storages.contents.keys():
         raise BrokenFileError("its storages are not those that its pickle names")
-    for key in keys:
-        memory, dtype = storages.contents[str(key)], storages.dtypes[str(key)]
+    for key in map(str, keys):
+        memory, dtype = storages.contents[key], storages.dtypes[key]
         count = int.from_bytes(file.read(8), "little") * dtype.itemsize
         if count != len(memory) or file.readinto(memory) != count:  # type: ignore[attr-defined]
-            raise BrokenFileError(f"storage {str(key)[:20]} is shorter than it should be")
-    return content
-
-
-def _read_pickle(file: IO[bytes], storages: _Storages) -> TensorFile:
-    reader = PickleReader(file, storages.load)
-    content = reader.load()
-    return TensorFile(
-        content=content, named=tuple(reader.named), has_stand_ins=reader.has_stand_ins
-    )
+            raise BrokenFileError(f"storage {key[:20]} is shorter than it should be")
+    return content, list(reader.named)
 
 
 class _Storages:
@@ -206,9 +169,7 @@ class _Storages:
         view = pid[5] if len(pid) > 5 else None
         _, start, count = view if isinstance(view, tuple) else (None, 0, count)
         if min(start, count) < 0 or (start + count) * dtype.itemsize > len(data):
-            raise BrokenFileError(
-                f"storage {key[:20]} is shorter than the {count} elements it should have"
-            )
+            raise BrokenFileError(f"storage {key[:20]} is shorter than its {count} elements")
         if not count:
             return torch.empty(0, dtype=dtype)
         return torch.frombuffer(data, dtype=dtype, count=count, offset=start * dtype.itemsize)
@@ -216,10 +177,7 @@ class _Storages:
 
 def _dtype(kind: Any) -> torch.dtype:
     name = kind.path.rpartition(".")[2] if isinstance(kind, Name) else ""
-    if name.startswith("Q"):
-        raise BrokenFileError(
-            f"its tensors are quantised, {name[:40]}; save their values as floats"
-        )
     if name not in _DTYPES:
-        raise BrokenFileError(f"a storage of type {name[:40] or '?'}")
+        quantised = "; save quantised tensors as floats" if name.startswith("Q") else ""
+        raise BrokenFileError(f"a storage of type {name[:40] or '?'}{quantised}")
     return _DTYPES[name]

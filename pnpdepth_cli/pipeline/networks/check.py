@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from pnpdepth_cli.core.split import Split, gradient_at
 from pnpdepth_cli.errors import ModelError
@@ -23,29 +21,9 @@ from pnpdepth_cli.points import SparsePoints
 _SIZE = (240, 320)
 
 
-@dataclass(frozen=True, kw_only=True)
-class CheckedModel:
-    """What a network is, what it returned, and how its layers can be cut.
-
-    input, output: rows and columns. range: least and greatest value of the prediction as the
-    network returns it. layers: by name "ok", or why the network cannot be cut there. notes: what
-    was assumed, fitted or verified.
-    """
-
-    name: str
-    input: list[int]
-    output: list[int]
-    output_kind: str
-    output_scale: str
-    range: list[float]
-    parameters: int
-    layers: dict[str, str]
-    notes: list[str]
-
-
 def check_model(
     model: str, checkpoint: Path | None, image: Path | None, device: str = "cpu"
-) -> CheckedModel:
+) -> dict[str, Any]:
     """Loads a network, runs it once, and cuts it at every layer of its definition.
 
     At each layer the cut network must return what the whole one does, bit for bit, and a gradient
@@ -56,6 +34,11 @@ def check_model(
         checkpoint: Its weights; None takes those of the definition.
         image: The rgb image to run it on; None runs it on a synthetic frame.
         device: Name of a torch device.
+
+    Returns:
+        input, output: rows and columns. range: least and greatest value of the prediction as the
+        network returns it. layers: by name "ok", or why the network cannot be cut there. notes:
+        what was assumed, fitted or verified.
 
     Raises:
         ModelError: The network cannot be run or verified.
@@ -71,21 +54,18 @@ def check_model(
         notes = [*network.notes, *network.verified(arguments)]
         with torch.no_grad():
             raw = network.raw_of(network.module(*arguments))
-        layers = {
-            name: _check_layer(network.module, name, arguments, network.raw_of, raw)
-            for name in definition.layers
-        }
-    return CheckedModel(
-        name=definition.name,
-        input=list(prepared.map.network),
-        output=list(raw.shape[-2:]),
-        output_kind=definition.output_kind,
-        output_scale=definition.output_scale,
-        range=[float(raw.min()), float(raw.max())],
-        parameters=sum(p.numel() for p in network.module.parameters()),
-        layers=layers,
-        notes=notes,
-    )
+        layers = {name: _check_layer(network, name, arguments, raw) for name in definition.layers}
+    return {
+        "name": definition.name,
+        "input": list(prepared.map.network),
+        "output": list(raw.shape[-2:]),
+        "output_kind": definition.output_kind,
+        "output_scale": definition.output_scale,
+        "range": [float(raw.min()), float(raw.max())],
+        "parameters": sum(p.numel() for p in network.module.parameters()),
+        "layers": layers,
+        "notes": notes,
+    }
 
 
 def _synthetic(network: Network) -> Frame:
@@ -101,20 +81,14 @@ def _read(image: Path) -> Frame:
     return Frame(rgb=rgb, points=no_points)
 
 
-def _check_layer(
-    module: nn.Module,
-    name: str,
-    arguments: tuple[Tensor, ...],
-    raw_of: Callable[[Any], Tensor],
-    whole: Tensor,
-) -> str:
+def _check_layer(network: Network, name: str, arguments: tuple[Tensor, ...], whole: Tensor) -> str:
     """ "ok", or why the network cannot be cut at the layer."""
     try:
-        with Split(module, name) as split:
+        with Split(network.module, name) as split:
             with torch.no_grad():
                 z = split.front(*arguments)
             z.requires_grad_(True)
-            raw = raw_of(split.rear(z))
+            raw = network.raw_of(split.rear(z))
             if not torch.equal(raw.detach(), whole):
                 return "the cut network gives something else than the whole one"
             gradient = gradient_at(z, raw.sum())

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 
 from safetensors import SafetensorError
@@ -21,19 +20,9 @@ _ALWAYS_ALLOWED = 1 << 28  # bytes
 _RESERVED_NAME = "__metadata__"  # of the safetensors format
 
 
-@dataclass(frozen=True, kw_only=True)
-class ConvertedCheckpoint:
-    """What was read and written, and the numbers of tensors and of their elements."""
-
-    source: str
-    output: str
-    tensors: int
-    values: int
-
-
 def convert_checkpoint(
     source: Path, target: Path, *, overwrite: bool = False
-) -> ConvertedCheckpoint:
+) -> dict[str, str | int]:
     """Writes the named tensors of a checkpoint to a safetensors file; nothing in it is run.
 
     Tensors that share memory are written one by one.
@@ -42,6 +31,9 @@ def convert_checkpoint(
         source: See `pnpdepth_cli.models.weights.checkpoint.read_checkpoint`.
         target: A path that ends in .safetensors.
         overwrite: Whether `target` may exist and is replaced.
+
+    Returns:
+        The paths `source` and `output`, and the numbers of `tensors` and of their `values`.
 
     Raises:
         CheckpointError: The checkpoint cannot be read, or its tensors cannot be stored.
@@ -65,12 +57,8 @@ def convert_checkpoint(
                 f"checkpoint {source} cannot be stored as safetensors:"
                 f" {type(error).__name__}: {str(error)[:120]}"
             ) from None
-    return ConvertedCheckpoint(
-        source=str(source),
-        output=str(target),
-        tensors=len(state),
-        values=sum(tensor.numel() for tensor in state.values()),
-    )
+    values = sum(tensor.numel() for tensor in state.values())
+    return {"source": str(source), "output": str(target), "tensors": len(state), "values": values}
 
 
 def _refuse_what_cannot_be_stored(state: Mapping[str, Tensor], source: Path) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import re
 import shutil
-from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -22,21 +21,14 @@ _WANTED = re.compile(
 RECORD = "fetched.json"
 
 
-@dataclass(frozen=True, kw_only=True)
-class FetchedModel:
-    """What was downloaded: of ORG/NAME at a commit, files in a folder, their hashes by name."""
-
-    repository: str
-    revision: str | None
-    folder: str
-    sha256: dict[str, str]
-
-
-def fetch_model(repo: str, revision: str | None = None, output: Path | None = None) -> FetchedModel:
+def fetch_model(
+    repo: str, revision: str | None = None, output: Path | None = None
+) -> dict[str, Any]:
     """Downloads the settings and safetensors weights of a Hugging Face repository to a folder.
 
-    What was downloaded is returned, and stored as `fetched.json` in the folder. Nothing stays there
-    unless every file has the digest that the repository states.
+    What was downloaded is returned (repository, revision, folder, and sha256 by file), and stored
+    as `fetched.json` in the folder. Nothing stays there unless every file has the digest that the
+    repository states.
 
     Args:
         repo: ORG/NAME.
@@ -67,43 +59,30 @@ def fetch_model(repo: str, revision: str | None = None, output: Path | None = No
             for file in files:
                 hf_hub_download(repo, file.rfilename, revision=info.sha, local_dir=temporary)
         except Exception as error:  # its own errors, the HTTP client's and the system's
-            raise _cannot_fetch(repo, error) from None
+            raise ModelError(
+                f"{repo} cannot be fetched from Hugging Face ({type(error).__name__}:"
+                f" {one_line(error)}); is this machine online, and the name right? A folder copied"
+                " from elsewhere works too"
+            ) from None
         if not files:
             raise ModelError(f"{repo} has no config.json and no model.safetensors; name another")
         shutil.rmtree(temporary / ".cache", ignore_errors=True)  # of huggingface_hub
         for file in files:
             _check_content(repo, temporary / file.rfilename, file)
-        fetched = FetchedModel(
-            repository=repo,
-            revision=info.sha,
-            folder=str(folder),
-            sha256={file.rfilename: sha256_of(temporary / file.rfilename) for file in files},
-        )
-        write_json(temporary / RECORD, asdict(fetched))
+        digests = {file.rfilename: sha256_of(temporary / file.rfilename) for file in files}
+        fetched = {
+            "repository": repo, "revision": info.sha, "folder": str(folder), "sha256": digests
+        }  # fmt: skip
+        write_json(temporary / RECORD, fetched)
     return fetched
 
 
-def _cannot_fetch(repo: str, error: Exception) -> ModelError:
-    reason = one_line(error)
-    return ModelError(
-        f"{repo} cannot be fetched from Hugging Face ({type(error).__name__}: {reason}); is"
-        " this machine online, and the name right? A folder copied from elsewhere works too"
-    )
-
-
 def _check_content(repo: str, path: Path, stated: Any) -> None:
-    """Raises ModelError unless a file has the digest that the repository states.
-
-    Args:
-        repo: Named in messages.
-        path: The file.
-        stated: Its entry in the repository: the SHA-256 of a file in LFS, the Git blob of others.
-    """
-    if stated.lfs is not None:
-        same = sha256_of(path) == stated.lfs.sha256
-    else:
-        same = _git_blob(path) == stated.blob_id
-    if not same:
+    """ModelError unless a file has the SHA-256 (in LFS) or Git blob that the repository states."""
+    in_lfs = stated.lfs is not None
+    if (sha256_of(path) if in_lfs else _git_blob(path)) != (
+        stated.lfs.sha256 if in_lfs else stated.blob_id
+    ):
         raise ModelError(
             f"{repo}: {path.name} arrived with another content than the repository states; fetch it"
             " again, over another connection if this repeats"
@@ -111,8 +90,5 @@ def _check_content(repo: str, path: Path, stated: Any) -> None:
 
 
 def _git_blob(path: Path) -> str:
-    digest = hashlib.sha1(b"blob %d\0" % path.stat().st_size, usedforsecurity=False)
-    with path.open("rb") as file:
-        while block := file.read(1 << 20):
-            digest.update(block)
-    return digest.hexdigest()
+    content = path.read_bytes()  # a small file of text
+    return hashlib.sha1(b"blob %d\0" % len(content) + content, usedforsecurity=False).hexdigest()

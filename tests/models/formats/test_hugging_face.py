@@ -19,6 +19,7 @@ from pnpdepth_cli.models.formats.hugging_face import hf_definition
 from pnpdepth_cli.models.frame import FrameMap
 from pnpdepth_cli.models.network import load_network
 from pnpdepth_cli.points import SparsePoints
+from tests.models.weights.files import little
 
 transformers = pytest.importorskip("transformers", reason="needs the extra [hf]")
 
@@ -213,9 +214,6 @@ def test_incomplete_folders_are_refused_with_a_remedy(tmp_path: Path) -> None:
     (folder / "pytorch_model.bin").unlink()
     with pytest.raises(CheckpointError, match="no model"):
         hf_definition(folder)
-    (folder / "preprocessor_config.json").unlink()
-    with pytest.raises(ModelError, match=r"preprocessor_config\.json is missing"):
-        hf_definition(folder)
     (folder / "config.json").write_text(json.dumps({"model_type": "bert"}))
     with pytest.raises(ModelError, match="'bert' are not known"):
         hf_definition(folder)
@@ -225,6 +223,55 @@ def test_incomplete_folders_are_refused_with_a_remedy(tmp_path: Path) -> None:
     (folder / "config.json").unlink()
     with pytest.raises(ModelError, match=r"config\.json is missing"):
         hf_definition(folder)
+
+
+@pytest.mark.parametrize(
+    ("name", "size"),
+    [
+        ("depth_anything", Near(of=14, height=518, width=518)),
+        ("prompt_depth_anything", Near(of=14, height=756, width=756)),
+        ("dpt", Fixed(384, 384)),
+        ("zoedepth", Near(of=32, height=384, width=512)),
+        ("glpn", Near(of=32)),
+        ("depth_pro", Fixed(1536, 1536)),
+    ],
+)
+def test_a_folder_as_transformers_saves_it_is_prepared_as_usual_for_its_type(
+    name: str, size: Fixed | Near, tmp_path: Path
+) -> None:
+    folder = saved(tmp_path / "net", name)
+    (folder / "preprocessor_config.json").unlink()
+    definition = hf_definition(folder)
+    assert definition.size == size
+    assert definition.normalisation is not None
+    mean = {"depth_anything": 0.485, "prompt_depth_anything": 0.485, "glpn": 0.0}.get(name, 0.5)
+    assert definition.normalisation.mean[0] == mean
+    assert f"no preprocessor_config.json; assumed, as usual for {name}" in definition.assumed
+
+
+def test_a_multiple_may_be_a_fraction_of_the_image(tmp_path: Path) -> None:
+    folder = changed(
+        saved(tmp_path / "net", "zoedepth"),
+        "preprocessor_config.json",
+        {"ensure_multiple_of": 1 / 32},
+    )
+    assert hf_definition(folder).size == Near(of=32, height=64, width=96)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"depths": [1_000_000_000, 1, 1, 1]}, "1000000000 is larger than any part of a network"),
+        ({"depths": [900_000, 1, 1, 1]}, "describes a larger network than its weights"),
+        ({"hidden_sizes": [8, 8, 16, 1_000_000]}, "describes a larger network than its weights"),
+    ],
+)
+def test_a_network_far_larger_than_its_weights_is_not_built(
+    change: dict[str, Any], message: str, tmp_path: Path
+) -> None:
+    folder = changed(saved(tmp_path / "net", "glpn"), "config.json", change)
+    with little(megabytes=900, seconds=30), pytest.raises(ModelError, match=message):
+        load_network(str(folder), None)
 
 
 def test_weights_that_do_not_fit_the_configuration_are_refused(tmp_path: Path) -> None:

@@ -2,17 +2,25 @@
 
 from __future__ import annotations
 
+import io
+import json
+import os
+import zipfile
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 from torch import nn
+from torch.export import Dim
 
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.errors import CheckpointError, ModelError
-from pnpdepth_cli.models.definition import Fixed
+from pnpdepth_cli.models.definition import Fixed, Multiple
 from pnpdepth_cli.models.network import load_network
 from pnpdepth_cli.models.registry import find_definition
+from tests.models.weights.files import Hostile, little
 
 
 class Net(nn.Module):
@@ -25,7 +33,7 @@ class Net(nn.Module):
 
     def forward(self, rgb: torch.Tensor) -> torch.Tensor:
         z = torch.relu(self.middle(self.encode(rgb)))
-        up = nn.functional.interpolate(self.decode(z), scale_factor=4, mode="bilinear")
+        up = nn.functional.interpolate(self.decode(z), scale_factor=4.0, mode="bilinear")
         return 1 + 2 * torch.sigmoid(up)
 
 
@@ -46,6 +54,50 @@ def test_an_exported_program_is_cut_at_its_graphs_nodes_bit_for_bit(tmp_path: Pa
                 assert torch.equal(network.raw_of(split.rear(split.front(x))), whole), name
 
 
+class Dynamic(nn.Module):
+    """Sizes that are reckoned, an equation, attention, a constant, and a part without gradients."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.inward, self.out = nn.Conv2d(3, 8, 3, 2, 1), nn.Conv2d(8, 1, 1)
+        self.levels = torch.arange(1, 9)
+
+    def forward(self, rgb: torch.Tensor) -> torch.Tensor:
+        height, width = rgb.shape[2:]
+        z = torch.einsum("bchw,c->bchw", self.inward(rgb).relu(), self.levels.float())
+        rows = z.flatten(2).transpose(1, 2)
+        z = z + nn.functional.scaled_dot_product_attention(rows, rows, rows).mean()
+        with torch.no_grad():
+            mean = rgb.mean()
+        left, right = torch.split(self.out(z), [8, z.shape[3] - 8], dim=3)
+        y = torch.cat([left, right.clamp(min=-float("inf"))], dim=3)
+        y = nn.functional.interpolate(y, size=(height, width), mode="bilinear")
+        return 1 + torch.sigmoid(y) + mean
+
+
+@pytest.fixture
+def archive(tmp_path: Path) -> Path:
+    torch.manual_seed(0)
+    sides = {2: 32 * Dim("rows", min=1, max=64), 3: 32 * Dim("columns", min=1, max=64)}
+    net, image = Dynamic().eval(), torch.rand(1, 3, 64, 96)
+    program = torch.export.export(net, (image,), dynamic_shapes=(sides,))
+    torch.export.save(program, tmp_path / "net.pt2")
+    return tmp_path / "net.pt2"
+
+
+def test_a_program_for_many_sizes_gives_what_the_network_gives_and_blocks_the_same_gradients(
+    archive: Path,
+) -> None:
+    network = load_network(str(archive), None)
+    assert network.definition.size == Multiple(32)
+    torch.manual_seed(0)
+    net, rgb = Dynamic().eval(), torch.rand(1, 3, 96, 32, requires_grad=True)
+    depth, expected = network.raw_of(network.module(rgb)), net(rgb)
+    assert torch.equal(depth, expected)
+    ours, theirs = (torch.autograd.grad(one.sum(), rgb)[0] for one in (depth, expected))
+    torch.testing.assert_close(ours, theirs)
+
+
 def test_what_is_no_exported_program_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ModelError, match="does not exist"):
         find_definition(str(tmp_path / "no.pt2"))
@@ -54,10 +106,140 @@ def test_what_is_no_exported_program_is_refused(tmp_path: Path) -> None:
         find_definition(str(tmp_path / "bad.pt2"))
 
 
+Change = Callable[[bytes], bytes]
+
+
+def rewritten(file: Path, name: str, change: Change, how: int = zipfile.ZIP_STORED) -> Path:
+    """The archive with one entry changed, or added where there is none of that name."""
+    with zipfile.ZipFile(file) as source:
+        entries = {info.filename: source.read(info) for info in source.infolist()}
+    full = f"{next(iter(entries)).partition('/')[0]}/{name}"
+    entries[full] = change(entries.get(full, b""))
+    target = file.with_name("changed.pt2")
+    with zipfile.ZipFile(target, "w", how) as archive_out:
+        for entry, content in entries.items():
+            archive_out.writestr(entry, content)
+    return target
+
+
+def edited(change: Callable[[Any], object]) -> Change:
+    """The JSON changed by a function."""
+
+    def on(content: bytes) -> bytes:
+        value = json.loads(content)
+        change(value)
+        return json.dumps(value).encode()
+
+    return on
+
+
+def call(target: str) -> Change:
+    """The first operator is another one."""
+    return edited(lambda p: p["graph_module"]["graph"]["nodes"][0].update(target=target))
+
+
+def first_weight(**meta: Any) -> Change:
+    def change(config: Any) -> None:
+        stated = next(iter(config["config"].values()))
+        stated.update({k: v for k, v in meta.items() if k in stated})
+        stated["tensor_meta"].update({k: v for k, v in meta.items() if k not in stated})
+
+    return edited(change)
+
+
+MODEL = "models/model.json"
+WEIGHTS = "data/weights/model_weights_config.json"
+HUGE = [{"as_int": 10**12}]
+HOSTILE: dict[str, tuple[str, Change, str]] = {
+    **{
+        target: (MODEL, call(target), f"it calls '{target}'")
+        for target in (
+            "torch.os.system", "torch.ops.load_library", "torch.ops.aten.from_file.default",
+            "torch.ops.aten.save.default", "torch.ops.torchvision.write_file.default",
+            "_operator.methodcaller", "math.__loader__",
+            "torch.ops.aten.__class__.mro", "torch.ops.aten.add.__call__",
+            "torch.load", "os.system", "torch.ops.higher_order.run_const_graph",
+        )
+    },
+    "pickled weights": (WEIGHTS, first_weight(use_pickle=True), "is pickled"),
+    "a large weight": (WEIGHTS, first_weight(sizes=HUGE, strides=HUGE), "goes beyond"),
+    "a repeated weight": (
+        WEIGHTS, first_weight(sizes=HUGE, strides=[{"as_int": 0}]), "goes beyond"
+    ),
+    "a weight outside": (WEIGHTS, first_weight(path_name="../../../etc/hostname"), "KeyError"),
+    "a negative offset": (WEIGHTS, first_weight(storage_offset={"as_int": -1}), "negative"),
+    "no JSON": (MODEL, lambda _: b"[" * 100_000, "RecursionError"),
+    "a number without end": (MODEL, lambda _: b"9" * 10_000, "ValueError"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", HOSTILE)
+def test_what_could_do_more_than_compute_is_refused_in_one_line(archive: Path, kind: str) -> None:
+    entry, change, message = HOSTILE[kind]
+    with little(), pytest.raises(ModelError, match="cannot be read: ") as error:
+        find_definition(str(rewritten(archive, entry, change)))
+    assert message in str(error.value)
+    assert "\n" not in str(error.value)
+    assert len(str(error.value)) < 500
+
+
+def test_a_compressed_archive_is_refused(archive: Path) -> None:
+    packed = rewritten(archive, "data/x", lambda _: b"\0" * 10**7, zipfile.ZIP_DEFLATED)
+    with pytest.raises(ModelError, match="compressed"):
+        find_definition(str(packed))
+
+
+def test_pickles_libraries_and_code_in_an_archive_are_left_alone(
+    archive: Path, tmp_path: Path
+) -> None:
+    trap = tmp_path / "trap"
+    pickled = io.BytesIO()
+    torch.save((Hostile(os.mkdir, str(trap)),), pickled)
+    code = f"__import__('os').mkdir({str(trap)!r})"
+
+    def with_code(program: Any) -> None:
+        program["guards_code"] = [code]
+        program["range_constraints"][code] = {"min_val": 1, "max_val": 2}
+        for value in program["graph_module"]["graph"]["sym_int_values"].values():
+            value["as_expr"]["expr_str"] = code
+
+    hostile = rewritten(archive, "data/sample_inputs/model.pt", lambda _: pickled.getvalue())
+    hostile = rewritten(hostile, "data/constants/custom_obj_0", lambda _: pickled.getvalue())
+    hostile = rewritten(hostile, "data/aotinductor/model/m.so", lambda _: b"x")
+    hostile = rewritten(hostile, MODEL, edited(with_code))
+    network = load_network(str(hostile), None)
+    rgb = torch.rand(1, 3, 64, 96)
+    assert torch.equal(network.module(rgb), load_network(str(archive), None).module(rgb))
+    assert not trap.exists()
+    with pytest.raises(Exception):  # noqa: B017
+        torch.export.load(hostile)
+    assert trap.exists()  # where torch itself reads the file, it is run
+
+
 @pytest.mark.parametrize("suffix", [".pt", ".pth", ".torchscript", ".safetensors", ".pth.tar"])
 def test_weights_as_a_model_are_refused_with_a_remedy(suffix: str) -> None:
     with pytest.raises(ModelError, match=r"--checkpoint.*ONNX"):
         find_definition(f"net{suffix}")
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+def test_a_torchscript_archive_and_a_pickled_module_are_named_with_the_lines_that_export_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("onnx", reason="needs the extra [onnx]")
+    torch.jit.save(torch.jit.script(Net()), tmp_path / "script.pt")
+    torch.save(Net(), tmp_path / "module.pth")
+    torch.save(Net().state_dict(), tmp_path / "weights.pth")
+    monkeypatch.chdir(tmp_path)
+    for name, what in (("script.pt", "a TorchScript archive"), ("module.pth", "pickled module")):
+        with pytest.raises(ModelError, match=what) as error:
+            find_definition(name)
+        lines = str(error.value).partition("images): ")[2].replace("480, 640", "32, 48")
+        exec(lines, {"torch": torch})
+        network = load_network(f"{Path(name).stem}.onnx", None)
+        assert network.definition.size == Fixed(32, 48)
+    with pytest.raises(ModelError, match=r"a file of weights.*--checkpoint"):
+        find_definition("weights.pth")
 
 
 BARE = """

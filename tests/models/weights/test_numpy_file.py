@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import pickle
-import resource
 import struct
 import sys
 import zipfile
@@ -17,13 +16,18 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from pnpdepth_cli.errors import CheckpointError
 from pnpdepth_cli.models.weights.numpy_file import read_numpy_file
-from tests.models.weights.numpy_files import pickled, write_npy
-from tests.models.weights.test_torch_file import Hostile, hostile
+from tests.models.weights.files import (
+    Hostile,
+    hostile,
+    little,
+    npy_of,
+    pickled,
+    refused,
+    write_npy,
+)
 
 WRITERS = ["python 2", "2", "3", "4"]
-HEADER = {"descr": "|O", "fortran_order": False, "shape": ()}
 
 
 def layers() -> dict[str, Any]:
@@ -36,22 +40,6 @@ def layers() -> dict[str, Any]:
         "bn_conv1": {"mean": rng.normal(size=300).astype(np.float32)},
         "alone": np.arange(6, dtype=np.int64),
     }
-
-
-def with_object(path: Path, content: bytes, **header: Any) -> Path:
-    with path.open("wb") as file:
-        np.lib.format.write_array_header_1_0(file, HEADER | header)
-        file.write(content)
-    return path
-
-
-def refused(path: Path) -> str:
-    with pytest.raises(CheckpointError) as error:
-        read_numpy_file(path)
-    assert str(path) in str(error.value)
-    assert "\n" not in str(error.value)
-    assert len(str(error.value)) < 400 + len(str(path))
-    return str(error.value)
 
 
 @pytest.mark.parametrize("written_by", WRITERS)
@@ -68,11 +56,6 @@ def test_a_pickled_dict_of_dicts_gives_its_arrays_to_the_bit(
         assert np.array_equal(tensor.numpy(), own)
         assert tensor.numpy().dtype == own.dtype
     assert arrays["conv1.weights"].is_contiguous()
-
-
-def test_what_numpy_saves_today_is_read(tmp_path: Path) -> None:
-    np.save(tmp_path / "x.npy", layers(), allow_pickle=True)  # type: ignore[arg-type]
-    assert torch.equal(read_numpy_file(tmp_path / "x.npy")["alone"], torch.arange(6))
 
 
 @pytest.mark.parametrize("written_by", WRITERS)
@@ -122,7 +105,7 @@ def test_an_array_named_twice_is_read_once(tmp_path: Path) -> None:
     ],
 )
 def test_other_contents_are_named(content: Any, message: str, tmp_path: Path) -> None:
-    assert message in refused(with_object(tmp_path / "x.npy", pickled(content, "4")))
+    assert message in refused(npy_of(tmp_path / "x.npy", pickled(content, "4")))
 
 
 def test_a_plain_array_or_several_objects_are_no_checkpoint(tmp_path: Path) -> None:
@@ -131,13 +114,13 @@ def test_a_plain_array_or_several_objects_are_no_checkpoint(tmp_path: Path) -> N
     np.save(tmp_path / "b.npy", np.array([{}, {}]), allow_pickle=True)
     assert "one array of shape (2,)" in refused(tmp_path / "b.npy")
     np.savez(tmp_path / "c.npz", a=np.array([{}], dtype=object), allow_pickle=True)
-    assert "a.npy holds objects" in refused(tmp_path / "c.npz")
+    assert "cannot be read as a numpy file" in refused(tmp_path / "c.npz")
 
 
 def test_a_dict_in_itself_is_refused(tmp_path: Path) -> None:
     ring: dict[str, Any] = {}
     ring["again"] = ring
-    assert "deeper" in refused(with_object(tmp_path / "x.npy", pickled(ring, "4")))
+    assert "deeper" in refused(npy_of(tmp_path / "x.npy", pickled(ring, "4")))
 
 
 @pytest.mark.parametrize("written_by", WRITERS)
@@ -145,7 +128,7 @@ def test_a_dict_in_itself_is_refused(tmp_path: Path) -> None:
 def test_nothing_of_a_hostile_pickle_runs(kind: str, written_by: str, tmp_path: Path) -> None:
     marker = tmp_path / "ran"
     content = {"w": {"weights": np.ones(2)}, "x": hostile(marker)[kind]}
-    path = with_object(tmp_path / "bad.npy", pickled(content, written_by))
+    path = npy_of(tmp_path / "bad.npy", pickled(content, written_by))
     before = set(sys.modules)
     refused(path)
     assert not marker.exists()
@@ -169,7 +152,7 @@ class HostileArray:
 @pytest.mark.parametrize("field", ["version", "shape", "dtype", "fortran", "data"])
 def test_calls_inside_an_array_are_not_run(field: str, tmp_path: Path) -> None:
     marker = tmp_path / "ran"
-    path = with_object(tmp_path / "bad.npy", pickled({"a": HostileArray(marker, field)}, "4"))
+    path = npy_of(tmp_path / "bad.npy", pickled({"a": HostileArray(marker, field)}, "4"))
     if field in ("version", "fortran"):  # what it would have been makes no difference
         assert torch.equal(read_numpy_file(path)["a"], torch.ones(2))
     else:
@@ -179,7 +162,7 @@ def test_calls_inside_an_array_are_not_run(field: str, tmp_path: Path) -> None:
 
 def test_the_hostile_files_do_run_where_numpy_itself_reads_them(tmp_path: Path) -> None:
     marker = tmp_path / "ran"
-    path = with_object(tmp_path / "bad.npy", pickled({"x": hostile(marker)["exec"]}, "python 2"))
+    path = npy_of(tmp_path / "bad.npy", pickled({"x": hostile(marker)["exec"]}, "python 2"))
     np.load(path, allow_pickle=True, encoding="latin1")
     assert marker.exists()
 
@@ -210,10 +193,9 @@ BOMBS = {
 
 @pytest.mark.parametrize("kind", BOMBS)
 def test_what_claims_to_be_larger_than_the_file_is_refused(kind: str, tmp_path: Path) -> None:
-    path = with_object(tmp_path / "bomb.npy", pickled(BOMBS[kind], "4"))
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    refused(path)
-    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 60_000  # kB
+    path = npy_of(tmp_path / "bomb.npy", pickled(BOMBS[kind], "4"))
+    with little():
+        refused(path)
 
 
 def test_an_archive_that_inflates_far_beyond_its_size_is_refused(tmp_path: Path) -> None:
@@ -227,7 +209,8 @@ def test_an_archive_whose_header_claims_more_than_is_there_is_refused(tmp_path: 
     np.lib.format.write_array_header_1_0(header, claim)
     with zipfile.ZipFile(tmp_path / "x.npz", "w") as archive:
         archive.writestr("a.npy", header.getvalue() + b"\0" * 4)
-    assert "does not have its 4 bytes" in refused(tmp_path / "x.npz")
+    with little():
+        refused(tmp_path / "x.npz")
 
 
 def with_directory_size(path: Path, size: int) -> None:
@@ -246,9 +229,8 @@ def test_an_archive_that_inflates_beyond_its_directory_takes_no_memory(
     with zipfile.ZipFile(path, "w", getattr(zipfile, f"ZIP_{method}")) as archive:
         archive.writestr("a.npy", b"\0" * 300_000_000 if method != "STORED" else b"\0" * 1000)
     with_directory_size(path, 100)
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    refused(path)
-    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 60_000  # kB
+    with little():
+        refused(path)
 
 
 @pytest.mark.parametrize("method", ["DEFLATED", "BZIP2", "LZMA"])
@@ -282,7 +264,7 @@ def test_a_file_cut_anywhere_is_refused(suffix: str, tmp_path: Path) -> None:
 def test_any_other_bytes_are_refused(data: bytes, kind: str, tmp_path: Path) -> None:
     path = tmp_path / "fuzz.npy"
     if kind == "pickle":
-        with_object(path, data)
+        npy_of(path, data)
     elif kind == "archive":
         with zipfile.ZipFile(path, "w") as archive:
             archive.writestr("a.npy", b"\x93NUMPY\x01\x00" + data)

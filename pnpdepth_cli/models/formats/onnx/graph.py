@@ -8,10 +8,10 @@ network can be cut at it.
 from __future__ import annotations
 
 import graphlib
-import heapq
+import math
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ from torch import Tensor, nn
 
 from pnpdepth_cli.core.user_code import describe
 from pnpdepth_cli.errors import ModelError
-from pnpdepth_cli.models.formats.onnx.limits import FoldingBudget
+from pnpdepth_cli.models.formats.onnx.limits import SizeLimit
 from pnpdepth_cli.models.formats.onnx.operators import HOST_INPUTS, OPERATORS, Node, Unsupported
 
 _STANDARD = ("", "ai.onnx")
@@ -29,6 +29,13 @@ _WHOLE = ("uint16", "uint32", "uint64", "int4", "uint4")
 _HALF = ("float16", "bfloat16")
 _MODULE_ATTRIBUTES = frozenset(vars(nn.Module()))
 """Such as `training`, which torch itself sets; no submodule can have such a name."""
+
+_CONSTANT_ELEMENTS, _CONSTANT_GROWTH, _CONSTANTS = 1 << 24, 4, 4
+"""One computed constant may have so many elements, or so many times those stored in the file; all
+of them together so many times as many as one."""
+
+_ACTIVATION_ELEMENTS, _ACTIVATION_GROWTH = 1 << 28, 64
+"""One activation may have so many elements (1 GB), or so many times those of input and weights."""
 
 
 class OnnxNode(nn.Module):
@@ -43,7 +50,6 @@ class OnnxNode(nn.Module):
     def __init__(self, node: Node, inputs: Sequence[Tensor | str | None]) -> None:
         super().__init__()
         self.node = node
-        self._run = OPERATORS[node.op]
         host = HOST_INPUTS.get(node.op, ())
         # Of each input the constant itself if it stays on the CPU, else the name of its buffer;
         # "" if the call gives it, None if it is left out.
@@ -72,9 +78,10 @@ class OnnxNode(nn.Module):
             for value in self._inputs
         ]
         try:
-            return self._run(self.node, inputs)
+            return OPERATORS[self.node.op](self.node, inputs)
         except Unsupported as error:
-            raise ModelError(f"ONNX node {self.node.name!r}: {_not_covered(self.node, error)}")  # noqa: B904
+            reason = f"{self.node.op} with {error} is not covered"
+            raise ModelError(f"ONNX node {self.node.name!r}: {reason}") from None
 
     def extra_repr(self) -> str:
         """Returns the operator, for `print(network)`."""
@@ -85,22 +92,23 @@ class OnnxNode(nn.Module):
 class _Step:
     """One node, in the order in which they run, and the names of the values around it.
 
-    last_read: values that no later step reads. on_shapes: True for arithmetic on the shapes of
-    tensors, which stays on the CPU.
+    on_shapes: True for arithmetic on the shapes of tensors, which stays on the CPU. last_read:
+    values that no later step reads.
     """
 
     run: OnnxNode
     inputs: tuple[str, ...]
     outputs: tuple[str, ...]
-    last_read: tuple[str, ...]
     on_shapes: bool
+    last_read: tuple[str, ...] = ()
 
 
 class OnnxGraph(nn.Module):
     """An ONNX model as a module: called with the graph's inputs, it returns its outputs.
 
     One output is a tensor, several are a dict by name. Everything is computed in float32; weights
-    in half precision are widened.
+    in half precision are widened. The first pass with inputs of a size allocates no activation
+    beyond _ACTIVATION_ELEMENTS.
 
     Args:
         model: The onnx.ModelProto, without functions of its own.
@@ -123,9 +131,11 @@ class OnnxGraph(nn.Module):
         _check_operators([graph.node[n] for n in order], path)
         names = _names(graph.node)
         nodes = [(names[n], graph.node[n]) for n in order]
+        self._stored = sum(constant.numel() for constant in constants.values())
         steps = self._steps_of(nodes, opset, constants, path)
         self._steps = _with_ends(steps, self.output_names)
         self._constants = {n: constants[n] for n in self.output_names if n in constants}
+        self._allowed: set[tuple[torch.Size, ...]] = set()  # sizes of inputs
         for step in self._steps:
             if not step.on_shapes:
                 # Not add_module, which refuses the dots that node names have.
@@ -136,48 +146,43 @@ class OnnxGraph(nn.Module):
     ) -> list[_Step]:
         shapes: set[str] = set()
         steps = []
-        budget = FoldingBudget(sum(constant.numel() for constant in constants.values()))
+        largest = max(_CONSTANT_ELEMENTS, _CONSTANT_GROWTH * self._stored)
+        limit = SizeLimit(largest, in_all=_CONSTANTS * largest)
         for name, proto in nodes:
             attributes = {a.name: _attribute(a, path) for a in proto.attribute}
-            outputs = [output for output in proto.output if output]
+            used = sum(bool(output) for output in proto.output)
             node = Node(
-                name=name,
-                op=proto.op_type,
-                opset=opset,
-                outputs=len(outputs),
-                attributes=attributes,
+                name=name, op=proto.op_type, opset=opset, outputs=used, attributes=attributes
             )
             inputs: list[Tensor | str] = [constants.get(n, n) for n in proto.input]
             module = OnnxNode(node, [None if isinstance(n, str) and not n else n for n in inputs])
             handed_in = tuple(n for n in inputs if isinstance(n, str) and n)
             if not handed_in:
-                constants.update(_folded(module, proto.output, budget, path))
+                constants.update(_folded(module, proto.output, limit, path))
                 continue
             on_shapes = node.op in _TO_SHAPES or all(n in shapes for n in handed_in)
             if on_shapes:
-                shapes.update(outputs)
-            steps.append(_Step(module, handed_in, tuple(proto.output), (), on_shapes))
+                shapes.update(filter(None, proto.output))
+            steps.append(_Step(module, handed_in, tuple(proto.output), on_shapes))
         return steps
 
     def forward(self, *inputs: Tensor) -> Any:
         """Returns the output, or several outputs by name."""
+        sizes = tuple(one.shape for one in inputs)
         values: dict[str, Tensor] = dict(zip(self.input_names, inputs, strict=True))
-        for step in self._run(values, inputs[0].device):
-            for name in step.last_read:
-                del values[name]
+        if sizes in self._allowed:
+            self._run(values, inputs[0].device)
+        else:
+            elements = self._stored + sum(one.numel() for one in inputs)
+            largest = max(_ACTIVATION_ELEMENTS, _ACTIVATION_GROWTH * elements)
+            with SizeLimit(largest):
+                self._run(values, inputs[0].device, most=2 * largest)
+            self._allowed.add(sizes)
         outputs = {n: values[n] if n in values else self._constants[n] for n in self.output_names}
         return outputs if len(outputs) > 1 else outputs[self.output_names[0]]
 
-    def every_value(self, *inputs: Tensor) -> Iterator[tuple[str, str, Tensor]]:
-        """Yields (node, value's name, value) of all nodes in the order in which they run."""
-        values: dict[str, Tensor] = dict(zip(self.input_names, inputs, strict=True))
-        for step in self._run(values, inputs[0].device):
-            for name in step.outputs:
-                if name in values:
-                    yield step.run.node.name, name, values[name]
-
-    def _run(self, values: dict[str, Tensor], device: torch.device) -> Iterator[_Step]:
-        """Yields the steps, each after its results were added to the values."""
+    def _run(self, values: dict[str, Tensor], device: torch.device, most: float = math.inf) -> None:
+        """Adds the results to the values, of which so many elements may be needed at a time."""
         for step in self._steps:
             arguments = [values[name] for name in step.inputs]
             if not step.on_shapes:
@@ -188,21 +193,21 @@ class OnnxGraph(nn.Module):
             result = step.run(*arguments)
             results = result if isinstance(result, tuple) else (result,)
             values.update(zip(step.outputs, results, strict=False))
-            yield step
-
-
-_QUANTISED = (
-    "it quantises activations (QuantizeLinear, {count} ×), and rounding has no gradient;"
-    " use the file with float weights, or one where only weights are quantised"
-)
+            if sum(value.numel() for value in values.values()) > most:
+                raise ModelError(
+                    f"ONNX node {step.run.node.name!r}: more than {most:,} elements are needed at a"
+                    " time, far more than image and weights have"
+                )
+            for name in step.last_read:
+                del values[name]
 
 
 def _folded(
-    module: OnnxNode, outputs: Sequence[str], budget: FoldingBudget, path: Path
+    module: OnnxNode, outputs: Sequence[str], limit: SizeLimit, path: Path
 ) -> dict[str, Tensor]:
     """The outputs of a node that has only constant inputs."""
     try:
-        with torch.no_grad(), budget:
+        with torch.no_grad(), limit:
             result = module()
     except ModelError as error:
         raise ModelError(f"ONNX file {path}: {error}") from None
@@ -220,11 +225,9 @@ def _with_ends(steps: list[_Step], outputs: Sequence[str]) -> list[_Step]:
     for step in reversed(steps):
         if needed.intersection(step.outputs):
             # Going backwards, the first step that reads a value is its last reader.
-            last = {n for n in step.inputs if n not in needed}
-            unread = {n for n in step.outputs if n and n not in needed}
+            ends = {n for n in (*step.inputs, *step.outputs) if n and n not in needed}
             needed.update(step.inputs)
-            ends = tuple(sorted(last | unread))
-            kept.append(_Step(step.run, step.inputs, step.outputs, ends, step.on_shapes))
+            kept.append(replace(step, last_read=tuple(sorted(ends))))
     return kept[::-1]
 
 
@@ -242,7 +245,11 @@ def _check_operators(nodes: Sequence[Any], path: Path) -> None:
         )
     quantised = sum(proto.op_type == "QuantizeLinear" for proto in nodes)
     if quantised:
-        raise ModelError(f"ONNX file {path}: {_QUANTISED.format(count=quantised)}")
+        raise ModelError(
+            f"ONNX file {path}: it quantises activations (QuantizeLinear, {quantised} ×), and"
+            " rounding has no gradient; use the file with float weights, or one where only weights"
+            " are quantised"
+        )
 
 
 def order_of_nodes(
@@ -250,7 +257,7 @@ def order_of_nodes(
 ) -> list[int]:
     """Returns the indices of the nodes that the outputs need, each after those it reads.
 
-    Otherwise the order is that of the file. Files converted to half precision are not in order.
+    The order is that of the file if possible; files converted to half precision are not in order.
 
     Args:
         nodes: The nodes of an onnx.GraphProto.
@@ -274,19 +281,12 @@ def order_of_nodes(
             raise ModelError(f"ONNX file {path}: a node reads {absent[0]!r}, which nothing gives")
         reads[n] = {producer[name] for name in inputs}
         pending += reads[n]
-    sorter = graphlib.TopologicalSorter(reads)
+    if all(before < n for n, befores in reads.items() for before in befores):
+        return sorted(reads)
     try:
-        sorter.prepare()
+        return [*graphlib.TopologicalSorter(dict(sorted(reads.items()))).static_order()]
     except graphlib.CycleError:
         raise ModelError(f"ONNX file {path}: its nodes read each other in a circle") from None
-    order: list[int] = []
-    ready: list[int] = []
-    while len(order) < len(reads):
-        for n in sorter.get_ready():
-            heapq.heappush(ready, n)
-        order.append(heapq.heappop(ready))
-        sorter.done(order[-1])
-    return order
 
 
 def _names(nodes: Iterable[Any]) -> list[str]:
@@ -323,17 +323,12 @@ def _tensor(proto: Any, path: Path) -> Tensor:
 
     try:
         array = numpy_helper.to_array(proto)
-        kind = array.dtype.name
-        if kind in _HALF:
+        if array.dtype.name in _HALF:
             array = array.astype("float32")
-        elif kind in _WHOLE:
+        elif array.dtype.name in _WHOLE:
             array = array.astype("int64")
         return torch.tensor(array)
     except (ValueError, TypeError, KeyError, RuntimeError) as error:
         raise ModelError(
             f"ONNX file {path}: tensor {proto.name!r} cannot be read ({error})"
         ) from None
-
-
-def _not_covered(node: Node, error: Unsupported) -> str:
-    return f"{node.op} with {error} is not covered"

@@ -35,20 +35,12 @@ def stated_input_range(model: Any) -> tuple[Normalisation, str] | None:
         Identity and "0…1", or times 255 and "0…255". None if the graph does not normalise its
         input, or in no such range.
     """
-    first = _first_arithmetic(model)
-    if first is None:
-        return None
-    factor, offset = first
-    if _is_plausible(offset, factor):
-        return Normalisation(), "0…1"
-    if _is_plausible(offset, factor * BYTES):
-        return Normalisation(std=(1 / BYTES, 1 / BYTES, 1 / BYTES)), "0…255"
+    factor, black = _first_arithmetic(model) or (0.0, 0.0)
+    for white, words in ((1.0, "0…1"), (BYTES, "0…255")):
+        span = factor * white
+        if _SPAN[0] <= span <= _SPAN[1] and -0.9 * span <= black <= 0.1 * span:
+            return Normalisation(std=(1 / white,) * 3), words
     return None
-
-
-def _is_plausible(black: float, span: float) -> bool:
-    """Whether normalised images have black here and white so far above it."""
-    return _SPAN[0] <= span <= _SPAN[1] and -0.9 * span <= black <= 0.1 * span
 
 
 def _first_arithmetic(model: Any) -> tuple[float, float] | None:
@@ -57,34 +49,35 @@ def _first_arithmetic(model: Any) -> tuple[float, float] | None:
     constants = _constants(graph)
     (name,) = (each.name for each in graph.input if each.name not in constants)
     factor, offset, has_operation = 1.0, 0.0, False
-    while (node := _only_consumer(graph, name)) is not None:
+    while True:
+        consumers = [node for node in graph.node if name in node.input]
+        if len(consumers) != 1 or len(consumers[0].output) != 1:
+            break
+        node = consumers[0]
         if node.op_type not in _PASSED:
             operand = _operand(node, name, constants)
             if operand is None:
                 break
-            if node.op_type in ("Mul", "Div"):
-                scale = float(operand.mean() if node.op_type == "Mul" else (1 / operand).mean())
-                factor, offset = factor * scale, offset * scale
-            else:
-                offset += float(operand.mean()) * (1 if node.op_type == "Add" else -1)
+            match node.op_type:
+                case "Mul" | "Div":
+                    scale = float((operand if node.op_type == "Mul" else 1 / operand).mean())
+                    factor, offset = factor * scale, offset * scale
+                case "Add":
+                    offset += float(operand.mean())
+                case "Sub":
+                    offset -= float(operand.mean())
             has_operation = True
         name = node.output[0]
     return (factor, offset) if has_operation else None
-
-
-def _only_consumer(graph: Any, name: str) -> Any:
-    """The node that takes the value, or None where several do."""
-    consumers = [node for node in graph.node if name in node.input]
-    return consumers[0] if len(consumers) == 1 and len(consumers[0].output) == 1 else None
 
 
 def _operand(node: Any, name: str, constants: Constants) -> NDArray[np.float64] | None:
     """The constant that the node adds, subtracts, multiplies or divides by; None for any other."""
     if node.op_type not in ("Add", "Sub", "Mul", "Div") or len(node.input) != 2:
         return None
-    other = node.input[1] if node.input[0] == name else node.input[0]
-    operand = constants.get(other)
-    if operand is None or (node.op_type in ("Sub", "Div") and node.input[0] != name):
+    is_first = node.input[0] == name
+    operand = constants.get(node.input[1 if is_first else 0])
+    if operand is None or (node.op_type in ("Sub", "Div") and not is_first):
         return None
     usable = operand.size and bool(np.isfinite(operand).all())
     scaling = node.op_type in ("Mul", "Div")

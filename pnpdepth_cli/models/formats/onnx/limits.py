@@ -1,15 +1,15 @@
 """Keeps what a small ONNX file makes as small as a network is.
 
 The functions that a model defines itself may call each other and, written out, become endless.
-ConstantOfShape, Range, Expand, Concat of a value with itself and many other operators can turn a
-few bytes into gigabytes; `FoldingBudget` knows the size of every result before it is allocated.
+ConstantOfShape, Tile, Pad, Expand and many other operators can turn a few bytes into gigabytes;
+`SizeLimit` knows the size of every result before it is allocated.
 """
 
 from __future__ import annotations
 
-import graphlib
+import functools
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -21,11 +21,8 @@ from torch.utils._pytree import tree_flatten, tree_map_only
 from pnpdepth_cli.errors import ModelError
 from pnpdepth_cli.models.formats.onnx.operators import Unsupported
 
-MAX_NODES = 100_000
-"""Nodes of the graph with all functions written out. Depth networks have up to 10,000."""
-
-MAX_BYTES = 1 << 28
-"""Bytes of them, without the weights that lie in the graph itself."""
+_MAX_WRITTEN_OUT = 1 << 28  # bytes
+_NODE_BYTES = 1 << 12  # that a node takes in memory at least; depth networks have up to 10,000
 
 
 def inlined(model: Any, path: Path) -> Any:
@@ -37,35 +34,27 @@ def inlined(model: Any, path: Path) -> Any:
     if not model.functions:
         return model
     functions = {(f.domain, f.name, getattr(f, "overload", "")): f for f in model.functions}
-    calls = {key: _calls(function) for key, function in functions.items()}
+
+    @functools.cache
+    def written_out(key: tuple[str, str, str]) -> int:
+        return int(functions[key].ByteSize()) + size(functions[key])
+
+    def size(graph: Any) -> int:
+        calls = [(n.domain, n.op_type, getattr(n, "overload", "")) for n in _nodes(graph.node)]
+        return sum(written_out(call) if call in functions else _NODE_BYTES for call in calls)
+
     try:
-        order = [*graphlib.TopologicalSorter(calls).static_order()]
-    except graphlib.CycleError as error:
-        name = str(error.args[1][0][1])[:60]
-        raise ModelError(f"ONNX file {path}: its function {name!r} calls itself") from None
-    sizes: dict[Any, tuple[int, int]] = {}  # nodes and bytes when written out
-    for key in order:
-        if key in functions:
-            inner = [sizes[call] for call in calls[key] if call in functions]
-            sizes[key] = (
-                len(calls[key]) + sum(count for count, _ in inner),
-                functions[key].ByteSize() + sum(size for _, size in inner),
-            )
-    called = [sizes[call] for call in _calls(model.graph) if call in functions]
-    nodes, size = (sum(some[part] for some in called) for part in (0, 1))
-    if nodes > MAX_NODES or size > MAX_BYTES:
+        too_large = size(model.graph) > _MAX_WRITTEN_OUT
+    except RecursionError:
+        raise ModelError(f"ONNX file {path}: its functions call each other without end") from None
+    if too_large:
         raise ModelError(
-            f"ONNX file {path}: its functions, written out, are more than {MAX_NODES:,} nodes or"
-            f" {MAX_BYTES / 1e6:,.0f} MB"
+            f"ONNX file {path}: its functions, written out, are more than"
+            f" {_MAX_WRITTEN_OUT / 1e6:,.0f} MB"
         )
     from onnx import inliner
 
     return inliner.inline_local_functions(model)
-
-
-def _calls(graph: Any) -> list[tuple[str, str, str]]:
-    """What the nodes of a graph or function are, by which a function may be called."""
-    return [(n.domain, n.op_type, getattr(n, "overload", "")) for n in _nodes(graph.node)]
 
 
 def _nodes(nodes: Iterable[Any]) -> Iterable[Any]:
@@ -77,37 +66,17 @@ def _nodes(nodes: Iterable[Any]) -> Iterable[Any]:
                 yield from _nodes(graph.node)
 
 
-_ALWAYS_ALLOWED = 1 << 24
-"""Elements of one constant."""
-
-_GROWTH = 4
-"""How many times the elements stored in the file one constant may have."""
-
-_CONSTANTS = 4
-"""How many constants of the largest size there may be."""
-
-_ELEMENTWISE = frozenset(
-    {
-        *("add", "sub", "rsub", "mul", "div", "true_divide", "floor_divide", "pow", "remainder"),
-        *("__add__", "__sub__", "__mul__", "__truediv__", "__pow__", "maximum", "minimum", "where"),
-        *("to", "float", "long", "clone", "contiguous", "clamp", "neg", "abs", "sqrt", "exp"),
-        *("reshape", "view", "permute", "transpose", "squeeze", "unsqueeze", "movedim"),
-    }
-)
-"""Functions whose result has the elements of their tensors broadcast together."""
-
-
-class FoldingBudget(TorchFunctionMode):
-    """Inside, an operation whose result is too large raises Unsupported instead of being run.
+class SizeLimit(TorchFunctionMode):
+    """Inside, an operation with a result of too many elements raises Unsupported without being run.
 
     Args:
-        stored: Number of elements that the file itself holds.
+        largest: Elements of one result.
+        in_all: Elements of all results together, or no limit.
     """
 
-    def __init__(self, stored: int) -> None:
+    def __init__(self, largest: int, in_all: float = math.inf) -> None:
         super().__init__()
-        self._largest = max(_ALWAYS_ALLOWED, _GROWTH * stored)
-        self._left = _CONSTANTS * self._largest
+        self._largest, self._left = largest, in_all
 
     def __torch_function__(
         self, func: Any, types: Any, args: Any = (), kwargs: dict[str, Any] | None = None
@@ -123,37 +92,29 @@ class FoldingBudget(TorchFunctionMode):
 
     def _refuse(self, elements: float) -> None:
         if elements > self._largest or self._left < 0:
-            raise Unsupported(f"a constant of {elements:.3g} elements")
+            raise Unsupported(f"a result of {elements:.3g} elements")
 
 
 def _elements_at_most(func: Any, args: Any, kwargs: dict[str, Any], largest: int) -> float:
     """An upper bound on the elements of the result.
 
-    The product of all sizes and numbers bounds most results; each factor is at least 2, so that it
-    bounds sums too, as of concatenation: a + b ≤ a·b for a, b ≥ 2. If it exceeds `largest`, the
-    shape is inferred on the meta device instead.
+    For most functions it is known. Elsewhere the product of all sizes and numbers bounds the
+    result; each factor is at least 2, so that it bounds sums too. If that exceeds `largest`, the
+    shape is inferred on the meta device, where nothing is allocated (its import takes a second).
     """
     name = getattr(func, "__name__", "")
     leaves = tree_flatten((args, kwargs))[0]
-    sizes = [leaf.shape for leaf in leaves if isinstance(leaf, Tensor)]
-    numbers = [abs(leaf) for leaf in leaves if isinstance(leaf, int | float)]
-    if name in _ELEMENTWISE and sizes:
-        return _broadcast(sizes)
-    bound: float = math.prod(max(2, size.numel()) for size in sizes)
-    bound *= math.prod(2 + number for number in numbers)
-    if bound <= largest and name != "arange":  # whose result is larger the smaller its step
+    shapes = [leaf.shape for leaf in leaves if isinstance(leaf, Tensor)]
+    known = _KNOWN.get(name)
+    if shapes and (known is not None or name in _ELEMENTWISE):
+        return known(*args, **kwargs) if known is not None else _broadcast(shapes)
+    if shapes and name in _NO_LARGER:
+        return shapes[0].numel()
+    bound: float = math.prod(max(2, shape.numel()) for shape in shapes)
+    bound *= math.prod(2 + abs(leaf) for leaf in leaves if isinstance(leaf, int | float))
+    # The result of arange is larger the smaller its step.
+    if bound <= largest and name != "arange":
         return bound
-    return _elements_on_meta(func, args, kwargs)
-
-
-def _broadcast(sizes: list[torch.Size]) -> int:
-    axes = max(map(len, sizes))
-    padded = [(*(1 for _ in range(axes - len(size))), *size) for size in sizes]
-    return math.prod(map(max, *padded)) if len(padded) > 1 else math.prod(padded[0])
-
-
-def _elements_on_meta(func: Any, args: Any, kwargs: dict[str, Any]) -> int:
-    """Elements of the largest result, found on the meta device, where nothing is allocated."""
     args, kwargs = tree_map_only(Tensor, _without_values, (args, kwargs))
     if kwargs.get("device") is not None:
         kwargs = {**kwargs, "device": "meta"}
@@ -163,6 +124,77 @@ def _elements_on_meta(func: Any, args: Any, kwargs: dict[str, Any]) -> int:
     except (RuntimeError, NotImplementedError):  # its size depends on values; it makes few of them
         return 0
     return max((part.numel() for part in _tensors_in(result)), default=0)
+
+
+_ELEMENTWISE = frozenset(
+    {
+        *("add", "sub", "rsub", "mul", "div", "true_divide", "floor_divide", "pow", "remainder"),
+        *("__add__", "__sub__", "__mul__", "__truediv__", "__pow__", "maximum", "minimum", "where"),
+        *("__radd__", "__rsub__", "__rmul__", "__rtruediv__", "fmod", "eq", "gt", "lt", "ge", "le"),
+    }
+)
+"""Functions whose result has the elements of their tensors broadcast together."""
+
+_NO_LARGER = frozenset(
+    {
+        *("relu", "sigmoid", "tanh", "erf", "exp", "log", "sqrt", "neg", "abs", "clamp", "softmax"),
+        *("leaky_relu", "elu", "hardswish", "gelu", "softplus", "batch_norm", "layer_norm"),
+        *("instance_norm", "group_norm", "mean", "sum", "amax", "amin", "square", "clone", "to"),
+        *("float", "long", "contiguous", "reshape", "view", "permute", "transpose", "squeeze"),
+        *(
+            "unsqueeze",
+            "movedim",
+            "split",
+            "pixel_shuffle",
+            "max_pool2d",
+            "max_pool2d_with_indices",
+        ),
+        *("boolean_dispatch", "_max_pool2d", "avg_pool2d", "detach", "cpu"),
+    }
+)
+"""Functions whose result is no larger than their first tensor."""
+
+
+def _broadcast(shapes: list[torch.Size]) -> int:
+    axes = max(map(len, shapes))
+    padded = [(*(1 for _ in range(axes - len(shape))), *shape) for shape in shapes]
+    sides: list[int] = [max(along) for along in zip(*padded, strict=True)]
+    return math.prod(sides)
+
+
+def _of_convolution(
+    x: Tensor, weight: Tensor, bias: Any, stride: Any, padding: list[int], *_: Any
+) -> int:
+    sides = [n + 2 * p for n, p in zip(x.shape[2:], padding, strict=True)]
+    return len(x) * len(weight) * math.prod(sides)
+
+
+def _of_transposed(x: Tensor, weight: Tensor, bias: Any, stride: list[int], *rest: Any) -> int:
+    *_, groups, dilation = rest
+    parts = zip(x.shape[2:], stride, weight.shape[2:], dilation, strict=True)
+    sides = [int(n * s + k * d) for n, s, k, d in parts]
+    return len(x) * weight.shape[1] * int(groups) * math.prod(sides)
+
+
+def _of_product(a: Tensor, b: Tensor) -> int:
+    if min(a.ndim, b.ndim) < 2:
+        return max(a.numel(), b.numel())
+    return _broadcast([a.shape[:-2], b.shape[:-2]]) * a.shape[-2] * b.shape[-1]
+
+
+_KNOWN: dict[str, Callable[..., int]] = {
+    **{f"conv{axes}d": _of_convolution for axes in (1, 2, 3)},
+    **{f"conv_transpose{axes}d": _of_transposed for axes in (1, 2, 3)},
+    **dict.fromkeys(("matmul", "__matmul__"), _of_product),
+    "interpolate": lambda x, size, **_: x.shape[:2].numel() * math.prod(size),
+    **dict.fromkeys(("cat", "stack"), lambda tensors, *_, **__: sum(map(torch.numel, tensors))),
+    "index_select": lambda x, axis, at: x.numel() // max(1, x.shape[axis]) * at.numel(),
+    "expand": lambda _, *sizes: math.prod(sizes[0] if len(sizes) == 1 else sizes),
+    "pad": lambda x, pads, **_: math.prod(
+        n + sum(pads[2 * at : 2 * at + 2]) for at, n in enumerate(reversed(x.shape))
+    ),
+}
+"""Elements of the results of functions that may be far larger than their tensors."""
 
 
 def _tensors_in(value: Any) -> list[Tensor]:

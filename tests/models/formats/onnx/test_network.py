@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import resource
-import time
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,12 +18,14 @@ from onnx import helper, numpy_helper
 
 from pnpdepth_cli.core.refine import RefineSettings, refine
 from pnpdepth_cli.core.split import Split
-from pnpdepth_cli.errors import LayerError, ModelError, UsageError
+from pnpdepth_cli.errors import ModelError, UsageError
 from pnpdepth_cli.models.aligned import AlignedDepth
+from pnpdepth_cli.models.formats.onnx.graph import OnnxGraph
 from pnpdepth_cli.models.formats.onnx.operators import OPERATORS
 from pnpdepth_cli.models.network import load_network
 from pnpdepth_cli.points import SparsePoints
 from tests.models.formats.onnx.onnx_files import write_network
+from tests.models.weights.files import little
 
 
 def image(*shape: int) -> torch.Tensor:
@@ -47,11 +46,6 @@ def test_layers_are_the_graphs_nodes_and_the_bottleneck_comes_first(tmp_path: Pa
                      "dec/sigmoid", "dec/scale", "dec/shift"]  # fmt: skip
     assert network.definition.layers[0] == "Relu_d"
     assert network.checkpoint == tmp_path / "net.onnx"
-
-
-def test_numbers_that_python_reads_are_no_weights_and_stay_on_the_cpu(tmp_path: Path) -> None:
-    module = load_network(str(write_network(tmp_path / "net.onnx")), None).module
-    assert all(p.ndim != 1 or "up" not in name for name, p in module.named_parameters())
 
 
 @pytest.mark.parametrize("channels_last", [False, True])
@@ -79,14 +73,14 @@ def test_fixed_and_free_input_sizes_agree_with_onnxruntime(
     assert "agrees with onnxruntime" in note
 
 
-def test_an_incorrect_conversion_is_refused_with_the_first_node_that_differs(
+def test_an_incorrect_conversion_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     right = OPERATORS["Resize"]
     monkeypatch.setitem(OPERATORS, "Resize", lambda node, options: right(node, options).flip(3))
     network = load_network(str(write_network(tmp_path / "net.onnx")), None)
     assert network.definition.verify is not None
-    with pytest.raises(ModelError, match=r"first node that differs is 'dec/up' \(OnnxNode\(Resize"):
+    with pytest.raises(ModelError, match="by torch differs from onnxruntime's by"):
         network.definition.verify(network.module, (image(1, 3, 32, 48),))
 
 
@@ -186,20 +180,6 @@ def test_a_checkpoint_beside_an_onnx_file_is_refused(tmp_path: Path) -> None:
     path = write_network(tmp_path / "net.onnx")
     with pytest.raises(UsageError, match="comes with its weights"):
         load_network(str(path), path)
-
-
-def test_an_unknown_node_is_refused_with_near_names(tmp_path: Path) -> None:
-    module = load_network(str(write_network(tmp_path / "net.onnx")), None).module
-    with pytest.raises(LayerError, match=r"dec/conv"):
-        Split(module, "dec/conb")
-
-
-def test_the_definition_can_be_changed_like_any_other(tmp_path: Path) -> None:
-    definition = load_network(str(write_network(tmp_path / "net.onnx")), None).definition
-    assert definition.default_alignment == "auto"
-    assert (
-        replace(definition, output_kind="depth", output_scale="metric").default_alignment == "none"
-    )
 
 
 def test_arithmetic_on_shapes_is_no_layer_and_leaves_the_cut_exact(tmp_path: Path) -> None:
@@ -318,11 +298,14 @@ def constant(name: str, values: Any) -> Any:
     return helper.make_node("Constant", [], [name], value=tensor)
 
 
+def size_of(*sides: int) -> Any:
+    return constant("n", list(sides))
+
+
 DOUBLING = [helper.make_node("Concat", [f"d{n}"] * 2, [f"d{n + 1}"], axis=0) for n in range(34)]
-BOMBS = {
+CONSTANT_BOMBS = {
     "ConstantOfShape": [
-        constant("n", [100_000, 100_000]),
-        helper.make_node("ConstantOfShape", ["n"], ["big"]),
+        size_of(100_000, 100_000), helper.make_node("ConstantOfShape", ["n"], ["big"]),
     ],
     "Range": [
         constant("n", 0), constant("m", 10**9), constant("k", 1),
@@ -338,31 +321,74 @@ BOMBS = {
         helper.make_node("MatMul", ["a1", "a2"], ["big"]),
     ],
     "Tile": [
-        constant("a1", [[1.0]]), constant("n", [100_000, 100_000]),
+        constant("a1", [[1.0]]), size_of(100_000, 100_000),
         helper.make_node("Tile", ["a1", "n"], ["big"]),
     ],
     "Pad": [
-        constant("a1", [1.0]), constant("n", [10**10, 0]),
-        helper.make_node("Pad", ["a1", "n"], ["big"]),
+        constant("a1", [1.0]), size_of(10**10, 0), helper.make_node("Pad", ["a1", "n"], ["big"]),
+    ],
+}  # fmt: skip
+NONE = [
+    constant("z", [0]), constant("o", [1]), constant("axis", [3]),
+    helper.make_node("Slice", ["depth", "z", "z", "axis"], ["none"]),
+]  # fmt: skip
+ACTIVATION_BOMBS = {
+    "Tile": [size_of(1, 1, 1000, 1000), helper.make_node("Tile", ["depth", "n"], ["big"])],
+    "Pad": [
+        size_of(0, 0, 0, 0, 0, 0, 10**4, 10**5), helper.make_node("Pad", ["depth", "n"], ["big"]),
+    ],
+    "Pad of nothing": [
+        *NONE, size_of(0, 0, 0, 0, 0, 0, 0, 10**9), helper.make_node("Pad", ["none", "n"], ["big"]),
+    ],
+    "Expand": [
+        size_of(10**6, 1, 32, 48), helper.make_node("Expand", ["depth", "n"], ["wide"]),
+        helper.make_node("Sigmoid", ["wide"], ["big"]),
+    ],
+    "Resize": [
+        constant("s", np.float32([1, 1, 1000, 1000])),
+        helper.make_node("Resize", ["depth", "", "s"], ["big"], mode="linear"),
+    ],
+    "MatMul": [
+        constant("n", [-1, 1]), constant("m", [1, -1]), constant("k", [1, 1, 1, 20]),
+        helper.make_node("Tile", ["depth", "k"], ["long"]),
+        helper.make_node("Reshape", ["long", "n"], ["a1"]),
+        helper.make_node("Reshape", ["long", "m"], ["a2"]),
+        helper.make_node("MatMul", ["a1", "a2"], ["big"]),
     ],
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("kind", BOMBS)
-def test_constants_far_larger_than_the_file_are_refused_before_allocation(
+@pytest.mark.parametrize("kind", [*CONSTANT_BOMBS, *(f"activation {k}" for k in ACTIVATION_BOMBS)])
+def test_what_is_far_larger_than_the_file_is_refused_before_allocation(
     kind: str, tmp_path: Path
 ) -> None:
+    bombs = CONSTANT_BOMBS | {f"activation {name}": b for name, b in ACTIVATION_BOMBS.items()}
     tail = [
         helper.make_node("ReduceSum", ["big"], ["small"], keepdims=0),
         helper.make_node("Cast", ["small"], ["number"], to=1),
         helper.make_node("Mul", ["depth", "number"], ["out"]),
     ]
-    path = write_network(tmp_path / "x.onnx", nodes=(*BOMBS[kind], *tail), outputs=("out",))
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    start = time.process_time()
-    assert "a constant of" in refused(path)
-    assert time.process_time() - start < 5
-    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 500_000  # kB
+    path = write_network(tmp_path / "x.onnx", nodes=(*bombs[kind], *tail), outputs=("out",))
+    with little(megabytes=500):
+        assert "a result of" in refused(path)
+
+
+def test_activations_that_are_needed_at_a_time_are_bounded_together(tmp_path: Path) -> None:
+    tiles = [
+        node
+        for n in range(6)
+        for node in (
+            constant(f"n{n}", [1, 1, 350, 350]),
+            helper.make_node("Tile", ["depth", f"n{n}"], [f"t{n}"]),
+            helper.make_node("ReduceSum", [f"t{n}"], [f"s{n}"], keepdims=0),
+        )
+    ]
+    last = helper.make_node("Sum", [*(f"t{n}" for n in range(6))], ["out"])
+    path = write_network(tmp_path / "x.onnx", nodes=(*tiles, last), outputs=("out",))
+    network = OnnxGraph(onnx.load(path), path)
+    assert network.input_names == ("rgb",)
+    with pytest.raises(ModelError, match="elements are needed at a time"):
+        network.to("meta")(image(1, 3, 32, 48).to("meta"))  # where nothing is allocated
 
 
 def with_functions(path: Path, calls: Callable[[int], list[str]], count: int) -> Path:
@@ -397,8 +423,7 @@ def test_functions_are_written_out_but_neither_recursive_nor_exponential_ones(
     plain = load_network(str(write_network(tmp_path / "net.onnx")), None)
     assert torch.equal(load_network(str(chain), None).module(x), plain.module(x))
     ring = with_functions(tmp_path / "b.onnx", lambda n: [f"f{1 - n}"], 2)
-    assert "calls itself" in refused(ring)
+    assert "without end" in refused(ring)
     doubling = lambda n: [f"f{n + 1}"] * 2 if n < 39 else []  # noqa: E731
-    start = time.process_time()
-    assert "written out" in refused(with_functions(tmp_path / "c.onnx", doubling, 40))
-    assert time.process_time() - start < 5
+    with little():
+        assert "written out" in refused(with_functions(tmp_path / "c.onnx", doubling, 40))

@@ -22,51 +22,18 @@ from pnpdepth_cli.models.formats.onnx.operators.table import (
     whole_numbers,
 )
 
-_UNARY: dict[str, Callable[[Tensor], Tensor]] = {
-    "Relu": torch.relu,
-    "Sigmoid": torch.sigmoid,
-    "Tanh": torch.tanh,
-    "Softplus": F.softplus,
-    "Softsign": F.softsign,
-    "HardSwish": F.hardswish,
-    "Mish": F.mish,
-    "Erf": torch.erf,
-    "Exp": torch.exp,
-    "Log": torch.log,
-    "Sqrt": torch.sqrt,
-    "Reciprocal": torch.reciprocal,
-    "Abs": torch.abs,
-    "Neg": torch.neg,
-    "Floor": torch.floor,
-    "Ceil": torch.ceil,
-    "Round": torch.round,
-    "Sign": torch.sign,
-    "Sin": torch.sin,
-    "Cos": torch.cos,
-    "Tan": torch.tan,
-    "Asin": torch.asin,
-    "Acos": torch.acos,
-    "Atan": torch.atan,
-    "Sinh": torch.sinh,
-    "Cosh": torch.cosh,
-    "Not": torch.logical_not,
-    "IsNaN": torch.isnan,
-    "Identity": lambda x: x.clone(),
-}
+_UNARY = (
+    *("Relu", "Sigmoid", "Tanh", "Erf", "Exp", "Log", "Sqrt", "Reciprocal", "Abs", "Neg", "Floor"),
+    *("Ceil", "Round", "Sign", "Sin", "Cos", "Tan", "Asin", "Acos", "Atan", "Sinh", "Cosh"),
+    *("IsNaN", "Softplus", "Softsign", "HardSwish", "Mish"),
+)
+"""Named as in torch, but for capitals."""
 
 _BINARY: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
-    "Add": torch.add,
-    "Sub": torch.sub,
-    "Mul": torch.mul,
-    "Equal": torch.eq,
-    "Greater": torch.gt,
-    "Less": torch.lt,
-    "GreaterOrEqual": torch.ge,
-    "LessOrEqual": torch.le,
-    "And": torch.logical_and,
-    "Or": torch.logical_or,
-    "Xor": torch.logical_xor,
-}
+    "Add": torch.add, "Sub": torch.sub, "Mul": torch.mul, "Equal": torch.eq, "Greater": torch.gt,
+    "Less": torch.lt, "GreaterOrEqual": torch.ge, "LessOrEqual": torch.le,
+    "And": torch.logical_and, "Or": torch.logical_or, "Xor": torch.logical_xor,
+}  # fmt: skip
 
 _FOLDED: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
     "Max": torch.maximum,
@@ -75,7 +42,8 @@ _FOLDED: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
 }
 
 
-def _unary(function: Callable[[Tensor], Tensor]) -> Operator:
+def _unary(name: str) -> Operator:
+    function = getattr(torch, name.lower(), None) or getattr(F, name.lower())
     return lambda _, inputs: function(inputs[0])
 
 
@@ -87,11 +55,13 @@ def _folded(function: Callable[[Tensor, Tensor], Tensor]) -> Operator:
     return lambda _, inputs: functools.reduce(function, inputs)
 
 
-register({name: _unary(function) for name, function in _UNARY.items()})
+register({name: _unary(name) for name in _UNARY})
 register({name: _binary(function) for name, function in _BINARY.items()})
 register({name: _folded(function) for name, function in _FOLDED.items()})
 register(
     {
+        "Identity": lambda _, i: i[0].clone(),
+        "Not": lambda _, i: torch.logical_not(i[0]),
         "Mean": lambda _, i: functools.reduce(torch.add, i) / len(i),
         "Mod": lambda node, i: (torch.fmod if node.get("fmod", 0) else torch.remainder)(i[0], i[1]),
         "Where": lambda _, i: torch.where(i[0], i[1], i[2]),
@@ -137,10 +107,8 @@ def power(node: Node, inputs: Inputs) -> Tensor:
 
 @operator("IsInf")
 def is_infinite(node: Node, inputs: Inputs) -> Tensor:
-    infinite = torch.zeros_like(inputs[0], dtype=torch.bool)
-    if node.get("detect_positive", 1):
-        infinite = infinite | torch.isposinf(inputs[0])
-    return infinite | torch.isneginf(inputs[0]) if node.get("detect_negative", 1) else infinite
+    above = torch.isposinf(inputs[0]) & bool(node.get("detect_positive", 1))
+    return above | (torch.isneginf(inputs[0]) & bool(node.get("detect_negative", 1)))
 
 
 @operator("Clip")
@@ -149,10 +117,10 @@ def clip(node: Node, inputs: Inputs) -> Tensor:
     high = optional(inputs, 2) if node.opset >= 11 else node.get("max")
     x: Tensor = inputs[0]
     # Two steps: if low > high, the standard's result is high; either may be left out.
-    x = x if low is None else torch.maximum(x, torch.as_tensor(low, dtype=x.dtype, device=x.device))
-    if high is None:
-        return x
-    return torch.minimum(x, torch.as_tensor(high, dtype=x.dtype, device=x.device))
+    for bound, function in ((low, torch.maximum), (high, torch.minimum)):
+        if bound is not None:
+            x = function(x, torch.as_tensor(bound, dtype=x.dtype, device=x.device))
+    return x
 
 
 @operator("PRelu")

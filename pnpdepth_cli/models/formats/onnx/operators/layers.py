@@ -44,9 +44,8 @@ def _pads(
     pads = []
     for n, k, s, d in zip(size, kernel, stride, dilation, strict=True):
         total = max(0, (math.ceil(n / s) - 1) * s + (k - 1) * d + 1 - n)
-        small, large = total // 2, total - total // 2
-        pads.append((small, large) if auto == "SAME_UPPER" else (large, small))
-    return pads
+        pads.append((total // 2, total - total // 2))
+    return pads if auto == "SAME_UPPER" else [(end, begin) for begin, end in pads]
 
 
 @operator("Conv")
@@ -84,17 +83,13 @@ def conv_transpose(node: Node, inputs: Inputs) -> Tensor:
 
 def _transposed_pads(node: Node, x: Tensor, stride: Sequence[int], full: Sequence[int]) -> Pads:
     auto, wanted = node.get("auto_pad", "NOTSET"), node.get("output_shape")
-    if wanted is None and not auto.startswith("SAME"):
-        return _pads(node, x.shape[2:], full, stride, stride)
     if wanted is None:
+        if not auto.startswith("SAME"):
+            return _pads(node, x.shape[2:], full, stride, stride)
         wanted = [n * s for n, s in zip(x.shape[2:], stride, strict=True)]
-    pads = []
-    for size, out in zip(full, wanted[-len(full) :], strict=True):
-        total = size - out
-        half = total // 2 if total > 0 else 0
-        rest = total - half
-        pads.append((half, rest) if auto == "SAME_UPPER" else (rest, half))
-    return pads
+    totals = [size - out for size, out in zip(full, wanted[-len(full) :], strict=True)]
+    pads = [(max(0, total) // 2, total - max(0, total) // 2) for total in totals]
+    return pads if auto == "SAME_UPPER" else [(end, begin) for begin, end in pads]
 
 
 def _pooled(node: Node, x: Tensor) -> tuple[list[int], list[int], list[int], Pads, Pads]:
@@ -148,12 +143,6 @@ register(
     {
         "GlobalAveragePool": lambda _, i: i[0].mean(list(range(2, i[0].ndim)), keepdim=True),
         "GlobalMaxPool": lambda _, i: i[0].amax(list(range(2, i[0].ndim)), keepdim=True),
-    }
-)
-
-
-register(
-    {
         "InstanceNormalization": lambda node, i: F.instance_norm(
             i[0], weight=i[1], bias=i[2], eps=node.get("epsilon", 1e-5)
         ),
@@ -186,13 +175,6 @@ def layer_norm(node: Node, inputs: Inputs) -> Tensor:
     return F.layer_norm(x, shape, weight.expand(shape), bias, node.get("epsilon", 1e-5))
 
 
-@operator("RMSNormalization")
-def rms_norm(node: Node, inputs: Inputs) -> Tensor:
-    x, weight = inputs
-    shape = list(x.shape[node.get("axis", -1) % x.ndim :])
-    return F.rms_norm(x, shape, weight.expand(shape), node.get("epsilon", 1e-5))
-
-
 @operator("GroupNormalization")
 def group_norm(node: Node, inputs: Inputs) -> Tensor:
     x, weight, bias = inputs
@@ -200,21 +182,6 @@ def group_norm(node: Node, inputs: Inputs) -> Tensor:
     if node.opset < 21:  # one weight per group
         weight, bias = (v.repeat_interleave(x.shape[1] // groups) for v in (weight, bias))
     return F.group_norm(x, groups, weight, bias, node.get("epsilon", 1e-5))
-
-
-@operator("LpNormalization")
-def lp_norm(node: Node, inputs: Inputs) -> Tensor:
-    x, axis, p = inputs[0], node.get("axis", -1), node.get("p", 2)
-    norm = x.norm(p, dim=axis, keepdim=True)
-    return torch.where(norm == 0, torch.zeros_like(x), x / norm)
-
-
-@operator("MeanVarianceNormalization")
-def mean_variance_norm(node: Node, inputs: Inputs) -> Tensor:
-    x, axes = inputs[0], list(node.get("axes", [0, 2, 3]))
-    centred = x - x.mean(axes, keepdim=True)
-    std: Tensor = centred.square().mean(axes, keepdim=True).sqrt()
-    return centred / (std + 1e-9)
 
 
 @operator("DequantizeLinear")

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
@@ -21,6 +22,18 @@ from pnpdepth_cli.models.formats.onnx.operators.table import (
     optional,
     whole_numbers,
 )
+
+
+@dataclass(frozen=True)
+class _Plan:
+    """How output coordinates map to the input, and how values are interpolated there."""
+
+    mode: str
+    coordinates: str
+    nearest: str
+    a: float = -0.75
+    exclude_outside: bool = False
+    antialias: bool = False
 
 
 @operator("Upsample", host=(1,))
@@ -53,46 +66,22 @@ def resize(node: Node, inputs: Inputs) -> Tensor:
     axes = [a % x.ndim for a in node.get("axes", range(x.ndim))]
     if given_sizes is not None and given_sizes.numel():
         sizes = dict(zip(axes, whole_numbers(given_sizes), strict=True))
-        policy, factors = node.get("keep_aspect_ratio_policy", "stretch"), {}
+        policy = node.get("keep_aspect_ratio_policy", "stretch")
+        factors = {a: n / x.shape[a] for a, n in sizes.items()}
         if policy != "stretch":
-            ratios = [sizes[a] / x.shape[a] for a in axes]
-            ratio = min(ratios) if policy == "not_larger" else max(ratios)
+            ratio = (min if policy == "not_larger" else max)(factors.values())
             sizes = {a: math.floor(ratio * x.shape[a] + 0.5) for a in axes}
             factors = dict.fromkeys(axes, ratio)
         wanted = [sizes.get(a, x.shape[a]) for a in range(x.ndim)]
-        return _resized(
-            x,
-            plan,
-            [factors[a] if a in factors else n / x.shape[a] for a, n in enumerate(wanted)],
-            wanted,
-        )
+        return _resized(x, plan, [factors.get(a, 1.0) for a in range(x.ndim)], wanted)
     if given_scales is None:
         raise Unsupported("neither scales nor sizes")
     factors = dict(zip(axes, given_scales.tolist(), strict=True))
     return _resized(x, plan, [factors.get(a, 1.0) for a in range(x.ndim)], None)
 
 
-class _Plan:
-    """How output coordinates map to the input, and how values are interpolated there."""
-
-    def __init__(
-        self,
-        mode: str,
-        coordinates: str,
-        nearest: str,
-        a: float = -0.75,
-        exclude_outside: bool = False,
-        antialias: bool = False,
-    ) -> None:
-        self.mode, self.coordinates, self.nearest = mode, coordinates, nearest
-        self.a, self.exclude_outside, self.antialias = a, exclude_outside, antialias
-
-
-def _resized(x: Tensor, plan: _Plan, scales: list[float] | None, sizes: list[int] | None) -> Tensor:
-    if sizes is None:
-        assert scales is not None
-        sizes = [math.floor(n * s) for n, s in zip(x.shape, scales, strict=True)]
-    factors = scales or [out / n for out, n in zip(sizes, x.shape, strict=True)]
+def _resized(x: Tensor, plan: _Plan, factors: list[float], sizes: list[int] | None) -> Tensor:
+    sizes = sizes or [math.floor(n * s) for n, s in zip(x.shape, factors, strict=True)]
     fast = _by_torch(x, plan, factors, sizes)
     if fast is not None:
         return fast

@@ -42,6 +42,10 @@ register(
         "Concat": lambda node, i: torch.cat(i, node.get("axis", 1)),
         "CastLike": lambda _, i: i[0].to(i[1].dtype),
         "Dropout": lambda _, i: i[0].clone(),
+        "Flatten": lambda node, i: i[0].reshape(math.prod(i[0].shape[: node.get("axis", 1)]), -1),
+        "GatherElements": lambda node, i: i[0].gather(
+            node.get("axis", 0), _from_start(i[1], i[0].shape[node.get("axis", 0)])
+        ),
     }
 )
 register(
@@ -63,14 +67,6 @@ def reshape(node: Node, inputs: Inputs) -> Tensor:
     if not node.get("allowzero", 0):
         wanted = [x.shape[i] if n == 0 else n for i, n in enumerate(wanted)]
     return x.reshape(wanted)
-
-
-@operator("Flatten")
-def flatten(node: Node, inputs: Inputs) -> Tensor:
-    x = inputs[0]
-    axis = node.get("axis", 1)
-    axis = axis + x.ndim if axis < 0 else axis
-    return x.reshape(math.prod(x.shape[:axis]), -1)
 
 
 @operator("Unsqueeze", host=(1,))
@@ -192,15 +188,16 @@ def number_range(node: Node, inputs: Inputs) -> Tensor:
 @operator("Slice", host=(1, 2, 3, 4))
 def slice_(node: Node, inputs: Inputs) -> Tensor:
     x = inputs[0]
-    if len(inputs) == 1:
-        starts, ends, axes, steps = node.get("starts"), node.get("ends"), node.get("axes"), None
-    else:
-        starts, ends = whole_numbers(inputs[1]), whole_numbers(inputs[2])
-        axes, steps = (
-            None if optional(inputs, n) is None else whole_numbers(inputs[n]) for n in (3, 4)
-        )
-    axes = axes if axes is not None else range(len(starts))
-    steps = steps if steps is not None else [1] * len(starts)
+    stated: list[list[int] | None] = [node.get(name) for name in ("starts", "ends", "axes")]
+    if len(inputs) > 1:
+        stated = [
+            None if (one := optional(inputs, n)) is None else whole_numbers(one)
+            for n in (1, 2, 3, 4)
+        ]
+    starts, ends, axes, steps = (*stated, None)[:4]
+    assert starts is not None
+    assert ends is not None
+    axes, steps = axes or [*range(len(starts))], steps or [1] * len(starts)
     for start, end, axis, step in zip(starts, ends, axes, steps, strict=True):
         size = x.shape[axis]
         kept = range(*slice(start, _backwards_end(end, size, step), step).indices(size))
@@ -218,18 +215,15 @@ def _backwards_end(end: int, size: int, step: int) -> int | None:
 
 @operator("Gather")
 def gather(node: Node, inputs: Inputs) -> Tensor:
-    x, index = inputs[0], inputs[1].long()
-    axis = node.get("axis", 0) % x.ndim
-    size = x.shape[axis]
-    flat = torch.where(index < 0, index + size, index).reshape(-1).to(x.device)
-    picked = x.index_select(axis, flat)
+    x, axis = inputs[0], node.get("axis", 0) % inputs[0].ndim
+    index = _from_start(inputs[1], x.shape[axis])
+    picked = x.index_select(axis, index.reshape(-1).to(x.device))
     return picked.reshape((*x.shape[:axis], *index.shape, *x.shape[axis + 1 :]))
 
 
-@operator("GatherElements")
-def gather_elements(node: Node, inputs: Inputs) -> Tensor:
-    x, index, axis = inputs[0], inputs[1].long(), node.get("axis", 0)
-    return x.gather(axis, torch.where(index < 0, index + x.shape[axis], index))
+def _from_start(index: Tensor, size: int) -> Tensor:
+    """The index with negative elements counted from the start, too."""
+    return torch.where(index < 0, index + size, index).long()
 
 
 @operator("GatherND")
@@ -251,16 +245,8 @@ def scatter_nd(node: Node, inputs: Inputs) -> Tensor:
 def scatter_elements(node: Node, inputs: Inputs) -> Tensor:
     if node.get("reduction", "none") != "none":
         raise Unsupported(f"reduction {node.get('reduction')}")
-    x, index, axis = inputs[0], inputs[1].long(), node.get("axis", 0)
-    return x.scatter(axis, torch.where(index < 0, index + x.shape[axis], index), inputs[2])
-
-
-@operator("OneHot", host=(1,))
-def one_hot(node: Node, inputs: Inputs) -> Tensor:
-    index, count, values = inputs[0].long(), whole_numbers(inputs[1])[0], inputs[2]
-    hot = F.one_hot(index.remainder(count), count).bool()
-    axis = node.get("axis", -1)
-    return torch.where(hot, values[1], values[0]).movedim(-1, axis)
+    x, axis = inputs[0], node.get("axis", 0)
+    return x.scatter(axis, _from_start(inputs[1], x.shape[axis]), inputs[2])
 
 
 @operator("TopK", host=(1,))
