@@ -63,7 +63,7 @@ def is_unchanged(path: Path, known: Fingerprint, listing: Listing | None = None)
     """
     try:
         if isinstance(path, RemotePath):
-            status = (listing or Listing()).status(path)
+            status = status_of(path) if listing is None else listing.status(path)
             if status is None or status.version:
                 return status is not None and status.version == known.version
             with local_files([path]) as copies:

@@ -50,7 +50,7 @@ class ResultFrame:
         entry = _entry(self.record, "camera")
         try:
             return FrameCamera.of_record(entry) if entry else None
-        except (KeyError, ValueError, TypeError) as error:
+        except (KeyError, ValueError, TypeError, OverflowError) as error:
             raise FileFormatError(
                 f"{self.depth}: the camera in the record beside it is damaged; refine it again"
             ) from error

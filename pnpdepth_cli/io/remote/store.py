@@ -101,10 +101,11 @@ def local_files(paths: Iterable[Path]) -> Iterator[dict[Path, Path]]:
         yield {}
         return
     with tempfile.TemporaryDirectory(prefix="pnpdepth-") as folder:
-        copies = {path: Path(folder, str(n), path.name) for n, path in enumerate(wanted)}
-        for path in wanted:
+        copies = dict[Path, Path]()
+        for number, path in enumerate(wanted):
+            copies[path] = Path(folder, str(number), path.name)
             _download(path, copies[path])
-        yield dict(copies)
+        yield copies
 
 
 def renamed(value: Any, names: Mapping[str, str]) -> Any:
@@ -140,7 +141,7 @@ def _listed(folder: Path) -> Mapping[str, Status | None]:
     """The names in a folder; none if there is no such folder. Raises as `status_of`."""
     try:
         if not isinstance(folder, RemotePath):
-            return dict.fromkeys(os.listdir(folder))
+            return dict.fromkeys(entry.name for entry in os.scandir(folder))
         infos = _call(folder, "ls", detail=True)
     except (FileNotFoundError, _MissingError):
         return {}
@@ -196,9 +197,7 @@ def _file_system(scheme: str) -> Any:
         raise UsageError(f"{scheme}:// needs fsspec and {package}: {install}") from None
 
 
-def _call(
-    path: RemotePath, method: str, *more: Any, writing: bool = False, **options: Any
-) -> Any:
+def _call(path: RemotePath, method: str, *more: Any, writing: bool = False, **options: Any) -> Any:
     with _errors_of(path, writing=writing):
         call = getattr(_file_system(_scheme(path)), method)
         return call(str(path) + path.query, *more, **options)

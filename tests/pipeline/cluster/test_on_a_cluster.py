@@ -17,8 +17,8 @@ import pytest
 
 from pnpdepth_cli.errors import ClusterError
 from pnpdepth_cli.pipeline.batch import ray_workers
+from pnpdepth_cli.pipeline.batch.request import ClusterOptions
 from pnpdepth_cli.pipeline.batch.state import remove_all_leftovers
-from pnpdepth_cli.pipeline.cluster.options import ClusterOptions
 from tests.pipeline.batches import (
     RecordingListener,
     add_frame,
@@ -119,7 +119,7 @@ def test_a_killed_driver_is_resumed(cluster: Any, root: Path) -> None:
     program = (
         "import sys; from pathlib import Path\n"
         "from tests.pipeline.batches import RecordingListener, batch\n"
-        "from pnpdepth_cli.pipeline.cluster.options import ClusterOptions\n"
+        "from pnpdepth_cli.pipeline.batch.request import ClusterOptions\n"
         "class Telling(RecordingListener):\n"
         "    def frame(self, row): print(row['name'], flush=True)\n"
         "options = ClusterOptions(ray=sys.argv[2], ray_workers=1)\n"

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from pnpdepth_cli.io.remote.address import path_of
-from pnpdepth_cli.pipeline.cluster.options import LOCAL, ClusterOptions
+from pnpdepth_cli.pipeline.batch.request import LOCAL, ClusterOptions
 from tests.pipeline.batches import NAMES, RecordingListener, batch, pairs_on_disk, results
 from tests.stores import Bucket, s3_server
 
