@@ -30,8 +30,7 @@ import psutil
 
 from benchmarks.batch import make_frames
 from pnpdepth_cli.pipeline.batch.batch import run_batch
-from pnpdepth_cli.pipeline.batch.request import BatchRequest
-from pnpdepth_cli.pipeline.batch.request import LOCAL, ClusterOptions
+from pnpdepth_cli.pipeline.batch.request import LOCAL, BatchRequest, ClusterOptions
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest
 from pnpdepth_cli.sensors import SamplePattern
 

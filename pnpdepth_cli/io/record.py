@@ -18,11 +18,7 @@ from pnpdepth_cli.io.file_bytes import cannot_read, one_line, read_bytes, size_o
 
 
 def write_json(path: Path, mapping: Mapping[str, Any]) -> None:
-    """Writes the mapping as indented JSON in its own order; NaN and infinity become null.
-
-    Raises:
-        OutputError: The file cannot be written.
-    """
+    """Writes the mapping as indented JSON in its own order; NaN and infinity become null."""
     text = json.dumps(plain(mapping), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
     with atomic_path(path) as temporary:
         # A file name that is not UTF-8 has surrogates, which JSON spells as \udcff.

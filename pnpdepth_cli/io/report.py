@@ -150,7 +150,7 @@ def begin_report(folder: Path, made_of: Mapping[str, Any]) -> Path:
 
 @contextmanager
 def whole_report(folder: Path) -> Iterator[Path]:
-    """Yields a folder for a report that replaces the one in `folder`; if it fails, that one stays."""
+    """Yields a folder for a report that replaces the one in `folder`, which stays if it fails."""
     remove_report_leftovers(folder)
     with atomic_folder(folder) as temporary:
         yield temporary

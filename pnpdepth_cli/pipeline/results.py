@@ -57,10 +57,7 @@ class ResultFrame:
 
 
 def result_frames(root: Path) -> list[ResultFrame]:
-    """Returns the frame of a depth file, or those of a folder in the order of their names.
-
-    Args:
-        root: A depth file, or a folder with files NAME_depth.SUFFIX.
+    """Returns the frame of a depth file, or those of a folder with files NAME_depth.SUFFIX.
 
     Raises:
         InputError: There is none, or a record cannot be read.

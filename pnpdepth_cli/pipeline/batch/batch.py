@@ -100,8 +100,6 @@ def run_batch(
         batch.state.mark()
         if batch.report is not None:
             batch.report.begin()
-        for row in batch.refused_rows():
-            listener.frame(row)
         began, refined, start = 0, 0, time.perf_counter()
         seconds = Counter[str]()
         if to_do:
@@ -122,10 +120,7 @@ def run_batch(
 def plan_batch(request: BatchRequest, say: Callable[[str], None]) -> list[Planned]:
     """Returns the frames that `run_batch` would do, and why; nothing is written."""
     batch = _Batch(request, say)
-    planned = [Planned(frame.name, why) for frame, why in batch.to_do(check=False)]
-    for frame, why in batch.found.refused:
-        say(f"failed: {frame.name}: {why}")
-    return planned
+    return [Planned(frame.name, why) for frame, why in batch.to_do(check=False)]
 
 
 class _Batch:
@@ -193,6 +188,8 @@ class _Batch:
         if request.shard is not None:
             number, of = request.shard
             yield f"shard {number}/{of}: {_count(len(self.found.chosen), 'frame')} of them"
+        for frame, why in self.found.refused:
+            yield f"failed: {frame.name}: {why}"
         for each in unmatched[:_MAX_LISTED]:
             yield f"warning: {each}"
         if (more := len(unmatched) - _MAX_LISTED) > 0:
@@ -277,16 +274,13 @@ class _Batch:
                 task = task_of(self.request, by_name[each.name])
                 yield replace(task, written=task.name in names)
 
-    def refused_rows(self) -> list[Row]:
-        """Returns the rows of the frames whose results have no files of their own."""
-        return [failed_row(frame.name, {}, why) for frame, why in self.found.refused]
-
     def summarise(self, local: Path, profile: dict[str, Any]) -> dict[str, Any]:
         """Writes the summaries and the report; returns the summary without its frames."""
         request, state, tally = self.request, self._new_state(), Tally()
+        refused = (failed_row(frame.name, {}, why) for frame, why in self.found.refused)
         known = _read_in_parts(lambda frame: state.row(task_of(request, frame)), self.found.frames)
         with tempfile.TemporaryFile("w+", dir=local, encoding="utf-8") as file:
-            for row in itertools.chain(self.refused_rows(), known):
+            for row in itertools.chain(refused, known):
                 if row is not None:
                     tally.add(row)
                     file.write(json.dumps(row) + "\n")

@@ -19,9 +19,8 @@ from pnpdepth_cli.errors import InputError, LayerError, ModelError, OutputError,
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.pipeline.batch import reading as batch_reading
 from pnpdepth_cli.pipeline.batch import running as batch_running
-from pnpdepth_cli.pipeline.batch.batch import plan_batch
+from pnpdepth_cli.pipeline.batch.batch import plan_batch, run_batch
 from pnpdepth_cli.pipeline.batch.request import BatchRequest
-from pnpdepth_cli.pipeline.batch.settings import SettingsDigests, settings_digest
 from pnpdepth_cli.pipeline.batch.summary import _SCORES, Tally
 from pnpdepth_cli.pipeline.refinement.inputs import read_inputs
 from pnpdepth_cli.pipeline.refinement.refine import refine_image
@@ -357,14 +356,40 @@ def test_a_summary_that_no_batch_made_is_not_replaced(name: str, root: Path) -> 
     assert (root / "out" / name).read_text() != "mine"
 
 
-def test_a_name_that_leads_elsewhere_or_to_the_summary_is_left_out(root: Path) -> None:
-    rows = [f"rgb/{n}.png,sparse/{n}.png,{m}" for n, m in
-            (("a", "../up"), ("b", "summary"), ("c", "/c"), ("d", "fine"))]  # fmt: skip
-    (root / "list.csv").write_text("\n".join(["image,sparse,name", *rows]))
-    outcome = batch(root, source=root / "list.csv")
-    assert outcome.summary["counts"]["frames"] == 1
-    assert len(outcome.summary["unmatched"]) == 3
+@pytest.mark.parametrize(
+    ("name", "why"),
+    [
+        ("../up", "leads out of the output folder"),
+        ("/up", "leads out of the output folder"),
+        ("summary", "needs a file of the batch's own"),
+        ("summary.csv/x", "needs a file of the batch's own"),
+        (".batch.lock/x", "needs a file of the batch's own"),
+        ("fine\u0301", "is that of another frame"),
+        ("ok_depth.png/x", "needs a file of frame 'ok'"),
+        ("ok.json/deep/x", "needs a file of frame 'ok'"),
+        ("ok_sigma", "needs a file of frame 'ok'"),
+    ],
+)
+def test_a_name_without_files_of_its_own_is_a_failed_frame_in_plan_and_run(
+    root: Path, name: str, why: str
+) -> None:
+    names = ("ok", "fin\u00e9", name)
+    rows = [f'rgb/a.png,sparse/a.png,"{each}"' for each in names]
+    (root / "list.csv").write_text("\n".join(["image,sparse,name", *rows]), encoding="utf-8")
+    request = BatchRequest(
+        source=root / "list.csv",
+        output=root / "out",
+        refine=refinement(root, uncertainty=True, iterations=0),
+    )
+    said: list[str] = []
+    assert [each.name for each in plan_batch(request, said.append)] == ["ok", "fin\u00e9"]
+    assert sum(f"{why}; rename it" in line for line in said) == 1
+    listener = RecordingListener()
+    counts = run_batch(request, listener).summary["counts"]
+    assert (counts["frames"], counts["done"], counts["failed"], counts["pending"]) == (3, 2, 1, 0)
+    assert [row["status"] for row in listener.rows] == ["done", "done"]
     assert not (root / "up_depth.png").exists()
+    assert {row["name"]: row["message"] for row in summary(root)["frames"]}[name].count(why) == 1
 
 
 def test_a_listed_file_that_is_not_there_is_a_failed_frame(root: Path) -> None:
@@ -625,19 +650,3 @@ def test_a_formula_as_a_name_is_text_in_the_summary(tmp_path: Path) -> None:
     batch(root)
     with (root / "out/summary.csv").open(newline="") as file:
         assert [row["name"] for row in csv.DictReader(file)] == ["'=1+1", "'@b"]
-
-
-def test_digests_of_consecutive_frames_are_those_of_each_alone(root: Path) -> None:
-    base = refinement(root)
-    requests = [
-        base.with_fields(image=Path("a.png")),
-        base.with_fields(image=Path("b.png")),
-        base.with_fields(gt_scale=5.0),
-        base.with_fields(iterations=3),
-        base.with_fields(scan=ScanOptions(camera=3, calib=Path("c.txt"))),
-        base.with_fields(scan=ScanOptions(camera=2)),
-    ]
-    digests = SettingsDigests({"model": "m"})
-    known = [digests.of(each) for each in requests]
-    assert known == [settings_digest(each, {"model": "m"}) for each in requests]
-    assert len(set(known)) == 5

@@ -71,7 +71,8 @@ def results(
     to_do: Any = range(count)
     given = list(
         rows_of_actors(
-            Calls(), [actor(refine, starts) for _ in range(3)], to_do, worked=worked, say=messages.append,
+            Calls(), [actor(refine, starts) for _ in range(3)], to_do,
+            worked=worked, say=messages.append,
             lost=lambda frame, why: {"name": frame, "status": "failed", "message": why},
             **{"stopped": lambda: False, "retries": 2} | options,
         )
