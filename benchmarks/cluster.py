@@ -209,7 +209,7 @@ class LosingANode(Quiet):
 
 def nodes(source: Path, frames: int, model: str) -> dict[str, Any]:
     """Whether results of three nodes, one of which is lost, equal those of one process."""
-    from tests.pipeline.cluster.nodes import three_nodes
+    from tests.pipeline.batch.ray_nodes import three_nodes
 
     with tempfile.TemporaryDirectory() as temporary:
         out = Path(temporary) / "out"

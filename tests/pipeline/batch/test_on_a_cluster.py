@@ -19,6 +19,7 @@ from pnpdepth_cli.errors import ClusterError
 from pnpdepth_cli.pipeline.batch import ray_workers
 from pnpdepth_cli.pipeline.batch.request import ClusterOptions
 from pnpdepth_cli.pipeline.batch.state import remove_all_leftovers
+from tests.pipeline.batch.ray_nodes import three_nodes
 from tests.pipeline.batches import (
     RecordingListener,
     add_frame,
@@ -26,7 +27,6 @@ from tests.pipeline.batches import (
     pairs_on_disk,
     results,
 )
-from tests.pipeline.cluster.nodes import three_nodes
 
 pytest.importorskip("ray")
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="nodes are addresses of loopback")
