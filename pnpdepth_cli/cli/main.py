@@ -15,6 +15,7 @@ import click
 
 from pnpdepth_cli import __version__
 from pnpdepth_cli.cli.printable import printable, shortened
+from pnpdepth_cli.cli.streams import INTERRUPTED, StdoutError, drop_stdout, guard_streams
 from pnpdepth_cli.errors import DeviceError, InputError, ModelError, OutputError, PnpDepthError
 
 _EXIT_CODES = """\b

@@ -296,7 +296,7 @@ def _with_own_files(
     """
     endings = [path.name for path in Outputs.in_folder(Path(), "", refine).paths()]
     pairs = itertools.permutations(endings, 2)
-    between = {one.removesuffix(two) for one, two in pairs if one.endswith(two)}
+    between = tuple({one.removesuffix(two) for one, two in pairs if one.endswith(two)})
     of_summary = {own.removesuffix(each) for own in (CSV, JSON) for each in endings}
     names, seen = {_normalised(frame.name) for frame in frames}, set[str]()
 
@@ -308,6 +308,8 @@ def _with_own_files(
         top, slash, _ = name.partition("/")
         if name in of_summary or (slash and (top in (CSV, JSON) or fnmatch(top, LOCKS))):
             return "needs a file of the batch's own"
+        if not slash and not name.endswith(between):
+            return None
         folders = [str(parent) for parent in PurePosixPath(name).parents] if slash else []
         clashes = itertools.product([name], between), itertools.product(folders, endings)
         for path, ending in itertools.chain(*clashes):

@@ -164,7 +164,8 @@ def _basis(row: Row) -> str | None:
 
 def _columns(measured: bool, unit: str) -> list[Column]:
     """Errors before and after; with gains if any frame has ground truth or held-out points."""
-    columns, percent = [], {"decimals": 1, "percent": True, "higher_is_better": True}
+    columns = []
+    percent: dict[str, Any] = {"decimals": 1, "percent": True, "higher_is_better": True}
     for key, measure in _ERRORS.items():
         if measured:
             title = f"{measure.title} gain"

@@ -523,7 +523,7 @@ def test_numbers_that_make_no_sense_are_refused(root: Path, changes: dict[str, A
 def test_only_a_few_frames_are_in_memory_at_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, batch_size: int, most_allowed: int
 ) -> None:
-    root = pairs_on_disk(tmp_path / "drive", tuple(f"{i:02}" for i in range(24)), gt=False)
+    root = pairs_on_disk(tmp_path / "drive", tuple(f"{i:02}" for i in range(16)), gt=False)
     alive: weakref.WeakSet[Any] = weakref.WeakSet()
     most = 0
 
