@@ -197,8 +197,12 @@ def test_a_lens_that_nerfstudio_does_not_know_is_refused_and_nothing_is_written(
 
 
 NO_CAMERA: dict[str, Any] = {
-    "intrinsics": np.eye(3).tolist(), "lens": "radial-tangential", "distortion": [], "pose": None, "source": "x",
-}  # fmt: skip
+    "intrinsics": np.eye(3).tolist(),
+    "lens": "radial-tangential",
+    "distortion": [],
+    "pose": None,
+    "source": "x",
+}
 BAD_CAMERAS: list[dict[str, Any]] = [
     {"intrinsics": [[10**400, 0, 0], [0, 1, 0], [0, 0, 1]]},
     {"pose": [[10**400, 0, 0, 0]] * 3},

@@ -141,21 +141,8 @@ def rows_of_workers(
     """Refines and writes the frames on Ray workers; yields the rows as they are done.
 
     A frame whose worker dies is refined by another one. One whose worker dies again and again is
-    reported as failed.
-
-    Args:
-        request: How, on one device.
-        workers: Which workers.
-        references: The frames that decide what the network leaves open.
-        to_do: The frames to refine.
-        state: Records frames that fail.
-        settings_worked: True if a frame was refined with these settings before.
-        say: Receives notes.
-        stopped: True if nothing more is to be handed out.
-
-    Raises:
-        PnpDepthError: As of `refine_tasks`.
-        ClusterError: The cluster cannot be used.
+    reported as failed. Arguments and errors are as of `refine_tasks`, with ClusterError if the
+    cluster cannot be used.
     """
     shared = [request.source]
     if not isinstance(request.output, RemotePath):

@@ -232,14 +232,7 @@ def _refine(group: Sequence[FrameInMemory], network: OpenNetwork | None) -> None
 
 
 class OpenNetwork:
-    """Refines frames of one size, several together where the user asks for it.
-
-    Args:
-        refiner: The network and its settings.
-        opened: The refiner's networks, open.
-        batch_size: How many frames go together.
-        say: Receives notes.
-    """
+    """Refines frames of one size, several together where the user asks for it."""
 
     def __init__(
         self, refiner: Refiner, opened: Opened, batch_size: int, say: Callable[[str], None]

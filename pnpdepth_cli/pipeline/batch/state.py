@@ -144,9 +144,6 @@ class BatchState:
             task: The frame.
             inputs: What identifies its files, by part.
             write: Writes all but the record to the paths that it is given.
-
-        Raises:
-            OutputError: A file cannot be written.
         """
         planned = task.outputs.by_kind()
         with _staged(task.outputs, self.output) as stage:

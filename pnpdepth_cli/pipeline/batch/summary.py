@@ -35,14 +35,7 @@ _EFFECTIVE = ("layer", "iterations", "lr", "step", "loss", "update", "align")
 def row_of(
     name: str, inputs: Mapping[str, str], record: Mapping[str, Any], outputs: Mapping[str, str]
 ) -> dict[str, Any]:
-    """Returns the summary's row of a refined frame.
-
-    Args:
-        name: The frame's name.
-        inputs: Its files by part.
-        record: The refinement's record.
-        outputs: Its results by kind, as paths in the output folder.
-    """
+    """Returns the summary's row of a refined frame, from its files and record."""
     unsure = [note for note in record["notes"] if ", unsure (" in note]
     return {
         "name": name,
@@ -196,11 +189,6 @@ def profile_of(seconds: Mapping[str, float], frames: int, wall_s: float) -> dict
     """Returns where the time of a run went: {"frames": 24, "seconds": {"read": …, "wall": …}, …}.
 
     Reading and writing run beside the network, so their seconds do not add up to the wall time.
-
-    Args:
-        seconds: Of all refined frames, by stage.
-        frames: Their number.
-        wall_s: From the first frame's start to the end of the last.
     """
     stages = {stage: round(seconds.get(stage, 0.0), 4) for stage in _RUN_STAGES}
     return {
@@ -219,11 +207,7 @@ def write_summaries(
 ) -> None:
     """Writes `summary.json`, the head with the rows as its list `frames`, and `summary.csv`.
 
-    Args:
-        folder: Where they are written.
-        head: The summary without its frames.
-        rows: The rows, of JSON's own types.
-        baselines: Names of baselines, whose errors make the last columns of the table.
+    The errors of the baselines make the last columns of the table.
     """
     text = json.dumps(plain(head), indent=2, ensure_ascii=False, allow_nan=False)
     with (
