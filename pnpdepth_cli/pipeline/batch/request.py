@@ -69,9 +69,9 @@ class SequenceOptions:
 
     def __post_init__(self) -> None:
         if self.accumulate < 0:
-            raise UsageError(f"--accumulate {self.accumulate}: give a number of frames, 0 or more")
+            raise UsageError(f"--accumulate must be 0 or more, got {self.accumulate}")
         if self.warm_start < 0 or self.warm_start == 1:
-            raise UsageError(f"--warm-start {self.warm_start}: give a window of 2 frames or more")
+            raise UsageError(f"--warm-start must be a window of 2 or more, got {self.warm_start}")
         if self.poses is not None and not self.accumulate:
             raise UsageError("--poses is for --accumulate; give --accumulate 2, say")
 
@@ -157,15 +157,15 @@ class BatchRequest(FrameSelection):
 
         if self.html_3d and self.html is None:
             raise UsageError("--html-3d adds to the report; name its folder with --html")
-        if self.workers < 1:
-            raise UsageError(f"workers {self.workers}: at least one thread has to read")
-        if self.batch_size < 1:
-            raise UsageError(f"batch size {self.batch_size}: give 1 or more frames")
-        if self.limit is not None and self.limit < 1:
-            raise UsageError(f"limit {self.limit}: give the number of frames to do, 1 or more")
+        counts = {"workers": self.workers, "batch-size": self.batch_size, "limit": self.limit}
+        for name, count in counts.items():
+            if count is not None and count < 1:
+                raise UsageError(f"--{name} must be 1 or more, got {count}")
         if self.shard is not None and not 1 <= self.shard[0] <= self.shard[1]:
             number, of = self.shard
-            raise UsageError(f"shard {number}/{of}: give I/N with I from 1 to N, such as 1/4")
+            raise UsageError(
+                f"--shard must be I/N with I from 1 to N, such as 1/4, got {number}/{of}"
+            )
         if self.protocol is not None:
             find_protocol(self.protocol)
 

@@ -285,9 +285,9 @@ def _means(basis: str, mean: Mapping[str, Any], unit: str) -> Table:
     rows = []
     for measure in measures:
         before, after = (mean[stage].get(measure.key) for stage in ("before", "after"))
-        title = column_title(in_unit(measure, unit))
         values = [format_value(measure, before), format_value(measure, after)]
-        rows.append([title, *values, _gain_text(measure, before, after)])
+        change = _gain_text(measure, before, after)
+        rows.append([column_title(in_unit(measure, unit)), *values, change])
     if basis == _GT:
         coverage = [mean[stage].get("coverage") for stage in ("before", "after")]
         shares = ["–" if value is None else f"{value:.2%}" for value in coverage]
@@ -304,17 +304,12 @@ def _baselines(mean: Mapping[str, Mapping[str, Any]] | None, unit: str) -> list[
     """A table of the simple baselines, the network and the result; empty without --baselines."""
     if not mean:
         return []
-    mae = _ERRORS["mae"]
-    errors = {
-        "held_out_mae": f"MAE at held-out points [{unit}]",
-        "mae": f"MAE [{unit}]",
-        "rmse": f"RMSE [{unit}]",
-    }
+    places = {"held_out_mae": "MAE at held-out points", "mae": "MAE", "rmse": "RMSE"}
     rows = [
-        [name, *(format_value(mae, row[key]) for key in errors), f"{row['frames']:,}"]
+        [name, *(format_value(_ERRORS["mae"], row[key]) for key in places), f"{row['frames']:,}"]
         for name, row in mean.items()
     ]
-    header = ["", *errors.values(), "frames"]
+    header = ["", *(f"{title} [{unit}]" for title in places.values()), "frames"]
     return [Table(caption="Simple baselines: means over frames", header=header, rows=rows)]
 
 

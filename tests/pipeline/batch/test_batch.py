@@ -625,3 +625,15 @@ def test_a_formula_as_a_name_is_text_in_the_summary(tmp_path: Path) -> None:
     batch(root)
     with (root / "out/summary.csv").open(newline="") as file:
         assert [row["name"] for row in csv.DictReader(file)] == ["'=1+1", "'@b"]
+
+
+def test_an_unsure_guess_of_the_input_range_is_repeated_at_the_end(root: Path) -> None:
+    batch(root, limit=2)
+    note = "input: rgb range 'unit', unsure (error after alignment: unit 9.0%, imagenet 9.1%)"
+    for name in "ab":
+        path = root / "out" / f"{name}.json"
+        record = json.loads(path.read_text())
+        path.write_text(json.dumps(record | {"notes": [*record["notes"], note]}))
+    listener = RecordingListener()
+    assert batch(root, listener, limit=2).summary["unsure"] == [note]
+    assert listener.messages[-1] == f"warning: {note}"
