@@ -54,19 +54,13 @@ def status_of(path: RemotePath) -> Status | None:
         InputError: It may not be read.
         StorageError: The store cannot be reached.
     """
-    try:
-        info = _call(path, "info")
-    except _MissingError:
-        return None
-    return None if info.get("type") == "directory" else _status(info)
+    info = _call_if_there(path, "info")
+    return None if info is None or info.get("type") == "directory" else _status(info)
 
 
 def read_object(path: RemotePath) -> bytes | None:
     """Returns the content of a small object; None if there is none. Raises as `status_of`."""
-    try:
-        data: bytes = _call(path, "cat_file")
-    except _MissingError:
-        return None
+    data: bytes | None = _call_if_there(path, "cat_file")
     return data
 
 
@@ -139,14 +133,14 @@ class Listing:
 
 def _listed(folder: Path) -> Mapping[str, Status | None]:
     """The names in a folder; none if there is no such folder. Raises as `status_of`."""
-    try:
-        if not isinstance(folder, RemotePath):
+    if not isinstance(folder, RemotePath):
+        try:
             return dict.fromkeys(entry.name for entry in os.scandir(folder))
-        infos = _call(folder, "ls", detail=True)
-    except (FileNotFoundError, _MissingError):
-        return {}
-    except OSError as error:
-        raise cannot_read(folder, error) from error
+        except FileNotFoundError:
+            return {}
+        except OSError as error:
+            raise cannot_read(folder, error) from error
+    infos = _call_if_there(folder, "ls", detail=True) or ()
     files = (info for info in infos if info.get("type") != "directory")
     return {info["name"].rpartition("/")[2]: _status(info) for info in files}
 
@@ -201,6 +195,13 @@ def _call(path: RemotePath, method: str, *more: Any, writing: bool = False, **op
     with _errors_of(path, writing=writing):
         call = getattr(_file_system(_scheme(path)), method)
         return call(str(path) + path.query, *more, **options)
+
+
+def _call_if_there(path: RemotePath, method: str, **options: Any) -> Any:
+    try:
+        return _call(path, method, **options)
+    except _MissingError:
+        return None
 
 
 def _scheme(path: RemotePath) -> str:

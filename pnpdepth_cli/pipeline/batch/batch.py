@@ -150,7 +150,7 @@ class _Batch:
 
     def _new_state(self) -> BatchState:
         """The state as it is now; what changes later in a folder is not seen."""
-        return BatchState(self.request.output, self.request.refine, self.model)
+        return BatchState(self.request.output, self.model)
 
     def _report(self) -> BatchReport | None:
         """The report, if one is wanted. OutputError if it cannot or may not be written there."""

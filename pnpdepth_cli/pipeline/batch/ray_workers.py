@@ -69,8 +69,8 @@ class Job(NamedTuple):
     request: BatchRequest
     references: References | None
     """The frames that decide what the network leaves open; None if no frame can be read."""
-    state: tuple[Any, ...]
-    """Arguments of the `BatchState`."""
+    model: dict[str, Any]
+    """The network's `model_identity`."""
     folder: str
     """The driver's working folder, which relative paths start from."""
     versions: dict[str, str]
@@ -99,7 +99,7 @@ class Worker:
         cv2.setNumThreads(job.threads)
         set_max_pixels(job.max_pixels)
         self._job = job
-        self._state = BatchState(*job.state)
+        self._state = BatchState(job.request.output, job.model)
         self._open = ExitStack()  # until the process ends
         self._network: OpenNetwork | None = None
         self._notes: list[str] = []
@@ -148,8 +148,7 @@ def rows_of_workers(
     if not isinstance(request.output, RemotePath):
         shared += [path.absolute() for path in request.output.glob(LOCKS)]
     job = Job(
-        request, references, (request.output, request.refine, state.model), str(Path.cwd()),
-        software(), shared, workers.options.cpus_per_worker, chosen_max_pixels(),
+        request, references, state.model, str(Path.cwd()), software(), shared, workers.options.cpus_per_worker, chosen_max_pixels(),
     )  # fmt: skip
     with connected(workers) as (ray, count, resources):
         say(f"Ray workers: starting {count:,}, each with {workers.each}")

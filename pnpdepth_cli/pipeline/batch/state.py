@@ -29,7 +29,6 @@ from pnpdepth_cli.pipeline.batch.frames import Task
 from pnpdepth_cli.pipeline.batch.settings import settings_of
 from pnpdepth_cli.pipeline.batch.summary import JSON, Tally, failed_row, row_of
 from pnpdepth_cli.pipeline.refinement.output_files import Outputs
-from pnpdepth_cli.pipeline.refinement.request import FrameFiles, RefineRequest
 
 if TYPE_CHECKING:
     from pnpdepth_cli.pipeline.refinement.refine import RefineOutcome
@@ -46,13 +45,11 @@ class BatchState:
 
     Args:
         output: The folder.
-        refine: How its frames are refined.
-        model: The `model_identity` of `refine`.
+        model: The network's `model_identity`.
     """
 
-    def __init__(self, output: Path, refine: RefineRequest, model: dict[str, Any]) -> None:
+    def __init__(self, output: Path, model: dict[str, Any]) -> None:
         self.output, self.model = output, model
-        self._settings = json.dumps(settings_of(replace(refine, files=FrameFiles()), model))
         self._last: tuple[dict[str, Any], str] | None = None
         self._listing = Listing()
         names = self._listing.names(output)
@@ -179,17 +176,14 @@ class BatchState:
 
     def _digest(self, task: Task) -> str:
         """The SHA-256 of the settings that decide the frame's result."""
-        files = task.request.settings("files")
-        if files.get("calibration") is None and not files.get("neighbours"):  # no arrays
-            last = self._last  # several threads ask; equal for most consecutive frames
-            if last is None or last[0] != files:
-                last = self._last = files, self._digest_of(task)
+        files, last = task.request.settings("files"), self._last  # several threads ask
+        arrays = files.get("calibration") is not None or files.get("neighbours")
+        if not arrays and last is not None and last[0] == files:  # as of most consecutive frames
             return last[1]
-        return self._digest_of(task)
-
-    def _digest_of(self, task: Task) -> str:
-        files = json.dumps(settings_of(task.request, {}, "files"))
-        return hashlib.sha256(f"{self._settings}{files}".encode()).hexdigest()
+        text = json.dumps(settings_of(task.request, self.model), sort_keys=True)
+        digest = hashlib.sha256(text.encode()).hexdigest()
+        self._last = None if arrays else (files, digest)
+        return digest
 
 
 def remove_all_leftovers(output: Path) -> int:
