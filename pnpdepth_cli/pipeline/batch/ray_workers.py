@@ -148,7 +148,8 @@ def rows_of_workers(
     if not isinstance(request.output, RemotePath):
         shared += [path.absolute() for path in request.output.glob(LOCKS)]
     job = Job(
-        request, references, state.model, str(Path.cwd()), software(), shared, workers.options.cpus_per_worker, chosen_max_pixels(),
+        request, references, state.model, str(Path.cwd()), software(), shared,
+        workers.options.cpus_per_worker, chosen_max_pixels(),
     )  # fmt: skip
     with connected(workers) as (ray, count, resources):
         say(f"Ray workers: starting {count:,}, each with {workers.each}")
