@@ -89,7 +89,13 @@ def test_before_after_and_ground_truth_are_drawn_and_differ(page: webdriver.Chro
     assert (pixels(page) == drawn["before"]).all()
 
 
-def test_it_opens_from_disk_without_an_error_and_without_a_network(page: webdriver.Chrome) -> None:
+def test_it_opens_from_disk_without_an_error_or_a_network_and_is_not_loaded_before(
+    page: webdriver.Chrome,
+) -> None:
+    page.find_element(By.CSS_SELECTOR, "#rows .open").click()
+    wait(page, lambda: bool(page.find_elements(By.CSS_SELECTOR, "button.load")))
+    assert not [entry for entry in page.get_log("performance") if VIEWER in entry["message"]]
+    page.find_element(By.CSS_SELECTOR, "#close").click()
     open_view(page)
     pixels(page)
     messages = [entry["message"] for entry in page.get_log("browser")]
@@ -125,6 +131,19 @@ def test_a_frame_without_ground_truth_has_two_clouds_and_the_next_opens_at_once(
     page.find_element(By.CSS_SELECTOR, "#previous:enabled, #next:enabled").click()
     wait(page, lambda: bool(page.find_elements(By.CSS_SELECTOR, ".switch input[value=gt]")))
     assert page.find_element(By.CSS_SELECTOR, "#frame-title").text == "a"
+
+
+def test_a_phone_shows_it_without_overflow_and_leaves_touches_to_it(page: webdriver.Chrome) -> None:
+    screen = {"width": 360, "height": 740, "deviceScaleFactor": 2, "mobile": True}
+    page.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", screen)
+    page.refresh()
+    open_view(page)
+    script = "const e = document.getElementById('frame'); return [e.scrollWidth, e.clientWidth]"
+    inner, outer = page.execute_script(script)
+    assert inner == outer <= 360
+    canvas = page.find_element(By.CSS_SELECTOR, ".space canvas")
+    assert canvas.value_of_css_property("touch-action") == "none"
+    assert canvas.accessible_name.endswith("points")
 
 
 def test_a_missing_view_is_reported(page: webdriver.Chrome, root: Path) -> None:
