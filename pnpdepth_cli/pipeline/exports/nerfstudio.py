@@ -126,7 +126,9 @@ def _entry(folder: Path, frame: ExportFrame, factor: float) -> dict[str, Any]:
 
 
 def _relative(path: Path, folder: Path) -> str:
-    return path.resolve().relative_to(folder.resolve()).as_posix()
+    if not path.is_relative_to(folder):
+        path, folder = path.resolve(), folder.resolve()
+    return path.relative_to(folder).as_posix()
 
 
 EXPORT = Export(
