@@ -30,8 +30,7 @@ import psutil
 
 from benchmarks.batch import make_frames
 from pnpdepth_cli.pipeline.batch.batch import run_batch
-from pnpdepth_cli.pipeline.batch.request import BatchRequest
-from pnpdepth_cli.pipeline.cluster.options import LOCAL, ClusterOptions
+from pnpdepth_cli.pipeline.batch.request import LOCAL, BatchRequest, ClusterOptions
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest
 from pnpdepth_cli.sensors import SamplePattern
 
@@ -210,7 +209,7 @@ class LosingANode(Quiet):
 
 def nodes(source: Path, frames: int, model: str) -> dict[str, Any]:
     """Whether results of three nodes, one of which is lost, equal those of one process."""
-    from tests.pipeline.cluster.nodes import three_nodes
+    from tests.pipeline.batch.ray_nodes import three_nodes
 
     with tempfile.TemporaryDirectory() as temporary:
         out = Path(temporary) / "out"

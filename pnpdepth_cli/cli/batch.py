@@ -15,11 +15,10 @@ from typing import Any
 import click
 
 from pnpdepth_cli.cli import grouped_help, options
-from pnpdepth_cli.cli.exit_codes import INTERRUPTED
 from pnpdepth_cli.cli.printable import printable
+from pnpdepth_cli.cli.streams import INTERRUPTED
 from pnpdepth_cli.errors import FramesFailedError, StorageError
-from pnpdepth_cli.pipeline.batch.request import BatchRequest, SequenceOptions
-from pnpdepth_cli.pipeline.cluster.options import ClusterOptions
+from pnpdepth_cli.pipeline.batch.request import BatchRequest, ClusterOptions, SequenceOptions
 from pnpdepth_cli.pipeline.refinement.request import parse_sample
 from pnpdepth_cli.pipeline.sparse.options import BagOptions
 

@@ -27,8 +27,8 @@ def export(as_json: bool, **values: Any) -> None:
 
     \b
     colmap              stereo/depth_maps, stereo/normal_maps, for `colmap stereo_fusion`
-    nerfstudio          transforms.json, depths/ (16-bit PNG in millimetres), images/
-    gaussian-splatting  inverse_depths/ (its option -d), sparse/0/depth_params.json
+    nerfstudio          transforms.json (also for Instant-NGP), depths/ (16-bit PNG), images/
+    gaussian-splatting  inverse_depths/ (its option -d), depth_masks/, sparse/0/depth_params.json
 
     Camera and pose come from the records, so RESULTS are best those of a COLMAP project
     (`pnpdepth batch --layout colmap`). OUTPUT may be the project itself.

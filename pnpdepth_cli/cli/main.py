@@ -14,9 +14,8 @@ from typing import NoReturn
 import click
 
 from pnpdepth_cli import __version__
-from pnpdepth_cli.cli.exit_codes import INTERRUPTED
 from pnpdepth_cli.cli.printable import printable, shortened
-from pnpdepth_cli.cli.streams import StdoutError, drop_stdout, guard_streams
+from pnpdepth_cli.cli.streams import INTERRUPTED, StdoutError, drop_stdout, guard_streams
 from pnpdepth_cli.errors import DeviceError, InputError, ModelError, OutputError, PnpDepthError
 
 _EXIT_CODES = """\b

@@ -6,8 +6,12 @@ import contextlib
 import errno
 import io
 import os
+import signal
 import sys
 from typing import Any, TextIO
+
+INTERRUPTED = 128 + signal.SIGINT
+"""The exit code after Ctrl-C."""
 
 
 class StdoutError(Exception):
@@ -19,7 +23,10 @@ class StdoutError(Exception):
 
 
 class _Raw(io.RawIOBase):
-    """The raw stream of stdout or stderr, with errors that differ from those of files."""
+    """The raw stream of stdout or stderr, with errors that differ from those of files.
+
+    A stream that is None was closed before the program started.
+    """
 
     def __init__(self, stream: Any, *, ignore_errors: bool) -> None:
         self._stream, self.ignore_errors = stream, ignore_errors
@@ -28,13 +35,15 @@ class _Raw(io.RawIOBase):
         return True
 
     def fileno(self) -> int:
-        return int(self._stream.fileno())
+        return 1 if self._stream is None else int(self._stream.fileno())
 
     def isatty(self) -> bool:
-        return bool(self._stream.isatty())
+        return self._stream is not None and bool(self._stream.isatty())
 
     def write(self, data: Any) -> int:
         try:
+            if self._stream is None:
+                raise OSError(errno.EBADF, "it is closed")
             count = self._stream.write(data)
         except OSError as error:
             if not self.ignore_errors:
@@ -51,7 +60,7 @@ def guard_streams() -> None:
     """
     closed = _open_closed_descriptors()
     if 1 in closed or sys.stdout is None:
-        sys.stdout = _text(_Raw(_Closed(), ignore_errors=False), None)
+        sys.stdout = _text(_Raw(None, ignore_errors=False), None)
     elif sys.stdout is sys.__stdout__ and isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout = _text(_Raw(_raw_of(sys.stdout), ignore_errors=False), sys.stdout)
     if 2 in closed or sys.stderr is None:
@@ -68,19 +77,6 @@ def drop_stdout() -> None:
     if isinstance(raw, _Raw):
         raw.ignore_errors = True
     sys.stdout = open(os.devnull, "w", encoding="utf-8")  # noqa: PTH123, SIM115
-
-
-class _Closed:
-    """A stdout that was closed before the program started."""
-
-    def write(self, data: Any) -> int:
-        raise OSError(errno.EBADF, "it is closed")
-
-    def fileno(self) -> int:
-        return 1
-
-    def isatty(self) -> bool:
-        return False
 
 
 def _open_closed_descriptors() -> set[int]:

@@ -11,8 +11,8 @@ import click
 
 from pnpdepth_cli.choices import PLOT_FORMATS
 from pnpdepth_cli.cli import grouped_help, options
-from pnpdepth_cli.cli.exit_codes import INTERRUPTED
 from pnpdepth_cli.cli.progress import BatchProgress
+from pnpdepth_cli.cli.streams import INTERRUPTED
 from pnpdepth_cli.errors import FramesFailedError, StorageError
 from pnpdepth_cli.pipeline.batch.request import FrameSelection
 from pnpdepth_cli.pipeline.refinement.request import FrameFiles, MethodOptions, NetworkChoice

@@ -25,10 +25,7 @@ def atomic_path(path: Path) -> Iterator[Path]:
     """Replaces `path` by what is written to the yielded path; untouched if anything fails.
 
     The yielded path is an empty file in the same folder with the same suffix. A link is
-    followed, so the file it points to is the one replaced.
-
-    Raises:
-        OutputError: The folder cannot be written to, also when that shows only inside the block.
+    followed, so the file it points to is the one replaced. OSErrors become OutputErrors.
     """
     target = Path(os.path.realpath(path))
     _check_target(target, named=path)
@@ -49,10 +46,7 @@ def atomic_folder(folder: Path) -> Iterator[Path]:
     """Adds what is written to the yielded empty folder to `folder`; untouched if anything fails.
 
     Files of the same name are replaced, others stay. The yielded folder is in `folder`, which is
-    created, and removed again if the block fails.
-
-    Raises:
-        OutputError: The folder cannot be written to, also when that shows only inside the block.
+    created, and removed again if the block fails. OSErrors become OutputErrors.
     """
     existed = folder.exists()
     make_folder(folder)
@@ -98,10 +92,7 @@ def make_folder(folder: Path) -> None:
 
 
 def remove_leftovers(folder: Path) -> int:
-    """Removes temporary files and folders of killed writers and returns how many there were.
-
-    To be called only while nobody writes to the folder.
-    """
+    """Removes what killed writers left, while nobody writes there; returns how many there were."""
     paths = folder.iterdir() if folder.is_dir() else ()
     leftovers = [path for path in paths if _TEMPORARY.fullmatch(path.name)]
     for path in leftovers:

@@ -11,13 +11,7 @@ _STARTS_FORMULA = ("=", "+", "-", "@", "\t", "\r")
 
 
 def write_csv(file: TextIO, header: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
-    """Writes RFC 4180 with lines that end in \\n, each text as `text_cell`.
-
-    Args:
-        file: Opened without conversion of line ends.
-        header: Names of the columns.
-        rows: Numbers, texts, and None for an empty cell.
-    """
+    """Writes RFC 4180 with lines that end in \\n, each text as `text_cell`, None as nothing."""
     writer = csv.writer(file, lineterminator="\n")
     for row in itertools.chain([header], rows):
         writer.writerow([text_cell(each) if isinstance(each, str) else each for each in row])

@@ -21,7 +21,6 @@ class Fingerprint:
     size: int
     """Bytes."""
     sha256: str
-    """Of the content, hexadecimal."""
     mtime_ns: int = 0
     """When the content was changed last, as programs may set it; 0 of an object in a store."""
     ctime_ns: int = 0
@@ -69,12 +68,11 @@ def is_unchanged(path: Path, known: Fingerprint, listing: Listing | None = None)
                 return status is not None and status.version == known.version
             with local_files([path]) as copies:
                 return sha256_of(copies[path]) == known.sha256
-        size, mtime_ns, ctime_ns = _status(path)
-        if size != known.size:
-            return False
-        if (mtime_ns, ctime_ns) == (known.mtime_ns, known.ctime_ns):
+        now = _status(path)
+        if now == (known.size, known.mtime_ns, known.ctime_ns):
             return True
-        return _digest(path, size, mtime_ns, ctime_ns) == known.sha256
+        same_size = now[0] == known.size
+        return same_size and _digest(path, *now) == known.sha256
     except InputError:
         return False
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import errno
 import os
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 
 from filelock import FileLock, Timeout
@@ -40,14 +40,12 @@ def locked_folder(
     Raises:
         OutputError: Another run writes there, or the folder cannot be written to.
     """
-    own = _WHOLE if shard is None else f".batch.{shard[0]}of{shard[1]}.lock"
-    with ExitStack() as held:
-        if not _acquired(folder / own, held, _TRIED_S):
-            raise _in_use(folder)
+    own = folder / (_WHOLE if shard is None else f".batch.{shard[0]}of{shard[1]}.lock")
+    with _held(own):
         for other in sorted(folder.glob(LOCKS)) if shard is None else [folder / _WHOLE]:
-            with ExitStack() as tried:
-                if other.name != own and other.exists() and not _acquired(other, tried, _TRIED_S):
-                    raise _in_use(folder)
+            if other != own and other.exists():
+                with _held(other):
+                    pass
         if shard is None:
             when_alone()
         yield
@@ -56,29 +54,30 @@ def locked_folder(
 @contextmanager
 def in_turn(folder: Path) -> Iterator[None]:
     """No other shard is inside at the same time; each waits for the one before."""
-    with ExitStack() as held:
-        _acquired(folder / ".batch.summary.lock", held, timeout_s=-1)
+    with _held(folder / ".batch.summary.lock", timeout_s=-1):
         yield
 
 
-def _acquired(path: Path, held: ExitStack, timeout_s: float) -> bool:
-    """True if the lock is held until `held` ends; a negative timeout waits for ever."""
+@contextmanager
+def _held(path: Path, timeout_s: float | None = None) -> Iterator[None]:
+    """Holds a lock; a negative timeout waits for ever. OutputError if another process does."""
     if not path.parent.is_dir():  # filelock would make it
         raise cannot_write(path.parent, FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT)))
+    lock = FileLock(path)
     try:
-        held.enter_context(FileLock(path).acquire(timeout=timeout_s))
+        lock.acquire(timeout=_TRIED_S if timeout_s is None else timeout_s)
     except Timeout:
-        return False
+        raise OutputError(
+            f"{path.parent}: another batch writes there; wait for it to end, or choose another"
+            " output folder"
+        ) from None
     except NotImplementedError as error:
         raise OutputError(
             "files in the output folder cannot be locked; choose another folder"
         ) from error
     except OSError as error:
         raise cannot_write(path, error) from error
-    return True
-
-
-def _in_use(folder: Path) -> OutputError:
-    return OutputError(
-        f"{folder}: another batch writes there; wait for it to end, or choose another output folder"
-    )
+    try:
+        yield
+    finally:
+        lock.release()

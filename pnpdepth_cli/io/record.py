@@ -6,6 +6,7 @@ import hashlib
 import json
 import math
 from collections.abc import Mapping
+from dataclasses import asdict, is_dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,11 +18,7 @@ from pnpdepth_cli.io.file_bytes import cannot_read, one_line, read_bytes, size_o
 
 
 def write_json(path: Path, mapping: Mapping[str, Any]) -> None:
-    """Writes the mapping as indented JSON in its own order; NaN and infinity become null.
-
-    Raises:
-        OutputError: The file cannot be written.
-    """
+    """Writes the mapping as indented JSON in its own order; NaN and infinity become null."""
     text = json.dumps(plain(mapping), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
     with atomic_path(path) as temporary:
         # A file name that is not UTF-8 has surrogates, which JSON spells as \udcff.
@@ -72,6 +69,8 @@ def sha256_of(path: Path) -> str:
 
 def plain(value: Any) -> Any:
     """Returns the value in JSON's own types; NaN and infinity become None."""
+    if is_dataclass(value) and not isinstance(value, type):
+        value = asdict(value)
     if isinstance(value, Mapping):
         return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):

@@ -20,7 +20,7 @@ import numpy as np
 from markupsafe import Markup
 
 from pnpdepth_cli import __version__
-from pnpdepth_cli.errors import FileFormatError, InputError, OutputError
+from pnpdepth_cli.errors import InputError, OutputError
 from pnpdepth_cli.io.atomic import (
     atomic_folder,
     atomic_path,
@@ -113,14 +113,12 @@ class Head:
 def check_report_folder(
     folder: Path, inputs: Sequence[Path], *, made_of: Mapping[str, Any] | None, overwrite: bool
 ) -> None:
-    """Raises OutputError for a folder that a report must not be written to.
-
-    It must not hold inputs or lie in one. It must be empty, or an earlier report of the same.
+    """Raises OutputError for a folder that holds inputs, lies in one, or is not this report's.
 
     Args:
         folder: The report's folder.
         inputs: Files and folders that are read.
-        made_of: What the report is of, as given to `begin_report`; None for anything.
+        made_of: What an earlier report in it was made of, as given to `begin_report`.
         overwrite: Whether any other content may be replaced.
     """
     if folder.exists() and not folder.is_dir():
@@ -143,15 +141,7 @@ def check_report_folder(
 
 
 def begin_report(folder: Path, made_of: Mapping[str, Any]) -> Path:
-    """Creates the report's folder and returns its folder for images.
-
-    Args:
-        folder: The report's folder.
-        made_of: What the report is of, by which a later run recognises it.
-
-    Raises:
-        OutputError: The folder cannot be written to.
-    """
+    """Creates the report's folder, known by what it is made of; returns its folder for images."""
     images = folder / IMAGES
     make_folder(images)
     write_json(folder / _MADE_OF, made_of)
@@ -160,11 +150,7 @@ def begin_report(folder: Path, made_of: Mapping[str, Any]) -> Path:
 
 @contextmanager
 def whole_report(folder: Path) -> Iterator[Path]:
-    """Yields a folder for a report that replaces the one in `folder`; if it fails, that one stays.
-
-    Raises:
-        OutputError: The folder cannot be written to.
-    """
+    """Yields a folder for a report that replaces the one in `folder`, which stays if it fails."""
     remove_report_leftovers(folder)
     with atomic_folder(folder) as temporary:
         yield temporary
@@ -174,10 +160,7 @@ def whole_report(folder: Path) -> Iterator[Path]:
 
 
 def remove_report_leftovers(folder: Path) -> int:
-    """Removes what killed writers left and returns how many there were.
-
-    To be called only while nobody writes to the report.
-    """
+    """Removes what killed writers left, while nobody writes; returns how many there were."""
     try:
         return sum(remove_leftovers(each) for each in (folder, folder / IMAGES) if each.is_dir())
     except OSError as error:
@@ -205,12 +188,6 @@ def write_report(
         frames: A mapping per frame, taken one by one, as report.js shows it; its `key` is that of
             its images, or None.
         viewer: Whether frames have 3D views, so that the page may run scripts of its folder.
-
-    Returns:
-        Bytes of the page.
-
-    Raises:
-        OutputError: The page cannot be written.
     """
     keys: set[str] = set()
 
@@ -248,15 +225,12 @@ def write_report(
 
 
 def save_views(images: Path, key: str, views: Mapping[str, Pixels]) -> dict[str, dict[str, Any]]:
-    """Writes a JPEG of each view, at most 960 pixels long, and returns the page's entries of them.
+    """Writes a JPEG of each (H, W, 3) view, at most 960 pixels long; returns the page's entries.
 
     Args:
         images: The report's folder for images.
         key: Start of their names.
-        views: (H, W, 3) by the name of the view.
-
-    Raises:
-        OutputError: A file cannot be written.
+        views: Pixels by the name of the view.
     """
     from PIL import Image
 
@@ -271,16 +245,13 @@ def save_views(images: Path, key: str, views: Mapping[str, Pixels]) -> dict[str,
 
 
 def link_image(source: Path, target: Path) -> None:
-    """Makes `target` the same file as `source`, or a copy of it on another file system.
-
-    Raises:
-        OutputError: The file cannot be written.
-    """
+    """Makes `target` the same file as `source`, or a copy of it on another file system."""
     try:
-        if target.exists() and _looks_same(source.stat(), target.stat()):
-            return
+        old, new = (target.stat() if target.exists() else None), source.stat()
     except OSError as error:
         raise cannot_write(target, error) from error
+    if old and (old.st_mtime_ns, old.st_size) == (new.st_mtime_ns, new.st_size):
+        return
     with atomic_path(target) as temporary:
         temporary.unlink()
         try:
@@ -292,16 +263,8 @@ def link_image(source: Path, target: Path) -> None:
 def save_view_3d(source: Path, target: Path) -> float:
     """Writes a frame's 3D view as a script, which a page opened from disk can load.
 
-    Args:
-        source: As `write_view` of `pipeline.refinement.view_3d` wrote it.
-        target: The script.
-
     Returns:
         Its size in MB, rounded to 0.1 and at least that.
-
-    Raises:
-        InputError: The source cannot be read.
-        OutputError: The script cannot be written.
     """
     text = json.dumps(read_json(source), allow_nan=False, separators=(",", ":"))
     _write_text(target, f"pnpdepthView({text});\n")
@@ -311,10 +274,6 @@ def save_view_3d(source: Path, target: Path) -> float:
 def _write_text(path: Path, text: str) -> None:
     with atomic_path(path) as temporary:
         temporary.write_text(text, encoding="utf-8", newline="\n")
-
-
-def _looks_same(source: os.stat_result, target: os.stat_result) -> bool:
-    return (source.st_mtime_ns, source.st_size) == (target.st_mtime_ns, target.st_size)
 
 
 def _remove_unused(folder: Path, unused: Callable[[str, str], bool], *, viewer: bool) -> None:
@@ -333,7 +292,7 @@ def _remove_unused(folder: Path, unused: Callable[[str, str], bool], *, viewer: 
 def _is_of(folder: Path, made_of: Mapping[str, Any] | None) -> bool:
     try:
         return made_of is not None and read_json(folder / _MADE_OF) == plain(made_of)
-    except (InputError, FileFormatError):
+    except InputError:
         return False
 
 

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import functools
+import operator
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pnpdepth_cli import __version__
 from pnpdepth_cli.choices import EXPORTS
@@ -19,6 +21,9 @@ from pnpdepth_cli.io.record import write_json
 from pnpdepth_cli.io.rgb import read_rgb, upright_size
 from pnpdepth_cli.pipeline.exports import Depth, Export, ExportFrame
 from pnpdepth_cli.pipeline.results import ResultFrame, result_frames
+
+_LONGEST_NAME = 200
+"""Bytes of a name of a record that becomes a path."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,6 +52,8 @@ def export_results(request: ExportRequest) -> dict[str, Any]:
     frames = [_frame(result, export) for result in result_frames(request.results)]
     _check_one_unit(frames)
     written = [*export.files(request.output, frames), request.output / f"export_{request.to}.json"]
+    if len(set(written)) < len(written):
+        raise InputError(f"{request.results}: two frames have one image name; refine them again")
     for path in written:
         if path.exists() and not request.overwrite:
             raise OutputError(f"{path} exists; --overwrite replaces it, -o names another folder")
@@ -79,29 +86,40 @@ def _frame(result: ResultFrame, export: Export) -> ExportFrame:
             " `batch --layout colmap` does"
         )
     try:
-        width, height = (int(side) for side in record["size"])
-        farthest = float(record["points"]["farthest"])
+        size = tuple(operator.index(side) for side in record["size"])
         sparse = record["inputs"]["sparse"]
-        name, unit_scale = sparse.get("image"), float(sparse.get("unit_scale") or 1)
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        numbers = float(record["points"]["farthest"]), float(sparse.get("unit_scale") or 1)
+        name = sparse.get("image") or (PurePosixPath(result.name).parent / image.name).as_posix()
+        if not all(1e-9 < number < 1e9 for number in numbers) or not _is_fit(name):
+            raise ValueError
+    except (KeyError, TypeError, ValueError, OverflowError, AttributeError) as error:
         raise FileFormatError(
             f"{result.depth}: the record beside it is damaged; refine it again"
         ) from error
-    if upright_size(image) != (height, width):
+    height, width = upright_size(image)
+    if size != (width, height):
         raise SizeError(
             f"{result.depth} is not of the size of {image}; refine the whole image"
             " (--protocol whole)"
         )
     return ExportFrame(
         image=image,
-        image_name=name or (PurePosixPath(result.name).parent / image.name).as_posix(),
+        image_name=name,
         size=(height, width),
         camera=camera,
         unit=result.unit,
-        unit_scale=unit_scale,
-        farthest=farthest,
+        unit_scale=numbers[1],
+        farthest=numbers[0],
         read=functools.partial(_read, result),
     )
+
+
+def _is_fit(name: Any) -> bool:
+    """Whether a name of a record is fit for a file: relative, inside, printable, not long."""
+    path = PurePosixPath(name)  # TypeError if it is no text
+    inside = path.parts and not path.is_absolute() and ".." not in path.parts
+    long = len(name.encode("utf-8", "surrogateescape")) > _LONGEST_NAME
+    return bool(inside) and name.isprintable() and "\\" not in name and not long
 
 
 def _check_one_unit(frames: Sequence[ExportFrame]) -> None:
@@ -110,11 +128,12 @@ def _check_one_unit(frames: Sequence[ExportFrame]) -> None:
         raise InputError(f"the depths are in different units: {', '.join(units)}; refine all alike")
 
 
-def _read(result: ResultFrame) -> Depth:
+def _read(result: ResultFrame) -> tuple[Depth, NDArray[np.bool_]]:
     depth = read_depth(result.depth).values
+    known = depth > 0
     if result.valid is None:
-        return depth
+        return depth, known
     valid = read_rgb(result.valid).values[..., 0] > 0
     if valid.shape != depth.shape:
         raise SizeError(f"{result.valid} is not of the size of {result.depth}")
-    return np.where(valid, depth, np.float32(0))
+    return depth, known & valid

@@ -17,11 +17,6 @@ def in_order(
     """Yields work(item) of each item in order, computed by several threads.
 
     Only a few items are taken in advance, so memory does not grow with their number.
-
-    Args:
-        work: The function.
-        items: Its arguments.
-        workers: Number of threads.
     """
     waiting: deque[Future[Result]] = deque()
     with ThreadPoolExecutor(workers) as pool:

@@ -50,17 +50,14 @@ class ResultFrame:
         entry = _entry(self.record, "camera")
         try:
             return FrameCamera.of_record(entry) if entry else None
-        except (KeyError, ValueError, TypeError) as error:
+        except (KeyError, ValueError, TypeError, OverflowError) as error:
             raise FileFormatError(
                 f"{self.depth}: the camera in the record beside it is damaged; refine it again"
             ) from error
 
 
 def result_frames(root: Path) -> list[ResultFrame]:
-    """Returns the frame of a depth file, or those of a folder in the order of their names.
-
-    Args:
-        root: A depth file, or a folder with files NAME_depth.SUFFIX.
+    """Returns the frame of a depth file, or those of a folder with files NAME_depth.SUFFIX.
 
     Raises:
         InputError: There is none, or a record cannot be read.

@@ -89,7 +89,7 @@ EXITS: list[tuple[list[str], int, str]] = [
     (["--device", "cuda:9"], 6, "--device cpu"),
     (["--device", "cpu,cuda"], 2, "workers run on cpu, cuda"),
     (["--ray", "frames"], 2, "is no address of a Ray cluster"),
-    (["--ray", "127.0.0.1:1"], 6, "cannot be reached (connection refused)"),
+    (["--ray", "127.0.0.1:1"], 6, "cannot be used: Connection refused"),
 ]
 
 

@@ -29,43 +29,33 @@ def no_long_wait(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(lock, "_TRIED_S", 0.05)
 
 
-class Alone:
-    """Counts how often a run was called as the only one."""
+def test_one_run_at_a_time_and_after_it_another_also_after_an_error(tmp_path: Path) -> None:
+    calls: list[int] = []
 
-    def __init__(self) -> None:
-        self.calls = 0
-
-    def __call__(self) -> None:
-        self.calls += 1
-
-
-def test_one_run_at_a_time_and_after_it_another(tmp_path: Path) -> None:
-    for _ in range(2):
-        alone = Alone()
-        with locked_folder(tmp_path, None, alone):
-            assert alone.calls == 1
+    def held(number: int) -> None:
+        with locked_folder(tmp_path, None, lambda: calls.append(number)):
             with (
                 pytest.raises(OutputError, match="another batch writes there; wait for it"),
-                locked_folder(tmp_path, None, Alone()),
+                locked_folder(tmp_path, None, pytest.fail),
             ):
                 pass
+            raise ZeroDivisionError
+
+    for number in (1, 2):
+        with pytest.raises(ZeroDivisionError):
+            held(number)
+    assert calls == [1, 2]
 
 
 def test_shards_run_together_but_not_twice_nor_beside_a_whole_run(tmp_path: Path) -> None:
-    alone = Alone()
-    with locked_folder(tmp_path, (1, 3), alone), locked_folder(tmp_path, (3, 3), alone):
+    with locked_folder(tmp_path, (1, 3)), locked_folder(tmp_path, (3, 3), pytest.fail):
         for shard in ((1, 3), (3, 3), None):
-            with pytest.raises(OutputError), locked_folder(tmp_path, shard, alone):
+            with pytest.raises(OutputError), locked_folder(tmp_path, shard):
                 pass
-        with locked_folder(tmp_path, (2, 3), alone):
+        with locked_folder(tmp_path, (2, 3)):
             pass
-    with (
-        locked_folder(tmp_path, None, lambda: None),
-        pytest.raises(OutputError),
-        locked_folder(tmp_path, (1, 2), alone),
-    ):
+    with locked_folder(tmp_path), pytest.raises(OutputError), locked_folder(tmp_path, (1, 2)):
         pass
-    assert alone.calls == 0
 
 
 def test_the_lock_ends_with_its_process_however_it_ends(tmp_path: Path) -> None:
@@ -74,22 +64,15 @@ def test_the_lock_ends_with_its_process_however_it_ends(tmp_path: Path) -> None:
     ) as holder:
         assert holder.stdout is not None
         assert holder.stdout.readline() == "held\n"
-        with pytest.raises(OutputError), locked_folder(tmp_path, None, Alone()):
+        with pytest.raises(OutputError), locked_folder(tmp_path):
             pass
         os.kill(holder.pid, signal.SIGKILL)
-    with locked_folder(tmp_path, None, Alone()):
-        pass
-
-
-def test_an_error_inside_gives_the_lock_back(tmp_path: Path) -> None:
-    with pytest.raises(ZeroDivisionError), locked_folder(tmp_path, (1, 1), Alone()):
-        raise ZeroDivisionError
-    with locked_folder(tmp_path, None, Alone()):
+    with locked_folder(tmp_path):
         pass
 
 
 def test_a_folder_that_is_not_there_cannot_be_locked(tmp_path: Path) -> None:
-    with pytest.raises(StorageError), locked_folder(tmp_path / "no", None, Alone()):
+    with pytest.raises(StorageError), locked_folder(tmp_path / "no"):
         pass
 
 

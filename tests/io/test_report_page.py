@@ -129,7 +129,9 @@ def test_the_worst_frame_is_first_and_a_click_turns_the_order(
     assert header.get_attribute("aria-sort") == "descending"
 
 
-def test_it_sorts_by_every_column_and_by_name(page: webdriver.Chrome, report: Path) -> None:
+def test_it_sorts_by_every_column_and_by_name_and_can_be_searched(
+    page: webdriver.Chrome, report: Path
+) -> None:
     one(page, "#sort-column option[value='2']").click()  # an error: the largest is the worst
     assert names(page) == shown_by(report, page_data(report)["columns"][2]["key"])[::-1]
     one(page, "#sort-column option[value='-1']").click()
@@ -137,14 +139,9 @@ def test_it_sorts_by_every_column_and_by_name(page: webdriver.Chrome, report: Pa
     assert names(page) == by_name
     one(page, "#sort-turn").click()
     assert names(page) == by_name[::-1]
-
-
-def test_the_list_can_be_searched(page: webdriver.Chrome) -> None:
     one(page, "#filter").send_keys("B")
     assert names(page) == ["b"]
     assert one(page, "#count").text == "1 of 4 frames."
-    one(page, "#filter").send_keys("zzz")
-    assert names(page) == []
 
 
 def test_a_frame_opens_moves_on_and_closes_by_keyboard_alone(page: webdriver.Chrome) -> None:
@@ -172,25 +169,21 @@ def test_a_frame_opens_moves_on_and_closes_by_keyboard_alone(page: webdriver.Chr
     wait(page, lambda: focused(page) == order[0])
 
 
-def test_the_slider_moves_by_keyboard_and_names_its_position(page: webdriver.Chrome) -> None:
+def test_the_slider_moves_by_keyboard_and_pointer_and_names_its_position(
+    page: webdriver.Chrome,
+) -> None:
     one(page, "#rows .open").send_keys(Keys.ENTER)
     slider = page.switch_to.active_element
-    assert slider.get_attribute("type") == "range"
     for key, position in ((Keys.ARROW_RIGHT, 51), (Keys.HOME, 0), (Keys.END, 100)):
         slider.send_keys(key)
         text = f"{position} % Before, {100 - position} % After"
         assert slider.get_attribute("aria-valuetext") == text
         clip = page.execute_script("return document.querySelector('.over').style.clipPath")
         assert clip.startswith(f"inset(0px {100 - position}%")
-        assert one(page, ".handle").get_attribute("style") == f"left: {position}%;"
-
-
-def test_the_slider_follows_the_pointer(page: webdriver.Chrome) -> None:
-    one(page, "#rows .open").send_keys(Keys.ENTER)
     wait(page, lambda: loaded(page, "#views img"))
-    slider, stage = one(page, "#views input"), one(page, "#views .stage")
-    left = -round(stage.rect["width"] / 4)  # from the middle
-    webdriver.ActionChains(page).move_to_element_with_offset(stage, left, 0).click().perform()
+    left = -round(one(page, "#views .stage").rect["width"] / 4)  # from the middle
+    actions = webdriver.ActionChains(page)
+    actions.move_to_element_with_offset(one(page, "#views .stage"), left, 0).click().perform()
     assert abs(int(slider.get_property("value")) - 25) <= 1
 
 
@@ -211,33 +204,26 @@ def test_the_histogram_counts_all_frames_and_has_a_text_alternative(page: webdri
     assert "RMSE before" in one(page, "#chart svg").get_attribute("aria-label")
 
 
-@pytest.mark.parametrize("dark", [False, True])
-@pytest.mark.parametrize("width", [320, 390, 768, 1280])
-def test_no_width_overflows(page: webdriver.Chrome, width: int, dark: bool) -> None:
+@pytest.mark.parametrize(("width", "dark"), [(320, False), (768, True), (1280, False)])
+def test_no_width_overflows_and_colours_are_those_that_the_reader_prefers(
+    page: webdriver.Chrome, width: int, dark: bool
+) -> None:
     size(page, width, 800, dark=dark)
     page.refresh()
     script = "const e = {}; return [e.scrollWidth, e.clientWidth]"
-    root = script.replace("{}", "document.documentElement")
-    inner, outer = page.execute_script(root)
+    inner, outer = page.execute_script(script.replace("{}", "document.documentElement"))
     assert inner == outer <= width  # a scroll bar takes some of it
+    style = "const s = getComputedStyle(document.body); return [s.color, s.backgroundColor]"
+    ink, paper = (
+        sum(int(level) for level in colour[4:-1].split(","))
+        for colour in page.execute_script(style)
+    )
+    assert (ink > paper) == dark
+    assert abs(ink - paper) > 500
     one(page, "#rows .open").send_keys(Keys.ENTER)
     wait(page, lambda: loaded(page, "#views img"))
     inner, outer = page.execute_script(script.replace("{}", "document.getElementById('frame')"))
     assert inner == outer <= width
-
-
-@pytest.mark.parametrize("dark", [False, True])
-def test_text_is_dark_on_light_or_light_on_dark_as_the_reader_prefers(
-    page: webdriver.Chrome, dark: bool
-) -> None:
-    size(page, 1280, 900, dark=dark)
-    script = "const s = getComputedStyle(document.body); return [s.color, s.backgroundColor]"
-    ink, paper = (
-        sum(int(level) for level in colour[4:-1].split(","))
-        for colour in page.execute_script(script)
-    )
-    assert (ink > paper) == dark
-    assert abs(ink - paper) > 500
 
 
 def test_every_control_has_a_name(page: webdriver.Chrome) -> None:
@@ -292,13 +278,9 @@ def test_a_thousand_frames_are_usable_within_seconds_and_few_thumbnails_are_read
         chrome.get((thousand / "index.html").as_uri())
     assert len(names(chrome)) == 1000
     spent_ms = chrome.execute_script(
-        "const [e] = performance.getEntriesByType('navigation');"
-        "return [e.domContentLoadedEventEnd, e.loadEventEnd,"
-        " ...performance.getEntriesByType('paint').map(p => p.startTime)]"
+        "return performance.getEntriesByType('navigation')[0].loadEventEnd"
     )
-    print("content, load, paint after", [f"{ms:.0f} ms" for ms in spent_ms])  # noqa: T201
-    # The aim is 2 s, on a machine that does nothing else.
-    assert max(spent_ms) < 10_000
+    assert spent_ms < 10_000  # 2 s on a machine that does nothing else
     one(chrome, "#rows .open").send_keys(Keys.ARROW_DOWN)
     wait(chrome, lambda: loaded(chrome, "#rows tr:first-child img"))
     read = [e for e in chrome.get_log("performance") if "requestWillBeSent" in e["message"]]

@@ -89,7 +89,13 @@ def test_before_after_and_ground_truth_are_drawn_and_differ(page: webdriver.Chro
     assert (pixels(page) == drawn["before"]).all()
 
 
-def test_it_opens_from_disk_without_an_error_and_without_a_network(page: webdriver.Chrome) -> None:
+def test_it_opens_from_disk_without_an_error_or_a_network_and_is_not_loaded_before(
+    page: webdriver.Chrome,
+) -> None:
+    page.find_element(By.CSS_SELECTOR, "#rows .open").click()
+    wait(page, lambda: bool(page.find_elements(By.CSS_SELECTOR, "button.load")))
+    assert not [entry for entry in page.get_log("performance") if VIEWER in entry["message"]]
+    page.find_element(By.CSS_SELECTOR, "#close").click()
     open_view(page)
     pixels(page)
     messages = [entry["message"] for entry in page.get_log("browser")]
@@ -102,12 +108,6 @@ def test_it_opens_from_disk_without_an_error_and_without_a_network(page: webdriv
     ]
     assert any(url.endswith(VIEWER) for url in requests)
     assert {url.split(":")[0] for url in requests} <= {"file", "data"}
-
-
-def test_nothing_is_loaded_before_the_view_is_opened(page: webdriver.Chrome) -> None:
-    page.find_element(By.CSS_SELECTOR, "#rows .open").click()
-    wait(page, lambda: bool(page.find_elements(By.CSS_SELECTOR, "button.load")))
-    assert not [entry for entry in page.get_log("performance") if VIEWER in entry["message"]]
 
 
 def test_dragging_turns_the_cloud_and_reset_turns_it_back(page: webdriver.Chrome) -> None:

@@ -126,11 +126,22 @@ def test_3dgs_gets_the_inverse_depth_of_the_model(root: Path) -> None:
         assert inverse == pytest.approx(1 / DEPTH, rel=2e-4)
 
 
-def test_unknown_depth_is_reported_to_3dgs_users(root: Path) -> None:
+def test_no_pixel_is_infinitely_far_in_3dgs_and_masks_mark_what_is_not_known(root: Path) -> None:
     depth = DEPTH.copy()
-    depth[:2] = 0
-    record = export(results(root, depth), "gaussian-splatting", root)
-    assert f"warning: {3 * 2 * WIDTH:,} pixels of unknown depth" in "".join(record["notes"])
+    depth[:2] = 0  # unknown: taken from the nearest pixel
+    folder = results(root, depth)
+    valid = np.full((HEIGHT, WIDTH), 255, np.uint8)
+    valid[5] = 0  # not valid: its own depth
+    for name in NAMES:
+        cv2.imwrite(str(folder / f"{name}_valid.png"), valid)
+    record = export(folder, "gaussian-splatting", root)
+    assert f"warning: {3 * 3 * WIDTH:,} pixels are unknown or not valid" in "".join(record["notes"])
+    scale = json.loads((root / "sparse/0/depth_params.json").read_text())["a"]["scale"]
+    png = cv2.imread(str(root / "inverse_depths/a.png"), cv2.IMREAD_UNCHANGED)
+    expected = np.concatenate([DEPTH[[2, 2]], DEPTH[2:]])
+    assert png / 2**16 * scale == pytest.approx(1 / expected, rel=2e-4)
+    mask = cv2.imread(str(root / "depth_masks/a.png"), cv2.IMREAD_UNCHANGED)
+    assert ((mask == 255) == ((depth > 0) & (valid > 0))).all()
 
 
 @pytest.mark.parametrize("unit_scale", [None, 0.25])
@@ -145,6 +156,8 @@ def test_transforms_put_every_pixel_where_the_model_has_it(
     entry = content["frames"][1]
     assert (scene / entry["file_path"]).read_bytes() == (root / "images/b.png").read_bytes()
     depth = cv2.imread(str(scene / entry["depth_file_path"]), cv2.IMREAD_UNCHANGED) * 1e-3
+    assert content["enable_depth_loading"]  # Instant-NGP's names
+    assert (content["integer_depth_scale"], entry["depth_path"]) == (1e-3, entry["depth_file_path"])
     u, v = 10, 20
     # Nerfstudio's ray of a pixel centre, in OpenGL's axes; depth is z
     ray = [(u + 0.5 - entry["cx"]) / entry["fl_x"], -(v + 0.5 - entry["cy"]) / entry["fl_y"], -1]
@@ -183,6 +196,22 @@ def test_a_lens_that_nerfstudio_does_not_know_is_refused_and_nothing_is_written(
     assert list((tmp_path / "scene").rglob("*.*")) == []
 
 
+NO_CAMERA: dict[str, Any] = {
+    "intrinsics": np.eye(3).tolist(),
+    "lens": "radial-tangential",
+    "distortion": [],
+    "pose": None,
+    "source": "x",
+}
+BAD_CAMERAS: list[dict[str, Any]] = [
+    {"intrinsics": [[10**400, 0, 0], [0, 1, 0], [0, 0, 1]]},
+    {"pose": [[10**400, 0, 0, 0]] * 3},
+    {"distortion": [10**400]},
+    {"lens": 5},
+]
+BAD_NAMES = ["../../../ESC", "/etc/x.png", "a\nb.png", 7, "..", "n" * 201, "a\\b.png", "x/../../y"]
+
+
 def change(path: Path, **entries: Any) -> None:
     path.write_text(json.dumps(json.loads(path.read_text()) | entries))
 
@@ -192,20 +221,45 @@ def change(path: Path, **entries: Any) -> None:
     [
         ({"camera": None}, InputError, "a_depth.exr lacks a record with its camera"),
         ({"inputs": {}}, InputError, "a_depth.exr lacks its image"),
-        ({"size": [9, 9]}, SizeError, "--protocol whole"),
         ({"unit": "m"}, InputError, "in different units"),
-        ({"points": None}, FileFormatError, "the record beside it is damaged"),
-        ({"size": "big"}, FileFormatError, "the record beside it is damaged"),
+        ({"size": [9, 9]}, SizeError, "--protocol whole"),
+        *(
+            (entries, FileFormatError, "beside it is damaged; refine it again")
+            for entries in (
+                {"points": None},
+                {"points": {"farthest": 10**400}},
+                {"points": {"farthest": -1}},
+                {"size": "big"},
+                {"size": [WIDTH, 1.5]},
+                *({"camera": NO_CAMERA | change} for change in BAD_CAMERAS),
+                *({"inputs": {"sparse": {"unit_scale": value}}} for value in (10**400, -1, "x")),
+                *({"inputs": {"sparse": {"image": name}}} for name in BAD_NAMES),
+            )
+        ),
     ],
 )
 def test_results_that_cannot_be_exported_are_one_line(
     root: Path, entries: dict[str, Any], error: type[PnpDepthError], message: str
 ) -> None:
     folder = results(root)
+    inputs = entries.get("inputs")
+    if inputs:
+        known = json.loads((folder / "a.json").read_text())["inputs"]
+        entries = {"inputs": known | {"sparse": known["sparse"] | inputs["sparse"]}}
     change(folder / "a.json", **entries)
-    with pytest.raises(error, match=message):
+    before = sorted(root.parent.rglob("*"))
+    with pytest.raises(error, match=message) as caught:
         export(folder, "colmap", root / "dense")
-    assert not (root / "dense").exists()
+    assert "\n" not in str(caught.value)
+    assert sorted(root.parent.rglob("*")) == before
+
+
+def test_two_frames_of_one_image_name_are_refused(root: Path) -> None:
+    folder = results(root)
+    known = json.loads((folder / "a.json").read_text())["inputs"]
+    change(folder / "a.json", inputs=known | {"sparse": known["sparse"] | {"image": "b.png"}})
+    with pytest.raises(InputError, match="two frames have one image name"):
+        export(folder, "colmap", root / "dense")
 
 
 def test_depth_without_poses_is_no_scene_of_nerfstudio(root: Path) -> None:

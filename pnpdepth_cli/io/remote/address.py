@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import posixpath
 import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -23,7 +24,7 @@ class RemotePath(_Path):
     """A file in a store; made by `path_of`.
 
     Its names, parents and joins are those of any path. Its content is read through a local copy
-    (`io.remote.store`); `str` gives the address without its query.
+    (`io.remote.store`); `str` gives the address without its query. A store has no folders or links.
 
     Attributes:
         query: Of a presigned address, with its question mark. Joins and parents do not have it.
@@ -47,28 +48,22 @@ class RemotePath(_Path):
 
         return status_of(self) is not None
 
-    def is_file(self, **_: Any) -> bool:
-        """Returns whether the store has the file."""
-        return self.exists()
+    is_file = exists
 
     def is_dir(self, **_: Any) -> bool:
-        """Returns False: a store has no folders."""
+        """Returns False."""
         return False
 
-    def is_symlink(self) -> bool:
-        """Returns False: a store has no links."""
-        return False
+    is_symlink = is_dir
 
     def resolve(self, strict: bool = False) -> RemotePath:
         """Returns the path itself."""
         return self
 
-    def absolute(self) -> RemotePath:
-        """Returns the path itself."""
-        return self
+    absolute = resolve
 
     def glob(self, *_: Any, **__: Any) -> Any:
-        """Yields nothing: a store has no folders."""
+        """Yields nothing."""
         return iter(())
 
     def stat(self, **_: Any) -> Any:
@@ -89,26 +84,29 @@ def path_of(text: str) -> Path:
     match = _SCHEME.match(text)
     if match is None:
         return Path(text)
-    scheme = match[1].lower()
+    scheme, rest = match[1].lower(), text[match.end() :]
     if scheme == "file":
-        return _local(text)
+        parts = urlsplit(text)
+        if parts.netloc not in ("", "localhost"):
+            raise UsageError(f"{text[:100]} names a host; give file:///PATH")
+        return Path(unquote(parts.path))
     if scheme not in STORES:
         raise UsageError(f"{scheme}:// is no known store; stores are {', '.join(STORES)}")
-    rest, query = text[match.end() :], ""
-    if scheme in _WITH_QUERY and "?" in rest:
-        query = rest[rest.index("?") :]
-        rest = rest.removesuffix(query)
-    parts = rest.rstrip("/").split("/")
-    if "@" in parts[0]:
+    query = ""
+    if scheme in _WITH_QUERY:
+        rest, question, query = rest.partition("?")
+        query = question + query
+    names = rest.rstrip("/").split("/")
+    if "@" in names[0]:
         raise UsageError(
             f"an address of {scheme}:// has a user name in it; leave it out, and give credentials"
             " in the environment"
         )
-    if any(part in ("", ".", "..") for part in parts):
+    if any(name in ("", ".", "..") for name in names):
         raise UsageError(
             f"{scheme}://{rest[:100]} has an empty or relative part; give SCHEME://BUCKET/KEY"
         )
-    return _with_query(f"{scheme}://{'/'.join(parts)}", query)
+    return _with_query(f"{scheme}://{'/'.join(names)}", query)
 
 
 def joined(folder: Path, text: str) -> Path:
@@ -122,15 +120,8 @@ def joined(folder: Path, text: str) -> Path:
         return path_of(text)
     if not isinstance(folder, RemotePath):
         return folder / text
-    parts: list[str] = []
-    for part in text.split("/"):
-        if part == ".." and parts:
-            parts.pop()
-        elif part == "..":
-            folder = folder.parent
-        elif part not in ("", "."):
-            parts.append(part)
-    return path_of("/".join([str(folder), *parts]))
+    scheme, _, rest = str(folder).partition("://")
+    return path_of(f"{scheme}://{posixpath.normpath(f'{rest}/{text}')}")
 
 
 def _with_query(text: str, query: str) -> RemotePath:
@@ -138,10 +129,3 @@ def _with_query(text: str, query: str) -> RemotePath:
     if query:
         path.query = query
     return path
-
-
-def _local(text: str) -> Path:
-    parts = urlsplit(text)
-    if parts.netloc not in ("", "localhost"):
-        raise UsageError(f"{text[:100]} names a host; give file:///PATH")
-    return Path(unquote(parts.path))

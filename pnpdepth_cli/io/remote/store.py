@@ -9,9 +9,8 @@ import re
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from pnpdepth_cli.budget import budget
 from pnpdepth_cli.choices import STORES
@@ -25,26 +24,20 @@ from pnpdepth_cli.errors import (
 from pnpdepth_cli.io.file_bytes import cannot_read, one_line
 from pnpdepth_cli.io.remote.address import RemotePath
 
-_VERSIONS = ("ETag", "etag", "generation", "md5Hash", "blob_id")
-"""What stores call the version of an object's content."""
+_VERSIONS = ("ETag", "etag", "generation", "md5Hash", "blob_id", "LastModified", "mtime")
+"""What stores call the version of an object's content, the surest first."""
 _NOT_LISTED = ("http", "https")
 _FOLDERS = 64
 """Folders whose names are kept."""
+_RETRIES = {"total_max_attempts": 3, "mode": "standard"}
 _OPTIONS: dict[str, dict[str, Any]] = {
-    "s3": {
-        "config_kwargs": {
-            "connect_timeout": 5,
-            "read_timeout": 30,
-            "retries": {"total_max_attempts": 3, "mode": "standard"},
-        }
-    }
+    "s3": {"config_kwargs": {"connect_timeout": 5, "read_timeout": 30, "retries": _RETRIES}}
 }
 _FORBIDDEN = (401, 403)
 _OF_THE_DISK = {errno.ENOSPC, errno.EDQUOT}
 
 
-@dataclass(frozen=True, kw_only=True)
-class Status:
+class Status(NamedTuple):
     """What a store says of an object."""
 
     size: int
@@ -61,22 +54,14 @@ def status_of(path: RemotePath) -> Status | None:
         InputError: It may not be read.
         StorageError: The store cannot be reached.
     """
-    try:
-        with _errors_of(path):
-            info = _call(path, "info")
-    except _MissingError:
-        return None
-    return None if info.get("type") == "directory" else _status(info)
+    info = _call_if_there(path, "info")
+    return None if info is None or info.get("type") == "directory" else _status(info)
 
 
 def read_object(path: RemotePath) -> bytes | None:
     """Returns the content of a small object; None if there is none. Raises as `status_of`."""
-    try:
-        with _errors_of(path):
-            data: bytes = _call(path, "cat_file")
-            return data
-    except _MissingError:
-        return None
+    data: bytes | None = _call_if_there(path, "cat_file")
+    return data
 
 
 def upload(file: Path, path: RemotePath) -> None:
@@ -93,8 +78,7 @@ def upload(file: Path, path: RemotePath) -> None:
 def remove(path: RemotePath) -> None:
     """Removes an object, if there is one. Raises as `upload`."""
     if status_of(path) is not None:
-        with _errors_of(path, writing=True):
-            _call(path, "rm_file")
+        _call(path, "rm_file", writing=True)
 
 
 @contextmanager
@@ -106,7 +90,7 @@ def local_files(paths: Iterable[Path]) -> Iterator[dict[Path, Path]]:
         FileFormatError: It is larger than the budget of readers.
         StorageError: The store cannot be reached, or the disk is full.
     """
-    wanted = list(dict.fromkeys(path for path in paths if isinstance(path, RemotePath)))
+    wanted = dict.fromkeys(path for path in paths if isinstance(path, RemotePath))
     if not wanted:
         yield {}
         return
@@ -148,26 +132,15 @@ class Listing:
 
 
 def _listed(folder: Path) -> Mapping[str, Status | None]:
-    """The names in a folder; none if there is no such folder.
-
-    Raises:
-        UsageError: The store's package is not installed.
-        InputError: It may not be listed.
-        StorageError: The store cannot be reached.
-    """
+    """The names in a folder; none if there is no such folder. Raises as `status_of`."""
     if not isinstance(folder, RemotePath):
         try:
-            with os.scandir(folder) as entries:
-                return dict.fromkeys(entry.name for entry in entries)
+            return dict.fromkeys(entry.name for entry in os.scandir(folder))
         except FileNotFoundError:
             return {}
         except OSError as error:
             raise cannot_read(folder, error) from error
-    try:
-        with _errors_of(folder):
-            infos = _call(folder, "ls", detail=True)
-    except _MissingError:
-        return {}
+    infos = _call_if_there(folder, "ls", detail=True) or ()
     files = (info for info in infos if info.get("type") != "directory")
     return {info["name"].rpartition("/")[2]: _status(info) for info in files}
 
@@ -178,10 +151,9 @@ def forget_stores() -> None:
 
 
 def _download(path: RemotePath, copy: Path) -> None:
-    status = status_of(path)
+    status, limit = status_of(path), budget().max_file_bytes
     if status is None:
         raise InputError(f"{path}: no such object; check the address")
-    limit = budget().max_file_bytes
     if status.size < 0:
         raise FileFormatError(f"{path}: its server does not say its size; copy the file first")
     if status.size > limit:
@@ -191,8 +163,7 @@ def _download(path: RemotePath, copy: Path) -> None:
         )
     try:
         copy.parent.mkdir()
-        with _errors_of(path):
-            _call(path, "get_file", str(copy))
+        _call(path, "get_file", str(copy))
     except OSError as error:
         raise StorageError(
             f"{path} cannot be copied to {copy.parent} ({error.strerror}); set TMPDIR to a larger"
@@ -209,8 +180,6 @@ class _MissingError(InputError):
 @functools.cache
 def _file_system(scheme: str) -> Any:
     package = STORES[scheme]
-    extra = "pip install 'pnpdepth[remote]'"
-    install = extra if scheme == "s3" else f"{extra} {package}"
     try:
         import fsspec
 
@@ -218,11 +187,21 @@ def _file_system(scheme: str) -> Any:
             scheme, use_listings_cache=False, skip_instance_cache=True, **_OPTIONS.get(scheme, {})
         )
     except (ImportError, ValueError):
+        install = "pip install 'pnpdepth[remote]'" + ("" if scheme == "s3" else f" {package}")
         raise UsageError(f"{scheme}:// needs fsspec and {package}: {install}") from None
 
 
-def _call(path: RemotePath, method: str, *more: Any, **options: Any) -> Any:
-    return getattr(_file_system(_scheme(path)), method)(str(path) + path.query, *more, **options)
+def _call(path: RemotePath, method: str, *more: Any, writing: bool = False, **options: Any) -> Any:
+    with _errors_of(path, writing=writing):
+        call = getattr(_file_system(_scheme(path)), method)
+        return call(str(path) + path.query, *more, **options)
+
+
+def _call_if_there(path: RemotePath, method: str, **options: Any) -> Any:
+    try:
+        return _call(path, method, **options)
+    except _MissingError:
+        return None
 
 
 def _scheme(path: RemotePath) -> str:
@@ -232,12 +211,11 @@ def _scheme(path: RemotePath) -> str:
 def _status(info: Mapping[str, Any]) -> Status:
     size = info.get("size")
     version = next((str(info[key]) for key in _VERSIONS if info.get(key)), "")
-    version = version or str(info.get("LastModified") or info.get("mtime") or "")
-    return Status(size=-1 if size is None else int(size), version=version.strip('"'))
+    return Status(-1 if size is None else int(size), version.strip('"'))
 
 
 @contextmanager
-def _errors_of(path: RemotePath, *, writing: bool = False) -> Iterator[None]:
+def _errors_of(path: RemotePath, *, writing: bool) -> Iterator[None]:
     """Turns what fsspec and its stores raise into the program's own errors."""
     try:
         yield

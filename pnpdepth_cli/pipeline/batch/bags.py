@@ -23,14 +23,9 @@ def unpacked(
     The frames are in OUTPUT_frames, and stay there for the next run. Their poses are used where
     points are accumulated and no others are given.
 
-    Args:
-        request: Of the batch.
-        options: Which messages make a frame.
-        say: Receives notes.
-        may_write: False refuses a bag whose frames are not written yet.
-
     Raises:
-        UsageError: Options of a bag are given for another source.
+        UsageError: Options of a bag are given for another source, or the frames are not written
+            yet and may not be.
     """
     if not is_bag(request.source):
         if options != BagOptions():

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, TypeVar
 
-from pnpdepth_cli.errors import FileFormatError, UsageError
+from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.io.atomic import make_folder
 from pnpdepth_cli.io.dataset.frame import Frame
 from pnpdepth_cli.io.lock import in_turn, locked_folder
@@ -20,25 +21,26 @@ from pnpdepth_cli.io.record import plain
 from pnpdepth_cli.io.remote.address import RemotePath
 from pnpdepth_cli.io.remote.store import upload
 from pnpdepth_cli.io.report import remove_report_leftovers
-from pnpdepth_cli.pipeline.batch.frames import (
-    BatchFrames,
-    Task,
-    find_frames,
-    source_files,
-    task_of,
-)
-from pnpdepth_cli.pipeline.batch.request import BatchRequest, SequenceOptions
+from pnpdepth_cli.pipeline.batch.frames import Task, find_frames, source_files, task_of
+from pnpdepth_cli.pipeline.batch.request import BatchRequest, SequenceOptions, ray_workers_of
 from pnpdepth_cli.pipeline.batch.sequence import in_windows, note_of_poses
 from pnpdepth_cli.pipeline.batch.settings import model_identity, settings_of
 from pnpdepth_cli.pipeline.batch.state import BatchState, Row, remove_all_leftovers
-from pnpdepth_cli.pipeline.batch.summary import CSV, JSON, Tally, profile_of, write_summaries
-from pnpdepth_cli.pipeline.cluster.options import RayWorkers, ray_workers_of
+from pnpdepth_cli.pipeline.batch.summary import (
+    CSV,
+    JSON,
+    Tally,
+    failed_row,
+    profile_of,
+    write_summaries,
+)
 from pnpdepth_cli.pipeline.ordered_pool import in_order
 from pnpdepth_cli.pipeline.refinement.method import resolve_method
 
 if TYPE_CHECKING:
     from pnpdepth_cli.pipeline.report.batch import BatchReport
 
+Result = TypeVar("Result")
 _MAX_LISTED = 5
 """Files named in messages; the rest is counted, and summary.json lists all."""
 _READERS = 8
@@ -70,14 +72,11 @@ class BatchOutcome:
     """True if it was stopped before all frames were done."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Planned:
-    """A frame that is to be done."""
+class Planned(NamedTuple):
+    """A frame that is to be done, and why, such as "new" or "other settings"."""
 
     name: str
-    """The frame's name."""
     why: str
-    """Why it is to be done, such as "new" or "other settings"."""
 
 
 def run_batch(
@@ -94,305 +93,251 @@ def run_batch(
         PnpDepthError: For what concerns all frames, such as a network that cannot be loaded, or a
             full disk.
     """
-    request, workers = _request_of_workers(request)
-    if workers is not None and request.sequence.warm_start:
-        raise UsageError(
-            "--warm-start refines frames in order, in one process; give each process a --shard of"
-            " the windows instead of --ray"
-        )
-    batch = find_frames(request)
-    report = _report_of(request, batch)
-    for note in _notes_of(request, batch):
-        listener.say(note)
-    state = BatchState(request.output, model_identity(request.refine))
+    batch = _Batch(request, listener.say)
     with ExitStack() as stack:
-        local = _opened_output(request, stack, report, listener.say)
-        to_do, reasons = _to_do(request, batch, state)
-        done = len(batch.chosen) - len(to_do)
-        listener.say(_plan_text(len(batch.chosen), done, reasons))
-        state.mark()
-        if report is not None:
-            report.begin()
-        began, refined_frames, start = 0, 0, time.perf_counter()
+        local = batch.opened_output(stack)
+        to_do = [frame for frame, _ in batch.to_do(check=not request.refine.outputs.overwrite)]
+        batch.state.mark()
+        if batch.report is not None:
+            batch.report.begin()
+        began, refined, start = 0, 0, time.perf_counter()
         seconds = Counter[str]()
         if to_do:
-            refined = _rows(request, batch, to_do, state, workers, listener, stopped)
-            with closing(refined) as rows:
+            with closing(batch.rows(to_do, listener, stopped)) as rows:
                 for row in rows:
                     listener.frame(row)
                     began += 1
-                    refined_frames += row["status"] != "failed"
+                    refined += row["status"] != "failed"
                     seconds.update(row.get("seconds") or {})
-        profile = profile_of(seconds, refined_frames, time.perf_counter() - start)
+        profile = profile_of(seconds, refined, time.perf_counter() - start)
         with in_turn(local):  # so the summary of the shard that ends last stays
-            summary = _summarise(request, batch, local, report, profile)
+            summary = batch.summarise(local, profile)
+    for note in summary.get("unsure", ()):
+        listener.say(f"warning: {note}")
     return BatchOutcome(summary=summary, stopped=began < len(to_do))
 
 
 def plan_batch(request: BatchRequest, say: Callable[[str], None]) -> list[Planned]:
     """Returns the frames that `run_batch` would do, and why; nothing is written."""
-    request, _ = _request_of_workers(request)
-    batch = find_frames(request)
-    _report_of(request, batch)
-    for note in _notes_of(request, batch):
-        say(note)
-    state = BatchState(request.output, model_identity(request.refine))
-    planned = [
-        Planned(name=batch.chosen[number].name, why=why)
-        for number, why in _reasons(request, batch, state, check=False)
-    ]
-    reasons = Counter(each.why for each in planned)
-    say(_plan_text(len(batch.chosen), len(batch.chosen) - len(planned), reasons))
-    return planned
+    batch = _Batch(request, say)
+    return [Planned(frame.name, why) for frame, why in batch.to_do(check=False)]
 
 
-def _request_of_workers(request: BatchRequest) -> tuple[BatchRequest, RayWorkers | None]:
-    """The request of each worker, and the Ray workers; None for this process alone."""
-    workers = ray_workers_of(request.refine.network.device, request.cluster)
-    if workers is None:
-        return request, None
-    return replace(request, refine=request.refine.with_fields(device=workers.device)), workers
+class _Batch:
+    """The frames of a batch, and what its output folder holds of them.
 
-
-def _opened_output(
-    request: BatchRequest,
-    stack: ExitStack,
-    report: BatchReport | None,
-    say: Callable[[str], None],
-) -> Path:
-    """The output folder, locked; of one in a store, a local folder for the summaries."""
-    if isinstance(request.output, RemotePath):
-        return Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="pnpdepth-")))
-
-    def clean() -> None:
-        leftovers = remove_all_leftovers(request.output)
-        leftovers += 0 if report is None else remove_report_leftovers(report.folder)
-        if leftovers:
-            say(f"removed {leftovers:,} half-written files of a run that was killed")
-
-    make_folder(request.output)
-    stack.enter_context(locked_folder(request.output, request.shard, clean))
-    return request.output
-
-
-def _to_do(
-    request: BatchRequest, batch: BatchFrames, state: BatchState
-) -> tuple[list[Frame], Counter[str]]:
-    """The frames that are to be done, and how many for which reason.
-
-    OutputError if one would replace a file that no batch wrote, unless --overwrite is set.
-    """
-    check = not request.refine.outputs.overwrite
-    if check:
-        state.check_replaceable(request.output / name for name in (CSV, JSON))
-    planned = list(_reasons(request, batch, state, check=check))
-    return [batch.chosen[number] for number, _ in planned], Counter(why for _, why in planned)
-
-
-def _reasons(
-    request: BatchRequest, batch: BatchFrames, state: BatchState, *, check: bool
-) -> Iterator[tuple[int, str]]:
-    """The numbers of the frames that are to be done, and why.
-
-    OutputError, if `check`, where one would replace a file that no batch wrote.
+    Args:
+        request: As of `run_batch`.
+        say: Receives what was assumed, and warnings of files that are in no frame.
     """
 
-    def of_part(start: int) -> list[tuple[int, str]]:
-        reasons = []
-        for number in range(start, min(start + _PART, len(batch.chosen))):
-            task = task_of(request, batch.chosen[number])
+    def __init__(self, request: BatchRequest, say: Callable[[str], None]) -> None:
+        self.workers = ray_workers_of(request.refine.network.device, request.cluster)
+        if self.workers is not None:
+            refine = request.refine.with_fields(device=self.workers.device)
+            request = replace(request, refine=refine)
+        if self.workers is not None and request.sequence.warm_start:
+            raise UsageError(
+                "--warm-start refines frames in order, in one process; give each process a --shard"
+                " of the windows instead of --ray"
+            )
+        self.request, self._say, self.found = request, say, find_frames(request)
+        self.model = model_identity(request.refine)
+        self.report = self._report()
+        for note in self._notes():
+            say(note)
+        self.state = self._new_state()
+
+    def _new_state(self) -> BatchState:
+        """The state as it is now; what changes later in a folder is not seen."""
+        return BatchState(self.request.output, self.model)
+
+    def _report(self) -> BatchReport | None:
+        """The report, if one is wanted. OutputError if it cannot or may not be written there."""
+        request = self.request
+        if request.html is None:
+            return None
+        if isinstance(request.output, RemotePath) or isinstance(request.html, RemotePath):
+            raise UsageError("--html needs local folders; give a local -o and a local folder")
+        from pnpdepth_cli.pipeline.report.batch import BatchReport
+
+        report = BatchReport(
+            folder=request.html,
+            output=request.output,
+            view_3d=request.html_3d,
+            colors=request.refine.outputs.colors,
+        )
+        files = (path for frame in self.found.frames for path in source_files(frame))
+        inputs = [request.source, *(files if request.html.exists() else ())]
+        report.check(inputs, overwrite=request.refine.outputs.overwrite)
+        return report
+
+    def _notes(self) -> Iterator[str]:
+        request, frames, unmatched = self.request, self.found.frames, self.found.unmatched
+        with_gt = sum(frame.gt is not None for frame in frames)
+        guessed = " (guessed; --layout names another)" if request.layout is None else ""
+        count = _count(len(frames), "frame")
+        yield f"layout: {self.found.layout}{guessed}: {count}, {with_gt:,} with ground truth"
+        cut = sorted({f.protocol.name for f in frames if f.protocol.halved or f.protocol.crop})
+        if cut and request.protocol is None:
+            yield f"protocol: {', '.join(cut)} cuts the frames; --protocol whole keeps all of them"
+        if poses := note_of_poses(frames):
+            yield poses
+        if request.limit is not None:
+            yield f"limit: the first {request.limit:,} of them"
+        if request.shard is not None:
+            number, of = request.shard
+            yield f"shard {number}/{of}: {_count(len(self.found.chosen), 'frame')} of them"
+        for frame, why in self.found.refused:
+            yield f"failed: {frame.name}: {why}"
+        for each in unmatched[:_MAX_LISTED]:
+            yield f"warning: {each}"
+        if (more := len(unmatched) - _MAX_LISTED) > 0:
+            yield f"warning: {more:,} more files are in no frame; summary.json lists them"
+
+    def opened_output(self, stack: ExitStack) -> Path:
+        """Returns the output folder, locked; of one in a store, a local one for the summaries."""
+        output, report = self.request.output, self.report
+        if isinstance(output, RemotePath):
+            return Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="pnpdepth-")))
+
+        def clean() -> None:
+            leftovers = remove_all_leftovers(output)
+            leftovers += 0 if report is None else remove_report_leftovers(report.folder)
+            if leftovers:
+                self._say(f"removed {leftovers:,} half-written files of a run that was killed")
+
+        make_folder(output)
+        stack.enter_context(locked_folder(output, self.request.shard, clean))
+        return output
+
+    def to_do(self, *, check: bool) -> list[tuple[Frame, str]]:
+        """Returns the frames that are to be done, and why, and says how many.
+
+        OutputError, if `check`, where a result would replace a file that no batch wrote.
+        """
+        state, chosen = self.state, self.found.chosen
+        if check:
+            state.check_replaceable(self.request.output / name for name in (CSV, JSON))
+
+        def reason(frame: Frame) -> tuple[Frame, str] | None:
+            task = task_of(self.request, frame)
             why = state.reason_to_refine(task)
-            if why is not None:
-                if check:
-                    state.check_replaceable(task.outputs.paths(), task.record)
-                reasons.append((number, why))
-        return reasons
+            if why is not None and check:
+                state.check_replaceable(task.outputs.paths(), task.record)
+            return None if why is None else (frame, why)
 
-    for part in in_order(of_part, range(0, len(batch.chosen), _PART), _READERS):
-        yield from part
+        to_do = [each for each in _read_in_parts(reason, chosen) if each is not None]
+        kinds = Counter(why.split(":")[0] for _, why in to_do)
+        reasons = ", ".join(f"{count:,} {kind}" for kind, count in kinds.items())
+        frames, done = _count(len(chosen), "frame"), len(chosen) - len(to_do)
+        if to_do:
+            self._say(f"{frames}: {done:,} done already, {len(to_do):,} to do ({reasons})")
+        else:
+            self._say(f"{frames}, all of them done already")
+        return to_do
 
+    def rows(
+        self, to_do: list[Frame], listener: Listener, stopped: Callable[[], bool]
+    ) -> Generator[Row, None, None]:
+        """Refines frames in this process or on Ray workers; yields a row as each is done."""
+        # these import torch, which a run with nothing to do does not need
+        from pnpdepth_cli.pipeline.batch.ray_workers import rows_of_workers
+        from pnpdepth_cli.pipeline.batch.running import opened_network, references_of, refine_tasks
 
-def _rows(
-    request: BatchRequest,
-    batch: BatchFrames,
-    to_do: list[Frame],
-    state: BatchState,
-    workers: RayWorkers | None,
-    listener: Listener,
-    stopped: Callable[[], bool],
-) -> Generator[Row, None, None]:
-    """A row for each frame as it is done, in this process or on Ray workers."""
-    # these import torch, which a run with nothing to do does not need
-    from pnpdepth_cli.pipeline.batch.ray_workers import rows_of_workers
-    from pnpdepth_cli.pipeline.batch.resolving import load_batch_refiner, references_of
-    from pnpdepth_cli.pipeline.batch.running import opened_network, refine_tasks
+        request, say = self.request, listener.say
+        references = references_of(request, self.found.frames)
+        worked = len(to_do) < len(self.found.chosen)
+        if self.workers is not None:
+            listener.begin(len(to_do))
+            yield from rows_of_workers(
+                request, self.workers, references, to_do, self.state,
+                settings_worked=worked, say=say, stopped=stopped,
+            )  # fmt: skip
+            return
+        with opened_network(request, references, say) as network:
+            listener.begin(len(to_do))
+            yield from refine_tasks(
+                self._tasks(to_do), network, self.state,
+                threads=request.workers, settings_worked=worked, stopped=stopped,
+            )  # fmt: skip
 
-    references = references_of(request, batch.frames)
-    worked = len(to_do) < len(batch.chosen)
-    if workers is not None:
-        listener.begin(len(to_do))
-        yield from rows_of_workers(
-            request, workers, references, to_do, state,
-            settings_worked=worked, say=listener.say, stopped=stopped,
-        )  # fmt: skip
-        return
-    refiner = None
-    if references is not None:
-        refiner = load_batch_refiner(request, references, listener.say)
-    listener.begin(len(to_do))
-    with opened_network(refiner, request.batch_size, listener.say) as network:
-        yield from refine_tasks(
-            _tasks(request, batch, to_do), network, state,
-            threads=request.workers, settings_worked=worked, stopped=stopped,
-        )  # fmt: skip
+    def _tasks(self, to_do: list[Frame]) -> Iterator[Task]:
+        """The frames to refine in their order, and within windows those that they begin with."""
+        if not self.request.sequence.warm_start:
+            yield from (task_of(self.request, frame) for frame in to_do)
+            return
+        by_name = {frame.name: frame for frame in self.found.frames}
+        for wanted in in_windows(to_do):
+            names = {frame.name for frame in wanted}
+            for each in wanted[-1].window:
+                task = task_of(self.request, by_name[each.name])
+                yield replace(task, written=task.name in names)
 
+    def summarise(self, local: Path, profile: dict[str, Any]) -> dict[str, Any]:
+        """Writes the summaries and the report; returns the summary without its frames."""
+        request, state, tally = self.request, self._new_state(), Tally()
+        refused = (failed_row(frame.name, {}, why) for frame, why in self.found.refused)
+        known = _read_in_parts(lambda frame: state.row(task_of(request, frame)), self.found.frames)
+        with tempfile.TemporaryFile("w+", dir=local, encoding="utf-8") as file:
+            for row in itertools.chain(refused, known):
+                if row is not None:
+                    tally.add(row)
+                    file.write(json.dumps(row) + "\n")
+            summary = self._head(tally)
+            if request.profile:
+                summary["profile"] = profile
 
-def _tasks(request: BatchRequest, batch: BatchFrames, to_do: list[Frame]) -> Iterator[Task]:
-    """The frames to refine in their order, and within windows those that they begin with."""
-    if not request.sequence.warm_start:
-        yield from (task_of(request, frame) for frame in to_do)
-        return
-    by_name = {frame.name: frame for frame in batch.frames}
-    for wanted in in_windows(to_do):
-        names = {frame.name for frame in wanted}
-        for each in wanted[-1].window:
-            task = task_of(request, by_name[each.name])
-            yield replace(task, written=task.name in names)
+            def rows() -> Iterator[Row]:
+                file.seek(0)
+                return map(json.loads, file)
 
+            write_summaries(local, summary, rows(), tally.baseline_names)
+            if self.report is not None:
+                self.report.write(summary, rows)
+        if isinstance(request.output, RemotePath):
+            for name in (CSV, JSON):
+                upload(local / name, request.output / name)
+        return summary
 
-def _report_of(request: BatchRequest, batch: BatchFrames) -> BatchReport | None:
-    """The report, if one is wanted. OutputError if it cannot or may not be written there."""
-    if request.html is None:
-        return None
-    if isinstance(request.output, RemotePath) or isinstance(request.html, RemotePath):
-        raise UsageError("--html needs local folders; give a local -o and a local report folder")
-    from pnpdepth_cli.pipeline.report.batch import BatchReport
-
-    report = BatchReport(
-        folder=request.html,
-        output=request.output,
-        view_3d=request.html_3d,
-        colors=request.refine.outputs.colors,
-    )
-    files = (path for frame in batch.frames for path in source_files(frame))
-    inputs = [request.source, *(files if request.html.exists() else ())]
-    report.check(inputs, overwrite=request.refine.outputs.overwrite)
-    return report
-
-
-def _summarise(
-    request: BatchRequest,
-    batch: BatchFrames,
-    local: Path,
-    report: BatchReport | None,
-    profile: dict[str, Any],
-) -> dict[str, Any]:
-    """Writes summary.csv, summary.json and the report; returns the summary without its frames."""
-    model, tally = model_identity(request.refine), Tally()
-    with tempfile.TemporaryFile("w+", dir=local, encoding="utf-8") as file:
-        for row in _known_rows(request, batch, BatchState(request.output, model)):
-            try:
-                tally.add(row)
-            except (AttributeError, KeyError, TypeError) as error:
-                raise FileFormatError(
-                    f"the record of frame {row['name']} in {request.output} is damaged; remove it,"
-                    " and run again"
-                ) from error
-            file.write(json.dumps(row) + "\n")
-        summary = _head_of(request, batch, model, tally)
-        if request.profile:
-            summary["profile"] = profile
-
-        def rows() -> Iterator[Row]:
-            file.seek(0)
-            return map(json.loads, file)
-
-        write_summaries(local, summary, rows(), tally.baseline_names)
-        if report is not None:
-            report.write(summary, rows)
-    if isinstance(request.output, RemotePath):
-        for name in (CSV, JSON):
-            upload(local / name, request.output / name)
-    return summary
+    def _head(self, tally: Tally) -> dict[str, Any]:
+        """The summary without its frames."""
+        request, found = self.request, self.found
+        frames, method = len(found.frames) + len(found.refused), resolve_method(request.refine)
+        head = {
+            "command": "batch",
+            "source": str(request.source),
+            "output": str(request.output),
+            "layout": found.layout,
+            "method": {
+                "kind": "default" if method.is_default else "fixed",
+                "reason": method.reason,
+            },
+            "settings": settings_of(request.refine, self.model),
+            "counts": {
+                "frames": frames,
+                **tally.counts,
+                "pending": frames - tally.counts.total(),
+                "with_warnings": tally.warned,
+            },
+            "unit": tally.unit,
+            "mean": tally.mean(),
+            "linear": tally.mean_linear(),
+            "baselines": tally.mean_baselines(),
+            "unmatched": [str(each) for each in found.unmatched],
+        }
+        if tally.unsure:
+            head["unsure"] = tally.unsure
+        if request.sequence != SequenceOptions():
+            head["sequence"] = plain(asdict(request.sequence))
+        return head
 
 
-def _known_rows(request: BatchRequest, batch: BatchFrames, state: BatchState) -> Iterator[Row]:
-    """The rows of all frames that are done, or have failed, with the present settings."""
-
-    def of_part(start: int) -> list[Row | None]:
-        part = batch.frames[start : start + _PART]
-        return [state.row(task_of(request, frame)) for frame in part]
-
-    for part in in_order(of_part, range(0, len(batch.frames), _PART), _READERS):
-        yield from (row for row in part if row is not None)
-
-
-def _head_of(
-    request: BatchRequest, batch: BatchFrames, model: dict[str, Any], tally: Tally
-) -> dict[str, Any]:
-    """The summary without its frames."""
-    known, method = sum(tally.counts.values()), resolve_method(request.refine)
-    head = {
-        "command": "batch",
-        "source": str(request.source),
-        "output": str(request.output),
-        "layout": batch.layout,
-        "method": {"kind": "default" if method.is_default else "fixed", "reason": method.reason},
-        "settings": settings_of(request.refine, model),
-        "counts": {
-            "frames": len(batch.frames),
-            **tally.counts,
-            "pending": len(batch.frames) - known,
-            "with_warnings": tally.warned,
-        },
-        "unit": tally.unit,
-        "mean": tally.mean(),
-        "linear": tally.mean_linear(),
-        "baselines": tally.mean_baselines(),
-        "unmatched": [str(each) for each in batch.unmatched],
-    }
-    if request.sequence != SequenceOptions():
-        head["sequence"] = plain(asdict(request.sequence))
-    return head
-
-
-def _notes_of(request: BatchRequest, batch: BatchFrames) -> Iterator[str]:
-    """What was assumed, and warnings of files that are in no frame."""
-    frames = batch.frames
-    with_gt = sum(frame.gt is not None for frame in frames)
-    guessed = " (guessed; --layout names another)" if request.layout is None else ""
-    yield (
-        f"layout: {batch.layout}{guessed}: {_count(len(frames), 'frame')},"
-        f" {with_gt:,} with ground truth"
-    )
-    cut = sorted({f.protocol.name for f in frames if f.protocol.halved or f.protocol.crop})
-    if cut and request.protocol is None:
-        yield f"protocol: {', '.join(cut)} cuts the frames; --protocol whole keeps all of them"
-    poses = note_of_poses(frames)
-    if poses is not None:
-        yield poses
-    if request.limit is not None:
-        yield f"limit: the first {request.limit:,} of them"
-    if request.shard is not None:
-        number, of = request.shard
-        yield f"shard {number}/{of}: {_count(len(batch.chosen), 'frame')} of them"
-    for each in batch.unmatched[:_MAX_LISTED]:
-        yield f"warning: {each}"
-    if len(batch.unmatched) > _MAX_LISTED:
-        more = len(batch.unmatched) - _MAX_LISTED
-        yield f"warning: {more:,} more files are in no frame; summary.json lists them"
-
-
-def _plan_text(frames: int, done: int, reasons: Counter[str]) -> str:
-    kinds = Counter[str]()
-    for why, count in reasons.items():
-        kinds[why.split(":")[0]] += count
-    reason_text = ", ".join(f"{count:,} {kind}" for kind, count in kinds.items())
-    if not kinds:
-        return f"{_count(frames, 'frame')}, all of them done already"
-    return (
-        f"{_count(frames, 'frame')}: {done:,} done already, {frames - done:,} to do ({reason_text})"
-    )
+def _read_in_parts(work: Callable[[Frame], Result], frames: Sequence[Frame]) -> Iterator[Result]:
+    """Yields the result of each frame in order, computed by threads that take many at once."""
+    starts = range(0, len(frames), _PART)
+    parts = in_order(lambda n: [work(frame) for frame in frames[n : n + _PART]], starts, _READERS)
+    return (each for part in parts for each in part)
 
 
 def _count(number: int, noun: str) -> str:

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Collection, Iterator, Sequence
+import itertools
+import unicodedata
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
+from fnmatch import fnmatch
+from pathlib import Path, PurePosixPath
 from typing import TypeVar
 
 from pnpdepth_cli.errors import InputError, OutputError, UsageError
@@ -20,6 +23,7 @@ from pnpdepth_cli.io.dataset.frame import (
 from pnpdepth_cli.io.dataset.frame_names import name_problem
 from pnpdepth_cli.io.file_bytes import one_line
 from pnpdepth_cli.io.layouts import LAYOUTS, find_protocol, list_frames
+from pnpdepth_cli.io.lock import LOCKS
 from pnpdepth_cli.io.remote.address import RemotePath
 from pnpdepth_cli.pipeline.batch.request import BatchRequest
 from pnpdepth_cli.pipeline.batch.sequence import (
@@ -28,12 +32,9 @@ from pnpdepth_cli.pipeline.batch.sequence import (
     with_neighbours,
     with_windows,
 )
+from pnpdepth_cli.pipeline.batch.summary import CSV, JSON
 from pnpdepth_cli.pipeline.refinement.output_files import Outputs
-from pnpdepth_cli.pipeline.refinement.request import (
-    FrameFiles,
-    NeighbourFiles,
-    RefineRequest,
-)
+from pnpdepth_cli.pipeline.refinement.request import FrameFiles, NeighbourFiles, RefineRequest
 
 Item = TypeVar("Item")
 REGISTERING = 16
@@ -48,11 +49,12 @@ class BatchFrames:
     """The frames of a batch."""
 
     layout: str
-    """Name of the layout."""
     frames: Sequence[Frame]
-    """All frames of the source."""
+    """All frames of the source whose results have files of their own."""
     chosen: Sequence[Frame]
     """Those within the limit and the shard."""
+    refused: Sequence[tuple[Frame, str]]
+    """Frames whose results would have no files of their own, and why."""
     unmatched: tuple[Unmatched, ...]
     """Files that are in no frame, and why."""
 
@@ -62,13 +64,11 @@ class Task:
     """One frame to refine."""
 
     name: str
-    """The frame's name."""
     request: RefineRequest
     """With the frame's files."""
     inputs: dict[str, Path]
     """The files that are read for it, by their part."""
     outputs: Outputs
-    """The files that are written for it."""
     written: bool = True
     """False for a frame that is refined only because another begins where it ends."""
 
@@ -87,27 +87,34 @@ def find_frames(request: BatchRequest) -> BatchFrames:
         UsageError: If none has sparse depth.
         OutputError: If the output is a file, or holds the frames.
     """
-    _check_stored(request.source)
-    if request.output.exists() and not request.output.is_dir():
-        raise OutputError(f"{request.output} is a file; name a folder")
-    if request.source.is_dir() and _is_inside(request.source, request.output):
-        raise _holds_the_frames(request.output)
-    layout, listing = list_frames(request.source, request.layout)
-    frames, unmatched = _usable(request.output, listing.frames)
+    source, output, sequence = request.source, request.output, request.sequence
+    if isinstance(source, RemotePath) and source.suffix not in _LISTS:
+        raise UsageError(
+            f"{source}: folders in a store are not searched for frames; give a list of them"
+            f" ({' or '.join(_LISTS)})"
+        )
+    if isinstance(source, RemotePath) and not source.exists():
+        raise InputError(f"{source}: no such object; check the address")
+    if output.exists() and not output.is_dir():
+        raise OutputError(f"{output} is a file; name a folder")
+    if source.is_dir() and _is_inside(source, output):
+        raise _holds_the_frames(output)
+    layout, listing = list_frames(source, request.layout)
+    found, unmatched = _outside(output, listing.frames)
+    frames, refused = _with_own_files(found, request.refine)
     lost = [*listing.broken, *listing.spare]
-    unmatched += [each for each in lost if not _is_inside(each.path, request.output)]
-    if not frames:
+    unmatched += [each for each in lost if not _is_inside(each.path, output)]
+    if not found:
         first = f" ({lost[0]})" if lost else ""
         raise InputError(
-            f"{request.source} looks like {layout!r} but has no frame in it{first};"
+            f"{source} looks like {layout!r} but has no frame in it{first};"
             f" layouts are {', '.join(LAYOUTS)}"
         )
-    if request.refine.files.sample is None and all(frame.sparse is None for frame in frames):
+    if request.refine.files.sample is None and all(frame.sparse is None for frame in found):
         raise UsageError(
-            f"{request.source} looks like {layout!r}, which has no sparse depth; --sample 500"
+            f"{source} looks like {layout!r}, which has no sparse depth; --sample 500"
             " draws so many points from the ground truth"
         )
-    sequence = request.sequence
     if sequence.accumulate:
         frames = with_neighbours(frames, sequence.accumulate, sequence.poses)
     if sequence.warm_start:
@@ -117,21 +124,9 @@ def find_frames(request: BatchRequest) -> BatchFrames:
         layout=layout,
         frames=frames,
         chosen=_chosen(request, frames[: request.limit]),
+        refused=refused,
         unmatched=tuple(unmatched),
     )
-
-
-def _check_stored(source: Path) -> None:
-    """Raises an error for a source in a store that is no list of frames."""
-    if not isinstance(source, RemotePath):
-        return
-    if source.suffix not in _LISTS:
-        raise UsageError(
-            f"{source}: folders in a store are not searched for frames; give a list of them"
-            f" ({' or '.join(_LISTS)})"
-        )
-    if not source.exists():
-        raise InputError(f"{source}: no such object; check the address")
 
 
 def _chosen(request: BatchRequest, frames: list[Frame]) -> list[Frame]:
@@ -150,7 +145,7 @@ def task_of(request: BatchRequest, frame: Frame) -> Task:
         refine = refine.with_fields(view_3d=True)
     needs_camera = refine.outputs.needs_camera or bool(frame.neighbours)
     files = _files_of(request, frame, needs_camera=needs_camera)
-    neighbours = tuple(
+    neighbours = (
         NeighbourFiles(
             files=_files_of(request, each.frame, needs_camera=True),
             motion=each.motion,
@@ -159,9 +154,8 @@ def task_of(request: BatchRequest, frame: Frame) -> Task:
         )
         for each in frame.neighbours
     )
-    if neighbours or frame.window:
-        window = tuple(each.name for each in frame.window)
-        files = replace(files, neighbours=neighbours, window=window)
+    window = tuple(each.name for each in frame.window)
+    files = replace(files, neighbours=tuple(neighbours), window=window)
     return Task(
         name=frame.name,
         request=replace(refine, files=files),
@@ -217,13 +211,10 @@ def registering(frames: Sequence[Item], first: int) -> list[Item]:
 
 def _reads_scan(files: FrameFiles, sparse: Path | None, gt: Source | None) -> bool:
     """Whether one of them is a scan that is projected, which needs the scanner's pose."""
-    return _is_scan_file(gt) or (sparse is not None and _is_scan(files, sparse))
-
-
-def _is_scan(files: FrameFiles, sparse: Path) -> bool:
-    suffix, known = sparse.suffix.lower(), files.calibration
+    suffix, known = "" if sparse is None else sparse.suffix.lower(), files.calibration
     return (
-        suffix in SCAN_ONLY_SUFFIXES
+        _is_scan_file(gt)
+        or _is_scan_file(sparse)
         or (suffix == ".npy" and files.scan.calib is not None)
         or (suffix == ".npz" and known is not None and known.has_pose)
     )
@@ -240,41 +231,29 @@ def source_files(frame: Frame) -> list[Path]:
 
 
 def _input_files(files: FrameFiles) -> Iterator[tuple[str, Path]]:
-    parts: dict[str, Source | None] = {
-        "image": files.image,
-        "sparse": files.sparse,
-        "gt": files.gt,
-    }
-    for part, source in parts.items():
-        if source is None:
-            continue
-        path = file_of(source)
-        if part == "sparse" and path.is_dir():  # a COLMAP model
+    parts = (("image", files.image), ("sparse", files.sparse), ("gt", files.gt))
+    for part, source in parts:
+        path = None if source is None else file_of(source)
+        if path is not None and part == "sparse" and path.is_dir():  # a COLMAP model
             yield from ((f"sparse {file.name}", file) for file in model_files(path))
-        else:
+        elif path is not None:
             yield part, path
     for each in files.neighbours:
-        yield from _neighbour_files(each.files, estimated=each.motion is None)
+        points, image = each.files.sparse or each.files.gt, each.files.image
+        if points is not None:
+            path = file_of(points)
+            yield f"sparse of {path.stem}", path
+            if each.motion is None and image is not None:  # the motion is estimated
+                yield f"image of {path.stem}", file_of(image)
     if files.gt is not None:
         yield from ((f"mask {number}", path) for number, path in enumerate(files.gt_masks))
     calib, extrinsics = files.scan.calib or files.camera_file, files.scan.extrinsics
     if _reads_scan(files, files.sparse, files.gt) and extrinsics is not None:
         yield "extrinsics", extrinsics
-    if calib is not None:
-        if calib.is_dir():
-            yield from ((f"calib {p.name}", p) for p in sorted(calib.glob("calib_*.txt")))
-        else:
-            yield "calib", calib
-
-
-def _neighbour_files(files: FrameFiles, *, estimated: bool) -> Iterator[tuple[str, Path]]:
-    """The files of a neighbour that are read: its points and, to estimate motion, its image."""
-    points = files.sparse or files.gt
-    if points is not None:
-        path = file_of(points)
-        yield f"sparse of {path.stem}", path
-        if estimated and files.image is not None:
-            yield f"image of {path.stem}", file_of(files.image)
+    if calib is not None and calib.is_dir():
+        yield from ((f"calib {path.name}", path) for path in sorted(calib.glob("calib_*.txt")))
+    elif calib is not None:
+        yield "calib", calib
 
 
 def _earlier_files(frame: Frame) -> Iterator[tuple[str, Path]]:
@@ -286,56 +265,79 @@ def _earlier_files(frame: Frame) -> Iterator[tuple[str, Path]]:
                     yield f"file {number} of {other.name}", path
 
 
-def _holds_the_frames(output: Path) -> OutputError:
-    return OutputError(
-        f"{output} holds the frames themselves; name a folder of its own, such as {output / 'out'}"
-    )
-
-
-def _usable(output: Path, frames: Sequence[Frame]) -> tuple[list[Frame], list[Unmatched]]:
-    """The frames outside of the output folder whose name is fit for results, and the others."""
-    kept, ignored = list[Frame](), list[Unmatched]()
-    inside, names, within = _finder(output), set[str](), 0
+def _outside(output: Path, frames: Sequence[Frame]) -> tuple[list[Frame], list[Unmatched]]:
+    """The frames without a file in the output folder, and the files of the others there."""
+    if not output.exists():
+        return list(frames), []
+    folder, kept, ignored = output.resolve(), list[Frame](), list[Unmatched]()
+    is_inside = functools.cache(lambda parent: parent.resolve().is_relative_to(folder))
     for frame in frames:
-        path = None if inside is None else inside(frame)
-        within += path is not None
-        why = _problem_of_name(frame.name, names) if path is None else _IN_OUTPUT
-        if why is None:
-            names.add(frame.name)
+        inside = (
+            path
+            for path in source_files(frame)
+            if is_inside(path.parent) or (path.is_symlink() and is_inside(path))
+        )
+        path = next(inside, None)
+        if path is None:
             kept.append(frame)
         else:
-            file = file_of(frame.image or frame.sparse or Path(frame.name))
-            ignored.append(Unmatched(path=path or file, why=why))
-    if frames and within == len(frames):
+            ignored.append(Unmatched(path=path, why=_IN_OUTPUT))
+    if frames and not kept:
         raise _holds_the_frames(output)
     return kept, ignored
 
 
-def _finder(output: Path) -> Callable[[Frame], Path | None] | None:
-    """A function of a frame that returns a file of it in the output folder; None without one."""
-    if not output.exists():
+def _with_own_files(
+    frames: Sequence[Frame], refine: RefineRequest
+) -> tuple[list[Frame], list[tuple[Frame, str]]]:
+    """The frames whose results have files of their own, and the others with the reason.
+
+    Names that differ in Unicode normalisation only are one file on macOS.
+    """
+    endings = [path.name for path in Outputs.in_folder(Path(), "", refine).paths()]
+    pairs = itertools.permutations(endings, 2)
+    between = tuple({one.removesuffix(two) for one, two in pairs if one.endswith(two)})
+    of_summary = {own.removesuffix(each) for own in (CSV, JSON) for each in endings}
+    names, seen = {_normalised(frame.name) for frame in frames}, set[str]()
+
+    def problem(name: str) -> str | None:
+        if why := name_problem(name):
+            return why
+        if name in seen:
+            return "is that of another frame"
+        top, slash, _ = name.partition("/")
+        if name in of_summary or (slash and (top in (CSV, JSON) or fnmatch(top, LOCKS))):
+            return "needs a file of the batch's own"
+        if not slash and not name.endswith(between):
+            return None
+        folders = [str(parent) for parent in PurePosixPath(name).parents] if slash else []
+        clashes = itertools.product([name], between), itertools.product(folders, endings)
+        for path, ending in itertools.chain(*clashes):
+            if path.endswith(ending) and path.removesuffix(ending) in names:
+                return f"needs a file of frame {one_line(path.removesuffix(ending))!r}"
         return None
-    folder = output.resolve()
-    is_inside = functools.cache(lambda parent: parent.resolve().is_relative_to(folder))
 
-    def file_inside(frame: Frame) -> Path | None:
-        for path in source_files(frame):
-            if is_inside(path.parent) or (path.is_symlink() and is_inside(path)):
-                return path
-        return None
+    kept, refused = list[Frame](), list[tuple[Frame, str]]()
+    for frame in frames:
+        name = _normalised(frame.name)
+        why = problem(name)
+        seen.add(name)
+        if why is None:
+            kept.append(frame)
+        else:
+            refused.append((frame, f"the name {one_line(frame.name)!r} {why}; rename it"))
+    return kept, refused
 
-    return file_inside
 
-
-def _problem_of_name(name: str, taken: Collection[str]) -> str | None:
-    """Why a frame of this name cannot have results; None if it can."""
-    problem = name_problem(name)
-    if problem is not None:
-        return f"is named {one_line(name)!r}, which {problem}; rename it"
-    if name == "summary":
-        return "would be recorded in summary.json, which is the batch's own; rename it"
-    return f"is a second frame {name!r}; rename it" if name in taken else None
+def _normalised(name: str) -> str:
+    return unicodedata.normalize("NFC", name)
 
 
 def _is_inside(path: Path, folder: Path) -> bool:
     return path.resolve().is_relative_to(folder.resolve())
+
+
+def _holds_the_frames(output: Path) -> OutputError:
+    return OutputError(
+        f"{output} holds the frames themselves; name a folder of its own, such as {output / 'out'}"
+    )

@@ -8,27 +8,24 @@ import socket
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from pnpdepth_cli import __version__
 from pnpdepth_cli.budget import chosen_max_pixels, set_max_pixels
-from pnpdepth_cli.errors import ClusterError, ModelError, PnpDepthError, UsageError
+from pnpdepth_cli.errors import ClusterError, ModelError, UsageError
 from pnpdepth_cli.io.dataset.frame import Frame
 from pnpdepth_cli.io.file_bytes import one_line
 from pnpdepth_cli.io.lock import LOCKS
 from pnpdepth_cli.io.remote.address import RemotePath
 from pnpdepth_cli.pipeline.batch.frames import task_of
-from pnpdepth_cli.pipeline.batch.request import BatchRequest
-from pnpdepth_cli.pipeline.batch.resolving import References, load_batch_refiner
+from pnpdepth_cli.pipeline.batch.ray_cluster import connected
+from pnpdepth_cli.pipeline.batch.request import BatchRequest, RayWorkers
 from pnpdepth_cli.pipeline.batch.state import BatchState, Row, remove_all_leftovers
-from pnpdepth_cli.pipeline.cluster.connection import connected
-from pnpdepth_cli.pipeline.cluster.options import RayWorkers
 
 if TYPE_CHECKING:
-    from pnpdepth_cli.pipeline.batch.running import OpenRefiner
+    from pnpdepth_cli.pipeline.batch.running import OpenNetwork, References
 
 _FRAMES_OF_A_CALL = 8
 """So many are read and written beside the network; fewer at the end, to balance the workers."""
@@ -66,8 +63,7 @@ def check_node(versions: Mapping[str, str], shared: Sequence[Path]) -> None:
             )
 
 
-@dataclass(frozen=True, kw_only=True)
-class Job:
+class Job(NamedTuple):
     """What every worker is started with."""
 
     request: BatchRequest
@@ -79,7 +75,7 @@ class Job:
     """The driver's working folder, which relative paths start from."""
     versions: dict[str, str]
     """Of the driver, as `software` returns them."""
-    shared: tuple[Path, ...]
+    shared: list[Path]
     """Files and folders that every worker has to see."""
     threads: int
     """Threads of torch, OpenCV and OpenMP."""
@@ -105,7 +101,7 @@ class Worker:
         self._job = job
         self._state = BatchState(job.request.output, job.model)
         self._open = ExitStack()  # until the process ends
-        self._network: OpenRefiner | None = None
+        self._network: OpenNetwork | None = None
         self._notes: list[str] = []
 
     def ready(self) -> None:
@@ -116,10 +112,9 @@ class Worker:
         """Returns the rows of the frames, and notes, after their results are written."""
         from pnpdepth_cli.pipeline.batch.running import opened_network, refine_tasks
 
-        request, references = self._job.request, self._job.references
-        if self._network is None and references is not None:
-            refiner = load_batch_refiner(request, references, self._notes.append)
-            opened = opened_network(refiner, request.batch_size, self._notes.append)
+        request = self._job.request
+        if self._network is None:
+            opened = opened_network(request, self._job.references, self._notes.append)
             self._network = self._open.enter_context(opened)
         tasks = (task_of(request, frame) for frame in frames)
         rows = list(
@@ -146,43 +141,27 @@ def rows_of_workers(
     """Refines and writes the frames on Ray workers; yields the rows as they are done.
 
     A frame whose worker dies is refined by another one. One whose worker dies again and again is
-    reported as failed.
-
-    Args:
-        request: How, on one device.
-        workers: Which workers.
-        references: The frames that decide what the network leaves open.
-        to_do: The frames to refine.
-        state: Records frames that fail.
-        settings_worked: True if a frame was refined with these settings before.
-        say: Receives notes.
-        stopped: True if nothing more is to be handed out.
-
-    Raises:
-        PnpDepthError: As of `refine_tasks`.
-        ClusterError: The cluster cannot be used.
+    reported as failed. Arguments and errors are as of `refine_tasks`, with ClusterError if the
+    cluster cannot be used.
     """
     shared = [request.source]
     if not isinstance(request.output, RemotePath):
         shared += [path.absolute() for path in request.output.glob(LOCKS)]
     job = Job(
-        request=request, references=references, model=state.model, folder=str(Path.cwd()),
-        versions=software(), shared=tuple(shared), threads=workers.options.cpus_per_worker,
-        max_pixels=chosen_max_pixels(),
+        request, references, state.model, str(Path.cwd()), software(), shared,
+        workers.options.cpus_per_worker, chosen_max_pixels(),
     )  # fmt: skip
-    with connected(workers) as cluster:
-        ray, count = cluster.ray, cluster.workers
+    with connected(workers) as (ray, count, resources):
         say(f"Ray workers: starting {count:,}, each with {workers.each}")
-        options = {"scheduling_strategy": "SPREAD", "max_restarts": _RESTARTS, **cluster.resources}
+        options = {"scheduling_strategy": "SPREAD", "max_restarts": _RESTARTS, **resources}
         actor, reference = ray.remote(Worker).options(**options), ray.put(job)
         actors = [actor.remote(reference) for _ in range(count)]
         try:
-            driver = _Driver(ray, actors, to_do, settings_worked, say)
-            for result in driver.results(stopped, workers.options.retries):
-                if isinstance(result, _Lost):
-                    yield state.fail(task_of(request, result.frame), result.message)
-                else:
-                    yield result
+            yield from rows_of_actors(
+                ray, actors, to_do, retries=workers.options.retries, worked=settings_worked,
+                lost=lambda frame, why: state.fail(task_of(request, frame), why), say=say,
+                stopped=stopped,
+            )  # fmt: skip
         finally:
             for each in actors:
                 ray.kill(each)
@@ -190,142 +169,100 @@ def rows_of_workers(
         remove_all_leftovers(request.output)  # of workers that died
 
 
-@dataclass(kw_only=True)
-class _Call:
+class _Call(NamedTuple):
     """Frames that go to a worker together; none while it starts."""
 
+    actor: Any
     frames: Sequence[Frame] = ()
     deaths: int = 0
     """How often a worker died of this frame, if it is a single one."""
-    actor: Any = None
+    worked: bool = False
+    """True if a frame was refined with these settings before the call."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Lost:
-    """A frame whose worker died each time."""
+def rows_of_actors(
+    ray: Any,
+    actors: Sequence[Any],
+    to_do: Sequence[Frame],
+    *,
+    retries: int,
+    worked: bool,
+    lost: Callable[[Frame, str], Row],
+    say: Callable[[str], None],
+    stopped: Callable[[], bool],
+) -> Iterator[Row]:
+    """Hands out frames, a call at a time for each worker; yields the rows as they are done.
 
-    frame: Frame
-    message: str
-
-
-class _Driver:
-    """Hands out frames, a call at a time for each worker, and again those whose worker died.
+    The frames of a worker that dies are handed out again, one by one.
 
     Args:
         ray: Ray, connected.
-        actors: The workers.
+        actors: The workers, which may be starting.
         to_do: The frames.
-        settings_worked: True if a frame was refined with these settings before.
+        retries: How often a single frame whose worker died is tried again.
+        worked: True if a frame was refined with these settings before.
+        lost: Returns the row of a frame whose worker died each time, by frame and reason.
         say: Receives notes.
+        stopped: True if nothing more is to be handed out.
     """
+    idle, said, running = list[Any](), set[str](), dict[Any, _Call]()
+    again, position = deque[tuple[Sequence[Frame], int]](), 0
 
-    def __init__(
-        self,
-        ray: Any,
-        actors: Sequence[Any],
-        to_do: Sequence[Frame],
-        settings_worked: bool,
-        say: Callable[[str], None],
-    ) -> None:
-        self._ray, self._to_do, self._say = ray, to_do, say
-        self._workers, self._next, self._worked = len(actors), 0, settings_worked
-        self._idle: list[Any] = []
-        self._again: deque[_Call] = deque()
-        self._unproven: list[tuple[_Call, PnpDepthError]] = []  # failed before any frame succeeded
-        self._running: dict[Any, _Call] = {}  # by reference
-        self._said: set[str] = set()
-        for actor in actors:
-            self._start(actor)
+    def start(actor: Any) -> None:
+        running[actor.ready.options(max_task_retries=-1).remote()] = _Call(actor)
 
-    def results(self, stopped: Callable[[], bool], retries: int) -> Iterator[Row | _Lost]:
-        """Yields a row for each frame as it is done, or that it is lost.
-
-        Args:
-            stopped: True if nothing more is to be handed out.
-            retries: How often a single frame is tried again.
-        """
-        while True:
-            if not stopped():
-                self._hand_out()
-            busy = any(call.frames for call in self._running.values())
-            if not busy and stopped():
-                return
-            if not busy and self._unproven:
-                raise self._unproven[0][1]
-            if not busy and not self._again and self._next == len(self._to_do):
-                return
-            timeout = None if busy else _NO_WORKER_S
-            ended, _ = self._ray.wait(list(self._running), timeout=timeout)
-            if not ended:
-                raise ClusterError(
-                    f"no worker has started for {_NO_WORKER_S:.0f} s; check the cluster with `ray"
-                    " status`, and run the same command to continue"
-                )
-            yield from self._result(ended[0], retries)
-
-    def _start(self, actor: Any) -> None:
-        ready = actor.ready.options(max_task_retries=-1).remote()  # until it has started
-        self._running[ready] = _Call(actor=actor)
-
-    def _hand_out(self) -> None:
-        while self._idle and not self._unproven:
-            if self._again:
-                call = self._again.popleft()
+    for actor in actors:
+        start(actor)
+    while True:
+        over = stopped() or (not again and position == len(to_do))
+        if not over and idle:
+            if again:
+                frames, deaths = again.popleft()
             else:
-                left = len(self._to_do) - self._next
-                size = max(1, min(_FRAMES_OF_A_CALL, left // (2 * self._workers)))
-                call = _Call(frames=self._to_do[self._next : self._next + size])
-                self._next += len(call.frames)
-            if not call.frames:
-                return
-            call.actor = self._idle.pop()
-            self._running[call.actor.refine.remote(call.frames, self._worked)] = call
-
-    def _result(self, reference: Any, retries: int) -> Iterator[Row | _Lost]:
-        call, exceptions = self._running.pop(reference), self._ray.exceptions
+                size = min(_FRAMES_OF_A_CALL, (len(to_do) - position) // (2 * len(actors)))
+                frames, deaths = to_do[position : position + max(1, size)], 0
+                position += len(frames)
+            actor = idle.pop()
+            running[actor.refine.remote(frames, worked)] = _Call(actor, frames, deaths, worked)
+            continue
+        busy = any(call.frames for call in running.values())
+        if over and not busy:
+            return
+        ended, _ = ray.wait(list(running), timeout=None if busy else _NO_WORKER_S)
+        if not ended:
+            raise ClusterError(
+                f"no worker has started for {_NO_WORKER_S:.0f} s; check the cluster with `ray"
+                " status`, and run the same command to continue"
+            )
+        call = running.pop(ended[0])
         try:
-            result = self._ray.get(reference)
-        except exceptions.RayTaskError as error:
-            self._failed(call, error)
-            return
-        except exceptions.RayError as error:
-            yield from self._died(call, reason_of(error), retries)
-            return
-        self._idle.append(call.actor)
-        rows, notes = result or ((), ())
+            rows, notes = ray.get(ended[0]) or ((), ())
+        except ray.exceptions.RayTaskError as error:
+            of_settings = isinstance(error.cause, ModelError) or type(error.cause) is UsageError
+            if call.worked or not (call.frames and of_settings and worked):
+                raise error.cause if isinstance(error.cause, Exception) else error from None
+            again.append((call.frames, call.deaths))  # of one frame, as others worked meanwhile
+            idle.append(call.actor)
+            continue
+        except ray.exceptions.RayError as error:
+            reason = reason_of(error)
+            if not call.frames:
+                raise ClusterError(f"a worker died {_RESTARTS} times: {reason}") from None
+            say(f"warning: a worker died ({reason}); Ray starts another one")
+            start(call.actor)
+            deaths = call.deaths + (len(call.frames) == 1)
+            if deaths > retries:
+                yield lost(call.frames[0], f"its worker died {deaths} times: {reason}")
+            else:
+                again.extend(([frame], deaths) for frame in call.frames)
+            continue
+        idle.append(call.actor)
         for note in notes:
-            if note not in self._said:
-                self._said.add(note)
-                self._say(note)
-        if any(row["status"] != "failed" for row in rows):
-            self._worked = True
-            self._again.extend(call for call, _ in self._unproven)
-            self._unproven.clear()
+            if note not in said:
+                said.add(note)
+                say(note)
+        worked |= any(row["status"] != "failed" for row in rows)
         yield from rows
-
-    def _failed(self, call: _Call, error: Any) -> None:
-        """Raises what a worker raised, unless other settings of the same run worked."""
-        cause = error.cause
-        of_settings = isinstance(cause, ModelError) or type(cause) is UsageError
-        if not call.frames or not of_settings:
-            raise cause if isinstance(cause, Exception) else error from None
-        self._idle.append(call.actor)
-        if self._worked:
-            self._again.append(call)
-        else:
-            self._unproven.append((call, cause))
-
-    def _died(self, call: _Call, reason: str, retries: int) -> Iterator[_Lost]:
-        """Hands out the frames of a dead worker again, one by one; gives up a single one."""
-        if not call.frames:
-            raise ClusterError(f"a worker died {_RESTARTS} times: {reason}")
-        self._say(f"warning: a worker died ({reason}); Ray starts another one")
-        self._start(call.actor)
-        deaths = call.deaths + (len(call.frames) == 1)
-        if deaths > retries:
-            yield _Lost(frame=call.frames[0], message=f"its worker died {deaths} times: {reason}")
-        else:
-            self._again.extend(_Call(frames=[frame], deaths=deaths) for frame in call.frames)
 
 
 def reason_of(error: Exception) -> str:

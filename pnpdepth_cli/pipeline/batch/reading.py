@@ -54,8 +54,6 @@ def _with_copies(value: Any, copies: Mapping[Path, Path]) -> Any:
     if isinstance(value, tuple):
         return tuple(_with_copies(item, copies) for item in value)
     if is_dataclass(value) and not isinstance(value, type):
-        old = {field.name: getattr(value, field.name) for field in fields(value) if field.init}
-        new = {name: _with_copies(item, copies) for name, item in old.items()}
-        changed = {name: item for name, item in new.items() if item is not old[name]}
-        return replace(value, **changed) if any(changed) else value
+        names = [field.name for field in fields(value) if field.init]
+        return replace(value, **{n: _with_copies(getattr(value, n), copies) for n in names})
     return value

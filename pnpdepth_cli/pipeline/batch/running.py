@@ -6,12 +6,14 @@ the threads are bounded, so memory does not grow with the number of frames.
 
 from __future__ import annotations
 
+import functools
 import time
 import traceback
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -25,18 +27,111 @@ from pnpdepth_cli.errors import (
     UsageError,
 )
 from pnpdepth_cli.frames.frame import RefinedFrame, WarmStart
+from pnpdepth_cli.io.dataset.frame import Frame
 from pnpdepth_cli.io.fingerprint import Fingerprint
-from pnpdepth_cli.pipeline.batch.frames import Task
-from pnpdepth_cli.pipeline.batch.reading import read_task
+from pnpdepth_cli.pipeline.batch.frames import Task, reference_frames, registering, task_of
+from pnpdepth_cli.pipeline.batch.reading import read_frame, read_task
+from pnpdepth_cli.pipeline.batch.request import BatchRequest
 from pnpdepth_cli.pipeline.batch.state import BatchState, Row
 from pnpdepth_cli.pipeline.ordered_pool import in_order
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs
+from pnpdepth_cli.pipeline.refinement.load_refiner import load_refiner
 from pnpdepth_cli.pipeline.refinement.refine import write_refined
 from pnpdepth_cli.pipeline.refinement.refiner import Opened, Refiner
 from pnpdepth_cli.pipeline.stopwatch import Stopwatch
 
 _ROUNDING = 1e-3
 """A larger relative difference of plain predictions is more than rounding."""
+
+
+class References(NamedTuple):
+    """The frames that decide for all frames of a batch."""
+
+    first: Frame
+    """The first one that can be read."""
+    others: Sequence[Frame]
+    """More frames, for input ranges where the network states none."""
+    registering: Sequence[Frame]
+    """Frames that decide how images are moved into the frame of the points."""
+
+
+def references_of(request: BatchRequest, frames: Sequence[Frame]) -> References | None:
+    """Returns the frames that decide, of all frames, so that every run and shard decides the same.
+
+    Returns:
+        None if no frame can be read.
+    """
+    for number, frame in enumerate(frames):
+        if _readable(task_of(request, frame)) is not None:
+            others = reference_frames(frames, number)
+            return References(frame, others, registering(frames, number))
+    return None
+
+
+@contextmanager
+def opened_network(
+    request: BatchRequest, references: References | None, say: Callable[[str], None]
+) -> Iterator[OpenNetwork | None]:
+    """Yields the network, resolved on the frames that decide, open for any number of frames.
+
+    Args:
+        request: The batch.
+        references: Of `references_of`; None yields None.
+        say: Receives what was decided.
+    """
+    if references is None:
+        yield None
+        return
+    refiner = _load(request, references, say)
+    with refiner.opened() as opened:
+        yield OpenNetwork(refiner, opened, request.batch_size, say)
+
+
+def _load(request: BatchRequest, references: References, say: Callable[[str], None]) -> Refiner:
+    task = task_of(request, references.first)
+    first = read_frame(task)
+    for note in first.notes:
+        say(f"{task.name}: {note}")
+
+    def readable(frames: Iterable[Frame]) -> Iterator[Inputs]:
+        read = (_readable(task_of(request, frame)) for frame in frames)
+        return (inputs for inputs in read if inputs is not None)
+
+    others = functools.cache(lambda: [*readable(references.others)])
+    refiner = load_refiner(task.request, first, others)
+    for note in refiner.network.notes:
+        say(note)
+    if first.registration == "auto":
+        refiner = refiner.with_registration_of(readable(references.registering))
+        for (height, width), registration in refiner.registrations.items():
+            if registration is not None:
+                say(
+                    f"images of {width}×{height} are moved into the frame of the points by"
+                    f" {registration}; --registration off leaves them"
+                )
+    if refiner.method.is_default:
+        names = " and ".join(member.network.definition.name for member in refiner.members)
+        say(f"method: the default, with {names}")
+    else:
+        s = refiner.settings
+        say(
+            f"network: {refiner.network.definition.name} cut at {refiner.layer}, {s.iterations}"
+            f" updates of z ({s.update}, {s.loss}, step {s.lr})"
+        )
+    return refiner
+
+
+def _readable(task: Task) -> Inputs | None:
+    """The frame's contents; None if it cannot be read, which is reported later.
+
+    UsageError if an option is wrong, for all frames.
+    """
+    try:
+        return read_frame(task)
+    except UsageError:
+        raise
+    except Exception:
+        return None
 
 
 @dataclass(kw_only=True)
@@ -53,7 +148,7 @@ class FrameInMemory:
 
 def refine_tasks(
     tasks: Iterable[Task],
-    network: OpenRefiner | None,
+    network: OpenNetwork | None,
     state: BatchState,
     *,
     threads: int,
@@ -64,7 +159,7 @@ def refine_tasks(
 
     Args:
         tasks: The frames to refine.
-        network: The network, open; None if no frame could be read.
+        network: The network; None if no frame could be read.
         state: Writes the results.
         threads: Number of threads that read, and of threads that write.
         settings_worked: True if a frame was refined with these settings before.
@@ -78,7 +173,7 @@ def refine_tasks(
 
     def refined(reading: Iterable[FrameInMemory]) -> Iterator[FrameInMemory]:
         worked = settings_worked
-        for group in _groups(reading, lambda: 1 if network is None else network.batch_size):
+        for group in _groups(reading, network):
             if stopped():
                 return
             _refine(group, network)
@@ -101,54 +196,43 @@ def refine_tasks(
 
 
 def _groups(
-    frames: Iterable[FrameInMemory], size: Callable[[], int]
+    frames: Iterable[FrameInMemory], network: OpenNetwork | None
 ) -> Iterator[list[FrameInMemory]]:
-    """The frames in their order, in groups of at most so many of one shape.
+    """The frames in their order, in groups of those that go through the network together.
 
     A frame that could not be read is in the group of those before it.
     """
     group: list[FrameInMemory] = []
-    shape = None
     for frame in frames:
-        if frame.inputs is not None:
-            if shape not in (None, frame.inputs.size):
-                yield group
-                group = []
-            shape = frame.inputs.size
-        group.append(frame)
-        if len(group) >= size():
+        sizes = {each.inputs.size for each in (*group, frame) if each.inputs is not None}
+        if len(sizes) > 1:
             yield group
-            group, shape = [], None
+            group = []
+        group.append(frame)
+        if network is None or len(group) >= network.batch_size:
+            yield group
+            group = []
     if group:
         yield group
 
 
-def _refine(group: Sequence[FrameInMemory], network: OpenRefiner | None) -> None:
+def _refine(group: Sequence[FrameInMemory], network: OpenNetwork | None) -> None:
     """Sets the results of the frames that were read."""
     frames = [frame for frame in group if frame.inputs is not None]
-    if network is None:
-        for frame in frames:
-            frame.result = InputError("no frame could be read when the batch began; run it again")
-        return
-    if not frames:
-        return
     start = time.perf_counter()
-    results = network.refine([frame.inputs for frame in frames if frame.inputs is not None])
-    seconds = (time.perf_counter() - start) / len(frames)
+    results: Sequence[RefinedFrame | Exception]
+    if network is None:
+        error = InputError("no frame could be read when the batch began; run it again")
+        results = [error] * len(frames)
+    else:
+        results = network.refine([frame.inputs for frame in frames if frame.inputs is not None])
     for frame, result in zip(frames, results, strict=True):
-        frame.watch.add("refine", seconds)
+        frame.watch.add("refine", (time.perf_counter() - start) / len(frames))
         frame.result = result
 
 
-class OpenRefiner:
-    """Refines frames of one size, several together where the user asks for it.
-
-    Args:
-        refiner: The network and its settings.
-        opened: The refiner's networks, open.
-        batch_size: How many frames go together.
-        say: Receives notes.
-    """
+class OpenNetwork:
+    """Refines frames of one size, several together where the user asks for it."""
 
     def __init__(
         self, refiner: Refiner, opened: Opened, batch_size: int, say: Callable[[str], None]
@@ -168,24 +252,20 @@ class OpenRefiner:
     def refine(self, group: Sequence[Inputs]) -> Sequence[RefinedFrame | Exception]:
         """Returns the refined frames, all of one size; for one that fails, its error."""
         if len(group) > 1 and not any(inputs.window for inputs in group):
-            together = self._together(group)
-            if together is not None:
-                return together
+            try:
+                return self._together(group)
+            except PnpDepthError as error:
+                self._say(f"{len(group)} frames are refined one at a time; together: {error}")
+                if isinstance(error, BatchError):
+                    self.batch_size = 1
         return [self._alone(inputs) for inputs in group]
 
-    def _together(self, group: Sequence[Inputs]) -> list[RefinedFrame | Exception] | None:
-        """The frames refined in one pass; None if the network does not take them together."""
+    def _together(self, group: Sequence[Inputs]) -> list[RefinedFrame | Exception]:
+        """The frames refined in one pass. PnpDepthError if the network does not take them so."""
         assert isinstance(self._opened, Split)
-        refiner = self.refiner
-        try:
-            frames = refiner.refine_together(self._opened, group, refiner.settings)
-            if not self._checked:
-                self._check_independent(group[0], frames[0])
-        except PnpDepthError as error:
-            self._say(f"{len(group)} frames are refined one at a time; together: {error}")
-            if isinstance(error, BatchError):
-                self.batch_size = 1
-            return None
+        frames = self.refiner.refine_together(self._opened, group, self.refiner.settings)
+        if not self._checked:
+            self._check_independent(group[0], frames[0])
         note = f"refined together with {len(group) - 1} others, which alters the last bits"
         return [
             replace(frame, notes=(*frame.notes, note)) if isinstance(frame, RefinedFrame) else frame
@@ -208,27 +288,13 @@ class OpenRefiner:
         try:
             if not inputs.window:
                 return self.refiner.refine(self._opened, inputs)
-            first = inputs.window[0]
-            carried = (
-                WarmStart() if len(inputs.window) == 1 else self._carried.pop(first, WarmStart())
-            )
+            first, begins = inputs.window[0], len(inputs.window) == 1
+            carried = WarmStart() if begins else self._carried.pop(first, WarmStart())
             frame = self.refiner.refine_next(self._opened, inputs, carried)
         except Exception as error:  # concerns this frame only
             return error
         self._carried = {first: frame.carried or WarmStart()}
         return replace(frame, carried=None)
-
-
-@contextmanager
-def opened_network(
-    refiner: Refiner | None, batch_size: int, say: Callable[[str], None]
-) -> Iterator[OpenRefiner | None]:
-    """Yields the network, open for any number of frames; None for None."""
-    if refiner is None:
-        yield None
-        return
-    with refiner.opened() as opened:
-        yield OpenRefiner(refiner, opened, batch_size, say)
 
 
 def _read(task: Task) -> FrameInMemory:
@@ -241,24 +307,23 @@ def _read(task: Task) -> FrameInMemory:
     return frame
 
 
-def _write(frame: FrameInMemory, network: OpenRefiner | None, state: BatchState) -> Row:
+def _write(frame: FrameInMemory, network: OpenNetwork | None, state: BatchState) -> Row:
     """Writes a frame's results, or why there are none; returns the summary's row."""
-    task, inputs, result = frame.task, frame.inputs, frame.result
-    if not isinstance(result, RefinedFrame):
-        assert result is not None
-        return state.fail(task, _message(result))
-    assert network is not None
-    assert inputs is not None
-    try:
-        return state.write(
-            task,
-            frame.fingerprints,
-            lambda outputs: write_refined(outputs, network.refiner, inputs, result, frame.watch),
-        )
-    except StorageError:
-        raise
-    except Exception as error:
-        return state.fail(task, _message(error))
+    inputs, result = frame.inputs, frame.result
+    if isinstance(result, RefinedFrame) and network is not None and inputs is not None:
+        refiner = network.refiner
+        try:
+            return state.write(
+                frame.task,
+                frame.fingerprints,
+                lambda outputs: write_refined(outputs, refiner, inputs, result, frame.watch),
+            )
+        except StorageError:
+            raise
+        except Exception as error:
+            return state.fail(frame.task, _message(error))
+    assert isinstance(result, Exception)
+    return state.fail(frame.task, _message(result))
 
 
 def _message(error: Exception) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,21 +18,12 @@ from pnpdepth_cli.pipeline.evaluation.dependence import groups_by_name
 from pnpdepth_cli.pipeline.refinement.method import needs_check, resolve_method
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest
 
-Floats = NDArray[np.float64]
+KnownPose = tuple[NDArray[np.float64], str]
+"""(3, 4) from the camera's frame to the world's in metres, and where it is from."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class KnownPose:
-    """The pose of a frame."""
-
-    matrix: Floats
-    """(3, 4) from the camera's frame to the world's, metres."""
-    source: str
-    """Where it is from, for a person."""
-
-
-def sequences_of(frames: Sequence[Frame]) -> list[list[int]]:
-    """Returns the indices of the frames of each sequence, which one camera took, in order."""
+def _sequences_of(frames: Sequence[Frame]) -> list[list[int]]:
+    """The indices of the frames of each sequence, which one camera took, in order."""
     by_name = groups_by_name([frame.name for frame in frames])
     sequences: dict[tuple[str, int | None], list[int]] = {}
     for index, (frame, name) in enumerate(zip(frames, by_name, strict=True)):
@@ -44,7 +35,7 @@ def sequences_of(frames: Sequence[Frame]) -> list[list[int]]:
 def with_windows(frames: Sequence[Frame], length: int) -> list[Frame]:
     """Returns the frames, each with its window: so many frames of its sequence in a row."""
     result = list(frames)
-    for sequence in sequences_of(frames) if length else ():
+    for sequence in _sequences_of(frames):
         for number, index in enumerate(sequence):
             first = number - number % length
             window = tuple(frames[other] for other in sequence[first : number + 1])
@@ -76,7 +67,7 @@ def with_neighbours(frames: Sequence[Frame], reach: int, poses: Path | None) -> 
 
     Args:
         frames: All frames of the data set.
-        reach: Number of frames to each side; 0 returns the frames as they are.
+        reach: Number of frames to each side.
         poses: A file with a row for each frame. None: the frames' own poses; where a frame has
             none, the motion is to be estimated.
 
@@ -84,11 +75,8 @@ def with_neighbours(frames: Sequence[Frame], reach: int, poses: Path | None) -> 
         InputError: The file has another number of poses.
         UsageError: A frame has no points, or its points are those of all images already.
     """
-    if not reach:
-        return list(frames)
-    known = _poses(frames, poses)
-    result = list(frames)
-    for sequence in sequences_of(frames):
+    known, result = _poses(frames, poses), list(frames)
+    for sequence in _sequences_of(frames):
         for number, index in enumerate(sequence):
             near = range(max(0, number - reach), min(len(sequence), number + reach + 1))
             neighbours = (
@@ -121,30 +109,23 @@ def _neighbour(
     if pose is None or other_pose is None:
         kind = "scans" if other.image is None else "images"
         return Neighbour(frame=other, motion=None, poses=f"estimated from the {kind}", apart=apart)
-    rotation = pose.matrix[:, :3].T
-    turn = rotation @ other_pose.matrix[:, :3]
-    shift = rotation @ (other_pose.matrix[:, 3] - pose.matrix[:, 3])
-    rows = np.column_stack([turn, shift])
-    motion = tuple(tuple(float(value) for value in row) for row in rows)
-    return Neighbour(frame=other, motion=motion, poses=pose.source, apart=apart)
+    (matrix, source), (other_matrix, _) = pose, other_pose
+    turn = matrix[:, :3].T @ other_matrix[:, :3]
+    shift = matrix[:, :3].T @ (other_matrix[:, 3] - matrix[:, 3])
+    motion = tuple(map(tuple, np.column_stack([turn, shift]).tolist()))
+    return Neighbour(frame=other, motion=motion, poses=source, apart=apart)
 
 
 def _poses(frames: Sequence[Frame], path: Path | None) -> list[KnownPose | None]:
     """The pose of each frame; None where it is unknown."""
     if path is not None:
-        rows = read_pose_of_each(path, len(frames), "frames")
-        return [KnownPose(matrix=row, source=str(path)) for row in rows]
-    poses = [
-        None
-        if frame.pose is None
-        else KnownPose(matrix=np.array(frame.pose), source="the layout's")
-        for frame in frames
-    ]
-    for sequence in sequences_of(frames):
+        return [(row, str(path)) for row in read_pose_of_each(path, len(frames), "frames")]
+    poses = [None if f.pose is None else (np.array(f.pose), "the layout's") for f in frames]
+    for sequence in _sequences_of(frames):
         packets = [frames[index].oxts for index in sequence]
         first = frames[sequence[0]]
         if first.calib is not None and None not in packets:
             read = read_oxts_poses([p for p in packets if p], first.calib, first.camera)
             for index, pose in zip(sequence, read, strict=True):
-                poses[index] = KnownPose(matrix=pose, source="KITTI's inertial system")
+                poses[index] = pose, "KITTI's inertial system"
     return poses

@@ -1,16 +1,15 @@
-"""Reduces the settings of a frame to one digest, equal where the results would be equal."""
+"""The settings of a frame that decide its result, by which a batch knows what is done."""
 
 from __future__ import annotations
 
-import hashlib
-import json
-from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 from pnpdepth_cli import __version__
 from pnpdepth_cli.io.record import plain, sha256_of
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest
+
+_ONLY_IF_SET = {"window", "neighbours", "calibration"}
 
 
 def settings_of(request: RefineRequest, model: dict[str, Any], *groups: str) -> dict[str, Any]:
@@ -24,60 +23,19 @@ def settings_of(request: RefineRequest, model: dict[str, Any], *groups: str) -> 
         model: The `model_identity` of the request.
         *groups: Names of the request's groups. None: all of them.
     """
-    fields = request.settings(*groups)
-    fields.pop("more_models", None)  # `model` has the digests of all networks
+    fields = {
+        name: value
+        for name, value in request.settings(*groups).items()
+        if name != "more_models" and (value or name not in _ONLY_IF_SET)
+    }
+    if "neighbours" in fields:
+        fields["neighbours"] = [(each.motion, each.apart) for each in fields["neighbours"]]
     if "device" in fields:  # devices of one kind give equal results, so shards may use one each
         fields["device"] = fields["device"].split(":")[0]
-    if "scan" in fields:
-        fields["scan"] = asdict(fields["scan"])
-        del fields["scan"]["calib"], fields["scan"]["extrinsics"]
-    if not fields.get("window"):
-        fields.pop("window", None)
-    neighbours = fields.pop("neighbours", ())
-    if neighbours:
-        fields["neighbours"] = [(each.motion, each.apart) for each in neighbours]
-    calibration = fields.pop("calibration", None)
-    if calibration is not None:
-        fields["calibration"] = asdict(calibration)
-    for name in ("colmap", "sample", "protocol"):
-        if fields.get(name) is not None:
-            fields[name] = asdict(fields[name])
     settings: dict[str, Any] = plain(fields | model)
+    for name in ("calib", "extrinsics"):
+        settings.get("scan", {}).pop(name, None)
     return settings
-
-
-def settings_digest(request: RefineRequest, model: dict[str, Any]) -> str:
-    """Returns the SHA-256 of `settings_of`."""
-    text = json.dumps(settings_of(request, model), sort_keys=True)
-    return hashlib.sha256(text.encode()).hexdigest()
-
-
-class SettingsDigests:
-    """The `settings_digest` of frames, computed once for consecutive frames of equal settings.
-
-    Args:
-        model: The `model_identity` of their requests.
-    """
-
-    def __init__(self, model: dict[str, Any]) -> None:
-        self._model = model
-        self._last: tuple[Any, str] | None = None
-
-    def of(self, request: RefineRequest) -> str:
-        """Returns the digest of a frame's request."""
-        files = request.files
-        if files.calibration is not None or files.neighbours:  # of arrays, and of each frame alone
-            return settings_digest(request, self._model)
-        scan = replace(files.scan, calib=None, extrinsics=None)
-        alike = replace(
-            files, image=None, sparse=None, gt=None, gt_masks=(), scan=scan,
-            camera_file=None, camera_number=None,
-        )  # fmt: skip
-        key = (alike, request.network, request.method, request.hold_out, request.outputs)
-        last = self._last  # several threads may ask
-        if last is None or last[0] != key:
-            last = self._last = key, settings_digest(request, self._model)
-        return last[1]
 
 
 def model_identity(request: RefineRequest) -> dict[str, Any]:

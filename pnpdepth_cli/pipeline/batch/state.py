@@ -7,11 +7,12 @@ written; or why the frame failed.
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import replace
 from fnmatch import fnmatch
 from pathlib import Path
@@ -25,8 +26,8 @@ from pnpdepth_cli.io.record import write_json
 from pnpdepth_cli.io.remote.address import RemotePath
 from pnpdepth_cli.io.remote.store import Listing, read_object, remove, renamed, upload
 from pnpdepth_cli.pipeline.batch.frames import Task
-from pnpdepth_cli.pipeline.batch.settings import SettingsDigests
-from pnpdepth_cli.pipeline.batch.summary import JSON, failed_row, row_of
+from pnpdepth_cli.pipeline.batch.settings import settings_of
+from pnpdepth_cli.pipeline.batch.summary import JSON, Tally, failed_row, row_of
 from pnpdepth_cli.pipeline.refinement.output_files import Outputs
 
 if TYPE_CHECKING:
@@ -35,8 +36,6 @@ if TYPE_CHECKING:
 Row = dict[str, Any]
 NEW = "new"
 _ENTRY = "batch"
-_START = b'{\n  "batch": '
-"""How a record of a batch begins; parsing the rest of it takes five times as long."""
 _OWN_SUMMARY = b'{\n  "command": "batch"'
 _LOCK = ".batch.lock"
 
@@ -51,7 +50,7 @@ class BatchState:
 
     def __init__(self, output: Path, model: dict[str, Any]) -> None:
         self.output, self.model = output, model
-        self._digests = SettingsDigests(model)
+        self._last: tuple[dict[str, Any], str] | None = None
         self._listing = Listing()
         names = self._listing.names(output)
         self._is_ours = any(fnmatch(name, LOCKS) for name in names) or (
@@ -69,16 +68,15 @@ class BatchState:
 
         The reason is a word or two, with details after a colon.
         """
-        names = self._listing.names(task.record.parent)
+        names, files = self._listing.names(task.record.parent), task.outputs.by_kind()
         if task.record.name not in names:
-            there = any(path.name in names for path in task.outputs.paths())
-            return "interrupted" if there else NEW
-        entry = _entry(_record(task.record, entry_only=True))
+            return "interrupted" if any(path.name in names for path in files.values()) else NEW
+        entry = _entry(_record(task.record))
         if entry is None:
             return NEW
         if "failed" in entry:
             return "failed before"
-        if entry["settings"] != self._digests.of(task.request):
+        if entry["settings"] != self._digest(task):
             return "other settings"
         if entry["inputs"].keys() != task.inputs.keys():
             return "other input files"
@@ -90,7 +88,7 @@ class BatchState:
             if not is_unchanged(path, known, self._listing):
                 return f"input changed: {part}"
         may_lack = task.outputs.optional()
-        for kind, path in task.outputs.by_kind().items():
+        for kind, path in files.items():
             wanted = kind in entry["outputs"] or path not in may_lack
             if wanted and path.name not in names:
                 return f"result missing: {path.name}"
@@ -115,15 +113,21 @@ class BatchState:
                 )
 
     def row(self, task: Task) -> Row | None:
-        """Returns the summary's row of a frame with its present settings; None if there is none."""
+        """Returns the summary's row of a frame with its present settings; None if there is none.
+
+        Raises:
+            FileFormatError: The record is damaged.
+        """
         record = _record(task.record)
         entry = _entry(record)
-        if record is None or entry is None or entry["settings"] != self._digests.of(task.request):
+        if record is None or entry is None or entry["settings"] != self._digest(task):
             return None
         try:
-            return _row(task, record, entry)
+            row = _row(task, record, entry)
+            Tally().add(row)  # takes all that the summary takes
         except (AttributeError, IndexError, KeyError, TypeError) as error:
             raise FileFormatError(f"{task.record} is damaged; remove it, and run again") from error
+        return row
 
     def write(
         self,
@@ -137,44 +141,49 @@ class BatchState:
             task: The frame.
             inputs: What identifies its files, by part.
             write: Writes all but the record to the paths that it is given.
-
-        Raises:
-            OutputError: A file cannot be written.
         """
+        planned = task.outputs.by_kind()
         with _staged(task.outputs, self.output) as stage:
             _remove(task.record)
             outcome = write(replace(stage, record=None))
-            written = {**outcome.outputs.by_kind(), "record": _record_of(stage)}
-            planned = task.outputs.by_kind()
+            staged = stage.by_kind()
+            written = [*outcome.outputs.by_kind(), "record"]
+            paths = {kind: planned[kind].relative_to(self.output).as_posix() for kind in written}
             entry = {
-                "settings": self._digests.of(task.request),
+                "settings": self._digest(task),
                 "inputs": {part: each.as_record() for part, each in inputs.items()},
-                "outputs": {
-                    kind: planned[kind].relative_to(self.output).as_posix() for kind in written
-                },
+                "outputs": paths,
             }
             record = {_ENTRY: entry} | outcome.record
             if isinstance(self.output, RemotePath):
-                names = {str(stage.by_kind()[kind]): str(path) for kind, path in planned.items()}
-                record = renamed(record, names)
+                record = renamed(record, {str(staged[k]): str(planned[k]) for k in planned})
                 for path in task.outputs.optional():
                     _remove(path)
-            write_json(_record_of(stage), record)
-            for kind, file in written.items():
-                target = planned[kind]
-                if isinstance(target, RemotePath):
-                    upload(file, target)
+            write_json(staged["record"], record)
+            for kind in written:
+                _put(staged[kind], planned[kind])
         return _row(task, record, entry)
 
     def fail(self, task: Task, message: str) -> Row:
         """Writes a record that says why a frame failed; returns the summary's row."""
-        entry = {"settings": self._digests.of(task.request), "failed": message}
+        entry = {"settings": self._digest(task), "failed": message}
         with _staged(task.outputs, self.output) as stage:
-            make_folder(_record_of(stage).parent)
-            write_json(_record_of(stage), {_ENTRY: entry})
-            if isinstance(task.record, RemotePath):
-                upload(_record_of(stage), task.record)
-        return failed_row(task.name, _paths(task), message)
+            file = stage.by_kind()["record"]
+            make_folder(file.parent)
+            write_json(file, {_ENTRY: entry})
+            _put(file, task.record)
+        return _row(task, {}, entry)
+
+    def _digest(self, task: Task) -> str:
+        """The SHA-256 of the settings that decide the frame's result."""
+        files, last = task.request.settings("files"), self._last  # several threads ask
+        arrays = files.get("calibration") is not None or files.get("neighbours")
+        if not arrays and last is not None and last[0] == files:  # as of most consecutive frames
+            return last[1]
+        text = json.dumps(settings_of(task.request, self.model), sort_keys=True)
+        digest = hashlib.sha256(text.encode()).hexdigest()
+        self._last = None if arrays else (files, digest)
+        return digest
 
 
 def remove_all_leftovers(output: Path) -> int:
@@ -186,32 +195,25 @@ def remove_all_leftovers(output: Path) -> int:
 
 
 def _row(task: Task, record: Mapping[str, Any], entry: Mapping[str, Any]) -> Row:
+    inputs = {part: str(path) for part, path in task.inputs.items()}
     if "failed" in entry:
-        return failed_row(task.name, _paths(task), entry["failed"])
-    return row_of(task.name, _paths(task), record, entry["outputs"])
-
-
-def _paths(task: Task) -> dict[str, str]:
-    return {part: str(path) for part, path in task.inputs.items()}
+        return failed_row(task.name, inputs, entry["failed"])
+    return row_of(task.name, inputs, record, entry["outputs"])
 
 
 def _entry(record: Mapping[str, Any] | None) -> dict[str, Any] | None:
     """What a batch says in a record; None if none wrote it."""
     entry: Any = None if record is None else record.get(_ENTRY)
-    keys = entry.keys() if isinstance(entry, dict) else ()
-    whole = "settings" in keys and (
-        "failed" in keys or all(isinstance(entry.get(k), dict) for k in ("inputs", "outputs"))
-    )
-    return entry if whole else None
+    if not isinstance(entry, dict) or "settings" not in entry:
+        return None
+    whole = all(isinstance(entry.get(name), dict) for name in ("inputs", "outputs"))
+    return entry if whole or "failed" in entry else None
 
 
-def _record(path: Path, *, entry_only: bool = False) -> dict[str, Any] | None:
-    """The content of a record, or only its first entry; None if there is none, or another file."""
-    data = _content(path)
+def _record(path: Path) -> dict[str, Any] | None:
+    """The content of a record; None if there is none, or another file."""
     try:
-        if entry_only and data is not None and data.startswith(_START):
-            return {_ENTRY: json.JSONDecoder().raw_decode(data.decode(), len(_START))[0]}
-        record = None if data is None else json.loads(data)
+        record = json.loads(_content(path) or b"")
     except (ValueError, RecursionError):
         return None
     return record if isinstance(record, dict) else None
@@ -226,20 +228,19 @@ def _content(path: Path) -> bytes | None:
         return None
 
 
-def _record_of(outputs: Outputs) -> Path:
-    assert outputs.record is not None
-    return outputs.record
-
-
 def _remove(path: Path) -> None:
     if isinstance(path, RemotePath):
         remove(path)
         return
     try:
-        with suppress(FileNotFoundError):
-            path.unlink()
+        path.unlink(missing_ok=True)
     except OSError as error:
         raise cannot_write(path, error) from error
+
+
+def _put(file: Path, target: Path) -> None:
+    if isinstance(target, RemotePath):
+        upload(file, target)
 
 
 @contextmanager
@@ -249,8 +250,6 @@ def _staged(outputs: Outputs, output: Path) -> Iterator[Outputs]:
         yield outputs
         return
     with tempfile.TemporaryDirectory(prefix="pnpdepth-") as folder:
-        paths: dict[str, Any] = {
-            kind: Path(folder) / path.relative_to(output)
-            for kind, path in outputs.by_kind().items()
-        }
+        planned = outputs.by_kind().items()
+        paths: Any = {kind: Path(folder) / path.relative_to(output) for kind, path in planned}
         yield replace(outputs, **paths)

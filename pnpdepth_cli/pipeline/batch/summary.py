@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -25,7 +25,8 @@ _MEASURED = {
     "held_out_error": _POINT_ERRORS,
     "scores": _SCORES,
 }
-_STAGES = ("before", "after")
+_OF_LINEAR = ("scores", "held_out_error")
+_RUN_STAGES = ("read", "refine", "write")
 _CHECKED = {"before": "aligned", "after": "result", "linear": "linear"}
 BASELINE_MEASURES = ("held_out_mae", "mae", "rmse")
 _EFFECTIVE = ("layer", "iterations", "lr", "step", "loss", "update", "align")
@@ -34,14 +35,8 @@ _EFFECTIVE = ("layer", "iterations", "lr", "step", "loss", "update", "align")
 def row_of(
     name: str, inputs: Mapping[str, str], record: Mapping[str, Any], outputs: Mapping[str, str]
 ) -> dict[str, Any]:
-    """Returns the summary's row of a refined frame.
-
-    Args:
-        name: The frame's name.
-        inputs: Its files by part.
-        record: The refinement's record.
-        outputs: Its results by kind, as paths in the output folder.
-    """
+    """Returns the summary's row of a refined frame, from its files and record."""
+    unsure = [note for note in record["notes"] if ", unsure (" in note]
     return {
         "name": name,
         "status": "diverged" if record["diverged"] else "done",
@@ -59,6 +54,7 @@ def row_of(
         "baselines": record.get("baselines"),
         "warnings": [note for note in record["notes"] if note.startswith("warning")],
         "seconds": record["seconds"],
+        **({"unsure": unsure} if unsure else {}),
     }
 
 
@@ -70,10 +66,33 @@ def failed_row(name: str, inputs: Mapping[str, str], message: str) -> dict[str, 
         "message": message,
         "inputs": dict(inputs),
         "outputs": {},
-        **dict.fromkeys(_MEASURED),
-        "linear": None,
-        "baselines": None,
+        **dict.fromkeys((*_MEASURED, "linear", "baselines")),
     }
+
+
+class _Means:
+    """The mean of each value over the frames that have it; None and NaN are not counted."""
+
+    def __init__(self) -> None:
+        self._totals: dict[str, float] = {}
+        self._counts = Counter[str]()
+
+    def add(self, values: Mapping[str, float | None]) -> None:
+        """Adds the values of a frame."""
+        for name, value in values.items():
+            known = value is not None and not math.isnan(value)
+            self._totals[name] = self._totals.get(name, 0.0) + (value if known and value else 0.0)
+            self._counts[name] += known
+
+    def values(self) -> dict[str, float | None]:
+        """Returns the means; None for a value that no frame has."""
+        counts = self._counts
+        return {n: total / counts[n] if counts[n] else None for n, total in self._totals.items()}
+
+    @property
+    def frames(self) -> int:
+        """The number of frames that have any of the values."""
+        return max(self._counts.values(), default=0)
 
 
 class Tally:
@@ -82,33 +101,33 @@ class Tally:
     def __init__(self) -> None:
         self.counts: Counter[str] = Counter({"done": 0, "diverged": 0, "failed": 0})
         self.warned = 0
+        self.unsure: list[str] = []
+        """What was guessed of the network and may be wrong, each once."""
         self._units: set[str] = set()
         self._compared, self._worse = 0, 0
-        self._linear: dict[tuple[str, str], tuple[int, float]] = {}
-        self._checks: dict[str, tuple[int, float]] = {}
-        self._sums: dict[tuple[str, str, str], tuple[int, float]] = {}
-        self._baselines: dict[tuple[str, str], tuple[int, float]] = {}
+        self._means: defaultdict[tuple[str, str], _Means] = defaultdict(_Means)
+        self._baselines: defaultdict[str, _Means] = defaultdict(_Means)
+        self._check = _Means()
 
     def add(self, row: Mapping[str, Any]) -> None:
         """Adds one row."""
         self.counts[row["status"]] += 1
         self.warned += bool(row.get("warnings"))
+        self.unsure += [note for note in row.get("unsure", ()) if note not in self.unsure]
         self._units |= {row["unit"]} if "unit" in row else set()
-        for key, value in _measures(row):
-            _add(self._sums, key, value)
+        for key, values in _measured(row).items():
+            self._means[key].add(values)
         linear = row.get("linear") or {}
+        for kind in _OF_LINEAR:
+            scores = linear.get(kind) or {}
+            self._means[kind, "linear"].add({name: scores.get(name) for name in _MEASURED[kind]})
         if linear.get("worse") is not None:
             self._compared += 1
             self._worse += linear["worse"]
-        for kind in ("scores", "held_out_error"):
-            for measure in _MEASURED[kind]:
-                _add(self._linear, (kind, measure), (linear.get(kind) or {}).get(measure))
-        if linear.get("worse") is not None and linear.get("check"):
-            for stage, name in _CHECKED.items():
-                _add(self._checks, stage, linear["check"][name])
+            if linear.get("check"):
+                self._check.add({key: linear["check"][name] for key, name in _CHECKED.items()})
         for name, entry in (row.get("baselines") or {}).items():
-            for measure, value in _baseline_measures(entry).items():
-                _add(self._baselines, (name, measure), value)
+            self._baselines[name].add(_of_baseline(entry))
 
     @property
     def unit(self) -> str:
@@ -118,84 +137,60 @@ class Tally:
     @property
     def baseline_names(self) -> list[str]:
         """The baselines of any row, in the order of the records."""
-        return list(dict.fromkeys(name for name, _ in self._baselines))
+        return list(self._baselines)
 
     def mean(self) -> dict[str, Any]:
         """Returns {"scores": {"frames": 9, "before": {"rmse": …}, …}, …}; None without frames."""
-        means: dict[str, Any] = {
-            kind: {"frames": 0, **{stage: {} for stage in _STAGES}} for kind in _MEASURED
-        }
-        for (kind, stage, measure), (count, total) in self._sums.items():
-            means[kind]["frames"] = max(means[kind]["frames"], count)
-            means[kind][stage][measure] = total / count if count else None
-        return {kind: mean if mean["frames"] else None for kind, mean in means.items()}
+        means: dict[str, Any] = {}
+        for kind in _MEASURED:
+            before, after = self._means[kind, "before"], self._means[kind, "after"]
+            frames = max(before.frames, after.frames)
+            both = {"frames": frames, "before": before.values(), "after": after.values()}
+            means[kind] = both if frames else None
+        return means
 
     def mean_linear(self) -> dict[str, Any]:
         """Returns the means of linear interpolation's scores, and how many frames are worse.
 
         "check" has the mean errors of all three at the hidden points.
         """
-        means: dict[str, Any] = {
-            kind: {
-                measure: total / count if count else None
-                for (of, measure), (count, total) in self._linear.items()
-                if of == kind
-            }
-            for kind in ("scores", "held_out_error")
-        }
-        check = {stage: total / count for stage, (count, total) in self._checks.items() if count}
-        if check:
-            check["frames"] = max(count for count, _ in self._checks.values())
-        return means | {
-            "check": check or None,
+        return {
+            **{kind: self._means[kind, "linear"].values() for kind in _OF_LINEAR},
+            "check": self._check.values() | {"frames": self._check.frames}
+            if self._check.frames
+            else None,
             "frames": self._compared,
             "worse": self._worse,
         }
 
     def mean_baselines(self) -> dict[str, dict[str, Any]] | None:
         """Returns {"linear": {"frames": 9, "held_out_mae": …, "mae": …, "rmse": …}, …}."""
-        means: dict[str, dict[str, Any]] = {
-            name: {"frames": 0, **dict.fromkeys(BASELINE_MEASURES)} for name in self.baseline_names
-        }
-        for (name, measure), (count, total) in self._baselines.items():
-            means[name]["frames"] = max(means[name]["frames"], count)
-            means[name][measure] = total / count if count else None
-        return means or None
+        means = self._baselines.items()
+        return {name: {"frames": mean.frames, **mean.values()} for name, mean in means} or None
 
 
-def _measures(row: Mapping[str, Any]) -> Iterator[tuple[tuple[str, str, str], float | None]]:
-    for kind, measures in _MEASURED.items():
-        scores = row.get(kind)
-        if scores:
-            for stage in _STAGES:
-                for measure in measures:
-                    yield (kind, stage, measure), (scores[stage] or {}).get(measure)
+def _measured(row: Mapping[str, Any]) -> dict[tuple[str, str], dict[str, float | None]]:
+    """The errors of a row by kind and stage."""
+    return {
+        (kind, stage): {measure: (row[kind][stage] or {}).get(measure) for measure in measures}
+        for kind, measures in _MEASURED.items()
+        if row.get(kind)
+        for stage in ("before", "after")
+    }
 
 
-def _baseline_measures(entry: Mapping[str, Any]) -> dict[str, float | None]:
+def _of_baseline(entry: Mapping[str, Any]) -> dict[str, float | None]:
     scores = entry.get("scores") or {}
     measured = {"held_out_mae": entry.get("held_out_mae")}
     return measured | {measure: scores.get(measure) for measure in ("mae", "rmse")}
-
-
-def _add(sums: dict[Any, tuple[int, float]], key: Any, value: float | None) -> None:
-    """Adds a value to a count and a sum; one that is None or NaN makes only the entry."""
-    count, total = sums.setdefault(key, (0, 0.0))
-    if value is not None and not math.isnan(value):
-        sums[key] = (count + 1, total + value)
 
 
 def profile_of(seconds: Mapping[str, float], frames: int, wall_s: float) -> dict[str, Any]:
     """Returns where the time of a run went: {"frames": 24, "seconds": {"read": …, "wall": …}, …}.
 
     Reading and writing run beside the network, so their seconds do not add up to the wall time.
-
-    Args:
-        seconds: Of all refined frames, by stage.
-        frames: Their number.
-        wall_s: From the first frame's start to the end of the last.
     """
-    stages = {stage: round(seconds.get(stage, 0.0), 4) for stage in ("read", "refine", "write")}
+    stages = {stage: round(seconds.get(stage, 0.0), 4) for stage in _RUN_STAGES}
     return {
         "frames": frames,
         "seconds": stages | {"wall": round(wall_s, 4)},
@@ -212,23 +207,8 @@ def write_summaries(
 ) -> None:
     """Writes `summary.json`, the head with the rows as its list `frames`, and `summary.csv`.
 
-    Args:
-        folder: Where they are written.
-        head: The summary without its frames.
-        rows: The rows, of JSON's own types.
-        baselines: Names of baselines, whose errors make the last columns of the table.
+    The errors of the baselines make the last columns of the table.
     """
-    header = [
-        *("name", "status", "message", "points", "held_out_points", "improved_fraction"),
-        *(
-            f"{kind}_{measure}_{stage}" if kind != "scores" else f"{measure}_{stage}"
-            for kind, measures in _MEASURED.items()
-            for stage in _STAGES
-            for measure in measures
-        ),
-        *("warnings", "seconds_read", "seconds_refine", "seconds_write"),
-        *(f"baseline_{name}_{measure}" for name in baselines for measure in BASELINE_MEASURES),
-    ]
     text = json.dumps(plain(head), indent=2, ensure_ascii=False, allow_nan=False)
     with (
         atomic_path(folder / JSON) as json_path,
@@ -238,39 +218,38 @@ def write_summaries(
     ):
         file.write(text.removesuffix("\n}") + ',\n  "frames": [')
 
-        def table_rows() -> Iterator[list[Any]]:
+        def cells() -> Iterator[list[Any]]:
             for number, row in enumerate(rows):
                 line = json.dumps(row, ensure_ascii=False, allow_nan=False)
                 file.write(f"{',' if number else ''}\n    {line}")
-                yield _table_row(row, baselines)
+                yield list(_columns(row, baselines).values())
 
-        write_csv(table, header, table_rows())
+        write_csv(table, list(_columns(failed_row("", {}, ""), baselines)), cells())
         file.write("\n  ]\n}\n")
 
 
-def _table_row(row: Mapping[str, Any], baselines: Sequence[str]) -> list[Any]:
-    points, seconds = row.get("points") or {}, row.get("seconds") or {}
-    measured = dict(_measures(row))
-    of_baselines = {
-        name: _baseline_measures(entry) for name, entry in (row.get("baselines") or {}).items()
+def _columns(row: Mapping[str, Any], baselines: Sequence[str]) -> dict[str, Any]:
+    """The cells of a row by the name of their column; None where a row has no value."""
+    points, seconds, measured = row.get("points") or {}, row.get("seconds") or {}, _measured(row)
+    cells = {
+        "name": row["name"],
+        "status": row["status"],
+        "message": row["message"] or "",
+        "points": points.get("used"),
+        "held_out_points": points.get("held_out"),
+        "improved_fraction": row.get("improved_fraction"),
     }
-    return [
-        *(row["name"], row["status"], row["message"] or ""),
-        *(points.get("used"), points.get("held_out"), row.get("improved_fraction")),
-        *(
-            measured.get((kind, stage, measure))
-            for kind, measures in _MEASURED.items()
-            for stage in _STAGES
-            for measure in measures
-        ),
-        "; ".join(row.get("warnings") or ()),
-        *(seconds.get(stage) for stage in ("read", "refine", "write")),
-        *(
-            of_baselines.get(name, {}).get(measure)
-            for name in baselines
-            for measure in BASELINE_MEASURES
-        ),
-    ]
+    for kind, measures in _MEASURED.items():
+        start = "" if kind == "scores" else f"{kind}_"
+        for stage in ("before", "after"):
+            values = measured.get((kind, stage), {})
+            cells |= {f"{start}{name}_{stage}": values.get(name) for name in measures}
+    cells["warnings"] = "; ".join(row.get("warnings") or ())
+    cells |= {f"seconds_{stage}": seconds.get(stage) for stage in _RUN_STAGES}
+    for name in baselines:
+        values = _of_baseline((row.get("baselines") or {}).get(name, {}))
+        cells |= {f"baseline_{name}_{measure}": values[measure] for measure in BASELINE_MEASURES}
+    return cells
 
 
 def _text_file(path: Path) -> Any:

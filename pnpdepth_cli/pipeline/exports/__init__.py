@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,33 +23,30 @@ class ExportFrame:
     """A refined frame."""
 
     image: Path
-    """The image."""
-
     image_name: str
     """Its path below the folder of the images, as COLMAP names it, with slashes."""
-
     size: tuple[int, int]
     """(H, W)."""
-
     camera: FrameCamera
     """The camera; its pose is in `unit`."""
-
     unit: str
     """Of depth and pose, as in the record."""
-
     unit_scale: float
     """Units of the depth per unit of the COLMAP model; 1 without a model."""
-
     farthest: float
     """Depth of the farthest sparse point."""
-
-    read: Callable[[], Depth]
-    """Reads the (H, W) depth, 0 = unknown or not valid."""
+    read: Callable[[], tuple[Depth, NDArray[np.bool_]]]
+    """Reads the (H, W) depth, 0 = unknown, and where it is known and valid."""
 
     @property
     def stem(self) -> str:
         """The image name without its suffix."""
-        return self.image_name[: -len(self.image.suffix)]
+        return PurePosixPath(self.image_name).with_suffix("").as_posix()
+
+    def valid_depth(self) -> Depth:
+        """Returns the (H, W) depth, 0 where it is unknown or not valid."""
+        depth, valid = self.read()
+        return np.where(valid, depth, np.float32(0))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,13 +55,9 @@ class Export:
 
     title: str
     """What is written, for a person."""
-
     needs_pose: bool
-    """Whether every frame needs a pose."""
-
     files: Callable[[Path, Sequence[ExportFrame]], list[Path]]
     """The files that `write` writes into a folder."""
-
     write: Callable[[Path, Sequence[ExportFrame]], list[str]]
     """Writes them and returns notes. Raises PnpDepthError."""
 

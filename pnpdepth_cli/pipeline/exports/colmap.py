@@ -16,15 +16,9 @@ from pnpdepth_cli.io.atomic import atomic_path, make_folder
 from pnpdepth_cli.pipeline.exports import Export, ExportFrame, distortion_note
 from pnpdepth_cli.sensors.cloud import depth_normals
 
-_ENDING = ".geometric.bin"
 
-
-def _depth_map(folder: Path, frame: ExportFrame) -> Path:
-    return folder / "stereo" / "depth_maps" / f"{frame.image_name}{_ENDING}"
-
-
-def _normal_map(folder: Path, frame: ExportFrame) -> Path:
-    return folder / "stereo" / "normal_maps" / f"{frame.image_name}{_ENDING}"
+def _map(folder: Path, frame: ExportFrame, kind: str) -> Path:
+    return folder / "stereo" / f"{kind}_maps" / f"{frame.image_name}.geometric.bin"
 
 
 def _images_to_fuse(folder: Path) -> Path:
@@ -32,15 +26,15 @@ def _images_to_fuse(folder: Path) -> Path:
 
 
 def _files(folder: Path, frames: Sequence[ExportFrame]) -> list[Path]:
-    maps = [path(folder, frame) for frame in frames for path in (_depth_map, _normal_map)]
+    maps = [_map(folder, frame, kind) for frame in frames for kind in ("depth", "normal")]
     return maps if _images_to_fuse(folder).exists() else [*maps, _images_to_fuse(folder)]
 
 
 def _write(folder: Path, frames: Sequence[ExportFrame]) -> list[str]:
     for frame in frames:
-        depth = frame.read()
-        _write_map(_normal_map(folder, frame), depth_normals(depth, frame.camera.camera))
-        _write_map(_depth_map(folder, frame), depth[..., None] / frame.unit_scale)
+        depth = frame.valid_depth()
+        _write_map(_map(folder, frame, "normal"), depth_normals(depth, frame.camera.camera))
+        _write_map(_map(folder, frame, "depth"), depth[..., None] / frame.unit_scale)
     listed = _images_to_fuse(folder)
     if not listed.exists():  # image_undistorter has written it already
         with atomic_path(listed) as temporary:

@@ -2,7 +2,7 @@
 
 Nerfstudio's data conventions: camera axes are x right, y up, z backwards; principal points count
 from the image's corner, so pixel centres are at .5; a depth is PNG code × 0.001 in the unit of the
-poses.
+poses. Instant-NGP reads the same file; it takes that factor from `integer_depth_scale`.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ def _write(folder: Path, frames: Sequence[ExportFrame]) -> list[str]:
     clipped, entries = 0, []
     for frame in frames:
         entries.append(_entry(folder, frame, factor))
-        depth = frame.read() * np.float32(factor)
+        depth = frame.valid_depth() * np.float32(factor)
         fits = np.rint(depth * _CODES_PER_UNIT) <= LARGEST_CODE
         clipped += int((~fits).sum())
         path = _depth_image(folder, frame)
@@ -69,7 +69,12 @@ def _write(folder: Path, frames: Sequence[ExportFrame]) -> list[str]:
             make_folder(copy.parent)
             with atomic_path(copy) as temporary:
                 shutil.copyfile(frame.image, temporary)
-    content = {"camera_model": _MODELS[lenses[0]], "frames": entries}
+    content = {
+        "camera_model": _MODELS[lenses[0]],
+        "enable_depth_loading": True,
+        "integer_depth_scale": 1 / _CODES_PER_UNIT,
+        "frames": entries,
+    }
     write_json(folder / "transforms.json", content)
     notes = []
     if clipped:
@@ -99,6 +104,7 @@ def _entry(folder: Path, frame: ExportFrame, factor: float) -> dict[str, Any]:
             f"{frame.image} has a lens that Nerfstudio does not know ({camera.lens},"
             f" {len(camera.distortion)} coefficients); undistort the images first"
         )
+    depth = _relative(_depth_image(folder, frame), folder)
     matrix = np.eye(4)
     matrix[:3] = pose
     matrix[:3, 3] *= factor
@@ -106,7 +112,8 @@ def _entry(folder: Path, frame: ExportFrame, factor: float) -> dict[str, Any]:
     intrinsics = camera.intrinsics
     return {
         "file_path": _relative(_image(folder, frame), folder),
-        "depth_file_path": _relative(_depth_image(folder, frame), folder),
+        "depth_file_path": depth,
+        "depth_path": depth,
         "transform_matrix": matrix.tolist(),
         "w": frame.size[1],
         "h": frame.size[0],
@@ -119,11 +126,13 @@ def _entry(folder: Path, frame: ExportFrame, factor: float) -> dict[str, Any]:
 
 
 def _relative(path: Path, folder: Path) -> str:
-    return path.resolve().relative_to(folder.resolve()).as_posix()
+    if not path.is_relative_to(folder):
+        path, folder = path.resolve(), folder.resolve()
+    return path.relative_to(folder).as_posix()
 
 
 EXPORT = Export(
-    title="Nerfstudio's transforms.json with depth_file_path",
+    title="transforms.json of Nerfstudio and Instant-NGP with depth",
     needs_pose=True,
     files=_files,
     write=_write,

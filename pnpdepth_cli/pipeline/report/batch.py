@@ -43,6 +43,14 @@ _PANELS = {
     "Image": "image",
     "Sparse depth": "sparse",
 }
+_LABELS = {
+    "first": "Before",
+    "second": "After",
+    "map": "Change of error",
+    "image": "Image",
+    "sparse": "Sparse depth",
+    "gt": "Ground truth",
+}
 _GT, _HELD_OUT, _USED = "scores", "held_out_error", "sparse_error"
 _BASES = {
     _GT: "against ground truth",
@@ -58,11 +66,9 @@ class BatchReport:
     """Writes the report of a batch."""
 
     folder: Path
-    """Where the report is written."""
     output: Path
     """The folder of the results."""
     view_3d: bool = False
-    """Whether the frames have 3D views."""
     colors: str = "blue-orange"
     """Colours of the improvement maps."""
 
@@ -88,7 +94,6 @@ class BatchReport:
             summary: The batch's summary without its frames.
             rows: Gives the summary's rows, each time anew.
         """
-        measured = any(summary["mean"][basis] for basis in (_GT, _HELD_OUT))
         bases, failed, first = set[str | None](), [], None
         for row in rows():
             if row["outputs"]:
@@ -96,24 +101,19 @@ class BatchReport:
                 bases.add(_basis(row))
             else:
                 failed.append((row["name"], row["message"]))
-        head = _head(summary, first, failed, measured, self.colors)
-        mixed = len(bases - {None}) > 1
-        entries = (
-            self._entry(row, head.columns, measured, mixed=mixed)
-            for row in rows()
-            if row["outputs"]
-        )
+        head, mixed = _head(summary, first, failed, self.colors), len(bases - {None}) > 1
+        entries = (self._entry(row, head.columns, mixed) for row in rows() if row["outputs"])
         write_report(self.folder, head, entries, viewer=self.view_3d)
 
     def _source(self) -> dict[str, Any]:
         folder, output = self.folder.resolve(), self.output.resolve()
         return {"command": "batch", "output": os.path.relpath(output, folder)}
 
-    def _entry(
-        self, row: Row, columns: Sequence[Column], measured: bool, *, mixed: bool
-    ) -> dict[str, Any]:
+    def _entry(self, row: Row, columns: Sequence[Column], mixed: bool) -> dict[str, Any]:
         basis = _basis(row)
-        values = _values(row, basis, measured)
+        values = _values(row, basis)
+        if basis == _USED and columns[0].signed:
+            values = {}  # others have a gain that means something
         tag = _BASES[basis] if mixed and basis else ""
         try:
             views = self._views(row)
@@ -129,30 +129,27 @@ class BatchReport:
 
     def _views(self, row: Row) -> dict[str, Any]:
         """Links the images of the row's frame; returns the page's entry of them."""
-        files = {kind: row["outputs"].get(kind) for kind in ("preview", "improvement", "view")}
-        if not (files["preview"] and files["improvement"]):
+        files = {kind: self.output / path for kind, path in row["outputs"].items()}
+        if not ("preview" in files and "improvement" in files):
             return {"key": None}
-        key, views = image_key(row["name"]), {}
-        preview, improvement = (
-            figure_content(self.output / files[kind]) for kind in ("preview", "improvement")
-        )
-        for kind, figure in (("preview", preview), ("improvement", improvement)):
+        key, views, figures = image_key(row["name"]), {}, {}
+        for kind in ("preview", "improvement"):
+            figure = figures[kind] = figure_content(files[kind])
             name = f"{IMAGES}/{key}_{kind}.png"
-            link_image(self.output / files[kind], self.folder / name)
+            link_image(files[kind], self.folder / name)
             for panel in figure["panels"]:
                 if panel["title"] in _PANELS:
                     place = {"src": name, "box": panel["box"], "size": figure["size"]}
                     views[_PANELS[panel["title"]]] = place
         view_mb = None
-        if self.view_3d and files["view"]:
-            script = self.folder / IMAGES / f"{key}_view.js"
-            view_mb = save_view_3d(self.output / files["view"], script)
+        if self.view_3d and "view" in files:
+            view_mb = save_view_3d(files["view"], self.folder / IMAGES / f"{key}_view.js")
         return {
             "key": key,
             "views": views,
             "view_mb": view_mb,
-            "scale_m": [preview["low_m"], preview["high_m"]],
-            "map": {name: improvement[name] for name in ("ends", "unknown", "footer")},
+            "scale_m": [figures["preview"][end] for end in ("low_m", "high_m")],
+            "map": {name: figures["improvement"][name] for name in ("ends", "unknown", "footer")},
         }
 
 
@@ -168,30 +165,21 @@ def _basis(row: Row) -> str | None:
 def _columns(measured: bool, unit: str) -> list[Column]:
     """Errors before and after; with gains if any frame has ground truth or held-out points."""
     columns = []
+    percent: dict[str, Any] = {"decimals": 1, "percent": True, "higher_is_better": True}
     for key, measure in _ERRORS.items():
         if measured:
             title = f"{measure.title} gain"
-            columns.append(
-                Column(
-                    key=f"{key}_gain", title=title, decimals=1, percent=True, signed=True,
-                    higher_is_better=True,
-                )
-            )  # fmt: skip
+            columns.append(Column(key=f"{key}_gain", title=title, signed=True, **percent))
         for stage in ("before", "after"):
             title, name = f"{measure.title} {stage}", f"{key}_{stage}"
             columns.append(column_of(in_unit(measure, unit), title=title, key=name, listed=True))
-    improved = Column(
-        key="improved", title="Improved", decimals=1, percent=True, higher_is_better=True
-    )
-    return [*columns, improved]
+    return [*columns, Column(key="improved", title="Improved", **percent)]
 
 
-def _values(row: Row, basis: str | None, measured: bool) -> dict[str, float | None]:
-    if basis is None or (measured and basis == _USED):
+def _values(row: Row, basis: str | None) -> dict[str, float | None]:
+    if basis is None:
         return {}
-    values: dict[str, float | None] = {
-        "improved": row.get("improved_fraction", row.get("improved_share"))
-    }
+    values: dict[str, float | None] = {"improved": row.get("improved_fraction")}
     for key in _ERRORS:
         before, after = (row[basis][stage].get(key) for stage in ("before", "after"))
         values |= {f"{key}_before": before, f"{key}_after": after}
@@ -216,29 +204,21 @@ def _notes(row: Row, basis: str | None) -> Iterator[str]:
 
 
 def _head(
-    summary: Mapping[str, Any],
-    first: Row | None,
-    failed: list[tuple[str, str]],
-    measured: bool,
-    colors: str,
+    summary: Mapping[str, Any], first: Row | None, failed: list[tuple[str, str]], colors: str
 ) -> Head:
-    unmatched = len(summary["unmatched"])
-    notes = [f"warning: {unmatched:,} files are in no frame; summary.json has them"]
-    unit = summary["unit"]
+    unit, unmatched, notes = summary["unit"], len(summary["unmatched"]), []
     means = {basis: summary["mean"][basis] for basis in _BASES if summary["mean"][basis]}
+    measured = bool(means.keys() - {_USED})
+    if unmatched:
+        notes = [f"warning: {unmatched:,} files are in no frame; summary.json has them"]
+    if means and not measured:
+        notes.append("Without ground truth or --holdout, no error is measured.")
     return Head(
         kind="Batch refinement",
         title=summary["output"],
-        tiles=_tiles(summary, measured),
+        tiles=_tiles(summary),
         facts=_facts(summary, first),
-        notes=[
-            *(notes if unmatched else []),
-            *(
-                ["Without ground truth or --holdout, no error is measured."]
-                if means and not measured
-                else []
-            ),
-        ],
+        notes=notes,
         tables=[
             *(_means(basis, mean, unit) for basis, mean in means.items()),
             *_baselines(summary.get("baselines"), unit),
@@ -247,21 +227,14 @@ def _head(
         without=failed,
         columns=_columns(measured, unit),
         sort_by="rmse_gain" if measured else "rmse_after",
-        labels={
-            "first": "Before",
-            "second": "After",
-            "map": "Change of error",
-            "image": "Image",
-            "sparse": "Sparse depth",
-            "gt": "Ground truth",
-        },
+        labels=_LABELS,
         thumb="second",
         map_colours=swatches(paint_gain(np.linspace(-1, 1, 9), np.full(9, 0.88), colors)),
         unit=unit,
     )
 
 
-def _tiles(summary: Mapping[str, Any], measured: bool) -> list[tuple[str, str, str]]:
+def _tiles(summary: Mapping[str, Any]) -> list[tuple[str, str, str]]:
     """The number of frames, and errors that were not measured at the points used."""
     counts = summary["counts"]
     refined = counts["done"] + counts["diverged"]
@@ -312,12 +285,13 @@ def _means(basis: str, mean: Mapping[str, Any], unit: str) -> Table:
     rows = []
     for measure in measures:
         before, after = (mean[stage].get(measure.key) for stage in ("before", "after"))
-        title = column_title(in_unit(measure, unit))
         values = [format_value(measure, before), format_value(measure, after)]
-        rows.append([title, *values, _gain_text(measure, before, after)])
+        change = _gain_text(measure, before, after)
+        rows.append([column_title(in_unit(measure, unit)), *values, change])
     if basis == _GT:
-        coverage = [_percent(mean[stage].get("coverage")) for stage in ("before", "after")]
-        rows.append(["coverage", *coverage, ""])
+        coverage = [mean[stage].get("coverage") for stage in ("before", "after")]
+        shares = ["–" if value is None else f"{value:.2%}" for value in coverage]
+        rows.append(["coverage", *shares, ""])
     shown = 3 if basis == _USED else 4  # a gain at the points used means nothing
     return Table(
         caption=f"Means over {frames_text(mean['frames'])}, {_BASES[basis]}",
@@ -330,27 +304,18 @@ def _baselines(mean: Mapping[str, Mapping[str, Any]] | None, unit: str) -> list[
     """A table of the simple baselines, the network and the result; empty without --baselines."""
     if not mean:
         return []
-    mae = _ERRORS["mae"]
-    errors = {
-        "held_out_mae": f"MAE at held-out points [{unit}]",
-        "mae": f"MAE [{unit}]",
-        "rmse": f"RMSE [{unit}]",
-    }
+    places = {"held_out_mae": "MAE at held-out points", "mae": "MAE", "rmse": "RMSE"}
     rows = [
-        [name, *(format_value(mae, row[key]) for key in errors), f"{row['frames']:,}"]
+        [name, *(format_value(_ERRORS["mae"], row[key]) for key in places), f"{row['frames']:,}"]
         for name, row in mean.items()
     ]
-    header = ["", *errors.values(), "frames"]
+    header = ["", *(f"{title} [{unit}]" for title in places.values()), "frames"]
     return [Table(caption="Simple baselines: means over frames", header=header, rows=rows)]
 
 
 def in_unit(measure: Measure, unit: str) -> Measure:
     """Returns the measure of depths whose unit is not the metre, such as a model's."""
     return replace(measure, unit=unit) if measure.unit == "m" else measure
-
-
-def _percent(value: float | None) -> str:
-    return "–" if value is None else f"{value:.2%}"
 
 
 def _gain_text(measure: Measure, before: float | None, after: float | None) -> str:

@@ -19,9 +19,8 @@ from pnpdepth_cli.errors import InputError, LayerError, ModelError, OutputError,
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.pipeline.batch import reading as batch_reading
 from pnpdepth_cli.pipeline.batch import running as batch_running
-from pnpdepth_cli.pipeline.batch.batch import plan_batch
+from pnpdepth_cli.pipeline.batch.batch import plan_batch, run_batch
 from pnpdepth_cli.pipeline.batch.request import BatchRequest
-from pnpdepth_cli.pipeline.batch.settings import SettingsDigests, settings_digest
 from pnpdepth_cli.pipeline.batch.summary import _SCORES, Tally
 from pnpdepth_cli.pipeline.refinement.inputs import read_inputs
 from pnpdepth_cli.pipeline.refinement.refine import refine_image
@@ -86,15 +85,17 @@ def test_so_does_a_batch_of_lidar_scans(tmp_path: Path) -> None:
     assert together == results(root / "out")
 
 
-def test_a_second_run_does_nothing(root: Path) -> None:
+def test_a_second_run_does_nothing_also_where_files_were_touched_or_moved(root: Path) -> None:
     batch(root)
-    before = times(root / "out")
-    listener = RecordingListener()
-    batch(root, listener)
-    assert listener.to_do == 0
+    os.utime(root / "rgb/a.png", (1, 1))
+    os.utime(root / "out/b_depth.png", (1, 1))
+    moved = root.rename(root.with_name("moved"))
+    before, listener = times(moved / "out"), RecordingListener()
+    batch(moved, listener)
+    assert (listener.to_do, listener.names) == (0, [])
     assert listener.messages[-1] == "4 frames, all of them done already"
-    assert times(root / "out") == before
-    assert [row["name"] for row in summary(root)["frames"]] == list(NAMES)
+    assert times(moved / "out") == before
+    assert [row["name"] for row in summary(moved)["frames"]] == list(NAMES)
 
 
 def remove_a_result(root: Path) -> None:
@@ -130,16 +131,6 @@ def test_only_what_is_missing_or_changed_is_done_again(root: Path, change: Any, 
     shutil.rmtree(root / "out")
     batch(root)
     assert redone == results(root / "out")
-
-
-def test_a_file_that_was_only_touched_or_moved_has_not_changed(root: Path) -> None:
-    batch(root)
-    os.utime(root / "rgb/a.png", (1, 1))
-    os.utime(root / "out/b_depth.png", (1, 1))
-    moved = root.rename(root.with_name("moved"))
-    listener = RecordingListener()
-    batch(moved, listener)
-    assert listener.names == []
 
 
 @pytest.mark.parametrize(
@@ -242,14 +233,6 @@ def test_a_network_that_fails_on_one_frame_only_fails_there(root: Path) -> None:
         assert (counts["done"], counts["failed"]) == (4, 1)
 
 
-def test_frames_of_several_sizes_go_through(root: Path) -> None:
-    small = np.zeros((20, 33, 3), np.uint8)
-    add_frame(root, "e", small, gt=False)
-    cv2.imwrite(str(root / "sparse/e.png"), np.full((20, 33), 2000, np.uint16))
-    assert batch(root).summary["counts"]["done"] == 5
-    assert read_depth(root / "out/e_depth.png").values.shape == (20, 33)
-
-
 def test_every_file_without_a_partner_is_reported(root: Path) -> None:
     (root / "sparse/b.png").unlink()
     shutil.copy(root / "gt/a.png", root / "gt/lost.png")
@@ -335,36 +318,53 @@ def test_an_output_folder_that_holds_the_frames_is_refused(root: Path, output: s
     assert not list(root.rglob("batch.jsonl"))
 
 
-def test_what_no_batch_made_is_not_replaced_unless_asked_for(root: Path) -> None:
-    (root / "out").mkdir()
-    (root / "out/c.json").write_text("mine")
-    with pytest.raises(OutputError, match=r"c\.json exists, and no batch wrote it; --overwrite"):
-        batch(root)
-    assert [p.name for p in (root / "out").iterdir() if p.suffix != ".lock"] == ["c.json"]
-    batch(root, refine={"overwrite": True})
-    assert (root / "out/c.json").read_text() != "mine"
-
-
-@pytest.mark.parametrize("name", ["summary.csv", "summary.json"])
-def test_a_summary_that_no_batch_made_is_not_replaced(name: str, root: Path) -> None:
+@pytest.mark.parametrize("name", ["c.json", "c_depth.png", "summary.csv", "summary.json"])
+def test_what_no_batch_made_is_not_replaced_unless_asked_for(name: str, root: Path) -> None:
     (root / "out").mkdir()
     (root / "out" / name).write_text("mine")
-    with pytest.raises(OutputError, match="exists, and no batch wrote it; --overwrite"):
+    with pytest.raises(OutputError, match=rf"{name} exists, and no batch wrote it; --overwrite"):
         batch(root)
+    assert [p.name for p in (root / "out").iterdir() if p.suffix != ".lock"] == [name]
     assert (root / "out" / name).read_text() == "mine"
     batch(root, refine={"overwrite": True})
     batch(root)  # it is the batch's own now
-    assert (root / "out" / name).read_text() != "mine"
+    assert (root / "out" / name).read_bytes() != b"mine"
 
 
-def test_a_name_that_leads_elsewhere_or_to_the_summary_is_left_out(root: Path) -> None:
-    rows = [f"rgb/{n}.png,sparse/{n}.png,{m}" for n, m in
-            (("a", "../up"), ("b", "summary"), ("c", "/c"), ("d", "fine"))]  # fmt: skip
-    (root / "list.csv").write_text("\n".join(["image,sparse,name", *rows]))
-    outcome = batch(root, source=root / "list.csv")
-    assert outcome.summary["counts"]["frames"] == 1
-    assert len(outcome.summary["unmatched"]) == 3
+@pytest.mark.parametrize(
+    ("name", "why"),
+    [
+        ("../up", "leads out of the output folder"),
+        ("/up", "leads out of the output folder"),
+        ("summary", "needs a file of the batch's own"),
+        ("summary.csv/x", "needs a file of the batch's own"),
+        (".batch.lock/x", "needs a file of the batch's own"),
+        ("fine\u0301", "is that of another frame"),
+        ("ok_depth.png/x", "needs a file of frame 'ok'"),
+        ("ok.json/deep/x", "needs a file of frame 'ok'"),
+        ("ok_sigma", "needs a file of frame 'ok'"),
+    ],
+)
+def test_a_name_without_files_of_its_own_is_a_failed_frame_in_plan_and_run(
+    root: Path, name: str, why: str
+) -> None:
+    names = ("ok", "fin\u00e9", name)
+    rows = [f'rgb/a.png,sparse/a.png,"{each}"' for each in names]
+    (root / "list.csv").write_text("\n".join(["image,sparse,name", *rows]), encoding="utf-8")
+    request = BatchRequest(
+        source=root / "list.csv",
+        output=root / "out",
+        refine=refinement(root, uncertainty=True, iterations=0),
+    )
+    said: list[str] = []
+    assert [each.name for each in plan_batch(request, said.append)] == ["ok", "fin\u00e9"]
+    assert sum(f"{why}; rename it" in line for line in said) == 1
+    listener = RecordingListener()
+    counts = run_batch(request, listener).summary["counts"]
+    assert (counts["frames"], counts["done"], counts["failed"], counts["pending"]) == (3, 2, 1, 0)
+    assert [row["status"] for row in listener.rows] == ["done", "done"]
     assert not (root / "up_depth.png").exists()
+    assert {row["name"]: row["message"] for row in summary(root)["frames"]}[name].count(why) == 1
 
 
 def test_a_listed_file_that_is_not_there_is_a_failed_frame(root: Path) -> None:
@@ -498,7 +498,7 @@ def test_numbers_that_make_no_sense_are_refused(root: Path, changes: dict[str, A
 def test_only_a_few_frames_are_in_memory_at_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, batch_size: int, most_allowed: int
 ) -> None:
-    root = pairs_on_disk(tmp_path / "drive", tuple(f"{i:02}" for i in range(24)), gt=False)
+    root = pairs_on_disk(tmp_path / "drive", tuple(f"{i:02}" for i in range(16)), gt=False)
     alive: weakref.WeakSet[Any] = weakref.WeakSet()
     most = 0
 
@@ -627,17 +627,13 @@ def test_a_formula_as_a_name_is_text_in_the_summary(tmp_path: Path) -> None:
         assert [row["name"] for row in csv.DictReader(file)] == ["'=1+1", "'@b"]
 
 
-def test_digests_of_consecutive_frames_are_those_of_each_alone(root: Path) -> None:
-    base = refinement(root)
-    requests = [
-        base.with_fields(image=Path("a.png")),
-        base.with_fields(image=Path("b.png")),
-        base.with_fields(gt_scale=5.0),
-        base.with_fields(iterations=3),
-        base.with_fields(scan=ScanOptions(camera=3, calib=Path("c.txt"))),
-        base.with_fields(scan=ScanOptions(camera=2)),
-    ]
-    digests = SettingsDigests({"model": "m"})
-    known = [digests.of(each) for each in requests]
-    assert known == [settings_digest(each, {"model": "m"}) for each in requests]
-    assert len(set(known)) == 5
+def test_an_unsure_guess_of_the_input_range_is_repeated_at_the_end(root: Path) -> None:
+    batch(root, limit=2)
+    note = "input: rgb range 'unit', unsure (error after alignment: unit 9.0%, imagenet 9.1%)"
+    for name in "ab":
+        path = root / "out" / f"{name}.json"
+        record = json.loads(path.read_text())
+        path.write_text(json.dumps(record | {"notes": [*record["notes"], note]}))
+    listener = RecordingListener()
+    assert batch(root, listener, limit=2).summary["unsure"] == [note]
+    assert listener.messages[-1] == f"warning: {note}"

@@ -11,10 +11,9 @@ import pytest
 
 from pnpdepth_cli.errors import ClusterError, ModelError, StorageError
 from pnpdepth_cli.pipeline.batch.ray_workers import (
-    _Driver,
-    _Lost,
     check_node,
     reason_of,
+    rows_of_actors,
     software,
 )
 
@@ -60,14 +59,25 @@ def actor(refine: Refine, starts: Callable[[], None] = lambda: None) -> Any:
 
 
 def results(
-    refine: Refine, count: int, *, worked: bool = False, **options: Any
+    refine: Refine,
+    count: int,
+    *,
+    worked: bool = False,
+    starts: Callable[[], None] = lambda: None,
+    **options: Any,
 ) -> tuple[dict[Any, Any], list[str]]:
     """The result of each frame, which is a number, and the messages."""
     messages: list[str] = []
-    frames: Any = range(count)
-    driver = _Driver(Calls(), [actor(refine) for _ in range(3)], frames, worked, messages.append)
-    given = list(driver.results(**{"stopped": lambda: False, "retries": 2} | options))
-    by_frame = {each.frame if isinstance(each, _Lost) else each["name"]: each for each in given}
+    to_do: Any = range(count)
+    given = list(
+        rows_of_actors(
+            Calls(), [actor(refine, starts) for _ in range(3)], to_do,
+            worked=worked, say=messages.append,
+            lost=lambda frame, why: {"name": frame, "status": "failed", "message": why},
+            **{"stopped": lambda: False, "retries": 2} | options,
+        )
+    )  # fmt: skip
+    by_frame = {row["name"]: row for row in given}
     assert len(given) == len(by_frame), "a frame was reported twice"
     return by_frame, messages
 
@@ -89,7 +99,7 @@ def test_a_frame_that_kills_its_workers_is_lost_and_no_other() -> None:
         return rows_of(frames)
 
     rows, messages = results(refine, 40)
-    assert rows.pop(17).message.startswith("its worker died 3 times")
+    assert rows.pop(17)["message"].startswith("its worker died 3 times")
     assert {row["status"] for row in rows.values()} == {"done"}
     assert sum("Ray starts another one" in text for text in messages) == 4
 
@@ -132,10 +142,8 @@ def test_workers_that_do_not_start_end_the_run() -> None:
     def dies() -> None:
         raise SystemExit
 
-    driver = _Driver(Calls(), [actor(raising((), OSError()), dies)], [], True, print)
-    driver._next = -1  # a frame is left
     with pytest.raises(ClusterError, match="a worker died 100 times"):
-        list(driver.results(lambda: False, 2))
+        results(raising((), OSError()), 1, starts=dies)
 
 
 def test_a_node_must_have_the_versions_of_the_driver_and_see_its_files(tmp_path: Path) -> None:

@@ -19,7 +19,7 @@ from pnpdepth_cli.errors import OutputError
 from pnpdepth_cli.io.remote.address import path_of
 from pnpdepth_cli.io.remote.store import forget_stores
 from pnpdepth_cli.pipeline.batch.batch import plan_batch
-from pnpdepth_cli.pipeline.batch.request import BatchRequest
+from pnpdepth_cli.pipeline.batch.request import LOCAL, BatchRequest, ClusterOptions
 from tests.pipeline.batches import (
     NAMES,
     RecordingListener,
@@ -86,10 +86,13 @@ def without_names(content: Any) -> Any:
     return content
 
 
-def test_frames_and_results_in_a_store_equal_those_on_disk(
-    root: Path, bucket: Bucket, tmp_path: Path
+@pytest.mark.parametrize("cluster", [ClusterOptions(), ClusterOptions(ray=LOCAL, ray_workers=1)])
+def test_frames_and_results_in_a_store_equal_those_on_disk_also_on_ray_workers(
+    root: Path, bucket: Bucket, tmp_path: Path, cluster: ClusterOptions
 ) -> None:
-    in_store(root, bucket)
+    if cluster.ray:
+        pytest.importorskip("ray")
+    in_store(root, bucket, cluster=cluster)
     there = fetched(bucket, tmp_path / "there")
     assert there["a.json"]["outputs"]["depth"] == f"{bucket.address}/out/a_depth.png"
     assert there["a.json"]["inputs"]["image"]["path"] == f"{bucket.address}/drive/rgb/a.png"

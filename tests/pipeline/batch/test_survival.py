@@ -20,9 +20,9 @@ from tests.pipeline.batches import NAMES, RecordingListener, batch, pairs_on_dis
 ROOT = Path(__file__).parents[3]
 
 
-def test_killed_thirty_times_at_random_moments_it_ends_byte_identical(tmp_path: Path) -> None:
+def test_killed_many_times_at_random_moments_it_ends_byte_identical(tmp_path: Path) -> None:
     done = subprocess.run(
-        [sys.executable, "-m", "tests.pipeline.killed_batches", str(tmp_path), "30"],
+        [sys.executable, "-m", "tests.pipeline.killed_batches", str(tmp_path), "12"],
         capture_output=True,
         text=True,
         check=False,
@@ -31,7 +31,7 @@ def test_killed_thirty_times_at_random_moments_it_ends_byte_identical(tmp_path: 
     )
     assert done.returncode == 0, done.stderr
     report = json.loads(done.stdout)
-    assert report["kills"] == 30
+    assert report["kills"] == 12
     assert report["interrupted"] > 0
 
 

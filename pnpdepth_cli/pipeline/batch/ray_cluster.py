@@ -6,21 +6,19 @@ import os
 import socket
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from types import ModuleType
-from typing import Any
+from typing import Any, NamedTuple
 
 from pnpdepth_cli.errors import ClusterError, UsageError
 from pnpdepth_cli.io.file_bytes import one_line
-from pnpdepth_cli.pipeline.cluster.options import LOCAL, RayWorkers
+from pnpdepth_cli.pipeline.batch.request import LOCAL, RayWorkers
 
 _CONNECT_S = 5.0
 _OBJECT_STORE_BYTES = 100 * 2**20
 """Of a local cluster: only rows of frames go through it."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Cluster:
+class Cluster(NamedTuple):
     """A connection to a cluster."""
 
     ray: ModuleType
@@ -55,39 +53,24 @@ def connected(workers: RayWorkers) -> Iterator[Cluster]:
 
 
 def _connect(ray: ModuleType, workers: RayWorkers) -> None:
-    quiet = {"log_to_driver": False, "logging_level": "ERROR"}
-    if workers.address == LOCAL:
+    address, local = workers.address, {}
+    if address == LOCAL:
         _choose_gpus(workers.indices)
-        ray.init(
-            address=LOCAL,
-            num_cpus=os.cpu_count(),
-            include_dashboard=False,
-            object_store_memory=_OBJECT_STORE_BYTES,
-            **quiet,
-        )
-        return
-    if workers.address != "auto":
-        _check_answers(workers.address)
+        local = {
+            "num_cpus": os.cpu_count(),
+            "include_dashboard": False,
+            "object_store_memory": _OBJECT_STORE_BYTES,
+        }
     try:
-        ray.init(address=workers.address, **quiet)
+        if address not in (LOCAL, "auto"):  # Ray takes minutes to find out that nothing answers
+            host, _, port = address.removeprefix("ray://").rpartition(":")
+            socket.create_connection((host, int(port)), timeout=_CONNECT_S).close()
+        ray.init(address=address, log_to_driver=False, logging_level="ERROR", **local)
     except (Exception, SystemExit) as error:
-        reason = one_line(str(error)).split(". ")[0][:200]
+        reason = one_line(getattr(error, "strerror", None) or error).split(". ")[0][:200]
         raise ClusterError(
-            f"Ray cluster {workers.address!r} cannot be used: {reason}; start it with `ray start"
-            " --head`, or leave the address out"
-        ) from None
-
-
-def _check_answers(address: str) -> None:
-    """Raises ClusterError if nothing answers there, which Ray takes minutes to find out."""
-    host, _, port = address.removeprefix("ray://").rpartition(":")
-    try:
-        socket.create_connection((host, int(port)), timeout=_CONNECT_S).close()
-    except (OSError, OverflowError) as error:
-        reason = one_line(getattr(error, "strerror", None) or error).lower()
-        raise ClusterError(
-            f"Ray cluster {address!r} cannot be reached ({reason}); check the address and that the"
-            " head node runs"
+            f"Ray cluster {address!r} cannot be used: {reason}; check the address, start it with"
+            " `ray start --head`, or leave the address out"
         ) from None
 
 
@@ -102,14 +85,13 @@ def _choose_gpus(indices: tuple[int, ...]) -> None:
 
 def _planned(ray: ModuleType, workers: RayWorkers) -> Cluster:
     """The workers that the devices of the cluster allow."""
-    options, cpus = workers.options, workers.options.cpus_per_worker
+    options, resources = workers.options, {"num_cpus": workers.options.cpus_per_worker}
     if workers.device == "cuda":
         there = int(ray.cluster_resources().get("GPU", 0))
-        resources = {"num_gpus": 1, "num_cpus": cpus}
+        resources["num_gpus"] = 1
     else:
         nodes = [node["Resources"].get("CPU", 0) for node in ray.nodes() if node["Alive"]]
-        there = sum(int(count) // cpus for count in nodes)
-        resources = {"num_cpus": cpus}
+        there = sum(int(count) // options.cpus_per_worker for count in nodes)
     wanted = options.ray_workers or len(workers.indices) or there
     if wanted > there or not there:
         where = "this machine" if workers.address == LOCAL else f"Ray cluster {workers.address!r}"
@@ -117,4 +99,4 @@ def _planned(ray: ModuleType, workers: RayWorkers) -> Cluster:
             f"{where} has devices for {there} Ray workers with {workers.each} each, and"
             f" {max(1, wanted)} asked for; change --device, --ray-workers or --cpus-per-worker"
         )
-    return Cluster(ray=ray, workers=wanted, resources=resources)
+    return Cluster(ray, wanted, resources)

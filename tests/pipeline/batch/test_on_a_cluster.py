@@ -17,8 +17,9 @@ import pytest
 
 from pnpdepth_cli.errors import ClusterError
 from pnpdepth_cli.pipeline.batch import ray_workers
+from pnpdepth_cli.pipeline.batch.request import ClusterOptions
 from pnpdepth_cli.pipeline.batch.state import remove_all_leftovers
-from pnpdepth_cli.pipeline.cluster.options import ClusterOptions
+from tests.pipeline.batch.ray_nodes import three_nodes
 from tests.pipeline.batches import (
     RecordingListener,
     add_frame,
@@ -26,7 +27,6 @@ from tests.pipeline.batches import (
     pairs_on_disk,
     results,
 )
-from tests.pipeline.cluster.nodes import three_nodes
 
 pytest.importorskip("ray")
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="nodes are addresses of loopback")
@@ -119,7 +119,7 @@ def test_a_killed_driver_is_resumed(cluster: Any, root: Path) -> None:
     program = (
         "import sys; from pathlib import Path\n"
         "from tests.pipeline.batches import RecordingListener, batch\n"
-        "from pnpdepth_cli.pipeline.cluster.options import ClusterOptions\n"
+        "from pnpdepth_cli.pipeline.batch.request import ClusterOptions\n"
         "class Telling(RecordingListener):\n"
         "    def frame(self, row): print(row['name'], flush=True)\n"
         "options = ClusterOptions(ray=sys.argv[2], ray_workers=1)\n"

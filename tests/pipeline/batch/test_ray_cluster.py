@@ -6,8 +6,8 @@ import sys
 import pytest
 
 from pnpdepth_cli.errors import ClusterError, UsageError
-from pnpdepth_cli.pipeline.cluster.connection import connected
-from pnpdepth_cli.pipeline.cluster.options import (
+from pnpdepth_cli.pipeline.batch.ray_cluster import connected
+from pnpdepth_cli.pipeline.batch.request import (
     LOCAL,
     ClusterOptions,
     parse_address,
@@ -34,7 +34,7 @@ def test_an_address_where_nothing_answers_is_an_error_at_once(scheme: str) -> No
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-        with pytest.raises(ClusterError, match=r"cannot be reached \(connection refused\)"):
+        with pytest.raises(ClusterError, match=r"cannot be used: Connection refused; check the"):
             connect(f"{scheme}127.0.0.1:{port}")
 
 
