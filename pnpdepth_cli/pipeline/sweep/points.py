@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -98,36 +98,51 @@ class Sampling:
         lidar = self.lidar
         return asdict(self) | {"sensor": self.sensor if lidar is None else asdict(lidar)}
 
+    def with_values(self, values: Mapping[str, Any]) -> Sampling:
+        """Returns the sampling with other values of its fields; the sensor's is a sampling.
 
-def read_sensor_text(text: str) -> tuple[str, str | None]:
-    """Returns (sensor, points) of `500`, `grid:400`, `grid` or `vlp-16`, else raises UsageError."""
-    if text in (OWN, *PATTERNS, *LIDARS) or text.lower().endswith(".toml"):
-        return text, None
-    kind, colon, points = text.rpartition(":")
-    if (colon and kind not in (OWN, *PATTERNS, *LIDARS)) or not (colon or text[:1].isdigit()):
-        raise UsageError(
-            f"no sensor {text!r}; it is {OWN}, a pattern such as grid:500 ({', '.join(PATTERNS)}),"
-            f" a TOML file, or a LiDAR ({', '.join(LIDARS)})"
-        )
-    count_or_fraction(points)
-    return kind or "uniform", points
+        A number of points is of the sensor that it was given with, unless that is varied.
+
+        Raises:
+            UsageError: If they contradict each other, or the number of points is missing.
+        """
+        varied: dict[str, Any] = dict(values)
+        sensor = varied.pop("sensor", self)
+        if sensor is not self and sensor.points is not None and "points" in varied:
+            raise UsageError(
+                f"sensor '{sensor.sensor}:{sensor.points}' says how many points; leave that out or"
+                " do not vary the points"
+            )
+        same = sensor.is_pattern or sensor.sensor == self.sensor
+        kept = sensor.points or (self.points if same else None)
+        sampling = replace(self, **{"sensor": sensor.sensor, "points": kept, **varied})
+        if sampling.is_pattern:
+            sampling.pattern()
+        return sampling
 
 
 def read_sampling(text: str) -> Sampling:
-    """Returns the sampling of `500`, `grid:400` or `vlp-16`, without noise."""
-    sensor, points = read_sensor_text(known_sensor(text))
-    return Sampling(sensor=sensor, points=points)
+    """Returns the sampling of `500`, `grid:400`, `grid` or `vlp-16`, without noise.
 
-
-def known_sensor(text: str) -> str:
-    """Returns the text if it names a sensor, else raises UsageError."""
-    sensor, points = read_sensor_text(text)
+    Raises:
+        UsageError: There is no such sensor.
+        InputError: The file that describes it cannot be read.
+    """
+    sensor, points = text, None
+    if text not in (OWN, *PATTERNS, *LIDARS) and not text.lower().endswith(".toml"):
+        kind, colon, points = text.rpartition(":")
+        if (colon and kind not in (OWN, *PATTERNS, *LIDARS)) or not (colon or text[:1].isdigit()):
+            raise UsageError(
+                f"no sensor {text!r}; it is {OWN}, a pattern such as grid:500"
+                f" ({', '.join(PATTERNS)}), a TOML file, or a LiDAR ({', '.join(LIDARS)})"
+            )
+        count_or_fraction(points)
+        sensor = kind or "uniform"
     sampling = Sampling(sensor=sensor, points=points)
     if sampling.is_pattern and points is not None:
         sampling.pattern()
-    elif sampling.lidar is not None:
-        pass  # the sensor exists and its file is readable
-    return text
+    sampling.record()  # reads the file of a sensor
+    return sampling
 
 
 def frame_points(
@@ -145,32 +160,26 @@ def frame_points(
     Raises:
         InputError: If the frame cannot have such points.
     """
+    noise, rng = sampling.sample_noise, np.random.default_rng(seed)
+    if inputs.gt is None:
+        raise InputError("there is no ground truth")
     try:
-        points = _points_of(sampling, seed, inputs, request, frame)
+        if sampling.is_pattern:
+            pattern = sampling.pattern()
+            drawn = sample_points(inputs.gt, pattern, seed, image=inputs.rgb, noise=noise)
+            return drawn.tensors()
+        if sampling.lidar is not None:
+            points = _scanned(sampling, sampling.lidar, seed, inputs, request, frame)
+        elif request.files.sparse is None:
+            raise InputError(
+                "there is no sparse depth; --sample 500 draws points from the ground truth"
+            )
+        else:
+            own = inputs.points
+            points = SparsePoints(xy=own.xy.numpy(), depth=own.depth.numpy(), size=own.size)
+        return with_noise(_thinned(points, sampling.points, rng), noise, rng).tensors()
     except UsageError as error:  # the sensor is valid, but not for this frame
         raise InputError(str(error)) from error
-    return points.tensors()
-
-
-def _points_of(
-    sampling: Sampling, seed: int, inputs: Inputs, request: RefineRequest, frame: Frame
-) -> Points:
-    ground_truth, noise = inputs.gt, sampling.sample_noise
-    if ground_truth is None:
-        raise InputError("there is no ground truth")
-    if sampling.is_pattern:
-        return sample_points(ground_truth, sampling.pattern(), seed, image=inputs.rgb, noise=noise)
-    rng = np.random.default_rng(seed)
-    if sampling.lidar is not None:
-        points = _scanned(sampling, sampling.lidar, seed, inputs, request, frame)
-    elif request.files.sparse is None:
-        raise InputError(
-            "there is no sparse depth; --sample 500 draws points from the ground truth"
-        )
-    else:
-        own = inputs.points
-        points = SparsePoints(xy=own.xy.numpy(), depth=own.depth.numpy(), size=own.size)
-    return with_noise(_thinned(points, sampling.points, rng), noise, rng)
 
 
 def _scanned(
@@ -215,9 +224,3 @@ def _thinned(points: Points, wanted: str | None, rng: np.random.Generator) -> Po
         )
     kept = np.sort(rng.choice(available, number, replace=False))
     return replace(points, xy=points.xy[kept], depth=points.depth[kept])
-
-
-def calibration_file(sampling: Sampling, frame: Frame) -> Path | None:
-    """Returns the calibration file that these points need, if any."""
-    path = frame.calib if sampling.lidar is not None else None
-    return path if path is not None and path.is_file() else None

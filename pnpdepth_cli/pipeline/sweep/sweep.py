@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,6 @@ from pnpdepth_cli.io.atomic import make_folder, remove_leftovers
 from pnpdepth_cli.io.dataset.frame import Frame
 from pnpdepth_cli.io.lock import locked_folder
 from pnpdepth_cli.io.remote.address import RemotePath
-from pnpdepth_cli.models.definition import ModelDefinition
 from pnpdepth_cli.pipeline.batch.batch import Listener
 from pnpdepth_cli.pipeline.batch.frames import Task, find_frames, reference_frames, task_of
 from pnpdepth_cli.pipeline.batch.reading import read_frame
@@ -21,23 +20,15 @@ from pnpdepth_cli.pipeline.batch.request import BatchRequest, FrameSelection
 from pnpdepth_cli.pipeline.batch.settings import model_identity
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs
 from pnpdepth_cli.pipeline.refinement.load_refiner import load_refiner
-from pnpdepth_cli.pipeline.refinement.method import with_preset
 from pnpdepth_cli.pipeline.refinement.refiner import Refiner
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest
-from pnpdepth_cli.pipeline.refinement.resolve import resolve_layer, resolve_settings
-from pnpdepth_cli.pipeline.sweep.axes import Cell, Study
-from pnpdepth_cli.pipeline.sweep.plan import Plan, Run, sampling_of
+from pnpdepth_cli.pipeline.sweep.axes import Cell, Study, values_of
+from pnpdepth_cli.pipeline.sweep.journal import Journal
+from pnpdepth_cli.pipeline.sweep.plan import Plan, Run, RunId
 from pnpdepth_cli.pipeline.sweep.plots import draw_study, need_matplotlib
 from pnpdepth_cli.pipeline.sweep.points import OWN, Sampling, frame_points
 from pnpdepth_cli.pipeline.sweep.running import Result, results
-from pnpdepth_cli.pipeline.sweep.state import SweepState
-from pnpdepth_cli.pipeline.sweep.summary import (
-    FrameFigures,
-    over_seeds,
-    summarise,
-    write_frames,
-    write_sweep,
-)
+from pnpdepth_cli.pipeline.sweep.tables import over_seeds, row_of, summarise, write_sweep
 from pnpdepth_cli.sensors import SamplePattern
 
 Model = tuple[str, "Path | None"]
@@ -57,11 +48,12 @@ class SweepRequest(FrameSelection):
     sampling: Sampling | None = None
     """Where points come from unless that is varied; None for the frames' own, or else the ground
     truth."""
+    points: Cell = field(default_factory=dict)
+    """Other parameters of the points that are not varied."""
     seeds: int = 1
     """Draws of the points, with consecutive seeds."""
-    plots: bool = True
-    plot_format: str = "png"
-    """One of PLOT_FORMATS."""
+    plots: str = "png"
+    """One of PLOT_FORMATS, or "none"."""
     cost: bool = False
     """True to report the time of the refinement beside its error."""
     resamples: int = 2000
@@ -69,7 +61,7 @@ class SweepRequest(FrameSelection):
 
     def __post_init__(self) -> None:
         if self.seeds < 1:
-            raise UsageError(f"seeds {self.seeds}: the points have to be drawn once at least")
+            raise UsageError(f"--seeds must be >= 1, got {self.seeds}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,10 +69,8 @@ class _Network:
     """A network of the sweep and its runs."""
 
     refiner: Refiner
-    base: dict[str, Any]
-    """The settings that are not varied."""
     plan: Plan
-    runs: tuple[Run, ...]
+    runs: Mapping[RunId, Run]
     """Of all frames."""
 
 
@@ -93,21 +83,28 @@ def run_sweep(request: SweepRequest, listener: Listener) -> dict[str, Any]:
     Raises:
         PnpDepthError: For what concerns all frames.
     """
-    if isinstance(request.output, RemotePath):
-        raise UsageError(f"{request.output}: sweep writes to a local folder; name one with -o")
-    if request.plots:
+    output = request.output
+    if isinstance(output, RemotePath):
+        raise UsageError(f"{output}: sweep writes to a local folder; name one with -o")
+    if request.plots != "none":
         need_matplotlib()
     sampling, tasks = _frames(request, listener)
-    make_folder(request.output)
-    with locked_folder(request.output, None, lambda: _clean(request.output)):
-        state = SweepState(request.output)
-        for note in state.notes:
+    make_folder(output)
+    with locked_folder(output, None, lambda: None):
+        remove_leftovers(output)
+        journal = Journal(output)
+        for note in journal.notes:
             listener.say(note)
-        cells = [cell for study in request.studies for cell in study.cells()]
-        models = dict.fromkeys(_model_of(cell, request) for cell in cells)
-        networks = {model: _network(model, request, sampling, tasks, listener) for model in models}
+        cells: dict[Model, list[Cell]] = {}
+        for study in request.studies:
+            for cell in study.cells():
+                cells.setdefault(_model_of(cell, request), []).append(cell)
+        networks = {
+            model: _network(model, of, request, sampling, tasks, listener)
+            for model, of in cells.items()
+        }
         to_do = {
-            model: [run for run in each.runs if not state.is_done(run)]
+            model: [run for run in each.runs.values() if not journal.is_done(run)]
             for model, each in networks.items()
         }
         count = sum(len(each.runs) for each in networks.values())
@@ -118,12 +115,8 @@ def run_sweep(request: SweepRequest, listener: Listener) -> dict[str, Any]:
         listener.begin(left)
         for model, each in networks.items():
             for run, result in results(to_do[model], each.refiner.network):
-                listener.frame(_recorded(run, result, state))
-        return _write(request, sampling, networks, [task.name for task, _ in tasks], state)
-
-
-def _clean(output: Path) -> None:
-    remove_leftovers(output)
+                listener.frame(_recorded(run, result, journal))
+        return _write(request, sampling, networks, [task.name for task, _ in tasks], journal)
 
 
 def _frames(request: SweepRequest, listener: Listener) -> tuple[Sampling, list[tuple[Task, Frame]]]:
@@ -158,7 +151,13 @@ def _frames(request: SweepRequest, listener: Listener) -> tuple[Sampling, list[t
             "the frames' own" if own else "uniform of the ground truth, as frames have no others"
         )
         listener.say(f"points: {origin}; --sample to change")
-    samplings = [sampling_of(cell, sampling) for study in request.studies for cell in study.cells()]
+    if request.points:
+        sampling = sampling.with_values(values_of(request.points, of_points=True))
+    samplings = [
+        sampling.with_values(values_of(cell, of_points=True))
+        for study in request.studies
+        for cell in study.cells()
+    ]
     scan = request.refine.files.scan
     if any(each.lidar for each in samplings):
         # the calibration is then of the camera, not of a scan
@@ -192,42 +191,35 @@ def _model_of(cell: Cell, request: SweepRequest) -> Model:
 
 def _network(
     model: Model,
+    cells: Sequence[Cell],
     request: SweepRequest,
     sampling: Sampling,
     tasks: Sequence[tuple[Task, Frame]],
     listener: Listener,
 ) -> _Network:
     """The network, loaded, and the runs of its cells."""
-    spec, checkpoint = model
-    cells = [
-        cell
-        for study in request.studies
-        for cell in study.cells()
-        if _model_of(cell, request) == model
-    ]
-    refine = request.refine.with_fields(model=spec, checkpoint=checkpoint)
+    named = {"model": model[0], "checkpoint": model[1]}
+    refine = request.refine.with_fields(**named)
     tasks = [
-        (replace(task, request=task.request.with_fields(model=spec, checkpoint=checkpoint)), frame)
-        for task, frame in tasks
+        (replace(task, request=task.request.with_fields(**named)), frame) for task, frame in tasks
     ]
-    axes = [axis for study in request.studies for axis in study.axes if axis.name == "layer"]
-    layer = axes[0].values[0] if axes else refine.method.layer
+    layer = next((cell["layer"] for cell in cells if "layer" in cell), refine.method.layer)
     refiner = _resolved(layer, refine, tasks, listener)
     definition = refiner.network.definition
     if layer is None:  # the default is what `refine` cuts the first frame at
         defaults = replace(definition.defaults, layer=refiner.layer)
         definition = replace(definition, defaults=defaults)
-    base = _base(definition, refine)
+    plan = Plan(cells, definition, refine, sampling, request.seeds, model_identity(refine))
+    base = plan.base()
     listener.say(
         f"network: {definition.name}; where not varied: cut at {base['layer']},"
         f" {base['iterations']} updates of z ({base['update']}, {base['loss']}, step {base['lr']})"
     )
-    plan = Plan(cells, definition, refine, sampling, request.seeds, model_identity(refine))
     for each in plan.layers:
         with refiner.network.cut_at(each):
             pass  # reports an unknown layer before anything is computed
-    runs = tuple(run for task, frame in tasks for run in plan.runs(task, frame))
-    return _Network(refiner=refiner, base=base, plan=plan, runs=runs)
+    runs = {run.id: run for task, frame in tasks for run in plan.runs(task, frame)}
+    return _Network(refiner=refiner, plan=plan, runs=runs)
 
 
 def _resolved(
@@ -279,25 +271,12 @@ def _with_points_of_truth(task: Task, frame: Frame, seed: int) -> Inputs:
     return replace(inputs, points=frame_points(some, seed, inputs, task.request, frame))
 
 
-def _base(definition: ModelDefinition, request: RefineRequest) -> dict[str, Any]:
-    """The settings that are not varied."""
-    method = with_preset(request.method)
-    settings = resolve_settings(definition, method)
-    layer = method.layer or definition.default_layer
-    return {
-        "layer": None if layer is None else resolve_layer(definition, layer),
-        **asdict(settings),
-        "propagate": method.propagate or "none",
-    }
-
-
-def _recorded(run: Run, result: Result, state: SweepState) -> dict[str, Any]:
-    """Records the run; returns its row for a listener."""
+def _recorded(run: Run, result: Result, journal: Journal) -> dict[str, Any]:
+    """Records the run; returns its row for a listener. A run that failed is tried again."""
     row = {"name": run.frame.name, "status": "done", "message": None}
     if isinstance(result, PnpDepthError):
-        state.fail(run, str(result))
         return row | {"status": "failed", "message": str(result)}
-    state.add(run, result)
+    journal.add(run, result)
     if result.get("diverged"):
         return row | {"status": "diverged", "message": result["diverged"]}
     return row
@@ -308,36 +287,23 @@ def _write(
     sampling: Sampling,
     networks: Mapping[Model, _Network],
     names: Sequence[str],
-    state: SweepState,
+    journal: Journal,
 ) -> dict[str, Any]:
     """Writes the tables and plots; returns the contents of sweep.json."""
-    lines = {
-        (model, run.id): state.result(run.key)
-        for model, each in networks.items()
-        for run in each.runs
-    }
     studies: list[dict[str, Any]] = []
     rows: list[dict[str, Any]] = []
     for study in request.studies:
         cells = []
         for cell in study.cells():
-            model = _model_of(cell, request)
-            setup = networks[model].plan.setup(cell)
-            figures = [
-                FrameFigures.of(
-                    name,
-                    seed,
-                    setup.iterations,
-                    linear=lines[model, (name, seed, setup.sampling, None)],
-                    curve=lines[model, (name, seed, setup.sampling, setup.method)],
-                )
-                for name in names
-                for seed in setup.seeds
-            ]
-            summary = summarise(figures, request.resamples, cost=request.cost)
+            network = networks[_model_of(cell, request)]
+            of_cell = _rows(study, cell, network, names, journal)
+            summary = summarise(of_cell, request.resamples)
+            for each in (summary, *of_cell):
+                if not request.cost:
+                    each.pop("time_s", None)
             cells.append({"parameters": dict(cell), **summary})
-            rows += [{"study": study.name, "parameters": cell, "figures": f} for f in figures]
-        plot = f"sweep_{study.name}.{request.plot_format}" if request.plots else None
+            rows += of_cell
+        plot = None if request.plots == "none" else f"sweep_{study.name}.{request.plots}"
         if plot is not None:
             draw_study(study, cells, request.output / plot)
         studies.append(
@@ -358,9 +324,24 @@ def _write(
         **({"more_models": [each.refiner.model_record for each in others]} if others else {}),
         "frames": list(names),
         "seeds": request.seeds,
-        "base": first.base | asdict(sampling),
+        "base": first.plan.base() | asdict(sampling),
         "studies": studies,
     }
-    write_sweep(request.output, record)
-    write_frames(request.output / "sweep_frames.csv", rows)
+    write_sweep(request.output, record, rows)
     return record
+
+
+def _rows(
+    study: Study, cell: Cell, network: _Network, names: Sequence[str], journal: Journal
+) -> list[dict[str, Any]]:
+    """A row for each frame of a cell and each draw of its points."""
+    setup, rows = network.plan.setup(cell), []
+    for name in names:
+        for seed in setup.seeds:
+            linear, refined = (
+                journal.result(network.runs[name, seed, setup.sampling, method])
+                for method in (None, setup.method)
+            )
+            scores = row_of(setup.iterations, linear, refined)
+            rows.append({"study": study.name, **cell, "frame": name, "seed": seed, **scores})
+    return rows

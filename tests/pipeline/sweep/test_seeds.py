@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pnpdepth_cli.pipeline.sweep.summary import over_seeds
+from pnpdepth_cli.pipeline.sweep.tables import over_seeds
 
 
 def cell(seed: int, value: float | None, **others: str) -> dict[str, Any]:

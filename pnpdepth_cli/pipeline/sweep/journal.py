@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import zlib
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -14,12 +13,11 @@ from pnpdepth_cli.io.fingerprint import Fingerprint, fingerprint, is_unchanged
 from pnpdepth_cli.io.record import plain
 from pnpdepth_cli.io.remote.store import local_files
 from pnpdepth_cli.pipeline.sweep.plan import Run
-from pnpdepth_cli.pipeline.sweep.points import OWN, calibration_file
 
 RESULTS = ("sweep.json", "sweep.csv", "sweep_frames.csv", "sweep.tex")
 
 
-class SweepState:
+class Journal:
     """The results in `sweep.jsonl`, a line for each run, which ends with its checksum.
 
     Lines that are damaged, or were not written to their end, are removed.
@@ -33,36 +31,31 @@ class SweepState:
 
     def __init__(self, output: Path) -> None:
         self._path = output / "sweep.jsonl"
-        unowned = [name for name in RESULTS if (output / name).exists()]
-        if unowned and not self._path.exists():
-            raise OutputError(
-                f"{output / unowned[0]} exists, and no sweep wrote it; -o names another folder"
-            )
         self._lines: dict[str, dict[str, Any]] = {}
         self.notes: list[str] = []
         if self._path.exists():
             self._read()
+        elif unowned := [name for name in RESULTS if (output / name).exists()]:
+            raise OutputError(
+                f"{output / unowned[0]} exists, and no sweep wrote it; -o names another folder"
+            )
 
     def _read(self) -> None:
         lines = self._path.read_bytes().splitlines(keepends=True)
-        whole = [line for line in lines if _content(line) is not None]
-        for line in whole:
-            content = _content(line)
-            assert content is not None
-            self._lines[content["run"]] = content
-        damaged = sum(line.endswith(b"\n") for line in lines) - len(whole)
-        if damaged:
+        read = [(line, _content(line)) for line in lines]
+        whole = [(line, content) for line, content in read if content is not None]
+        self._lines = {content["run"]: content for _, content in whole}
+        if damaged := sum(line.endswith(b"\n") for line in lines) - len(whole):
             self.notes.append(
                 f"warning: {damaged} lines of {self._path} are damaged; their runs are repeated"
             )
         if len(whole) < len(lines):
             with atomic_path(self._path) as temporary:
-                temporary.write_bytes(b"".join(whole))
+                temporary.write_bytes(b"".join(line for line, _ in whole))
 
-    def result(self, key: str) -> dict[str, Any] | None:
-        """Returns the run's line; None if it was not computed."""
-        line = self._lines.get(key)
-        return line if line is not None and line.get("state") == "done" else None
+    def result(self, run: Run) -> dict[str, Any] | None:
+        """Returns the run's result; None if it was not computed."""
+        return self._lines.get(run.key)
 
     def is_done(self, run: Run) -> bool:
         """Returns True if all scores of the run exist, of the files as they are now."""
@@ -72,42 +65,22 @@ class SweepState:
     def add(self, run: Run, result: dict[str, Any]) -> None:
         """Records the result, with known scores after other numbers of updates."""
         before = self._still_good(run)
-        if before is not None and "scores" in result:
+        if before is not None:
             result = result | {"scores": before["scores"] | result["scores"]}
-        files = _files(run)
+        files = run.files()
         with local_files(files.values()) as copies:
             inputs = {n: fingerprint(p, copies.get(p)).as_record() for n, p in files.items()}
-        self._append(
-            {
-                "run": run.key,
-                "frame": run.frame.name,
-                "seed": run.seed,
-                "sampling": asdict(run.sampling),
-                "method": None if run.method is None else run.method.record(),
-                "inputs": inputs,
-                **result,
-            }
-        )
-
-    def fail(self, run: Run, message: str) -> None:
-        """Records why the run failed; the next sweep tries it again."""
-        self._append(
-            {"run": run.key, "frame": run.frame.name, "seed": run.seed, "state": "failed",
-             "message": message}
-        )  # fmt: skip
-
-    def _append(self, content: dict[str, Any]) -> None:
-        content = json.loads(json.dumps(plain(content), allow_nan=False))
-        line = json.dumps(content | {"crc32": _checksum(content)})
+        line = {"run": run.key, "frame": run.frame.name, "seed": run.seed, "inputs": inputs}
+        content = json.loads(json.dumps(plain(line | result), allow_nan=False))
         try:
             with self._path.open("a", encoding="ascii") as file:
-                file.write(f"{line}\n")
+                file.write(json.dumps(content | {"crc32": _checksum(content)}) + "\n")
         except OSError as error:
             raise cannot_write(self._path, error) from error
-        self._lines[content["run"]] = content
+        self._lines[run.key] = content
 
     def _still_good(self, run: Run) -> dict[str, Any] | None:
-        line, files = self.result(run.key), _files(run)
+        line, files = self.result(run), run.files()
         if line is None or line["inputs"].keys() != files.keys():
             return None
         known = {name: Fingerprint(**seen) for name, seen in line["inputs"].items()}
@@ -128,11 +101,3 @@ def _content(line: bytes) -> dict[str, Any] | None:
 
 def _checksum(content: dict[str, Any]) -> int:
     return zlib.crc32(json.dumps(content).encode())
-
-
-def _files(run: Run) -> dict[str, Path]:
-    """The files that decide the run."""
-    calib = calibration_file(run.sampling, run.frame)
-    own = run.sampling.sensor == OWN
-    read = {name: p for name, p in run.task.inputs.items() if own or name in ("image", "gt")}
-    return read | ({} if calib is None else {"calib": calib})

@@ -1,0 +1,225 @@
+"""Averages the rows of a sweep over frames, with intervals, and writes its tables."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from scipy import stats
+from torch import Tensor
+
+from pnpdepth_cli.core.metrics import MEASURES
+from pnpdepth_cli.io.atomic import atomic_path
+from pnpdepth_cli.io.record import plain, write_json
+from pnpdepth_cli.pipeline.evaluation.dependence import (
+    MIN_CLUSTERS,
+    find_clusters,
+    groups_by_name,
+)
+from pnpdepth_cli.pipeline.evaluation.resampling import Floats, FrameTable, studentised_interval
+from pnpdepth_cli.pipeline.evaluation.score_files import csv_text, latex_text
+
+METHODS = ("plain", "linear", "refined")
+SWEPT = tuple(m for m in MEASURES if m.key in ("mae", "rmse", "mre", "delta1"))
+"""The measures of a sweep."""
+MIN_SEEDS = 3
+"""An interval of fewer draws says nothing: of two it is 13 standard errors wide."""
+SCORES = tuple(f"{measure.key}_{method}" for measure in SWEPT for method in METHODS)
+"""Columns of a row."""
+
+_BETTER = torch.tensor([1.0 if m.higher_is_better else -1.0 for m in SWEPT]).double()
+_COLUMNS = (
+    *(*METHODS, "refined_low", "refined_high"),
+    *("gain", "gain_low", "gain_high", "gain_over_linear"),
+)
+_ROWS = (*METHODS, "gain", "gain_over_linear")
+
+
+def row_of(
+    iterations: int, linear: Mapping[str, Any] | None, refined: Mapping[str, Any] | None
+) -> dict[str, Any]:
+    """Returns the status and the scores of one frame with one draw of its points.
+
+    Args:
+        iterations: The number of updates whose scores are wanted.
+        linear: The journal's result of linear interpolation; None if it failed.
+        refined: That of the refinement; None if it failed.
+    """
+    if linear is None or refined is None:
+        return {"status": "failed", "points_used": 0, **dict.fromkeys(SCORES)}
+    after = refined["scores"][str(iterations)]
+    by_method = (refined["plain"], linear["scores"]["linear"], after)
+    return {
+        "status": "diverged" if after["updates"] < iterations else "done",
+        "points_used": refined["points"],
+        **dict(zip(SCORES, (of[m.key] for m in SWEPT for of in by_method), strict=True)),
+        "time_s": after["time_s"],
+    }
+
+
+def summarise(rows: Sequence[Mapping[str, Any]], resamples: int) -> dict[str, Any]:
+    """Returns a cell's means over frames, of each frame's mean over its draws.
+
+    Frames of which a draw failed are left out. Gains are in per cent, positive where the refinement
+    is better: over the plain network, and over linear interpolation.
+
+    Args:
+        rows: All draws of all frames of the cell, as of `row_of`, with the frame's name.
+        resamples: Bootstrap samples behind the intervals, which are studentised and over sequences
+            of frames; there are none with fewer than MIN_CLUSTERS of these.
+    """
+    by_frame: dict[str, list[Mapping[str, Any]]] = {}
+    for row in rows:
+        by_frame.setdefault(row["frame"], []).append(row)
+    whole = {n: of for n, of in by_frame.items() if all(r["status"] != "failed" for r in of)}
+    counts = {
+        "frames": len(whole),
+        "failed": len(by_frame) - len(whole),
+        "diverged": sum(row["status"] == "diverged" for row in rows),
+    }
+    if not whole:
+        return counts | {"time_s": None, "points": None, "measures": None}
+    scores = [np.array([[r[k] for k in SCORES] for r in of], float) for of in whole.values()]
+    table = np.stack([each.mean(axis=0) for each in scores])
+    table = table.reshape(len(table), len(SWEPT), len(METHODS)).swapaxes(1, 2)
+    mean, low, high = _mean_and_interval(table, list(whole), resamples)
+    values = {name: mean[row] for row, name in enumerate(_ROWS)}
+    for name in ("refined", "gain"):
+        values[f"{name}_low"], values[f"{name}_high"] = (
+            end[_ROWS.index(name)] for end in (low, high)
+        )
+    used = [row for of in whole.values() for row in of]
+    result: dict[str, Any] = plain(
+        counts
+        | {
+            "time_s": float(np.mean([row["time_s"] for row in used])),
+            "points": float(np.mean([row["points_used"] for row in used])),
+            "measures": {
+                measure.key: {name: float(values[name][m]) for name in _COLUMNS}
+                for m, measure in enumerate(SWEPT)
+            },
+        }
+    )
+    return result
+
+
+def _mean_and_interval(
+    table: Floats, names: Sequence[str], resamples: int
+) -> tuple[Floats, Floats, Floats]:
+    """(5, measures) each, of a table (frames, methods, measures): means and gains, their ends."""
+    frames = FrameTable(rows=table.reshape(len(table), -1))
+    clusters = find_clusters(groups_by_name(names), frames.rows)
+
+    def statistic(totals: Tensor) -> Tensor:
+        means = frames.means_of(totals)
+        return _with_gains(means.reshape(*means.shape[:-1], *table.shape[1:])).flatten(-2)
+
+    mean = _with_gains(torch.from_numpy(table.mean(axis=0))).numpy()
+    low = high = np.full(mean.shape, np.nan)
+    if clusters.count >= MIN_CLUSTERS:
+        totals = frames.cluster_totals(clusters.ids)
+        ends = studentised_interval(statistic, totals, resamples, seed=0)
+        low, high = (end.reshape(mean.shape) for end in ends)
+    return mean, low, high
+
+
+def _with_gains(means: Tensor) -> Tensor:
+    """(…, 5, measures) of means (…, methods, measures): these, and the gains over the others."""
+    before, refined = means[..., :2, :], means[..., 2:, :]
+    change = 100 * _BETTER * (refined - before) / before.abs()
+    gains = torch.where(before == refined, torch.zeros_like(change), change)
+    gains = torch.where(gains.isfinite(), gains, torch.full_like(gains, torch.nan))
+    return torch.cat([means, gains], dim=-2)
+
+
+def over_seeds(cells: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Returns the MAE over the seeds of the points, for each setting of the other parameters.
+
+    Every figure has a mean and the ends of its 95 % interval (Student's t over the draws, of each
+    of which the mean over all frames is taken). The interval covers the choice of the points, not
+    that of the frames.
+
+    Args:
+        cells: Of one study; those without a parameter `seed`, or without scores, are left out.
+    """
+    groups: dict[tuple[tuple[str, str], ...], list[Mapping[str, float | None]]] = {}
+    for cell in cells:
+        if "seed" in cell["parameters"] and cell["measures"] is not None:
+            others = tuple((n, v) for n, v in cell["parameters"].items() if n != "seed")
+            groups.setdefault(others, []).append(cell["measures"]["mae"])
+    return [
+        {
+            "parameters": dict(others),
+            "seeds": len(drawn),
+            "mae": {n: _over_draws([each[n] for each in drawn]) for n in (*METHODS, "gain")},
+        }
+        for others, drawn in groups.items()
+        if len(drawn) >= MIN_SEEDS
+    ]
+
+
+def _over_draws(values: Sequence[float | None]) -> dict[str, float | None]:
+    """The mean and the ends of its interval; None where a value is missing."""
+    numbers = np.array(values, float)
+    half = stats.t.ppf(0.975, len(numbers) - 1) * stats.sem(numbers)
+    ends = {"mean": numbers.mean(), "low": numbers.mean() - half, "high": numbers.mean() + half}
+    return {name: float(end) if math.isfinite(end) else None for name, end in ends.items()}
+
+
+def write_sweep(folder: Path, record: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> None:
+    """Writes sweep.json, the means to sweep.csv and sweep.tex, and all rows to sweep_frames.csv."""
+    studies = record["studies"]
+    write_json(folder / "sweep.json", record)
+    _write(folder / "sweep.tex", "\n".join(_latex(study, record) for study in studies))
+    names = list(dict.fromkeys(name for study in studies for name in study["parameters"]))
+    timed = ["time_s"] * any("time_s" in cell for study in studies for cell in study["cells"])
+    counts = ("frames", "failed", "diverged", "points_used", *timed)
+    means = [f"{measure.key}_{name}" for measure in SWEPT for name in _COLUMNS]
+    cells = [
+        {
+            "study": study["name"],
+            **cell["parameters"],
+            **{f"{m}_{n}": v for m, of in (cell["measures"] or {}).items() for n, v in of.items()},
+            **{name: cell[name.removesuffix("_used")] for name in counts},
+        }
+        for study in studies
+        for cell in study["cells"]
+    ]
+    _write_csv(folder / "sweep.csv", ("study", *names, *counts, *means), cells)
+    columns = ("study", *names, "frame", "seed", "status", "points_used", *timed, *SCORES)
+    _write_csv(folder / "sweep_frames.csv", tuple(dict.fromkeys(columns)), rows)
+
+
+def _latex(study: Mapping[str, Any], record: Mapping[str, Any]) -> str:
+    """A tabular of a study: MAE and RMSE of each method, the gain in MAE and its interval."""
+    names = list(study["parameters"])
+    header = [*names, *(f"{m} {what} [m]" for m in ("MAE", "RMSE") for what in METHODS)]
+    header += ["gain [%]", "low", "high"]
+    shown = [("mae", n, ".4f") for n in METHODS] + [("rmse", n, ".4f") for n in METHODS]
+    shown += [("mae", name, "+.1f") for name in ("gain", "gain_low", "gain_high")]
+    rows = []
+    for cell in study["cells"]:
+        measures = cell["measures"] or {}
+        values = [(measures.get(key, {}).get(name), form) for key, name, form in shown]
+        texts = ["–" if value is None else f"{value:{form}}" for value, form in values]
+        rows.append([*(cell["parameters"][name] for name in names), *texts])
+    caption = (
+        f"means over {len(record['frames']):,} frames, {record['seeds']} draws of the points each;"
+        " gain: in per cent of the plain network's MAE; interval: 95 %, over sequences of frames"
+    )
+    return latex_text(header, rows, caption)
+
+
+def _write_csv(path: Path, header: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> None:
+    cells: list[list[Any]] = [[row.get(name) for name in header] for row in rows]
+    _write(path, csv_text(header, cells))
+
+
+def _write(path: Path, text: str) -> None:
+    with atomic_path(path) as temporary:
+        # a file name that is no UTF-8 has surrogates
+        temporary.write_bytes(text.encode("utf-8", "backslashreplace"))
