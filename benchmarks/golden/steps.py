@@ -15,9 +15,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-_STEP = re.compile(
-    r"(?P<name>[^:]*?)(?: > (?P<save>\S+))?(?: - (?P<remove>\S+))?: ?(?P<line>.*)"
-)
+_STEP = re.compile(r"(?P<name>[^:]*?)(?: > (?P<save>\S+))?(?: - (?P<remove>\S+))?: ?(?P<line>.*)")
 _ALTERNATIVES = re.compile(r"\((.+)\)")
 
 

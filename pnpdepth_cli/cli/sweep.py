@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import click
@@ -48,11 +48,7 @@ _SCAN_DETAILS = ("inverse_extrinsics", "euclidean", "keep_occluded", "point_fiel
     help="Parameter and its values; two --vary make a grid.",
 )
 @click.option(
-    "--set",
-    "settings",
-    multiple=True,
-    metavar="NAME=V",
-    help="Parameter that is not varied, by the same names.",
+    "--set", "settings", multiple=True, metavar="NAME=V", help="Parameter that is not varied."
 )
 @click.option(
     "--one-by-one",
@@ -102,8 +98,7 @@ def sweep(
     pnpdepth sweep frames.csv -o sweep/ --seeds 3 --vary points=20,100,500 --vary iterations=0,5,20
     pnpdepth sweep frames.csv -o sweep/ --one-by-one --sample 500 --set iterations=10 \\
         --vary lr=1%,3%,10% --vary layer=0,0.5,1 --vary loss=l1,l2,log
-    pnpdepth sweep kitti/ -o sweep/ --vary points=1%,3%,10%,30%,100%   # of the LiDAR's points
-    pnpdepth sweep street/ -o sweep/ --vary sensor=vlp-16,vlp-32c,hdl-32e,hdl-64e
+    pnpdepth sweep kitti/ -o sweep/ --vary sensor=vlp-16,vlp-32c,hdl-32e,hdl-64e
 
     FOLDER or LIST is what `pnpdepth batch` takes.
 
@@ -111,16 +106,13 @@ def sweep(
     points      N; or P% of the known pixels, of the frame's points or of the LiDAR's points
     sensor      own; a pattern of `pnpdepth sample` such as grid, grid:500 or lines:16; or a LiDAR
                 of `pnpdepth simulate` at the camera, which needs a calibration
-    noise, relative-noise, outliers, jitter
-                noise of the points, as in `pnpdepth sample`
-    rotation-noise
-                rotation of a LiDAR, degrees
+    noise, relative-noise, outliers, jitter, rotation-noise
+                faults of the points as in `pnpdepth sample`, of a LiDAR as in `pnpdepth simulate`
     preset, layer, iterations, lr, loss, update, schedule, blur, target, parameters, mask,
     mask-fraction, mask-scale, proximity, line-search, keep-best, align, align-every, propagate
                 the options of `pnpdepth refine` of these names; switches are on or off
     model       networks, as NETWORK or NETWORK@WEIGHTS
-    seed        of the draw of the points, in place of --seeds; from 3 on, a second table has the
-                means over seeds with their intervals
+    seed        of the draw of the points, in place of --seeds
 
     One --vary gives one table and one plot; two give a table and a plot of their grid; with
     --one-by-one every --vary gives its own. Tables compare the refined depth with the network's
@@ -187,49 +179,28 @@ def _print(record: Mapping[str, Any]) -> None:
 
     for study in record["studies"]:
         names = list(study["parameters"])
-        cost = any("time_s" in cell for cell in study["cells"])
+        cost = ["time [s]"] * any("time_s" in cell for cell in study["cells"])
         print_rows(
             f"{' × '.join(names)}: means over frames, MAE in metres, gains over plain in %",
             [*names, "points used", "frames", "linear", "plain", "refined", "±", "gain", "95 %",
-             "RMSE gain", "MRE gain", "δ1 gain", *(["time [s]"] if cost else [])],
-            [_cells(names, cell) for cell in study["cells"]],
+             "RMSE gain", "MRE gain", "δ1 gain", *cost],
+            [[*cell["parameters"].values(), *_cells(cell)] for cell in study["cells"]],
         )  # fmt: skip
-        if rows := study["over_seeds"]:
-            others = list(rows[0]["parameters"])
-            print_rows(
-                "over seeds of the points: mean MAE in metres with its 95 % interval over draws,"
-                " gain in %",
-                [*others, "seeds", "linear", "plain", "refined", "gain"],
-                [[*row["parameters"].values(), str(row["seeds"]), *_over_seeds(row)]
-                 for row in rows],
-            )  # fmt: skip
-    folder = record["output"]
-    files = ["sweep.csv", "sweep.json", "sweep.tex", "sweep_frames.csv"]
-    files += [study["plot"] for study in record["studies"] if study["plot"]]
-    click.echo("wrote " + "  ".join(f"{folder}/{name}" for name in files), err=True)
+    plots = [study["plot"] for study in record["studies"] if study["plot"]]
+    names = ["sweep.csv", "sweep.json", "sweep.tex", "sweep_frames.csv", *plots]
+    click.echo("wrote " + "  ".join(f"{record['output']}/{name}" for name in names), err=True)
 
 
-def _over_seeds(row: Mapping[str, Any]) -> Iterator[str]:
-    for name in ("linear", "plain", "refined", "gain"):
-        mean, low, high = (
-            _text(row["mae"][name][end], "+.1f" if name == "gain" else ".4f")
-            for end in ("mean", "low", "high")
-        )
-        yield f"{mean} [{low}, {high}]"
-
-
-def _cells(names: list[str], cell: Mapping[str, Any]) -> list[str]:
-    start = [cell["parameters"][name] for name in names]
+def _cells(cell: Mapping[str, Any]) -> list[str]:
     time = [_text(cell["time_s"], ".3g")] if "time_s" in cell else []
     if cell["measures"] is None:
-        return [*start, "–", "0", *["–"] * 9, *time]
-    mae = cell["measures"]["mae"]
+        return ["–", "0", *["–"] * 9, *time]
+    mae, diverged = cell["measures"]["mae"], cell["diverged"]
     low, high = mae["refined_low"], mae["refined_high"]
     ends = (_text(mae[name], "+.1f") for name in ("gain_low", "gain_high"))
     return [
-        *start,
         f"{cell['points']:,.0f}",
-        f"{cell['frames']:,}" + (f", {cell['diverged']:,} diverged" if cell["diverged"] else ""),
+        f"{cell['frames']:,}" + (f", {diverged:,} diverged" if diverged else ""),
         *(_text(mae[name], ".4f") for name in ("linear", "plain", "refined")),
         _text(None if low is None else (high - low) / 2, ".4f"),
         _text(mae["gain"], "+.1f"),

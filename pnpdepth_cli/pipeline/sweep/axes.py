@@ -44,11 +44,6 @@ class Axis:
     name: str
     values: tuple[str, ...]
 
-    @property
-    def log(self) -> bool:
-        """Whether equal ratios are drawn equally far apart."""
-        return PARAMETERS[self.name].shown.log
-
     def numbers(self) -> list[float] | None:
         """Returns the values as numbers; None if they are not numbers of one unit."""
         percents = {value.endswith("%") for value in self.values}
@@ -187,18 +182,13 @@ def _of_method(field: OptionField) -> Parameter:
     )
 
 
-def _of_points(title: str, value: Callable[[str], Any]) -> Parameter:
-    return Parameter(shown=Shown(title=title), value=value, of_points=True)
+def _of_points(title: str, value: Callable[[str], Any], **shown: Any) -> Parameter:
+    return Parameter(shown=Shown(title=title, **shown), value=value, of_points=True)
 
 
+_OF_THOSE = "sparse points (% of those there are)"
 PARAMETERS: Mapping[str, Parameter] = {
-    "points": Parameter(
-        shown=Shown(
-            title="sparse points", title_percent="sparse points (% of those there are)", log=True
-        ),
-        value=_points,
-        of_points=True,
-    ),
+    "points": _of_points("sparse points", _points, title_percent=_OF_THOSE, log=True),
     "sensor": _of_points("sensor", read_sampling),
     "noise": _of_points("noise of the points (m)", _number(float)),
     "relative-noise": _of_points("noise of the points (fraction of depth)", _number(float)),

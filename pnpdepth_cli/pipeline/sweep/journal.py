@@ -1,4 +1,4 @@
-"""Remembers the results of a sweep, and whether they are up to date."""
+"""Remembers the results of a sweep."""
 
 from __future__ import annotations
 
@@ -9,9 +9,7 @@ from typing import Any
 
 from pnpdepth_cli.errors import OutputError
 from pnpdepth_cli.io.atomic import atomic_path, cannot_write
-from pnpdepth_cli.io.fingerprint import Fingerprint, fingerprint, is_unchanged
 from pnpdepth_cli.io.record import plain
-from pnpdepth_cli.io.remote.store import local_files
 from pnpdepth_cli.pipeline.sweep.plan import Run
 
 RESULTS = ("sweep.json", "sweep.csv", "sweep_frames.csv", "sweep.tex")
@@ -59,18 +57,14 @@ class Journal:
 
     def is_done(self, run: Run) -> bool:
         """Returns True if all scores of the run exist, of the files as they are now."""
-        line = self._still_good(run)
+        line = self.result(run)
         return line is not None and {str(k) for k in run.iterations} <= line["scores"].keys()
 
     def add(self, run: Run, result: dict[str, Any]) -> None:
         """Records the result, with known scores after other numbers of updates."""
-        before = self._still_good(run)
-        if before is not None:
+        if before := self.result(run):
             result = result | {"scores": before["scores"] | result["scores"]}
-        files = run.files()
-        with local_files(files.values()) as copies:
-            inputs = {n: fingerprint(p, copies.get(p)).as_record() for n, p in files.items()}
-        line = {"run": run.key, "frame": run.frame.name, "seed": run.seed, "inputs": inputs}
+        line = {"run": run.key, "frame": run.frame.name, "seed": run.seed}
         content = json.loads(json.dumps(plain(line | result), allow_nan=False))
         try:
             with self._path.open("a", encoding="ascii") as file:
@@ -78,13 +72,6 @@ class Journal:
         except OSError as error:
             raise cannot_write(self._path, error) from error
         self._lines[run.key] = content
-
-    def _still_good(self, run: Run) -> dict[str, Any] | None:
-        line, files = self.result(run), run.files()
-        if line is None or line["inputs"].keys() != files.keys():
-            return None
-        known = {name: Fingerprint(**seen) for name, seen in line["inputs"].items()}
-        return line if all(is_unchanged(files[name], known[name]) for name in files) else None
 
 
 def _content(line: bytes) -> dict[str, Any] | None:

@@ -12,9 +12,11 @@ from typing import Any
 from pnpdepth_cli.core.refine import RefineSettings
 from pnpdepth_cli.io.dataset.frame import Frame
 from pnpdepth_cli.io.record import plain
+from pnpdepth_cli.io.remote.address import RemotePath
+from pnpdepth_cli.io.remote.store import status_of
 from pnpdepth_cli.models.definition import ModelDefinition
 from pnpdepth_cli.pipeline.batch.frames import Task
-from pnpdepth_cli.pipeline.batch.settings import settings_of
+from pnpdepth_cli.pipeline.batch.settings import model_identity, settings_of
 from pnpdepth_cli.pipeline.refinement.method import with_preset
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest
 from pnpdepth_cli.pipeline.refinement.resolve import resolve_layer, resolve_settings
@@ -37,23 +39,8 @@ class Method:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Setup:
-    """What one cell is."""
-
-    sampling: Sampling
-    method: Method
-    iterations: int
-    seeds: tuple[int, ...]
-    """Of the draws of the points."""
-
-
-RunId = tuple[str, int, Sampling, "Method | None"]
-"""(frame's name, seed, points, method); unique in a sweep."""
-
-
-@dataclass(frozen=True, kw_only=True)
 class Run:
-    """One computation for one frame."""
+    """One computation for one frame, scored after some numbers of updates."""
 
     task: Task
     frame: Frame
@@ -62,112 +49,99 @@ class Run:
     method: Method | None
     """None interpolates the points linearly."""
     iterations: tuple[int, ...]
-    """Numbers of updates after which the depth is scored."""
     key: str
-    """Digest of all that decides the result, but the content of files."""
-
-    @property
-    def id(self) -> RunId:
-        """What distinguishes the run from the others of its network."""
-        return self.frame.name, self.seed, self.sampling, self.method
-
-    def files(self) -> dict[str, Path]:
-        """Returns the files that decide the result."""
-        own, calib = self.sampling.sensor == OWN, self.frame.calib
-        read = {n: path for n, path in self.task.inputs.items() if own or n in ("image", "gt")}
-        scanned = self.sampling.lidar is not None and calib is not None and calib.is_file()
-        return read | ({"calib": calib} if scanned and calib is not None else {})
+    """Digest of all that decides the result."""
 
 
+Runs = dict[tuple[str, int, Sampling, Method | None], Run]
+"""By the frame's name, the seed, the points and the method."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Plan:
-    """The runs that the cells of one network need, the same for every frame.
+    """How the cells of one network are computed."""
 
-    Args:
-        cells: The cells.
-        definition: Of the network.
-        base: How a frame is refined where nothing is varied.
-        sampling: The points where nothing is varied.
-        seeds: Number of draws of the points.
-        model: The `model_identity` of the network.
-    """
+    definition: ModelDefinition
+    base: RefineRequest
+    """How a frame is refined where nothing is varied."""
+    sampling: Sampling
+    """The points where nothing is varied."""
+    seeds: int
+    """Number of draws of the points."""
 
-    def __init__(
-        self,
-        cells: Sequence[Cell],
-        definition: ModelDefinition,
-        base: RefineRequest,
-        sampling: Sampling,
-        seeds: int,
-        model: dict[str, Any],
-    ) -> None:
-        self._definition, self._base, self._sampling = definition, base, sampling
-        self._seeds, self._model = range(base.hold_out.seed, base.hold_out.seed + seeds), model
-        self._wanted: dict[tuple[Sampling, int], dict[Method | None, set[int]]] = {}
-        for setup in map(self.setup, cells):
-            for seed in setup.seeds:
-                methods = self._wanted.setdefault((setup.sampling, seed), {None: set()})
-                methods.setdefault(setup.method, set()).add(setup.iterations)
+    def method(self, cell: Cell) -> tuple[Method, int]:
+        """Returns the method of a cell and the number of updates.
 
-    @property
-    def layers(self) -> list[str]:
-        """The layers of all methods, each once."""
-        methods = (method for methods in self._wanted.values() for method in methods if method)
-        return list(dict.fromkeys(method.layer for method in methods))
-
-    def setup(self, cell: Cell) -> Setup:
-        """Returns what the cell is. Raises UsageError if its parameters contradict each other."""
+        Raises:
+            UsageError: If parameters contradict each other.
+        """
         varied = values_of(cell, of_points=False)
-        varied.pop("model", None)
-        seed = varied.pop("seed", None)
-        options = with_preset(replace(self._base.method, **varied))
-        settings = resolve_settings(self._definition, options)
+        varied = {name: value for name, value in varied.items() if name not in ("model", "seed")}
+        options = with_preset(replace(self.base.method, **varied))
+        settings = resolve_settings(self.definition, options)
         settings = replace(settings, lr=_one_spelling(settings.lr))
         iterations = settings.iterations
         if settings.schedule == "constant":  # more updates then begin as fewer do
             settings = replace(settings, iterations=0)
-        layer = resolve_layer(self._definition, options.layer)
-        sampling = self._sampling.with_values(values_of(cell, of_points=True))
-        seeds = tuple(self._seeds) if seed is None else (seed,)
-        return Setup(
-            sampling=sampling,
-            seeds=seeds if sampling.is_random else seeds[:1],
-            method=Method(layer=layer, settings=settings, propagate=options.propagate or "none"),
-            iterations=iterations,
-        )
+        layer, kind = resolve_layer(self.definition, options.layer), options.propagate or "none"
+        return Method(layer=layer, settings=settings, propagate=kind), iterations
 
-    def base(self) -> dict[str, Any]:
-        """Returns the settings that are not varied."""
-        options = with_preset(self._base.method)
-        layer = options.layer or self._definition.default_layer
-        return {
-            "layer": None if layer is None else resolve_layer(self._definition, layer),
-            **asdict(resolve_settings(self._definition, options)),
-            "propagate": options.propagate or "none",
-        }
+    def draws(self, cell: Cell) -> tuple[Sampling, Sequence[int]]:
+        """Returns where a cell's points come from, and the seeds of their draws."""
+        sampling = self.sampling.with_values(values_of(cell, of_points=True))
+        if "seed" in cell:
+            return sampling, (int(cell["seed"]),)
+        own = self.base.hold_out.seed
+        return sampling, range(own, own + (self.seeds if sampling.is_random else 1))
 
-    def runs(self, task: Task, frame: Frame) -> Iterator[Run]:
-        """Yields the runs of one frame; those with the same points follow each other."""
-        read = settings_of(task.request, self._model, "files", "network")
-        del read["sample"]  # `sampling` says it
-        for (sampling, seed), methods in self._wanted.items():
-            for method, wanted in methods.items():
-                identity = {
-                    "frame": frame.name,
-                    "seed": seed,
-                    "sampling": sampling.record(),
-                    "method": None if method is None else method.record(),
-                    "read": read,
-                }
-                text = json.dumps(plain(identity), sort_keys=True)
-                yield Run(
-                    task=task,
-                    frame=frame,
-                    seed=seed,
-                    sampling=sampling,
-                    method=method,
-                    iterations=tuple(sorted(wanted)),
-                    key=hashlib.sha256(text.encode()).hexdigest(),
-                )
+    def runs(self, cells: Sequence[Cell], tasks: Sequence[tuple[Task, Frame]]) -> Runs:
+        """Returns the runs of the cells by frame; those with the same points follow each other."""
+        model, runs, states = model_identity(self.base), Runs(), dict[Path, Any]()
+        wanted: dict[tuple[Sampling, int], dict[Method | None, set[int]]] = {}
+        for cell in cells:
+            (sampling, seeds), (method, iterations) = self.draws(cell), self.method(cell)
+            for seed in seeds:
+                methods = wanted.setdefault((sampling, seed), {None: set()})
+                methods.setdefault(method, set()).add(iterations)
+        for task, frame in tasks:
+            read = settings_of(task.request, model, "files", "network") | {"frame": frame.name}
+            del read["sample"]  # `sampling` says it
+            for (sampling, seed), methods in wanted.items():
+                paths = dict(_files(task, frame, sampling))
+                states |= {path: _state(path) for path in paths.values() if path not in states}
+                files = {name: states[path] for name, path in paths.items()}
+                drawn = {"seed": seed, "sampling": sampling.record(), "files": files}
+                for each, numbers in methods.items():
+                    runs[frame.name, seed, sampling, each] = Run(
+                        task=task, frame=frame, seed=seed, sampling=sampling, method=each,
+                        iterations=tuple(sorted(numbers)),
+                        key=_digest({**read, **drawn, "method": each and each.record()}),
+                    )  # fmt: skip
+        return runs
+
+
+def _digest(identity: dict[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(plain(identity), sort_keys=True).encode()).hexdigest()
+
+
+def _files(task: Task, frame: Frame, sampling: Sampling) -> Iterator[tuple[str, Path]]:
+    """The files that decide the result with these points."""
+    own = sampling.sensor == OWN
+    yield from ((n, path) for n, path in task.inputs.items() if own or n in ("image", "gt"))
+    if sampling.lidar is not None and frame.calib is not None:
+        yield "calib", frame.calib
+
+
+def _state(path: Path) -> tuple[int, int | str] | None:
+    """What changes with a file's content: size and time, or the version that a store states."""
+    if isinstance(path, RemotePath):
+        status = status_of(path)
+        return None if status is None else (status.size, status.version)
+    try:
+        status = path.stat()
+    except OSError:  # the run will say so
+        return None
+    return status.st_size, status.st_mtime_ns
 
 
 def _one_spelling(lr: float | str) -> float | str:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.io.atomic import atomic_path
-from pnpdepth_cli.pipeline.sweep.axes import Axis, Study
+from pnpdepth_cli.pipeline.sweep.axes import PARAMETERS, Axis, Study
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -23,21 +23,17 @@ _MARKS = "osD^vP"
 _STYLE: dict[Any, Any] = {
     "svg.hashsalt": "pnpdepth",
     "font.size": 8,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.grid": True,
-    "grid.color": "#e6e6e6",
-    "grid.linewidth": 0.6,
-    "axes.axisbelow": True,
     "lines.linewidth": 1.4,
     "lines.markersize": 4,
     "legend.frameon": False,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.axisbelow": True,
+    "axes.grid": True,
+    "grid.color": "#e6e6e6",
+    "grid.linewidth": 0.6,
 }
-_METADATA: dict[str, dict[str, Any]] = {
-    "png": {"Software": None},
-    "svg": {"Date": None},
-    "pdf": {"CreationDate": None},
-}
+_METADATA = {"png": {"Software": None}, "svg": {"Date": None}, "pdf": {"CreationDate": None}}
 """Without the program's version and the date, so that the same sweep gives the same bytes."""
 _MAX_LETTERS = 30
 """More letters of values below an axis are rotated."""
@@ -52,13 +48,7 @@ def need_matplotlib() -> None:
 
 
 def draw_study(study: Study, cells: Cells, path: Path) -> None:
-    """Writes a plot of the cells of one axis or two, with a third panel where times are known.
-
-    Args:
-        study: The axes.
-        cells: The cells in the order of the study.
-        path: The file, of one of PLOT_FORMATS.
-    """
+    """Writes a plot of a study's cells, with a third panel where times are known."""
     import matplotlib as mpl
     from matplotlib.figure import Figure
 
@@ -151,14 +141,8 @@ def _draw_cost(axes: Axes, cells: Cells) -> None:
         (error,) = _values([cell], "mae", "refined")
         if cell["time_s"] is not None and error == error:
             axes.plot(cell["time_s"], error, "o", color=_COLOURS[0])
-            axes.annotate(
-                ", ".join(cell["parameters"].values()),
-                (cell["time_s"], error),
-                textcoords="offset points",
-                xytext=(4, 3),
-                fontsize=6,
-                color=_GREY,
-            )
+            text = "  " + ", ".join(cell["parameters"].values())
+            axes.text(cell["time_s"], error, text, fontsize=6, color=_GREY)
     axes.set_xlabel("time of the refinement (s)")
     axes.set_ylabel("MAE (m)")
 
@@ -177,7 +161,7 @@ def _scale(both: Sequence[Axes], axis: Axis) -> None:
     turned = numbers is None and sum(map(len, axis.values)) > _MAX_LETTERS
     for axes in both:
         axes.set_xlabel(axis.title())
-        if numbers is not None and axis.log and min(numbers) > 0:
+        if numbers is not None and PARAMETERS[axis.name].shown.log and min(numbers) > 0:
             axes.set_xscale("log")
         if numbers is None:
             axes.set_xlim(-0.5, len(axis.values) - 0.5)

@@ -39,7 +39,7 @@ _DETERMINISTIC = ("grid", "lines", "features", OWN)
 
 @dataclass(frozen=True, kw_only=True)
 class Sampling:
-    """Where the points of a run come from."""
+    """Where the points of a run come from; noises are standard deviations."""
 
     sensor: str = OWN
     """OWN, a pattern of `pnpdepth sample`, or a LiDAR of `pnpdepth simulate`."""
@@ -47,15 +47,14 @@ class Sampling:
     """Number or fraction (`500`, `5%`), for a pattern of the known pixels, else of the sensor's
     points; None for all of these."""
     noise: float = 0.0
-    """Standard deviation of the depth, metres."""
+    """Of the depth, metres; `relative_noise` as a fraction of it."""
     relative_noise: float = 0.0
-    """Standard deviation as a fraction of the depth."""
     outliers: float = 0.0
     """Fraction of points with a random depth."""
     jitter: float = 0.0
-    """Standard deviation of the pixel coordinates."""
+    """Of the pixel coordinates."""
     rotation_noise: float = 0.0
-    """Standard deviation of the scanner's rotation, degrees."""
+    """Of the scanner, degrees."""
 
     @property
     def is_pattern(self) -> bool:
@@ -70,11 +69,9 @@ class Sampling:
     @property
     def sample_noise(self) -> SampleNoise:
         """The noise of each point."""
+        absolute, relative = self.noise, self.relative_noise
         return SampleNoise(
-            metres=self.noise,
-            relative=self.relative_noise,
-            outliers=self.outliers,
-            jitter_px=self.jitter,
+            metres=absolute, relative=relative, outliers=self.outliers, jitter_px=self.jitter
         )
 
     @property
@@ -95,8 +92,7 @@ class Sampling:
 
     def record(self) -> dict[str, Any]:
         """Returns all that decides the points except the frame and the seed."""
-        lidar = self.lidar
-        return asdict(self) | {"sensor": self.sensor if lidar is None else asdict(lidar)}
+        return asdict(self) | ({"sensor": asdict(self.lidar)} if self.lidar else {})
 
     def with_values(self, values: Mapping[str, Any]) -> Sampling:
         """Returns the sampling with other values of its fields; the sensor's is a sampling.
@@ -148,17 +144,10 @@ def read_sampling(text: str) -> Sampling:
 def frame_points(
     sampling: Sampling, seed: int, inputs: Inputs, request: RefineRequest, frame: Frame
 ) -> SparsePoints:
-    """Returns the points of one frame.
+    """Returns the points of one frame, drawn with a seed. Raises InputError if it has none such.
 
     Args:
-        sampling: Where they come from.
-        seed: Of the drawing.
-        inputs: The frame as read, with its own points if the sensor is OWN.
-        request: How it was read.
-        frame: The frame in its data set.
-
-    Raises:
-        InputError: If the frame cannot have such points.
+        inputs: The frame as read by the request, with its own points if the sensor is OWN.
     """
     noise, rng = sampling.sample_noise, np.random.default_rng(seed)
     if inputs.gt is None:
@@ -191,16 +180,13 @@ def _scanned(
     frame: Frame,
 ) -> Points:
     """The points of a LiDAR at the camera's position, simulated in the frame's ground truth."""
+    sensor, protocol = f"sensor {sampling.sensor!r} needs", request.files.protocol
     if frame.calib is None:
-        raise InputError(
-            f"sensor {sampling.sensor!r} needs to know the camera; give --calib, or a list with a"
-            " column calib"
-        )
-    protocol = request.files.protocol
+        raise InputError(f"{sensor} the camera; give --calib, or a list with a column calib")
     if protocol.halved or protocol.crop:
         raise InputError(
-            f"sensor {sampling.sensor!r} needs the image that the calibration is of, but protocol"
-            f" {protocol.name!r} crops it; --protocol whole does not"
+            f"{sensor} the image that the calibration is of, but protocol {protocol.name!r} crops"
+            " it; --protocol whole does not"
         )
     calibration = read_calibration(frame.calib, frame.camera)
     check_size(frame.calib, calibration, inputs.size)

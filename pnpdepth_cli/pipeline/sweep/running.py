@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import asdict, replace
 from itertools import groupby
 from typing import Any, TypeVar
@@ -35,11 +35,9 @@ a refinement, the scores of the `plain` network and why it `diverged`. Or why th
 
 
 def results(runs: Sequence[Run], network: Network) -> Iterator[tuple[Run, Result]]:
-    """Yields the runs with their results; each frame is read once.
+    """Yields the runs of a network with their results; each frame is read once.
 
-    Args:
-        runs: Those of a frame follow each other, and among these those with the same points.
-        network: The network of all runs.
+    The runs of a frame follow each other, and among these those with the same points.
     """
     with SplitCache(network) as cuts:
         for _, of_frame in groupby(runs, key=lambda run: run.frame.name):
@@ -93,19 +91,12 @@ def _result_of(run: Run, inputs: Inputs, cuts: SplitCache) -> dict[str, Any]:
 
 
 def refined(
-    network: Network, split: Split, method: Method, inputs: Inputs, wanted: Sequence[int]
+    network: Network, split: Split, method: Method, inputs: Inputs, wanted: Collection[int]
 ) -> dict[str, Any]:
     """Returns a refinement's scores after each wanted number of updates.
 
     They equal those of a refinement of each number alone if the step is constant. After a
-    divergence they are those of the last finite depth.
-
-    Args:
-        network: The network.
-        split: The network cut at the method's layer, open.
-        method: How to refine.
-        inputs: The frame with its points.
-        wanted: Numbers of updates.
+    divergence they are those of the last finite depth. The network is cut at the method's layer.
     """
     prepared = prepare(network, inputs.frame())
     if not len(prepared.points):

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,24 +18,23 @@ from pnpdepth_cli.pipeline.batch.batch import Listener
 from pnpdepth_cli.pipeline.batch.frames import Task, find_frames, reference_frames, task_of
 from pnpdepth_cli.pipeline.batch.reading import read_frame
 from pnpdepth_cli.pipeline.batch.request import BatchRequest, FrameSelection
-from pnpdepth_cli.pipeline.batch.settings import model_identity
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs
 from pnpdepth_cli.pipeline.refinement.load_refiner import load_refiner
+from pnpdepth_cli.pipeline.refinement.method import with_preset
 from pnpdepth_cli.pipeline.refinement.refiner import Refiner
-from pnpdepth_cli.pipeline.refinement.request import RefineRequest
+from pnpdepth_cli.pipeline.refinement.resolve import resolve_settings
 from pnpdepth_cli.pipeline.sweep.axes import Cell, Study, values_of
 from pnpdepth_cli.pipeline.sweep.journal import Journal
-from pnpdepth_cli.pipeline.sweep.plan import Plan, Run, RunId
+from pnpdepth_cli.pipeline.sweep.plan import Plan, Runs
 from pnpdepth_cli.pipeline.sweep.plots import draw_study, need_matplotlib
 from pnpdepth_cli.pipeline.sweep.points import OWN, Sampling, frame_points
-from pnpdepth_cli.pipeline.sweep.running import Result, results
-from pnpdepth_cli.pipeline.sweep.tables import over_seeds, row_of, summarise, write_sweep
+from pnpdepth_cli.pipeline.sweep.running import results
+from pnpdepth_cli.pipeline.sweep.tables import row_of, summarise, write_sweep
 from pnpdepth_cli.sensors import SamplePattern
 
 Model = tuple[str, "Path | None"]
 """A network and its weights, as the user names them."""
 
-_GROUND_TRUTH_ONLY = SamplePattern(count=1)
 _RESOLVE_POINTS = 500
 """Points of the ground truth that the definition is resolved on; the paper uses 500 indoors."""
 
@@ -70,8 +70,9 @@ class _Network:
 
     refiner: Refiner
     plan: Plan
-    runs: Mapping[RunId, Run]
-    """Of all frames."""
+    base: Mapping[str, Any]
+    """The settings that are not varied."""
+    runs: Runs
 
 
 def run_sweep(request: SweepRequest, listener: Listener) -> dict[str, Any]:
@@ -115,19 +116,23 @@ def run_sweep(request: SweepRequest, listener: Listener) -> dict[str, Any]:
         listener.begin(left)
         for model, each in networks.items():
             for run, result in results(to_do[model], each.refiner.network):
-                listener.frame(_recorded(run, result, journal))
+                row = {"name": run.frame.name, "status": "done", "message": None}
+                if isinstance(result, PnpDepthError):  # it is tried again next time
+                    row |= {"status": "failed", "message": str(result)}
+                else:
+                    journal.add(run, result)
+                    if result.get("diverged"):
+                        row |= {"status": "diverged", "message": result["diverged"]}
+                listener.frame(row)
         return _write(request, sampling, networks, [task.name for task, _ in tasks], journal)
 
 
 def _frames(request: SweepRequest, listener: Listener) -> tuple[Sampling, list[tuple[Task, Frame]]]:
-    """Where points come from unless that is varied, and the frames with ground truth.
-
-    InputError if there are none, UsageError if no points can be drawn.
-    """
+    """Where points come from unless that is varied, and the frames with ground truth."""
     batch = BatchRequest(
         source=request.source,
         output=request.output,
-        refine=request.refine.with_fields(sample=_GROUND_TRUTH_ONLY),
+        refine=request.refine.with_fields(sample=SamplePattern(count=1)),
         layout=request.layout,
         protocol=request.protocol,
         limit=request.limit,
@@ -147,28 +152,18 @@ def _frames(request: SweepRequest, listener: Listener) -> tuple[Sampling, list[t
     if sampling is None:
         own = any(frame.sparse is not None for frame in frames)
         sampling = Sampling(sensor=OWN if own else "uniform")
-        origin = (
-            "the frames' own" if own else "uniform of the ground truth, as frames have no others"
-        )
+        origin = "the frames' own" if own else "uniform of the ground truth"
         listener.say(f"points: {origin}; --sample to change")
     if request.points:
         sampling = sampling.with_values(values_of(request.points, of_points=True))
-    samplings = [
-        sampling.with_values(values_of(cell, of_points=True))
-        for study in request.studies
-        for cell in study.cells()
-    ]
+    cells = [cell for study in request.studies for cell in study.cells()]
+    samplings = [sampling.with_values(values_of(cell, of_points=True)) for cell in cells]
     scan = request.refine.files.scan
     if any(each.lidar for each in samplings):
         # the calibration is then of the camera, not of a scan
-        frames = [
-            replace(
-                frame,
-                calib=scan.calib or frame.calib,
-                camera=frame.camera if scan.camera is None else scan.camera,
-            )
-            for frame in frames
-        ]
+        given = {"calib": scan.calib, "camera": scan.camera}
+        given = {name: value for name, value in given.items() if value is not None}
+        frames = [replace(frame, **given) for frame in frames]
         scan = replace(scan, calib=None, camera=None)
     own_wanted = any(each.sensor == OWN for each in samplings)
     reading_own = replace(batch, refine=request.refine.with_fields(scan=scan, sample=None))
@@ -204,56 +199,57 @@ def _network(
         (replace(task, request=task.request.with_fields(**named)), frame) for task, frame in tasks
     ]
     layer = next((cell["layer"] for cell in cells if "layer" in cell), refine.method.layer)
-    refiner = _resolved(layer, refine, tasks, listener)
+    refiner = _resolved(layer, refine.hold_out.seed, tasks, listener)
     definition = refiner.network.definition
-    if layer is None:  # the default is what `refine` cuts the first frame at
+    if (
+        layer is None or definition.default_layer is None
+    ):  # the default is what `refine` cuts the first frame at
         defaults = replace(definition.defaults, layer=refiner.layer)
         definition = replace(definition, defaults=defaults)
-    plan = Plan(cells, definition, refine, sampling, request.seeds, model_identity(refine))
-    base = plan.base()
+    plan = Plan(definition=definition, base=refine, sampling=sampling, seeds=request.seeds)
+    settings, method = resolve_settings(definition, with_preset(refine.method)), plan.method({})[0]
+    base = {"layer": method.layer, **asdict(settings), "propagate": method.propagate}
     listener.say(
         f"network: {definition.name}; where not varied: cut at {base['layer']},"
         f" {base['iterations']} updates of z ({base['update']}, {base['loss']}, step {base['lr']})"
     )
-    for each in plan.layers:
+    runs = plan.runs(cells, tasks)
+    for each in dict.fromkeys(run.method.layer for run in runs.values() if run.method):
         with refiner.network.cut_at(each):
             pass  # reports an unknown layer before anything is computed
-    runs = {run.id: run for task, frame in tasks for run in plan.runs(task, frame)}
-    return _Network(refiner=refiner, plan=plan, runs=runs)
+    return _Network(refiner=refiner, plan=plan, base=base, runs=runs)
 
 
 def _resolved(
-    layer: str | None,
-    refine: RefineRequest,
-    tasks: Sequence[tuple[Task, Frame]],
-    listener: Listener,
+    layer: str | None, seed: int, tasks: Sequence[tuple[Task, Frame]], listener: Listener
 ) -> Refiner:
     """The network, its definition resolved on the first frame that can be read.
 
-    Args:
-        layer: A layer to cut at, as a network may have no default.
-        refine: How frames are refined.
-        tasks: The frames.
-        listener: Receives notes.
+    A layer to cut at is named, as the network may have no default.
     """
-    seed = refine.hold_out.seed
+
+    def read(task: Task, frame: Frame) -> Inputs:
+        """The frame with points of its ground truth, so as not to depend on what is varied."""
+        inputs = read_frame(task)
+        known = 0 if inputs.gt is None else int((inputs.gt > 0).sum())
+        some = Sampling(sensor="uniform", points=str(min(_RESOLVE_POINTS, known)))
+        return replace(inputs, points=frame_points(some, seed, inputs, task.request, frame))
+
+    def others(number: int) -> Iterator[Inputs]:
+        """Further frames, which decide the input range as well; errors are reported later."""
+        for other in reference_frames(tasks, number):
+            with contextlib.suppress(PnpDepthError):
+                yield read(*other)
+
     errors = []
     for number, (task, frame) in enumerate(tasks):
         try:
-            inputs = _with_points_of_truth(task, frame, seed)
+            inputs = read(task, frame)
         except InputError as error:
             errors.append(error)
             continue
-
-        def others(number: int = number) -> list[Inputs]:
-            """Further frames, which decide the input range as well."""
-            read = []
-            for other in reference_frames(tasks, number):
-                with contextlib.suppress(PnpDepthError):  # it is read again, which reports this
-                    read.append(_with_points_of_truth(*other, seed))
-            return read
-
-        refiner = load_refiner(task.request.with_fields(layer=layer), inputs, others)
+        further = partial(lambda first: list(others(first)), number)
+        refiner = load_refiner(task.request.with_fields(layer=layer), inputs, further)
         for note in inputs.notes:
             if task.request.files.sample is None or not note.startswith("sparse"):
                 listener.say(f"{task.name}: {note}")
@@ -261,25 +257,6 @@ def _resolved(
             listener.say(note)
         return refiner
     raise errors[0]
-
-
-def _with_points_of_truth(task: Task, frame: Frame, seed: int) -> Inputs:
-    """The frame with points of its ground truth, so as not to depend on what is varied."""
-    inputs = read_frame(task)
-    known = 0 if inputs.gt is None else int((inputs.gt > 0).sum())
-    some = Sampling(sensor="uniform", points=str(min(_RESOLVE_POINTS, known)))
-    return replace(inputs, points=frame_points(some, seed, inputs, task.request, frame))
-
-
-def _recorded(run: Run, result: Result, journal: Journal) -> dict[str, Any]:
-    """Records the run; returns its row for a listener. A run that failed is tried again."""
-    row = {"name": run.frame.name, "status": "done", "message": None}
-    if isinstance(result, PnpDepthError):
-        return row | {"status": "failed", "message": str(result)}
-    journal.add(run, result)
-    if result.get("diverged"):
-        return row | {"status": "diverged", "message": result["diverged"]}
-    return row
 
 
 def _write(
@@ -306,15 +283,8 @@ def _write(
         plot = None if request.plots == "none" else f"sweep_{study.name}.{request.plots}"
         if plot is not None:
             draw_study(study, cells, request.output / plot)
-        studies.append(
-            {
-                "name": study.name,
-                "parameters": {axis.name: list(axis.values) for axis in study.axes},
-                "plot": plot,
-                "cells": cells,
-                "over_seeds": over_seeds(cells),
-            }
-        )
+        values = {axis.name: list(axis.values) for axis in study.axes}
+        studies.append({"name": study.name, "parameters": values, "plot": plot, "cells": cells})
     first, *others = networks.values()
     record = {
         "command": "sweep",
@@ -324,7 +294,7 @@ def _write(
         **({"more_models": [each.refiner.model_record for each in others]} if others else {}),
         "frames": list(names),
         "seeds": request.seeds,
-        "base": first.plan.base() | asdict(sampling),
+        "base": first.base | asdict(sampling),
         "studies": studies,
     }
     write_sweep(request.output, record, rows)
@@ -335,13 +305,13 @@ def _rows(
     study: Study, cell: Cell, network: _Network, names: Sequence[str], journal: Journal
 ) -> list[dict[str, Any]]:
     """A row for each frame of a cell and each draw of its points."""
-    setup, rows = network.plan.setup(cell), []
+    sampling, seeds = network.plan.draws(cell)
+    (method, iterations), rows = network.plan.method(cell), []
     for name in names:
-        for seed in setup.seeds:
+        for seed in seeds:
             linear, refined = (
-                journal.result(network.runs[name, seed, setup.sampling, method])
-                for method in (None, setup.method)
+                journal.result(network.runs[name, seed, sampling, each]) for each in (None, method)
             )
-            scores = row_of(setup.iterations, linear, refined)
+            scores = row_of(iterations, linear, refined)
             rows.append({"study": study.name, **cell, "frame": name, "seed": seed, **scores})
     return rows

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from scipy import stats
 from torch import Tensor
 
 from pnpdepth_cli.core.metrics import MEASURES
@@ -26,8 +24,6 @@ from pnpdepth_cli.pipeline.evaluation.score_files import csv_text, latex_text
 METHODS = ("plain", "linear", "refined")
 SWEPT = tuple(m for m in MEASURES if m.key in ("mae", "rmse", "mre", "delta1"))
 """The measures of a sweep."""
-MIN_SEEDS = 3
-"""An interval of fewer draws says nothing: of two it is 13 standard errors wide."""
 SCORES = tuple(f"{measure.key}_{method}" for measure in SWEPT for method in METHODS)
 """Columns of a row."""
 
@@ -44,10 +40,7 @@ def row_of(
 ) -> dict[str, Any]:
     """Returns the status and the scores of one frame with one draw of its points.
 
-    Args:
-        iterations: The number of updates whose scores are wanted.
-        linear: The journal's result of linear interpolation; None if it failed.
-        refined: That of the refinement; None if it failed.
+    They are of the journal's results after a number of updates; None is one that failed.
     """
     if linear is None or refined is None:
         return {"status": "failed", "points_used": 0, **dict.fromkeys(SCORES)}
@@ -93,16 +86,13 @@ def summarise(rows: Sequence[Mapping[str, Any]], resamples: int) -> dict[str, An
             end[_ROWS.index(name)] for end in (low, high)
         )
     used = [row for of in whole.values() for row in of]
+    measures = {
+        measure.key: {name: float(values[name][m]) for name in _COLUMNS}
+        for m, measure in enumerate(SWEPT)
+    }
+    time_s, points = (np.mean([row[key] for row in used]) for key in ("time_s", "points_used"))
     result: dict[str, Any] = plain(
-        counts
-        | {
-            "time_s": float(np.mean([row["time_s"] for row in used])),
-            "points": float(np.mean([row["points_used"] for row in used])),
-            "measures": {
-                measure.key: {name: float(values[name][m]) for name in _COLUMNS}
-                for m, measure in enumerate(SWEPT)
-            },
-        }
+        counts | {"time_s": time_s, "points": points, "measures": measures}
     )
     return result
 
@@ -134,40 +124,6 @@ def _with_gains(means: Tensor) -> Tensor:
     gains = torch.where(before == refined, torch.zeros_like(change), change)
     gains = torch.where(gains.isfinite(), gains, torch.full_like(gains, torch.nan))
     return torch.cat([means, gains], dim=-2)
-
-
-def over_seeds(cells: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Returns the MAE over the seeds of the points, for each setting of the other parameters.
-
-    Every figure has a mean and the ends of its 95 % interval (Student's t over the draws, of each
-    of which the mean over all frames is taken). The interval covers the choice of the points, not
-    that of the frames.
-
-    Args:
-        cells: Of one study; those without a parameter `seed`, or without scores, are left out.
-    """
-    groups: dict[tuple[tuple[str, str], ...], list[Mapping[str, float | None]]] = {}
-    for cell in cells:
-        if "seed" in cell["parameters"] and cell["measures"] is not None:
-            others = tuple((n, v) for n, v in cell["parameters"].items() if n != "seed")
-            groups.setdefault(others, []).append(cell["measures"]["mae"])
-    return [
-        {
-            "parameters": dict(others),
-            "seeds": len(drawn),
-            "mae": {n: _over_draws([each[n] for each in drawn]) for n in (*METHODS, "gain")},
-        }
-        for others, drawn in groups.items()
-        if len(drawn) >= MIN_SEEDS
-    ]
-
-
-def _over_draws(values: Sequence[float | None]) -> dict[str, float | None]:
-    """The mean and the ends of its interval; None where a value is missing."""
-    numbers = np.array(values, float)
-    half = stats.t.ppf(0.975, len(numbers) - 1) * stats.sem(numbers)
-    ends = {"mean": numbers.mean(), "low": numbers.mean() - half, "high": numbers.mean() + half}
-    return {name: float(end) if math.isfinite(end) else None for name, end in ends.items()}
 
 
 def write_sweep(folder: Path, record: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> None:
