@@ -20,6 +20,7 @@ _GREY = "#555555"
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
 """Distinguishable for the colour-blind (Okabe and Ito 2008)."""
 _MARKS = "osD^vP"
+_BESIDE = {"plain network": ("plain", "--"), "linear interpolation": ("linear", ":")}
 _STYLE: dict[Any, Any] = {
     "svg.hashsalt": "pnpdepth",
     "font.size": 8,
@@ -56,23 +57,18 @@ def draw_study(study: Study, cells: Cells, path: Path) -> None:
         timed = any(cell.get("time_s") is not None for cell in cells)
         figure = Figure(figsize=(11.4 if timed else 8.2, 2.9), dpi=200, layout="constrained")
         error, gain, *cost = figure.subplots(1, 3 if timed else 2)
-        if len(study.axes) == 1:
-            (across,) = study.axes
-            _draw_one(across, cells, error, gain)
-        else:
-            across, apart = across_and_apart(*study.axes)
-            _draw_two(across, apart, cells, error, gain)
-        error.set_ylabel("MAE (m)")
-        gain.set_ylabel("gain over the plain network (%)")
-        gain.axhline(0, color=_GREY, linewidth=0.8, zorder=1)
+        across, apart = (
+            (*study.axes, None) if len(study.axes) == 1 else across_and_apart(*study.axes)
+        )
+        _draw_lines(across, apart, cells, error, gain)
         _scale((error, gain), across)
         for axes in cost:
             _draw_cost(axes, cells)
-        drawn = [line for axes in (error, gain) for line in axes.get_lines()]
-        named = {str(line.get_label()): line for line in reversed(drawn)}
+        lines = [line for axes in (error, gain) for line in axes.get_lines()]
+        named = {str(line.get_label()): line for line in reversed(lines)}
         labels = [name for name in reversed(named) if not name.startswith("_")]
-        title = apart.title() if len(study.axes) == 2 else None
         handles = [named[name] for name in labels]
+        title = None if apart is None else apart.title()
         figure.legend(handles, labels, title=title, loc="outside right center")
         kind = path.suffix.removeprefix(".")
         with atomic_path(path) as temporary:
@@ -85,35 +81,32 @@ def across_and_apart(first: Axis, second: Axis) -> tuple[Axis, Axis]:
     return along, first if along is second else second
 
 
-def _draw_one(axis: Axis, cells: Cells, error: Axes, gain: Axes) -> None:
-    blue, vermilion = _COLOURS[:2]
-    _draw(error, axis, cells, "mae", "plain", color=_GREY, linestyle="--", label="plain network")
-    _draw(error, axis, cells, "mae", "linear", color=_COLOURS[-1], linestyle=":",
-          label="linear interpolation")  # fmt: skip
-    _draw(error, axis, cells, "mae", "refined", color=blue, marker="o", label="refined, MAE")
-    _draw(gain, axis, cells, "mae", "gain", color=blue, marker="o", label="refined, MAE")
-    _draw(gain, axis, cells, "rmse", "gain", color=vermilion, marker="s", label="refined, RMSE")
-
-
-def _draw_two(across: Axis, apart: Axis, cells: Cells, error: Axes, gain: Axes) -> None:
-    """A line for each value: from dark to light if they are ordered, else of distinct colours."""
+def _draw_lines(across: Axis, apart: Axis | None, cells: Cells, error: Axes, gain: Axes) -> None:
+    """A line for each value apart: from dark to light if they are ordered, else of own colours."""
     import matplotlib as mpl
 
-    many = len(apart.values)
-    shades = mpl.colormaps["viridis"]
-    ordered = apart.numbers() is not None or many > len(_COLOURS)
-    for n, value in enumerate(apart.values):
-        of = [cell for cell in cells if cell["parameters"][apart.name] == value]
+    groups = {"refined": cells}
+    if apart is not None:
+        groups = {v: [c for c in cells if c["parameters"][apart.name] == v] for v in apart.values}
+    many, shades = len(groups), mpl.colormaps["viridis"]
+    ordered = many > len(_COLOURS) or (apart is not None and apart.numbers() is not None)
+    for n, (label, of) in enumerate(groups.items()):
         # the lightest fifth is hard to see on white
         colour = shades(0.8 * n / max(1, many - 1)) if ordered else _COLOURS[n]
-        look = {"color": colour, "marker": _MARKS[n % len(_MARKS)], "label": value}
+        look = {"color": colour, "marker": _MARKS[n % len(_MARKS)], "label": label}
         _draw(error, across, of, "mae", "refined", **look)
         _draw(gain, across, of, "mae", "gain", **look)
-        for method, dashes in (("plain", "--"), ("linear", ":")):
-            own = {"color": colour, "linestyle": dashes, "linewidth": 0.8}
-            _draw(error, across, of, "mae", method, **own)
-    for dashes, label in (("--", "plain network"), (":", "linear interpolation")):
+        for method, dashes in _BESIDE.values():
+            own = {"color": _GREY if apart is None else colour, "linewidth": 0.8}
+            _draw(error, across, of, "mae", method, linestyle=dashes, **own)
+    if apart is None:
+        look = {"color": _COLOURS[1], "marker": "s", "label": "refined, RMSE"}
+        _draw(gain, across, cells, "rmse", "gain", **look)
+    for label, (_, dashes) in _BESIDE.items():
         error.plot([], [], color=_GREY, linestyle=dashes, label=label)
+    error.set_ylabel("MAE (m)")
+    gain.set_ylabel("gain over the plain network (%)")
+    gain.axhline(0, color=_GREY, linewidth=0.8, zorder=1)
 
 
 def _draw(axes: Axes, axis: Axis, cells: Cells, key: str, name: str, **look: Any) -> None:

@@ -201,9 +201,7 @@ def _network(
     layer = next((cell["layer"] for cell in cells if "layer" in cell), refine.method.layer)
     refiner = _resolved(layer, refine.hold_out.seed, tasks, listener)
     definition = refiner.network.definition
-    if (
-        layer is None or definition.default_layer is None
-    ):  # the default is what `refine` cuts the first frame at
+    if layer is None or definition.default_layer is None:  # where `refine` cuts the first frame
         defaults = replace(definition.defaults, layer=refiner.layer)
         definition = replace(definition, defaults=defaults)
     plan = Plan(definition=definition, base=refine, sampling=sampling, seeds=request.seeds)
