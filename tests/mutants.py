@@ -36,14 +36,19 @@ PACKAGES = ("pnpdepth_cli", "model_zoo_defs")
 ALARM_S = 90.0
 """After the limit of a mutant, its tests are ended: it hangs."""
 
-_SWAPS = (
-    "Lt LtE Gt,LtE Lt Gt,Gt GtE Lt,GtE Gt Lt,Eq NotEq,NotEq Eq,In NotIn,NotIn In,Is IsNot,"
-    "IsNot Is,Add Sub,Sub Add,Mult Div,Div Mult,FloorDiv Mult,Mod Mult,Pow Mult,BitAnd BitOr,"
-    "BitOr BitAnd,And Or,Or And"
-)
-_OPERATORS = {first: others for first, *others in (swap.split() for swap in _SWAPS.split(","))}
-_PAIRS = "min max,any all,floor ceil,mean median,zeros ones,argmin argmax,amin amax,sin cos"
-_NAMES = {a: b for pair in _PAIRS.split(",") for a, b in (pair.split(), pair.split()[::-1])}
+_ORDER = "Lt LtE Gt,LtE Lt Gt,Gt GtE Lt,GtE Gt Lt,FloorDiv Mult,Mod Mult,Pow Mult"
+_PAIRS = "Eq NotEq,In NotIn,Is IsNot,Add Sub,Mult Div,BitAnd BitOr,And Or"
+_CALLS = "min max,any all,floor ceil,mean median,zeros ones,argmin argmax,amin amax,sin cos"
+
+
+def _swaps(text: str, *, both: bool = True) -> dict[str, list[str]]:
+    """From `a b,c d`: b for a and, both ways, a for b."""
+    pairs = [words.split() for words in text.split(",")]
+    back = {other: [first] for first, *others in pairs for other in others} if both else {}
+    return {first: others for first, *others in pairs} | back
+
+
+_OPERATORS, _NAMES = _swaps(_ORDER, both=False) | _swaps(_PAIRS), _swaps(_CALLS)
 
 
 @dataclass(frozen=True)
@@ -82,9 +87,9 @@ def changed(node: ast.AST) -> Iterator[ast.AST]:
             yield ast.Constant(other.value + 1)
             yield ast.Constant(other.value - 1)
         case ast.Name(id=name) if name in _NAMES:
-            yield ast.Name(_NAMES[name])
+            yield ast.Name(*_NAMES[name])
         case ast.Attribute(attr=name) if name in _NAMES:
-            other.attr = _NAMES[name]
+            (other.attr,) = _NAMES[name]
             yield other
         case ast.Return(value=ast.expr()) if ast.unparse(other) != "return None":
             yield ast.Return(ast.Constant(None))
@@ -128,17 +133,15 @@ def mutants(only: str) -> list[Mutant]:
 
 def matching_tests(file: Path) -> list[str]:
     """Returns the test files that mirror a module, then those that import it."""
-    package, name = "/".join(file.parts[1:-1]), file.stem
-    folder = Path("tests", package if file.parts[0] == "pnpdepth_cli" else file.parts[0])
-    mirror = sorted((ROOT / folder).glob(f"test_{name}*.py"))
+    parts = file.parts[1:-1] if file.parts[0] == "pnpdepth_cli" else file.parts[:1]
+    folder = ROOT.joinpath("tests", *parts)
     module = ".".join(file.with_suffix("").parts).removesuffix(".__init__")
     parent, _, last = module.rpartition(".")
-    imports = re.compile(
-        rf"{re.escape(module)}\b|from {re.escape(parent)} import [^)\n]*\b{re.escape(last)}\b"
-    )
+    imports = re.compile(rf"{module}\b|from {parent} import [^)\n]*\b{last}\b")
     tests = sorted((ROOT / "tests").rglob("test_*.py"))
     importing = [path for path in tests if imports.search(path.read_text("utf-8"))]
-    near = sorted((ROOT / folder).glob("test_*.py")) or sorted((ROOT / "tests").glob("test_*.py"))
+    mirror = sorted(folder.glob(f"test_{file.stem}*.py"))
+    near = sorted(folder.glob("test_*.py")) or sorted((ROOT / "tests").glob("test_*.py"))
     chosen = dict.fromkeys([*mirror, *importing]) or near
     return [path.relative_to(ROOT).as_posix() for path in chosen]
 
@@ -156,20 +159,17 @@ class Trees:
 
     def outcome(self, mutant: Mutant) -> str:
         """Returns `survived`, or what killed the mutant."""
-        tree = self._free.get()
-        file = tree / mutant.file
+        tree, broken = self._free.get(), list[str]()
+        file, tests = tree / mutant.file, matching_tests(mutant.file)
         original = file.read_bytes()
         try:
-            file.write_bytes(mutant.source())
-            broken: list[str] = []
             while True:  # a test that fails without the mutant too is left out
-                failed = self._failed(tree, matching_tests(mutant.file), broken)
-                if failed in ("", "time"):
+                file.write_bytes(mutant.source())
+                failed = self._failed(tree, tests, broken)
+                if failed in ("", "time") or self._sound.get(failed):
                     return failed or "survived"
-                if failed not in self._sound:
-                    file.write_bytes(original)
-                    self._sound[failed] = not self._failed(tree, [failed], [])
-                    file.write_bytes(mutant.source())
+                file.write_bytes(original)
+                self._sound[failed] = not self._failed(tree, [failed], [])
                 if self._sound[failed]:
                     return failed
                 broken.append(failed)
@@ -224,7 +224,7 @@ def main() -> None:
     arguments = parser.parse_args()
     everything = mutants(arguments.only)
     chosen = random.Random(arguments.seed).sample(everything, min(arguments.count, len(everything)))
-    tried, killed, survivors = Counter[str](), Counter[str](), []
+    tried, killed, lines = Counter[str](), Counter[str](), []
     with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(arguments.jobs) as pool:
         trees = Trees(Path(folder), arguments)
         for mutant, outcome in zip(chosen, pool.map(trees.outcome, chosen), strict=True):
@@ -232,14 +232,13 @@ def main() -> None:
             tried[package] += 1
             killed[package] += outcome != "survived"
             print(f"{outcome}: {mutant.difference()}", file=sys.stderr, flush=True)
-            if outcome == "survived":
-                survivors.append(mutant)
+            lines += [mutant.difference()] if outcome == "survived" else []
     print(f"seed {arguments.seed}, {len(chosen)} of {len(everything):,} mutants\n")
     print("| package | mutants | killed | survived |\n|---|---|---|---|")
-    for name in [*sorted(tried), "all"]:
-        counts = [sum(c.values()) if name == "all" else c[name] for c in (tried, killed)]
-        print(f"| {name} | {counts[0]} | {counts[1]} | {counts[0] - counts[1]} |")
-    print("".join(f"\n{mutant.difference()}" for mutant in survivors))
+    tried["all"], killed["all"] = tried.total(), killed.total()
+    for name, count in tried.items():
+        print(f"| {name} | {count} | {killed[name]} | {count - killed[name]} |")
+    print("\n" + "\n".join(lines))
 
 
 if __name__ == "__main__":

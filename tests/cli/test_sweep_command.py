@@ -61,10 +61,29 @@ def test_json_prints_what_is_in_the_file_and_the_csv_has_the_same_cells(
     assert not list(Path("out").glob("*.png"))
 
 
+def test_what_is_set_is_not_varied_and_is_recorded(
+    root: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    fixed = ("lr=10%", "line-search=on", "noise=0.1", "seed=3", "points=20")
+    options = [part for text in fixed for part in ("--set", text)]
+    assert (
+        code_of(arguments(*options, "--vary", "iterations=0,2", "--plots", "none", "--json")) == 0
+    )
+    record = json.loads(capsys.readouterr().out)
+    base = record["base"]
+    assert (base["lr"], base["line_search"], base["noise"]) == ("10%", True, 0.1)
+    assert record["studies"][0]["parameters"] == {"iterations": ["0", "2"]}
+    with Path("out/sweep_frames.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert {(row["seed"], row["points_used"]) for row in rows} == {("3", "20")}
+
+
 EXITS: list[tuple[list[str], int, str]] = [
     (["--vary", "point=20"], 2, "no parameter 'point' to vary; there are points, sensor"),
     (["--vary", "points=a"], 2, "neither a number"),
     (["--vary", "points=500"], 7, "runs failed"),
+    (["--vary", "points=9", "--set", "colour=red"], 2, "no parameter 'colour'"),
+    (["--vary", "points=9", "--set", "lr"], 2, "is not a step size"),
     (["--vary", "lr=1", "--vary", "loss=l1", "--vary", "points=9"], 2, "--one-by-one"),
     (["--vary", "lr=1", "--sample", "many"], 2, "no sensor 'many'"),
     (["--vary", "lr=1", "--seeds", "0"], 2, "--seeds must be >= 1"),

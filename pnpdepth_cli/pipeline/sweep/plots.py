@@ -94,13 +94,14 @@ def _draw_lines(across: Axis, apart: Axis | None, cells: Cells, error: Axes, gai
         # the lightest fifth is hard to see on white
         colour = shades(0.8 * n / max(1, many - 1)) if ordered else _COLOURS[n]
         look = {"color": colour, "marker": _MARKS[n % len(_MARKS)], "label": label}
+        look["aside"] = 0.6 * ((n + 0.5) / many - 0.5)
         _draw(error, across, of, "mae", "refined", **look)
         _draw(gain, across, of, "mae", "gain", **look)
         for method, dashes in _BESIDE.values():
             own = {"color": _GREY if apart is None else colour, "linewidth": 0.8}
             _draw(error, across, of, "mae", method, linestyle=dashes, **own)
     if apart is None:
-        look = {"color": _COLOURS[1], "marker": "s", "label": "refined, RMSE"}
+        look = {"color": _COLOURS[1], "marker": "s", "label": "refined, RMSE", "aside": 0.1}
         _draw(gain, across, cells, "rmse", "gain", **look)
     for label, (_, dashes) in _BESIDE.items():
         error.plot([], [], color=_GREY, linestyle=dashes, label=label)
@@ -109,9 +110,11 @@ def _draw_lines(across: Axis, apart: Axis | None, cells: Cells, error: Axes, gai
     gain.axhline(0, color=_GREY, linewidth=0.8, zorder=1)
 
 
-def _draw(axes: Axes, axis: Axis, cells: Cells, key: str, name: str, **look: Any) -> None:
-    """Draws a line through the cells' values; gains with their intervals."""
-    x = axis.numbers() or [float(n) for n in range(len(axis.values))]
+def _draw(
+    axes: Axes, axis: Axis, cells: Cells, key: str, name: str, *, aside: float = 0.0, **look: Any
+) -> None:
+    """Draws a line through the cells' values, those of names aside; gains with their intervals."""
+    x = axis.numbers() or [n + aside for n in range(len(axis.values))]
     order = sorted(range(len(x)), key=lambda n: x[n])
     at = [x[n] for n in order]
     values, low, high = (
