@@ -25,9 +25,10 @@ import time
 from collections import Counter
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from itertools import accumulate
 from pathlib import Path
 from queue import SimpleQueue
+from typing import NamedTuple
 
 import pytest
 
@@ -51,23 +52,14 @@ def _swaps(text: str, *, both: bool = True) -> dict[str, list[str]]:
 _OPERATORS, _NAMES = _swaps(_ORDER, both=False) | _swaps(_PAIRS), _swaps(_CALLS)
 
 
-@dataclass(frozen=True)
-class Mutant:
-    """A file with one expression changed: bytes `start` to `end` become `text`."""
+class Mutant(NamedTuple):
+    """A file with bytes `start` to `end` changed, and the change in words."""
 
     file: Path
-    line: int
     start: int
     end: int
-    text: str
-
-    def source(self) -> bytes:
-        content = (ROOT / self.file).read_bytes()
-        return content[: self.start] + self.text.encode() + content[self.end :]
-
-    def difference(self) -> str:
-        before = (ROOT / self.file).read_bytes()[self.start : self.end].decode()
-        return f"{self.file}:{self.line}: {' '.join(before.split())}  ->  {self.text}"
+    text: bytes
+    change: str
 
 
 def changed(node: ast.AST) -> Iterator[ast.AST]:
@@ -116,9 +108,7 @@ def mutants(only: str) -> list[Mutant]:
             if "training" in file.parts or not file.as_posix().startswith(only):
                 continue
             content = path.read_bytes()
-            starts = [0]
-            for line in content.splitlines(keepends=True):
-                starts.append(starts[-1] + len(line))
+            starts = [0, *accumulate(len(line) for line in content.splitlines(keepends=True))]
             for node in places(ast.parse(content)):
                 for other in changed(node):
                     assert isinstance(node, ast.expr | ast.stmt)
@@ -127,7 +117,9 @@ def mutants(only: str) -> list[Mutant]:
                         text = f"({text})"
                     start = starts[node.lineno - 1] + node.col_offset
                     end = starts[(node.end_lineno or 0) - 1] + (node.end_col_offset or 0)
-                    found.append(Mutant(file, node.lineno, start, end, text))
+                    before = " ".join(content[start:end].decode().split())
+                    change = f"{file}:{node.lineno}: {before}  ->  {text}"
+                    found.append(Mutant(file, start, end, text.encode(), change))
     return found
 
 
@@ -164,7 +156,7 @@ class Trees:
         original = file.read_bytes()
         try:
             while True:  # a test that fails without the mutant too is left out
-                file.write_bytes(mutant.source())
+                file.write_bytes(original[: mutant.start] + mutant.text + original[mutant.end :])
                 failed = self._failed(tree, tests, broken)
                 if failed in ("", "time") or self._sound.get(failed):
                     return failed or "survived"
@@ -183,8 +175,8 @@ class Trees:
         options += ["-m", self._arguments.marked, *(f"--deselect={name}" for name in without)]
         data = os.environ.get("PNPDEPTH_TEST_DATA", str(ROOT.parent / "shared" / "data"))
         limit = self._arguments.limit
-        changes = {"PYTHONPATH": str(tree), "PYTHONDONTWRITEBYTECODE": "1"}
-        changes |= {"PNPDEPTH_TEST_DATA": data, "PNPDEPTH_MUTANT_LIMIT": str(limit)}
+        changes = {"PYTHONPATH": str(tree), "PNPDEPTH_TEST_DATA": data}
+        changes |= {"PNPDEPTH_MUTANT_LIMIT": str(limit), "PYTHONDONTWRITEBYTECODE": "1"}
         command = [sys.executable, "-m", "pytest", *options, *tests]
         how = {"capture_output": True, "text": True, "stdin": subprocess.DEVNULL}
         try:
@@ -231,8 +223,8 @@ def main() -> None:
             package = mutant.file.parts[1] if len(mutant.file.parts) > 2 else mutant.file.parts[0]
             tried[package] += 1
             killed[package] += outcome != "survived"
-            print(f"{outcome}: {mutant.difference()}", file=sys.stderr, flush=True)
-            lines += [mutant.difference()] if outcome == "survived" else []
+            print(f"{outcome}: {mutant.change}", file=sys.stderr, flush=True)
+            lines += [mutant.change] if outcome == "survived" else []
     print(f"seed {arguments.seed}, {len(chosen)} of {len(everything):,} mutants\n")
     print("| package | mutants | killed | survived |\n|---|---|---|---|")
     tried["all"], killed["all"] = tried.total(), killed.total()
