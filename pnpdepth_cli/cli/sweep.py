@@ -114,15 +114,14 @@ def sweep(
     model       networks, as NETWORK or NETWORK@WEIGHTS
     seed        of the draw of the points, in place of --seeds
 
-    One --vary gives one table and one plot; two give a table and a plot of their grid; with
-    --one-by-one every --vary gives its own. Tables compare the refined depth with the network's
-    prediction and with linear interpolation of the same points. Means are over frames, after the
-    mean over seeds; 95 % intervals are over frames. Gains are in per cent, positive if refinement
-    is better.
+    One --vary gives a table and a plot of one parameter, two of their grid, and with --one-by-one
+    every --vary its own. The refined depth stands beside the network's prediction and linear
+    interpolation of the same points. Means are over frames, after the mean over seeds; intervals
+    (95 %) are over frames. Gains are in per cent, positive if refinement is better.
 
     OUTPUT gets sweep.csv, sweep.json and sweep.tex (means), sweep_frames.csv (every frame), a plot
-    per table, and sweep.jsonl (the journal). Run again, also with other values, only missing values
-    are computed. Plots need the extra pnpdepth[plot].
+    per table (extra pnpdepth[plot]), and sweep.jsonl (the journal). Run again, also with other
+    values, only missing values are computed.
     """
     from pnpdepth_cli.pipeline.sweep.axes import PARAMETERS, read_axis, studies_of, values_of
     from pnpdepth_cli.pipeline.sweep.points import read_sampling

@@ -41,25 +41,22 @@ def results(runs: Sequence[Run], network: Network) -> Iterator[tuple[Run, Result
     """
     with SplitCache(network) as cuts:
         for _, of_frame in groupby(runs, key=lambda run: run.frame.name):
-            inputs: Inputs | PnpDepthError | None = None
-            for _, of_points in groupby(of_frame, key=lambda run: (run.sampling, run.seed)):
+            same_frame = list(of_frame)
+            inputs = _tried(read_frame, same_frame[0].task)
+            for _, of_points in groupby(same_frame, key=lambda run: (run.sampling, run.seed)):
                 same_points = list(of_points)
-                if inputs is None:
-                    inputs = _result_or_error(read_frame, same_points[0].task)
-                drawn = inputs
-                if not isinstance(inputs, PnpDepthError):
-                    drawn = _result_or_error(_drawn, same_points[0], inputs)
+                drawn = _tried(_drawn, same_points[0], inputs)
                 for run in same_points:
-                    if isinstance(drawn, PnpDepthError):
-                        yield run, drawn
-                    else:
-                        yield run, _result_or_error(_result_of, run, drawn, cuts)
+                    yield run, _tried(_result_of, run, drawn, cuts)
 
 
-def _result_or_error(read: Callable[..., T], *arguments: Any) -> T | PnpDepthError:
-    """The result, or the error of a frame that cannot be used."""
+def _tried(step: Callable[..., T], *arguments: Any) -> T | PnpDepthError:
+    """The result, or the error of a frame that cannot be used: of this step, or of one before."""
+    for each in arguments:
+        if isinstance(each, PnpDepthError):
+            return each
     try:
-        return read(*arguments)
+        return step(*arguments)
     except (StorageError, DeviceError):
         raise
     except PnpDepthError as error:
