@@ -135,8 +135,8 @@ def _files(task: Task, frame: Frame, sampling: Sampling) -> Iterator[tuple[str, 
 def _state(path: Path) -> tuple[int, int | str] | None:
     """What changes with a file's content: size and time, or the version that a store states."""
     if isinstance(path, RemotePath):
-        status = status_of(path)
-        return None if status is None else (status.size, status.version)
+        stored = status_of(path)
+        return None if stored is None else (stored.size, stored.version)
     try:
         status = path.stat()
     except OSError:  # the run will say so

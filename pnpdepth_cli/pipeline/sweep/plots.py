@@ -93,13 +93,14 @@ def _draw_lines(across: Axis, apart: Axis | None, cells: Cells, error: Axes, gai
     for n, (label, of) in enumerate(groups.items()):
         # the lightest fifth is hard to see on white
         colour = shades(0.8 * n / max(1, many - 1)) if ordered else _COLOURS[n]
+        look: dict[str, Any]
         look = {"color": colour, "marker": _MARKS[n % len(_MARKS)], "label": label}
         look["aside"] = 0.6 * ((n + 0.5) / many - 0.5)
         _draw(error, across, of, "mae", "refined", **look)
         _draw(gain, across, of, "mae", "gain", **look)
         for method, dashes in _BESIDE.values():
-            own = {"color": _GREY if apart is None else colour, "linewidth": 0.8}
-            _draw(error, across, of, "mae", method, linestyle=dashes, **own)
+            own = _GREY if apart is None else colour
+            _draw(error, across, of, "mae", method, linestyle=dashes, color=own, linewidth=0.8)
     if apart is None:
         look = {"color": _COLOURS[1], "marker": "s", "label": "refined, RMSE", "aside": 0.1}
         _draw(gain, across, cells, "rmse", "gain", **look)

@@ -70,7 +70,7 @@ class _Network:
 
     refiner: Refiner
     plan: Plan
-    base: Mapping[str, Any]
+    base: dict[str, Any]
     """The settings that are not varied."""
     runs: Runs
 
@@ -161,7 +161,7 @@ def _frames(request: SweepRequest, listener: Listener) -> tuple[Sampling, list[t
     scan = request.refine.files.scan
     if any(each.lidar for each in samplings):
         # the calibration is then of the camera, not of a scan
-        given = {"calib": scan.calib, "camera": scan.camera}
+        given: dict[str, Any] = {"calib": scan.calib, "camera": scan.camera}
         given = {name: value for name, value in given.items() if value is not None}
         frames = [replace(frame, **given) for frame in frames]
         scan = replace(scan, calib=None, camera=None)
