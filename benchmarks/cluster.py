@@ -1,20 +1,13 @@
-"""Plan, resume and summary of many frames, and what a Ray cluster costs.
+"""Plan, resume and summary of many frames.
 
 `python -m benchmarks.cluster entries --count 1000000` makes a list of so many frames, a record for
 each that says it is done, and hard links for its other results, and prints CPU seconds and peak
 memory of planning, and of a run that has nothing to do, with its summary.
-
-`… overhead FOLDER --frames 60` refines frames of a data set with and without a Ray worker, compares
-the results, and prints the CPU seconds of all processes between the first frame and the last.
-
-`… nodes FOLDER --frames 60` refines them on a cluster of three nodes on loopback, one of which is
-lost after a third of the frames, and compares the results with those of one process.
 """
 
 from __future__ import annotations
 
 import argparse
-import contextlib
 import json
 import os
 import shutil
@@ -25,14 +18,13 @@ import time
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
-import psutil
 
-from benchmarks.batch import make_frames
+from pnpdepth_cli.io.depth import write_depth
 from pnpdepth_cli.pipeline.batch.batch import run_batch
-from pnpdepth_cli.pipeline.batch.request import LOCAL, BatchRequest, ClusterOptions
+from pnpdepth_cli.pipeline.batch.request import BatchRequest
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest
-from pnpdepth_cli.sensors import SamplePattern
 
 LINKS = 50_000
 """Hard links of a file; ext4 allows 65,000."""
@@ -58,9 +50,21 @@ def request_of(root: Path) -> BatchRequest:
     return BatchRequest(source=root / "list.csv", output=root / "out", refine=refine)
 
 
+def make_frame(root: Path) -> None:
+    """rgb/ sparse/ gt/ with one small frame of slanted depth."""
+    y, x = np.mgrid[:48, :64] / 64
+    depth, keep = (1 + x + y).astype(np.float32), np.random.default_rng(0).random((48, 64)) < 0.07
+    rgb = (127 + 120 * np.sin(6 * np.stack([x, y, x + y], axis=-1))).astype(np.uint8)
+    for part in ("rgb", "sparse", "gt"):
+        (root / part).mkdir(parents=True)
+    cv2.imwrite(str(root / "rgb" / "000000.png"), rgb)
+    write_depth(root / "sparse" / "000000.png", np.where(keep, depth, 0), scale=1000)
+    write_depth(root / "gt" / "000000.png", depth, scale=1000)
+
+
 def make_entries(root: Path, count: int) -> None:
     """A list of frames that share one image, and records that say they are done."""
-    make_frames(root, 1, 48, 64)
+    make_frame(root)
     with (root / "list.csv").open("w") as file:
         file.write("name,image,sparse,gt\n")
         for number in range(count):
@@ -136,140 +140,15 @@ def entries(count: int, folder: Path | None) -> dict[str, Any]:
         }
 
 
-class Clock(Quiet):
-    """CPU seconds at the first frame and at the last."""
-
-    def __init__(self) -> None:
-        self.moments: list[tuple[float, float, float]] = []
-
-    def frame(self, row: dict[str, Any]) -> None:
-        """One more."""
-        self.moments.append((*cpu_seconds(), time.perf_counter()))
-
-    def between(self) -> dict[str, float]:
-        """What the frames between the first row and the last took."""
-        spent = np.subtract(self.moments[-1], self.moments[0])
-        frames = len(self.moments) - 1
-        return {
-            "cpu_s_a_frame": round(spent[0] / frames, 4),
-            "wall_s_a_frame": round(spent[2] / frames, 4),
-            "daemons_of_a_core": round(spent[1] / spent[2], 4),
-        }
-
-
-def cpu_seconds() -> tuple[float, float]:
-    """Of this process and its Ray workers, and of Ray's daemons."""
-    own = psutil.Process()
-    workers = daemons = 0.0
-    for process in (own, *own.children(recursive=True)):
-        with contextlib.suppress(psutil.Error):
-            times, command = process.cpu_times(), " ".join(process.cmdline())
-            if process == own or command.startswith("ray::"):
-                workers += times.user + times.system
-            else:
-                daemons += times.user + times.system
-    return workers, daemons
-
-
-def overhead(source: Path, frames: int, model: str) -> dict[str, Any]:
-    """Of a Ray worker over this process, on the same frames, and whether results are equal."""
-    figures: dict[str, Any] = {"frames": frames}
-    results = []
-    with tempfile.TemporaryDirectory() as temporary:
-        out = Path(temporary) / "out"  # of one name, which is in the records
-        for name, cluster in (
-            ("one process", ClusterOptions()),
-            ("one Ray worker", ClusterOptions(ray=LOCAL, ray_workers=1)),
-        ):
-            clock = Clock()
-            results.append(made_by(clock, source, out, frames, model, cluster))
-            figures[name] = clock.between()
-    one, other = (figures[name]["cpu_s_a_frame"] for name in list(figures)[1:])
-    equal = results[0] == results[1]
-    return figures | {
-        "overhead": round(other / one - 1, 3),
-        "equal": equal,
-        "files": len(results[0]),
-    }
-
-
-class LosingANode(Quiet):
-    """Removes a node from a cluster when so many frames are done."""
-
-    def __init__(self, cluster: Any, after: int) -> None:
-        self._cluster, self._left = cluster, after
-
-    def frame(self, row: dict[str, Any]) -> None:
-        """Counts the frame."""
-        self._left -= 1
-        if self._left == 0:
-            lost = next(iter(self._cluster.worker_nodes))
-            self._cluster.remove_node(lost, allow_graceful=False)
-
-
-def nodes(source: Path, frames: int, model: str) -> dict[str, Any]:
-    """Whether results of three nodes, one of which is lost, equal those of one process."""
-    from tests.pipeline.batch.ray_nodes import three_nodes
-
-    with tempfile.TemporaryDirectory() as temporary:
-        out = Path(temporary) / "out"
-        one = made_by(Quiet(), source, out, frames, model, ClusterOptions())
-        with three_nodes() as cluster:
-            options = ClusterOptions(ray=cluster.address)
-            losing = LosingANode(cluster, max(1, frames // 3))
-            other = made_by(losing, source, out, frames, model, options)
-    return {"frames": frames, "files": len(one), "equal": one == other}
-
-
-def made_by(
-    listener: Quiet, source: Path, out: Path, frames: int, model: str, cluster: ClusterOptions
-) -> dict[str, bytes]:
-    """The results of a batch, which are removed."""
-    refine = RefineRequest.from_fields(model=model, preset="paper", sample=SamplePattern(count=500))
-    request = BatchRequest(source=source, output=out, limit=frames, refine=refine, cluster=cluster)
-    run_batch(request, listener)
-    made = contents(out)
-    shutil.rmtree(out)
-    return made
-
-
-def contents(folder: Path) -> dict[str, bytes]:
-    """The results below a folder by name; of records, without times and memory."""
-    results = {}
-    for path in sorted(folder.rglob("*")):
-        name = path.relative_to(folder).as_posix()
-        if path.is_dir() or name.startswith(("summary.", "batch.", ".")):
-            continue
-        results[name] = path.read_bytes()
-        if path.suffix == ".json":
-            record = json.loads(results[name])
-            del record["seconds"], record["peak_memory_mb"], record["batch"]
-            results[name] = json.dumps(record).encode()
-    return results
-
-
 def main() -> None:
+    """Make the entries, measure, print."""
     parser = argparse.ArgumentParser(description=__doc__)
     commands = parser.add_subparsers(dest="command", required=True)
     of_entries = commands.add_parser("entries")
     of_entries.add_argument("--count", type=int, default=1_000_000)
     of_entries.add_argument("--folder", type=Path, help="where the files are made")
-    of_overhead = commands.add_parser("overhead")
-    of_overhead.add_argument("source", type=Path)
-    of_overhead.add_argument("--frames", type=int, default=60)
-    of_overhead.add_argument("--model", default="compact")
-    of_nodes = commands.add_parser("nodes")
-    of_nodes.add_argument("source", type=Path)
-    of_nodes.add_argument("--frames", type=int, default=60)
-    of_nodes.add_argument("--model", default="compact")
     args = parser.parse_args()
-    if args.command == "entries":
-        result = entries(args.count, args.folder)
-    elif args.command == "overhead":
-        result = overhead(args.source, args.frames, args.model)
-    else:
-        result = nodes(args.source, args.frames, args.model)
-    print(json.dumps(result, indent=2))
+    print(json.dumps(entries(args.count, args.folder), indent=2))
 
 
 if __name__ == "__main__":

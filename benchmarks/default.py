@@ -17,44 +17,55 @@ import json
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 
-from benchmarks.accuracy import Case, Errors, by_default, errors_of, opened
 from benchmarks.frames import (
     MORE_SETS,
     REGISTRATIONS,
     SETS,
     EvalFrame,
+    by_default,
     drawn_inputs,
+    errors_of,
+    opened,
+    print_row,
     registered,
     without_occluded,
 )
 from pnpdepth_cli.completion.interpolation import linear
 from pnpdepth_cli.models.network import Network
 
-ROOMS = ("7scenes", "icl_nuim")
 COUNTS = (20, 100, 500)
-OF_ROOMS = ("fastdepth", "compact", "fcrn-tiny", "eigen-tiny")
-OF_STREETS = ("fastdepth", "compact", "sparse2dense-tiny-kitti", "sfmlearner-tiny")
-REPORT_ONLY = ("tum_fr1_rpy", "tum_fr3_cabinet")
-OF_SENSORS = ("pncnn", "nconv")
-"""Networks trained for KITTI's scanner."""
+NETWORKS = {
+    "7scenes": ("fastdepth", "compact", "fcrn-tiny", "eigen-tiny"),
+    "icl_nuim": ("fastdepth", "compact", "fcrn-tiny", "eigen-tiny"),
+    "kitti_dc": (
+        *("fastdepth", "compact", "sparse2dense-tiny-kitti", "sfmlearner-tiny"),
+        *("pncnn", "nconv"),  # trained for KITTI's scanner
+    ),
+    "tum_fr1_rpy": ("fastdepth", "compact"),
+    "tum_fr3_cabinet": ("fastdepth", "compact"),
+}
+"""By set; nothing was chosen on the last two."""
+STAGES = ("linear", "aligned", "fused", "updated", "propagated", "result")
+HEAD = ("network", "set, runs", "points", *STAGES, "result / linear", "worse", "moved", "CPU s")
 
 
-def cells() -> Iterator[Case]:
-    """All that is measured."""
-    for frames in ROOMS:
-        for points in COUNTS:
-            yield from (Case(network, frames, points) for network in OF_ROOMS)
-    yield from (Case(network, "kitti_dc", None) for network in (*OF_STREETS, *OF_SENSORS))
-    for frames in REPORT_ONLY:
-        for points in COUNTS:
-            yield from (Case(network, frames, points) for network in ("fastdepth", "compact"))
+def cases(args: argparse.Namespace) -> Iterator[tuple[str, str, int | None]]:
+    """(network, set, points; None for a LiDAR's), those that are asked for."""
+    for name, networks in NETWORKS.items():
+        for count in (None,) if name == "kitti_dc" else COUNTS:
+            for network in networks:
+                wanted = (args.networks, network), (args.sets, name)
+                wanted += () if count is None else ((args.points, count),)
+                if all(not chosen or one in chosen for chosen, one in wanted):
+                    yield network, name, count
 
 
-def measure(network: Network, frame: EvalFrame, count: int | None, seed: int) -> dict[str, object]:
+def measure(network: Network, frame: EvalFrame, count: int | None, seed: int) -> dict[str, Any]:
     """MAE and RMSE of every column on one frame, the choice, and its time."""
     if count is None:  # as the commands read a projected scan
         frame = without_occluded(frame)
@@ -64,46 +75,24 @@ def measure(network: Network, frame: EvalFrame, count: int | None, seed: int) ->
     seconds = time.process_time() - start
     depths = {"linear": linear(inputs.points), "result": torch.from_numpy(refined.after)}
     depths |= {name: torch.from_numpy(depth) for name, depth in refined.stages.items()}
-    moved = not np.array_equal(refined.after, refined.stages["propagated"])
     return {
         "errors": errors_of(depths, torch.from_numpy(frame.gt)),
         "cpu_s": seconds,
-        "moved": moved,
+        "moved": not np.array_equal(refined.after, refined.stages["propagated"]),
     }
 
 
-def summary(rows: list[dict[str, object]]) -> dict[str, object]:
-    """Means over the frames of a cell."""
-    errors: list[Errors] = [row["errors"] for row in rows]  # type: ignore[misc]
+def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """Means over the frames of a case."""
+    errors = [row["errors"] for row in rows]
     names = [name for name in errors[0] if all(name in each for each in errors)]
-    mean = {n: tuple(float(np.mean([e[n][k] for e in errors])) for k in (0, 1)) for n in names}
-    worse = [each["result"][0] > each["linear"][0] for each in errors]
     return {
         "frames": len(rows),
-        "mean": mean,
-        "worse": float(np.mean(worse)),
+        "mean": {n: tuple(np.mean([each[n] for each in errors], axis=0).tolist()) for n in names},
+        "worse": float(np.mean([each["result"][0] > each["linear"][0] for each in errors])),
         "moved": float(np.mean([row["moved"] for row in rows])),
         "cpu_s": float(np.median([row["cpu_s"] for row in rows])),
     }
-
-
-STAGES = ("linear", "aligned", "fused", "updated", "propagated", "result")
-HEAD = ("network", "set, runs", "points", *STAGES, "result / linear", "worse", "moved", "CPU s")
-
-
-def table_row(cell: Case, measured: dict[str, object]) -> str:
-    """A line of the table."""
-    mean: dict[str, tuple[float, float]] = measured["mean"]  # type: ignore[assignment]
-    values = [f"{mean[name][0]:.4f} / {mean[name][1]:.3f}" for name in STAGES]
-    values[-1] = f"**{values[-1]}**"
-    cells_ = [
-        *(cell.network, f"{cell.frames}, {measured['frames']}", str(cell.points or "LiDAR")),
-        *values,
-        f"{mean['result'][0] / mean['linear'][0]:.3f}",
-        *(f"{measured[name]:.0%}" for name in ("worse", "moved")),
-        f"{measured['cpu_s']:.1f}",
-    ]
-    return "| " + " | ".join(cells_) + " |"
 
 
 def frames_of(name: str, data: Path, half: str, count: int) -> list[EvalFrame]:
@@ -125,27 +114,26 @@ def main() -> None:
     parser.add_argument("--registration", choices=REGISTRATIONS, default="frame")
     parser.add_argument("--json", type=Path, help="everything, to this file")
     args = parser.parse_args()
-    print("| " + " | ".join(HEAD) + " |\n|" + "---|" * len(HEAD))
+    print_row(*HEAD, head=True)
     networks: dict[str, Network] = {}
     everything = []
-    for cell in cells():
-        if args.networks and cell.network not in args.networks:
-            continue
-        if args.sets and cell.frames not in args.sets:
-            continue
-        if args.points and cell.points is not None and cell.points not in args.points:
-            continue
-        network = networks.setdefault(cell.network, opened(cell.network, args.data))
-        frames = frames_of(cell.frames, args.data, args.half, args.frames)
-        seeds = range(args.seeds if cell.points else 1)
+    for name, set_name, count in cases(args):
+        network = networks.setdefault(name, opened(name, args.data))
+        frames = frames_of(set_name, args.data, args.half, args.frames)
         rows = [
-            measure(network, frame, cell.points, seed)
-            for seed in seeds
-            for frame in registered(frames, cell.points, seed, args.registration)
+            measure(network, frame, count, seed)
+            for seed in range(args.seeds if count else 1)
+            for frame in registered(frames, count, seed, args.registration)
         ]
-        measured = summary(rows)
-        print(table_row(cell, measured), flush=True)
-        everything.append({"cell": vars(cell), "summary": measured, "frames": rows})
+        of = summary(rows)
+        *errors, result = (f"{mae:.4f} / {rmse:.3f}" for mae, rmse in map(of["mean"].get, STAGES))
+        print_row(
+            *(name, f"{set_name}, {of['frames']}", count or "LiDAR", *errors, f"**{result}**"),
+            f"{of['mean']['result'][0] / of['mean']['linear'][0]:.3f}",
+            *(f"{of['worse']:.0%}", f"{of['moved']:.0%}", f"{of['cpu_s']:.1f}"),
+        )
+        cell = {"network": name, "frames": set_name, "points": count}
+        everything.append({"cell": cell, "summary": of, "frames": rows})
         if args.json:
             args.json.write_text(json.dumps(everything, indent=1))
 

@@ -2,13 +2,13 @@
 
     python -m benchmarks.engine [--runs 15] [--only NAME …] [--no-memory] [--json]
 
-For the paper's seven networks at full size and two more, random weights, K = 5, in one process, in
-turn: a plain forward pass, its front and rear, refinement with a hand-written front and rear, ours
-(a network that stays open from frame to frame, as in a batch), ours opened anew for one frame,
-ours in bf16, a hook that replaces the layer's output and re-runs the whole network, and a loop
-written after the description of the paper's PyTorch code: the front with gradients on,
-`create_graph=True`. The limit is (front + 11·rear)/(front + rear). Peak memory of each is measured
-in a process of its own, above that of a plain forward pass.
+For the paper's seven networks at full size, random weights, K = 5, in one process, in turn: a plain
+forward pass, its front and rear, refinement with a hand-written front and rear, ours (a network
+that stays open from frame to frame, as in a batch), ours opened anew for one frame, ours in bf16, a
+hook that replaces the layer's output and re-runs the whole network, and a loop written after the
+description of the paper's PyTorch code: the front with gradients on, `create_graph=True`. The limit
+is (front + 11·rear)/(front + rear). Peak memory of each is measured in a process of its own, above
+that of a plain forward pass.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ import platform
 import statistics
 import subprocess
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 
 import torch
 from torch import Tensor, nn
 
-from benchmarks.hand_cuts import ZOO
-from benchmarks.networks import CASES, Case
+from benchmarks.frames import print_row
+from benchmarks.hand_cuts import ZOO, Case
 from pnpdepth_cli.core.refine import RefineSettings, refine
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.models.precision import lower
@@ -212,25 +212,16 @@ def peak_of(case: Case, variant: str) -> float:
 
 
 def print_peak(name: str, variant: str) -> None:
-    with variants(next(case for case in (*ZOO, *CASES) if case.name == name)) as todo:
+    with variants(next(case for case in ZOO if case.name == name)) as todo:
         todo["forward"]()
         todo[variant]()
         print(peak_mb(todo[variant], CPU))
 
 
-def print_rows(rows: Sequence[Mapping[str, object]]) -> None:
-    """The rows as a Markdown table, their keys its head."""
-    print("| " + " | ".join(rows[0]) + " |")
-    print("|" + "---|" * len(rows[0]))
-    for row in rows:
-        cells = (f"{v:.3g}" if isinstance(v, float) else str(v) for v in row.values())
-        print("| " + " | ".join(cells) + " |")
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--runs", type=int, default=15)
-    parser.add_argument("--only", nargs="+", default=[case.name for case in (*ZOO, *CASES)])
+    parser.add_argument("--only", nargs="+", default=[case.name for case in ZOO])
     parser.add_argument("--no-memory", action="store_true")
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--peak", nargs=2, help=argparse.SUPPRESS)
@@ -239,7 +230,7 @@ def main() -> None:
         print_peak(*args.peak)
         return
     results = []
-    for case in (*ZOO, *CASES):
+    for case in ZOO:
         if case.name in args.only:
             print(case.name, file=sys.stderr)
             results.append(measure(case, args.runs, memory=not args.no_memory))
@@ -251,7 +242,10 @@ def main() -> None:
         f" torch {torch.__version__}, fp32, K = {ITERATIONS}, {args.runs} runs, medians; in units"
         " of a forward pass unless noted\n"
     )
-    print_rows(results)
+    for number, row in enumerate(results):
+        if not number:
+            print_row(*row, head=True)
+        print_row(*(f"{v:.3g}" if isinstance(v, float) else v for v in row.values()))
 
 
 if __name__ == "__main__":

@@ -6,19 +6,24 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from pnpdepth_cli.completion.image_registration import estimated, evidence
+from pnpdepth_cli.core.metrics import score
 from pnpdepth_cli.core.refine import RefineSettings
 from pnpdepth_cli.frames.frame import RefinedFrame
 from pnpdepth_cli.frames.refine import refine_frame
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.io.rgb import read_rgb
-from pnpdepth_cli.models.network import Network
+from pnpdepth_cli.models.definition import Normalisation
+from pnpdepth_cli.models.network import Network, load_network
 from pnpdepth_cli.pipeline.batch.frames import registering
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs
+from pnpdepth_cli.pipeline.refinement.load_refiner import refiner_of
+from pnpdepth_cli.pipeline.refinement.request import RefineRequest
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.sensors import Points, occluded_in_map
 
@@ -33,20 +38,6 @@ class EvalFrame:
     rgb: NDArray[np.float32]
     gt: Depth
     sensor: Depth | None = None
-
-
-def seven_scenes(root: Path) -> Iterator[EvalFrame]:
-    """Kinect frames of one kitchen; 0 and 65535 are unknown."""
-    for path in sorted((root / "7scenes").glob("*.color.jpg")):
-        depth = path.with_name(path.name.replace("color.jpg", "depth.png"))
-        yield EvalFrame(path.stem, read_rgb(path).values, read_depth(depth, scale=1000).values)
-
-
-def icl_nuim(root: Path) -> Iterator[EvalFrame]:
-    """Frames of a rendered living room with perfect depth."""
-    for path in sorted((root / "icl_nuim" / "image").glob("*.jpg")):
-        depth = root / "icl_nuim" / "depth" / f"{path.stem}.png"
-        yield EvalFrame(path.stem, read_rgb(path).values, read_depth(depth, scale=1000).values)
 
 
 def kitti_dc(root: Path) -> Iterator[EvalFrame]:
@@ -65,33 +56,58 @@ def nyu(root: Path) -> Iterator[EvalFrame]:
     ready = (np.load(root / "nyu" / f"{name}.npy").squeeze() for name in ("rgb", "depth"))
     rgb, gt = (np.ascontiguousarray(values.astype(np.float32)) for values in ready)
     yield EvalFrame("nyu", rgb, gt)
-    for path in sorted((root / "nyu" / "metric3d").glob("rgb_*.jpg")):
-        depth = path.with_name(path.name.replace("rgb", "sync_depth")).with_suffix(".png")
-        yield EvalFrame(path.stem, read_rgb(path).values, read_depth(depth, scale=1000).values)
+    yield from _pairs(root / "nyu" / "metric3d", "rgb_*.jpg", ("rgb", "sync_depth"), 1000)
+
+
+def _pairs(folder: Path, images: str, change: tuple[str, str], scale: float) -> Iterator[EvalFrame]:
+    """The frames of a folder; a change in the image's path gives that of its depth."""
+    for path in sorted(folder.glob(images)):
+        name = path.relative_to(folder).as_posix().replace(*change)
+        depth = (folder / name).with_suffix(".png")
+        yield EvalFrame(path.stem, read_rgb(path).values, read_depth(depth, scale=scale).values)
 
 
 def rgbd(folder: str, scale: float) -> Callable[[Path], Iterator[EvalFrame]]:
     """Returns the frames of a folder with `image/*.jpg` and `depth/*.png` of this scale."""
-
-    def frames(root: Path) -> Iterator[EvalFrame]:
-        for path in sorted((root / folder / "image").glob("*.jpg")):
-            depth = root / folder / "depth" / f"{path.stem}.png"
-            yield EvalFrame(path.stem, read_rgb(path).values, read_depth(depth, scale=scale).values)
-
-    return frames
+    return lambda root: _pairs(root / folder, "image/*.jpg", ("image/", "depth/"), scale)
 
 
-SETS = {
-    "7scenes": seven_scenes,
-    "icl_nuim": icl_nuim,
+SETS: dict[str, Callable[[Path], Iterator[EvalFrame]]] = {
+    "7scenes": lambda root: _pairs(root / "7scenes", "*.color.jpg", (".color", ".depth"), 1000),
+    "icl_nuim": rgbd("icl_nuim", 1000),
     "kitti_dc": kitti_dc,
 }
-MORE_SETS = {
+"""Kinect frames of one kitchen (0 and 65535 are unknown), of a rendered room, and of streets."""
+MORE_SETS: dict[str, Callable[[Path], Iterator[EvalFrame]]] = {
+    "nyu": nyu,
     "tum_fr1_rpy": rgbd("tum_fr1_rpy", 5000),
     "tum_fr3_cabinet": rgbd("tum_fr3_cabinet", 5000),
     "realsense": rgbd("realsense_unregistered", 1000),
 }
 """Sets on which nothing was chosen."""
+
+
+def rendered(folder: Path) -> list[EvalFrame]:
+    """The frames of shards that this project rendered."""
+    from model_zoo_defs.training.learning.dataset import Frames
+
+    shards = Frames(folder)
+    frames = (shards[number] for number in range(len(shards)))
+    return [EvalFrame(str(n), f[0].astype(np.float32) / 255, f[1]) for n, f in enumerate(frames)]
+
+
+def as_fastdepth_sees_it(frame: EvalFrame) -> EvalFrame:
+    """The frame at 224×224, cropped as the network's own evaluation does."""
+    if frame.gt.shape == (224, 224):
+        return frame
+
+    def cut(image: np.ndarray, how: int) -> np.ndarray:
+        height, width = image.shape[0] * 250 // 480, image.shape[1] * 250 // 480
+        image = cv2.resize(image, (width, height), interpolation=how)
+        top, left = (height - 228) // 2, (width - 304) // 2
+        return cv2.resize(image[top : top + 228, left : left + 304], (224, 224), interpolation=how)
+
+    return EvalFrame(frame.name, cut(frame.rgb, cv2.INTER_AREA), cut(frame.gt, cv2.INTER_NEAREST))
 
 
 def sampled(gt: Depth, count: int, seed: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -175,3 +191,48 @@ def refined(network: Network, layer: str, settings: RefineSettings, inputs: Inpu
     """The refinement of a frame with all of its points."""
     with network.cut_at(layer) as split:
         return refine_frame(network, split, settings, inputs.frame())
+
+
+WEIGHTS = {
+    "pncnn": "pncnn/kitti_model_best.pth.tar",
+    "nconv": "nconv/CNN_ep0003.pth.tar",
+}
+
+
+def opened(name: str, data: Path) -> Network:
+    """The network with its published or shipped weights."""
+    if name == "fastdepth":
+        network = load_network(str(data / "weights" / "fastdepth_nyu.onnx"), None)
+        definition = replace(network.definition, normalisation=Normalisation())
+        return replace(network, definition=definition)
+    return load_network(name, data / "weights" / WEIGHTS[name] if name in WEIGHTS else None)
+
+
+def by_default(network: Network, inputs: Inputs, seed: int = 0) -> RefinedFrame:
+    """The frame as `pnpdepth refine` gives it by default."""
+    refiner = refiner_of(RefineRequest.from_fields(seed=seed), [network], inputs)
+    with refiner.opened() as open_refiner:
+        return refiner.refine(open_refiner, inputs)
+
+
+def with_outliers(points: SparsePoints, fraction: float, seed: int) -> SparsePoints:
+    """So many of the points at random depths, from half the nearest to twice the farthest."""
+    generator = torch.Generator().manual_seed(seed)
+    outlier = torch.rand(len(points), generator=generator) < fraction
+    low, high = float(points.depth.min()) / 2, float(points.depth.max()) * 2
+    random = low + (high - low) * torch.rand(len(points), generator=generator)
+    return replace(points, depth=torch.where(outlier, random, points.depth))
+
+
+def errors_of(depths: dict[str, torch.Tensor], gt: torch.Tensor) -> dict[str, tuple[float, float]]:
+    """(MAE, RMSE) over the pixels with ground truth where all are known."""
+    seen = torch.stack([depth > 0 for depth in depths.values()]).all(dim=0)
+    gt = torch.where(seen, gt, 0.0)
+    scores = {name: score(depth, gt) for name, depth in depths.items()}
+    return {name: (s.mae, s.rmse) for name, s in scores.items()}
+
+
+def print_row(*cells: object, head: bool = False) -> None:
+    """Prints a line of a Markdown table at once, with the line below it if it is the head."""
+    line = "| " + " | ".join(map(str, cells)) + " |"
+    print(line + ("\n|" + "---|" * len(cells) if head else ""), flush=True)

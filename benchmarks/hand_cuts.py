@@ -6,13 +6,14 @@ limit for a cut that works on any network at any layer.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import torch
 import torch.nn.functional as F
-from torch import Tensor
+from torch import Tensor, nn
 
-from benchmarks.networks import Case
 from model_zoo_defs import adnn, fcrn, sfmlearner
 from model_zoo_defs.adnn import Adnn
 from model_zoo_defs.eigen import Eigen
@@ -21,6 +22,27 @@ from model_zoo_defs.latefusion import FARTHEST, LEVELS, LateFusion
 from model_zoo_defs.sfmlearner import DispNet
 from model_zoo_defs.sparse2dense import SparseToDense
 from model_zoo_defs.sparseconv import SparseConvNet
+from pnpdepth_cli.models.registry import find_definition
+
+
+@dataclass(frozen=True)
+class Case:
+    """A network of the zoo, the layer its `front` ends with, and the inputs' channels and size.
+
+    front(network, *inputs) gives z and what `rear` needs beside it, rear(network, z, kept) what the
+    network gives. Inputs are in 0..1; one of one channel is sparse depth.
+    """
+
+    name: str
+    layer: str
+    channels: tuple[int, ...]
+    size: tuple[int, int]
+    front: Callable[..., Any]
+    rear: Callable[..., Tensor]
+
+    def network(self) -> nn.Module:
+        """It, with random weights, in eval mode."""
+        return find_definition(self.name).build().eval().requires_grad_(False)
 
 
 def eigen_front(network: Eigen, rgb: Tensor) -> Any:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from benchmarks.paper_figures import MEASURES, ROWS, SETTING, PaperRow
+from benchmarks.paper_figures import MEASURES, ROWS, PaperRow
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.io.atomic import atomic_path
 
@@ -18,8 +18,6 @@ TITLES = ("RMSE", "MAE", "MRE", "δ1", "δ2", "δ3")
 STATES = {"paper": "the paper's setting", "tuned": "our setting"}
 PUBLISHED = "published"
 COLOURS = {PUBLISHED: "0.7", STATES["paper"]: "tab:orange", STATES["tuned"]: "tab:blue"}
-SMALL_MOVE = 0.02  # of std(z), by all steps together: comparable to rounding errors of the features
-LARGE_STEP = 0.1  # of std(z), by one step
 
 
 def markdown(table: Table) -> str:
@@ -162,7 +160,7 @@ def _steps(rows: Sequence[Result]) -> str:
 
 
 def remarks(rows: Sequence[Result]) -> list[str]:
-    """For how many MAE falls; where not, and why; alignments, pixels not scored, divergence."""
+    """For how many MAE falls, and where not; alignments, pixels not scored, divergence."""
     notes = [
         f"MAE falls for {_count(rows, state, 'before')} at {STATES[state]}" for state in STATES
     ]
@@ -178,10 +176,7 @@ def remarks(rows: Sequence[Result]) -> list[str]:
         for state, title in STATES.items():
             gain = row["settings"][state]["gains"]["mae"]
             if gain <= 0:
-                notes.append(
-                    f"`{row['network']}`: {title} does not improve MAE ({gain:+.2f} %): "
-                    + reason(row, state)
-                )
+                notes.append(f"`{row['network']}`: {title} does not improve MAE ({gain:+.2f} %)")
         if row["coverage"] < 0.9995:
             notes.append(
                 f"`{row['network']}`: {100 * (1 - row['coverage']):.2f} % of the pixels with known"
@@ -196,26 +191,6 @@ def _count(rows: Sequence[Result], state: str, other: str) -> str:
     """How many of the networks have a lower MAE in one state than in the other."""
     lower = sum(row["scores"][state]["mae"] < row["scores"][other]["mae"] for row in rows)
     return f"{lower} of {len(rows)} networks"
-
-
-def reason(row: Result, state: str) -> str:
-    """Why a setting does not help: what the loss at the points, and the step, say."""
-    how = row["settings"][state]
-    before, after = how["loss_before"], how["loss_after"]
-    losses = f"the loss at the points goes from {before:.3f} to {after:.3f}"
-    if state == "paper":
-        fraction = SETTING.lr / row["std_z"] if isinstance(SETTING.lr, float) else 0.0
-        if fraction >= LARGE_STEP:
-            return f"a step is {fraction:.0%} of std(z) = {row['std_z']:.2g}, too long; {losses}"
-        if fraction * SETTING.iterations <= SMALL_MOVE:
-            return (
-                f"all {SETTING.iterations} steps together are"
-                f" {SETTING.iterations * fraction:.2%} of std(z) = {row['std_z']:.3g}, too"
-                f" short to move anything; {losses}"
-            )
-    if after < before:
-        return f"{losses}, so the points are met, at the cost of what lies between them"
-    return f"{losses}, so the steps go too far"
 
 
 def plot(tables: Sequence[Table], path: Path) -> None:

@@ -1,4 +1,4 @@
-"""The frames of `benchmarks.paper_tables`: rendered for it, the real ones at hand, or data sets."""
+"""The frames of `benchmarks.paper_tables`: rendered for it, or the real ones at hand."""
 
 from __future__ import annotations
 
@@ -14,11 +14,6 @@ from numpy.typing import NDArray
 from benchmarks.frames import SETS, Depth, EvalFrame, points_on_grid, sampled
 from pnpdepth_cli.errors import NoPointsError, UsageError
 from pnpdepth_cli.io.dataset.protocols import PROTOCOLS, Protocol
-from pnpdepth_cli.io.layouts import Frame, read_frame_ground_truth, read_frame_image, read_frames
-from pnpdepth_cli.pipeline.batch.frames import task_of
-from pnpdepth_cli.pipeline.batch.request import BatchRequest
-from pnpdepth_cli.pipeline.refinement.inputs import read_inputs
-from pnpdepth_cli.pipeline.refinement.request import RefineRequest
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.sensors import FORWARD_LEFT_UP, LIDARS, Camera, as_depth_image, simulate_lidar
 
@@ -70,7 +65,7 @@ class TableFrame:
 class FrameSet:
     """frames(): in a fixed order, `count` of them. street: for table II.
 
-    beside_paper: its figures stand beside the paper's. notes: what else to know of it.
+    beside_paper: its figures stand beside the paper's.
     """
 
     name: str
@@ -78,7 +73,6 @@ class FrameSet:
     count: int
     frames: Callable[[], Iterator[TableFrame]]
     beside_paper: bool = True
-    notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -200,68 +194,3 @@ def _shared_frame(frame: EvalFrame) -> TableFrame:
         return TableFrame(rgb=frame.rgb, gt=gt, pool=gt).cut_by(PROTOCOLS["nyu"])
     gt, scan = (within(depth, STREET_LIMIT) for depth in (frame.gt, frame.sensor))
     return TableFrame(rgb=frame.rgb, gt=gt, pool=scan, scan=scan)
-
-
-def data_set(what: str, most: int | None) -> FrameSet:
-    """The frames of a data set on disk, `nyu=PATH` or `kitti=PATH`, as its layout reads them.
-
-    The layouts cut frames as the paper's protocols say, but for depth completion, where the row
-    decides. Frames that networks are trained on are left out (`test_frames`). UsageError for
-    another kind of set, or one that the path does not look like.
-    """
-    kind, _, path = what.partition("=")
-    if kind not in ("nyu", "kitti") or not path:
-        raise UsageError(f"--data {what}: give nyu=PATH or kitti=PATH")
-    root = Path(path)
-    every, note = test_frames(root, read_frames(root))
-    if (every[0].protocol.name == "nyu") != (kind == "nyu"):
-        raise UsageError(f"--data {what}: {root} is read as {every[0].protocol.name!r} frames")
-    chosen = _evenly(every, most)
-    return FrameSet(
-        name=f"{kind} ({root.name})",
-        street=kind == "kitti",
-        count=len(chosen),
-        frames=lambda: (_data_frame(root, frame) for frame in chosen),
-        notes=(f"{root.name}: {len(chosen)} of {note}",),
-    )
-
-
-def test_frames(root: Path, every: Sequence[Frame]) -> tuple[Sequence[Frame], str]:
-    """The frames of the official test or validation split, and what they are.
-
-    All of them if they belong to one split, or if nothing says to which.
-    """
-    if every[0].protocol.name == "kitti-odometry" and every[0].sparse:
-        first, rest = "sequences 00 to 10", "sequences 11 to 21"
-        trained = [frame.name[:2] <= "10" for frame in every]
-    else:
-        first, rest = "train", "val or test"
-        trained = ["train" in _parts(root, frame) for frame in every]
-    if all(trained):
-        return every, f"{len(every)} frames, all of {first}: networks may have been trained on them"
-    kept = [frame for frame, seen in zip(every, trained, strict=True) if not seen]
-    if any(trained):
-        return kept, f"{len(kept)} frames of {rest}; {len(every) - len(kept)} of {first} left out"
-    return kept, f"{len(kept)} frames; nothing in their paths says that any is of {first}"
-
-
-def _parts(root: Path, frame: Frame) -> tuple[str, ...]:
-    """The folders that the frame's ground truth, or its image, lies in, from the root on."""
-    source = frame.gt or frame.image
-    path = source if isinstance(source, Path) else source.path if source else root
-    return path.absolute().parts[len(root.absolute().parts) - 1 : -1]
-
-
-def _data_frame(root: Path, frame: Frame) -> TableFrame:
-    """A frame in memory; without ground truth the scan is it, as in KITTI odometry."""
-    if frame.sparse is None:
-        gt = read_frame_ground_truth(frame)
-        return TableFrame(rgb=read_frame_image(frame), gt=gt, pool=gt)
-    # Nothing is written; this is how `batch` reads scans and scales.
-    batch = BatchRequest(source=root, output=root / "out", refine=RefineRequest())
-    inputs = read_inputs(task_of(batch, frame).request)
-    assert inputs.rgb is not None
-    scan = inputs.points.scatter()[0, 0].numpy()
-    if inputs.gt is None:
-        return TableFrame(rgb=inputs.rgb, gt=scan, pool=scan)
-    return TableFrame(rgb=inputs.rgb, gt=inputs.gt, pool=scan, scan=scan)

@@ -1,14 +1,11 @@
 """The paper's tables I and II for the seven networks: `python -m benchmarks.paper_tables`.
 
     python -m benchmarks.paper_tables --shared ../shared/data --json t.json --plot t.png
-    python -m benchmarks.paper_tables --data nyu=PATH kitti=PATH --checkpoints DIR
 
-By itself: the tiny editions that come with the program, on rooms and streets rendered from seeds
-that nothing else uses (into --cache, once; needs pnpdepth[train]). --data names real data sets
-instead: NYU Depth v2 as .h5 or the official .mat; KITTI odometry or depth completion, each with a
-`kitti=` of its own. --checkpoints names a folder with published weights, each called after its
-network (`pnpdepth models`): fcrn.npy, sfmlearner.pth.tar, sparse2dense-r18-upproj-kitti.pth.tar,
-eigen/ with its two files.
+The tiny editions that come with the program, on rooms and streets rendered from seeds that nothing
+else uses (into --cache, once; needs pnpdepth[train]), and with --shared on the real frames at hand.
+Networks with published weights on NYU and KITTI are measured by `pnpdepth batch --preset paper` and
+`pnpdepth eval`.
 
 Each network: as it is, refined at the paper's setting (sign, α = 0.01, K = 5, L1, the paper's z)
 and with its definition's defaults; beside it, the points interpolated linearly without any network.
@@ -38,16 +35,15 @@ from tqdm import tqdm
 from benchmarks.frames import Depth, frame_inputs, refined
 from benchmarks.paper_figures import FINE_THRESHOLDS, MEASURES, ROWS, SETTING, PaperRow, networks_of
 from benchmarks.paper_report import heading, markdown, plot
-from benchmarks.paper_sets import ROOMS, STREETS, FrameSet, TableFrame, data_set, rendered, shared
+from benchmarks.paper_sets import ROOMS, STREETS, FrameSet, TableFrame, rendered, shared
 from pnpdepth_cli.cli.printable import printable
 from pnpdepth_cli.completion.interpolation import linear
 from pnpdepth_cli.core.metrics import score
 from pnpdepth_cli.core.refine import RefineSettings
-from pnpdepth_cli.errors import CheckpointError, PnpDepthError, UsageError
+from pnpdepth_cli.errors import PnpDepthError, UsageError
 from pnpdepth_cli.io.atomic import atomic_path
 from pnpdepth_cli.models.network import Network, load_network
 from pnpdepth_cli.models.registry import names
-from pnpdepth_cli.models.weights.checkpoint import WEIGHT_SUFFIXES
 from pnpdepth_cli.pipeline.refinement.request import MethodOptions
 from pnpdepth_cli.pipeline.refinement.resolve import resolve_layer, resolve_settings
 
@@ -198,67 +194,33 @@ def table_of(frame_set: FrameSet, entries: Sequence[Entry]) -> dict[str, Any]:
         "street": frame_set.street,
         "beside_paper": frame_set.beside_paper,
         "rows": rows,
-        "notes": [*frame_set.notes, *notes],
+        "notes": notes,
     }
 
 
-def checkpoints_in(folder: Path | None) -> dict[str, Path | None]:
-    """Networks by name and their weights: the tiny editions, or what a folder's names say."""
-    known = names()
-    if folder is None:
-        return {name: None for name in known if "-tiny" in name}
-    if not folder.is_dir():
-        raise UsageError(f"--checkpoints {folder} is no folder; put the files of weights into one")
-    known += ["sparse2dense", "sparse2dense-kitti"]
-    measured: dict[str, Path | None] = {}
-    for path in sorted(folder.iterdir()):
-        name = path.name.split(".")[0]
-        if name not in known or not (path.is_dir() or path.suffix in WEIGHT_SUFFIXES):
-            continue
-        if name in measured:
-            raise UsageError(f"{measured[name]} and {path} are both for {name}; keep one of them")
-        measured[name] = path
-    if not measured:
-        raise UsageError(f"no file in {folder} is called after a network, such as fcrn.npy")
-    return measured
-
-
-def entries_of(
-    weights: dict[str, Path | None], only: Sequence[str]
-) -> tuple[list[Entry], list[str]]:
-    """The networks with weights, row by row, and notes on what there is none of."""
-    unknown = set(only) - set(weights)
-    if unknown:
-        raise UsageError(f"--only: no {', '.join(sorted(unknown))}; there are {', '.join(weights)}")
+def entries_of(only: Sequence[str]) -> tuple[list[Entry], list[str]]:
+    """The tiny editions, row by row, and notes on what there is none of."""
+    tiny = [name for name in names() if "-tiny" in name]
+    if unknown := set(only) - set(tiny):
+        raise UsageError(f"--only: no {', '.join(sorted(unknown))}; there are {', '.join(tiny)}")
     entries, notes = [], []
     loaded: dict[str, Network] = {}
     for row in ROWS:
-        wanted = networks_of(row, [name for name in weights if not only or name in only])
+        wanted = networks_of(row, only or tiny)
         if not wanted and not only:
-            # the reason for a missing tiny edition is noted only where tiny editions are requested
-            missing = row.missing if None in weights.values() else ""
-            notes.append(missing or f"no weights for the row of {row.name} ({row.family})")
+            notes.append(row.missing)
         for name in wanted:
-            try:
-                loaded[name] = loaded.get(name) or load_network(name, weights[name])
-            except CheckpointError as error:
-                if weights[name] is not None:
-                    raise
-                notes.append(f"`{name}` has no row: {error}")
-            else:
-                entries.append(entry_of(row, loaded[name]))
-    return entries, list(dict.fromkeys(notes))
+            loaded[name] = loaded.get(name) or load_network(name, None)
+            entries.append(entry_of(row, loaded[name]))
+    return entries, notes
 
 
 def sets_of(args: argparse.Namespace, entries: Sequence[Entry]) -> Iterable[FrameSet]:
     """The sets that the command line asks for, each rendered when its turn comes, if needed."""
-    if args.data:
-        yield from [data_set(what, args.frames) for what in args.data]
-    else:
-        rooms = args.frames or ROOM_FRAMES
-        for scenes, count in ((ROOMS, rooms), (STREETS, -(-rooms // 4))):
-            if any(entry.row.street == (scenes is STREETS) for entry in entries):
-                yield rendered(scenes, args.cache, count, args.workers)
+    rooms = args.frames or ROOM_FRAMES
+    for scenes, count in ((ROOMS, rooms), (STREETS, -(-rooms // 4))):
+        if any(entry.row.street == (scenes is STREETS) for entry in entries):
+            yield rendered(scenes, args.cache, count, args.workers)
     if args.shared:
         yield from shared(args.shared, args.frames or SHARED_FRAMES)
 
@@ -272,8 +234,6 @@ def parsed(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--only", nargs="+", default=[], metavar="NAME", help="these networks")
     parser.add_argument("--cache", type=Path, default=Path("out/paper_tables"))
     parser.add_argument("--shared", type=Path, help="also these real frames (../shared/data)")
-    parser.add_argument("--data", nargs="+", metavar="KIND=PATH", help="nyu=PATH, kitti=PATH")
-    parser.add_argument("--checkpoints", type=Path, help="folder with published weights")
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1, help="that render")
     parser.add_argument("--json", type=Path, help="write everything into this file")
     parser.add_argument("--plot", type=Path, help="draw the gains into this image")
@@ -287,7 +247,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """The tables on stdout; returns the exit code."""
     args, began = parsed(arguments), time.monotonic()
     try:
-        entries, notes = entries_of(checkpoints_in(args.checkpoints), args.only)
+        entries, notes = entries_of(args.only)
         tables = []
         for frame_set in sets_of(args, entries):
             table = table_of(frame_set, entries)

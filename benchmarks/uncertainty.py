@@ -7,16 +7,17 @@ default method, on odd frames; the constants were chosen on even frames.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
-from benchmarks.accuracy import by_default, opened
 from benchmarks.frames import (
     SETS,
     EvalFrame,
+    by_default,
     drawn_inputs,
+    opened,
+    print_row,
     without_occluded,
 )
 from pnpdepth_cli.frames.uncertainty import uncertainty
@@ -46,26 +47,17 @@ def coverage(network: Network, frame: EvalFrame, count: int | None) -> list[floa
     return [float((ratio <= multiple).mean()) for multiple in MULTIPLES]
 
 
-def rows(data: Path) -> Iterator[str]:
-    """A line of the table for each case."""
-    for name, network_name, count in CASES:
-        network = opened(network_name, data)
-        frames = list(SETS[name](data))
-        means = np.mean([coverage(network, frames[n], count) for n in FRAMES[name]], axis=0)
-        yield (
-            f"| {name} | {count or 'LiDAR'} | {network_name} |"
-            + "".join(f" {mean:.0%} |" for mean in means)
-        )
-
-
 def main() -> None:
     """Print the table as it comes."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("data", type=Path, help="folder with kitti_dc, 7scenes, icl_nuim")
-    within = "".join(f" within ± {multiple} σ |" for multiple in MULTIPLES)
-    print(f"| set | points | network |{within}\n|---|---|---|" + "---|" * len(MULTIPLES))
-    for row in rows(parser.parse_args().data):
-        print(row, flush=True)
+    data = parser.parse_args().data
+    within = (f"within ± {multiple} σ" for multiple in MULTIPLES)
+    print_row("set", "points", "network", *within, head=True)
+    for name, network_name, count in CASES:
+        network, frames = opened(network_name, data), list(SETS[name](data))
+        means = np.mean([coverage(network, frames[n], count) for n in FRAMES[name]], axis=0)
+        print_row(name, count or "LiDAR", network_name, *(f"{mean:.0%}" for mean in means))
 
 
 if __name__ == "__main__":

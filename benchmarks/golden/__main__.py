@@ -32,11 +32,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from benchmarks.golden.commands import groups
 from benchmarks.golden.differences import compared
 from benchmarks.golden.inputs import ROOT, make_inputs
 from benchmarks.golden.running import Observer, Runner, files_in
-from benchmarks.golden.steps import Group
+from benchmarks.golden.steps import Group, groups
 
 ENVIRONMENT = {
     "OMP_NUM_THREADS": "1",

@@ -29,7 +29,7 @@ _MEASURED_TEXT = (
 )
 _NUMBER = re.compile(r"\d[\d,]*(?:\.\d+)?(?:e[+-]?\d+)?")
 _MEASURED = re.compile(
-    r"^(versions?|seconds(_\w+)?|\w+_(ms|mb|seconds)|[cm]time_ns|crc32|frames_per_second|network_busy)$"
+    r"^(versions?|seconds(_\w+)?|\w+_(ms|mb|seconds)|[cm]time_ns|crc32|run|time_s|frames_per_second|network_busy)$"
 )
 _IMAGES = (".png", ".jpg", ".jpeg", ".tiff", ".tif")
 _MOST_LINES = 120

@@ -105,8 +105,8 @@ class Runner:
 
     def _start(self, each: _Running, running: dict[int, _Running]) -> None:
         step = each.step
-        if step.before is not None:
-            step.before(each.folder)
+        if step.remove is not None:
+            (each.folder / step.remove).unlink(missing_ok=True)
         each.known = files_in(each.folder)
         sys.stdout.flush()
         sys.stderr.flush()

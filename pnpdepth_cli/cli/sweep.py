@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import click
@@ -15,7 +14,11 @@ from pnpdepth_cli.cli.progress import BatchProgress
 from pnpdepth_cli.cli.streams import INTERRUPTED
 from pnpdepth_cli.errors import FramesFailedError, StorageError
 from pnpdepth_cli.pipeline.batch.request import FrameSelection
-from pnpdepth_cli.pipeline.refinement.request import FrameFiles, MethodOptions, NetworkChoice
+from pnpdepth_cli.pipeline.refinement.request import FrameFiles, NetworkChoice
+from pnpdepth_cli.pipeline.sparse.options import ScanOptions
+
+_SCAN_DETAILS = ("inverse_extrinsics", "euclidean", "keep_occluded", "point_fields")
+"""A scan that needs these is projected first."""
 
 
 @click.command(
@@ -23,17 +26,16 @@ from pnpdepth_cli.pipeline.refinement.request import FrameFiles, MethodOptions, 
     cls=grouped_help.GroupedCommand,
     common=frozenset(
         {
-            *("--vary", "--one-by-one", "--sample", "--seeds", "--layout", "--limit", "--calib"),
-            *("--model", "--checkpoint", "--output", "--plots", "--json"),
+            *("--vary", "--set", "--one-by-one", "--sample", "--seeds", "--layout", "--limit"),
+            *("--calib", "--model", "--checkpoint", "--output", "--plots", "--json"),
         }
     ),
     groups={
-        "Sweep": ("--vary", "--one-by-one", "--sample", "--seeds", "--seed"),
+        "Sweep": ("--vary", "--set", "--one-by-one", "--sample", "--seeds"),
         "Frames": ("--layout", "--protocol", "--limit"),
         "Input": (*grouped_help.LIDAR, *grouped_help.FILE_READING),
         "Network": grouped_help.NETWORK,
-        "Method": tuple(name for name in grouped_help.METHOD if name != "--seed"),
-        "Output": ("--output", "--plots", "--plot-format", "--cost", "--json"),
+        "Output": ("--output", "--plots", "--cost", "--json"),
     },
 )
 @click.argument("source", type=options.FILE, metavar="FOLDER|LIST")
@@ -46,9 +48,12 @@ from pnpdepth_cli.pipeline.refinement.request import FrameFiles, MethodOptions, 
     help="Parameter and its values; two --vary make a grid.",
 )
 @click.option(
+    "--set", "settings", multiple=True, metavar="NAME=V", help="Parameter that is not varied."
+)
+@click.option(
     "--one-by-one",
     is_flag=True,
-    help="Vary each parameter alone, with the others at their defaults.",
+    help="Vary each parameter alone, with the others as set or at their defaults.",
 )
 @click.option(
     "--sample",
@@ -61,28 +66,26 @@ from pnpdepth_cli.pipeline.refinement.request import FrameFiles, MethodOptions, 
     default=1,
     show_default=True,
     metavar="N",
-    help="Number of random draws of the points; the first uses --seed.",
+    help="Number of random draws of the points, with consecutive seeds.",
 )
 @options.options_of_groups(FrameSelection)
-@click.option("--plots/--no-plots", default=True, help="Draw plots, or write tables only.")
 @click.option(
-    "--plot-format",
-    type=click.Choice(PLOT_FORMATS),
+    "--plots",
+    type=click.Choice((*PLOT_FORMATS, "none")),
     default="png",
     show_default=True,
-    help="File format of the plots.",
+    help="Format of the plots; none writes tables only.",
 )
 @click.option(
     "--cost", is_flag=True, help="Add the time of the refinement to tables, and a plot over it."
 )
-@options.scan
-@options.options_of_groups(FrameFiles, NetworkChoice, MethodOptions, without=["tile"])
-@options.seed
+@options.options_of_groups(ScanOptions, without=_SCAN_DETAILS)
+@options.max_pixels
+@options.options_of_groups(FrameFiles, NetworkChoice, without=["tile"])
 @options.as_json
 def sweep(
-    source: Path,
-    output: Path,
     vary: tuple[str, ...],
+    settings: tuple[str, ...],
     one_by_one: bool,
     sample: str | None,
     as_json: bool,
@@ -93,10 +96,9 @@ def sweep(
     \b
     pnpdepth sweep frames.csv -o sweep/ --sample 500 --vary iterations=0,1,2,5,10,20
     pnpdepth sweep frames.csv -o sweep/ --seeds 3 --vary points=20,100,500 --vary iterations=0,5,20
-    pnpdepth sweep frames.csv -o sweep/ --one-by-one --sample 500 --vary lr=1%,3%,10% \\
-        --vary layer=0,0.5,1 --vary loss=l1,l2,log --vary update=sign,adam
-    pnpdepth sweep kitti/ -o sweep/ --vary points=1%,3%,10%,30%,100%   # of the LiDAR's points
-    pnpdepth sweep street/ -o sweep/ --vary sensor=vlp-16,vlp-32c,hdl-32e,hdl-64e
+    pnpdepth sweep frames.csv -o sweep/ --one-by-one --sample 500 --set iterations=10 \\
+        --vary lr=1%,3%,10% --vary layer=0,0.5,1 --vary loss=l1,l2,log
+    pnpdepth sweep kitti/ -o sweep/ --vary sensor=vlp-16,vlp-32c,hdl-32e,hdl-64e
 
     FOLDER or LIST is what `pnpdepth batch` takes.
 
@@ -104,44 +106,37 @@ def sweep(
     points      N; or P% of the known pixels, of the frame's points or of the LiDAR's points
     sensor      own; a pattern of `pnpdepth sample` such as grid, grid:500 or lines:16; or a LiDAR
                 of `pnpdepth simulate` at the camera, which needs a calibration
-    noise, relative-noise, outliers, jitter
-                noise of the points, as in `pnpdepth sample`
-    rotation-noise
-                rotation of a LiDAR, degrees
-    iterations, layer, lr, loss, update, schedule, blur, parameters, proximity, align, propagate,
-    target, mask, mask-scale, mask-fraction
-                the options of the same names
-    preset, model
-                presets of the method; networks, as NETWORK or NETWORK@WEIGHTS
-    seed        of the draw of the points, in place of --seeds; from 3 on, a second table has the
-                means over seeds with their intervals
+    noise, relative-noise, outliers, jitter, rotation-noise
+                faults of the points as in `pnpdepth sample`, of a LiDAR as in `pnpdepth simulate`
+    preset, layer, iterations, lr, loss, update, schedule, blur, target, parameters, mask,
+    mask-fraction, mask-scale, proximity, line-search, keep-best, align, align-every, propagate
+                the options of `pnpdepth refine` of these names; switches are on or off
+    model       networks, as NETWORK or NETWORK@WEIGHTS
+    seed        of the draw of the points, in place of --seeds
 
-    One --vary gives one table and one plot; two give a table and a plot of their grid; with
-    --one-by-one every --vary gives its own. Tables compare the refined depth with the network's
-    prediction and with linear interpolation of the same points. Means are over frames, after the
-    mean over seeds; 95 % intervals are over frames. Gains are in per cent, positive if refinement
-    is better.
+    One --vary gives a table and a plot of one parameter, two of their grid, and with --one-by-one
+    every --vary its own. The refined depth stands beside the network's prediction and linear
+    interpolation of the same points. Means are over frames, after the mean over seeds; intervals
+    (95 %) are over frames. Gains are in per cent, positive if refinement is better.
 
     OUTPUT gets sweep.csv, sweep.json and sweep.tex (means), sweep_frames.csv (every frame), a plot
-    per table, and sweep.jsonl (the journal). Run again, also with other values, only missing values
-    are computed. Plots need the extra pnpdepth[plot].
+    per table (extra pnpdepth[plot]), and sweep.jsonl (the journal). Run again, also with other
+    values, only missing values are computed.
     """
-    from pnpdepth_cli.pipeline.sweep.axes import read_axis, studies_of
+    from pnpdepth_cli.pipeline.sweep.axes import PARAMETERS, read_axis, studies_of, values_of
     from pnpdepth_cli.pipeline.sweep.points import read_sampling
     from pnpdepth_cli.pipeline.sweep.sweep import SweepRequest, run_sweep
 
-    own = options.taken(FrameSelection, values)
+    fixed = dict(text.partition("=")[::2] for text in settings)
+    method = values_of(fixed, of_points=False)
+    own = {name: values.pop(name) for name in ("output", "source", "seeds", "plots", "cost")}
     request = SweepRequest(
-        source=source,
-        output=output,
+        **own,
+        **options.taken(FrameSelection, values),
         studies=studies_of([read_axis(text) for text in vary], one_by_one=one_by_one),
         sampling=None if sample is None else read_sampling(sample),
-        seeds=values.pop("seeds"),
-        plots=values.pop("plots"),
-        plot_format=values.pop("plot_format"),
-        cost=values.pop("cost"),
-        refine=options.request_of(values),
-        **own,
+        points={name: text for name, text in fixed.items() if PARAMETERS[name].of_points},
+        refine=options.request_of(values).with_fields(**method),
     )
     with _Progress() as progress:
         try:
@@ -157,8 +152,8 @@ def sweep(
         _print(record)
     if progress.failed:
         raise FramesFailedError(
-            f"{progress.failed:,} of {progress.to_do:,} runs failed; {output}/sweep.csv counts the"
-            " frames missing from each mean; run the same command to retry them"
+            f"{progress.failed:,} of {progress.to_do:,} runs failed; {request.output}/sweep.csv"
+            " counts the frames missing from each mean; run the same command to retry them"
         )
 
 
@@ -183,75 +178,36 @@ def _print(record: Mapping[str, Any]) -> None:
 
     for study in record["studies"]:
         names = list(study["parameters"])
-        cost = any("time_s" in cell for cell in study["cells"])
+        cost = ["time [s]"] * any("time_s" in cell for cell in study["cells"])
         print_rows(
             f"{' × '.join(names)}: means over frames, MAE in metres, gains over plain in %",
             [*names, "points used", "frames", "linear", "plain", "refined", "±", "gain", "95 %",
-             "RMSE gain", "MRE gain", "δ1 gain", *(["time [s]"] if cost else [])],
-            [_cells(names, cell) for cell in study["cells"]],
+             "RMSE gain", "MRE gain", "δ1 gain", *cost],
+            [[*cell["parameters"].values(), *_cells(cell)] for cell in study["cells"]],
         )  # fmt: skip
-        _print_over_seeds(study)
-    folder = record["output"]
-    files = ["sweep.csv", "sweep.json", "sweep.tex", "sweep_frames.csv"]
-    files += [study["plot"] for study in record["studies"] if study["plot"]]
-    click.echo("wrote " + "  ".join(f"{folder}/{name}" for name in files), err=True)
+    plots = [study["plot"] for study in record["studies"] if study["plot"]]
+    names = ["sweep.csv", "sweep.json", "sweep.tex", "sweep_frames.csv", *plots]
+    click.echo("wrote " + "  ".join(f"{record['output']}/{name}" for name in names), err=True)
 
 
-def _print_over_seeds(study: Mapping[str, Any]) -> None:
-    """Prints the means over the draws of the points, where seeds were varied."""
-    from pnpdepth_cli.cli.tables import print_rows
-
-    rows = study["over_seeds"]
-    if not rows:
-        return
-    others = list(rows[0]["parameters"])
-    print_rows(
-        "over seeds of the points: mean MAE in metres with its 95 % interval over draws, gain in %",
-        [*others, "seeds", "linear", "plain", "refined", "gain"],
-        [
-            [
-                *(row["parameters"][name] for name in others),
-                str(row["seeds"]),
-                *(
-                    _with_interval(row["mae"][name], ".4f")
-                    for name in ("linear", "plain", "refined")
-                ),
-                _with_interval(row["mae"]["gain"], "+.1f"),
-            ]
-            for row in rows
-        ],
-    )
-
-
-def _with_interval(value: Mapping[str, float | None], form: str) -> str:
-    if value["mean"] is None:
-        return "–"
-    return f"{value['mean']:{form}} [{value['low']:{form}}, {value['high']:{form}}]"
-
-
-def _cells(names: list[str], cell: Mapping[str, Any]) -> list[str]:
-    start = [cell["parameters"][name] for name in names]
-    time = [] if "time_s" not in cell else [_seconds(cell["time_s"])]
+def _cells(cell: Mapping[str, Any]) -> list[str]:
+    time = [_text(cell["time_s"], ".3g")] if "time_s" in cell else []
     if cell["measures"] is None:
-        return [*start, "–", "0", *["–"] * 9, *time]
-    mae = cell["measures"]["mae"]
+        return ["–", "0", *["–"] * 9, *time]
+    mae, diverged = cell["measures"]["mae"], cell["diverged"]
     low, high = mae["refined_low"], mae["refined_high"]
+    ends = (_text(mae[name], "+.1f") for name in ("gain_low", "gain_high"))
     return [
-        *start,
         f"{cell['points']:,.0f}",
-        f"{cell['frames']:,}" + (f", {cell['diverged']:,} diverged" if cell["diverged"] else ""),
-        *(f"{mae[name]:.4f}" for name in ("linear", "plain", "refined")),
-        "–" if low is None else f"{(high - low) / 2:.4f}",
-        _percent(mae["gain"]),
-        "–" if low is None else f"{_percent(mae['gain_low'])} … {_percent(mae['gain_high'])}",
-        *(_percent(cell["measures"][key]["gain"]) for key in ("rmse", "mre", "delta1")),
+        f"{cell['frames']:,}" + (f", {diverged:,} diverged" if diverged else ""),
+        *(_text(mae[name], ".4f") for name in ("linear", "plain", "refined")),
+        _text(None if low is None else (high - low) / 2, ".4f"),
+        _text(mae["gain"], "+.1f"),
+        "–" if low is None else " … ".join(ends),
+        *(_text(cell["measures"][key]["gain"], "+.1f") for key in ("rmse", "mre", "delta1")),
         *time,
     ]
 
 
-def _seconds(value: float | None) -> str:
-    return "–" if value is None else f"{value:.3g}"
-
-
-def _percent(value: float | None) -> str:
-    return "–" if value is None else f"{value:+.1f}"
+def _text(value: float | None, form: str) -> str:
+    return "–" if value is None else f"{value:{form}}"

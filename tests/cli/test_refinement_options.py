@@ -16,6 +16,7 @@ from pnpdepth_cli.models.definition import UNTUNED_DEFAULTS, ModelDefinition, Mu
 from pnpdepth_cli.pipeline.options import options_of
 from pnpdepth_cli.pipeline.refinement.request import MethodOptions, RefineRequest
 from pnpdepth_cli.pipeline.refinement.resolve import resolve_settings
+from pnpdepth_cli.pipeline.sweep.axes import PARAMETERS
 from tests.core.networks import UNet
 
 METHOD = MethodOptions()
@@ -84,9 +85,9 @@ def test_every_option_of_a_request_is_an_option_of_refine() -> None:
             assert each.flag in spelled
 
 
-def test_a_sweep_takes_what_decides_a_depth_and_nothing_else() -> None:
+def test_a_sweep_varies_or_sets_what_decides_a_depth_and_nothing_else() -> None:
     names = {option.name for option in sweep.params}
-    assert {each.name for each in fields(MethodOptions)} <= names
+    assert {each.name.replace("_", "-") for each in fields(MethodOptions)} <= PARAMETERS.keys()
     assert not names & {"auto", "holdout", "uncertainty", "format", "overwrite", "tile"}
 
 

@@ -45,7 +45,7 @@ def test_a_sweep_prints_a_table_per_study_and_the_files_it_wrote(
 def test_json_prints_what_is_in_the_file_and_the_csv_has_the_same_cells(
     root: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    vary = ("--vary", "iterations=0,2", "--vary", "update=sign,adam", "--no-plots", "--json")
+    vary = ("--vary", "iterations=0,2", "--vary", "update=sign,adam", "--plots", "none", "--json")
     assert code_of(arguments(*vary)) == 0
     printed = json.loads(capsys.readouterr().out)
     assert printed == json.loads(Path("out/sweep.json").read_text())
@@ -61,13 +61,32 @@ def test_json_prints_what_is_in_the_file_and_the_csv_has_the_same_cells(
     assert not list(Path("out").glob("*.png"))
 
 
+def test_what_is_set_is_not_varied_and_is_recorded(
+    root: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    fixed = ("lr=10%", "line-search=on", "noise=0.1", "seed=3", "points=20")
+    options = [part for text in fixed for part in ("--set", text)]
+    assert (
+        code_of(arguments(*options, "--vary", "iterations=0,2", "--plots", "none", "--json")) == 0
+    )
+    record = json.loads(capsys.readouterr().out)
+    base = record["base"]
+    assert (base["lr"], base["line_search"], base["noise"]) == ("10%", True, 0.1)
+    assert record["studies"][0]["parameters"] == {"iterations": ["0", "2"]}
+    with Path("out/sweep_frames.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert {(row["seed"], row["points_used"]) for row in rows} == {("3", "20")}
+
+
 EXITS: list[tuple[list[str], int, str]] = [
     (["--vary", "point=20"], 2, "no parameter 'point' to vary; there are points, sensor"),
     (["--vary", "points=a"], 2, "neither a number"),
     (["--vary", "points=500"], 7, "runs failed"),
+    (["--vary", "points=9", "--set", "colour=red"], 2, "no parameter 'colour'"),
+    (["--vary", "points=9", "--set", "lr"], 2, "is not a step size"),
     (["--vary", "lr=1", "--vary", "loss=l1", "--vary", "points=9"], 2, "--one-by-one"),
     (["--vary", "lr=1", "--sample", "many"], 2, "no sensor 'many'"),
-    (["--vary", "lr=1", "--seeds", "0"], 2, "once at least"),
+    (["--vary", "lr=1", "--seeds", "0"], 2, "--seeds must be >= 1"),
     (["--vary", "lr=1", "--limit", "0"], 2, "1 or more"),
     (["--vary", "lr=1", "--layout", "tum"], 3, "does not look like 'tum'"),
     (["--vary", "layer=encod,middle"], 4, "encode"),
@@ -80,7 +99,7 @@ EXITS: list[tuple[list[str], int, str]] = [
 def test_the_exit_code_is_that_of_the_kind_of_error(
     root: Path, capsys: pytest.CaptureFixture[str], more: list[str], code: int, message: str
 ) -> None:
-    assert code_of(arguments(*more, "--no-plots")) == code
+    assert code_of(arguments(*more, "--plots", "none")) == code
     err = capsys.readouterr().err
     assert message in err.splitlines()[-1]
     assert "Traceback" not in err
@@ -89,7 +108,7 @@ def test_the_exit_code_is_that_of_the_kind_of_error(
 def test_why_a_frame_failed_is_reported_once(
     root: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert code_of(arguments("--vary", "points=500", "--vary", "lr=1,2", "--no-plots")) == 7
+    assert code_of(arguments("--vary", "points=500", "--vary", "lr=1,2", "--plots", "none")) == 7
     failed = [e for e in capsys.readouterr().err.splitlines() if e.startswith("failed")]
     assert failed == [
         f"failed: {name}: 500 points of 60; ask for fewer, or draw them from the ground"
@@ -117,7 +136,7 @@ def test_ctrl_c_prints_how_to_continue_and_exits_130(
 ) -> None:
     from pnpdepth_cli.pipeline.sweep import running as sweep_running
 
-    own, calls = sweep_running.refined_curve, []
+    own, calls = sweep_running.refined, []
 
     def interrupted(*request: object) -> object:
         calls.append(request)
@@ -125,8 +144,8 @@ def test_ctrl_c_prints_how_to_continue_and_exits_130(
             raise KeyboardInterrupt
         return own(*request)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(sweep_running, "refined_curve", interrupted)
-    vary = ("--vary", "lr=1%,3%", "--no-plots")
+    monkeypatch.setattr(sweep_running, "refined", interrupted)
+    vary = ("--vary", "lr=1%,3%", "--plots", "none")
     assert code_of(arguments(*vary)) == 130
     assert "stopped; run the same command to continue" in capsys.readouterr().err
     assert code_of(arguments(*vary)) == 0
@@ -141,8 +160,8 @@ def test_the_help_names_all_that_can_be_varied() -> None:
 
 def test_options_that_a_sweep_would_not_heed_are_not_there() -> None:
     names = {option.name for option in sweep.params}
-    assert not names & {"format", "overwrite", "holdout"}
-    assert {"layer", "lr", "keep_best", "calib", "device"} <= names
+    assert not names & {"format", "overwrite", "holdout", "lr"}
+    assert {"settings", "calib", "device"} <= names
     parameters = click.command()(options.refinement(lambda: None)).params
     assert {"format", "overwrite", "holdout"} <= {option.name for option in parameters}
 

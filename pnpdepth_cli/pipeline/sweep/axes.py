@@ -10,47 +10,42 @@ from typing import Any
 
 import torch
 
-from pnpdepth_cli.choices import PRESETS
 from pnpdepth_cli.core.step_sizes import step_size
 from pnpdepth_cli.errors import UsageError
-from pnpdepth_cli.pipeline.options import options_of
-from pnpdepth_cli.pipeline.refinement.request import MethodOptions, count_or_fraction
-from pnpdepth_cli.pipeline.sweep.points import known_sensor
+from pnpdepth_cli.pipeline.options import Axis as Shown
+from pnpdepth_cli.pipeline.options import OptionField, options_of
+from pnpdepth_cli.pipeline.refinement.request import (
+    LARGEST_SEED,
+    MethodOptions,
+    count_or_fraction,
+)
+from pnpdepth_cli.pipeline.sweep.points import read_sampling
 
 Cell = Mapping[str, str]
-"""The varied parameters: name to value, as the user wrote it."""
+"""Parameters: name to value, as the user wrote it."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Parameter:
     """A parameter that can be varied."""
 
-    title: str
+    shown: Shown
+    """Titles of its axis."""
     value: Callable[[str], Any]
     """Parses a text; raises ValueError or UsageError."""
-    of_percent: str = ""
-    """Title where the values are in per cent."""
-    log: bool = False
     of_points: bool = False
-    """True if it concerns the points, not the update."""
+    """Whether it decides the points."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Axis:
-    """A parameter and its values."""
+    """A parameter and its values, as the user wrote them."""
 
     name: str
-    """Key of PARAMETERS."""
     values: tuple[str, ...]
-    """As the user wrote them, in that order."""
-
-    @property
-    def parameter(self) -> Parameter:
-        """What is varied."""
-        return PARAMETERS[self.name]
 
     def numbers(self) -> list[float] | None:
-        """Returns the values as numbers; None if they are no numbers of one unit."""
+        """Returns the values as numbers; None if they are not numbers of one unit."""
         percents = {value.endswith("%") for value in self.values}
         try:
             return [float(v.removesuffix("%")) for v in self.values] if len(percents) == 1 else None
@@ -58,18 +53,18 @@ class Axis:
             return None
 
     def title(self) -> str:
-        """Returns the title of the plot's axis."""
+        """Returns the title of the plot's axis; its unit is in brackets."""
+        shown = PARAMETERS[self.name].shown
         if self.numbers() is None:
-            return self.parameter.title.partition(" (")[0]  # the unit in brackets is of numbers
-        return self.parameter.of_percent if self.values[0].endswith("%") else self.parameter.title
+            return shown.title.partition(" (")[0]
+        return shown.title_percent if self.values[0].endswith("%") else shown.title
 
 
 @dataclass(frozen=True, kw_only=True)
 class Study:
-    """One table: every combination of the values of its axes."""
+    """One table: every combination of the values of one axis or two."""
 
     axes: tuple[Axis, ...]
-    """One or two."""
 
     @property
     def name(self) -> str:
@@ -85,11 +80,9 @@ class Study:
 
 def read_axis(text: str) -> Axis:
     """Returns the axis of a text such as `points=20,100,500`. Raises UsageError for any other."""
-    name, equals, listed = text.partition("=")
-    if name not in PARAMETERS:
-        raise UsageError(f"no parameter {name!r} to vary; there are {', '.join(PARAMETERS)}")
+    name, _, listed = text.partition("=")
     values = tuple(value.strip() for value in listed.split(","))
-    if not equals or not all(values):
+    if name in PARAMETERS and not all(values):
         raise UsageError(f"--vary {text}: give values after =, with commas between them")
     for value in values:
         read_value(name, value)
@@ -99,27 +92,33 @@ def read_axis(text: str) -> Axis:
 
 
 def read_value(name: str, text: str) -> Any:
-    """Returns the parameter's value of a text. Raises UsageError for an invalid one."""
+    """Returns the value of a parameter. Raises UsageError for an invalid name or value."""
+    if name not in PARAMETERS:
+        raise UsageError(f"no parameter {name!r} to vary; there are {', '.join(PARAMETERS)}")
     try:
         return PARAMETERS[name].value(text)
     except (ValueError, UsageError) as error:
-        raise UsageError(f"--vary {name}={text}: {error}") from None
+        raise UsageError(f"{name}={text}: {error}") from None
+
+
+def values_of(cell: Cell, *, of_points: bool) -> dict[str, Any]:
+    """Returns the values of a cell by the names of fields: of the points, or all others."""
+    return {
+        name.replace("-", "_"): read_value(name, text)
+        for name, text in cell.items()
+        if name not in PARAMETERS or PARAMETERS[name].of_points == of_points
+    }
 
 
 def studies_of(axes: Sequence[Axis], *, one_by_one: bool) -> list[Study]:
     """Returns a study for each axis, or one of all of them.
-
-    Args:
-        axes: What is varied.
-        one_by_one: True for a study of each axis.
 
     Raises:
         UsageError: Without an axis, with one twice, or for a grid of more than two.
     """
     if not axes:
         raise UsageError("nothing to vary; say what with --vary, such as --vary points=20,100,500")
-    names = [axis.name for axis in axes]
-    if len(set(names)) < len(names):
+    if len({axis.name for axis in axes}) < len(axes):
         raise UsageError("a parameter comes in two --vary; give all its values in one")
     if one_by_one:
         return [Study(axes=(axis,)) for axis in axes]
@@ -131,37 +130,32 @@ def studies_of(axes: Sequence[Axis], *, one_by_one: bool) -> list[Study]:
     return [Study(axes=tuple(axes))]
 
 
-def _whole(text: str) -> int:
-    try:
-        number = int(text)
-    except ValueError:
-        raise ValueError(f"{text!r} is no whole number") from None
-    if number < 0:
-        raise ValueError(f"{number} is negative")
-    return number
-
-
-def _within(high: float) -> Callable[[str], float]:
+def _number(kind: type[int | float], most: float = math.inf) -> Callable[[str], float]:
     def value(text: str) -> float:
         try:
-            number = float(text)
+            number = kind(text)
         except ValueError:
-            raise ValueError(f"{text!r} is not a number") from None
-        if not (math.isfinite(number) and 0 <= number <= high):
-            limit = "finite" if math.isinf(high) else f"{high:g} at most"
-            raise ValueError(f"{text} is not 0 or more and {limit}")
+            whole = "whole " if kind is int else ""
+            raise ValueError(f"{text!r} is not a {whole}number") from None
+        if not 0 <= number <= most or math.isinf(number):
+            limit = "" if math.isinf(most) else f" and <= {most:g}"
+            raise ValueError(f"must be finite, >= 0{limit}, got {text}")
         return number
 
     return value
 
 
-def _one_of(names: Sequence[str]) -> Callable[[str], str]:
+def _one_of(names: Sequence[Any]) -> Callable[[str], str]:
     def value(text: str) -> str:
         if text not in names:
             raise ValueError(f"{text!r} is not one of {', '.join(names)}")
         return text
 
     return value
+
+
+def _switch(text: str) -> bool:
+    return _one_of(("on", "off"))(text) == "on"
 
 
 def _points(text: str) -> str:
@@ -176,58 +170,33 @@ def _step(text: str) -> str:
     return text
 
 
-_ANY = _within(math.inf)
-_VALUES: Mapping[str, Callable[[str], Any]] = {"int": _whole, "float": _ANY, "str": str}
+def _of_method(field: OptionField) -> Parameter:
+    """The parameter of an option of the method."""
+    kinds: Mapping[str, Callable[[str], Any]]
+    kinds = {"int": _number(int), "float": _number(float), "bool": _switch, "str": str}
+    choices = field.option.choices
+    value = kinds[field.type] if choices is None else _one_of(tuple(choices))
+    return Parameter(
+        shown=field.option.axis or Shown(title=field.name.replace("_", " ")),
+        value=_step if field.name == "lr" else value,
+    )
 
 
-def _method_parameters() -> Iterator[tuple[str, Parameter]]:
-    """Yields the options of the method that have an axis."""
-    for each in options_of(MethodOptions):
-        axis, names = each.option.axis, each.option.choices
-        if axis is None:
-            continue
-        value = _VALUES[each.type] if names is None else _one_of(tuple(names))
-        yield (
-            each.name.replace("_", "-"),
-            Parameter(
-                title=axis.title,
-                of_percent=axis.title_percent,
-                value=_step if each.name == "lr" else value,
-                log=axis.log,
-            ),
-        )
+def _of_points(title: str, value: Callable[[str], Any], **shown: Any) -> Parameter:
+    return Parameter(shown=Shown(title=title, **shown), value=value, of_points=True)
 
 
-def _seed(text: str) -> int:
-    number = _whole(text)
-    if number >= 2**63:
-        raise ValueError(f"{number} is no seed; give one below 2^63")
-    return number
-
-
+_OF_THOSE = "sparse points (% of those there are)"
 PARAMETERS: Mapping[str, Parameter] = {
-    "points": Parameter(
-        title="sparse points",
-        of_percent="sparse points (% of those there are)",
-        value=_points,
-        log=True,
-        of_points=True,
-    ),
-    "sensor": Parameter(title="sensor", value=known_sensor, of_points=True),
-    "noise": Parameter(title="noise of the points (m)", value=_ANY, of_points=True),
-    "relative-noise": Parameter(
-        title="noise of the points (fraction of depth)", value=_ANY, of_points=True
-    ),
-    "outliers": Parameter(
-        title="outliers among the points (fraction)", value=_within(1), of_points=True
-    ),
-    "jitter": Parameter(title="jitter of the points (px)", value=_ANY, of_points=True),
-    "rotation-noise": Parameter(
-        title="rotation noise of the scanner (°)", value=_within(360), of_points=True
-    ),
-    **dict(_method_parameters()),
-    "preset": Parameter(title="preset", value=_one_of(tuple(PRESETS))),
-    "model": Parameter(title="network", value=str),
-    "seed": Parameter(title="seed of the points", value=_seed),
+    "points": _of_points("sparse points", _points, title_percent=_OF_THOSE, log=True),
+    "sensor": _of_points("sensor", read_sampling),
+    "noise": _of_points("noise of the points (m)", _number(float)),
+    "relative-noise": _of_points("noise of the points (fraction of depth)", _number(float)),
+    "outliers": _of_points("outliers among the points (fraction)", _number(float, 1)),
+    "jitter": _of_points("jitter of the points (px)", _number(float)),
+    "rotation-noise": _of_points("rotation noise of the scanner (°)", _number(float, 360)),
+    **{each.name.replace("_", "-"): _of_method(each) for each in options_of(MethodOptions)},
+    "model": Parameter(shown=Shown(title="network"), value=str),
+    "seed": Parameter(shown=Shown(title="seed of the points"), value=_number(int, LARGEST_SEED)),
 }
 """All parameters that can be varied, in the order of the help."""

@@ -6,23 +6,22 @@ import hashlib
 import json
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 from typing import Any
 
 from pnpdepth_cli.core.refine import RefineSettings
-from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.io.dataset.frame import Frame
 from pnpdepth_cli.io.record import plain
+from pnpdepth_cli.io.remote.address import RemotePath
+from pnpdepth_cli.io.remote.store import status_of
 from pnpdepth_cli.models.definition import ModelDefinition
 from pnpdepth_cli.pipeline.batch.frames import Task
-from pnpdepth_cli.pipeline.batch.settings import settings_of
+from pnpdepth_cli.pipeline.batch.settings import model_identity, settings_of
 from pnpdepth_cli.pipeline.refinement.method import with_preset
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest
 from pnpdepth_cli.pipeline.refinement.resolve import resolve_layer, resolve_settings
-from pnpdepth_cli.pipeline.sweep.axes import PARAMETERS, Cell, read_value
-from pnpdepth_cli.pipeline.sweep.points import Sampling, read_sensor_text
-
-_NOT_OF_UPDATE = ("model", "seed")
-"""Parameters that neither the update nor the points have."""
+from pnpdepth_cli.pipeline.sweep.axes import Cell, values_of
+from pnpdepth_cli.pipeline.sweep.points import OWN, Sampling
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,11 +29,9 @@ class Method:
     """A refinement and the propagation of its residuals."""
 
     layer: str
-    """Where the network is cut."""
     settings: RefineSettings
-    """Of the refinement; `iterations` is 0 unless the schedule of the step depends on it."""
+    """`iterations` is 0 unless the schedule of the step depends on it."""
     propagate: str = "none"
-    """How the residuals at the points are propagated."""
 
     def record(self) -> dict[str, Any]:
         """Returns all that decides the depth after a number of updates."""
@@ -42,161 +39,112 @@ class Method:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Setup:
-    """What one cell is: the points, the method, and the number of updates."""
-
-    sampling: Sampling
-    """Where the points come from."""
-    method: Method
-    """How they refine the depth."""
-    iterations: int
-    """Number of updates."""
-    seeds: tuple[int, ...]
-    """Of the draws of the points."""
-
-
-RunId = tuple[str, int, Sampling, "Method | None"]
-"""(frame's name, seed, points, method); unique in a sweep."""
-
-
-@dataclass(frozen=True, kw_only=True)
 class Run:
-    """One computation for one frame."""
+    """One computation for one frame, scored after some numbers of updates."""
 
     task: Task
-    """The frame's files and settings."""
     frame: Frame
-    """The frame."""
     seed: int
-    """Of the drawing of points."""
     sampling: Sampling
-    """Where the points come from."""
     method: Method | None
     """None interpolates the points linearly."""
     iterations: tuple[int, ...]
-    """Numbers of updates after which the depth is scored."""
     key: str
     """Digest of all that decides the result."""
 
-    @property
-    def id(self) -> RunId:
-        """What distinguishes the run from the others of its sweep."""
-        return self.frame.name, self.seed, self.sampling, self.method
+
+Runs = dict[tuple[str, int, Sampling, Method | None], Run]
+"""By the frame's name, the seed, the points and the method."""
 
 
+@dataclass(frozen=True, kw_only=True)
 class Plan:
-    """The runs that the cells of one network need, the same for every frame."""
+    """How the cells of one network are computed."""
 
-    def __init__(
-        self,
-        cells: Sequence[Cell],
-        definition: ModelDefinition,
-        base: RefineRequest,
-        sampling: Sampling,
-        seeds: int,
-        model: dict[str, Any],
-    ) -> None:
-        self._definition, self._base, self._sampling = definition, base, sampling
-        self._seeds, self._model = range(base.hold_out.seed, base.hold_out.seed + seeds), model
-        self._wanted: dict[tuple[Sampling, int], dict[Method, set[int]]] = {}
-        for cell in cells:
-            setup = self.setup(cell)
-            for seed in setup.seeds:
-                methods = self._wanted.setdefault((setup.sampling, seed), {})
-                methods.setdefault(setup.method, set()).add(setup.iterations)
+    definition: ModelDefinition
+    base: RefineRequest
+    """How a frame is refined where nothing is varied."""
+    sampling: Sampling
+    """The points where nothing is varied."""
+    seeds: int
+    """Number of draws of the points."""
 
-    @property
-    def layers(self) -> list[str]:
-        """The layers of all methods, each once."""
-        methods = (method for methods in self._wanted.values() for method in methods)
-        return list(dict.fromkeys(method.layer for method in methods))
+    def method(self, cell: Cell) -> tuple[Method, int]:
+        """Returns the method of a cell and the number of updates.
 
-    def setup(self, cell: Cell) -> Setup:
-        """Returns what the cell is. Raises UsageError if its parameters contradict each other."""
-        of_update = {
-            name.replace("-", "_"): read_value(name, text)
-            for name, text in cell.items()
-            if not PARAMETERS[name].of_points and name not in _NOT_OF_UPDATE
-        }
-        method = with_preset(replace(self._base.method, **of_update))
-        settings = resolve_settings(self._definition, method)
+        Raises:
+            UsageError: If parameters contradict each other.
+        """
+        varied = values_of(cell, of_points=False)
+        varied = {name: value for name, value in varied.items() if name not in ("model", "seed")}
+        options = with_preset(replace(self.base.method, **varied))
+        settings = resolve_settings(self.definition, options)
         settings = replace(settings, lr=_one_spelling(settings.lr))
         iterations = settings.iterations
         if settings.schedule == "constant":  # more updates then begin as fewer do
             settings = replace(settings, iterations=0)
-        sampling = sampling_of(cell, self._sampling)
-        seeds = tuple(self._seeds)
-        if "seed" in cell:
-            seeds = (read_value("seed", cell["seed"]),)
-        return Setup(
-            sampling=sampling,
-            seeds=seeds if sampling.is_random else seeds[:1],
-            method=Method(
-                layer=resolve_layer(self._definition, method.layer),
-                settings=settings,
-                propagate=method.propagate or "none",
-            ),
-            iterations=iterations,
-        )
+        layer, kind = resolve_layer(self.definition, options.layer), options.propagate or "none"
+        return Method(layer=layer, settings=settings, propagate=kind), iterations
 
-    def runs(self, task: Task, frame: Frame) -> Iterator[Run]:
-        """Yields the runs of one frame; those with the same points follow each other."""
-        read = settings_of(task.request, self._model, "files", "network")
-        del read["sample"]  # `sampling` says it
-        for (sampling, seed), methods in self._wanted.items():
-            none: set[int] = set()
-            for method, wanted in ((None, none), *methods.items()):
-                yield Run(
-                    task=task,
-                    frame=frame,
-                    seed=seed,
-                    sampling=sampling,
-                    method=method,
-                    iterations=tuple(sorted(wanted)),
-                    key=run_key(frame.name, seed, sampling, method, read),
-                )
+    def draws(self, cell: Cell) -> tuple[Sampling, Sequence[int]]:
+        """Returns where a cell's points come from, and the seeds of their draws."""
+        sampling = self.sampling.with_values(values_of(cell, of_points=True))
+        if "seed" in cell:
+            return sampling, (int(cell["seed"]),)
+        own = self.base.hold_out.seed
+        return sampling, range(own, own + (self.seeds if sampling.is_random else 1))
+
+    def runs(self, cells: Sequence[Cell], tasks: Sequence[tuple[Task, Frame]]) -> Runs:
+        """Returns the runs of the cells by frame; those with the same points follow each other."""
+        model, runs, states = model_identity(self.base), Runs(), dict[Path, Any]()
+        wanted: dict[tuple[Sampling, int], dict[Method | None, set[int]]] = {}
+        for cell in cells:
+            (sampling, seeds), (method, iterations) = self.draws(cell), self.method(cell)
+            for seed in seeds:
+                methods = wanted.setdefault((sampling, seed), {None: set()})
+                methods.setdefault(method, set()).add(iterations)
+        for task, frame in tasks:
+            read = settings_of(task.request, model, "files", "network") | {"frame": frame.name}
+            del read["sample"]  # `sampling` says it
+            for (sampling, seed), methods in wanted.items():
+                paths = dict(_files(task, frame, sampling))
+                states |= {path: _state(path) for path in paths.values() if path not in states}
+                files = {name: states[path] for name, path in paths.items()}
+                drawn = {"seed": seed, "sampling": sampling.record(), "files": files}
+                for each, numbers in methods.items():
+                    runs[frame.name, seed, sampling, each] = Run(
+                        task=task, frame=frame, seed=seed, sampling=sampling, method=each,
+                        iterations=tuple(sorted(numbers)),
+                        key=_digest({**read, **drawn, "method": each and each.record()}),
+                    )  # fmt: skip
+        return runs
+
+
+def _digest(identity: dict[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(plain(identity), sort_keys=True).encode()).hexdigest()
+
+
+def _files(task: Task, frame: Frame, sampling: Sampling) -> Iterator[tuple[str, Path]]:
+    """The files that decide the result with these points."""
+    own = sampling.sensor == OWN
+    yield from ((n, path) for n, path in task.inputs.items() if own or n in ("image", "gt"))
+    if sampling.lidar is not None and frame.calib is not None:
+        yield "calib", frame.calib
+
+
+def _state(path: Path) -> tuple[int, int | str] | None:
+    """What changes with a file's content: size and time, or the version that a store states."""
+    if isinstance(path, RemotePath):
+        stored = status_of(path)
+        return None if stored is None else (stored.size, stored.version)
+    try:
+        status = path.stat()
+    except OSError:  # the run will say so
+        return None
+    return status.st_size, status.st_mtime_ns
 
 
 def _one_spelling(lr: float | str) -> float | str:
     """The step in one spelling, 0.01 for `1e-2`, so that equal steps compare equal."""
     number = float(str(lr).strip().removesuffix("%"))
     return f"{number!r}%" if str(lr).strip().endswith("%") else number
-
-
-def sampling_of(cell: Cell, base: Sampling) -> Sampling:
-    """Returns where the cell's points come from. Raises UsageError for a contradiction."""
-    varied = {
-        name.replace("-", "_"): read_value(name, text)
-        for name, text in cell.items()
-        if PARAMETERS[name].of_points
-    }
-    if "sensor" in varied:
-        sensor, points = read_sensor_text(varied["sensor"])
-        if points is not None and "points" in varied:
-            raise UsageError(
-                f"sensor {varied['sensor']!r} says how many points; leave that out or do not vary"
-                " the points"
-            )
-        varied["sensor"] = sensor
-        if points is not None:
-            varied["points"] = points
-    sampling = replace(base, **varied)
-    if not sampling.is_pattern and "points" not in varied and sampling.sensor != base.sensor:
-        sampling = replace(sampling, points=None)  # the number in --sample is of its own pattern
-    if sampling.is_pattern:
-        sampling.pattern()
-    return sampling
-
-
-def run_key(
-    name: str, seed: int, sampling: Sampling, method: Method | None, read: dict[str, Any]
-) -> str:
-    """Returns a digest, equal for runs whose results would be equal."""
-    identity = {
-        "frame": name,
-        "seed": seed,
-        "sampling": sampling.record(),
-        "method": None if method is None else method.record(),
-        "read": read,
-    }
-    return hashlib.sha256(json.dumps(plain(identity), sort_keys=True).encode()).hexdigest()

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -39,7 +39,7 @@ _DETERMINISTIC = ("grid", "lines", "features", OWN)
 
 @dataclass(frozen=True, kw_only=True)
 class Sampling:
-    """Where the points of a run come from."""
+    """Where the points of a run come from; noises are standard deviations."""
 
     sensor: str = OWN
     """OWN, a pattern of `pnpdepth sample`, or a LiDAR of `pnpdepth simulate`."""
@@ -47,15 +47,14 @@ class Sampling:
     """Number or fraction (`500`, `5%`), for a pattern of the known pixels, else of the sensor's
     points; None for all of these."""
     noise: float = 0.0
-    """Standard deviation of the depth, metres."""
+    """Of the depth, metres; `relative_noise` as a fraction of it."""
     relative_noise: float = 0.0
-    """Standard deviation as a fraction of the depth."""
     outliers: float = 0.0
     """Fraction of points with a random depth."""
     jitter: float = 0.0
-    """Standard deviation of the pixel coordinates."""
+    """Of the pixel coordinates."""
     rotation_noise: float = 0.0
-    """Standard deviation of the scanner's rotation, degrees."""
+    """Of the scanner, degrees."""
 
     @property
     def is_pattern(self) -> bool:
@@ -70,11 +69,9 @@ class Sampling:
     @property
     def sample_noise(self) -> SampleNoise:
         """The noise of each point."""
+        absolute, relative = self.noise, self.relative_noise
         return SampleNoise(
-            metres=self.noise,
-            relative=self.relative_noise,
-            outliers=self.outliers,
-            jitter_px=self.jitter,
+            metres=absolute, relative=relative, outliers=self.outliers, jitter_px=self.jitter
         )
 
     @property
@@ -95,82 +92,83 @@ class Sampling:
 
     def record(self) -> dict[str, Any]:
         """Returns all that decides the points except the frame and the seed."""
-        lidar = self.lidar
-        return asdict(self) | {"sensor": self.sensor if lidar is None else asdict(lidar)}
+        return asdict(self) | ({"sensor": asdict(self.lidar)} if self.lidar else {})
 
+    def with_values(self, values: Mapping[str, Any]) -> Sampling:
+        """Returns the sampling with other values of its fields; the sensor's is a sampling.
 
-def read_sensor_text(text: str) -> tuple[str, str | None]:
-    """Returns (sensor, points) of `500`, `grid:400`, `grid` or `vlp-16`, else raises UsageError."""
-    if text in (OWN, *PATTERNS, *LIDARS) or text.lower().endswith(".toml"):
-        return text, None
-    kind, colon, points = text.rpartition(":")
-    if (colon and kind not in (OWN, *PATTERNS, *LIDARS)) or not (colon or text[:1].isdigit()):
-        raise UsageError(
-            f"no sensor {text!r}; it is {OWN}, a pattern such as grid:500 ({', '.join(PATTERNS)}),"
-            f" a TOML file, or a LiDAR ({', '.join(LIDARS)})"
-        )
-    count_or_fraction(points)
-    return kind or "uniform", points
+        A number of points is of the sensor that it was given with, unless that is varied.
+
+        Raises:
+            UsageError: If they contradict each other, or the number of points is missing.
+        """
+        varied: dict[str, Any] = dict(values)
+        sensor = varied.pop("sensor", self)
+        if sensor is not self and sensor.points is not None and "points" in varied:
+            raise UsageError(
+                f"sensor '{sensor.sensor}:{sensor.points}' says how many points; leave that out or"
+                " do not vary the points"
+            )
+        same = sensor.is_pattern or sensor.sensor == self.sensor
+        kept = sensor.points or (self.points if same else None)
+        sampling = replace(self, **{"sensor": sensor.sensor, "points": kept, **varied})
+        if sampling.is_pattern:
+            sampling.pattern()
+        return sampling
 
 
 def read_sampling(text: str) -> Sampling:
-    """Returns the sampling of `500`, `grid:400` or `vlp-16`, without noise."""
-    sensor, points = read_sensor_text(known_sensor(text))
-    return Sampling(sensor=sensor, points=points)
+    """Returns the sampling of `500`, `grid:400`, `grid` or `vlp-16`, without noise.
 
-
-def known_sensor(text: str) -> str:
-    """Returns the text if it names a sensor, else raises UsageError."""
-    sensor, points = read_sensor_text(text)
+    Raises:
+        UsageError: There is no such sensor.
+        InputError: The file that describes it cannot be read.
+    """
+    sensor, points = text, None
+    if text not in (OWN, *PATTERNS, *LIDARS) and not text.lower().endswith(".toml"):
+        kind, colon, points = text.rpartition(":")
+        if (colon and kind not in (OWN, *PATTERNS, *LIDARS)) or not (colon or text[:1].isdigit()):
+            raise UsageError(
+                f"no sensor {text!r}; it is {OWN}, a pattern such as grid:500"
+                f" ({', '.join(PATTERNS)}), a TOML file, or a LiDAR ({', '.join(LIDARS)})"
+            )
+        count_or_fraction(points)
+        sensor = kind or "uniform"
     sampling = Sampling(sensor=sensor, points=points)
     if sampling.is_pattern and points is not None:
         sampling.pattern()
-    elif sampling.lidar is not None:
-        pass  # the sensor exists and its file is readable
-    return text
+    sampling.record()  # reads the file of a sensor
+    return sampling
 
 
 def frame_points(
     sampling: Sampling, seed: int, inputs: Inputs, request: RefineRequest, frame: Frame
 ) -> SparsePoints:
-    """Returns the points of one frame.
+    """Returns the points of one frame, drawn with a seed. Raises InputError if it has none such.
 
     Args:
-        sampling: Where they come from.
-        seed: Of the drawing.
-        inputs: The frame as read, with its own points if the sensor is OWN.
-        request: How it was read.
-        frame: The frame in its data set.
-
-    Raises:
-        InputError: If the frame cannot have such points.
+        inputs: The frame as read by the request, with its own points if the sensor is OWN.
     """
+    noise, rng = sampling.sample_noise, np.random.default_rng(seed)
+    if inputs.gt is None:
+        raise InputError("there is no ground truth")
     try:
-        points = _points_of(sampling, seed, inputs, request, frame)
+        if sampling.is_pattern:
+            pattern = sampling.pattern()
+            drawn = sample_points(inputs.gt, pattern, seed, image=inputs.rgb, noise=noise)
+            return drawn.tensors()
+        if sampling.lidar is not None:
+            points = _scanned(sampling, sampling.lidar, seed, inputs, request, frame)
+        elif request.files.sparse is None:
+            raise InputError(
+                "there is no sparse depth; --sample 500 draws points from the ground truth"
+            )
+        else:
+            own = inputs.points
+            points = SparsePoints(xy=own.xy.numpy(), depth=own.depth.numpy(), size=own.size)
+        return with_noise(_thinned(points, sampling.points, rng), noise, rng).tensors()
     except UsageError as error:  # the sensor is valid, but not for this frame
         raise InputError(str(error)) from error
-    return points.tensors()
-
-
-def _points_of(
-    sampling: Sampling, seed: int, inputs: Inputs, request: RefineRequest, frame: Frame
-) -> Points:
-    ground_truth, noise = inputs.gt, sampling.sample_noise
-    if ground_truth is None:
-        raise InputError("there is no ground truth")
-    if sampling.is_pattern:
-        return sample_points(ground_truth, sampling.pattern(), seed, image=inputs.rgb, noise=noise)
-    rng = np.random.default_rng(seed)
-    if sampling.lidar is not None:
-        points = _scanned(sampling, sampling.lidar, seed, inputs, request, frame)
-    elif request.files.sparse is None:
-        raise InputError(
-            "there is no sparse depth; --sample 500 draws points from the ground truth"
-        )
-    else:
-        own = inputs.points
-        points = SparsePoints(xy=own.xy.numpy(), depth=own.depth.numpy(), size=own.size)
-    return with_noise(_thinned(points, sampling.points, rng), noise, rng)
 
 
 def _scanned(
@@ -182,16 +180,13 @@ def _scanned(
     frame: Frame,
 ) -> Points:
     """The points of a LiDAR at the camera's position, simulated in the frame's ground truth."""
+    sensor, protocol = f"sensor {sampling.sensor!r} needs", request.files.protocol
     if frame.calib is None:
-        raise InputError(
-            f"sensor {sampling.sensor!r} needs to know the camera; give --calib, or a list with a"
-            " column calib"
-        )
-    protocol = request.files.protocol
+        raise InputError(f"{sensor} the camera; give --calib, or a list with a column calib")
     if protocol.halved or protocol.crop:
         raise InputError(
-            f"sensor {sampling.sensor!r} needs the image that the calibration is of, but protocol"
-            f" {protocol.name!r} crops it; --protocol whole does not"
+            f"{sensor} the image that the calibration is of, but protocol {protocol.name!r} crops"
+            " it; --protocol whole does not"
         )
     calibration = read_calibration(frame.calib, frame.camera)
     check_size(frame.calib, calibration, inputs.size)
@@ -215,9 +210,3 @@ def _thinned(points: Points, wanted: str | None, rng: np.random.Generator) -> Po
         )
     kept = np.sort(rng.choice(available, number, replace=False))
     return replace(points, xy=points.xy[kept], depth=points.depth[kept])
-
-
-def calibration_file(sampling: Sampling, frame: Frame) -> Path | None:
-    """Returns the calibration file that these points need, if any."""
-    path = frame.calib if sampling.lidar is not None else None
-    return path if path is not None and path.is_file() else None

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Collection, Iterator, Sequence
+from dataclasses import asdict, replace
 from itertools import groupby
 from typing import Any, TypeVar
 
@@ -17,7 +17,6 @@ from pnpdepth_cli.core.metrics import score
 from pnpdepth_cli.core.refine import Refinement, RefineSettings, refine
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.errors import DeviceError, DivergedError, PnpDepthError, StorageError
-from pnpdepth_cli.frames.frame import RefinedFrame
 from pnpdepth_cli.frames.opened import SplitCache
 from pnpdepth_cli.frames.prepare import prepare
 from pnpdepth_cli.frames.refine import refine_frame
@@ -29,56 +28,35 @@ from pnpdepth_cli.pipeline.sweep.plan import Method, Run
 from pnpdepth_cli.pipeline.sweep.points import frame_points
 
 T = TypeVar("T")
+Scores = dict[str, Any]
 Result = dict[str, Any] | PnpDepthError
-"""What the journal has of a run, or why it failed."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Curve:
-    """A refinement scored after several numbers of updates."""
-
-    plain: dict[str, Any]
-    """Scores of the network alone."""
-    scores: dict[int, dict[str, Any]]
-    """By the number of updates; after a divergence of the last finite depth."""
-    step: float
-    """α as a number."""
-    times_s: dict[int, float]
-    """By the number of updates: seconds until the depth after it."""
-    updates: int
-    """Number of updates until the end or a divergence."""
-    diverged: str | None
-    """Why it diverged; None if it did not."""
+"""What the journal has of a run: `points`, `scores` by the number of updates (or "linear") and, of
+a refinement, the scores of the `plain` network and why it `diverged`. Or why the run failed."""
 
 
 def results(runs: Sequence[Run], network: Network) -> Iterator[tuple[Run, Result]]:
-    """Yields the runs with their results; each frame is read once.
+    """Yields the runs of a network with their results; each frame is read once.
 
-    Args:
-        runs: Those of a frame follow each other, and among these those with the same points.
-        network: The network of all runs.
+    The runs of a frame follow each other, and among these those with the same points.
     """
     with SplitCache(network) as cuts:
         for _, of_frame in groupby(runs, key=lambda run: run.frame.name):
-            inputs: Inputs | PnpDepthError | None = None
-            for _, of_points in groupby(of_frame, key=lambda run: (run.sampling, run.seed)):
+            same_frame = list(of_frame)
+            inputs = _tried(read_frame, same_frame[0].task)
+            for _, of_points in groupby(same_frame, key=lambda run: (run.sampling, run.seed)):
                 same_points = list(of_points)
-                if inputs is None:
-                    inputs = _result_or_error(read_frame, same_points[0].task)
-                drawn = inputs
-                if not isinstance(inputs, PnpDepthError):
-                    drawn = _result_or_error(_drawn, same_points[0], inputs)
+                drawn = _tried(_drawn, same_points[0], inputs)
                 for run in same_points:
-                    if isinstance(drawn, PnpDepthError):
-                        yield run, drawn
-                    else:
-                        yield run, _result_or_error(_result_of, run, drawn, cuts)
+                    yield run, _tried(_result_of, run, drawn, cuts)
 
 
-def _result_or_error(read: Callable[..., T], *arguments: Any) -> T | PnpDepthError:
-    """The result, or the error of a frame that cannot be used."""
+def _tried(step: Callable[..., T], *arguments: Any) -> T | PnpDepthError:
+    """The result, or the error of a frame that cannot be used: of this step, or of one before."""
+    for each in arguments:
+        if isinstance(each, PnpDepthError):
+            return each
     try:
-        return read(*arguments)
+        return step(*arguments)
     except (StorageError, DeviceError):
         raise
     except PnpDepthError as error:
@@ -92,60 +70,38 @@ def _drawn(run: Run, inputs: Inputs) -> Inputs:
 
 
 def _result_of(run: Run, inputs: Inputs, cuts: SplitCache) -> dict[str, Any]:
-    """The result of a run as the journal has it, of the frame with the run's points."""
-    done = {"state": "done", "points": len(inputs.points)}
+    """The result of a run, of the frame with its points."""
+    points, network = len(inputs.points), cuts.network
     if run.method is None:
-        return done | {"scores": {"linear": interpolated(cuts.network, inputs)}}
+        scores = _score(linear(inputs.points), network, inputs)
+        return {"points": points, "scores": {"linear": scores}}
     torch.manual_seed(run.seed)
     try:
         if run.method.settings.moves_weights:
             cuts.close()
-            curve = weights_curve(
-                cuts.network, _seeded(run.method, run.seed), inputs, run.iterations
-            )
-        else:
-            split = cuts.at(run.method.layer)
-            curve = refined_curve(cuts.network, split, run.method, inputs, run.iterations)
+            return {"points": points} | _weights_result(network, run, run.method, inputs)
+        split = cuts.at(run.method.layer)
+        return {"points": points} | refined(network, split, run.method, inputs, run.iterations)
     except BaseException:
         cuts.close()
         raise
-    return done | {
-        "plain": curve.plain,
-        "scores": {
-            str(k): scores | {"updates": min(k, curve.updates), "time_s": curve.times_s[k]}
-            for k, scores in curve.scores.items()
-        },
-        "step": curve.step,
-        "diverged": curve.diverged,
-    }
 
 
-def refined_curve(
-    network: Network,
-    split: Split,
-    method: Method,
-    inputs: Inputs,
-    wanted: Sequence[int],
-) -> Curve:
+def refined(
+    network: Network, split: Split, method: Method, inputs: Inputs, wanted: Collection[int]
+) -> dict[str, Any]:
     """Returns a refinement's scores after each wanted number of updates.
 
-    They equal those of a refinement of each number alone if the step is constant.
-
-    Args:
-        network: The network.
-        split: The network cut at the method's layer, open.
-        method: How to refine.
-        inputs: The frame with its points.
-        wanted: Numbers of updates.
+    They equal those of a refinement of each number alone if the step is constant. After a
+    divergence they are those of the last finite depth. The network is cut at the method's layer.
     """
     prepared = prepare(network, inputs.frame())
     if not len(prepared.points):
         raise prepared.no_points_error()
     settings = replace(method.settings, iterations=max(wanted))
-    reader = prepared.depth_reader(settings)
     keep = range(settings.iterations + 1) if settings.gives_best else {0, *wanted}
     diverged: DivergedError | None = None
-    clock = _Clock()
+    moments = [time.perf_counter()]
     with out_of_memory_is_a_device_error(network.device):
         try:
             result = refine(
@@ -153,106 +109,43 @@ def refined_curve(
                 prepared.arguments,
                 prepared.points,
                 settings,
-                depth_of=reader,
+                depth_of=prepared.depth_reader(settings),
                 keep_depths=keep,
-                on_iteration=clock.on_iteration,
+                on_iteration=lambda *_: moments.append(time.perf_counter()),
             )
         except DivergedError as error:
             if not isinstance(error.last_good, Refinement):
                 raise
             diverged, result = error, error.last_good
-        clock.stop()
+        moments.append(time.perf_counter())
         updates = len(result.losses) - 1
-        kept = {k: _kept(result.losses, min(k, updates), settings) for k in wanted}
-        ground_truth = ground_truth_in_view(network, inputs)
         seen = {**result.depths, result.kept: result.after}
-        depths = {k: prepared.map.depth_to_image(seen[k]).cpu() for k in {0, *kept.values()}}
-        scores = {
-            index: asdict(score(_propagated(depths[index], inputs, method.propagate), ground_truth))
-            for index in set(kept.values())
+
+        def after(k: int, propagation: str) -> Scores:
+            depth = prepared.map.depth_to_image(seen[k]).cpu()
+            if propagation != "none":
+                frame = inputs.frame()
+                depth = propagate(depth, inputs.points, frame.rgb, kind=propagation).depth
+            return _score(depth, network, inputs)
+
+        scored = {k: _kept(result.losses, min(k, updates), settings) for k in wanted}
+        by_index = {index: after(index, method.propagate) for index in set(scored.values())}
+        return {
+            "plain": after(0, "none"),
+            "scores": {
+                str(k): by_index[index]
+                | {"updates": min(k, updates), "time_s": _until(moments, min(k, updates))}
+                for k, index in sorted(scored.items())
+            },
+            "diverged": str(diverged) if diverged else None,
         }
-    return Curve(
-        plain=asdict(score(depths[0], ground_truth)),
-        scores={k: scores[index] for k, index in sorted(kept.items())},
-        times_s={k: clock.until(min(k, updates)) for k in kept},
-        step=result.step,
-        updates=updates,
-        diverged=str(diverged) if diverged else None,
-    )
 
 
-def _seeded(method: Method, seed: int) -> Method:
-    settings = method.settings
-    return replace(method, settings=replace(settings, mask=replace(settings.mask, seed=seed)))
-
-
-def weights_curve(network: Network, method: Method, inputs: Inputs, wanted: Sequence[int]) -> Curve:
-    """Returns the same where weights move; each number of updates is refined for itself."""
-    truth, frame = ground_truth_in_view(network, inputs), inputs.frame()
-    refined: dict[int, RefinedFrame] = {}
-    times: dict[int, float] = {}
-    cut = network.cut_at_points() if method.settings.masked else network.cut_at(method.layer)
-    with cut as split:
-        for k in wanted:
-            settings = replace(method.settings, iterations=k)
-            began = time.perf_counter()
-            refined[k] = refine_frame(network, split, settings, frame, propagation=method.propagate)
-            times[k] = time.perf_counter() - began
-    last = refined[max(wanted)]
-    before = _propagated(torch.from_numpy(last.before), inputs, method.propagate)
-    return Curve(
-        plain=asdict(score(torch.from_numpy(last.before), truth)),
-        scores={
-            k: asdict(score(torch.from_numpy(each.after) if k else before, truth))
-            for k, each in sorted(refined.items())
-        },
-        times_s=times,
-        step=last.refinement.step,
-        updates=len(last.refinement.losses),
-        diverged=str(last.diverged) if last.diverged else None,
-    )
-
-
-class _Clock:
-    """Times a refinement, and from it the shorter ones that it includes."""
-
-    def __init__(self) -> None:
-        self._began = time.perf_counter()
-        self._updates: list[float] = []
-        self._last_pass = 0.0
-
-    def on_iteration(self, iteration: int, loss: float) -> None:
-        """Notes that an update is done."""
-        self._updates.append(time.perf_counter() - self._began)
-
-    def stop(self) -> None:
-        """Notes that the pass after the last update is done."""
-        done = time.perf_counter() - self._began
-        self._last_pass = done - (self._updates[-1] if self._updates else 0.0)
-
-    def until(self, updates: int) -> float:
-        """Returns seconds until the depth after so many updates; after none, by extrapolation."""
-        if not self._updates:
-            return self._last_pass
-        if updates > 0:
-            return self._updates[min(updates, len(self._updates)) - 1] + self._last_pass
-        apart = (self._updates[-1] - self._updates[0]) / max(1, len(self._updates) - 1)
-        return max(0.0, self._updates[0] - apart) + self._last_pass
-
-
-def interpolated(network: Network, inputs: Inputs) -> dict[str, Any]:
-    """Returns the scores of linear interpolation on the pixels inside the network's crop."""
-    return asdict(score(linear(inputs.points), ground_truth_in_view(network, inputs)))
-
-
-def ground_truth_in_view(network: Network, inputs: Inputs) -> Tensor:
-    """Returns (H, W) the ground truth, 0 outside the network's crop."""
-    assert inputs.gt is not None
-    top, left, height, width = FrameMap.fit(network.definition.size, *inputs.size).crop
-    ground_truth = torch.zeros(inputs.size)
-    here = (slice(top, top + height), slice(left, left + width))
-    ground_truth[here] = torch.from_numpy(inputs.gt)[here]
-    return ground_truth
+def _until(moments: Sequence[float], updates: int) -> float:
+    """Seconds until the depth after so many updates, of the moments of all and of the end."""
+    began, *done, end = moments
+    last_pass = end - (done[-1] if done else began)
+    return last_pass + (done[min(updates, len(done)) - 1] - began if updates and done else 0.0)
 
 
 def _kept(losses: Sequence[float], updates: int, settings: RefineSettings) -> int:
@@ -262,8 +155,30 @@ def _kept(losses: Sequence[float], updates: int, settings: RefineSettings) -> in
     return min(range(updates + 1), key=lambda k: (losses[k], -k))
 
 
-def _propagated(depth: Tensor, inputs: Inputs, kind: str) -> Tensor:
-    """(H, W) the depth with the residuals at the points propagated."""
-    if kind == "none":
-        return depth
-    return propagate(depth, inputs.points, inputs.frame().rgb, kind=kind).depth
+def _weights_result(network: Network, run: Run, method: Method, inputs: Inputs) -> dict[str, Any]:
+    """The same where weights move; each number of updates is refined for itself."""
+    mask = replace(method.settings.mask, seed=run.seed)
+    frame, scores, plain, diverged = inputs.frame(), {}, Scores(), None
+    cut = network.cut_at_points() if method.settings.masked else network.cut_at(method.layer)
+    with cut as split:
+        for k in run.iterations:
+            settings = replace(method.settings, iterations=k, mask=mask)
+            began = time.perf_counter()
+            one = refine_frame(network, split, settings, frame, propagation=method.propagate)
+            updates = min(k, len(one.refinement.losses))
+            time_s = time.perf_counter() - began
+            plain = _score(torch.from_numpy(one.before), network, inputs)
+            scores[str(k)] = _score(torch.from_numpy(one.after), network, inputs)
+            scores[str(k)] |= {"updates": updates, "time_s": time_s}
+            diverged = str(one.diverged) if one.diverged else None
+    return {"plain": plain, "scores": scores, "diverged": diverged}
+
+
+def _score(depth: Tensor, network: Network, inputs: Inputs) -> Scores:
+    """The scores of (H, W) depth on the ground truth inside the network's crop."""
+    assert inputs.gt is not None
+    top, left, height, width = FrameMap.fit(network.definition.size, *inputs.size).crop
+    ground_truth = torch.zeros(inputs.size)
+    here = (slice(top, top + height), slice(left, left + width))
+    ground_truth[here] = torch.from_numpy(inputs.gt)[here]
+    return asdict(score(depth, ground_truth))

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,37 +14,27 @@ from pnpdepth_cli.io.atomic import make_folder, remove_leftovers
 from pnpdepth_cli.io.dataset.frame import Frame
 from pnpdepth_cli.io.lock import locked_folder
 from pnpdepth_cli.io.remote.address import RemotePath
-from pnpdepth_cli.models.definition import ModelDefinition
 from pnpdepth_cli.pipeline.batch.batch import Listener
 from pnpdepth_cli.pipeline.batch.frames import Task, find_frames, reference_frames, task_of
 from pnpdepth_cli.pipeline.batch.reading import read_frame
 from pnpdepth_cli.pipeline.batch.request import BatchRequest, FrameSelection
-from pnpdepth_cli.pipeline.batch.settings import model_identity
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs
 from pnpdepth_cli.pipeline.refinement.load_refiner import load_refiner
 from pnpdepth_cli.pipeline.refinement.method import with_preset
 from pnpdepth_cli.pipeline.refinement.refiner import Refiner
-from pnpdepth_cli.pipeline.refinement.request import RefineRequest
-from pnpdepth_cli.pipeline.refinement.resolve import resolve_layer, resolve_settings
-from pnpdepth_cli.pipeline.sweep.axes import Cell, Study
-from pnpdepth_cli.pipeline.sweep.plan import Plan, Run, sampling_of
+from pnpdepth_cli.pipeline.refinement.resolve import resolve_settings
+from pnpdepth_cli.pipeline.sweep.axes import Cell, Study, values_of
+from pnpdepth_cli.pipeline.sweep.journal import Journal
+from pnpdepth_cli.pipeline.sweep.plan import Plan, Runs
 from pnpdepth_cli.pipeline.sweep.plots import draw_study, need_matplotlib
 from pnpdepth_cli.pipeline.sweep.points import OWN, Sampling, frame_points
-from pnpdepth_cli.pipeline.sweep.running import Result, results
-from pnpdepth_cli.pipeline.sweep.state import SweepState
-from pnpdepth_cli.pipeline.sweep.summary import (
-    FrameFigures,
-    over_seeds,
-    summarise,
-    write_frames,
-    write_sweep,
-)
+from pnpdepth_cli.pipeline.sweep.running import results
+from pnpdepth_cli.pipeline.sweep.tables import row_of, summarise, write_sweep
 from pnpdepth_cli.sensors import SamplePattern
 
 Model = tuple[str, "Path | None"]
 """A network and its weights, as the user names them."""
 
-_GROUND_TRUTH_ONLY = SamplePattern(count=1)
 _RESOLVE_POINTS = 500
 """Points of the ground truth that the definition is resolved on; the paper uses 500 indoors."""
 
@@ -57,11 +48,12 @@ class SweepRequest(FrameSelection):
     sampling: Sampling | None = None
     """Where points come from unless that is varied; None for the frames' own, or else the ground
     truth."""
+    points: Cell = field(default_factory=dict)
+    """Other parameters of the points that are not varied."""
     seeds: int = 1
     """Draws of the points, with consecutive seeds."""
-    plots: bool = True
-    plot_format: str = "png"
-    """One of PLOT_FORMATS."""
+    plots: str = "png"
+    """One of PLOT_FORMATS, or "none"."""
     cost: bool = False
     """True to report the time of the refinement beside its error."""
     resamples: int = 2000
@@ -69,7 +61,7 @@ class SweepRequest(FrameSelection):
 
     def __post_init__(self) -> None:
         if self.seeds < 1:
-            raise UsageError(f"seeds {self.seeds}: the points have to be drawn once at least")
+            raise UsageError(f"--seeds must be >= 1, got {self.seeds}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,11 +69,10 @@ class _Network:
     """A network of the sweep and its runs."""
 
     refiner: Refiner
+    plan: Plan
     base: dict[str, Any]
     """The settings that are not varied."""
-    plan: Plan
-    runs: tuple[Run, ...]
-    """Of all frames."""
+    runs: Runs
 
 
 def run_sweep(request: SweepRequest, listener: Listener) -> dict[str, Any]:
@@ -93,21 +84,28 @@ def run_sweep(request: SweepRequest, listener: Listener) -> dict[str, Any]:
     Raises:
         PnpDepthError: For what concerns all frames.
     """
-    if isinstance(request.output, RemotePath):
-        raise UsageError(f"{request.output}: sweep writes to a local folder; name one with -o")
-    if request.plots:
+    output = request.output
+    if isinstance(output, RemotePath):
+        raise UsageError(f"{output}: sweep writes to a local folder; name one with -o")
+    if request.plots != "none":
         need_matplotlib()
     sampling, tasks = _frames(request, listener)
-    make_folder(request.output)
-    with locked_folder(request.output, None, lambda: _clean(request.output)):
-        state = SweepState(request.output)
-        for note in state.notes:
+    make_folder(output)
+    with locked_folder(output, None, lambda: None):
+        remove_leftovers(output)
+        journal = Journal(output)
+        for note in journal.notes:
             listener.say(note)
-        cells = [cell for study in request.studies for cell in study.cells()]
-        models = dict.fromkeys(_model_of(cell, request) for cell in cells)
-        networks = {model: _network(model, request, sampling, tasks, listener) for model in models}
+        cells: dict[Model, list[Cell]] = {}
+        for study in request.studies:
+            for cell in study.cells():
+                cells.setdefault(_model_of(cell, request), []).append(cell)
+        networks = {
+            model: _network(model, of, request, sampling, tasks, listener)
+            for model, of in cells.items()
+        }
         to_do = {
-            model: [run for run in each.runs if not state.is_done(run)]
+            model: [run for run in each.runs.values() if not journal.is_done(run)]
             for model, each in networks.items()
         }
         count = sum(len(each.runs) for each in networks.values())
@@ -118,23 +116,23 @@ def run_sweep(request: SweepRequest, listener: Listener) -> dict[str, Any]:
         listener.begin(left)
         for model, each in networks.items():
             for run, result in results(to_do[model], each.refiner.network):
-                listener.frame(_recorded(run, result, state))
-        return _write(request, sampling, networks, [task.name for task, _ in tasks], state)
-
-
-def _clean(output: Path) -> None:
-    remove_leftovers(output)
+                row = {"name": run.frame.name, "status": "done", "message": None}
+                if isinstance(result, PnpDepthError):  # it is tried again next time
+                    row |= {"status": "failed", "message": str(result)}
+                else:
+                    journal.add(run, result)
+                    if result.get("diverged"):
+                        row |= {"status": "diverged", "message": result["diverged"]}
+                listener.frame(row)
+        return _write(request, sampling, networks, [task.name for task, _ in tasks], journal)
 
 
 def _frames(request: SweepRequest, listener: Listener) -> tuple[Sampling, list[tuple[Task, Frame]]]:
-    """Where points come from unless that is varied, and the frames with ground truth.
-
-    InputError if there are none, UsageError if no points can be drawn.
-    """
+    """Where points come from unless that is varied, and the frames with ground truth."""
     batch = BatchRequest(
         source=request.source,
         output=request.output,
-        refine=request.refine.with_fields(sample=_GROUND_TRUTH_ONLY),
+        refine=request.refine.with_fields(sample=SamplePattern(count=1)),
         layout=request.layout,
         protocol=request.protocol,
         limit=request.limit,
@@ -154,22 +152,18 @@ def _frames(request: SweepRequest, listener: Listener) -> tuple[Sampling, list[t
     if sampling is None:
         own = any(frame.sparse is not None for frame in frames)
         sampling = Sampling(sensor=OWN if own else "uniform")
-        origin = (
-            "the frames' own" if own else "uniform of the ground truth, as frames have no others"
-        )
+        origin = "the frames' own" if own else "uniform of the ground truth"
         listener.say(f"points: {origin}; --sample to change")
-    samplings = [sampling_of(cell, sampling) for study in request.studies for cell in study.cells()]
+    if request.points:
+        sampling = sampling.with_values(values_of(request.points, of_points=True))
+    cells = [cell for study in request.studies for cell in study.cells()]
+    samplings = [sampling.with_values(values_of(cell, of_points=True)) for cell in cells]
     scan = request.refine.files.scan
     if any(each.lidar for each in samplings):
         # the calibration is then of the camera, not of a scan
-        frames = [
-            replace(
-                frame,
-                calib=scan.calib or frame.calib,
-                camera=frame.camera if scan.camera is None else scan.camera,
-            )
-            for frame in frames
-        ]
+        given: dict[str, Any] = {"calib": scan.calib, "camera": scan.camera}
+        given = {name: value for name, value in given.items() if value is not None}
+        frames = [replace(frame, **given) for frame in frames]
         scan = replace(scan, calib=None, camera=None)
     own_wanted = any(each.sensor == OWN for each in samplings)
     reading_own = replace(batch, refine=request.refine.with_fields(scan=scan, sample=None))
@@ -192,76 +186,68 @@ def _model_of(cell: Cell, request: SweepRequest) -> Model:
 
 def _network(
     model: Model,
+    cells: Sequence[Cell],
     request: SweepRequest,
     sampling: Sampling,
     tasks: Sequence[tuple[Task, Frame]],
     listener: Listener,
 ) -> _Network:
     """The network, loaded, and the runs of its cells."""
-    spec, checkpoint = model
-    cells = [
-        cell
-        for study in request.studies
-        for cell in study.cells()
-        if _model_of(cell, request) == model
-    ]
-    refine = request.refine.with_fields(model=spec, checkpoint=checkpoint)
+    named = {"model": model[0], "checkpoint": model[1]}
+    refine = request.refine.with_fields(**named)
     tasks = [
-        (replace(task, request=task.request.with_fields(model=spec, checkpoint=checkpoint)), frame)
-        for task, frame in tasks
+        (replace(task, request=task.request.with_fields(**named)), frame) for task, frame in tasks
     ]
-    axes = [axis for study in request.studies for axis in study.axes if axis.name == "layer"]
-    layer = axes[0].values[0] if axes else refine.method.layer
-    refiner = _resolved(layer, refine, tasks, listener)
+    layer = next((cell["layer"] for cell in cells if "layer" in cell), refine.method.layer)
+    refiner = _resolved(layer, refine.hold_out.seed, tasks, listener)
     definition = refiner.network.definition
-    if layer is None:  # the default is what `refine` cuts the first frame at
+    if layer is None or definition.default_layer is None:  # where `refine` cuts the first frame
         defaults = replace(definition.defaults, layer=refiner.layer)
         definition = replace(definition, defaults=defaults)
-    base = _base(definition, refine)
+    plan = Plan(definition=definition, base=refine, sampling=sampling, seeds=request.seeds)
+    settings, method = resolve_settings(definition, with_preset(refine.method)), plan.method({})[0]
+    base = {"layer": method.layer, **asdict(settings), "propagate": method.propagate}
     listener.say(
         f"network: {definition.name}; where not varied: cut at {base['layer']},"
         f" {base['iterations']} updates of z ({base['update']}, {base['loss']}, step {base['lr']})"
     )
-    plan = Plan(cells, definition, refine, sampling, request.seeds, model_identity(refine))
-    for each in plan.layers:
+    runs = plan.runs(cells, tasks)
+    for each in dict.fromkeys(run.method.layer for run in runs.values() if run.method):
         with refiner.network.cut_at(each):
             pass  # reports an unknown layer before anything is computed
-    runs = tuple(run for task, frame in tasks for run in plan.runs(task, frame))
-    return _Network(refiner=refiner, base=base, plan=plan, runs=runs)
+    return _Network(refiner=refiner, plan=plan, base=base, runs=runs)
 
 
 def _resolved(
-    layer: str | None,
-    refine: RefineRequest,
-    tasks: Sequence[tuple[Task, Frame]],
-    listener: Listener,
+    layer: str | None, seed: int, tasks: Sequence[tuple[Task, Frame]], listener: Listener
 ) -> Refiner:
     """The network, its definition resolved on the first frame that can be read.
 
-    Args:
-        layer: A layer to cut at, as a network may have no default.
-        refine: How frames are refined.
-        tasks: The frames.
-        listener: Receives notes.
+    A layer to cut at is named, as the network may have no default.
     """
-    seed = refine.hold_out.seed
+
+    def read(task: Task, frame: Frame) -> Inputs:
+        """The frame with points of its ground truth, so as not to depend on what is varied."""
+        inputs = read_frame(task)
+        known = 0 if inputs.gt is None else int((inputs.gt > 0).sum())
+        some = Sampling(sensor="uniform", points=str(min(_RESOLVE_POINTS, known)))
+        return replace(inputs, points=frame_points(some, seed, inputs, task.request, frame))
+
+    def others(number: int) -> Iterator[Inputs]:
+        """Further frames, which decide the input range as well; errors are reported later."""
+        for other in reference_frames(tasks, number):
+            with contextlib.suppress(PnpDepthError):
+                yield read(*other)
+
     errors = []
     for number, (task, frame) in enumerate(tasks):
         try:
-            inputs = _with_points_of_truth(task, frame, seed)
+            inputs = read(task, frame)
         except InputError as error:
             errors.append(error)
             continue
-
-        def others(number: int = number) -> list[Inputs]:
-            """Further frames, which decide the input range as well."""
-            read = []
-            for other in reference_frames(tasks, number):
-                with contextlib.suppress(PnpDepthError):  # it is read again, which reports this
-                    read.append(_with_points_of_truth(*other, seed))
-            return read
-
-        refiner = load_refiner(task.request.with_fields(layer=layer), inputs, others)
+        further = partial(lambda first: list(others(first)), number)
+        refiner = load_refiner(task.request.with_fields(layer=layer), inputs, further)
         for note in inputs.notes:
             if task.request.files.sample is None or not note.startswith("sparse"):
                 listener.say(f"{task.name}: {note}")
@@ -271,84 +257,32 @@ def _resolved(
     raise errors[0]
 
 
-def _with_points_of_truth(task: Task, frame: Frame, seed: int) -> Inputs:
-    """The frame with points of its ground truth, so as not to depend on what is varied."""
-    inputs = read_frame(task)
-    known = 0 if inputs.gt is None else int((inputs.gt > 0).sum())
-    some = Sampling(sensor="uniform", points=str(min(_RESOLVE_POINTS, known)))
-    return replace(inputs, points=frame_points(some, seed, inputs, task.request, frame))
-
-
-def _base(definition: ModelDefinition, request: RefineRequest) -> dict[str, Any]:
-    """The settings that are not varied."""
-    method = with_preset(request.method)
-    settings = resolve_settings(definition, method)
-    layer = method.layer or definition.default_layer
-    return {
-        "layer": None if layer is None else resolve_layer(definition, layer),
-        **asdict(settings),
-        "propagate": method.propagate or "none",
-    }
-
-
-def _recorded(run: Run, result: Result, state: SweepState) -> dict[str, Any]:
-    """Records the run; returns its row for a listener."""
-    row = {"name": run.frame.name, "status": "done", "message": None}
-    if isinstance(result, PnpDepthError):
-        state.fail(run, str(result))
-        return row | {"status": "failed", "message": str(result)}
-    state.add(run, result)
-    if result.get("diverged"):
-        return row | {"status": "diverged", "message": result["diverged"]}
-    return row
-
-
 def _write(
     request: SweepRequest,
     sampling: Sampling,
     networks: Mapping[Model, _Network],
     names: Sequence[str],
-    state: SweepState,
+    journal: Journal,
 ) -> dict[str, Any]:
     """Writes the tables and plots; returns the contents of sweep.json."""
-    lines = {
-        (model, run.id): state.result(run.key)
-        for model, each in networks.items()
-        for run in each.runs
-    }
     studies: list[dict[str, Any]] = []
     rows: list[dict[str, Any]] = []
     for study in request.studies:
         cells = []
         for cell in study.cells():
-            model = _model_of(cell, request)
-            setup = networks[model].plan.setup(cell)
-            figures = [
-                FrameFigures.of(
-                    name,
-                    seed,
-                    setup.iterations,
-                    linear=lines[model, (name, seed, setup.sampling, None)],
-                    curve=lines[model, (name, seed, setup.sampling, setup.method)],
-                )
-                for name in names
-                for seed in setup.seeds
-            ]
-            summary = summarise(figures, request.resamples, cost=request.cost)
+            network = networks[_model_of(cell, request)]
+            of_cell = _rows(study, cell, network, names, journal)
+            summary = summarise(of_cell, request.resamples)
+            for each in (summary, *of_cell):
+                if not request.cost:
+                    each.pop("time_s", None)
             cells.append({"parameters": dict(cell), **summary})
-            rows += [{"study": study.name, "parameters": cell, "figures": f} for f in figures]
-        plot = f"sweep_{study.name}.{request.plot_format}" if request.plots else None
+            rows += of_cell
+        plot = None if request.plots == "none" else f"sweep_{study.name}.{request.plots}"
         if plot is not None:
             draw_study(study, cells, request.output / plot)
-        studies.append(
-            {
-                "name": study.name,
-                "parameters": {axis.name: list(axis.values) for axis in study.axes},
-                "plot": plot,
-                "cells": cells,
-                "over_seeds": over_seeds(cells),
-            }
-        )
+        values = {axis.name: list(axis.values) for axis in study.axes}
+        studies.append({"name": study.name, "parameters": values, "plot": plot, "cells": cells})
     first, *others = networks.values()
     record = {
         "command": "sweep",
@@ -361,6 +295,21 @@ def _write(
         "base": first.base | asdict(sampling),
         "studies": studies,
     }
-    write_sweep(request.output, record)
-    write_frames(request.output / "sweep_frames.csv", rows)
+    write_sweep(request.output, record, rows)
     return record
+
+
+def _rows(
+    study: Study, cell: Cell, network: _Network, names: Sequence[str], journal: Journal
+) -> list[dict[str, Any]]:
+    """A row for each frame of a cell and each draw of its points."""
+    sampling, seeds = network.plan.draws(cell)
+    (method, iterations), rows = network.plan.method(cell), []
+    for name in names:
+        for seed in seeds:
+            linear, refined = (
+                journal.result(network.runs[name, seed, sampling, each]) for each in (None, method)
+            )
+            scores = row_of(iterations, linear, refined)
+            rows.append({"study": study.name, **cell, "frame": name, "seed": seed, **scores})
+    return rows

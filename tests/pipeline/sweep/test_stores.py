@@ -44,7 +44,7 @@ def swept(root: Path, source: Path, output: Path) -> tuple[bytes, list[str]]:
     request = SweepRequest(
         source=source, output=output, refine=refinement(root),
         studies=studies_of([read_axis("iterations=0,2")], one_by_one=True),
-        sampling=read_sampling("40"), plots=False,
+        sampling=read_sampling("40"), plots="none",
     )  # fmt: skip
     run_sweep(request, listener)
     return (output / "sweep_frames.csv").read_bytes(), listener.names

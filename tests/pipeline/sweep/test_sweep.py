@@ -32,13 +32,13 @@ from pnpdepth_cli.pipeline.refinement.load_refiner import load_refiner
 from pnpdepth_cli.pipeline.refinement.refine import refine_image
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest
 from pnpdepth_cli.pipeline.sparse.options import ScanOptions
-from pnpdepth_cli.pipeline.sweep import plots as sweep_plots
 from pnpdepth_cli.pipeline.sweep.axes import PARAMETERS, read_axis, studies_of
 from pnpdepth_cli.pipeline.sweep.plan import Method
+from pnpdepth_cli.pipeline.sweep.plots import across_and_apart
 from pnpdepth_cli.pipeline.sweep.points import Sampling, frame_points, read_sampling
-from pnpdepth_cli.pipeline.sweep.running import refined_curve
-from pnpdepth_cli.pipeline.sweep.summary import FrameFigures, summarise
+from pnpdepth_cli.pipeline.sweep.running import refined
 from pnpdepth_cli.pipeline.sweep.sweep import SweepRequest, run_sweep
+from pnpdepth_cli.pipeline.sweep.tables import METHODS, SWEPT, summarise
 from pnpdepth_cli.sensors import (
     FORWARD_LEFT_UP,
     LIDARS,
@@ -72,7 +72,7 @@ def sweep(
         "output": root / "out",
         "refine": refinement(root, **(refine or {})),
         "studies": studies_of([read_axis(text) for text in vary], one_by_one=one_by_one),
-        "plots": False,
+        "plots": "none",
         "resamples": 50,
     }
     return run_sweep(SweepRequest(**fields | changes), listener or RecordingListener())
@@ -125,11 +125,11 @@ def test_one_run_scores_every_number_of_updates_as_a_refinement_of_that_number_a
     refiner = load_refiner(request, inputs)
     with Split(refiner.network.module, refiner.layer) as split:
         method = Method(layer=refiner.layer, settings=refiner.settings)
-        curve = refined_curve(refiner.network, split, method, inputs, (0, 1, 3, 8))
-    assert curve.plain == curve.scores[0]
-    assert curve.scores == {
-        k: alone(root, lr=lr, keep_best=keep_best, iterations=k)["after"] for k in (0, 1, 3, 8)
-    }
+        result = refined(refiner.network, split, method, inputs, (0, 1, 3, 8))
+    for k in (0, 1, 3, 8):
+        wanted = alone(root, lr=lr, keep_best=keep_best, iterations=k)["after"]
+        assert result["scores"][str(k)].items() >= wanted.items()
+    assert result["scores"]["0"].items() >= result["plain"].items()
 
 
 def test_what_is_propagated_afterwards_is_scored_so_and_the_plain_network_is_not(
@@ -249,10 +249,10 @@ def test_a_refinement_that_diverges_counts_with_its_last_good_depth(root: Path) 
 def test_the_same_command_again_computes_nothing_and_writes_the_same(root: Path) -> None:
     names = ("sweep.csv", "sweep.json", "sweep_frames.csv", "sweep_points_iterations.png")
     vary = ("points=20,60", "iterations=0,2")
-    sweep(root, *vary, seeds=2, plots=True)
+    sweep(root, *vary, seeds=2, plots="png")
     before = [(root / "out" / name).read_bytes() for name in names]
     listener = RecordingListener()
-    sweep(root, *vary, seeds=2, plots=True, listener=listener)
+    sweep(root, *vary, seeds=2, plots="png", listener=listener)
     assert listener.to_do == 0
     assert listener.rows == []
     assert [(root / "out" / name).read_bytes() for name in names] == before
@@ -370,9 +370,9 @@ def test_seeds_draw_other_points_and_only_where_something_is_random(root: Path) 
     sweep(root, "sensor=own,grid:40,uniform:40", seeds=3, refine={"seed": 5})
     seeds: dict[str, list[int]] = {}
     for line in journal(root / "out"):
-        if line["frame"] == "a" and line["method"] is None:
-            seeds.setdefault(line["sampling"]["sensor"], []).append(line["seed"])
-    assert seeds == {"own": [5], "grid": [5], "uniform": [5, 6, 7]}
+        if line["frame"] == "a" and "linear" in line["scores"]:
+            seeds.setdefault(line["points"], []).append(line["seed"])
+    assert sorted(map(len, seeds.values())) == [1, 1, 3]
     rows = [e for e in lines(root / "out/sweep_frames.csv") if e["sensor"] == "uniform:40"]
     assert len({each["mae_linear"] for each in rows if each["frame"] == "a"}) == 3
 
@@ -408,19 +408,23 @@ def test_frames_without_sparse_depth_have_points_of_the_truth(root: Path, tmp_pa
 # means
 
 
-def figures(name: str, seed: int, refined: Sequence[float], plain: float = 2.0) -> FrameFigures:
-    values = np.array([[plain] * 4, [4.0] * 4, list(refined)])
-    return FrameFigures(name=name, seed=seed, values=values, points=10 * (seed + 1))
+def row(frame: str, seed: int, refined: Sequence[float], plain: float = 2.0) -> dict[str, Any]:
+    """Scores of one frame; the measures are rmse, mae, mre and δ1."""
+    scores = {
+        f"{measure.key}_{method}": value
+        for measure, after in zip(SWEPT, refined, strict=True)
+        for method, value in zip(METHODS, (plain, 4.0, after), strict=True)
+    }
+    return {"frame": frame, "seed": seed, "status": "done", "points_used": 10 * (seed + 1),
+            "time_s": 1.0 + seed, **scores}  # fmt: skip
+
+
+FAILED = {"frame": "b", "seed": 1, "status": "failed", "points_used": 0}
 
 
 def test_a_mean_is_over_frames_of_each_frames_mean_over_seeds() -> None:
-    # the measures are rmse, mae, mre and δ1
     summary = summarise(
-        [
-            figures("a", 0, [1, 1, 1, 3]),
-            figures("a", 1, [2, 1, 1, 3]),
-            figures("b", 0, [3, 1, 1, 3]),
-        ],
+        [row("a", 0, [1, 1, 1, 3]), row("a", 1, [2, 1, 1, 3]), row("b", 0, [3, 1, 1, 3])],
         resamples=200,
     )
     rmse, mae, delta1 = (summary["measures"][key] for key in ("rmse", "mae", "delta1"))
@@ -432,29 +436,28 @@ def test_a_mean_is_over_frames_of_each_frames_mean_over_seeds() -> None:
     assert delta1["gain"] == 50  # of δ1 more is better
     assert delta1["gain_over_linear"] == -25
     assert summary["points"] == (10 + 20 + 10) / 3
+    assert summary["time_s"] == (1 + 2 + 1) / 3
 
 
 def test_the_interval_of_a_cell_is_over_its_frames() -> None:
     rows = [
-        figures(name, 0, [value, 1, 1, 3])
+        row(name, 0, [value, 1, 1, 3])
         for name, value in zip("abcdef", (3, 6, 1, 5, 2, 4), strict=True)
     ]
     rmse, mae = (summarise(rows, resamples=500)["measures"][key] for key in ("rmse", "mae"))
     assert 1 < rmse["refined_low"] < rmse["refined"] == 3.5 < rmse["refined_high"]
     assert rmse["gain_low"] < rmse["gain"] < rmse["gain_high"]
     assert (mae["gain_low"], mae["gain_high"]) == pytest.approx((50, 50))
-    one_sequence = [figures(f"a_{n:03}", 0, [1, 1, 1, 3]) for n in range(3)]
-    two_sequences = one_sequence + [figures(f"b_{n:03}", 0, [1, 1, 1, 3]) for n in range(3)]
+    two_sequences = [row(f"{of}_{n:03}", 0, [1, 1, 1, 3]) for of in "ab" for n in range(3)]
     assert summarise(two_sequences, resamples=50)["measures"]["rmse"]["refined_low"] is None
 
 
 def test_one_frame_has_no_interval_and_a_frame_that_failed_once_is_left_out() -> None:
-    failed = FrameFigures(name="b", seed=1, values=None)
-    summary = summarise([figures("a", 0, [1] * 4), figures("b", 0, [9] * 4), failed], resamples=10)
+    summary = summarise([row("a", 0, [1] * 4), row("b", 0, [9] * 4), FAILED], resamples=10)
     assert (summary["frames"], summary["failed"]) == (1, 1)
     assert summary["measures"]["rmse"]["refined"] == 1
     assert summary["measures"]["rmse"]["refined_low"] is None
-    assert summarise([failed], resamples=10)["measures"] is None
+    assert summarise([FAILED], resamples=10)["measures"] is None
 
 
 # what can be wrong
@@ -512,15 +515,15 @@ BAD = [
     ("points=many", "neither a number"),
     ("points=0", "at least one point"),
     ("points=200%", "at most 100 %"),
-    ("iterations=1.5", "no whole number"),
-    ("iterations=-1", "negative"),
+    ("iterations=1.5", "not a whole number"),
+    ("iterations=-1", ">= 0, got -1"),
     ("lr=0", "not a step size"),
     ("loss=l3", "not one of l1, l2"),
     ("update=newton", "sign"),
-    ("outliers=2", "1 at most"),
-    ("noise=-1", "0 or more"),
-    ("blur=inf", "0 or more"),
-    ("noise=nan", "0 or more"),
+    ("outliers=2", "<= 1, got 2"),
+    ("noise=-1", ">= 0, got -1"),
+    ("blur=inf", "finite"),
+    ("noise=nan", "finite"),
     ("sensor=vlp-17", "no sensor 'vlp-17'"),
     ("sensor=gird:40", "no sensor 'gird:40'"),
     ("sensor=grid:x", "neither a number"),
@@ -557,11 +560,11 @@ def test_a_sensor_with_its_own_number_does_not_go_with_points(root: Path) -> Non
 
 def test_every_study_has_a_plot(root: Path) -> None:
     record = sweep(
-        root, "layer=0,1", "loss=l1,log", "points=20,50%", one_by_one=True, plots=True, seeds=2
+        root, "layer=0,1", "loss=l1,log", "points=20,50%", one_by_one=True, plots="png", seeds=2
     )
     for study in record["studies"]:
         plot = cv2.imread(str(root / "out" / study["plot"]))
-        assert plot.shape == (580, 1440, 3)
+        assert plot.shape == (580, 1640, 3)
         assert (plot < 128).mean() > 0.005
 
 
@@ -579,8 +582,8 @@ def test_numbers_are_on_the_x_axis_and_more_values_before_fewer(
     first: str, second: str, along: str
 ) -> None:
     axes = read_axis(first), read_axis(second)
-    assert sweep_plots._across(*axes)[0].name == along
-    assert sweep_plots._across(*axes)[1].name in {axis.name for axis in axes} - {along}
+    assert across_and_apart(*axes)[0].name == along
+    assert across_and_apart(*axes)[1].name in {axis.name for axis in axes} - {along}
 
 
 def test_axes_have_units_and_numbers_only_where_all_values_are_of_one_kind() -> None:
@@ -590,16 +593,16 @@ def test_axes_have_units_and_numbers_only_where_all_values_are_of_one_kind() -> 
     assert read_axis("layer=0,0.5").title() == "layer cut at (0 first, 1 last)"
     assert read_axis("layer=encode,middle").title() == "layer cut at"
     assert read_axis("points=1%,100%").numbers() == [1, 100]
-    assert {axis.title for axis in PARAMETERS.values()} > {"sensor", "loss"}
+    assert {each.shown.title for each in PARAMETERS.values()} > {"sensor", "loss"}
 
 
 def test_without_matplotlib_an_error_names_the_extra_at_once(
     root: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "matplotlib", None)
-    monkeypatch.setattr(sweep_plots, "find_spec", lambda name: None)
+    monkeypatch.setattr("pnpdepth_cli.pipeline.sweep.plots.find_spec", lambda name: None)
     with pytest.raises(UsageError, match=r"pip install 'pnpdepth\[plot\]'"):
-        sweep(root, "iterations=0,2", plots=True)
+        sweep(root, "iterations=0,2", plots="png")
     assert not (root / "out").exists()
     assert sweep(root, "iterations=0,2")["studies"][0]["plot"] is None
 
@@ -695,7 +698,7 @@ def test_plots_can_be_vector_graphics_of_the_same_bytes(
     plot = root / "out" / f"sweep_iterations.{kind}"
     written = []
     for _ in range(2):
-        sweep(root, "iterations=0,1", plots=True, plot_format=kind, cost=True)
+        sweep(root, "iterations=0,1", plots=kind, cost=True)
         written.append(plot.read_bytes())
     assert written[0].startswith(start)
     assert written[0] == written[1]

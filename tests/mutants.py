@@ -1,0 +1,237 @@
+"""Random mutants of the package, and whether the tests notice them.
+
+    python -m tests.mutants --count 40 --seed 0 --only pnpdepth_cli/core --jobs 2
+
+One expression of a file is changed: a comparison, an arithmetic operator, a constant, `and`, a
+returned value, min, any, floor, mean and the like. In a temporary copy of the tree the test files
+that mirror the module run first, then those that import it. A test that fails with the mutant and
+passes without it kills it; so does a run without end. Prints a table by package, and each survivor
+with its place and change.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import copy
+import os
+import random
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from itertools import accumulate
+from pathlib import Path
+from queue import SimpleQueue
+from typing import NamedTuple
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGES = ("pnpdepth_cli", "model_zoo_defs")
+ALARM_S = 90.0
+"""After the limit of a mutant, its tests are ended: it hangs."""
+
+_ORDER = "Lt LtE Gt,LtE Lt Gt,Gt GtE Lt,GtE Gt Lt,FloorDiv Mult,Mod Mult,Pow Mult"
+_PAIRS = "Eq NotEq,In NotIn,Is IsNot,Add Sub,Mult Div,BitAnd BitOr,And Or"
+_CALLS = "min max,any all,floor ceil,mean median,zeros ones,argmin argmax,amin amax,sin cos"
+
+
+def _swaps(text: str, *, both: bool = True) -> dict[str, list[str]]:
+    """From `a b,c d`: b for a and, both ways, a for b."""
+    pairs = [words.split() for words in text.split(",")]
+    back = {other: [first] for first, *others in pairs for other in others} if both else {}
+    return {first: others for first, *others in pairs} | back
+
+
+_OPERATORS, _NAMES = _swaps(_ORDER, both=False) | _swaps(_PAIRS), _swaps(_CALLS)
+
+
+class Mutant(NamedTuple):
+    """A file with bytes `start` to `end` changed, and the change in words."""
+
+    file: Path
+    start: int
+    end: int
+    text: bytes
+    change: str
+
+
+def changed(node: ast.AST) -> Iterator[ast.AST]:
+    """Yields the mutations of this node alone."""
+    other = copy.copy(node)
+    match other:
+        case ast.Compare(ops=[op]) | ast.BinOp(op=op) | ast.BoolOp(op=op):
+            for name in _OPERATORS.get(type(op).__name__, ()):
+                kind = getattr(ast, name)()
+                setattr(other, *("ops", [kind]) if isinstance(other, ast.Compare) else ("op", kind))
+                yield other
+        case ast.UnaryOp(op=ast.Not() | ast.USub()):
+            yield other.operand
+        case ast.Constant(value=bool()):
+            yield ast.Constant(not other.value)
+        case ast.Constant(value=int() | float()):
+            yield ast.Constant(other.value + 1)
+            yield ast.Constant(other.value - 1)
+        case ast.Name(id=name) if name in _NAMES:
+            yield ast.Name(*_NAMES[name])
+        case ast.Attribute(attr=name) if name in _NAMES:
+            (other.attr,) = _NAMES[name]
+            yield other
+        case ast.Return(value=ast.expr()) if ast.unparse(other) != "return None":
+            yield ast.Return(ast.Constant(None))
+
+
+def places(node: ast.AST) -> Iterator[ast.AST]:
+    """Yields the nodes that run: no annotations, texts or imports for types."""
+    yield node
+    for name, value in ast.iter_fields(node):
+        if name in ("annotation", "returns", "decorator_list") or isinstance(node, ast.JoinedStr):
+            continue
+        for child in value if isinstance(value, list) else [value]:
+            typing = isinstance(child, ast.If) and "TYPE_CHECKING" in ast.dump(child.test)
+            if isinstance(child, ast.AST) and not typing:
+                yield from places(child)
+
+
+def mutants(only: str) -> list[Mutant]:
+    """Returns all mutants of the files whose path begins with `only`."""
+    found = []
+    for package in PACKAGES:
+        for path in sorted((ROOT / package).rglob("*.py")):
+            file = path.relative_to(ROOT)
+            if "training" in file.parts or not file.as_posix().startswith(only):
+                continue
+            content = path.read_bytes()
+            starts = [0, *accumulate(len(line) for line in content.splitlines(keepends=True))]
+            for node in places(ast.parse(content)):
+                for other in changed(node):
+                    assert isinstance(node, ast.expr | ast.stmt)
+                    text = ast.unparse(other)
+                    if isinstance(other, ast.BinOp | ast.BoolOp | ast.Compare):
+                        text = f"({text})"
+                    start = starts[node.lineno - 1] + node.col_offset
+                    end = starts[(node.end_lineno or 0) - 1] + (node.end_col_offset or 0)
+                    before = " ".join(content[start:end].decode().split())
+                    change = f"{file}:{node.lineno}: {before}  ->  {text}"
+                    found.append(Mutant(file, start, end, text.encode(), change))
+    return found
+
+
+def matching_tests(file: Path) -> list[str]:
+    """Returns the test files that mirror a module, then those that import it."""
+    parts = file.parts[1:-1] if file.parts[0] == "pnpdepth_cli" else file.parts[:1]
+    folder = ROOT.joinpath("tests", *parts)
+    module = ".".join(file.with_suffix("").parts).removesuffix(".__init__")
+    parent, _, last = module.rpartition(".")
+    imports = re.compile(rf"{module}\b|from {parent} import [^)\n]*\b{last}\b")
+    tests = sorted((ROOT / "tests").rglob("test_*.py"))
+    importing = [path for path in tests if imports.search(path.read_text("utf-8"))]
+    mirror = sorted(folder.glob(f"test_{file.stem}*.py"))
+    near = sorted(folder.glob("test_*.py")) or sorted((ROOT / "tests").glob("test_*.py"))
+    chosen = dict.fromkeys([*mirror, *importing]) or near
+    return [path.relative_to(ROOT).as_posix() for path in chosen]
+
+
+class Trees:
+    """Copies of the tree, one a job, in which mutants are tried."""
+
+    def __init__(self, folder: Path, arguments: argparse.Namespace) -> None:
+        self._free: SimpleQueue[Path] = SimpleQueue()
+        self._arguments, self._sound = arguments, dict[str, bool]()
+        ignored = shutil.ignore_patterns(".*", "__pycache__", "out", "dist", "build", "site")
+        for number in range(arguments.jobs):
+            shutil.copytree(ROOT, folder / str(number), ignore=ignored)
+            self._free.put(folder / str(number))
+
+    def outcome(self, mutant: Mutant) -> str:
+        """Returns `survived`, or what killed the mutant."""
+        tree, broken = self._free.get(), list[str]()
+        file, tests = tree / mutant.file, matching_tests(mutant.file)
+        original = file.read_bytes()
+        try:
+            while True:  # a test that fails without the mutant too is left out
+                file.write_bytes(original[: mutant.start] + mutant.text + original[mutant.end :])
+                failed = self._failed(tree, tests, broken)
+                if failed in ("", "time") or self._sound.get(failed):
+                    return failed or "survived"
+                file.write_bytes(original)
+                self._sound[failed] = not self._failed(tree, [failed], [])
+                if self._sound[failed]:
+                    return failed
+                broken.append(failed)
+        finally:
+            file.write_bytes(original)
+            self._free.put(tree)
+
+    def _failed(self, tree: Path, tests: list[str], without: list[str]) -> str:
+        """The first test that fails, `time` if it does not end, or an empty text."""
+        options = ["-p", "no:cacheprovider", "-p", "tests.mutants", "-x", "-q", "-rfE", "--tb=no"]
+        options += ["-m", self._arguments.marked, *(f"--deselect={name}" for name in without)]
+        data = os.environ.get("PNPDEPTH_TEST_DATA", str(ROOT.parent / "shared" / "data"))
+        limit = self._arguments.limit
+        changes = {"PYTHONPATH": str(tree), "PNPDEPTH_TEST_DATA": data}
+        changes |= {"PNPDEPTH_MUTANT_LIMIT": str(limit), "PYTHONDONTWRITEBYTECODE": "1"}
+        command = [sys.executable, "-m", "pytest", *options, *tests]
+        how = {"capture_output": True, "text": True, "stdin": subprocess.DEVNULL}
+        try:
+            done = subprocess.run(  # type: ignore[call-overload]
+                command, cwd=tree, env=os.environ | changes, timeout=limit + ALARM_S, **how
+            )
+        except subprocess.TimeoutExpired:
+            return "time"
+        if done.returncode in (0, 5):  # 5: no test is left
+            return ""
+        named = re.search(r"^(?:FAILED|ERROR) (.+?)(?: - .*)?$", done.stdout, re.MULTILINE)
+        return named[1] if named else tests[0]
+
+
+_STARTED = time.monotonic()
+
+
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Skips the tests that begin after the limit, where pytest has this file as its plugin."""
+    limit = float(os.environ.get("PNPDEPTH_MUTANT_LIMIT", "inf"))
+    if time.monotonic() - _STARTED > limit:
+        pytest.skip("no time left for this mutant")
+
+
+def main() -> None:
+    """Tries random mutants, and prints a table by package and the survivors."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    for name, default, text in (
+        ("--count", 40, "number of mutants"),
+        ("--seed", 0, "of the choice of mutants"),
+        ("--only", "", "a file or folder, from the root of the tree"),
+        ("--jobs", 1, "mutants at once"),
+        ("--limit", 120.0, "seconds of tests for a mutant"),
+        ("--marked", "not shared_data", "pytest's -m"),
+    ):
+        parser.add_argument(name, type=type(default), default=default, help=text)
+    arguments = parser.parse_args()
+    everything = mutants(arguments.only)
+    chosen = random.Random(arguments.seed).sample(everything, min(arguments.count, len(everything)))
+    tried, killed, lines = Counter[str](), Counter[str](), []
+    with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(arguments.jobs) as pool:
+        trees = Trees(Path(folder), arguments)
+        for mutant, outcome in zip(chosen, pool.map(trees.outcome, chosen), strict=True):
+            package = mutant.file.parts[1] if len(mutant.file.parts) > 2 else mutant.file.parts[0]
+            tried[package] += 1
+            killed[package] += outcome != "survived"
+            print(f"{outcome}: {mutant.change}", file=sys.stderr, flush=True)
+            lines += [mutant.change] if outcome == "survived" else []
+    print(f"seed {arguments.seed}, {len(chosen)} of {len(everything):,} mutants\n")
+    print("| package | mutants | killed | survived |\n|---|---|---|---|")
+    tried["all"], killed["all"] = tried.total(), killed.total()
+    for name, count in tried.items():
+        print(f"| {name} | {count} | {killed[name]} | {count - killed[name]} |")
+    print("\n" + "\n".join(lines))
+
+
+if __name__ == "__main__":
+    main()
