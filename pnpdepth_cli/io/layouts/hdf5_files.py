@@ -1,8 +1,4 @@
-"""Data sets with arrays in HDF5 and MATLAB files.
-
-`hypersim`: ai_*/images/scene_cam_*_final_preview/ and scene_cam_*_geometry_hdf5/. The images are
-the tone-mapped previews. depth_meters is the distance from the camera's centre; z is computed with
-the focal length of a field of view of 60 degrees. The cameras of some scenes differ slightly.
+"""NYU Depth v2 in HDF5 and MATLAB files.
 
 `nyu-h5`: one .h5 file a frame, as Ma et al. distribute NYU Depth v2 and KITTI odometry. Files as
 wide as KITTI's hold the projected scan as depth, and are cropped as the paper crops KITTI.
@@ -22,41 +18,12 @@ from pnpdepth_cli.io.dataset.hdf5 import shape_of
 from pnpdepth_cli.io.dataset.matlab import read_matlab_array
 from pnpdepth_cli.io.dataset.protocols import PROTOCOLS, Protocol
 from pnpdepth_cli.io.file_bytes import one_line, read_bytes
-from pnpdepth_cli.io.layouts.layout import Layout, Parts, files_in, joined, merged
+from pnpdepth_cli.io.layouts.layout import Layout
 
-_FOCAL_PX = 886.81  # of Hypersim's images, 1024 pixels wide
-_PREVIEW, _GEOMETRY = "_final_preview", "_geometry_hdf5"
 _WIDEST_KINECT = 1000  # pixels; NYU's frames have 640, KITTI's 1224 or more
 _LABELED = "nyu_depth_v2_labeled.mat"
 _MOST_FRAMES = 100_000
 """The official file of NYU has 1,449."""
-
-
-def _hypersim_cameras(root: Path) -> list[Path]:
-    starts = ("", "images/", "*/images/", "*/*/images/")
-    found = (p for start in starts for p in root.glob(f"{start}scene_cam_*{_PREVIEW}"))
-    return sorted(p for p in found if p.is_dir())
-
-
-def _of_hypersim_camera(previews: Path) -> Listing:
-    camera, scene = previews.name.removesuffix(_PREVIEW), previews.parents[1].name
-    folders = {"image": previews, "gt": previews.with_name(camera + _GEOMETRY)}
-
-    def make(stem: str, files: Parts) -> Frame:
-        array = Hdf5Array(path=files["gt"], name="dataset", axes=(0, 1), focal_px=_FOCAL_PX)
-        name = f"{scene}/{camera.removeprefix('scene_')}_{stem}"
-        return Frame(name=name, image=files["image"], gt=array, group=f"{scene}/{camera}")
-
-    patterns = {"image": r"(frame\.\d+)\.tonemap\.jpg", "gt": r"(frame\.\d+)\.depth_meters\.hdf5"}
-    files = {part: files_in(folder, patterns[part]) for part, folder in folders.items()}
-    return joined(folders, files, make)
-
-
-HYPERSIM = Layout(
-    matches=lambda root: bool(_hypersim_cameras(root)),
-    listing=lambda root: merged(_of_hypersim_camera(each) for each in _hypersim_cameras(root)),
-    needs=("*/images/scene_cam_*_final_preview", "*/images/scene_cam_*_geometry_hdf5"),
-)
 
 
 def _h5_files(root: Path) -> list[Path]:
@@ -117,12 +84,12 @@ def _mat_listing(root: Path) -> Listing:
 
 def _split(folder: Path, count: int) -> list[int]:
     """The numbers of the test set, sorted; empty without a file of them."""
-    text, matlab = folder / "test.txt", folder / "splits.mat"
+    text, source = folder / "test.txt", folder / "splits.mat"
+    words: Any
     if text.is_file():
-        source = text
-        words: Any = read_bytes(text).decode("utf-8", "replace").split()
-    elif matlab.is_file():
-        source, words = matlab, read_matlab_array(matlab, "testNdxs")[:_MOST_FRAMES]
+        source, words = text, read_bytes(text).decode("utf-8", "replace").split()
+    elif source.is_file():
+        words = read_matlab_array(source, "testNdxs")[:_MOST_FRAMES]
     else:
         return []
     try:
