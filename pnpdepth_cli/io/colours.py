@@ -36,10 +36,8 @@ class DepthScale:
 
     low_m: float
     """Near end, metres."""
-
     high_m: float
     """Far end, metres."""
-
     warm_is_far: bool = False
     """Whether the warm end is the far one, as for a standard deviation."""
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pnpdepth_cli.io.decoding import QUIET_PILLOW, read_tags
+from pnpdepth_cli.io.decoding import check_exif, silence
 
 _EXIF_FOLDER = 0x8769
 _FOCAL_LENGTH, _FOCAL_LENGTH_35MM = 0x920A, 0xA405
@@ -26,7 +26,6 @@ class ExifFocalLength:
 
     pixels: float
     """In pixels of the image."""
-
     source: str
     """What it was computed from, for a person."""
 
@@ -72,9 +71,8 @@ def _tags(path: Path) -> dict[int, float]:
     from PIL import Image
 
     try:
-        with QUIET_PILLOW, Image.open(path) as image:
-            if exif := image.info.get("exif"):
-                read_tags(exif.removeprefix(b"Exif\0\0") + bytes(4))  # without a next page
+        with silence(), Image.open(path) as image:
+            check_exif(image)
             folder: Mapping[int, Any] = image.getexif().get_ifd(_EXIF_FOLDER)
     except Exception:  # Pillow raises many kinds; damaged EXIF gives no focal length
         return {}

@@ -1,7 +1,6 @@
 """A white figure with titled panels and a colour bar: the frame of every PNG for people.
 
-The PNG's text says where its panels are, so that a report can show each by itself: the depth before
-refinement is in no other file.
+The PNG's text says where its panels are.
 """
 
 from __future__ import annotations
@@ -61,10 +60,7 @@ class Panel:
 def magnification(shape: tuple[int, ...], *, columns: int, legend: bool) -> float:
     """Returns the factor by which an image fits its column, a whole number if it enlarges.
 
-    Args:
-        shape: (H, W, ...) of the image.
-        columns: Columns of the figure.
-        legend: Whether the figure has a colour bar beside the columns.
+    The image is (H, W, ...); `legend` is for a colour bar beside the columns.
     """
     height, width = shape[:2]
     room = FIGURE_WIDTH - 2 * MARGIN - (columns - 1) * GAP - (_LEGEND_WIDTH if legend else 0)
@@ -82,12 +78,7 @@ def resized(pixels: NDArray[Any], factor: float, *, smooth: bool = False) -> NDA
 
 
 def hatched(pixels: Pixels, valid: NDArray[np.bool_] | None) -> Pixels:
-    """Returns an image faded and with diagonal lines where its depth is not valid.
-
-    Args:
-        pixels: (H', W', 3).
-        valid: (H, W), of any size. None: all is valid.
-    """
+    """Returns an image faded and with diagonal lines where its depth, of any size, is not valid."""
     if valid is None or valid.all():
         return pixels
     height, width = pixels.shape[:2]
@@ -107,10 +98,10 @@ def draw_discs(
     factor: float,
     order: NDArray[np.intp],
 ) -> Pixels:
-    """Returns a copy of an enlarged image with a disc at each point.
+    """Returns a copy of an image with a disc at each of N points.
 
     Args:
-        pixels: (H, W, 3), already enlarged.
+        pixels: (H, W, 3), enlarged by `factor`.
         xy: (N, 2) pixel coordinates in the original image.
         colours: (N, 3).
         factor: Of the enlargement.
@@ -128,9 +119,10 @@ def draw_discs(
     for index in order:
         centre = (int(sixteenths[index, 0]), int(sixteenths[index, 1]))
         red, green, blue = (int(level) for level in colours[index])
-        if rim:
-            _disc(canvas, centre, rim, (15, 15, 15), fraction)
-        _disc(canvas, centre, radius, (red, green, blue), fraction)
+        for size, ink in ((rim, (15, 15, 15)), (radius, (red, green, blue))):
+            if size:
+                sixteenth = round(size * (1 << fraction))
+                cv2.circle(canvas, centre, sixteenth, ink, -1, cv2.LINE_AA, fraction)
     return canvas
 
 
@@ -165,14 +157,9 @@ def depth_figure(
 def gain_figure(
     panel: Panel, bar: Pixels, ends: tuple[str, str], swatch: tuple[Ink, str] | None, footer: str
 ) -> PIL.Image.Image:
-    """Returns a figure of one panel with a colour bar, a swatch and a footer under it.
+    """Returns a figure of one panel with a colour bar, its ends, a swatch and a footer under it.
 
-    Args:
-        panel: The image.
-        bar: (H, W, 3) colours from one end to the other.
-        ends: Meaning of the two ends.
-        swatch: A colour outside the bar and its meaning; None for none.
-        footer: The last line.
+    The bar is (H, W, 3) colours from one end to the other; the swatch a colour and its meaning.
     """
     figure, draw = _lay_out([panel], 1, least_width=_GAIN_LEGEND[0], legend_height=_GAIN_LEGEND[1])
     unknown = swatch[1] if swatch is not None else None
@@ -268,13 +255,6 @@ def _labels(ticks: list[float]) -> list[tuple[float, str]]:
     smallest = min([*gaps, *ticks[:1]], default=1.0)
     decimals = max(0, -math.floor(math.log10(smallest) + 1e-9)) if smallest > 0 else 0
     return [(tick, f"{tick:,.{decimals}f}") for tick in ticks]
-
-
-def _disc(
-    canvas: Pixels, centre: tuple[int, int], radius: float, colour: Ink, fraction: int
-) -> None:
-    sixteenths = round(radius * (1 << fraction))
-    cv2.circle(canvas, centre, sixteenths, colour, -1, cv2.LINE_AA, fraction)
 
 
 def _paste(figure: PIL.Image.Image, pixels: Pixels, x: int, y: int) -> None:

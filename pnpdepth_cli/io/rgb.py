@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import FileFormatError
 from pnpdepth_cli.io.decoding import (
-    QUIET_PILLOW,
     decode_with_opencv,
     opened_image,
     orientation_of,
     raw_mode,
+    silence,
 )
 from pnpdepth_cli.io.file_bytes import read_bytes
 from pnpdepth_cli.io.formats import kind_of
@@ -28,16 +28,12 @@ class RgbImage:
 
     values: NDArray[np.float32]
     """(H, W, 3) in 0..1, sRGB-encoded."""
-
     note: str | None
     """What was assumed or changed, for a person; None if nothing was."""
 
 
 def read_rgb(path: Path) -> RgbImage:
     """Returns the image in a file; grey is repeated, alpha dropped, EXIF rotation applied.
-
-    Args:
-        path: A PNG, JPEG, TIFF, WebP or EXR file.
 
     Raises:
         InputError: The file is missing, damaged, cut short, beyond the budget, or no image.
@@ -47,6 +43,11 @@ def read_rgb(path: Path) -> RgbImage:
     if kind == "EXR":
         return _from_linear_light(path, data)
     if kind not in ("PNG", "JPEG", "TIFF", "WEBP"):
+        if data[4:8] == b"ftyp":
+            raise FileFormatError(
+                f"{path} is a HEIC or AVIF photo; save it as JPEG, such as with ImageMagick:"
+                f" magick {path.name} {path.stem}.jpg"
+            )
         raise FileFormatError(f"{path} is not an image; give a PNG, JPEG, TIFF, WebP or EXR file")
     if kind == "TIFF":
         facts = read_tiff_facts(path, data)
@@ -85,7 +86,7 @@ def upright_size(path: Path) -> tuple[int, int]:
     from PIL import Image
 
     try:
-        with QUIET_PILLOW, Image.open(path) as image:
+        with silence(), Image.open(path) as image:
             width, height = image.size
             return (width, height) if orientation_of(image) >= 5 else (height, width)
     except OSError:
@@ -136,16 +137,13 @@ def srgb_from_linear(linear: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def _colour_of(path: Path, channels: dict[str, NDArray[Any]]) -> NDArray[Any]:
-    prefixes = [name[:-1] for name in channels if name.endswith("R")]
-    full = [p for p in prefixes if all(p + letter in channels for letter in "RGB")]
-    if "" in full:
-        full = [""]
-    if len(full) == 1:
-        return np.stack([channels[full[0] + letter] for letter in "RGB"], axis=2)
+    layers = [n[:-1] for n in channels if all(n[:-1] + letter in channels for letter in "RGB")]
+    layers = [""] if "" in layers else sorted(set(layers))
+    if len(layers) == 1:
+        return np.stack([channels[layers[0] + letter] for letter in "RGB"], axis=2)
     grey = [name for name in channels if name != "A"]
-    if not full and len(grey) == 1:
+    if not layers and len(grey) == 1:
         return np.repeat(channels[grey[0]][:, :, None], 3, axis=2)
-    listing = ", ".join(channels)
     raise FileFormatError(
-        f"{path} has no single image in its channels ({listing}); export R, G and B"
+        f"{path} has no single image in its channels ({', '.join(channels)}); export R, G and B"
     )

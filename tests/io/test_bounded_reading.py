@@ -19,10 +19,11 @@ import pytest
 from pnpdepth_cli.budget import set_max_pixels
 from pnpdepth_cli.errors import FileFormatError, InputError
 from pnpdepth_cli.io.calibration import read_calibration
-from pnpdepth_cli.io.depth import read_depth, read_sparse, write_depth
+from pnpdepth_cli.io.depth import read_depth, write_depth
 from pnpdepth_cli.io.record import read_json, sha256_of
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.io.scans import read_scan
+from pnpdepth_cli.io.sparse_reading import read_sparse
 
 READERS = [read_depth, read_sparse, read_rgb, read_calibration, read_json, sha256_of]
 DEPTH = np.full((6, 8), 2.5, np.float32)

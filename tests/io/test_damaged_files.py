@@ -14,8 +14,9 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from pnpdepth_cli.errors import FileFormatError, InputError
-from pnpdepth_cli.io.depth import DEPTH_SUFFIXES, read_depth, read_sparse, write_depth
+from pnpdepth_cli.io.depth import DEPTH_SUFFIXES, read_depth, write_depth
 from pnpdepth_cli.io.rgb import read_rgb
+from pnpdepth_cli.io.sparse_reading import read_sparse
 
 DEPTH = np.random.default_rng(5).uniform(0.5, 80, (40, 53)).astype(np.float32)
 

@@ -9,7 +9,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 import pytest
-
 from pnpdepth_cli.io.quiet import SharedContext, silent_thread
 
 

@@ -22,9 +22,10 @@ from pnpdepth_cli.io.colours import (
     paint_gain,
     round_steps,
 )
-from pnpdepth_cli.io.depth import read_depth, read_sparse
+from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.io.figure import draw_discs, figure_content, magnification
 from pnpdepth_cli.io.rgb import read_rgb
+from pnpdepth_cli.io.sparse_reading import read_sparse
 from pnpdepth_cli.io.visualisation import (
     error_map,
     improvement,

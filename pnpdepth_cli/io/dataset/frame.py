@@ -19,18 +19,12 @@ class Hdf5Array:
     """An array in an HDF5 or MATLAB 7.3 file."""
 
     path: Path
-    """The file."""
-
     name: str
-    """The array's name in the file."""
-
     focal_px: float | None = None
     """For depth that is the distance from the camera's centre: the focal length, with the principal
     point in the middle, to get z. None for z itself."""
-
     axes: tuple[int, ...]
     """Order of the axes that makes the array, without its indexed axis, (H, W) or (H, W, 3)."""
-
     index: int | None = None
     """Which element of the first axis; None for the whole array."""
 
@@ -55,14 +49,10 @@ class Neighbour:
     """Another frame of the same sequence, whose points are moved into this one."""
 
     frame: Frame
-    """Its files."""
-
     motion: Pose | None
     """(3, 4) from the other camera's frame to this one's, metres. None: to be estimated."""
-
     poses: str
     """Where the motion is from, for a person."""
-
     apart: int
     """Frames between the two, at least 1."""
 
@@ -73,55 +63,36 @@ class Frame:
 
     name: str
     """Unique in its data set, and fit for a file name; slashes separate folders."""
-
     image: Source | None = None
-    """The RGB image."""
-
     sparse: Path | None = None
     """A depth file, a list of points, or a scan; None where points are sampled from `gt`."""
-
     gt: Source | None = None
-    """The ground truth depth."""
-
     calib: Path | None = None
     """The calibration, as `read_calibration` takes it."""
-
     camera: int | None = None
     """Which camera of the calibration."""
-
     calibration: Calibration | None = None
     """The calibration itself, of a data set that has one for each frame and no file of it."""
-
     sparse_scale: float | None = None
     """Codes per metre of integer sparse depth."""
-
     gt_scale: float | None = None
     """Codes per metre of integer ground truth."""
-
     protocol: Protocol = WHOLE
     """The part of the frame that is used."""
-
     pose: Pose | None = None
     """x_world = pose · (x, 1) for points in the camera's frame; of KITTI odometry camera 0's."""
-
     oxts: Path | None = None
     """The packet of KITTI's inertial system that gives the pose."""
-
     neighbours: tuple[Neighbour, ...] = ()
     """Other frames whose points are moved into this one."""
-
     window: tuple[Frame, ...] = ()
     """The frames of its window up to and with this one; empty outside of windows."""
-
     masks: tuple[Path, ...] = ()
     """Images or arrays of the ground truth's size; where one is 0, the ground truth is unknown."""
-
     gt_other_size: bool = False
     """Whether the ground truth may have another size than the image, of the same view."""
-
     sparse_other_size: bool = False
     """The same for the sparse depth."""
-
     group: str | None = None
     """The sequence it belongs to; None derives it from the name."""
 
@@ -136,8 +107,6 @@ class Unmatched:
     """A file or folder that belongs to no frame."""
 
     path: Path
-    """The file or folder."""
-
     why: str
     """The reason, as the end of a sentence that begins with the path."""
 
@@ -154,10 +123,8 @@ class Listing:
 
     frames: Sequence[Frame]
     """Complete frames, in a fixed order."""
-
     broken: tuple[Unmatched, ...] = ()
     """Files of frames that lack a part, or cannot be read."""
-
     spare: tuple[Unmatched, ...] = ()
     """Other files beside them."""
 

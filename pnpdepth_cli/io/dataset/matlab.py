@@ -28,14 +28,10 @@ _MOST_BYTES = 1 << 20
 def read_matlab_array(path: Path, name: str) -> NDArray[np.int64]:
     """Returns the values of a variable as (N,) int64, in the order of the file.
 
-    Args:
-        path: A file of MATLAB's versions 5 to 7, compressed or not.
-        name: The variable.
+    Source: MAT-File Format, MathWorks, chapter "Level 5 MAT-File Format".
 
     Raises:
-        FileFormatError: The file is damaged or of another version, or lacks the variable.
-
-    Source: MAT-File Format, MathWorks, chapter "Level 5 MAT-File Format".
+        FileFormatError: The file is damaged or not of versions 5 to 7, or lacks the variable.
     """
     data = read_bytes(path)
     order = {b"IM": "<", b"MI": ">"}.get(data[126:_HEADER_BYTES])

@@ -17,13 +17,10 @@ class Protocol:
 
     name: str
     """One of `choices.FRAME_PROTOCOLS`."""
-
     halved: bool = False
     """Every second pixel in both directions (nearest neighbour) is used."""
-
     crop: tuple[int, int] | None = None
     """(H, W) of the crop after halving; None for the whole image."""
-
     anchor: Literal["centre", "bottom"] = "centre"
     """Vertical position of the crop, which is centred horizontally."""
 

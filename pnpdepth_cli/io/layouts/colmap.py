@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pnpdepth_cli.io.colmap.model import model_files, read_model
+from pnpdepth_cli.io.colmap.reading import model_files, read_model
 from pnpdepth_cli.io.dataset.find_files import find_files
 from pnpdepth_cli.io.dataset.frame import IMAGE_SUFFIXES, Frame, Listing, Unmatched
 from pnpdepth_cli.io.layouts.layout import Layout

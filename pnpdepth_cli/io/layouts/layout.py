@@ -37,10 +37,8 @@ class Layout:
 
     matches: Callable[[Path], bool]
     """Whether a folder or file is of this layout."""
-
     listing: Callable[[Path], Listing]
     """The frames of a folder or file that matches, and what is in no frame."""
-
     needs: tuple[str, ...] = ()
     """Patterns of what the folder or one in it holds, for the message of an unknown folder."""
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from pnpdepth_cli.errors import InputError, OutputError, UsageError
-from pnpdepth_cli.io.colmap.model import model_files
+from pnpdepth_cli.io.colmap.reading import model_files
 from pnpdepth_cli.io.dataset.frame import (
     SCAN_ONLY_SUFFIXES,
     Frame,

@@ -12,11 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import InputError, SizeError, UsageError
-from pnpdepth_cli.io.dataset.masks import masked, read_mask
-from pnpdepth_cli.io.depth import DepthImage, read_sparse
-from pnpdepth_cli.io.depth_reading import depth_from_stored, known_metres, load_stored
+from pnpdepth_cli.io.dataset.reading import masked, read_mask
+from pnpdepth_cli.io.depth import DepthImage, depth_from_stored, known_metres, load_stored
 from pnpdepth_cli.io.layouts import Hdf5Array, read_frame_ground_truth
 from pnpdepth_cli.io.rgb import read_rgb
+from pnpdepth_cli.io.sparse_reading import read_sparse
 from pnpdepth_cli.pipeline.evaluation.pairing import FramePair
 from pnpdepth_cli.pipeline.evaluation.protocols import EvalProtocol
 from pnpdepth_cli.pipeline.evaluation.scaling import Fit, scaled

@@ -15,18 +15,11 @@ from pnpdepth_cli.completion.image_registration import ImageRegistration, estima
 from pnpdepth_cli.errors import InputError, NoPointsError, SizeError, UsageError
 from pnpdepth_cli.frames.frame import Frame
 from pnpdepth_cli.io.dataset.frame import SCAN_ONLY_SUFFIXES, Hdf5Array, Source
-from pnpdepth_cli.io.dataset.hdf5 import depth_of, rgb_of
-from pnpdepth_cli.io.dataset.masks import masked, moved_to
-from pnpdepth_cli.io.depth import (
-    DepthImage,
-    describe_range,
-    implausible,
-    read_depth,
-    read_sparse,
-)
-from pnpdepth_cli.io.depth_range import metres
+from pnpdepth_cli.io.dataset.reading import depth_of, masked, moved_to, rgb_of
+from pnpdepth_cli.io.depth import DepthImage, describe_range, implausible, metres, read_depth
 from pnpdepth_cli.io.fingerprint import fingerprint
 from pnpdepth_cli.io.rgb import read_rgb
+from pnpdepth_cli.io.sparse_reading import read_sparse
 from pnpdepth_cli.pipeline.refinement.frame_camera import FrameCamera, camera_of_frame
 from pnpdepth_cli.pipeline.refinement.method import PAPER
 from pnpdepth_cli.pipeline.refinement.neighbours import (

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pnpdepth_cli.core.metrics import Measure
 from pnpdepth_cli.errors import InputError, PnpDepthError
 from pnpdepth_cli.io.colours import depth_scale, grey_of, paint_error, swatches
-from pnpdepth_cli.io.dataset.hdf5 import rgb_of
+from pnpdepth_cli.io.dataset.reading import rgb_of
 from pnpdepth_cli.io.layouts import Hdf5Array
 from pnpdepth_cli.io.report import (
     Chart,

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import InputError, NoPointsError, SizeError
-from pnpdepth_cli.io.colmap.model import find_model, model_files, name_in_model, read_model
-from pnpdepth_cli.io.colmap.parts import ColmapCamera, ColmapImage, ColmapModel
+from pnpdepth_cli.io.colmap.model import ColmapCamera, ColmapImage, ColmapModel
+from pnpdepth_cli.io.colmap.reading import find_model, model_files, name_in_model, read_model
 from pnpdepth_cli.io.depth import describe_range
 from pnpdepth_cli.io.fingerprint import fingerprint
 from pnpdepth_cli.pipeline.sparse.options import METRES, MODEL_UNITS, ColmapOptions

@@ -11,7 +11,7 @@ import pytest
 
 from pnpdepth_cli.errors import FileFormatError, SizeError
 from pnpdepth_cli.io.dataset.frame import Frame
-from pnpdepth_cli.io.dataset.masks import masked, moved_to
+from pnpdepth_cli.io.dataset.reading import masked, moved_to
 from pnpdepth_cli.io.layouts import LAYOUTS, find_layout, list_frames, read_frames
 from pnpdepth_cli.pipeline.batch.frames import task_of
 from pnpdepth_cli.pipeline.batch.request import BatchRequest

@@ -345,7 +345,7 @@ def test_an_hdf5_file_that_is_damaged_or_of_another_kind_is_named(tmp_path: Path
     other = read_frames(tmp_path)[1]
     assert isinstance(other.image, Hdf5Array)
     wrong = Hdf5Array(path=other.image.path, name="infra", axes=(0, 1))
-    from pnpdepth_cli.io.dataset.hdf5 import depth_of
+    from pnpdepth_cli.io.dataset.reading import depth_of
 
     with pytest.raises(FileFormatError, match="has no array infra"):
         depth_of(wrong)
