@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import FileFormatError
-from pnpdepth_cli.io.decoding import check_tags, opened_image, silence
+from pnpdepth_cli.io.decoding import check_tags, decode_with_opencv, silence
 from pnpdepth_cli.io.file_bytes import check_pixel_count, damaged
 from pnpdepth_cli.io.formats import DepthFormat, StoredArray, WriteOptions, scale_in_text
 from pnpdepth_cli.io.formats.png import eight_bits
@@ -78,10 +78,9 @@ def _read(path: Path, data: bytes, channel: str | None) -> StoredArray:
         raise FileFormatError(
             f"{path} is a {facts.bits}-bit {facts.number} TIFF; save depth as float32 or uint16"
         )
-    with opened_image(path, data, "TIFF") as image:
-        values = np.asarray(image)  # float32, or uint16 in the file's byte order
-    if facts.number == "uint":
-        values = values.astype(np.uint16, copy=False)
+    values = decode_with_opencv(path, data, "TIFF")  # Pillow has no 64-bit floats
+    if values.ndim != 2 or values.dtype.itemsize * 8 != facts.bits:
+        raise damaged(path, "TIFF", "cannot be decoded as one channel")
     description = f"{facts.bits}-bit {'float ' if facts.number == 'float' else ''}TIFF"
     scale = scale_in_text(path, facts.description)
     return StoredArray(values=values, description=description, scale=scale)
