@@ -71,12 +71,8 @@ def check_exif(image: PIL.Image.Image) -> None:
 def opened_image(path: Path, data: bytes, kind: str) -> Iterator[PIL.Image.Image]:
     """Yields the image of a file, not yet decoded; errors inside the block become ours.
 
-    The checksums of a PNG and the size that the header claims are checked.
-
-    Args:
-        path: Named in messages.
-        data: Content of the file.
-        kind: "PNG", "JPEG", "TIFF" or "WEBP".
+    The checksums of a PNG and the size that the header claims are checked. The kind is "PNG",
+    "JPEG", "TIFF" or "WEBP".
 
     Raises:
         FileFormatError: The file is damaged or cut short, or exceeds the budget.
@@ -131,11 +127,6 @@ def decode_with_opencv(path: Path, data: bytes, kind: str) -> NDArray[Any]:
     """Returns the pixels in the file's own type, (H, W) or (H, W, C) with blue first.
 
     Pillow cuts colours of 16 bits to 8.
-
-    Args:
-        path: Named in messages.
-        data: Content of the file.
-        kind: The kind of file that messages name.
 
     Raises:
         FileFormatError: OpenCV cannot decode it.

@@ -152,13 +152,13 @@ def write_depth(
     scale: float = KITTI_SCALE,
     text: Mapping[str, str] | None = None,
 ) -> None:
-    """Write depth in the format that the suffix names; not finite or <= 0 becomes 0, unknown.
+    """Writes depth in the format that the suffix names; not finite or <= 0 becomes 0, unknown.
 
     Args:
-        path: The file to write, with a suffix of `DEPTH_SUFFIXES`.
+        path: The file, with a suffix of `DEPTH_SUFFIXES`.
         depth: (H, W) metres.
-        scale: Codes per metre of a PNG, which keeps it in the file.
-        text: Texts by key that a PNG keeps.
+        scale: Codes per metre of a PNG, which keeps it in the file, as `text`.
+        text: By key.
 
     Raises:
         OutputError: The suffix is unknown, the file cannot be written, or a depth is too large for
@@ -190,14 +190,8 @@ def describe_range(
 ) -> str:
     """Returns a line such as `1,842 points, 2.1–63.4 m (16-bit PNG ÷ 256)`.
 
-    Args:
-        depth: Metres of any shape; 0 and values that are not finite are unknown.
-        source: What was read.
-        assumed_scale: Whether the scale is assumed. The line then names the option that changes it
-            and, where KITTI's scale gives near depths only, their range if they are millimetres.
-        noun: What is counted, in the plural.
-        option: That option.
-        unit: Of the depth.
+    An assumed scale adds the option that changes it and, where KITTI's scale gives near depths
+    only, their range if they are millimetres. Unknown depth is 0 or not finite.
     """
     known = _known(depth)
     hint = f"; {option} to change" if assumed_scale else ""
@@ -216,9 +210,7 @@ def describe_range(
 def implausible(depth: NDArray[Any], scale: float | None = None) -> str | None:
     """Returns a warning if half of the known depths cannot be metres, else None.
 
-    Args:
-        depth: Metres of any shape; 0 and values that are not finite are unknown.
-        scale: Codes per metre that integers were divided by; None for a float file.
+    `scale` is that of integers, in codes per metre; None for a float file.
     """
     known = _known(depth)
     if known.size == 0:

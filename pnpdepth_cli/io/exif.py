@@ -35,11 +35,7 @@ def read_focal_length(path: Path, size: tuple[int, int]) -> ExifFocalLength | No
 
     The 35 mm equivalent is preferred. It is taken as one of equal diagonal field of view, which is
     how CIPA DCG-001 has it. Else the focal length and the resolution of the sensor are used
-    (Exif 2.32, tags 0x920A, 0xA20E, 0xA210).
-
-    Args:
-        path: The image.
-        size: (H, W) of the image as it is used, of the same field of view as the file.
+    (Exif 2.32, tags 0x920A, 0xA20E, 0xA210). The image is used at the size (H, W).
     """
     values = _tags(path)
     focal = _of_film(values, size) or _of_sensor(values, size)

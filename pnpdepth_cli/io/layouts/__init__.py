@@ -14,8 +14,8 @@ from pathlib import Path
 
 from pnpdepth_cli.choices import LAYOUTS
 from pnpdepth_cli.errors import InputError, UsageError
-from pnpdepth_cli.io.dataset.frame import Frame, Hdf5Array, Listing, Source, Unmatched
-from pnpdepth_cli.io.dataset.protocols import PROTOCOLS, Protocol, find_protocol
+from pnpdepth_cli.io.dataset.frame import Frame, Hdf5Array, Listing, Source
+from pnpdepth_cli.io.dataset.protocols import PROTOCOLS, find_protocol
 from pnpdepth_cli.io.dataset.reading import read_frame_ground_truth, read_frame_image
 from pnpdepth_cli.io.layouts import colmap, driving, hdf5_files, kitti, manifest, rows, tum
 from pnpdepth_cli.io.layouts.layout import Layout, merged
@@ -26,10 +26,7 @@ __all__ = [
     "Frame",
     "Hdf5Array",
     "Layout",
-    "Listing",
-    "Protocol",
     "Source",
-    "Unmatched",
     "find_layout",
     "find_protocol",
     "list_frames",
@@ -132,12 +129,8 @@ def _data_sets(root: Path, name: str | None) -> tuple[list[Path], str]:
         return [root], find_layout(root, name)
     except InputError as error:
         inside = sorted(root.iterdir()) if root.is_dir() else []
-        found = {}
-        for folder in inside:
-            if folder.is_dir() and not folder.name.startswith("."):
-                layout = _match(folder, name)
-                if layout is not None:
-                    found[folder] = layout
+        folders = [path for path in inside if path.is_dir() and not path.name.startswith(".")]
+        found = {path: layout for path in folders if (layout := _match(path, name)) is not None}
         layouts = sorted(set(found.values()))
         if len(layouts) > 1:
             raise InputError(
