@@ -177,7 +177,12 @@ def test_an_image_with_damaged_exif_is_read(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("content", "fact"),
-    [(b"", "is empty"), (b"hello, world", "is not an image"), (b"\x93NUMPY\x01\x00", "not an im")],
+    [
+        (b"", "is empty"),
+        (b"hello, world", "is not an image"),
+        (b"\x93NUMPY\x01\x00", "not an im"),
+        (b"\0\0\0\x18ftypheic\0\0\0\0", "is a HEIC or AVIF photo; save it as JPEG"),
+    ],
 )
 def test_what_is_no_image_is_refused(tmp_path: Path, content: bytes, fact: str) -> None:
     path = tmp_path / "a.png"
