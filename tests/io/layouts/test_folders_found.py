@@ -120,7 +120,7 @@ def test_an_unknown_folder_names_the_nearest_layout_and_what_it_lacks(
 
 
 def test_a_folder_that_is_near_no_layout_lists_what_they_need(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="layouts need: .*; pairs rgb, sparse; ") as caught:
+    with pytest.raises(InputError, match=r"layouts need: .*; pairs rgb, sparse; ") as caught:
         find_layout(tmp_path)
     assert "\n" not in str(caught.value)
     assert len(str(caught.value)) < 2000

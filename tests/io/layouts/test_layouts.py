@@ -458,7 +458,7 @@ def test_a_depth_file_is_read_with_the_scale_of_its_frame(tmp_path: Path) -> Non
 
 
 def test_a_listing_has_the_files_of_no_frame(tmp_path: Path) -> None:
-    pairs(tmp_path)
+    tree(tmp_path, TREES["pairs"][0])
     touch(tmp_path / "rgb/c.png", tmp_path / "sparse/d.png", tmp_path / "gt/e.exr")
     touch(tmp_path / "calib/f.txt", tmp_path / "rgb/.hidden.png", tmp_path / "rgb/notes.txt")
     layout, listing = list_frames(tmp_path)
@@ -480,7 +480,7 @@ def test_folders_in_pairs_go_with_folders_of_the_same_name(tmp_path: Path) -> No
 
 
 def test_two_files_of_one_frame_are_both_left_out_and_reported(tmp_path: Path) -> None:
-    pairs(tmp_path)
+    tree(tmp_path, TREES["pairs"][0])
     touch(tmp_path / "rgb/a.jpg")
     _, listing = list_frames(tmp_path)
     assert [frame.name for frame in listing.frames] == ["b"]
@@ -488,7 +488,7 @@ def test_two_files_of_one_frame_are_both_left_out_and_reported(tmp_path: Path) -
 
 
 def test_links_are_followed_but_not_in_circles(tmp_path: Path) -> None:
-    pairs(tmp_path / "real")
+    tree(tmp_path / "real", TREES["pairs"][0])
     root = tmp_path / "linked"
     root.mkdir()
     for part in ("rgb", "sparse"):
@@ -518,7 +518,7 @@ def test_a_manifest_may_name_files_with_new_lines(tmp_path: Path) -> None:
 def test_a_folder_that_may_not_be_read_is_an_input_error(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    seven_scenes(tmp_path)
+    tree(tmp_path, TREES["7scenes"][0])
 
     def locked(path: Path) -> bool:
         raise PermissionError(13, "Permission denied", str(path))
