@@ -32,8 +32,10 @@ class RgbImage:
     """What was assumed or changed, for a person; None if nothing was."""
 
 
-def read_rgb(path: Path) -> RgbImage:
+def read_rgb(path: Path, *, upright: bool = True) -> RgbImage:
     """Returns the image in a file; grey is repeated, alpha dropped, EXIF rotation applied.
+
+    Without `upright` the pixels are as they are stored, which is how COLMAP reads photos.
 
     Raises:
         InputError: The file is missing, damaged, cut short, beyond the budget, or no image.
@@ -73,12 +75,15 @@ def read_rgb(path: Path) -> RgbImage:
             image.seek(0)
             pixels = np.asarray(image if image.mode == "RGB" else image.convert("RGB"))
             values = np.divide(pixels, np.float32(255), dtype=np.float32)
-    upright = _turn_upright(values, orientation)
-    return RgbImage(values=np.ascontiguousarray(upright), note=note)
+    if upright:
+        values = _turn_upright(values, orientation)
+    elif orientation in range(2, 9):
+        note = "EXIF rotation not applied, as COLMAP reads the photo"
+    return RgbImage(values=np.ascontiguousarray(values), note=note)
 
 
-def upright_size(path: Path) -> tuple[int, int]:
-    """Returns (H, W) of the image that `read_rgb` returns; of an EXR it reads all of it.
+def sizes_of(path: Path) -> tuple[tuple[int, int], tuple[int, int]]:
+    """Returns (H, W) of the image that `read_rgb` returns, upright and as stored.
 
     Raises:
         InputError: The file is missing or no image.
@@ -88,10 +93,11 @@ def upright_size(path: Path) -> tuple[int, int]:
     try:
         with silence(), Image.open(path) as image:
             width, height = image.size
-            return (width, height) if orientation_of(image) >= 5 else (height, width)
-    except OSError:
-        shape = read_rgb(path).values.shape
-        return shape[0], shape[1]
+            stored = height, width
+            return stored[:: -1 if orientation_of(image) >= 5 else 1], stored
+    except OSError:  # an EXR, say
+        height, width, _ = read_rgb(path).values.shape
+        return (height, width), (height, width)
 
 
 def _decode_16_bit(path: Path, data: bytes, kind: str) -> NDArray[np.float32]:

@@ -16,7 +16,7 @@ from pnpdepth_cli.errors import FileFormatError, InputError, OutputError, SizeEr
 from pnpdepth_cli.io.atomic import all_or_none, make_folder
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.io.record import write_json
-from pnpdepth_cli.io.rgb import read_rgb, upright_size
+from pnpdepth_cli.io.rgb import read_rgb, sizes_of
 from pnpdepth_cli.pipeline.exports import Depth, Export, ExportFrame
 from pnpdepth_cli.pipeline.results import ResultFrame, result_frames
 
@@ -87,7 +87,7 @@ def _frame(result: ResultFrame, export: Export) -> ExportFrame:
         raise FileFormatError(
             f"{result.depth}: the record beside it is damaged; refine it again"
         ) from error
-    if upright_size(image) != (height, width):
+    if (height, width) not in sizes_of(image):
         raise SizeError(
             f"{result.depth} is not of the size of {image}; refine the whole image"
             " (--protocol whole)"

@@ -14,7 +14,8 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from pnpdepth_cli.errors import FileFormatError, InputError
-from pnpdepth_cli.io.depth import DEPTH_SUFFIXES, read_depth, write_depth
+from pnpdepth_cli.io.depth import read_depth, write_depth
+from pnpdepth_cli.io.formats import DEPTH_SUFFIXES
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.io.sparse_reading import read_sparse
 

@@ -33,7 +33,8 @@ USE_FORMAT = """
 import sys
 from pathlib import Path
 import numpy as np
-from pnpdepth_cli.io.depth import DEPTH_SUFFIXES, read_depth, write_depth
+from pnpdepth_cli.io.depth import read_depth, write_depth
+from pnpdepth_cli.io.formats import DEPTH_SUFFIXES
 from pnpdepth_cli.io.sparse_writing import SPARSE_SUFFIXES
 from pnpdepth_cli.cli.refine import refine
 

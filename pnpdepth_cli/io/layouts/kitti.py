@@ -34,7 +34,8 @@ from pnpdepth_cli.io.oxts import PACKETS
 _CAMERAS, _SCANS, _CALIBRATION = "image_0[23]", "velodyne_points/data", "calib_cam_to_cam.txt"
 _STEM = r"(.*_sync|)(?:_(?:image|velodyne_raw|groundtruth_depth)(?=_))?(.+)"
 """Names of the selection, without the kind of file in the middle."""
-_AS_PUBLISHED = {"sparse_scale": 256.0, "gt_scale": 256.0, "protocol": PROTOCOLS["kitti-depth"]}
+_SCALES = {"sparse_scale": 256.0, "gt_scale": 256.0}
+_AS_PUBLISHED: dict[str, Any] = {**_SCALES, "protocol": PROTOCOLS["kitti-depth"]}
 
 
 def _of_sequence(place: Path, files: Parts) -> Mapping[str, Any]:

@@ -14,7 +14,7 @@ import csv
 import io
 import json
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -30,7 +30,7 @@ from pnpdepth_cli.io.remote.store import local_files
 
 _PATHS = ("image", "sparse", "gt", "calib", "mask")
 _FLAGS = {"1": True, "true": True, "yes": True, "0": False, "false": False, "no": False}
-_VALUES = {
+_VALUES: dict[str, Callable[[str], Any]] = {
     "camera": int,
     "sparse_scale": float,
     "gt_scale": float,
