@@ -14,9 +14,8 @@ from typing import Any
 
 from pnpdepth_cli.errors import FileFormatError
 from pnpdepth_cli.io.dataset.frame import Frame, Hdf5Array, Listing
-from pnpdepth_cli.io.dataset.matlab import read_matlab_array
 from pnpdepth_cli.io.dataset.protocols import PROTOCOLS, Protocol
-from pnpdepth_cli.io.dataset.reading import shape_of
+from pnpdepth_cli.io.dataset.reading import read_matlab_array, shape_of
 from pnpdepth_cli.io.file_bytes import one_line, read_bytes
 from pnpdepth_cli.io.layouts.layout import Layout
 

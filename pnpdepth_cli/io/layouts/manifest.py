@@ -20,8 +20,13 @@ from pathlib import Path
 from typing import Any
 
 from pnpdepth_cli.errors import FileFormatError, UsageError
-from pnpdepth_cli.io.dataset.frame import Frame, Listing, Unmatched
-from pnpdepth_cli.io.dataset.frame_names import normalised_name, portable_name_problem
+from pnpdepth_cli.io.dataset.frame import (
+    Frame,
+    Listing,
+    Unmatched,
+    normalised_name,
+    portable_name_problem,
+)
 from pnpdepth_cli.io.dataset.protocols import find_protocol
 from pnpdepth_cli.io.file_bytes import one_line, read_bytes
 from pnpdepth_cli.io.layouts.layout import Layout

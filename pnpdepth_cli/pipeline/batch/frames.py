@@ -16,8 +16,8 @@ from pnpdepth_cli.io.dataset.frame import (
     Source,
     Unmatched,
     file_of,
+    name_problem,
 )
-from pnpdepth_cli.io.dataset.frame_names import name_problem
 from pnpdepth_cli.io.file_bytes import one_line
 from pnpdepth_cli.io.layouts import LAYOUTS, find_protocol, list_frames
 from pnpdepth_cli.io.remote.address import RemotePath
