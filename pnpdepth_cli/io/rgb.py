@@ -105,8 +105,8 @@ def sizes_of(path: Path) -> tuple[tuple[int, int], tuple[int, int]]:
     try:
         with silence(), Image.open(path) as image:
             width, height = image.size
-            stored = height, width
-            return stored[:: -1 if orientation_of(image) >= 5 else 1], stored
+            upright = (width, height) if orientation_of(image) >= 5 else (height, width)
+            return upright, (height, width)
     except OSError:  # an EXR, say
         height, width, _ = read_rgb(path).values.shape
         return (height, width), (height, width)
