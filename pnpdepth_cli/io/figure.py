@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import FileFormatError, InputError
 from pnpdepth_cli.io.atomic import atomic_path
-from pnpdepth_cli.io.colours import DepthScale, Pixels
+from pnpdepth_cli.io.colours import DepthScale, Pixels, paint_gain
 
 if TYPE_CHECKING:
     import PIL.Image
@@ -39,10 +39,9 @@ _HATCH_FADED, _HATCH_LINE = 0.45, 0.8  # fractions of white
 _INK = (32, 33, 36)
 _FAINT_INK = (95, 99, 104)
 _LINE = (200, 202, 206)
+_UNKNOWN_GAIN = (52, 52, 52)
 _FAST = 2  # zlib's level: a third of the time of its default 6, files a tenth larger
 _CONTENT_KEY = "pnpdepth"  # of the PNG text that describes the figure
-
-Ink = tuple[int, int, int]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -155,28 +154,35 @@ def depth_figure(
 
 
 def gain_figure(
-    panel: Panel, bar: Pixels, ends: tuple[str, str], swatch: tuple[Ink, str] | None, footer: str
+    panel: Panel, gain: NDArray[np.float64], amount: str, noun: str, colors: str, unknown: str
 ) -> PIL.Image.Image:
-    """Returns a figure of one panel with a colour bar, its ends, a swatch and a footer under it.
+    """Returns a figure of one map of gains with a colour bar and a footer under it.
 
-    The bar is (H, W, 3) colours from one end to the other; the swatch a colour and its meaning.
+    Args:
+        panel: The map.
+        gain: (N,) gains; the footer says how many are above and below 0.
+        amount: Gain of full colour, with its unit.
+        noun: What is counted.
+        colors: One of `choices.COLORS`.
+        unknown: Meaning of the dark pixels; "" where there are none.
     """
     figure, draw = _lay_out([panel], 1, least_width=_GAIN_LEGEND[0], legend_height=_GAIN_LEGEND[1])
-    unknown = swatch[1] if swatch is not None else None
-    figure.info[_CONTENT_KEY] |= {"ends": ends, "unknown": unknown, "footer": footer}
+    improved, worse = float((gain > 0).mean()), float((gain < 0).mean())
+    footer = f"{100 * improved:.1f} % of {gain.size:,} {noun} improved, {100 * worse:.1f} % worse"
+    ends = (f"worse by {amount} or more", f"better by {amount} or more")
+    figure.info[_CONTENT_KEY] |= {"ends": ends, "unknown": unknown or None, "footer": footer}
+    bar = np.repeat(paint_gain(np.linspace(-1, 1, 220), np.full(220, 0.88), colors)[None], 18, 0)
     font, small = _font(_FONT_SIZE), _font(_SMALL_FONT_SIZE)
-    y = figure.height - MARGIN - 56
-    x = float(MARGIN)
+    x, y = float(MARGIN), figure.height - MARGIN - 56
     draw.text((x, y), ends[0], font=small, fill=_INK, anchor="lm")
     x += draw.textlength(ends[0], font=small) + 12
     _paste(figure, bar, round(x), y - bar.shape[0] // 2)
     x += bar.shape[1] + 12
     draw.text((x, y), ends[1], font=small, fill=_INK, anchor="lm")
     x += draw.textlength(ends[1], font=small) + 2 * GAP
-    if swatch is not None:
-        colour, meaning = swatch
-        draw.rectangle((x, y - 9, x + 18, y + 9), fill=colour)
-        draw.text((x + 28, y), meaning, font=small, fill=_INK, anchor="lm")
+    if unknown:
+        draw.rectangle((x, y - 9, x + 18, y + 9), fill=_UNKNOWN_GAIN)
+        draw.text((x + 28, y), unknown, font=small, fill=_INK, anchor="lm")
     draw.text((MARGIN, y + 40), footer, font=font, fill=_INK, anchor="lm")
     return figure
 

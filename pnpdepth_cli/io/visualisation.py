@@ -301,10 +301,10 @@ def improvement(
     pixels, strongest = _painted(gain, known, None if rgb is None else grey_of(rgb), paint)
     factor = magnification(gt.shape, columns=1, legend=False)
     panel = Panel(title="Change of error", pixels=resized(pixels, factor), remark=_GAIN)
-    return _save_gain(
-        panel, gain, path, amount=f"{strongest:.3g} m", noun="pixels", colors=colors,
-        unknown=None if known.all() else "no ground truth",
-    )  # fmt: skip
+    unknown = "" if known.all() else "no ground truth"
+    figure = gain_figure(panel, gain, f"{strongest:.3g} m", "pixels", colors, unknown)
+    save_figure(figure, path)
+    return float((gain > 0).mean())
 
 
 def improvement_at_points(
@@ -354,7 +354,8 @@ def improvement_at_points(
     noun = "held-out points" if held_out else "points used"
     remark = f"at {len(gain):,} {noun}" if held_out else f"at the {len(gain):,} sparse {noun}"
     panel = Panel(title="Change of error", pixels=discs, remark=remark)
-    return _save_gain(panel, gain, path, amount=f"{strongest:.3g} {unit}", noun=noun, colors=colors)
+    save_figure(gain_figure(panel, gain, f"{strongest:.3g} {unit}", noun, colors, ""), path)
+    return float((gain > 0).mean())
 
 
 def _gain(before: Depth, after: Depth, gt: Depth) -> NDArray[np.float64]:
@@ -368,29 +369,6 @@ def _strongest(gain: NDArray[np.float64]) -> float:
     """The change in metres that has full colour."""
     changed = np.abs(gain[gain != 0])
     return float(np.percentile(changed, _STRONGEST_PERCENTILE)) if changed.size else 1.0
-
-
-def _save_gain(
-    panel: Panel,
-    gain: NDArray[np.float64],
-    path: Path,
-    *,
-    amount: str,
-    noun: str,
-    colors: str,
-    unknown: str | None = None,
-) -> float:
-    """Writes the panel with a colour bar, whose ends are `amount`, and a footer.
-
-    `unknown` is the meaning of the dark pixels. Returns the fraction with a gain above 0.
-    """
-    improved, worse = float((gain > 0).mean()), float((gain < 0).mean())
-    bar = np.repeat(paint_gain(np.linspace(-1, 1, 220), np.full(220, 0.88), colors)[None], 18, 0)
-    swatch = None if unknown is None else ((52, 52, 52), unknown)
-    footer = f"{100 * improved:.1f} % of {gain.size:,} {noun} improved, {100 * worse:.1f} % worse"
-    ends = (f"worse by {amount} or more", f"better by {amount} or more")
-    save_figure(gain_figure(panel, bar, ends, swatch, footer), path)
-    return improved
 
 
 def _bytes(image: NDArray[np.floating]) -> NDArray[np.uint8]:
