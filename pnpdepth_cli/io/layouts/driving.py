@@ -12,7 +12,7 @@ TRI Dataset Governance Policy has them. Images are those of pinhole cameras.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -25,7 +25,7 @@ from pnpdepth_cli.io.calibration import Calibration, Floats
 from pnpdepth_cli.io.dataset.frame import Frame, Listing, Unmatched
 from pnpdepth_cli.io.extrinsics import Extrinsics, inverse, pose_of_quaternion
 from pnpdepth_cli.io.file_bytes import check_pixel_count, one_line, read_bytes
-from pnpdepth_cli.io.layouts.layout import Layout
+from pnpdepth_cli.io.layouts.layout import Layout, listing_of
 
 _TABLES = ("sample_data", "calibrated_sensor", "ego_pose", "sensor", "sample", "scene")
 _LARGEST_PX = 1e9
@@ -90,14 +90,6 @@ def _frame(
     return Frame(image=image, sparse=scan, calibration=calibration, **fields)
 
 
-def _listing(found: Iterable[Frame | Unmatched]) -> Listing:
-    every = list(found)
-    return Listing(
-        frames=[each for each in every if isinstance(each, Frame)],
-        broken=tuple(each for each in every if isinstance(each, Unmatched)),
-    )
-
-
 def _version(root: Path) -> Path | None:
     """The folder of nuScenes' tables, the first of several."""
     return min((p.parent for p in root.glob("v1.0-*/sample_data.json")), default=None)
@@ -112,7 +104,7 @@ def _nuscenes(root: Path) -> Listing:
             name: {_text(row, "token"): row for row in _json(version / f"{name}.json")}
             for name in _TABLES
         }
-        listing = _listing(_of_tables(root, tables))
+        listing = listing_of(_of_tables(root, tables))
     return replace(listing, frames=sorted(listing.frames, key=lambda frame: frame.name))
 
 
@@ -174,7 +166,7 @@ def _ddad(root: Path) -> Listing:
     for path in _scenes(root):
         with _as_our_errors(path):
             found += _of_scene(path)
-    return _listing(found)
+    return listing_of(found)
 
 
 def _of_scene(path: Path) -> list[Frame | Unmatched]:

@@ -9,6 +9,9 @@ a test.txt with the numbers of its frames from 1, beside it names the test set, 
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +20,7 @@ from pnpdepth_cli.io.dataset.frame import Frame, Hdf5Array, Listing
 from pnpdepth_cli.io.dataset.protocols import PROTOCOLS, Protocol
 from pnpdepth_cli.io.dataset.reading import read_matlab_array, shape_of
 from pnpdepth_cli.io.file_bytes import one_line, read_bytes
-from pnpdepth_cli.io.layouts.layout import Layout
+from pnpdepth_cli.io.layouts.layout import Layout, Parts, row
 
 _WIDEST_KINECT = 1000  # pixels; NYU's frames have 640, KITTI's 1224 or more
 _LABELED = "nyu_depth_v2_labeled.mat"
@@ -25,38 +28,33 @@ _MOST_FRAMES = 100_000
 """The official file of NYU has 1,449."""
 
 
-def _h5_files(root: Path) -> list[Path]:
-    return sorted(p for start in ("", "*/", "*/*/") for p in root.glob(f"{start}*.h5"))
-
-
-def _h5_listing(root: Path) -> Listing:
-    """One frame per file, with rgb (3, H, W) and depth (H, W) in it."""
-    files = _h5_files(root)
-    protocol = _protocol_of(files)
-    frames = [
-        Frame(
-            name="_".join(path.relative_to(root).with_suffix("").parts),
-            image=Hdf5Array(path=path, name="rgb", axes=(1, 2, 0)),
-            gt=Hdf5Array(path=path, name="depth", axes=(0, 1)),
-            protocol=protocol,
-        )
-        for path in files
-    ]
-    return Listing(frames=frames)
-
-
-def _protocol_of(files: list[Path]) -> Protocol:
-    """The protocol for the width of the first file that can be read."""
-    for path in files:
-        try:
-            width = shape_of(path, "depth")[-1]
-        except FileFormatError:
-            continue  # it is reported when the frame is read
-        return PROTOCOLS["kitti-odometry" if width > _WIDEST_KINECT else "nyu"]
+@functools.lru_cache(maxsize=1)
+def _protocol_of(place: Path, changed_ns: int) -> Protocol:
+    """The protocol for the width of the first file that can be read; kept for the next frame."""
+    for path in sorted(place.glob("*.h5")):
+        with suppress(FileFormatError):  # it is reported when the frame is read
+            wide = shape_of(path, "depth")[-1] > _WIDEST_KINECT
+            return PROTOCOLS["kitti-odometry" if wide else "nyu"]
     return PROTOCOLS["nyu"]
 
 
-NYU_H5 = Layout(matches=lambda root: bool(_h5_files(root)), listing=_h5_listing, needs=("*.h5",))
+def _of_file(place: Path, files: Parts) -> Mapping[str, Any]:
+    """The arrays rgb (3, H, W) and depth (H, W) of a file."""
+    path = files["gt"]
+    return {
+        "image": Hdf5Array(path=path, name="rgb", axes=(1, 2, 0)),
+        "gt": Hdf5Array(path=path, name="depth", axes=(0, 1)),
+        "protocol": _protocol_of(place, place.stat().st_mtime_ns),
+    }
+
+
+NYU_H5 = row(
+    {"gt": "*.h5"},
+    below="|*/|*/*/",
+    marks=("*.h5",),
+    name=lambda root, place, stem: "_".join((*place.relative_to(root).parts, stem)),
+    more=_of_file,
+)
 
 
 def _labeled(root: Path) -> Path:

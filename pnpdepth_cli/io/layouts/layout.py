@@ -187,15 +187,26 @@ def _joined(
 
     lost = [each for field in needed for each in alone(first, field)]
     spare = [each for field in others for each in alone(field, first)]
-    return Listing(
-        frames=[each for each in made if isinstance(each, Frame)],
+    return listing_of(
+        made,
         broken=(
             *(each for _, unreadable in found.values() for each in unreadable),
             *([] if gaps else lost),
-            *dict.fromkeys(each for each in made if isinstance(each, Unmatched)),
         ),
         spare=(*(lost if gaps else []), *spare),
     )
+
+
+def listing_of(
+    made: Iterable[Frame | Unmatched | None],
+    broken: tuple[Unmatched, ...] = (),
+    spare: tuple[Unmatched, ...] = (),
+) -> Listing:
+    """Returns the frames, and what could not become one after what is broken already."""
+    every = list(made)
+    lost = dict.fromkeys(each for each in every if isinstance(each, Unmatched))
+    frames = [each for each in every if isinstance(each, Frame)]
+    return Listing(frames=frames, broken=(*broken, *lost), spare=spare)
 
 
 def merged(listings: Iterable[Listing]) -> Listing:
