@@ -175,11 +175,11 @@ def silence() -> Iterator[None]:
 @contextmanager
 def _state_for_silence() -> Iterator[None]:
     """Sets what all threads share: sys.stdout, warnings, limits and log levels."""
+    import cv2
     from PIL import Image
 
-    stdout, limit, cv2 = sys.stdout, Image.MAX_IMAGE_PIXELS, sys.modules.get("cv2")
-    logging = None if cv2 is None else cv2.utils.logging
-    level = None if logging is None else logging.setLogLevel(logging.LOG_LEVEL_SILENT)
+    stdout, limit = sys.stdout, Image.MAX_IMAGE_PIXELS
+    level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     ours: Any = _OthersOnly(stdout)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -190,8 +190,7 @@ def _state_for_silence() -> Iterator[None]:
             Image.MAX_IMAGE_PIXELS = limit
             if sys.stdout is ours:
                 sys.stdout = stdout
-            if logging is not None:
-                logging.setLogLevel(level)
+            cv2.utils.logging.setLogLevel(level)
 
 
 class _OthersOnly:
