@@ -57,12 +57,9 @@ class DepthImage:
 def read_depth(path: Path, *, scale: float | None = None, channel: str | None = None) -> DepthImage:
     """Returns the depth image in a file of any of `choices.FORMATS`.
 
-    Zero, NaN, infinite and negative values are unknown, and so is the largest 16-bit code.
-
-    Args:
-        path: The file, recognised by its content.
-        scale: Codes per metre of an integer file; float files hold metres and ignore it.
-        channel: The EXR channel or NPZ array to read; other formats have one and ignore it.
+    Zero, NaN, infinite and negative values are unknown, and so is the largest 16-bit code. The
+    content tells the format. `scale` is in codes per metre; float files hold metres and ignore it.
+    `channel` is the EXR channel or NPZ array to read; other formats ignore it.
 
     Raises:
         InputError: The file is missing, damaged, beyond the budget, or not a depth image.
@@ -154,11 +151,7 @@ def write_depth(
 ) -> None:
     """Writes depth in the format that the suffix names; not finite or <= 0 becomes 0, unknown.
 
-    Args:
-        path: The file, with a suffix of `DEPTH_SUFFIXES`.
-        depth: (H, W) metres.
-        scale: Codes per metre of a PNG, which keeps it in the file, as `text`.
-        text: By key.
+    Depth is (H, W) metres. A PNG has `scale` codes per metre, which it keeps as text, as `text`.
 
     Raises:
         OutputError: The suffix is unknown, the file cannot be written, or a depth is too large for

@@ -97,14 +97,9 @@ def draw_discs(
     factor: float,
     order: NDArray[np.intp],
 ) -> Pixels:
-    """Returns a copy of an image with a disc at each of N points.
+    """Returns a copy of an image, enlarged by `factor`, with a disc at each of N points.
 
-    Args:
-        pixels: (H, W, 3), enlarged by `factor`.
-        xy: (N, 2) pixel coordinates in the original image.
-        colours: (N, 3).
-        factor: Of the enlargement.
-        order: (N,) indices of points, the last on top.
+    Pixel coordinates (N, 2) are those of the original image; `order` has the topmost point last.
     """
     canvas = np.ascontiguousarray(pixels).copy()
     if len(xy) == 0:
@@ -156,15 +151,10 @@ def depth_figure(
 def gain_figure(
     panel: Panel, gain: NDArray[np.float64], amount: str, noun: str, colors: str, unknown: str
 ) -> PIL.Image.Image:
-    """Returns a figure of one map of gains with a colour bar and a footer under it.
+    """Returns a figure of one map of N gains with a colour bar, and how many are above 0 or below.
 
-    Args:
-        panel: The map.
-        gain: (N,) gains; the footer says how many are above and below 0.
-        amount: Gain of full colour, with its unit.
-        noun: What is counted.
-        colors: One of `choices.COLORS`.
-        unknown: Meaning of the dark pixels; "" where there are none.
+    `amount` is the gain of full colour, with its unit; `noun` what is counted; `unknown` the meaning
+    of the dark pixels, "" where there are none.
     """
     figure, draw = _lay_out([panel], 1, least_width=_GAIN_LEGEND[0], legend_height=_GAIN_LEGEND[1])
     improved, worse = float((gain > 0).mean()), float((gain < 0).mean())

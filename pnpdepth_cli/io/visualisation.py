@@ -320,16 +320,9 @@ def improvement_at_points(
 ) -> float:
     """Writes a PNG of where the error at sparse points fell and rose, as discs on the grey image.
 
-    Args:
-        rgb_or_grey: (H, W, 3) or (H, W) in 0..1.
-        xy: (N, 2) pixel coordinates.
-        depth: (N,) measured there, in `unit`.
-        before_at: (N,) before refinement.
-        after_at: (N,) after refinement.
-        held_out: Whether refinement did not use the points, which the PNG says.
-        path: The PNG.
-        unit: Of all depths.
-        colors: One of `choices.COLORS`.
+    The image is (H, W, 3) or (H, W) in 0..1, points are (N, 2) pixel coordinates. Depths in `unit`
+    are (N,): measured, before refinement, and after it. The PNG says whether the points were held
+    out of the refinement.
 
     Returns:
         The fraction of points whose error fell.

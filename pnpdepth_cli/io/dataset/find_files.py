@@ -15,14 +15,8 @@ def find_files(
     """Returns the files with one of these suffixes, by relative path without suffix, and problems.
 
     Links are followed, except into a folder that they lie in. Hidden files and folders are skipped.
-
-    Args:
-        folder: Where to search; need not exist.
-        suffixes: In lower case.
-
-    Returns:
-        Files, sorted by path; and folders that cannot be read, and files that differ in suffix
-        only, which are left out.
+    Files are sorted by path. Problems are folders that cannot be read, and files that differ in
+    suffix only, which are left out. The folder need not exist.
     """
     files: dict[str, Path] = {}
     broken: list[Unmatched] = []
