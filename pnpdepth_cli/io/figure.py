@@ -153,8 +153,8 @@ def gain_figure(
 ) -> PIL.Image.Image:
     """Returns a figure of one map of N gains with a colour bar, and how many are above 0 or below.
 
-    `amount` is the gain of full colour, with its unit; `noun` what is counted; `unknown` the meaning
-    of the dark pixels, "" where there are none.
+    `amount` is the gain of full colour, with its unit; `noun` what is counted; `unknown` what the
+    dark pixels are, "" where there are none.
     """
     figure, draw = _lay_out([panel], 1, least_width=_GAIN_LEGEND[0], legend_height=_GAIN_LEGEND[1])
     improved, worse = float((gain > 0).mean()), float((gain < 0).mean())
