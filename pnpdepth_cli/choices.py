@@ -217,7 +217,7 @@ LAYOUTS = Table(
     names=(
         *("manifest", "nyu-mat", "kitti-odometry", "kitti-object", "kitti-depth", "kitti-raw"),
         *("tum", "7scenes", "synthia", "colmap", "void", "diode", "ibims", "scannet"),
-        *("arkitscenes", "hypersim", "nuscenes", "ddad", "pairs", "nyu-h5"),
+        *("arkitscenes", "hypersim", "nuscenes", "ddad", "pairs", "image-depth", "nyu-h5"),
     ),
 )
 """Data set layouts, in the order in which they are guessed: `pnpdepth_cli.io.layouts.Layout`."""

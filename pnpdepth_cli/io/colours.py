@@ -36,10 +36,8 @@ class DepthScale:
 
     low_m: float
     """Near end, metres."""
-
     high_m: float
     """Far end, metres."""
-
     warm_is_far: bool = False
     """Whether the warm end is the far one, as for a standard deviation."""
 
@@ -112,13 +110,9 @@ def dimmed(grey: NDArray[np.float32]) -> Pixels:
 def paint_gain(
     strength: NDArray[np.floating], light: NDArray[np.floating], colors: str = "blue-orange"
 ) -> Pixels:
-    """Returns (..., 3) colours of a gain: `light` at strength 0.
+    """Returns (..., 3) colours of a gain: better at 1, worse at -1, the grey `light` 0..1 at 0.
 
-    Args:
-        strength: 1 for better, -1 for worse; by default blue and orange, which colour-blind eyes
-            tell apart.
-        light: Grey level 0..1 at strength 0, of the same shape.
-        colors: One of `choices.COLORS`.
+    Blue and orange are told apart by colour-blind eyes.
     """
     return _between(strength, light, *_GAIN_COLOURS[colors])
 

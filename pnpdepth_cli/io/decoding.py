@@ -1,13 +1,19 @@
-"""Images opened by Pillow or decoded by OpenCV, after what they claim is checked."""
+"""Images opened by Pillow or decoded by OpenCV, after what they claim is checked, in silence.
+
+On damaged files OpenEXR's binding prints to sys.stdout, where data of a command belongs, Pillow
+warns, and OpenCV, OpenEXR, libpng and libtiff print to the standard error of the process.
+"""
 
 from __future__ import annotations
 
 import io
+import os
 import struct
+import sys
+import threading
 import warnings
-from collections import defaultdict
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,65 +22,57 @@ from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import FileFormatError
 from pnpdepth_cli.io.file_bytes import check_pixel_count, damaged, one_line
-from pnpdepth_cli.io.quiet import SharedContext, quiet_libraries
 
 if TYPE_CHECKING:
     import PIL.Image
 
-_LETTER_OF_TYPE = {1: "B", 2: "B", 3: "H", 4: "I", 5: "Q", 7: "B", 10: "q", 11: "f", 12: "d"}
-
-_BASELINE_TAGS = range(254, 340)
-_MOST_NUMBERS = 1 << 20
-"""Of a tag; 64 megapixels have fewer strips or tiles."""
-
-
-def read_tags(data: bytes) -> defaultdict[int, tuple[int, ...]]:
-    """Returns the numbers of the first page's baseline tags; none for one that is absent.
-
-    Thousands of tags can share the same bytes, which libraries copy for each.
-
-    Raises:
-        ValueError: The tags together claim more bytes than there are, or one has too many numbers.
-        struct.error: A tag points outside the data.
-    """
-    order = "<" if data[:2] == b"II" else ">"
-    (start,) = struct.unpack_from(f"{order}I", data, 4)
-    (count,) = struct.unpack_from(f"{order}H", data, start)
-    end = start + 2 + 12 * count
-    struct.unpack_from(f"{order}I", data, end)  # where the next page is: the list is complete
-    tags: defaultdict[int, tuple[int, ...]] = defaultdict(tuple)
-    claimed = 0
-    for entry in range(start + 2, end, 12):
-        tag, kind, number = struct.unpack_from(f"{order}HHI", data, entry)
-        layout = f"{order}{number}{_LETTER_OF_TYPE.get(kind, 'B')}"
-        size = struct.calcsize(layout)
-        claimed += size
-        if claimed > len(data):
-            raise ValueError(f"its tags claim more than {len(data):,} bytes")
-        if not _BASELINE_TAGS.start <= tag < _BASELINE_TAGS.stop:
-            continue
-        if number > _MOST_NUMBERS:
-            raise ValueError(f"tag {tag} has {number:,} numbers")
-        (where,) = (entry + 8,) if size <= 4 else struct.unpack_from(f"{order}I", data, entry + 8)
-        tags[tag] = struct.unpack_from(layout, data, where)
-    return tags
-
-
+_BYTES_OF_TYPE = {3: 2, 4: 4, 5: 8, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8, 13: 4}
+_POINTERS = (34665, 34853, 40965)  # to further tags: Exif, GPS and interoperability
+_MOST_NUMBERS = 1 << 20  # of a tag; 64 megapixels have fewer strips or tiles
 _EXIF_ORIENTATION = 0x0112
 _END_OF_PNG = b"\xaeB`\x82"
 """The checksum of the last chunk, which Pillow does not read."""
+
+
+def check_tags(data: bytes) -> None:
+    """Checks the tags of all pages of a TIFF, or of EXIF, before a library copies them.
+
+    Thousands of tags can share the same bytes.
+
+    Raises:
+        ValueError: The tags together claim more bytes than there are, or one has too many numbers.
+        struct.error: A page or a tag lies outside the data.
+    """
+    order = "<" if data[:2] == b"II" else ">"
+    pages, seen, claimed = list(struct.unpack_from(f"{order}I", data, 4)), set[int](), 0
+    while pages:
+        start = pages.pop()
+        if start == 0 or start in seen:
+            continue
+        seen.add(start)
+        end = start + 2 + 12 * struct.unpack_from(f"{order}H", data, start)[0]
+        pages += struct.unpack_from(f"{order}I", data, end)  # the list of tags is complete
+        for tag, kind, number, value in struct.iter_unpack(f"{order}HHII", data[start + 2 : end]):
+            size = _BYTES_OF_TYPE.get(kind, 1)
+            claimed += number * size
+            if claimed > len(data) or (size > 1 and number > _MOST_NUMBERS):
+                raise ValueError(f"its tags claim more than {len(data):,} bytes")
+            pages += [value] if tag in _POINTERS else []
+
+
+def check_exif(image: PIL.Image.Image) -> None:
+    """Raises the errors of `check_tags` for an image's EXIF, which may end without a next page."""
+    exif = image.info.get("exif")
+    if exif:
+        check_tags(exif.removeprefix(b"Exif\0\0") + bytes(4))
 
 
 @contextmanager
 def opened_image(path: Path, data: bytes, kind: str) -> Iterator[PIL.Image.Image]:
     """Yields the image of a file, not yet decoded; errors inside the block become ours.
 
-    The checksums of a PNG and the size that the header claims are checked.
-
-    Args:
-        path: Named in messages.
-        data: Content of the file.
-        kind: "PNG", "JPEG", "TIFF" or "WEBP".
+    The checksums of a PNG and the size that the header claims are checked. The kind is "PNG",
+    "JPEG", "TIFF" or "WEBP".
 
     Raises:
         FileFormatError: The file is damaged or cut short, or exceeds the budget.
@@ -83,19 +81,18 @@ def opened_image(path: Path, data: bytes, kind: str) -> Iterator[PIL.Image.Image
 
     stream = io.BytesIO(data)
     try:
-        with QUIET_PILLOW:
+        with silence():
             if kind == "PNG":
                 with Image.open(stream, formats=[kind]) as image:
                     image.verify()
                 if stream.read(4) != _END_OF_PNG:
                     raise damaged(path, kind, f"is cut short after {len(data):,} bytes")
             with Image.open(stream, formats=[kind]) as image:
-                width, height = image.size
                 # Pillow decodes three channels into four bytes
                 channels = 1 if len(image.getbands()) == 1 else 4
-                wide = ";16" in raw_mode(image)
+                value_bytes = 4 if image.mode in "IF" else 2 if ";16" in raw_mode(image) else 1
                 check_pixel_count(
-                    path, width, height, channels=channels, value_bytes=1 + wide,
+                    path, *image.size, channels=channels, value_bytes=value_bytes,
                     file_bytes=len(data),
                 )  # fmt: skip
                 yield image
@@ -103,9 +100,11 @@ def opened_image(path: Path, data: bytes, kind: str) -> Iterator[PIL.Image.Image
         raise
     except Exception as error:  # Pillow's plugins raise many kinds on damaged files
         kinds = {"truncated": "is cut short", "checksum": "has a wrong checksum"}
-        text = str(error).lower()
-        fact = next((f for word, f in kinds.items() if word in text), "cannot be decoded")
-        raise damaged(path, kind, f"{fact} ({_reason(error)})") from error
+        text = one_line(error) or type(error).__name__
+        fact = next((f for word, f in kinds.items() if word in text.lower()), "cannot be decoded")
+        # Pillow names the in-memory buffer, which means nothing to a reader
+        reason = "unknown content" if "BytesIO" in text else text
+        raise damaged(path, kind, f"{fact} ({reason})") from error
 
 
 def raw_mode(image: PIL.Image.Image) -> str:
@@ -118,45 +117,16 @@ def raw_mode(image: PIL.Image.Image) -> str:
 def orientation_of(image: PIL.Image.Image) -> int:
     """Returns the EXIF orientation 1..8, or another number that means nothing."""
     try:
-        exif = image.info.get("exif", b"")
-        if exif:
-            read_tags(exif.removeprefix(b"Exif\0\0") + bytes(4))  # without a next page
+        check_exif(image)
         return int(image.getexif().get(_EXIF_ORIENTATION, 1))
     except Exception:  # unreadable EXIF in a valid image says nothing of its rotation
         return 1
 
 
-def _reason(error: Exception) -> str:
-    text = one_line(error)
-    # Pillow names the in-memory buffer, which means nothing to a reader.
-    return "unknown content" if "BytesIO" in text else text or type(error).__name__
-
-
-@contextmanager
-def _quiet_pillow() -> Iterator[None]:
-    """Pillow neither warns of damaged EXIF nor refuses large images, which the budget does."""
-    from PIL import Image
-
-    limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            yield
-    finally:
-        Image.MAX_IMAGE_PIXELS = limit
-
-
-QUIET_PILLOW = SharedContext(_quiet_pillow)
-"""While it is open, in any number of threads, Pillow does not warn."""
-
-
 def decode_with_opencv(path: Path, data: bytes, kind: str) -> NDArray[Any]:
     """Returns the pixels in the file's own type, (H, W) or (H, W, C) with blue first.
 
-    Args:
-        path: Named in messages.
-        data: Content of the file.
-        kind: The kind of file that messages name.
+    Pillow cuts colours of 16 bits to 8.
 
     Raises:
         FileFormatError: OpenCV cannot decode it.
@@ -165,7 +135,7 @@ def decode_with_opencv(path: Path, data: bytes, kind: str) -> NDArray[Any]:
 
     buffer = np.frombuffer(data, dtype=np.uint8)
     try:
-        with _SILENT_OPENCV, quiet_libraries():
+        with silence():
             pixels = cv2.imdecode(buffer, cv2.IMREAD_UNCHANGED)
     except cv2.error as error:
         raise damaged(path, kind, f"cannot be decoded ({error})") from error
@@ -174,16 +144,82 @@ def decode_with_opencv(path: Path, data: bytes, kind: str) -> NDArray[Any]:
     return pixels
 
 
-@contextmanager
-def _silent_opencv() -> Iterator[None]:
-    """OpenCV does not print several lines of its own about a damaged file."""
-    import cv2
+_lock = threading.Lock()
+_silent: list[int] = []
+"""Identifiers of the silent threads, as often as each has entered."""
+_before = ExitStack()
+"""What the last of them restores."""
 
-    level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+
+@contextmanager
+def silence() -> Iterator[None]:
+    """Drops what libraries say inside the block, in any number of threads; may be nested.
+
+    What they print to standard error is dropped only while no other thread runs, because theirs
+    would be lost too. Pillow accepts images of any size, which the budget bounds.
+    """
+    with _lock:
+        if not _silent:
+            _before.enter_context(_state_for_silence())
+        _silent.append(threading.get_ident())
     try:
+        with _without_standard_error():
+            yield
+    finally:
+        with _lock:
+            _silent.remove(threading.get_ident())
+            if not _silent:
+                _before.close()
+
+
+@contextmanager
+def _state_for_silence() -> Iterator[None]:
+    """Sets what all threads share: sys.stdout, warnings, limits and log levels."""
+    import cv2
+    from PIL import Image
+
+    stdout, limit = sys.stdout, Image.MAX_IMAGE_PIXELS
+    level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    ours: Any = _OthersOnly(stdout)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        sys.stdout, Image.MAX_IMAGE_PIXELS = ours, None
+        try:
+            yield
+        finally:
+            Image.MAX_IMAGE_PIXELS = limit
+            if sys.stdout is ours:
+                sys.stdout = stdout
+            cv2.utils.logging.setLogLevel(level)
+
+
+class _OthersOnly:
+    """A stream that passes on what all but the silent threads write."""
+
+    def __init__(self, stream: Any) -> None:
+        self._stream = stream
+
+    def write(self, text: str) -> int:
+        return len(text) if threading.get_ident() in _silent else int(self._stream.write(text))
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+
+@contextmanager
+def _without_standard_error() -> Iterator[None]:
+    try:
+        kept = os.dup(2) if threading.active_count() == 1 else None
+    except OSError:  # it is closed
+        kept = None
+    if kept is None:
+        yield
+        return
+    nothing = os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(nothing, 2)
         yield
     finally:
-        cv2.utils.logging.setLogLevel(level)
-
-
-_SILENT_OPENCV = SharedContext(_silent_opencv)
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(nothing)

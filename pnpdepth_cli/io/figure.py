@@ -1,7 +1,6 @@
 """A white figure with titled panels and a colour bar: the frame of every PNG for people.
 
-The PNG's text says where its panels are, so that a report can show each by itself: the depth before
-refinement is in no other file.
+The PNG's text says where its panels are.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import FileFormatError, InputError
 from pnpdepth_cli.io.atomic import atomic_path
-from pnpdepth_cli.io.colours import DepthScale, Pixels
+from pnpdepth_cli.io.colours import DepthScale, Pixels, paint_gain
 
 if TYPE_CHECKING:
     import PIL.Image
@@ -40,10 +39,9 @@ _HATCH_FADED, _HATCH_LINE = 0.45, 0.8  # fractions of white
 _INK = (32, 33, 36)
 _FAINT_INK = (95, 99, 104)
 _LINE = (200, 202, 206)
+_UNKNOWN_GAIN = (52, 52, 52)
 _FAST = 2  # zlib's level: a third of the time of its default 6, files a tenth larger
 _CONTENT_KEY = "pnpdepth"  # of the PNG text that describes the figure
-
-Ink = tuple[int, int, int]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,10 +59,7 @@ class Panel:
 def magnification(shape: tuple[int, ...], *, columns: int, legend: bool) -> float:
     """Returns the factor by which an image fits its column, a whole number if it enlarges.
 
-    Args:
-        shape: (H, W, ...) of the image.
-        columns: Columns of the figure.
-        legend: Whether the figure has a colour bar beside the columns.
+    The image is (H, W, ...); `legend` is for a colour bar beside the columns.
     """
     height, width = shape[:2]
     room = FIGURE_WIDTH - 2 * MARGIN - (columns - 1) * GAP - (_LEGEND_WIDTH if legend else 0)
@@ -82,12 +77,7 @@ def resized(pixels: NDArray[Any], factor: float, *, smooth: bool = False) -> NDA
 
 
 def hatched(pixels: Pixels, valid: NDArray[np.bool_] | None) -> Pixels:
-    """Returns an image faded and with diagonal lines where its depth is not valid.
-
-    Args:
-        pixels: (H', W', 3).
-        valid: (H, W), of any size. None: all is valid.
-    """
+    """Returns an image faded and with diagonal lines where its depth, of any size, is not valid."""
     if valid is None or valid.all():
         return pixels
     height, width = pixels.shape[:2]
@@ -107,14 +97,9 @@ def draw_discs(
     factor: float,
     order: NDArray[np.intp],
 ) -> Pixels:
-    """Returns a copy of an enlarged image with a disc at each point.
+    """Returns a copy of an image, enlarged by `factor`, with a disc at each of N points.
 
-    Args:
-        pixels: (H, W, 3), already enlarged.
-        xy: (N, 2) pixel coordinates in the original image.
-        colours: (N, 3).
-        factor: Of the enlargement.
-        order: (N,) indices of points, the last on top.
+    Pixel coordinates (N, 2) are those of the original image; `order` has the topmost point last.
     """
     canvas = np.ascontiguousarray(pixels).copy()
     if len(xy) == 0:
@@ -128,9 +113,10 @@ def draw_discs(
     for index in order:
         centre = (int(sixteenths[index, 0]), int(sixteenths[index, 1]))
         red, green, blue = (int(level) for level in colours[index])
-        if rim:
-            _disc(canvas, centre, rim, (15, 15, 15), fraction)
-        _disc(canvas, centre, radius, (red, green, blue), fraction)
+        for size, ink in ((rim, (15, 15, 15)), (radius, (red, green, blue))):
+            if size:
+                sixteenth = round(size * (1 << fraction))
+                cv2.circle(canvas, centre, sixteenth, ink, -1, cv2.LINE_AA, fraction)
     return canvas
 
 
@@ -163,33 +149,30 @@ def depth_figure(
 
 
 def gain_figure(
-    panel: Panel, bar: Pixels, ends: tuple[str, str], swatch: tuple[Ink, str] | None, footer: str
+    panel: Panel, gain: NDArray[np.float64], amount: str, noun: str, colors: str, unknown: str
 ) -> PIL.Image.Image:
-    """Returns a figure of one panel with a colour bar, a swatch and a footer under it.
+    """Returns a figure of one map of N gains with a colour bar, and how many are above 0 or below.
 
-    Args:
-        panel: The image.
-        bar: (H, W, 3) colours from one end to the other.
-        ends: Meaning of the two ends.
-        swatch: A colour outside the bar and its meaning; None for none.
-        footer: The last line.
+    `amount` is the gain of full colour, with its unit; `noun` what is counted; `unknown` what the
+    dark pixels are, "" where there are none.
     """
     figure, draw = _lay_out([panel], 1, least_width=_GAIN_LEGEND[0], legend_height=_GAIN_LEGEND[1])
-    unknown = swatch[1] if swatch is not None else None
-    figure.info[_CONTENT_KEY] |= {"ends": ends, "unknown": unknown, "footer": footer}
+    improved, worse = float((gain > 0).mean()), float((gain < 0).mean())
+    footer = f"{100 * improved:.1f} % of {gain.size:,} {noun} improved, {100 * worse:.1f} % worse"
+    ends = (f"worse by {amount} or more", f"better by {amount} or more")
+    figure.info[_CONTENT_KEY] |= {"ends": ends, "unknown": unknown or None, "footer": footer}
+    bar = np.repeat(paint_gain(np.linspace(-1, 1, 220), np.full(220, 0.88), colors)[None], 18, 0)
     font, small = _font(_FONT_SIZE), _font(_SMALL_FONT_SIZE)
-    y = figure.height - MARGIN - 56
-    x = float(MARGIN)
+    x, y = float(MARGIN), figure.height - MARGIN - 56
     draw.text((x, y), ends[0], font=small, fill=_INK, anchor="lm")
     x += draw.textlength(ends[0], font=small) + 12
     _paste(figure, bar, round(x), y - bar.shape[0] // 2)
     x += bar.shape[1] + 12
     draw.text((x, y), ends[1], font=small, fill=_INK, anchor="lm")
     x += draw.textlength(ends[1], font=small) + 2 * GAP
-    if swatch is not None:
-        colour, meaning = swatch
-        draw.rectangle((x, y - 9, x + 18, y + 9), fill=colour)
-        draw.text((x + 28, y), meaning, font=small, fill=_INK, anchor="lm")
+    if unknown:
+        draw.rectangle((x, y - 9, x + 18, y + 9), fill=_UNKNOWN_GAIN)
+        draw.text((x + 28, y), unknown, font=small, fill=_INK, anchor="lm")
     draw.text((MARGIN, y + 40), footer, font=font, fill=_INK, anchor="lm")
     return figure
 
@@ -268,13 +251,6 @@ def _labels(ticks: list[float]) -> list[tuple[float, str]]:
     smallest = min([*gaps, *ticks[:1]], default=1.0)
     decimals = max(0, -math.floor(math.log10(smallest) + 1e-9)) if smallest > 0 else 0
     return [(tick, f"{tick:,.{decimals}f}") for tick in ticks]
-
-
-def _disc(
-    canvas: Pixels, centre: tuple[int, int], radius: float, colour: Ink, fraction: int
-) -> None:
-    sixteenths = round(radius * (1 << fraction))
-    cv2.circle(canvas, centre, sixteenths, colour, -1, cv2.LINE_AA, fraction)
 
 
 def _paste(figure: PIL.Image.Image, pixels: Pixels, x: int, y: int) -> None:

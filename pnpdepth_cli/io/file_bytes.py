@@ -90,15 +90,8 @@ def check_pixel_count(
 ) -> None:
     """Raises FileFormatError for an image without pixels, or with more than the budget.
 
-    To be called with what the header of a file claims, before the file is decoded.
-
-    Args:
-        path: Named in messages.
-        width: Pixels.
-        height: Pixels.
-        channels: Values of a pixel that are decoded.
-        value_bytes: Bytes of a value that is decoded.
-        file_bytes: Size of the file, where the format allows a few bytes to claim any size.
+    To be called with what the header of a file claims, before `channels` values of `value_bytes`
+    are decoded for each pixel; with `file_bytes` where few bytes of the format claim any size.
     """
     if width < 1 or height < 1:
         raise FileFormatError(f"{path} has no pixels ({width}x{height}); create it again")
@@ -109,14 +102,7 @@ def check_pixel_count(
 def check_value_count(
     path: Path, count: int, file_bytes: int | None = None, *, value_bytes: int = 1
 ) -> None:
-    """Raises FileFormatError for an array of more values than the budget.
-
-    Args:
-        path: Named in messages.
-        count: Values of the array.
-        file_bytes: Size of the file, where a few bytes can claim any count.
-        value_bytes: Bytes of a value that is decoded.
-    """
+    """Raises FileFormatError for an array of more values than the budget."""
     _check_claim(path, count, 1, value_bytes, file_bytes, f"{count:,} values")
 
 

@@ -1,7 +1,9 @@
-"""RGB images from PNG, JPEG, TIFF, WebP and EXR files."""
+"""RGB images from PNG, JPEG, TIFF, WebP and EXR files, and the focal length in their EXIF."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,15 +13,25 @@ from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import FileFormatError
 from pnpdepth_cli.io.decoding import (
-    QUIET_PILLOW,
+    check_exif,
     decode_with_opencv,
     opened_image,
     orientation_of,
     raw_mode,
+    silence,
 )
 from pnpdepth_cli.io.file_bytes import read_bytes
 from pnpdepth_cli.io.formats import kind_of
 from pnpdepth_cli.io.formats.tiff import read_tiff_facts
+
+_EXIF_FOLDER = 0x8769
+_FOCAL_LENGTH, _FOCAL_LENGTH_35MM = 0x920A, 0xA405
+_RESOLUTION, _RESOLUTION_UNIT = 0xA20E, 0xA210
+_WIDTH, _HEIGHT = 0xA002, 0xA003
+_UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 1e-3}
+_FILM_DIAGONAL_MM = math.hypot(36, 24)
+_PLAUSIBLE = (0.2, 50.0)
+"""Focal length as a multiple of the image's longer side: fields of view of 136° to 1°."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,16 +40,14 @@ class RgbImage:
 
     values: NDArray[np.float32]
     """(H, W, 3) in 0..1, sRGB-encoded."""
-
     note: str | None
     """What was assumed or changed, for a person; None if nothing was."""
 
 
-def read_rgb(path: Path) -> RgbImage:
+def read_rgb(path: Path, *, upright: bool = True) -> RgbImage:
     """Returns the image in a file; grey is repeated, alpha dropped, EXIF rotation applied.
 
-    Args:
-        path: A PNG, JPEG, TIFF, WebP or EXR file.
+    Without `upright` the pixels are as they are stored, which is how COLMAP reads photos.
 
     Raises:
         InputError: The file is missing, damaged, cut short, beyond the budget, or no image.
@@ -47,6 +57,11 @@ def read_rgb(path: Path) -> RgbImage:
     if kind == "EXR":
         return _from_linear_light(path, data)
     if kind not in ("PNG", "JPEG", "TIFF", "WEBP"):
+        if data[4:8] == b"ftyp":
+            raise FileFormatError(
+                f"{path} is a HEIC or AVIF photo; save it as JPEG, such as with ImageMagick:"
+                f" magick {path.name} {path.stem}.jpg"
+            )
         raise FileFormatError(f"{path} is not an image; give a PNG, JPEG, TIFF, WebP or EXR file")
     if kind == "TIFF":
         facts = read_tiff_facts(path, data)
@@ -72,12 +87,15 @@ def read_rgb(path: Path) -> RgbImage:
             image.seek(0)
             pixels = np.asarray(image if image.mode == "RGB" else image.convert("RGB"))
             values = np.divide(pixels, np.float32(255), dtype=np.float32)
-    upright = _turn_upright(values, orientation)
-    return RgbImage(values=np.ascontiguousarray(upright), note=note)
+    if upright:
+        values = _turn_upright(values, orientation)
+    elif orientation in range(2, 9):
+        note = "EXIF rotation not applied, as COLMAP reads the photo"
+    return RgbImage(values=np.ascontiguousarray(values), note=note)
 
 
-def upright_size(path: Path) -> tuple[int, int]:
-    """Returns (H, W) of the image that `read_rgb` returns; of an EXR it reads all of it.
+def sizes_of(path: Path) -> tuple[tuple[int, int], tuple[int, int]]:
+    """Returns (H, W) of the image that `read_rgb` returns, upright and as stored.
 
     Raises:
         InputError: The file is missing or no image.
@@ -85,12 +103,13 @@ def upright_size(path: Path) -> tuple[int, int]:
     from PIL import Image
 
     try:
-        with QUIET_PILLOW, Image.open(path) as image:
+        with silence(), Image.open(path) as image:
             width, height = image.size
-            return (width, height) if orientation_of(image) >= 5 else (height, width)
-    except OSError:
-        shape = read_rgb(path).values.shape
-        return shape[0], shape[1]
+            upright = (width, height) if orientation_of(image) >= 5 else (height, width)
+            return upright, (height, width)
+    except OSError:  # an EXR, say
+        height, width, _ = read_rgb(path).values.shape
+        return (height, width), (height, width)
 
 
 def _decode_16_bit(path: Path, data: bytes, kind: str) -> NDArray[np.float32]:
@@ -136,16 +155,76 @@ def srgb_from_linear(linear: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def _colour_of(path: Path, channels: dict[str, NDArray[Any]]) -> NDArray[Any]:
-    prefixes = [name[:-1] for name in channels if name.endswith("R")]
-    full = [p for p in prefixes if all(p + letter in channels for letter in "RGB")]
-    if "" in full:
-        full = [""]
-    if len(full) == 1:
-        return np.stack([channels[full[0] + letter] for letter in "RGB"], axis=2)
+    layers = [n[:-1] for n in channels if all(n[:-1] + letter in channels for letter in "RGB")]
+    layers = [""] if "" in layers else sorted(set(layers))
+    if len(layers) == 1:
+        return np.stack([channels[layers[0] + letter] for letter in "RGB"], axis=2)
     grey = [name for name in channels if name != "A"]
-    if not full and len(grey) == 1:
+    if not layers and len(grey) == 1:
         return np.repeat(channels[grey[0]][:, :, None], 3, axis=2)
-    listing = ", ".join(channels)
     raise FileFormatError(
-        f"{path} has no single image in its channels ({listing}); export R, G and B"
+        f"{path} has no single image in its channels ({', '.join(channels)}); export R, G and B"
     )
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExifFocalLength:
+    """A focal length from EXIF."""
+
+    pixels: float
+    """In pixels of the image."""
+    source: str
+    """What it was computed from, for a person."""
+
+
+def read_focal_length(path: Path, size: tuple[int, int]) -> ExifFocalLength | None:
+    """Returns the focal length in an image's EXIF; None if there is none that a camera can have.
+
+    The 35 mm equivalent is preferred. It is taken as one of equal diagonal field of view, which is
+    how CIPA DCG-001 has it. Else the focal length and the resolution of the sensor are used
+    (Exif 2.32, tags 0x920A, 0xA20E, 0xA210). The image is used at the size (H, W).
+    """
+    values = _tags(path)
+    focal = _of_film(values, size) or _of_sensor(values, size)
+    if focal is None or not _PLAUSIBLE[0] <= focal.pixels / max(size) <= _PLAUSIBLE[1]:
+        return None
+    return focal
+
+
+def _of_film(values: Mapping[int, float], size: tuple[int, int]) -> ExifFocalLength | None:
+    film_mm = values.get(_FOCAL_LENGTH_35MM)
+    if not film_mm:
+        return None
+    pixels = film_mm / _FILM_DIAGONAL_MM * math.hypot(*size)
+    return ExifFocalLength(pixels=pixels, source=f"EXIF, equivalent to {film_mm:g} mm on film")
+
+
+def _of_sensor(values: Mapping[int, float], size: tuple[int, int]) -> ExifFocalLength | None:
+    focal_mm, resolution = values.get(_FOCAL_LENGTH), values.get(_RESOLUTION)
+    unit_mm = _UNIT_MM.get(int(values.get(_RESOLUTION_UNIT, 2)))
+    if not focal_mm or not resolution or unit_mm is None:
+        return None
+    taken = max(values.get(_WIDTH, 0), values.get(_HEIGHT, 0)) or max(size)
+    pixels = focal_mm * resolution / unit_mm * max(size) / taken
+    return ExifFocalLength(pixels=pixels, source=f"EXIF, {focal_mm:g} mm and the sensor's pixels")
+
+
+def _tags(path: Path) -> dict[int, float]:
+    """The numbers among the EXIF tags; none if they cannot be read."""
+    from PIL import Image
+
+    try:
+        with silence(), Image.open(path) as image:
+            check_exif(image)
+            folder: Mapping[int, Any] = image.getexif().get_ifd(_EXIF_FOLDER)
+    except Exception:  # Pillow raises many kinds; damaged EXIF gives no focal length
+        return {}
+    numbers = {}
+    for tag, value in folder.items():
+        try:
+            number = float(value)
+        except (TypeError, ValueError, ZeroDivisionError):
+            continue
+        if math.isfinite(number) and number > 0:
+            numbers[tag] = number
+    return numbers

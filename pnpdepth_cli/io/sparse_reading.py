@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import FileFormatError, NoPointsError, SizeError
-from pnpdepth_cli.io.depth_reading import depth_from_stored, known_metres, load_stored
+from pnpdepth_cli.io.depth import depth_from_stored, known_metres, load_stored
 from pnpdepth_cli.io.file_bytes import one_line, read_bytes
 from pnpdepth_cli.io.formats import check_scale, kind_of
 from pnpdepth_cli.points import SparsePoints

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli.io.atomic import atomic_path
-from pnpdepth_cli.io.depth_writing import write_depth
+from pnpdepth_cli.io.depth import write_depth
 from pnpdepth_cli.io.formats import DEPTH_SUFFIXES, KITTI_SCALE
 
 SPARSE_SUFFIXES = (*DEPTH_SUFFIXES, ".csv")

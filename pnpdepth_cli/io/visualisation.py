@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -66,13 +68,13 @@ def preview(
     Args:
         rgb: (H, W, 3) in 0..1; None for a network without image.
         sparse_xy: (N, 2) pixel coordinates.
-        sparse_depth: (N,) in `unit`.
-        before: (H, W) in `unit`, before refinement.
-        after: (H, W) in `unit`, after refinement.
+        sparse_depth: (N,) in `unit`, as all depths.
+        before: (H, W) before refinement.
+        after: (H, W) after refinement.
         path: The PNG.
-        unit: Name of the unit of all depths, for the legend.
+        unit: Name in the legend.
         valid: (H, W); the depth after is hatched where false. None: all is valid.
-        linear: (H, W) in `unit`, linear interpolation of the points; 0 where unknown.
+        linear: (H, W) linear interpolation of the points; 0 where unknown.
 
     Raises:
         SizeError: Image and depth differ in size.
@@ -102,7 +104,7 @@ def preview(
             remark="" if valid is None or valid.all() else "hatched: not valid",
         ),
         _change_panel(before, after, grey, factor, zoom),
-        _zoom_panel(depths, scale, zoom, panel_size=_size_of(before, factor)),
+        _zoom_panel(depths, scale, zoom, resized(before, factor).shape),
     ]
     save_figure(depth_figure(panels, columns, scale, unit), path)
 
@@ -112,14 +114,7 @@ def overlay(
 ) -> None:
     """Writes a PNG with N points in the colours of their depth on the grey image, nearest on top.
 
-    Args:
-        rgb: (H, W, 3) in 0..1.
-        xy: (N, 2) pixel coordinates.
-        depth: (N,) metres.
-        path: The PNG.
-
-    Raises:
-        OutputError: The file cannot be written.
+    The image is (H, W, 3) in 0..1, the points are (N, 2) pixel coordinates and (N,) metres.
     """
     scale = depth_scale(depth)
     factor = magnification(rgb.shape, columns=1, legend=True)
@@ -130,17 +125,7 @@ def overlay(
 def sigma_preview(
     sigma: Depth, valid: NDArray[np.bool_] | None, path: Path, unit: str = "m"
 ) -> None:
-    """Writes a PNG of a standard deviation, hatched where depth is not valid.
-
-    Args:
-        sigma: (H, W) metres.
-        valid: (H, W). None: all is valid.
-        path: The PNG.
-        unit: Of sigma, where it is not the metre.
-
-    Raises:
-        OutputError: The file cannot be written.
-    """
+    """Writes a PNG of a standard deviation (H, W) in `unit`, hatched where depth is not valid."""
     scale = replace(depth_scale(sigma), warm_is_far=True)
     factor = magnification(sigma.shape, columns=1, legend=True)
     panel = Panel(
@@ -162,7 +147,7 @@ def write_mask(path: Path, mask: NDArray[np.bool_]) -> None:
 def error_map(
     prediction: Depth, ground_truth: Depth, grey: NDArray[np.float32] | None
 ) -> tuple[Pixels, float]:
-    """Returns a map of where the prediction is too far or too near, and its error of full colour.
+    """Returns a map (H, W, 3) of where the prediction is too far or too near.
 
     Args:
         prediction: (H, W) metres, 0 where there is none.
@@ -170,14 +155,23 @@ def error_map(
         grey: (H, W) in 0..1, the ground of the map; None for a uniform one.
 
     Returns:
-        (H, W, 3) colours, and metres.
+        The colours, and the error in metres that has full colour.
     """
     both = (prediction > 0) & (ground_truth > 0)
     error = prediction[both].astype(np.float64) - ground_truth[both]
-    strongest = _strongest(error)
-    ground = np.full(ground_truth.shape, 0.3, np.float32) if grey is None else grey
-    pixels = dimmed(np.asarray(0.6 * ground, np.float32))
-    pixels[both] = paint_error(error / strongest, 0.66 + 0.3 * ground[both])
+    return _painted(error, both, grey, paint_error)
+
+
+def _painted(
+    values: NDArray[np.float64],
+    where: NDArray[np.bool_],
+    grey: NDArray[np.float32] | None,
+    paint: Callable[[NDArray[np.float64], NDArray[np.float32]], Pixels],
+) -> tuple[Pixels, float]:
+    """A map with the colours of signed values on the dark grey image, and that of full colour."""
+    ground = np.full(where.shape, 0.3, np.float32) if grey is None else grey
+    pixels, strongest = dimmed(np.asarray(0.6 * ground, np.float32)), _strongest(values)
+    pixels[where] = paint(values / strongest, 0.66 + 0.3 * ground[where])
     return pixels, strongest
 
 
@@ -204,11 +198,9 @@ def _change_panel(
     zoom: tuple[int, int, int, int],
 ) -> Panel:
     """The signed change in metres, with a frame around the zoom."""
-    both = (before > 0) & (after > 0) & np.isfinite(before) & np.isfinite(after)
-    change = np.where(both, np.nan_to_num(after) - np.nan_to_num(before), 0).astype(np.float64)
-    strongest = _strongest(change[both])
-    pixels = dimmed(0.6 * grey)
-    pixels[both] = paint_change(change[both] / strongest, 0.66 + 0.3 * grey[both])
+    both = _both_known(before, after)
+    pixels, strongest = _painted((after[both] - before[both]).astype(np.float64), both, grey,
+                                 paint_change)  # fmt: skip
     shown = resized(pixels, factor)
     top, left, height, width = zoom
     low = (round(left * factor), round(top * factor))
@@ -222,12 +214,12 @@ def _zoom_panel(
     depths: dict[str, Depth],
     scale: DepthScale,
     zoom: tuple[int, int, int, int],
-    panel_size: tuple[int, int],
+    size: tuple[int, ...],
 ) -> Panel:
     """The window of each depth, side by side."""
     y, x, height, width = zoom
     area = np.s_[y : y + height, x : x + width]
-    columns, rows = panel_size
+    rows, columns = size
     part = columns // len(depths)
     pixels = np.full((rows, columns, 3), 255, np.uint8)
     starts = np.linspace(0, columns - part, len(depths)).round().astype(int)
@@ -240,10 +232,8 @@ def _zoom_panel(
     return Panel(title="Zoom", pixels=pixels, remark=f"{' | '.join(depths)}, {most} (frame)")
 
 
-def _size_of(depth: Depth, factor: float) -> tuple[int, int]:
-    """Width and height of the image resized by the factor."""
-    height, width = depth.shape
-    return max(1, round(width * factor)), max(1, round(height * factor))
+def _both_known(first: Depth, second: Depth) -> NDArray[np.bool_]:
+    return (first > 0) & (second > 0) & np.isfinite(first) & np.isfinite(second)
 
 
 def _area(xy: NDArray[np.float32]) -> tuple[slice, slice]:
@@ -266,7 +256,7 @@ def _zoom(depths: dict[str, Depth], of_points: tuple[slice, slice]) -> tuple[int
     height, width = max(1, rows // _ZOOM), max(1, columns // (len(depths) * _ZOOM))
     apart = []
     for other in others:
-        both = (other > 0) & (after > 0) & np.isfinite(other) & np.isfinite(after)
+        both = _both_known(other, after)
         difference = np.where(both, np.nan_to_num(after) - np.nan_to_num(other), 0)
         apart.append(np.abs(difference.astype(np.float64)) / np.where(both, after, 1))
     relative = np.min(apart, axis=0) + _FARTHEST * np.sum(apart, axis=0)
@@ -291,15 +281,8 @@ def improvement(
 ) -> float:
     """Writes a PNG of where |depth - gt| fell and rose, as figure 4(d) of the paper.
 
-    Only pixels with known ground truth count; equal errors are neither better nor worse.
-
-    Args:
-        before: (H, W) metres before refinement.
-        after: (H, W) metres after refinement.
-        gt: (H, W) metres of ground truth, 0 where unknown.
-        path: The PNG.
-        rgb: (H, W, 3) in 0..1, the ground of the map; None for grey.
-        colors: One of `choices.COLORS`: blue better and orange worse, or red and green.
+    Only pixels with known ground truth count; equal errors are neither better nor worse. All are
+    (H, W) in metres; the image, (H, W, 3) in 0..1, is the ground of the map.
 
     Returns:
         The fraction of pixels whose error fell.
@@ -313,18 +296,15 @@ def improvement(
     known = np.isfinite(gt) & (gt > 0)
     if not known.any():
         raise InputError("the ground truth has no pixel with known depth; give another file")
-    gain = np.zeros(gt.shape, dtype=np.float64)
-    gain[known] = _gain(before[known], after[known], gt[known])
-    grey = grey_of(rgb) if rgb is not None else np.full(gt.shape, 0.3, dtype=np.float32)
-    strongest = _strongest(gain[known])
-    pixels = dimmed(0.6 * grey)
-    pixels[known] = paint_gain(gain[known] / strongest, 0.66 + 0.3 * grey[known], colors)
+    gain = _gain(before[known], after[known], gt[known])
+    paint = functools.partial(paint_gain, colors=colors)
+    pixels, strongest = _painted(gain, known, None if rgb is None else grey_of(rgb), paint)
     factor = magnification(gt.shape, columns=1, legend=False)
     panel = Panel(title="Change of error", pixels=resized(pixels, factor), remark=_GAIN)
-    return _save_gain(
-        panel, gain[known], path, amount=f"{strongest:.3g} m", noun="pixels", colors=colors,
-        unknown=None if known.all() else "no ground truth",
-    )  # fmt: skip
+    unknown = "" if known.all() else "no ground truth"
+    figure = gain_figure(panel, gain, f"{strongest:.3g} m", "pixels", colors, unknown)
+    save_figure(figure, path)
+    return float((gain > 0).mean())
 
 
 def improvement_at_points(
@@ -340,16 +320,9 @@ def improvement_at_points(
 ) -> float:
     """Writes a PNG of where the error at sparse points fell and rose, as discs on the grey image.
 
-    Args:
-        rgb_or_grey: (H, W, 3) or (H, W) in 0..1.
-        xy: (N, 2) pixel coordinates.
-        depth: (N,) metres measured there.
-        before_at: (N,) metres before refinement.
-        after_at: (N,) metres after refinement.
-        held_out: Whether refinement did not use the points, which the PNG says.
-        path: The PNG.
-        unit: Of all depths, where it is not the metre.
-        colors: One of `choices.COLORS`.
+    The image is (H, W, 3) or (H, W) in 0..1, points are (N, 2) pixel coordinates. Depths in `unit`
+    are (N,): measured, before refinement, and after it. The PNG says whether the points were held
+    out of the refinement.
 
     Returns:
         The fraction of points whose error fell.
@@ -371,23 +344,17 @@ def improvement_at_points(
     colours = paint_gain(gain / strongest, np.full(len(gain), 0.92), colors)
     weakest_first = np.argsort(np.abs(gain), kind="stable")
     discs = draw_discs(ground, xy, colours, factor, weakest_first)
-    remark = f"at {len(gain):,} held-out points"
-    panel = Panel(
-        title="Change of error",
-        pixels=discs,
-        remark=remark if held_out else f"at the {len(gain):,} sparse points used",
-    )
     noun = "held-out points" if held_out else "points used"
-    return _save_gain(panel, gain, path, amount=f"{strongest:.3g} {unit}", noun=noun, colors=colors)
+    remark = f"at {len(gain):,} {noun}" if held_out else f"at the {len(gain):,} sparse {noun}"
+    panel = Panel(title="Change of error", pixels=discs, remark=remark)
+    save_figure(gain_figure(panel, gain, f"{strongest:.3g} {unit}", noun, colors, ""), path)
+    return float((gain > 0).mean())
 
 
 def _gain(before: Depth, after: Depth, gt: Depth) -> NDArray[np.float64]:
     """Metres by which the error fell; a depth that is not finite counts as an error of 1e9."""
-    ground_truth = gt.astype(np.float64)
-    was, now = (
-        np.nan_to_num(np.abs(np.asarray(d, dtype=np.float64) - ground_truth), nan=1e9, posinf=1e9)
-        for d in (before, after)
-    )
+    errors = (np.abs(depth.astype(np.float64) - gt.astype(np.float64)) for depth in (before, after))
+    was, now = (np.nan_to_num(error, nan=1e9, posinf=1e9) for error in errors)
     return np.asarray(was - now, dtype=np.float64)
 
 
@@ -395,39 +362,6 @@ def _strongest(gain: NDArray[np.float64]) -> float:
     """The change in metres that has full colour."""
     changed = np.abs(gain[gain != 0])
     return float(np.percentile(changed, _STRONGEST_PERCENTILE)) if changed.size else 1.0
-
-
-def _save_gain(
-    panel: Panel,
-    gain: NDArray[np.float64],
-    path: Path,
-    *,
-    amount: str,
-    noun: str,
-    colors: str,
-    unknown: str | None = None,
-) -> float:
-    """Writes the panel with a colour bar and a footer.
-
-    Args:
-        panel: The map.
-        gain: (N,) gains.
-        path: The PNG.
-        amount: Change of full colour.
-        noun: What is counted.
-        colors: One of `choices.COLORS`.
-        unknown: Meaning of the dark pixels; None where there are none.
-
-    Returns:
-        The fraction with a gain above 0.
-    """
-    improved, worse = float((gain > 0).mean()), float((gain < 0).mean())
-    bar = np.repeat(paint_gain(np.linspace(-1, 1, 220), np.full(220, 0.88), colors)[None], 18, 0)
-    swatch = None if unknown is None else ((52, 52, 52), unknown)
-    footer = f"{100 * improved:.1f} % of {gain.size:,} {noun} improved, {100 * worse:.1f} % worse"
-    ends = (f"worse by {amount} or more", f"better by {amount} or more")
-    save_figure(gain_figure(panel, bar, ends, swatch, footer), path)
-    return improved
 
 
 def _bytes(image: NDArray[np.floating]) -> NDArray[np.uint8]:

@@ -27,10 +27,6 @@ def parse_yaml(path: Path, text: str) -> Any:
     Tags are ignored, so that OpenCV's matrices are mappings with rows, cols and data. Its own
     cv2.FileStorage is not used, because it aborts the process on damaged files.
 
-    Args:
-        path: Named in messages.
-        text: Its content.
-
     Raises:
         FileFormatError: The text is too long, has aliases, or is not YAML.
         UsageError: PyYAML is not installed.

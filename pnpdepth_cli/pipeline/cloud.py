@@ -145,6 +145,8 @@ def _cloud(
     rgb, image = None, _image(request, frame)
     if coloured and image is not None:
         rgb = read_rgb(image).values
+        if rgb.shape[:2] != depth.shape:  # of a photo that COLMAP read as it is stored
+            rgb = read_rgb(image, upright=False).values
         if rgb.shape[:2] != depth.shape:
             raise SizeError(
                 f"{image} is {rgb.shape[1]}×{rgb.shape[0]} but {frame.depth} is"

@@ -18,7 +18,7 @@ from pnpdepth_cli.errors import FileFormatError, InputError, OutputError, SizeEr
 from pnpdepth_cli.io.atomic import all_or_none, make_folder
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.io.record import write_json
-from pnpdepth_cli.io.rgb import read_rgb, upright_size
+from pnpdepth_cli.io.rgb import read_rgb, sizes_of
 from pnpdepth_cli.pipeline.exports import Depth, Export, ExportFrame
 from pnpdepth_cli.pipeline.results import ResultFrame, result_frames
 
@@ -86,7 +86,7 @@ def _frame(result: ResultFrame, export: Export) -> ExportFrame:
             " `batch --layout colmap` does"
         )
     try:
-        size = tuple(operator.index(side) for side in record["size"])
+        width, height = map(operator.index, record["size"])
         sparse = record["inputs"]["sparse"]
         numbers = float(record["points"]["farthest"]), float(sparse.get("unit_scale") or 1)
         name = sparse.get("image") or (PurePosixPath(result.name).parent / image.name).as_posix()
@@ -96,8 +96,7 @@ def _frame(result: ResultFrame, export: Export) -> ExportFrame:
         raise FileFormatError(
             f"{result.depth}: the record beside it is damaged; refine it again"
         ) from error
-    height, width = upright_size(image)
-    if size != (width, height):
+    if (height, width) not in sizes_of(image):
         raise SizeError(
             f"{result.depth} is not of the size of {image}; refine the whole image"
             " (--protocol whole)"

@@ -9,7 +9,7 @@ import numpy as np
 from click.testing import CliRunner
 
 from pnpdepth_cli.cli.main import cli
-from pnpdepth_cli.io.depth_writing import write_depth
+from pnpdepth_cli.io.depth import write_depth
 
 
 def test_the_points_are_counted_and_the_camera_is_reported(tmp_path: Path) -> None:

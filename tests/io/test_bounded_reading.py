@@ -19,10 +19,11 @@ import pytest
 from pnpdepth_cli.budget import set_max_pixels
 from pnpdepth_cli.errors import FileFormatError, InputError
 from pnpdepth_cli.io.calibration import read_calibration
-from pnpdepth_cli.io.depth import read_depth, read_sparse, write_depth
+from pnpdepth_cli.io.depth import read_depth, write_depth
 from pnpdepth_cli.io.record import read_json, sha256_of
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.io.scans import read_scan
+from pnpdepth_cli.io.sparse_reading import read_sparse
 
 READERS = [read_depth, read_sparse, read_rgb, read_calibration, read_json, sha256_of]
 DEPTH = np.full((6, 8), 2.5, np.float32)
@@ -121,28 +122,29 @@ def test_an_npz_whose_directory_lies_about_the_size_is_damaged(tmp_path: Path) -
         read_depth(path)
 
 
-@pytest.mark.parametrize("suffix", [".npy", ".npz"])
-def test_an_array_of_more_pixels_than_the_budget_is_refused_before_it_is_read(
+@pytest.mark.parametrize("suffix", [".png", ".exr", ".pfm", ".tiff", ".npy", ".npz"])
+def test_more_pixels_than_the_budget_are_refused_before_they_are_read(
     tmp_path: Path, suffix: str
 ) -> None:
     path = tmp_path / f"d{suffix}"
     write_depth(path, np.ones((300, 400), np.float32))
-    set_max_pixels(100_000)
-    with pytest.raises(FileFormatError, match="120,000 values, more than 100,000"):
-        read_depth(path)
-    set_max_pixels(120_000)
-    assert read_depth(path).values.shape == (300, 400)
-
-
-@pytest.mark.parametrize("suffix", [".png", ".exr", ".pfm", ".tiff"])
-def test_an_image_of_more_pixels_than_the_budget_is_refused(tmp_path: Path, suffix: str) -> None:
-    path = tmp_path / f"d{suffix}"
-    write_depth(path, np.ones((300, 400), np.float32))
     set_max_pixels(119_999)
-    with pytest.raises(FileFormatError, match=r"400x300 pixels, more than .* with --max-pixels"):
+    what = "120,000 values" if suffix in (".npy", ".npz") else "400x300 pixels"
+    with pytest.raises(FileFormatError, match=rf"{what}, more than 119,999.* with --max-pixels"):
         read_depth(path)
     set_max_pixels(120_000)
     assert read_depth(path).values.shape == (300, 400)
+
+
+@pytest.mark.parametrize("name", ["a.pfm", "a.npy"])
+def test_a_header_that_promises_too_much_is_refused(name: str, tmp_path: Path) -> None:
+    headers = {
+        "a.pfm": b"Pf\n999999999 999999999\n-1\n",
+        "a.npy": npy_header((1 << 30, 1 << 30), "<f8"),
+    }
+    (tmp_path / name).write_bytes(headers[name] + bytes(64))
+    with pytest.raises(FileFormatError, match=r"pixels, more than|NPY cannot be read"):
+        read_depth(tmp_path / name)
 
 
 def test_an_exr_of_a_few_bytes_with_a_vast_display_window_is_refused(tmp_path: Path) -> None:

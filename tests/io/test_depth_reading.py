@@ -23,66 +23,53 @@ METRES = np.array([[0, 1.5, np.nan], [np.inf, -2, 80.25]], dtype=np.float32)
 KNOWN = np.array([[0, 1.5, 0], [0, 0, 80.25]], dtype=np.float32)
 
 
-@pytest.fixture
-def png(tmp_path: Path) -> Path:
-    path = tmp_path / "d.png"
-    cv2.imwrite(str(path), CODES)
+def save(path: Path, values: np.ndarray, text: str | None = None) -> Path:
+    """Writes by the suffix; `text` is the scale that the file itself gives."""
+    if path.suffix == ".npy":
+        np.save(path, values)
+    elif text is None:
+        cv2.imwrite(str(path), values)
+    elif path.suffix == ".png":
+        info = PngInfo()
+        info.add_text("pnpdepth:scale", text)
+        Image.fromarray(values).save(path, pnginfo=info)
+    else:
+        Image.fromarray(values).save(path, description=f"pnpdepth:scale={text}")
     return path
 
 
-def test_a_16_bit_png_without_scale_is_read_as_kitti_with_a_note(png: Path) -> None:
-    depth = read_depth(png)
-    assert np.array_equal(depth.values, CODES.astype(np.float32) / 256)
+@pytest.mark.parametrize("name", ["d.png", "d.tif"])
+@pytest.mark.parametrize(
+    ("text", "scale", "used", "end"),
+    [
+        (None, None, 256, "÷ 256"),
+        (None, 1000, 1000, "÷ 1000"),
+        ("1000", None, 1000, "÷ 1000 (from the file)"),
+        ("1000", 500, 500, "÷ 500"),
+    ],
+)
+def test_a_given_scale_beats_that_in_the_file_which_beats_kittis(
+    name: str, text: str | None, scale: float | None, used: float, end: str, tmp_path: Path
+) -> None:
+    depth = read_depth(save(tmp_path / name, CODES, text), scale=scale)
+    assert np.array_equal(depth.values, (CODES / used).astype(np.float32))
     assert depth.values.dtype == np.float32
-    assert depth.assumed_scale
-    assert depth.source == "16-bit PNG ÷ 256"
-    assert depth.scale == 256
+    assert depth.source == f"16-bit {'PNG' if name == 'd.png' else 'TIFF'} {end}"
+    assert depth.assumed_scale == (text is None and scale is None)
+    assert depth.scale == used
     assert np.array_equal(depth.valid, CODES > 0)
-
-
-def test_a_given_scale_is_used_and_not_called_assumed(png: Path) -> None:
-    depth = read_depth(png, scale=1000)
-    assert np.array_equal(depth.values, (CODES / 1000).astype(np.float32))
-    assert not depth.assumed_scale
-    assert depth.source == "16-bit PNG ÷ 1000"
-
-
-def test_the_scale_in_the_file_beats_256_and_a_given_one_beats_it(tmp_path: Path) -> None:
-    path = tmp_path / "d.png"
-    text = PngInfo()
-    text.add_text("pnpdepth:scale", "1000")
-    Image.fromarray(CODES).save(path, pnginfo=text)
-    assert read_depth(path).values[1, 0] == 1
-    assert read_depth(path).source == "16-bit PNG ÷ 1000 (from the file)"
-    assert not read_depth(path).assumed_scale
-    assert read_depth(path, scale=500).values[1, 0] == 2
-    assert read_depth(path, scale=500).source == "16-bit PNG ÷ 500"
 
 
 @pytest.mark.parametrize("text", ["0", "-1", "nan", "inf", "many"])
 def test_a_senseless_scale_in_the_file_is_refused(tmp_path: Path, text: str) -> None:
-    path = tmp_path / "d.png"
-    info = PngInfo()
-    info.add_text("pnpdepth:scale", text)
-    Image.fromarray(CODES).save(path, pnginfo=info)
     with pytest.raises(FileFormatError, match=f"pnpdepth:scale={text}"):
-        read_depth(path)
+        read_depth(save(tmp_path / "d.png", CODES, text))
 
 
 @pytest.mark.parametrize("scale", [0.0, -256.0, math.nan, math.inf])
-def test_a_senseless_given_scale_is_wrong_usage(png: Path, scale: float) -> None:
+def test_a_senseless_given_scale_is_wrong_usage(tmp_path: Path, scale: float) -> None:
     with pytest.raises(UsageError, match="--depth-scale must be a finite number above 0"):
-        read_depth(png, scale=scale)
-
-
-def test_a_16_bit_tiff_has_the_same_rule(tmp_path: Path) -> None:
-    path = tmp_path / "d.tif"
-    cv2.imwrite(str(path), CODES)
-    assert read_depth(path).source == "16-bit TIFF ÷ 256"
-    assert read_depth(path).assumed_scale
-    Image.fromarray(CODES).save(path, description="pnpdepth:scale=1000")
-    assert read_depth(path).source == "16-bit TIFF ÷ 1000 (from the file)"
-    assert np.array_equal(read_depth(path).values, (CODES / 1000).astype(np.float32))
+        read_depth(save(tmp_path / "d.png", CODES), scale=scale)
 
 
 def test_the_largest_code_is_unknown_and_gets_a_note(tmp_path: Path) -> None:
@@ -95,37 +82,25 @@ def test_the_largest_code_is_unknown_and_gets_a_note(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.int32, np.int64, np.uint64])
 def test_integers_in_npy_need_a_scale_as_png_does(tmp_path: Path, dtype: type) -> None:
-    path = tmp_path / "d.npy"
-    np.save(path, np.array([[0, 128]], dtype=dtype))
-    depth = read_depth(path)
+    depth = read_depth(save(tmp_path / "d.npy", np.array([[0, 128]], dtype=dtype)))
     assert depth.values.tolist() == [[0, 0.5]]
     assert depth.assumed_scale
     assert depth.source == f"{np.dtype(dtype)} NPY ÷ 256"
-
-
-def test_negative_integers_are_unknown(tmp_path: Path) -> None:
-    np.save(tmp_path / "d.npy", np.array([[-1, 256]], dtype=np.int16))
-    assert read_depth(tmp_path / "d.npy").values.tolist() == [[0, 1]]
+    negative = read_depth(save(tmp_path / "d.npy", np.array([[-1, 256]], dtype=np.int16)))
+    assert negative.values.tolist() == [[0, 1]]
 
 
 @pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64, ">f4"])
-def test_everything_but_finite_depth_above_zero_is_unknown(tmp_path: Path, dtype: str) -> None:
-    path = tmp_path / "d.npy"
-    np.save(path, METRES.astype(dtype))
-    depth = read_depth(path)
-    assert np.array_equal(depth.values, KNOWN)
-    assert not depth.assumed_scale
-    assert depth.scale is None
-
-
-def test_a_float_file_holds_metres_whatever_the_scale(tmp_path: Path) -> None:
-    np.save(tmp_path / "d.npy", METRES)
-    assert np.array_equal(read_depth(tmp_path / "d.npy", scale=1000).values, KNOWN)
-
-
-def test_a_float64_too_large_for_float32_is_unknown(tmp_path: Path) -> None:
-    np.save(tmp_path / "d.npy", np.array([[1e300, 2.0]]))
-    assert read_depth(tmp_path / "d.npy").values.tolist() == [[0, 2]]
+def test_floats_are_metres_whatever_the_scale_and_known_where_finite_and_above_zero(
+    tmp_path: Path, dtype: str
+) -> None:
+    path = save(tmp_path / "d.npy", METRES.astype(dtype))
+    for depth in (read_depth(path), read_depth(path, scale=1000)):
+        assert np.array_equal(depth.values, KNOWN)
+        assert not depth.assumed_scale
+        assert depth.scale is None
+    beyond_float32 = read_depth(save(tmp_path / "d.npy", np.array([[1e300, 2.0]])))
+    assert beyond_float32.values.tolist() == [[0, 2]]
 
 
 @pytest.mark.parametrize("shape", [(2, 3), (1, 2, 3), (2, 3, 1), (1, 1, 2, 3), (1, 2, 3, 1)])

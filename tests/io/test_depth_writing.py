@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays
 
 from pnpdepth_cli.errors import OutputError, SizeError, UsageError
-from pnpdepth_cli.io.depth import DEPTH_SUFFIXES, read_depth, write_depth
+from pnpdepth_cli.io.depth import read_depth, write_depth
+from pnpdepth_cli.io.formats import DEPTH_SUFFIXES
 
 FLOAT_SUFFIXES = [suffix for suffix in DEPTH_SUFFIXES if suffix != ".png"]
 images = array_shapes(min_dims=2, max_dims=2, min_side=1, max_side=12)
@@ -83,13 +84,9 @@ def test_the_depth_given_is_not_changed(tmp_path: Path, suffix: str) -> None:
     write_depth(tmp_path / f"d{suffix}", depth)
     assert np.array_equal(depth, np.array([[np.nan, -1, 2]], np.float32), equal_nan=True)
     assert read_depth(tmp_path / f"d{suffix}").values.tolist() == [[0, 0, 2]]
-
-
-@pytest.mark.parametrize("suffix", DEPTH_SUFFIXES)
-def test_an_image_in_another_memory_layout_is_written_the_same(tmp_path: Path, suffix: str) -> None:
-    depth = np.arange(1, 13, dtype=np.float32).reshape(3, 4)
-    write_depth(tmp_path / f"d{suffix}", depth[::-1].T)
-    assert np.array_equal(read_depth(tmp_path / f"d{suffix}").values, depth[::-1].T)
+    other_memory_layout = np.arange(1, 13, dtype=np.float32).reshape(3, 4)[::-1].T
+    write_depth(tmp_path / f"D{suffix.upper()}", other_memory_layout)
+    assert np.array_equal(read_depth(tmp_path / f"D{suffix.upper()}").values, other_memory_layout)
 
 
 def test_exr_holds_one_float32_channel_called_z(tmp_path: Path) -> None:
@@ -139,11 +136,6 @@ def test_a_senseless_scale_is_wrong_usage(tmp_path: Path, scale: float) -> None:
 def test_another_suffix_is_refused_with_the_possible_ones(tmp_path: Path, name: str) -> None:
     with pytest.raises(OutputError, match=r"\.png, \.exr, \.npy, \.npz, \.pfm, \.tif, \.tiff"):
         write_depth(tmp_path / name, np.ones((2, 2), np.float32))
-
-
-def test_the_suffix_may_be_in_capitals(tmp_path: Path) -> None:
-    write_depth(tmp_path / "D.PNG", np.ones((2, 2), np.float32))
-    assert (tmp_path / "D.PNG").read_bytes().startswith(b"\x89PNG")
 
 
 @pytest.mark.parametrize("shape", [(3,), (1, 2, 3), (0, 4)])

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from pnpdepth_cli.io.exif import read_focal_length
+from pnpdepth_cli.io.rgb import read_focal_length
 
 EXIF = 0x8769
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import sys
 import threading
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+import warnings
+from contextlib import ExitStack
 
+import PIL.Image
 import pytest
 
-from pnpdepth_cli.io.quiet import SharedContext, silent_thread
+from pnpdepth_cli.io.decoding import silence
 
 
 def test_only_the_thread_inside_is_silent(capsys: pytest.CaptureFixture[str]) -> None:
@@ -18,7 +18,7 @@ def test_only_the_thread_inside_is_silent(capsys: pytest.CaptureFixture[str]) ->
     inside, done = threading.Event(), threading.Event()
 
     def work() -> None:
-        with silent_thread():
+        with silence():
             sys.stdout.write("dropped\n")
             inside.set()
             done.wait(10)
@@ -29,68 +29,29 @@ def test_only_the_thread_inside_is_silent(capsys: pytest.CaptureFixture[str]) ->
     thread.start()
     assert inside.wait(10)
     sys.stdout.write("said meanwhile\n")
+    with silence():
+        sys.stdout.write("dropped\n")
     done.set()
     thread.join()
     assert capsys.readouterr().out == "said meanwhile\nsaid afterwards\n"
     assert sys.stdout is before
 
 
-def test_the_stream_comes_back_after_an_error() -> None:
-    before = sys.stdout
+def test_the_state_comes_back_after_an_error_and_in_whatever_order_they_leave() -> None:
+    before, limit = sys.stdout, PIL.Image.MAX_IMAGE_PIXELS
+    first, second = ExitStack(), ExitStack()
+    first.enter_context(silence())
+    second.enter_context(silence())
+    assert PIL.Image.MAX_IMAGE_PIXELS is None
+    first.close()
+    assert PIL.Image.MAX_IMAGE_PIXELS is None  # the second is still inside
+    assert sys.stdout.encoding == before.encoding
 
     def fail() -> None:
-        with silent_thread():
-            assert sys.stdout.encoding == before.encoding
+        with second:
+            warnings.warn("dropped", UserWarning, stacklevel=1)
             raise ValueError("inside")
 
     with pytest.raises(ValueError, match="inside"):
         fail()
-    assert sys.stdout is before
-
-
-def test_the_first_enters_and_the_last_leaves_whatever_the_order() -> None:
-    states: list[str] = []
-
-    @contextmanager
-    def change() -> Iterator[None]:
-        states.append("changed")
-        yield
-        states.append("as before")
-
-    shared = SharedContext(change)
-    first_is_in, second_is_in = threading.Event(), threading.Event()
-
-    def first() -> None:
-        with shared:
-            first_is_in.set()
-            second_is_in.wait()
-        assert states == ["changed"]  # the second is still inside
-
-    def second() -> None:
-        first_is_in.wait()
-        with shared:
-            second_is_in.set()
-            time.sleep(0.05)
-
-    threads = [threading.Thread(target=work) for work in (first, second)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert states == ["changed", "as before"]
-
-
-def test_an_error_inside_passes_through_and_leaves() -> None:
-    states: list[str] = []
-
-    @contextmanager
-    def change() -> Iterator[None]:
-        try:
-            yield
-        finally:
-            states.append("as before")
-
-    shared = SharedContext(change)
-    with pytest.raises(ValueError, match="mine"), shared:
-        raise ValueError("mine")
-    assert states == ["as before"]
+    assert (sys.stdout, PIL.Image.MAX_IMAGE_PIXELS) == (before, limit)

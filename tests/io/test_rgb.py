@@ -41,18 +41,12 @@ def test_16_bit_colours_keep_all_16_bits(tmp_path: Path, suffix: str) -> None:
 
 
 @pytest.mark.parametrize("suffix", [".png", ".tif"])
-def test_16_bit_grey_is_repeated(tmp_path: Path, suffix: str) -> None:
-    path = tmp_path / f"a{suffix}"
-    cv2.imwrite(str(path), COLOURS_16[:, :, 0])
-    expected = COLOURS_16[:, :, :1].astype(np.float32) / np.float32(65535)
+@pytest.mark.parametrize("colours", [COLOURS, COLOURS_16])
+def test_grey_is_repeated(tmp_path: Path, suffix: str, colours: np.ndarray) -> None:
+    path, grey = tmp_path / f"a{suffix}", colours[:, :, :1]
+    cv2.imwrite(str(path), grey)
+    expected = grey.astype(np.float32) / np.float32(np.iinfo(colours.dtype).max)
     assert np.array_equal(read_rgb(path).values, np.repeat(expected, 3, axis=2))
-
-
-def test_8_bit_grey_is_repeated(tmp_path: Path) -> None:
-    path = tmp_path / "a.png"
-    Image.fromarray(COLOURS[:, :, 0]).save(path)
-    expected = np.repeat(COLOURS[:, :, :1].astype(np.float32) / np.float32(255), 3, axis=2)
-    assert np.array_equal(read_rgb(path).values, expected)
 
 
 @pytest.mark.parametrize("bits", [8, 16])
@@ -100,19 +94,6 @@ def test_exif_rotation_is_honoured(tmp_path: Path, orientation: int, kind: str) 
     Image.fromarray(pixels).save(path, kind.removesuffix("16"), exif=exif, **options)
     values = read_rgb(path).values[8::16, 8::16, 0] * 255
     assert np.allclose(values, np.arange(6).reshape(2, 3) * 50, atol=1.5)
-
-
-def test_the_rotation_agrees_with_pillow(tmp_path: Path) -> None:
-    from PIL import ImageOps
-
-    for orientation in range(1, 9):
-        exif = Image.Exif()
-        exif[0x0112] = orientation
-        path = tmp_path / "a.png"
-        Image.fromarray(COLOURS).save(path, exif=exif)
-        with Image.open(path) as image:
-            expected = np.asarray(ImageOps.exif_transpose(image))
-        assert np.array_equal(np.rint(read_rgb(path).values * 255), expected)
 
 
 def test_linear_exr_gets_the_srgb_curve_and_a_note(tmp_path: Path) -> None:
@@ -177,7 +158,12 @@ def test_an_image_with_damaged_exif_is_read(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("content", "fact"),
-    [(b"", "is empty"), (b"hello, world", "is not an image"), (b"\x93NUMPY\x01\x00", "not an im")],
+    [
+        (b"", "is empty"),
+        (b"hello, world", "is not an image"),
+        (b"\x93NUMPY\x01\x00", "not an im"),
+        (b"\0\0\0\x18ftypheic\0\0\0\0", "is a HEIC or AVIF photo; save it as JPEG"),
+    ],
 )
 def test_what_is_no_image_is_refused(tmp_path: Path, content: bytes, fact: str) -> None:
     path = tmp_path / "a.png"
@@ -243,13 +229,3 @@ def test_a_real_frame_is_read_as_other_programs_read_it(shared_data: Path) -> No
     assert values.shape == (480, 640, 3)
     with Image.open(path) as image:
         assert np.array_equal(np.rint(values * 255), np.asarray(image))
-
-
-def test_a_real_jpeg_cut_in_half_is_refused(shared_data: Path, tmp_path: Path) -> None:
-    content = next((shared_data / "kitti_dc" / "image").glob("*.jpg")).read_bytes()
-    path = tmp_path / "half.jpg"
-    path.write_bytes(content[: len(content) // 2])
-    # OpenCV reads this without a word, the lower half grey.
-    assert cv2.imread(str(path)) is not None
-    with pytest.raises(FileFormatError, match=r"half\.jpg: JPEG is cut short"):
-        read_rgb(path)

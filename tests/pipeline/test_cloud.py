@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from pnpdepth_cli.errors import FileFormatError, InputError, OutputError, SizeError, UsageError
-from pnpdepth_cli.io.depth_writing import write_depth
+from pnpdepth_cli.io.depth import write_depth
 from pnpdepth_cli.io.scans import read_scan
 from pnpdepth_cli.pipeline.cloud import CloudRequest, write_depth_cloud
 

@@ -1,107 +1,201 @@
-"""A sparse model from its folder, read once and kept for the other images of a batch."""
+"""A sparse model of COLMAP, and how its numbers become cameras, poses and points."""
 
 from __future__ import annotations
 
-import functools
-import threading
-from collections.abc import Iterable
-from pathlib import Path, PurePosixPath
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
 
-from pnpdepth_cli.errors import FileFormatError, InputError
-from pnpdepth_cli.io.colmap import binary, text
-from pnpdepth_cli.io.colmap.parts import ColmapModel
-from pnpdepth_cli.io.file_bytes import size_of_regular_file
+import numpy as np
+from numpy.typing import NDArray
 
-_PARTS = ("cameras", "images", "points3D")
-_SUFFIXES = (".bin", ".txt")
-_LOCK = threading.Lock()
-"""So that threads that read frames of one model wait for it instead of reading it again."""
+from pnpdepth_cli.errors import FileFormatError
+from pnpdepth_cli.io.extrinsics import rotation_of
+from pnpdepth_cli.io.file_bytes import check_pixel_count, one_line
+
+Floats = NDArray[np.float64]
 
 
-def model_files(folder: Path) -> list[Path]:
-    """Returns the three files of a model; none if this is no folder with a model."""
-    for suffix in _SUFFIXES:  # binary first, as COLMAP itself
-        files = [folder / f"{part}{suffix}" for part in _PARTS]
-        if all(file.is_file() for file in files):
-            return files
-    return []
+@dataclass(frozen=True, kw_only=True)
+class ColmapCamera:
+    """A camera of the model; several images may share it."""
+
+    model: str
+    """COLMAP's name, such as "SIMPLE_RADIAL"."""
+    size: tuple[int, int]
+    """(H, W) of its images."""
+    intrinsics: Floats
+    """(3, 3) in pixels, with whole numbers at pixel centres (COLMAP has them at .5)."""
+    lens: str
+    """One of `choices.LENSES`."""
+    distortion: tuple[float, ...]
+    """Coefficients of the lens, or none."""
 
 
-def find_model(path: Path) -> Path:
-    """Returns the folder of the model: this folder or its 0/, sparse/0/ or sparse/.
+@dataclass(frozen=True, kw_only=True)
+class ColmapImage:
+    """A registered image: x_camera = rotation · x_model + translation."""
 
-    Raises:
-        InputError: There is none.
-    """
-    for folder in (path, path / "0", path / "sparse" / "0", path / "sparse"):
-        if model_files(folder):
-            return folder
-    raise InputError(
-        f"{path} is a folder without a COLMAP model; give the one with cameras, images and"
-        " points3D as .bin or .txt, usually sparse/0"
-    )
+    camera: int
+    rotation: Floats
+    """(3, 3)."""
+    translation: Floats
+    """(3,) in model units."""
+    points: NDArray[np.int64]
+    """Numbers of the points that are observed in it, sorted and unique."""
 
 
-def read_model(path: Path) -> ColmapModel:
-    """Returns the sparse model in a folder, or in its 0/, sparse/0/ or sparse/.
+@dataclass(frozen=True, kw_only=True)
+class ColmapPoints:
+    """The points of a model, sorted by number."""
 
-    Raises:
-        InputError: There is none.
-        FileFormatError: It is damaged or cut short.
-    """
-    files = model_files(find_model(path))
-    states = tuple((file, size_of_regular_file(file), file.stat().st_mtime_ns) for file in files)
-    with _LOCK:
-        return _read(states)
+    number: NDArray[np.int64]
+    """(N,) COLMAP's numbers."""
+    xyz: Floats
+    """(N, 3) in model units."""
+    error: Floats
+    """(N,) mean reprojection error in pixels, negative where it was not computed."""
+    track: NDArray[np.int64]
+    """(N,) images that observe the point."""
 
 
-@functools.lru_cache(maxsize=2)
-def _read(states: tuple[tuple[Path, int, int], ...]) -> ColmapModel:
-    cameras, images, points = (state[0] for state in states)
-    reader = binary if cameras.suffix == ".bin" else text
-    model = ColmapModel(
-        folder=cameras.parent,
-        cameras=reader.read_cameras(cameras),
-        images=reader.read_images(images),
-        points=reader.read_points(points),
-    )
-    lost = next((i for i in model.images.values() if i.camera not in model.cameras), None)
-    if lost is not None:
+@dataclass(frozen=True, kw_only=True)
+class ColmapModel:
+    """A sparse model."""
+
+    folder: Path
+    cameras: dict[int, ColmapCamera]
+    """By number."""
+    images: dict[str, ColmapImage]
+    """The registered images by name, a path below the image folder."""
+    points: ColmapPoints
+
+
+@dataclass(frozen=True)
+class _Model:
+    """Number in binary files, count of focal lengths, and the lens with its coefficients."""
+
+    number: int
+    focals: int
+    lens: str
+    coefficients: int
+
+    @property
+    def parameters(self) -> int:
+        return self.focals + 2 + self.coefficients
+
+
+_RADIAL, _FISHEYE = "radial-tangential", "fisheye"
+MODELS = {
+    "SIMPLE_PINHOLE": _Model(0, 1, _RADIAL, 0),
+    "PINHOLE": _Model(1, 2, _RADIAL, 0),
+    "SIMPLE_RADIAL": _Model(2, 1, _RADIAL, 1),
+    "RADIAL": _Model(3, 1, _RADIAL, 2),
+    "OPENCV": _Model(4, 2, _RADIAL, 4),
+    "OPENCV_FISHEYE": _Model(5, 2, _FISHEYE, 4),
+    "FULL_OPENCV": _Model(6, 2, _RADIAL, 8),
+    "FOV": _Model(7, 2, "fov", 1),
+    "SIMPLE_RADIAL_FISHEYE": _Model(8, 1, _FISHEYE, 1),
+    "RADIAL_FISHEYE": _Model(9, 1, _FISHEYE, 2),
+    "THIN_PRISM_FISHEYE": _Model(10, 2, "thin-prism-fisheye", 8),
+    "RAD_TAN_THIN_PRISM_FISHEYE": _Model(11, 2, "rad-tan-thin-prism-fisheye", 12),
+    "SIMPLE_DIVISION": _Model(12, 1, "division", 1),
+    "DIVISION": _Model(13, 2, "division", 1),
+    "SIMPLE_FISHEYE": _Model(14, 1, _FISHEYE, 0),
+    "FISHEYE": _Model(15, 2, _FISHEYE, 0),
+    "EUCM": _Model(16, 2, "eucm", 2),
+}
+"""COLMAP 4.2's camera models except EQUIRECTANGULAR, whose images have no z axis."""
+
+NAME_OF_NUMBER = {model.number: name for name, model in MODELS.items()} | {17: "EQUIRECTANGULAR"}
+_LARGEST = 1e9
+
+
+def parameter_count(path: Path, name: str) -> int:
+    """Returns how many parameters a camera model has. Raises FileFormatError if it is unknown."""
+    if name == "EQUIRECTANGULAR":
         raise FileFormatError(
-            f"{images}: an image has camera {lost.camera}, which {cameras.name} lacks; create the"
+            f"{path}: a camera of model EQUIRECTANGULAR has no z axis; render perspective views of"
+            " its panoramas"
+        )
+    if name not in MODELS:
+        raise FileFormatError(
+            f"{path}: {one_line(name)[:40]!r} is no camera model of COLMAP 4.2; the file is"
+            " damaged, or written by a newer COLMAP"
+        )
+    return MODELS[name].parameters
+
+
+def camera_of(
+    path: Path, name: str, size: tuple[int, int], parameters: Sequence[float]
+) -> ColmapCamera:
+    """Returns the camera of a model `name` with its parameters in COLMAP's order.
+
+    Raises:
+        FileFormatError: No camera has these parameters.
+    """
+    model = MODELS[name]
+    check_pixel_count(path, size[1], size[0])
+    fx, fy = parameters[0], parameters[model.focals - 1]
+    cx, cy = parameters[model.focals : model.focals + 2]
+    values = np.array(parameters)
+    if not (np.abs(values) < _LARGEST).all() or min(fx, fy) <= 0:
+        raise FileFormatError(
+            f"{path}: a {name} camera with parameters {one_line(list(parameters))[:80]} cannot"
+            " exist; create the model again"
+        )
+    distortion = tuple(parameters[model.focals + 2 :])
+    if model.lens == _RADIAL and distortion:
+        distortion = (*distortion, *[0.0] * (4 - len(distortion)))
+    return ColmapCamera(
+        model=name,
+        size=size,
+        intrinsics=np.array([[fx, 0, cx - 0.5], [0, fy, cy - 0.5], [0, 0, 1]]),
+        lens=model.lens,
+        distortion=distortion,
+    )
+
+
+def image_of(
+    path: Path, name: str, camera: int, pose: Sequence[float], points: NDArray[np.int64]
+) -> ColmapImage:
+    """Returns the image with a pose qw qx qy qz tx ty tz from the model's frame to the camera's.
+
+    `points` (K,) are the numbers of the points at its keypoints, -1 for none.
+
+    Raises:
+        FileFormatError: The numbers are no pose.
+    """
+    values = np.array(pose, np.float64)
+    length = float(np.linalg.norm(values[:4]))
+    if not np.isfinite(values).all() or not 1e-6 < length < 1e6:
+        raise FileFormatError(
+            f"{path}: the pose of {one_line(name)!r} is not made of finite numbers; create the"
             " model again"
         )
-    return model
-
-
-def name_in_model(model: ColmapModel, image: Path) -> str:
-    """Returns the name under which the model has a photo: the longest that ends its path.
-
-    Raises:
-        InputError: The model lacks it, or has several of its name.
-    """
-    whole = PurePosixPath(image.absolute().as_posix()).parts
-    ending = [n for n in model.images if _ends(whole, PurePosixPath(n).parts)]
-    if ending:
-        return max(ending, key=len)
-    alike = [name for name in model.images if PurePosixPath(name).name == image.name]
-    if len(alike) == 1:
-        return alike[0]
-    if alike:
-        raise InputError(
-            f"{image} could be any of {_listing(alike)} of {model.folder}; give it in the image"
-            " folder of the model"
-        )
-    raise InputError(
-        f"{image} is not among the {len(model.images):,} images of {model.folder}"
-        f" ({_listing(model.images)}); COLMAP did not register it, or its name has changed"
+    return ColmapImage(
+        camera=camera,
+        rotation=rotation_of(values[:4]),
+        translation=values[4:],
+        points=np.unique(points[points != -1]),
     )
 
 
-def _ends(whole: tuple[str, ...], part: tuple[str, ...]) -> bool:
-    return bool(part) and whole[-len(part) :] == part
+def points_of(
+    path: Path, number: NDArray[np.int64], rows: Floats, track: NDArray[np.int64]
+) -> ColmapPoints:
+    """Returns the points, sorted by number, from rows (N, 4) of x y z and reprojection error.
 
-
-def _listing(names: Iterable[str]) -> str:
-    first = sorted(names)
-    return ", ".join(first[:3]) + (", …" if len(first) > 3 else "")
+    Raises:
+        FileFormatError: A coordinate is not finite.
+    """
+    bad = ~np.isfinite(rows).all(axis=1)
+    if bad.any():
+        raise FileFormatError(
+            f"{path}: {int(bad.sum()):,} of {len(rows):,} points have no finite coordinates;"
+            " create the model again"
+        )
+    order = np.argsort(number, kind="stable")
+    return ColmapPoints(
+        number=number[order], xyz=rows[order, :3], error=rows[order, 3], track=track[order]
+    )

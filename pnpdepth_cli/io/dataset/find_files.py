@@ -3,41 +3,33 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 from pnpdepth_cli.io.dataset.frame import Unmatched
 
 
 def find_files(
-    folder: Path, suffixes: Iterable[str]
+    folder: Path, suffixes: tuple[str, ...]
 ) -> tuple[dict[str, Path], tuple[Unmatched, ...]]:
     """Returns the files with one of these suffixes, by relative path without suffix, and problems.
 
     Links are followed, except into a folder that they lie in. Hidden files and folders are skipped.
-
-    Args:
-        folder: Where to search; need not exist.
-        suffixes: In lower case.
-
-    Returns:
-        Files, sorted by path; and folders that cannot be read, and files that differ in suffix
-        only, which are left out.
+    Files are sorted by path. Problems are folders that cannot be read, and files that differ in
+    suffix only, which are left out. The folder need not exist.
     """
-    wanted = set(suffixes)
     files: dict[str, Path] = {}
     broken: list[Unmatched] = []
     ambiguous: set[str] = set()
-    paths = sorted(_walk(folder, frozenset(), broken)) if folder.is_dir() else ()
+    paths = sorted(_walk(folder, frozenset(), broken)) if folder.is_dir() else []
     for path in paths:
-        if path.suffix.lower() not in wanted:
-            continue
-        name = path.relative_to(folder).with_suffix("").as_posix()
-        if name in files:
-            why = f"and {files[name].name} are one frame; keep one"
-            broken.append(Unmatched(path=path, why=why))
-            ambiguous.add(name)
-        files.setdefault(name, path)
+        if path.suffix.lower() in suffixes:
+            name = path.relative_to(folder).with_suffix("").as_posix()
+            if name in files:
+                why = f"and {files[name].name} are one frame; keep one"
+                broken.append(Unmatched(path=path, why=why))
+                ambiguous.add(name)
+            files.setdefault(name, path)
     return {name: path for name, path in files.items() if name not in ambiguous}, tuple(broken)
 
 
@@ -46,16 +38,13 @@ def _walk(folder: Path, above: frozenset[str], broken: list[Unmatched]) -> Itera
     if real in above:
         return  # a link to a folder that it is in
     try:
-        entries = [Path(entry.path) for entry in os.scandir(folder)]
+        paths = [path for path in folder.iterdir() if not path.name.startswith(".")]
     except OSError as error:
-        why = (
-            f"cannot be read ({(error.strerror or str(error)).lower()}); what is in it is left out"
-        )
+        reason = (error.strerror or str(error)).lower()
+        why = f"cannot be read ({reason}); what is in it is left out"
         broken.append(Unmatched(path=folder, why=why))
         return
-    for path in entries:
-        if path.name.startswith("."):
-            continue
+    for path in paths:
         if path.is_dir():
             yield from _walk(path, above | {real}, broken)
         elif path.is_file():

@@ -17,13 +17,10 @@ class Protocol:
 
     name: str
     """One of `choices.FRAME_PROTOCOLS`."""
-
     halved: bool = False
     """Every second pixel in both directions (nearest neighbour) is used."""
-
     crop: tuple[int, int] | None = None
     """(H, W) of the crop after halving; None for the whole image."""
-
     anchor: Literal["centre", "bottom"] = "centre"
     """Vertical position of the crop, which is centred horizontally."""
 
@@ -35,12 +32,7 @@ class Protocol:
         return small[top : top + height, left : left + width]
 
     def in_crop(self, xy: NDArray[np.floating], size: tuple[int, int]) -> NDArray[np.float32]:
-        """Returns pixel coordinates in that part.
-
-        Args:
-            xy: (N, 2) pixel coordinates in the whole image.
-            size: (H, W) of the whole image.
-        """
+        """Returns pixel coordinates (N, 2) in that part, from those in the whole image."""
         top, left, _, _ = self._window(size)
         moved = (np.asarray(xy, np.float64) + 0.5) / 2 - 0.5 if self.halved else xy
         return np.asarray(moved - np.array([left, top]), np.float32)

@@ -1,16 +1,45 @@
-"""Image and ground truth of a frame, cropped to what its protocol uses."""
+"""Parts of a frame from their files: images, masked depth, arrays of HDF5 and MATLAB files."""
 
 from __future__ import annotations
+
+import math
+import struct
+import zlib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pnpdepth_cli.errors import InputError
-from pnpdepth_cli.io.dataset.frame import Frame, Hdf5Array
-from pnpdepth_cli.io.dataset.hdf5 import depth_of, rgb_of
-from pnpdepth_cli.io.dataset.masks import masked
-from pnpdepth_cli.io.depth import read_depth
+from pnpdepth_cli.errors import (
+    FileFormatError,
+    InputError,
+    PnpDepthError,
+    SizeError,
+    UsageError,
+)
+from pnpdepth_cli.io.dataset.frame import IMAGE_SUFFIXES, Frame, Hdf5Array
+from pnpdepth_cli.io.depth import known_metres, load_stored, read_depth
+from pnpdepth_cli.io.file_bytes import (
+    check_value_count,
+    damaged,
+    one_line,
+    read_bytes,
+    size_of_regular_file,
+)
 from pnpdepth_cli.io.rgb import read_rgb
+
+_ASPECT_TOLERANCE = 0.02
+"""Relative difference of aspect ratios of images of one view."""
+
+_HEADER_BYTES = 128
+_TYPES = {
+    1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8",
+}  # fmt: skip
+_MATRIX, _COMPRESSED = 14, 15
+_MOST_BYTES = 1 << 20
+"""Of a decompressed variable."""
 
 
 def read_frame_image(frame: Frame) -> NDArray[np.float32]:
@@ -32,3 +61,184 @@ def read_frame_ground_truth(frame: Frame) -> NDArray[np.float32]:
         depth = read_depth(frame.gt, scale=frame.gt_scale).values
     depth = masked(depth, frame.masks)
     return np.ascontiguousarray(frame.protocol.apply(depth))
+
+
+def read_mask(path: Path) -> NDArray[np.bool_]:
+    """Returns (H, W), true where an image has any channel above 0, or an array a number above 0.
+
+    Raises:
+        InputError: The file holds no mask.
+    """
+    if path.suffix.lower() in IMAGE_SUFFIXES:
+        return np.asarray(read_rgb(path).values.max(axis=2) > 0)
+    values = load_stored(path, None).values
+    if values.ndim == 3 and values.shape[2] == 1:
+        values = values[:, :, 0]
+    if values.ndim != 2:
+        raise FileFormatError(f"{path}: a mask is (H, W), not of shape {values.shape}")
+    return np.asarray(values > 0)
+
+
+def masked(depth: NDArray[np.float32], masks: tuple[Path, ...]) -> NDArray[np.float32]:
+    """Returns the depth (H, W) with 0 where any of the masks is 0.
+
+    Raises:
+        SizeError: A mask has another size.
+    """
+    for path in masks:
+        mask = read_mask(path)
+        if mask.shape != depth.shape:
+            raise SizeError(
+                f"mask {path} is {mask.shape[1]}×{mask.shape[0]} but the ground truth is"
+                f" {depth.shape[1]}×{depth.shape[0]}"
+            )
+        depth = np.where(mask, depth, np.float32(0))
+    return depth
+
+
+def check_same_view(what: str, own: tuple[int, ...], size: tuple[int, int]) -> None:
+    """Raises SizeError if what has the size `own` (H, W) has another aspect ratio than an image."""
+    if abs(own[1] * size[0] / (own[0] * size[1]) - 1) > _ASPECT_TOLERANCE:
+        turned = abs(own[0] * size[0] / (own[1] * size[1]) - 1) <= _ASPECT_TOLERANCE
+        raise SizeError(
+            f"{what} is {own[1]}×{own[0]} and the image {size[1]}×{size[0]}: they do not show the"
+            " same view" + ("; one is turned by 90°, turn it back" if turned else "")
+        )
+
+
+def moved_to(path: Path, depth: NDArray[np.float32], size: tuple[int, int]) -> NDArray[np.float32]:
+    """Returns the known depths (H, W) at the pixels of an image of the same view; the nearest wins.
+
+    No depth is interpolated: in an image that is larger, `size` (H, W), most pixels stay unknown.
+
+    Raises:
+        SizeError: The two have different aspect ratios.
+    """
+    check_same_view(str(path), depth.shape[:2], size)
+    rows, columns = np.nonzero(depth)
+    row = ((rows + 0.5) * size[0] / depth.shape[0]).astype(np.intp)
+    column = ((columns + 0.5) * size[1] / depth.shape[1]).astype(np.intp)
+    moved = np.full(size, np.inf, np.float32)
+    np.minimum.at(moved, (row, column), depth[rows, columns])
+    return np.where(np.isinf(moved), np.float32(0), moved)
+
+
+def shape_of(path: Path, name: str) -> tuple[int, ...]:
+    """Returns the shape of an array of the file. Raises InputError if it has none."""
+    return tuple(_with_array(path, name, lambda array: array.shape))
+
+
+def rgb_of(source: Hdf5Array) -> NDArray[np.float32]:
+    """Returns (H, W, 3) float32 in 0..1 of an array of bytes. Raises InputError for another."""
+    pixels = _read(source)
+    if pixels.dtype != np.uint8 or pixels.ndim != 3 or pixels.shape[2] != 3:
+        raise FileFormatError(f"{source} is {pixels.dtype} of shape {pixels.shape}, not an image")
+    return pixels.astype(np.float32) / np.float32(255)
+
+
+def depth_of(source: Hdf5Array) -> NDArray[np.float32]:
+    """Returns (H, W) float32 metres, 0 where unknown, of floats. Raises InputError for others."""
+    metres = _read(source)
+    if metres.dtype.kind != "f" or metres.ndim != 2:
+        raise FileFormatError(f"{source} is {metres.dtype} of shape {metres.shape}, not depth")
+    if source.focal_px is None:
+        return known_metres(metres)
+    height, width = metres.shape
+    y = np.arange(height)[:, None] - (height - 1) / 2
+    x = np.arange(width)[None, :] - (width - 1) / 2
+    along_axis = source.focal_px / np.sqrt(x * x + y * y + source.focal_px**2)
+    return known_metres(metres.astype(np.float64) * along_axis)
+
+
+def _read(source: Hdf5Array) -> NDArray[Any]:
+    def pick(array: Any) -> NDArray[Any]:
+        if array.dtype.kind not in "fiu":
+            raise FileFormatError(f"{source} holds {array.dtype} values, not numbers")
+        one = array.shape if source.index is None else array.shape[1:]
+        check_value_count(source.path, math.prod(one), size_of_regular_file(source.path))
+        if source.index is not None and source.index >= array.shape[0]:
+            raise FileFormatError(f"{source}: there are only {array.shape[0]}")
+        return np.asarray(array[()] if source.index is None else array[source.index])
+
+    values: NDArray[Any] = _with_array(source.path, source.name, pick)
+    if values.ndim != len(source.axes):
+        raise FileFormatError(f"{source} has {values.ndim} axes instead of {len(source.axes)}")
+    return values.transpose(source.axes)
+
+
+def _with_array(path: Path, name: str, use: Callable[[Any], Any]) -> Any:
+    try:
+        import h5py
+    except ImportError:
+        raise UsageError(f"reading {path} needs h5py: pip install 'pnpdepth[nyu]'") from None
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; check the path")
+    try:
+        with h5py.File(path, "r") as file:
+            link = file.get(name, getlink=True)
+            if link is None:
+                raise FileFormatError(f"{path} has no array {name}; it is of another kind")
+            array = file[name] if isinstance(link, h5py.HardLink) else None
+            if array is None or array.external or array.is_virtual:
+                raise FileFormatError(
+                    f"{path}: {name} is stored outside the file; copy its values into this one"
+                )
+            return use(array)
+    except PnpDepthError:
+        raise
+    except Exception as error:  # h5py raises many kinds for a damaged file
+        raise FileFormatError(f"{path} cannot be read as HDF5 ({one_line(error)})") from error
+
+
+def read_matlab_array(path: Path, name: str) -> NDArray[np.int64]:
+    """Returns the values of a variable of a MATLAB 5 file as (N,) int64, in the file's order.
+
+    Own reader, because scipy's aborts the process on about one in a thousand damaged files.
+    Source: MAT-File Format, MathWorks, chapter "Level 5 MAT-File Format".
+
+    Raises:
+        FileFormatError: The file is damaged or not of versions 5 to 7, or lacks the variable.
+    """
+    data = read_bytes(path)
+    order = {b"IM": "<", b"MI": ">"}.get(data[126:_HEADER_BYTES])
+    if order is None:
+        raise FileFormatError(f"{path} is no MATLAB 5 file; save it with -v7 or older")
+    try:
+        for kind, content in _elements(data, _HEADER_BYTES, order):
+            if kind == _COMPRESSED:
+                content = zlib.decompressobj().decompress(content, _MOST_BYTES)
+                kind, content = next(_elements(content, 0, order))
+            values = _numbers(content, name, order) if kind == _MATRIX else None
+            if values is not None:
+                return values
+    except (struct.error, zlib.error, StopIteration, ValueError, OverflowError) as error:
+        raise damaged(path, "MATLAB file", f"cannot be read ({error})") from error
+    raise FileFormatError(f"{path} has no {name}; it is of another kind")
+
+
+def _elements(data: bytes, position: int, order: str) -> Iterator[tuple[int, bytes]]:
+    """The type and the content of each element; short ones have both in one word."""
+    while position < len(data):
+        kind, size = struct.unpack_from(f"{order}II", data, position)
+        if kind >> 16:
+            kind, size, begin, end = kind & 0xFFFF, kind >> 16, position + 4, position + 8
+        else:
+            begin = position + 8
+            end = begin + (size if kind == _COMPRESSED else -(-size // 8) * 8)
+        if begin + size > len(data):
+            raise ValueError(f"an element of {size:,} bytes goes beyond the end")
+        yield kind, data[begin : begin + size]
+        position = end
+
+
+def _numbers(matrix: bytes, name: str, order: str) -> NDArray[np.int64] | None:
+    """The values of a variable of this name; None for another."""
+    _, _, (_, variable), (kind, content) = list(_elements(matrix, 0, order))[:4]
+    if variable.decode("ascii", "replace") != name:
+        return None
+    if kind not in _TYPES:
+        raise ValueError(f"{name} is not made of numbers")
+    values = np.frombuffer(content, order + _TYPES[kind])
+    if not (np.isfinite(values) & (np.abs(values) < 2.0**53) & (values == np.rint(values))).all():
+        raise ValueError(f"{name} is not made of whole numbers")
+    return values.astype(np.int64)

@@ -35,13 +35,10 @@ class StoredArray:
 
     values: NDArray[Any]
     """Floats in metres, or integer codes; (H, W) or any shape that `is_image` allows."""
-
     description: str
     """What was read, for a person, such as "16-bit PNG"."""
-
     is_image: bool = True
     """False for NPY and NPZ, whose arrays may also be lists of points."""
-
     scale: float | None = None
     """Codes per metre that the file itself gives; None if it does not."""
 
@@ -52,10 +49,8 @@ class WriteOptions:
 
     path: Path
     """The output file that the user named; messages name it."""
-
     scale: float
     """Codes per metre of a format of integers."""
-
     text: Mapping[str, str]
     """Texts by key that the file carries, where the format has room for them."""
 
@@ -66,19 +61,14 @@ class DepthFormat:
 
     name: str
     """As messages call it, such as "PNG"."""
-
     suffixes: tuple[str, ...]
     """Of its files, in lower case; "." and the name in `choices.FORMATS` is one of them."""
-
     magic: tuple[bytes, ...]
     """What the content begins with; files are recognised by content, never by suffix."""
-
     read: Callable[[Path, bytes, str | None], StoredArray]
     """From path (for messages), content and `--channel`. Raises FileFormatError."""
-
     write: Callable[[Path, NDArray[np.float32], WriteOptions], None]
     """(H, W) metres, 0 where unknown, into an existing empty file. Raises OutputError."""
-
     integer: bool = False
     """Whether files hold 16-bit integer codes, not float32 metres."""
 

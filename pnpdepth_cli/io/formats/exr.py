@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import FileFormatError, UsageError
+from pnpdepth_cli.io.decoding import silence
 from pnpdepth_cli.io.file_bytes import check_pixel_count, damaged
 from pnpdepth_cli.io.formats import DepthFormat, StoredArray, WriteOptions
-from pnpdepth_cli.io.quiet import silent_thread
 
 _DEPTH_NAMES = frozenset({"z", "depth"})
 
@@ -22,17 +22,13 @@ def read_exr_channels(path: Path, data: bytes) -> dict[str, NDArray[Any]]:
     Channels of a file with several parts are called `part.channel`. Pixels of the display
     window outside the data window are 0.
 
-    Args:
-        path: The file.
-        data: Its content.
-
     Raises:
         FileFormatError: The file is damaged, deep or subsampled, or exceeds the budget.
     """
     import OpenEXR
 
     try:
-        with silent_thread():
+        with silence():
             with OpenEXR.File(str(path), header_only=True) as file:
                 count = len(file.parts)
                 for index in range(count):
@@ -94,21 +90,16 @@ def _part_channels(part: Any) -> dict[str, NDArray[Any]]:
     channels = {name: np.asarray(channel.pixels) for name, channel in part.channels.items()}
     if np.array_equal(data, display):
         return channels
-    return {name: _in_display(pixels, data, display) for name, pixels in channels.items()}
-
-
-def _in_display(
-    pixels: NDArray[Any], data: NDArray[np.int64], display: NDArray[np.int64]
-) -> NDArray[Any]:
     width, height = display[1] - display[0] + 1
-    placed = np.zeros((height, width), dtype=pixels.dtype)
     left, top = np.maximum(data[0], display[0])
-    right, bottom = np.minimum(data[1], display[1]) + 1
-    if left < right and top < bottom:
-        (x0, y0), (x1, y1) = data[0], display[0]
-        placed[top - y1 : bottom - y1, left - x1 : right - x1] = pixels[
-            top - y0 : bottom - y0, left - x0 : right - x0
-        ]
+    right, bottom = np.maximum(np.minimum(data[1], display[1]) + 1, (left, top))
+    inside, there = (
+        np.s_[top - y : bottom - y, left - x : right - x] for x, y in (data[0], display[0])
+    )
+    placed = {name: np.zeros((height, width), of.dtype) for name, of in channels.items()}
+    for name, pixels in channels.items():
+        if left < right and top < bottom:
+            placed[name][there] = pixels[inside]
     return placed
 
 

@@ -31,37 +31,22 @@ that evaluate at once, and raises SystemError for a good file."""
 def parse_npy(path: Path, data: bytes, kind: str = "NPY") -> NDArray[Any]:
     """Returns the array of an NPY file, of any shape; numbers only, never pickled objects.
 
-    Args:
-        path: Named in messages.
-        data: Content of the file.
-        kind: The kind of file that messages name.
-
-    Raises:
-        FileFormatError: The content is damaged, too large, or not made of numbers.
+    Messages name `path` and `kind`. Raises FileFormatError if it is damaged or holds no numbers.
     """
     shape, order, dtype, start = read_npy_header(path, data, kind)
     count = math.prod(shape)
     if len(data) - start < count * dtype.itemsize:
-        fact = (
-            f"cannot be read ({len(data) - start:,} bytes of data instead of"
-            f" {count * dtype.itemsize:,})"
-        )
-        raise damaged(path, kind, fact)
+        fact = f"{len(data) - start:,} bytes of data instead of {count * dtype.itemsize:,}"
+        raise damaged(path, kind, f"cannot be read ({fact})")
     return np.frombuffer(data, dtype, count=count, offset=start).reshape(shape, order=order)
 
 
 def read_npy_header(
     path: Path, data: bytes, kind: str = "NPY"
 ) -> tuple[tuple[int, ...], Any, np.dtype[Any], int]:
-    """Returns shape, order ("C" or "F"), dtype, and the position of the data.
+    """Returns shape, order ("C" or "F"), dtype, and the position of the data, from the beginning.
 
-    Args:
-        path: Named in messages.
-        data: The beginning of an NPY file, header included.
-        kind: The kind of file that messages name.
-
-    Raises:
-        FileFormatError: The header is damaged, or its array is not made of numbers.
+    Raises FileFormatError if the header is damaged, or its array is not made of numbers.
     """
     length = "<H" if data[6:8] == b"\1\0" else "<I"
     start = 8 + struct.calcsize(length)

@@ -14,12 +14,7 @@ from numpy.typing import NDArray
 from pnpdepth_cli.errors import FileFormatError, UsageError
 from pnpdepth_cli.io.file_bytes import check_value_count, damaged, one_line
 from pnpdepth_cli.io.formats import DepthFormat, StoredArray, WriteOptions
-from pnpdepth_cli.io.formats.npy import (
-    LONGEST_HEADER,
-    npy_bytes,
-    parse_npy,
-    read_npy_header,
-)
+from pnpdepth_cli.io.formats.npy import LONGEST_HEADER, npy_bytes, parse_npy, read_npy_header
 
 # A fixed time in the archive: the same depth gives the same bytes.
 _EPOCH = (1980, 1, 1, 0, 0, 0)
@@ -29,11 +24,6 @@ _COMPRESSIONS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 
 def parse_npz(path: Path, data: bytes, key: str | None) -> tuple[str, NDArray[Any]]:
     """Returns the name and content of the array called `key`, or of the only one.
-
-    Args:
-        path: Named in messages.
-        data: Content of the file.
-        key: The array wanted; None if there is only one.
 
     Raises:
         FileFormatError: The archive is damaged or holds no such array of numbers, or sizes in it
@@ -55,16 +45,6 @@ def parse_npz(path: Path, data: bytes, key: str | None) -> tuple[str, NDArray[An
         raise
     except Exception as error:  # zipfile and zlib each have their own
         raise damaged(path, "NPZ", f"cannot be read ({error})") from error
-
-
-def npz_bytes(name: str, array: NDArray[Any]) -> bytes:
-    """Returns a compressed NPZ file with the one array."""
-    buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
-        member = zipfile.ZipInfo(f"{name}.npy", date_time=_EPOCH)
-        member.compress_type = zipfile.ZIP_DEFLATED
-        archive.writestr(member, npy_bytes(array))
-    return buffer.getvalue()
 
 
 def _array(path: Path, name: str, member: IO[bytes], file_bytes: int) -> NDArray[Any]:
@@ -101,7 +81,10 @@ def _read(path: Path, data: bytes, channel: str | None) -> StoredArray:
 
 
 def _write(file: Path, metres: NDArray[np.float32], options: WriteOptions) -> None:
-    file.write_bytes(npz_bytes("depth", metres))
+    member = zipfile.ZipInfo("depth.npy", date_time=_EPOCH)
+    member.compress_type = zipfile.ZIP_DEFLATED
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr(member, npy_bytes(metres))
 
 
 FORMAT = DepthFormat(

@@ -27,7 +27,7 @@ _COMPRESSION_LEVEL = 4  # of zlib: a third of the time of its default 6, files 4
 
 
 def eight_bits(path: Path, kind: str) -> FileFormatError:
-    """Returns the error for an 8-bit image given as depth."""
+    """The error for an 8-bit image given as depth."""
     return FileFormatError(
         f"{path} is an 8-bit {kind}; 8 bits cannot hold depth and it is probably an image of a "
         "depth map, give the 16-bit PNG, EXR or NPY"

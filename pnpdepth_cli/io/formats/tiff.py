@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-import struct
+import io
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import FileFormatError
-from pnpdepth_cli.io.decoding import decode_with_opencv, read_tags
+from pnpdepth_cli.io.decoding import check_tags, decode_with_opencv, silence
 from pnpdepth_cli.io.file_bytes import check_pixel_count, damaged
 from pnpdepth_cli.io.formats import DepthFormat, StoredArray, WriteOptions, scale_in_text
 from pnpdepth_cli.io.formats.png import eight_bits
 
 _WIDTH, _HEIGHT, _BITS, _DESCRIPTION, _SAMPLES, _FORMAT = 256, 257, 258, 270, 277, 339
 _BLOCK_TAGS = ((273, 279), (324, 325))  # offsets and byte counts, of strips or of tiles
+_NUMBERS = {2: "int", 3: "float"}
 
 
 class TiffFacts(NamedTuple):
@@ -33,32 +34,36 @@ class TiffFacts(NamedTuple):
 
 
 def read_tiff_facts(path: Path, data: bytes) -> TiffFacts:
-    """Returns the tags of the first page; Pillow does not open every TIFF that OpenCV decodes.
+    """Returns the tags of the first page, also of pixels that Pillow does not open.
 
     Raises:
         FileFormatError: Tags or pixels lie outside the file, or the image exceeds the budget.
     """
+    from PIL.TiffImagePlugin import ImageFileDirectory_v2
+
     try:
-        tags = read_tags(data)
-        width, height = tags[_WIDTH][0], tags[_HEIGHT][0]
-        ends = [sum(block) for a, b in _BLOCK_TAGS for block in zip(tags[a], tags[b], strict=True)]
-        bits, number, samples = (
-            tags[tag][0] if tags[tag] else 1 for tag in (_BITS, _FORMAT, _SAMPLES)
-        )
-    except (struct.error, ValueError, IndexError) as error:
+        check_tags(data)
+        with silence():
+            tags: Any = ImageFileDirectory_v2(data[:8])
+            stream = io.BytesIO(data)
+            stream.seek(tags.next)
+            tags.load(stream)
+        width, height, samples = tags[_WIDTH], tags[_HEIGHT], tags.get(_SAMPLES, 1)
+        bits, number = (tags.get(tag, (1,))[0] for tag in (_BITS, _FORMAT))
+        blocks = [zip(tags[a], tags[b], strict=True) for a, b in _BLOCK_TAGS if a in tags]
+        end = max(sum(block) for of_kind in blocks for block in of_kind)
+        description = str(tags.get(_DESCRIPTION, ""))
+        if end > len(data):
+            raise damaged(path, "TIFF", f"is cut short: {len(data):,} of {end:,} bytes")
+        check_pixel_count(
+            path, int(width), int(height), channels=int(samples),
+            value_bytes=max(1, int(bits) // 8), file_bytes=len(data),
+        )  # fmt: skip
+    except FileFormatError:
+        raise
+    except Exception as error:  # Pillow raises many kinds on damaged tags
         raise damaged(path, "TIFF", f"is cut short or corrupt ({error})") from error
-    if not ends or max(ends) > len(data):
-        fact = f"is cut short: {len(data):,} of {max(ends, default=0):,} bytes"
-        raise damaged(path, "TIFF", fact)
-    check_pixel_count(
-        path, width, height, channels=samples, value_bytes=max(1, bits // 8), file_bytes=len(data)
-    )
-    return TiffFacts(
-        bits=bits,
-        number={2: "int", 3: "float"}.get(number, "uint"),
-        samples=samples,
-        description=bytes(tags[_DESCRIPTION]).decode("utf-8", "replace").rstrip("\0"),
-    )
+    return TiffFacts(int(bits), _NUMBERS.get(number, "uint"), int(samples), description)
 
 
 def _read(path: Path, data: bytes, channel: str | None) -> StoredArray:
@@ -73,7 +78,7 @@ def _read(path: Path, data: bytes, channel: str | None) -> StoredArray:
         raise FileFormatError(
             f"{path} is a {facts.bits}-bit {facts.number} TIFF; save depth as float32 or uint16"
         )
-    values = decode_with_opencv(path, data, "TIFF")
+    values = decode_with_opencv(path, data, "TIFF")  # Pillow has no 64-bit floats
     if values.ndim != 2 or values.dtype.itemsize * 8 != facts.bits:
         raise damaged(path, "TIFF", "cannot be decoded as one channel")
     description = f"{facts.bits}-bit {'float ' if facts.number == 'float' else ''}TIFF"

@@ -3,35 +3,22 @@
     frames = read_frames(Path("KITTI/object"))            # layout guessed
     frames = read_frames(Path("frames"), "pairs")         # layout named
 
-A new layout is one entry of `TABLE`, a row of `folders` or a `Layout`, with its name in
-`choices.LAYOUTS`; or an entry point of the group `pnpdepth.layouts`.
+A new layout is a row of `rows`, or a `Layout` in `TABLE`, with its name in `choices.LAYOUTS`; or an
+entry point of the group `pnpdepth.layouts`.
 """
 
 from __future__ import annotations
 
-from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
 from pnpdepth_cli.choices import LAYOUTS
 from pnpdepth_cli.errors import InputError, UsageError
-from pnpdepth_cli.io.dataset.frame import Frame, Hdf5Array, Listing, Source, Unmatched
-from pnpdepth_cli.io.dataset.protocols import PROTOCOLS, Protocol, find_protocol
+from pnpdepth_cli.io.dataset.frame import Frame, Hdf5Array, Listing, Source
+from pnpdepth_cli.io.dataset.protocols import PROTOCOLS, find_protocol
 from pnpdepth_cli.io.dataset.reading import read_frame_ground_truth, read_frame_image
-from pnpdepth_cli.io.layouts.layout import Layout, merged  # isort: split
-
-# after Layout, which the manifest's module imports from here
-from pnpdepth_cli.io.layouts import (
-    colmap,
-    driving,
-    folders,
-    hdf5_files,
-    kitti,
-    manifest,
-    pairs,
-    synthia,
-    tum,
-)
+from pnpdepth_cli.io.layouts import colmap, driving, hdf5_files, kitti, manifest, rows, tum
+from pnpdepth_cli.io.layouts.layout import Layout, merged
 
 __all__ = [
     "LAYOUTS",
@@ -39,10 +26,7 @@ __all__ = [
     "Frame",
     "Hdf5Array",
     "Layout",
-    "Listing",
-    "Protocol",
     "Source",
-    "Unmatched",
     "find_layout",
     "find_protocol",
     "list_frames",
@@ -53,19 +37,16 @@ __all__ = [
 
 
 TABLE: dict[str, Layout] = {
-    **folders.ROWS,
-    "manifest": manifest.LAYOUT,
+    **rows.ROWS,
+    "manifest": manifest.MANIFEST,
     "nyu-mat": hdf5_files.NYU_MAT,
     "kitti-odometry": kitti.ODOMETRY,
     "kitti-depth": kitti.DEPTH,
     "kitti-raw": kitti.RAW,
     "tum": tum.TUM,
-    "synthia": synthia.SYNTHIA,
     "colmap": colmap.COLMAP,
-    "hypersim": hdf5_files.HYPERSIM,
     "nuscenes": driving.NUSCENES,
     "ddad": driving.DDAD,
-    "pairs": pairs.PAIRS,
     "nyu-h5": hdf5_files.NYU_H5,
 }
 """The layouts of this package, which `choices.LAYOUTS` lists in the order of guessing."""
@@ -86,9 +67,9 @@ def find_layout(root: Path, name: str | None = None) -> str:
         raise UsageError(f"no layout {name!r}; there are {', '.join(LAYOUTS)}")
     if not root.exists():
         raise InputError(f"{root}: no such folder; check the path")
-    for each in LAYOUTS if name is None else (name,):
-        if LAYOUTS[each].matches(root):
-            return each
+    found = _match(root, name)
+    if found is not None:
+        return found
     if name is not None:
         needed = ", ".join(LAYOUTS[name].needs)
         raise InputError(
@@ -98,22 +79,19 @@ def find_layout(root: Path, name: str | None = None) -> str:
 
 
 def _nearest(root: Path) -> str:
-    """What the nearest layout lacks, and what the others need."""
+    """What the nearest layout lacks; what all need, if no layout is near."""
     needs = {each: LAYOUTS[each].needs for each in LAYOUTS if LAYOUTS[each].needs}
     present = {
-        each: [pattern for pattern in patterns if next(root.glob(pattern), None)]
+        each: [p for p in patterns if any(next(root.glob(s + p), None) for s in ("", "*/", "*/*/"))]
         for each, patterns in needs.items()
     }
     best = max(needs, key=lambda each: len(present[each]) / len(needs[each]))
-    text = "layouts need: "
     if present[best]:
         lacking = [pattern for pattern in needs[best] if pattern not in present[best]]
-        fact = f" and lacks {', '.join(lacking)}" if lacking else ""
-        text = f"nearest is {best!r}, which needs {', '.join(needs[best])}{fact}; others need: "
-    others = (each for each in needs if each != best or not present[best])
-    without = [each for each in LAYOUTS if each not in needs]
-    more = f"; without a fixed folder: {', '.join(without)}" if without else ""
-    return text + "; ".join(f"{each} {', '.join(needs[each])}" for each in others) + more
+        fact = f"lacks {', '.join(lacking)}" if lacking else "has them, but not in one place"
+        return f"nearest is {best!r}, which needs {', '.join(needs[best])}; the folder {fact}"
+    listed = "; ".join(f"{each} {', '.join(patterns)}" for each, patterns in needs.items())
+    return f"layouts need: {listed}; without a fixed folder: manifest (a .csv or .jsonl file)"
 
 
 def list_frames(root: Path, name: str | None = None) -> tuple[str, Listing]:
@@ -127,45 +105,46 @@ def list_frames(root: Path, name: str | None = None) -> tuple[str, Listing]:
         InputError: The folder matches no layout, or cannot be read.
     """
     try:
-        parts = _data_sets(root, name)
-        layout = parts[0][1]
-        if parts[0][0] == root:
+        data_sets, layout = _data_sets(root, name)
+        if data_sets == [root]:
             return layout, LAYOUTS[layout].listing(root)
-        listings = [_prefixed(LAYOUTS[layout].listing(folder), folder) for folder, _ in parts]
+        listings = [LAYOUTS[layout].listing(folder) for folder in data_sets]
     except OSError as error:
         reason = (error.strerror or str(error)).lower()
         raise InputError(f"{error.filename or root} cannot be read ({reason}); check it") from error
-    return layout, merged(listings)
+    named = (
+        replace(one, frames=[replace(f, name=f"{folder.name}/{f.name}") for f in one.frames])
+        for folder, one in zip(data_sets, listings, strict=True)
+    )
+    return layout, merged(named)
 
 
-def _prefixed(listing: Listing, folder: Path) -> Listing:
-    frames = [replace(frame, name=f"{folder.name}/{frame.name}") for frame in listing.frames]
-    return replace(listing, frames=frames)
-
-
-def _data_sets(root: Path, name: str | None) -> list[tuple[Path, str]]:
-    """The folder, or those in it that are of one layout, with that layout.
+def _data_sets(root: Path, name: str | None) -> tuple[list[Path], str]:
+    """The folder, or those in it that are of one layout, and that layout.
 
     Raises:
         InputError: Neither is, or the folders in it are of several layouts.
     """
     try:
-        return [(root, find_layout(root, name))]
+        return [root], find_layout(root, name)
     except InputError as error:
-        data_sets = []
-        for folder in sorted(root.iterdir()) if root.is_dir() else []:
-            if folder.is_dir() and not folder.name.startswith("."):
-                with suppress(InputError):
-                    data_sets.append((folder, find_layout(folder, name)))
-        layouts = sorted({layout for _, layout in data_sets})
+        inside = sorted(root.iterdir()) if root.is_dir() else []
+        folders = [path for path in inside if path.is_dir() and not path.name.startswith(".")]
+        found = {path: layout for path in folders if (layout := _match(path, name)) is not None}
+        layouts = sorted(set(found.values()))
         if len(layouts) > 1:
             raise InputError(
                 f"{root} holds folders of several layouts ({', '.join(layouts)}); give one of"
                 " them, or name the layout"
             ) from error
-        if not data_sets:
+        if not found:
             raise
-        return data_sets
+        return list(found), layouts[0]
+
+
+def _match(root: Path, name: str | None) -> str | None:
+    names = LAYOUTS if name is None else (name,)
+    return next((each for each in names if LAYOUTS[each].matches(root)), None)
 
 
 def read_frames(root: Path, name: str | None = None) -> list[Frame]:

@@ -10,27 +10,16 @@ from pathlib import Path
 
 import numpy as np
 
-from pnpdepth_cli.io.colmap.model import model_files, read_model
-from pnpdepth_cli.io.colmap.parts import ColmapImage
+from pnpdepth_cli.io.colmap.reading import model_files, read_model
 from pnpdepth_cli.io.dataset.find_files import find_files
-from pnpdepth_cli.io.dataset.frame import IMAGE_SUFFIXES, Frame, Listing, Pose, Unmatched
+from pnpdepth_cli.io.dataset.frame import IMAGE_SUFFIXES, Frame, Listing, Unmatched
 from pnpdepth_cli.io.layouts.layout import Layout
 
 
-def matches(root: Path) -> bool:
-    """Returns whether there is images/ and a sparse model."""
-    return (root / "images").is_dir() and bool(_models(root))
-
-
-def listing(root: Path) -> Listing:
-    """Returns one frame for each registered image that exists.
-
-    Raises:
-        FileFormatError: The model is damaged.
-    """
+def _listing(root: Path) -> Listing:
+    """One frame for each registered image that exists."""
     models = [read_model(folder) for folder in _models(root)]
-    model = max(models, key=lambda each: len(each.images))
-    photos = root / "images"
+    model, photos = max(models, key=lambda each: len(each.images)), root / "images"
     files, unreadable = find_files(photos, IMAGE_SUFFIXES)
     spare = [
         Unmatched(path=path, why=f"is not registered in {model.folder}")
@@ -43,15 +32,12 @@ def listing(root: Path) -> Listing:
             spare.append(Unmatched(path=other.folder, why=why))
     frames, broken = [], list(unreadable)
     for name, image in sorted(model.images.items()):
-        path = photos / name
+        path, turn = photos / name, image.rotation.T  # the pose is the inverse of COLMAP's
         if path.is_file():
+            pose = np.column_stack([turn, -turn @ image.translation]).tolist()
+            stem = Path(name).with_suffix("").as_posix()
             frames.append(
-                Frame(
-                    name=Path(name).with_suffix("").as_posix(),
-                    image=path,
-                    sparse=model.folder,
-                    pose=_pose(image),
-                )
+                Frame(name=stem, image=path, sparse=model.folder, pose=tuple(map(tuple, pose)))
             )
         else:
             why = f"is missing, but registered in {model.folder}; add it"
@@ -67,11 +53,8 @@ def _models(root: Path) -> list[Path]:
     return [folder for folder in (*numbered, sparse, root) if model_files(folder)]
 
 
-def _pose(image: ColmapImage) -> Pose:
-    """Camera to model: the inverse of COLMAP's."""
-    rotation = image.rotation.T
-    rows = np.column_stack([rotation, -rotation @ image.translation])
-    return tuple(tuple(float(value) for value in row) for row in rows)
-
-
-COLMAP = Layout(matches=matches, listing=listing, needs=("images", "sparse/*/cameras.*"))
+COLMAP = Layout(
+    matches=lambda root: (root / "images").is_dir() and bool(_models(root)),
+    listing=_listing,
+    needs=("images", "sparse/*/cameras.*"),
+)

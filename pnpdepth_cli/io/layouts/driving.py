@@ -14,6 +14,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,7 @@ from pnpdepth_cli.io.calibration import Calibration, Floats
 from pnpdepth_cli.io.dataset.frame import Frame, Listing, Unmatched
 from pnpdepth_cli.io.extrinsics import Extrinsics, inverse, pose_of_quaternion
 from pnpdepth_cli.io.file_bytes import check_pixel_count, one_line, read_bytes
-from pnpdepth_cli.io.layouts.layout import Layout
+from pnpdepth_cli.io.layouts.layout import Layout, listing_of
 
 _TABLES = ("sample_data", "calibrated_sensor", "ego_pose", "sensor", "sample", "scene")
 _LARGEST_PX = 1e9
@@ -57,41 +58,41 @@ def _text(row: Row, key: str) -> str:
     return str(row[key])
 
 
-def _calibration(
-    path: Path, intrinsics: Floats, image: Row, pose: Extrinsics, source: str
-) -> Calibration:
-    """The camera of an image, with the pose of the scan in it."""
+def _frame(
+    image: Path,
+    scan: Path | None,
+    row: Row,
+    intrinsics: Floats,
+    poses: tuple[Extrinsics, ...],
+    source: str,
+    **fields: Any,
+) -> Frame | Unmatched:
+    """The frame of an image; `row` has its size, and the poses lead from the scan to the camera."""
+    if scan is None or not image.is_file() or not scan.is_file():
+        return Unmatched(path=image, why="or its LiDAR scan does not exist; add it")
     if not (np.abs(intrinsics) < _LARGEST_PX).all() or min(intrinsics[0, 0], intrinsics[1, 1]) <= 0:
         raise ValueError("no pinhole camera")
-    size = int(image["height"]), int(image["width"])
-    check_pixel_count(path, size[1], size[0])
-    return Calibration(
+    size = int(row["height"]), int(row["width"])
+    check_pixel_count(image, size[1], size[0])
+    rotation, translation = np.eye(3), np.zeros(3)
+    for turn, shift in poses:
+        translation = rotation @ shift + translation
+        rotation = rotation @ turn
+    calibration = Calibration(
         intrinsics=intrinsics,
-        rotation=pose[0],
-        translation=pose[1],
+        rotation=rotation,
+        translation=translation,
         distortion=(),
         size=size,
         has_pose=True,
         source=source,
     )
-
-
-def _chained(*poses: Extrinsics) -> Extrinsics:
-    rotation, translation = np.eye(3), np.zeros(3)
-    for turn, shift in poses:
-        translation = rotation @ shift + translation
-        rotation = rotation @ turn
-    return rotation, translation
-
-
-def _missing(image: Path) -> Unmatched:
-    return Unmatched(path=image, why="or its LiDAR scan does not exist; add it")
+    return Frame(image=image, sparse=scan, calibration=calibration, **fields)
 
 
 def _version(root: Path) -> Path | None:
     """The folder of nuScenes' tables, the first of several."""
-    folders = sorted(p.parent for p in root.glob("v1.0-*/sample_data.json"))
-    return folders[0] if folders else None
+    return min((p.parent for p in root.glob("v1.0-*/sample_data.json")), default=None)
 
 
 def _nuscenes(root: Path) -> Listing:
@@ -103,11 +104,8 @@ def _nuscenes(root: Path) -> Listing:
             name: {_text(row, "token"): row for row in _json(version / f"{name}.json")}
             for name in _TABLES
         }
-        found = list(_of_tables(root, tables))
-    frames = sorted((each for each in found if isinstance(each, Frame)), key=lambda f: f.name)
-    return Listing(
-        frames=frames, broken=tuple(each for each in found if isinstance(each, Unmatched))
-    )
+        listing = listing_of(_of_tables(root, tables))
+    return replace(listing, frames=sorted(listing.frames, key=lambda frame: frame.name))
 
 
 def _of_tables(root: Path, tables: dict[str, dict[str, Row]]) -> Iterator[Frame | Unmatched]:
@@ -118,27 +116,26 @@ def _of_tables(root: Path, tables: dict[str, dict[str, Row]]) -> Iterator[Frame 
             channel = _text(tables["sensor"][sensor], "channel")
             samples.setdefault(row["sample_token"], {})[channel] = row
     for sample, rows in samples.items():
-        scan = rows.get("LIDAR_TOP")
         scene = _text(tables["scene"][tables["sample"][sample]["scene_token"]], "name")
+        scan = rows.get("LIDAR_TOP")
         for channel in sorted(name for name in rows if name.startswith("CAM_")):
             row = rows[channel]
-            image = root / _text(row, "filename")
-            sparse = None if scan is None else root / _text(scan, "filename")
-            if scan is None or not image.is_file() or sparse is None or not sparse.is_file():
-                yield _missing(image)
-                continue
-            camera, scanner = (
-                tables["calibrated_sensor"][each["calibrated_sensor_token"]] for each in (row, scan)
+            sensors, cars = (
+                [tables[table][each[f"{table}_token"]] for each in (row, scan or row)]
+                for table in ("calibrated_sensor", "ego_pose")
             )
-            car, car_at_scan = (tables["ego_pose"][each["ego_pose_token"]] for each in (row, scan))
-            poses = [_car_pose(root, each) for each in (camera, car, car_at_scan, scanner)]
-            matrix = np.array(camera["camera_intrinsic"], np.float64).reshape(3, 3)
-            pose = _chained(inverse(poses[0]), inverse(poses[1]), *poses[2:])
-            yield Frame(
+            camera, car, car_at_scan, scanner = (
+                _car_pose(root, each) for each in (sensors[0], *cars, sensors[1])
+            )
+            image = root / _text(row, "filename")
+            yield _frame(
+                image,
+                None if scan is None else root / _text(scan, "filename"),
+                row,
+                np.array(sensors[0]["camera_intrinsic"], np.float64).reshape(3, 3),
+                (inverse(camera), inverse(car), car_at_scan, scanner),
+                "nuScenes tables",
                 name=f"{scene}/{image.stem}",
-                image=image,
-                sparse=sparse,
-                calibration=_calibration(image, matrix, row, pose, "nuScenes tables"),
                 group=f"{scene}/{channel}",
             )
 
@@ -169,10 +166,7 @@ def _ddad(root: Path) -> Listing:
     for path in _scenes(root):
         with _as_our_errors(path):
             found += _of_scene(path)
-    return Listing(
-        frames=[each for each in found if isinstance(each, Frame)],
-        broken=tuple(each for each in found if isinstance(each, Unmatched)),
-    )
+    return listing_of(found)
 
 
 def _of_scene(path: Path) -> list[Frame | Unmatched]:
@@ -194,18 +188,17 @@ def _of_scene(path: Path) -> list[Frame | Unmatched]:
 def _of_sample(
     folder: Path, name: str, rows: dict[str, Row], calibration: Row
 ) -> Frame | Unmatched:
-    image = rows[name]["image"]
+    image, scan = rows[name]["image"], rows.get("LIDAR", {}).get("point_cloud")
     path = folder / _text(image, "filename")
-    scan = rows.get("LIDAR", {}).get("point_cloud")
-    if scan is None or not path.is_file() or not (folder / _text(scan, "filename")).is_file():
-        return _missing(path)
-    camera, scanner = _sensor_pose(path, image["pose"]), _sensor_pose(path, scan["pose"])
-    pose = _chained(inverse(camera), scanner)
-    return Frame(
+    camera = _sensor_pose(path, image["pose"])
+    return _frame(
+        path,
+        None if scan is None else folder / _text(scan, "filename"),
+        image,
+        _pinhole(name, calibration),
+        (inverse(camera), *([] if scan is None else [_sensor_pose(path, scan["pose"])])),
+        "DDAD scene",
         name=f"{folder.name}/{name}_{path.stem}",
-        image=path,
-        sparse=folder / _text(scan, "filename"),
-        calibration=_calibration(path, _pinhole(name, calibration), image, pose, "DDAD scene"),
         pose=tuple(map(tuple, np.column_stack(camera).tolist())),
         group=f"{folder.name}/{name}",
     )

@@ -1,8 +1,4 @@
-"""Data sets with arrays in HDF5 and MATLAB files.
-
-`hypersim`: ai_*/images/scene_cam_*_final_preview/ and scene_cam_*_geometry_hdf5/. The images are
-the tone-mapped previews. depth_meters is the distance from the camera's centre; z is computed with
-the focal length of a field of view of 60 degrees. The cameras of some scenes differ slightly.
+"""NYU Depth v2 in HDF5 and MATLAB files.
 
 `nyu-h5`: one .h5 file a frame, as Ma et al. distribute NYU Depth v2 and KITTI odometry. Files as
 wide as KITTI's hold the projected scan as depth, and are cropped as the paper crops KITTI.
@@ -13,84 +9,52 @@ a test.txt with the numbers of its frames from 1, beside it names the test set, 
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from pnpdepth_cli.errors import FileFormatError
 from pnpdepth_cli.io.dataset.frame import Frame, Hdf5Array, Listing
-from pnpdepth_cli.io.dataset.hdf5 import shape_of
-from pnpdepth_cli.io.dataset.matlab import read_matlab_array
 from pnpdepth_cli.io.dataset.protocols import PROTOCOLS, Protocol
+from pnpdepth_cli.io.dataset.reading import read_matlab_array, shape_of
 from pnpdepth_cli.io.file_bytes import one_line, read_bytes
-from pnpdepth_cli.io.layouts.layout import Layout, Parts, files_in, joined, merged
+from pnpdepth_cli.io.layouts.layout import Layout, Parts, row
 
-_FOCAL_PX = 886.81  # of Hypersim's images, 1024 pixels wide
-_PREVIEW, _GEOMETRY = "_final_preview", "_geometry_hdf5"
 _WIDEST_KINECT = 1000  # pixels; NYU's frames have 640, KITTI's 1224 or more
 _LABELED = "nyu_depth_v2_labeled.mat"
 _MOST_FRAMES = 100_000
 """The official file of NYU has 1,449."""
 
 
-def _hypersim_cameras(root: Path) -> list[Path]:
-    starts = ("", "images/", "*/images/", "*/*/images/")
-    found = (p for start in starts for p in root.glob(f"{start}scene_cam_*{_PREVIEW}"))
-    return sorted(p for p in found if p.is_dir())
-
-
-def _of_hypersim_camera(previews: Path) -> Listing:
-    camera, scene = previews.name.removesuffix(_PREVIEW), previews.parents[1].name
-    folders = {"image": previews, "gt": previews.with_name(camera + _GEOMETRY)}
-
-    def make(stem: str, files: Parts) -> Frame:
-        array = Hdf5Array(path=files["gt"], name="dataset", axes=(0, 1), focal_px=_FOCAL_PX)
-        name = f"{scene}/{camera.removeprefix('scene_')}_{stem}"
-        return Frame(name=name, image=files["image"], gt=array, group=f"{scene}/{camera}")
-
-    patterns = {"image": r"(frame\.\d+)\.tonemap\.jpg", "gt": r"(frame\.\d+)\.depth_meters\.hdf5"}
-    files = {part: files_in(folder, patterns[part]) for part, folder in folders.items()}
-    return joined(folders, files, make)
-
-
-HYPERSIM = Layout(
-    matches=lambda root: bool(_hypersim_cameras(root)),
-    listing=lambda root: merged(_of_hypersim_camera(each) for each in _hypersim_cameras(root)),
-    needs=("*/images/scene_cam_*_final_preview", "*/images/scene_cam_*_geometry_hdf5"),
-)
-
-
-def _h5_files(root: Path) -> list[Path]:
-    return sorted(p for start in ("", "*/", "*/*/") for p in root.glob(f"{start}*.h5"))
-
-
-def _h5_listing(root: Path) -> Listing:
-    """One frame per file, with rgb (3, H, W) and depth (H, W) in it."""
-    files = _h5_files(root)
-    protocol = _protocol_of(files)
-    frames = [
-        Frame(
-            name="_".join(path.relative_to(root).with_suffix("").parts),
-            image=Hdf5Array(path=path, name="rgb", axes=(1, 2, 0)),
-            gt=Hdf5Array(path=path, name="depth", axes=(0, 1)),
-            protocol=protocol,
-        )
-        for path in files
-    ]
-    return Listing(frames=frames)
-
-
-def _protocol_of(files: list[Path]) -> Protocol:
-    """The protocol for the width of the first file that can be read."""
-    for path in files:
-        try:
-            width = shape_of(path, "depth")[-1]
-        except FileFormatError:
-            continue  # it is reported when the frame is read
-        return PROTOCOLS["kitti-odometry" if width > _WIDEST_KINECT else "nyu"]
+@functools.lru_cache(maxsize=1)
+def _protocol_of(place: Path, changed_ns: int) -> Protocol:
+    """The protocol for the width of the first file that can be read; kept for the next frame."""
+    for path in sorted(place.glob("*.h5")):
+        with suppress(FileFormatError):  # it is reported when the frame is read
+            wide = shape_of(path, "depth")[-1] > _WIDEST_KINECT
+            return PROTOCOLS["kitti-odometry" if wide else "nyu"]
     return PROTOCOLS["nyu"]
 
 
-NYU_H5 = Layout(matches=lambda root: bool(_h5_files(root)), listing=_h5_listing, needs=("*.h5",))
+def _of_file(place: Path, files: Parts) -> Mapping[str, Any]:
+    """The arrays rgb (3, H, W) and depth (H, W) of a file."""
+    path = files["gt"]
+    return {
+        "image": Hdf5Array(path=path, name="rgb", axes=(1, 2, 0)),
+        "gt": Hdf5Array(path=path, name="depth", axes=(0, 1)),
+        "protocol": _protocol_of(place, place.stat().st_mtime_ns),
+    }
+
+
+NYU_H5 = row(
+    {"gt": "*.h5"},
+    below="|*/|*/*/",
+    marks=("*.h5",),
+    name=lambda root, place, stem: "_".join((*place.relative_to(root).parts, stem)),
+    more=_of_file,
+)
 
 
 def _labeled(root: Path) -> Path:
@@ -117,12 +81,12 @@ def _mat_listing(root: Path) -> Listing:
 
 def _split(folder: Path, count: int) -> list[int]:
     """The numbers of the test set, sorted; empty without a file of them."""
-    text, matlab = folder / "test.txt", folder / "splits.mat"
+    text, source = folder / "test.txt", folder / "splits.mat"
+    words: Any
     if text.is_file():
-        source = text
-        words: Any = read_bytes(text).decode("utf-8", "replace").split()
-    elif matlab.is_file():
-        source, words = matlab, read_matlab_array(matlab, "testNdxs")[:_MOST_FRAMES]
+        source, words = text, read_bytes(text).decode("utf-8", "replace").split()
+    elif source.is_file():
+        words = read_matlab_array(source, "testNdxs")[:_MOST_FRAMES]
     else:
         return []
     try:

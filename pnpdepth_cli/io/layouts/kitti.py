@@ -18,43 +18,27 @@ folder data_depth_annotated/{train,val}/ beside the dates has it.
 from __future__ import annotations
 
 import functools
-import re
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from pnpdepth_cli.errors import FileFormatError, InputError
-from pnpdepth_cli.io.dataset.frame import Frame, Listing, Pose, Unmatched
+from pnpdepth_cli.io.dataset.frame import Pose, Unmatched
 from pnpdepth_cli.io.dataset.protocols import PROTOCOLS
 from pnpdepth_cli.io.file_bytes import one_line, read_bytes
-from pnpdepth_cli.io.layouts.layout import (
-    BIN,
-    IMAGE,
-    PNG,
-    TXT,
-    Files,
-    Layout,
-    Part,
-    Parts,
-    files_in,
-    joined,
-    merged,
-    of_folders,
-)
+from pnpdepth_cli.io.layouts.layout import Parts, either, row
 from pnpdepth_cli.io.oxts import PACKETS
 
-_SCALE = 256.0
-_KIND = re.compile(r"_sync_(image|velodyne_raw|groundtruth_depth)_")
-_RAW = "proj_depth/velodyne_raw/image_0[23]"
-_SCANS = "velodyne_points/data"
-_CAMERAS = ("image_02", "image_03")
-_CALIBRATION = "calib_cam_to_cam.txt"
+_CAMERAS, _SCANS, _CALIBRATION = "image_0[23]", "velodyne_points/data", "calib_cam_to_cam.txt"
+_STEM = r"(.*_sync|)(?:_(?:image|velodyne_raw|groundtruth_depth)(?=_))?(.+)"
+"""Names of the selection, without the kind of file in the middle."""
+_SCALES = {"sparse_scale": 256.0, "gt_scale": 256.0}
+_AS_PUBLISHED: dict[str, Any] = {**_SCALES, "protocol": PROTOCOLS["kitti-depth"]}
 
 
-def _of_sequence(root: Path, place: Path, files: Parts) -> Mapping[str, Any]:
+def _of_sequence(place: Path, files: Parts) -> Mapping[str, Any]:
     """Calibration and pose; poses belong to frames by number, so a part of a sequence has its own.
 
     Raises:
@@ -92,158 +76,109 @@ def _pose(path: Path, number: int, line: str) -> Pose:
     return tuple(tuple(values[start : start + 4]) for start in (0, 4, 8))
 
 
-ODOMETRY = of_folders(
-    {"image": Part("image_2", IMAGE), "sparse": Part("velodyne", BIN)},
-    below=("", "sequences/*/", "dataset/sequences/*/"),
-    probe="calib.txt",
-    needs=("sequences/*/image_2", "sequences/*/velodyne", "sequences/*/calib.txt"),
+ODOMETRY = row(
+    {"image": "image_2/*.IMAGE", "sparse": "velodyne/*.bin"},
+    below="|sequences/*/|dataset/sequences/*/",
+    marks=("calib.txt",),
     name=lambda root, place, stem: f"{place.name}_{stem}",
-    spare=("sparse",),
     more=_of_sequence,
     camera=2,
     protocol=PROTOCOLS["kitti-odometry"],
 )
 
 
-_SELECTION = {
-    "image": Part("image", IMAGE),
-    "sparse": Part("velodyne_raw"),
-    "gt": Part("groundtruth_depth|groundtruth"),
-    "calib": Part("intrinsics", TXT),
-}
+def _name(root: Path, place: Path, stem: str) -> str:
+    drive = place.parents[2] if place.parent.name == "velodyne_raw" else place.parent
+    return f"{drive.name}_{stem}_{place.name}"
 
 
-def _is_selection(root: Path) -> bool:
-    return (root / "image").is_dir() and (root / "velodyne_raw").is_dir()
+def _truth_of(drive: Path, camera: str) -> Path:
+    """The folder of the annotated depth, which may not exist."""
+    inside = Path("proj_depth/groundtruth", camera)
+    bases = (base / "data_depth_annotated" for base in drive.parents[:3])
+    drives = (drive, *(base / part / drive.name for base in bases for part in ("train", "val")))
+    return next((path / inside for path in drives if (path / inside).is_dir()), drive / inside)
 
 
-def _selection(root: Path) -> Listing:
-    folders = {part: kind.path(root) for part, kind in _SELECTION.items()}
-    files = {  # without the kind of file in the middle of the name
-        part: {
-            _KIND.sub("_sync_", stem): path
-            for stem, path in files_in(kind.path(root), kind.pattern).items()
-        }
-        for part, kind in _SELECTION.items()
-    }
-    shared = {"calib": root} if (root / _CALIBRATION).is_file() else {}
-    return joined(
-        folders,
-        files,
-        lambda stem, found: _depth_frame(stem, {**shared, **found}),
-        optional=("gt", "calib"),
-        spare=("sparse", "gt"),
-    )
-
-
-def _depth_frame(name: str, fields: Mapping[str, Any]) -> Frame:
-    protocol = PROTOCOLS["kitti-depth"]
-    return Frame(name=name, sparse_scale=_SCALE, gt_scale=_SCALE, protocol=protocol, **fields)
-
-
-def _scan_folders(root: Path) -> list[Path]:
-    starts = ("", "*/", "*/*/", "data_depth_velodyne/*/*/")
-    return sorted({p for start in starts for p in root.glob(start + _RAW) if p.is_dir()})
-
-
-def _of_scans(root: Path, scans: Path) -> Listing:
-    """The frames of one drive and camera."""
-    camera, drive = scans.name, scans.parents[2]
-    images, calib = _images_of(root, drive, camera)
-    if images is None:
-        why = (
-            f"has no {camera}/data with images; put KITTI's raw drive {drive.name} there, or into"
-            f" {root / drive.name[:10]}"
-        )
-        return Listing(frames=[], broken=(Unmatched(path=drive, why=why),))
-    base, annotated = drive.parents[1], drive
-    if base.name == "data_depth_velodyne":
-        annotated = base.with_name("data_depth_annotated") / drive.parent.name / drive.name
-    truth = annotated / "proj_depth" / "groundtruth" / camera
-    fields = {"calib": calib, "camera": int(camera[-1])}
-    return joined(
-        {"sparse": scans, "image": images, "gt": truth},
-        {
-            "sparse": files_in(scans, PNG),
-            "image": files_in(images, IMAGE),
-            "gt": files_in(truth, PNG),
-        },
-        lambda stem, files: _depth_frame(f"{drive.name}_{stem}_{camera}", {**files, **fields}),
-        optional=("gt",),
-        spare=("image", "gt"),
-    )
-
-
-def _images_of(root: Path, drive: Path, camera: str) -> tuple[Path | None, Path | None]:
-    """The folders of a drive's images and of its calibration; None for one that is missing."""
-    above = [drive.parents[2]] if drive.parents[1].name == "data_depth_velodyne" else []
-    folders = [base / raw for base in (root, *above) for raw in ("", "raw", "kitti_raw")]
-    for parent in (drive, *(folder / drive.name[:10] / drive.name for folder in folders)):
-        images = parent / camera / "data"
-        if images.is_dir():
-            return images, _calibration_of(parent)
-    return None, None
+def _images_of(scans: Path) -> Path:
+    """The raw data's images of a drive and camera, which may not exist."""
+    drive, inside = scans.parents[2], Path(scans.name, "data")
+    bases = (base / raw for base in drive.parents[:3] for raw in ("", "raw", "kitti_raw"))
+    drives = (drive, *(base / drive.name[:10] / drive.name for base in bases))
+    return next((path / inside for path in drives if (path / inside).is_dir()), drive / inside)
 
 
 def _calibration_of(drive: Path) -> Path | None:
     return next((p for p in (drive.parent, drive) if (p / _CALIBRATION).is_file()), None)
 
 
-DEPTH = Layout(
-    matches=lambda root: _is_selection(root) or bool(_scan_folders(root)),
-    listing=lambda root: (
-        _selection(root)
-        if _is_selection(root)
-        else merged(_of_scans(root, scans) for scans in _scan_folders(root))
+def _scan_folders(root: Path) -> list[Path]:
+    starts = ("", "*/", "*/*/", "data_depth_velodyne/*/*/")
+    found = {p for s in starts for p in root.glob(f"{s}proj_depth/velodyne_raw/{_CAMERAS}")}
+    return sorted(path for path in found if path.is_dir())
+
+
+_SELECTION = row(
+    {
+        "image": f"image/{_STEM}.IMAGE",
+        "sparse": f"velodyne_raw/{_STEM}.png",
+        "gt": f"groundtruth_depth|groundtruth/{_STEM}.png?",
+        "calib": f"intrinsics/{_STEM}.txt?",
+    },
+    marks=("velodyne_raw",),
+    name=lambda root, place, stem: stem,
+    more=lambda place, files: (
+        {"calib": place} if "calib" not in files and (place / _CALIBRATION).is_file() else {}
     ),
-    needs=("*/proj_depth/velodyne_raw/image_0[23]", "*/image_0[23]/data"),
+    **_AS_PUBLISHED,
 )
+_TREE = row(
+    {"sparse": "*.png", "image": "*.IMAGE", "gt": "*.png?"},
+    places=_scan_folders,
+    folders={
+        "image": _images_of,
+        "gt": lambda scans: _truth_of(scans.parents[2], scans.name),
+    },
+    needs=(f"proj_depth/velodyne_raw/{_CAMERAS}", f"{_CAMERAS}/data"),
+    absent=lambda scans: (
+        f"has no {scans.name}/data with images; put KITTI's raw drive {scans.parents[2].name} into"
+        f" {scans.parents[3] / scans.parents[2].name[:10]}"
+    ),
+    name=_name,
+    more=lambda scans, files: {
+        "calib": _calibration_of(files["image"].parents[2]),
+        "camera": int(scans.name[-1]),
+    },
+    **_AS_PUBLISHED,
+)
+DEPTH = either(_SELECTION, _TREE)
 
 
-def _drives(root: Path) -> list[Path]:
-    scans = (p for start in ("", "*/", "*/*/") for p in root.glob(start + _SCANS))
-    drives = (p.parents[1] for p in scans if p.is_dir())
-    return sorted(p for p in drives if any((p / c / "data").is_dir() for c in _CAMERAS))
+def _raw_cameras(root: Path) -> list[Path]:
+    """The cameras of drives with scans."""
+    found = (p for start in ("", "*/", "*/*/") for p in root.glob(f"{start}{_CAMERAS}/data"))
+    return sorted(p.parent for p in found if p.is_dir() and (p.parents[1] / _SCANS).is_dir())
 
 
-def _of_drive(root: Path, drive: Path) -> Listing:
-    calib = _calibration_of(drive)
-    if calib is None:
-        why = f"has no {_CALIBRATION}; put KITTI's calibration into {drive.parent}"
-        return Listing(frames=[], broken=(Unmatched(path=drive, why=why),))
-    scans, packets = files_in(drive / _SCANS, BIN), files_in(drive / PACKETS, TXT)
-    listings = []
-    for camera in _CAMERAS:
-        folders = {"image": drive / camera / "data", "sparse": drive / _SCANS,
-                   "gt": drive, "oxts": drive / PACKETS}  # fmt: skip
-        files = {"image": files_in(folders["image"], IMAGE), "sparse": scans,
-                 "gt": _annotated(root, drive, camera), "oxts": packets}  # fmt: skip
-        listing = joined(
-            folders, files, functools.partial(_raw_frame, drive, camera, calib),
-            optional=("gt", "oxts"),
-        )  # fmt: skip
-        # some drives lack scans of a few frames, which is no fault of the copy
-        listings.append(replace(listing, broken=(), spare=listing.broken))
-    return merged(listings)
+def _of_camera(camera: Path, files: Parts) -> Mapping[str, Any] | Unmatched:
+    calibration = _calibration_of(camera.parent)
+    if calibration is None:
+        why = f"has no {_CALIBRATION}; put KITTI's calibration into {camera.parents[1]}"
+        return Unmatched(path=camera.parent, why=why)
+    return {"calib": calibration, "camera": int(camera.name[-1])}
 
 
-def _raw_frame(drive: Path, camera: str, calib: Path, stem: str, files: Parts) -> Frame:
-    number = int(camera[-1])
-    name = f"{drive.name}_{stem}_{camera}"
-    return Frame(name=name, gt_scale=_SCALE, calib=calib, camera=number, **files)
-
-
-def _annotated(root: Path, drive: Path, camera: str) -> Files:
-    """KITTI's annotated depth of a drive, by frame number."""
-    inside = Path("proj_depth", "groundtruth", camera)
-    bases = (root, root.parent, root.parent.parent)
-    folders = [b / "data_depth_annotated" / p / drive.name for b in bases for p in ("train", "val")]
-    paths = (folder / inside for folder in (drive, *folders))
-    return next((files_in(path, PNG) for path in paths if path.is_dir()), {})
-
-
-RAW = Layout(
-    matches=lambda root: bool(_drives(root)),
-    listing=lambda root: merged(_of_drive(root, drive) for drive in _drives(root)),
-    needs=("*_sync/velodyne_points/data", "*_sync/image_02/data", "calib_cam_to_cam.txt"),
+RAW = row(
+    {"image": "data/*.IMAGE", "sparse": "*.bin", "gt": "*.png?", "oxts": "*.txt?"},
+    places=_raw_cameras,
+    folders={
+        "sparse": lambda camera: camera.parent / _SCANS,
+        "gt": lambda camera: _truth_of(camera.parent, camera.name),
+        "oxts": lambda camera: camera.parent / PACKETS,
+    },
+    needs=(_SCANS, f"{_CAMERAS}/data", _CALIBRATION),
+    name=_name,
+    gaps=True,  # some drives lack scans of a few frames, which is no fault of the copy
+    more=_of_camera,
+    gt_scale=256.0,
 )

@@ -11,132 +11,74 @@ are in. Frames of one group are of one sequence.
 from __future__ import annotations
 
 import csv
+import io
 import json
 import os
-from array import array
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any
 
 from pnpdepth_cli.errors import FileFormatError, UsageError
-from pnpdepth_cli.io.dataset.frame import Frame, Listing, Unmatched
-from pnpdepth_cli.io.dataset.frame_names import normalised_name, portable_name_problem
-from pnpdepth_cli.io.dataset.protocols import WHOLE, find_protocol
-from pnpdepth_cli.io.file_bytes import cannot_read, check_size, one_line
-from pnpdepth_cli.io.layouts import Layout
+from pnpdepth_cli.io.dataset.frame import (
+    Frame,
+    Listing,
+    Unmatched,
+    normalised_name,
+    portable_name_problem,
+)
+from pnpdepth_cli.io.dataset.protocols import find_protocol
+from pnpdepth_cli.io.file_bytes import one_line, read_bytes
+from pnpdepth_cli.io.layouts.layout import Layout
 from pnpdepth_cli.io.remote.address import RemotePath, joined
 from pnpdepth_cli.io.remote.store import local_files
 
 _PATHS = ("image", "sparse", "gt", "calib", "mask")
-_NUMBERS = {"camera": int, "sparse_scale": float, "gt_scale": float}
 _FLAGS = {"1": True, "true": True, "yes": True, "0": False, "false": False, "no": False}
-_KEYS = (*_PATHS, *_NUMBERS, "gt_size_ok", "name", "group", "protocol")
+_VALUES: dict[str, Callable[[str], Any]] = {
+    "camera": int,
+    "sparse_scale": float,
+    "gt_scale": float,
+    "gt_size_ok": lambda text: _flag(text),
+    "name": lambda text: _name(text),
+    "group": str,
+    "protocol": find_protocol,
+}
+"""What a text becomes, by column; ValueError and our errors say what is wrong."""
 
 
-def matches(root: Path) -> bool:
-    """Returns whether this is a .csv or .jsonl file."""
-    return root.is_file() and root.suffix.lower() in (".csv", ".jsonl")
-
-
-def listing(root: Path) -> Listing:
-    """Returns a frame for each line of the file; missing files are listed as broken.
+def _listing(root: Path) -> Listing:
+    """A frame for each line of the file; missing files are broken.
 
     Raises:
         FileFormatError: A line is invalid, or two frames would share the files of their results.
     """
-    frames, lines = list[Frame](), array("q")
-    broken: list[Unmatched] = []
-    with local_files([root]) as local, _text_of(root, local.get(root, root)) as file:
-        rows = _csv_rows(root, file) if root.suffix.lower() == ".csv" else _json_rows(root, file)
-        for number, row in rows:
-            values = _parts(root, number, row)
-            masks = (values["mask"],) if "mask" in values else ()
-            fields = {key: value for key, value in values.items() if key != "mask"}
-            frames.append(Frame(**{"name": "", **fields, "masks": masks}))
-            lines.append(number)
-            lost = [file for file in _files(values) if _is_missing(file)]
-            why = f"does not exist; correct line {number} of {root}"
-            broken += [Unmatched(path=file, why=why) for file in lost]
-    _name(frames)
+    with local_files([root]) as local:
+        data = read_bytes(local.get(root, root))
+    try:
+        text = data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise FileFormatError(f"{root} is not a text file; give CSV or JSON lines") from error
+    rows = _csv_rows if root.suffix.lower() == ".csv" else _json_rows
+    frames, lines, broken = list[Frame](), list[int](), list[Unmatched]()
+    for number, row in rows(root, text):
+        where = f"{root}, line {number}"
+        files, values = _parts(root.parent, where, row)
+        other_size = values.pop("gt_size_ok", False)
+        lost = [path for path in files.values() if _is_missing(path)]
+        why = f"does not exist; correct line {number} of {root}"
+        broken += [Unmatched(path=path, why=why) for path in lost]
+        masks = (files.pop("mask"),) if "mask" in files else ()
+        frame = {"name": "", "masks": masks, "gt_other_size": other_size, **files, **values}
+        frames.append(Frame(**frame))
+        lines.append(number)
+    frames = _named(frames)
     _check_names(root, frames, lines)
     return Listing(frames=frames, broken=tuple(broken))
 
 
-@contextmanager
-def _text_of(root: Path, copy: Path) -> Iterator[TextIO]:
-    """Yields the list's file, open; it is not read as a whole, as it may have millions of lines.
-
-    Args:
-        root: Named in messages.
-        copy: What is read.
-    """
-    check_size(copy)
-    try:
-        with copy.open(encoding="utf-8-sig", newline="\n") as file:
-            while file.read(1 << 20):  # all of it is text
-                pass
-            file.seek(0)
-            yield file
-    except UnicodeDecodeError as error:
-        raise FileFormatError(f"{root} is not a text file; give CSV or JSON lines") from error
-    except OSError as error:
-        raise cannot_read(root, error) from error
-
-
-def _check_names(root: Path, frames: Sequence[Frame], lines: Sequence[int]) -> None:
-    """Raises FileFormatError if two frames would share the files of their results."""
-    hashes: set[int] = set()
-    for count, frame in enumerate(frames):
-        key = hash(frame.name.casefold())
-        if key in hashes:
-            _check_earlier(root, frames, lines, count)
-        hashes.add(key)
-
-
-def _check_earlier(root: Path, frames: Sequence[Frame], lines: Sequence[int], count: int) -> None:
-    *earlier, name = (frame.name for frame in frames[: count + 1])
-    for other in earlier:
-        if other.casefold() == name.casefold():
-            hint = "" if other == name else f", which some disks take for {other!r}"
-            raise FileFormatError(
-                f"{root}, line {lines[count]}: a second frame {one_line(name)!r}{hint}; give it a"
-                " name of its own"
-            )
-
-
-def _files(values: dict[str, Any]) -> list[Path]:
-    return [values[key] for key in _PATHS if key in values]
-
-
-def _is_missing(file: Path) -> bool:
-    """Whether the file is not there; a store is asked only when the frame is read."""
-    return not isinstance(file, RemotePath) and not file.exists()
-
-
-def _name(frames: list[Frame]) -> None:
-    """Names those without a name: by the stem, or by the path if stems are not unique."""
-    unnamed = [number for number, frame in enumerate(frames) if not frame.name]
-    paths = [_first_file(frames[number]) for number in unnamed]
-    if len({path.stem for path in paths}) == len(paths):
-        names = [path.stem for path in paths]
-    else:
-        folder = os.path.commonpath([path.parent.absolute() for path in paths])
-        below = (path.absolute().relative_to(folder) for path in paths)
-        names = [path.with_suffix("").as_posix() for path in below]
-    for number, name in zip(unnamed, names, strict=True):
-        frames[number] = replace(frames[number], name=name)
-
-
-def _first_file(frame: Frame) -> Path:
-    file = frame.image or frame.sparse
-    assert isinstance(file, Path)
-    return file
-
-
-def _csv_rows(path: Path, file: TextIO) -> Iterator[tuple[int, dict[str, Any]]]:
-    reader = csv.DictReader(file, restkey="more than the header has")
+def _csv_rows(path: Path, text: str) -> Iterator[tuple[int, dict[str, Any]]]:
+    reader = csv.DictReader(io.StringIO(text, newline="\n"), restkey="more than the header has")
     try:
         for row in reader:
             yield reader.line_num, {str(k).strip(): v for k, v in row.items()}
@@ -144,8 +86,8 @@ def _csv_rows(path: Path, file: TextIO) -> Iterator[tuple[int, dict[str, Any]]]:
         raise FileFormatError(f"{path}, line {reader.line_num}: {one_line(error)}") from error
 
 
-def _json_rows(path: Path, file: TextIO) -> Iterator[tuple[int, dict[str, Any]]]:
-    for number, line in enumerate(file, start=1):
+def _json_rows(path: Path, text: str) -> Iterator[tuple[int, dict[str, Any]]]:
+    for number, line in enumerate(io.StringIO(text, newline="\n"), start=1):
         if not line.strip():
             continue
         try:
@@ -157,59 +99,73 @@ def _json_rows(path: Path, file: TextIO) -> Iterator[tuple[int, dict[str, Any]]]
         yield number, row
 
 
-def _parts(path: Path, number: int, row: dict[str, Any]) -> dict[str, Any]:
-    """The fields of a `Frame` that a row gives."""
-    where = f"{path}, line {number}"
-    values = {k: str(v).strip() for k, v in row.items() if v is not None and str(v).strip()}
-    unknown = sorted(set(values) - set(_KEYS))
+def _parts(folder: Path, where: str, row: dict[str, Any]) -> tuple[dict[str, Path], dict[str, Any]]:
+    """The files and the other values of a row, by column."""
+    texts = {k: str(v).strip() for k, v in row.items() if v is not None and str(v).strip()}
+    unknown = sorted(set(texts) - {*_PATHS, *_VALUES})
     if unknown:
         commas = "; columns are parted by commas" if ";" in unknown[0] else ""
-        raise FileFormatError(
-            f"{where}: column {unknown[0]!r} is not one of {', '.join(_KEYS)}{commas}"
-        )
-    files = _paths(path.parent, where, values)
-    nul = next((k for k, v in values.items() if "\0" in v), None)
+        keys = ", ".join((*_PATHS, *_VALUES))
+        raise FileFormatError(f"{where}: column {unknown[0]!r} is not one of {keys}{commas}")
+    nul = next((key for key, text in texts.items() if "\0" in text), None)
     if nul is not None:
         raise FileFormatError(f"{where}: {nul} holds a NUL character; correct it")
-    if "image" not in files and "sparse" not in files:
+    if "image" not in texts and "sparse" not in texts:
         raise FileFormatError(f"{where}: has neither image nor sparse; give one")
     try:
-        numbers: dict[str, Any] = {k: f(values[k]) for k, f in _NUMBERS.items() if k in values}
-    except (ValueError, OverflowError) as error:
+        files = {key: joined(folder, texts[key]) for key in _PATHS if key in texts}
+        values = {key: value(texts[key]) for key, value in _VALUES.items() if key in texts}
+    except (ValueError, OverflowError, UsageError) as error:
         raise FileFormatError(f"{where}: {one_line(error)}") from error
-    protocol = find_protocol(values["protocol"]) if "protocol" in values else WHOLE
-    group = {"group": values["group"]} if "group" in values else {}
-    if values.get("gt_size_ok", "0").lower() not in _FLAGS:
-        raise FileFormatError(
-            f"{where}: gt_size_ok is {values['gt_size_ok'][:20]!r}, not true or false"
-        )
-    other_size = _FLAGS[values.get("gt_size_ok", "0").lower()]
-    return {
-        "protocol": protocol,
-        **_given_name(where, values),
-        **group,
-        **files,
-        **numbers,
-        "gt_other_size": other_size,
-    }
+    return files, values
 
 
-def _paths(folder: Path, where: str, values: dict[str, str]) -> dict[str, Any]:
-    try:
-        return {key: joined(folder, values[key]) for key in _PATHS if key in values}
-    except UsageError as error:
-        raise FileFormatError(f"{where}: {error}") from error
+def _flag(text: str) -> bool:
+    if text.lower() not in _FLAGS:
+        raise ValueError(f"gt_size_ok is {text[:20]!r}, not true or false")
+    return _FLAGS[text.lower()]
 
 
-def _given_name(where: str, values: dict[str, str]) -> dict[str, str]:
-    if "name" not in values:
-        return {}
-    problem = portable_name_problem(values["name"])
+def _name(text: str) -> str:
+    problem = portable_name_problem(text)
     if problem is not None:
-        raise FileFormatError(
-            f"{where}: name {one_line(values['name'])[:60]!r} {problem}; choose another"
-        )
-    return {"name": normalised_name(values["name"])}
+        raise ValueError(f"name {one_line(text)[:60]!r} {problem}; choose another")
+    return normalised_name(text)
 
 
-LAYOUT: Layout = Layout(matches=matches, listing=listing)
+def _is_missing(file: Path) -> bool:
+    """Whether it does not exist; files of a store are looked at when they are read."""
+    return not isinstance(file, RemotePath) and not file.exists()
+
+
+def _named(frames: list[Frame]) -> list[Frame]:
+    """All with names: by the stem, or by the path if stems are not unique."""
+    paths = [frame.image or frame.sparse for frame in frames if not frame.name]
+    files = [path for path in paths if isinstance(path, Path)]
+    names = [path.stem for path in files]
+    if len(set(names)) < len(names):
+        folder = os.path.commonpath([path.parent.absolute() for path in files])
+        below = (path.absolute().relative_to(folder) for path in files)
+        names = [path.with_suffix("").as_posix() for path in below]
+    given = iter(names)
+    return [frame if frame.name else replace(frame, name=next(given)) for frame in frames]
+
+
+def _check_names(root: Path, frames: list[Frame], lines: list[int]) -> None:
+    """Raises FileFormatError if two frames would share the files of their results."""
+    first: dict[str, str] = {}
+    for frame, line in zip(frames, lines, strict=True):
+        other = first.get(frame.name.casefold())
+        if other is not None:
+            hint = "" if other == frame.name else f", which some disks take for {other!r}"
+            raise FileFormatError(
+                f"{root}, line {line}: a second frame {one_line(frame.name)!r}{hint}; give it a"
+                " name of its own"
+            )
+        first[frame.name.casefold()] = frame.name
+
+
+MANIFEST = Layout(
+    matches=lambda root: root.is_file() and root.suffix.lower() in (".csv", ".jsonl"),
+    listing=_listing,
+)

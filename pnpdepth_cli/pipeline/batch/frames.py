@@ -12,15 +12,15 @@ from pathlib import Path, PurePosixPath
 from typing import TypeVar
 
 from pnpdepth_cli.errors import InputError, OutputError, UsageError
-from pnpdepth_cli.io.colmap.model import model_files
+from pnpdepth_cli.io.colmap.reading import model_files
 from pnpdepth_cli.io.dataset.frame import (
     SCAN_ONLY_SUFFIXES,
     Frame,
     Source,
     Unmatched,
     file_of,
+    name_problem,
 )
-from pnpdepth_cli.io.dataset.frame_names import name_problem
 from pnpdepth_cli.io.file_bytes import one_line
 from pnpdepth_cli.io.layouts import LAYOUTS, find_protocol, list_frames
 from pnpdepth_cli.io.lock import LOCKS

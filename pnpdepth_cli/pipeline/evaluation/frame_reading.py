@@ -11,12 +11,11 @@ import numpy as np
 
 from pnpdepth_cli.errors import InputError, SizeError, UsageError
 from pnpdepth_cli.io.calibration import read_calibration
-from pnpdepth_cli.io.dataset.hdf5 import depth_of, rgb_of
-from pnpdepth_cli.io.dataset.masks import masked, read_mask
-from pnpdepth_cli.io.depth import DepthImage, read_sparse
-from pnpdepth_cli.io.depth_reading import depth_from_stored, known_metres, load_stored
+from pnpdepth_cli.io.dataset.reading import depth_of, masked, read_mask, rgb_of
+from pnpdepth_cli.io.depth import DepthImage, depth_from_stored, known_metres, load_stored
 from pnpdepth_cli.io.layouts import Hdf5Array
 from pnpdepth_cli.io.rgb import read_rgb
+from pnpdepth_cli.io.sparse_reading import read_sparse
 from pnpdepth_cli.pipeline.evaluation.measures import Depth, Floats, Mask, MeasuredFrame
 from pnpdepth_cli.pipeline.evaluation.pairing import FramePair
 from pnpdepth_cli.pipeline.evaluation.protocols import EvalProtocol

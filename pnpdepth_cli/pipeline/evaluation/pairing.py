@@ -11,8 +11,8 @@ from typing import Any
 
 from pnpdepth_cli.errors import InputError, PnpDepthError, UsageError
 from pnpdepth_cli.io.dataset.frame import IMAGE_SUFFIXES, file_of
-from pnpdepth_cli.io.depth import DEPTH_SUFFIXES
 from pnpdepth_cli.io.file_bytes import one_line
+from pnpdepth_cli.io.formats import DEPTH_SUFFIXES
 from pnpdepth_cli.io.layouts import Frame, Source, find_layout, find_protocol, list_frames
 from pnpdepth_cli.io.record import read_json
 from pnpdepth_cli.io.remote.address import RemotePath

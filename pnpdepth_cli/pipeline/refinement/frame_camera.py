@@ -15,7 +15,7 @@ from pnpdepth_cli.choices import LENSES
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.io.calibration import read_calibration
 from pnpdepth_cli.io.dataset.protocols import Protocol
-from pnpdepth_cli.io.exif import read_focal_length
+from pnpdepth_cli.io.rgb import read_focal_length
 from pnpdepth_cli.pipeline.refinement.request import FrameFiles, RefineRequest
 from pnpdepth_cli.pipeline.sparse.scans import camera_of, check_size
 from pnpdepth_cli.sensors.camera import Camera

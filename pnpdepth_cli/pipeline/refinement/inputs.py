@@ -15,18 +15,11 @@ from pnpdepth_cli.completion.image_registration import ImageRegistration, estima
 from pnpdepth_cli.errors import InputError, NoPointsError, SizeError, UsageError
 from pnpdepth_cli.frames.frame import Frame
 from pnpdepth_cli.io.dataset.frame import SCAN_ONLY_SUFFIXES, Hdf5Array, Source
-from pnpdepth_cli.io.dataset.hdf5 import depth_of, rgb_of
-from pnpdepth_cli.io.dataset.masks import masked, moved_to
-from pnpdepth_cli.io.depth import (
-    DepthImage,
-    describe_range,
-    implausible,
-    read_depth,
-    read_sparse,
-)
-from pnpdepth_cli.io.depth_range import metres
+from pnpdepth_cli.io.dataset.reading import check_same_view, depth_of, masked, moved_to, rgb_of
+from pnpdepth_cli.io.depth import DepthImage, describe_range, implausible, metres, read_depth
 from pnpdepth_cli.io.fingerprint import fingerprint
 from pnpdepth_cli.io.rgb import read_rgb
+from pnpdepth_cli.io.sparse_reading import read_sparse
 from pnpdepth_cli.pipeline.refinement.frame_camera import FrameCamera, camera_of_frame
 from pnpdepth_cli.pipeline.refinement.method import PAPER
 from pnpdepth_cli.pipeline.refinement.neighbours import (
@@ -315,7 +308,7 @@ def _read_image(files: FrameFiles, source: Source) -> _Part:
     if isinstance(source, Hdf5Array):
         rgb, note = rgb_of(source), None
     else:
-        image = read_rgb(source)
+        image = read_rgb(source, upright=files.sparse is None or not files.sparse.is_dir())
         rgb, note = image.values, image.note
     return _Part(
         values=np.ascontiguousarray(files.protocol.apply(rgb)),
@@ -430,6 +423,7 @@ def _read_points(
     sparse = read_sparse(path, size=image_size, scale=scale, channel=files.channel)
     sparse_size, depth = sparse.points.size, sparse.points.depth
     size = image_size or sparse_size
+    check_same_view(str(path), sparse_size, size)
     if sparse_size != size and not files.sparse_size_ok:
         raise SizeError(
             f"{path} is {sparse_size[1]}×{sparse_size[0]} but {files.image} is"

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from pnpdepth_cli.frames.frame import RefinedFrame
-from pnpdepth_cli.io.depth_range import metres
+from pnpdepth_cli.io.depth import metres
 from pnpdepth_cli.io.formats import format_of_suffix
 from pnpdepth_cli.io.formats.png import LARGEST_CODE
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs

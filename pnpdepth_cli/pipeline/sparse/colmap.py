@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import InputError, NoPointsError, SizeError
-from pnpdepth_cli.io.colmap.model import find_model, model_files, name_in_model, read_model
-from pnpdepth_cli.io.colmap.parts import ColmapCamera, ColmapImage, ColmapModel
+from pnpdepth_cli.io.colmap.model import ColmapCamera, ColmapImage, ColmapModel
+from pnpdepth_cli.io.colmap.reading import find_model, model_files, name_in_model, read_model
+from pnpdepth_cli.io.dataset.reading import check_same_view
 from pnpdepth_cli.io.depth import describe_range
 from pnpdepth_cli.io.fingerprint import fingerprint
 from pnpdepth_cli.pipeline.sparse.options import METRES, MODEL_UNITS, ColmapOptions
@@ -72,6 +73,7 @@ def read_colmap_points(
             f" {camera.size[1]}×{camera.size[0]}; give the photo that COLMAP was given, unrotated,"
             " or --sparse-size-ok if it was only resized"
         )
+    check_same_view(f"the camera of {image} in {model.folder}", camera.size, size)
     points = _observed(model, name, options)
     unit = MODEL_UNITS if options.unit_scale is None else METRES
     source = f"COLMAP model, image {name}, {camera.model} camera"

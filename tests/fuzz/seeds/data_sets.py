@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pnpdepth_cli.io.depth_writing import write_depth
+from pnpdepth_cli.io.depth import write_depth
 from tests.colmap_models import write_text_model
 from tests.fuzz.seeds.seed import DRY_RUN, Seed
 from tests.io.layouts import test_benchmark_layouts, test_ddad, test_nuscenes

@@ -7,7 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from pnpdepth_cli.io.depth_writing import write_depth
+from pnpdepth_cli.io.depth import write_depth
 from tests.fuzz.seeds.seed import HEIGHT, OUT, WIDTH, Seed
 
 

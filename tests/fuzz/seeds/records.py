@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from pnpdepth_cli.cli.main import run
-from pnpdepth_cli.io.depth_writing import write_depth
+from pnpdepth_cli.io.depth import write_depth
 from tests.fuzz.seeds.seed import Seed
 
 _NETWORK = ("--model", "fcrn-tiny", "--propagate", "none")

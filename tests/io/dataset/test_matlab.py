@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pnpdepth_cli.errors import FileFormatError
-from pnpdepth_cli.io.dataset.matlab import read_matlab_array
+from pnpdepth_cli.io.dataset.reading import read_matlab_array
 from tests.fuzz.mutations import mutated
 
 

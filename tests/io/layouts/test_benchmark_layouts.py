@@ -11,8 +11,8 @@ import pytest
 
 from pnpdepth_cli.errors import FileFormatError, SizeError
 from pnpdepth_cli.io.dataset.frame import Frame
-from pnpdepth_cli.io.dataset.masks import masked, moved_to
-from pnpdepth_cli.io.layouts import LAYOUTS, find_layout, list_frames, read_frames
+from pnpdepth_cli.io.dataset.reading import masked, moved_to
+from pnpdepth_cli.io.layouts import list_frames, read_frames
 from pnpdepth_cli.pipeline.batch.frames import task_of
 from pnpdepth_cli.pipeline.batch.request import BatchRequest
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs, read_inputs
@@ -116,16 +116,6 @@ def inputs_of(frame: Frame, root: Path) -> Inputs:
 
 
 @pytest.mark.parametrize("name", MAKERS)
-def test_a_layout_is_guessed_and_no_other_takes_it(name: str, tmp_path: Path) -> None:
-    make, names = MAKERS[name]
-    make(tmp_path / "set")
-    assert find_layout(tmp_path / "set") == name
-    assert [frame.name for frame in read_frames(tmp_path / "set")] == names
-    alike = [other for other, layout in LAYOUTS.items() if layout.matches(tmp_path / "set")]
-    assert alike == [name]
-
-
-@pytest.mark.parametrize("name", MAKERS)
 def test_depth_is_read_in_metres_where_it_is_valid(name: str, tmp_path: Path) -> None:
     MAKERS[name][0](tmp_path)
     inputs = inputs_of(read_frames(tmp_path)[0], tmp_path)
@@ -160,6 +150,8 @@ def test_ground_truth_is_moved_and_never_interpolated(tmp_path: Path) -> None:
     assert moved_to(tmp_path, depth, (1, 1)).tolist() == [[1]]
     with pytest.raises(SizeError, match="do not show the same view"):
         moved_to(tmp_path, depth, (4, 9))
+    with pytest.raises(SizeError, match="one is turned by 90°, turn it back"):
+        moved_to(tmp_path, depth[:1], (4, 2))
 
 
 def test_a_mask_of_another_size_is_refused(tmp_path: Path) -> None:

@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 
 from pnpdepth_cli.errors import FileFormatError
-from pnpdepth_cli.io.dataset.frame import Hdf5Array
-from pnpdepth_cli.io.dataset.frame_names import name_problem
-from pnpdepth_cli.io.dataset.hdf5 import depth_of, shape_of
+from pnpdepth_cli.io.dataset.frame import Hdf5Array, name_problem
+from pnpdepth_cli.io.dataset.reading import depth_of, shape_of
 from pnpdepth_cli.io.layouts import LAYOUTS, read_frames
 
 

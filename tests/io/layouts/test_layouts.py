@@ -24,45 +24,48 @@ from pnpdepth_cli.io.layouts import (
     read_frames,
 )
 from tests.colmap_models import write_text_model
-from tests.empty_files import touch
+from tests.empty_files import touch, tree
+from tests.io.layouts.test_benchmark_layouts import MAKERS as BENCHMARKS
 
 DEPTH = np.random.default_rng(0).uniform(1, 9, (12, 16)).astype(np.float32)
 
 
-def pairs(root: Path) -> None:
-    touch(*(root / f / f"{s}.png" for f in ("rgb", "sparse") for s in "ab"), root / "gt/a.exr")
-    touch(root / "calib/a.json")
-
-
-def kitti_object(root: Path) -> None:
-    part = root / "training"
-    touch(*(part / f / f"00000{i}{s}" for i in (0, 1) for f, s in
-            (("image_2", ".png"), ("velodyne", ".bin"), ("calib", ".txt"))))  # fmt: skip
-
-
-def kitti_odometry(root: Path) -> None:
-    for sequence in ("00", "03"):
-        part = root / "sequences" / sequence
-        touch(part / "image_2/000000.png", part / "velodyne/000000.bin", part / "calib.txt")
-
-
-def kitti_selection(root: Path) -> None:
-    name = "2011_09_26_drive_0002_sync_{}_0000000005_image_02"
-    for folder, suffix in (
-        ("image", ".png"), ("velodyne_raw", ".png"), ("groundtruth_depth", ".png"),
-        ("intrinsics", ".txt"),
-    ):  # fmt: skip
-        kind = "image" if folder == "intrinsics" else folder
-        touch(root / folder / f"{name.format(kind)}{suffix}")
-
-
-def kitti_tree(root: Path) -> None:
-    drive = root / "val" / "2011_09_26_drive_0002_sync"
-    for camera in ("image_02", "image_03"):
-        for kind in ("velodyne_raw", "groundtruth"):
-            touch(drive / "proj_depth" / kind / camera / "0000000005.png")
-        touch(root / "2011_09_26" / drive.name / camera / "data" / "0000000005.png")
-    touch(root / "2011_09_26" / "calib_cam_to_cam.txt")
+SELECTED = "2011_09_26_drive_0002_sync_{}_0000000005_image_02"
+DRIVE = "2011_09_26_drive_0002_sync"
+TREES = {
+    "pairs": ("rgb/{a,b}.png sparse/{a,b}.png gt/a.exr calib/a.json", ["a", "b"]),
+    "image-depth": ("images/x/{a,b}.jpg depth/x/{a,b}.png", ["x/a", "x/b"]),
+    "kitti-object": (
+        "training/image_2/00000{0,1}.png training/velodyne/00000{0,1}.bin"
+        " training/calib/00000{0,1}.txt",
+        ["training_000000", "training_000001"],
+    ),
+    "kitti-odometry": (
+        "sequences/{00,03}/image_2/000000.png sequences/{00,03}/velodyne/000000.bin"
+        " sequences/{00,03}/calib.txt",
+        ["00_000000", "03_000000"],
+    ),
+    "kitti-depth": (
+        f"image/{SELECTED.format('image')}.png intrinsics/{SELECTED.format('image')}.txt"
+        f" velodyne_raw/{SELECTED.format('velodyne_raw')}.png"
+        f" groundtruth_depth/{SELECTED.format('groundtruth_depth')}.png",
+        [f"{DRIVE}_0000000005_image_02"],
+    ),
+    "7scenes": (
+        "seq-0{1,2}/frame-000000.{color,depth}.png",
+        ["seq-01_frame-000000", "seq-02_frame-000000"],
+    ),
+    "synthia": (
+        "{RGB,Depth}/Stereo_Left/Omni_F/000000.png {RGB,Depth}/Stereo_Right/Omni_B/000000.png"
+        " CameraParams/intrinsics.txt",
+        ["Stereo_Left_Omni_F_000000", "Stereo_Right_Omni_B_000000"],
+    ),
+}
+"""Empty files of a layout by its name, and the names of their frames."""
+TREE_OF_KITTI = (
+    f"val/{DRIVE}/proj_depth/{{velodyne_raw,groundtruth}}/image_0{{2,3}}/0000000005.png"
+    f" 2011_09_26/{DRIVE}/image_0{{2,3}}/data/0000000005.png 2011_09_26/calib_cam_to_cam.txt"
+)
 
 
 def tum(root: Path) -> None:
@@ -71,18 +74,6 @@ def tum(root: Path) -> None:
         "# time file\n1.000 rgb/1.000.png\n1.033 rgb/1.033.png\n2 rgb/2.png\n"
     )
     (root / "depth.txt").write_text("1.015 depth/1.015.png\n1.030 depth/1.030.png\n")
-
-
-def seven_scenes(root: Path) -> None:
-    touch(
-        *(root / f"seq-0{n}/frame-000000.{kind}.png" for n in (1, 2) for kind in ("color", "depth"))
-    )
-
-
-def synthia(root: Path) -> None:
-    for camera in ("Stereo_Left/Omni_F", "Stereo_Right/Omni_B"):
-        touch(*(root / kind / camera / "000000.png" for kind in ("RGB", "Depth")))
-    touch(root / "CameraParams/intrinsics.txt")
 
 
 def colmap(root: Path) -> None:
@@ -111,40 +102,32 @@ def nyu_mat(root: Path) -> None:
 
 
 MAKERS = {
-    "pairs": (pairs, ["a", "b"]),
-    "kitti-object": (kitti_object, ["training_000000", "training_000001"]),
-    "kitti-odometry": (kitti_odometry, ["00_000000", "03_000000"]),
-    "kitti-depth": (kitti_selection, ["2011_09_26_drive_0002_sync_0000000005_image_02"]),
     "tum": (tum, ["1.000", "1.033"]),
-    "7scenes": (seven_scenes, ["seq-01_frame-000000", "seq-02_frame-000000"]),
-    "synthia": (synthia, ["Stereo_Left_Omni_F_000000", "Stereo_Right_Omni_B_000000"]),
     "colmap": (colmap, ["b", "left/a"]),
     "nyu-h5": (nyu_h5, ["official_00001", "official_00009"]),
     "nyu-mat": (nyu_mat, ["0001", "0002", "0003", "0004"]),
 }
 
 
-@pytest.mark.parametrize("name", MAKERS)
-def test_a_layout_is_guessed_from_its_folder_and_gives_its_frames(
+@pytest.mark.parametrize("name", [*TREES, *MAKERS, *BENCHMARKS])
+def test_a_layout_is_guessed_from_its_folder_and_no_other_takes_it(
     name: str, tmp_path: Path
 ) -> None:
-    make, names = MAKERS[name]
-    make(tmp_path / "set")
-    assert find_layout(tmp_path / "set") == name
-    frames = read_frames(tmp_path / "set")
+    root = tmp_path / "set"
+    if name in TREES:
+        files, names = TREES[name]
+        tree(root, files)
+    else:
+        make, names = {**MAKERS, **BENCHMARKS}[name]
+        make(root)
+    frames = read_frames(root)
     assert [frame.name for frame in frames] == names
-    assert frames == read_frames(tmp_path / "set", name)
-
-
-@pytest.mark.parametrize("name", MAKERS)
-def test_no_other_layout_takes_it_for_its_own(name: str, tmp_path: Path) -> None:
-    MAKERS[name][0](tmp_path / "set")
-    alike = [other for other, layout in LAYOUTS.items() if layout.matches(tmp_path / "set")]
-    assert alike == [name]
+    assert frames == read_frames(root, name)
+    assert [other for other, layout in LAYOUTS.items() if layout.matches(root)] == [name]
 
 
 def test_pairs_may_lack_truth_and_calibration_but_not_sparse_depth(tmp_path: Path) -> None:
-    pairs(tmp_path)
+    tree(tmp_path, TREES["pairs"][0])
     a, b = read_frames(tmp_path)
     assert (a.gt, a.calib) == (tmp_path / "gt/a.exr", tmp_path / "calib/a.json")
     assert (b.gt, b.calib) == (None, None)
@@ -159,17 +142,18 @@ def test_pairs_may_lack_truth_and_calibration_but_not_sparse_depth(tmp_path: Pat
 
 
 def test_kittis_selection_pairs_its_long_names(tmp_path: Path) -> None:
-    kitti_selection(tmp_path)
+    tree(tmp_path, TREES["kitti-depth"][0])
     (frame,) = read_frames(tmp_path)
-    middle = "2011_09_26_drive_0002_sync_{}_0000000005_image_02"
-    assert frame.sparse == tmp_path / "velodyne_raw" / f"{middle.format('velodyne_raw')}.png"
-    assert frame.gt == tmp_path / "groundtruth_depth" / f"{middle.format('groundtruth_depth')}.png"
-    assert frame.calib == tmp_path / "intrinsics" / f"{middle.format('image')}.txt"
+    assert frame.sparse == tmp_path / "velodyne_raw" / f"{SELECTED.format('velodyne_raw')}.png"
+    assert (
+        frame.gt == tmp_path / "groundtruth_depth" / f"{SELECTED.format('groundtruth_depth')}.png"
+    )
+    assert frame.calib == tmp_path / "intrinsics" / f"{SELECTED.format('image')}.txt"
     assert (frame.sparse_scale, frame.gt_scale) == (256, 256)
 
 
 def test_kittis_tree_finds_its_images_in_the_raw_data(tmp_path: Path) -> None:
-    kitti_tree(tmp_path)
+    tree(tmp_path, TREE_OF_KITTI)
     left, right = read_frames(tmp_path, "kitti-depth")
     assert left.name == "2011_09_26_drive_0002_sync_0000000005_image_02"
     assert (left.camera, right.camera) == (2, 3)
@@ -204,8 +188,8 @@ def test_tum_poses_are_those_at_the_times_of_the_images(tmp_path: Path) -> None:
 
 def test_synthias_sequences_pair_each_camera_with_its_depth(tmp_path: Path) -> None:
     sequence = tmp_path / "SYNTHIA-SEQS-01-DAWN"
-    synthia(sequence)
-    synthia(tmp_path / "SYNTHIA-SEQS-02-FALL")
+    for folder in (sequence, tmp_path / "SYNTHIA-SEQS-02-FALL"):
+        tree(folder, TREES["synthia"][0])
     frames = read_frames(tmp_path)
     assert len(frames) == 4
     frame = frames[1]
@@ -244,7 +228,7 @@ def test_rgb_and_depth_with_other_names_in_them_are_not_synthia(tmp_path: Path) 
 def test_the_odometrys_training_sequences_have_poses(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    kitti_odometry(tmp_path)
+    tree(tmp_path, TREES["kitti-odometry"][0])
     part = tmp_path / "sequences/00"
     touch(part / "image_2/000001.png", part / "velodyne/000001.bin")
     (tmp_path / "poses").mkdir()
@@ -259,7 +243,7 @@ def test_the_odometrys_training_sequences_have_poses(
 
 
 def test_a_part_of_an_odometry_sequence_keeps_its_own_poses(tmp_path: Path) -> None:
-    kitti_odometry(tmp_path)
+    tree(tmp_path, TREES["kitti-odometry"][0])
     part = tmp_path / "sequences/00"
     for folder, suffix in (("image_2", ".png"), ("velodyne", ".bin")):
         (part / folder / f"000000{suffix}").rename(part / folder / f"000002{suffix}")
@@ -285,7 +269,7 @@ _ROW = "1 0 0 0 0 1 0 0 0 0 1 0\n"
 def test_poses_that_are_not_twelve_numbers_a_frame_are_refused(
     tmp_path: Path, text: str, message: str
 ) -> None:
-    kitti_odometry(tmp_path)
+    tree(tmp_path, TREES["kitti-odometry"][0])
     (tmp_path / "poses").mkdir()
     (tmp_path / "poses/00.txt").write_text(text)
     with pytest.raises(InputError) as error:
@@ -335,6 +319,16 @@ def test_the_official_file_is_split_by_the_file_beside_it(tmp_path: Path, kind: 
         read_frames(tmp_path)
 
 
+def test_a_small_file_that_claims_a_billion_frames_is_refused(tmp_path: Path) -> None:
+    h5py = pytest.importorskip("h5py")
+    path = tmp_path / "nyu_depth_v2_labeled.mat"
+    with h5py.File(path, "w") as file:
+        file.create_dataset("depths", shape=(10**9, 640, 480), dtype="<f4", chunks=(1, 64, 48))
+    assert path.stat().st_size < 10_000
+    with pytest.raises(FileFormatError, match="claims 1,000,000,000 frames"):
+        list_frames(tmp_path)
+
+
 def test_an_hdf5_file_that_is_damaged_or_of_another_kind_is_named(tmp_path: Path) -> None:
     nyu_h5(tmp_path)
     path = tmp_path / "official" / "00001.h5"
@@ -345,7 +339,7 @@ def test_an_hdf5_file_that_is_damaged_or_of_another_kind_is_named(tmp_path: Path
     other = read_frames(tmp_path)[1]
     assert isinstance(other.image, Hdf5Array)
     wrong = Hdf5Array(path=other.image.path, name="infra", axes=(0, 1))
-    from pnpdepth_cli.io.dataset.hdf5 import depth_of
+    from pnpdepth_cli.io.dataset.reading import depth_of
 
     with pytest.raises(FileFormatError, match="has no array infra"):
         depth_of(wrong)
@@ -464,7 +458,7 @@ def test_a_depth_file_is_read_with_the_scale_of_its_frame(tmp_path: Path) -> Non
 
 
 def test_a_listing_has_the_files_of_no_frame(tmp_path: Path) -> None:
-    pairs(tmp_path)
+    tree(tmp_path, TREES["pairs"][0])
     touch(tmp_path / "rgb/c.png", tmp_path / "sparse/d.png", tmp_path / "gt/e.exr")
     touch(tmp_path / "calib/f.txt", tmp_path / "rgb/.hidden.png", tmp_path / "rgb/notes.txt")
     layout, listing = list_frames(tmp_path)
@@ -486,7 +480,7 @@ def test_folders_in_pairs_go_with_folders_of_the_same_name(tmp_path: Path) -> No
 
 
 def test_two_files_of_one_frame_are_both_left_out_and_reported(tmp_path: Path) -> None:
-    pairs(tmp_path)
+    tree(tmp_path, TREES["pairs"][0])
     touch(tmp_path / "rgb/a.jpg")
     _, listing = list_frames(tmp_path)
     assert [frame.name for frame in listing.frames] == ["b"]
@@ -494,7 +488,7 @@ def test_two_files_of_one_frame_are_both_left_out_and_reported(tmp_path: Path) -
 
 
 def test_links_are_followed_but_not_in_circles(tmp_path: Path) -> None:
-    pairs(tmp_path / "real")
+    tree(tmp_path / "real", TREES["pairs"][0])
     root = tmp_path / "linked"
     root.mkdir()
     for part in ("rgb", "sparse"):
@@ -524,7 +518,7 @@ def test_a_manifest_may_name_files_with_new_lines(tmp_path: Path) -> None:
 def test_a_folder_that_may_not_be_read_is_an_input_error(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    seven_scenes(tmp_path)
+    tree(tmp_path, TREES["7scenes"][0])
 
     def locked(path: Path) -> bool:
         raise PermissionError(13, "Permission denied", str(path))

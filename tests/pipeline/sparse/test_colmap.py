@@ -9,6 +9,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 
 from pnpdepth_cli.cli.main import main
 from pnpdepth_cli.errors import FileFormatError, InputError, NoPointsError, SizeError, UsageError
@@ -53,6 +54,30 @@ def change(project: Path, file: str, old: str, new: str) -> None:
 def refine(frame: FrameOnDisk, project: Path, **changes: Any) -> dict[str, Any]:
     files = {"image": project / "images" / "a.png", "sparse": project / "sparse" / "0"}
     return run(frame, **(files | changes)).record
+
+
+@pytest.mark.parametrize("orientation", [3, 6])
+def test_a_photo_with_exif_rotation_is_read_as_colmap_reads_it(
+    orientation: int, tmp_path: Path, project: Path
+) -> None:
+    plain = refine(frame_on_disk(tmp_path), project)
+    photo = project / "images" / "a.png"
+    with Image.open(photo) as image:
+        exif = image.getexif()
+        exif[0x0112] = orientation
+        image.save(photo, exif=exif)
+    turned = refine(frame_on_disk(tmp_path), project)
+    assert turned["size"] == plain["size"] == [WIDTH, HEIGHT]
+    assert turned["points"] == plain["points"]
+    assert "image: EXIF rotation not applied, as COLMAP reads the photo" in turned["notes"]
+
+
+def test_a_photo_of_another_view_is_refused_whatever_size_is_allowed(project: Path) -> None:
+    for size, why in (((WIDTH, HEIGHT), "turned by 90°"), ((WIDTH, 3 * WIDTH), "same view")):
+        with pytest.raises(SizeError, match=why):
+            read_colmap_points(
+                project, ColmapOptions(), project / "images/a.png", size, any_size=True
+            )
 
 
 @pytest.mark.parametrize("name", ["03", "04"])

@@ -21,7 +21,9 @@ from pnpdepth_cli.errors import (
     UsageError,
 )
 from pnpdepth_cli.io.calibration import read_calibration
-from pnpdepth_cli.io.depth import DEPTH_SUFFIXES, read_depth, read_sparse
+from pnpdepth_cli.io.depth import read_depth
+from pnpdepth_cli.io.formats import DEPTH_SUFFIXES
+from pnpdepth_cli.io.sparse_reading import read_sparse
 from pnpdepth_cli.pipeline.sparse.make import (
     SampleNoise,
     SamplePattern,

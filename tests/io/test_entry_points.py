@@ -1,4 +1,4 @@
-"""A depth format of another package is read, written and offered like one of ours."""
+"""A depth format and a layout of another package are offered and used like ours."""
 
 from __future__ import annotations
 
@@ -7,35 +7,34 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 from pnpdepth_cli.choices import FORMATS
 from pnpdepth_cli.io.formats import DEPTH_SUFFIXES
 
-FORMAT_MODULE = """
+FORMAT = """
 import numpy as np
 from pnpdepth_cli.io.formats import DepthFormat, StoredArray
-
 
 def read(path, data, channel):
     rows = [line.split() for line in data.decode().splitlines()[1:]]
     return StoredArray(values=np.array(rows, np.float32), description="table of metres")
 
-
 def write(file, metres, options):
     lines = ["METRES", *(" ".join(map(repr, row)) for row in metres.tolist())]
     file.write_text("\\n".join(lines))
 
-
-FORMAT = DepthFormat(
+ENTRY = DepthFormat(
     name="METRES", suffixes=(".metres",), magic=(b"METRES",), read=read, write=write
 )
 """
 
-USE = """
+USE_FORMAT = """
 import sys
 from pathlib import Path
 import numpy as np
-from pnpdepth_cli.choices import FORMATS
-from pnpdepth_cli.io.depth import DEPTH_SUFFIXES, read_depth, write_depth
+from pnpdepth_cli.io.depth import read_depth, write_depth
+from pnpdepth_cli.io.formats import DEPTH_SUFFIXES
 from pnpdepth_cli.io.sparse_writing import SPARSE_SUFFIXES
 from pnpdepth_cli.cli.refine import refine
 
@@ -45,23 +44,60 @@ write_depth(path, depth)
 image = read_depth(path)
 assert np.array_equal(image.values, depth), image
 assert image.source == "table of metres", image
-assert "metres" in FORMATS
 for suffixes in (DEPTH_SUFFIXES, SPARSE_SUFFIXES):
     assert ".metres" in suffixes, suffixes
 option = next(each for each in refine.params if each.name == "format")
 assert "metres" in option.type.choices, option.type.choices
 """
 
+LAYOUT = """
+from pnpdepth_cli.io.dataset.frame import Frame, Listing
+from pnpdepth_cli.io.layouts import Layout
 
-def test_a_format_of_another_package_is_one_file_and_one_entry_point(tmp_path: Path) -> None:
+def listing(root):
+    images = sorted((root / "camera").glob("*.png"))
+    return Listing(frames=[Frame(name=image.stem, image=image) for image in images])
+
+ENTRY = Layout(matches=lambda root: (root / "camera").is_dir(), listing=listing)
+"""
+
+USE_LAYOUT = """
+import sys
+from pathlib import Path
+from pnpdepth_cli.cli.batch import batch
+from pnpdepth_cli.io.layouts import find_layout, read_frames
+
+root = Path(sys.argv[1])
+(root / "camera").mkdir()
+for name in "ba":
+    (root / "camera" / f"{name}.png").touch()
+assert find_layout(root) == "field-robot"
+assert [frame.name for frame in read_frames(root, "field-robot")] == ["a", "b"]
+option = next(each for each in batch.params if each.name == "layout")
+assert option.type.choices[-1] == "field-robot", option.type.choices
+"""
+
+
+@pytest.mark.parametrize(
+    ("entry", "module", "use"),
+    [
+        ("[pnpdepth.formats]\nmetres", FORMAT, USE_FORMAT),
+        ("[pnpdepth.layouts]\nfield-robot", LAYOUT, USE_LAYOUT),
+    ],
+    ids=["format", "layout"],
+)
+def test_what_another_package_adds_is_one_file_and_one_entry_point(
+    entry: str, module: str, use: str, tmp_path: Path
+) -> None:
     info = tmp_path / "site" / "other-1.0.dist-info"
     info.mkdir(parents=True)
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: other\nVersion: 1.0\n")
-    (info / "entry_points.txt").write_text("[pnpdepth.formats]\nmetres = other_format:FORMAT\n")
-    (tmp_path / "site" / "other_format.py").write_text(FORMAT_MODULE)
+    (info / "entry_points.txt").write_text(f"{entry} = other:ENTRY\n")
+    (tmp_path / "site" / "other.py").write_text(module)
+    (tmp_path / "files").mkdir()
     path = os.pathsep.join([str(tmp_path / "site"), *sys.path])
     done = subprocess.run(
-        [sys.executable, "-c", USE, str(tmp_path)],
+        [sys.executable, "-c", use, str(tmp_path / "files")],
         env={**os.environ, "PYTHONPATH": path},
         capture_output=True,
         text=True,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -11,7 +12,7 @@ import pytest
 from pnpdepth_cli.cli.main import main
 from pnpdepth_cli.errors import FileFormatError, InputError
 from pnpdepth_cli.io.layouts import find_layout, list_frames, read_frames
-from tests.empty_files import touch
+from tests.empty_files import touch, tree
 from tests.pipeline.frames import frame_on_disk
 from tests.pipeline.scan_frames import HEIGHT, WIDTH, scan_on_disk
 
@@ -97,19 +98,32 @@ def test_the_parent_of_data_sets_of_one_layout_has_their_frames(tmp_path: Path) 
     assert len(list_frames(tmp_path, "pairs")[1].frames) == 1
 
 
-def test_an_unknown_folder_names_the_nearest_layout_and_what_the_others_need(
-    tmp_path: Path,
+@pytest.mark.parametrize(
+    ("files", "nearest", "lacking"),
+    [
+        ("image_2/0.png calib/0.txt", "'kitti-object', which needs image_2, velodyne", "velodyne"),
+        (
+            f"2011_09_26/{DRIVE}/image_02/data/0.png 2011_09_26/calib_cam_to_cam.txt",
+            "'kitti-raw', which needs velodyne_points/data, image_0[23]/data",
+            "velodyne_points/data",
+        ),
+    ],
+)
+def test_an_unknown_folder_names_the_nearest_layout_and_what_it_lacks(
+    files: str, nearest: str, lacking: str, tmp_path: Path
 ) -> None:
-    touch(tmp_path / "image_2/000000.png", tmp_path / "calib/000000.txt")
-    with pytest.raises(InputError) as caught:
+    tree(tmp_path, files)
+    with pytest.raises(InputError, match=rf"nearest is {re.escape(nearest)}.* lacks {lacking}$"):
         find_layout(tmp_path)
-    message = str(caught.value)
-    assert "nearest is 'kitti-object', which needs image_2, velodyne, calib and lacks" in message
-    assert "pairs rgb, sparse" in message
-    assert "\n" not in message
-    assert len(message) < 2000
     with pytest.raises(InputError, match="does not look like 'pairs', which needs rgb, sparse"):
         find_layout(tmp_path, "pairs")
+
+
+def test_a_folder_that_is_near_no_layout_lists_what_they_need(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"layouts need: .*; pairs rgb, sparse; ") as caught:
+        find_layout(tmp_path)
+    assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) < 2000
 
 
 def test_points_are_sampled_from_the_scan_that_is_the_ground_truth(tmp_path: Path) -> None:
