@@ -9,7 +9,7 @@ import pytest
 
 from pnpdepth_cli.errors import FileFormatError
 from pnpdepth_cli.io.layouts import read_frames
-from pnpdepth_cli.io.oxts import read_oxts_poses
+from pnpdepth_cli.io.poses import read_oxts_poses
 from tests.kitti_drives import write_calibrations, write_packet
 
 

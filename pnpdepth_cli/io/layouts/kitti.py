@@ -44,7 +44,7 @@ from pnpdepth_cli.io.layouts.layout import (
     merged,
     of_folders,
 )
-from pnpdepth_cli.io.oxts import PACKETS
+from pnpdepth_cli.io.poses import PACKETS
 
 _SCALE = 256.0
 _KIND = re.compile(r"_sync_(image|velodyne_raw|groundtruth_depth)_")
