@@ -35,15 +35,12 @@ from pnpdepth_cli.sensors import (
     FORWARD_LEFT_UP,
     LIDARS,
     Camera,
-    ProjectionSettings,
     project_velodyne,
     simulate_lidar,
 )
 from pnpdepth_cli.sensors.projection import hidden_points
 
 STREET = Path(__file__).parent.parent / "samples" / "street"
-KEEP_ALL = ProjectionSettings(keep_occluded=True)
-
 # Wang et al. 2019, table on LiDAR types: per cent of the pixels of a SYNTHIA frame.
 PAPER_PERCENT = {"vlp-16": 5.3, "vlp-32c": 28.8, "hdl-32e": 10.3, "hdl-64e": 18.7}
 
@@ -74,7 +71,7 @@ def street() -> None:
     camera = camera_of(read_calibration(STREET / "calib.txt"))
     scan = read_scan(STREET / "000000.bin").points
     gt = read_depth(STREET / "gt.png").values
-    points = project_velodyne(scan, camera, gt.shape, KEEP_ALL)
+    points = project_velodyne(scan, camera, gt.shape, keep_occluded=True)
     column, row = np.floor(points.xy + 0.5).astype(int).T
     there = gt[row, column]
     error = np.abs(points.depth - there)[there > 0]
@@ -147,11 +144,11 @@ def speed(data: Path, runs: int) -> None:
     folder = data / "kitti_object"
     camera = camera_of(read_calibration(folder / "calib" / "000001.txt"))
     scan = read_scan(folder / "velodyne" / "000001.bin").points
-    for name, settings in (("with filter", None), ("without", KEEP_ALL)):
+    for name, keep_occluded in (("with filter", False), ("without", True)):
         wall, processor = [], []
         for _ in range(runs):
             start, start_processor = time.perf_counter(), time.process_time()
-            project_velodyne(scan, camera, (375, 1242), settings)
+            project_velodyne(scan, camera, (375, 1242), keep_occluded=keep_occluded)
             wall.append(1000 * (time.perf_counter() - start))
             processor.append(1000 * (time.process_time() - start_processor))
         print(

@@ -19,7 +19,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -86,6 +86,8 @@ class Calibration:
     """What was read, for a person."""
     lens: str = "radial-tangential"
     """One of `choices.LENSES`."""
+    rectified: Mapping[str, Calibration] = field(default_factory=dict)
+    """Cameras of rectified images by what they are made of, relative to this one, of raw images."""
 
 
 def read_calibration(path: Path, camera: int | None = None) -> Calibration:
@@ -159,6 +161,7 @@ def camera_in_yaml(path: Path, content: Any, camera: int | None) -> Calibration:
         kind = "ROS camera_info" if is_ros else "OpenCV calibration"
         fields = {name: content[name] for name in content if name != "R"}  # the rectification
         calibration = _single(path, fields, camera, kind)
+        calibration = replace(calibration, rectified=_rectified_cameras(path, content, calibration))
     else:
         name = f"cam{0 if camera is None else camera}"
         if name not in chain:
@@ -167,6 +170,44 @@ def camera_in_yaml(path: Path, content: Any, camera: int | None) -> Calibration:
     if not calibration.distortion:
         return calibration
     return replace(calibration, source=f"{calibration.source}, {calibration.lens} lens")
+
+
+def _rectified_cameras(
+    path: Path, content: Mapping[str, Any], raw: Calibration
+) -> dict[str, Calibration]:
+    """The cameras of a rectified image of camera_info, without distortion.
+
+    Whether the transforms lead to the rectified camera (kitti2bag) or to the raw one, to which R
+    and the last column of P then lead, no file says. The first is as the definition of CameraInfo
+    has it. Empty without P, or where P describes the raw image.
+    """
+    p, r = (
+        next((np.array(_numbers(path, content, n)) for n in names if n in content), np.empty(0))
+        for names in (("projection_matrix", "P", "p"), ("rectification_matrix", "R", "r"))
+    )
+    if p.size != 12 or not (p[0] > 0 and p[5] > 0):
+        return {}
+    intrinsics, offset = p.reshape(3, 4)[:, :3], np.zeros(3)
+    turn = r.reshape(3, 3) if r.size == 9 and r.any() else np.eye(3)
+    if np.linalg.det(intrinsics):
+        offset = np.linalg.solve(intrinsics, p.reshape(3, 4)[:, 3])
+    plain = replace(
+        raw,
+        intrinsics=intrinsics,
+        distortion=(),
+        lens="radial-tangential",
+        rotation=np.eye(3),
+        translation=np.zeros(3),
+    )
+    same = np.allclose(intrinsics, raw.intrinsics, atol=1e-3) and not raw.distortion
+    turned = not np.allclose(turn, np.eye(3), atol=1e-9)
+    cameras = {"P": plain}
+    if turned:
+        cameras = {"P and R": replace(plain, rotation=turn)} | cameras
+    if np.abs(offset).max() > 1e-9:
+        name = "P with its offset, and R" if turned else "P with its offset"
+        cameras = {name: replace(plain, rotation=turn, translation=offset)} | cameras
+    return {} if same and len(cameras) == 1 else cameras
 
 
 def _kitti(path: Path, fields: Mapping[str, Any], camera: int | None) -> Calibration:
@@ -210,9 +251,8 @@ def _rectified(
 ) -> Calibration:
     """P · R_rect · [R t], with the camera's own offset in P's last column as a translation."""
     intrinsics = _checked_intrinsics(path, projection[:, :3])
-    rectify, offset = checked_pose(
-        path, "rectification", rectify, np.linalg.solve(intrinsics, projection[:, 3])
-    )
+    offset: Floats = np.linalg.solve(intrinsics, projection[:, 3])
+    rectify, offset = checked_pose(path, "rectification", rectify, offset)
     rotation, translation = np.eye(3), np.zeros(3)
     if scanner is not None:
         rotation, translation = rectify @ scanner[0], rectify @ scanner[1] + offset
@@ -247,9 +287,7 @@ def _kalibr(path: Path, name: str, fields: Mapping[str, Any]) -> Calibration:
     return _single(path, single, None, f"Kalibr camchain, {name}")
 
 
-def _single(
-    path: Path, fields: Mapping[str, Any], camera: int | None, source: str
-) -> Calibration:
+def _single(path: Path, fields: Mapping[str, Any], camera: int | None, source: str) -> Calibration:
     """The camera of a plain file, or of one of OpenCV or ROS."""
     if camera is not None:
         raise UsageError(f"{path} describes one camera; leave out --camera {camera}")

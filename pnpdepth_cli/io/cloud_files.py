@@ -23,7 +23,7 @@ CLOUD_SUFFIXES = (".ply", ".glb", ".laz")
 _LAZ_STEP = 1e-4  # metres between two coordinates that LAZ can tell apart
 
 Part = tuple[NDArray[np.float32], NDArray[np.float32], "NDArray[np.uint8] | None"]
-"""(N, 3) points; (N, 3) unit normals, 0 where unknown; (N, 3) colours 0…255, None in all or none."""
+"""(N, 3) points; (N, 3) unit normals, 0 where unknown; (N, 3) colours 0…255, or None."""
 
 
 def write_cloud(path: Path, parts: Iterable[Part]) -> int:
@@ -67,14 +67,26 @@ def _write_ply(path: Path, parts: Iterator[Part]) -> int:
                 rows[name] = column
             body.write(rows.tobytes())
             count += len(rows)
-        properties = [f"property float {name}\n" for name in coordinates]
-        properties += [f"property uchar {name}\n" for name in colours if coloured]
-        header = f"ply\nformat binary_little_endian 1.0\nelement vertex {count}\n"
+        header = _ply_header(count, coordinates, colours if coloured else ())
         body.seek(0)
         with path.open("wb") as file:
-            file.write(f"{header}{''.join(properties)}end_header\n".encode())
+            file.write(header.encode())
             shutil.copyfileobj(body, file, 1 << 20)
     return count
+
+
+def write_points(path: Path, xyz: NDArray[np.float32]) -> None:
+    """Writes points (N, 3) as a PLY without normals."""
+    with atomic_path(path) as temporary, temporary.open("wb") as file:
+        file.write(_ply_header(len(xyz), "xyz").encode())
+        file.write(xyz.astype("<f4").tobytes())
+
+
+def _ply_header(count: int, floats: Iterable[str], bytes_: Iterable[str] = ()) -> str:
+    properties = [f"property float {name}\n" for name in floats]
+    properties += [f"property uchar {name}\n" for name in bytes_]
+    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {count}\n"
+    return f"{header}{''.join(properties)}end_header\n"
 
 
 def _write_glb(path: Path, xyz: NDArray[np.float32], rgb: NDArray[np.uint8] | None) -> None:

@@ -166,7 +166,7 @@ def _points_of(path: Path, array: NDArray[Any]) -> Points:
 class _Column(NamedTuple):
     name: str
     kind: str
-    count: int = 1
+    numbers: int = 1
 
 
 def _parse_pcd(path: Path, data: bytes) -> tuple[Points, str]:
@@ -179,7 +179,7 @@ def _parse_pcd(path: Path, data: bytes) -> tuple[Points, str]:
     names = entries["FIELDS"]
     counts = entries.get("COUNT", ["1"] * len(names))
     columns = [
-        _Column(name=name, kind=f"{_PCD_KINDS.get(kind, '?')}{size}", count=_whole(path, count))
+        _Column(name=name, kind=f"{_PCD_KINDS.get(kind, '?')}{size}", numbers=_whole(path, count))
         for name, kind, size, count in zip(
             names, entries["TYPE"], entries["SIZE"], counts, strict=False
         )
@@ -250,16 +250,16 @@ def _xyz(
     """x y z of rows of these columns, in bytes of this order, or in text where it is None."""
     names = [column.name.lower() for column in columns]
     for name in "xyz":
-        if names.count(name) != 1 or columns[names.index(name)].count != 1:
+        if names.count(name) != 1 or columns[names.index(name)].numbers != 1:
             listing = one_line(", ".join(names))
             raise FileFormatError(f"{path}: a {kind} without one {name} ({listing}); add it")
     wanted = [names.index(name) for name in "xyz"]
     if order is None:
-        starts = np.cumsum([0, *(column.count for column in columns)])
+        starts = np.cumsum([0, *(column.numbers for column in columns)])
         table = _table(path, kind, number, body, int(starts[-1]))
         values = [table[:, starts[index]] for index in wanted]
     else:
-        rows = _rows(path, kind, [(order + c.kind, c.count) for c in columns], number, body)
+        rows = _rows(path, kind, [(order + c.kind, c.numbers) for c in columns], number, body)
         values = [rows[f"f{index}"] for index in wanted]
     with np.errstate(over="ignore"):
         return np.column_stack(values).astype(np.float32)

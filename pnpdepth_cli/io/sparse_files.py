@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from pnpdepth_cli.errors import FileFormatError, NoPointsError, SizeError
 from pnpdepth_cli.io.atomic import atomic_path
 from pnpdepth_cli.io.depth_reading import depth_from_stored, known_metres, load_stored
-from pnpdepth_cli.io.file_bytes import one_line, read_bytes
 from pnpdepth_cli.io.depth_writing import write_depth
+from pnpdepth_cli.io.file_bytes import one_line, read_bytes
 from pnpdepth_cli.io.formats import DEPTH_SUFFIXES, KITTI_SCALE, check_scale, kind_of
 from pnpdepth_cli.points import SparsePoints
 

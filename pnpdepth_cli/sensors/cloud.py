@@ -140,7 +140,9 @@ def _normals(points: Floats, known: Mask) -> Floats:
     across = _difference(points, known, 1)
     normals = np.cross(_difference(points, known, 0), across)
     length = np.linalg.norm(normals, axis=2, keepdims=True)
-    normals = np.where(known[..., None] & (length > 0), normals / np.where(length > 0, length, 1), 0)
+    normals = np.where(
+        known[..., None] & (length > 0), normals / np.where(length > 0, length, 1), 0
+    )
     away = (normals * points).sum(axis=2, keepdims=True) > 0
     return np.where(away, -normals, normals)
 

@@ -21,7 +21,14 @@ from numpy.typing import NDArray
 from pnpdepth_cli.errors import NoPointsError, UsageError
 from pnpdepth_cli.scan_pattern import scan_pattern
 from pnpdepth_cli.sensors.camera import Camera
-from pnpdepth_cli.sensors.sparse import DropCounter, Floats, Mask, Points, as_depth_image, pixel_index
+from pnpdepth_cli.sensors.sparse import (
+    DropCounter,
+    Floats,
+    Mask,
+    Points,
+    as_depth_image,
+    pixel_index,
+)
 
 Indices = NDArray[np.intp]
 

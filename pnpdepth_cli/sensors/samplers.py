@@ -228,9 +228,7 @@ def _region(scene: Scene) -> Pixels:
     row, column = np.divmod(scene.known, scene.size[1])
     inside = (column >= left) & (column < left + width) & (row >= top) & (row < top + height)
     if not inside.any():
-        raise NoPointsError(
-            f"no known pixel in the region {left},{top},{width},{height}; check it"
-        )
+        raise NoPointsError(f"no known pixel in the region {left},{top},{width},{height}; check it")
     pixels = scene.known[inside]
     return scene.chosen(pixels, scene.pattern.wanted(pixels.size))
 

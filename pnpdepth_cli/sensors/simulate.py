@@ -23,9 +23,7 @@ _LONGEST_WALK = 2048
 """Steps; beams that cross more pixels, close to the scanner, take longer steps."""
 
 
-def simulate_lidar(
-    depth: NDArray[np.floating], camera: Camera, sensor: Lidar, seed: int
-) -> Points:
+def simulate_lidar(depth: NDArray[np.floating], camera: Camera, sensor: Lidar, seed: int) -> Points:
     """Returns sparse depth of one revolution of the scanner, in the image of the dense depth.
 
     Args:

@@ -28,6 +28,8 @@ BAG_SUFFIXES = (".bag", ".mcap", ".db3")
 IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 CLOUDS = ("sensor_msgs/msg/PointCloud2",)
 CAMERAS = ("sensor_msgs/msg/CameraInfo",)
+ODOMETRY = ("nav_msgs/msg/Odometry",)
+POSES = ("geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped")
 TRANSFORMS = ("tf2_msgs/msg/TFMessage",)
 
 
@@ -113,26 +115,32 @@ def message_types(*, ros1: bool) -> Any:
     return store
 
 
-def topic_of(bag: Bag, wanted: str | None, kinds: Sequence[str], option: str) -> str:
-    """Returns the topic that is named, or the only one of these message types.
+def topic_of(bag: Bag, wanted: Sequence[str], kinds: Sequence[str]) -> str:
+    """Returns the topic of these message types that is named, or else the only one.
 
     Raises:
-        UsageError: The named one is not there, or there are several or none.
+        UsageError: There are several or none.
     """
     topics = bag.topics(kinds)
-    listing = ", ".join(f"{name} ({count:,} messages)" for name, count in topics.items())
-    if wanted is not None:
-        if wanted not in topics:
-            raise UsageError(
-                f"{bag.path} has no topic {wanted} of {kinds[0]}; there are {listing or 'none'}"
-            )
-        return wanted
     # an image and its compressed copy are one camera
     names = [n for n in topics if not (n.endswith("/compressed") and n[:-11] in topics)]
+    names = [n for n in wanted if n in topics] or names
     if len(names) != 1:
+        listing = ", ".join(f"{name} ({count:,} messages)" for name, count in topics.items())
         what = f"several topics of {kinds[0]}" if names else f"no topic of {kinds[0]}"
-        raise UsageError(f"{bag.path} has {what}; choose with {option}: {listing or 'none'}")
+        raise UsageError(f"{bag.path} has {what}; choose with --topics: {listing or 'none'}")
     return names[0]
+
+
+def check_topics(bag: Bag, wanted: Sequence[str], kinds: Sequence[str]) -> None:
+    """Raises UsageError for a topic that is not there, or not of these message types."""
+    topics = bag.topics(kinds)
+    for name in wanted:
+        if name not in topics:
+            raise UsageError(
+                f"{bag.path} has no topic {name} of images, points or poses; there are"
+                f" {', '.join(topics) or 'none'}"
+            )
 
 
 @contextmanager

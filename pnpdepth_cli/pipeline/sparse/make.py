@@ -17,9 +17,10 @@ from pnpdepth_cli.io.calibration import Calibration, read_calibration
 from pnpdepth_cli.io.depth import DepthImage, describe_range, implausible, read_depth
 from pnpdepth_cli.io.record import plain, sha256_of, write_json
 from pnpdepth_cli.io.rgb import read_rgb
-from pnpdepth_cli.io.sensor_file import read_sensor
-from pnpdepth_cli.io.sparse_writing import SPARSE_SUFFIXES, write_sparse
+from pnpdepth_cli.io.sensor_file import OPTIONAL, read_sensor
+from pnpdepth_cli.io.sparse_files import SPARSE_SUFFIXES, write_sparse
 from pnpdepth_cli.io.visualisation import overlay
+from pnpdepth_cli.pipeline.refinement.request import count_or_fraction
 from pnpdepth_cli.pipeline.sparse.options import ScanOptions
 from pnpdepth_cli.pipeline.sparse.scans import camera_of, check_size, read_scan_points
 from pnpdepth_cli.sensors import (
@@ -30,24 +31,13 @@ from pnpdepth_cli.sensors import (
     Points,
     SampleNoise,
     SamplePattern,
-    SimulationSettings,
     as_depth_image,
     sample_points,
     simulate_lidar,
 )
 
-__all__ = [
-    "SampleNoise",
-    "SamplePattern",
-    "SampleRequest",
-    "SimulateRequest",
-    "SimulationSettings",
-    "SparseTarget",
-    "find_sensor",
-    "project_scan",
-    "sample_depth",
-    "simulate_scan",
-]
+AT_CALIBRATION = "calib"
+"""Position of a simulated scanner: the pose that the calibration gives."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,8 +48,6 @@ class SparseTarget:
     """The sparse depth; its suffix is one of `SPARSE_SUFFIXES`."""
     overlay: Path | None = None
     """A PNG of the points on the image; None for none."""
-    depth_scale: float = 256.0
-    """Codes per metre of a PNG."""
     overwrite: bool = False
 
     @property
@@ -68,17 +56,11 @@ class SparseTarget:
         return self.output.with_suffix(".json")
 
     def check(self, inputs: Iterable[Path | None]) -> None:
-        """Raises OutputError for files that cannot be written, before any work is done.
-
-        Args:
-            inputs: Files that are read, which must not be replaced.
-        """
+        """Raises OutputError for files that cannot be written, or that replace an input."""
         if self.output.suffix.lower() not in SPARSE_SUFFIXES:
             raise OutputError(
                 f"{self.output}: sparse depth is written as one of {', '.join(SPARSE_SUFFIXES)}"
             )
-        if not 0 < self.depth_scale < np.inf:
-            raise UsageError(f"--output-scale must be a number above 0, not {self.depth_scale:g}")
         if self.overlay is not None and self.overlay.suffix.lower() != ".png":
             raise OutputError(f"{self.overlay}: the overlay is a PNG; name it so")
         taken = {p.resolve() for p in inputs if p is not None}
@@ -106,35 +88,25 @@ class SparseTarget:
             inputs: Input files, for the record.
             notes: What was assumed, and warnings.
             rgb: (H, W, 3) in 0..1, the image of the overlay.
-
-        Raises:
-            OutputError: A file cannot be written.
         """
         provenance = {"command": settings["command"], "version": __version__, **settings}
         for path in filter(None, (self.output, self.overlay)):
             make_folder(path.parent)
-        write_sparse(
-            self.output,
-            points.xy,
-            points.depth,
-            as_depth_image(points),
-            provenance=provenance,
-            scale=self.depth_scale,
-        )
+        image = as_depth_image(points)
+        write_sparse(self.output, points.xy, points.depth, image, provenance=provenance)
         if self.overlay is not None and rgb is not None:
             overlay(rgb, points.xy, points.depth, self.overlay)
-        height, width = points.size
         record = {
             **provenance,
             "inputs": inputs,
             "points": {
-                "count": len(points.depth),
-                "fraction_of_pixels": len(points.depth) / (height * width),
+                "count": len(points),
+                "fraction_of_pixels": len(points) / image.size,
                 "nearest": float(points.depth.min()),
                 "farthest": float(points.depth.max()),
                 "dropped": dict(points.dropped),
             },
-            "size": [width, height],
+            "size": [points.size[1], points.size[0]],
             "notes": list(notes),
             "outputs": {
                 "sparse": str(self.output),
@@ -162,9 +134,6 @@ def project_scan(
         target: Files to write.
         image: The camera's image, which gives the size and the ground of an overlay.
         size: (H, W) of the image, where there is no file of it.
-
-    Raises:
-        PnpDepthError: An input or output is at fault; then nothing is written.
     """
     target.check((scan, image, options.calib, options.extrinsics))
     if target.overlay is not None and image is None:
@@ -194,7 +163,6 @@ class DenseDepth:
     depth: Path
     target: SparseTarget
     seed: int = 0
-    """Of all noise and random choices."""
     depth_scale: float | None = None
     """Codes per metre of an integer depth file; None for the file's own."""
     channel: str | None = None
@@ -212,83 +180,99 @@ class DenseDepth:
 
 @dataclass(frozen=True, kw_only=True)
 class SampleRequest(DenseDepth):
-    """What to sample, and where to."""
+    """What to sample."""
 
     pattern: SamplePattern
     noise: SampleNoise = field(default_factory=SampleNoise)
     image: Path | None = None
-    """For the patterns that need one and for an overlay."""
+    """For the patterns that need one."""
 
 
 def sample_depth(request: SampleRequest) -> dict[str, Any]:
-    """Writes points of the depth map, and returns the record.
-
-    Raises:
-        PnpDepthError: An input or output is at fault; then nothing is written.
-    """
+    """Writes points of the depth map, and returns the record."""
     request.target.check((request.depth, request.image))
     pattern, noise, seed = request.pattern, request.noise, request.seed
     dense, notes = request.read()
     rgb = None if request.image is None else read_rgb(request.image).values
     points = sample_points(dense.values, pattern, seed, image=rgb, noise=noise)
     wanted = pattern.wanted(int(np.count_nonzero(dense.values)))
-    sampled = len(points.depth) + sum(points.dropped.values())
+    sampled = len(points) + sum(points.dropped.values())
     if pattern.kind in ("features", "edges") and sampled < wanted:
         notes.append(f"warning: the image has {sampled:,} of the {wanted:,} points asked for")
     notes.append(f"sparse: {describe_range(points.depth, f'{pattern.kind}, seed {seed}')}")
+    settings = {"pattern": asdict(pattern), "noise": asdict(noise), "seed": seed}
     return request.target.write(
         points,
-        {
-            "command": "sample",
-            "pattern": asdict(pattern),
-            "noise": asdict(noise),
-            "seed": seed,
-        },
+        {"command": "sample", **settings},
         inputs=_files(depth=request.depth, image=request.image),
         notes=notes,
-        rgb=rgb,
     )
+
+
+def read_pattern(text: str, count: str | None) -> SamplePattern:
+    """Returns the pattern of `uniform` and `500` or `5%`, or of `region:X,Y,W,H`."""
+    kind, colon, rectangle = text.partition(":")
+    number, fraction = (None, None) if count is None else count_or_fraction(count)
+    region = None
+    if colon:
+        try:
+            left, top, width, height = (int(word) for word in rectangle.split(","))
+        except ValueError:
+            raise UsageError(f"pattern {text!r} is not of the form region:X,Y,W,H") from None
+        region = left, top, width, height
+    return SamplePattern(kind=kind, count=number, fraction=fraction, region=region)
+
+
+def read_noise(text: str | None) -> SampleNoise:
+    """Returns the noise of `0.05` metres, `2%` of the depth, `outliers=10%` and `jitter=1` pixel.
+
+    Several are separated by commas. Raises UsageError for any other text.
+    """
+    names = {"outliers": "outliers", "jitter": "jitter_px"}
+    values: dict[str, float] = {}
+    for word in filter(None, (text or "").split(",")):
+        name, equals, number = word.rpartition("=")
+        try:
+            value = float(number.removesuffix("%")) / (100 if number.endswith("%") else 1)
+            key = names[name] if equals else ("relative" if number.endswith("%") else "metres")
+        except (ValueError, KeyError):
+            raise UsageError(
+                f"--noise must be metres, P%, outliers=P% or jitter=PIXELS, got {word!r}"
+            ) from None
+        values[key] = value
+    return SampleNoise(**values)
 
 
 @dataclass(frozen=True, kw_only=True)
 class SimulateRequest(DenseDepth):
-    """What to simulate, and where to."""
+    """What to simulate."""
 
     calib: Path
     sensor: str = "hdl-64e"
-    """One of `LIDARS`, or a TOML file."""
+    """As `find_sensor` takes it."""
     camera: int | None = None
     """One of KITTI's four, 0 to 3; None for the left colour camera."""
-    offset: tuple[float, float, float] | None = None
-    """Position of the scanner: metres to the right of, below and in front of the camera."""
-    at_scanner: bool = False
-    """The scanner has the pose that the calibration gives."""
-    settings: SimulationSettings = field(default_factory=SimulationSettings)
+    position: str | None = None
+    """Of the scanner: metres right of, below and in front of the camera as X,Y,Z, or
+    `AT_CALIBRATION`. None: at the camera."""
 
 
 def simulate_scan(request: SimulateRequest) -> dict[str, Any]:
-    """Writes the simulated sensor's points, and returns the record.
-
-    Raises:
-        PnpDepthError: An input or output is at fault; then nothing is written.
-    """
+    """Writes the simulated sensor's points, and returns the record."""
     sensor = find_sensor(request.sensor)
-    request.target.check((request.depth, request.calib, Path(request.sensor)))
+    request.target.check((request.depth, request.calib, Path(request.sensor.partition(",")[0])))
     dense, notes = request.read()
     calibration = read_calibration(request.calib, request.camera)
     height, width = dense.values.shape
     notes += check_size(request.calib, calibration, (height, width), request.depth)
     camera = _camera(request, calibration)
-    points = simulate_lidar(dense.values, camera, sensor, request.seed, request.settings)
-    source = f"{sensor.name}, seed {request.seed}"
-    notes.append(f"sparse: {describe_range(points.depth, source)}")
-    max_range = sensor.max_range if np.isfinite(sensor.max_range) else None  # JSON lacks infinity
+    points = simulate_lidar(dense.values, camera, sensor, request.seed)
+    notes.append(f"sparse: {describe_range(points.depth, f'{sensor.name}, seed {request.seed}')}")
     return request.target.write(
         points,
         {
             "command": "simulate",
-            "sensor": asdict(sensor) | {"max_range": max_range},
-            **asdict(request.settings),
+            "sensor": plain(asdict(sensor)),
             "rotation": camera.rotation.tolist(),
             "translation": camera.translation.tolist(),
             "seed": request.seed,
@@ -300,29 +284,45 @@ def simulate_scan(request: SimulateRequest) -> dict[str, Any]:
 
 
 def find_sensor(spec: str) -> Lidar:
-    """Returns the named sensor, or the one that a TOML file describes.
+    """Returns the sensor of `NAME` or `FILE.toml`, with `,key=value` of `OPTIONAL` after it.
 
     Raises:
         UsageError: There is no sensor of this name, or it is described wrongly.
         InputError: The file cannot be read.
     """
-    if spec in LIDARS:
-        return LIDARS[spec]
-    if Path(spec).suffix.lower() == ".toml":
-        return Lidar(**asdict(read_sensor(Path(spec))))
-    raise UsageError(f"no sensor {spec!r}; --sensor is a TOML file or one of: {', '.join(LIDARS)}")
+    name, *changes = spec.split(",")
+    if name in LIDARS:
+        sensor = LIDARS[name]
+    elif Path(name).suffix.lower() == ".toml":
+        sensor = Lidar(**read_sensor(Path(name)))
+    else:
+        known = ", ".join(LIDARS)
+        raise UsageError(f"no sensor {name!r}; --sensor is a TOML file or one of: {known}")
+    values: dict[str, Any] = {}
+    for change in changes:
+        key, _, value = change.partition("=")
+        try:
+            values[OPTIONAL[OPTIONAL.index(key)]] = float(value)
+        except ValueError:
+            raise UsageError(
+                f"--sensor {spec}: {change!r} is not NAME=NUMBER with one of {', '.join(OPTIONAL)}"
+            ) from None
+    return replace(sensor, **values)
 
 
 def _camera(request: SimulateRequest, calibration: Calibration) -> Camera:
     """The camera, with the scanner at the position that is asked for."""
-    if request.at_scanner and request.offset is not None:
-        raise UsageError("--at-scanner takes the position from the calibration; leave out --offset")
     camera = camera_of(calibration)
-    if request.at_scanner:
+    if request.position == AT_CALIBRATION:
         if not calibration.has_pose:
             raise UsageError(f"{request.calib} has no pose of the scanner; add R and t")
         return camera
-    position = np.array(request.offset or (0.0, 0.0, 0.0))
+    try:
+        position = np.array((request.position or "0,0,0").split(","), np.float64)
+    except ValueError:
+        position = np.empty(0)
+    if position.shape != (3,) or not np.isfinite(position).all():
+        raise UsageError(f"--position must be X,Y,Z in metres or calib, got {request.position!r}")
     return replace(camera, rotation=FORWARD_LEFT_UP, translation=position)
 
 

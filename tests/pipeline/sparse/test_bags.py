@@ -12,7 +12,7 @@ pytest.importorskip("rosbags")
 
 from pnpdepth_cli.cli.main import main
 from pnpdepth_cli.errors import FileFormatError, OutputError, PnpDepthError, UsageError
-from pnpdepth_cli.io.bags.pairing import Stamped, nearest_pairs
+from pnpdepth_cli.io.bags.messages import Stamped, nearest_pairs
 from pnpdepth_cli.io.calibration import read_calibration
 from pnpdepth_cli.io.layouts import read_frames
 from pnpdepth_cli.io.rgb import read_rgb

@@ -23,18 +23,18 @@ from pnpdepth_cli.errors import (
 from pnpdepth_cli.io.calibration import read_calibration
 from pnpdepth_cli.io.depth import DEPTH_SUFFIXES, read_depth, read_sparse
 from pnpdepth_cli.pipeline.sparse.make import (
-    SampleNoise,
-    SamplePattern,
     SampleRequest,
     SimulateRequest,
     SparseTarget,
     find_sensor,
     project_scan,
+    read_noise,
     sample_depth,
     simulate_scan,
 )
 from pnpdepth_cli.pipeline.sparse.options import ScanOptions
 from pnpdepth_cli.pipeline.sparse.scans import camera_of, read_scan_points
+from pnpdepth_cli.sensors import LIDARS, SampleNoise, SamplePattern
 from tests.pipeline.scan_frames import ScanOnDisk, scan_on_disk
 
 
@@ -140,8 +140,6 @@ def test_results_are_replaced_only_with_overwrite(frame: ScanOnDisk) -> None:
     refused(frame, OutputError, "is an input", target=into, options=ScanOptions(calib=calib))
     below = SparseTarget(output=frame.gt / "s.png")
     refused(frame, OutputError, "cannot be written (file exists)", target=below)
-    scale = SparseTarget(output=frame.folder / "s.png", depth_scale=0)
-    refused(frame, UsageError, "--output-scale", target=scale)
     refused(frame, OutputError, ".jpg", target=SparseTarget(output=frame.folder / "s.jpg"))
 
 
@@ -198,7 +196,7 @@ def simulating(frame: ScanOnDisk, output: str, **more: object) -> SimulateReques
 def test_a_simulated_sensor_of_ones_own_measures_the_truth(frame: ScanOnDisk) -> None:
     sensor = frame.folder / "mine.toml"
     sensor.write_text("top_deg = 20\nstep_deg = 2\nbeams = 21\nazimuth_step_deg = 0.5\n")
-    for output, position in (("camera.csv", {}), ("scanner.csv", {"at_scanner": True})):
+    for output, position in (("camera.csv", {}), ("scanner.csv", {"position": "calib"})):
         record = simulate_scan(simulating(frame, output, sensor=str(sensor), **position))
         got = read_sparse(frame.folder / output, size=(60, 100)).points
         np.testing.assert_allclose(got.depth, 4 + 0.02 * got.xy[:, 0], atol=0.02)
@@ -208,10 +206,36 @@ def test_a_simulated_sensor_of_ones_own_measures_the_truth(frame: ScanOnDisk) ->
 
 
 def test_the_scanner_can_stand_beside_the_camera(frame: ScanOnDisk) -> None:
-    record = simulate_scan(simulating(frame, "s.csv", sensor="vlp-16", offset=(0.5, 0.0, -0.1)))
+    record = simulate_scan(simulating(frame, "s.csv", sensor="vlp-16", position="0.5,0,-0.1"))
     assert record["translation"] == [0.5, 0, -0.1]
-    with pytest.raises(UsageError, match="leave out --offset"):
-        simulate_scan(simulating(frame, "t.csv", offset=(0.0, 0.0, 0.0), at_scanner=True))
+    with pytest.raises(UsageError, match="--position must be X,Y,Z"):
+        simulate_scan(simulating(frame, "t.csv", position="0,0"))
+
+
+@pytest.mark.parametrize(
+    ("text", "noise"),
+    [
+        (None, SampleNoise()),
+        ("0.05", SampleNoise(metres=0.05)),
+        ("2%,outliers=10%,jitter=1", SampleNoise(relative=0.02, outliers=0.1, jitter_px=1)),
+    ],
+)
+def test_noise_is_read_as_it_is_written(text: str | None, noise: SampleNoise) -> None:
+    assert read_noise(text) == noise
+
+
+@pytest.mark.parametrize("text", ["much", "blur=1", "jitter="])
+def test_noise_of_another_kind_is_refused(text: str) -> None:
+    with pytest.raises(UsageError, match="--noise must be metres"):
+        read_noise(text)
+
+
+def test_a_named_sensor_can_be_changed() -> None:
+    sensor = find_sensor("vlp-16,dropout=0.1,max_range=30")
+    assert sensor == replace(LIDARS["vlp-16"], dropout=0.1, max_range=30)
+    for spec in ("vlp-16,beams=3", "vlp-16,dropout", "vlp-16,dropout=x"):
+        with pytest.raises(UsageError, match="is not NAME=NUMBER"):
+            find_sensor(spec)
 
 
 def test_an_unknown_sensor_is_answered_with_the_known_ones() -> None:
