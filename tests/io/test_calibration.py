@@ -100,7 +100,10 @@ BROKEN = [
     ("hello\n" + KITTI, "line 1: 'hello' has no name"),
     (YAML.replace("K:", "k:"), "'k' is not part of a calibration"),
     (YAML.replace("t:", "#t:"), "has R but no t"),
-    (YAML.replace("[-0.3, 0.1, 0.0, 0.001]", "[-0.3]"), "1 coefficients of radial-tangential distortion"),
+    (
+        YAML.replace("[-0.3, 0.1, 0.0, 0.001]", "[-0.3]"),
+        "1 coefficients of radial-tangential",
+    ),
     (YAML.replace("1242", "0"), "no image"),
     ("1 2 3", "K has 3 numbers instead of 9"),
     ('{"K": [1, 2', "is not valid JSON"),

@@ -173,7 +173,10 @@ def test_what_is_no_pose_is_one_line(text: str, message: str, tmp_path: Path) ->
         ("a: &a [1, 1]\ncamera_matrix: *a\n", "has an alias"),
         ("camera_matrix: [" * 2000, "is not valid YAML"),
         ("camera_matrix: 1\n" + " " * 300_000, "more than a calibration"),
-        ("camera_matrix: !!python/object/apply:os.system ['true']", "is not made of finite numbers"),
+        (
+            "camera_matrix: !!python/object/apply:os.system ['true']",
+            "is not made of finite numbers",
+        ),
         ("camera_matrix: [1, 2, .inf]", "is not made of finite numbers"),
     ],
 )
