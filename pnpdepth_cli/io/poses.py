@@ -100,10 +100,6 @@ class Trajectory:
 
         Position is interpolated linearly, rotation along the shortest arc. None outside of the
         trajectory, and between poses that are farther apart than the longest gap.
-
-        Args:
-            time_s: Seconds, on the trajectory's clock.
-            longest_gap_s: Between two poses, seconds.
         """
         from scipy.spatial.transform import Rotation, Slerp
 
@@ -129,12 +125,7 @@ def trajectory_of(times_s: Floats, poses: Floats) -> Trajectory:
 
 
 def read_trajectory(path: Path) -> Trajectory:
-    """Returns the trajectory in a file with rows of time, position and quaternion x y z w.
-
-    Raises:
-        FileFormatError: A row has other numbers, or its rotation is none.
-        InputError: The file cannot be read.
-    """
+    """Returns the trajectory in a file with rows of time, position and quaternion x y z w."""
     times, poses = [], []
     for number, values, pose in pose_rows(path):
         if len(values) != _TUM_COLUMNS or not np.isfinite(values[0]):
@@ -149,16 +140,9 @@ def read_trajectory(path: Path) -> Trajectory:
 
 
 def read_oxts_poses(packets: list[Path], calibration: Path, camera: int | None) -> Floats:
-    """Returns the poses (N, 3, 4) from the camera's frame to one world's, metres.
+    """Returns the poses (N, 3, 4) of a camera of a drive, from its frame to one world's, metres.
 
-    Args:
-        packets: Of one drive.
-        calibration: The folder with KITTI's raw calibrations.
-        camera: Number of the camera, None for the left colour camera.
-
-    Raises:
-        FileFormatError: A packet or a calibration is damaged.
-        InputError: A file cannot be read.
+    The calibration is the folder with KITTI's raw calibrations.
     """
     to_camera = read_calibration(calibration, camera)
     of_scanner = square((to_camera.rotation, to_camera.translation))

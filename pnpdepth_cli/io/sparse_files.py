@@ -145,24 +145,15 @@ def write_sparse(
     image: NDArray[np.float32],
     *,
     provenance: Mapping[str, Any],
-    scale: float = KITTI_SCALE,
 ) -> None:
-    """Writes N points in the format that the suffix names.
+    """Writes N points, of pixels (N, 2) and metres (N,), in the format that the suffix names.
 
-    Args:
-        path: The file to write, with a suffix of `SPARSE_SUFFIXES`.
-        xy: (N, 2) pixel coordinates.
-        depth: (N,) metres.
-        image: The same points as (H, W) metres, for every format but .csv.
-        provenance: How they were made; a PNG and a CSV keep it.
-        scale: Codes per metre of a PNG.
-
-    Raises:
-        OutputError: The file cannot be written.
+    Every format but .csv holds the image, the same points as (H, W) metres. A PNG and a CSV keep
+    the provenance: how the points were made.
     """
     text = json.dumps(provenance, sort_keys=True)
     if path.suffix.lower() != ".csv":
-        write_depth(path, image, scale=scale, text={_PROVENANCE_KEY: text})
+        write_depth(path, image, scale=KITTI_SCALE, text={_PROVENANCE_KEY: text})
         return
     rows = [f"{x:.9g},{y:.9g},{z:.9g}" for (x, y), z in zip(xy, depth, strict=True)]
     with atomic_path(path) as temporary:

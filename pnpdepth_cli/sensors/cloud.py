@@ -32,11 +32,7 @@ class PointCloud(NamedTuple):
     """(N, 3) colours 0…255. None: without colours."""
 
     def transformed(self, pose: Floats) -> PointCloud:
-        """Returns the cloud in another frame.
-
-        Args:
-            pose: (3, 4) or (4, 4), from the cloud's frame to the other; its rotation has no scale.
-        """
+        """Returns the cloud in the frame that a pose, (3, 4) or (4, 4), leads to."""
         rotation, translation = pose[:3, :3], pose[:3, 3]
         return PointCloud(
             xyz=(self.xyz @ rotation.T + translation).astype(np.float32),
@@ -99,10 +95,6 @@ def depth_edges(depth: NDArray[np.float32], edge: float) -> Mask:
 
     A jump is a second difference of inverse depth of more than `edge` of the inverse depth. A
     plane has none, whatever its slope: inverse depth is linear in the pixel coordinates.
-
-    Args:
-        depth: (H, W), 0 = unknown.
-        edge: Fraction of the inverse depth.
     """
     known = depth > 0
     inverse = np.where(known, 1 / np.where(known, depth, 1), np.nan)
@@ -117,12 +109,7 @@ def depth_edges(depth: NDArray[np.float32], edge: float) -> Mask:
 
 
 def depth_normals(depth: NDArray[np.float32], camera: Camera) -> Floats:
-    """Returns (H, W, 3) unit normals towards the camera; 0 where depth or neighbours are unknown.
-
-    Args:
-        depth: (H, W), 0 = unknown.
-        camera: Intrinsics and distortion of the image that the depth belongs to.
-    """
+    """Returns (H, W, 3) unit normals towards the camera; 0 where depth is unknown."""
     known = kept_pixels(depth, edge=0)
     return _normals(_points(depth, known, camera), known)
 
@@ -158,11 +145,7 @@ def _difference(points: Floats, known: Mask, axis: int) -> Floats:
 
 
 class VoxelGrid:
-    """Merges clouds: one point per occupied cube, the mean of all points in it.
-
-    Args:
-        side: Of a cube, in the unit of the clouds.
-    """
+    """Merges clouds: one point per occupied cube of this side, the mean of all points in it."""
 
     def __init__(self, side: float) -> None:
         self._side = side

@@ -123,12 +123,8 @@ def project_velodyne(
 def edge_agreement(points: Points, rgb: NDArray[np.float32]) -> float:
     """Returns how much stronger the image's edges are at jumps of depth than elsewhere, −1 to 1.
 
-    That is the mean rank of the gradient beside the points at the near side of a jump, less that
-    at all points. It tells calibrations of the same scan apart. 0 for points without a jump.
-
-    Args:
-        points: A projected scan.
-        rgb: (H, W, 3) in 0..1, of the same size.
+    That is the mean rank of the gradient of rgb, (H, W, 3) in 0..1, beside the points at the near
+    side of a jump, less that at all points. It tells calibrations of the same scan apart.
     """
     from scipy.spatial import cKDTree
 
@@ -221,14 +217,8 @@ def occluded_in_map(points: Points) -> Mask | None:
     """Returns (N,) true for points of a projected scan that are occluded by something nearer.
 
     A point is occluded if a point nearer by more than `NEARER` lies within a fraction of the
-    spacing of scan lines. Scanner and focal length are unknown.
-
-    Args:
-        points: Points of a depth map, on whole pixel coordinates.
-
-    Returns:
-        The mask; None for points that are no projected scan, or whose occluded points are removed
-        already.
+    spacing of scan lines. Scanner and focal length are unknown. None for points that are no
+    projected scan on whole pixels, or whose occluded points are removed already.
     """
     if len(points) < MIN_POINTS or bool((points.xy != np.floor(points.xy)).any()):
         return None
@@ -245,11 +235,7 @@ def occluded_in_map(points: Points) -> Mask | None:
 
 
 def interleaved(depth: NDArray[np.float32]) -> Mask:
-    """Returns (H, W) true for points of a map with nearer points on two opposite sides.
-
-    Args:
-        depth: (H, W) metres, 0 = unknown.
-    """
+    """Returns (H, W) true for points of a map, 0 = unknown, between nearer ones on two sides."""
     known = np.where(depth > 0, depth, np.float32(np.inf))
     limit = np.where(depth > 0, depth * np.float32(1 - NEARER), 0)
     reach, half = _INTERLEAVED_REACH

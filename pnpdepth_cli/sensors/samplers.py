@@ -236,11 +236,6 @@ def _region(scene: Scene) -> Pixels:
 def with_noise(points: Points, noise: SampleNoise, rng: np.random.Generator) -> Points:
     """Returns the points with noise, without those that it makes impossible or moves outside.
 
-    Args:
-        points: Points of one image.
-        noise: What is added.
-        rng: Draws the noise.
-
     Raises:
         NoPointsError: No point is left.
     """
