@@ -81,6 +81,7 @@ def project(
 @options.overwrite
 @options.as_json
 def sample(
+    depth: Path,
     pattern: str,
     count: str | None,
     noise: str | None,
@@ -109,13 +110,10 @@ def sample(
     """
     from pnpdepth_cli.pipeline.sparse import make
 
-    request = make.SampleRequest(
-        target=make.SparseTarget(output=output, overwrite=overwrite),
-        pattern=make.read_pattern(pattern, count),
-        noise=make.read_noise(noise),
-        **values,
-    )
-    _print(make.sample_depth(request), as_json=as_json)
+    values["scale"] = values.pop("depth_scale")
+    target = make.SparseTarget(output=output, overwrite=overwrite)
+    chosen, added = make.read_pattern(pattern, count), make.read_noise(noise)
+    _print(make.sample_depth(depth, target, chosen, noise=added, **values), as_json=as_json)
 
 
 @click.command(short_help="Simulate a LiDAR in a scene with dense depth.")
@@ -148,7 +146,15 @@ def sample(
 @options.sparse_output
 @options.overwrite
 @options.as_json
-def simulate(output: Path, overwrite: bool, as_json: bool, **values: Any) -> None:
+def simulate(
+    depth: Path,
+    sensor: str,
+    calib: Path,
+    output: Path,
+    overwrite: bool,
+    as_json: bool,
+    **values: Any,
+) -> None:
     """Simulate the sparse depth of a LiDAR in the scene of the dense DEPTH.
 
     \b
@@ -165,10 +171,11 @@ def simulate(output: Path, overwrite: bool, as_json: bool, **values: Any) -> Non
                     rotation_noise_deg = 0.1   of the whole scanner
                     dropout = 0.05             fraction of lost beams
     """
-    from pnpdepth_cli.pipeline.sparse.make import SimulateRequest, SparseTarget, simulate_scan
+    from pnpdepth_cli.pipeline.sparse.make import SparseTarget, simulate_scan
 
+    values["scale"] = values.pop("depth_scale")
     target = SparseTarget(output=output, overwrite=overwrite)
-    _print(simulate_scan(SimulateRequest(target=target, **values)), as_json=as_json)
+    _print(simulate_scan(depth, target, sensor, calib, **values), as_json=as_json)
 
 
 @click.command(short_help="Write the frames of a ROS bag as files.")

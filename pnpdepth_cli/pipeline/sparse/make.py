@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ from pnpdepth_cli import __version__
 from pnpdepth_cli.errors import OutputError, SizeError, UsageError
 from pnpdepth_cli.io.atomic import make_folder
 from pnpdepth_cli.io.calibration import Calibration, read_calibration
-from pnpdepth_cli.io.depth import DepthImage, describe_range, implausible, read_depth
+from pnpdepth_cli.io.depth import describe_range, implausible, read_depth
 from pnpdepth_cli.io.record import plain, sha256_of, write_json
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.io.sensor_file import OPTIONAL, read_sensor
@@ -156,57 +156,93 @@ def project_scan(
     )
 
 
-@dataclass(frozen=True, kw_only=True)
-class DenseDepth:
-    """Dense depth that sparse points are made from, and where to."""
+def sample_depth(
+    depth: Path,
+    target: SparseTarget,
+    pattern: SamplePattern,
+    *,
+    noise: SampleNoise | None = None,
+    image: Path | None = None,
+    seed: int = 0,
+    **reading: Any,
+) -> dict[str, Any]:
+    """Writes points of a dense depth map, and returns the record.
 
-    depth: Path
-    target: SparseTarget
-    seed: int = 0
-    depth_scale: float | None = None
-    """Codes per metre of an integer depth file; None for the file's own."""
-    channel: str | None = None
-    """The EXR channel or NPZ array with the depth."""
-
-    def read(self) -> tuple[DepthImage, list[str]]:
-        """Returns the dense depth, and lines for a person."""
-        dense = read_depth(self.depth, scale=self.depth_scale, channel=self.channel)
-        text = describe_range(
-            dense.values, dense.source, assumed_scale=dense.assumed_scale, noun="pixels"
-        )
-        unlikely = implausible(dense.values, dense.scale)
-        return dense, [f"depth: {text}", *([f"warning: {unlikely}"] if unlikely else [])]
-
-
-@dataclass(frozen=True, kw_only=True)
-class SampleRequest(DenseDepth):
-    """What to sample."""
-
-    pattern: SamplePattern
-    noise: SampleNoise = field(default_factory=SampleNoise)
-    image: Path | None = None
-    """For the patterns that need one."""
-
-
-def sample_depth(request: SampleRequest) -> dict[str, Any]:
-    """Writes points of the depth map, and returns the record."""
-    request.target.check((request.depth, request.image))
-    pattern, noise, seed = request.pattern, request.noise, request.seed
-    dense, notes = request.read()
-    rgb = None if request.image is None else read_rgb(request.image).values
-    points = sample_points(dense.values, pattern, seed, image=rgb, noise=noise)
-    wanted = pattern.wanted(int(np.count_nonzero(dense.values)))
+    Args:
+        depth: The file of the map.
+        target: Files to write.
+        pattern: Which pixels are sampled.
+        noise: Added to the points; None for none.
+        image: For the patterns that need one.
+        seed: Of all random choices.
+        **reading: `scale` and `channel` of `read_depth`.
+    """
+    target.check((depth, image))
+    noise = noise or SampleNoise()
+    dense, notes = _dense(depth, **reading)
+    rgb = None if image is None else read_rgb(image).values
+    points = sample_points(dense, pattern, seed, image=rgb, noise=noise)
+    wanted = pattern.wanted(int(np.count_nonzero(dense)))
     sampled = len(points) + sum(points.dropped.values())
     if pattern.kind in ("features", "edges") and sampled < wanted:
         notes.append(f"warning: the image has {sampled:,} of the {wanted:,} points asked for")
     notes.append(f"sparse: {describe_range(points.depth, f'{pattern.kind}, seed {seed}')}")
     settings = {"pattern": asdict(pattern), "noise": asdict(noise), "seed": seed}
-    return request.target.write(
-        points,
-        {"command": "sample", **settings},
-        inputs=_files(depth=request.depth, image=request.image),
-        notes=notes,
+    inputs = _files(depth=depth, image=image)
+    return target.write(points, {"command": "sample", **settings}, inputs=inputs, notes=notes)
+
+
+def simulate_scan(
+    depth: Path,
+    target: SparseTarget,
+    spec: str,
+    calib: Path,
+    *,
+    camera: int | None = None,
+    position: str | None = None,
+    seed: int = 0,
+    **reading: Any,
+) -> dict[str, Any]:
+    """Writes the points of a simulated sensor in a dense depth map, and returns the record.
+
+    Args:
+        depth: The file of the map.
+        target: Files to write.
+        spec: The sensor, as `find_sensor` takes it.
+        calib: Calibration of the camera.
+        camera: Which camera of it.
+        position: Of the scanner: metres right of, below and in front of the camera as X,Y,Z, or
+            `AT_CALIBRATION`. None: at the camera.
+        seed: Of all noise.
+        **reading: `scale` and `channel` of `read_depth`.
+    """
+    sensor = find_sensor(spec)
+    target.check((depth, calib, Path(spec.partition(",")[0])))
+    dense, notes = _dense(depth, **reading)
+    calibration = read_calibration(calib, camera)
+    notes += check_size(calib, calibration, (dense.shape[0], dense.shape[1]), depth)
+    eye = _placed(calib, calibration, position)
+    points = simulate_lidar(dense, eye, sensor, seed)
+    notes.append(f"sparse: {describe_range(points.depth, f'{sensor.name}, seed {seed}')}")
+    settings = {
+        "command": "simulate",
+        "sensor": plain(asdict(sensor)),
+        "rotation": eye.rotation.tolist(),
+        "translation": eye.translation.tolist(),
+        "seed": seed,
+    }
+    named = {"calibration": {"path": str(calib), "read_as": calibration.source}}
+    return target.write(points, settings, inputs=_files(depth=depth) | named, notes=notes)
+
+
+def _dense(path: Path, **reading: Any) -> tuple[NDArray[np.float32], list[str]]:
+    """The dense depth (H, W), and lines for a person."""
+    dense = read_depth(path, **reading)
+    text = describe_range(
+        dense.values, dense.source, assumed_scale=dense.assumed_scale, noun="pixels"
     )
+    unlikely = implausible(dense.values, dense.scale)
+    return dense.values, [f"depth: {text}", *([f"warning: {unlikely}"] if unlikely else [])]
 
 
 def read_pattern(text: str, count: str | None) -> SamplePattern:
@@ -243,46 +279,6 @@ def read_noise(text: str | None) -> SampleNoise:
     return SampleNoise(**values)
 
 
-@dataclass(frozen=True, kw_only=True)
-class SimulateRequest(DenseDepth):
-    """What to simulate."""
-
-    calib: Path
-    sensor: str = "hdl-64e"
-    """As `find_sensor` takes it."""
-    camera: int | None = None
-    """One of KITTI's four, 0 to 3; None for the left colour camera."""
-    position: str | None = None
-    """Of the scanner: metres right of, below and in front of the camera as X,Y,Z, or
-    `AT_CALIBRATION`. None: at the camera."""
-
-
-def simulate_scan(request: SimulateRequest) -> dict[str, Any]:
-    """Writes the simulated sensor's points, and returns the record."""
-    sensor = find_sensor(request.sensor)
-    request.target.check((request.depth, request.calib, Path(request.sensor.partition(",")[0])))
-    dense, notes = request.read()
-    calibration = read_calibration(request.calib, request.camera)
-    height, width = dense.values.shape
-    notes += check_size(request.calib, calibration, (height, width), request.depth)
-    camera = _camera(request, calibration)
-    points = simulate_lidar(dense.values, camera, sensor, request.seed)
-    notes.append(f"sparse: {describe_range(points.depth, f'{sensor.name}, seed {request.seed}')}")
-    return request.target.write(
-        points,
-        {
-            "command": "simulate",
-            "sensor": plain(asdict(sensor)),
-            "rotation": camera.rotation.tolist(),
-            "translation": camera.translation.tolist(),
-            "seed": request.seed,
-        },
-        inputs=_files(depth=request.depth)
-        | {"calibration": {"path": str(request.calib), "read_as": calibration.source}},
-        notes=notes,
-    )
-
-
 def find_sensor(spec: str) -> Lidar:
     """Returns the sensor of `NAME` or `FILE.toml`, with `,key=value` of `OPTIONAL` after it.
 
@@ -310,20 +306,20 @@ def find_sensor(spec: str) -> Lidar:
     return replace(sensor, **values)
 
 
-def _camera(request: SimulateRequest, calibration: Calibration) -> Camera:
+def _placed(path: Path, calibration: Calibration, position: str | None) -> Camera:
     """The camera, with the scanner at the position that is asked for."""
     camera = camera_of(calibration)
-    if request.position == AT_CALIBRATION:
+    if position == AT_CALIBRATION:
         if not calibration.has_pose:
-            raise UsageError(f"{request.calib} has no pose of the scanner; add R and t")
+            raise UsageError(f"{path} has no pose of the scanner; add R and t")
         return camera
     try:
-        position = np.array((request.position or "0,0,0").split(","), np.float64)
+        metres = np.array((position or "0,0,0").split(","), np.float64)
     except ValueError:
-        position = np.empty(0)
-    if position.shape != (3,) or not np.isfinite(position).all():
-        raise UsageError(f"--position must be X,Y,Z in metres or calib, got {request.position!r}")
-    return replace(camera, rotation=FORWARD_LEFT_UP, translation=position)
+        metres = np.empty(0)
+    if metres.shape != (3,) or not np.isfinite(metres).all():
+        raise UsageError(f"--position must be X,Y,Z in metres or calib, got {position!r}")
+    return replace(camera, rotation=FORWARD_LEFT_UP, translation=metres)
 
 
 def _files(**paths: Path | None) -> dict[str, Any]:

@@ -23,8 +23,6 @@ from pnpdepth_cli.errors import (
 from pnpdepth_cli.io.calibration import read_calibration
 from pnpdepth_cli.io.depth import DEPTH_SUFFIXES, read_depth, read_sparse
 from pnpdepth_cli.pipeline.sparse.make import (
-    SampleRequest,
-    SimulateRequest,
     SparseTarget,
     find_sensor,
     project_scan,
@@ -153,14 +151,14 @@ def test_options_of_a_scan_are_refused_for_anything_else(frame: ScanOnDisk) -> N
     assert not ScanOptions(keep_occluded=True).describes(frame.gt)
 
 
-def sampling(frame: ScanOnDisk, output: str, **more: Any) -> SampleRequest:
+def sampled(frame: ScanOnDisk, output: str, **more: Any) -> dict[str, Any]:
     pattern = {name: more.pop(name) for name in ("kind", "count", "fraction") if name in more}
     target = SparseTarget(output=frame.folder / output)
-    return SampleRequest(depth=frame.gt, target=target, pattern=SamplePattern(**pattern), **more)
+    return sample_depth(frame.gt, target, SamplePattern(**pattern), **more)
 
 
 def test_the_seed_is_in_the_png_and_in_the_record(frame: ScanOnDisk) -> None:
-    sample_depth(sampling(frame, "u.png", count=100, seed=11))
+    sampled(frame, "u.png", count=100, seed=11)
     assert np.count_nonzero(read_depth(frame.folder / "u.png").values) == 100
     settings = json.loads(Image.open(frame.folder / "u.png").text["pnpdepth:made"])
     assert settings["seed"] == 11
@@ -171,33 +169,29 @@ def test_the_seed_is_in_the_png_and_in_the_record(frame: ScanOnDisk) -> None:
 
 def test_the_same_seed_gives_the_same_bytes(frame: ScanOnDisk) -> None:
     for name in ("a", "b"):
-        sample_depth(
-            sampling(frame, f"{name}.png", fraction=0.1, noise=SampleNoise(metres=0.1), seed=2)
-        )
+        sampled(frame, f"{name}.png", fraction=0.1, noise=SampleNoise(metres=0.1), seed=2)
     assert (frame.folder / "a.png").read_bytes() == (frame.folder / "b.png").read_bytes()
 
 
 def test_fewer_edges_than_requested_are_reported(frame: ScanOnDisk) -> None:
-    request = sampling(frame, "e.png", kind="edges", count=3000, image=frame.image)
     image = np.zeros((48, 64, 3), np.uint8)
     image[:, 30:] = 255
     cv2.imwrite(str(frame.image), image)
-    record = sample_depth(request)
+    record = sampled(frame, "e.png", kind="edges", count=3000, image=frame.image)
     assert record["points"]["count"] < 3000
     assert any("of the 3,000 points asked for" in note for note in record["notes"])
 
 
-def simulating(frame: ScanOnDisk, output: str, **more: object) -> SimulateRequest:
+def simulated(frame: ScanOnDisk, output: str, sensor: str, **more: Any) -> dict[str, Any]:
     target = SparseTarget(output=frame.folder / output)
-    request = SimulateRequest(depth=frame.gt, calib=frame.calib, target=target)
-    return replace(request, **more)  # type: ignore[arg-type]
+    return simulate_scan(frame.gt, target, sensor, frame.calib, **more)
 
 
 def test_a_simulated_sensor_of_ones_own_measures_the_truth(frame: ScanOnDisk) -> None:
     sensor = frame.folder / "mine.toml"
     sensor.write_text("top_deg = 20\nstep_deg = 2\nbeams = 21\nazimuth_step_deg = 0.5\n")
     for output, position in (("camera.csv", {}), ("scanner.csv", {"position": "calib"})):
-        record = simulate_scan(simulating(frame, output, sensor=str(sensor), **position))
+        record = simulated(frame, output, str(sensor), **position)
         got = read_sparse(frame.folder / output, size=(60, 100)).points
         np.testing.assert_allclose(got.depth, 4 + 0.02 * got.xy[:, 0], atol=0.02)
         assert record["sensor"]["name"] == "mine"
@@ -206,10 +200,10 @@ def test_a_simulated_sensor_of_ones_own_measures_the_truth(frame: ScanOnDisk) ->
 
 
 def test_the_scanner_can_stand_beside_the_camera(frame: ScanOnDisk) -> None:
-    record = simulate_scan(simulating(frame, "s.csv", sensor="vlp-16", position="0.5,0,-0.1"))
+    record = simulated(frame, "s.csv", "vlp-16", position="0.5,0,-0.1")
     assert record["translation"] == [0.5, 0, -0.1]
     with pytest.raises(UsageError, match="--position must be X,Y,Z"):
-        simulate_scan(simulating(frame, "t.csv", position="0,0"))
+        simulated(frame, "t.csv", "vlp-16", position="0,0")
 
 
 @pytest.mark.parametrize(
