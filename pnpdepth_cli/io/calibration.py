@@ -251,7 +251,7 @@ def _rectified(
 ) -> Calibration:
     """P · R_rect · [R t], with the camera's own offset in P's last column as a translation."""
     intrinsics = _checked_intrinsics(path, projection[:, :3])
-    offset: Floats = np.linalg.solve(intrinsics, projection[:, 3])
+    offset = np.asarray(np.linalg.solve(intrinsics, projection[:, 3]), np.float64)
     rectify, offset = checked_pose(path, "rectification", rectify, offset)
     rotation, translation = np.eye(3), np.zeros(3)
     if scanner is not None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -84,10 +84,8 @@ def write_depth_cloud(request: CloudRequest) -> dict[str, Any]:
     coloured = all(request.image or frame.image for frame in frames)
     notes: list[str] = []
     parts = _parts(request, frames, poses, coloured, notes)
-    if request.voxel is not None:
-        parts = _merged(parts, VoxelGrid(request.voxel), coloured=coloured)
     make_folder(request.output.parent)
-    points = write_cloud(request.output, _some(parts, request.depth))
+    points = write_cloud(request.output, _merged(request, parts, coloured))
     inputs = ("depth", "output", "image", "overwrite", "camera", "calib", "poses")
     settings = {name: value for name, value in asdict(request).items() if name not in inputs}
     record = {
@@ -166,40 +164,32 @@ def _parts(
 
     for index, (frame, pose) in enumerate(zip(frames, poses, strict=True)):
         here = view(index)
-        depth = here.depth if request.min_views == 1 else _agreed(request, index, poses, view)
+        depth = here.depth
+        if request.min_views > 1:
+            known = np.stack([each for each in poses if each is not None])
+            others = (view(other) for other in neighbouring_views(known, index))
+            depth = consistent_depth(here, others, request.min_views)
         rgb = _colours(request, frame, here.depth) if coloured else None
         for part in cloud_from_depth(depth, here.camera, rgb=rgb, edge=request.edge):
             yield part if pose is None else part.transformed(pose)
 
 
-def _agreed(
-    request: CloudRequest,
-    index: int,
-    poses: list[NDArray[np.float64] | None],
-    view: Callable[[int], View],
-) -> NDArray[np.float32]:
-    """The depth of a view where enough of its neighbours agree with it."""
-    known = np.stack([pose for pose in poses if pose is not None])
-    others = (view(other) for other in neighbouring_views(known, index))
-    return consistent_depth(view(index), others, request.min_views)
-
-
 def _merged(
-    parts: Iterator[PointCloud], grid: VoxelGrid, *, coloured: bool
+    request: CloudRequest, parts: Iterator[PointCloud], coloured: bool
 ) -> Iterator[PointCloud]:
-    for part in parts:
-        grid.add(part)
-    yield grid.cloud(coloured=coloured)
-
-
-def _some(parts: Iterator[PointCloud], source: Path) -> Iterator[PointCloud]:
-    """The parts. Raises InputError if none has a point."""
+    """The parts, or their points merged. Raises InputError if there is none."""
+    grid = None if request.voxel is None else VoxelGrid(request.voxel)
     empty = True
     for part in parts:
         empty &= not len(part.xyz)
-        yield part
+        if grid is None:
+            yield part
+        else:
+            grid.add(part)
     if empty:
-        raise InputError(f"{source}: no pixel is left; relax --max-depth, --max-sigma, …")
+        raise InputError(f"{request.depth}: no pixel is left; relax --max-depth, --max-sigma, …")
+    if grid is not None:
+        yield grid.cloud(coloured=coloured)
 
 
 def _depth_and_camera(
