@@ -71,7 +71,7 @@ def motion_of_images(
     depth, known = _depth_at(points, at)
     at, to, depth = at[known], to[known], depth[known]
     if len(at) < MIN_INLIERS:
-        return MotionEstimate(None, f"{len(at)} of {MIN_INLIERS} matches with depth")
+        return MotionEstimate(None, f"{len(at)} matches with depth, at least {MIN_INLIERS} needed")
     focal_px = float(camera.intrinsics[0, 0])
     rays = camera.unproject(to, np.ones(len(to)))[:, :2]
     solved, turn, shift, index = cv2.solvePnPRansac(
@@ -102,7 +102,9 @@ def motion_of_scans(here: Points, there: Points, camera: Camera) -> MotionEstima
             "motion between frames without images needs small_gicp: pip install 'pnpdepth[icp]'"
         ) from None
     if min(len(here), len(there)) < MIN_INLIERS:
-        return MotionEstimate(None, f"{min(len(here), len(there))} of {MIN_INLIERS} points")
+        return MotionEstimate(
+            None, f"{min(len(here), len(there))} points, at least {MIN_INLIERS} needed"
+        )
     median = float(np.median(here.depth))
     clouds = [
         small_gicp.preprocess_points(
@@ -157,5 +159,6 @@ def _plausible(motion: Floats, median: float, basis: str) -> MotionEstimate:
     """The motion unless it is longer than the median depth."""
     length = float(np.linalg.norm(motion[:, 3]))
     if not length <= median:
-        return MotionEstimate(None, f"{length:.1f} m of motion at a median of {median:.1f} m")
+        basis = f"{length:.1f} m of motion at a median depth of {median:.1f} m"
+        return MotionEstimate(None, basis)
     return MotionEstimate(motion, basis)
