@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
@@ -149,28 +148,16 @@ def sample_points(
     return with_noise(points, noise or SampleNoise(), rng)
 
 
-PATTERNS: dict[str, Callable[[Scene], Pixels]] = {}
-"""The patterns by name, as in `choices.PATTERNS`; each returns row-major indices of pixels."""
-
-
-def _pattern(function: Callable[[Scene], Pixels]) -> Callable[[Scene], Pixels]:
-    PATTERNS[function.__name__.removeprefix("_")] = function
-    return function
-
-
-@_pattern
 def _uniform(scene: Scene) -> Pixels:
     return scene.chosen(scene.known, scene.wanted)
 
 
-@_pattern
 def _bernoulli(scene: Scene) -> Pixels:
     """Each known pixel with the same probability; the count is only the expected one."""
     count = scene.known.size
     return scene.known[scene.rng.random(count) < scene.wanted / count]
 
 
-@_pattern
 def _grid(scene: Scene) -> Pixels:
     """Known pixels of a square grid whose spacing gives a full map the wanted count."""
     height, width = scene.size
@@ -186,7 +173,6 @@ def _grid(scene: Scene) -> Pixels:
     return np.intersect1d(nodes, scene.known)
 
 
-@_pattern
 def _lines(scene: Scene) -> Pixels:
     """All known pixels of evenly spaced rows."""
     height, width = scene.size
@@ -197,7 +183,6 @@ def _lines(scene: Scene) -> Pixels:
     return scene.known[np.isin(scene.known // width, rows)]
 
 
-@_pattern
 def _features(scene: Scene) -> Pixels:
     """The strongest ORB corners with known depth, as structure from motion has its points."""
     # Corners of several pyramid levels share pixels; three times as many leave enough when merged.
@@ -213,7 +198,6 @@ def _features(scene: Scene) -> Pixels:
     return kept
 
 
-@_pattern
 def _edges(scene: Scene) -> Pixels:
     """Known pixels on the image's edges (Canny), a random choice of the wanted count."""
     edges = cv2.Canny(cv2.GaussianBlur(scene.grey, (5, 5), 0), 30, 90)
@@ -221,7 +205,6 @@ def _edges(scene: Scene) -> Pixels:
     return scene.chosen(candidates, min(scene.wanted, candidates.size))
 
 
-@_pattern
 def _region(scene: Scene) -> Pixels:
     """Known pixels of a rectangle: all, or a random choice of the wanted count."""
     left, top, width, height = scene.pattern.region or (0, 0, 0, 0)
@@ -231,6 +214,11 @@ def _region(scene: Scene) -> Pixels:
         raise NoPointsError(f"no known pixel in the region {left},{top},{width},{height}; check it")
     pixels = scene.known[inside]
     return scene.chosen(pixels, scene.pattern.wanted(pixels.size))
+
+
+_FUNCTIONS = (_uniform, _bernoulli, _grid, _lines, _features, _edges, _region)
+PATTERNS = {function.__name__.removeprefix("_"): function for function in _FUNCTIONS}
+"""The patterns by name, as in `choices.PATTERNS`; each returns row-major indices of pixels."""
 
 
 def with_noise(points: Points, noise: SampleNoise, rng: np.random.Generator) -> Points:

@@ -49,11 +49,7 @@ class Bag:
         self._decode = typestore.deserialize_ros1 if ros1 else typestore.deserialize_cdr
 
     def topics(self, kinds: Sequence[str]) -> dict[str, int]:
-        """Returns the topics of these message types with their number of messages.
-
-        Raises:
-            FileFormatError: The bag is damaged.
-        """
+        """Returns the topics of these message types with their number of messages."""
         with _as_our_errors(self.path):
             return {
                 name: int(info.msgcount)
@@ -62,11 +58,7 @@ class Bag:
             }
 
     def messages(self, topics: Sequence[str]) -> Iterator[tuple[str, int, Any]]:
-        """Yields (topic, nanoseconds at which it was logged, message) in the order of the log.
-
-        Raises:
-            FileFormatError: The bag is damaged.
-        """
+        """Yields (topic, nanoseconds at which it was logged, message) in the order of the log."""
         wanted = [each for each in self._reader.connections if each.topic in topics]
         if not wanted:
             return
@@ -171,11 +163,7 @@ _COMPUTED = """
 
 
 def check_bag(path: Path) -> None:
-    """Raises FileFormatError if a bag is compressed as a whole, or its database computes values.
-
-    Args:
-        path: A file, or a folder with metadata.yaml.
-    """
+    """Raises FileFormatError if a bag is compressed as a whole, or its database computes values."""
     if path.is_dir():
         _check_metadata(path / _METADATA)
     files = sorted(path.glob("*.db3")) if path.is_dir() else [path]
