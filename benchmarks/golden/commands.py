@@ -424,17 +424,15 @@ def _of_sparse_depth() -> Iterator[Group]:
         ("lines", f"{sample} --pattern lines --count 6 -o lines.exr"),
         (
             "features",
-            f"{sample} --pattern features --count 40 --image ../in/small/rgb.png -o features.csv"
-            " --overlay features_overlay.png",
+            f"{sample} --pattern features --count 40 --image ../in/small/rgb.png -o features.csv",
         ),
         ("edges", f"{sample} --pattern edges --count 40 --image ../in/small/rgb.png -o e.tiff"),
-        ("region", f"{sample} --pattern region --region 10,20,40,30 --count 30 -o region.pfm"),
+        ("region", f"{sample} --pattern region:10,20,40,30 --count 30 -o region.pfm"),
         (
             "noise",
-            f"{sample} --count 80 --noise 0.05 --relative-noise 0.02 --outliers 0.1 --jitter 1"
-            " --seed 5 --output-scale 1000 -o noise.png",
+            f"{sample} --count 80 --noise 0.05,2%,outliers=10%,jitter=1 --seed 5 -o noise.png",
         ),
-        ("jitter-csv", f"{sample} --count 30 --jitter 0.4 -o jitter.csv"),
+        ("jitter-csv", f"{sample} --count 30 --noise jitter=0.4 -o jitter.csv"),
         ("no-image", f"{sample} --pattern features --count 40 -o none.png"),
         ("too-many", f"{sample} --count 10000000 -o many.png"),
     )
@@ -445,11 +443,11 @@ def _of_sparse_depth() -> Iterator[Group]:
             (sensor, f"{simulate} --sensor {sensor} {STREET} --seed 1 -o {sensor}.png")
             for sensor in ("vlp-16", "vlp-32c", "hdl-32e", "hdl-64e", "paper-vlp-16")
         ),
-        ("at-scanner", f"{simulate} --sensor vlp-16 {STREET} --at-scanner --json -o at.npy"),
+        ("at-scanner", f"{simulate} --sensor vlp-16 {STREET} --position calib --json -o at.npy"),
         (
             "own",
-            f"{simulate} --sensor ../in/lidar.toml {STREET} --offset 0.1 -0.2 0.3 --rotation-noise"
-            " 0.3 --angle-noise 0.02 --range-noise 0.1 --dropout 0.2 --max-range 30 --range"
+            f"{simulate} --sensor ../in/lidar.toml,rotation_noise_deg=0.3,angle_noise_deg=0.02"
+            f",range_noise=0.1,dropout=0.2,max_range=30 {STREET} --position 0.1,-0.2,0.3"
             " --seed 7 -o own.csv",
         ),
         ("unknown", f"{simulate} --sensor vlp-17 {STREET} -o none.png"),
