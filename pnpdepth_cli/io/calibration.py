@@ -130,12 +130,7 @@ def read_calibration(path: Path, camera: int | None = None) -> Calibration:
 
 
 def read_rigid_motion(path: Path) -> Extrinsics:
-    """Returns (rotation (3, 3), translation (3,) metres) of KITTI's raw files with R and T.
-
-    Raises:
-        FileFormatError: One is missing, or the rotation is none.
-        InputError: The file cannot be read.
-    """
+    """Returns (rotation (3, 3), translation (3,) metres) of KITTI's raw files with R and T."""
     fields = _fields(path, _text(path))
     rotation = _matrix(path, fields, "R", 9).reshape(3, 3)
     return checked_pose(path, "R", rotation, _matrix(path, fields, "T", 3))
@@ -144,14 +139,7 @@ def read_rigid_motion(path: Path) -> Extrinsics:
 def camera_in_yaml(path: Path, content: Any, camera: int | None) -> Calibration:
     """Returns a camera of the content of a YAML file of OpenCV, ROS or Kalibr.
 
-    Args:
-        path: Named in messages.
-        content: Of the file.
-        camera: Number of a camera of a camchain; None for cam0.
-
-    Raises:
-        FileFormatError: The camera is incomplete, or of a model that is not known here.
-        UsageError: There is no such camera.
+    `camera` is the number of a camera of a camchain, None for cam0.
     """
     if not isinstance(content, Mapping):
         raise FileFormatError(f"{path} is not a calibration; give OpenCV's, ROS's or Kalibr's YAML")

@@ -38,12 +38,7 @@ class View:
 
 
 def neighbouring_views(poses: Floats, index: int) -> list[int]:
-    """Returns the views nearest to one that look about the same way, the nearest first.
-
-    Args:
-        poses: (N, 3, 4) from each camera's frame to the world's.
-        index: Of the view.
-    """
+    """Returns the views, of poses (N, 3, 4), nearest to one that look about the same way."""
     distance = np.linalg.norm(poses[:, :, 3] - poses[index, :, 3], axis=1)
     alike = poses[:, :, 2] @ poses[index, :, 2] > np.cos(np.radians(_WIDEST_DEG))
     alike[index] = False
@@ -54,10 +49,7 @@ def neighbouring_views(poses: Floats, index: int) -> list[int]:
 def consistent_depth(here: View, others: Iterable[View], min_views: int) -> NDArray[np.float32]:
     """Returns the mean depth of the views that agree with one, 0 where they are fewer.
 
-    Args:
-        here: The view.
-        others: Its neighbours.
-        min_views: Views that have to agree, this one included.
+    `min_views` have to agree, this one included.
     """
     known = (here.depth > 0) & np.isfinite(here.depth)
     rows, columns = np.nonzero(known)

@@ -65,11 +65,7 @@ class Lidar:
                 raise UsageError(f"sensor {self.name!r}: {fault}")
 
     def directions(self, rng: np.random.Generator) -> Floats:
-        """Returns (M, 3) unit vectors of one revolution in the scanner's frame, beam by beam.
-
-        Args:
-            rng: Draws the angle noise; unused if there is none.
-        """
+        """Returns (M, 3) unit vectors of one revolution in the scanner's frame, beam by beam."""
         elevation = np.radians(self.elevations_deg)[:, None]
         steps = round(360 / self.azimuth_step_deg)
         azimuth = np.radians(np.arange(steps) * self.azimuth_step_deg)[None, :]

@@ -82,11 +82,6 @@ def camera_trajectory(bag: Bag, topic: str, camera: str) -> Trajectory | None:
     An odometry message names the frame that it moves, and /tf_static gives the camera in it. A pose
     message names none, so its pose is the camera's own. Of transforms, the first above the camera
     that changes is taken: that of odometry, without later corrections of the map.
-
-    Args:
-        bag: An open bag.
-        topic: One of `poses_topics`.
-        camera: Name of the camera's frame.
     """
     if topic in bag.topics(TRANSFORMS):
         return _of_transforms(bag, topic, camera)

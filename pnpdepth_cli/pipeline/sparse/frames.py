@@ -82,9 +82,7 @@ class FramesRequest:
 def write_frames(request: FramesRequest, say: Say) -> dict[str, Any]:
     """Writes the frames of a bag in the layout `pairs`, one at a time, and returns the record.
 
-    Args:
-        request: What to write.
-        say: Receives what was guessed, and warnings.
+    `say` receives what was guessed, and warnings.
 
     Raises:
         InputError: The bag cannot be read, or has no frame.
@@ -190,17 +188,9 @@ def _write_frame(folder: Path, topics: tuple[str, str], image: Stamped, scan: St
 def _write_calibration(
     request: FramesRequest, bag: Bag, image_topic: str, frames: tuple[str, str], say: Say
 ) -> str:
-    """Writes calib.txt as far as there is a calibration; says what is missing.
+    """Writes calib.txt as far as there is a calibration; returns the name of the camera's frame.
 
-    Args:
-        request: With the folder, in which the frames are written already.
-        bag: An open bag.
-        image_topic: Of the images.
-        frames: Names of the frames in the headers of an image and a scan.
-        say: Receives what is used, and warnings.
-
-    Returns:
-        The name of the camera's frame.
+    `frames` are the names in the headers of an image and a scan.
     """
     topic = camera_info_topic(bag, image_topic)
     of_bag = None if topic is None else camera_of_bag(bag, topic)
@@ -259,15 +249,7 @@ def _calibration_text(calibration: Calibration) -> str:
 def _write_poses(
     request: FramesRequest, bag: Bag, camera: str, times: Sequence[float], say: Say
 ) -> str | None:
-    """Writes poses.txt if the bag has a pose for every frame; returns the topic, None without one.
-
-    Args:
-        request: With the folder of the frames.
-        bag: An open bag.
-        camera: Name of the camera's frame.
-        times: Of the frames, seconds.
-        say: Receives what is used, or why there are no poses.
-    """
+    """Writes poses.txt if the bag has a pose for every frame; returns the topic, else None."""
     topics = poses_topics(bag, request.options.wanted)
     if len(topics) != 1:
         if topics:

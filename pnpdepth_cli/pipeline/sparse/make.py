@@ -82,12 +82,7 @@ class SparseTarget:
     ) -> dict[str, Any]:
         """Writes the sparse depth, its record and the overlay, and returns the record.
 
-        Args:
-            points: The sparse depth.
-            settings: The command and its settings, seed included; a PNG or CSV keeps them too.
-            inputs: Input files, for the record.
-            notes: What was assumed, and warnings.
-            rgb: (H, W, 3) in 0..1, the image of the overlay.
+        A PNG or CSV keeps the settings too. `rgb`, (H, W, 3) in 0..1, is the image of the overlay.
         """
         provenance = {"command": settings["command"], "version": __version__, **settings}
         for path in filter(None, (self.output, self.overlay)):
