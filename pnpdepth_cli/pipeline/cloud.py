@@ -30,8 +30,8 @@ from pnpdepth_cli.pipeline.results import ResultFrame, result_frames
 from pnpdepth_cli.sensors.cloud import EDGE, PointCloud, VoxelGrid, cloud_from_depth
 from pnpdepth_cli.sensors.consistency import View, consistent_depth, neighbouring_views
 
-_IN_MEMORY = 16
-"""Depth maps of neighbouring views that are kept."""
+_IN_MEMORY = 12
+"""Depth maps of neighbouring views that are kept, with their points."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -7,6 +7,7 @@ MVSNet fuses depth maps: Yao et al., 2018, section 4.2).
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterable
 from dataclasses import dataclass
 
@@ -36,6 +37,20 @@ class View:
     pose: Floats
     """(3, 4) from the camera's frame to the world's."""
 
+    @functools.cached_property
+    def known(self) -> NDArray[np.intp]:
+        """(N,) row-major indices of the pixels with known depth."""
+        return np.flatnonzero((self.depth > 0) & np.isfinite(self.depth))
+
+    @functools.cached_property
+    def points(self) -> NDArray[np.float32]:
+        """(H·W, 3) point of each pixel in the camera's frame, 0 where unknown."""
+        rows, columns = np.divmod(self.known, self.depth.shape[1])
+        points = np.zeros((self.depth.size, 3), np.float32)
+        xy, depth = np.column_stack([columns, rows]), self.depth.ravel()[self.known]
+        points[self.known] = self.camera.unproject(xy, depth)
+        return points
+
 
 def neighbouring_views(poses: Floats, index: int) -> list[int]:
     """Returns the views, of poses (N, 3, 4), nearest to one that look about the same way."""
@@ -51,10 +66,9 @@ def consistent_depth(here: View, others: Iterable[View], min_views: int) -> NDAr
 
     `min_views` have to agree, this one included.
     """
-    known = (here.depth > 0) & np.isfinite(here.depth)
-    rows, columns = np.nonzero(known)
-    xy, depth = np.column_stack([columns, rows]).astype(np.float64), here.depth[known].astype(float)
-    world = _moved(here.camera.unproject(xy, depth), here.pose)
+    rows, columns = np.divmod(here.known, here.depth.shape[1])
+    xy, depth = np.column_stack([columns, rows]), here.depth.ravel()[here.known].astype(float)
+    world = _moved(here.points[here.known], here.pose)
     total, count = depth.copy(), np.ones(len(depth))
     for other in others:
         index, back = _seen_back(world, here, other)
@@ -63,9 +77,9 @@ def consistent_depth(here: View, others: Iterable[View], min_views: int) -> NDAr
         agrees = (away <= _RETURN_PX) & same
         total[index[agrees]] += back[agrees, 2]
         count[index[agrees]] += 1
-    result = np.zeros(here.depth.shape, np.float32)
-    result[known] = np.where(count >= min_views, total / count, 0)
-    return result
+    result = np.zeros(here.depth.size, np.float32)
+    result[here.known] = np.where(count >= min_views, total / count, 0)
+    return result.reshape(here.depth.shape)
 
 
 def _seen_back(world: Floats, here: View, other: View) -> tuple[NDArray[np.intp], Floats]:
@@ -75,15 +89,13 @@ def _seen_back(world: Floats, here: View, other: View) -> tuple[NDArray[np.intp]
     xy = other.camera.pixels_of(seen[index])
     size = (other.depth.shape[0], other.depth.shape[1])
     inside = in_frame(xy, size)
-    index, xy = index[inside], xy[inside]
-    depth = other.depth.ravel()[pixel_index(xy, size)]
-    has_depth = (depth > 0) & np.isfinite(depth)
-    index, points = index[has_depth], other.camera.unproject(xy[has_depth], depth[has_depth])
+    index, points = index[inside], other.points[pixel_index(xy[inside], size)]
     back = _moved_back(_moved(points, other.pose), here.pose)
-    return index[back[:, 2] > 0], back[back[:, 2] > 0]
+    usable = (points[:, 2] > 0) & (back[:, 2] > 0)
+    return index[usable], back[usable]
 
 
-def _moved(points: Floats, pose: Floats) -> Floats:
+def _moved(points: NDArray[np.floating], pose: Floats) -> Floats:
     return np.asarray(points @ pose[:, :3].T + pose[:, 3])
 
 
