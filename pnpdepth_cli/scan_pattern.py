@@ -25,7 +25,6 @@ class ScanPattern:
     """Spacing of sparse points."""
 
     points: int
-    """Number of points."""
     along_px: float
     """Median distance to the next point along a row."""
     across_px: float
@@ -41,12 +40,7 @@ class ScanPattern:
 
 
 def scan_pattern(xy: NDArray[np.floating], size: tuple[int, int]) -> ScanPattern:
-    """Returns the spacing of points along rows and along columns.
-
-    Args:
-        xy: (N, 2) pixel coordinates inside the image.
-        size: (H, W) of the image.
-    """
+    """Returns the spacing along rows and columns of (N, 2) pixel coordinates in an image (H, W)."""
     import numpy as np
 
     known = np.zeros(size, bool)
@@ -60,10 +54,6 @@ def scan_lines(xy: NDArray[np.floating], size: tuple[int, int]) -> NDArray[np.in
 
     Each point is linked with the next one to the right in nearly the same row; a line that is
     interrupted, as by the sky, is several.
-
-    Args:
-        xy: (N, 2) pixel coordinates inside the image.
-        size: (H, W) of the image.
     """
     import numpy as np
     from scipy.sparse import coo_matrix

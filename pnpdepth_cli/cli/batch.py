@@ -46,7 +46,7 @@ _STOPPING = b"\nfinishing the current frame; press Ctrl-C again to stop at once\
     groups={
         "Frames": (
             *("--layout", "--protocol", "--sample", "--limit", "--shard"),
-            *("--image-topic", "--points-topic", "--poses-topic", "--tolerance"),
+            *("--topics", "--tolerance"),
         ),
         "Sequences": ("--accumulate", "--poses", "--warm-start"),
         "Input": (*grouped_help.LIDAR, *grouped_help.COLMAP, *grouped_help.FILE_READING),

@@ -32,7 +32,6 @@ from pnpdepth_cli.cli import options
     " records']",
 )
 @click.option("--depth-scale", type=float, metavar="S", help="Integer depth files hold metres × S.")
-@click.option("--min-depth", type=float, default=0.0, metavar="M", help="Drop nearer pixels.")
 @click.option("--max-depth", type=float, default=math.inf, metavar="M", help="Drop farther pixels.")
 @click.option(
     "--max-sigma",
@@ -48,6 +47,14 @@ from pnpdepth_cli.cli import options
     show_default=True,
     help="Cut where depth jumps by this fraction; 0 never cuts.",
 )
+@click.option(
+    "--min-views",
+    type=click.IntRange(1),
+    default=1,
+    metavar="N",
+    show_default=True,
+    help="Keep pixels on which N views agree; their depth is the mean.",
+)
 @click.option("--voxel", type=float, metavar="M", help="Merge the points in cubes of this side.")
 @click.option("-o", "--output", type=options.FILE, required=True, help="PLY, GLB or LAZ file.")
 @options.overwrite
@@ -57,7 +64,7 @@ def cloud(as_json: bool, **values: Any) -> None:
 
     \b
     pnpdepth cloud out/img_depth.png -o img.ply
-    pnpdepth cloud out/ --calib calib.txt --poses poses.txt --voxel 0.05 -o drive.ply
+    pnpdepth cloud out/ --calib calib.txt --poses poses.txt --min-views 2 -o drive.ply
     pnpdepth cloud depth.exr --image img.png --fov 60 -o img.glb
 
     The cloud is in the camera's frame (x right, y down, z forward), with poses in the world's.

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
 from pnpdepth_cli.budget import set_max_pixels
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.pipeline.options import OptionField, options_of, parse_file
-from pnpdepth_cli.pipeline.refinement import request
 from pnpdepth_cli.pipeline.refinement.request import (
     LARGEST_SEED,
     FrameFiles,
@@ -22,9 +21,6 @@ from pnpdepth_cli.pipeline.refinement.request import (
     RefineRequest,
 )
 from pnpdepth_cli.pipeline.sparse.options import ColmapOptions, ScanOptions
-
-if TYPE_CHECKING:
-    from pnpdepth_cli.pipeline.sparse.make import SparseTarget
 
 FILE = click.Path(path_type=Path)
 SEED = click.IntRange(0, LARGEST_SEED)
@@ -139,8 +135,6 @@ channel = _only(FrameFiles, "channel")
 seed = _only(HoldOut, "seed")
 overwrite = _only(OutputOptions, "overwrite")
 camera = _only(ScanOptions, "camera")
-euclidean = _only(ScanOptions, "euclidean")
-max_range = _only(ScanOptions, "max_range")
 as_json = click.option("--json", "as_json", is_flag=True, help="Print the result as JSON.")
 
 
@@ -162,14 +156,6 @@ sample = click.option(
     "--sample",
     metavar="[PATTERN:]N|P%",
     help="Sample the sparse depth from the ground truth, as `pnpdepth sample` does.",
-)
-output_scale = click.option(
-    "--output-scale",
-    type=float,
-    default=256.0,
-    show_default=True,
-    metavar="S",
-    help="A written PNG holds metres × S.",
 )
 
 
@@ -235,26 +221,9 @@ def request_of(values: dict[str, Any], **others: Any) -> RefineRequest:
     return RefineRequest.from_fields(scan=scan_options, **values, **others)
 
 
-def sparse_target(values: dict[str, Any]) -> SparseTarget:
-    """Returns where sparse depth is written; its options are removed from `values`."""
-    from pnpdepth_cli.pipeline.sparse.make import SparseTarget
-
-    return SparseTarget(
-        output=values.pop("output"),
-        overlay=values.pop("overlay", None),
-        depth_scale=values.pop("output_scale"),
-        overwrite=values.pop("overwrite"),
-    )
-
-
 def height_and_width(text: str) -> tuple[int, int]:
     """Returns (H, W) from a text such as 480x640. Raises UsageError for any other text."""
     height, x, width = text.lower().partition("x")
     if not (x and height.isdecimal() and width.isdecimal() and int(height) and int(width)):
         raise UsageError(f"size {text!r} is not of the form HxW, such as 480x640")
     return int(height), int(width)
-
-
-def count_or_fraction(text: str | None) -> tuple[int | None, float | None]:
-    """Returns (count, None) for `500`, (None, fraction) for `5%`. Raises UsageError otherwise."""
-    return (None, None) if text is None else request.count_or_fraction(text)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -13,16 +12,11 @@ import click
 from pnpdepth_cli.choices import PATTERNS, SENSORS
 from pnpdepth_cli.cli import options
 from pnpdepth_cli.cli.printable import printable
-from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.pipeline.sparse.options import BagOptions, ScanOptions
 
-_NOISE = {
-    "metres": "noise",
-    "relative": "relative_noise",
-    "outliers": "outliers",
-    "jitter_px": "jitter",
-}
-"""Options by the kind of noise that they set."""
+_seed = click.option(
+    "--seed", type=options.SEED, default=0, show_default=True, metavar="N", help="Random seed."
+)
 
 
 @click.command(short_help="Project a LiDAR scan into a camera image.")
@@ -31,11 +25,19 @@ _NOISE = {
 @click.option("--image", type=options.FILE, help="Camera image: gives the size, and is drawn on.")
 @click.option("--size", metavar="HxW", help="Size of the image, instead of --image.")
 @options.sparse_output
-@options.output_scale
 @click.option("--overlay", type=options.FILE, help="Also write a PNG of the points on the image.")
 @options.overwrite
 @options.as_json
-def project(scan: Path, image: Path | None, size: str | None, as_json: bool, **values: Any) -> None:
+def project(
+    scan: Path,
+    image: Path | None,
+    size: str | None,
+    output: Path,
+    overlay: Path | None,
+    overwrite: bool,
+    as_json: bool,
+    **values: Any,
+) -> None:
     """Project a LiDAR SCAN (KITTI's BIN, NPY, PCD or PLY) to a sparse depth map.
 
     \b
@@ -45,9 +47,9 @@ def project(scan: Path, image: Path | None, size: str | None, as_json: bool, **v
     Points behind the camera, outside the image, behind another point in their pixel, or occluded by
     the foreground are dropped and counted. A JSON file beside the output records the settings.
     """
-    from pnpdepth_cli.pipeline.sparse.make import project_scan
+    from pnpdepth_cli.pipeline.sparse.make import SparseTarget, project_scan
 
-    target = options.sparse_target(values)
+    target = SparseTarget(output=output, overlay=overlay, overwrite=overwrite)
     height_and_width = options.height_and_width(size) if size else None
     record = project_scan(scan, ScanOptions(**values), target, image=image, size=height_and_width)
     _print(record, as_json=as_json)
@@ -55,49 +57,44 @@ def project(scan: Path, image: Path | None, size: str | None, as_json: bool, **v
 
 @click.command(short_help="Sample sparse depth from dense depth.")
 @click.argument("depth", type=options.FILE)
-@click.option("--pattern", type=click.Choice(PATTERNS), default="uniform", show_default=True)
+@click.option(
+    "--pattern",
+    default="uniform",
+    show_default=True,
+    metavar="NAME",
+    help=f"{', '.join(PATTERNS[:-1])}, or region:X,Y,W,H.",
+)
 @click.option(
     "--count", metavar="N|P%", help="Number of points (of lines for `lines`), or % of known pixels."
 )
-@click.option("--region", metavar="X,Y,W,H", help="Rectangle of the pattern `region`.")
 @click.option("--image", type=options.FILE, help="Image for `features` and `edges`.")
+@_seed
 @click.option(
-    "--seed", type=options.SEED, default=0, show_default=True, metavar="N", help="Random seed."
-)
-@click.option("--noise", type=float, default=0.0, metavar="M", help="Gaussian noise, metres.")
-@click.option(
-    "--relative-noise",
-    type=float,
-    default=0.0,
-    metavar="F",
-    help="Gaussian noise, as a fraction of the depth.",
-)
-@click.option(
-    "--outliers", type=float, default=0.0, metavar="F", help="Fraction of points of random depth."
-)
-@click.option(
-    "--jitter",
-    type=float,
-    default=0.0,
-    metavar="PX",
-    help="Gaussian noise of the pixel coordinates.",
+    "--noise",
+    metavar="NOISE,...",
+    help="Gaussian noise of the depth, metres or P%; outliers=P% of random depth; jitter=PIXELS.",
 )
 @options.depth_scale
 @options.channel
 @options.max_pixels
 @options.sparse_output
-@options.output_scale
-@click.option("--overlay", type=options.FILE, help="Also write a PNG of the points on --image.")
 @options.overwrite
 @options.as_json
 def sample(
-    pattern: str, count: str | None, region: str | None, as_json: bool, **values: Any
+    depth: Path,
+    pattern: str,
+    count: str | None,
+    noise: str | None,
+    output: Path,
+    overwrite: bool,
+    as_json: bool,
+    **values: Any,
 ) -> None:
     """Sample sparse depth from the dense DEPTH.
 
     \b
     pnpdepth sample gt.png --pattern uniform --count 500 --seed 1 -o sparse.png
-    pnpdepth sample gt.png --pattern lines --count 16 -o sparse.exr
+    pnpdepth sample gt.png --count 500 --noise 2%,outliers=5% -o noisy.png
     pnpdepth sample gt.png --pattern features --count 300 --image rgb.png -o sparse.png
 
     \b
@@ -111,29 +108,12 @@ def sample(
 
     The settings, with the seed, are stored in the file (PNG, CSV) and in a JSON file beside it.
     """
-    from pnpdepth_cli.pipeline.sparse.make import (
-        SampleNoise,
-        SamplePattern,
-        SampleRequest,
-        sample_depth,
-    )
+    from pnpdepth_cli.pipeline.sparse import make
 
-    points, fraction = options.count_or_fraction(count)
-    target = options.sparse_target(values)
-    noise = SampleNoise(**{key: values.pop(name) for key, name in _NOISE.items()})
-    chosen = SamplePattern(
-        kind=pattern, count=points, fraction=fraction, region=_region(region) if region else None
-    )
-    record = sample_depth(SampleRequest(target=target, pattern=chosen, noise=noise, **values))
-    _print(record, as_json=as_json)
-
-
-def _region(text: str) -> tuple[int, int, int, int]:
-    try:
-        left, top, width, height = (int(word) for word in text.split(","))
-    except ValueError:
-        raise UsageError(f"region {text!r} is not of the form X,Y,WIDTH,HEIGHT") from None
-    return left, top, width, height
+    values["scale"] = values.pop("depth_scale")
+    target = make.SparseTarget(output=output, overwrite=overwrite)
+    chosen, added = make.read_pattern(pattern, count), make.read_noise(noise)
+    _print(make.sample_depth(depth, target, chosen, noise=added, **values), as_json=as_json)
 
 
 @click.command(short_help="Simulate a LiDAR in a scene with dense depth.")
@@ -141,8 +121,9 @@ def _region(text: str) -> tuple[int, int, int, int]:
 @click.option(
     "--sensor",
     required=True,
-    metavar="NAME|FILE.toml",
-    help=f"{', '.join(SENSORS)}, the paper's idealised paper-{SENSORS[0]} etc., or a TOML file.",
+    metavar="NAME|FILE.toml[,KEY=VALUE,...]",
+    help=f"{', '.join(SENSORS)}, the paper's idealised paper-{SENSORS[0]} etc., or a TOML file; and"
+    " changes of its optional keys.",
 )
 @click.option(
     "--calib",
@@ -153,68 +134,48 @@ def _region(text: str) -> tuple[int, int, int, int]:
 )
 @options.camera
 @click.option(
-    "--offset",
-    type=float,
-    nargs=3,
-    metavar="X Y Z",
-    help="Position of the scanner right of, below and in front of the camera, metres.",
+    "--position",
+    metavar="X,Y,Z|calib",
+    help="Of the scanner: metres right of, below and in front of the camera, or as in the"
+    " calibration.",
 )
-@click.option("--at-scanner", is_flag=True, help="Place the scanner as in the calibration.")
-@click.option(
-    "--seed", type=options.SEED, default=0, show_default=True, metavar="N", help="Random seed."
-)
-@click.option(
-    "--rotation-noise",
-    "rotation_noise_deg",
-    type=float,
-    default=0.0,
-    metavar="DEG",
-    help="Random rotation of the scanner about each axis, standard deviation.",
-)
-@click.option(
-    "--angle-noise",
-    "angle_noise_deg",
-    type=float,
-    metavar="DEG",
-    help="Angular noise of each beam.  [default: the sensor's]",
-)
-@click.option(
-    "--range-noise", type=float, metavar="M", help="Range noise.  [default: the sensor's]"
-)
-@click.option("--dropout", type=float, default=0.0, metavar="F", help="Fraction of lost beams.")
-@options.max_range
-@options.euclidean
+@_seed
 @options.depth_scale
 @options.channel
 @options.max_pixels
 @options.sparse_output
-@options.output_scale
 @options.overwrite
 @options.as_json
-def simulate(as_json: bool, **values: Any) -> None:
+def simulate(
+    depth: Path,
+    sensor: str,
+    calib: Path,
+    output: Path,
+    overwrite: bool,
+    as_json: bool,
+    **values: Any,
+) -> None:
     """Simulate the sparse depth of a LiDAR in the scene of the dense DEPTH.
 
     \b
     pnpdepth simulate gt.exr --sensor hdl-64e --calib intrinsics.txt --seed 1 -o sparse.png
-    pnpdepth simulate gt.png --sensor my_lidar.toml --calib calib.txt --at-scanner -o sparse.exr
+    pnpdepth simulate gt.png --sensor my_lidar.toml --calib calib.txt --position calib -o sparse.exr
+    pnpdepth simulate gt.png --sensor vlp-16,dropout=0.1 --calib calib.txt -o sparse.exr
 
     \b
     A sensor file:  elevations_deg = [10, 5, 0, -5, -10]
                     azimuth_step_deg = 0.2
-                    max_range = 80
-                    range_noise = 0.02
+    Optional keys:  max_range = 80             metres
+                    range_noise = 0.02         metres
+                    angle_noise_deg = 0.05     of each beam
+                    rotation_noise_deg = 0.1   of the whole scanner
+                    dropout = 0.05             fraction of lost beams
     """
-    from pnpdepth_cli.pipeline.sparse.make import (
-        SimulateRequest,
-        SimulationSettings,
-        simulate_scan,
-    )
+    from pnpdepth_cli.pipeline.sparse.make import SparseTarget, simulate_scan
 
-    target = options.sparse_target(values)
-    names = [each.name for each in fields(SimulationSettings) if each.name in values]
-    settings = SimulationSettings(**{name: values.pop(name) for name in names})
-    record = simulate_scan(SimulateRequest(target=target, settings=settings, **values))
-    _print(record, as_json=as_json)
+    values["scale"] = values.pop("depth_scale")
+    target = SparseTarget(output=output, overwrite=overwrite)
+    _print(simulate_scan(depth, target, sensor, calib, **values), as_json=as_json)
 
 
 @click.command(short_help="Write the frames of a ROS bag as files.")
@@ -236,7 +197,7 @@ def frames(bag: Path, output: Path, as_json: bool, **values: Any) -> None:
 
     \b
     pnpdepth frames drive.mcap -o drive/
-    pnpdepth frames drive.bag -o drive/ --image-topic /front/image_raw --points-topic /velodyne
+    pnpdepth frames drive.bag -o drive/ --topics /front/image_raw,/velodyne
     pnpdepth batch drive/ -o refined/
 
     BAG is a file of ROS 1 (.bag) or ROS 2 (.mcap, .db3), or a folder that ROS 2 recorded. OUTPUT

@@ -10,40 +10,84 @@ separate, and a value may continue over several lines:
     lens: radial-tangential                    # or fisheye: OpenCV's k1 k2 k3 k4
     size: [1242, 375]                          # optional: width and height
 
-Nine bare numbers are K alone.
+Nine bare numbers are K alone. YAML is OpenCV's FileStorage, ROS camera_info, or Kalibr's camchain,
+with the intrinsics of the raw image; a matrix T_camera_lidar there is the pose of the scanner.
 """
 
 from __future__ import annotations
 
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import FileFormatError, InputError, UsageError
+from pnpdepth_cli.io.extrinsics import Extrinsics, checked_pose, numbers_in, pose_of_matrix
 from pnpdepth_cli.io.file_bytes import check_pixel_count, one_line, read_bytes
 from pnpdepth_cli.io.formats import kind_of
-from pnpdepth_cli.io.robot_calibration import Calibration, camera_in_yaml, is_robot_calibration
 from pnpdepth_cli.io.yaml_file import parse_yaml
-
-__all__ = ["CAMERA", "Calibration", "Floats", "read_calibration", "read_rigid_motion"]
 
 CAMERA = 2
 """KITTI's left colour camera, whose images the benchmarks have."""
 
 _RAW_FILES = ("calib_cam_to_cam.txt", "calib_velo_to_cam.txt")
-_COEFFICIENTS = {"radial-tangential": (0, 4, 5, 8, 12, 14), "fisheye": (4,)}
 _PLAIN = ("K", "R", "t", "distortion", "lens", "size")
-_SEPARATORS = re.compile(r"[\[\](),;\s]+")
+_YAML_MARKS = ("camera_matrix:", "distortion_model:", "camera_model:", "distortion_coeffs:")
+_MATRICES = ("camera_matrix", "cameraMatrix", "CameraMat", "camera_mat", "K", "k")
+_DISTORTIONS = (
+    *("distortion_coefficients", "distCoeffs", "dist_coeffs", "DistCoeff", "distortion_coeffs"),
+    *("distortion", "D", "d"),
+)
+_POSES = ("T_camera_lidar", "T_cam_lidar", "T_camera_scanner", "T_cam_velo")
+_LENSES = {
+    **dict.fromkeys(
+        ("plumb_bob", "rational_polynomial", "radtan", "radial-tangential", "none", "", "pinhole"),
+        "radial-tangential",
+    ),
+    **dict.fromkeys(("equidistant", "fisheye", "kannala_brandt", "equi"), "fisheye"),
+    "fov": "fov",
+}
+"""Distortion models by their names in ROS and Kalibr."""
+
+_COEFFICIENTS = {
+    "radial-tangential": (0, 4, 5, 8, 12, 14),
+    "fisheye": (0, 4),
+    "fov": (1,),
+    "eucm": (2,),
+}
 _FIELD = re.compile(r"^\s*([A-Za-z_]\w*)\s*:(.*)$")
-_ROTATION_TOLERANCE = 1e-3
 _LARGEST = 1e9
 """Of the numbers of a calibration, in pixels or metres; beyond it, products overflow."""
 
 Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Calibration:
+    """A camera and a scanner: x_camera = rotation · x_scanner + translation."""
+
+    intrinsics: Floats
+    """(3, 3), last row 0 0 1, in pixels."""
+    rotation: Floats
+    """(3, 3), from the scanner's frame to the camera's."""
+    translation: Floats
+    """(3,) metres, the scanner's origin in the camera's frame."""
+    distortion: tuple[float, ...]
+    size: tuple[int, int] | None
+    """(H, W) of the images; None if the file does not give it."""
+    has_pose: bool
+    """False if the file has no pose of a scanner; rotation and translation are then identity."""
+    source: str
+    """What was read, for a person."""
+    lens: str = "radial-tangential"
+    """One of `choices.LENSES`."""
+    rectified: Mapping[str, Calibration] = field(default_factory=dict)
+    """Cameras of rectified images by what they are made of, relative to this one, of raw images."""
 
 
 def read_calibration(path: Path, camera: int | None = None) -> Calibration:
@@ -62,129 +106,238 @@ def read_calibration(path: Path, camera: int | None = None) -> Calibration:
     if path.is_dir() or path.name in _RAW_FILES:
         return _kitti_raw(path if path.is_dir() else path.parent, camera)
     text = _text(path)
-    if is_robot_calibration(text):
-        calibration = camera_in_yaml(path, parse_yaml(path, text), camera)
-        _check_intrinsics(path, calibration.intrinsics)
-        return calibration
+    if text.lstrip().startswith("%YAML") or any(mark in text for mark in _YAML_MARKS):
+        return camera_in_yaml(path, parse_yaml(path, text), camera)
+    fields: dict[str, Any]
     if text.lstrip().startswith("{"):
-        return _plain(path, _json_fields(path, text), camera)
-    if not re.search(r"[A-Za-z_]\w*\s*:", text):
-        return _plain(path, {"K": text}, camera)
-    fields = _fields(path, text)
-    if any(re.fullmatch(r"P\d", name) for name in fields):
+        try:
+            fields = json.loads(text)
+        except (ValueError, RecursionError) as error:
+            reason = one_line(error)
+            raise FileFormatError(f"{path} is not valid JSON ({reason}); correct it") from error
+    elif re.search(r"[A-Za-z_]\w*\s*:", text):
+        fields = _fields(path, text)
+    else:
+        fields = {"K": text}
+    if any(re.fullmatch(r"P\d", str(name)) for name in fields):
         return _kitti(path, fields, camera)
-    return _plain(path, fields, camera)
-
-
-def read_rigid_motion(path: Path) -> tuple[Floats, Floats]:
-    """Returns (rotation (3, 3), translation (3,) metres) of KITTI's raw files with R and T.
-
-    Raises:
-        FileFormatError: One is missing, or the rotation is none.
-        InputError: The file cannot be read.
-    """
-    fields = _fields(path, _text(path))
-    rotation = _matrix(path, fields, "R", (3, 3))
-    _check_rotation(path, "R", rotation)
-    return rotation, _matrix(path, fields, "T", (3,))
-
-
-def _kitti(path: Path, fields: dict[str, str], camera: int | None) -> Calibration:
-    """KITTI's object set (R0_rect, Tr_velo_to_cam) and odometry set (Tr, already rectified)."""
-    number = _camera(path, camera, [int(n[1:]) for n in fields if re.fullmatch(r"P\d", n)])
-    projection = _matrix(path, fields, f"P{number}", (3, 4))
-    source = f"KITTI calibration, camera {number}"
-    if "Tr" in fields:
-        return _rectified(path, projection, np.eye(3), _matrix(path, fields, "Tr", (3, 4)), source)
-    velo_to_cam = _matrix(path, fields, "Tr_velo_to_cam", (3, 4))
-    rectify = _matrix(path, fields, "R0_rect", (3, 3))
-    return _rectified(path, projection, rectify, velo_to_cam, source)
-
-
-def _kitti_raw(folder: Path, camera: int | None) -> Calibration:
-    cameras, scanner = (folder / name for name in _RAW_FILES)
-    if not cameras.is_file() or not scanner.is_file():
-        missing = next(p for p in (cameras, scanner) if not p.is_file())
-        raise InputError(
-            f"{folder} has no {missing.name}; give the folder with KITTI's {_RAW_FILES[0]} and"
-            f" {_RAW_FILES[1]}, or one calibration file"
-        )
-    fields = _fields(cameras, _text(cameras))
-    cameras_there = [
-        int(n.removeprefix("P_rect_")) for n in fields if re.fullmatch(r"P_rect_\d\d", n)
-    ]
-    number = _camera(cameras, camera, cameras_there)
-    pose = _fields(scanner, _text(scanner))
-    # The raw data's development kit rotates every camera by camera 0's rectification.
-    return _rectified(
-        cameras,
-        _matrix(cameras, fields, f"P_rect_{number:02}", (3, 4)),
-        _matrix(cameras, fields, "R_rect_00", (3, 3)),
-        np.column_stack([_matrix(scanner, pose, "R", (3, 3)), _matrix(scanner, pose, "T", (3, 1))]),
-        f"KITTI raw calibration, camera {number}",
-        size=_numbers(cameras, fields, f"S_rect_{number:02}", (2,)),
-    )
-
-
-def _rectified(
-    path: Path,
-    projection: Floats,
-    rectify: Floats,
-    scanner: Floats,
-    source: str,
-    size: Sequence[float] | None = None,
-) -> Calibration:
-    """P · R_rect · [R t], with the camera's own offset in P's last column as a translation."""
-    intrinsics = projection[:, :3]
-    _check_intrinsics(path, intrinsics)
-    _check_rotation(path, "rectification", rectify)
-    _check_rotation(path, "rotation of the scanner", scanner[:, :3])
-    return Calibration(
-        intrinsics=intrinsics,
-        rotation=rectify @ scanner[:, :3],
-        translation=rectify @ scanner[:, 3] + np.linalg.solve(intrinsics, projection[:, 3]),
-        distortion=(),
-        size=None if size is None else _height_width(path, size),
-        has_pose=True,
-        source=source,
-    )
-
-
-def _plain(path: Path, fields: dict[str, str], camera: int | None) -> Calibration:
     unknown = sorted(set(fields) - set(_PLAIN))
     if unknown:
         raise FileFormatError(
             f"{path}: {unknown[0]!r} is not part of a calibration; use {', '.join(_PLAIN)}"
         )
-    if camera is not None:
-        raise UsageError(f"{path} describes one camera; leave out --camera {camera}")
-    intrinsics = _matrix(path, fields, "K", (3, 3))
-    _check_intrinsics(path, intrinsics)
-    if ("R" in fields) != ("t" in fields):
-        present, missing = ("R", "t") if "R" in fields else ("t", "R")
-        raise FileFormatError(f"{path} has {present} but no {missing}; give both")
-    has_pose = "R" in fields
-    rotation = _matrix(path, fields, "R", (3, 3)) if has_pose else np.eye(3)
-    _check_rotation(path, "R", rotation)
-    lens = fields.get("lens", "radial-tangential").strip(" \"'")
-    if lens not in _COEFFICIENTS:
-        raise FileFormatError(
-            f"{path}: lens {one_line(lens)[:40]!r} is not one of {', '.join(_COEFFICIENTS)}"
+    return _single(path, fields, camera, "calibration")
+
+
+def read_rigid_motion(path: Path) -> Extrinsics:
+    """Returns (rotation (3, 3), translation (3,) metres) of KITTI's raw files with R and T."""
+    fields = _fields(path, _text(path))
+    rotation = _matrix(path, fields, "R", 9).reshape(3, 3)
+    return checked_pose(path, "R", rotation, _matrix(path, fields, "T", 3))
+
+
+def camera_in_yaml(path: Path, content: Any, camera: int | None) -> Calibration:
+    """Returns a camera of the content of a YAML file of OpenCV, ROS or Kalibr.
+
+    `camera` is the number of a camera of a camchain, None for cam0.
+    """
+    if not isinstance(content, Mapping):
+        raise FileFormatError(f"{path} is not a calibration; give OpenCV's, ROS's or Kalibr's YAML")
+    chain = {str(k): v for k, v in content.items() if isinstance(v, Mapping) and "intrinsics" in v}
+    if not chain:
+        is_ros = content.get("distortion_model") is not None
+        kind = "ROS camera_info" if is_ros else "OpenCV calibration"
+        fields = {name: content[name] for name in content if name != "R"}  # the rectification
+        calibration = _single(path, fields, camera, kind)
+        calibration = replace(calibration, rectified=_rectified_cameras(path, content, calibration))
+    else:
+        name = f"cam{0 if camera is None else camera}"
+        if name not in chain:
+            raise UsageError(f"{path} has no {name}; --camera can be one of: {', '.join(chain)}")
+        calibration = _kalibr(path, name, chain[name])
+    if not calibration.distortion:
+        return calibration
+    return replace(calibration, source=f"{calibration.source}, {calibration.lens} lens")
+
+
+def _rectified_cameras(
+    path: Path, content: Mapping[str, Any], raw: Calibration
+) -> dict[str, Calibration]:
+    """The cameras of a rectified image of camera_info, without distortion.
+
+    Whether the transforms lead to the rectified camera (kitti2bag) or to the raw one, to which R
+    and the last column of P then lead, no file says. The first is as the definition of CameraInfo
+    has it. Empty without P, or where P describes the raw image.
+    """
+    p, r = (
+        next((np.array(_numbers(path, content, n)) for n in names if n in content), np.empty(0))
+        for names in (("projection_matrix", "P", "p"), ("rectification_matrix", "R", "r"))
+    )
+    if p.size != 12 or not (p[0] > 0 and p[5] > 0):
+        return {}
+    intrinsics, offset = p.reshape(3, 4)[:, :3], np.zeros(3)
+    turn = r.reshape(3, 3) if r.size == 9 and r.any() else np.eye(3)
+    if np.linalg.det(intrinsics):
+        offset = np.linalg.solve(intrinsics, p.reshape(3, 4)[:, 3])
+    plain = replace(
+        raw,
+        intrinsics=intrinsics,
+        distortion=(),
+        lens="radial-tangential",
+        rotation=np.eye(3),
+        translation=np.zeros(3),
+    )
+    same = np.allclose(intrinsics, raw.intrinsics, atol=1e-3) and not raw.distortion
+    turned = not np.allclose(turn, np.eye(3), atol=1e-9)
+    cameras = {"P": plain}
+    if turned:
+        cameras = {"P and R": replace(plain, rotation=turn)} | cameras
+    if np.abs(offset).max() > 1e-9:
+        name = "P with its offset, and R" if turned else "P with its offset"
+        cameras = {name: replace(plain, rotation=turn, translation=offset)} | cameras
+    return {} if same and len(cameras) == 1 else cameras
+
+
+def _kitti(path: Path, fields: Mapping[str, Any], camera: int | None) -> Calibration:
+    """KITTI's object set (R0_rect, Tr_velo_to_cam) and odometry set (Tr, already rectified)."""
+    number = _camera(path, camera, [int(n[1:]) for n in fields if re.fullmatch(r"P\d", n)])
+    odometry = "Tr" in fields
+    name = "Tr" if odometry else "Tr_velo_to_cam"
+    scanner = _matrix(path, fields, name, 12).reshape(3, 4)
+    pose = checked_pose(path, "rotation of the scanner", scanner[:, :3], scanner[:, 3])
+    rectify = np.eye(3) if odometry else _matrix(path, fields, "R0_rect", 9).reshape(3, 3)
+    projection = _matrix(path, fields, f"P{number}", 12).reshape(3, 4)
+    return _rectified(path, projection, rectify, pose, f"KITTI calibration, camera {number}")
+
+
+def _kitti_raw(folder: Path, camera: int | None) -> Calibration:
+    """KITTI's raw data; without the file of the scanner, the camera alone."""
+    cameras, scanner = (folder / name for name in _RAW_FILES)
+    if not cameras.is_file():
+        raise InputError(
+            f"{folder} has no {cameras.name}; give the folder with KITTI's {_RAW_FILES[0]} and"
+            f" {_RAW_FILES[1]}, or one calibration file"
         )
-    counts = _COEFFICIENTS[lens]
-    distortion = _numbers(path, fields, "distortion", counts) if "distortion" in fields else []
+    fields = _fields(cameras, _text(cameras))
+    numbers = [int(name[-2:]) for name in fields if re.fullmatch(r"P_rect_\d\d", name)]
+    number = _camera(cameras, camera, numbers)
+    pose = read_rigid_motion(scanner) if scanner.is_file() else None
+    # The raw data's development kit rotates every camera by camera 0's rectification.
+    calibration = _rectified(
+        cameras,
+        _matrix(cameras, fields, f"P_rect_{number:02}", 12).reshape(3, 4),
+        _matrix(cameras, fields, "R_rect_00", 9).reshape(3, 3),
+        pose,
+        f"KITTI raw calibration, camera {number}",
+    )
+    size = _numbers(cameras, fields, f"S_rect_{number:02}", (2,))
+    return replace(calibration, size=_height_width(cameras, size))
+
+
+def _rectified(
+    path: Path, projection: Floats, rectify: Floats, scanner: Extrinsics | None, source: str
+) -> Calibration:
+    """P · R_rect · [R t], with the camera's own offset in P's last column as a translation."""
+    intrinsics = _checked_intrinsics(path, projection[:, :3])
+    offset = np.asarray(np.linalg.solve(intrinsics, projection[:, 3]), np.float64)
+    rectify, offset = checked_pose(path, "rectification", rectify, offset)
+    rotation, translation = np.eye(3), np.zeros(3)
+    if scanner is not None:
+        rotation, translation = rectify @ scanner[0], rectify @ scanner[1] + offset
     return Calibration(
         intrinsics=intrinsics,
         rotation=rotation,
-        translation=_matrix(path, fields, "t", (3,)) if has_pose else np.zeros(3),
-        distortion=tuple(distortion),
-        lens=lens,
-        size=_height_width(path, _numbers(path, fields, "size", (2,)))
-        if "size" in fields
-        else None,
-        has_pose=has_pose,
-        source="calibration",
+        translation=translation,
+        distortion=(),
+        size=None,
+        has_pose=scanner is not None,
+        source=source,
     )
+
+
+def _kalibr(path: Path, name: str, fields: Mapping[str, Any]) -> Calibration:
+    model = str(fields.get("camera_model", "pinhole"))
+    values = _numbers(path, fields, "intrinsics")
+    lens = str(fields.get("distortion_model", "none"))
+    distortion: Any = fields.get("distortion_coeffs", [])
+    if model == "eucm" and len(values) == 6:
+        lens, distortion, values = "eucm", values[:2], values[2:]
+    elif model != "pinhole" or len(values) != 4:
+        raise FileFormatError(
+            f"{path}: {name} is a {one_line(model)[:20]} camera with {len(values)} intrinsics; only"
+            " pinhole (4) and eucm (6) are known, so calibrate it as one of them"
+        )
+    fx, fy, cx, cy = values
+    size: Any = fields.get("resolution")
+    single = {name: fields[name] for name in _POSES if name in fields}
+    single |= {"K": [fx, 0, cx, 0, fy, cy, 0, 0, 1], "distortion": distortion, "lens": lens}
+    single |= {} if size is None else {"size": size}
+    return _single(path, single, None, f"Kalibr camchain, {name}")
+
+
+def _single(path: Path, fields: Mapping[str, Any], camera: int | None, source: str) -> Calibration:
+    """The camera of a plain file, or of one of OpenCV or ROS."""
+    if camera is not None:
+        raise UsageError(f"{path} describes one camera; leave out --camera {camera}")
+    matrix = next((name for name in _MATRICES if name in fields), "K")
+    intrinsics = _checked_intrinsics(path, _matrix(path, fields, matrix, 9).reshape(3, 3))
+    pose = _pose(path, fields)
+    lens, distortion = _lens(path, fields)
+    rotation, translation = pose or (np.eye(3), np.zeros(3))
+    return Calibration(
+        intrinsics=intrinsics,
+        rotation=rotation,
+        translation=translation,
+        distortion=distortion,
+        lens=lens,
+        size=_size(path, fields),
+        has_pose=pose is not None,
+        source=source,
+    )
+
+
+def _lens(path: Path, fields: Mapping[str, Any]) -> tuple[str, tuple[float, ...]]:
+    model = str(fields.get("lens", fields.get("distortion_model")) or "none").strip(" \"'")
+    if fields.get("fisheye_model") and "distortion_model" not in fields:  # of OpenCV
+        model = "fisheye"
+    lens = "eucm" if model == "eucm" else _LENSES.get(model)
+    if lens is None:
+        known = ", ".join(name for name in _LENSES if name)
+        raise FileFormatError(
+            f"{path}: distortion model {one_line(model)[:30]!r} is not known; known are {known}"
+        )
+    name = next((name for name in _DISTORTIONS if name in fields), None)
+    coefficients = () if name is None else tuple(_numbers(path, fields, name))
+    if lens == "radial-tangential" and not any(coefficients):
+        coefficients = ()
+    if len(coefficients) not in _COEFFICIENTS[lens]:
+        wanted = " or ".join(str(count) for count in _COEFFICIENTS[lens])
+        raise FileFormatError(
+            f"{path}: {len(coefficients)} coefficients of {lens} distortion instead of {wanted}"
+        )
+    return lens, coefficients
+
+
+def _pose(path: Path, fields: Mapping[str, Any]) -> Extrinsics | None:
+    name = next((name for name in _POSES if name in fields), None)
+    if name is not None:
+        return pose_of_matrix(path, name, _numbers(path, fields, name))
+    if "R" not in fields and "t" not in fields:
+        return None
+    if "R" not in fields or "t" not in fields:
+        present, missing = ("R", "t") if "R" in fields else ("t", "R")
+        raise FileFormatError(f"{path} has {present} but no {missing}; give both")
+    rotation = _matrix(path, fields, "R", 9).reshape(3, 3)
+    return checked_pose(path, "R", rotation, _matrix(path, fields, "t", 3))
+
+
+def _size(path: Path, fields: Mapping[str, Any]) -> tuple[int, int] | None:
+    if "size" in fields:
+        return _height_width(path, _numbers(path, fields, "size", (2,)))
+    names = [next((n for n in (f"image_{s}", s) if n in fields), "") for s in ("width", "height")]
+    if not all(names):
+        return None
+    return _height_width(path, [_numbers(path, fields, name, (1,))[0] for name in names])
 
 
 def _text(path: Path) -> str:
@@ -199,9 +352,9 @@ def _text(path: Path) -> str:
     )
 
 
-def _fields(path: Path, text: str) -> dict[str, str]:
+def _fields(path: Path, text: str) -> dict[str, Any]:
     """`name: value`; a line without a name continues the value before it."""
-    fields: dict[str, str] = {}
+    fields: dict[str, Any] = {}
     name = None
     for number, line in enumerate(text.splitlines(), start=1):
         content = line.split("#", 1)[0]
@@ -221,41 +374,29 @@ def _fields(path: Path, text: str) -> dict[str, str]:
     return fields
 
 
-def _json_fields(path: Path, text: str) -> dict[str, str]:
-    try:
-        content = json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise FileFormatError(
-            f"{path} is not valid JSON ({one_line(error)}); correct it"
-        ) from error
-    return {str(name): json.dumps(value) for name, value in content.items()}
-
-
-def _numbers(path: Path, fields: dict[str, str], name: str, counts: Sequence[int]) -> list[float]:
-    """The finite numbers of a field, as many as one of `counts`."""
+def _numbers(
+    path: Path, fields: Mapping[str, Any], name: str, counts: Sequence[int] = ()
+) -> list[float]:
+    """The finite numbers of a field, as many as one of `counts` if there are any."""
     if name not in fields:
         raise FileFormatError(
             f"{path} has no {name}; this calibration is incomplete or of another kind"
         )
-    words = [w for w in _SEPARATORS.split(fields[name]) if w not in ("", "-")]
-    try:
-        numbers = [float(word) for word in words]
-    except ValueError:
-        numbers = [np.nan]
-    if not np.isfinite(numbers).all():
+    numbers = numbers_in(fields[name])
+    if numbers is None or not np.isfinite(numbers).all():
         raise FileFormatError(f"{path}: {name} is not made of finite numbers; correct it")
     if max(map(abs, numbers), default=0) > _LARGEST:
         raise FileFormatError(
             f"{path}: {name} holds {max(numbers, key=abs):g}, which no camera has; correct it"
         )
-    if len(numbers) not in counts:
+    if counts and len(numbers) not in counts:
         wanted = " or ".join(str(count) for count in counts)
         raise FileFormatError(f"{path}: {name} has {len(numbers)} numbers instead of {wanted}")
     return numbers
 
 
-def _matrix(path: Path, fields: dict[str, str], name: str, shape: tuple[int, ...]) -> Floats:
-    return np.reshape(_numbers(path, fields, name, (int(np.prod(shape)),)), shape)
+def _matrix(path: Path, fields: Mapping[str, Any], name: str, count: int) -> Floats:
+    return np.array(_numbers(path, fields, name, (count,)))
 
 
 def _camera(path: Path, wanted: int | None, present: list[int]) -> int:
@@ -266,18 +407,13 @@ def _camera(path: Path, wanted: int | None, present: list[int]) -> int:
     return number
 
 
-def _check_intrinsics(path: Path, matrix: Floats) -> None:
+def _checked_intrinsics(path: Path, matrix: Floats) -> Floats:
     bottom = np.array_equal(matrix[2], [0, 0, 1])
     if not (bottom and matrix[0, 0] > 0 and matrix[1, 1] > 0 and matrix[1, 0] == 0):
         raise FileFormatError(
             f"{path}: the intrinsics are not of the form fx s cx, 0 fy cy, 0 0 1; correct them"
         )
-
-
-def _check_rotation(path: Path, name: str, matrix: Floats) -> None:
-    off = np.abs(matrix @ matrix.T - np.eye(3)).max()
-    if not off <= _ROTATION_TOLERANCE or np.linalg.det(matrix) < 0:
-        raise FileFormatError(f"{path}: the {name} is no rotation (R·Rᵀ is off by {off:.2g})")
+    return matrix
 
 
 def _height_width(path: Path, size: Sequence[float]) -> tuple[int, int]:

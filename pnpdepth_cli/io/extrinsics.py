@@ -39,46 +39,9 @@ def read_extrinsics(path: Path) -> Extrinsics:
         FileFormatError: The file holds no pose.
     """
     text = read_bytes(path).decode("utf-8", "replace")
-    words = [word for word in _SEPARATORS.split(re.sub(r"#.*", "", text)) if word]
-    try:
-        return _pose_of_numbers(path, [float(word) for word in words])
-    except ValueError:
+    numbers = numbers_in(re.sub(r"#.*", "", text))
+    if numbers is None:
         return _pose_of_fields(path, parse_yaml(path, text))
-
-
-def pose_of_matrix(path: Path, name: str, numbers: list[float]) -> Extrinsics:
-    """Returns the pose of a 3×4 or 4×4 matrix by rows. Raises FileFormatError if it is none."""
-    if len(numbers) not in (12, 16):
-        raise FileFormatError(f"{path}: {name} has {len(numbers)} numbers instead of 12 or 16")
-    matrix = np.reshape(numbers, (-1, 4))
-    rotation, translation = matrix[:3, :3], matrix[:3, 3]
-    _check_translation(path, translation)
-    off = np.abs(rotation @ rotation.T - np.eye(3)).max()
-    if not off <= _ROTATION_TOLERANCE or np.linalg.det(rotation) < 0:
-        raise FileFormatError(f"{path}: {name} has no rotation (R·Rᵀ is off by {off:.2g})")
-    if len(numbers) == 16 and not np.allclose(matrix[3], [0, 0, 0, 1]):
-        raise FileFormatError(f"{path}: the last row of {name} is not 0 0 0 1; correct it")
-    return rotation, translation
-
-
-def pose_of_quaternion(path: Path, translation: list[float], xyzw: list[float]) -> Extrinsics:
-    """Returns the pose of a translation and a quaternion x y z w."""
-    length = float(np.linalg.norm(xyzw))
-    if len(xyzw) != 4 or not abs(length - 1) < 0.01:
-        raise FileFormatError(f"{path}: the quaternion has length {length:.3g} instead of 1")
-    if len(translation) != 3:
-        raise FileFormatError(f"{path}: a translation has 3 numbers, not {len(translation)}")
-    _check_translation(path, np.array(translation))
-    return rotation_of(np.roll(xyzw, 1)), np.array(translation)
-
-
-def inverse(pose: Extrinsics) -> Extrinsics:
-    """Returns the pose of the camera in the scanner's frame."""
-    rotation, translation = pose
-    return rotation.T, -rotation.T @ translation
-
-
-def _pose_of_numbers(path: Path, numbers: list[float]) -> Extrinsics:
     if len(numbers) == 7:
         return pose_of_quaternion(path, numbers[:3], numbers[3:])
     if len(numbers) in (12, 16):
@@ -89,57 +52,68 @@ def _pose_of_numbers(path: Path, numbers: list[float]) -> Extrinsics:
     )
 
 
-def _pose_of_fields(path: Path, content: Any) -> Extrinsics:
-    fields = content
-    for _ in range(3):  # transforms: - header, transform: translation, rotation
-        if isinstance(fields, list) and fields:
-            fields = fields[0]
-        if not isinstance(fields, Mapping):
-            break
-        if "translation" in fields and {"rotation", "quaternion"} & fields.keys():
-            turn = fields.get("rotation", fields.get("quaternion"))
-            shift = _components(path, fields["translation"], "xyz")
-            numbers = _components(path, turn, "xyzw")
-            if len(numbers) == 9:
-                rows = [[*numbers[3 * i : 3 * i + 3], shift[i]] for i in range(3)]
-                return pose_of_matrix(path, "rotation", [v for row in rows for v in row])
-            return pose_of_quaternion(path, shift, numbers)
-        if "R" in fields and {"t", "T"} & fields.keys():
-            turn, shift = (
-                _components(path, fields[n], "xyz") for n in ("R", "t" if "t" in fields else "T")
-            )
-            if len(turn) == 9 and len(shift) == 3:
-                rows = [[*turn[3 * i : 3 * i + 3], shift[i]] for i in range(3)]
-                return pose_of_matrix(path, "R", [v for row in rows for v in row])
-        name = next((n for n in fields if str(n).startswith(("T_", "matrix"))), None)
-        if name is not None:
-            return pose_of_matrix(path, str(name), _components(path, fields[name], "xyz"))
-        fields = fields.get("transforms", fields.get("transform"))
-    raise FileFormatError(
-        f"{path} holds no extrinsics; give a matrix, tx ty tz qx qy qz qw, or translation and"
-        " rotation"
-    )
+def numbers_in(value: Any) -> list[float] | None:
+    """Returns the numbers of a text, a list, nested lists, or the `data` of a matrix.
 
-
-def _components(path: Path, value: Any, names: str) -> list[float]:
+    None for anything that is not made of numbers.
+    """
     if isinstance(value, Mapping):
-        value = value.get("data", [value.get(name) for name in names])
+        value = value.get("data", list(value.values()))
+    if isinstance(value, str):
+        value = [word for word in _SEPARATORS.split(value) if word not in ("", "-")]
     flat: list[Any] = []
     for each in value if isinstance(value, list) else [value]:
         flat += each if isinstance(each, list) else [each]
     try:
         return [float(each) for each in flat]
-    except (TypeError, ValueError, OverflowError) as error:
-        raise FileFormatError(
-            f"{path}: {one_line(value)[:60]} is not made of numbers; correct it"
-        ) from error
+    except (TypeError, ValueError, OverflowError):
+        return None
 
 
-def _check_translation(path: Path, translation: Floats) -> None:
+def pose_of_matrix(path: Path, name: str, numbers: list[float]) -> Extrinsics:
+    """Returns the pose of a 3×4 or 4×4 matrix by rows. Raises FileFormatError if it is none."""
+    if len(numbers) not in (12, 16):
+        raise FileFormatError(f"{path}: {name} has {len(numbers)} numbers instead of 12 or 16")
+    matrix = np.reshape(numbers, (-1, 4))
+    if len(numbers) == 16 and not np.allclose(matrix[3], [0, 0, 0, 1]):
+        raise FileFormatError(f"{path}: the last row of {name} is not 0 0 0 1; correct it")
+    return checked_pose(path, name, matrix[:3, :3], matrix[:3, 3])
+
+
+def pose_of_quaternion(path: Path, translation: list[float], xyzw: list[float]) -> Extrinsics:
+    """Returns the pose of a translation and a quaternion x y z w."""
+    length = float(np.linalg.norm(xyzw))
+    if len(xyzw) != 4 or not abs(length - 1) < 0.01:
+        raise FileFormatError(f"{path}: the quaternion has length {length:.3g} instead of 1")
+    if len(translation) != 3:
+        raise FileFormatError(f"{path}: a translation has 3 numbers, not {len(translation)}")
+    rotation = rotation_of(np.roll(xyzw, 1))
+    return checked_pose(path, "the quaternion", rotation, np.array(translation))
+
+
+def checked_pose(path: Path, name: str, rotation: Floats, translation: Floats) -> Extrinsics:
+    """Returns the pose. Raises FileFormatError if it holds no rotation, or is of no sensor."""
+    off = np.abs(rotation @ rotation.T - np.eye(3)).max()
+    if not off <= _ROTATION_TOLERANCE or np.linalg.det(rotation) < 0:
+        raise FileFormatError(f"{path}: the {name} is no rotation (R·Rᵀ is off by {off:.2g})")
     if not (np.abs(translation) < _FARTHEST_M).all():
         raise FileFormatError(
             f"{path}: a translation of {one_line(translation)} m is none of a sensor; correct it"
         )
+    return rotation, translation
+
+
+def inverse(pose: Extrinsics) -> Extrinsics:
+    """Returns the pose of the camera in the scanner's frame."""
+    rotation, translation = pose
+    return rotation.T, -rotation.T @ translation
+
+
+def square(pose: Extrinsics) -> Floats:
+    """Returns the pose as a (4, 4) matrix."""
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = pose
+    return matrix
 
 
 def rotation_of(wxyz: Floats) -> Floats:
@@ -153,3 +127,40 @@ def rotation_of(wxyz: Floats) -> Floats:
             [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
         ]
     )
+
+
+def _pose_of_fields(path: Path, fields: Any) -> Extrinsics:
+    """The pose in a mapping; tf nests it: transforms: - header, transform: translation, …."""
+    for _ in range(3):
+        if isinstance(fields, list) and fields:
+            fields = fields[0]
+        if not isinstance(fields, Mapping):
+            break
+        shift = next((fields[n] for n in ("translation", "t", "T") if n in fields), None)
+        turn = next((fields[n] for n in ("rotation", "quaternion", "R") if n in fields), None)
+        if shift is not None and turn is not None:
+            translation, numbers = (
+                _components(path, *pair) for pair in ((shift, "xyz"), (turn, "xyzw"))
+            )
+            if len(numbers) == 9 and len(translation) == 3:
+                rotation = np.reshape(numbers, (3, 3))
+                return checked_pose(path, "rotation", rotation, np.array(translation))
+            return pose_of_quaternion(path, translation, numbers)
+        name = next((n for n in fields if str(n).startswith(("T_", "matrix"))), None)
+        if name is not None:
+            return pose_of_matrix(path, str(name), _components(path, fields[name], ""))
+        fields = fields.get("transforms", fields.get("transform"))
+    raise FileFormatError(
+        f"{path} holds no extrinsics; give a matrix, tx ty tz qx qy qz qw, or translation and"
+        " rotation"
+    )
+
+
+def _components(path: Path, value: Any, names: str) -> list[float]:
+    """The numbers of a list, or of the fields of these names."""
+    if isinstance(value, Mapping) and "data" not in value:
+        value = [value.get(name) for name in names]
+    numbers = numbers_in(value)
+    if numbers is None:
+        raise FileFormatError(f"{path}: {one_line(value)[:60]} is not made of numbers; correct it")
+    return numbers

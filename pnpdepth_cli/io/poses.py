@@ -1,7 +1,14 @@
-"""Camera poses in files, in rows of KITTI odometry or of TUM RGB-D, and at the times of images."""
+"""Camera poses: rows of KITTI odometry or TUM RGB-D, KITTI's packets, and at times between rows.
+
+A packet (oxts/data/*.txt of KITTI's raw drives) begins with latitude, longitude (degrees), altitude
+(metres), roll, pitch and yaw (radians) of the inertial system, which is x forward, y left, z up. As
+in the data set's development kit, positions are in a Mercator projection, scaled at the latitude of
+the first packet.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,50 +17,44 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import FileFormatError, InputError
-from pnpdepth_cli.io.extrinsics import rotation_of
+from pnpdepth_cli.io.calibration import read_calibration, read_rigid_motion
+from pnpdepth_cli.io.extrinsics import rotation_of, square
 from pnpdepth_cli.io.file_bytes import read_bytes
 
 _KITTI_COLUMNS, _TUM_COLUMNS = 12, 8
 _ROTATION_TOLERANCE = 1e-3
 
+PACKETS = "oxts/data"
+"""Folder of the packets in a drive."""
+IMU_CALIBRATION = "calib_imu_to_velo.txt"
+_EARTH_RADIUS_M = 6378137.0
+_FIELDS = 30
+
 Floats = NDArray[np.float64]
 
 
-def read_poses(path: Path) -> Floats:
+def read_poses(path: Path, count: int | None = None, what: str = "") -> Floats:
     """Returns the poses (N, 3, 4) from each camera's frame to the world's, in file order.
 
     Args:
         path: Rows of 12 numbers, a 3×4 matrix (KITTI odometry), or of 8 numbers, time, position
             and quaternion x y z w (TUM RGB-D benchmark); `#` begins a comment.
+        count: Number of poses that are needed; None for any.
+        what: What they are of, in the plural.
 
     Raises:
         FileFormatError: A row has other numbers, or its rotation is none.
-        InputError: The file cannot be read.
+        InputError: The file has another number of poses, or cannot be read.
     """
     poses = [pose for _, _, pose in pose_rows(path)]
     if not poses:
         raise FileFormatError(f"{path} has no poses")
-    return np.stack(poses)
-
-
-def read_pose_of_each(path: Path, count: int, what: str) -> Floats:
-    """Returns the poses (count, 3, 4) of a file that has one row for each of something.
-
-    Args:
-        path: As `read_poses` takes it.
-        count: Number of poses that are needed.
-        what: What they are of, in the plural.
-
-    Raises:
-        InputError: The file has another number of poses, or cannot be read.
-    """
-    poses = read_poses(path)
-    if len(poses) != count:
+    if count is not None and len(poses) != count:
         raise InputError(
             f"{path} has {len(poses)} poses for {count} {what}; it needs one row for each, in"
             " their order"
         )
-    return poses
+    return np.stack(poses)
 
 
 def pose_rows(path: Path) -> Iterator[tuple[int, Floats, Floats]]:
@@ -99,10 +100,6 @@ class Trajectory:
 
         Position is interpolated linearly, rotation along the shortest arc. None outside of the
         trajectory, and between poses that are farther apart than the longest gap.
-
-        Args:
-            time_s: Seconds, on the trajectory's clock.
-            longest_gap_s: Between two poses, seconds.
         """
         from scipy.spatial.transform import Rotation, Slerp
 
@@ -128,12 +125,7 @@ def trajectory_of(times_s: Floats, poses: Floats) -> Trajectory:
 
 
 def read_trajectory(path: Path) -> Trajectory:
-    """Returns the trajectory in a file with rows of time, position and quaternion x y z w.
-
-    Raises:
-        FileFormatError: A row has other numbers, or its rotation is none.
-        InputError: The file cannot be read.
-    """
+    """Returns the trajectory in a file with rows of time, position and quaternion x y z w."""
     times, poses = [], []
     for number, values, pose in pose_rows(path):
         if len(values) != _TUM_COLUMNS or not np.isfinite(values[0]):
@@ -145,3 +137,40 @@ def read_trajectory(path: Path) -> Trajectory:
     if not poses:
         raise FileFormatError(f"{path} has no poses")
     return trajectory_of(np.array(times), np.stack(poses))
+
+
+def read_oxts_poses(packets: list[Path], calibration: Path, camera: int | None) -> Floats:
+    """Returns the poses (N, 3, 4) of a camera of a drive, from its frame to one world's, metres.
+
+    The calibration is the folder with KITTI's raw calibrations.
+    """
+    to_camera = read_calibration(calibration, camera)
+    of_scanner = square((to_camera.rotation, to_camera.translation))
+    of_imu = square(read_rigid_motion(calibration / IMU_CALIBRATION))
+    from_camera = np.linalg.inv(of_scanner @ of_imu)
+    read = [_packet(path) for path in packets]
+    scale = math.cos(math.radians(read[0][0]))
+    return np.stack([(_pose_of_packet(packet, scale) @ from_camera)[:3] for packet in read])
+
+
+def _packet(path: Path) -> Floats:
+    words = read_bytes(path).decode("utf-8", "replace").split()
+    try:
+        values = np.array(words, np.float64)
+    except ValueError:
+        values = np.empty(0)
+    if len(values) != _FIELDS or not np.isfinite(values).all() or abs(values[0]) >= 90:
+        raise FileFormatError(f"{path} is no packet of KITTI's inertial system; copy it again")
+    return values
+
+
+def _pose_of_packet(packet: Floats, scale: float) -> Floats:
+    """(4, 4) from the inertial system's frame to the world's."""
+    from scipy.spatial.transform import Rotation
+
+    latitude, longitude, altitude = packet[:3]
+    radius = scale * _EARTH_RADIUS_M
+    east = radius * math.radians(longitude)
+    north = radius * math.log(math.tan(math.pi / 4 + math.radians(latitude) / 2))
+    turn = Rotation.from_euler("xyz", packet[3:6]).as_matrix()  # roll, pitch, yaw
+    return square((turn, np.array([east, north, altitude])))

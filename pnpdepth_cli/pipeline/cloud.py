@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +17,8 @@ from pnpdepth_cli.errors import InputError, OutputError, SizeError, UsageError
 from pnpdepth_cli.io.atomic import make_folder
 from pnpdepth_cli.io.cloud_files import CLOUD_SUFFIXES, write_cloud
 from pnpdepth_cli.io.depth import read_depth
-from pnpdepth_cli.io.poses import read_pose_of_each
-from pnpdepth_cli.io.record import write_json
+from pnpdepth_cli.io.poses import read_poses
+from pnpdepth_cli.io.record import plain, write_json
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.pipeline.refinement.frame_camera import (
     FrameCamera,
@@ -26,7 +27,11 @@ from pnpdepth_cli.pipeline.refinement.frame_camera import (
     camera_of_fov,
 )
 from pnpdepth_cli.pipeline.results import ResultFrame, result_frames
-from pnpdepth_cli.sensors.cloud import EDGE, PointCloud, VoxelGrid, cloud_from_depth, concatenated
+from pnpdepth_cli.sensors.cloud import EDGE, PointCloud, VoxelGrid, cloud_from_depth
+from pnpdepth_cli.sensors.consistency import View, consistent_depth, neighbouring_views
+
+_IN_MEMORY = 12
+"""Depth maps of neighbouring views that are kept, with their points."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,18 +55,16 @@ class CloudRequest:
     poses, the cloud is in the world's frame."""
     depth_scale: float | None = None
     """Integer depth files hold metres × this."""
-    min_depth: float = 0.0
-    """Nearer pixels are left out."""
     max_depth: float = math.inf
-    """Farther pixels are left out."""
     max_sigma: float | None = None
-    """Pixels with a larger standard deviation, as a fraction of the depth, are left out."""
+    """Largest standard deviation of a pixel, as a fraction of its depth."""
     edge: float = EDGE
     """Jump of depth at which the cloud is cut, see `cloud_from_depth`."""
+    min_views: int = 1
+    """Views that have to agree on a pixel, its own included; see `consistent_depth`."""
     voxel: float | None = None
     """Side of the cubes in which points are merged. None: all points are kept."""
     overwrite: bool = False
-    """Whether an existing file is replaced."""
 
 
 def write_depth_cloud(request: CloudRequest) -> dict[str, Any]:
@@ -73,23 +76,34 @@ def write_depth_cloud(request: CloudRequest) -> dict[str, Any]:
     _check(request)
     frames = result_frames(request.depth)
     poses = _poses(request, frames)
-    grid = None if request.voxel is None else VoxelGrid(request.voxel)
-    clouds, notes = [], []
-    coloured = all(_image(request, frame) is not None for frame in frames)
-    for frame, pose in zip(frames, poses, strict=True):
-        cloud, frame_notes = _cloud(request, frame, pose, coloured)
-        notes += [note for note in frame_notes if note not in notes]
-        if grid is None:
-            clouds.append(cloud)
-        else:
-            grid.add(cloud)
-    cloud = concatenated(clouds) if grid is None else grid.cloud(coloured=coloured)
-    if not len(cloud):
-        raise InputError(f"{request.depth}: no pixel is left; relax --max-depth, --max-sigma, …")
+    if request.min_views > 1 and (poses[0] is None or len(frames) < request.min_views):
+        raise UsageError(
+            f"--min-views {request.min_views} needs as many frames with poses; give a folder of"
+            " results, and --poses"
+        )
+    coloured = all(request.image or frame.image for frame in frames)
+    notes: list[str] = []
+    parts = _parts(request, frames, poses, coloured, notes)
     make_folder(request.output.parent)
-    write_cloud(request.output, cloud.xyz, cloud.normals, cloud.rgb)
-    record = _record(request, frames, cloud, notes)
-    record["frame"] = "camera" if poses[0] is None else "world"
+    points = write_cloud(request.output, _merged(request, parts, coloured))
+    inputs = ("depth", "output", "image", "overwrite", "camera", "calib", "poses")
+    settings = {name: value for name, value in asdict(request).items() if name not in inputs}
+    record = {
+        "command": "cloud",
+        "version": __version__,
+        "output": str(request.output),
+        "points": points,
+        "coloured": coloured,
+        "unit": frames[0].unit,
+        "inputs": {
+            "depth": [str(frame.depth) for frame in frames],
+            "calib": None if request.calib is None else str(request.calib),
+            "poses": None if request.poses is None else str(request.poses),
+        },
+        "settings": plain(settings),
+        "notes": notes,
+        "frame": "camera" if poses[0] is None else "world",
+    }
     write_json(record_path(request.output), record)
     return record
 
@@ -112,71 +126,114 @@ def _check(request: CloudRequest) -> None:
     if request.image is not None and request.depth.is_dir():
         raise UsageError("--image is for one depth file; records name the images of a folder")
     if request.voxel is not None and not 0 < request.voxel < math.inf:
-        raise UsageError(f"--voxel is {request.voxel:g}; give a length above 0")
+        raise UsageError(f"--voxel must be a length above 0, got {request.voxel:g}")
     if not 0 <= request.edge < math.inf:
-        raise UsageError(f"--edge is {request.edge:g}; give a fraction such as {EDGE}, 0 for none")
+        raise UsageError(f"--edge must be a fraction such as {EDGE}, got {request.edge:g}")
 
 
 def _poses(request: CloudRequest, frames: list[ResultFrame]) -> list[NDArray[np.float64] | None]:
     """The pose of each frame: of the file that is given, else of the records."""
-    if request.poses is None:
-        cameras = [frame.camera for frame in frames]
-        poses = [None if camera is None else camera.pose for camera in cameras]
-        if any(pose is None for pose in poses) and any(pose is not None for pose in poses):
-            without = next(f.depth for f, pose in zip(frames, poses, strict=True) if pose is None)
-            raise InputError(
-                f"{without} has no pose in its record, but others have; give --poses for all, or"
-                " refine it again as the others"
-            )
-        return poses
-    return list(read_pose_of_each(request.poses, len(frames), "depth files"))
-
-
-def _image(request: CloudRequest, frame: ResultFrame) -> Path | None:
-    return request.image or frame.image
-
-
-def _cloud(
-    request: CloudRequest, frame: ResultFrame, pose: NDArray[np.float64] | None, coloured: bool
-) -> tuple[PointCloud, tuple[str, ...]]:
-    """The cloud of one depth map, in the world's frame if there is a pose, and notes."""
-    depth = read_depth(frame.depth, scale=request.depth_scale).values
-    camera = _camera(request, frame, (depth.shape[0], depth.shape[1]))
-    rgb, image = None, _image(request, frame)
-    if coloured and image is not None:
-        rgb = read_rgb(image).values
-        if rgb.shape[:2] != depth.shape:  # of a photo that COLMAP read as it is stored
-            rgb = read_rgb(image, upright=False).values
-        if rgb.shape[:2] != depth.shape:
-            raise SizeError(
-                f"{image} is {rgb.shape[1]}×{rgb.shape[0]} but {frame.depth} is"
-                f" {depth.shape[1]}×{depth.shape[0]}; give the image of this depth with --image"
-            )
-    keep = (depth >= request.min_depth) & (depth <= request.max_depth)
-    for path, mask in _masks(request, frame, depth):
-        if mask.shape != depth.shape:
-            raise SizeError(f"{path} is not of the size of {frame.depth}")
-        keep &= mask
-    cloud = cloud_from_depth(depth, camera.camera, rgb=rgb, keep=keep, edge=request.edge)
-    return (cloud if pose is None else cloud.transformed(pose)), camera.notes
-
-
-def _masks(
-    request: CloudRequest, frame: ResultFrame, depth: NDArray[np.float32]
-) -> Iterator[tuple[Path, NDArray[np.bool_]]]:
-    """Files beside the depth that say which pixels are valid, and the masks."""
-    if frame.valid is not None:
-        yield frame.valid, read_rgb(frame.valid).values[..., 0] > 0
-    if request.max_sigma is None:
-        return
-    if frame.sigma is None:
+    if request.poses is not None:
+        return list(read_poses(request.poses, len(frames), "depth files"))
+    cameras = [frame.camera for frame in frames]
+    poses = [None if camera is None else camera.pose for camera in cameras]
+    without = [f.depth for f, pose in zip(frames, poses, strict=True) if pose is None]
+    if without and len(without) < len(frames):
         raise InputError(
-            f"{frame.depth} has no standard deviation beside it; --max-sigma needs the file that"
-            " `pnpdepth refine --uncertainty` writes"
+            f"{without[0]} has no pose in its record, but others have; give --poses for all, or"
+            " refine it again as the others"
         )
-    sigma = read_depth(frame.sigma).values
-    same_size = sigma.shape == depth.shape
-    yield frame.sigma, sigma <= request.max_sigma * depth if same_size else sigma > 0
+    return poses
+
+
+def _parts(
+    request: CloudRequest,
+    frames: list[ResultFrame],
+    poses: list[NDArray[np.float64] | None],
+    coloured: bool,
+    notes: list[str],
+) -> Iterator[PointCloud]:
+    """Yields the clouds of all depth maps, in the world's frame if there are poses."""
+
+    @functools.lru_cache(maxsize=_IN_MEMORY)
+    def view(index: int) -> View:
+        depth, found = _depth_and_camera(request, frames[index])
+        pose = poses[index]
+        notes.extend(note for note in found.notes if note not in notes)
+        return View(depth=depth, camera=found.camera, pose=np.eye(4)[:3] if pose is None else pose)
+
+    for index, (frame, pose) in enumerate(zip(frames, poses, strict=True)):
+        here = view(index)
+        depth = here.depth
+        if request.min_views > 1:
+            known = np.stack([each for each in poses if each is not None])
+            others = (view(other) for other in neighbouring_views(known, index))
+            depth = consistent_depth(here, others, request.min_views)
+        rgb = _colours(request, frame, here.depth) if coloured else None
+        for part in cloud_from_depth(depth, here.camera, rgb=rgb, edge=request.edge):
+            yield part if pose is None else part.transformed(pose)
+
+
+def _merged(
+    request: CloudRequest, parts: Iterator[PointCloud], coloured: bool
+) -> Iterator[PointCloud]:
+    """The parts, or their points merged. Raises InputError if there is none."""
+    grid = None if request.voxel is None else VoxelGrid(request.voxel)
+    empty = True
+    for part in parts:
+        empty &= not len(part.xyz)
+        if grid is None:
+            yield part
+        else:
+            grid.add(part)
+    if empty:
+        raise InputError(f"{request.depth}: no pixel is left; relax --max-depth, --max-sigma, …")
+    if grid is not None:
+        yield grid.cloud(coloured=coloured)
+
+
+def _depth_and_camera(
+    request: CloudRequest, frame: ResultFrame
+) -> tuple[NDArray[np.float32], FrameCamera]:
+    """The depth of a frame, 0 where it is excluded, and its camera."""
+    depth = read_depth(frame.depth, scale=request.depth_scale).values
+    keep = depth <= request.max_depth
+    if frame.valid is not None:
+        keep &= _of_size(frame, frame.valid, read_rgb(frame.valid).values[..., 0], depth) > 0
+    if request.max_sigma is not None:
+        if frame.sigma is None:
+            raise InputError(
+                f"{frame.depth} has no standard deviation beside it; --max-sigma needs the file"
+                " that `pnpdepth refine --uncertainty` writes"
+            )
+        sigma = _of_size(frame, frame.sigma, read_depth(frame.sigma).values, depth)
+        keep &= sigma <= request.max_sigma * depth
+    size = (depth.shape[0], depth.shape[1])
+    return np.where(keep, depth, np.float32(0)), _camera(request, frame, size)
+
+
+def _of_size(
+    frame: ResultFrame, path: Path, values: NDArray[np.float32], depth: NDArray[np.float32]
+) -> NDArray[np.float32]:
+    if values.shape != depth.shape:
+        raise SizeError(f"{path} is not of the size of {frame.depth}")
+    return values
+
+
+def _colours(
+    request: CloudRequest, frame: ResultFrame, depth: NDArray[np.float32]
+) -> NDArray[np.float32]:
+    image = request.image or frame.image
+    assert image is not None
+    rgb = read_rgb(image).values
+    if rgb.shape[:2] != depth.shape:  # of a photo that COLMAP read as it is stored
+        rgb = read_rgb(image, upright=False).values
+    if rgb.shape[:2] != depth.shape:
+        raise SizeError(
+            f"{image} is {rgb.shape[1]}×{rgb.shape[0]} but {frame.depth} is"
+            f" {depth.shape[1]}×{depth.shape[0]}; give the image of this depth with --image"
+        )
+    return rgb
 
 
 def _camera(request: CloudRequest, frame: ResultFrame, size: tuple[int, int]) -> FrameCamera:
@@ -193,7 +250,7 @@ def _camera(request: CloudRequest, frame: ResultFrame, size: tuple[int, int]) ->
             )
         note = f"camera: {frame.camera.source} (from the record)"
         return replace(frame.camera, notes=(note,))
-    image = _image(request, frame)
+    image = request.image or frame.image
     camera = None if image is None else camera_of_exif(image, size)
     if camera is None:
         raise UsageError(
@@ -201,25 +258,3 @@ def _camera(request: CloudRequest, frame: ResultFrame, size: tuple[int, int]) ->
             " give --calib or --fov"
         )
     return camera
-
-
-def _record(
-    request: CloudRequest, frames: list[ResultFrame], cloud: PointCloud, notes: list[str]
-) -> dict[str, Any]:
-    settings = ("fov_deg", "depth_scale", "min_depth", "max_sigma", "edge", "voxel")
-    return {
-        "command": "cloud",
-        "version": __version__,
-        "output": str(request.output),
-        "points": len(cloud),
-        "coloured": cloud.rgb is not None,
-        "unit": frames[0].unit,
-        "inputs": {
-            "depth": [str(frame.depth) for frame in frames],
-            "calib": None if request.calib is None else str(request.calib),
-            "poses": None if request.poses is None else str(request.poses),
-        },
-        "settings": {name: getattr(request, name) for name in settings}
-        | {"max_depth": None if math.isinf(request.max_depth) else request.max_depth},
-        "notes": notes,
-    }

@@ -1,7 +1,5 @@
 """Sources of sparse depth: projected scans, sampled dense depth, and simulated LiDARs.
 
-    from pnpdepth_cli.sensors import LIDARS, Camera, project_velodyne, sample_points, simulate_lidar
-
 All return `SparsePoints` of numpy arrays: N depths in metres at pixel coordinates of one image,
 x right, y down, whole numbers at pixel centres. Nothing here reads a file.
 """
@@ -11,13 +9,7 @@ from __future__ import annotations
 from pnpdepth_cli.sensors.accumulation import NeighbourScan, accumulated
 from pnpdepth_cli.sensors.camera import Camera
 from pnpdepth_cli.sensors.lidar import FORWARD_LEFT_UP, LIDARS, Lidar
-from pnpdepth_cli.sensors.projection import (
-    ProjectedScan,
-    ProjectionSettings,
-    edge_agreement,
-    occluded_in_map,
-    project_velodyne,
-)
+from pnpdepth_cli.sensors.projection import edge_agreement, occluded_in_map, project_velodyne
 from pnpdepth_cli.sensors.samplers import (
     PATTERNS,
     SampleNoise,
@@ -25,7 +17,7 @@ from pnpdepth_cli.sensors.samplers import (
     sample_points,
     with_noise,
 )
-from pnpdepth_cli.sensors.simulate import SimulationSettings, simulate_lidar
+from pnpdepth_cli.sensors.simulate import simulate_lidar
 from pnpdepth_cli.sensors.sparse import Points, as_depth_image, describe_dropped
 
 __all__ = [
@@ -36,11 +28,8 @@ __all__ = [
     "Lidar",
     "NeighbourScan",
     "Points",
-    "ProjectedScan",
-    "ProjectionSettings",
     "SampleNoise",
     "SamplePattern",
-    "SimulationSettings",
     "accumulated",
     "as_depth_image",
     "describe_dropped",

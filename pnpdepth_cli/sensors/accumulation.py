@@ -63,17 +63,13 @@ class NeighbourScan:
 
 @dataclass(frozen=True, kw_only=True)
 class Surface:
-    """Points of a scan with the planes through their neighbours."""
+    """N points of a scan with the planes through their neighbours."""
 
     points: Points
-    xyz: Floats
-    """(N, 3) metres in the camera's frame."""
-    normal: Floats
-    """(N, 3) unit normals."""
-    flat: Mask
-    """(N,) true where the neighbours lie on a plane."""
-    tree: cKDTree
-    """Of the pixel coordinates."""
+    xyz: Floats  # (N, 3) metres in the camera's frame
+    normal: Floats  # (N, 3) unit vectors
+    flat: Mask  # (N,) where the neighbours lie on a plane
+    tree: cKDTree  # of the pixel coordinates
 
     @property
     def spacing_px(self) -> float:
@@ -83,13 +79,7 @@ class Surface:
 
 
 def accumulated(points: Points, neighbours: Sequence[NeighbourScan], camera: Camera) -> Points:
-    """Returns the frame's own points followed by those of its neighbours that agree with them.
-
-    Args:
-        points: The frame's own.
-        neighbours: Other frames of the same camera.
-        camera: Its intrinsics and distortion.
-    """
+    """Returns the frame's own points followed by those of its neighbours that agree with them."""
     surface, result = surface_of(points, camera), points
     for apart in sorted({scan.apart for scan in neighbours}):
         moved = []
@@ -153,13 +143,9 @@ def surface_of(points: Points, camera: Camera) -> Surface:
 
 
 def registered(surface: Surface, xyz: Floats, motion: Floats, camera: Camera) -> Floats:
-    """Returns the motion (3, 4) that puts points on a surface; the given one if that fails.
+    """Returns the motion (3, 4) that puts points (M, 3) on a surface; the given one if that fails.
 
-    Args:
-        surface: Of the frame.
-        xyz: (M, 3) points, metres in the other camera's frame.
-        motion: (3, 4) about from the other camera's frame to this one's.
-        camera: Intrinsics of both.
+    Points are in the other camera's frame, the motion leads from there to the surface's.
     """
     from scipy.spatial.transform import Rotation
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -61,12 +62,9 @@ class Camera:
         return (np.asarray(points, np.float64) - self.translation) @ self.rotation
 
     def pixels_of(self, points: NDArray[np.floating]) -> Floats:
-        """Returns the (N, 2) pixel coordinates of points.
+        """Returns the (N, 2) pixel coordinates of (N, 3) points of the camera's frame, z > 0.
 
         NaN for a direction beyond the one where the distortion turns back on itself.
-
-        Args:
-            points: (N, 3) metres in the camera's frame, all with z > 0.
         """
         plane = points[:, :2] / points[:, 2:3]
         if self.has_lens:
@@ -74,12 +72,7 @@ class Camera:
         return np.asarray(plane @ self.intrinsics[:2, :2].T + self.intrinsics[:2, 2])
 
     def unproject(self, xy: NDArray[np.floating], depth: NDArray[np.floating]) -> Floats:
-        """Returns the (N, 3) points, metres in the camera's frame, at pixel coordinates.
-
-        Args:
-            xy: (N, 2) pixel coordinates.
-            depth: (N,) metres along the camera's axis.
-        """
+        """Returns the (N, 3) points of the camera's frame at (N, 2) pixels of (N,) depth z."""
         inverse = np.linalg.inv(self.intrinsics)
         plane = np.asarray(xy, np.float64) @ inverse[:2, :2].T + inverse[:2, 2]
         if self.has_lens:
@@ -93,11 +86,6 @@ def distort(plane: Floats, lens: str, coefficients: Coefficients) -> Floats:
 
     NaN beyond the angle at which the distortion turns back on itself: there the model would show
     directions from outside the field of view inside it.
-
-    Args:
-        plane: (N, 2) directions x / z and y / z.
-        lens: One of `choices.LENSES`.
-        coefficients: Of the lens.
     """
     with np.errstate(all="ignore"):
         shown = _shown(plane, lens, coefficients)
@@ -109,11 +97,6 @@ def undistort(shown: Floats, lens: str, coefficients: Coefficients) -> Floats:
     """Returns the (N, 2) directions that the lens shows at points on the image plane.
 
     Newton's method from the inverse of the radial part; NaN where the lens shows nothing.
-
-    Args:
-        shown: (N, 2) points on the image plane.
-        lens: One of `choices.LENSES`.
-        coefficients: Of the lens.
     """
     radius, seen = _radial_curve(lens, coefficients)
     last = int(np.searchsorted(radius, largest_radius(lens, coefficients), side="right"))
@@ -169,8 +152,7 @@ def _square(plane: Floats) -> Floats:
     return np.asarray(np.einsum("ij,ij->i", plane, plane))
 
 
-@dataclass(frozen=True, kw_only=True)
-class LensModel:
+class LensModel(NamedTuple):
     """A lens distortion."""
 
     shown: Callable[[Floats, Coefficients], Floats]
@@ -191,7 +173,7 @@ def _lens(
     """Returns a decorator that adds a lens model."""
 
     def add(shown: Callable[..., Floats]) -> Callable[..., Floats]:
-        LENS_MODELS[name] = LensModel(shown=shown, by_angle=by_angle, radial=radial)
+        LENS_MODELS[name] = LensModel(shown, by_angle, radial)
         return shown
 
     return add

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterator
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,30 +14,25 @@ Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 EDGE = 0.05
-"""Default of `EdgeCut.jump`: of depth maps of indoor and street scenes, it cuts silhouettes and
-keeps floors down to a grazing angle of about 5 degrees."""
+"""Default jump of depth: of depth maps of indoor and street scenes, it cuts silhouettes and keeps
+floors down to a grazing angle of about 5 degrees."""
+
+_PART_PIXELS = 1 << 20
+"""Pixels whose points and normals are in memory at once."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class PointCloud:
-    """N points with colours and normals."""
+class PointCloud(NamedTuple):
+    """N points with normals and colours."""
 
     xyz: NDArray[np.float32]
     """(N, 3) in the unit of the depth, in the camera's or the world's frame."""
-    rgb: NDArray[np.uint8] | None
-    """(N, 3) colours 0…255. None: without colours."""
     normals: NDArray[np.float32]
     """(N, 3) unit vectors towards the camera; 0 where a point has no two neighbours."""
-
-    def __len__(self) -> int:
-        return len(self.xyz)
+    rgb: NDArray[np.uint8] | None
+    """(N, 3) colours 0…255. None: without colours."""
 
     def transformed(self, pose: Floats) -> PointCloud:
-        """Returns the cloud in another frame.
-
-        Args:
-            pose: (3, 4) or (4, 4), from the cloud's frame to the other; its rotation has no scale.
-        """
+        """Returns the cloud in the frame that a pose, (3, 4) or (4, 4), leads to."""
         rotation, translation = pose[:3, :3], pose[:3, 3]
         return PointCloud(
             xyz=(self.xyz @ rotation.T + translation).astype(np.float32),
@@ -53,8 +48,8 @@ def cloud_from_depth(
     rgb: NDArray[np.float32] | None = None,
     keep: Mask | None = None,
     edge: float = EDGE,
-) -> PointCloud:
-    """Returns the points of a depth map in the camera's frame.
+) -> Iterator[PointCloud]:
+    """Yields the points of a depth map in the camera's frame, some rows of pixels after others.
 
     Args:
         depth: (H, W), 0 = unknown.
@@ -65,12 +60,24 @@ def cloud_from_depth(
             this fraction from what continues its own surface. 0 keeps all pixels.
     """
     known = kept_pixels(depth, keep, edge)
-    points = _points(depth, known, camera)
-    return PointCloud(
-        xyz=points[known].astype(np.float32),
-        rgb=None if rgb is None else np.rint(np.clip(rgb[known], 0, 1) * 255).astype(np.uint8),
-        normals=_normals(points, known)[known].astype(np.float32),
-    )
+    height, width = depth.shape
+    rows = max(1, _PART_PIXELS // width)
+    for top in range(0, height, rows):
+        part = slice(top, min(top + rows, height))
+        around = slice(max(0, top - 1), part.stop + 1)  # the normals take neighbours
+        points = _points(depth[around], known[around], camera, around.start)
+        normals = _normals(points, known[around])
+        inner = slice(top - around.start, part.stop - around.start)
+        kept = known[part]
+        yield PointCloud(
+            xyz=points[inner][kept].astype(np.float32),
+            rgb=None if rgb is None else _bytes_of(rgb[part][kept]),
+            normals=normals[inner][kept].astype(np.float32),
+        )
+
+
+def _bytes_of(rgb: NDArray[np.float32]) -> NDArray[np.uint8]:
+    return np.rint(np.clip(rgb, 0, 1) * 255).astype(np.uint8)
 
 
 def kept_pixels(depth: NDArray[np.float32], keep: Mask | None = None, edge: float = EDGE) -> Mask:
@@ -88,10 +95,6 @@ def depth_edges(depth: NDArray[np.float32], edge: float) -> Mask:
 
     A jump is a second difference of inverse depth of more than `edge` of the inverse depth. A
     plane has none, whatever its slope: inverse depth is linear in the pixel coordinates.
-
-    Args:
-        depth: (H, W), 0 = unknown.
-        edge: Fraction of the inverse depth.
     """
     known = depth > 0
     inverse = np.where(known, 1 / np.where(known, depth, 1), np.nan)
@@ -106,55 +109,43 @@ def depth_edges(depth: NDArray[np.float32], edge: float) -> Mask:
 
 
 def depth_normals(depth: NDArray[np.float32], camera: Camera) -> Floats:
-    """Returns (H, W, 3) unit normals towards the camera; 0 where depth or neighbours are unknown.
-
-    Args:
-        depth: (H, W), 0 = unknown.
-        camera: Intrinsics and distortion of the image that the depth belongs to.
-    """
+    """Returns (H, W, 3) unit normals towards the camera; 0 where depth is unknown."""
     known = kept_pixels(depth, edge=0)
     return _normals(_points(depth, known, camera), known)
 
 
-def _points(depth: NDArray[np.float32], known: Mask, camera: Camera) -> Floats:
-    """(H, W, 3) points in the camera's frame, 0 where unknown."""
+def _points(depth: NDArray[np.float32], known: Mask, camera: Camera, top: int = 0) -> Floats:
+    """(H, W, 3) points in the camera's frame, 0 where unknown; `top` is the number of row 0."""
     rows, columns = np.nonzero(known)
     points = np.zeros((*depth.shape, 3))
-    points[known] = camera.unproject(np.column_stack([columns, rows]), depth[known])
+    points[known] = camera.unproject(np.column_stack([columns, rows + top]), depth[known])
     return points
 
 
 def _normals(points: Floats, known: Mask) -> Floats:
     """Unit normals (H, W, 3) towards the camera from the differences of neighbours."""
-    across, has_across = _difference(points, known, 1)
-    down, has_down = _difference(points, known, 0)
-    normals = np.cross(down, across)
-    length = np.linalg.norm(normals, axis=2)
-    valid = known & has_across & has_down & (length > 0)
-    normals = np.where(valid[..., None], normals / np.where(valid, length, 1)[..., None], 0)
-    away = (normals * points).sum(axis=2) > 0
-    return np.where(away[..., None], -normals, normals)
+    across = _difference(points, known, 1)
+    normals = np.cross(_difference(points, known, 0), across)
+    length = np.linalg.norm(normals, axis=2, keepdims=True)
+    normals = np.where(
+        known[..., None] & (length > 0), normals / np.where(length > 0, length, 1), 0
+    )
+    away = (normals * points).sum(axis=2, keepdims=True) > 0
+    return np.where(away, -normals, normals)
 
 
-def _difference(points: Floats, known: Mask, axis: int) -> tuple[Floats, Mask]:
-    """Difference (H, W, 3) of the neighbours along an axis, and where at least one is known."""
+def _difference(points: Floats, known: Mask, axis: int) -> Floats:
+    """Difference (H, W, 3) of the known neighbours along an axis; 0 where there is none."""
     points, known = np.moveaxis(points, axis, 0), np.moveaxis(known, axis, 0)
     before, after = points.copy(), points.copy()
-    valid = np.zeros(known.shape, bool)
-    has_before, has_after = known[1:] & known[:-1], known[:-1] & known[1:]
-    before[1:][has_before] = points[:-1][has_before]
-    after[:-1][has_after] = points[1:][has_after]
-    valid[1:] |= has_before
-    valid[:-1] |= has_after
-    return np.moveaxis(after - before, 0, axis), np.moveaxis(valid, 0, axis)
+    both = known[1:] & known[:-1]
+    before[1:][both] = points[:-1][both]
+    after[:-1][both] = points[1:][both]
+    return np.moveaxis(after - before, 0, axis)
 
 
 class VoxelGrid:
-    """Merges clouds: one point per occupied cube, the mean of all points in it.
-
-    Args:
-        side: Of a cube, in the unit of the clouds.
-    """
+    """Merges clouds: one point per occupied cube of this side, the mean of all points in it."""
 
     def __init__(self, side: float) -> None:
         self._side = side
@@ -164,8 +155,8 @@ class VoxelGrid:
     def add(self, cloud: PointCloud) -> None:
         """Adds the points of a cloud in the grid's frame."""
         cells = np.floor(cloud.xyz / self._side).astype(np.int64)
-        rgb = np.zeros((len(cloud), 3)) if cloud.rgb is None else cloud.rgb
-        ones = np.ones((len(cloud), 1))
+        rgb = np.zeros(cloud.xyz.shape) if cloud.rgb is None else cloud.rgb
+        ones = np.ones((len(cloud.xyz), 1))
         values = np.concatenate([cloud.xyz, rgb, cloud.normals, ones], axis=1)
         cells = np.concatenate([self._cells, cells])
         values = np.concatenate([self._sums, values])
@@ -183,14 +174,3 @@ class VoxelGrid:
             rgb=np.rint(mean[:, 3:6]).astype(np.uint8) if coloured else None,
             normals=normals.astype(np.float32),
         )
-
-
-def concatenated(clouds: Iterable[PointCloud]) -> PointCloud:
-    """Returns all points of the clouds, one after another; all or none have colours."""
-    clouds = list(clouds)
-    colours = [cloud.rgb for cloud in clouds if cloud.rgb is not None]
-    return PointCloud(
-        xyz=np.concatenate([cloud.xyz for cloud in clouds]),
-        rgb=np.concatenate(colours) if len(colours) == len(clouds) else None,
-        normals=np.concatenate([cloud.normals for cloud in clouds]),
-    )

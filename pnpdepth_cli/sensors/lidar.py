@@ -23,47 +23,49 @@ _MOST_RAYS = 1 << 23
 
 @dataclass(frozen=True, kw_only=True)
 class Lidar:
-    """A rotating LiDAR."""
+    """A rotating LiDAR; noise is given as standard deviations."""
 
     name: str
     elevations_deg: tuple[float, ...]
     """Elevation of each beam, −90° to 90°."""
     azimuth_step_deg: float
     """Angle between firings."""
-    max_range: float
-    """Metres; may be infinite."""
+    max_range: float = np.inf
+    """Metres from the scanner."""
     range_noise: float = 0.0
-    """Standard deviation of a range, metres."""
+    """Metres."""
     angle_noise_deg: float = 0.0
-    """Standard deviation of the direction of each measurement, in elevation and in azimuth."""
+    """Of the direction of each measurement, in elevation and in azimuth."""
+    rotation_noise_deg: float = 0.0
+    """Of a rotation of the whole scanner about each axis."""
+    dropout: float = 0.0
+    """Fraction of beams without return."""
 
     def __post_init__(self) -> None:
-        angles = np.array(self.elevations_deg, np.float64)
-        if not angles.size or not (np.abs(angles) <= 90).all():
-            raise UsageError(f"sensor {self.name!r}: give elevations between −90° and 90°")
-        if not 0.001 <= self.azimuth_step_deg <= 360:
-            raise UsageError(
-                f"sensor {self.name!r}: azimuth step {self.azimuth_step_deg:g}° is not"
-                " between 0.001° and 360°"
-            )
-        rays = angles.size * round(360 / self.azimuth_step_deg)
-        if rays > _MOST_RAYS:
-            raise UsageError(
-                f"sensor {self.name!r} measures {rays:,} points per revolution; give fewer beams or"
-                f" a larger azimuth step, at most {_MOST_RAYS:,}"
-            )
+        angles, step = np.array(self.elevations_deg, np.float64), self.azimuth_step_deg
+        rays = angles.size * round(360 / step) if 0.001 <= step <= 360 else 0
         noise = (self.range_noise, self.angle_noise_deg)
-        if not self.max_range > 0 or not all(0 <= size < np.inf for size in noise):
-            raise UsageError(
-                f"sensor {self.name!r}: give a maximum range above 0 and no negative noise"
-            )
+        faults = {
+            "elevations must be between −90° and 90°": (
+                not angles.size or not (np.abs(angles) <= 90).all()
+            ),
+            f"azimuth_step_deg must be 0.001 to 360, got {step:g}": not 0.001 <= step <= 360,
+            f"it measures {rays:,} points per revolution; at most {_MOST_RAYS:,}": (
+                rays > _MOST_RAYS
+            ),
+            f"max_range must be > 0, got {self.max_range:g}": not self.max_range > 0,
+            "noise must be >= 0": not all(0 <= size < np.inf for size in noise),
+            f"rotation_noise_deg must be 0 to 360, got {self.rotation_noise_deg:g}": (
+                not 0 <= self.rotation_noise_deg <= 360
+            ),
+            f"dropout must be >= 0 and < 1, got {self.dropout:g}": not 0 <= self.dropout < 1,
+        }
+        for fault, holds in faults.items():
+            if holds:
+                raise UsageError(f"sensor {self.name!r}: {fault}")
 
     def directions(self, rng: np.random.Generator) -> Floats:
-        """Returns (M, 3) unit vectors of one revolution in the scanner's frame, beam by beam.
-
-        Args:
-            rng: Draws the angle noise; unused if there is none.
-        """
+        """Returns (M, 3) unit vectors of one revolution in the scanner's frame, beam by beam."""
         elevation = np.radians(self.elevations_deg)[:, None]
         steps = round(360 / self.azimuth_step_deg)
         azimuth = np.radians(np.arange(steps) * self.azimuth_step_deg)[None, :]
@@ -109,8 +111,7 @@ _PAPER_FOV = {
     "hdl-32e": (41, 1.3, 10.67),
     "hdl-64e": (27, 0.4, 2.0),
 }
-_PAPER_AZIMUTH_STEP_DEG = 0.19
-_PAPER_ANGLE_NOISE_DEG = 0.4
+_PAPER_NOISE = {"azimuth_step_deg": 0.19, "angle_noise_deg": 0.4}
 
 
 def _by_sheet(name: str) -> Lidar:
@@ -129,9 +130,7 @@ def _paper(name: str) -> Lidar:
     return Lidar(
         name=f"paper-{name}",
         elevations_deg=evenly_spaced(top_deg, step_deg, int(fov_deg / step_deg + 1e-9) + 1),
-        azimuth_step_deg=_PAPER_AZIMUTH_STEP_DEG,
-        max_range=np.inf,
-        angle_noise_deg=_PAPER_ANGLE_NOISE_DEG,
+        **_PAPER_NOISE,
     )
 
 

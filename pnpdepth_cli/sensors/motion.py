@@ -9,7 +9,7 @@ small_gicp. An estimate that few matches or points support is refused.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -34,18 +34,14 @@ _JUMP = 1.1  # ratio of depths of the points around a keypoint
 _VOXEL, _PAIR = 0.015, 0.15  # fractions of the median depth: voxels and farthest pairs of ICP
 
 
-@dataclass(frozen=True, kw_only=True)
-class Keypoints:
-    """SIFT keypoints of an image."""
+class Keypoints(NamedTuple):
+    """SIFT keypoints of an image: (K, 2) pixel coordinates and (K, 128) descriptors."""
 
     xy: Floats
-    """(K, 2) pixel coordinates."""
     descriptors: NDArray[np.float32]
-    """(K, 128)."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class MotionEstimate:
+class MotionEstimate(NamedTuple):
     """An estimated motion, or why it is refused."""
 
     motion: Floats | None
@@ -60,28 +56,22 @@ def keypoints_of(rgb: NDArray[np.float32]) -> Keypoints:
     # OpenCV's annotations lack SIFT
     keypoints, descriptors = cv2.SIFT_create(nfeatures=_KEYPOINTS).detectAndCompute(grey, None)  # type: ignore[attr-defined, unused-ignore]
     if descriptors is None:
-        return Keypoints(xy=np.empty((0, 2)), descriptors=np.empty((0, 128), np.float32))
-    return Keypoints(
-        xy=np.array([each.pt for each in keypoints], np.float64), descriptors=descriptors
-    )
+        return Keypoints(np.empty((0, 2)), np.empty((0, 128), np.float32))
+    return Keypoints(np.array([each.pt for each in keypoints], np.float64), descriptors)
 
 
 def motion_of_images(
     here: Keypoints, there: Keypoints, points: Points, camera: Camera
 ) -> MotionEstimate:
-    """Returns the motion from the other camera's frame to this one's, from matched keypoints.
+    """Returns the motion from the other frame's camera to this one's, from matched keypoints.
 
-    Args:
-        here: Of this frame.
-        there: Of the other frame.
-        points: Sparse depth of the other frame.
-        camera: Intrinsics and lens of both.
+    The points are the sparse depth of the other frame; both have the same camera.
     """
     at, to = _matches(here, there)
     depth, known = _depth_at(points, at)
     at, to, depth = at[known], to[known], depth[known]
     if len(at) < MIN_INLIERS:
-        return _refused(f"{len(at)} matches with depth, at least {MIN_INLIERS} are needed")
+        return MotionEstimate(None, f"{len(at)} matches with depth, at least {MIN_INLIERS} needed")
     focal_px = float(camera.intrinsics[0, 0])
     rays = camera.unproject(to, np.ones(len(to)))[:, :2]
     solved, turn, shift, index = cv2.solvePnPRansac(
@@ -92,7 +82,7 @@ def motion_of_images(
     inliers = np.empty(0, np.intp) if not solved or index is None else index.ravel()
     basis = f"{len(inliers)} of {len(at)} matches of the images"
     if len(inliers) < max(MIN_INLIERS, MIN_FRACTION * len(at)):
-        return _refused(f"{basis} agree")
+        return MotionEstimate(None, f"{basis} agree")
     xyz = camera.unproject(at[inliers], depth[inliers])
     turn, shift = cv2.solvePnPRefineLM(xyz, rays[inliers], np.eye(3), None, turn, shift)
     motion = np.column_stack([cv2.Rodrigues(turn)[0], shift])
@@ -112,7 +102,9 @@ def motion_of_scans(here: Points, there: Points, camera: Camera) -> MotionEstima
             "motion between frames without images needs small_gicp: pip install 'pnpdepth[icp]'"
         ) from None
     if min(len(here), len(there)) < MIN_INLIERS:
-        return _refused(f"{min(len(here), len(there))} points, at least {MIN_INLIERS} are needed")
+        return MotionEstimate(
+            None, f"{min(len(here), len(there))} points, at least {MIN_INLIERS} needed"
+        )
     median = float(np.median(here.depth))
     clouds = [
         small_gicp.preprocess_points(
@@ -126,7 +118,7 @@ def motion_of_scans(here: Points, there: Points, camera: Camera) -> MotionEstima
     )
     basis = f"{result.num_inliers} of {source.size()} voxels of the scans"
     if not result.converged or result.num_inliers < MIN_FRACTION * source.size():
-        return _refused(f"{basis} agree")
+        return MotionEstimate(None, f"{basis} agree")
     return _plausible(np.array(result.T_target_source)[:3], median, basis)
 
 
@@ -167,9 +159,6 @@ def _plausible(motion: Floats, median: float, basis: str) -> MotionEstimate:
     """The motion unless it is longer than the median depth."""
     length = float(np.linalg.norm(motion[:, 3]))
     if not length <= median:
-        return _refused(f"{length:.1f} m of motion at a median depth of {median:.1f} m")
-    return MotionEstimate(motion=motion, basis=basis)
-
-
-def _refused(why: str) -> MotionEstimate:
-    return MotionEstimate(motion=None, basis=why)
+        basis = f"{length:.1f} m of motion at a median depth of {median:.1f} m"
+        return MotionEstimate(None, basis)
+    return MotionEstimate(motion, basis)

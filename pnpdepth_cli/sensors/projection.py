@@ -58,26 +58,6 @@ _INTERLEAVED_REACH = (4, 2)  # pixels to each side, and half the width, of the a
 
 
 @dataclass(frozen=True, kw_only=True)
-class ProjectionSettings:
-    """How a scan becomes sparse depth."""
-
-    euclidean: bool = False
-    """Depth is the distance from the camera's centre instead of z, along its axis."""
-    min_range: float = 0.0
-    """Metres from the scanner; nearer points are dropped."""
-    max_range: float = np.inf
-    """Metres from the scanner; farther points are dropped."""
-    keep_occluded: bool = False
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.min_range < self.max_range:
-            raise UsageError(
-                f"range {self.min_range:g} to {self.max_range:g} m is empty; give"
-                " 0 ≤ minimum < maximum"
-            )
-
-
-@dataclass(frozen=True, kw_only=True)
 class ProjectedScan(Points):
     """The points of a scan that the camera sees, in the scan's order."""
 
@@ -89,7 +69,10 @@ def project_velodyne(
     points: NDArray[np.floating],
     camera: Camera,
     size: tuple[int, int],
-    settings: ProjectionSettings | None = None,
+    *,
+    euclidean: bool = False,
+    limits: tuple[float, float] = (0.0, np.inf),
+    keep_occluded: bool = False,
 ) -> ProjectedScan:
     """Returns the scan as sparse depth in an image.
 
@@ -97,20 +80,26 @@ def project_velodyne(
         points: (N, 3) or more columns, x y z in metres in the scanner's frame.
         camera: Intrinsics and the scanner's pose.
         size: (H, W) of the image.
-        settings: Ranges and occlusion; None for the defaults.
+        euclidean: Whether depth is the distance from the camera's centre instead of z.
+        limits: Smallest and largest distance from the scanner, metres.
+        keep_occluded: Whether points behind the foreground stay.
 
     Raises:
         NoPointsError: No point is visible in the image.
+        UsageError: The limits are empty.
     """
-    settings = settings or ProjectionSettings()
+    if not 0 <= limits[0] < limits[1]:
+        raise UsageError(
+            f"range {limits[0]:g} to {limits[1]:g} m is empty; give 0 ≤ minimum < maximum"
+        )
     xyz = np.asarray(points)[:, :3]
     drops = DropCounter(len(xyz))
     distance = np.sqrt(np.einsum("ij,ij->i", xyz, xyz))
-    in_range = (distance >= settings.min_range) & (distance <= settings.max_range)
+    in_range = (distance >= limits[0]) & (distance <= limits[1])
     seen = camera.from_scanner(xyz[drops.keep(in_range, "out of range")])
     seen = seen[drops.keep(seen[:, 2] > 0, "behind the camera")]
     seen, xy = drops.keep_seen(seen, camera.pixels_of(seen), size)
-    if not settings.keep_occluded:
+    if not keep_occluded:
         focal_px = float(camera.intrinsics[0, 0])
         scanner = np.asarray(camera.intrinsics @ camera.translation)
         hidden = hidden_points(xy, seen[:, 2], size, focal_px=focal_px, scanner=scanner)
@@ -121,7 +110,7 @@ def project_velodyne(
             f"none of the scan's {len(xyz):,} points lies in the image ({drops}); check that"
             " scan and calibration belong to this camera"
         )
-    depth = np.linalg.norm(seen, axis=1) if settings.euclidean else seen[:, 2]
+    depth = np.linalg.norm(seen, axis=1) if euclidean else seen[:, 2]
     return ProjectedScan(
         xy=xy.astype(np.float32),
         depth=depth.astype(np.float32),
@@ -134,12 +123,8 @@ def project_velodyne(
 def edge_agreement(points: Points, rgb: NDArray[np.float32]) -> float:
     """Returns how much stronger the image's edges are at jumps of depth than elsewhere, −1 to 1.
 
-    That is the mean rank of the gradient beside the points at the near side of a jump, less that
-    at all points. It tells calibrations of the same scan apart. 0 for points without a jump.
-
-    Args:
-        points: A projected scan.
-        rgb: (H, W, 3) in 0..1, of the same size.
+    That is the mean rank of the gradient of rgb, (H, W, 3) in 0..1, beside the points at the near
+    side of a jump, less that at all points. It tells calibrations of the same scan apart.
     """
     from scipy.spatial import cKDTree
 
@@ -232,14 +217,8 @@ def occluded_in_map(points: Points) -> Mask | None:
     """Returns (N,) true for points of a projected scan that are occluded by something nearer.
 
     A point is occluded if a point nearer by more than `NEARER` lies within a fraction of the
-    spacing of scan lines. Scanner and focal length are unknown.
-
-    Args:
-        points: Points of a depth map, on whole pixel coordinates.
-
-    Returns:
-        The mask; None for points that are no projected scan, or whose occluded points are removed
-        already.
+    spacing of scan lines. Scanner and focal length are unknown. None for points that are no
+    projected scan on whole pixels, or whose occluded points are removed already.
     """
     if len(points) < MIN_POINTS or bool((points.xy != np.floor(points.xy)).any()):
         return None
@@ -256,11 +235,7 @@ def occluded_in_map(points: Points) -> Mask | None:
 
 
 def interleaved(depth: NDArray[np.float32]) -> Mask:
-    """Returns (H, W) true for points of a map with nearer points on two opposite sides.
-
-    Args:
-        depth: (H, W) metres, 0 = unknown.
-    """
+    """Returns (H, W) true for points of a map, 0 = unknown, between nearer ones on two sides."""
     known = np.where(depth > 0, depth, np.float32(np.inf))
     limit = np.where(depth > 0, depth * np.float32(1 - NEARER), 0)
     reach, half = _INTERLEAVED_REACH

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
@@ -31,21 +30,19 @@ class SamplePattern:
     """x, y, width and height in pixels, for `region` alone."""
 
     def __post_init__(self) -> None:
+        count, fraction = self.count, self.fraction
         if self.kind not in PATTERNS:
             raise UsageError(f"pattern {self.kind!r} is not one of {', '.join(PATTERNS)}")
-        if self.count is not None and self.fraction is not None:
+        if count is not None and fraction is not None:
             raise UsageError("give a number of points or a fraction of the pixels, not both")
-        too_few = self.count is not None and self.count < 1
-        if too_few or (self.fraction is not None and not 0 < self.fraction <= 1):
+        if (count is not None and count < 1) or (fraction is not None and not 0 < fraction <= 1):
             raise UsageError("give at least one point, or a fraction above 0 and at most 100 %")
-        if self.kind == "lines" and self.count is None:
+        if self.kind == "lines" and count is None:
             raise UsageError("pattern 'lines' needs the number of lines as its count")
-        if self.kind not in ("lines", "region") and self.count is None and self.fraction is None:
+        if self.kind != "region" and count is None and fraction is None:
             raise UsageError(f"pattern {self.kind!r} needs a count, N or N %")
         if (self.region is None) == (self.kind == "region"):
-            raise UsageError(
-                "a region X,Y,WIDTH,HEIGHT goes with the pattern 'region', and only it"
-            )
+            raise UsageError("pattern 'region', and only it, has a rectangle: region:X,Y,W,H")
 
     def wanted(self, known: int) -> int:
         """Returns the number of points to sample from `known` pixels."""
@@ -82,16 +79,29 @@ class Scene:
     known: Pixels
     """Row-major indices of the pixels with known depth."""
     size: tuple[int, int]
-    """(H, W)."""
     image: Image | None
-    """(H, W, 3) in 0..1 of the same view."""
+    pattern: SamplePattern
+    rng: np.random.Generator
 
-    def grey(self, pattern: SamplePattern) -> NDArray[np.uint8]:
-        """Returns the image in grey. Raises UsageError if there is none."""
+    @property
+    def wanted(self) -> int:
+        """The number of points to sample."""
+        return self.pattern.wanted(self.known.size)
+
+    @property
+    def grey(self) -> NDArray[np.uint8]:
+        """The image in grey. Raises UsageError if there is none."""
         if self.image is None:
-            raise UsageError(f"pattern {pattern.kind!r} needs the image that the depth belongs to")
+            kind = self.pattern.kind
+            raise UsageError(f"pattern {kind!r} needs the image that the depth belongs to")
         grey = self.image @ np.array([0.299, 0.587, 0.114], np.float32)
         return np.rint(255 * np.clip(grey, 0, 1)).astype(np.uint8)
+
+    def chosen(self, pixels: Pixels, count: int) -> Pixels:
+        """Returns a random choice of pixels. Raises UsageError for more than there are."""
+        if count > pixels.size:
+            raise UsageError(f"{count:,} points of {pixels.size:,} known pixels; ask for fewer")
+        return self.rng.choice(pixels, count, replace=False)
 
 
 def sample_points(
@@ -125,9 +135,8 @@ def sample_points(
     known = np.flatnonzero(np.isfinite(depth) & (depth > 0))
     if not known.size:
         raise NoPointsError("the depth map has no pixel with known depth to sample from")
-    chosen = np.sort(
-        PATTERNS[pattern.kind](Scene(known=known, size=size, image=image), pattern, rng)
-    )
+    scene = Scene(known=known, size=size, image=image, pattern=pattern, rng=rng)
+    chosen = np.sort(PATTERNS[pattern.kind](scene))
     if not chosen.size:
         raise NoPointsError(f"pattern {pattern.kind!r} leaves no point; ask for more")
     row, column = np.divmod(chosen, size[1])
@@ -139,30 +148,23 @@ def sample_points(
     return with_noise(points, noise or SampleNoise(), rng)
 
 
-def _uniform(scene: Scene, pattern: SamplePattern, rng: np.random.Generator) -> Pixels:
-    return _choice(scene.known, pattern, rng)
+def _uniform(scene: Scene) -> Pixels:
+    return scene.chosen(scene.known, scene.wanted)
 
 
-def _choice(known: Pixels, pattern: SamplePattern, rng: np.random.Generator) -> Pixels:
-    count = pattern.wanted(known.size)
-    if count > known.size:
-        raise UsageError(f"{count:,} points of {known.size:,} known pixels; ask for fewer")
-    return rng.choice(known, count, replace=False)
-
-
-def _bernoulli(scene: Scene, pattern: SamplePattern, rng: np.random.Generator) -> Pixels:
+def _bernoulli(scene: Scene) -> Pixels:
     """Each known pixel with the same probability; the count is only the expected one."""
     count = scene.known.size
-    return scene.known[rng.random(count) < pattern.wanted(count) / count]
+    return scene.known[scene.rng.random(count) < scene.wanted / count]
 
 
-def _grid(scene: Scene, pattern: SamplePattern, rng: np.random.Generator) -> Pixels:
+def _grid(scene: Scene) -> Pixels:
     """Known pixels of a square grid whose spacing gives a full map the wanted count."""
     height, width = scene.size
-    if pattern.fraction is not None:
-        spacing = pattern.fraction**-0.5
+    if scene.pattern.fraction is not None:
+        spacing = scene.pattern.fraction**-0.5
     else:
-        spacing = max(1.0, (height * width / pattern.wanted(scene.known.size)) ** 0.5)
+        spacing = max(1.0, (height * width / scene.wanted) ** 0.5)
     rows, columns = (
         (np.floor((np.arange(max(1, round(side / spacing))) + 0.5) * spacing)).astype(np.intp)
         for side in (height, width)
@@ -171,35 +173,22 @@ def _grid(scene: Scene, pattern: SamplePattern, rng: np.random.Generator) -> Pix
     return np.intersect1d(nodes, scene.known)
 
 
-def _lines(scene: Scene, pattern: SamplePattern, rng: np.random.Generator) -> Pixels:
+def _lines(scene: Scene) -> Pixels:
     """All known pixels of evenly spaced rows."""
     height, width = scene.size
-    count = pattern.wanted(height)
+    count = scene.pattern.wanted(height)
     if count > height:
         raise UsageError(f"{count:,} lines do not fit {height:,} rows; ask for fewer")
     rows = np.floor((np.arange(count) + 0.5) * height / count).astype(np.intp)
     return scene.known[np.isin(scene.known // width, rows)]
 
 
-def _region(scene: Scene, pattern: SamplePattern, rng: np.random.Generator) -> Pixels:
-    """Known pixels of a rectangle: all, or a random choice of the wanted count."""
-    left, top, width, height = pattern.region or (0, 0, 0, 0)
-    row, column = np.divmod(scene.known, scene.size[1])
-    inside = (column >= left) & (column < left + width) & (row >= top) & (row < top + height)
-    if not inside.any():
-        raise NoPointsError(
-            f"region {left},{top},{width},{height} holds no pixel with known depth of the"
-            f" {scene.size[1]}×{scene.size[0]} image"
-        )
-    return _choice(scene.known[inside], pattern, rng)
-
-
-def _features(scene: Scene, pattern: SamplePattern, rng: np.random.Generator) -> Pixels:
+def _features(scene: Scene) -> Pixels:
     """The strongest ORB corners with known depth, as structure from motion has its points."""
     # Corners of several pyramid levels share pixels; three times as many leave enough when merged.
-    wanted = pattern.wanted(scene.known.size)
+    wanted = scene.wanted
     detector = cv2.ORB_create(nfeatures=3 * wanted + 100, edgeThreshold=4, fastThreshold=5)  # type: ignore[attr-defined]
-    corners = sorted(detector.detect(scene.grey(pattern)), key=lambda corner: -corner.response)
+    corners = sorted(detector.detect(scene.grey), key=lambda corner: -corner.response)
     xy = np.array([corner.pt for corner in corners], np.float64).reshape(-1, 2)
     column, row = np.rint(xy).astype(np.intp).T
     pixels = row * scene.size[1] + column
@@ -209,33 +198,31 @@ def _features(scene: Scene, pattern: SamplePattern, rng: np.random.Generator) ->
     return kept
 
 
-def _edges(scene: Scene, pattern: SamplePattern, rng: np.random.Generator) -> Pixels:
+def _edges(scene: Scene) -> Pixels:
     """Known pixels on the image's edges (Canny), a random choice of the wanted count."""
-    grey = cv2.GaussianBlur(scene.grey(pattern), (5, 5), 0)
-    candidates = np.intersect1d(np.flatnonzero(cv2.Canny(grey, 30, 90)), scene.known)
-    count = min(pattern.wanted(scene.known.size), candidates.size)
-    return rng.choice(candidates, count, replace=False)
+    edges = cv2.Canny(cv2.GaussianBlur(scene.grey, (5, 5), 0), 30, 90)
+    candidates = np.intersect1d(np.flatnonzero(edges), scene.known)
+    return scene.chosen(candidates, min(scene.wanted, candidates.size))
 
 
-PATTERNS: dict[str, Callable[[Scene, SamplePattern, np.random.Generator], Pixels]] = {
-    "uniform": _uniform,
-    "bernoulli": _bernoulli,
-    "grid": _grid,
-    "lines": _lines,
-    "features": _features,
-    "edges": _edges,
-    "region": _region,
-}
+def _region(scene: Scene) -> Pixels:
+    """Known pixels of a rectangle: all, or a random choice of the wanted count."""
+    left, top, width, height = scene.pattern.region or (0, 0, 0, 0)
+    row, column = np.divmod(scene.known, scene.size[1])
+    inside = (column >= left) & (column < left + width) & (row >= top) & (row < top + height)
+    if not inside.any():
+        raise NoPointsError(f"no known pixel in the region {left},{top},{width},{height}; check it")
+    pixels = scene.known[inside]
+    return scene.chosen(pixels, scene.pattern.wanted(pixels.size))
+
+
+_FUNCTIONS = (_uniform, _bernoulli, _grid, _lines, _features, _edges, _region)
+PATTERNS = {function.__name__.removeprefix("_"): function for function in _FUNCTIONS}
 """The patterns by name, as in `choices.PATTERNS`; each returns row-major indices of pixels."""
 
 
 def with_noise(points: Points, noise: SampleNoise, rng: np.random.Generator) -> Points:
     """Returns the points with noise, without those that it makes impossible or moves outside.
-
-    Args:
-        points: Points of one image.
-        noise: What is added.
-        rng: Draws the noise.
 
     Raises:
         NoPointsError: No point is left.

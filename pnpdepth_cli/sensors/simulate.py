@@ -2,23 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pnpdepth_cli.errors import NoPointsError, UsageError
+from pnpdepth_cli.errors import NoPointsError
 from pnpdepth_cli.points import in_frame
 from pnpdepth_cli.sensors.camera import Camera
 from pnpdepth_cli.sensors.lidar import Lidar
-from pnpdepth_cli.sensors.sparse import (
-    FARTHEST_M,
-    DropCounter,
-    Floats,
-    Mask,
-    Points,
-    pixel_index,
-)
+from pnpdepth_cli.sensors.sparse import FARTHEST_M, DropCounter, Floats, Mask, Points, pixel_index
 
 _SAME_SURFACE = 1.1
 """Neighbouring pixels whose depths are within this ratio belong to one surface."""
@@ -30,63 +23,28 @@ _LONGEST_WALK = 2048
 """Steps; beams that cross more pixels, close to the scanner, take longer steps."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class SimulationSettings:
-    """Noise and limits of a simulated scan; None means the sensor's own value."""
-
-    rotation_noise_deg: float = 0.0
-    """Standard deviation of a rotation of the whole scanner about each axis."""
-    angle_noise_deg: float | None = None
-    """Standard deviation of the direction of each measurement."""
-    range_noise: float | None = None
-    """Standard deviation of a range, metres."""
-    dropout: float = 0.0
-    """Fraction of beams without return."""
-    max_range: float | None = None
-    """Metres from the scanner."""
-    euclidean: bool = False
-    """Depth is the distance from the camera's centre instead of z."""
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.rotation_noise_deg <= 360 or not 0 <= self.dropout < 1:
-            raise UsageError(
-                "give a rotation noise of 0° to 360° and a drop-out of at least 0 and below 1"
-            )
-
-
-def simulate_lidar(
-    depth: NDArray[np.floating],
-    camera: Camera,
-    sensor: Lidar,
-    seed: int,
-    settings: SimulationSettings | None = None,
-) -> Points:
+def simulate_lidar(depth: NDArray[np.floating], camera: Camera, sensor: Lidar, seed: int) -> Points:
     """Returns sparse depth of one revolution of the scanner, in the image of the dense depth.
 
     Args:
         depth: (H, W) metres along the camera's axis, 0 = unknown.
         camera: Intrinsics, and the scanner's pose (`FORWARD_LEFT_UP` and zero: at the camera).
-        sensor: The scanner.
+        sensor: The scanner, with its noise.
         seed: Of all noise; the same seed gives the same points.
-        settings: Noise and limits; None for the sensor's own.
 
     Raises:
         NoPointsError: No beam hits anything that the camera sees.
     """
-    settings = settings or SimulationSettings()
-    names = ("angle_noise_deg", "range_noise", "max_range")
-    given = {name: getattr(settings, name) for name in names}
-    sensor = replace(sensor, **{name: value for name, value in given.items() if value is not None})
     size = (depth.shape[0], depth.shape[1])
     rng = np.random.default_rng(seed)
-    turned = _rotated(camera, settings.rotation_noise_deg, rng)
+    turned = _rotated(camera, sensor.rotation_noise_deg, rng)
     beams = sensor.directions(rng) @ turned.rotation.T
     drops = DropCounter(len(beams))
     z = _depth_at_first_hit(np.asarray(depth, np.float64), turned, beams)
     met = drops.keep(np.isfinite(z), "meets nothing that the camera sees")
     distance = (z[met] - camera.translation[2]) / beams[met, 2]
     kept = drops.keep(distance <= sensor.max_range, "out of range")
-    returned = drops.keep(rng.random(np.count_nonzero(kept)) >= settings.dropout, "dropped out")
+    returned = drops.keep(rng.random(np.count_nonzero(kept)) >= sensor.dropout, "dropped out")
     distance, beams = distance[kept][returned], beams[met][kept][returned]
     if sensor.range_noise > 0:
         distance = distance + rng.normal(0, sensor.range_noise, len(distance))
@@ -102,10 +60,9 @@ def simulate_lidar(
             f"no beam of {sensor.name} gives a point in the image ({drops}); check depth,"
             " intrinsics and where the scanner stands"
         )
-    values = np.linalg.norm(points, axis=1) if settings.euclidean else points[:, 2]
     return Points(
         xy=xy.astype(np.float32),
-        depth=values.astype(np.float32),
+        depth=points[:, 2].astype(np.float32),
         size=size,
         dropped=drops.dropped,
     )
@@ -176,7 +133,7 @@ def _walk_length(camera: Camera, beams: Floats, near: float, far: float, depth: 
     """The number of steps in which no beam in the image moves by more than a pixel."""
     start = camera.translation
     ends = [camera.pixels_of(_reached(start, beams, z)) for z in (near, far)]
-    size = (depth.shape[0], depth.shape[1])
+    size = depth.shape[0], depth.shape[1]
     seen = in_frame(ends[0], size) | in_frame(ends[1], size)
     if not seen.any():
         return 1

@@ -41,23 +41,15 @@ class DropCounter:
         self.dropped: dict[str, int] = {}
 
     def keep(self, mask: Mask, otherwise: str) -> Mask:
-        """Keeps the rows where `mask` is true and returns it.
-
-        Args:
-            mask: Over the rows that were left by the step before.
-            otherwise: Why the other rows are dropped.
-        """
+        """Keeps the rows, of those left, where `mask` is true; returns it. `otherwise` says why."""
         self.dropped[otherwise] = int(len(mask) - np.count_nonzero(mask))
         self.index = self.index[mask]
         return mask
 
     def keep_seen(self, xyz: Floats, xy: Floats, size: tuple[int, int]) -> tuple[Floats, Floats]:
-        """Keeps the points in an image that are the nearest of their pixel, and returns them.
+        """Keeps the points in an image (H, W) that are the nearest of their pixel; returns them.
 
-        Args:
-            xyz: (N, 3) in the camera's frame.
-            xy: (N, 2) their pixel coordinates; NaN for points that the lens does not show.
-            size: (H, W) of the image.
+        They are given in the camera's frame and at pixels, NaN where the lens does not show them.
         """
         inside = self.keep(in_frame(xy, size), "outside the image")
         xyz, xy = xyz[inside], xy[inside]

@@ -75,8 +75,8 @@ def test_sample_takes_a_number_or_a_share(
         assert record["points"]["count"] == points
         assert record["seed"] == 3
     assert code_of([*arguments, "--count", "many"]) == 2
-    assert code_of([*arguments, "--pattern", "region", "--region", "1,2,3"]) == 2
-    assert code_of([*arguments, "--pattern", "region", "--region", "1,2,3,4"]) == 0
+    assert code_of([*arguments, "--pattern", "region:1,2,3"]) == 2
+    assert code_of([*arguments, "--pattern", "region:1,2,3,4"]) == 0
 
 
 def test_simulate_writes_the_sensors_points(
@@ -84,7 +84,7 @@ def test_simulate_writes_the_sensors_points(
 ) -> None:
     arguments = ["simulate", str(frame.gt), "--calib", str(frame.calib), "--seed", "1"]
     output = ["-o", str(frame.folder / "s.exr")]
-    assert code_of([*arguments, *output, "--sensor", "hdl-64e", "--offset", "0", "-0.1", "0"]) == 0
+    assert code_of([*arguments, *output, "--sensor", "hdl-64e", "--position", "0,-0.1,0"]) == 0
     assert "hdl-64e, seed 1" in capsys.readouterr().err
     assert (frame.folder / "s.exr").exists()
     assert code_of([*arguments, *output, "--overwrite", "--sensor", "hdl-65e"]) == 2

@@ -23,7 +23,7 @@ from pnpdepth_cli.io.depth import read_depth, write_depth
 from pnpdepth_cli.io.record import read_json, sha256_of
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.io.scans import read_scan
-from pnpdepth_cli.io.sparse_reading import read_sparse
+from pnpdepth_cli.io.sparse_files import read_sparse
 
 READERS = [read_depth, read_sparse, read_rgb, read_calibration, read_json, sha256_of]
 DEPTH = np.full((6, 8), 2.5, np.float32)

@@ -100,7 +100,10 @@ BROKEN = [
     ("hello\n" + KITTI, "line 1: 'hello' has no name"),
     (YAML.replace("K:", "k:"), "'k' is not part of a calibration"),
     (YAML.replace("t:", "#t:"), "has R but no t"),
-    (YAML.replace("[-0.3, 0.1, 0.0, 0.001]", "[-0.3]"), "distortion has 1 numbers"),
+    (
+        YAML.replace("[-0.3, 0.1, 0.0, 0.001]", "[-0.3]"),
+        "1 coefficients of radial-tangential",
+    ),
     (YAML.replace("1242", "0"), "no image"),
     ("1 2 3", "K has 3 numbers instead of 9"),
     ('{"K": [1, 2', "is not valid JSON"),
@@ -127,9 +130,22 @@ def test_a_camera_of_a_plain_file_is_refused(tmp_path: Path) -> None:
 def test_a_folder_without_kittis_files_is_an_error_that_names_them(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"has no calib_cam_to_cam\.txt"):
         read_calibration(tmp_path)
-    (tmp_path / "calib_cam_to_cam.txt").write_text("x: 1")
-    with pytest.raises(InputError, match=r"has no calib_velo_to_cam\.txt"):
+    (tmp_path / "calib_velo_to_cam.txt").write_text("x: 1")
+    with pytest.raises(InputError, match=r"has no calib_cam_to_cam\.txt"):
         read_calibration(tmp_path)
+
+
+def test_kittis_cameras_are_read_without_their_scanner(tmp_path: Path) -> None:
+    path = write(
+        tmp_path,
+        "calib_time: 09-Jan-2012 13:57:47\nR_rect_00: 1 0 0 0 1 0 0 0 1\n"
+        "S_rect_02: 1242 375\nP_rect_02: 700 0 600 42 0 700 170 0 0 0 1 0\n",
+        "calib_cam_to_cam.txt",
+    )
+    for place in (tmp_path, path):
+        got = read_calibration(place)
+        assert got.intrinsics.tolist() == [[700, 0, 600], [0, 700, 170], [0, 0, 1]]
+        assert (got.size, got.has_pose) == ((375, 1242), False)
 
 
 def test_an_image_as_calibration_is_recognised(tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ NORMALS = (XYZ / np.linalg.norm(XYZ, axis=1, keepdims=True)).astype(np.float32)
 @pytest.mark.parametrize("rgb", [RGB, None])
 def test_trimesh_reads_points_and_colours_of_a_ply(tmp_path: Path, rgb: np.ndarray | None) -> None:
     trimesh = pytest.importorskip("trimesh")
-    write_cloud(tmp_path / "a.ply", XYZ, NORMALS, rgb)
+    write_cloud(tmp_path / "a.ply", [(XYZ, NORMALS, rgb)])
     cloud = trimesh.load(tmp_path / "a.ply")
     assert (cloud.vertices.astype(np.float32) == XYZ).all()
     if rgb is not None:
@@ -30,13 +30,14 @@ def test_trimesh_reads_points_and_colours_of_a_ply(tmp_path: Path, rgb: np.ndarr
 def test_our_own_reader_takes_a_ply_as_a_scan(tmp_path: Path) -> None:
     from pnpdepth_cli.io.scans import read_scan
 
-    write_cloud(tmp_path / "a.ply", XYZ, NORMALS, RGB)
+    parts = [(XYZ[part], NORMALS[part], RGB[part]) for part in (slice(0, 70), slice(70, 200))]
+    assert write_cloud(tmp_path / "a.ply", parts) == 200
     assert (read_scan(tmp_path / "a.ply").points[:, :3] == XYZ).all()
 
 
 def test_a_glb_has_y_up_and_z_backwards(tmp_path: Path) -> None:
     trimesh = pytest.importorskip("trimesh")
-    write_cloud(tmp_path / "a.glb", XYZ, NORMALS, RGB)
+    write_cloud(tmp_path / "a.glb", [(XYZ, NORMALS, RGB)])
     (cloud,) = trimesh.load(tmp_path / "a.glb").geometry.values()
     assert cloud.vertices == pytest.approx(XYZ * [1, -1, -1], abs=1e-6)
     assert (np.asarray(cloud.colors)[:, :3] == RGB).all()
@@ -45,7 +46,7 @@ def test_a_glb_has_y_up_and_z_backwards(tmp_path: Path) -> None:
 def test_a_laz_keeps_points_to_a_tenth_of_a_millimetre(tmp_path: Path) -> None:
     laspy = pytest.importorskip("laspy")
     pytest.importorskip("lazrs")
-    write_cloud(tmp_path / "a.laz", XYZ, NORMALS, RGB)
+    write_cloud(tmp_path / "a.laz", [(XYZ, NORMALS, RGB)])
     las = laspy.read(tmp_path / "a.laz")
     assert np.column_stack([las.x, las.y, las.z]) == pytest.approx(XYZ, abs=1e-4)
     assert (np.column_stack([las.red, las.green, las.blue]) // 257 == RGB).all()
@@ -53,7 +54,7 @@ def test_a_laz_keeps_points_to_a_tenth_of_a_millimetre(tmp_path: Path) -> None:
 
 def test_a_suffix_without_a_writer_is_refused_and_nothing_is_written(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match=r"\.ply, \.glb, \.laz"):
-        write_cloud(tmp_path / "a.obj", XYZ, NORMALS, RGB)
+        write_cloud(tmp_path / "a.obj", [(XYZ, NORMALS, RGB)])
     assert list(tmp_path.iterdir()) == []
 
 
@@ -63,5 +64,5 @@ def test_a_missing_package_names_the_extra(
 ) -> None:
     monkeypatch.setitem(sys.modules, package, None)
     with pytest.raises(UsageError, match=r"pnpdepth\[cloud\]"):
-        write_cloud(tmp_path / f"a{suffix}", XYZ, NORMALS, RGB)
+        write_cloud(tmp_path / f"a{suffix}", [(XYZ, NORMALS, RGB)])
     assert list(tmp_path.iterdir()) == []

@@ -16,7 +16,7 @@ from pnpdepth_cli.errors import FileFormatError, InputError
 from pnpdepth_cli.io.depth import read_depth, write_depth
 from pnpdepth_cli.io.formats import DEPTH_SUFFIXES
 from pnpdepth_cli.io.rgb import read_rgb
-from pnpdepth_cli.io.sparse_reading import read_sparse
+from pnpdepth_cli.io.sparse_files import read_sparse
 
 DEPTH = np.random.default_rng(5).uniform(0.5, 80, (40, 53)).astype(np.float32)
 

@@ -35,7 +35,7 @@ from pathlib import Path
 import numpy as np
 from pnpdepth_cli.io.depth import read_depth, write_depth
 from pnpdepth_cli.io.formats import DEPTH_SUFFIXES
-from pnpdepth_cli.io.sparse_writing import SPARSE_SUFFIXES
+from pnpdepth_cli.io.sparse_files import SPARSE_SUFFIXES
 from pnpdepth_cli.cli.refine import refine
 
 depth = np.array([[1.5, 0], [2.25, 80]], np.float32)

@@ -17,18 +17,20 @@ def write(folder: Path, text: str) -> Path:
 def test_listed_elevations_are_taken_as_they_stand(tmp_path: Path) -> None:
     text = 'name = "five"\nelevations_deg = [10, 5, 0.5, -5, -10]\nazimuth_step_deg = 0.2\n'
     got = read_sensor(write(tmp_path, text + "max_range = 80\nrange_noise = 0.02\n"))
-    assert got.name == "five"
-    assert got.elevations_deg == (10, 5, 0.5, -5, -10)
-    assert (got.azimuth_step_deg, got.max_range) == (0.2, 80)
-    assert (got.range_noise, got.angle_noise_deg) == (0.02, 0)
+    assert got == {
+        "name": "five",
+        "elevations_deg": (10, 5, 0.5, -5, -10),
+        "azimuth_step_deg": 0.2,
+        "max_range": 80,
+        "range_noise": 0.02,
+    }
 
 
 def test_even_elevations_go_down_from_the_top(tmp_path: Path) -> None:
     text = "top_deg = 3\nstep_deg = 1.5\nbeams = 4\nazimuth_step_deg = 1\n"
     got = read_sensor(write(tmp_path, text))
-    assert got.elevations_deg == (3, 1.5, 0, -1.5)
-    assert got.name == "mine"
-    assert got.max_range == float("inf")
+    assert got["elevations_deg"] == (3, 1.5, 0, -1.5)
+    assert got["name"] == "mine"
 
 
 @pytest.mark.parametrize(
@@ -37,13 +39,19 @@ def test_even_elevations_go_down_from_the_top(tmp_path: Path) -> None:
         ("elevations_deg = [1\n", "not valid TOML"),
         ("elevations_deg = [1]\n", "azimuth_step_deg is missing"),
         ("azimuth_step_deg = 1\n", "top_deg is missing"),
-        ("elevations_deg = []\nazimuth_step_deg = 1\n", "not a list of degrees"),
+        ("elevations_deg = []\nazimuth_step_deg = 1\n", "not a list of at most"),
         ('elevations_deg = ["up"]\nazimuth_step_deg = 1\n', "not a number"),
         ("elevations_deg = [1]\ntop_deg = 1\nazimuth_step_deg = 1\n", "not both"),
         ("top_deg = 1\nstep_deg = 1\nbeams = 1.5\nazimuth_step_deg = 1\n", "whole number"),
         ("elevations_deg = [1]\nazimut_step_deg = 1\n", "'azimut_step_deg' is not part"),
         ("elevations_deg = [nan]\nazimuth_step_deg = 1\n", "not a number"),
+        ("elevations_deg = " + "[" * 5000 + "]" * 5000, "not valid TOML"),
+        ("elevations_deg = [1]\nazimuth_step_deg = 1" + "0" * 400 + "\n", "not a number"),
+        ("elevations_deg = [1]\nazimuth_step_deg = 1" + "0" * 5000 + "\n", "not valid TOML"),
+        (f"elevations_deg = {[0] * 300_000}\nazimuth_step_deg = 1\n", "at most 4,096 degrees"),
+        ("elevations_deg = [[[[]]]]\nazimuth_step_deg = 1\n", "not a number"),
     ],
+    ids=range(14),
 )
 def test_what_is_missing_or_wrong_is_named_in_one_line(
     tmp_path: Path, text: str, message: str
@@ -51,22 +59,5 @@ def test_what_is_missing_or_wrong_is_named_in_one_line(
     with pytest.raises(FileFormatError) as error:
         read_sensor(write(tmp_path, text))
     assert message in str(error.value)
-    assert "\n" not in str(error.value)
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("elevations_deg = " + "[" * 5000 + "]" * 5000, "not valid TOML"),
-        ("elevations_deg = [1]\nazimuth_step_deg = 1" + "0" * 400 + "\n", "not a number"),
-        ("elevations_deg = [1]\nazimuth_step_deg = 1" + "0" * 5000 + "\n", "not valid TOML"),
-        (f"elevations_deg = {[0] * 300_000}\nazimuth_step_deg = 1\n", "300,000 elevations"),
-        ("elevations_deg = [[[[]]]]\nazimuth_step_deg = 1\n", "not a number"),
-    ],
-    ids=["nested", "400-digits", "5000-digits", "many-beams", "list-in-list"],
-)
-def test_a_hostile_file_is_refused_in_one_line(tmp_path: Path, text: str, message: str) -> None:
-    with pytest.raises(FileFormatError, match=message) as error:
-        read_sensor(write(tmp_path, text))
     assert "\n" not in str(error.value)
     assert len(str(error.value)) < 500

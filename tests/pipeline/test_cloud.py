@@ -122,8 +122,8 @@ def test_a_damaged_camera_in_a_record_is_one_line(tmp_path: Path, changes: dict[
 def test_pixels_beyond_the_limits_are_left_out(tmp_path: Path) -> None:
     depth = np.linspace(1, 5, HEIGHT * WIDTH).reshape(HEIGHT, WIDTH).astype(np.float32)
     write_depth(tmp_path / "d.exr", depth)
-    record = written(tmp_path / "d.exr", tmp_path / "d.ply", edge=0, min_depth=2, max_depth=3)
-    assert record["points"] == int(((depth >= 2) & (depth <= 3)).sum())
+    record = written(tmp_path / "d.exr", tmp_path / "d.ply", edge=0, max_depth=3)
+    assert record["points"] == int((depth <= 3).sum())
     assert not record["coloured"]
 
 
@@ -170,7 +170,8 @@ def test_voxels_merge_what_two_frames_see(tmp_path: Path) -> None:
         ({"fov_deg": 0.0}, UsageError, "--fov is 0"),
         ({"voxel": 0.0}, UsageError, "--voxel"),
         ({"edge": math.inf}, UsageError, "--edge"),
-        ({"min_depth": 90.0}, InputError, "no pixel is left"),
+        ({"max_depth": 0.5}, InputError, "no pixel is left"),
+        ({"min_views": 2}, UsageError, "--min-views 2 needs"),
         ({"max_sigma": 0.1}, InputError, "--uncertainty"),
     ],
 )

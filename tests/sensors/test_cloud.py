@@ -2,23 +2,36 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from pnpdepth_cli.sensors import cloud as module
 from pnpdepth_cli.sensors.camera import Camera
 from pnpdepth_cli.sensors.cloud import (
     PointCloud,
     VoxelGrid,
     cloud_from_depth,
-    concatenated,
     depth_edges,
 )
 
 HEIGHT, WIDTH = 24, 32
 INTRINSICS = np.array([[30.0, 0, 15.5], [0, 28.0, 11.0], [0, 0, 1]])
 CAMERA = Camera(intrinsics=INTRINSICS)
+
+
+def whole(depth: np.ndarray, camera: Camera, **options: Any) -> PointCloud:
+    return joined(cloud_from_depth(depth, camera, **options))
+
+
+def joined(clouds: Iterable[PointCloud]) -> PointCloud:
+    xyz, normals, rgb = zip(*clouds, strict=True)
+    colours = None if rgb[0] is None else np.concatenate(rgb)
+    return PointCloud(xyz=np.concatenate(xyz), normals=np.concatenate(normals), rgb=colours)
 
 
 def plane_depth(normal: tuple[float, float, float], distance: float) -> np.ndarray:
@@ -30,7 +43,7 @@ def plane_depth(normal: tuple[float, float, float], distance: float) -> np.ndarr
 
 def test_points_project_back_onto_their_pixels() -> None:
     depth = np.random.default_rng(0).uniform(1, 9, (HEIGHT, WIDTH)).astype(np.float32)
-    cloud = cloud_from_depth(depth, CAMERA, edge=0)
+    cloud = whole(depth, CAMERA, edge=0)
     rows, columns = np.mgrid[:HEIGHT, :WIDTH]
     pixels = np.column_stack([columns.ravel(), rows.ravel()])
     assert cloud.xyz[:, 2] == pytest.approx(depth.ravel(), rel=1e-6)
@@ -40,7 +53,7 @@ def test_points_project_back_onto_their_pixels() -> None:
 def test_points_of_a_lens_with_distortion_project_back_onto_their_pixels() -> None:
     camera = Camera(intrinsics=INTRINSICS, distortion=(-0.1, 0.02, 0.001, -0.002, 0.0))
     depth = np.full((HEIGHT, WIDTH), 2, np.float32)
-    xyz = cloud_from_depth(depth, camera).xyz.astype(np.float64)
+    xyz = whole(depth, camera).xyz.astype(np.float64)
     rows, columns = np.mgrid[:HEIGHT, :WIDTH]
     pixels = np.column_stack([columns.ravel(), rows.ravel()])
     assert camera.pixels_of(xyz) == pytest.approx(pixels, abs=1e-3)
@@ -49,10 +62,10 @@ def test_points_of_a_lens_with_distortion_project_back_onto_their_pixels() -> No
 @given(st.floats(-0.4, 0.4), st.floats(-0.4, 0.4), st.floats(0.5, 20))
 def test_a_plane_has_its_normal_everywhere_and_no_edge(a: float, b: float, distance: float) -> None:
     normal = np.array([a, b, 1.0]) / np.linalg.norm([a, b, 1.0])
-    cloud = cloud_from_depth(plane_depth(tuple(normal), distance), CAMERA)
-    assert len(cloud) == HEIGHT * WIDTH
-    assert cloud.xyz @ normal == pytest.approx(np.full(len(cloud), distance), rel=1e-4)
-    assert cloud.normals @ -normal == pytest.approx(np.ones(len(cloud)), abs=1e-3)
+    cloud = whole(plane_depth(tuple(normal), distance), CAMERA)
+    assert len(cloud.xyz) == HEIGHT * WIDTH
+    assert cloud.xyz @ normal == pytest.approx(np.full(len(cloud.xyz), distance), rel=1e-4)
+    assert cloud.normals @ -normal == pytest.approx(np.ones(len(cloud.xyz)), abs=1e-3)
 
 
 def test_both_sides_of_a_jump_are_left_out_and_nothing_else() -> None:
@@ -61,8 +74,8 @@ def test_both_sides_of_a_jump_are_left_out_and_nothing_else() -> None:
     expected = np.zeros_like(depth, bool)
     expected[:, 19:21] = True
     assert (depth_edges(depth, 0.05) == expected).all()
-    assert len(cloud_from_depth(depth, CAMERA)) == HEIGHT * (WIDTH - 2)
-    assert len(cloud_from_depth(depth, CAMERA, edge=0)) == HEIGHT * WIDTH
+    assert len(whole(depth, CAMERA).xyz) == HEIGHT * (WIDTH - 2)
+    assert len(whole(depth, CAMERA, edge=0).xyz) == HEIGHT * WIDTH
 
 
 def test_unknown_and_excluded_pixels_have_no_point() -> None:
@@ -70,32 +83,44 @@ def test_unknown_and_excluded_pixels_have_no_point() -> None:
     depth[8, 4], depth[5, 6] = 0, np.inf
     keep = np.ones(depth.shape, bool)
     keep[:2] = False
-    cloud = cloud_from_depth(depth, CAMERA, keep=keep)
-    assert len(cloud) == HEIGHT * WIDTH - 2 * WIDTH - 2
+    cloud = whole(depth, CAMERA, keep=keep)
+    assert len(cloud.xyz) == HEIGHT * WIDTH - 2 * WIDTH - 2
     assert np.isfinite(cloud.xyz).all()
-    assert np.linalg.norm(cloud.normals, axis=1) == pytest.approx(np.ones(len(cloud)), abs=1e-5)
+    assert np.linalg.norm(cloud.normals, axis=1) == pytest.approx(np.ones(len(cloud.xyz)), abs=1e-5)
 
 
 def test_a_lone_pixel_has_no_normal() -> None:
     depth = np.zeros((HEIGHT, WIDTH), np.float32)
     depth[4, 4] = 2
-    assert (cloud_from_depth(depth, CAMERA).normals == 0).all()
+    assert (whole(depth, CAMERA).normals == 0).all()
 
 
 def test_colours_are_those_of_the_pixels() -> None:
     depth = np.full((HEIGHT, WIDTH), 3, np.float32)
     codes = np.random.default_rng(1).integers(0, 256, (HEIGHT, WIDTH, 3))
-    cloud = cloud_from_depth(depth, CAMERA, rgb=(codes / 255).astype(np.float32))
+    cloud = whole(depth, CAMERA, rgb=(codes / 255).astype(np.float32))
     assert cloud.rgb is not None
     assert (cloud.rgb == codes.reshape(-1, 3)).all()
 
 
 def test_a_pose_moves_points_and_turns_normals() -> None:
-    cloud = cloud_from_depth(np.full((HEIGHT, WIDTH), 3, np.float32), CAMERA)
+    cloud = whole(np.full((HEIGHT, WIDTH), 3, np.float32), CAMERA)
     turn = np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])
     moved = cloud.transformed(np.column_stack([turn, [1.0, 2, 3]]))
     assert moved.xyz == pytest.approx(cloud.xyz @ turn.T + [1, 2, 3], abs=1e-5)
-    assert moved.normals == pytest.approx(np.tile([-1.0, 0, 0], (len(cloud), 1)), abs=1e-5)
+    assert moved.normals == pytest.approx(np.tile([-1.0, 0, 0], (len(cloud.xyz), 1)), abs=1e-5)
+
+
+def test_a_cloud_in_parts_is_that_of_the_whole_map(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(5)
+    depth = plane_depth((0.2, 0.1, 1.0), 4.0) * rng.choice([0, 1, 1.01], (HEIGHT, WIDTH))
+    rgb = rng.uniform(0, 1, (HEIGHT, WIDTH, 3)).astype(np.float32)
+    at_once = whole(depth.astype(np.float32), CAMERA, rgb=rgb)
+    monkeypatch.setattr(module, "_PART_PIXELS", 5 * WIDTH)
+    parts = list(cloud_from_depth(depth.astype(np.float32), CAMERA, rgb=rgb))
+    assert len(parts) == 5
+    for one, other in zip(joined(parts), at_once, strict=True):
+        np.testing.assert_array_equal(one, other)
 
 
 def test_merged_clouds_have_one_mean_point_per_voxel_in_any_order() -> None:
@@ -113,9 +138,9 @@ def test_merged_clouds_have_one_mean_point_per_voxel_in_any_order() -> None:
         for cloud in order:
             grid.add(cloud)
     merged, other = (grid.cloud(coloured=True) for grid in grids)
-    every = concatenated(clouds)
+    every = joined(clouds)
     cells = np.floor(every.xyz / 0.5)
-    assert len(merged) == len(np.unique(cells, axis=0))
+    assert len(merged.xyz) == len(np.unique(cells, axis=0))
     assert merged.xyz == pytest.approx(other.xyz, abs=1e-6)
     first = (cells == np.floor(merged.xyz[0] / 0.5)).all(axis=1)
     assert merged.xyz[0] == pytest.approx(every.xyz[first].mean(axis=0), abs=1e-6)

@@ -55,6 +55,8 @@ def test_directions_are_unit_vectors_at_the_sensors_angles() -> None:
         {"azimuth_step_deg": 0.0},
         {"max_range": 0.0},
         {"range_noise": -0.1},
+        {"dropout": 1.0},
+        {"rotation_noise_deg": float("nan")},
     ],
 )
 def test_a_sensor_that_cannot_be_is_refused(values: dict[str, object]) -> None:

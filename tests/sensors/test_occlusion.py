@@ -14,7 +14,6 @@ from pnpdepth_cli.io.scans import read_scan
 from pnpdepth_cli.sensors import (
     FORWARD_LEFT_UP,
     Camera,
-    ProjectionSettings,
     project_velodyne,
 )
 from pnpdepth_cli.sensors.projection import hidden_points
@@ -48,7 +47,7 @@ def test_wall_seen_past_a_board_is_hidden_and_little_else(left_m: float) -> None
     camera = Camera(
         intrinsics=K, rotation=FORWARD_LEFT_UP, translation=np.array([-left_m, 0.0, 0.0])
     )
-    everything = project_velodyne(scan, camera, SIZE, ProjectionSettings(keep_occluded=True)).index
+    everything = project_velodyne(scan, camera, SIZE, keep_occluded=True).index
     kept = project_velodyne(scan, camera, SIZE).index
     removed = np.setdiff1d(everything, kept)
     truly_hidden = np.intersect1d(everything, np.flatnonzero(hidden))
@@ -111,7 +110,7 @@ def test_on_the_rendered_street_most_points_that_contradict_the_ground_truth_go(
     )
     gt = read_depth(STREET / "gt.png").values
     scan = read_scan(STREET / "000000.bin").points
-    points = project_velodyne(scan, camera, gt.shape, ProjectionSettings(keep_occluded=True))
+    points = project_velodyne(scan, camera, gt.shape, keep_occluded=True)
     column, row = np.floor(points.xy + 0.5).astype(int).T
     kept_rows = project_velodyne(scan, camera, gt.shape).index
     hidden = ~np.isin(points.index, kept_rows)

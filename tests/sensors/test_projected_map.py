@@ -20,7 +20,6 @@ from pnpdepth_cli.sensors import (
     FORWARD_LEFT_UP,
     Camera,
     Points,
-    ProjectionSettings,
     SamplePattern,
     as_depth_image,
     occluded_in_map,
@@ -59,7 +58,7 @@ def boards_before_a_wall(*, keep_occluded: bool = True) -> Points:
         np.column_stack([x, x * y, x * z]),
         camera,
         SIZE,
-        ProjectionSettings(keep_occluded=keep_occluded),
+        keep_occluded=keep_occluded,
     )
     return points_of(as_depth_image(scan))
 

@@ -12,7 +12,6 @@ from pnpdepth_cli.sensors import (
     LIDARS,
     Camera,
     Lidar,
-    SimulationSettings,
     simulate_lidar,
 )
 
@@ -100,19 +99,17 @@ def test_range_noise_moves_points_along_their_beams() -> None:
 def test_dropout_and_maximum_range_remove_points() -> None:
     depth = np.full((240, 320), 10.0)
     full = simulate_lidar(depth, CAMERA, IDEAL, seed=0)
-    thin = simulate_lidar(depth, CAMERA, IDEAL, seed=0, settings=SimulationSettings(dropout=0.3))
+    thin = simulate_lidar(depth, CAMERA, replace(IDEAL, dropout=0.3), seed=0)
     assert 0.65 < len(thin.depth) / len(full.depth) < 0.75
-    near = simulate_lidar(
-        depth, CAMERA, IDEAL, seed=0, settings=SimulationSettings(max_range=10.2, euclidean=True)
-    )
-    assert near.depth.max() <= 10.2 + 1e-5
+    near = simulate_lidar(depth, CAMERA, replace(IDEAL, max_range=10.2), seed=0)
+    ranges = np.linalg.norm(CAMERA.unproject(near.xy, near.depth), axis=1)
+    assert ranges.max() <= 10.2 + 1e-5
     assert near.dropped["out of range"] > 0
 
 
 def test_rotation_noise_turns_the_whole_scanner() -> None:
     depth = np.full((240, 320), 10.0)
-    noise = SimulationSettings(rotation_noise_deg=1.0)
-    got = simulate_lidar(depth, CAMERA, IDEAL, seed=4, settings=noise)
+    got = simulate_lidar(depth, CAMERA, replace(IDEAL, rotation_noise_deg=1.0), seed=4)
     points = CAMERA.to_scanner(CAMERA.unproject(got.xy, got.depth))
     elevation = np.degrees(np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1])))
     off = elevation - 2 * np.rint(elevation / 2)
@@ -134,12 +131,6 @@ def test_unknown_depth_gives_no_points() -> None:
     half = np.full((240, 320), 5.0)
     half[:, :160] = 0
     assert simulate_lidar(half, CAMERA, IDEAL, seed=0).xy[:, 0].min() >= 159.5
-
-
-def test_an_invalid_fraction_is_refused() -> None:
-    for settings in ({"dropout": 1.0}, {"rotation_noise_deg": float("nan")}):
-        with pytest.raises(UsageError):
-            SimulationSettings(**settings)
 
 
 PAPER_PERCENT = {"vlp-16": 5.3, "vlp-32c": 28.8, "hdl-32e": 10.3, "hdl-64e": 18.7}
@@ -183,9 +174,8 @@ def test_the_real_sensor_seen_on_the_street_has_the_density_of_kitti() -> None:
 
 @pytest.mark.filterwarnings("error")
 def test_noise_beyond_all_bounds_leaves_no_point_and_is_refused() -> None:
-    settings = SimulationSettings(range_noise=1e300)
     with pytest.raises(NoPointsError, match="noise put it"):
-        simulate_lidar(np.full((240, 320), 8.0), CAMERA, IDEAL, 0, settings)
+        simulate_lidar(np.full((240, 320), 8.0), CAMERA, replace(IDEAL, range_noise=1e300), 0)
 
 
 def test_a_scanner_of_too_many_points_a_turn_is_refused_before_simulation() -> None:

@@ -10,14 +10,12 @@ from pnpdepth_cli.errors import NoPointsError, UsageError
 from pnpdepth_cli.sensors import (
     FORWARD_LEFT_UP,
     Camera,
-    ProjectionSettings,
     as_depth_image,
     project_velodyne,
 )
 
 K = np.array([[100.0, 0, 50], [0, 100, 40], [0, 0, 1]])
 SIZE = (80, 101)
-ALL = ProjectionSettings(keep_occluded=True)
 
 
 def camera(**fields: object) -> Camera:
@@ -46,7 +44,7 @@ def test_a_scan_projects_as_computed_by_hand() -> None:
             [12.0, 9.0, 0.0, 0.3],  # camera (-9.5, ., 10): u = -45
         ]
     )
-    got = project_velodyne(scan, posed, SIZE, ALL)
+    got = project_velodyne(scan, posed, SIZE, keep_occluded=True)
     np.testing.assert_allclose(got.xy, [[45, 30], [65, 50], [52, 41.5]], atol=1e-5)
     np.testing.assert_allclose(got.depth, [10, 5, 4], rtol=1e-6)
     assert got.index.tolist() == [0, 1, 2]
@@ -62,13 +60,12 @@ def test_range_is_the_distance_from_the_camera_instead_of_z() -> None:
     scan = np.array([[4.0, 0.0, -3.0]])  # 3 m below the axis, 4 m ahead
     wide = camera(intrinsics=np.array([[40.0, 0, 50], [0, 40, 40], [0, 0, 1]]))
     assert project_velodyne(scan, wide, SIZE).depth.tolist() == [4]
-    settings_ = ProjectionSettings(euclidean=True)
-    assert project_velodyne(scan, wide, SIZE, settings_).depth.tolist() == [5]
+    assert project_velodyne(scan, wide, SIZE, euclidean=True).depth.tolist() == [5]
 
 
 def test_of_two_points_on_a_pixel_the_nearer_wins_and_keeps_its_subpixel_position() -> None:
     scan = np.array([[20.0, 0.02, 0.0], [10.0, 0.03, 0.0], [10.0, 1.0, 0.0]])
-    got = project_velodyne(scan, camera(), SIZE, ALL)
+    got = project_velodyne(scan, camera(), SIZE, keep_occluded=True)
     assert got.index.tolist() == [1, 2]
     np.testing.assert_allclose(got.xy[0], [49.7, 40], atol=1e-5)
     assert got.dropped["behind another in their pixel"] == 1
@@ -77,15 +74,15 @@ def test_of_two_points_on_a_pixel_the_nearer_wins_and_keeps_its_subpixel_positio
 
 def test_minimum_and_maximum_range_are_distances_from_the_scanner() -> None:
     scan = np.array([[3.0, 0, 0], [5.0, 0.5, 0], [9.0, 2.0, 0]])
-    limits = ProjectionSettings(min_range=4, max_range=9, keep_occluded=True)
-    got = project_velodyne(scan, camera(translation=np.array([0, 0, 1.0])), SIZE, limits)
+    ahead = camera(translation=np.array([0, 0, 1.0]))
+    got = project_velodyne(scan, ahead, SIZE, limits=(4, 9), keep_occluded=True)
     assert got.index.tolist() == [1]  # the last is 9.2 m away
     assert got.dropped["out of range"] == 2
 
 
 def test_an_empty_range_is_a_mistake_of_the_user() -> None:
     with pytest.raises(UsageError, match="5 to 5 m is empty"):
-        ProjectionSettings(min_range=5, max_range=5)
+        project_velodyne(np.ones((1, 3)), camera(), SIZE, limits=(5, 5))
 
 
 def test_a_scan_outside_the_image_is_an_error_that_counts_its_points() -> None:
@@ -98,7 +95,7 @@ def test_a_scan_outside_the_image_is_an_error_that_counts_its_points() -> None:
 def test_the_outermost_half_pixels_belong_to_the_image_and_no_more() -> None:
     # u = 50 - 10 y: the left border of the image is at -0.5, the right one at 100.5
     scan = np.array([[10.0, y, 0] for y in (5.0499, 5.0501, -5.0499, -5.0501)])
-    assert project_velodyne(scan, camera(), SIZE, ALL).index.tolist() == [0, 2]
+    assert project_velodyne(scan, camera(), SIZE, keep_occluded=True).index.tolist() == [0, 2]
 
 
 angles = st.floats(-0.3, 0.3)
@@ -134,7 +131,7 @@ def test_a_projected_point_unprojects_to_where_it_was(
     )
     scan = np.random.default_rng(seed).uniform([-20, -20, -4], [60, 20, 4], (400, 3))
     try:
-        got = project_velodyne(scan, eye, size, ALL)
+        got = project_velodyne(scan, eye, size, keep_occluded=True)
     except NoPointsError:
         return
     back = eye.to_scanner(eye.unproject(got.xy.astype(np.float64), got.depth))
@@ -168,4 +165,4 @@ def test_a_lens_model_does_not_fold_points_from_outside_into_the_image() -> None
     folded = np.array([[10.0, 15.8, 0.0]])
     assert np.isnan(eye.pixels_of(eye.from_scanner(folded))).all()
     inside = np.array([[10.0, 5.0, 0.0], *folded])
-    assert project_velodyne(inside, eye, SIZE, ALL).index.tolist() == [0]
+    assert project_velodyne(inside, eye, SIZE, keep_occluded=True).index.tolist() == [0]

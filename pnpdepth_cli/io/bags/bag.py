@@ -28,6 +28,8 @@ BAG_SUFFIXES = (".bag", ".mcap", ".db3")
 IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 CLOUDS = ("sensor_msgs/msg/PointCloud2",)
 CAMERAS = ("sensor_msgs/msg/CameraInfo",)
+ODOMETRY = ("nav_msgs/msg/Odometry",)
+POSES = ("geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped")
 TRANSFORMS = ("tf2_msgs/msg/TFMessage",)
 
 
@@ -47,11 +49,7 @@ class Bag:
         self._decode = typestore.deserialize_ros1 if ros1 else typestore.deserialize_cdr
 
     def topics(self, kinds: Sequence[str]) -> dict[str, int]:
-        """Returns the topics of these message types with their number of messages.
-
-        Raises:
-            FileFormatError: The bag is damaged.
-        """
+        """Returns the topics of these message types with their number of messages."""
         with _as_our_errors(self.path):
             return {
                 name: int(info.msgcount)
@@ -60,11 +58,7 @@ class Bag:
             }
 
     def messages(self, topics: Sequence[str]) -> Iterator[tuple[str, int, Any]]:
-        """Yields (topic, nanoseconds at which it was logged, message) in the order of the log.
-
-        Raises:
-            FileFormatError: The bag is damaged.
-        """
+        """Yields (topic, nanoseconds at which it was logged, message) in the order of the log."""
         wanted = [each for each in self._reader.connections if each.topic in topics]
         if not wanted:
             return
@@ -113,26 +107,32 @@ def message_types(*, ros1: bool) -> Any:
     return store
 
 
-def topic_of(bag: Bag, wanted: str | None, kinds: Sequence[str], option: str) -> str:
-    """Returns the topic that is named, or the only one of these message types.
+def topic_of(bag: Bag, wanted: Sequence[str], kinds: Sequence[str]) -> str:
+    """Returns the topic of these message types that is named, or else the only one.
 
     Raises:
-        UsageError: The named one is not there, or there are several or none.
+        UsageError: There are several or none.
     """
     topics = bag.topics(kinds)
-    listing = ", ".join(f"{name} ({count:,} messages)" for name, count in topics.items())
-    if wanted is not None:
-        if wanted not in topics:
-            raise UsageError(
-                f"{bag.path} has no topic {wanted} of {kinds[0]}; there are {listing or 'none'}"
-            )
-        return wanted
     # an image and its compressed copy are one camera
     names = [n for n in topics if not (n.endswith("/compressed") and n[:-11] in topics)]
+    names = [n for n in wanted if n in topics] or names
     if len(names) != 1:
+        listing = ", ".join(f"{name} ({count:,} messages)" for name, count in topics.items())
         what = f"several topics of {kinds[0]}" if names else f"no topic of {kinds[0]}"
-        raise UsageError(f"{bag.path} has {what}; choose with {option}: {listing or 'none'}")
+        raise UsageError(f"{bag.path} has {what}; choose with --topics: {listing or 'none'}")
     return names[0]
+
+
+def check_topics(bag: Bag, wanted: Sequence[str], kinds: Sequence[str]) -> None:
+    """Raises UsageError for a topic that is not there, or not of these message types."""
+    topics = bag.topics(kinds)
+    for name in wanted:
+        if name not in topics:
+            raise UsageError(
+                f"{bag.path} has no topic {name} of images, points or poses; there are"
+                f" {', '.join(topics) or 'none'}"
+            )
 
 
 @contextmanager
@@ -163,11 +163,7 @@ _COMPUTED = """
 
 
 def check_bag(path: Path) -> None:
-    """Raises FileFormatError if a bag is compressed as a whole, or its database computes values.
-
-    Args:
-        path: A file, or a folder with metadata.yaml.
-    """
+    """Raises FileFormatError if a bag is compressed as a whole, or its database computes values."""
     if path.is_dir():
         _check_metadata(path / _METADATA)
     files = sorted(path.glob("*.db3")) if path.is_dir() else [path]

@@ -1,8 +1,13 @@
-"""Images and point clouds of ROS messages; every size is checked against the bytes there are."""
+"""Images and point clouds of ROS messages, and which belong together.
+
+Every size is checked against the bytes there are.
+"""
 
 from __future__ import annotations
 
-from typing import Any
+from collections import deque
+from collections.abc import Iterable, Iterator
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -13,6 +18,9 @@ from pnpdepth_cli.io.file_bytes import one_line
 
 _NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 """Data types of sensor_msgs/PointField."""
+
+_MOST_WAITING = 64
+"""Images or scans that wait for a partner; further ones push the oldest out."""
 
 _MAGIC = {b"\xff\xd8\xff": ".jpg", b"\x89PN": ".png"}
 _CHANNELS = {"rgb8": 3, "bgr8": 3, "8UC3": 3, "rgba8": 4, "bgra8": 4, "mono8": 1, "8UC1": 1}
@@ -29,13 +37,7 @@ _TO_BGR = {
 
 
 def image_file(message: Any, topic: str) -> tuple[str, bytes]:
-    """Returns (suffix, bytes) of an image file with the pixels of a message.
-
-    A compressed image is the file that it holds; any other becomes a PNG.
-
-    Args:
-        message: sensor_msgs/Image or sensor_msgs/CompressedImage.
-        topic: Named in messages.
+    """Returns (suffix, bytes) of the file in a CompressedImage, or of a PNG of an Image.
 
     Raises:
         FileFormatError: The message holds no image that is known here.
@@ -47,7 +49,7 @@ def image_file(message: Any, topic: str) -> tuple[str, bytes]:
         if suffix is None:
             raise FileFormatError(
                 f"{topic}: a compressed image ({one_line(message.format)[:30]}) is neither JPEG nor"
-                " PNG; name another --image-topic"
+                " PNG; name another topic with --topics"
             )
         return suffix, data
     done, encoded = cv2.imencode(".png", _pixels(message, topic), [cv2.IMWRITE_PNG_COMPRESSION, 1])
@@ -82,10 +84,6 @@ def _pixels(message: Any, topic: str) -> NDArray[np.uint8]:
 
 def cloud_points(message: Any, topic: str) -> NDArray[np.float32]:
     """Returns the (N, 3) finite points x y z of a sensor_msgs/PointCloud2, of any field layout.
-
-    Args:
-        message: The cloud.
-        topic: Named in messages.
 
     Raises:
         FileFormatError: It has no x, y and z, or claims more than it holds.
@@ -126,3 +124,44 @@ def seconds_of(message: Any, logged_ns: int) -> float:
     stamp = message.header.stamp
     time_s = int(stamp.sec) + 1e-9 * int(stamp.nanosec)
     return time_s if time_s > 0 else 1e-9 * logged_ns
+
+
+class Stamped(NamedTuple):
+    """A message with the time of its header."""
+
+    time_s: float
+    message: Any
+
+
+def nearest_pairs(
+    stream: Iterable[tuple[bool, Stamped]], tolerance_s: float
+) -> Iterator[tuple[Stamped, Stamped | None]]:
+    """Yields each image, in order, with the scan nearest in time; None without one.
+
+    Few messages are in memory. A scan may be the nearest of several images.
+
+    Args:
+        stream: (whether it is an image, the message); each kind in the order of its time.
+        tolerance_s: Largest difference of the two times.
+    """
+    images: deque[Stamped] = deque()
+    scans: deque[Stamped] = deque(maxlen=_MOST_WAITING)
+    for is_image, each in stream:
+        (images if is_image else scans).append(each)
+        # an image is decided once a scan after it is known
+        while images and (
+            (scans and scans[-1].time_s >= images[0].time_s) or len(images) > _MOST_WAITING
+        ):
+            yield _paired(images.popleft(), scans, tolerance_s)
+    for image in images:
+        yield _paired(image, scans, tolerance_s)
+
+
+def _paired(
+    image: Stamped, scans: deque[Stamped], tolerance_s: float
+) -> tuple[Stamped, Stamped | None]:
+    while len(scans) > 1 and scans[1].time_s <= image.time_s:
+        scans.popleft()
+    nearest = min(scans, key=lambda scan: abs(scan.time_s - image.time_s), default=None)
+    near = nearest is not None and abs(nearest.time_s - image.time_s) <= tolerance_s
+    return image, nearest if near else None

@@ -29,7 +29,7 @@ from pnpdepth_cli.io.dataset.frame import Pose, Unmatched
 from pnpdepth_cli.io.dataset.protocols import PROTOCOLS
 from pnpdepth_cli.io.file_bytes import one_line, read_bytes
 from pnpdepth_cli.io.layouts.layout import Parts, either, row
-from pnpdepth_cli.io.oxts import PACKETS
+from pnpdepth_cli.io.poses import PACKETS
 
 _CAMERAS, _SCANS, _CALIBRATION = "image_0[23]", "velodyne_points/data", "calib_cam_to_cam.txt"
 _STEM = r"(.*_sync|)(?:_(?:image|velodyne_raw|groundtruth_depth)(?=_))?(.+)"

@@ -29,13 +29,10 @@ def unpacked(
     """
     if not is_bag(request.source):
         if options != BagOptions():
-            raise UsageError(
-                f"{request.source} is no bag, so --image-topic, --points-topic, --poses-topic and"
-                " --tolerance do not apply"
-            )
+            raise UsageError(f"{request.source} is no bag; leave out --topics and --tolerance")
         return request
     from pnpdepth_cli.pipeline.sparse.frames import (
-        POSES,
+        POSES_FILE,
         FramesRequest,
         write_frames,
         written_before,
@@ -50,7 +47,7 @@ def unpacked(
             raise UsageError(f"--dry-run writes nothing; run `pnpdepth frames {request.source}`")
         record = write_frames(frames, say)
         say(f"bag: wrote {record['frames']:,} frames to {folder}")
-    sequence, poses = request.sequence, folder / POSES
+    sequence, poses = request.sequence, folder / POSES_FILE
     if sequence.accumulate and sequence.poses is None and poses.is_file():
         sequence = replace(sequence, poses=poses)
     return replace(request, source=folder, sequence=sequence)

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.io.dataset.frame import Frame, Neighbour
-from pnpdepth_cli.io.oxts import read_oxts_poses
-from pnpdepth_cli.io.poses import read_pose_of_each
+from pnpdepth_cli.io.poses import read_oxts_poses, read_poses
 from pnpdepth_cli.pipeline.evaluation.dependence import groups_by_name
 from pnpdepth_cli.pipeline.refinement.method import needs_check, resolve_method
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest
@@ -119,7 +118,7 @@ def _neighbour(
 def _poses(frames: Sequence[Frame], path: Path | None) -> list[KnownPose | None]:
     """The pose of each frame; None where it is unknown."""
     if path is not None:
-        return [(row, str(path)) for row in read_pose_of_each(path, len(frames), "frames")]
+        return [(row, str(path)) for row in read_poses(path, len(frames), "frames")]
     poses = [None if f.pose is None else (np.array(f.pose), "the layout's") for f in frames]
     for sequence in _sequences_of(frames):
         packets = [frames[index].oxts for index in sequence]

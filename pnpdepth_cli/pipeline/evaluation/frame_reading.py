@@ -15,7 +15,7 @@ from pnpdepth_cli.io.dataset.reading import depth_of, masked, read_mask, rgb_of
 from pnpdepth_cli.io.depth import DepthImage, depth_from_stored, known_metres, load_stored
 from pnpdepth_cli.io.layouts import Hdf5Array
 from pnpdepth_cli.io.rgb import read_rgb
-from pnpdepth_cli.io.sparse_reading import read_sparse
+from pnpdepth_cli.io.sparse_files import read_sparse
 from pnpdepth_cli.pipeline.evaluation.measures import Depth, Floats, Mask, MeasuredFrame
 from pnpdepth_cli.pipeline.evaluation.pairing import FramePair
 from pnpdepth_cli.pipeline.evaluation.protocols import EvalProtocol

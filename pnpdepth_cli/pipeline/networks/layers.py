@@ -9,7 +9,7 @@ from pathlib import Path
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.frames.frame import Frame
 from pnpdepth_cli.frames.prepare import prepare
-from pnpdepth_cli.io.sparse_reading import read_sparse
+from pnpdepth_cli.io.sparse_files import read_sparse
 from pnpdepth_cli.models.definition import Fixed
 from pnpdepth_cli.models.frame import synthetic_frame
 from pnpdepth_cli.models.network import load_network, out_of_memory_is_a_device_error

@@ -19,7 +19,7 @@ from pnpdepth_cli.io.dataset.reading import check_same_view, depth_of, masked, m
 from pnpdepth_cli.io.depth import DepthImage, describe_range, implausible, metres, read_depth
 from pnpdepth_cli.io.fingerprint import fingerprint
 from pnpdepth_cli.io.rgb import read_rgb
-from pnpdepth_cli.io.sparse_reading import read_sparse
+from pnpdepth_cli.io.sparse_files import read_sparse
 from pnpdepth_cli.pipeline.refinement.frame_camera import FrameCamera, camera_of_frame
 from pnpdepth_cli.pipeline.refinement.method import PAPER
 from pnpdepth_cli.pipeline.refinement.neighbours import (

@@ -77,11 +77,10 @@ def write_outputs(outputs: Outputs, inputs: Inputs, frame: RefinedFrame) -> dict
 def _write_cloud(path: Path, inputs: Inputs, frame: RefinedFrame) -> dict[str, Any]:
     """Writes the cloud of the refined depth, in the world's frame if the pose is known."""
     assert inputs.camera is not None
-    cloud = cloud_from_depth(frame.after, inputs.camera.camera, rgb=inputs.rgb, keep=frame.valid)
+    parts = cloud_from_depth(frame.after, inputs.camera.camera, rgb=inputs.rgb, keep=frame.valid)
     pose = inputs.camera.pose
-    cloud = cloud if pose is None else cloud.transformed(pose)
-    write_cloud(path, cloud.xyz, cloud.normals, cloud.rgb)
-    return {"points": len(cloud), "frame": "camera" if pose is None else "world"}
+    points = write_cloud(path, (part if pose is None else part.transformed(pose) for part in parts))
+    return {"points": points, "frame": "camera" if pose is None else "world"}
 
 
 def _write_improvement(path: Path, inputs: Inputs, frame: RefinedFrame, colors: str) -> float:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import InputError, NoPointsError, SizeError
-from pnpdepth_cli.io.colmap.model import ColmapCamera, ColmapImage, ColmapModel
+from pnpdepth_cli.io.colmap.model import ColmapCamera, ColmapModel
 from pnpdepth_cli.io.colmap.reading import find_model, model_files, name_in_model, read_model
 from pnpdepth_cli.io.dataset.reading import check_same_view
 from pnpdepth_cli.io.depth import describe_range
@@ -57,7 +57,7 @@ def read_colmap_points(
         options: Limits and unit.
         image: The photo.
         size: (H, W) of the photo.
-        any_size: Accept a photo of another size than the model's camera; points move with it.
+        any_size: Whether a photo of another size than the model's camera is accepted.
 
     Raises:
         InputError: The model cannot be read, or lacks the image.
@@ -75,6 +75,7 @@ def read_colmap_points(
         )
     check_same_view(f"the camera of {image} in {model.folder}", camera.size, size)
     points = _observed(model, name, options)
+    turn, shift = model.images[name].rotation.T, model.images[name].translation
     unit = MODEL_UNITS if options.unit_scale is None else METRES
     source = f"COLMAP model, image {name}, {camera.model} camera"
     notes = [f"sparse: {describe_range(points.depth, source, unit=unit)}"]
@@ -87,7 +88,7 @@ def read_colmap_points(
     return ColmapPointsOfImage(
         points=points.resized(*size),
         camera=_resized(_eye(camera), camera.size, size),
-        pose=_pose(model.images[name], options.unit_scale or 1.0),
+        pose=np.column_stack([turn, -turn @ shift * (options.unit_scale or 1.0)]),
         unit=unit,
         scale=_output_scale(model) if unit == MODEL_UNITS else None,
         record={
@@ -156,12 +157,6 @@ def _resized(camera: Camera, old: tuple[int, int], new: tuple[int, int]) -> Came
     intrinsics[:2] *= scale
     intrinsics[:2, 2] -= 0.5
     return replace(camera, intrinsics=intrinsics)
-
-
-def _pose(image: ColmapImage, unit: float) -> NDArray[np.float64]:
-    """(3, 4) from the camera's frame to the model's, of which a unit is so long."""
-    rotation = image.rotation.T
-    return np.column_stack([rotation, -rotation @ image.translation * unit])
 
 
 def _output_scale(model: ColmapModel) -> float:

@@ -14,31 +14,51 @@ from scipy.spatial.transform import Rotation
 
 from pnpdepth_cli.errors import InputError, OutputError
 from pnpdepth_cli.io.atomic import atomic_path, make_folder
-from pnpdepth_cli.io.bags.bag import CLOUDS, IMAGES, Bag, open_bag, topic_of
-from pnpdepth_cli.io.bags.calibration import (
+from pnpdepth_cli.io.bags.bag import (
+    CLOUDS,
+    IMAGES,
+    ODOMETRY,
+    POSES,
+    TRANSFORMS,
+    Bag,
+    check_topics,
+    open_bag,
+    topic_of,
+)
+from pnpdepth_cli.io.bags.messages import (
+    Stamped,
+    cloud_points,
+    image_file,
+    nearest_pairs,
+    seconds_of,
+)
+from pnpdepth_cli.io.bags.transforms import (
     camera_info_topic,
     camera_of_bag,
+    camera_trajectory,
     frame_of,
-    rectified_cameras,
+    poses_topics,
     static_pose,
 )
-from pnpdepth_cli.io.bags.messages import cloud_points, image_file, seconds_of
-from pnpdepth_cli.io.bags.pairing import Stamped, nearest_pairs
-from pnpdepth_cli.io.bags.poses import camera_trajectory, poses_topics
 from pnpdepth_cli.io.calibration import Calibration, read_calibration
+from pnpdepth_cli.io.cloud_files import write_points
 from pnpdepth_cli.io.poses import Trajectory
 from pnpdepth_cli.io.record import plain, read_json, write_json
+from pnpdepth_cli.io.rgb import read_rgb
+from pnpdepth_cli.io.scans import read_scan
 from pnpdepth_cli.pipeline.sparse.options import BagOptions
-from pnpdepth_cli.pipeline.sparse.rectified import chosen_camera
+from pnpdepth_cli.pipeline.sparse.scans import chosen_camera
 
-POSES = "poses.txt"
+POSES_FILE = "poses.txt"
 """Rows as of the TUM RGB-D benchmark, one for each frame in the order of their names."""
 
 RECORD = "frames.json"
 _FOLDERS = ("rgb", "sparse")
-
+_COMPARED_FRAMES = 5
 _LONGEST_GAP_S = 0.5
 """Between two poses that one is interpolated from."""
+
+Say = Callable[[str], None]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,12 +79,10 @@ class FramesRequest:
     """Which camera of `calib`."""
 
 
-def write_frames(request: FramesRequest, say: Callable[[str], None]) -> dict[str, Any]:
+def write_frames(request: FramesRequest, say: Say) -> dict[str, Any]:
     """Writes the frames of a bag in the layout `pairs`, one at a time, and returns the record.
 
-    Args:
-        request: What to write.
-        say: Receives what was guessed, and warnings.
+    `say` receives what was guessed, and warnings.
 
     Raises:
         InputError: The bag cannot be read, or has no frame.
@@ -72,18 +90,15 @@ def write_frames(request: FramesRequest, say: Callable[[str], None]) -> dict[str
         OutputError: The folder holds files that may not be replaced.
     """
     _check_output(request)
+    wanted, tolerance = request.options.wanted, request.options.tolerance
     with open_bag(request.bag) as bag:
-        options = request.options
-        topics = (
-            topic_of(bag, options.image_topic, IMAGES, "--image-topic"),
-            topic_of(bag, options.points_topic, CLOUDS, "--points-topic"),
-        )
+        check_topics(bag, wanted, (*IMAGES, *CLOUDS, *ODOMETRY, *POSES, *TRANSFORMS))
+        topics = topic_of(bag, wanted, IMAGES), topic_of(bag, wanted, CLOUDS)
         say(f"topics: images of {topics[0]}, points of {topics[1]}")
         _clear(request)
         lost, times, poses = 0, list[float](), None
         frames = "", ""
-        pairs = nearest_pairs(_stream(bag, *topics), options.tolerance)
-        for image, scan in pairs:
+        for image, scan in nearest_pairs(_stream(bag, *topics), tolerance):
             if scan is None:
                 lost += 1
                 continue
@@ -94,13 +109,13 @@ def write_frames(request: FramesRequest, say: Callable[[str], None]) -> dict[str
                 break
         if times:
             camera = _write_calibration(request, bag, topics[0], frames, say)
-            poses = _write_poses(request.output, bag, options.poses_topic, camera, times, say)
+            poses = _write_poses(request, bag, camera, times, say)
     if lost:
-        say(f"warning: {lost:,} images have no scan within {options.tolerance:g} s")
+        say(f"warning: {lost:,} images have no scan within {tolerance:g} s")
     if not times:
         raise InputError(
             f"{request.bag}: no image of {topics[0]} has a scan of {topics[1]} within"
-            f" {options.tolerance:g} s; check the clocks, or give a larger --tolerance"
+            f" {tolerance:g} s; check the clocks, or give a larger --tolerance"
         )
     record = _identity(request) | {
         "image_topic": topics[0],
@@ -119,8 +134,7 @@ def written_before(request: FramesRequest) -> bool:
     path = request.output / RECORD
     if not path.is_file():
         return False
-    record = read_json(path)
-    identity = plain(_identity(request) | {"complete": True})
+    identity, record = plain(_identity(request) | {"complete": True}), read_json(path)
     return all(record.get(name) == value for name, value in identity.items())
 
 
@@ -139,18 +153,17 @@ def _clear(request: FramesRequest) -> None:
         make_folder(request.output / name)
         for path in (request.output / name).iterdir():
             path.unlink()
-    for name in ("calib.txt", POSES):
+    for name in ("calib.txt", POSES_FILE):
         (request.output / name).unlink(missing_ok=True)
     write_json(request.output / RECORD, _identity(request) | {"complete": False})
 
 
 def _identity(request: FramesRequest) -> dict[str, Any]:
     paths = sorted(request.bag.iterdir()) if request.bag.is_dir() else [request.bag]
-    files = {path.name: [path.stat().st_size, path.stat().st_mtime_ns] for path in paths}
     return {
         "command": "frames",
         "bag": str(request.bag),
-        "bag_files": files,
+        "bag_files": {p.name: [p.stat().st_size, p.stat().st_mtime_ns] for p in paths},
         "options": asdict(request.options),
         "limit": request.limit,
         "calib": None if request.calib is None else str(request.calib),
@@ -160,8 +173,7 @@ def _identity(request: FramesRequest) -> dict[str, Any]:
 
 def _stream(bag: Bag, images: str, points: str) -> Iterator[tuple[bool, Stamped]]:
     for topic, logged_ns, message in bag.messages([images, points]):
-        time_s = seconds_of(message, logged_ns)
-        yield topic == images, Stamped(time_s=time_s, message=message)
+        yield topic == images, Stamped(seconds_of(message, logged_ns), message)
 
 
 def _write_frame(folder: Path, topics: tuple[str, str], image: Stamped, scan: Stamped) -> None:
@@ -170,47 +182,26 @@ def _write_frame(folder: Path, topics: tuple[str, str], image: Stamped, scan: St
     suffix, data = image_file(image.message, topics[0])
     with atomic_path(folder / "rgb" / f"{name}{suffix}") as temporary:
         temporary.write_bytes(data)
-    with atomic_path(folder / "sparse" / f"{name}.ply") as temporary:
-        temporary.write_bytes(_ply(cloud_points(scan.message, topics[1])))
-
-
-def _ply(points: NDArray[np.float32]) -> bytes:
-    header = (
-        f"ply\nformat binary_little_endian 1.0\nelement vertex {len(points)}\n"
-        "property float x\nproperty float y\nproperty float z\nend_header\n"
-    )
-    return header.encode() + points.astype("<f4").tobytes()
+    write_points(folder / "sparse" / f"{name}.ply", cloud_points(scan.message, topics[1]))
 
 
 def _write_calibration(
-    request: FramesRequest,
-    bag: Bag,
-    image_topic: str,
-    frames: tuple[str, str],
-    say: Callable[[str], None],
+    request: FramesRequest, bag: Bag, image_topic: str, frames: tuple[str, str], say: Say
 ) -> str:
-    """Writes calib.txt as far as there is a calibration; says what is missing.
+    """Writes calib.txt as far as there is a calibration; returns the name of the camera's frame.
 
-    Args:
-        request: With the folder, in which the frames are written already.
-        bag: An open bag.
-        image_topic: Of the images.
-        frames: Names of the frames in the headers of an image and a scan.
-        say: Receives what is used, and warnings.
-
-    Returns:
-        The name of the camera's frame.
+    `frames` are the names in the headers of an image and a scan.
     """
     topic = camera_info_topic(bag, image_topic)
     of_bag = None if topic is None else camera_of_bag(bag, topic)
     names = (of_bag[1] if of_bag else "") or frames[0], frames[1]
     if request.calib is not None:
         calibration, source = read_calibration(request.calib, request.camera), str(request.calib)
-    elif topic is None or of_bag is None:
+    elif of_bag is None:
         say(f"warning: {bag.path} has no camera_info of {image_topic}; refine with --calib")
         return frames[0]
     else:
-        calibration, source = of_bag[0], topic
+        calibration, source = of_bag[0], str(topic)
     pose = None if calibration.has_pose else static_pose(bag, *names)
     if pose is not None:
         source += f", and /tf_static from {names[0]} to {names[1]}"
@@ -222,22 +213,31 @@ def _write_calibration(
         )
     else:
         say(f"calibration: {source}")
-    if request.calib is None and topic is not None and of_bag is not None:
-        rectified = rectified_cameras(bag, topic, of_bag[0])
-        if rectified:
-            calibration = chosen_camera(request.output, image_topic, calibration, rectified, say)
+    if request.calib is None and calibration.rectified:
+        pairs = _some_frames(request.output)
+        calibration, note = chosen_camera(calibration, pairs, image_topic)
+        say(note)
     with atomic_path(request.output / "calib.txt") as temporary:
         temporary.write_text(_calibration_text(calibration))
     return names[0]
 
 
+def _some_frames(
+    folder: Path,
+) -> Iterator[tuple[NDArray[np.float32], NDArray[np.float32]]]:
+    """Yields the image and the points of a few frames."""
+    scans = sorted((folder / "sparse").iterdir())
+    positions = np.linspace(0, len(scans) - 1, min(_COMPARED_FRAMES, len(scans)))
+    for scan in (scans[round(position)] for position in positions):
+        (image,) = (folder / "rgb").glob(f"{scan.stem}.*")
+        yield read_rgb(image).values, read_scan(scan).points
+
+
 def _calibration_text(calibration: Calibration) -> str:
     fields: dict[str, Any] = {"K": calibration.intrinsics.ravel().tolist()}
     if calibration.has_pose:
-        fields |= {
-            "R": calibration.rotation.ravel().tolist(),
-            "t": calibration.translation.tolist(),
-        }
+        fields["R"] = calibration.rotation.ravel().tolist()
+        fields["t"] = calibration.translation.tolist()
     if calibration.distortion:
         fields["distortion"] = list(calibration.distortion)
     if calibration.size is not None:
@@ -247,30 +247,13 @@ def _calibration_text(calibration: Calibration) -> str:
 
 
 def _write_poses(
-    folder: Path,
-    bag: Bag,
-    wanted: str | None,
-    camera: str,
-    times: Sequence[float],
-    say: Callable[[str], None],
+    request: FramesRequest, bag: Bag, camera: str, times: Sequence[float], say: Say
 ) -> str | None:
-    """Writes poses.txt if the bag has a pose for every frame; returns the topic, None without one.
-
-    Args:
-        folder: Of the frames.
-        bag: An open bag.
-        wanted: The topic of the poses. None: the only one.
-        camera: Name of the camera's frame.
-        times: Of the frames, seconds.
-        say: Receives what is used, or why there are no poses.
-
-    Raises:
-        UsageError: The topic is not there.
-    """
-    topics = poses_topics(bag, wanted)
+    """Writes poses.txt if the bag has a pose for every frame; returns the topic, else None."""
+    topics = poses_topics(bag, request.options.wanted)
     if len(topics) != 1:
         if topics:
-            say(f"poses: none, as several topics give some; --poses-topic {' | '.join(topics)}")
+            say(f"poses: none, as several topics give some; --topics {' | '.join(topics)}")
         return None
     (topic,) = topics
     trajectory = camera_trajectory(bag, topic, camera)
@@ -284,7 +267,7 @@ def _write_poses(
             f" within {_LONGEST_GAP_S:g} s, so poses.txt is not written"
         )
         return None
-    with atomic_path(folder / POSES) as temporary:
+    with atomic_path(request.output / POSES_FILE) as temporary:
         temporary.write_text("".join(rows))
     say(f"poses: of {topic}")
     return topic

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,12 +14,13 @@ from pnpdepth_cli import __version__
 from pnpdepth_cli.errors import OutputError, SizeError, UsageError
 from pnpdepth_cli.io.atomic import make_folder
 from pnpdepth_cli.io.calibration import Calibration, read_calibration
-from pnpdepth_cli.io.depth import DepthImage, describe_range, implausible, read_depth
+from pnpdepth_cli.io.depth import describe_range, implausible, read_depth
 from pnpdepth_cli.io.record import plain, sha256_of, write_json
 from pnpdepth_cli.io.rgb import read_rgb
-from pnpdepth_cli.io.sensor_file import read_sensor
-from pnpdepth_cli.io.sparse_writing import SPARSE_SUFFIXES, write_sparse
+from pnpdepth_cli.io.sensor_file import OPTIONAL, read_sensor
+from pnpdepth_cli.io.sparse_files import SPARSE_SUFFIXES, write_sparse
 from pnpdepth_cli.io.visualisation import overlay
+from pnpdepth_cli.pipeline.refinement.request import count_or_fraction
 from pnpdepth_cli.pipeline.sparse.options import ScanOptions
 from pnpdepth_cli.pipeline.sparse.scans import camera_of, check_size, read_scan_points
 from pnpdepth_cli.sensors import (
@@ -30,24 +31,13 @@ from pnpdepth_cli.sensors import (
     Points,
     SampleNoise,
     SamplePattern,
-    SimulationSettings,
     as_depth_image,
     sample_points,
     simulate_lidar,
 )
 
-__all__ = [
-    "SampleNoise",
-    "SamplePattern",
-    "SampleRequest",
-    "SimulateRequest",
-    "SimulationSettings",
-    "SparseTarget",
-    "find_sensor",
-    "project_scan",
-    "sample_depth",
-    "simulate_scan",
-]
+AT_CALIBRATION = "calib"
+"""Position of a simulated scanner: the pose that the calibration gives."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,8 +48,6 @@ class SparseTarget:
     """The sparse depth; its suffix is one of `SPARSE_SUFFIXES`."""
     overlay: Path | None = None
     """A PNG of the points on the image; None for none."""
-    depth_scale: float = 256.0
-    """Codes per metre of a PNG."""
     overwrite: bool = False
 
     @property
@@ -68,17 +56,11 @@ class SparseTarget:
         return self.output.with_suffix(".json")
 
     def check(self, inputs: Iterable[Path | None]) -> None:
-        """Raises OutputError for files that cannot be written, before any work is done.
-
-        Args:
-            inputs: Files that are read, which must not be replaced.
-        """
+        """Raises OutputError for files that cannot be written, or that replace an input."""
         if self.output.suffix.lower() not in SPARSE_SUFFIXES:
             raise OutputError(
                 f"{self.output}: sparse depth is written as one of {', '.join(SPARSE_SUFFIXES)}"
             )
-        if not 0 < self.depth_scale < np.inf:
-            raise UsageError(f"--output-scale must be a number above 0, not {self.depth_scale:g}")
         if self.overlay is not None and self.overlay.suffix.lower() != ".png":
             raise OutputError(f"{self.overlay}: the overlay is a PNG; name it so")
         taken = {p.resolve() for p in inputs if p is not None}
@@ -100,41 +82,26 @@ class SparseTarget:
     ) -> dict[str, Any]:
         """Writes the sparse depth, its record and the overlay, and returns the record.
 
-        Args:
-            points: The sparse depth.
-            settings: The command and its settings, seed included; a PNG or CSV keeps them too.
-            inputs: Input files, for the record.
-            notes: What was assumed, and warnings.
-            rgb: (H, W, 3) in 0..1, the image of the overlay.
-
-        Raises:
-            OutputError: A file cannot be written.
+        A PNG or CSV keeps the settings too. `rgb`, (H, W, 3) in 0..1, is the image of the overlay.
         """
         provenance = {"command": settings["command"], "version": __version__, **settings}
         for path in filter(None, (self.output, self.overlay)):
             make_folder(path.parent)
-        write_sparse(
-            self.output,
-            points.xy,
-            points.depth,
-            as_depth_image(points),
-            provenance=provenance,
-            scale=self.depth_scale,
-        )
+        image = as_depth_image(points)
+        write_sparse(self.output, points.xy, points.depth, image, provenance=provenance)
         if self.overlay is not None and rgb is not None:
             overlay(rgb, points.xy, points.depth, self.overlay)
-        height, width = points.size
         record = {
             **provenance,
             "inputs": inputs,
             "points": {
-                "count": len(points.depth),
-                "fraction_of_pixels": len(points.depth) / (height * width),
+                "count": len(points),
+                "fraction_of_pixels": len(points) / image.size,
                 "nearest": float(points.depth.min()),
                 "farthest": float(points.depth.max()),
                 "dropped": dict(points.dropped),
             },
-            "size": [width, height],
+            "size": [points.size[1], points.size[0]],
             "notes": list(notes),
             "outputs": {
                 "sparse": str(self.output),
@@ -162,9 +129,6 @@ def project_scan(
         target: Files to write.
         image: The camera's image, which gives the size and the ground of an overlay.
         size: (H, W) of the image, where there is no file of it.
-
-    Raises:
-        PnpDepthError: An input or output is at fault; then nothing is written.
     """
     target.check((scan, image, options.calib, options.extrinsics))
     if target.overlay is not None and image is None:
@@ -187,143 +151,170 @@ def project_scan(
     )
 
 
-@dataclass(frozen=True, kw_only=True)
-class DenseDepth:
-    """Dense depth that sparse points are made from, and where to."""
+def sample_depth(
+    depth: Path,
+    target: SparseTarget,
+    pattern: SamplePattern,
+    *,
+    noise: SampleNoise | None = None,
+    image: Path | None = None,
+    seed: int = 0,
+    **reading: Any,
+) -> dict[str, Any]:
+    """Writes points of a dense depth map, and returns the record.
 
-    depth: Path
-    target: SparseTarget
-    seed: int = 0
-    """Of all noise and random choices."""
-    depth_scale: float | None = None
-    """Codes per metre of an integer depth file; None for the file's own."""
-    channel: str | None = None
-    """The EXR channel or NPZ array with the depth."""
-
-    def read(self) -> tuple[DepthImage, list[str]]:
-        """Returns the dense depth, and lines for a person."""
-        dense = read_depth(self.depth, scale=self.depth_scale, channel=self.channel)
-        text = describe_range(
-            dense.values, dense.source, assumed_scale=dense.assumed_scale, noun="pixels"
-        )
-        unlikely = implausible(dense.values, dense.scale)
-        return dense, [f"depth: {text}", *([f"warning: {unlikely}"] if unlikely else [])]
-
-
-@dataclass(frozen=True, kw_only=True)
-class SampleRequest(DenseDepth):
-    """What to sample, and where to."""
-
-    pattern: SamplePattern
-    noise: SampleNoise = field(default_factory=SampleNoise)
-    image: Path | None = None
-    """For the patterns that need one and for an overlay."""
-
-
-def sample_depth(request: SampleRequest) -> dict[str, Any]:
-    """Writes points of the depth map, and returns the record.
-
-    Raises:
-        PnpDepthError: An input or output is at fault; then nothing is written.
+    Args:
+        depth: The file of the map.
+        target: Files to write.
+        pattern: Which pixels are sampled.
+        noise: Added to the points; None for none.
+        image: For the patterns that need one.
+        seed: Of all random choices.
+        **reading: `scale` and `channel` of `read_depth`.
     """
-    request.target.check((request.depth, request.image))
-    pattern, noise, seed = request.pattern, request.noise, request.seed
-    dense, notes = request.read()
-    rgb = None if request.image is None else read_rgb(request.image).values
-    points = sample_points(dense.values, pattern, seed, image=rgb, noise=noise)
-    wanted = pattern.wanted(int(np.count_nonzero(dense.values)))
-    sampled = len(points.depth) + sum(points.dropped.values())
+    target.check((depth, image))
+    noise = noise or SampleNoise()
+    dense, notes = _dense(depth, **reading)
+    rgb = None if image is None else read_rgb(image).values
+    points = sample_points(dense, pattern, seed, image=rgb, noise=noise)
+    wanted = pattern.wanted(int(np.count_nonzero(dense)))
+    sampled = len(points) + sum(points.dropped.values())
     if pattern.kind in ("features", "edges") and sampled < wanted:
         notes.append(f"warning: the image has {sampled:,} of the {wanted:,} points asked for")
     notes.append(f"sparse: {describe_range(points.depth, f'{pattern.kind}, seed {seed}')}")
-    return request.target.write(
-        points,
-        {
-            "command": "sample",
-            "pattern": asdict(pattern),
-            "noise": asdict(noise),
-            "seed": seed,
-        },
-        inputs=_files(depth=request.depth, image=request.image),
-        notes=notes,
-        rgb=rgb,
-    )
+    settings = {"pattern": asdict(pattern), "noise": asdict(noise), "seed": seed}
+    inputs = _files(depth=depth, image=image)
+    return target.write(points, {"command": "sample", **settings}, inputs=inputs, notes=notes)
 
 
-@dataclass(frozen=True, kw_only=True)
-class SimulateRequest(DenseDepth):
-    """What to simulate, and where to."""
+def simulate_scan(
+    depth: Path,
+    target: SparseTarget,
+    spec: str,
+    calib: Path,
+    *,
+    camera: int | None = None,
+    position: str | None = None,
+    seed: int = 0,
+    **reading: Any,
+) -> dict[str, Any]:
+    """Writes the points of a simulated sensor in a dense depth map, and returns the record.
 
-    calib: Path
-    sensor: str = "hdl-64e"
-    """One of `LIDARS`, or a TOML file."""
-    camera: int | None = None
-    """One of KITTI's four, 0 to 3; None for the left colour camera."""
-    offset: tuple[float, float, float] | None = None
-    """Position of the scanner: metres to the right of, below and in front of the camera."""
-    at_scanner: bool = False
-    """The scanner has the pose that the calibration gives."""
-    settings: SimulationSettings = field(default_factory=SimulationSettings)
-
-
-def simulate_scan(request: SimulateRequest) -> dict[str, Any]:
-    """Writes the simulated sensor's points, and returns the record.
-
-    Raises:
-        PnpDepthError: An input or output is at fault; then nothing is written.
+    Args:
+        depth: The file of the map.
+        target: Files to write.
+        spec: The sensor, as `find_sensor` takes it.
+        calib: Calibration of the camera.
+        camera: Which camera of it.
+        position: Of the scanner: metres right of, below and in front of the camera as X,Y,Z, or
+            `AT_CALIBRATION`. None: at the camera.
+        seed: Of all noise.
+        **reading: `scale` and `channel` of `read_depth`.
     """
-    sensor = find_sensor(request.sensor)
-    request.target.check((request.depth, request.calib, Path(request.sensor)))
-    dense, notes = request.read()
-    calibration = read_calibration(request.calib, request.camera)
-    height, width = dense.values.shape
-    notes += check_size(request.calib, calibration, (height, width), request.depth)
-    camera = _camera(request, calibration)
-    points = simulate_lidar(dense.values, camera, sensor, request.seed, request.settings)
-    source = f"{sensor.name}, seed {request.seed}"
-    notes.append(f"sparse: {describe_range(points.depth, source)}")
-    max_range = sensor.max_range if np.isfinite(sensor.max_range) else None  # JSON lacks infinity
-    return request.target.write(
-        points,
-        {
-            "command": "simulate",
-            "sensor": asdict(sensor) | {"max_range": max_range},
-            **asdict(request.settings),
-            "rotation": camera.rotation.tolist(),
-            "translation": camera.translation.tolist(),
-            "seed": request.seed,
-        },
-        inputs=_files(depth=request.depth)
-        | {"calibration": {"path": str(request.calib), "read_as": calibration.source}},
-        notes=notes,
+    sensor = find_sensor(spec)
+    target.check((depth, calib, Path(spec.partition(",")[0])))
+    dense, notes = _dense(depth, **reading)
+    calibration = read_calibration(calib, camera)
+    notes += check_size(calib, calibration, (dense.shape[0], dense.shape[1]), depth)
+    eye = _placed(calib, calibration, position)
+    points = simulate_lidar(dense, eye, sensor, seed)
+    notes.append(f"sparse: {describe_range(points.depth, f'{sensor.name}, seed {seed}')}")
+    settings = {
+        "command": "simulate",
+        "sensor": plain(asdict(sensor)),
+        "rotation": eye.rotation.tolist(),
+        "translation": eye.translation.tolist(),
+        "seed": seed,
+    }
+    named = {"calibration": {"path": str(calib), "read_as": calibration.source}}
+    return target.write(points, settings, inputs=_files(depth=depth) | named, notes=notes)
+
+
+def _dense(path: Path, **reading: Any) -> tuple[NDArray[np.float32], list[str]]:
+    """The dense depth (H, W), and lines for a person."""
+    dense = read_depth(path, **reading)
+    text = describe_range(
+        dense.values, dense.source, assumed_scale=dense.assumed_scale, noun="pixels"
     )
+    unlikely = implausible(dense.values, dense.scale)
+    return dense.values, [f"depth: {text}", *([f"warning: {unlikely}"] if unlikely else [])]
+
+
+def read_pattern(text: str, count: str | None) -> SamplePattern:
+    """Returns the pattern of `uniform` and `500` or `5%`, or of `region:X,Y,W,H`."""
+    kind, colon, rectangle = text.partition(":")
+    number, fraction = (None, None) if count is None else count_or_fraction(count)
+    region = None
+    if colon:
+        try:
+            left, top, width, height = (int(word) for word in rectangle.split(","))
+        except ValueError:
+            raise UsageError(f"pattern {text!r} is not of the form region:X,Y,W,H") from None
+        region = left, top, width, height
+    return SamplePattern(kind=kind, count=number, fraction=fraction, region=region)
+
+
+def read_noise(text: str | None) -> SampleNoise:
+    """Returns the noise of `0.05` metres, `2%` of the depth, `outliers=10%` and `jitter=1` pixel.
+
+    Several are separated by commas. Raises UsageError for any other text.
+    """
+    names = {"outliers": "outliers", "jitter": "jitter_px"}
+    values: dict[str, float] = {}
+    for word in filter(None, (text or "").split(",")):
+        name, equals, number = word.rpartition("=")
+        try:
+            value = float(number.removesuffix("%")) / (100 if number.endswith("%") else 1)
+            key = names[name] if equals else ("relative" if number.endswith("%") else "metres")
+        except (ValueError, KeyError):
+            raise UsageError(
+                f"--noise must be metres, P%, outliers=P% or jitter=PIXELS, got {word!r}"
+            ) from None
+        values[key] = value
+    return SampleNoise(**values)
 
 
 def find_sensor(spec: str) -> Lidar:
-    """Returns the named sensor, or the one that a TOML file describes.
+    """Returns the sensor of `NAME` or `FILE.toml`, with `,key=value` of `OPTIONAL` after it.
 
     Raises:
         UsageError: There is no sensor of this name, or it is described wrongly.
         InputError: The file cannot be read.
     """
-    if spec in LIDARS:
-        return LIDARS[spec]
-    if Path(spec).suffix.lower() == ".toml":
-        return Lidar(**asdict(read_sensor(Path(spec))))
-    raise UsageError(f"no sensor {spec!r}; --sensor is a TOML file or one of: {', '.join(LIDARS)}")
+    name, *changes = spec.split(",")
+    if name in LIDARS:
+        sensor = LIDARS[name]
+    elif Path(name).suffix.lower() == ".toml":
+        sensor = Lidar(**read_sensor(Path(name)))
+    else:
+        known = ", ".join(LIDARS)
+        raise UsageError(f"no sensor {name!r}; --sensor is a TOML file or one of: {known}")
+    values: dict[str, Any] = {}
+    for change in changes:
+        key, _, value = change.partition("=")
+        try:
+            values[OPTIONAL[OPTIONAL.index(key)]] = float(value)
+        except ValueError:
+            raise UsageError(
+                f"--sensor {spec}: {change!r} is not NAME=NUMBER with one of {', '.join(OPTIONAL)}"
+            ) from None
+    return replace(sensor, **values)
 
 
-def _camera(request: SimulateRequest, calibration: Calibration) -> Camera:
+def _placed(path: Path, calibration: Calibration, position: str | None) -> Camera:
     """The camera, with the scanner at the position that is asked for."""
-    if request.at_scanner and request.offset is not None:
-        raise UsageError("--at-scanner takes the position from the calibration; leave out --offset")
     camera = camera_of(calibration)
-    if request.at_scanner:
+    if position == AT_CALIBRATION:
         if not calibration.has_pose:
-            raise UsageError(f"{request.calib} has no pose of the scanner; add R and t")
+            raise UsageError(f"{path} has no pose of the scanner; add R and t")
         return camera
-    position = np.array(request.offset or (0.0, 0.0, 0.0))
-    return replace(camera, rotation=FORWARD_LEFT_UP, translation=position)
+    try:
+        metres = np.array((position or "0,0,0").split(","), np.float64)
+    except ValueError:
+        metres = np.empty(0)
+    if metres.shape != (3,) or not np.isfinite(metres).all():
+        raise UsageError(f"--position must be X,Y,Z in metres or calib, got {position!r}")
+    return replace(camera, rotation=FORWARD_LEFT_UP, translation=metres)
 
 
 def _files(**paths: Path | None) -> dict[str, Any]:

@@ -91,7 +91,7 @@ class ColmapOptions:
 
     def __post_init__(self) -> None:
         if self.unit_scale is not None and not 0 < self.unit_scale < math.inf:
-            raise UsageError(f"--unit-scale {self.unit_scale:g} is no length; give metres per unit")
+            raise UsageError(f"--unit-scale must be metres per unit, got {self.unit_scale:g}")
         if self.min_track < 1 or not self.max_reprojection > 0:
             raise UsageError("--min-track must be 1 or more, and --max-reprojection above 0")
 
@@ -100,11 +100,11 @@ class ColmapOptions:
 class BagOptions:
     """Which messages of a ROS bag make a frame."""
 
-    image_topic: str | None = option(
-        None, "Topic of the images of a bag.  [default: the only one]", metavar="TOPIC"
-    )
-    points_topic: str | None = option(
-        None, "Topic of the PointCloud2 of a bag.  [default: the only one]", metavar="TOPIC"
+    topics: str | None = option(
+        None,
+        "Topics of a bag, separated by commas: of images, points (PointCloud2), and poses."
+        "  [default: the only ones]",
+        metavar="TOPIC,...",
     )
     tolerance: float = option(
         0.05,
@@ -113,13 +113,11 @@ class BagOptions:
         show_default=True,
     )
 
-    poses_topic: str | None = option(
-        None,
-        "Topic of the camera's poses in a bag: odometry, poses or transforms.  [default: the only"
-        " one]",
-        metavar="TOPIC",
-    )
-
     def __post_init__(self) -> None:
         if not self.tolerance >= 0:
-            raise UsageError(f"--tolerance {self.tolerance:g} is no time; give 0 s or more")
+            raise UsageError(f"--tolerance must be >= 0, got {self.tolerance:g}")
+
+    @property
+    def wanted(self) -> list[str]:
+        """The names of the topics."""
+        return [name for name in (self.topics or "").split(",") if name]

@@ -24,7 +24,6 @@ from pnpdepth_cli.sensors import (
     Points,
     SampleNoise,
     SamplePattern,
-    SimulationSettings,
     sample_points,
     simulate_lidar,
     with_noise,
@@ -191,9 +190,9 @@ def _scanned(
     calibration = read_calibration(frame.calib, frame.camera)
     check_size(frame.calib, calibration, inputs.size)
     here = replace(camera_of(calibration), rotation=FORWARD_LEFT_UP, translation=np.zeros(3))
-    settings = SimulationSettings(rotation_noise_deg=sampling.rotation_noise)
+    lidar = replace(lidar, rotation_noise_deg=sampling.rotation_noise)
     assert inputs.gt is not None
-    return simulate_lidar(inputs.gt, here, lidar, seed, settings)
+    return simulate_lidar(inputs.gt, here, lidar, seed)
 
 
 def _thinned(points: Points, wanted: str | None, rng: np.random.Generator) -> Points:

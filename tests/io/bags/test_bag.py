@@ -1,14 +1,127 @@
-"""Bags whose metadata is damaged."""
+"""Bags that are damaged, or bombs: small files that claim, decompress to or compute gigabytes."""
 
 from __future__ import annotations
 
+import bz2
+import sqlite3
+import tracemalloc
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from pnpdepth_cli.errors import FileFormatError
-from pnpdepth_cli.io.bags.bag import Bag
+from pnpdepth_cli.io.bags import bag as bounds
+from pnpdepth_cli.io.bags.bag import Bag, open_bag
+from tests.bags import write_bag
+
+pytest.importorskip("rosbags")
+
+BOMB = 64 << 20
+
+
+def read_all(path: Path) -> int:
+    """The number of messages in the bag."""
+    with open_bag(path) as bag:
+        topics = [each.topic for each in bag._reader.connections]
+        return sum(1 for _ in bag.messages(topics))
+
+
+@pytest.fixture
+def small_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(bounds, "_CHUNK_BYTES", 1 << 20)
+
+
+def compressors() -> dict[str, Callable[[bytes], bytes]]:
+    import lz4.frame
+    from rosbags.rosbag2.storage_mcap import zstd
+
+    return {"bz2": bz2.compress, "lz4": lz4.frame.compress, "zstd": zstd.compress}
+
+
+@pytest.mark.usefixtures("small_chunks")
+@pytest.mark.parametrize(
+    ("store", "kind"), [("rosbag1", "bz2"), ("rosbag1", "lz4"), ("mcap", "lz4"), ("mcap", "zstd")]
+)
+@pytest.mark.parametrize("frames", [1, 2])
+def test_a_chunk_is_decompressed_up_to_the_limit_only(store: str, kind: str, frames: int) -> None:
+    from rosbags.rosbag1 import reader
+    from rosbags.rosbag2 import storage_mcap
+
+    bounds.bound_decompression()
+    table = reader.decompressors if store == "rosbag1" else storage_mcap.DECOMPRESSORS
+    size = [] if store == "rosbag1" else [1 << 40]
+    good, bomb = (frames * compressors()[kind](bytes(n // frames)) for n in (1 << 20, BOMB))
+    assert table[kind](good, *size) == bytes(1 << 20)  # type: ignore[operator]
+    tracemalloc.start()
+    with pytest.raises(ValueError, match="holds more than 1,048,576"):
+        table[kind](bomb, *size)  # type: ignore[operator]
+    assert tracemalloc.get_traced_memory()[1] < BOMB / 4
+    tracemalloc.stop()
+
+
+@pytest.mark.usefixtures("small_chunks")
+def test_a_compressed_bag_is_read(tmp_path: Path) -> None:
+    from rosbags.rosbag1 import Writer
+
+    plain = read_all(write_bag(tmp_path / "plain.bag"))
+    for kind in Writer.CompressionFormat:
+        path = tmp_path / f"{kind.name}.bag"
+        write_bag(path, compression=kind)
+        assert read_all(path) == plain
+
+
+@pytest.mark.parametrize("mode", ["file", "MESSAGE"])
+def test_a_bag_compressed_as_a_whole_is_refused(mode: str, tmp_path: Path) -> None:
+    bag = write_bag(tmp_path / "ros2")
+    metadata = bag / "metadata.yaml"
+    text = metadata.read_text()
+    assert "compression_mode: ''" in text
+    metadata.write_text(text.replace("compression_mode: ''", f"compression_mode: {mode}"))
+    with pytest.raises(FileFormatError, match=f"compression_mode '{mode.lower()}' are not read"):
+        read_all(bag)
+
+
+@pytest.mark.parametrize(
+    "metadata",
+    [
+        "[1, 2]",
+        "rosbag2_bagfile_information: 3",
+        "a: &a [x, x]\nb: &b [*a, *a]\n" + "rosbag2_bagfile_information: {version: [*b, *b]}",
+    ],
+)
+def test_metadata_of_another_kind_and_aliases_are_one_line(metadata: str, tmp_path: Path) -> None:
+    bag = write_bag(tmp_path / "ros2")
+    (bag / "metadata.yaml").write_text(metadata)
+    with pytest.raises(FileFormatError) as caught:
+        read_all(bag)
+    assert "metadata.yaml" in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "statements",
+    [
+        "ALTER TABLE messages ADD COLUMN big BLOB AS (zeroblob(900000000))",
+        "CREATE VIEW schema AS WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n)"
+        " SELECT i AS schema_version FROM n",
+        "CREATE TRIGGER t AFTER INSERT ON messages BEGIN SELECT 1; END",
+        "CREATE VIRTUAL TABLE v USING fts5(x)",
+    ],
+)
+def test_a_database_that_computes_what_is_read_is_refused(statements: str, tmp_path: Path) -> None:
+    bag = write_bag(tmp_path / "ros2")
+    (file,) = bag.glob("*.db3")
+    connection = sqlite3.connect(file)
+    if "VIEW schema" in statements:
+        connection.execute("DROP TABLE schema")
+    connection.execute(statements)
+    connection.commit()
+    connection.close()
+    for path in (bag, file):
+        with pytest.raises(FileFormatError, match="is no plain table"):
+            read_all(path)
 
 
 class _Reader:

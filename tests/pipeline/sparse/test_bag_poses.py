@@ -11,7 +11,7 @@ pytest.importorskip("rosbags")
 
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.io.bags.bag import open_bag
-from pnpdepth_cli.io.bags.poses import camera_trajectory
+from pnpdepth_cli.io.bags.transforms import camera_trajectory
 from pnpdepth_cli.io.poses import read_poses
 from pnpdepth_cli.io.record import read_json
 from pnpdepth_cli.pipeline.batch.bags import unpacked
@@ -63,8 +63,8 @@ def test_a_bag_without_poses_gives_none(tmp_path: Path) -> None:
 
 def test_a_topic_without_poses_is_refused_with_those_that_there_are(tmp_path: Path) -> None:
     bag = write_bag(tmp_path / "drive.mcap", poses="odometry")
-    with pytest.raises(UsageError, match="no poses in /gps; there are /odom"):
-        written(bag, tmp_path / "frames", options=BagOptions(poses_topic="/gps"))
+    with pytest.raises(UsageError, match=r"no topic /gps of .*/odom"):
+        written(bag, tmp_path / "frames", options=BagOptions(topics="/gps"))
 
 
 def test_a_fixed_transform_that_is_repeated_is_no_motion(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ pytest.importorskip("rosbags")
 
 from pnpdepth_cli.cli.main import main
 from pnpdepth_cli.errors import FileFormatError, OutputError, PnpDepthError, UsageError
-from pnpdepth_cli.io.bags.pairing import Stamped, nearest_pairs
+from pnpdepth_cli.io.bags.messages import Stamped, nearest_pairs
 from pnpdepth_cli.io.calibration import read_calibration
 from pnpdepth_cli.io.layouts import read_frames
 from pnpdepth_cli.io.rgb import read_rgb
@@ -84,10 +84,10 @@ def test_a_batch_takes_a_bag_and_writes_its_frames_once(
 
 def test_several_topics_are_listed_and_one_can_be_named(tmp_path: Path) -> None:
     bag = write_bag(tmp_path / "drive.mcap")
-    missing = BagOptions(image_topic="/rear")
-    with pytest.raises(UsageError, match=r"no topic /rear .* there are /front/image_raw \(3 mess"):
+    missing = BagOptions(topics="/rear")
+    with pytest.raises(UsageError, match=r"no topic /rear .* there are /front/image_raw, /lidar"):
         written(bag, tmp_path / "frames", options=missing)
-    named = BagOptions(image_topic=IMAGES, points_topic=POINTS)
+    named = BagOptions(topics=f"{POINTS},{IMAGES}")
     assert len(written(bag, tmp_path / "frames", options=named)) == 2
 
 

@@ -23,20 +23,18 @@ from pnpdepth_cli.errors import (
 from pnpdepth_cli.io.calibration import read_calibration
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.io.formats import DEPTH_SUFFIXES
-from pnpdepth_cli.io.sparse_reading import read_sparse
+from pnpdepth_cli.io.sparse_files import read_sparse
 from pnpdepth_cli.pipeline.sparse.make import (
-    SampleNoise,
-    SamplePattern,
-    SampleRequest,
-    SimulateRequest,
     SparseTarget,
     find_sensor,
     project_scan,
+    read_noise,
     sample_depth,
     simulate_scan,
 )
 from pnpdepth_cli.pipeline.sparse.options import ScanOptions
 from pnpdepth_cli.pipeline.sparse.scans import camera_of, read_scan_points
+from pnpdepth_cli.sensors import LIDARS, SampleNoise, SamplePattern
 from tests.pipeline.scan_frames import ScanOnDisk, scan_on_disk
 
 
@@ -142,8 +140,6 @@ def test_results_are_replaced_only_with_overwrite(frame: ScanOnDisk) -> None:
     refused(frame, OutputError, "is an input", target=into, options=ScanOptions(calib=calib))
     below = SparseTarget(output=frame.gt / "s.png")
     refused(frame, OutputError, "cannot be written (file exists)", target=below)
-    scale = SparseTarget(output=frame.folder / "s.png", depth_scale=0)
-    refused(frame, UsageError, "--output-scale", target=scale)
     refused(frame, OutputError, ".jpg", target=SparseTarget(output=frame.folder / "s.jpg"))
 
 
@@ -157,14 +153,14 @@ def test_options_of_a_scan_are_refused_for_anything_else(frame: ScanOnDisk) -> N
     assert not ScanOptions(keep_occluded=True).describes(frame.gt)
 
 
-def sampling(frame: ScanOnDisk, output: str, **more: Any) -> SampleRequest:
+def sampled(frame: ScanOnDisk, output: str, **more: Any) -> dict[str, Any]:
     pattern = {name: more.pop(name) for name in ("kind", "count", "fraction") if name in more}
     target = SparseTarget(output=frame.folder / output)
-    return SampleRequest(depth=frame.gt, target=target, pattern=SamplePattern(**pattern), **more)
+    return sample_depth(frame.gt, target, SamplePattern(**pattern), **more)
 
 
 def test_the_seed_is_in_the_png_and_in_the_record(frame: ScanOnDisk) -> None:
-    sample_depth(sampling(frame, "u.png", count=100, seed=11))
+    sampled(frame, "u.png", count=100, seed=11)
     assert np.count_nonzero(read_depth(frame.folder / "u.png").values) == 100
     settings = json.loads(Image.open(frame.folder / "u.png").text["pnpdepth:made"])
     assert settings["seed"] == 11
@@ -175,33 +171,29 @@ def test_the_seed_is_in_the_png_and_in_the_record(frame: ScanOnDisk) -> None:
 
 def test_the_same_seed_gives_the_same_bytes(frame: ScanOnDisk) -> None:
     for name in ("a", "b"):
-        sample_depth(
-            sampling(frame, f"{name}.png", fraction=0.1, noise=SampleNoise(metres=0.1), seed=2)
-        )
+        sampled(frame, f"{name}.png", fraction=0.1, noise=SampleNoise(metres=0.1), seed=2)
     assert (frame.folder / "a.png").read_bytes() == (frame.folder / "b.png").read_bytes()
 
 
 def test_fewer_edges_than_requested_are_reported(frame: ScanOnDisk) -> None:
-    request = sampling(frame, "e.png", kind="edges", count=3000, image=frame.image)
     image = np.zeros((48, 64, 3), np.uint8)
     image[:, 30:] = 255
     cv2.imwrite(str(frame.image), image)
-    record = sample_depth(request)
+    record = sampled(frame, "e.png", kind="edges", count=3000, image=frame.image)
     assert record["points"]["count"] < 3000
     assert any("of the 3,000 points asked for" in note for note in record["notes"])
 
 
-def simulating(frame: ScanOnDisk, output: str, **more: object) -> SimulateRequest:
+def simulated(frame: ScanOnDisk, output: str, sensor: str, **more: Any) -> dict[str, Any]:
     target = SparseTarget(output=frame.folder / output)
-    request = SimulateRequest(depth=frame.gt, calib=frame.calib, target=target)
-    return replace(request, **more)  # type: ignore[arg-type]
+    return simulate_scan(frame.gt, target, sensor, frame.calib, **more)
 
 
 def test_a_simulated_sensor_of_ones_own_measures_the_truth(frame: ScanOnDisk) -> None:
     sensor = frame.folder / "mine.toml"
     sensor.write_text("top_deg = 20\nstep_deg = 2\nbeams = 21\nazimuth_step_deg = 0.5\n")
-    for output, position in (("camera.csv", {}), ("scanner.csv", {"at_scanner": True})):
-        record = simulate_scan(simulating(frame, output, sensor=str(sensor), **position))
+    for output, position in (("camera.csv", {}), ("scanner.csv", {"position": "calib"})):
+        record = simulated(frame, output, str(sensor), **position)
         got = read_sparse(frame.folder / output, size=(60, 100)).points
         np.testing.assert_allclose(got.depth, 4 + 0.02 * got.xy[:, 0], atol=0.02)
         assert record["sensor"]["name"] == "mine"
@@ -210,10 +202,36 @@ def test_a_simulated_sensor_of_ones_own_measures_the_truth(frame: ScanOnDisk) ->
 
 
 def test_the_scanner_can_stand_beside_the_camera(frame: ScanOnDisk) -> None:
-    record = simulate_scan(simulating(frame, "s.csv", sensor="vlp-16", offset=(0.5, 0.0, -0.1)))
+    record = simulated(frame, "s.csv", "vlp-16", position="0.5,0,-0.1")
     assert record["translation"] == [0.5, 0, -0.1]
-    with pytest.raises(UsageError, match="leave out --offset"):
-        simulate_scan(simulating(frame, "t.csv", offset=(0.0, 0.0, 0.0), at_scanner=True))
+    with pytest.raises(UsageError, match="--position must be X,Y,Z"):
+        simulated(frame, "t.csv", "vlp-16", position="0,0")
+
+
+@pytest.mark.parametrize(
+    ("text", "noise"),
+    [
+        (None, SampleNoise()),
+        ("0.05", SampleNoise(metres=0.05)),
+        ("2%,outliers=10%,jitter=1", SampleNoise(relative=0.02, outliers=0.1, jitter_px=1)),
+    ],
+)
+def test_noise_is_read_as_it_is_written(text: str | None, noise: SampleNoise) -> None:
+    assert read_noise(text) == noise
+
+
+@pytest.mark.parametrize("text", ["much", "blur=1", "jitter="])
+def test_noise_of_another_kind_is_refused(text: str) -> None:
+    with pytest.raises(UsageError, match="--noise must be metres"):
+        read_noise(text)
+
+
+def test_a_named_sensor_can_be_changed() -> None:
+    sensor = find_sensor("vlp-16,dropout=0.1,max_range=30")
+    assert sensor == replace(LIDARS["vlp-16"], dropout=0.1, max_range=30)
+    for spec in ("vlp-16,beams=3", "vlp-16,dropout", "vlp-16,dropout=x"):
+        with pytest.raises(UsageError, match="is not NAME=NUMBER"):
+            find_sensor(spec)
 
 
 def test_an_unknown_sensor_is_answered_with_the_known_ones() -> None:

@@ -114,6 +114,27 @@ def test_the_edges_say_whether_the_transforms_lead_to_the_rectified_camera(
     np.testing.assert_allclose(calibration.rotation, expected, atol=1e-9)
 
 
+@pytest.mark.parametrize("rectified", [True, False])
+def test_a_camera_info_file_is_used_for_the_image_that_is_projected_onto(
+    rectified: bool, tmp_path: Path
+) -> None:
+    seen = view(rectified=rectified, topic="/front/image_raw")
+    written(write_bag(tmp_path / "a.mcap", view=seen), tmp_path / "frames")
+    (scan, *_), (image, *_) = (
+        sorted((tmp_path / "frames" / n).iterdir()) for n in ("sparse", "rgb")
+    )
+    pose = np.column_stack([[[0, -1, 0], [0, 0, -1], [1, 0, 0]], ABOVE])
+    info = {"distortion_model": "plumb_bob", "d": D.tolist(), "k": K.ravel().tolist()}
+    info |= {"p": seen.p.ravel().tolist(), "r": [0.0] * 9, "T_camera_lidar": pose.ravel().tolist()}
+    calib = tmp_path / "camera_info.yaml"
+    calib.write_text("".join(f"{name}: {value}\n" for name, value in info.items()))
+    read = read_scan_points(scan, ScanOptions(calib=calib), SIZE, image)
+    expected = RECTIFIED if rectified else K
+    np.testing.assert_array_equal(read.camera.intrinsics, expected)
+    assert read.camera.has_lens is not rectified
+    assert any(note.startswith("camera: rectified") == rectified for note in read.notes[-1:])
+
+
 def test_a_calibration_replaces_that_of_the_bag(tmp_path: Path) -> None:
     bag = write_bag(tmp_path / "a.mcap", view=view(rectified=True, topic="/front/image_raw"))
     (tmp_path / "own.txt").write_text("K: [200, 0, 150, 0, 201, 110, 0, 0, 1]")

@@ -45,7 +45,6 @@ from pnpdepth_cli.sensors import (
     Camera,
     SampleNoise,
     SamplePattern,
-    SimulationSettings,
     sample_points,
     simulate_lidar,
 )
@@ -348,8 +347,8 @@ def test_a_lidar_stands_where_the_camera_is(root: Path, tmp_path: Path) -> None:
     k = np.array([[60, 0, 31], [0, 60, 23], [0, 0, 1.0]])
     camera = Camera(intrinsics=k, rotation=FORWARD_LEFT_UP, translation=np.zeros(3))
     assert inputs.gt is not None
-    settings = SimulationSettings(rotation_noise_deg=2)
-    wanted = simulate_lidar(inputs.gt, camera, LIDARS["vlp-16"], 3, settings)
+    scanner = replace(LIDARS["vlp-16"], rotation_noise_deg=2)
+    wanted = simulate_lidar(inputs.gt, camera, scanner, 3)
     assert np.array_equal(points.xy.numpy(), wanted.xy)
     assert np.array_equal(points.depth.numpy(), wanted.depth)
 

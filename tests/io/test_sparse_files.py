@@ -10,7 +10,7 @@ from hypothesis.extra.numpy import array_shapes, arrays
 
 from pnpdepth_cli.errors import FileFormatError, InputError, NoPointsError, SizeError, UsageError
 from pnpdepth_cli.io.depth import read_depth, write_depth
-from pnpdepth_cli.io.sparse_reading import read_sparse
+from pnpdepth_cli.io.sparse_files import read_sparse
 
 SIZE = (10, 20)
 ROWS = [[10.5, 3.25, 4.0], [0.0, 0.0, 0.5], [7.0, 2.0, 80.0]]

@@ -1,20 +1,29 @@
-"""Sparse depth as points, from a depth image or a list of `x y depth` rows."""
+"""Sparse depth in files: a depth image, or a list of `x y depth` rows, which loses nothing."""
 
 from __future__ import annotations
 
-import math
+import json
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import FileFormatError, NoPointsError, SizeError
-from pnpdepth_cli.io.depth import depth_from_stored, known_metres, load_stored
+from pnpdepth_cli.io.atomic import atomic_path
+from pnpdepth_cli.io.depth import depth_from_stored, known_metres, load_stored, write_depth
 from pnpdepth_cli.io.file_bytes import one_line, read_bytes
-from pnpdepth_cli.io.formats import check_scale, kind_of
+from pnpdepth_cli.io.formats import DEPTH_SUFFIXES, KITTI_SCALE, check_scale, kind_of
 from pnpdepth_cli.points import SparsePoints
+
+SPARSE_SUFFIXES = (*DEPTH_SUFFIXES, ".csv")
+"""What `write_sparse` can write; .csv keeps coordinates between pixel centres."""
+
+_PROVENANCE_KEY = "pnpdepth:made"
+"""Key of the text in a PNG or CSV that says how its sparse depth was made."""
 
 _TEXT_SUFFIXES = (".csv", ".txt")
 _SEPARATOR = re.compile(r"[\s,;]+")
@@ -25,7 +34,6 @@ class SparseFile:
     """The points of a file, and how it was read."""
 
     points: SparsePoints[NDArray[np.float32]]
-    """The points with known depth."""
     source: str
     """What the file is, for messages."""
     assumed_scale: bool
@@ -111,24 +119,42 @@ def _parse_text(path: Path, data: bytes) -> NDArray[np.float64]:
     rows: list[tuple[float, float, float]] = []
     for number, line in enumerate(lines, start=1):
         text = line.split("#", 1)[0].strip()
-        if not text:
+        words = _SEPARATOR.split(text)
+        header = not rows and [word.strip('"').lower() for word in words] == ["x", "y", "depth"]
+        if not text or header:
             continue
-        fields = _SEPARATOR.split(text)
-        if not rows and [field.strip('"').lower() for field in fields] == ["x", "y", "depth"]:
-            continue
-        rows.append(_parse_row(path, number, text, fields))
+        try:
+            x, y, depth = map(float, words)
+        except ValueError as error:
+            raise FileFormatError(
+                f"{path}, line {number}: {one_line(text)[:60]!r} is not x, y and depth; correct it"
+            ) from error
+        if not np.isfinite((x, y)).all():
+            raise FileFormatError(
+                f"{path}, line {number}: the coordinates are not finite; correct or remove it"
+            )
+        rows.append((x, y, depth))
     return np.array(rows, dtype=np.float64).reshape(-1, 3)
 
 
-def _parse_row(path: Path, number: int, text: str, fields: list[str]) -> tuple[float, float, float]:
-    try:
-        x, y, depth = (float(field) for field in fields)
-    except ValueError as error:
-        raise FileFormatError(
-            f"{path}, line {number}: {one_line(text)[:60]!r} is not x, y and depth; correct it"
-        ) from error
-    if not (math.isfinite(x) and math.isfinite(y)):
-        raise FileFormatError(
-            f"{path}, line {number}: the coordinates are not finite; correct or remove it"
-        )
-    return x, y, depth
+def write_sparse(
+    path: Path,
+    xy: NDArray[np.float32],
+    depth: NDArray[np.float32],
+    image: NDArray[np.float32],
+    *,
+    provenance: Mapping[str, Any],
+) -> None:
+    """Writes N points, of pixels (N, 2) and metres (N,), in the format that the suffix names.
+
+    Every format but .csv holds the image, the same points as (H, W) metres. A PNG and a CSV keep
+    the provenance: how the points were made.
+    """
+    text = json.dumps(provenance, sort_keys=True)
+    if path.suffix.lower() != ".csv":
+        write_depth(path, image, scale=KITTI_SCALE, text={_PROVENANCE_KEY: text})
+        return
+    rows = [f"{x:.9g},{y:.9g},{z:.9g}" for (x, y), z in zip(xy, depth, strict=True)]
+    with atomic_path(path) as temporary:
+        content = "\n".join([f"# {_PROVENANCE_KEY} {text}", "x,y,depth", *rows]) + "\n"
+        temporary.write_text(content, encoding="utf-8", newline="\n")
