@@ -96,23 +96,17 @@ def test_the_residual_is_met_at_points_without_noise(
     assert torch.allclose(residuals.points.sample(mean).double(), residuals.residual, atol=2e-3)
 
 
-@pytest.mark.parametrize("count", [3, 40])
-def test_prediction_at_positions_equals_the_dense_prediction(count: int) -> None:
-    residuals = fit(field(count))
-    positions = torch.tensor([[3.0, 4.0], [29.0, 19.0], [0.0, 0.0]])
-    queries = SparsePoints(xy=positions, depth=torch.ones(3), size=SIZE)
-    at = residuals.features_at(queries)
-    mean = predict(residuals)
-    assert torch.allclose(predict_at(residuals, positions, at), queries.sample(mean), atol=1e-5)
-
-
-def test_with_many_points_prediction_at_positions_is_near_the_dense_prediction() -> None:
-    residuals = fit(field(900, size=(60, 80)))
-    positions = torch.tensor([[30.0, 40.0], [79.0, 59.0], [7.0, 8.0]])
-    queries = SparsePoints(xy=positions, depth=torch.ones(3), size=(60, 80))
-    at = residuals.features_at(queries)
-    mean = predict(residuals)
-    assert torch.allclose(predict_at(residuals, positions, at), queries.sample(mean), atol=0.02)
+@pytest.mark.parametrize(
+    ("count", "size", "atol"), [(3, SIZE, 1e-5), (40, SIZE, 1e-5), (900, (60, 80), 0.02)]
+)
+def test_prediction_at_positions_equals_the_dense_one_and_is_near_it_with_many_points(
+    count: int, size: tuple[int, int], atol: float
+) -> None:
+    residuals = fit(field(count, size=size))
+    positions = torch.tensor([[3.0, 4.0], [size[1] - 1.0, size[0] - 1.0], [0.0, 0.0], [7.0, 8.0]])
+    queries = SparsePoints(xy=positions, depth=torch.ones(4), size=size)
+    at = predict_at(residuals, positions, residuals.features_at(queries))
+    assert torch.allclose(at, queries.sample(predict(residuals)), atol=atol)
 
 
 def left_out_by_hand(residuals: ResidualField, index: int) -> float:

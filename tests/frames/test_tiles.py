@@ -153,7 +153,9 @@ def test_tiles_with_too_few_points_have_the_depth_of_the_whole_frame() -> None:
     refined = tiled(module, RefineSettings(iterations=200, lr=0.01), one)
     assert np.unique(refined.after[:, 100:]).size <= 3  # one number, to the last bit of a division
     np.testing.assert_allclose(refined.after[:, 100:], refined.after[0, 299], rtol=1e-6)
-    assert "of them left as in the whole frame, with fewer than 5 points" in refined.notes[-1]
+    assert refined.notes[-1] == (
+        "tiles: 6 of 64×64 pixels, 5 of them left as in the whole frame, with fewer than 5 points"
+    )
 
 
 def test_propagation_follows_once_over_all_tiles() -> None:
