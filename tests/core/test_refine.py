@@ -626,6 +626,7 @@ def test_settings_are_the_papers() -> None:
     assert RefineSettings() == RefineSettings(iterations=5, lr=0.01, loss="l1", update="sign")
 
 
+@pytest.mark.slow
 def test_a_refinement_does_not_import_the_compiler() -> None:
     code = (
         "import sys; from tests.core.test_refine import *;"

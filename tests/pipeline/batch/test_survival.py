@@ -20,6 +20,7 @@ from tests.pipeline.batches import NAMES, RecordingListener, batch, pairs_on_dis
 ROOT = Path(__file__).parents[3]
 
 
+@pytest.mark.slow
 def test_killed_thirty_times_at_random_moments_it_ends_byte_identical(tmp_path: Path) -> None:
     done = subprocess.run(
         [sys.executable, "-m", "tests.pipeline.killed_batches", str(tmp_path), "30"],

@@ -15,6 +15,8 @@ pytest.importorskip("ray")
 pytest.importorskip("s3fs")
 pytest.importorskip("moto")
 
+pytestmark = pytest.mark.slow
+
 
 def test_workers_read_and_write_a_store_as_one_process_does(tmp_path: Path) -> None:
     root = pairs_on_disk(tmp_path / "drive")
