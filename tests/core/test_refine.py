@@ -26,7 +26,7 @@ from pnpdepth_cli.errors import (
 )
 from pnpdepth_cli.points import SparsePoints
 from tests.completion.naive import naive_refine, plain
-from tests.core.networks import NETWORKS, TwoBranches, build, conv, depth_of, image
+from tests.core.networks import NETWORKS, build, conv, depth_of, image
 
 POINTS = SparsePoints(
     xy=torch.tensor([[3.0, 4.0], [10.0, 12.0], [15.0, 15.0], [7.0, 9.0], [0.0, 1.0]]),
@@ -156,13 +156,6 @@ def test_one_update_by_hand() -> None:
     assert result.before.flatten().tolist() == [6.0, 6.0]
     assert result.after.flatten().tolist() == [5.5, 6.5]
     assert result.losses == (2.0, 1.5)
-
-
-def test_the_front_and_independent_branches_run_once_in_a_whole_refinement() -> None:
-    network = TwoBranches()
-    refined(network, "cut", RefineSettings(iterations=5))
-    assert (network.front.calls, network.guide.calls) == (1, 1)
-    assert (network.detached.calls, network.head.calls) == (6, 6)
 
 
 def test_grad_mode_and_random_state_of_the_caller_stay_and_change_nothing() -> None:
@@ -600,26 +593,6 @@ def test_a_network_without_one_part_per_frame_is_refused_and_works_one_at_a_time
     with Split(network, layer) as split:
         alone = refine(split, (image(),), POINTS, RefineSettings(), depth_of=lambda y: y)
     assert alone.losses[-1] < alone.losses[0]
-
-
-def test_structures_are_taken_apart_for_each_frame() -> None:
-    class Pair(nn.Module):
-        def __init__(self) -> None:
-            super().__init__()
-            self.cut = nn.Identity()
-
-        def forward(self, x: Tensor) -> dict[str, Any]:
-            z = self.cut(x)
-            return {"depth": z[:, :1] + 1, "more": (z, None)}
-
-    network = Pair()
-    results = refined_at_once(network, "cut", RefineSettings(), read=lambda y: y["depth"])
-    for index, together in enumerate(results):
-        assert isinstance(together, Refinement)
-        x = (IMAGES[index : index + 1],)
-        with Split(network, "cut") as split:
-            alone = refine(split, x, OTHERS[index], RefineSettings(), depth_of=lambda y: y["depth"])
-        assert torch.equal(together.after, alone.after)
 
 
 def test_settings_are_the_papers() -> None:

@@ -137,7 +137,7 @@ def test_torch_transformer_layers_with_their_fast_path_come_out_the_same(
         with Split(network, name) as split, torch.no_grad():
             for frame, whole in zip(frames, wholes, strict=True):
                 assert torch.equal(split.rear(split.front(frame)), whole)
-            assert split.static_graph == (kind is not LooksAtValues or name.startswith("1"))
+            assert split.static_graph == (kind is not LooksAtValues)
 
 
 def test_a_compiled_network_can_be_cut() -> None:
