@@ -17,7 +17,7 @@ from pnpdepth_cli.core.split.tensors import SavedTensors
 from pnpdepth_cli.core.split.watch import Watch
 from pnpdepth_cli.errors import ModelError
 from tests.completion.naive import plain
-from tests.core.networks import Branching, Counting, build, conv, image
+from tests.core.networks import Branching, Counting, conv, image
 
 
 class Behind(nn.Module):
@@ -102,19 +102,6 @@ def test_python_may_take_another_branch_at_another_z(escape: Callable[[Tensor], 
         assert torch.equal(outputs[0], outputs[2])
         assert torch.equal(outputs[1], outputs[3])
         assert not torch.equal(outputs[0], outputs[1])
-
-
-def test_a_native_operator_that_reads_z_unseen_runs_again() -> None:
-    network, x = build("native"), image()
-    for gradient in (False, True):
-        with Split(network, "cut") as split, torch.set_grad_enabled(gradient):
-            z = split.front(x)
-            first = split.rear(z.requires_grad_(gradient))
-            second = split.rear((z * 3).detach())
-        assert not torch.equal(first, second)
-        with Split(network, "cut") as split, torch.no_grad():
-            split.front(x)
-            assert torch.equal(split.rear(z * 3), second)
 
 
 def test_a_saved_tensor_gets_its_copy_before_it_is_overwritten() -> None:
@@ -272,31 +259,3 @@ def test_what_other_threads_do_with_tensors_meanwhile_is_their_own_matter() -> N
         assert not watch.data_dependent
         z.numpy()
         assert watch.data_dependent
-
-
-def test_a_pass_is_the_same_while_other_threads_read_tensors() -> None:
-    network, x = Behind(DEPENDENT["a value"]), image()
-    with Split(network, "cut") as split, torch.no_grad():
-        z = split.front(x)
-        alone = [split.rear(z), split.rear(-z)]
-    stop = threading.Event()
-
-    def read() -> None:
-        tensor = torch.arange(10.0)
-        while not stop.is_set():
-            assert tensor.numpy()[3] == tensor.tolist()[3] == 3
-
-    threads = [threading.Thread(target=read) for _ in range(3)]
-    for thread in threads:
-        thread.start()
-    try:
-        for _ in range(20):
-            with Split(network, "cut") as split, torch.no_grad():
-                split.front(x)
-                assert torch.equal(split.rear(z), alone[0])
-                assert torch.equal(split.rear(-z), alone[1])
-    finally:
-        stop.set()
-        for thread in threads:
-            thread.join()
-    assert "numpy" not in vars(Tensor)
