@@ -63,6 +63,7 @@ def in_folder(folder: Path, root: Path, listener: RecordingListener | None = Non
         os.chdir(before)
 
 
+@pytest.mark.slow
 def test_a_full_disk_stops_it_cleanly_and_with_room_it_goes_on(
     tmp_path: Path, small_disk: Path
 ) -> None:
