@@ -49,3 +49,5 @@ def test_features_are_the_position_in_the_longer_side_and_depth_and_colour_in_de
 def test_a_flat_prediction_and_image_have_no_features_but_the_position() -> None:
     flat = features_of(torch.full(SIZE, math.log(3.0)), torch.full((3, *SIZE), 0.5))
     assert torch.stack(flat[2:]).abs().max() < 1e-3
+    nearly = features_of(torch.tensor([[0.0, 1e-3]]), None)[2]  # a deviation of 5e-4, and 1e-3 more
+    assert torch.allclose(nearly, torch.tensor([[-1 / 3, 1 / 3]]), rtol=1e-3)
