@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -31,6 +31,10 @@ class View:
     topic: str = IMAGES
 
 
+Make = Callable[..., Any]
+"""Makes a message of a type such as "std_msgs/Header" of its fields."""
+
+
 def write_bag(
     path: Path,
     *,
@@ -51,13 +55,43 @@ def write_bag(
     """
     ros1 = path.suffix == ".bag"
     store = message_types(ros1=ros1)
+
+    def make(kind: str, **fields: Any) -> Any:
+        return store.types[kind.replace("/", "/msg/")](**fields)
+
+    def header(time_ns: int, frame: str) -> Any:
+        stamp = make("builtin_interfaces/Time", sec=time_ns // 10**9, nanosec=time_ns % 10**9)
+        more = {"seq": 0} if ros1 else {}
+        return make("std_msgs/Header", stamp=stamp, frame_id=frame, **more)
+
+    def messages() -> Iterator[tuple[str, int, Any]]:
+        start, step = 1_700_000_000 * 10**9, 30_000_000
+        if static:
+            yield "/tf_static", start, _transforms(make, header)
+        for number in range(frames):
+            time_ns = start + step * number
+            if info:
+                stamp = header(time_ns, "camera")
+                yield "/front/camera_info", time_ns, _camera_info(make, stamp, ros1, view)
+            if poses:
+                stamp = header(time_ns - step // 2, "odom")
+                yield _moved(make, stamp, 0.3 * number - 0.15, poses)
+            pixels = np.full((HEIGHT, WIDTH, 3), 40 + number % 200, np.uint8)
+            pixels[:, : WIDTH // 2, 0] = 200
+            pixels, topic = (pixels, IMAGES) if view is None else (view.pixels, view.topic)
+            yield _image(make, header(time_ns, "camera"), pixels, time_ns, topic, compressed)
+            cloud = _cloud(make, header(time_ns + 4_000_000, "lidar"), view)
+            yield POINTS, time_ns + 5_000_000, cloud
+        if poses:
+            last = header(start + step * frames - step // 2, "odom")
+            yield _moved(make, last, 0.3 * frames - 0.15, poses)
+
     opened = _writer(path)
     if compression is not None:
         opened.set_compression(compression)
     with opened as writer:
         connections: dict[str, Any] = {}
-        messages = _messages(store.types, ros1, frames, compressed, static, info, poses, view)
-        for topic, time_ns, message in messages:
+        for topic, time_ns, message in messages():
             kind = message.__msgtype__
             if topic not in connections:
                 connections[topic] = writer.add_connection(topic, kind, typestore=store)
@@ -82,132 +116,93 @@ def _writer(path: Path) -> Any:
     return Writer2(path, version=9)
 
 
-def _messages(
-    types: Any,
-    ros1: bool,
-    frames: int,
-    compressed: bool,
-    static: bool,
-    info: bool,
-    poses: str,
-    view: View | None,
-) -> Iterator[tuple[str, int, Any]]:
-    def header(time_ns: int, frame: str) -> Any:
-        stamp = types["builtin_interfaces/msg/Time"](sec=time_ns // 10**9, nanosec=time_ns % 10**9)
-        more = {"seq": 0} if ros1 else {}
-        return types["std_msgs/msg/Header"](stamp=stamp, frame_id=frame, **more)
-
-    start = 1_700_000_000 * 10**9
-    if static:
-        yield "/tf_static", start, _transforms(types, header)
-    for number in range(frames):
-        time_ns = start + 30_000_000 * number
-        if info:
-            yield (
-                "/front/camera_info",
-                time_ns,
-                _camera_info(types, header(time_ns, "camera"), ros1, view),
-            )
-        if poses:
-            yield _moved(types, header(time_ns - 15_000_000, "odom"), 0.3 * number - 0.15, poses)
-        pixels = np.full((HEIGHT, WIDTH, 3), 40 + number % 200, np.uint8)
-        pixels[:, : WIDTH // 2, 0] = 200
-        pixels = pixels if view is None else view.pixels
-        topic = IMAGES if view is None else view.topic
-        yield _image(types, header(time_ns, "camera"), pixels, time_ns, topic, compressed)
-        cloud = _cloud(types, header(time_ns + 4_000_000, "lidar"), view)
-        yield POINTS, time_ns + 5_000_000, cloud
-    if poses:
-        last = start + 30_000_000 * frames - 15_000_000
-        yield _moved(types, header(last, "odom"), 0.3 * frames - 0.15, poses)
+def _vector(make: Make, x: float, y: float, z: float) -> Any:
+    return make("geometry_msgs/Vector3", x=x, y=y, z=z)
 
 
-def _moved(types: Any, header: Any, x: float, kind: str) -> tuple[str, int, Any]:
+def _moved(make: Make, header: Any, x: float, kind: str) -> tuple[str, int, Any]:
     """The pose of base, or for "pose" of the camera, at x metres."""
     time_ns = header.stamp.sec * 10**9 + header.stamp.nanosec
-    turn = types["geometry_msgs/msg/Quaternion"](x=0.0, y=0.0, z=0.0, w=1.0)
-    vector = types["geometry_msgs/msg/Vector3"](x=x, y=0.0, z=0.0)
+    turn = make("geometry_msgs/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0)
     if kind == "tf":
-        transform = types["geometry_msgs/msg/Transform"](translation=vector, rotation=turn)
-        link = types["geometry_msgs/msg/TransformStamped"](
-            header=header, child_frame_id="base", transform=transform
+        transform = make(
+            "geometry_msgs/Transform", translation=_vector(make, x, 0.0, 0.0), rotation=turn
         )
-        return "/tf", time_ns, types["tf2_msgs/msg/TFMessage"](transforms=[link])
-    point = types["geometry_msgs/msg/Point"](x=x, y=0.0, z=0.0)
-    pose = types["geometry_msgs/msg/Pose"](position=point, orientation=turn)
+        link = make(
+            "geometry_msgs/TransformStamped",
+            header=header,
+            child_frame_id="base",
+            transform=transform,
+        )
+        return "/tf", time_ns, make("tf2_msgs/TFMessage", transforms=[link])
+    point = make("geometry_msgs/Point", x=x, y=0.0, z=0.0)
+    pose = make("geometry_msgs/Pose", position=point, orientation=turn)
     if kind == "pose":
-        message = types["geometry_msgs/msg/PoseStamped"](header=header, pose=pose)
-        return "/vio/pose", time_ns, message
-    still = types["geometry_msgs/msg/Vector3"](x=0.0, y=0.0, z=0.0)
-    twist = types["geometry_msgs/msg/Twist"](linear=still, angular=still)
-    with_twist = types["geometry_msgs/msg/TwistWithCovariance"](
-        twist=twist, covariance=np.zeros(36)
-    )
-    with_pose = types["geometry_msgs/msg/PoseWithCovariance"](pose=pose, covariance=np.zeros(36))
-    message = types["nav_msgs/msg/Odometry"](
-        header=header, child_frame_id="base", pose=with_pose, twist=with_twist
+        return "/vio/pose", time_ns, make("geometry_msgs/PoseStamped", header=header, pose=pose)
+    still, unknown = _vector(make, 0.0, 0.0, 0.0), np.zeros(36)
+    twist = make("geometry_msgs/Twist", linear=still, angular=still)
+    message = make(
+        "nav_msgs/Odometry",
+        header=header,
+        child_frame_id="base",
+        pose=make("geometry_msgs/PoseWithCovariance", pose=pose, covariance=unknown),
+        twist=make("geometry_msgs/TwistWithCovariance", twist=twist, covariance=unknown),
     )
     return "/odom", time_ns, message
 
 
-def _transforms(types: Any, header: Any) -> Any:
+def _transforms(make: Make, header: Make) -> Any:
     """camera is in base, and so is lidar: x forward, y left, z up, 0.2 m above the camera."""
 
-    def link(child: str, shift: tuple[float, ...], xyzw: tuple[float, ...]) -> Any:
-        return types["geometry_msgs/msg/TransformStamped"](
+    def link(child: str, shift: tuple[float, float, float], xyzw: tuple[float, ...]) -> Any:
+        turn = make("geometry_msgs/Quaternion", **dict(zip("xyzw", xyzw, strict=True)))
+        transform = make(
+            "geometry_msgs/Transform", translation=_vector(make, *shift), rotation=turn
+        )
+        return make(
+            "geometry_msgs/TransformStamped",
             header=header(10**9, "base"),
             child_frame_id=child,
-            transform=types["geometry_msgs/msg/Transform"](
-                translation=types["geometry_msgs/msg/Vector3"](
-                    **dict(zip("xyz", shift, strict=True))
-                ),
-                rotation=types["geometry_msgs/msg/Quaternion"](
-                    **dict(zip("xyzw", xyzw, strict=True))
-                ),
-            ),
+            transform=transform,
         )
 
     camera = link("camera", (1.0, 0.0, 0.0), (-0.5, 0.5, -0.5, 0.5))
     lidar = link("lidar", (1.0, 0.0, 0.2), (0.0, 0.0, 0.0, 1.0))
-    return types["tf2_msgs/msg/TFMessage"](transforms=[camera, lidar])
+    return make("tf2_msgs/TFMessage", transforms=[camera, lidar])
 
 
-def _camera_info(types: Any, header: Any, ros1: bool, view: View | None) -> Any:
-    matrix = [FOCAL_PX, 0, 31.5, 0, FOCAL_PX, 23.5, 0, 0, 1.0]
-    values = {
-        "d": np.zeros(5),
-        "k": np.array(matrix),
-        "r": np.eye(3).ravel(),
-        "p": np.zeros(12),
-    }
+def _camera_info(make: Make, header: Any, ros1: bool, view: View | None) -> Any:
+    matrix = np.array([FOCAL_PX, 0, 31.5, 0, FOCAL_PX, 23.5, 0, 0, 1.0])
+    values = {"d": np.zeros(5), "k": matrix, "r": np.eye(3).ravel(), "p": np.zeros(12)}
     if view is not None:
         values = {name: getattr(view, name).ravel().astype(float) for name in "dkrp"}
     height, width = (HEIGHT, WIDTH) if view is None else view.pixels.shape[:2]
-    return types["sensor_msgs/msg/CameraInfo"](
+    whole = {"x_offset": 0, "y_offset": 0, "height": 0, "width": 0, "do_rectify": False}
+    return make(
+        "sensor_msgs/CameraInfo",
         header=header,
         height=height,
         width=width,
         distortion_model="plumb_bob",
         binning_x=0,
         binning_y=0,
-        roi=types["sensor_msgs/msg/RegionOfInterest"](
-            x_offset=0, y_offset=0, height=0, width=0, do_rectify=False
-        ),
+        roi=make("sensor_msgs/RegionOfInterest", **whole),
         **{name.upper() if ros1 else name: value for name, value in values.items()},
     )
 
 
 def _image(
-    types: Any, header: Any, pixels: np.ndarray, time_ns: int, topic: str, compressed: bool
+    make: Make, header: Any, pixels: np.ndarray, time_ns: int, topic: str, compressed: bool
 ) -> tuple[str, int, Any]:
     if compressed:
         data = cv2.imencode(".jpg", pixels[:, :, ::-1])[1].ravel()
-        message = types["sensor_msgs/msg/CompressedImage"](header=header, format="jpeg", data=data)
+        message = make("sensor_msgs/CompressedImage", header=header, format="jpeg", data=data)
         return f"{topic}/compressed", time_ns, message
     height, width = pixels.shape[:2]
     padded = np.zeros((height, width * 3 + 8), np.uint8)  # rows may be longer than their pixels
     padded[:, : width * 3] = pixels.reshape(height, -1)
-    message = types["sensor_msgs/msg/Image"](
+    message = make(
+        "sensor_msgs/Image",
         header=header,
         height=height,
         width=width,
@@ -219,16 +214,10 @@ def _image(
     return topic, time_ns, message
 
 
-def _cloud(types: Any, header: Any, view: View | None) -> Any:
+def _cloud(make: Make, header: Any, view: View | None) -> Any:
     """Fields that are not x y z, and not in this order; one point without return."""
-    layout = np.dtype(
-        {
-            "names": ["ring", "z", "y", "x"],
-            "formats": ["<u2", "<f4", "<f4", "<f8"],
-            "offsets": [0, 4, 8, 16],
-            "itemsize": 28,
-        }
-    )
+    names, formats, offsets = ["ring", "z", "y", "x"], ["<u2", "<f4", "<f4", "<f8"], [0, 4, 8, 16]
+    layout = np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": 28})
     y, z = np.meshgrid(np.linspace(-2, 2, 15), np.linspace(-1.5, 1.5, 10))
     points = np.zeros(151, layout)
     points["x"], points["y"][:150], points["z"][:150] = 5.0, y.ravel(), z.ravel()
@@ -236,14 +225,12 @@ def _cloud(types: Any, header: Any, view: View | None) -> Any:
     if view is not None:
         points = np.zeros(len(view.points), layout)
         points["x"], points["y"], points["z"] = view.points.T
-    kinds = {"ring": 4, "z": 7, "y": 7, "x": 8}
     fields = [
-        types["sensor_msgs/msg/PointField"](
-            name=name, offset=layout.fields[name][1], datatype=kinds[name], count=1
-        )
-        for name in layout.names
+        make("sensor_msgs/PointField", name=name, offset=offset, datatype=kind, count=1)
+        for name, offset, kind in zip(names, offsets, [4, 7, 7, 8], strict=True)
     ]
-    return types["sensor_msgs/msg/PointCloud2"](
+    return make(
+        "sensor_msgs/PointCloud2",
         header=header,
         height=1,
         width=len(points),

@@ -22,6 +22,8 @@ if "PYTEST_XDIST_WORKER" in os.environ:
     os.environ["OMP_NUM_THREADS"] = "1"
 
 _SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
+SLOW_FIXTURES = {"chrome", "shared_data"}
+"""A test that uses one of them belongs to the second tier."""
 
 
 @pytest.fixture
@@ -42,10 +44,10 @@ def frame(tmp_path: Path) -> FrameOnDisk:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Marks the tests that need the real frames, so that -m "not shared_data" leaves them out."""
+    """Marks the tests of the second tier that their fixtures tell."""
     for item in items:
-        if "shared_data" in getattr(item, "fixturenames", ()):
-            item.add_marker(pytest.mark.shared_data)
+        if SLOW_FIXTURES.intersection(getattr(item, "fixturenames", ())):
+            item.add_marker(pytest.mark.slow)
 
 
 @pytest.fixture

@@ -80,23 +80,30 @@ def test_core_and_models_read_no_files_through_cv2_and_io_needs_no_torch() -> No
         assert "cv2.im" not in file.read_text("utf-8"), file
 
 
-@pytest.mark.parametrize(
-    "command", [[], *([name] for name in COMMANDS), ["models", "check"], ["models", "fetch"]]
-)
-def test_help_imports_neither_torch_nor_numpy_nor_rich(command: list[str]) -> None:
+def imports_nothing_of(heavy: str, code: str, *arguments: str) -> str:
+    """What a process printed that ran the code and had none of these modules at its end."""
+    check = (
+        f"\nimport sys\nheavy = set({heavy.split()}) & set(sys.modules)\nassert not heavy, heavy"
+    )
+    command = [sys.executable, "-c", code + check, *arguments]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_help_imports_neither_torch_nor_numpy_nor_rich() -> None:
+    commands = [*COMMANDS, "models check", "models fetch"]
     code = (
         "import sys\n"
         "from pnpdepth_cli.cli.main import main\n"
-        "try:\n    main(sys.argv[1:])\n"
-        "except SystemExit as stop:\n    assert stop.code in (None, 0), stop.code\n"
-        "heavy = {'torch', 'numpy', 'cv2', 'rich', 'tqdm'} & set(sys.modules)\n"
-        "assert not heavy, heavy\n"
+        "for command in ['', *sys.argv[1:]]:\n"
+        "    try:\n        main([*command.split(), '--help'])\n"
+        "    except SystemExit as stop:\n        assert stop.code in (None, 0), stop.code\n"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", code, *command, "--help"],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
-    assert "Usage: pnpdepth" in done.stdout
+    shown = imports_nothing_of("torch numpy cv2 rich tqdm", code, *commands)
+    assert shown.count("Usage: pnpdepth") == 1 + len(commands)
+
+
+@pytest.mark.parametrize("module", ["pnpdepth_cli", "pnpdepth_cli.points"])
+def test_an_import_is_light(module: str) -> None:
+    imports_nothing_of("torch numpy", f"import {module}")

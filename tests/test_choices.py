@@ -32,29 +32,16 @@ def table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Table:
     return Table("io/formats", "__name__", group="test_table", noun="entry", first=("png",))
 
 
-def test_names_come_from_the_folder_and_from_entry_points(table: Table) -> None:
-    assert {"pfm", "png", "elsewhere"} <= set(table)
-    assert "--init--" not in table
-    assert len(table) == len(list(table))
-
-
-def test_names_given_first_are_listed_first_and_the_others_in_alphabetical_order(
+def test_names_come_from_the_folder_and_from_entry_points_and_are_loaded_from_there(
     table: Table,
 ) -> None:
     names = list(table)
-    assert names[0] == "png"
-    assert names[1:] == sorted(names[1:])
-
-
-def test_an_entry_of_this_package_is_loaded_from_its_module(table: Table) -> None:
-    assert table["pfm"] == "pnpdepth_cli.io.formats.pfm"
-
-
-def test_an_entry_of_another_package_is_loaded_from_its_entry_point(table: Table) -> None:
+    assert names == ["png", *sorted(set(names) - {"png"})]
+    assert {"pfm", "elsewhere"} <= set(names)
+    assert "--init--" not in table
+    assert len(table) == len(names)
+    assert table["pfm"] == "pnpdepth_cli.io.formats.pfm"  # of this package first
     assert table["elsewhere"] == "loaded from elsewhere"
-
-
-def test_an_unknown_name_is_an_error_that_names_the_nearest(table: Table) -> None:
     with pytest.raises(UsageError, match=r"unknown entry 'pfmm'; did you mean 'pfm'\?"):
         table["pfmm"]
 

@@ -51,11 +51,11 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def run(arguments: list[str], folder: Path) -> str:
+def run(arguments: list[str], folder: Path, *path: str) -> str:
     """What the finished Python process printed. Fails with its stderr if it failed."""
     done = subprocess.run(
         [sys.executable, *arguments],
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), *path])},
         capture_output=True,
         text=True,
         check=False,
@@ -73,6 +73,7 @@ def test_the_readme_shows_the_main_commands() -> None:
 WITH_COMMANDS = [page for page in PAGES if shown_commands(page) and page != RECONSTRUCTION]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("page", WITH_COMMANDS, ids=named)
 def test_the_commands_of_a_page_run(page: Path, folder: Path) -> None:
     for arguments in shown_commands(page):
@@ -80,19 +81,17 @@ def test_the_commands_of_a_page_run(page: Path, folder: Path) -> None:
         run(["-m", "pnpdepth_cli", *arguments, *overwrite], folder)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("page", [README, ROOT / "docs" / "python-api.md"], ids=named)
 def test_the_python_example_of_a_page_runs(page: Path, folder: Path) -> None:
     (code,) = [block for block in blocks(page, "python") if "import pnpdepth_cli as pnp" in block]
     assert run(["-c", code], folder)
 
 
-def test_the_example_of_the_readme_has_ten_lines() -> None:
+def test_the_readme_is_short_and_its_example_has_ten_lines() -> None:
+    assert len(README.read_text(encoding="utf-8").splitlines()) <= 160
     (code,) = [block for block in blocks(README, "python") if "import pnpdepth_cli as pnp" in block]
     assert len([line for line in code.splitlines() if line]) <= 10
-
-
-def test_the_readme_is_short() -> None:
-    assert len(README.read_text(encoding="utf-8").splitlines()) <= 160
 
 
 @pytest.mark.parametrize("page", PAGES, ids=named)

@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 
 from tests.test_readme import RECONSTRUCTION, ROOT, blocks, run, shown_commands
 
+pytestmark = pytest.mark.slow
 PROGRAMS = ("colmap", "nerfstudio", "gaussian-splatting")
 
 

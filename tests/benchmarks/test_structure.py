@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
+
 from benchmarks.structure import ROOT, figures, hops_of
 
 
@@ -24,6 +26,7 @@ def test_the_figures_of_a_small_tree(tmp_path: Path) -> None:
     assert (values["README, lines"], values["README, words"]) == (3, 4)
 
 
+@pytest.mark.slow
 def test_few_functions_lie_between_the_command_and_equation_3() -> None:
     names = hops_of(ROOT)
     assert names[0] == "refine.refine"

@@ -89,7 +89,6 @@ EXITS: list[tuple[list[str], int, str]] = [
     (["--device", "cuda:9"], 6, "--device cpu"),
     (["--device", "cpu,cuda"], 2, "workers run on cpu, cuda"),
     (["--ray", "frames"], 2, "is no address of a Ray cluster"),
-    (["--ray", "127.0.0.1:1"], 6, "cannot be used: Connection refused"),
 ]
 
 
@@ -101,6 +100,14 @@ def test_the_exit_code_is_that_of_the_kind_of_error(
     err = capsys.readouterr().err
     assert message in err.splitlines()[-1]
     assert "Traceback" not in err
+
+
+def test_a_cluster_that_does_not_answer_is_an_error_of_the_device(
+    root: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("ray")
+    assert code_of(arguments("--ray", "127.0.0.1:1")) == 6
+    assert "cannot be used: Connection refused" in capsys.readouterr().err.splitlines()[-1]
 
 
 def test_ray_without_an_address_is_this_machine(

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from pnpdepth_cli.completion.image_registration import (
@@ -64,10 +64,6 @@ def test_frames_of_another_size_than_the_first_are_left_out() -> None:
     assert estimated([first, smaller]) == estimated([first])
 
 
-def test_no_frame_shows_nothing() -> None:
-    assert estimated([]) is None
-
-
 def test_points_that_were_found_in_the_image_show_nothing() -> None:
     rgb, _ = frame(0)
     contrast = np.abs(np.diff(rgb.mean(-1), axis=1))[:, :-1] > 0.1
@@ -89,21 +85,16 @@ def test_scan_lines_few_points_and_points_of_one_side_show_nothing() -> None:
     assert evidence(rgb, points.select(points.xy[:, 0] < 100)) is None
 
 
-@pytest.mark.parametrize("line", [True, False], ids=["on a line", "at one depth"])
-def test_points_without_a_depth_edge_show_nothing_or_leave_the_image(line: bool) -> None:
+@pytest.mark.parametrize("case", ["on a line", "at one depth", "an image without an edge"])
+def test_points_or_an_image_without_an_edge_leave_the_image(case: str) -> None:
     rgb, points = frame(0, UNREGISTERED)
-    xy = points.xy.clone()
-    if line:
+    xy, depth = points.xy.clone(), torch.full((500,), 2.0)
+    if case == "on a line":
         xy[:, 1] = 100.0
-    known = evidence(rgb, SparsePoints(xy=xy, depth=torch.full((500,), 2.0), size=SIZE))
-    assert known is None or estimated([known]) is None
-
-
-def test_an_image_without_an_edge_stays() -> None:
-    _, points = frame(0)
-    grey = np.full((*SIZE, 3), 0.5, np.float32)
-    known = evidence(grey, points)
-    assert known is None or estimated([known]) is None
+    if case == "an image without an edge":
+        rgb, depth = np.full((*SIZE, 3), 0.5, np.float32), points.depth
+    known = evidence(rgb, SparsePoints(xy=xy, depth=depth, size=SIZE))
+    assert estimated([known] if known is not None else []) is None
 
 
 def test_the_same_frame_gives_the_same_bytes() -> None:
@@ -111,15 +102,12 @@ def test_the_same_frame_gives_the_same_bytes() -> None:
     assert first.log_likelihood.tobytes() == second.log_likelihood.tobytes()
 
 
-def test_an_unmoved_image_keeps_every_bit() -> None:
-    rgb, _ = frame(0)
-    assert (ImageRegistration(zoom=1.0, right=0.0, down=0.0).applied(rgb) == rgb).all()
-
-
+@example(right=0, down=0)
 @given(right=st.integers(-6, 6), down=st.integers(-6, 6))
 def test_an_image_moved_by_whole_pixels_keeps_its_values(right: int, down: int) -> None:
     rgb = np.random.default_rng(0).random((20, 30, 3), np.float32)
     moved = ImageRegistration(zoom=1.0, right=float(right), down=float(down)).applied(rgb)
+    assert (moved == rgb).all() == (right == down == 0)
     expected = np.roll(rgb, (-down, -right), axis=(0, 1))
     assert (moved[6:-6, 6:-6] == expected[6:-6, 6:-6]).all()
 

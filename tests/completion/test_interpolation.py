@@ -191,15 +191,6 @@ def test_inverse_distance_does_not_depend_on_how_many_pixels_are_looked_up_at_on
     assert torch.equal(inverse_distance(points), whole)
 
 
-@given(depth=st.floats(0.1, 100), count=st.integers(1, 300), seed=st.integers(0, 99))
-@settings(max_examples=20)
-def test_a_wall_is_a_wall_however_it_is_filled(depth: float, count: int, seed: int) -> None:
-    points = scattered(count, seed=seed)
-    wall = SparsePoints(xy=points.xy, depth=torch.full((count,), depth), size=points.size)
-    for name, fill in FILLS.items():
-        assert torch.allclose(fill(wall), torch.tensor(depth), rtol=1e-5), name
-
-
 def test_morphological_lets_what_is_near_grow_over_what_is_far() -> None:
     size = (40, 60)
     grid = pixels(size)[1::3, 1::3].reshape(-1, 2)

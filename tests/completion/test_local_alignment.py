@@ -23,16 +23,14 @@ def spoiled(points: SparsePoints, fraction: float = 0.2) -> SparsePoints:
 
 
 @pytest.mark.parametrize("space", SPACES)
-@pytest.mark.parametrize("count", [3, 30, 400])
+@pytest.mark.parametrize("count", [1, 2, 3, 30, 400])
 def test_a_prediction_that_is_a_line_away_everywhere_is_restored(space: str, count: int) -> None:
     gt = scene_depth()
-    value = to_space(gt, space)
-    prediction = from_space((value + 0.3) / 0.7, space)
-    assert torch.allclose(
-        locally_aligned(prediction, random_points(gt, count), space=space),
-        gt,
-        rtol=1e-3,
-    )
+    prediction = from_space((to_space(gt, space) + 0.3) / 0.7, space)
+    if count < 3:  # a factor is all that one and two points show
+        prediction = gt / 3
+    dense = locally_aligned(prediction, random_points(gt, count), space=space)
+    assert torch.allclose(dense, gt, rtol=1e-3)
 
 
 @pytest.mark.parametrize("space", SPACES)
@@ -52,16 +50,6 @@ def test_near_a_point_the_depth_is_the_points() -> None:
     prediction = scene_depth(left=13).roll(5, dims=0)  # objects at other positions
     off = points.sample(locally_aligned(prediction, points)).log() - points.depth.log()
     assert float(off.abs().median()) < 0.02
-
-
-@pytest.mark.parametrize("count", [1, 2])
-def test_one_and_two_points_move_the_whole_prediction(count: int) -> None:
-    gt = scene_depth()
-    assert torch.allclose(
-        locally_aligned(gt / 3, random_points(gt, count)),
-        gt,
-        rtol=1e-4,
-    )
 
 
 @pytest.mark.parametrize(("count", "fraction"), [(40, 0.5), (400, 0.05)])

@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 
 from pnpdepth_cli.core.metrics import (
     MEASURES,
-    SUMS,
     Scores,
     error_sums,
     measures_of,
@@ -78,23 +77,6 @@ def test_scores_are_those_of_plain_numpy(pairs: list[tuple[float, float]]) -> No
     }
 
 
-def test_a_perfect_prediction_scores_perfectly() -> None:
-    gt = torch.rand(3, 4) + 1
-    scores = score(gt, gt)
-    assert (scores.rmse, scores.mae, scores.mre, scores.irmse, scores.silog) == (0, 0, 0, 0, 0)
-    assert (scores.delta1, scores.coverage) == (1, 1)
-
-
-def test_a_scale_alone_is_no_error_of_silog() -> None:
-    gt = torch.rand(50) + 1
-    assert score(gt * 3, gt).silog == pytest.approx(0, abs=1e-4)
-
-
-def test_half_a_prediction_is_half_the_coverage() -> None:
-    scores = score(torch.tensor([1.0, 0.0, 5.0]), torch.tensor([1.0, 1.0, 0.0]))
-    assert (scores.pixels, scores.coverage, scores.rmse) == (1, 0.5, 0)
-
-
 def test_nothing_to_score_is_not_a_number() -> None:
     scores = score(torch.zeros(2, 2), torch.zeros(2, 2))
     assert scores.pixels == 0
@@ -145,30 +127,6 @@ def test_another_unit_of_length_changes_each_measure_as_its_unit_says(
             assert after[measure.key] == pytest.approx(expected, rel=1e-9, abs=1e-5), measure.key
 
 
-@given(positive)
-def test_prediction_and_ground_truth_can_be_swapped_in_symmetric_measures(
-    pairs: list[tuple[float, float]],
-) -> None:
-    predicted, gt = torch.tensor(pairs, dtype=torch.float64).T
-    one, other = asdict(score(predicted, gt)), asdict(score(gt, predicted))
-    for key in ("rmse", "mae", "log10", "rmse_log", "irmse", "imae", "silog", "delta1"):
-        assert one[key] == pytest.approx(other[key], rel=1e-9, abs=1e-5), key
-
-
-@given(positive)
-def test_no_mean_absolute_error_is_above_its_root_mean_square(
-    pairs: list[tuple[float, float]],
-) -> None:
-    predicted, gt = torch.tensor(pairs, dtype=torch.float64).T
-    scores = score(predicted, gt)
-    slack = 1 + 1e-12
-    assert scores.mae <= scores.rmse * slack
-    assert scores.imae <= scores.irmse * slack
-    assert scores.log10 * log(10) <= scores.rmse_log * slack
-    assert scores.silog / 100 <= scores.rmse_log * slack + 1e-7
-    assert scores.delta1 <= scores.delta2 <= scores.delta3
-
-
 @given(st.lists(st.tuples(depths, depths, st.integers(0, 2)), min_size=1, max_size=40))
 def test_the_sums_of_the_parts_are_the_sums_of_the_image(
     rows: list[tuple[float, float, int]],
@@ -178,20 +136,15 @@ def test_the_sums_of_the_parts_are_the_sums_of_the_image(
     part = torch.tensor([row[2] for row in rows])
     parts = error_sums(predicted, gt, part=part, parts=3)
     torch.testing.assert_close(parts.sum(0), error_sums(predicted, gt)[0])
+    assert torch.allclose(
+        measures_of(parts.sum(0)), measures_of(error_sums(predicted, gt)[0]), equal_nan=True
+    )
     for number in range(3):
         inside = part == number
         torch.testing.assert_close(parts[number], error_sums(predicted[inside], gt[inside])[0])
 
 
-def test_the_sums_of_two_images_are_those_of_both_together() -> None:
-    generator = torch.Generator().manual_seed(0)
-    predicted, gt = (torch.rand(2, 50, generator=generator) * 9 + 1 for _ in range(2))
-    pooled = error_sums(predicted[0], gt[0])[0] + error_sums(predicted[1], gt[1])[0]
-    torch.testing.assert_close(measures_of(pooled), measures_of(error_sums(predicted, gt)[0]))
-    assert int(pooled[SUMS.index("pixels")]) == 100
-
-
-def test_a_image_of_many_chunks_is_scored_as_one(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_image_of_many_chunks_is_scored_as_one(monkeypatch: pytest.MonkeyPatch) -> None:
     predicted, gt = torch.rand(7, 9) + 1, torch.rand(7, 9) + 1
     part = (gt * 2).long() - 2
     whole = error_sums(predicted, gt, part=part, parts=2)

@@ -76,10 +76,9 @@ def member(
     definition = ModelDefinition(
         name=build.__name__.lower(),
         build=build,
-        size=Multiple(4),
         layers=("layer",),
         input_kind=kind,
-        **({"takes_prior": build is TwicePrior} | of_definition),
+        **({"size": Multiple(4), "takes_prior": build is TwicePrior} | of_definition),
     )
     network = Network(
         definition=definition,

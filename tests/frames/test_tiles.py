@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,9 +15,11 @@ from torch import nn
 
 from pnpdepth_cli.core.refine import RefineSettings
 from pnpdepth_cli.core.split import Split
+from pnpdepth_cli.errors import DivergedError
+from pnpdepth_cli.frames import tiles
 from pnpdepth_cli.frames.frame import Frame, RefinedFrame
 from pnpdepth_cli.frames.refine import refine_frame
-from pnpdepth_cli.frames.tiles import OVERLAP, refine_tiled, tiles_of
+from pnpdepth_cli.frames.tiles import MIN_POINTS, OVERLAP, refine_tiled, tiles_of
 from pnpdepth_cli.models.definition import ModelDefinition, Multiple
 from pnpdepth_cli.models.network import Network, load_network
 from pnpdepth_cli.points import SparsePoints
@@ -153,7 +157,25 @@ def test_tiles_with_too_few_points_have_the_depth_of_the_whole_frame() -> None:
     refined = tiled(module, RefineSettings(iterations=200, lr=0.01), one)
     assert np.unique(refined.after[:, 100:]).size <= 3  # one number, to the last bit of a division
     np.testing.assert_allclose(refined.after[:, 100:], refined.after[0, 299], rtol=1e-6)
-    assert "of them left as in the whole frame, with fewer than 5 points" in refined.notes[-1]
+    for count, left in ((10, 5), (MIN_POINTS, 5), (MIN_POINTS - 1, 6)):
+        few = one.with_points(one.points.select(torch.arange(10) < count))
+        assert tiled(module, PLAIN, few).notes[-1] == (
+            f"tiles: 6 of 64×64 pixels, {left} of them left as in the whole frame,"
+            " with fewer than 5 points"
+        )
+
+
+def test_a_divergence_in_one_tile_is_one_of_the_frame(monkeypatch: pytest.MonkeyPatch) -> None:
+    error, calls = DivergedError("in the first tile"), list[int]()
+
+    def diverging(*arguments: Any, **more: Any) -> RefinedFrame:
+        calls.append(len(calls))
+        refined = refine_frame(*arguments, **more)
+        return replace(refined, diverged=error) if len(calls) == 2 else refined
+
+    monkeypatch.setattr(tiles, "refine_frame", diverging)
+    assert tiled(OneNumber(), PLAIN, everywhere((64, 150))).diverged is error
+    assert len(calls) == 4  # the whole frame, and three tiles
 
 
 def test_propagation_follows_once_over_all_tiles() -> None:

@@ -11,11 +11,6 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from selenium import webdriver
-from selenium.webdriver import Keys
-from selenium.webdriver.common.by import By
-from selenium.webdriver.remote.webelement import WebElement
-from selenium.webdriver.support.ui import WebDriverWait
 
 from pnpdepth_cli.io.report import (
     Column,
@@ -27,6 +22,14 @@ from pnpdepth_cli.io.report import (
 )
 from tests.pipeline.batches import add_frame, batch, pairs_on_disk
 from tests.pipeline.report_pages import frames_of, page_data
+
+pytest.importorskip("selenium", reason="needs selenium")
+
+from selenium import webdriver
+from selenium.webdriver import Keys
+from selenium.webdriver.common.by import By
+from selenium.webdriver.remote.webelement import WebElement
+from selenium.webdriver.support.ui import WebDriverWait
 
 STRANGE = "<img src=x onerror=document.title='run'>\n\"ü'"
 

@@ -10,15 +10,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from selenium import webdriver
-from selenium.webdriver import Keys
-from selenium.webdriver.common.by import By
-from selenium.webdriver.support.ui import WebDriverWait
 
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.io.report import VIEWER
 from tests.pipeline.batches import batch, pairs_on_disk
 from tests.pipeline.report_pages import page_data
+
+pytest.importorskip("selenium", reason="needs selenium")
+
+from selenium import webdriver
+from selenium.webdriver import Keys
+from selenium.webdriver.common.by import By
+from selenium.webdriver.support.ui import WebDriverWait
 
 BACKGROUND = (0x1B, 0x1D, 0x21)
 

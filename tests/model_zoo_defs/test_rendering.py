@@ -18,6 +18,8 @@ from model_zoo_defs.training.rendering.shapes import Group
 from model_zoo_defs.training.scenes import scenes
 from model_zoo_defs.training.scenes.world import Sky, View, World, looking
 
+pytestmark = pytest.mark.slow
+
 HEIGHT, WIDTH = 48, 64
 
 

@@ -21,6 +21,8 @@ from pnpdepth_cli.models.definition import ModelDefinition, Multiple
 pytest.importorskip("safetensors")
 tiny = pytest.importorskip("model_zoo_defs.training.learning.tiny")
 
+pytestmark = pytest.mark.slow
+
 SHAPE = (48, 64)
 WEIGHTS = Path(tiny.__file__).parents[2] / "weights"
 

@@ -29,6 +29,8 @@ validation = pytest.importorskip("model_zoo_defs.training.learning.validation")
 encoder_weights = pytest.importorskip("model_zoo_defs.training.learning.encoder_weights")
 train_inliers = pytest.importorskip("model_zoo_defs.training.learning.train_inliers")
 
+pytestmark = pytest.mark.slow
+
 SHAPE = (48, 64)
 seeds = st.integers(0, 2**32 - 1)
 drawn_often = settings(max_examples=40, deadline=None)

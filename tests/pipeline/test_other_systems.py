@@ -6,6 +6,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 SAMPLES = Path(__file__).parents[2] / "samples"
 
 WITHOUT_UNIX = """
@@ -22,6 +24,7 @@ main(sys.argv[1:])
 """
 
 
+@pytest.mark.slow
 def test_refine_runs_where_python_has_neither_fcntl_nor_resource(tmp_path: Path) -> None:
     done = subprocess.run(
         [

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from pnpdepth_cli.io.depth import read_depth
-from pnpdepth_cli.pipeline.batch.settings import settings_digest
+from pnpdepth_cli.pipeline.batch.settings import settings_of
 from pnpdepth_cli.pipeline.refinement.refine import refine_image
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest
 from tests.pipeline.frames import frame_on_disk
@@ -43,4 +43,4 @@ def test_bf16_refines_to_nearly_the_depth_of_fp32_and_is_recorded(
 
 def test_a_batch_in_another_precision_is_done_again(request_of_frame: RefineRequest) -> None:
     other = request_of_frame.with_fields(precision="bf16")
-    assert settings_digest(request_of_frame, {}) != settings_digest(other, {})
+    assert settings_of(request_of_frame, {}) != settings_of(other, {})

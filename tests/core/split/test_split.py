@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import inspect
 import weakref
+from collections.abc import Callable
 from contextlib import ExitStack
 from typing import Any
 from unittest import mock
@@ -14,7 +15,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from model_zoo_defs.compact import Compact
 from pnpdepth_cli.core.split import Split
+from pnpdepth_cli.core.split.cut_point import LayerName
 from pnpdepth_cli.core.split.tensors import tensors_in
 from pnpdepth_cli.errors import LayerError, ModelError
 from tests.completion.naive import plain
@@ -24,7 +27,6 @@ from tests.core.networks import (
     InPlace,
     MiDaSLike,
     Repeated,
-    Structured,
     TwoBranches,
     UNet,
     UNetTail,
@@ -87,10 +89,10 @@ def test_an_encoder_under_inference_mode_can_be_left_and_the_decoder_refined(lay
         assert z.grad is not None
 
 
-def test_it_holds_at_every_layer_of_compact() -> None:
-    compact = pytest.importorskip("model_zoo_defs.compact")
+@pytest.mark.parametrize("every", [13, pytest.param(1, marks=pytest.mark.slow)])
+def test_it_holds_at_the_layers_of_compact(every: int) -> None:
     torch.manual_seed(0)
-    network = compact.Compact()
+    network = Compact().eval()
     for parameter in network.parameters():
         if parameter.ndim > 1:  # some start at zero, where any cut would do
             nn.init.normal_(parameter, std=0.1)
@@ -98,31 +100,21 @@ def test_it_holds_at_every_layer_of_compact() -> None:
     sparse[..., ::5, ::3] = 1 + 4 * torch.rand(sparse[..., ::5, ::3].shape)
     arguments = (x, sparse, 1 + 4 * torch.rand(1, 1, 32, 32))
     several = {"encoder", "fit", "start"}  # return several tensors
-    network.eval()
+    layers = [
+        layer
+        for layer, module in network.named_modules()
+        if not isinstance(module, nn.ModuleDict | nn.ModuleList)
+        and layer not in several
+        and layer.split(".")[0] not in ("", "scale")
+    ]
+    assert len(layers) > 90
     with torch.no_grad():
         whole = network(*arguments)
-        cut = 0
-        for layer, module in network.named_modules():
-            container = isinstance(module, nn.ModuleDict | nn.ModuleList)
-            unused = container or layer.split(".")[0] in ("", "scale")
-            if not unused and layer not in several:
-                with Split(network, layer) as split:
-                    z = split.front(*arguments)
-                    assert torch.equal(split.rear(z), whole), layer
-                    assert torch.equal(split.rear(z), whole), layer
-                cut += 1
-    assert cut > 90
-
-
-def test_torch_transformer_layers_with_their_fast_path_come_out_the_same() -> None:
-    torch.manual_seed(0)
-    layer = nn.TransformerEncoderLayer(8, 2, 16, batch_first=True)
-    network = nn.Sequential(nn.Linear(4, 8), nn.TransformerEncoder(layer, 2), nn.Linear(8, 1))
-    x = torch.rand(1, 6, 4)
-    whole = plain(network, x)
-    for name in ("0", "1", "1.layers.0", "1.layers.1"):
-        with Split(network, name) as split, torch.no_grad():
-            assert torch.equal(split.rear(split.front(x)), whole)
+        for layer in layers[::every]:
+            with Split(network, layer) as split:
+                z = split.front(*arguments)
+                assert torch.equal(split.rear(z), whole), layer
+                assert torch.equal(split.rear(z), whole), layer
 
 
 class LooksAtValues(nn.TransformerEncoderLayer):
@@ -132,16 +124,20 @@ class LooksAtValues(nn.TransformerEncoderLayer):
         return super().forward(src, *args, **kwargs) * float(src.detach().numpy().max())
 
 
-def test_a_value_that_a_users_layer_reads_within_torchs_encoder_is_seen() -> None:
+@pytest.mark.parametrize("kind", [nn.TransformerEncoderLayer, LooksAtValues])
+def test_torch_transformer_layers_with_their_fast_path_come_out_the_same(
+    kind: type[nn.TransformerEncoderLayer],
+) -> None:
     torch.manual_seed(0)
-    layer = LooksAtValues(8, 2, 16, batch_first=True)
+    layer = kind(8, 2, 16, batch_first=True)
     network = nn.Sequential(nn.Linear(4, 8), nn.TransformerEncoder(layer, 2), nn.Linear(8, 1))
     frames = [torch.rand(1, 6, 4) * scale for scale in (1, 3, 1)]
     wholes = [plain(network, frame) for frame in frames]
-    with Split(network, "0") as split, torch.no_grad():
-        for frame, whole in zip(frames, wholes, strict=True):
-            assert torch.equal(split.rear(split.front(frame)), whole)
-            assert not split.static_graph
+    for name in ("0", "1", "1.layers.0", "1.layers.1"):
+        with Split(network, name) as split, torch.no_grad():
+            for frame, whole in zip(frames, wholes, strict=True):
+                assert torch.equal(split.rear(split.front(frame)), whole)
+            assert split.static_graph == (kind is not LooksAtValues)
 
 
 def test_a_compiled_network_can_be_cut() -> None:
@@ -150,14 +146,6 @@ def test_a_compiled_network_can_be_cut() -> None:
     compiled = torch.compile(network, backend="eager")
     with Split(compiled, "_orig_mod.bottleneck") as split, torch.no_grad():
         assert torch.equal(split.rear(split.front(x)), whole)
-
-
-def test_a_second_front_starts_over_with_the_new_image() -> None:
-    network, x, other = build("unet"), image(), image() * 0.5
-    whole = plain(network, other)
-    with Split(network, "bottleneck") as split, torch.no_grad():
-        split.rear(split.front(x))
-        assert torch.equal(split.rear(split.front(other)), whole)
 
 
 class ChoosesByValue(nn.Module):
@@ -174,24 +162,25 @@ class ChoosesByValue(nn.Module):
         return self.head(torch.cat([self.cut(features), y], 1))
 
 
-def test_a_network_that_chooses_by_value_is_learned_anew_for_every_frame() -> None:
+@pytest.mark.parametrize(
+    ("make", "layer", "frames"),
+    [
+        (ChoosesByValue, "cut", [image(), image() * 0.5, image(), image() * 0.5]),
+        (UNet, "bottleneck", [image(), image(32, 16), image() * 0.5]),
+    ],
+    ids=["chooses by value", "another size"],
+)
+def test_a_frame_that_needs_another_recording_is_learned_anew(
+    make: type[nn.Module], layer: str, frames: list[Tensor]
+) -> None:
     torch.manual_seed(0)
-    network, x = ChoosesByValue(), image()
-    frames = [x, x * 0.5, x, x * 0.5]
+    network = make()
     wholes = [plain(network, frame) for frame in frames]
-    with Split(network, "cut") as split, torch.no_grad():
+    with Split(network, layer) as split, torch.no_grad():
         for frame, whole in zip(frames, wholes, strict=True):
             z = split.front(frame)
             for _ in range(2):
                 assert torch.equal(split.rear(z), whole)
-
-
-def test_a_frame_of_another_size_is_learned_anew() -> None:
-    network, frames = build("unet"), [image(), image(32, 16), image() * 0.5]
-    wholes = [plain(network, frame) for frame in frames]
-    with Split(network, "bottleneck") as split, torch.no_grad():
-        for frame, whole in zip(frames, wholes, strict=True):
-            assert torch.equal(split.rear(split.front(frame)), whole)
 
 
 def test_further_frames_are_not_watched_and_hold_no_more_memory() -> None:
@@ -351,45 +340,40 @@ def test_z_is_safe_where_the_cut_layer_gives_back_its_own_input() -> None:
         assert torch.equal(split.rear(z), plain(network, x))
 
 
-def test_a_cut_whose_output_is_changed_under_another_name_is_refused() -> None:
-    with Split(InPlace(), "flat") as split, torch.no_grad():
-        z = split.front(image())
-        with pytest.raises(LayerError, match="memory of an earlier tensor"):
-            split.rear(z)
-
-
 # ------------------------------------------------------------------ naming the layer
 
 
 def test_every_call_of_a_layer_can_be_named_and_is_another_cut() -> None:
     network, x = build("repeated"), image()
-    shapes = []
-    for call in (1, 2, 3):
-        with Split(network, f"same#{call}") as split, torch.no_grad():
-            shapes.append(split.front(x))
-    assert not torch.equal(shapes[0], shapes[1])
-    assert not torch.equal(shapes[1], shapes[2])
+
+    def z(layer: str) -> Tensor:
+        with Split(network, layer) as split, torch.no_grad():
+            return split.front(x)
+
+    calls = [z(f"same#{call}") for call in (1, 2, 3)]
+    assert not torch.equal(calls[0], calls[1])
+    assert not torch.equal(calls[1], calls[2])
+    assert torch.equal(z("enter"), z("alias"))  # one layer under two names
 
 
-def test_a_layer_called_several_times_asks_which_call() -> None:
-    with Split(Repeated(), "same") as split, torch.no_grad():
-        z = split.front(image())
-        with pytest.raises(LayerError, match="is called 3 times; say which call: same#1, same#2"):
-            split.rear(z)
+@pytest.mark.parametrize(
+    ("text", "name"),
+    [
+        ("decoder.up1", LayerName("decoder.up1")),
+        ("relu#2", LayerName("relu", 2)),
+        ("a[hidden_states][3]", LayerName("a", None, ("hidden_states", "3"))),
+        ("a#12[0]", LayerName("a", 12, ("0",))),
+        (LayerName("a.b").of_output(("out", "1")), LayerName("a.b", None, ("out", "1"))),
+    ],
+)
+def test_a_name_has_its_parts(text: str, name: LayerName) -> None:
+    assert LayerName.parse(text) == name
 
 
-def test_a_call_beyond_the_last_is_an_error_that_names_their_number() -> None:
-    with Split(Repeated(), "same#4") as split, pytest.raises(LayerError, match="only 3 times"):
-        split.front(image())
-
-
-def test_a_shared_layer_can_be_cut_under_either_name() -> None:
-    network, x = build("repeated"), image()
-    outputs = []
-    for name in ("enter", "alias"):
-        with Split(network, name) as split, torch.no_grad():
-            outputs.append(split.front(x))
-    assert torch.equal(*outputs)
+@pytest.mark.parametrize("text", ["a#", "a#0", "a#-1", "a#1#2", "a[", "a[]", "a]", "a[0]#2"])
+def test_a_name_of_another_form_is_refused(text: str) -> None:
+    with pytest.raises(LayerError, match="the form is"):
+        LayerName.parse(text)
 
 
 @pytest.mark.parametrize(
@@ -418,66 +402,53 @@ def test_a_layer_with_several_outputs_names_them_and_each_can_be_cut(
         assert not torch.equal(changed, plain(network, x))
 
 
-def test_a_missing_output_is_named_with_those_that_exist() -> None:
-    with (
-        Split(Structured("dict"), "cut[wide]") as split,
-        pytest.raises(LayerError, match=r"no such output; it has cut\[deep\], cut\[shallow\]"),
-    ):
-        split.front(image())
+def with_an_unused_layer() -> nn.Module:
+    network = nn.Sequential(conv(3, 1))
+    network.unused = conv(1, 1)
+    network.forward = network[0].forward  # type: ignore[method-assign]
+    return network
 
 
 @pytest.mark.parametrize(
-    ("name", "message"),
+    ("make", "layer", "message"),
     [
-        ("botleneck", "did you mean bottleneck"),
-        ("encoder.stage.0.0", "did you mean encoder.stages.0.0"),
-        ("zzzzzzzzz", "pnpdepth layers --all"),
-        ("", "not in this network"),
-        ("ups.3", "did you mean ups."),
-        ("bottleneck#0", "the form is"),
-        ("bottleneck[", "the form is"),
-        ("bottleneck#x", "the form is"),
+        (UNet, "botleneck", "did you mean bottleneck"),
+        (UNet, "encoder.stage.0.0", "did you mean encoder.stages.0.0"),
+        (UNet, "zzzzzzzzz", "pnpdepth layers --all"),
+        (UNet, "", "not in this network"),
+        (UNet, "ups.3", "did you mean ups."),
+        (UNet, "bottleneck[", "the form is"),
+        (UNet, "encoder.stages", "cut at a part of it: encoder.stages.0"),
+        (with_an_unused_layer, "unused", "never runs"),
+        (Repeated, "same", "is called 3 times; say which call: same#1, same#2"),
+        (Repeated, "same#4", "only 3 times"),
+        (NETWORKS["dict output"], "cut[wide]", "it has cut[deep], cut[shallow]"),
+        (NETWORKS["side effects"], "hide", "returns no tensor"),
+        (InPlace, "flat", "memory of an earlier tensor"),
     ],
 )
-def test_an_unknown_layer_is_refused_with_what_is_near(name: str, message: str) -> None:
-    with pytest.raises(LayerError) as error:
-        Split(UNet(), name)
+def test_a_layer_that_cannot_be_cut_is_refused_on_one_line_that_names_the_way_out(
+    make: Callable[[], nn.Module], layer: str, message: str
+) -> None:
+    network = make()
+    with pytest.raises(LayerError) as error, torch.no_grad(), Split(network, layer) as split:
+        split.rear(split.front(image()))
     assert message in str(error.value)
     assert "\n" not in str(error.value)
 
 
-def test_a_container_that_is_never_called_points_to_its_parts() -> None:
-    with (
-        Split(UNet(), "encoder.stages") as split,
-        pytest.raises(LayerError, match=r"never runs .* cut at a part of it: encoder.stages.0"),
-    ):
-        split.front(image())
-
-
-def test_a_layer_that_never_runs_is_an_error() -> None:
-    network = nn.Sequential(conv(3, 1))
-    network.unused = conv(1, 1)
-    network.forward = network[0].forward  # type: ignore[method-assign]
-    with Split(network, "unused") as split, pytest.raises(LayerError, match="never runs"):
-        split.front(image())
-
-
-def test_a_layer_whose_output_is_no_tensor_is_refused() -> None:
-    with (
-        Split(build("side effects"), "hide") as split,
-        pytest.raises(LayerError, match="returns no tensor"),
-    ):
-        split.front(image())
-
-
-def test_the_rear_needs_a_front() -> None:
-    with Split(UNet(), "bottleneck") as split:
-        with pytest.raises(RuntimeError, match="front"):
-            split.rear(torch.zeros(1))
-        with pytest.raises(ModelError):
-            split.front(torch.zeros(1, 7, 4, 4))
-        with pytest.raises(RuntimeError, match="front"):
-            split.rear(torch.zeros(1))
+def test_the_rear_needs_a_front_that_succeeded_and_may_be_tried_again() -> None:
+    network, x = build("unet"), image()
+    with Split(network, "bottleneck") as split, torch.no_grad():
+        for _ in range(2):
+            with pytest.raises(RuntimeError, match="front"):
+                split.rear(torch.zeros(1))
+            with pytest.raises(ModelError):
+                split.front(torch.zeros(1, 7, 4, 4))
+        z = split.front(x)
+        with pytest.raises(ModelError, match="the network's forward raises RuntimeError"):
+            split.rear(z[:, :3])
+        assert torch.equal(split.rear(z), plain(network, x))
 
 
 # ------------------------------------------------------------------ leaving no trace
@@ -591,15 +562,6 @@ class Failing(nn.Module):
         if self.calls == self.n:
             raise self.kind("failing")
         return self.inner(x)
-
-
-def test_a_rear_that_failed_can_be_tried_again() -> None:
-    network, x = build("unet"), image()
-    with Split(network, "bottleneck") as split, torch.no_grad():
-        z = split.front(x)
-        with pytest.raises(ModelError, match="the network's forward raises RuntimeError"):
-            split.rear(z[:, :3])
-        assert torch.equal(split.rear(z), plain(network, x))
 
 
 def test_two_splits_of_one_network_can_be_open_one_in_the_other() -> None:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
 import warnings
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -36,43 +36,13 @@ def _checkpoints(folder: Path, rng: np.random.Generator) -> list[Seed]:
 
 
 def _networks(folder: Path) -> list[Seed]:
-    seeds = []
-    writers: tuple[tuple[str, Callable[[Path], None]], ...] = (
-        ("net.onnx", _write_onnx),
-        ("net.pt2", _write_exported),
-    )
-    for name, write in writers:
-        try:
-            write(folder / name)
-        except ImportError:  # the extra is not installed
-            continue
-        seeds.append(Seed(file=name, command=("models", "check", name)))
-    return seeds
+    _write_exported(folder / "net.pt2")
+    names = ["net.pt2"]
+    with contextlib.suppress(ImportError):  # the extra is not installed
+        from tests.models.formats.onnx.onnx_files import write_network
 
-
-def _write_onnx(path: Path) -> None:
-    import onnx
-    from onnx import TensorProto, helper, numpy_helper
-
-    shape = [1, 3, HEIGHT, WIDTH]
-    weight = np.full((1, 3, 3, 3), 0.1, np.float32)
-    nodes = [
-        helper.make_node("Conv", ["x", "w"], ["c"], pads=[1, 1, 1, 1]),
-        helper.make_node("Relu", ["c"], ["r"]),
-        helper.make_node("Reshape", ["r", "s"], ["y"]),
-    ]
-    graph = helper.make_graph(
-        nodes,
-        "net",
-        [helper.make_tensor_value_info("x", TensorProto.FLOAT, shape)],
-        [helper.make_tensor_value_info("y", TensorProto.FLOAT, [1, 1, HEIGHT, WIDTH])],
-        [
-            numpy_helper.from_array(weight, "w"),
-            numpy_helper.from_array(np.array([1, 1, HEIGHT, WIDTH]), "s"),
-        ],
-    )
-    opset = [helper.make_opsetid("", 17)]
-    onnx.save(helper.make_model(graph, opset_imports=opset, ir_version=9), path)
+        names.append(write_network(folder / "net.onnx", shape=(1, 3, HEIGHT, WIDTH)).name)
+    return [Seed(file=name, command=("models", "check", name)) for name in names]
 
 
 def _write_exported(path: Path) -> None:

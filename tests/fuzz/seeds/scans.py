@@ -8,6 +8,7 @@ import numpy as np
 
 from tests.bags import write_bag
 from tests.fuzz.seeds.seed import OUT, SIZE, Seed
+from tests.io.test_scans import FILES
 
 
 def write_seeds(folder: Path, depth: np.ndarray, rng: np.random.Generator) -> list[Seed]:
@@ -26,26 +27,12 @@ def lidar_points(rng: np.random.Generator) -> np.ndarray:
 
 
 def _scans(folder: Path, rng: np.random.Generator) -> list[Seed]:
-    points = lidar_points(rng)
-    points.tofile(folder / "scan.bin")
-    np.save(folder / "scan.npy", points)
-    rows = "\n".join(" ".join(f"{v:.4f}" for v in row) for row in points)
-    pcd = (
-        "# .PCD v0.7\nVERSION 0.7\nFIELDS x y z intensity\nSIZE 4 4 4 4\nTYPE F F F F\n"
-        "COUNT 1 1 1 1\nWIDTH 200\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS 200\n"
-    )
-    (folder / "ascii.pcd").write_text(f"{pcd}DATA ascii\n{rows}\n")
-    (folder / "binary.pcd").write_bytes(f"{pcd}DATA binary\n".encode() + points.tobytes())
-    properties = "".join(f"property float {name}\n" for name in ("x", "y", "z", "intensity"))
-    ply = f"ply\nformat {{}} 1.0\nelement vertex 200\n{properties}end_header\n"
-    (folder / "ascii.ply").write_text(ply.format("ascii") + rows + "\n")
-    for order, kind in (("little", "<f4"), ("big", ">f4")):
-        header = ply.format(f"binary_{order}_endian").encode()
-        (folder / f"{order}.ply").write_bytes(header + points.astype(kind).tobytes())
-    names = ("scan.bin", "scan.npy", "ascii.pcd", "binary.pcd", "ascii.ply")
+    points = lidar_points(rng)[:, :3]
+    for name, content in FILES.items():
+        (folder / name).write_bytes(content(points))
     return [
         Seed(file=name, command=("project", name, "--calib", "calib.txt", *SIZE, *OUT))
-        for name in (*names, "little.ply", "big.ply")
+        for name in FILES
     ]
 
 

@@ -14,7 +14,7 @@ from pnpdepth_cli.errors import FileFormatError
 from pnpdepth_cli.io.layouts import find_layout, list_frames
 from pnpdepth_cli.pipeline.batch.frames import task_of
 from pnpdepth_cli.pipeline.batch.request import BatchRequest
-from pnpdepth_cli.pipeline.batch.settings import settings_digest
+from pnpdepth_cli.pipeline.batch.settings import settings_of
 from pnpdepth_cli.pipeline.refinement.inputs import read_inputs
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest
 
@@ -88,7 +88,7 @@ def test_a_changed_pose_of_the_car_is_another_setting(tmp_path: Path) -> None:
     for moved in (0.5, 0.6, 0.5):
         write(tmp_path, moved=moved)
         (frame,) = list_frames(tmp_path)[1].frames
-        digests.add(settings_digest(task_of(request_of(tmp_path), frame).request, {}))
+        digests.add(repr(settings_of(task_of(request_of(tmp_path), frame).request, {})))
     assert len(digests) == 2
 
 

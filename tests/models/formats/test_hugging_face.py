@@ -23,6 +23,8 @@ from tests.models.weights.files import little
 
 transformers = pytest.importorskip("transformers", reason="needs the extra [hf]")
 
+pytestmark = pytest.mark.slow
+
 DINO = {
     "hidden_size": 24, "num_hidden_layers": 4, "num_attention_heads": 2, "image_size": 56,
     "patch_size": 14, "out_indices": [1, 2, 3, 4], "reshape_hidden_states": False,

@@ -164,6 +164,7 @@ def test_without_poses_the_motion_is_estimated_and_recorded(tmp_path: Path) -> N
     assert record["points"]["moved"] > 500
 
 
+@pytest.mark.slow
 def test_a_frame_is_done_again_when_the_image_of_its_motion_changes(tmp_path: Path) -> None:
     root, listener = rendered_drive(tmp_path), RecordingListener()
     without_poses(root)

@@ -29,7 +29,10 @@ from tests.pipeline.batches import (
 )
 
 pytest.importorskip("ray")
-pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="nodes are addresses of loopback")
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(sys.platform != "linux", reason="nodes are addresses of loopback"),
+]
 NAMES = tuple(f"f{number:02}" for number in range(12))
 DEADLY = "        if float(rgb.mean()) > 0.99:\n            import os\n            os._exit(1)\n"
 

@@ -32,6 +32,8 @@ from tests.stores import Bucket, s3_server
 
 pytest.importorskip("s3fs")
 pytest.importorskip("moto")
+
+pytestmark = pytest.mark.slow
 PARTS = {"image": "rgb", "sparse": "sparse", "gt": "gt"}
 
 

@@ -20,6 +20,7 @@ from tests.pipeline.batches import NAMES, RecordingListener, batch, pairs_on_dis
 ROOT = Path(__file__).parents[3]
 
 
+@pytest.mark.slow
 def test_killed_many_times_at_random_moments_it_ends_byte_identical(tmp_path: Path) -> None:
     done = subprocess.run(
         [sys.executable, "-m", "tests.pipeline.killed_batches", str(tmp_path), "12"],
@@ -62,6 +63,7 @@ def in_folder(folder: Path, root: Path, listener: RecordingListener | None = Non
         os.chdir(before)
 
 
+@pytest.mark.slow
 def test_a_full_disk_stops_it_cleanly_and_with_room_it_goes_on(
     tmp_path: Path, small_disk: Path
 ) -> None:

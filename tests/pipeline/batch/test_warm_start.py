@@ -117,6 +117,7 @@ def test_the_default_method_is_refused(tmp_path: Path, capsys: pytest.CaptureFix
     assert not (root / "out").exists()
 
 
+@pytest.mark.slow
 def test_weights_are_carried_over_in_a_window(tmp_path: Path) -> None:
     root = drive_on_disk(tmp_path, frames=4)
     refine = {"model": "sparse2dense-tiny", "checkpoint": None, "target": "masked"}

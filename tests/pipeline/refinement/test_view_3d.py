@@ -53,6 +53,7 @@ def test_colours_are_those_of_the_image(view: dict[str, Any], tmp_path: Path) ->
     assert (colours == np.rint(read_rgb(tmp_path / "img.png").values * 255)).all()
 
 
+@pytest.mark.slow
 def test_interpolated_directions_are_exact_to_a_twentieth_of_a_pixel() -> None:
     focal_px, size = 400.0, (360, 480)
     camera = Camera(

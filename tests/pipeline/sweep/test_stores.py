@@ -18,6 +18,8 @@ from tests.stores import Bucket, s3_server
 
 pytest.importorskip("s3fs")
 pytest.importorskip("moto")
+
+pytestmark = pytest.mark.slow
 NAMES = ("a", "b")
 
 
