@@ -37,18 +37,18 @@ from benchmarks.frames import (
 from model_zoo_defs.training.learning.dataset import Frames
 from pnpdepth_cli.choices import BASELINES
 from pnpdepth_cli.core.metrics import score
-from pnpdepth_cli.core.refine import RefineSettings
-from pnpdepth_cli.frames.frame import RefinedFrame
+from pnpdepth_cli.frames.frame import Refined
+from pnpdepth_cli.frames.resolve import resolve_layer, resolve_settings
 from pnpdepth_cli.frames.uncertainty import uncertainty
 from pnpdepth_cli.models.definition import Normalisation
 from pnpdepth_cli.models.network import Network, load_network
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs
-from pnpdepth_cli.pipeline.refinement.load_refiner import refiner_of
-from pnpdepth_cli.pipeline.refinement.request import MethodOptions, RefineRequest
-from pnpdepth_cli.pipeline.refinement.resolve import resolve_layer, resolve_settings
+from pnpdepth_cli.pipeline.refinement.refine import refiner_of
+from pnpdepth_cli.pipeline.refinement.request import RefineRequest
 from pnpdepth_cli.points import SparsePoints
+from pnpdepth_cli.settings import Settings
 
-PAPER = RefineSettings()
+PAPER = Settings()
 COUNTS: tuple[int | None, ...] = (20, 100, 500)
 ROOMS = ("7scenes", "icl_nuim", "nyu")
 RGB = ("compact", "fastdepth", "eigen-tiny", "fcrn-tiny")
@@ -129,7 +129,7 @@ def measure(
     inputs = frame_inputs(frame.rgb, points, frame.gt)
     definition = network.definition
     layer = resolve_layer(definition, None)
-    settings = resolve_settings(definition, MethodOptions())
+    settings = resolve_settings(definition, Settings())
     start = time.perf_counter()
     raw = refined(network, layer, replace(settings, iterations=0), inputs)
     plain_s = time.perf_counter() - start
@@ -166,7 +166,7 @@ def measure(
     }
 
 
-def by_default(network: Network, inputs: Inputs, seed: int = 0) -> RefinedFrame:
+def by_default(network: Network, inputs: Inputs, seed: int = 0) -> Refined:
     """The frame as `pnpdepth refine` gives it by default."""
     refiner = refiner_of(RefineRequest.from_fields(seed=seed), [network], inputs)
     with refiner.opened() as opened:

@@ -27,7 +27,7 @@ from pnpdepth_cli.io.depth import write_depth
 from pnpdepth_cli.pipeline.adapt import Progress, adapt
 from pnpdepth_cli.pipeline.adapt_request import AdaptRequest
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs
-from pnpdepth_cli.pipeline.refinement.load_refiner import load_refiner
+from pnpdepth_cli.pipeline.refinement.refine import load_refiner
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest
 from pnpdepth_cli.sensors import SamplePattern
 

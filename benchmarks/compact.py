@@ -45,11 +45,11 @@ from pnpdepth_cli.completion.alignment import aligned
 from pnpdepth_cli.completion.interpolation import linear, nearest
 from pnpdepth_cli.completion.outliers import outliers as suspected
 from pnpdepth_cli.core.metrics import score
+from pnpdepth_cli.frames.resolve import resolve_layer, resolve_settings
 from pnpdepth_cli.models.frame import FrameMap
 from pnpdepth_cli.models.network import Network, load_network
-from pnpdepth_cli.pipeline.refinement.request import MethodOptions
-from pnpdepth_cli.pipeline.refinement.resolve import resolve_layer, resolve_settings
 from pnpdepth_cli.points import SparsePoints
+from pnpdepth_cli.settings import Settings as Refinement
 
 CELLS = (
     ("7scenes", 500),
@@ -87,7 +87,7 @@ def measure_frame(
     """(MAE, RMSE) of every method on one frame."""
     inputs = drawn_inputs(frame, count, seed)
     points = inputs.points
-    method = MethodOptions(iterations=settings.iterations, lr=settings.lr, update=settings.update)
+    method = Refinement(iterations=settings.iterations, lr=settings.lr, update=settings.update)
     result = refined(
         network,
         resolve_layer(network.definition, settings.layer),

@@ -28,14 +28,15 @@ from torch import Tensor, nn
 
 from benchmarks.hand_cuts import ZOO
 from benchmarks.networks import CASES, Case
-from pnpdepth_cli.core.refine import RefineSettings, refine
+from pnpdepth_cli.core.refine import refine
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.models.precision import lower
 from pnpdepth_cli.pipeline.bench import Timed, in_turn, peak_mb
 from pnpdepth_cli.points import SparsePoints
+from pnpdepth_cli.settings import Settings
 
 ITERATIONS, STEP, POINTS = 5, 0.01, 500
-SETTINGS = RefineSettings(iterations=ITERATIONS, lr=STEP)
+SETTINGS = Settings(iterations=ITERATIONS, lr=STEP)
 CPU = torch.device("cpu")
 COMPARED = ("by hand", "ours", "ours, one frame", "by hook", "paper's code")
 """What gives the same, bit for bit."""

@@ -27,13 +27,13 @@ from benchmarks.frames import (
 )
 from benchmarks.frames import nyu as nyu_frames
 from pnpdepth_cli.core.metrics import score
-from pnpdepth_cli.core.refine import RefineSettings
 from pnpdepth_cli.models.definition import Normalisation
 from pnpdepth_cli.models.network import Network, load_network
+from pnpdepth_cli.settings import Settings
 
-PLAIN = RefineSettings(iterations=0)
-PAPER = RefineSettings()
-OURS = RefineSettings(iterations=20, lr="3%", update="adam")
+PLAIN = Settings(iterations=0)
+PAPER = Settings()
+OURS = Settings(iterations=20, lr="3%", update="adam")
 LAYERS = (0, 1, 2)
 COMPLETION = (
     ("pncnn", "pncnn/kitti_model_best.pth.tar"),
@@ -59,7 +59,7 @@ def nyu(data: Path) -> list[EvalFrame]:
     return [small, *(as_fastdepth_sees_it(frame) for frame in large)]
 
 
-def variants(network: Network) -> Iterator[tuple[str, str, RefineSettings]]:
+def variants(network: Network) -> Iterator[tuple[str, str, Settings]]:
     """(title, layer, settings) of each row."""
     layers = network.definition.layers
     yield "raw", layers[0], PLAIN
@@ -74,7 +74,7 @@ def variants(network: Network) -> Iterator[tuple[str, str, RefineSettings]]:
 
 
 def error(
-    network: Network, layer: str, settings: RefineSettings, frame: EvalFrame, count: int | None
+    network: Network, layer: str, settings: Settings, frame: EvalFrame, count: int | None
 ) -> tuple[float, float, float, float]:
     """MAE and RMSE before and after, on all pixels with known ground truth."""
     result = refined(network, layer, settings, drawn_inputs(frame, count, seed=0))

@@ -11,8 +11,7 @@ import torch
 from numpy.typing import NDArray
 
 from pnpdepth_cli.completion.image_registration import estimated, evidence
-from pnpdepth_cli.core.refine import RefineSettings
-from pnpdepth_cli.frames.frame import RefinedFrame
+from pnpdepth_cli.frames.frame import Refined
 from pnpdepth_cli.frames.refine import refine_frame
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.io.rgb import read_rgb
@@ -21,6 +20,7 @@ from pnpdepth_cli.pipeline.batch.frames import registering
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.sensors import Points, occluded_in_map
+from pnpdepth_cli.settings import Settings
 
 Depth = NDArray[np.float32]
 
@@ -171,7 +171,7 @@ def drawn_inputs(frame: EvalFrame, count: int | None, seed: int) -> Inputs:
     return frame_inputs(frame.rgb, points, frame.gt)
 
 
-def refined(network: Network, layer: str, settings: RefineSettings, inputs: Inputs) -> RefinedFrame:
+def refined(network: Network, layer: str, settings: Settings, inputs: Inputs) -> Refined:
     """The refinement of a frame with all of its points."""
     with network.cut_at(layer) as split:
-        return refine_frame(network, split, settings, inputs.frame())
+        return refine_frame(network, split, settings, inputs.registered())

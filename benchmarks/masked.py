@@ -33,22 +33,23 @@ from benchmarks.frames import (
 from pnpdepth_cli.core.metrics import score
 from pnpdepth_cli.frames.frame import DepthMap, is_dense
 from pnpdepth_cli.frames.refine import refine_frame, with_propagation
+from pnpdepth_cli.frames.resolve import resolve_layer, resolve_settings
 from pnpdepth_cli.models.network import Network
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs
-from pnpdepth_cli.pipeline.refinement.request import HoldOut, MethodOptions
-from pnpdepth_cli.pipeline.refinement.resolve import resolve_layer, resolve_settings
+from pnpdepth_cli.pipeline.refinement.request import HoldOut
+from pnpdepth_cli.settings import Settings
 
 _OUTLIER_FACTORS = (0.3, 3.0)
 """Range of the factor on the depth of outliers."""
-MASKED = MethodOptions(target="masked")
-METHODS: Mapping[str, MethodOptions] = {
-    "updates of z": MethodOptions(),
+MASKED = Settings(target="masked")
+METHODS: Mapping[str, Settings] = {
+    "updates of z": Settings(),
     "masked, 4 steps": replace(MASKED, iterations=4),
     "masked, 8 steps": replace(MASKED, iterations=8),
     "masked, 40 steps": replace(MASKED, iterations=40),
     "masked": MASKED,
-    "channels of z": MethodOptions(parameters="channels"),
-    "all points, weights": MethodOptions(parameters="weights"),
+    "channels of z": Settings(parameters="channels"),
+    "all points, weights": Settings(parameters="weights"),
     "masked, lora:8": replace(MASKED, parameters="lora:8"),
 }
 TABLE = ("updates of z", "masked, 8 steps", "masked", "masked, 40 steps")
@@ -110,14 +111,14 @@ def measured(network: Network, method: str, inputs: Inputs, case: Case) -> list[
     layer = resolve_layer(network.definition, options.layer)
     start = time.process_time()
     with network.cut_at_points() if settings.masked else network.cut_at(layer) as split:
-        frame = refine_frame(network, split, settings, inputs.frame())
+        frame = refine_frame(network, split, settings, inputs.registered())
     seconds = time.process_time() - start
     rows = [
         _row(case, inputs, "plain", frame.before, 0.0),
         _row(case, inputs, method, frame.after, seconds, frame.refinement.kept),
     ]
     if method in ("masked", "updates of z"):
-        depth = with_propagation(inputs.frame(), frame.after, "gp")
+        depth = with_propagation(inputs.registered(), frame.after, "gp")
         seconds = time.process_time() - start
         rows.append(_row(case, inputs, f"{method} + gp", depth, seconds, frame.refinement.kept))
     return rows

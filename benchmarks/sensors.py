@@ -24,12 +24,11 @@ from benchmarks.frames import (
 )
 from pnpdepth_cli.completion.interpolation import linear
 from pnpdepth_cli.core.metrics import score
+from pnpdepth_cli.frames.resolve import resolve_layer, resolve_settings
 from pnpdepth_cli.io.calibration import read_calibration
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.io.scans import read_scan
 from pnpdepth_cli.models.network import load_network
-from pnpdepth_cli.pipeline.refinement.request import MethodOptions
-from pnpdepth_cli.pipeline.refinement.resolve import resolve_layer, resolve_settings
 from pnpdepth_cli.pipeline.sparse.scans import camera_of
 from pnpdepth_cli.sensors import (
     FORWARD_LEFT_UP,
@@ -40,6 +39,7 @@ from pnpdepth_cli.sensors import (
     simulate_lidar,
 )
 from pnpdepth_cli.sensors.projection import hidden_points
+from pnpdepth_cli.settings import Settings
 
 STREET = Path(__file__).parent.parent / "samples" / "street"
 KEEP_ALL = ProjectionSettings(keep_occluded=True)
@@ -111,7 +111,7 @@ def projected_maps(data: Path) -> None:
     """MAE on KITTI's projected maps as they are and without occluded points, per half of them."""
     network = load_network("compact", None, "cpu")
     layer = resolve_layer(network.definition, None)
-    settings = resolve_settings(network.definition, MethodOptions())
+    settings = resolve_settings(network.definition, Settings())
     errors: dict[str, list[list[float]]] = {"even": [], "odd": []}
     for number, frame in enumerate(kitti_dc(data)):
         ground_truth = torch.from_numpy(frame.gt)

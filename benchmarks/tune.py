@@ -21,9 +21,9 @@ from benchmarks.frames import Depth, frame_inputs, points_on_grid, refined
 from model_zoo_defs.training.learning.dataset import Frames
 from model_zoo_defs.training.learning.patterns import keep, scan_lines, uniform
 from pnpdepth_cli.core.metrics import score
-from pnpdepth_cli.core.refine import RefineSettings
 from pnpdepth_cli.models.network import Network, load_network
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs
+from pnpdepth_cli.settings import Settings
 
 
 def drawn(pattern: str, rng: np.random.Generator, depth: Depth) -> Depth:
@@ -50,7 +50,7 @@ def rendered_inputs(folder: Path, count: int, patterns: list[str]) -> list[Input
 
 
 def ratios(
-    network: Network, layer: str, settings: RefineSettings, some: list[Inputs]
+    network: Network, layer: str, settings: Settings, some: list[Inputs]
 ) -> list[tuple[float, float]]:
     """MAE and RMSE after over those before, of every frame."""
     ratios_of_frames = []
@@ -85,7 +85,7 @@ def main() -> None:
     choices = (args.updates, args.lrs, args.iterations, args.losses)
     for layer, *chosen in product(layers, *(text.split(",") for text in choices)):
         update, lr, iterations, loss = chosen
-        settings = RefineSettings(iterations=int(iterations), lr=lr, loss=loss, update=update)
+        settings = Settings(iterations=int(iterations), lr=lr, loss=loss, update=update)
         ratios_of_frames = np.array(ratios(network, layer, settings, some))
         mae, rmse = 100 * np.exp(np.log(ratios_of_frames).mean(axis=0))
         worse = 100 * (ratios_of_frames[:, 0] > 1).mean()

@@ -26,12 +26,13 @@ from benchmarks.frames import SETS, drawn_inputs
 from benchmarks.sequences import inputs_of, split
 from pnpdepth_cli.frames.frame import Frame, WarmStart, is_dense
 from pnpdepth_cli.frames.refine import refine_frame
+from pnpdepth_cli.frames.resolve import resolve_layer, resolve_settings
 from pnpdepth_cli.frames.warm_start import refine_next
 from pnpdepth_cli.models.network import Network
 from pnpdepth_cli.pipeline.evaluation.measured_frame import MeasuredFrame
 from pnpdepth_cli.pipeline.evaluation.measures.flicker import flicker
-from pnpdepth_cli.pipeline.refinement.request import HoldOut, MethodOptions
-from pnpdepth_cli.pipeline.refinement.resolve import resolve_layer, resolve_settings
+from pnpdepth_cli.pipeline.refinement.request import HoldOut
+from pnpdepth_cli.settings import Settings
 
 KITTI = "kitti_raw"
 Depth = NDArray[np.float32]
@@ -72,9 +73,7 @@ def cases(data: Path, name: str, count: int, frames: int, seed: int, reach: int)
         yield Case(frame=inputs.frame(used), gt=held.scatter()[0, 0].numpy())
 
 
-def refined(
-    network: Network, method: MethodOptions, sequence: Sequence[Case], *, warm: bool
-) -> Row:
+def refined(network: Network, method: Settings, sequence: Sequence[Case], *, warm: bool) -> Row:
     """Returns how a sequence comes out, in one window or frame by frame."""
     dense = is_dense(sequence[0].frame.points)
     settings = resolve_settings(network.definition, method, HoldOut(), dense=dense)
@@ -135,7 +134,7 @@ def main() -> None:
     )
     print("|" + "---|" * 10)
     for count in args.iterations:
-        method = MethodOptions(iterations=count, target=args.target)
+        method = Settings(iterations=count, target=args.target)
         alone, window = [], []
         for seed in args.seeds:
             sequence = list(

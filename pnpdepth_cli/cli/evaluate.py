@@ -134,7 +134,6 @@ _SCALE_OPTIONS = {
 @click.option("--pred-scale", type=float, metavar="S", help="Integer predictions hold metres × S.")
 @click.option("--gt-scale", type=float, metavar="S", help="Integer ground truth holds metres × S.")
 @options.channel
-@options.max_pixels
 @click.option(
     "--resize",
     type=click.Choice(RESIZES),

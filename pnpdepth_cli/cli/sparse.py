@@ -84,7 +84,6 @@ def project(scan: Path, image: Path | None, size: str | None, as_json: bool, **v
 )
 @options.depth_scale
 @options.channel
-@options.max_pixels
 @options.sparse_output
 @options.output_scale
 @click.option("--overlay", type=options.FILE, help="Also write a PNG of the points on --image.")
@@ -186,7 +185,6 @@ def _region(text: str) -> tuple[int, int, int, int]:
 @options.euclidean
 @options.depth_scale
 @options.channel
-@options.max_pixels
 @options.sparse_output
 @options.output_scale
 @options.overwrite

@@ -15,7 +15,8 @@ from pnpdepth_cli.cli.exit_codes import INTERRUPTED
 from pnpdepth_cli.cli.progress import BatchProgress
 from pnpdepth_cli.errors import FramesFailedError, StorageError
 from pnpdepth_cli.pipeline.batch.request import FrameSelection
-from pnpdepth_cli.pipeline.refinement.request import FrameFiles, MethodOptions, NetworkChoice
+from pnpdepth_cli.pipeline.refinement.request import FrameFiles, NetworkChoice
+from pnpdepth_cli.settings import Settings
 
 
 @click.command(
@@ -76,8 +77,7 @@ from pnpdepth_cli.pipeline.refinement.request import FrameFiles, MethodOptions, 
     "--cost", is_flag=True, help="Add the time of the refinement to tables, and a plot over it."
 )
 @options.scan
-@options.options_of_groups(FrameFiles, NetworkChoice, MethodOptions, without=["tile"])
-@options.seed
+@options.options_of_groups(FrameFiles, NetworkChoice, Settings, without=["tile", "time_budget_s"])
 @options.as_json
 def sweep(
     source: Path,

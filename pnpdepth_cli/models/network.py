@@ -41,6 +41,7 @@ class Network:
     module: nn.Module
     device: torch.device
     checkpoint: Path | None
+    precision: str = "fp32"
     notes: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
@@ -260,6 +261,7 @@ def load_network(
         module=module,
         device=torch_device,
         checkpoint=path,
+        precision=precision,
         notes=tuple(notes),
     )
     if definition.layers or definition.defaults.layer:

@@ -17,19 +17,19 @@ from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode
 
 from pnpdepth_cli.choices import LOSSES
-from pnpdepth_cli.core.refine import RefineSettings, refine
+from pnpdepth_cli.core.refine import refine
 from pnpdepth_cli.core.split import Split, gradient_at
 from pnpdepth_cli.errors import NoPointsError, UsageError
 from pnpdepth_cli.frames.frame import Frame
 from pnpdepth_cli.frames.prepare import PreparedFrame, prepare
 from pnpdepth_cli.frames.refine import refine_frame
+from pnpdepth_cli.frames.resolve import resolve_layer, resolve_settings
 from pnpdepth_cli.models.definition import Fixed
 from pnpdepth_cli.models.frame import synthetic_frame
 from pnpdepth_cli.models.network import Network, load_network, out_of_memory_is_a_device_error
 from pnpdepth_cli.models.rank_layers import default_layer
-from pnpdepth_cli.pipeline.refinement.request import MethodOptions
-from pnpdepth_cli.pipeline.refinement.resolve import resolve_layer, resolve_settings
 from pnpdepth_cli.pipeline.stopwatch import versions
+from pnpdepth_cli.settings import Settings
 
 DEFAULT_SIZE = (480, 640)
 FIRST_FRAME, FULL = "refinement, first frame", "refinement, fp32"
@@ -144,11 +144,11 @@ def run_bench(
     rgb, points = synthetic_frame(request.size or own, request.points)
     layer = request.layer or default_layer(network, points.size, len(points))
     layer = resolve_layer(network.definition, layer)
-    method = MethodOptions(
-        iterations=request.iterations,
-        # the output of random weights has no relation to the points
-        align=None if network.checkpoint or network.definition.complete else "none",
-    )
+    method = Settings()
+    if request.iterations is not None:
+        method = replace(method, iterations=request.iterations)
+    if not (network.checkpoint or network.definition.complete):
+        method = replace(method, align="none")  # random weights have no relation to the points
     settings = resolve_settings(network.definition, method)
     prepared = prepare(network, Frame(rgb=rgb[0], points=points))
     if not len(prepared.points):
@@ -164,7 +164,7 @@ def run_bench(
             depth, exact = _refined(split, prepared, settings), todo[FULL].run(None)
             change = float(((depth - exact).abs() / exact)[exact > 0].mean())
         if request.target == "masked":
-            masked = replace(method, target="masked", iterations=None)
+            masked = replace(method.opened("iterations"), target="masked")
             todo[MASKED] = _masked(prepared, resolve_settings(network.definition, masked))
         spent = in_turn(todo, request.repeats, network.device, on_round=on_round)
         peaks = {
@@ -214,7 +214,7 @@ def _network(request: BenchRequest, precision: str) -> Network:
 
 
 def _parts(
-    split: Split, layer: str, prepared: PreparedFrame, settings: RefineSettings
+    split: Split, layer: str, prepared: PreparedFrame, settings: Settings
 ) -> dict[str, Timed]:
     """The network, its front and rear, and the refinement; tensors in, tensors out."""
     network, arguments, no_grad = prepared.network, prepared.arguments, torch.no_grad()
@@ -241,7 +241,7 @@ def _parts(
     }
 
 
-def _masked(prepared: PreparedFrame, settings: RefineSettings) -> Timed:
+def _masked(prepared: PreparedFrame, settings: Settings) -> Timed:
     """A refinement by hidden points, the cut included."""
 
     def run(_: object) -> None:
@@ -251,7 +251,7 @@ def _masked(prepared: PreparedFrame, settings: RefineSettings) -> Timed:
     return Timed(run=run)
 
 
-def _refined(split: Split, prepared: PreparedFrame, settings: RefineSettings) -> Tensor:
+def _refined(split: Split, prepared: PreparedFrame, settings: Settings) -> Tensor:
     reader = prepared.depth_reader(settings)
     return refine(split, prepared.arguments, prepared.points, settings, depth_of=reader).after
 

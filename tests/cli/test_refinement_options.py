@@ -10,15 +10,14 @@ from click.testing import CliRunner
 
 from pnpdepth_cli.cli.refine import refine
 from pnpdepth_cli.cli.sweep import sweep
-from pnpdepth_cli.core.refine import RefineSettings
 from pnpdepth_cli.errors import UsageError
+from pnpdepth_cli.frames.resolve import resolve_settings
 from pnpdepth_cli.models.definition import UNTUNED_DEFAULTS, ModelDefinition, Multiple
-from pnpdepth_cli.pipeline.options import options_of
-from pnpdepth_cli.pipeline.refinement.request import MethodOptions, RefineRequest
-from pnpdepth_cli.pipeline.refinement.resolve import resolve_settings
+from pnpdepth_cli.pipeline.refinement.request import RefineRequest
+from pnpdepth_cli.settings import Settings, options_of
 from tests.core.networks import UNet
 
-METHOD = MethodOptions()
+METHOD = Settings()
 STRANGER = ModelDefinition(
     name="stranger", input_kind="rgb", size=Multiple(8), build=UNet, defaults=UNTUNED_DEFAULTS
 )
@@ -29,12 +28,12 @@ def test_without_a_word_the_settings_are_the_networks() -> None:
     for name in ("iterations", "lr", "loss", "update", "schedule", "blur"):
         assert getattr(settings, name) == getattr(UNTUNED_DEFAULTS, name)
     plain = ModelDefinition(name="plain", input_kind="rgb", size=Multiple(8), build=UNet)
-    assert resolve_settings(plain, METHOD) == RefineSettings()
+    assert resolve_settings(plain, METHOD) == Settings()
 
 
 def test_another_update_starts_from_the_papers_step() -> None:
     settings = resolve_settings(STRANGER, replace(METHOD, update="sign"))
-    paper = RefineSettings()
+    paper = Settings()
     assert (settings.lr, settings.schedule, settings.blur) == (0.01, "constant", 0)
     assert (settings.lr, settings.schedule, settings.blur) == (
         paper.lr, paper.schedule, paper.blur,
@@ -86,7 +85,7 @@ def test_every_option_of_a_request_is_an_option_of_refine() -> None:
 
 def test_a_sweep_takes_what_decides_a_depth_and_nothing_else() -> None:
     names = {option.name for option in sweep.params}
-    assert {each.name for each in fields(MethodOptions)} <= names
+    assert {each.name for each in fields(Settings)} <= names
     assert not names & {"auto", "holdout", "uncertainty", "format", "overwrite", "tile"}
 
 

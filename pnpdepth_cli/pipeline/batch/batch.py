@@ -34,7 +34,6 @@ from pnpdepth_cli.pipeline.batch.state import BatchState, Row, remove_all_leftov
 from pnpdepth_cli.pipeline.batch.summary import CSV, JSON, Tally, profile_of, write_summaries
 from pnpdepth_cli.pipeline.cluster.options import RayWorkers, ray_workers_of
 from pnpdepth_cli.pipeline.ordered_pool import in_order
-from pnpdepth_cli.pipeline.refinement.method import resolve_method
 
 if TYPE_CHECKING:
     from pnpdepth_cli.pipeline.report.batch import BatchReport
@@ -331,13 +330,13 @@ def _head_of(
     request: BatchRequest, batch: BatchFrames, model: dict[str, Any], tally: Tally
 ) -> dict[str, Any]:
     """The summary without its frames."""
-    known, method = sum(tally.counts.values()), resolve_method(request.refine)
+    known, fixed_by = sum(tally.counts.values()), request.refine.method.fixed_by
     head = {
         "command": "batch",
         "source": str(request.source),
         "output": str(request.output),
         "layout": batch.layout,
-        "method": {"kind": "default" if method.is_default else "fixed", "reason": method.reason},
+        "method": {"kind": "fixed" if fixed_by else "default", "reason": fixed_by or "default"},
         "settings": settings_of(request.refine, model),
         "counts": {
             "frames": len(batch.frames),

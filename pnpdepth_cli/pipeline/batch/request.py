@@ -8,8 +8,8 @@ from pathlib import Path
 from pnpdepth_cli.choices import FRAME_PROTOCOLS, LAYOUTS
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.pipeline.cluster.options import ClusterOptions
-from pnpdepth_cli.pipeline.options import option
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest
+from pnpdepth_cli.settings import option
 
 
 def parse_shard(text: str) -> tuple[int, int]:

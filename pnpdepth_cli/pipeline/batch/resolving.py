@@ -7,13 +7,13 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 from pnpdepth_cli.errors import UsageError
+from pnpdepth_cli.frames.refiner import Refiner
 from pnpdepth_cli.io.dataset.frame import Frame
 from pnpdepth_cli.pipeline.batch.frames import Task, reference_frames, registering, task_of
 from pnpdepth_cli.pipeline.batch.reading import read_frame
 from pnpdepth_cli.pipeline.batch.request import BatchRequest
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs
-from pnpdepth_cli.pipeline.refinement.load_refiner import load_refiner
-from pnpdepth_cli.pipeline.refinement.refiner import Refiner
+from pnpdepth_cli.pipeline.refinement.refine import load_refiner
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,15 +68,15 @@ def load_batch_refiner(
     )
     for note in refiner.network.notes:
         say(note)
-    if first.registration == "auto":
-        refiner = refiner.with_registration_of(readable(references.registering))
+    if first.register == "auto":
+        refiner.share_registration(readable(references.registering))
         for (height, width), registration in refiner.registrations.items():
             if registration is not None:
                 say(
                     f"images of {width}×{height} are moved into the frame of the points by"
                     f" {registration}; --registration off leaves them"
                 )
-    if refiner.method.is_default:
+    if refiner.is_default:
         names = " and ".join(member.network.definition.name for member in refiner.members)
         say(f"method: the default, with {names}")
     else:

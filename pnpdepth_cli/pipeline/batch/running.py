@@ -15,7 +15,6 @@ from pathlib import Path
 
 import numpy as np
 
-from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.errors import (
     BatchError,
     InputError,
@@ -24,7 +23,8 @@ from pnpdepth_cli.errors import (
     StorageError,
     UsageError,
 )
-from pnpdepth_cli.frames.frame import RefinedFrame, WarmStart
+from pnpdepth_cli.frames.frame import Refined, WarmStart
+from pnpdepth_cli.frames.refiner import Refiner
 from pnpdepth_cli.io.fingerprint import Fingerprint
 from pnpdepth_cli.pipeline.batch.frames import Task
 from pnpdepth_cli.pipeline.batch.reading import read_task
@@ -32,7 +32,6 @@ from pnpdepth_cli.pipeline.batch.state import BatchState, Row
 from pnpdepth_cli.pipeline.ordered_pool import in_order
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs
 from pnpdepth_cli.pipeline.refinement.refine import write_refined
-from pnpdepth_cli.pipeline.refinement.refiner import Opened, Refiner
 from pnpdepth_cli.pipeline.stopwatch import Stopwatch
 
 _ROUNDING = 1e-3
@@ -47,7 +46,7 @@ class FrameInMemory:
     inputs: Inputs | None = None
     fingerprints: dict[str, Fingerprint] = field(default_factory=dict)
     watch: Stopwatch = field(default_factory=Stopwatch)
-    result: RefinedFrame | Exception | None = None
+    result: Refined | Exception | None = None
     """An error that occurred while it was read or refined. None before."""
 
 
@@ -83,7 +82,7 @@ def refine_tasks(
                 return
             _refine(group, network)
             for frame in group:
-                worked |= isinstance(frame.result, RefinedFrame)
+                worked |= isinstance(frame.result, Refined)
                 fatal = StorageError if worked else (StorageError, ModelError, UsageError)
                 if isinstance(frame.result, fatal):
                     raise frame.result
@@ -145,27 +144,24 @@ class OpenRefiner:
 
     Args:
         refiner: The network and its settings.
-        opened: The refiner's networks, open.
         batch_size: How many frames go together.
         say: Receives notes.
     """
 
-    def __init__(
-        self, refiner: Refiner, opened: Opened, batch_size: int, say: Callable[[str], None]
-    ) -> None:
-        self.refiner, self._opened, self._say = refiner, opened, say
+    def __init__(self, refiner: Refiner, batch_size: int, say: Callable[[str], None]) -> None:
+        self.refiner, self._say = refiner, say
         self._carried: dict[str, WarmStart] = {}  # of the last frame, by the first of its window
         fixed = (
-            isinstance(opened, Split)
+            not refiner.is_default
             and not refiner.settings.moves_weights
-            and refiner.request.network.tile is None
+            and refiner.settings.tile is None
         )
         if batch_size > 1 and not fixed:
             say("batch size: 1; only frames of a fixed network without tiles go together")
         self.batch_size = batch_size if fixed else 1
         self._checked = False
 
-    def refine(self, group: Sequence[Inputs]) -> Sequence[RefinedFrame | Exception]:
+    def refine(self, group: Sequence[Inputs]) -> Sequence[Refined | Exception]:
         """Returns the refined frames, all of one size; for one that fails, its error."""
         if len(group) > 1 and not any(inputs.window for inputs in group):
             together = self._together(group)
@@ -173,12 +169,10 @@ class OpenRefiner:
                 return together
         return [self._alone(inputs) for inputs in group]
 
-    def _together(self, group: Sequence[Inputs]) -> list[RefinedFrame | Exception] | None:
+    def _together(self, group: Sequence[Inputs]) -> list[Refined | Exception] | None:
         """The frames refined in one pass; None if the network does not take them together."""
-        assert isinstance(self._opened, Split)
-        refiner = self.refiner
         try:
-            frames = refiner.refine_together(self._opened, group, refiner.settings)
+            frames = self.refiner.refine_together(group)
             if not self._checked:
                 self._check_independent(group[0], frames[0])
         except PnpDepthError as error:
@@ -188,31 +182,31 @@ class OpenRefiner:
             return None
         note = f"refined together with {len(group) - 1} others, which alters the last bits"
         return [
-            replace(frame, notes=(*frame.notes, note)) if isinstance(frame, RefinedFrame) else frame
+            replace(frame, notes=(*frame.notes, note)) if isinstance(frame, Refined) else frame
             for frame in frames
         ]
 
-    def _check_independent(self, inputs: Inputs, together: RefinedFrame | PnpDepthError) -> None:
+    def _check_independent(self, inputs: Inputs, together: Refined | PnpDepthError) -> None:
         """Raises BatchError if the frames of a group influence each other."""
         alone = self._alone(inputs)
-        if not isinstance(alone, RefinedFrame) or not isinstance(together, RefinedFrame):
+        if not isinstance(alone, Refined) or not isinstance(together, Refined):
             return
         self._checked = True
-        assert isinstance(self._opened, Split)
-        if not self._opened.static_graph:
+        split = self.refiner.split
+        if split is None or not split.static_graph:
             raise BatchError("the network's control flow depends on image values")
         if not np.allclose(alone.before, together.before, rtol=_ROUNDING, atol=0):
             raise BatchError("frames that go together influence each other")
 
-    def _alone(self, inputs: Inputs) -> RefinedFrame | Exception:
+    def _alone(self, inputs: Inputs) -> Refined | Exception:
         try:
             if not inputs.window:
-                return self.refiner.refine(self._opened, inputs)
+                return self.refiner.refine_frame(inputs)
             first = inputs.window[0]
             carried = (
                 WarmStart() if len(inputs.window) == 1 else self._carried.pop(first, WarmStart())
             )
-            frame = self.refiner.refine_next(self._opened, inputs, carried)
+            frame = self.refiner.refine_next(inputs, carried)
         except Exception as error:  # concerns this frame only
             return error
         self._carried = {first: frame.carried or WarmStart()}
@@ -227,8 +221,8 @@ def opened_network(
     if refiner is None:
         yield None
         return
-    with refiner.opened() as opened:
-        yield OpenRefiner(refiner, opened, batch_size, say)
+    with refiner:
+        yield OpenRefiner(refiner, batch_size, say)
 
 
 def _read(task: Task) -> FrameInMemory:
@@ -244,7 +238,7 @@ def _read(task: Task) -> FrameInMemory:
 def _write(frame: FrameInMemory, network: OpenRefiner | None, state: BatchState) -> Row:
     """Writes a frame's results, or why there are none; returns the summary's row."""
     task, inputs, result = frame.task, frame.inputs, frame.result
-    if not isinstance(result, RefinedFrame):
+    if not isinstance(result, Refined):
         assert result is not None
         return state.fail(task, _message(result))
     assert network is not None

@@ -6,7 +6,7 @@ import re
 from dataclasses import dataclass
 
 from pnpdepth_cli.errors import UsageError
-from pnpdepth_cli.pipeline.options import option
+from pnpdepth_cli.settings import option
 
 LOCAL = "local"
 """The address of a cluster of this machine's devices, which ends with the command."""

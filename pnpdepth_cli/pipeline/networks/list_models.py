@@ -18,7 +18,7 @@ from pnpdepth_cli.models.registry import (
 
 @dataclass(frozen=True, kw_only=True)
 class ListedModel:
-    """One network that can be named; see `ModelDefinition` and `RefineDefaults` for the values.
+    """One network that can be named; see `ModelDefinition` and `Settings` for the values.
 
     family: the file or entry point that defines it. variant: True if the family's name stands for
     another network and no weights of this one ship. size: the image sizes it takes, in words.
@@ -54,7 +54,7 @@ def _listed(name: str) -> ListedModel:
     # On the meta device counting needs no memory.
     with wrap_user_errors(f"build of network {name!r}"), torch.device("meta"):
         module = definition.build()
-    defaults, family = definition.defaults, family_of(name)
+    defaults, family = definition.defaults.complete(), family_of(name)
     return ListedModel(
         name=definition.name,
         family=family,

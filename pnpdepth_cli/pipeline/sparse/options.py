@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from pnpdepth_cli.errors import UsageError
-from pnpdepth_cli.pipeline.options import option, options_of
+from pnpdepth_cli.settings import option, options_of
 
 METRES, MODEL_UNITS = "m", "model units"
 
@@ -26,17 +26,28 @@ class ScanOptions:
         "Pose of the scanner in the camera's frame: matrix, quaternion or tf.",
         metavar="FILE",
     )
-    inverse_extrinsics: bool = option(False, "The pose maps the camera to the scanner.")
+    inverse_extrinsics: bool = option(
+        False, "The pose maps the camera to the scanner.", within="--scan"
+    )
     camera: int | None = option(
         None, "Camera number of KITTI (0 to 3) or Kalibr.  [default: 2; 0]", metavar="N"
     )
-    euclidean: bool = option(False, "Depth is the distance from the camera, not z.", flag="--range")
-    keep_occluded: bool = option(False, "Keep LiDAR points that are occluded from the camera.")
-    min_range: float = option(0.0, "Drop points nearer than M metres.", metavar="M")
-    max_range: float | None = option(None, "Drop points farther than M metres.", metavar="M")
+    euclidean: bool = option(
+        False, "Depth is the distance from the camera, not z.", within="--scan"
+    )
+    keep_occluded: bool = option(
+        False, "Keep LiDAR points that are occluded from the camera.", within="--scan"
+    )
+    min_range: float = option(
+        0.0, "Drop points nearer than M metres.", within="--scan", metavar="M"
+    )
+    max_range: float | None = option(
+        None, "Drop points farther than M metres.", within="--scan", metavar="M"
+    )
     point_fields: int | None = option(
         None,
         "Float32 numbers of a point in a .bin: KITTI 4, nuScenes 5.  [default: recognised]",
+        within="--scan",
         metavar="N",
         least=3,
         most=64,
@@ -73,11 +84,13 @@ class ColmapOptions:
     unit_scale: float | None = option(
         None,
         "Metres per unit of a COLMAP model.  [default: depth is in model units]",
+        within="--colmap",
         metavar="M",
     )
     min_track: int = option(
         3,
         "Drop points of a COLMAP model that fewer images observe.",
+        within="--colmap",
         metavar="N",
         least=1,
         show_default=True,
@@ -85,6 +98,7 @@ class ColmapOptions:
     max_reprojection: float = option(
         2.0,
         "Drop points of a COLMAP model with a larger mean reprojection error.",
+        within="--colmap",
         metavar="PIXELS",
         show_default=True,
     )
@@ -101,14 +115,21 @@ class BagOptions:
     """Which messages of a ROS bag make a frame."""
 
     image_topic: str | None = option(
-        None, "Topic of the images of a bag.  [default: the only one]", metavar="TOPIC"
+        None,
+        "Topic of the images of a bag.  [default: the only one]",
+        metavar="TOPIC",
+        within="--bag",
     )
     points_topic: str | None = option(
-        None, "Topic of the PointCloud2 of a bag.  [default: the only one]", metavar="TOPIC"
+        None,
+        "Topic of the PointCloud2 of a bag.  [default: the only one]",
+        metavar="TOPIC",
+        within="--bag",
     )
     tolerance: float = option(
         0.05,
         "Largest time between an image of a bag and its scan.",
+        within="--bag",
         metavar="SECONDS",
         show_default=True,
     )
@@ -117,6 +138,7 @@ class BagOptions:
         None,
         "Topic of the camera's poses in a bag: odometry, poses or transforms.  [default: the only"
         " one]",
+        within="--bag",
         metavar="TOPIC",
     )
 

@@ -13,9 +13,9 @@ import torch
 from pnpdepth_cli.choices import PRESETS
 from pnpdepth_cli.core.step_sizes import step_size
 from pnpdepth_cli.errors import UsageError
-from pnpdepth_cli.pipeline.options import options_of
-from pnpdepth_cli.pipeline.refinement.request import MethodOptions, count_or_fraction
+from pnpdepth_cli.pipeline.refinement.request import count_or_fraction
 from pnpdepth_cli.pipeline.sweep.points import known_sensor
+from pnpdepth_cli.settings import Settings, options_of
 
 Cell = Mapping[str, str]
 """The varied parameters: name to value, as the user wrote it."""
@@ -182,7 +182,7 @@ _VALUES: Mapping[str, Callable[[str], Any]] = {"int": _whole, "float": _ANY, "st
 
 def _method_parameters() -> Iterator[tuple[str, Parameter]]:
     """Yields the options of the method that have an axis."""
-    for each in options_of(MethodOptions):
+    for each in options_of(Settings):
         axis, names = each.option.axis, each.option.choices
         if axis is None:
             continue

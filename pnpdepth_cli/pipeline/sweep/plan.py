@@ -8,18 +8,17 @@ from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
-from pnpdepth_cli.core.refine import RefineSettings
 from pnpdepth_cli.errors import UsageError
+from pnpdepth_cli.frames.resolve import resolve_layer, resolve_settings
 from pnpdepth_cli.io.dataset.frame import Frame
 from pnpdepth_cli.io.record import plain
 from pnpdepth_cli.models.definition import ModelDefinition
 from pnpdepth_cli.pipeline.batch.frames import Task
 from pnpdepth_cli.pipeline.batch.settings import settings_of
-from pnpdepth_cli.pipeline.refinement.method import with_preset
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest
-from pnpdepth_cli.pipeline.refinement.resolve import resolve_layer, resolve_settings
 from pnpdepth_cli.pipeline.sweep.axes import PARAMETERS, Cell, read_value
 from pnpdepth_cli.pipeline.sweep.points import Sampling, read_sensor_text
+from pnpdepth_cli.settings import Settings
 
 _NOT_OF_UPDATE = ("model", "seed")
 """Parameters that neither the update nor the points have."""
@@ -31,7 +30,7 @@ class Method:
 
     layer: str
     """Where the network is cut."""
-    settings: RefineSettings
+    settings: Settings
     """Of the refinement; `iterations` is 0 unless the schedule of the step depends on it."""
     propagate: str = "none"
     """How the residuals at the points are propagated."""
@@ -97,7 +96,7 @@ class Plan:
         model: dict[str, Any],
     ) -> None:
         self._definition, self._base, self._sampling = definition, base, sampling
-        self._seeds, self._model = range(base.hold_out.seed, base.hold_out.seed + seeds), model
+        self._seeds, self._model = range(base.method.seed, base.method.seed + seeds), model
         self._wanted: dict[tuple[Sampling, int], dict[Method, set[int]]] = {}
         for cell in cells:
             setup = self.setup(cell)
@@ -118,7 +117,7 @@ class Plan:
             for name, text in cell.items()
             if not PARAMETERS[name].of_points and name not in _NOT_OF_UPDATE
         }
-        method = with_preset(replace(self._base.method, **of_update))
+        method = replace(self._base.method, **of_update).with_preset()
         settings = resolve_settings(self._definition, method)
         settings = replace(settings, lr=_one_spelling(settings.lr))
         iterations = settings.iterations

@@ -159,7 +159,9 @@ def _points_of(
     if ground_truth is None:
         raise InputError("there is no ground truth")
     if sampling.is_pattern:
-        return sample_points(ground_truth, sampling.pattern(), seed, image=inputs.rgb, noise=noise)
+        return sample_points(
+            ground_truth, sampling.pattern(), seed, image=inputs.image, noise=noise
+        )
     rng = np.random.default_rng(seed)
     if sampling.lidar is not None:
         points = _scanned(sampling, sampling.lidar, seed, inputs, request, frame)

@@ -14,10 +14,10 @@ from torch import Tensor
 from pnpdepth_cli.completion.interpolation import linear
 from pnpdepth_cli.completion.propagation import propagate
 from pnpdepth_cli.core.metrics import score
-from pnpdepth_cli.core.refine import Refinement, RefineSettings, refine
+from pnpdepth_cli.core.refine import Refinement, refine
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.errors import DeviceError, DivergedError, PnpDepthError, StorageError
-from pnpdepth_cli.frames.frame import RefinedFrame
+from pnpdepth_cli.frames.frame import Refined
 from pnpdepth_cli.frames.opened import SplitCache
 from pnpdepth_cli.frames.prepare import prepare
 from pnpdepth_cli.frames.refine import refine_frame
@@ -27,6 +27,7 @@ from pnpdepth_cli.pipeline.batch.reading import read_frame
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs
 from pnpdepth_cli.pipeline.sweep.plan import Method, Run
 from pnpdepth_cli.pipeline.sweep.points import frame_points
+from pnpdepth_cli.settings import Settings
 
 T = TypeVar("T")
 Result = dict[str, Any] | PnpDepthError
@@ -138,7 +139,7 @@ def refined_curve(
         inputs: The frame with its points.
         wanted: Numbers of updates.
     """
-    prepared = prepare(network, inputs.frame())
+    prepared = prepare(network, inputs.registered())
     if not len(prepared.points):
         raise prepared.no_points_error()
     settings = replace(method.settings, iterations=max(wanted))
@@ -183,13 +184,13 @@ def refined_curve(
 
 def _seeded(method: Method, seed: int) -> Method:
     settings = method.settings
-    return replace(method, settings=replace(settings, mask=replace(settings.mask, seed=seed)))
+    return replace(method, settings=replace(settings, seed=seed))
 
 
 def weights_curve(network: Network, method: Method, inputs: Inputs, wanted: Sequence[int]) -> Curve:
     """Returns the same where weights move; each number of updates is refined for itself."""
-    truth, frame = ground_truth_in_view(network, inputs), inputs.frame()
-    refined: dict[int, RefinedFrame] = {}
+    truth, frame = ground_truth_in_view(network, inputs), inputs.registered()
+    refined: dict[int, Refined] = {}
     times: dict[int, float] = {}
     cut = network.cut_at_points() if method.settings.masked else network.cut_at(method.layer)
     with cut as split:
@@ -255,7 +256,7 @@ def ground_truth_in_view(network: Network, inputs: Inputs) -> Tensor:
     return ground_truth
 
 
-def _kept(losses: Sequence[float], updates: int, settings: RefineSettings) -> int:
+def _kept(losses: Sequence[float], updates: int, settings: Settings) -> int:
     """The index of z that a refinement of so many updates returns: the last, or of least loss."""
     if not settings.gives_best:
         return updates
@@ -266,4 +267,4 @@ def _propagated(depth: Tensor, inputs: Inputs, kind: str) -> Tensor:
     """(H, W) the depth with the residuals at the points propagated."""
     if kind == "none":
         return depth
-    return propagate(depth, inputs.points, inputs.frame().rgb, kind=kind).depth
+    return propagate(depth, inputs.points, inputs.registered().rgb, kind=kind).depth

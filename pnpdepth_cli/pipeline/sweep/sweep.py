@@ -9,6 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from pnpdepth_cli.errors import InputError, PnpDepthError, UsageError
+from pnpdepth_cli.frames.refiner import Refiner
+from pnpdepth_cli.frames.resolve import resolve_layer, resolve_settings
 from pnpdepth_cli.io.atomic import make_folder, remove_leftovers
 from pnpdepth_cli.io.dataset.frame import Frame
 from pnpdepth_cli.io.lock import locked_folder
@@ -20,11 +22,9 @@ from pnpdepth_cli.pipeline.batch.reading import read_frame
 from pnpdepth_cli.pipeline.batch.request import BatchRequest, FrameSelection
 from pnpdepth_cli.pipeline.batch.settings import model_identity
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs
-from pnpdepth_cli.pipeline.refinement.load_refiner import load_refiner
-from pnpdepth_cli.pipeline.refinement.method import with_preset
-from pnpdepth_cli.pipeline.refinement.refiner import Refiner
+from pnpdepth_cli.pipeline.refinement.record import model_record
+from pnpdepth_cli.pipeline.refinement.refine import load_refiner
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest
-from pnpdepth_cli.pipeline.refinement.resolve import resolve_layer, resolve_settings
 from pnpdepth_cli.pipeline.sweep.axes import Cell, Study
 from pnpdepth_cli.pipeline.sweep.plan import Plan, Run, sampling_of
 from pnpdepth_cli.pipeline.sweep.plots import draw_study, need_matplotlib
@@ -76,6 +76,7 @@ class SweepRequest(FrameSelection):
 class _Network:
     """A network of the sweep and its runs."""
 
+    spec: str
     refiner: Refiner
     base: dict[str, Any]
     """The settings that are not varied."""
@@ -227,7 +228,7 @@ def _network(
         with refiner.network.cut_at(each):
             pass  # reports an unknown layer before anything is computed
     runs = tuple(run for task, frame in tasks for run in plan.runs(task, frame))
-    return _Network(refiner=refiner, base=base, plan=plan, runs=runs)
+    return _Network(spec=spec, refiner=refiner, base=base, plan=plan, runs=runs)
 
 
 def _resolved(
@@ -244,7 +245,7 @@ def _resolved(
         tasks: The frames.
         listener: Receives notes.
     """
-    seed = refine.hold_out.seed
+    seed = refine.method.seed
     errors = []
     for number, (task, frame) in enumerate(tasks):
         try:
@@ -281,7 +282,7 @@ def _with_points_of_truth(task: Task, frame: Frame, seed: int) -> Inputs:
 
 def _base(definition: ModelDefinition, request: RefineRequest) -> dict[str, Any]:
     """The settings that are not varied."""
-    method = with_preset(request.method)
+    method = request.method.with_preset()
     settings = resolve_settings(definition, method)
     layer = method.layer or definition.default_layer
     return {
@@ -354,8 +355,12 @@ def _write(
         "command": "sweep",
         "source": str(request.source),
         "output": str(request.output),
-        "model": first.refiner.model_record,
-        **({"more_models": [each.refiner.model_record for each in others]} if others else {}),
+        "model": model_record(first.refiner.network, first.spec),
+        **(
+            {"more_models": [model_record(each.refiner.network, each.spec) for each in others]}
+            if others
+            else {}
+        ),
         "frames": list(names),
         "seeds": request.seeds,
         "base": first.base | asdict(sampling),

@@ -16,6 +16,7 @@ import pytest
 from pnpdepth_cli.cli.tables import print_batch
 from pnpdepth_cli.core.metrics import Scores
 from pnpdepth_cli.errors import InputError, LayerError, ModelError, OutputError, UsageError
+from pnpdepth_cli.frames.refiner import Refiner
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.pipeline.batch import reading as batch_reading
 from pnpdepth_cli.pipeline.batch import running as batch_running
@@ -25,7 +26,6 @@ from pnpdepth_cli.pipeline.batch.settings import SettingsDigests, settings_diges
 from pnpdepth_cli.pipeline.batch.summary import _SCORES, Tally
 from pnpdepth_cli.pipeline.refinement.inputs import read_inputs
 from pnpdepth_cli.pipeline.refinement.refine import refine_image
-from pnpdepth_cli.pipeline.refinement.refiner import Refiner
 from pnpdepth_cli.pipeline.report.batch import BatchReport
 from pnpdepth_cli.pipeline.sparse.options import ScanOptions
 from pnpdepth_cli.sensors import SamplePattern

@@ -14,7 +14,7 @@ from pnpdepth_cli.choices import BASELINES
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.pipeline.refinement.inputs import read_inputs
-from pnpdepth_cli.pipeline.refinement.load_refiner import HIDDEN_POINT_STEPS, load_refiner
+from pnpdepth_cli.pipeline.refinement.refine import HIDDEN_POINT_STEPS, load_refiner
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest
 from tests.pipeline.frames import FrameOnDisk, run
 

@@ -7,10 +7,11 @@ import torch
 
 from pnpdepth_cli import Refiner, load_network
 from pnpdepth_cli.errors import UsageError
+from pnpdepth_cli.frames.resolve import resolve_settings
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.models.definition import MASKED_DEFAULTS, WEIGHTS_DENSE_DEFAULTS
-from pnpdepth_cli.pipeline.refinement.request import HoldOut, MethodOptions
-from pnpdepth_cli.pipeline.refinement.resolve import resolve_settings
+from pnpdepth_cli.pipeline.refinement.request import HoldOut
+from pnpdepth_cli.settings import Settings
 from tests.core.split.test_split import same, state_of
 from tests.pipeline.frames import FrameOnDisk, run
 
@@ -101,7 +102,7 @@ def test_points_cannot_be_hidden_from_a_network_of_images(frame: FrameOnDisk) ->
 
 def test_dense_points_have_defaults_of_their_own(frame: FrameOnDisk) -> None:
     definition = load_network("compact").definition
-    method = MethodOptions(target="masked")
+    method = Settings(target="masked")
     settings = resolve_settings(definition, method, dense=True)
     assert (settings.iterations, settings.lr, settings.mask.scale) == (6, 3e-4, 0.5)
     assert run(frame, **MASKED | {"iterations": None}).record["settings"]["lr"] == 3e-4
@@ -112,7 +113,7 @@ def test_weights_moved_by_given_points_keep_their_defaults(
     dense: bool, expected: tuple[int, float]
 ) -> None:
     definition = load_network("compact").definition
-    settings = resolve_settings(definition, MethodOptions(parameters="weights"), dense=dense)
+    settings = resolve_settings(definition, Settings(parameters="weights"), dense=dense)
     assert (settings.iterations, settings.lr) == expected
     assert (settings.update, settings.schedule, settings.loss) == ("adam", "cosine", "log")
     assert (settings.target, settings.mask.scale) == ("given", 1.0)
@@ -121,7 +122,7 @@ def test_weights_moved_by_given_points_keep_their_defaults(
 def test_seed_and_budget_reach_the_settings() -> None:
     definition = load_network("compact").definition
     settings = resolve_settings(
-        definition, MethodOptions(target="masked"), HoldOut(seed=5, time_budget_s=2.0)
+        definition, Settings(target="masked"), HoldOut(seed=5, time_budget_s=2.0)
     )
     assert (settings.mask.seed, settings.time_budget_s) == (5, 2.0)
-    assert resolve_settings(definition, MethodOptions()).time_budget_s is None
+    assert resolve_settings(definition, Settings()).time_budget_s is None

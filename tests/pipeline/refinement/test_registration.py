@@ -17,8 +17,7 @@ from pnpdepth_cli.io.depth import read_depth, write_depth
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.pipeline.batch.request import BatchRequest
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs, read_inputs
-from pnpdepth_cli.pipeline.refinement.load_refiner import load_refiner
-from pnpdepth_cli.pipeline.refinement.refine import refine_image
+from pnpdepth_cli.pipeline.refinement.refine import load_refiner, refine_image
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest, parse_registration
 from tests.completion.unregistered import SIZE, UNREGISTERED, frame
 from tests.pipeline.batches import RecordingListener
