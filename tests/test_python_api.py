@@ -32,12 +32,12 @@ def frame() -> Frame:
 def test_the_public_names_are_these() -> None:
     assert sorted(pnp.__all__) == [
         "CheckpointError", "DeviceError", "DivergedError", "InputError", "LayerError", "ModelError",
-        "Network", "NoPointsError", "PnpDepthError", "Settings", "Refined", "Refiner",
-        "Scores", "SizeError", "SparsePoints", "Split", "UsageError", "__version__",
+        "Network", "NoPointsError", "PnpDepthError", "Refined", "Refiner",
+        "Scores", "Settings", "SizeError", "SparsePoints", "Split", "UsageError", "__version__",
         "load_network", "refine", "score",
     ]  # fmt: skip
     assert all(getattr(pnp, name) is not None for name in pnp.__all__)
-    assert set(pnp.__all__) <= set(dir(pnp))
+    assert dir(pnp) == sorted(pnp.__all__)
 
 
 def test_a_name_that_is_not_public_is_an_attribute_error() -> None:

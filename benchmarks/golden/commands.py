@@ -61,8 +61,8 @@ def _of_shared_data() -> Iterator[Group]:
         (
             "keep-occluded",
             f"project {data}/kitti_object/velodyne/000002.bin --calib"
-            f" {data}/kitti_object/calib/000002.txt --size 370x1224 --keep-occluded --camera 3"
-            " --range --min-range 5 --max-range 40 -o scan.csv",
+            f" {data}/kitti_object/calib/000002.txt --size 370x1224 --camera 3"
+            " --scan keep-occluded,euclidean,min-range=5,max-range=40 -o scan.csv",
         ),
         (
             "raw",
@@ -184,7 +184,7 @@ def _of_refinement() -> Iterator[Group]:
             "sfmlearner-align",
             f"{SMALL} {GT} --model sfmlearner-tiny --align auto -o out/",
         ),
-        ("eigen-align-every", f"{SMALL} --model eigen-tiny --align affine --align-every -o out/"),
+        ("eigen-align-every", f"{SMALL} --model eigen-tiny --align affine --set align-every -o out/"),
     )
     yield from single_steps(
         "losses",
@@ -203,13 +203,13 @@ def _of_refinement() -> Iterator[Group]:
     )
     yield from single_steps(
         "options",
-        ("linear", f"{SMALL} --schedule linear --lr 0.02 --iterations 3 -o out/"),
-        ("spread", f"{SMALL} --spread 1.5 --update normalised --lr 5% -o out/"),
-        ("channels", f"{SMALL} {GT} --parameters channels -o out/"),
-        ("channels-lbfgs", f"{SMALL} --parameters channels --update lbfgs -o out/ --iterations 3"),
-        ("anchor", f"{SMALL} {GT} --anchor 0.1 -o out/"),
-        ("line-search", f"{SMALL} {GT} --line-search --lr 30% -o out/"),
-        ("keep-best", f"{SMALL} {GT} --keep-best --lr 50% --iterations 8 -o out/"),
+        ("linear", f"{SMALL} --set schedule=linear --lr 0.02 --iterations 3 -o out/"),
+        ("spread", f"{SMALL} --set blur=1.5 --update normalised --lr 5% -o out/"),
+        ("channels", f"{SMALL} {GT} --set parameters=channels -o out/"),
+        ("channels-lbfgs", f"{SMALL} --set parameters=channels --update lbfgs -o out/ --iterations 3"),
+        ("anchor", f"{SMALL} {GT} --set proximity=0.1 -o out/"),
+        ("line-search", f"{SMALL} {GT} --set line-search --lr 30% -o out/"),
+        ("keep-best", f"{SMALL} {GT} --set keep-best --lr 50% --iterations 8 -o out/"),
         ("plain", f"{SMALL} {GT} --iterations 0 -o out/"),
         ("share", f"{SMALL} --layer 0.5 -o out/ --iterations 2"),
         ("layer", f"{SMALL} --layer decoder.s2 -o out/ --iterations 2"),
@@ -231,12 +231,12 @@ def _of_refinement() -> Iterator[Group]:
         (
             "scan",
             f"refine ../in/street_small/rgb.png --sparse ../in/street_small/000000.bin {STREET}"
-            " --gt ../in/street_small/gt.png --max-range 50 --holdout 0.1 -o out/",
+            " --gt ../in/street_small/gt.png --scan max-range=50 --holdout 0.1 -o out/",
         ),
         (
             "range",
             f"refine ../in/street_small/rgb.png --sparse ../in/street_small/000000.bin {STREET}"
-            " --range --keep-occluded --min-range 4 --camera 3 --iterations 1 -o out/",
+            " --scan euclidean,keep-occluded,min-range=4 --camera 3 --iterations 1 -o out/",
         ),
         ("csv-points", "refine ../in/small/rgb.png --sparse ../in/few.csv -o out/"),
         (
@@ -461,8 +461,8 @@ def _of_sparse_depth() -> Iterator[Group]:
             "picture",
             f"{project} --image ../in/street_small/rgb.png -o scan.png --overlay overlay.png",
         ),
-        ("exr", f"{project} --size 192x640 --keep-occluded -o kept.exr --json"),
-        ("csv", f"{project} --size 192x640 --camera 0 --max-range 20 -o near.csv"),
+        ("exr", f"{project} --size 192x640 --scan keep-occluded -o kept.exr --json"),
+        ("csv", f"{project} --size 192x640 --camera 0 --scan max-range=20 -o near.csv"),
         ("no-size", f"{project} -o none.png"),
         ("no-calib", "project ../in/street_small/000000.bin --size 192x640 -o none.png"),
     )
@@ -567,8 +567,8 @@ def _of_errors() -> Iterator[Group]:
         ("bad-lr", f"{SMALL} --lr fast {out}"),
         ("bad-budget", f"{SMALL} --time-budget soon {out}"),
         ("budget-alone", f"{SMALL} --time-budget 3s {out}"),
-        ("bad-spread", f"{SMALL} --spread nan {out}"),
-        ("bad-anchor", f"{SMALL} --anchor -1 {out}"),
+        ("bad-spread", f"{SMALL} --set blur=nan {out}"),
+        ("bad-anchor", f"{SMALL} --set proximity=-1 {out}"),
         ("bad-holdout", f"{SMALL} --holdout 1.5 {out}"),
         ("bad-tile", f"{SMALL} --tile 7 {out}"),
         ("wrong-layer", f"{SMALL} --layer decodr.s8 {out}"),

@@ -67,7 +67,6 @@ _SCALE_OPTIONS = {
                 "--sparse",
                 "--sparse-scale",
                 "--workers",
-                "--max-pixels",
             ),
         ),
         "Protocol": (

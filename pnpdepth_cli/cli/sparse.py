@@ -234,7 +234,7 @@ def frames(bag: Path, output: Path, as_json: bool, **values: Any) -> None:
 
     \b
     pnpdepth frames drive.mcap -o drive/
-    pnpdepth frames drive.bag -o drive/ --image-topic /front/image_raw --points-topic /velodyne
+    pnpdepth frames drive.bag -o drive/ --bag image-topic=/front/image_raw
     pnpdepth batch drive/ -o refined/
 
     BAG is a file of ROS 1 (.bag) or ROS 2 (.mcap, .db3), or a folder that ROS 2 recorded. OUTPUT

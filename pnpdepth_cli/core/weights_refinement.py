@@ -277,7 +277,7 @@ class WeightsRefinement:
         if not self._weights.theta:
             raise LayerError(
                 "no weight can move: the prediction depends on no parameter behind the cut; take"
-                " --parameters elements, or cut at an earlier layer"
+                " --set parameters=elements, or cut at an earlier layer"
             )
         self._checked = {0: list(self._weights.theta)}
         lr, update = self._settings.lr, self._settings.update

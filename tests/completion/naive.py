@@ -52,7 +52,7 @@ def naive_refine(
     depth_of: Callable[[Any], Tensor],
 ) -> tuple[Tensor, list[float]]:
     """(depth of z_K, L(z_0) … L(z_K))."""
-    name = LayerName.parse(layer)
+    name, settings = LayerName.parse(layer), settings.complete()
     loss_of, update = LOSSES[settings.loss], UPDATES[settings.update]()
     z: Tensor | None = None
 

@@ -14,8 +14,7 @@ import pytest
 import torch
 from torch import nn
 
-from pnpdepth_cli.core.step_sizes import step_size
-from pnpdepth_cli.errors import ModelError, UsageError
+from pnpdepth_cli.errors import ModelError
 from pnpdepth_cli.models.definition import (
     Fixed,
     ModelDefinition,
@@ -52,11 +51,6 @@ def test_arguments_come_in_the_order_of_the_input_kind() -> None:
 def test_a_missing_input_is_not_passed_over(kind: str) -> None:
     with pytest.raises(ValueError, match="needs all of its inputs"):
         definition(input_kind=kind).call_arguments(None, torch.zeros(1))
-
-
-def test_the_defaults_are_the_papers() -> None:
-    paper = Settings(layer=None, iterations=5, lr=0.01, loss="l1", update="sign")
-    assert Settings() == paper
 
 
 def test_reading_a_definition_needs_no_torch() -> None:
@@ -113,32 +107,6 @@ def test_a_deviation_is_above_zero_and_a_mean_need_not_be() -> None:
 
 
 @pytest.mark.parametrize(
-    ("field", "value"),
-    [
-        *(("iterations", value) for value in ("5", -1, 2.0, None)),
-        *(("lr", value) for value in ("x%", "", 0, -1, NAN, INF, "inf", None)),
-        *(("blur", value) for value in (-1, NAN, INF, "1", None)),
-        *((field, "foo") for field in ("loss", "update", "schedule", "align")),
-        *((field, None) for field in ("loss", "update", "schedule")),
-        ("align", ["auto"]),
-        ("layer", 3),
-    ],
-)
-def test_a_default_that_refinement_could_not_use_is_refused(field: str, value: Any) -> None:
-    assert "Settings: " in refused(Settings, **{field: value})
-
-
-@pytest.mark.parametrize("lr", ["x%", "", "0%", "3 %", "3%", "0.5", 0.1, 1, True, None])
-def test_a_definition_takes_those_steps_that_refinement_takes(lr: Any) -> None:
-    try:
-        step_size(lr, torch.randn(8))
-    except UsageError:
-        refused(Settings, lr=lr)
-    else:
-        assert Settings(lr=lr).lr == lr
-
-
-@pytest.mark.parametrize(
     ("field", "value", "message"),
     [
         ("name", 5, "a text is expected"),
@@ -169,13 +137,5 @@ def test_a_long_value_is_shortened() -> None:
 
 def test_numbers_of_numpy_and_lists_are_as_good() -> None:
     assert Multiple(np.int64(8)).of == 8  # type: ignore[arg-type]
-    assert Settings(lr=np.float32(0.5), iterations=np.int32(3)).iterations == 3  # type: ignore[arg-type]
     Normalisation(mean=[0.5, 0.5, 0.5], std=np.ones(3))  # type: ignore[arg-type]
     assert definition(layers=["a"], checkpoint=Path("x.pt"), normalisation=None).layers == ["a"]
-
-
-def test_former_names_of_fields_are_accepted_for_one_version() -> None:
-    with pytest.warns(DeprecationWarning, match="static_graph"):
-        assert definition(same_path=True) == definition(static_graph=True)
-    with pytest.warns(DeprecationWarning, match="blur"):
-        assert Settings(spread=0.5) == Settings(blur=0.5)

@@ -47,7 +47,7 @@ def image_file(message: Any, topic: str) -> tuple[str, bytes]:
         if suffix is None:
             raise FileFormatError(
                 f"{topic}: a compressed image ({one_line(message.format)[:30]}) is neither JPEG nor"
-                " PNG; name another --image-topic"
+                " PNG; name another --bag image-topic"
             )
         return suffix, data
     done, encoded = cv2.imencode(".png", _pixels(message, topic), [cv2.IMWRITE_PNG_COMPRESSION, 1])

@@ -34,10 +34,7 @@ def unpacked(
     """
     if not is_bag(request.source):
         if options != BagOptions():
-            raise UsageError(
-                f"{request.source} is no bag, so --image-topic, --points-topic, --poses-topic and"
-                " --tolerance do not apply"
-            )
+            raise UsageError(f"{request.source} is no bag, so --bag does not apply")
         return request
     from pnpdepth_cli.pipeline.sparse.frames import (
         POSES,

@@ -141,7 +141,7 @@ def read_inputs(request: RefineRequest) -> Inputs:
     if ground_truth is not None and sparse.unit != METRES:
         raise UsageError(
             f"the ground truth {files.gt} is in metres but the sparse depth in {sparse.unit}; give"
-            " --unit-scale, or leave out --gt"
+            " --colmap unit-scale, or leave out --gt"
         )
     if ground_truth is not None and ground_truth.values.shape != sparse.points.size:
         raise _size_error(files, ground_truth.values.shape, sparse.points.size)
@@ -227,10 +227,7 @@ def _read_sparse(request: RefineRequest, path: Path, size: tuple[int, int] | Non
     if path.is_dir():
         return _read_colmap(files, path, size)
     if files.colmap != ColmapOptions():
-        raise UsageError(
-            f"{path} is no COLMAP model, so --unit-scale, --min-track and --max-reprojection do not"
-            " apply"
-        )
+        raise UsageError(f"{path} is no COLMAP model, so --colmap does not apply")
     if files.is_scan(path):
         return _read_scan(files, path, size)
     keep = files.scan.keep_occluded or request.method.preset is not None
@@ -433,7 +430,7 @@ def _visible(points: Points, keep_occluded: bool) -> tuple[Points, dict[str, Any
     count = int(hidden.sum())
     note = (
         f"sparse: a projected LiDAR scan; dropped {count:,} points occluded from the camera by"
-        " nearer ones; --keep-occluded keeps them"
+        " nearer ones; --scan keep-occluded keeps them"
     )
     return points.select(~hidden), {"dropped": {"hidden by foreground": count}}, [note]
 

@@ -75,8 +75,8 @@ def write_frames(request: FramesRequest, say: Callable[[str], None]) -> dict[str
     with open_bag(request.bag) as bag:
         options = request.options
         topics = (
-            topic_of(bag, options.image_topic, IMAGES, "--image-topic"),
-            topic_of(bag, options.points_topic, CLOUDS, "--points-topic"),
+            topic_of(bag, options.image_topic, IMAGES, "--bag image-topic"),
+            topic_of(bag, options.points_topic, CLOUDS, "--bag points-topic"),
         )
         say(f"topics: images of {topics[0]}, points of {topics[1]}")
         _clear(request)
@@ -100,7 +100,7 @@ def write_frames(request: FramesRequest, say: Callable[[str], None]) -> dict[str
     if not times:
         raise InputError(
             f"{request.bag}: no image of {topics[0]} has a scan of {topics[1]} within"
-            f" {options.tolerance:g} s; check the clocks, or give a larger --tolerance"
+            f" {options.tolerance:g} s; check the clocks, or give a larger --bag tolerance"
         )
     record = _identity(request) | {
         "image_topic": topics[0],
@@ -270,7 +270,7 @@ def _write_poses(
     topics = poses_topics(bag, wanted)
     if len(topics) != 1:
         if topics:
-            say(f"poses: none, as several topics give some; --poses-topic {' | '.join(topics)}")
+            say(f"poses: none, as several topics give some; --bag poses-topic={' | '.join(topics)}")
         return None
     (topic,) = topics
     trajectory = camera_trajectory(bag, topic, camera)

@@ -105,9 +105,9 @@ class ColmapOptions:
 
     def __post_init__(self) -> None:
         if self.unit_scale is not None and not 0 < self.unit_scale < math.inf:
-            raise UsageError(f"--unit-scale {self.unit_scale:g} is no length; give metres per unit")
+            raise UsageError(f"unit-scale must be above 0 metres per unit, got {self.unit_scale:g}")
         if self.min_track < 1 or not self.max_reprojection > 0:
-            raise UsageError("--min-track must be 1 or more, and --max-reprojection above 0")
+            raise UsageError("min-track must be >= 1, and max-reprojection above 0")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -144,4 +144,4 @@ class BagOptions:
 
     def __post_init__(self) -> None:
         if not self.tolerance >= 0:
-            raise UsageError(f"--tolerance {self.tolerance:g} is no time; give 0 s or more")
+            raise UsageError(f"tolerance must be >= 0 s, got {self.tolerance:g}")

@@ -520,7 +520,7 @@ def test_reading_and_writing_go_on_while_the_network_runs(
     read: set[str] = set()
     second_is_read, second_is_refined = threading.Event(), threading.Event()
     refined = 0
-    refine, write = Refiner.refine, batch_running.write_refined
+    refine, write = Refiner.refine_frame, batch_running.write_refined
 
     def reading(request: Any) -> Any:
         read.add(str(request.files.image))
@@ -528,14 +528,14 @@ def test_reading_and_writing_go_on_while_the_network_runs(
             second_is_read.set()
         return read_inputs(request)
 
-    def refining(self: Refiner, split: Any, inputs: Any) -> Any:
+    def refining(self: Refiner, inputs: Any) -> Any:
         nonlocal refined
         assert threading.current_thread() is threading.main_thread()
         assert second_is_read.wait(60), "the second frame is not read while the first is refined"
         refined += 1
         if refined == 2:
             second_is_refined.set()
-        return refine(self, split, inputs)
+        return refine(self, inputs)
 
     def writing(*arguments: Any) -> Any:
         assert second_is_refined.wait(60), "the second frame waits until the first is written"
@@ -543,7 +543,7 @@ def test_reading_and_writing_go_on_while_the_network_runs(
 
     monkeypatch.setattr(batch_reading, "read_inputs", reading)
     monkeypatch.setattr(batch_running, "write_refined", writing)
-    monkeypatch.setattr(Refiner, "refine", refining)
+    monkeypatch.setattr(Refiner, "refine_frame", refining)
     assert batch(root, workers=1).summary["counts"]["done"] == 4
 
 

@@ -12,9 +12,10 @@ import pytest
 
 from pnpdepth_cli.choices import BASELINES
 from pnpdepth_cli.errors import UsageError
+from pnpdepth_cli.frames.refiner import HIDDEN_POINT_STEPS
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.pipeline.refinement.inputs import read_inputs
-from pnpdepth_cli.pipeline.refinement.refine import HIDDEN_POINT_STEPS, load_refiner
+from pnpdepth_cli.pipeline.refinement.refine import load_refiner
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest
 from tests.pipeline.frames import FrameOnDisk, run
 

@@ -27,7 +27,7 @@ PNG = Outputs(depth=Path("depth.png"))
 def inputs_at(*depths: float, scale: float | None = None) -> Inputs:
     xy = torch.tensor([[float(column), 0.0] for column in range(len(depths))])
     points = SparsePoints(xy=xy, depth=torch.tensor(depths), size=(1, 4))
-    return Inputs(rgb=None, points=points, gt=None, sparse_scale=scale, record={}, notes=())
+    return Inputs(rgb=None, points=points, own=points, sparse_scale=scale)
 
 
 def refined_to(*depths: float, inputs: Inputs) -> Refined:

@@ -26,7 +26,7 @@ from pnpdepth_cli.errors import (
 )
 from pnpdepth_cli.io.dataset.frame import Frame
 from pnpdepth_cli.io.lock import locked_folder
-from pnpdepth_cli.pipeline.refinement import load_refiner as refining
+from pnpdepth_cli.pipeline.refinement import refine as refining
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs, read_inputs
 from pnpdepth_cli.pipeline.refinement.refine import load_refiner, refine_image
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest
