@@ -24,7 +24,7 @@ from benchmarks.frames import (
 )
 from pnpdepth_cli.completion.interpolation import linear
 from pnpdepth_cli.io.depth import write_depth
-from pnpdepth_cli.pipeline.adapt import Progress, adapt
+from pnpdepth_cli.pipeline.adapt import adapt
 from pnpdepth_cli.pipeline.adapt_request import AdaptRequest
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs
 from pnpdepth_cli.pipeline.refinement.refine import load_refiner
@@ -94,7 +94,7 @@ def main() -> None:
                 refine=RefineRequest.from_fields(sample=pattern, seed=seed),
                 steps=args.steps,
             )
-            adapted = adapt(request, Progress(say=lambda _: None, step=lambda *_: None))
+            adapted = adapt(request, lambda _: None, lambda *_: None)
             tested = [drawn_inputs(frame, args.points, seed) for frame in frames[1::2]]
             before, after = mae(tested, None), mae(tested, weights)
             print(

@@ -184,7 +184,10 @@ def _of_refinement() -> Iterator[Group]:
             "sfmlearner-align",
             f"{SMALL} {GT} --model sfmlearner-tiny --align auto -o out/",
         ),
-        ("eigen-align-every", f"{SMALL} --model eigen-tiny --align affine --set align-every -o out/"),
+        (
+            "eigen-align-every",
+            f"{SMALL} --model eigen-tiny --align affine --set align-every -o out/",
+        ),
     )
     yield from single_steps(
         "losses",
@@ -206,7 +209,10 @@ def _of_refinement() -> Iterator[Group]:
         ("linear", f"{SMALL} --set schedule=linear --lr 0.02 --iterations 3 -o out/"),
         ("spread", f"{SMALL} --set blur=1.5 --update normalised --lr 5% -o out/"),
         ("channels", f"{SMALL} {GT} --set parameters=channels -o out/"),
-        ("channels-lbfgs", f"{SMALL} --set parameters=channels --update lbfgs -o out/ --iterations 3"),
+        (
+            "channels-lbfgs",
+            f"{SMALL} --set parameters=channels --update lbfgs -o out/ --iterations 3",
+        ),
         ("anchor", f"{SMALL} {GT} --set proximity=0.1 -o out/"),
         ("line-search", f"{SMALL} {GT} --set line-search --lr 30% -o out/"),
         ("keep-best", f"{SMALL} {GT} --set keep-best --lr 50% --iterations 8 -o out/"),

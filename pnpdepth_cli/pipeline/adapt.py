@@ -87,18 +87,13 @@ class Adapted:
         return self.losses[self.kept] / self.losses[0] - 1
 
 
-@dataclass(frozen=True, kw_only=True)
-class Progress:
-    """Receives the progress of an adaptation."""
-
-    say: Callable[[str], None]
-    """Receives notes, one line each."""
-    step: OnStep
-    """Called after the updates of each visit of a frame."""
-
-
-def adapt(request: AdaptRequest, progress: Progress) -> Adapted:
+def adapt(request: AdaptRequest, say: Callable[[str], None], on_step: OnStep) -> Adapted:
     """Writes the adapted weights and their card; returns what was learnt.
+
+    Args:
+        request: The frames and the network.
+        say: Receives notes, one line each.
+        on_step: Called after the updates of each visit of a frame.
 
     Raises:
         InputError: There are fewer than two frames, or a file cannot be used.
@@ -121,14 +116,14 @@ def adapt(request: AdaptRequest, progress: Progress) -> Adapted:
     )
     settings = resolve_settings(network.definition, options, dense=is_dense(first.points))
     for note in (*first.notes, *network.notes):
-        progress.say(note)
+        say(note)
     adaptation = _Adaptation(network, settings, tasks)
-    progress.say(
+    say(
         f"frames to learn from: {len(adaptation.training)}; for validation:"
         f" {len(adaptation.validation)}"
     )
     with network.cut_at_points() as split:
-        losses = adaptation.run(split, progress)
+        losses = adaptation.run(split, on_step)
     adapted = Adapted(
         network=network.definition.name,
         checkpoint=None if choice.checkpoint is None else str(choice.checkpoint),
@@ -187,7 +182,7 @@ class _Adaptation:
         self._alphas: list[float] = []
         self.best, self.kept = self._weights, 0
 
-    def run(self, split: InputSplit, progress: Progress) -> dict[int, float]:
+    def run(self, split: InputSplit, on_step: OnStep) -> dict[int, float]:
         """Makes all updates. Returns the validation loss by the number of updates."""
         of, updates = self._settings.iterations, 0
         losses = {0: self._validated(split)}
@@ -197,7 +192,7 @@ class _Adaptation:
             loss = self._visited(split, index, updates, visit)
             checked = (updates + visit) * CHECKS // of > updates * CHECKS // of
             updates += visit
-            progress.step(updates, of, f"loss {loss:.4f}")
+            on_step(updates, of, f"loss {loss:.4f}")
             if checked:
                 losses[updates] = self._validated(split)
                 if losses[updates] < losses[self.kept]:

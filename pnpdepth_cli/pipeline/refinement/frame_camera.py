@@ -28,16 +28,11 @@ class FrameCamera:
     """The camera that took a frame."""
 
     camera: Camera
-    """Intrinsics and lens, in pixels of the frame."""
-
     source: str
     """Where it is from, for a person."""
-
     pose: NDArray[np.float64] | None = None
     """(3, 4) x_world = pose · (x, 1), in the unit of the depth. None: unknown."""
-
     notes: tuple[str, ...] = ()
-    """What was assumed."""
 
     def in_part(self, protocol: Protocol, size: tuple[int, int]) -> FrameCamera:
         """Returns the camera of the part that a protocol keeps of an image of (H, W)."""

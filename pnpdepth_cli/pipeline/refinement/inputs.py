@@ -44,18 +44,10 @@ from pnpdepth_cli.sensors import (
 
 ImageArray = NDArray[np.float32]
 
-_LEAK_FRACTION = 0.5
-"""Of the ground truth's pixels; as much in common with the sparse depth gives a warning."""
-
-
-_FAR = 1000.0
-"""Times the median depth; no point of an image is farther."""
-
-_OTHER_SCALE = 1.5
-"""Ratio of ground truth to sparse depth that no noise explains."""
-
-_MIN_COMPARED = 10
-"""Fewer points decide nothing."""
+_LEAK_FRACTION = 0.5  # of the ground truth's pixels equal to the sparse depth gives a warning
+_FAR = 1000.0  # times the median depth; no point of an image is farther
+_OTHER_SCALE = 1.5  # ratio of ground truth to sparse depth that no noise explains
+_MIN_COMPARED = 10  # fewer points decide nothing
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,9 +88,7 @@ class _Part:
     whole: tuple[int, int]
     """(H, W) before the protocol's crop."""
     record: dict[str, Any]
-    """Of its file."""
     notes: tuple[str, ...] = ()
-    """What was assumed."""
     scale: float | None = None
     """Integers per metre of its file."""
 
@@ -108,15 +98,11 @@ class _Sparse:
     """The sparse depth of the frame."""
 
     points: SparsePoints
-    """In the image frame."""
     scale: float | None
     """Integers per metre of its file."""
     record: dict[str, Any]
-    """Of its file."""
     notes: tuple[str, ...]
-    """What was assumed."""
     unit: str = METRES
-    """Of the depth."""
     camera: FrameCamera | None = None
     """The camera of the whole image, where it came with the points."""
 

@@ -65,19 +65,18 @@ class FrameFiles:
     """The files of a frame and how they are read."""
 
     image: Source | None = None
-    """Input image. None for a network that takes sparse depth alone."""
+    """None for a network that takes sparse depth alone."""
     sparse: Path | None = None
     """Sparse depth, a LiDAR scan, or a COLMAP model. None: `sample` takes points of the ground
     truth."""
     gt: Source | None = None
-    """Ground truth depth."""
     depth_scale: float | None = option(
         None,
         "Integer depth files hold metres × S.  [default: from the file, else 256]",
         metavar="S",
     )
     sparse_scale: float | None = None
-    """The same for the sparse depth, over `depth_scale`."""
+    """Of the sparse depth, over `depth_scale`."""
     gt_scale: float | None = option(None, "--depth-scale of the ground truth.", metavar="S")
     channel: str | None = option(
         None, "EXR channel or NPZ array that holds the depth.", metavar="NAME"
@@ -94,20 +93,16 @@ class FrameFiles:
         show_default=True,
     )
     colmap: ColmapOptions = field(default_factory=ColmapOptions)
-    """Which points are used where `sparse` is a COLMAP model."""
     scan: ScanOptions = field(default_factory=ScanOptions)
-    """How `sparse` is projected where it is a LiDAR scan."""
     calibration: Calibration | None = None
     """Of a LiDAR scan, where the data set gives it instead of a file."""
     camera_file: Path | None = None
     """Calibration of the camera, where `sparse` is no LiDAR scan and an output needs the camera."""
     camera_number: int | None = None
-    """Which camera of `camera_file`."""
     neighbours: tuple[NeighbourFiles, ...] = ()
     """Other frames of the sequence, whose points are moved into this one."""
     window: tuple[str, ...] = ()
-    """Names of the frames of its window up to this one, which may begin where the last but one
-    ended. Empty for a frame outside of windows."""
+    """Names of the frames of its window up to this one. Empty for a frame outside of windows."""
     gt_masks: tuple[Path, ...] = ()
     """Where one of these is 0, the ground truth is unknown."""
     gt_size_ok: bool = False
@@ -115,7 +110,6 @@ class FrameFiles:
     sample: SamplePattern | None = None
     """Which pixels of the ground truth serve as sparse depth."""
     protocol: Protocol = field(default_factory=_whole_frame)
-    """Which part of the frame is used."""
 
     def is_scan(self, sparse: Path) -> bool:
         """Returns whether sparse depth is a scan that is projected.
@@ -140,7 +134,7 @@ class NeighbourFiles:
     poses: str
     """Where the motion is from, for a person."""
     apart: int
-    """Frames between the two, at least 1."""
+    """Distance in frames, at least 1."""
 
 
 @dataclass(frozen=True, kw_only=True)
