@@ -47,7 +47,7 @@ _STOPPING = b"\nfinishing the current frame; press Ctrl-C again to stop at once\
     groups={
         "Frames": (
             *("--layout", "--protocol", "--sample", "--limit", "--shard"),
-            *("--bag"),
+            "--bag",
         ),
         "Sequences": ("--accumulate", "--poses", "--warm-start"),
         "Input": (*grouped_help.LIDAR, *grouped_help.COLMAP, *grouped_help.FILE_READING),

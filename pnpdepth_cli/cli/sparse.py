@@ -49,7 +49,13 @@ def project(scan: Path, image: Path | None, size: str | None, as_json: bool, **v
 
     target = options.sparse_target(values)
     height_and_width = options.height_and_width(size) if size else None
-    record = project_scan(scan, ScanOptions(**values), target, image=image, size=height_and_width)
+    record = project_scan(
+        scan,
+        ScanOptions(**options.taken(ScanOptions, values)),
+        target,
+        image=image,
+        size=height_and_width,
+    )
     _print(record, as_json=as_json)
 
 

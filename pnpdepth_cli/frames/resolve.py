@@ -134,6 +134,11 @@ def resolve_settings(
     Raises:
         UsageError: The settings contradict each other.
     """
+    given = settings.given()
+    if misplaced := [name for name in _OF_MASKS if name in given and not settings.masked]:
+        raise UsageError(
+            f"{_spelled(misplaced[0])} is for points hidden from the input; add --target masked"
+        )
     of_weights = settings.masked or settings.moves_weights
     if of_weights and settings.preset is not None:
         raise UsageError(
@@ -153,11 +158,6 @@ def resolve_settings(
         alignment = "scale"
     closed = settings.over(replace(defaults, align=alignment)).complete()
     closed = replace(closed, layer=settings.layer)
-    given = settings.given()
-    if misplaced := [name for name in _OF_MASKS if name in given and not settings.masked]:
-        raise UsageError(
-            f"{_spelled(misplaced[0])} is for points hidden from the input; add --target masked"
-        )
     if not of_weights:
         return replace(closed, time_budget_s=None)
     _check_weights(definition, settings, closed)

@@ -639,12 +639,6 @@ def test_structures_are_taken_apart_for_each_frame() -> None:
         assert torch.equal(together.after, alone.after)
 
 
-def test_settings_are_the_papers() -> None:
-    assert Settings() == Settings(iterations=5, lr=0.01, loss="l1", update="sign")
-    with pytest.raises(AttributeError):
-        replace(Settings()).iterations = 3  # type: ignore[misc]
-
-
 def test_a_refinement_does_not_import_the_compiler() -> None:
     code = (
         "import sys; from tests.core.test_refine import *;"

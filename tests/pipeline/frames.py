@@ -19,8 +19,7 @@ from pnpdepth_cli.pipeline.refinement.request import RefineRequest
 NETWORK = """
 import torch
 from torch import nn
-from pnpdepth_cli.models.definition import ModelDefinition, Multiple
-from pnpdepth_cli.settings import Settings
+from pnpdepth_cli.models.definition import ModelDefinition, Multiple, Settings
 
 class Net(nn.Module):
     def __init__(self):
