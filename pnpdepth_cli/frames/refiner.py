@@ -36,7 +36,7 @@ from pnpdepth_cli.frames.frame import (
     registration_to_make,
 )
 from pnpdepth_cli.frames.fuse import Fusion, Member
-from pnpdepth_cli.frames.refine import OnIteration, refine_frame, refine_frames
+from pnpdepth_cli.frames.refine import OnIteration, refine_frames
 from pnpdepth_cli.frames.resolve import resolve_definition, resolve_layer, resolve_settings
 from pnpdepth_cli.frames.tiles import refine_tiled
 from pnpdepth_cli.frames.uncertainty import uncertainty
@@ -311,24 +311,18 @@ class Refiner:
     def _fixed(self, split: Split, frame: Frame, on_iteration: OnIteration) -> Refined:
         """The frame refined by the fixed method."""
         settings = self.settings
-        if settings.tile is None:
-            return refine_frame(
-                self.network,
-                split,
-                settings,
-                frame,
-                propagation=settings.propagate,
-                on_iteration=on_iteration,
-            )
-        return refine_tiled(
-            self.network,
-            split,
-            settings,
-            frame,
-            settings.tile,
-            propagation=settings.propagate,
-            on_iteration=on_iteration,
-        )
+        if settings.tile is not None:
+            return refine_tiled(
+                self.network, split, settings, frame, settings.tile,
+                propagation=settings.propagate, on_iteration=on_iteration,
+            )  # fmt: skip
+        (refined,) = refine_frames(
+            self.network, split, settings, (frame,),
+            propagation=settings.propagate, on_iteration=on_iteration,
+        )  # fmt: skip
+        if isinstance(refined, PnpDepthError):
+            raise refined
+        return refined
 
     def _checked(
         self, split: Split, frame: Frame, refined: Refined, on_iteration: OnIteration
