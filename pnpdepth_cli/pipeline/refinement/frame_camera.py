@@ -110,13 +110,7 @@ def camera_of_frame(
 def camera_of_file(
     path: Path, number: int | None, size: tuple[int, int], image: Path | None = None
 ) -> FrameCamera:
-    """Returns the camera of a calibration file for an image of (H, W).
-
-    Args:
-        path: As `read_calibration` takes it.
-        number: Which camera of the file.
-        size: (H, W) of the image.
-        image: Its file, for messages.
+    """Returns the camera of a calibration file for an image (H, W) of this file.
 
     Raises:
         InputError: The file is no calibration.

@@ -184,13 +184,7 @@ def output_scale(outputs: Outputs, inputs: Inputs) -> float:
 
 
 def within_range(outputs: Outputs, inputs: Inputs, frame: Refined) -> Refined:
-    """Returns the frame with depths that the file's format can hold, and a note if any is clipped.
-
-    Args:
-        outputs: The files that are written.
-        inputs: The frame as it was read.
-        frame: The refined frame.
-    """
+    """Returns the frame with depths that the format can hold, with a note if any is clipped."""
     depth_format = format_of_suffix(outputs.depth.suffix)
     if depth_format is None or not depth_format.integer:
         return frame
