@@ -38,13 +38,12 @@ from model_zoo_defs.training.learning.dataset import Frames
 from pnpdepth_cli.choices import BASELINES
 from pnpdepth_cli.core.metrics import score
 from pnpdepth_cli.frames.frame import Refined
+from pnpdepth_cli.frames.refiner import Refiner
 from pnpdepth_cli.frames.resolve import resolve_layer, resolve_settings
 from pnpdepth_cli.frames.uncertainty import uncertainty
 from pnpdepth_cli.models.definition import Normalisation
 from pnpdepth_cli.models.network import Network, load_network
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs
-from pnpdepth_cli.pipeline.refinement.refine import refiner_of
-from pnpdepth_cli.pipeline.refinement.request import RefineRequest
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.settings import Settings
 
@@ -168,9 +167,8 @@ def measure(
 
 def by_default(network: Network, inputs: Inputs, seed: int = 0) -> Refined:
     """The frame as `pnpdepth refine` gives it by default."""
-    refiner = refiner_of(RefineRequest.from_fields(seed=seed), [network], inputs)
-    with refiner.opened() as opened:
-        return refiner.refine(opened, inputs)
+    with Refiner(network, Settings(seed=seed)) as refiner:
+        return refiner.refine_frame(inputs)
 
 
 def errors_of(depths: dict[str, torch.Tensor], gt: torch.Tensor) -> Errors:

@@ -54,8 +54,8 @@ def mae(frames: Sequence[Inputs], checkpoint: Path | None) -> float:
     """MAE of compact's prediction, the mean over the frames."""
     options = {"iterations": 0, "propagate": "none", "checkpoint": checkpoint}
     refiner = load_refiner(RefineRequest.from_fields(**options), frames[0])
-    with refiner.opened() as opened:
-        depths = [refiner.refine(opened, frame).after for frame in frames]
+    with refiner:
+        depths = [refiner.refine_frame(frame).after for frame in frames]
     return float(np.mean([_error(d, f) for d, f in zip(depths, frames, strict=True)]))
 
 

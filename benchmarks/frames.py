@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 
 from pnpdepth_cli.completion.image_registration import estimated, evidence
-from pnpdepth_cli.frames.frame import Refined
+from pnpdepth_cli.frames.frame import Refined, tensor_of
 from pnpdepth_cli.frames.refine import refine_frame
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.io.rgb import read_rgb
@@ -162,7 +162,7 @@ def registered(
 
 def frame_inputs(rgb: NDArray[np.float32], points: SparsePoints, gt: Depth) -> Inputs:
     """A frame in memory, as the program reads one from files."""
-    return Inputs(rgb=rgb, points=points, gt=gt, sparse_scale=None, record={}, notes=())
+    return Inputs(rgb=tensor_of(rgb), points=points, own=points, gt=gt)
 
 
 def drawn_inputs(frame: EvalFrame, count: int | None, seed: int) -> Inputs:

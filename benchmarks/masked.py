@@ -36,7 +36,6 @@ from pnpdepth_cli.frames.refine import refine_frame, with_propagation
 from pnpdepth_cli.frames.resolve import resolve_layer, resolve_settings
 from pnpdepth_cli.models.network import Network
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs
-from pnpdepth_cli.pipeline.refinement.request import HoldOut
 from pnpdepth_cli.settings import Settings
 
 _OUTLIER_FACTORS = (0.3, 3.0)
@@ -104,10 +103,8 @@ def inputs_of(frame: EvalFrame, case: Case) -> Inputs:
 
 def measured(network: Network, method: str, inputs: Inputs, case: Case) -> list[Row]:
     """Returns the rows of a method on one frame: plain, refined, and with propagation."""
-    options, hold_out = METHODS[method], HoldOut(seed=case.seed)
-    settings = resolve_settings(
-        network.definition, options, hold_out, dense=is_dense(inputs.points)
-    )
+    options = replace(METHODS[method], seed=case.seed)
+    settings = resolve_settings(network.definition, options, dense=is_dense(inputs.points))
     layer = resolve_layer(network.definition, options.layer)
     start = time.process_time()
     with network.cut_at_points() if settings.masked else network.cut_at(layer) as split:

@@ -260,8 +260,8 @@ def _data_frame(root: Path, frame: Frame) -> TableFrame:
     # Nothing is written; this is how `batch` reads scans and scales.
     batch = BatchRequest(source=root, output=root / "out", refine=RefineRequest())
     inputs = read_inputs(task_of(batch, frame).request)
-    assert inputs.rgb is not None
+    assert inputs.image is not None
     scan = inputs.points.scatter()[0, 0].numpy()
     if inputs.gt is None:
-        return TableFrame(rgb=inputs.rgb, gt=scan, pool=scan)
-    return TableFrame(rgb=inputs.rgb, gt=inputs.gt, pool=scan, scan=scan)
+        return TableFrame(rgb=inputs.image, gt=scan, pool=scan)
+    return TableFrame(rgb=inputs.image, gt=inputs.gt, pool=scan, scan=scan)

@@ -148,17 +148,23 @@ def contradicted(inputs: Inputs, held: SparsePoints) -> NDArray[np.bool_]:
 
 def interpolated(inputs: Inputs, used: SparsePoints, held: SparsePoints) -> torch.Tensor:
     """Linear interpolation."""
-    return linear(inputs.frame(used).points, held.xy)
+    return linear(of_used(inputs, used).points, held.xy)
+
+
+def of_used(inputs: Inputs, used: SparsePoints) -> Inputs:
+    """The frame with these of its own points, and its neighbours'."""
+    moved = torch.arange(len(inputs.points)) >= inputs.own_used
+    return replace(inputs, points=used.joined(inputs.points.select(moved)))
 
 
 def refined_by(**options: object) -> Predict:
     """Returns a prediction by the refinement with these options."""
 
     def predict(inputs: Inputs, used: SparsePoints, held: SparsePoints) -> torch.Tensor:
-        without_held = replace(inputs, points=used)
+        without_held = of_used(inputs, used)
         refiner = load_refiner(RefineRequest.from_fields(**options), without_held)
-        with refiner.opened() as opened:
-            frame = refiner.refine(opened, without_held)
+        with refiner:
+            frame = refiner.refine_frame(without_held)
         return held.sample(torch.from_numpy(frame.after))
 
     return predict
@@ -174,7 +180,7 @@ METHODS: dict[str, Predict] = {
 
 def errors(predict: Predict, inputs: Inputs, how: str, seed: int) -> Iterator[NDArray[np.float64]]:
     """Absolute errors at the held-out points: with the frame's own points, then accumulated."""
-    used, held = split(inputs.points, how, seed)
+    used, held = split(inputs.own, how, seed)
     for each in (replace(inputs, neighbours=()), inputs):
         yield (predict(each, used, held) - held.depth).abs().double().numpy()
 
@@ -186,7 +192,7 @@ def flicker_of_linear(frames: list[Inputs], seed: int) -> tuple[float, float]:
     """
     errors: list[list[dict[tuple[float, ...], float]]] = [[], []]
     for inputs in frames:
-        used, held = split(inputs.points, "points", seed)
+        used, held = split(inputs.own, "points", seed)
         for of_kind, each in zip(errors, (replace(inputs, neighbours=()), inputs), strict=True):
             error = (interpolated(each, used, held) - held.depth).tolist()
             of_kind.append(dict(zip(map(tuple, held.xy.tolist()), error, strict=True)))
@@ -251,7 +257,7 @@ def _row(args: argparse.Namespace, frames: list[Inputs], how: str, name: str) ->
         of_frame = []
         for seed in args.seeds:
             inputs = frames[index]
-            wrong = contradicted(inputs, split(inputs.points, how, seed)[1])
+            wrong = contradicted(inputs, split(inputs.own, how, seed)[1])
             pair = list(errors(METHODS[name], inputs, how, seed))
             of_frame.append([each[part].mean() for part in (slice(None), wrong) for each in pair])
         means += of_frame

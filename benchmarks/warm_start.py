@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from benchmarks.accuracy import opened
 from benchmarks.frames import SETS, drawn_inputs
-from benchmarks.sequences import inputs_of, split
+from benchmarks.sequences import inputs_of, of_used, split
 from pnpdepth_cli.frames.frame import Frame, WarmStart, is_dense
 from pnpdepth_cli.frames.refine import refine_frame
 from pnpdepth_cli.frames.resolve import resolve_layer, resolve_settings
@@ -31,7 +31,6 @@ from pnpdepth_cli.frames.warm_start import refine_next
 from pnpdepth_cli.models.network import Network
 from pnpdepth_cli.pipeline.evaluation.measured_frame import MeasuredFrame
 from pnpdepth_cli.pipeline.evaluation.measures.flicker import flicker
-from pnpdepth_cli.pipeline.refinement.request import HoldOut
 from pnpdepth_cli.settings import Settings
 
 KITTI = "kitti_raw"
@@ -66,17 +65,17 @@ def cases(data: Path, name: str, count: int, frames: int, seed: int, reach: int)
     """Yields consecutive frames of a set."""
     if name != KITTI:
         for each in list(SETS[name](data))[:frames]:
-            yield Case(frame=drawn_inputs(each, count, seed).frame(), gt=each.gt)
+            yield Case(frame=drawn_inputs(each, count, seed), gt=each.gt)
         return
     for inputs in inputs_of(data, reach)[:frames]:
-        used, held = split(inputs.points, "points", seed)
-        yield Case(frame=inputs.frame(used), gt=held.scatter()[0, 0].numpy())
+        used, held = split(inputs.own, "points", seed)
+        yield Case(frame=of_used(inputs, used), gt=held.scatter()[0, 0].numpy())
 
 
 def refined(network: Network, method: Settings, sequence: Sequence[Case], *, warm: bool) -> Row:
     """Returns how a sequence comes out, in one window or frame by frame."""
     dense = is_dense(sequence[0].frame.points)
-    settings = resolve_settings(network.definition, method, HoldOut(), dense=dense)
+    settings = resolve_settings(network.definition, method, dense=dense)
     layer = resolve_layer(network.definition, method.layer)
     depths, seconds, taken, carried = [], [], 0, WarmStart()
     with network.cut_at_points() if settings.masked else network.cut_at(layer) as split_:

@@ -119,7 +119,7 @@ def resolve_layer(definition: ModelDefinition, layer: str | None) -> str:
 def resolve_settings(
     definition: ModelDefinition, settings: Settings, *, metric: bool = True, dense: bool = False
 ) -> Settings:
-    """Returns settings with nothing open but the layer: the user's, else the network's defaults.
+    """Returns settings with nothing open: the user's, else the network's defaults.
 
     Another update rule than the network's starts from the paper's step size, schedule and blur,
     because those of the network were tuned for its own rule. The output of a network of metres from
@@ -157,7 +157,8 @@ def resolve_settings(
     if not metric and alignment == "none" and definition.input_kind == "rgb":
         alignment = "scale"
     closed = settings.over(replace(defaults, align=alignment)).complete()
-    closed = replace(closed, layer=settings.layer)
+    layer = settings.layer or definition.default_layer
+    closed = replace(closed, layer=None if layer is None else resolve_layer(definition, layer))
     if not of_weights:
         return replace(closed, time_budget_s=None)
     _check_weights(definition, settings, closed)
