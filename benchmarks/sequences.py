@@ -21,7 +21,6 @@ from pathlib import Path
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from pnpdepth_cli.pipeline.refinement.points import split_points
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
@@ -30,7 +29,7 @@ from pnpdepth_cli.io.dataset.frame import Frame
 from pnpdepth_cli.pipeline.batch.frames import task_of
 from pnpdepth_cli.pipeline.batch.request import BatchRequest
 from pnpdepth_cli.pipeline.batch.sequence import with_neighbours
-from pnpdepth_cli.pipeline.refinement.inputs import Inputs, read_inputs
+from pnpdepth_cli.pipeline.refinement.inputs import Inputs, read_inputs, split_points
 from pnpdepth_cli.pipeline.refinement.refine import load_refiner
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest
 from pnpdepth_cli.points import SparsePoints

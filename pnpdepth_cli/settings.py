@@ -57,7 +57,7 @@ class OptionField:
 
     name: str
     type: str
-    """Type of the value without "| None", as it is written."""
+    """Type of the value as it is written, without "| None"; of several, the last."""
     default: Any
     option: Option
 
@@ -97,7 +97,7 @@ def options_of(group: type) -> Iterator[OptionField]:
         if _KEY in declared.metadata:
             yield OptionField(
                 name=declared.name,
-                type=str(declared.type).removesuffix(" | None"),
+                type=str(declared.type).removesuffix(" | None").rpartition(" | ")[2],
                 default=declared.default,
                 option=declared.metadata[_KEY],
             )
