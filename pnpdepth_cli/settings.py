@@ -298,7 +298,7 @@ class Settings:
 
     def with_preset(self) -> Settings:
         """Returns these settings, and those of the preset where these are open."""
-        return self if self.preset is None else self.over(PAPER)
+        return self if self.preset is None else self.over(PAPER.opened(*_OF_MASKS))
 
     def given(self) -> dict[str, Any]:
         """Returns the fields that are not open."""
@@ -366,6 +366,7 @@ _CHECKS: Mapping[str, tuple[Callable[[Any], bool], str]] = {
 """Whether a value of the field is valid, and what it must be."""
 
 _NOT_OF_METHOD = ("time_budget_s", "seed")
+_OF_MASKS = ("mask", "mask_fraction", "mask_scale")
 
 _OPEN = {each.name: each.default for each in fields(Settings)}
 

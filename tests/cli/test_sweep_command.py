@@ -142,7 +142,7 @@ def test_the_help_names_all_that_can_be_varied() -> None:
 def test_options_that_a_sweep_would_not_heed_are_not_there() -> None:
     names = {option.name for option in sweep.params}
     assert not names & {"format", "overwrite", "holdout"}
-    assert {"layer", "lr", "keep_best", "calib", "device"} <= names
+    assert {"layer", "lr", "set_assigned", "calib", "device"} <= names
     parameters = click.command()(options.refinement(lambda: None)).params
     assert {"format", "overwrite", "holdout"} <= {option.name for option in parameters}
 

@@ -28,7 +28,7 @@ from pnpdepth_cli.pipeline.batch.sequence import (
     with_neighbours,
     with_windows,
 )
-from pnpdepth_cli.pipeline.refinement.outputs import Outputs
+from pnpdepth_cli.pipeline.refinement.output_files import Outputs
 from pnpdepth_cli.pipeline.refinement.request import (
     FrameFiles,
     NeighbourFiles,

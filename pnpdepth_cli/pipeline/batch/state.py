@@ -27,7 +27,7 @@ from pnpdepth_cli.io.remote.store import Listing, read_object, remove, renamed, 
 from pnpdepth_cli.pipeline.batch.frames import Task
 from pnpdepth_cli.pipeline.batch.settings import SettingsDigests
 from pnpdepth_cli.pipeline.batch.summary import JSON, failed_row, row_of
-from pnpdepth_cli.pipeline.refinement.outputs import Outputs
+from pnpdepth_cli.pipeline.refinement.output_files import Outputs
 
 if TYPE_CHECKING:
     from pnpdepth_cli.pipeline.refinement.refine import RefineOutcome

@@ -13,12 +13,8 @@ from pnpdepth_cli.frames.resolve import redefined
 from pnpdepth_cli.io.atomic import all_or_none
 from pnpdepth_cli.models.network import load_network
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs, read_inputs
-from pnpdepth_cli.pipeline.refinement.outputs import (
-    Outputs,
-    plan_outputs,
-    within_range,
-    write_outputs,
-)
+from pnpdepth_cli.pipeline.refinement.output_files import Outputs, plan_outputs
+from pnpdepth_cli.pipeline.refinement.outputs import within_range, write_outputs
 from pnpdepth_cli.pipeline.refinement.record import record_of
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest
 from pnpdepth_cli.pipeline.stopwatch import Stopwatch, peak_memory_mb

@@ -219,7 +219,7 @@ def test_a_divergence_keeps_the_last_good_depth_and_is_counted(root: Path) -> No
 def test_a_mistake_that_concerns_all_frames_stops_the_batch_at_once(root: Path) -> None:
     with pytest.raises(LayerError, match="did you mean middle"):
         batch(root, refine={"layer": "midle"})
-    with pytest.raises(UsageError, match="not a step size"):
+    with pytest.raises(UsageError, match="lr must be a step size"):
         batch(root, refine={"lr": "fast"})
     with pytest.raises(UsageError, match="is no scan"):
         batch(root, refine={"scan": ScanOptions(max_range=10)})

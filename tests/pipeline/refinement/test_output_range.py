@@ -16,7 +16,8 @@ from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.frames.frame import Refined, no_points
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs
-from pnpdepth_cli.pipeline.refinement.outputs import Outputs, output_scale, within_range
+from pnpdepth_cli.pipeline.refinement.output_files import Outputs
+from pnpdepth_cli.pipeline.refinement.outputs import output_scale, within_range
 from pnpdepth_cli.pipeline.refinement.request import parse_codes_per_metre
 from pnpdepth_cli.points import SparsePoints
 from tests.pipeline.frames import frame_on_disk, run

@@ -148,7 +148,7 @@ def test_of_a_result_that_cannot_be_written_whole_nothing_stays(
     def full(*_: object) -> None:
         raise StorageError("the disk is full")
 
-    monkeypatch.setattr("pnpdepth_cli.pipeline.refinement.outputs.write_json", full)
+    monkeypatch.setattr("pnpdepth_cli.pipeline.refinement.output_files.write_json", full)
     with pytest.raises(StorageError):
         run(frame)
     assert not list((frame.folder / "out").iterdir())
